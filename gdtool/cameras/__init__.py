@@ -1,0 +1,5 @@
+"""Cameras: the six-view rig, orthographic and perspective projection."""
+
+from gdtool.cameras.camera import Camera, camera_at, look_at, project, rays, rig
+
+__all__ = ["Camera", "camera_at", "look_at", "project", "rays", "rig"]
