@@ -1,0 +1,7 @@
+"""`gdtool render-dataset`: options and help come from the stage."""
+
+from gdtool.stages import render_dataset as stage
+
+from ._common import stage_command
+
+command = stage_command(stage.STAGE, help=stage.__doc__)

@@ -1,0 +1,105 @@
+"""Run one function in a killable child process with a time and a memory limit.
+
+Native mesh code hangs, crashes or calls exit() on hard input (FAULTS.md). The child gets its arguments and gives its
+result by pickle over pipes of our own; it dies with its parent, however the parent dies.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+from typing import Any
+
+from gdtool.core import errors
+
+
+class ChildFailed(Exception):
+    """The child crashed, ran out of time or memory, or ended without a result; str() says which."""
+
+
+def call(function: str, *args: Any, seconds: float, memory_mb: int | None = None, **kwargs: Any) -> Any:
+    """Result of "package.module:function"(*args, **kwargs), computed in a child process.
+
+    memory_mb limits the growth of the child's address space over what it has after importing. A GdtoolError raised in
+    the child is raised here; everything else that goes wrong there raises ChildFailed.
+    """
+    request = pickle.dumps((function, args, kwargs, memory_mb), protocol=5)
+    process = subprocess.Popen([sys.executable, "-m", "gdtool.core.child"], stdin=subprocess.PIPE,
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    timed_out = threading.Event()
+
+    def stop() -> None:
+        timed_out.set()
+        process.kill()
+
+    timer = threading.Timer(seconds, stop)
+    timer.start()
+    try:
+        answer, noise = process.communicate(request)
+    except BaseException:
+        process.kill()
+        process.wait()
+        raise
+    finally:
+        timer.cancel()
+    if timed_out.is_set():
+        raise ChildFailed(f"{function} took longer than {seconds:g} s")
+    if process.returncode < 0:
+        raise ChildFailed(f"{function} died of {signal.Signals(-process.returncode).name}")
+    if not answer:
+        last = noise.decode(errors="replace").strip().splitlines()[-1:]
+        raise ChildFailed(f"{function} ended with exit code {process.returncode} and no result" + "".join(f" ({x})" for x in last))
+    status, value = pickle.loads(answer)
+    if status == "done":
+        return value
+    if status == "error":
+        raise value
+    raise ChildFailed(f"{function}: {value}")
+
+
+def _die_with_parent() -> None:
+    if sys.platform == "linux":
+        import ctypes
+
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+
+
+def _limit_memory(megabytes: int) -> None:
+    import resource
+
+    with open("/proc/self/statm") as file:
+        now = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    limit = now + megabytes * 2**20
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+def _main() -> None:
+    _die_with_parent()
+    # Native libraries print to stdout; the answer goes out through a descriptor they do not know.
+    answer_to = os.dup(1)
+    os.dup2(2, 1)
+    function, args, kwargs, memory_mb = pickle.loads(sys.stdin.buffer.read())
+    module, name = function.split(":")
+    try:
+        target = getattr(importlib.import_module(module), name)
+        if memory_mb is not None and sys.platform == "linux":
+            _limit_memory(memory_mb)
+        answer = ("done", target(*args, **kwargs))
+    except errors.GdtoolError as error:
+        answer = ("error", type(error)(error.subject, error.fact, error.cure))
+    except MemoryError:
+        answer = ("failed", f"needs more than {memory_mb} MB")
+    except Exception as error:  # reported to the parent, which knows a fallback
+        answer = ("failed", f"{type(error).__name__}: {error}")
+    with os.fdopen(answer_to, "wb") as file:
+        pickle.dump(answer, file, protocol=5)
+    os._exit(0)  # a native library may hang or crash in its own teardown; the answer is out
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,187 @@
+"""manifest.json: what a folder holds, what it was made from and how. A folder with a manifest is whole."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+import os
+import re
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+from gdtool.core.errors import InputError, from_os_error
+from gdtool.core.kinds import CONTENTS, Content, Scalar
+
+FORMAT = 1
+MANIFEST = "manifest.json"
+
+Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+
+
+class FileEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A file of the folder."""
+
+    path: Annotated[str, Meta(description="relative to the folder, forward slashes")]
+    size: Annotated[int, Meta(ge=0)]
+    sha256: Sha256
+
+
+class InputEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a folder was made from."""
+
+    role: Annotated[str, Meta(description="source, or the name of the flag that gave it")]
+    path: Annotated[str, Meta(description="relative to the folder, or procedural:SEED")]
+    digest: Sha256
+
+
+class Skip(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Work that the scene did not need."""
+
+    what: str
+    reason: str
+    saved_seconds: float | None = None
+
+
+class RunRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the run went; outside every digest, so that equal results have equal digests."""
+
+    seconds: dict[str, float] = {}
+    total_seconds: float = 0.0
+    peak_memory_mb: float = 0.0
+    finished: str = ""
+
+
+class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """manifest.json of every kind; content has the type that CONTENTS names for the kind."""
+
+    format: Annotated[int, Meta(ge=1)] = FORMAT
+    kind: str
+    name: Annotated[str, Meta(description="the object's name")]
+    stage: Annotated[str, Meta(description="what made the folder; any name when it was not gdtool")]
+    stage_version: Annotated[int, Meta(ge=0)] = 0
+    tool_version: str = ""
+    key: Annotated[str, Meta(description="sha256 of stage, stage version, options and input digests; may be empty")] = ""
+    options: dict[str, Any] = {}
+    inputs: tuple[InputEntry, ...] = ()
+    content: Any
+    skipped: tuple[Skip, ...] = ()
+    warnings: tuple[str, ...] = ()
+    files: tuple[FileEntry, ...]
+    run: RunRecord = RunRecord()
+
+    @property
+    def digest(self) -> str:
+        """sha256 of what the folder holds: kind, format, content and files; not how or when it was made."""
+        return digest_of([self.format, self.kind, self.content, sorted((f.path, f.sha256) for f in self.files)])
+
+
+def digest_of(value: Any) -> str:
+    """sha256 of the canonical JSON of value."""
+    text = json.dumps(msgspec.to_builtins(value), sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def file_sha256(path: Path) -> str:
+    """sha256 of a file's bytes."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def encode(manifest: Manifest) -> bytes:
+    """The bytes of manifest.json: indented, in field order, one trailing newline."""
+    return msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n"
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in out:
+            raise InputError("", f"key {key!r} appears twice")
+        out[key] = value
+    return out
+
+
+def _nearest(message: str, types: tuple[type, ...]) -> str:
+    """A hint for msgspec's unknown field message: the known field nearest to the unknown one."""
+    unknown = re.search(r"unknown field `([^`]+)`", message)
+    if not unknown:
+        return ""
+    known = {field for one in types for field in one.__struct_fields__}
+    near = difflib.get_close_matches(unknown[1], known, n=1)
+    return f"did you mean {near[0]!r}?" if near else ""
+
+
+def read_json(path: Path) -> Any:
+    """Parse a JSON file strictly. Raises InputError with the line of a fault, or when a key appears twice."""
+    try:
+        return json.loads(path.read_bytes(), object_pairs_hook=_unique)
+    except InputError as error:
+        raise InputError(path, error.fact) from None
+    except (UnicodeDecodeError, RecursionError) as error:
+        raise InputError(path, f"is not JSON ({type(error).__name__})") from None
+    except json.JSONDecodeError as error:
+        raise InputError(path, f"is not JSON: {error.msg} in line {error.lineno}") from None
+    except OSError as error:
+        raise from_os_error(error, path) from None
+
+
+def decode(raw: Any, path: Path) -> Manifest:
+    """Check parsed JSON against the format. Raises InputError that names path and the fault."""
+    if isinstance(raw, dict) and isinstance(raw.get("format"), int) and raw["format"] > FORMAT:
+        raise InputError(path, f"has format {raw['format']}, this gdtool reads up to {FORMAT}", "upgrade gdtool")
+    nested = (Manifest, FileEntry, InputEntry, Skip, RunRecord)
+    try:
+        manifest = msgspec.convert(raw, Manifest)
+        if manifest.kind not in CONTENTS:
+            raise InputError(path, f"has unknown kind {manifest.kind!r}", f"known: {', '.join(CONTENTS)}")
+        nested = (CONTENTS[manifest.kind],)
+        content = msgspec.convert(raw["content"], CONTENTS[manifest.kind])
+    except msgspec.ValidationError as error:
+        fact = str(error)
+        raise InputError(path, fact[0].lower() + fact[1:], _nearest(fact, nested)) from None
+    for entry in manifest.files:
+        pure = PurePosixPath(entry.path)
+        if pure.is_absolute() or ".." in pure.parts or "\\" in entry.path or not pure.parts:
+            raise InputError(path, f"file path {entry.path!r} leaves the folder")
+    return msgspec.structs.replace(manifest, content=content)
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest of a folder. Raises InputError when there is none or it is faulty."""
+    path = folder / MANIFEST
+    if not path.is_file():
+        fact = "has no manifest.json" if folder.is_dir() else ("is not a folder" if folder.exists() else "does not exist")
+        raise InputError(folder, fact, "a folder is whole only with its manifest")
+    return decode(read_json(path), path)
+
+
+def check_files(folder: Path, manifest: Manifest) -> None:
+    """Raises InputError when a listed file is missing, leaves the folder by a link, or has another size or hash."""
+    root = folder.resolve()
+    for entry in manifest.files:
+        path = folder / entry.path
+        if not path.is_file():
+            raise InputError(path, "is listed in the manifest but missing")
+        if not path.resolve().is_relative_to(root):
+            raise InputError(path, "is a link that leaves the folder")
+        if path.stat().st_size != entry.size or file_sha256(path) != entry.sha256:
+            raise InputError(path, "is not the file that the manifest lists (other size or hash)")
+
+
+def list_files(folder: Path) -> tuple[FileEntry, ...]:
+    """Entries for all files below folder except the manifest, sorted by path."""
+    out = []
+    for root, _, names in os.walk(folder):
+        for name in names:
+            path = Path(root, name)
+            relative = path.relative_to(folder).as_posix()
+            if relative != MANIFEST:
+                out.append(FileEntry(relative, path.stat().st_size, file_sha256(path)))
+    return tuple(sorted(out, key=lambda entry: entry.path))
+
+
+__all__ = ["Content", "FileEntry", "InputEntry", "Manifest", "RunRecord", "Scalar", "Skip"]

@@ -1,0 +1,245 @@
+"""Run a stage on its sources: where the result goes, whether it is up to date, one atomic publication each."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import itertools
+import os
+import resource
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from gdtool import __version__
+from gdtool.core import log, sources
+from gdtool.core.errors import GdtoolError, InputError, ResourceError, UsageError, from_os_error
+from gdtool.core.folder import Folder, find_ancestor, is_folder, open_folder
+from gdtool.core.manifest import (MANIFEST, InputEntry, Manifest, RunRecord, check_files, digest_of, encode, list_files,
+                                  read_manifest)
+from gdtool.core.publish import clear_stale, locked, partial_path, publish, workspace_path
+from gdtool.core.sources import Source
+from gdtool.core.stage import Inputs, Output, Stage
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to run, as against what to make: none of it enters the key."""
+
+    output: Path | None = None
+    several: bool = False
+    dry_run: bool = False
+    force: bool = False
+    threads: int = 0
+    device: str = "cpu"
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of one source. path is the finished folder, or the one that would be made."""
+
+    path: Path
+    kind: str
+    status: Literal["done", "up to date", "would run"]
+    seconds: float = 0.0
+    skipped: tuple[str, ...] = ()
+
+
+def default_output(stage: Stage, source: Source, output: Path | None, several: bool) -> Path:
+    """Where the result goes.
+
+    Without -o: beside the source folder, for files and datasets in ./<name>.asset of the working directory.
+    -o names the folder itself for one source, and the parent of <name>.asset/<kind> for several.
+    """
+    name = sources.name_of(source)
+    if output is not None:
+        return output / f"{name}.asset" / stage.writes if several else output
+    if isinstance(source, Folder) and source.kind != "dataset":
+        return source.path.parent / stage.writes
+    return Path(f"{name}.asset") / stage.writes
+
+
+def second_inputs(stage: Stage, source: Source, given: dict[str, str | None]) -> dict[str, Folder | Path | None]:
+    """The stage's other inputs: what the flags name, else what lies along the provenance chain."""
+    out: dict[str, Folder | Path | None] = {}
+    for flag in stage.second_inputs:
+        wanted = stage.second(flag)
+        if given.get(flag):
+            out[flag] = sources.resolve(given[flag], (wanted.kind,), f"--{flag} of {stage.name}")
+        elif wanted.search and isinstance(source, Folder):
+            found = find_ancestor(source, wanted.kind)
+            out[flag] = open_folder(found.path) if found else None
+        else:
+            out[flag] = None
+        if out[flag] is None and wanted.required:
+            raise UsageError(sources.name_of(source), f"has no {wanted.kind} along its provenance chain", f"name one with --{flag}")
+    return out
+
+
+def option_record(options: Any, folder: Path | None) -> dict[str, Any]:
+    """Options as plain values; files by digest (folder None, for the key) or by path relative to folder."""
+    record = msgspec.to_builtins(options)
+    for field in msgspec.structs.fields(options):
+        extra = getattr(getattr(field.type, "__metadata__", (None,))[0], "extra", None) or {}
+        value = record.get(field.name)
+        if extra.get("file") and isinstance(value, str) and Path(value).is_file():
+            record[field.name] = sources.digest(Path(value)) if folder is None else sources.relative_to(Path(value), folder)
+    return record
+
+
+def stale_reason(target: Path, stage: Stage, key: str, options: dict[str, Any], inputs: list[tuple[str, str]]) -> str | None:
+    """Why the folder at target is not the result of this key, cheapest check first; None when it is."""
+    if not is_folder(target):
+        return "not made yet"
+    try:
+        old = read_manifest(target)
+        if old.key != key:
+            if old.stage != stage.name:
+                return f"made by {old.stage}"
+            if old.stage_version != stage.version:
+                return f"{stage.name} changed (version {old.stage_version} → {stage.version})"
+            for name, value in options.items():
+                if old.options.get(name) != value:
+                    return f"{name} {old.options.get(name)} → {value}"
+            before = {entry.role: entry.digest for entry in old.inputs}
+            for role, digest in inputs:
+                if before.get(role) != digest:
+                    return f"{role} changed"
+            return "a file that an option names changed"
+        check_files(target, old)
+    except InputError as error:
+        return f"damaged: {error}"
+    return None
+
+
+def _refuse_other_source(target: Path, stage: Stage, source: Source, chosen: bool) -> None:
+    """A default place that another source's result holds is not overwritten."""
+    if chosen or stage.gathers or isinstance(source, Folder) or not is_folder(target):
+        return
+    before = next((entry.path for entry in read_manifest(target).inputs if entry.role == "source"), None)
+    here = source if isinstance(source, str) else os.path.realpath(source)
+    there = before if before is None or before.startswith("procedural:") else os.path.realpath(target / before)
+    if there is not None and there != here:
+        raise UsageError(target, f"was made from another source ({before})", "name an output folder with -o")
+
+
+def run_one(stage: Stage, given: list[Source], options: Any, flags: dict[str, str | None], settings: Settings) -> Result:
+    """Run a stage on one source (or, when it gathers, on all of them) and publish the result."""
+    source = given[0]
+    target = default_output(stage, source, settings.output, settings.several and not stage.gathers)
+    if target.exists() and not target.is_dir():
+        raise UsageError(target, "is a file", "name a folder with -o")
+    for one in given:
+        if isinstance(one, Folder) and target.resolve() == one.path.resolve():
+            raise UsageError(target, "is both source and output", "name another output with -o")
+    _refuse_other_source(target, stage, source, settings.output is not None and not settings.several)
+    if settings.dry_run:
+        return Result(target, stage.writes, "would run")
+    second = second_inputs(stage, source, flags)
+    roles = [("source", one) for one in given] + [(flag, one) for flag, one in second.items() if one is not None]
+    digests = [(role, sources.digest(one)) for role, one in roles]
+    keyed = option_record(options, None)
+    key = digest_of([stage.name, stage.version, keyed, digests])
+    target.parent.mkdir(parents=True, exist_ok=True)
+    recorded = option_record(options, target)
+    start = time.perf_counter()
+    with locked(target):
+        clear_stale(target, key)
+        reason = "asked by --force" if settings.force else stale_reason(target, stage, key, recorded, digests)
+        if reason is None:
+            os.utime(target / MANIFEST)
+            log.say(f"{target}: up to date")
+            return Result(target, stage.writes, "up to date")
+        log.say(f"{target}: running {stage.name} ({reason})")
+        partial = partial_path(target, key)
+        out = Output(partial, workspace_path(target, key), settings.threads or os.cpu_count() or 1, settings.device)
+        try:
+            partial.mkdir()
+            inputs = Inputs(source, sources.name_of(source), second, tuple(given))
+            try:
+                stage.run(inputs, options, out)
+            except MemoryError:
+                raise ResourceError(inputs.name, f"{stage.name} ran out of memory", "lower the resolution or free memory") from None
+            if out.content is None:
+                raise RuntimeError(f"{stage.name} gave no content")
+            entries = [
+                InputEntry(role, sources.relative_to(one.path if isinstance(one, Folder) else one, target), digest)
+                for (role, one), (_, digest) in zip(roles, digests, strict=True)
+            ]
+            manifest = Manifest(
+                kind=stage.writes, name=inputs.name, stage=stage.name, stage_version=stage.version, tool_version=__version__,
+                key=key, options=recorded, inputs=tuple(entries), content=out.content, skipped=tuple(out.skipped),
+                warnings=tuple(out.warnings), files=list_files(partial), run=_record(out, start),
+            )
+            (partial / MANIFEST).write_bytes(encode(manifest))
+            publish(partial, target)
+            shutil.rmtree(out._workspace, ignore_errors=True)
+        except OSError as error:
+            raise from_os_error(error, target) from error
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+    seconds = time.perf_counter() - start
+    log.say(f"{target}: done in {seconds:.1f} s" + (f", skipped {len(out.skipped)}" if out.skipped else ""))
+    return Result(target, stage.writes, "done", seconds, tuple(f"{s.what}: {s.reason}" for s in out.skipped))
+
+
+def _record(out: Output, start: float) -> RunRecord:
+    peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 1024
+    finished = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    seconds = {name: round(value, 4) for name, value in out.seconds.items()}
+    return RunRecord(seconds, round(time.perf_counter() - start, 4), round(peak, 1), finished)
+
+
+def write_dataset_index(root: Path, results: list[Result]) -> Path:
+    """Write or extend the dataset manifest at root over the views folders made below it."""
+    from gdtool.core.kinds import DatasetContent, DatasetObject
+
+    objects: dict[str, str] = {}
+    if is_folder(root):
+        old = read_manifest(root)
+        if old.kind != "dataset":
+            raise UsageError(root, f"holds {old.kind}", "name another output with -o")
+        objects = {one.path: one.digest for one in old.content.objects if is_folder(root / one.path)}
+    for result in results:
+        objects[result.path.relative_to(root).as_posix()] = read_manifest(result.path).digest
+    content = DatasetContent(objects=tuple(DatasetObject(path, objects[path]) for path in sorted(objects)))
+    manifest = Manifest(kind="dataset", name=root.absolute().name, stage="render-dataset", tool_version=__version__, content=content, files=())
+    temporary = root / f".{MANIFEST}.partial"
+    temporary.write_bytes(encode(manifest))
+    os.replace(temporary, root / MANIFEST)
+    return root
+
+
+def run_all(stage: Stage, arguments: tuple[str, ...], options: Any, flags: dict[str, str | None],
+            settings: Settings) -> Iterator[Result | GdtoolError]:
+    """Run a stage on every source, as they arrive; a source that fails yields its error and the rest go on."""
+    stream = sources.incoming(arguments)
+    if stage.gathers:
+        given = [sources.resolve(text, stage.reads, stage.name) for text in stream]
+        yield run_one(stage, given, options, flags, settings)
+        return
+    several = settings.several
+    if settings.output is not None and not several:
+        # -o means the folder itself for one source and a parent for several: look one source ahead.
+        first = list(itertools.islice(stream, 2))
+        several = len(first) > 1
+        stream = itertools.chain(first, stream)
+    settings = dataclasses.replace(settings, several=several)
+    done: list[Result] = []
+    for text in stream:
+        try:
+            source = sources.resolve(text, stage.reads, stage.name, allow_missing=settings.dry_run)
+            result = run_one(stage, [source], options, flags, settings)
+            done.append(result)
+            yield result
+        except OSError as error:
+            yield from_os_error(error, text)
+        except GdtoolError as error:
+            yield error
+    if stage.dataset and several and settings.output is not None and done and not settings.dry_run:
+        write_dataset_index(settings.output, done)

@@ -1,0 +1,139 @@
+"""What a command is given to work on: folders, files, procedural:SEED; their names, digests and order of arrival."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import unquote
+
+from gdtool.core.errors import InputError, UsageError
+from gdtool.core.folder import Folder, is_folder, open_folder
+from gdtool.core.manifest import digest_of, file_sha256
+
+PROCEDURAL = re.compile(r"procedural:(\d+)(?:\.\.(\d+))?$")
+
+Source = Folder | Path | str  # a str is procedural:SEED
+
+
+def expand(text: str) -> Iterator[str]:
+    """procedural:A..B becomes its seeds, one by one; anything else is itself."""
+    match = PROCEDURAL.match(text)
+    if match and match[2]:
+        for seed in range(int(match[1]), int(match[2]) + 1):
+            yield f"procedural:{seed}"
+    else:
+        if text.startswith("procedural:") and not match:
+            raise UsageError(text, "is not procedural:SEED or procedural:FIRST..LAST")
+        yield text
+
+
+def incoming(arguments: tuple[str, ...]) -> Iterator[str]:
+    """Sources in order: the arguments, or without any the lines of stdin, each as soon as it arrives.
+
+    Raises UsageError when both are empty: a pipe whose first stage failed fails as a whole.
+    """
+    empty = True
+    for text in arguments or _lines():
+        empty = False
+        yield from expand(text)
+    if empty:
+        raise UsageError("stdin", "gave no sources", "name files or folders, or pipe their paths in")
+
+
+def _lines() -> Iterator[str]:
+    if sys.stdin is None or sys.stdin.isatty():
+        return
+    for raw in iter(sys.stdin.buffer.readline, b""):
+        line = os.fsdecode(raw.rstrip(b"\r\n"))
+        if line.startswith("{"):
+            try:
+                line = json.loads(line)["folder"]
+            except (ValueError, KeyError, TypeError):
+                raise UsageError("stdin", f"line {line[:60]!r} is neither a path nor an object of --json") from None
+            if line is None:
+                continue
+        if line:
+            yield line
+
+
+def resolve(text: str, kinds: tuple[str, ...], reader: str, allow_missing: bool = False) -> Source:
+    """Open what a source names. Raises InputError when it is missing or of the wrong kind."""
+    if text.startswith("procedural:"):
+        if "model-file" not in kinds and "mesh-file" not in kinds:
+            raise InputError(text, f"names a model, but {reader} reads {_words(kinds)}", "run gdtool render-dataset first")
+        return text
+    path = Path(text)
+    folder_kinds = tuple(kind for kind in kinds if not kind.endswith("-file"))
+    if path.is_dir() or path.name == "manifest.json":
+        if not folder_kinds and not is_folder(path):
+            raise InputError(path, f"is a folder, but {reader} reads {_words(kinds)}")
+        return open_folder(path, folder_kinds or ("a file",), reader)
+    if not path.exists() and not allow_missing:
+        raise InputError(path, "does not exist")
+    if path.exists() and len(folder_kinds) == len(kinds):
+        raise InputError(path, f"is a file, but {reader} reads a {_words(kinds)} folder")
+    return path
+
+
+def _words(kinds: tuple[str, ...]) -> str:
+    return " or ".join(kind.replace("-file", " files") for kind in kinds)
+
+
+def name_of(source: Source) -> str:
+    """The object's name: of a folder what its manifest says, of a file its stem."""
+    if isinstance(source, Folder):
+        return source.name
+    if isinstance(source, str):
+        return "procedural-" + source.split(":")[1].zfill(6)
+    return source.stem
+
+
+def digest(source: Source) -> str:
+    """sha256 that changes when the source's meaning does; of .gltf and .obj the files they name are part of it."""
+    if isinstance(source, Folder):
+        return source.manifest.digest
+    if isinstance(source, str):
+        from gdtool.assets.procedural import VERSION
+
+        return digest_of(["procedural", VERSION, source])
+    return digest_of([file_sha256(path) for path in (source, *_sidecars(source)) if path.is_file()])
+
+
+def _sidecars(path: Path) -> list[Path]:
+    """Files that a .gltf or .obj refers to."""
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".gltf":
+            document = json.loads(path.read_bytes())
+            uris = [item.get("uri") for key in ("buffers", "images") for item in document.get(key, [])]
+            return [path.parent / unquote(uri) for uri in uris if isinstance(uri, str) and not uri.startswith("data:")]
+        if suffix == ".obj":
+            out = []
+            with open(path, encoding="utf-8", errors="replace") as file:
+                for line in file:
+                    if line.startswith("mtllib "):
+                        out.append(path.parent / line[7:].strip())
+            for library in list(out):
+                if library.is_file():
+                    for line in library.read_text(errors="replace").splitlines():
+                        words = line.split()
+                        if len(words) > 1 and words[0].lower().startswith(("map_", "bump", "norm")):
+                            out.append(library.parent / words[-1])
+            return out
+    except (OSError, ValueError, AttributeError):
+        return []  # the reader will say what is wrong with it
+    return []
+
+
+def relative_to(path: Path | str, folder: Path) -> str:
+    """path as seen from folder, forward slashes; procedural:SEED stays as it is."""
+    if isinstance(path, str):
+        return path
+    return Path(os.path.relpath(path.absolute(), folder.absolute())).as_posix()
+
+
+__all__ = ["Source", "digest", "expand", "incoming", "name_of", "relative_to", "resolve"]

@@ -1,0 +1,118 @@
+"""What a stage is: a pure step from folders to a folder, and what it is handed to do that."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+
+from gdtool.core import log
+from gdtool.core.folder import Folder
+from gdtool.core.kinds import Content
+from gdtool.core.manifest import Skip
+from gdtool.core.sources import Source
+
+# An option that names a file: its content enters the key, its path relative to the output the manifest.
+FILE = {"file": True}
+
+
+def file_option(description: str) -> Any:
+    """The annotation of an option that names a file, or one of a stage's built-in names."""
+    return Annotated[str | None, msgspec.Meta(description=description, extra=FILE)]
+
+
+@dataclass(frozen=True)
+class SecondInput:
+    """An input beside the source: a flag, and when search is set found along the provenance chain without it."""
+
+    kind: str
+    required: bool = False
+    search: bool = True
+    help: str = ""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a run reads. second has an entry for each second input; None where there is none."""
+
+    main: Source
+    name: str
+    second: dict[str, Folder | Path | None] = field(default_factory=dict)
+    all: tuple[Source, ...] = ()
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage and all that its command line, its manifest and its schema are derived from.
+
+    reads: folder kinds, and "image-file", "model-file", "mesh-file" for files. version rises when results change.
+    gathers: all sources go into one run (train). dataset: several results share a root with an index.
+    """
+
+    name: str
+    version: int
+    reads: tuple[str, ...]
+    writes: str
+    Options: type[msgspec.Struct]
+    run: Callable[[Inputs, Any, "Output"], None]
+    second_inputs: dict[str, SecondInput | str] = field(default_factory=dict)
+    gathers: bool = False
+    dataset: bool = False
+
+    def second(self, flag: str) -> SecondInput:
+        """The declaration of a second input."""
+        found = self.second_inputs[flag]
+        return SecondInput(found) if isinstance(found, str) else found
+
+
+class Output:
+    """The unpublished folder a run writes into, and the record it keeps of the run."""
+
+    def __init__(self, folder: Path, workspace: Path, threads: int, device: str):
+        self.folder, self._workspace = folder, workspace
+        self.threads, self.device = threads, device
+        self.content: Content | None = None
+        self.seconds: dict[str, float] = {}
+        self.skipped: list[Skip] = []
+        self.warnings: list[str] = []
+
+    def path(self, relative: str) -> Path:
+        """Where to write a file of the result; its parents exist."""
+        path = self.folder / relative
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    @property
+    def workspace(self) -> Path:
+        """A folder that survives a kill and is removed when the result is published: checkpoints, caches."""
+        self._workspace.mkdir(parents=True, exist_ok=True)
+        return self._workspace
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Time a step; its seconds go into the manifest, added up when a name comes twice."""
+        log.say(f"  {name}", at=log.VERBOSE)
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+    def skip(self, what: str, reason: str, saved_seconds: float | None = None) -> None:
+        """Record work that the scene did not need."""
+        self.skipped.append(Skip(what, reason, saved_seconds))
+        log.say(f"  skipped {what}: {reason}", at=log.VERBOSE)
+
+    def warn(self, text: str) -> None:
+        """Record a warning and tell it."""
+        self.warnings.append(text)
+        log.say(f"warning: {text}")
+
+    def progress(self, iterable: Iterable, total: int | None = None, label: str = "") -> Iterator:
+        """Iterate with a bar on stderr when it is a terminal."""
+        return log.progress(iterable, total, label)

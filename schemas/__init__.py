@@ -1,0 +1,1 @@
+"""JSON Schemas and pages of the folder formats."""
