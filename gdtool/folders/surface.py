@@ -1,0 +1,140 @@
+"""Reading and writing `surface` folders (schemas/surface.md)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gdtool.core.errors import InputError
+from gdtool.core.folder import Folder
+from gdtool.core.kinds import IDENTITY, SurfaceContent
+from gdtool.core.stage import Output
+from gdtool.folders.records import read_record, write_record
+
+# albedo is 8-bit sRGB under the names that viewers show.
+_VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"), ("red", "u1"),
+                    ("green", "u1"), ("blue", "u1"), ("roughness", "<f4"), ("metallic", "<f4"), ("confidence", "<f4")])
+_FACE = np.dtype([("count", "u1"), ("idx", "<i4", 3)])
+_PLY_TYPES = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
+              "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"}
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A triangle mesh in the normalised frame with a material per vertex.
+
+    vertices (v, 3) float, faces (f, 3) int32, normals (v, 3) unit or None, albedo (v, 3) linear in [0, 1],
+    roughness, metallic and confidence (v,) in [0, 1].
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    albedo: np.ndarray
+    roughness: np.ndarray
+    metallic: np.ndarray
+    confidence: np.ndarray
+    normals: np.ndarray | None = None
+    light: dict[str, Any] | None = None
+
+
+def write_surface(out: Output, surface: Surface, *, watertight: bool, method: str = "", source_from_world=None, **extra: Any) -> None:
+    """Write surface.ply (and light.json) and set out.content; extra goes to SurfaceContent (report, field)."""
+    write_surface_ply(out.path("surface.ply"), surface)
+    if surface.light is not None:
+        write_record(out.path("light.json"), surface.light)
+    matrix = IDENTITY if source_from_world is None else tuple(float(x) for x in np.asarray(source_from_world).ravel())
+    out.content = SurfaceContent(vertices=len(surface.vertices), faces=len(surface.faces), watertight=bool(watertight),
+                                 light=surface.light is not None, method=method, source_from_world=matrix, **extra)
+
+
+def write_surface_ply(path: Path, surface: Surface) -> None:
+    """Write surface.ply: binary little-endian, the properties that schemas/surface.md lists."""
+    from gdtool.geometry.normals import vertex_normals
+    from gdtool.images.color import srgb_from_linear
+
+    vertex = np.empty(len(surface.vertices), _VERTEX)
+    normals = surface.normals if surface.normals is not None else vertex_normals(surface.vertices, surface.faces)
+    albedo = np.clip(surface.albedo, 0, 1)
+    encoded = np.round(srgb_from_linear(albedo) * 255)
+    for axis, names in enumerate((("x", "nx", "red"), ("y", "ny", "green"), ("z", "nz", "blue"))):
+        for name, values in zip(names, (surface.vertices, normals, encoded), strict=True):
+            vertex[name] = values[:, axis]
+    for name in ("roughness", "metallic", "confidence"):
+        vertex[name] = np.clip(getattr(surface, name), 0, 1)
+    face = np.empty(len(surface.faces), _FACE)
+    face["count"], face["idx"] = 3, surface.faces
+    kinds = {"<f4": "float", "|u1": "uchar"}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertex)}"]
+    lines += [f"property {kinds[_VERTEX[name].str]} {name}" for name in _VERTEX.names]
+    lines += [f"element face {len(face)}", "property list uchar int vertex_indices", "end_header", ""]
+    with open(path, "wb") as file:
+        file.write("\n".join(lines).encode())
+        file.write(vertex.tobytes())
+        file.write(face.tobytes())
+
+
+def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertex records and faces of a binary little-endian PLY of triangles. Raises InputError."""
+    content = path.read_bytes()
+    end = content.find(b"end_header\n")
+    header = content[:end].decode("ascii", "replace").split("\n") if end >= 0 else []
+    if not header or header[0].strip() != "ply" or "format binary_little_endian 1.0" not in header:
+        raise InputError(path, "is not a binary little-endian PLY")
+    counts, fields, element, list_types = {}, [], "", None
+    for line in header:
+        words = line.split()
+        if words[:1] == ["element"]:
+            element, counts[words[1]] = words[1], int(words[2])
+        elif words[:2] == ["property", "list"] and element == "face":
+            list_types = words[2:4]
+        elif words[:1] == ["property"] and element == "vertex" and words[1] in _PLY_TYPES:
+            fields.append((words[2], _PLY_TYPES[words[1]]))
+    if list_types is None or list(counts) != ["vertex", "face"] or any(t not in _PLY_TYPES for t in list_types):
+        raise InputError(path, "needs one vertex element and then one face element with one list")
+    vertex_type = np.dtype(fields)
+    face_type = np.dtype([("count", _PLY_TYPES[list_types[0]]), ("idx", _PLY_TYPES[list_types[1]], 3)])
+    body = content[end + len(b"end_header\n"):]
+    size = counts["vertex"] * vertex_type.itemsize
+    if len(body) != size + counts["face"] * face_type.itemsize:
+        raise InputError(path, "has not the length that its header says (faces must be triangles)")
+    vertex = np.frombuffer(body, vertex_type, counts["vertex"])
+    face = np.frombuffer(body, face_type, counts["face"], size)
+    if len(face) and (face["count"] != 3).any():
+        raise InputError(path, "has faces that are not triangles")
+    return vertex, face["idx"].astype(np.int32)
+
+
+def read_surface(folder: Folder) -> Surface:
+    """Read a surface folder. Materials that surface.ply does not hold get albedo 0.8, roughness 0.5, metallic 0.
+
+    Raises InputError when there are no faces, an index is out of range or a coordinate is not finite.
+    """
+    from gdtool.images.color import linear_from_srgb
+
+    path = folder.file("surface.ply")
+    vertex, faces = _read_ply(path)
+    names = vertex.dtype.names or ()
+    if not {"x", "y", "z"} <= set(names):
+        raise InputError(path, "has no x, y, z")
+    if not len(faces):
+        raise InputError(path, "has no faces")
+    if faces.min() < 0 or faces.max() >= len(vertex):
+        raise InputError(path, f"a face refers to vertex {int(faces.max())} of {len(vertex)}")
+    vertices = np.stack([vertex[k] for k in "xyz"], -1).astype(np.float64)
+    if not np.isfinite(vertices).all():
+        raise InputError(path, f"vertex {int(np.argwhere(~np.isfinite(vertices))[0][0])} is not finite")
+
+    def column(name: str, default: float) -> np.ndarray:
+        return np.clip(vertex[name], 0, 1).astype(np.float32) if name in names else np.full(len(vertex), default, np.float32)
+
+    if {"red", "green", "blue"} <= set(names):
+        albedo = linear_from_srgb(np.stack([vertex[k] for k in ("red", "green", "blue")], -1).astype(np.float32) / 255)
+    else:
+        albedo = np.full((len(vertex), 3), 0.8, np.float32)
+    normals = np.stack([vertex[k] for k in ("nx", "ny", "nz")], -1).astype(np.float32) if {"nx", "ny", "nz"} <= set(names) else None
+    light = read_record(folder.file("light.json")) if folder.content.light else None
+    return Surface(vertices, faces, albedo.astype(np.float32), column("roughness", 0.5), column("metallic", 0.0),
+                   column("confidence", 0.0), normals, light)

@@ -1,0 +1,122 @@
+"""Reading and writing `views` folders (schemas/views.md)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from gdtool.cameras import Camera
+from gdtool.core.errors import InputError
+from gdtool.core.folder import Folder
+from gdtool.core.kinds import DOMAINS, IDENTITY, ViewsContent
+from gdtool.core.stage import Output
+from gdtool.folders.records import read_cameras, read_record, write_cameras, write_record
+
+CHANNELS = {"color": 3, "normal": 3, "depth": 1, "albedo": 3, "roughness": 1, "metallic": 1, "closed_form": 3}
+
+
+@dataclass(frozen=True)
+class Views:
+    """What k cameras see.
+
+    images: domain to (k, h, w, 3) or (k, h, w) float32. color, albedo and closed_form are linear in [0, 1]; normal is
+    unit, in world axes; depth is the distance along the viewing axis in world units; zero where mask is zero.
+    mask (k, h, w) float32 coverage in [0, 1]. light: the record of light.json (folders.records), or None.
+    """
+
+    cameras: list[Camera]
+    images: dict[str, np.ndarray]
+    mask: np.ndarray
+    light: dict[str, Any] | None = None
+    names: tuple[str, ...] = field(default=())
+
+    def __post_init__(self):
+        object.__setattr__(self, "names", tuple(camera.name for camera in self.cameras))
+
+
+def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
+    """Read a views folder; domains limits what is read (those it does not hold are left out)."""
+    from gdtool.images.color import decode_normal, linear_from_srgb
+    from gdtool.images.io import read_image
+
+    cameras = read_cameras(folder.file("cameras.json"))
+    content: ViewsContent = folder.content
+    if tuple(camera.name for camera in cameras) != tuple(content.views):
+        raise InputError(folder.file("cameras.json"), "does not hold the views that the manifest lists, in that order")
+    wanted = [d for d in content.domains if domains is None or d in domains]
+
+    def load(domain: str, view: str, camera: Camera) -> np.ndarray:
+        path = folder.file(f"{domain}/{view}.{'exr' if domain == 'depth' else 'png'}")
+        image = read_image(path)
+        if image.shape[:2] != (camera.height, camera.width):
+            raise InputError(path, f"is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}")
+        channels = CHANNELS.get(domain, 1)
+        image = image.reshape(camera.height, camera.width, -1)
+        if image.shape[2] < channels:
+            raise InputError(path, f"has {image.shape[2]} channels, {domain} has {channels}")
+        image = image[..., :channels]
+        if image.dtype.kind == "u":
+            image = image.astype(np.float32) / np.iinfo(image.dtype).max
+        elif not np.isfinite(image).all():
+            row, column = np.argwhere(~np.isfinite(image))[0][:2]
+            raise InputError(path, f"is not finite at row {row}, column {column}")
+        return image if channels == 3 else image[..., 0]
+
+    if len({(camera.height, camera.width) for camera in cameras}) > 1:
+        raise InputError(folder.file("cameras.json"), "has cameras of different sizes")
+    mask = np.stack([load("mask", c.name, c) for c in cameras]).astype(np.float32)
+    images = {}
+    for domain in wanted:
+        stack = np.stack([load(domain, c.name, c) for c in cameras]).astype(np.float32)
+        if domain == "normal":
+            stack = decode_normal(stack)
+        elif domain in ("color", "albedo", "closed_form"):
+            stack = linear_from_srgb(stack).astype(np.float32)
+        inside = mask > 0
+        images[domain] = np.where(inside[..., None] if stack.ndim == 4 else inside, stack, 0).astype(np.float32)
+    light = read_record(folder.file("light.json")) if content.light else None
+    return Views(cameras, images, mask, light)
+
+
+def write_views(out: Output, views: Views, *, source_from_world: np.ndarray | None = None, **extra: Any) -> None:
+    """Write a views folder and set out.content; extra goes to ViewsContent (exposure, environment, report, …)."""
+    from gdtool.images.color import encode_normal, srgb_from_linear
+    from gdtool.images.contact import contact_sheet
+    from gdtool.images.io import write_exr, write_png
+
+    write_cameras(out.path("cameras.json"), views.cameras)
+    sheet: list[list[np.ndarray | None]] = []
+    for k, name in enumerate(views.names):
+        mask = np.clip(views.mask[k], 0, 1)
+        write_png(out.path(f"mask/{name}.png"), mask)
+        row: list[np.ndarray | None] = []
+        for domain, stack in views.images.items():
+            image = stack[k]
+            if domain == "depth":
+                write_exr(out.path(f"depth/{name}.exr"), image.astype(np.float32))
+                near, far = views.cameras[k].near, views.cameras[k].far
+                shown = np.where(mask > 0, np.clip((far - image) / (far - near), 0, 1), 1)
+            elif domain == "normal":
+                encoded = np.where(mask[..., None] > 0, encode_normal(image), 0.5)
+                write_png(out.path(f"normal/{name}.png"), encoded, bits=16)
+                shown = np.where(mask[..., None] > 0, encoded, 1)
+            elif domain in ("color", "albedo", "closed_form"):
+                encoded = srgb_from_linear(np.clip(image, 0, 1))
+                rgba = np.concatenate([encoded, mask[..., None]], -1) if domain == "color" else encoded
+                write_png(out.path(f"{domain}/{name}.png"), rgba)
+                shown = encoded * mask[..., None] + 1 - mask[..., None]
+            else:
+                write_png(out.path(f"{domain}/{name}.png"), np.clip(image, 0, 1))
+                shown = image * mask + 1 - mask
+            row.append(np.asarray(shown, np.float32))
+        sheet.append(row)
+    if views.light is not None:
+        write_record(out.path("light.json"), views.light)
+    if views.images:
+        picture = contact_sheet(sheet, labels_top=list(views.images), labels_left=list(views.names))
+        write_png(out.path("contact_sheet.png"), picture)
+    matrix = IDENTITY if source_from_world is None else tuple(float(x) for x in np.asarray(source_from_world).ravel())
+    present = tuple(d for d in (*DOMAINS, "closed_form") if d in views.images)
+    out.content = ViewsContent(views=views.names, domains=present, source_from_world=matrix, light=views.light is not None, **extra)
