@@ -15,7 +15,7 @@ import click
 import msgspec
 
 from gdtool.core import log
-from gdtool.core.errors import GdtoolError, InputError, UsageError, from_os_error
+from gdtool.core.errors import GdtoolError, UsageError, from_os_error
 from gdtool.core.stage import Stage
 
 INTERRUPTED, TERMINATED, BROKEN_PIPE = 130, 143, 141
@@ -69,18 +69,26 @@ def guarded(group: click.Group) -> None:
 
 def report(error: GdtoolError) -> None:
     """One line on stderr."""
-    print(f"gdtool: {error}".encode(errors="surrogateescape").decode(errors="replace"), file=sys.stderr, flush=True)
+    report_text(str(error))
 
 
-def _verbosity(function: Callable) -> Callable:
-    function = click.option("--debug", is_flag=True, help="Show tracebacks.")(function)
-    function = click.option("-v", "--verbose", is_flag=True, help="Tell steps and skips.")(function)
-    return click.option("-q", "--quiet", is_flag=True, help="Tell only errors.")(function)
+def report_text(text: str) -> None:
+    """A line on stderr; names that are not UTF-8 are shown with replacement characters."""
+    print(f"gdtool: {text}".encode(errors="surrogateescape").decode(errors="replace"), file=sys.stderr, flush=True)
+
+
+VERBOSITY = {
+    ("-q", "--quiet"): "Tell only errors.",
+    ("-v", "--verbose"): "Tell steps and skips.",
+    ("--debug",): "Show tracebacks.",
+}
 
 
 def verbosity_options(function: Callable) -> Callable:
-    """-q, -v, --debug and --json, for commands that print a report."""
-    return click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")(_verbosity(function))
+    """--json, -q, -v and --debug, for commands that print a report."""
+    for flags, text in reversed(VERBOSITY.items()):
+        function = click.option(*flags, is_flag=True, help=text)(function)
+    return click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")(function)
 
 
 def set_verbosity(quiet: bool, verbose: bool) -> None:
@@ -188,15 +196,5 @@ def stage_command(stage: Stage, help: str) -> click.Command:
         click.Option(["--threads"], type=click.IntRange(0), default=0, help="Threads; 0: all cores."),
         click.Option(["--device"], type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True, help="Where networks run."),
     ]
-    command = click.Command(stage.name, callback=invoke, params=params, help=help_of(help))
-    return _add_verbosity(command)
-
-
-def _add_verbosity(command: click.Command) -> click.Command:
-    for flags, text in ((("-q", "--quiet"), "Tell only errors."), (("-v", "--verbose"), "Tell steps and skips."),
-                        (("--debug",), "Show tracebacks.")):
-        command.params.append(click.Option(list(flags), is_flag=True, help=text))
-    return command
-
-
-__all__ = ["InputError", "build_options", "options_from", "set_verbosity", "stage_command", "verbosity_options"]
+    params += [click.Option(list(flags), is_flag=True, help=text) for flags, text in VERBOSITY.items()]
+    return click.Command(stage.name, callback=invoke, params=params, help=help_of(help))
