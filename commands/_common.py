@@ -25,7 +25,7 @@ class _Terminated(BaseException):
     """SIGTERM, raised where the program is, so that it cleans up on its way out."""
 
 
-def guarded(group: click.Group) -> None:
+def guarded(group: click.Command) -> None:
     """Run the group; every way out has its exit code, and none shows a traceback for what a user or a file did."""
     debug = "--debug" in sys.argv
 
@@ -34,7 +34,9 @@ def guarded(group: click.Group) -> None:
 
     signal.signal(signal.SIGTERM, terminate)
     try:
-        code = group.main(standalone_mode=False)
+        # Not group.main(): click would turn a broken pipe into exit code 1.
+        with group.make_context("gdtool", sys.argv[1:]) as context:
+            code = group.invoke(context)
         code = code if isinstance(code, int) else 0
         sys.stdout.flush()
     except click.exceptions.Exit as error:

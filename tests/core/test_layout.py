@@ -1,0 +1,96 @@
+"""The house rules that a machine can check: which way imports point, what is packaged, how quick help is."""
+
+import ast
+import importlib.metadata
+import subprocess
+import sys
+import time
+import tomllib
+
+import pytest
+
+from gdtool.commands import COMMANDS
+from gdtool.folders import schema
+from tests.conftest import ROOT
+
+HEAVY = {"numpy", "torch", "trimesh", "scipy", "igl", "pymeshlab", "skimage", "OpenImageIO", "embreex"}
+
+
+def modules(folder):
+    return sorted((ROOT / folder).rglob("*.py"))
+
+
+def imports(path, top_level_only=False):
+    tree = ast.parse(path.read_text())
+    nodes = tree.body if top_level_only else ast.walk(tree)
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            yield node.module or ""
+
+
+@pytest.mark.parametrize("path", modules("gdtool"), ids=lambda p: str(p.relative_to(ROOT)))
+def test_arrows_point_one_way(path):
+    room = path.relative_to(ROOT / "gdtool").parts[0]
+    for name in imports(path):
+        assert not name.startswith("commands"), name
+        if room != "__main__.py":
+            assert not name.startswith("gdtool.commands"), name
+        if room not in ("stages", "__main__.py"):
+            assert not name.startswith("gdtool.stages"), f"a room imports a stage: {name}"
+        if room == "core":
+            assert name.split(".")[0] not in HEAVY | {"click"}, name
+            if name.startswith("gdtool."):
+                assert name.startswith("gdtool.core") or "procedural" in name, name
+
+
+@pytest.mark.parametrize("path", modules("gdtool/stages") + modules("gdtool/core") + modules("commands"), ids=lambda p: p.name)
+def test_heavy_packages_load_inside_functions(path):
+    for name in imports(path, top_level_only=True):
+        assert name.split(".")[0] not in HEAVY, name
+        assert not name.startswith(tuple(f"gdtool.{room}" for room in ("geometry", "images", "shading", "fields", "diffusion", "texture"))), name
+
+
+def test_package_list_is_the_tree():
+    listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
+    found = {".".join(p.parent.relative_to(ROOT).parts) for p in ROOT.glob("gdtool/**/__init__.py")}
+    assert listed == found | {"gdtool.commands", "gdtool.schemas"}
+
+
+def test_every_command_has_its_file_and_stage():
+    for name in COMMANDS:
+        module = name.replace("-", "_") + ".py"
+        assert (ROOT / "commands" / module).is_file() and (ROOT / "gdtool/stages" / module).is_file(), name
+
+
+def test_version_is_the_installed_one():
+    import gdtool
+
+    assert importlib.metadata.version("gdtool") == gdtool.__version__
+
+
+def test_schemas_are_those_of_the_types():
+    for name, content in schema.schemas().items():
+        assert (ROOT / "schemas" / name).read_text() == schema.text(content), f"{name} is stale: make schemas"
+    for kind in schema.CONTENTS:
+        assert (ROOT / "schemas" / f"{kind}.md").is_file(), f"no page says what {kind} is"
+
+
+@pytest.mark.parametrize("arguments", [["--help"], *([name, "--help"] for name in COMMANDS)], ids=lambda a: a[0])
+def test_help_is_quick(arguments):
+    """Under 150 ms more than Python's own start (best of five: the machine may be busy)."""
+
+    def best(command):
+        times = []
+        for _ in range(5):
+            start = time.perf_counter()
+            subprocess.run(command, check=True, capture_output=True)
+            times.append(time.perf_counter() - start)
+        return min(times)
+
+    bare = best([sys.executable, "-c", "pass"])
+    shown = subprocess.run([sys.executable, "-m", "gdtool", *arguments], check=True, capture_output=True, text=True).stdout
+    if len(arguments) > 1:
+        assert "Example" in shown
+    assert best([sys.executable, "-m", "gdtool", *arguments]) - bare < 0.15
