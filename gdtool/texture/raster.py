@@ -1,0 +1,163 @@
+"""Exact rasterising of texture coordinates: which triangle owns which texel.
+
+Texture coordinates are snapped to 1/4096 of a texel and everything after that is integer arithmetic, with the top-left
+rule of the graphics interfaces (Direct3D 11 functional specification, section 3.4.1.2): triangles that share an edge
+or a vertex share no texel and leave none between them. Rays through texel centres, the usual other way, can miss an edge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+SUBTEXEL_BITS = 12
+_ONE = 1 << SUBTEXEL_BITS
+_FARTHEST_UV = 64.0  # keeps edge functions far below 2**63 for every size up to 65536
+_SPANS_AT_ONCE = 2_000_000
+_TEXELS_AT_ONCE = 8_000_000
+
+
+def _snapped(uv: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Corners x, y (t, 3) in 1/4096 texel, origin at the image's top-left corner."""
+    if not 1 <= size <= 65536:
+        raise ValueError(f"size {size} is not in 1..65536")
+    if len(uv) and not (np.abs(uv) <= _FARTHEST_UV).all():  # catches NaN as well
+        raise ValueError(f"texture coordinates must be finite and within ±{_FARTHEST_UV:g}")
+    fixed = np.rint(np.asarray(uv, np.float64) * (size * _ONE)).astype(np.int64)
+    return fixed[:, 0][faces], fixed[:, 1][faces]
+
+
+def _chunks(cost: np.ndarray, limit: int) -> Iterator[slice]:
+    """Consecutive slices whose summed cost stays near limit."""
+    total = np.cumsum(cost)
+    start = 0
+    while start < len(cost):
+        base = total[start - 1] if start else 0
+        stop = max(start + 1, int(np.searchsorted(total, base + limit, "right")))
+        yield slice(start, stop)
+        start = stop
+
+
+def _expand(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """For counts (n,): the index of the group each element belongs to, and its place within the group."""
+    group = np.repeat(np.arange(len(counts)), counts)
+    first = np.cumsum(counts) - counts
+    return group, np.arange(len(group)) - first[group]
+
+
+def owned_texels(uv: np.ndarray, faces: np.ndarray, size: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Batches of (face_idx (n,), row (n,), column (n,)): every texel whose centre a triangle owns, in order of triangles.
+
+    uv (v, 2), (0, 0) at the image's top left; faces (t, 3) into uv. Triangles may turn either way; those without area
+    own nothing. A texel comes up once per triangle that covers it: more than once only where triangles overlap.
+    """
+    x, y = _snapped(uv, faces, size)
+    area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (x[:, 2] - x[:, 0]) * (y[:, 1] - y[:, 0])
+    turned = area < 0
+    x[turned] = x[turned][:, [0, 2, 1]]
+    y[turned] = y[turned][:, [0, 2, 1]]
+    half = _ONE // 2
+    # Rows whose centre line y = row + 1/2 lies within the triangle's height.
+    top = np.clip(-((half - y.min(1)) // _ONE), 0, size)
+    bottom = np.clip((y.max(1) - half) // _ONE + 1, 0, size)
+    rows = np.where(area == 0, 0, np.maximum(bottom - top, 0))
+    for part in _chunks(rows, _SPANS_AT_ONCE):
+        group, step = _expand(rows[part])
+        face = group + part.start
+        row = top[face] + step
+        centre = row * _ONE + half
+        left, right = np.zeros(len(face), np.int64), np.full(len(face), size, np.int64)
+        for i in range(3):
+            xa, ya = x[face, i], y[face, i]
+            dx, dy = x[face, (i + 1) % 3] - xa, y[face, (i + 1) % 3] - ya
+            # Inside where dx (Y - ya) - dy (X - xa) >= 0, or > 0 on edges that are neither top nor left (y is down).
+            bias = np.where((dy < 0) | ((dy == 0) & (dx > 0)), 0, -1)
+            constant = dx * (centre - ya) - dy * (half - xa) + bias
+            slope = -dy * _ONE
+            safe = np.where(slope == 0, 1, np.abs(slope))
+            left = np.where(slope > 0, np.maximum(left, -(constant // safe)), left)
+            right = np.where(slope < 0, np.minimum(right, constant // safe + 1), right)
+            right = np.where((slope == 0) & (constant < 0), 0, right)
+        counts = np.maximum(right - left, 0)
+        for piece in _chunks(counts, _TEXELS_AT_ONCE):
+            span, offset = _expand(counts[piece])
+            span = span + piece.start
+            yield face[span].astype(np.int32), row[span].astype(np.int32), (left[span] + offset).astype(np.int32)
+
+
+def barycentric_at(uv: np.ndarray, faces: np.ndarray, face_idx: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates (n, 3) float64 of texture points at (n, 2) in triangles face_idx (n,); linear beyond them.
+
+    Triangles without area give their first corner.
+    """
+    a, b, c = (np.asarray(uv, np.float64)[faces[:, i]] for i in range(3))
+    e1, e2 = b - a, c - a
+    det = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
+    inverse = np.where(det == 0, 0.0, 1.0 / np.where(det == 0, 1.0, det))
+    from_b = np.stack([e2[:, 1], -e2[:, 0]], 1) * inverse[:, None]
+    from_c = np.stack([-e1[:, 1], e1[:, 0]], 1) * inverse[:, None]
+    offset = at - a[face_idx]
+    wb = (offset * from_b[face_idx]).sum(1)
+    wc = (offset * from_c[face_idx]).sum(1)
+    return np.stack([1 - wb - wc, wb, wc], 1)
+
+
+def rasterize_uv(uv: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Owner of each texel and the place of its centre in the owner.
+
+    uv (v, 2) with (0, 0) at the image's top left, faces (t, 3). Returns face_idx (size, size) int32, -1 where no
+    triangle covers the texel's centre, and barycentric (size, size, 3) float32, 0 there. Where triangles overlap, the
+    first one owns the texel. Raises ValueError for coordinates that are not finite or beyond ±64.
+    """
+    owner = np.full(size * size, -1, np.int32)
+    for face, row, column in owned_texels(uv, faces, size):
+        texel = row.astype(np.int64) * size + column
+        free = owner[texel] < 0
+        # Reversed, because of several assignments to one element the last one stays.
+        owner[texel[free][::-1]] = face[free][::-1]
+    covered = np.flatnonzero(owner >= 0)
+    barycentric = np.zeros((size * size, 3), np.float32)
+    for start in range(0, len(covered), 1_000_000):
+        texel = covered[start:start + 1_000_000]
+        centre = np.stack([texel % size + 0.5, texel // size + 0.5], 1) / size
+        inside = barycentric_at(uv, faces, owner[texel], centre)
+        inside = np.clip(inside, 0, 1)  # snapping moves corners by up to 1/8192 of a texel
+        barycentric[texel] = inside / inside.sum(1, keepdims=True)
+    return owner.reshape(size, size), barycentric.reshape(size, size, 3)
+
+
+def owner_count(uv: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
+    """(size, size) int32: how many triangles cover each texel centre; above 1 where texture coordinates overlap."""
+    count = np.zeros(size * size, np.int32)
+    for _, row, column in owned_texels(uv, faces, size):
+        count += np.bincount(row.astype(np.int64) * size + column, minlength=size * size).astype(np.int32)
+    return count.reshape(size, size)
+
+
+def extend_owners(uv: np.ndarray, faces: np.ndarray, face_idx: np.ndarray, rings: int,
+                  farthest: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Texels just outside the charts and where they would lie if the triangle beside them went on.
+
+    face_idx (size, size) as from rasterize_uv. Returns texel (n,) flat indices of up to `rings` texels around all
+    charts, owner (n,) the face of the nearest covered texel (of a smaller ring), barycentric (n, 3) float64, linearly
+    extrapolated and held within `farthest` outside [0, 1]. Lookups between texel centres at a chart's border read these.
+    """
+    size = face_idx.shape[0]
+    owner = np.pad(face_idx, 1, constant_values=-1)
+    texels, owners = [], []
+    for _ in range(rings):
+        neighbour = np.full((size, size), -1, np.int32)
+        # Straight neighbours last, so that they win over diagonal ones.
+        for dy, dx in ((-1, -1), (-1, 1), (1, -1), (1, 1), (-1, 0), (1, 0), (0, -1), (0, 1)):
+            seen = owner[1 + dy:1 + dy + size, 1 + dx:1 + dx + size]
+            neighbour = np.where(seen >= 0, seen, neighbour)
+        new = np.flatnonzero(((owner[1:-1, 1:-1] < 0) & (neighbour >= 0)).ravel())
+        found = neighbour.ravel()[new]
+        owner[1 + new // size, 1 + new % size] = found
+        texels.append(new)
+        owners.append(found)
+    texel, owned_by = np.concatenate(texels), np.concatenate(owners)
+    centre = np.stack([texel % size + 0.5, texel // size + 0.5], 1) / size
+    barycentric = np.clip(barycentric_at(uv, faces, owned_by, centre), -farthest, 1 + farthest)
+    return texel, owned_by, barycentric / barycentric.sum(1, keepdims=True)
