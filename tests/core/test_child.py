@@ -1,0 +1,89 @@
+"""Protected children: results, errors, crashes, time and memory limits."""
+
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from gdtool.core import child
+from gdtool.core.errors import InputError
+from tests.conftest import ROOT
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+
+
+def double(array, noise=""):
+    print(noise)
+    return array * 2
+
+
+def refuse():
+    raise InputError("mesh", "is a bow-tie", "cut it")
+
+
+def crash():
+    os.abort()
+
+
+def leave():
+    os._exit(0)
+
+
+def hang():
+    time.sleep(60)
+
+
+def grow():
+    return np.ones(2**28)  # 2 GB
+
+
+def test_arrays_go_there_and_back_whatever_the_function_prints():
+    assert (child.call("tests.core.test_child:double", np.arange(5), noise="text", seconds=30) == np.arange(5) * 2).all()
+
+
+def test_our_errors_come_back_as_themselves():
+    with pytest.raises(InputError, match="mesh: is a bow-tie; cut it") as caught:
+        child.call("tests.core.test_child:refuse", seconds=30)
+    assert caught.value.cure == "cut it"
+
+
+@pytest.mark.parametrize("name, words, limits", [
+    ("crash", "SIGABRT", {"seconds": 30}),
+    ("leave", "no result", {"seconds": 30}),
+    ("hang", "longer than 1 s", {"seconds": 1}),
+    ("grow", "more than 500 MB", {"seconds": 30, "memory_mb": 500}),
+])
+def test_everything_else_is_a_failure_with_its_reason(name, words, limits):
+    with pytest.raises(child.ChildFailed, match=words):
+        child.call(f"tests.core.test_child:{name}", **limits)
+
+
+def alive(pid):
+    """Whether a process runs (a zombie that nobody has reaped yet does not)."""
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_the_child_dies_with_its_parent():
+    code = "from gdtool.core import child; child.call('tests.core.test_child:hang', seconds=50)"
+    parent = subprocess.Popen([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(ROOT), "GDTOOL_MARK": "1"})
+    children = []
+    for _ in range(100):
+        time.sleep(0.05)
+        children = subprocess.run(["pgrep", "-P", str(parent.pid)], capture_output=True, text=True).stdout.split()
+        if children:
+            break
+    time.sleep(0.5)  # let it set its death signal
+    parent.kill()
+    parent.wait()
+    time.sleep(0.3)
+    assert children and not any(alive(pid) for pid in children)
