@@ -1,0 +1,89 @@
+"""The grid method's first half: prepared views to a grid of signed distances.
+
+What any view sees in front of its surface, or beside its silhouette, is outside; the rest is inside. So what no view
+sees (tops, bottoms, hollows) is closed at the largest extent that the views allow.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.fields.sights import WEAK, Sight, free_distance, hull_distance
+from gdtool.geometry.grids import Grid, band_cells, fine_points, grid_over
+
+COARSE = 2  # fine steps a coarse step
+_CHUNK = 400_000
+
+
+def combined_distance(sights: list[Sight], points: np.ndarray, blend: float, limit: float) -> np.ndarray:
+    """Signed distance (n,) float32 of points (n, 3) by all views, clipped to +-limit.
+
+    Outside where any view sees free space. The magnitude is that of the nearest surface among the views that agree
+    with the sign; estimates within about `blend` of it are averaged by their weights, so that views of one surface
+    agree to less than their noise. The silhouettes bound the distance from below.
+    """
+    out = np.empty(len(points), np.float32)
+    deep = [s for s in sights if s.planes is not None]
+    for start in range(0, len(points), _CHUNK):
+        part = points[start:start + _CHUNK]
+        hull = np.full(len(part), -np.inf, np.float32)
+        for sight in sights:
+            np.maximum(hull, hull_distance(sight, part), out=hull)
+        if deep:
+            pairs = [free_distance(sight, part) for sight in deep]
+            value = np.clip(np.stack([v for v, _ in pairs]), -limit, limit).astype(np.float32)
+            weight = np.stack([w for _, w in pairs]).astype(np.float32)
+            hull = np.maximum(hull, _nearest_surface(value, weight, blend, limit))
+        out[start:start + _CHUNK] = np.clip(hull, -limit, limit)
+    return out
+
+
+def _nearest_surface(value: np.ndarray, weight: np.ndarray, blend: float, limit: float) -> np.ndarray:
+    """Fuse distances value (k, n), unknown at -limit with weight 0, to (n,).
+
+    A weak distance (beside a jump in depth, where the pixel grid decides what is seen) carves only where no firm one
+    finds the surface close by.
+    """
+    firm = weight > WEAK
+    free, near = value > 0, firm & (value > -limit / 2)
+    nearest_free = np.where(free & firm, value, np.inf).min(0)
+    nearest_firm = np.where(near, value, -np.inf).max(0)
+    nearest_weak = np.where(free, value, np.inf).min(0)
+    reference = np.where(np.isfinite(nearest_free), nearest_free, np.where(
+        np.isfinite(nearest_firm), nearest_firm, np.where(np.isfinite(nearest_weak), nearest_weak, value.max(0))))
+    share = weight * np.exp(-(((value - reference) / blend) ** 2)) + 1e-12
+    return (share * value).sum(0) / share.sum(0)
+
+
+def hull_bounds(sights: list[Sight], reach: float = 0.75, samples: int = 48) -> tuple[np.ndarray, np.ndarray]:
+    """Box (low, high) around the silhouettes' common cone, found on a coarse grid over [-reach, reach]^3."""
+    step = 2 * reach / (samples - 1)
+    axis = np.linspace(-reach, reach, samples)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    value = np.max([hull_distance(s, points) for s in sights], 0)
+    near = points[value < step]
+    if len(near) == 0:
+        return np.full(3, -0.5), np.full(3, 0.5)
+    return near.min(0) - step, near.max(0) + step
+
+
+def carve(sights: list[Sight], step: float) -> tuple[Grid, np.ndarray]:
+    """Grid and its signed distances (a, b, c) float32, exact in a band around the surface and +-limit elsewhere."""
+    limit = 3.0 * step
+    low, high = hull_bounds(sights)
+    grid = grid_over(low, high, step, margin=2 * COARSE, multiple=COARSE)
+    coarse_shape = tuple((n - 1) // COARSE + 1 for n in grid.shape)
+    index = np.stack(np.meshgrid(*(np.arange(n) * COARSE for n in coarse_shape), indexing="ij"), -1).reshape(-1, 3)
+    coarse = combined_distance(sights, grid.points(index), step / 3, limit).reshape(coarse_shape)
+
+    touched = np.zeros(tuple(n - 1 for n in coarse_shape), bool)
+    for sight in sights:
+        if sight.points is not None:
+            seen = np.floor(grid.locate(sight.points[sight.weight > 0]) / COARSE).astype(int)
+            seen = seen[((seen >= 0) & (seen < touched.shape)).all(1)]
+            touched[tuple(seen.T)] = True
+    fine = fine_points(band_cells(coarse < 0, touched), COARSE)
+    values = np.repeat(np.repeat(np.repeat(np.where(coarse < 0, -limit, limit), COARSE, 0), COARSE, 1), COARSE, 2)
+    values = np.ascontiguousarray(values[:grid.shape[0], :grid.shape[1], :grid.shape[2]], np.float32)
+    values[fine] = combined_distance(sights, grid.points(np.argwhere(fine)), step / 3, limit)
+    return grid, values
