@@ -1,0 +1,132 @@
+"""Tangent frames by the MikkTSpace algorithm (Mikkelsen 2008, "Simulation of Wrinkled Surfaces Revisited", section 3.7).
+
+glTF viewers decode normal maps in this basis whether a file carries tangents or not, so a baker has to encode in it.
+The steps follow the algorithm's reference description: corners with identical position, normal and texture coordinate
+are one vertex; around each vertex, triangles that hang together by edges and turn the same way in texture space form a
+group; a group's tangent is the sum of its triangles' texture axes, each projected to the tangent plane, normalised and
+weighted by the corner's angle. Triangles without area in texture space take the frame of a neighbour at the vertex;
+unlike in the reference implementation they never join two groups that touch only through them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def weld(*columns: np.ndarray) -> np.ndarray:
+    """For rows given as columns (n, k_i): the index (n,) of the distinct row each one equals, bit by bit."""
+    rows = np.concatenate([np.ascontiguousarray(c).reshape(len(c), -1).astype(np.float32) + 0.0 for c in columns], 1)
+    keys = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.dtype.itemsize * rows.shape[1]))).ravel()
+    return np.unique(keys, return_inverse=True)[1].ravel()
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(v, axis=-1, keepdims=True)
+    return v / np.where(length > 0, length, 1.0)
+
+
+def _flatten(v: np.ndarray, n: np.ndarray) -> np.ndarray:
+    """v projected to the plane of n, unit."""
+    return _unit(v - n * (n * v).sum(-1, keepdims=True))
+
+
+def _groups(vertex: np.ndarray, sign: np.ndarray) -> np.ndarray:
+    """Group (t, 3) of each corner: corners of one vertex, connected by edges of triangles with one non-zero sign."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(vertex)
+    corner = np.arange(count * 3).reshape(count, 3)
+    start, end = vertex, np.roll(vertex, -1, 1)
+    start_corner, end_corner = corner, np.roll(corner, -1, 1)
+    low, high = np.minimum(start, end).ravel(), np.maximum(start, end).ravel()
+    forward = (start < end).ravel()
+    order = np.lexsort((np.arange(len(low)), ~forward, high, low))
+    same = (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])
+    # Two triangles meet at an edge when they run along it in opposite directions.
+    pair = np.flatnonzero(same & (forward[order][1:] != forward[order][:-1]))
+    one, two = order[pair], order[pair + 1]
+    fits = (sign[one // 3] == sign[two // 3]) & (sign[one // 3] != 0)
+    one, two = one[fits], two[fits]
+    a = np.concatenate([start_corner.ravel()[one], end_corner.ravel()[one]])
+    b = np.concatenate([end_corner.ravel()[two], start_corner.ravel()[two]])
+    graph = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(count * 3, count * 3))
+    return connected_components(graph, directed=False)[1].reshape(count, 3)
+
+
+def corner_tangents(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray,
+                    face_normals_idx: np.ndarray | None = None) -> np.ndarray:
+    """Tangents (t, 3, 4) float32 of the corners of triangles, glTF's form.
+
+    vertices (v, 3), faces (t, 3); normals (n, 3) unit, indexed by face_normals_idx (t, 3) or like vertices; uv (c, 2)
+    with (0, 0) at the image's top left, indexed by face_uvs (t, 3). xyz is unit and orthogonal to the corner's normal;
+    the bitangent w · cross(normal, tangent) points up in the image. Corners whose vertex has no triangle with area in
+    texture space get some tangent orthogonal to the normal and w = 1.
+    """
+    position = np.asarray(vertices, np.float64)[faces]
+    normal = _unit(np.asarray(normals, np.float64)[faces if face_normals_idx is None else face_normals_idx])
+    texture = np.asarray(uv, np.float64)[face_uvs] * (1, -1) + (0, 1)
+    vertex = weld(position.reshape(-1, 3), normal.reshape(-1, 3), texture.reshape(-1, 2)).reshape(-1, 3)
+
+    e1, e2 = position[:, 1] - position[:, 0], position[:, 2] - position[:, 0]
+    t1, t2 = texture[:, 1] - texture[:, 0], texture[:, 2] - texture[:, 0]
+    area = t1[:, 0] * t2[:, 1] - t1[:, 1] * t2[:, 0]
+    solid = np.linalg.norm(np.cross(e1, e2), axis=1) > 0
+    axis = (t2[:, 1:] * e1 - t1[:, 1:] * e2) * np.sign(area)[:, None]
+    usable = solid & (np.abs(area) > np.finfo(np.float32).tiny) & ((axis * axis).sum(1) > 0)
+    sign = np.where(usable, np.where(area > 0, 1, -1), 0)
+    group = _groups(vertex, sign)
+
+    tangent = _flatten(np.repeat(axis[:, None], 3, 1), normal)
+    before = _flatten(np.roll(position, 1, 1) - position, normal)
+    after = _flatten(np.roll(position, -1, 1) - position, normal)
+    angle = np.arccos(np.clip((before * after).sum(-1), -1, 1))
+    weighted = (tangent * np.where(usable[:, None], angle, 0)[..., None]).reshape(-1, 3)
+    total = np.stack([np.bincount(group.ravel(), weighted[:, k], group.max(initial=-1) + 1) for k in range(3)], 1)
+    frame = _unit(total)[group]
+    handed = np.repeat(sign[:, None], 3, 1).astype(np.float64)
+
+    # Corners of unusable triangles borrow from the first usable corner of their vertex.
+    lender = np.full(vertex.max(initial=-1) + 1, -1)
+    good = np.flatnonzero(np.repeat(usable, 3))
+    lender[vertex.ravel()[good][::-1]] = good[::-1]
+    lent = lender[vertex]
+    borrow = ~usable[:, None] & (lent >= 0)
+    frame = np.where(borrow[..., None], frame.reshape(-1, 3)[lent], frame)
+    handed = np.where(borrow, handed.reshape(-1)[lent], handed)
+
+    frame = _flatten(frame, normal)
+    lost = np.linalg.norm(frame, axis=-1) < 0.5
+    if lost.any():
+        helper = np.eye(3)[np.abs(normal[lost]).argmin(1)]
+        frame[lost] = _flatten(helper, normal[lost])
+    return np.concatenate([frame, np.where(handed < 0, -1.0, 1.0)[..., None]], -1).astype(np.float32)
+
+
+def frame_at(normals: np.ndarray, tangents: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
+    """Interpolated tangent frames (n, 3, 3), columns tangent, bitangent, normal, as viewers interpolate them.
+
+    normals (n, 3, 3) and tangents (n, 3, 4) of the corners, barycentric (n, 3). Nothing is normalised after
+    interpolation, as MikkTSpace asks: encoder and decoder then use the same basis.
+    """
+    normal = (normals * barycentric[..., None]).sum(1)
+    tangent = (tangents[..., :3] * barycentric[..., None]).sum(1)
+    bitangent = tangents[:, :1, 3] * np.cross(normal, tangent)
+    return np.stack([tangent, bitangent, normal], -1)
+
+
+def encode_tangent_space(frames: np.ndarray, world: np.ndarray) -> np.ndarray:
+    """Unit tangent-space normals (n, 3), +Y up, that decode to the unit world normals (n, 3) in frames (n, 3, 3)."""
+    tangent, bitangent, normal = frames[..., 0], frames[..., 1], frames[..., 2]
+    # Rows of the inverse, up to the determinant, which is positive or negative with the frame's handedness.
+    rows = (np.cross(bitangent, normal), np.cross(normal, tangent), np.cross(tangent, bitangent))
+    determinant = (tangent * rows[0]).sum(-1)
+    local = np.stack([(row * world).sum(-1) for row in rows], -1)
+    safe = np.abs(determinant) > 1e-9
+    local = np.where(safe[..., None], local * np.sign(determinant)[..., None], (0.0, 0.0, 1.0))
+    return _unit(local)
+
+
+def decode_tangent_space(frames: np.ndarray, local: np.ndarray) -> np.ndarray:
+    """World normals (n, 3), unit, of tangent-space normals (n, 3), +Y up, in frames (n, 3, 3)."""
+    return _unit((frames * local[..., None, :]).sum(-1))
