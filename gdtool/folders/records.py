@@ -92,9 +92,9 @@ def write_cameras(path: Path, cameras: list[Camera]) -> None:
     records = []
     for c in cameras:
         pose = tuple(float(x) for x in c.world_from_camera.ravel())
-        own = {"half_width": c.half_width} if c.projection == "orthographic" else {"fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy}
+        own = {"half_width": float(c.half_width)} if c.projection == "orthographic" else {k: float(getattr(c, k)) for k in ("fx", "fy", "cx", "cy")}
         records.append(CameraRecord(name=c.name, projection=c.projection, width=c.width, height=c.height,
-                                    world_from_camera=pose, near=c.near, far=c.far, **own))
+                                    world_from_camera=pose, near=float(c.near), far=float(c.far), **own))
     _write(path, Cameras(tuple(records)))
 
 
