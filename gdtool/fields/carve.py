@@ -15,27 +15,33 @@ COARSE = 2  # fine steps a coarse step
 _CHUNK = 400_000
 
 
-def combined_distance(sights: list[Sight], points: np.ndarray, blend: float, limit: float) -> np.ndarray:
-    """Signed distance (n,) float32 of points (n, 3) by all views, clipped to +-limit.
+def combined_distance(sights: list[Sight], points: np.ndarray, blend: float, limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Signed distance (n,) float32 of points (n, 3) by all views, clipped to +-limit, and whether it is measured (n,) bool.
 
     Outside where any view sees free space. The magnitude is that of the nearest surface among the views that agree
     with the sign; estimates within about `blend` of it are averaged by their weights, so that views of one surface
-    agree to less than their noise. The silhouettes bound the distance from below.
+    agree to less than their noise. The silhouettes bound the distance from below. A distance is measured when a view
+    sees the surface there, or when the silhouettes of most views end there (flat tops and bottoms).
     """
-    out = np.empty(len(points), np.float32)
+    out, measured = np.empty(len(points), np.float32), np.zeros(len(points), bool)
     deep = [s for s in sights if s.planes is not None]
     for start in range(0, len(points), _CHUNK):
         part = points[start:start + _CHUNK]
-        hull = np.full(len(part), -np.inf, np.float32)
+        value, ending = np.full(len(part), -np.inf, np.float32), np.zeros(len(part), np.int32)
         for sight in sights:
-            np.maximum(hull, hull_distance(sight, part), out=hull)
+            hull = hull_distance(sight, part)
+            np.maximum(value, hull, out=value)
+            ending += np.abs(hull) < limit / 3
+        seen = 2 * ending > len(sights)
         if deep:
             pairs = [free_distance(sight, part) for sight in deep]
-            value = np.clip(np.stack([v for v, _ in pairs]), -limit, limit).astype(np.float32)
+            free = np.clip(np.stack([v for v, _ in pairs]), -limit, limit).astype(np.float32)
             weight = np.stack([w for _, w in pairs]).astype(np.float32)
-            hull = np.maximum(hull, _nearest_surface(value, weight, blend, limit))
-        out[start:start + _CHUNK] = np.clip(hull, -limit, limit)
-    return out
+            value = np.maximum(value, _nearest_surface(free, weight, blend, limit))
+            seen |= ((np.abs(free - value) < limit / 3) & (weight > WEAK)).any(0)
+        out[start:start + _CHUNK] = np.clip(value, -limit, limit)
+        measured[start:start + _CHUNK] = seen
+    return out, measured
 
 
 def _nearest_surface(value: np.ndarray, weight: np.ndarray, blend: float, limit: float) -> np.ndarray:
@@ -67,14 +73,17 @@ def hull_bounds(sights: list[Sight], reach: float = 0.75, samples: int = 48) -> 
     return near.min(0) - step, near.max(0) + step
 
 
-def carve(sights: list[Sight], step: float) -> tuple[Grid, np.ndarray]:
-    """Grid and its signed distances (a, b, c) float32, exact in a band around the surface and +-limit elsewhere."""
+def carve(sights: list[Sight], step: float) -> tuple[Grid, np.ndarray, np.ndarray]:
+    """Grid, its signed distances (a, b, c) float32 and where they are measured (a, b, c) bool.
+
+    Exact in a band around the surface and +-3 steps elsewhere.
+    """
     limit = 3.0 * step
     low, high = hull_bounds(sights)
     grid = grid_over(low, high, step, margin=2 * COARSE, multiple=COARSE)
     coarse_shape = tuple((n - 1) // COARSE + 1 for n in grid.shape)
     index = np.stack(np.meshgrid(*(np.arange(n) * COARSE for n in coarse_shape), indexing="ij"), -1).reshape(-1, 3)
-    coarse = combined_distance(sights, grid.points(index), step / 3, limit).reshape(coarse_shape)
+    coarse = combined_distance(sights, grid.points(index), step / 3, limit)[0].reshape(coarse_shape)
 
     touched = np.zeros(tuple(n - 1 for n in coarse_shape), bool)
     for sight in sights:
@@ -85,5 +94,21 @@ def carve(sights: list[Sight], step: float) -> tuple[Grid, np.ndarray]:
     fine = fine_points(band_cells(coarse < 0, touched), COARSE)
     values = np.repeat(np.repeat(np.repeat(np.where(coarse < 0, -limit, limit), COARSE, 0), COARSE, 1), COARSE, 2)
     values = np.ascontiguousarray(values[:grid.shape[0], :grid.shape[1], :grid.shape[2]], np.float32)
-    values[fine] = combined_distance(sights, grid.points(np.argwhere(fine)), step / 3, limit)
-    return grid, values
+    measured = np.zeros(grid.shape, bool)
+    values[fine], measured[fine] = combined_distance(sights, grid.points(np.argwhere(fine)), step / 3, limit)
+    return grid, values, measured
+
+
+def smooth_unseen(values: np.ndarray, measured: np.ndarray, radius: float, rounds: int = 3) -> np.ndarray:
+    """Signed distances with the unmeasured part smoothed: fins and ridges left by the edges of what views see go.
+
+    radius in steps: the Gaussian's sigma. Measured samples and their neighbours keep their values.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    held = gaussian_filter(measured.astype(np.float32), 1.0, truncate=2.0)
+    loose = np.clip(1.0 - 4.0 * held, 0.0, 1.0)
+    out = values
+    for _ in range(rounds):
+        out = out + loose * (gaussian_filter(out, radius, mode="nearest", truncate=2.5) - out)
+    return out

@@ -188,7 +188,7 @@ def _curtain(points, normal, valid, foot) -> np.ndarray:
 def hull_distance(sight: Sight, points: np.ndarray) -> np.ndarray:
     """Signed distance (n,) of points (n, 3) to the view's silhouette cone, positive outside. A lower bound of the object's."""
     pixels, depth = project(sight.camera, points)
-    value = _bilinear(sight.silhouette[..., None], pixels)[:, 0]
+    value = bilinear(sight.silhouette[..., None], pixels)[:, 0]
     h, w = sight.mask.shape
     overflow = np.maximum(np.maximum(-pixels[:, 0], pixels[:, 0] - w), np.maximum(-pixels[:, 1], pixels[:, 1] - h))
     beyond = overflow > 0
@@ -204,13 +204,19 @@ def free_distance(sight: Sight, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     The distance is to the tangent planes behind the four pixels around the point, or to the nearest pixel's where
     they belong to different surfaces.
     """
+    value, weight, _ = tangent_distance(sight, points)
+    return value, weight
+
+
+def tangent_distance(sight: Sight, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """free_distance, and the unit normal (n, 3) of the plane it was measured to."""
     pixels, depth = project(sight.camera, points)
     h, w = sight.mask.shape
     column = np.clip(pixels[:, 0].astype(np.int64), 0, w - 1)
     row = np.clip(pixels[:, 1].astype(np.int64), 0, h - 1)
     nearest = row * w + column
     weighted = np.concatenate([sight.planes * sight.weight[..., None], sight.weight[..., None]], -1)
-    mixed = _bilinear(weighted, pixels)
+    mixed = bilinear(weighted, pixels)
     single = sight.rough.reshape(-1)[nearest] | (mixed[:, 4] <= 0)
     mixed[single] = weighted.reshape(-1, 5)[nearest[single]]
     weight = mixed[:, 4]
@@ -222,10 +228,10 @@ def free_distance(sight: Sight, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     weight = np.where(bounded, np.minimum(weight, WEAK), weight)
     inside = (pixels[:, 0] >= 0) & (pixels[:, 0] < w) & (pixels[:, 1] >= 0) & (pixels[:, 1] < h)
     known = (weight > 0) & inside & (depth > 0)
-    return np.where(known, value, -np.inf), np.where(known, weight, 0.0)
+    return np.where(known, value, -np.inf), np.where(known, weight, 0.0), mixed[:, :3] * scale[:, None]
 
 
-def _bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+def bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """image (h, w, c) at pixel positions (n, 2), centres at + 0.5, clamped at the border -> (n, c) float32."""
     h, w, c = image.shape
     flat = image.reshape(h * w, c)

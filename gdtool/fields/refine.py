@@ -1,0 +1,109 @@
+"""The grid method's second half: move the extracted mesh onto what the views measured, and smooth what none sees."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.fields.materials import neighbour_matrix
+from gdtool.fields.sights import WEAK, Sight, hull_distance, tangent_distance
+from gdtool.geometry.grids import components, keep_faces, signed_volume
+from gdtool.geometry.normals import vertex_normals
+
+
+def measured_planes(sights: list[Sight], vertices: np.ndarray, normals: np.ndarray, reach: float):
+    """Quadratic data term of each vertex: matrix (v, 3, 3) and vector (v, 3) of sum w (n·u + s)^2, and sum w (v,).
+
+    Planes farther than reach (world units) or turned away from the vertex's normal are another surface.
+    """
+    matrix = np.zeros((len(vertices), 3, 3), np.float32)
+    vector = np.zeros((len(vertices), 3), np.float32)
+    total = np.zeros(len(vertices), np.float32)
+    for sight in sights:
+        if sight.planes is None:
+            continue
+        distance, weight, normal = tangent_distance(sight, vertices)
+        same = (np.abs(distance) < reach) & (weight > WEAK) & ((normal * normals).sum(1) > 0.5)
+        weight = np.where(same, weight, 0.0).astype(np.float32)
+        distance = np.where(same, distance, 0.0).astype(np.float32)
+        matrix += (weight[:, None] * normal)[:, :, None] * normal[:, None, :]
+        vector -= (weight * distance)[:, None] * normal
+        total += weight
+    return matrix, vector, total
+
+
+def refine(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: float, *, rounds: int = 2,
+           smoothness: float = 0.05, iterations: int = 40) -> np.ndarray:
+    """New positions (v, 3): least squares of distances to the measured planes and of the umbrella Laplacian.
+
+    Seen vertices follow the planes; unseen ones minimise bending, held loosely where the carving put them and inside
+    the silhouettes.
+    """
+    from scipy.sparse import diags, identity
+
+    graph = neighbour_matrix(faces, len(vertices))
+    degree = np.asarray(graph.sum(1)).ravel()
+    umbrella = (identity(len(vertices), format="csr", dtype=np.float32) - diags(1 / np.maximum(degree, 1)) @ graph).tocsr()
+    start = vertices
+    for _ in range(rounds):
+        matrix, vector, total = measured_planes(sights, vertices, vertex_normals(vertices, faces), 1.5 * step)
+        unseen = np.exp(-10.0 * total)
+        bending = diags((smoothness + unseen).astype(np.float32))
+        energy = (umbrella.T @ bending @ umbrella).tocsr().astype(np.float32)
+        hold = (0.003 + 0.03 * unseen)[:, None].astype(np.float32)
+
+        def apply(u, matrix=matrix, energy=energy, hold=hold):
+            return np.einsum("vij,vj->vi", matrix, u) + energy @ u + hold * u
+
+        right = vector - energy @ vertices.astype(np.float32) + hold * (start - vertices).astype(np.float32)
+        diagonal = np.einsum("vii->vi", matrix) + energy.diagonal()[:, None] + hold
+        move = conjugate_gradients(apply, right, diagonal, iterations)
+        length = np.linalg.norm(move, axis=1, keepdims=True)
+        vertices = vertices + move * np.minimum(1.0, step / np.maximum(length, 1e-12))
+    return _inside_silhouettes(vertices, start, sights, 0.25 * step)
+
+
+def conjugate_gradients(apply, right: np.ndarray, diagonal: np.ndarray, iterations: int) -> np.ndarray:
+    """Jacobi-preconditioned conjugate gradients from zero, for a symmetric positive operator on (v, 3) arrays."""
+    x = np.zeros_like(right)
+    r = right.copy()
+    z = r / diagonal
+    p, rz = z, float((r * z).sum())
+    first = rz
+    for _ in range(iterations):
+        if rz <= 1e-8 * first:
+            break
+        q = apply(p)
+        step = rz / float((p * q).sum())
+        x += step * p
+        r -= step * q
+        z = r / diagonal
+        rz, before = float((r * z).sum()), rz
+        p = z + rz / before * p
+    return x
+
+
+def _inside_silhouettes(vertices: np.ndarray, start: np.ndarray, sights: list[Sight], slack: float) -> np.ndarray:
+    """Vertices that left a silhouette by more than slack, and farther than they began, go back to where they began."""
+    out = np.full(len(vertices), -np.inf)
+    for sight in sights:
+        out = np.maximum(out, hull_distance(sight, vertices) - np.maximum(hull_distance(sight, start), 0))
+    return np.where((out > slack)[:, None], start, vertices)
+
+
+def drop_debris(vertices: np.ndarray, faces: np.ndarray, support: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, int]:
+    """The mesh without inner bubbles and without pieces that are tiny or that no view supports (v,): and how many went.
+
+    The largest piece always stays.
+    """
+    labels = components(faces, len(vertices))
+    count = int(labels.max()) + 1 if len(labels) else 0
+    if count <= 1:
+        return vertices, faces, 0
+    order = np.argsort(labels, kind="stable")
+    bounds = np.searchsorted(labels[order], np.arange(count + 1))
+    volume = np.array([signed_volume(vertices, faces[order[a:b]]) for a, b in zip(bounds[:-1], bounds[1:], strict=True)])
+    held = np.bincount(labels, support[faces].mean(1) > 0.02, count) / np.bincount(labels, minlength=count)
+    keep = (volume > (2 * step) ** 3) & (held > 0.2)
+    keep[np.argmax(volume)] = True
+    vertices, faces, _ = keep_faces(vertices, faces, keep[labels])
+    return vertices, faces, int((~keep).sum())
