@@ -1,0 +1,185 @@
+"""Attention inside an image, across the views of an object and across its domains.
+
+Tokens are (b * d * k, t, c): objects b, domains d, views k, in this order, t pixels of c channels. Module names are
+those of diffusers' transformer blocks, so that Stable Diffusion's keys map one to one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from gdtool.diffusion.config import DOMAINS
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which images a batch holds: b objects, each with the same domains (indices into DOMAINS) and k views."""
+
+    objects: int
+    domains: tuple[int, ...]
+    views: int
+
+    @property
+    def images(self) -> int:
+        return self.objects * len(self.domains) * self.views
+
+
+def attend(q: torch.Tensor, k: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+    """softmax(q kᵀ / √d) v over (…, heads, tokens, d)."""
+    if q.device.type == "cpu" and k.shape[-2] <= 2048:
+        # Measured on Zen 5 (bfloat16, 384 tokens): 9 ms forward and backward against 27 ms of torch's fused kernel.
+        weights = torch.softmax(q @ k.transpose(-1, -2) * q.shape[-1] ** -0.5, -1)
+        return weights.to(v.dtype) @ v
+    return F.scaled_dot_product_attention(q, k, v)
+
+
+class Attention(nn.Module):
+    """Multi-head attention; context (…, tokens, context_width), None: the queries' own tokens."""
+
+    def __init__(self, width: int, heads: int, context_width: int | None = None):
+        super().__init__()
+        self.heads = heads
+        self.to_q = nn.Linear(width, width, bias=False)
+        self.to_k = nn.Linear(context_width or width, width, bias=False)
+        self.to_v = nn.Linear(context_width or width, width, bias=False)
+        self.to_out = nn.ModuleList([nn.Linear(width, width)])
+
+    def split(self, x: torch.Tensor) -> torch.Tensor:
+        """(n, t, c) -> (n, heads, t, c / heads)"""
+        return x.unflatten(-1, (self.heads, -1)).transpose(-2, -3)
+
+    def join(self, x: torch.Tensor) -> torch.Tensor:
+        return x.transpose(-2, -3).flatten(-2)
+
+    def forward(self, x: torch.Tensor, context: torch.Tensor | None = None) -> torch.Tensor:
+        context = x if context is None else context
+        out = attend(self.split(self.to_q(x)), self.split(self.to_k(context)), self.split(self.to_v(context)))
+        return self.to_out[0](self.join(out))
+
+
+class CrossDomainAttention(Attention):
+    """A star around color: color's queries read each other domain of the same view, their answers are fused by one
+    layer; in the two-way star the other domains' queries also read color.
+
+    The output projection starts at zero, so a pretrained network starts unchanged. With color queries only (one way)
+    the other domains never hear of color.
+    """
+
+    def __init__(self, width: int, heads: int, two_way: bool):
+        super().__init__(width, heads)
+        self.two_way = two_way
+        # One layer over the concatenated answers of the other domains; a domain that is absent contributes nothing.
+        self.fuse = nn.Linear((len(DOMAINS) - 1) * width, width)
+        nn.init.zeros_(self.to_out[0].weight)
+        nn.init.zeros_(self.to_out[0].bias)
+
+    def forward(self, x: torch.Tensor, layout: Layout) -> torch.Tensor:
+        """x (b d k, t, c) -> the same shape, to be added to x. Without color, or with color alone: zeros."""
+        others = [i for i, domain in enumerate(layout.domains) if domain != 0]
+        if 0 not in layout.domains or not others:
+            return torch.zeros_like(x)
+        color = layout.domains.index(0)
+        n, (t, c) = len(others), x.shape[1:]
+        per_domain = x.unflatten(0, (layout.objects, len(layout.domains), layout.views))
+        rest, color_tokens = per_domain[:, others], per_domain[:, color]  # (b, n, k, t, c), (b, k, t, c)
+        shape = rest.shape[:3]
+
+        queries = self.split(self.to_q(color_tokens)).unsqueeze(1).expand(-1, n, -1, -1, -1, -1)
+        answers = attend(queries, self.split(self.to_k(rest)), self.split(self.to_v(rest)))  # (b, n, k, heads, t, ·)
+        answers = self.join(answers)
+        fused = self.fuse.bias + sum(
+            F.linear(answers[:, j], self.fuse.weight[:, (layout.domains[i] - 1) * c: layout.domains[i] * c])
+            for j, i in enumerate(others))
+        out: list = [None] * len(layout.domains)
+        out[color] = self.to_out[0](fused)
+        if self.two_way:
+            keys, values = self.split(self.to_k(color_tokens)), self.split(self.to_v(color_tokens))
+            heard = attend(self.split(self.to_q(rest)), keys.unsqueeze(1).expand(-1, n, -1, -1, -1, -1),
+                           values.unsqueeze(1).expand(-1, n, -1, -1, -1, -1))
+            heard = self.to_out[0](self.join(heard))
+        else:
+            heard = torch.zeros(*shape, t, c, dtype=out[color].dtype, device=x.device)
+        for j, i in enumerate(others):
+            out[i] = heard[:, j]
+        return torch.stack(out, 1).flatten(0, 2)
+
+
+class GatedLinear(nn.Module):
+    """GEGLU (Shazeer 2020)."""
+
+    def __init__(self, width: int, inner: int):
+        super().__init__()
+        self.proj = nn.Linear(width, 2 * inner)
+
+    def forward(self, x):
+        value, gate = self.proj(x).chunk(2, -1)
+        return value * F.gelu(gate)
+
+
+class FeedForward(nn.Module):
+    def __init__(self, width: int, factor: int):
+        super().__init__()
+        self.net = nn.ModuleList([GatedLinear(width, factor * width), nn.Identity(), nn.Linear(factor * width, width)])
+
+    def forward(self, x):
+        return self.net[2](self.net[0](x))
+
+
+class TransformerBlock(nn.Module):
+    """Self-attention over all views of a domain, the star across domains, attention to the image's embedding, feed-forward."""
+
+    def __init__(self, width: int, heads: int, context_width: int, feed_forward: int, multi_view: bool, cross_domain: str):
+        super().__init__()
+        self.multi_view = multi_view
+        self.norm1 = nn.LayerNorm(width)
+        self.attn1 = Attention(width, heads)
+        if cross_domain != "none":
+            self.norm_cross_domain = nn.LayerNorm(width)
+            self.attn_cross_domain = CrossDomainAttention(width, heads, cross_domain == "two_way")
+        else:
+            self.attn_cross_domain = None
+        self.norm2 = nn.LayerNorm(width)
+        self.attn2 = Attention(width, heads, context_width)
+        self.norm3 = nn.LayerNorm(width)
+        self.ff = FeedForward(width, feed_forward)
+
+    def forward(self, x: torch.Tensor, context: torch.Tensor, layout: Layout) -> torch.Tensor:
+        """x (b d k, t, c), context (b, m, context_width)."""
+        images, t, c = x.shape
+        groups = layout.objects * len(layout.domains)
+        own = self.norm1(x)
+        if self.multi_view:  # keys and values of all views: the views' tokens are one sequence
+            own = own.reshape(groups, layout.views * t, c)
+        x = x + self.attn1(own).reshape(images, t, c)
+        if self.attn_cross_domain is not None:
+            x = x + self.attn_cross_domain(self.norm_cross_domain(x), layout)
+        # All images of an object read the same embedding: its keys and values are computed once per object.
+        read = self.attn2(self.norm2(x).reshape(layout.objects, -1, c), context)
+        x = x + read.reshape(images, t, c)
+        return x + self.ff(self.norm3(x))
+
+
+class Transformer(nn.Module):
+    """Transformer blocks over an image's features (n, c, h, w), with 1x1 projections and a residual."""
+
+    def __init__(self, width: int, heads: int, context_width: int, side: int | None, groups: int, config):
+        super().__init__()
+        self.norm = nn.GroupNorm(groups, width, eps=1e-6)
+        self.proj_in = nn.Conv2d(width, width, 1)
+        self.position = nn.Parameter(torch.randn(side * side, width) * 0.1) if side else None
+        self.transformer_blocks = nn.ModuleList([
+            TransformerBlock(width, heads, context_width, config.feed_forward, config.multi_view, config.cross_domain)])
+        self.proj_out = nn.Conv2d(width, width, 1)
+
+    def forward(self, x: torch.Tensor, context: torch.Tensor, layout: Layout) -> torch.Tensor:
+        n, c, h, w = x.shape
+        tokens = self.proj_in(self.norm(x)).flatten(2).transpose(1, 2)
+        if self.position is not None:
+            tokens = tokens + self.position.to(tokens.dtype)
+        for block in self.transformer_blocks:
+            tokens = block(tokens, context, layout)
+        return x + self.proj_out(tokens.transpose(1, 2).reshape(n, c, h, w))

@@ -1,0 +1,121 @@
+"""One readable configuration of the diffusion model and of its training: `paper` and `tiny` are the same code as `small`.
+
+Everything a model folder needs to be rebuilt is ModelConfig (its config.json); everything a run needs is TrainConfig.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+# The order of the domains is the order of the one-hot switcher and of every (…, domain, view, …) axis; color is primary.
+DOMAINS = ("color", "normal", "depth", "albedo", "roughness", "metallic")
+# Wonder3D's [elevation of the condition, view's elevation, view's azimuth] and our six labels, as sin and cos each.
+CLASS_WIDTH = 2 * (3 + len(DOMAINS))
+
+
+class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Shape of the network, of its inputs and of its noise. Sizes in pixels unless said otherwise."""
+
+    image_size: int = 64
+    views: tuple[str, ...] = ("front", "front_right", "right", "back", "left", "front_left")
+    domains: tuple[str, ...] = DOMAINS
+    # codec: "vae" is Stable Diffusion's (factor 8, 4 channels), "patch" is space-to-depth of the pixels.
+    codec: Literal["vae", "patch"] = "patch"
+    patch: int = 4
+    condition_alpha: bool = True  # the mask as fourth channel of the condition latent; patch codec only
+    mirror_back: bool = True  # the view from behind gets the mirrored condition latent: its silhouette is exactly that
+    # UNet, in Stable Diffusion's structure and key names.
+    channels: tuple[int, ...] = (64, 128, 160)
+    attention_levels: tuple[bool, ...] = (False, True, True)
+    layers_per_block: int = 1
+    heads: int = 0  # heads per attention; 0: as many as give head_width
+    head_width: int = 32
+    norm_groups: int = 16
+    feed_forward: int = 2  # width of the gated feed-forward in units of the token's width
+    time_scale_shift: bool = True  # the time embedding scales and shifts (True) or only shifts (Stable Diffusion)
+    position_embedding: bool = True  # learned, in front of each transformer
+    condition_skip: bool = True  # prediction += learned gate(domain, view) * condition's pixels; x-prediction only
+    gradient_checkpointing: bool = False
+    # attention across the images of an object
+    multi_view: bool = True
+    cross_domain: Literal["none", "one_way", "two_way"] = "two_way"
+    # image encoder: "clip" is one projected embedding as one token, "patch" a small transformer over the image's patches
+    encoder: Literal["clip", "patch"] = "patch"
+    encoder_width: int = 192
+    encoder_layers: int = 4
+    encoder_patch: int = 8
+    # noise
+    prediction: Literal["epsilon", "v", "x"] = "x"
+    timesteps: int = 1000
+    noise_schedule: Literal["scaled_linear", "cosine"] = "cosine"
+    # encoded background of color and albedo while training; sampling uses the first
+    backgrounds: tuple[Literal["white", "grey", "black"], ...] = ("grey",)
+    # where the pretrained parts of the paper's configuration live: a local folder or a hub id
+    pretrained: str = ""
+
+
+class Phase(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A part of the training: until `share` of it is over, each step sees so many domains and views of an object."""
+
+    share: float = 1.0
+    domains: int = 6
+    views: int = 6
+    learning_rate: float = 1e-3
+
+
+class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How a model is trained; `steps` are optimiser steps, `batch` counts objects per step over all accumulations."""
+
+    batch: int = 8
+    accumulate: int = 1
+    steps: int = 4000
+    phases: tuple[Phase, ...] = (Phase(share=0.6, domains=3, views=3), Phase(share=1.0))
+    warmup: int = 100
+    decay: bool = True  # cosine to a twentieth of the learning rate over the run
+    weight_decay: float = 1e-2
+    betas: tuple[float, float] = (0.9, 0.999)
+    clip: float = 1.0
+    class_rate: float = 1.0  # learning rate of the class embedding in units of the others'
+    ema: float = 0.999
+    snr_gamma: float = 5.0  # min-SNR: a clean image's error is weighted by min(SNR, gamma) …
+    snr_floor: float = 1.0  # … and at least by this, or a model that samples in few steps never learns the first one
+    pure_noise: float = 0.25  # share of samples at the last timestep
+    drop_embedding: float = 0.05
+    drop_both: float = 0.05
+    drop_latent: float = 0.05
+    tilted: float = 0.5  # share of condition images from a random elevation, or in perspective, where the data have them
+    mirror: bool = True
+    hue: bool = True
+    pbr_weight: float = 0.1
+    pbr_snr: float = 1.0  # supervision by rendering acts only where the SNR is above this
+    pbr_pixels: int = 768  # per object
+    precision: Literal["float32", "bfloat16"] = "bfloat16"
+
+
+PRESETS: dict[str, tuple[ModelConfig, TrainConfig]] = {
+    # a few thousand weights: what the tests train
+    "tiny": (
+        ModelConfig(image_size=32, patch=4, channels=(16, 32), attention_levels=(False, True), head_width=16,
+                    norm_groups=4, encoder_width=32, encoder_layers=1),
+        TrainConfig(batch=2, steps=20, warmup=2, pbr_pixels=64, ema=0.9,
+                    phases=(Phase(share=0.5, domains=2, views=2), Phase(share=1.0))),
+    ),
+    # what a laptop trains over lunch, and what the bundled model is
+    "small": (ModelConfig(), TrainConfig()),
+    # METHOD section 1: Stable Diffusion Image Variations grown to six domains; 30,000 multi-view steps, then 20,000
+    # with attention across the domains, batch 512
+    "paper": (
+        ModelConfig(image_size=256, codec="vae", condition_alpha=False, mirror_back=False,
+                    channels=(320, 640, 1280, 1280), attention_levels=(True, True, True, False), layers_per_block=2,
+                    heads=8, norm_groups=32, feed_forward=4, time_scale_shift=False, position_embedding=False,
+                    condition_skip=False, gradient_checkpointing=True, encoder="clip", encoder_width=768,
+                    prediction="epsilon", noise_schedule="scaled_linear", backgrounds=("white", "black", "grey"),
+                    pretrained="lambdalabs/sd-image-variations-diffusers"),
+        TrainConfig(batch=512, accumulate=64, steps=50_000, decay=False, class_rate=10.0, ema=0.9999, snr_floor=0.0,
+                    pure_noise=0.0, hue=False, mirror=False,
+                    phases=(Phase(share=0.6, domains=1, views=6, learning_rate=1e-4),
+                            Phase(share=1.0, domains=6, views=6, learning_rate=5e-5))),
+    ),
+}

@@ -1,0 +1,109 @@
+"""Domain images as what the network sees: three channels in [-1, 1], premultiplied by coverage, and back.
+
+Every domain carries the silhouette, so that a mask comes out with whatever subset is sampled:
+  color, albedo        sRGB, 2c - 1, over an encoded background (white 1, grey 0, black -1)
+  normal               world axes, times coverage: its length is the coverage
+  depth                linear over the object's slab, (2 - depth) / SLAB: nearer is larger; (value, value, coverage)
+  roughness, metallic  2v - 1; (value, value, coverage)
+In the third channel of the scalar domains coverage m is 2m - 1; values are multiplied by m, so the background is 0.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gdtool.cameras.camera import DISTANCE
+from gdtool.diffusion.config import DOMAINS
+
+SLAB = 0.75  # half the depth range that is encoded: a unit box turned about its vertical axis reaches 0.707
+BACKGROUND = {"white": 1.0, "grey": 0.0, "black": -1.0}
+SCALARS = ("depth", "roughness", "metallic")
+# The thirteen planes a view is stored in: premultiplied values of each domain, then coverage.
+PLANES = {"color": slice(0, 3), "normal": slice(3, 6), "depth": slice(6, 7), "albedo": slice(7, 10),
+          "roughness": slice(10, 11), "metallic": slice(11, 12), "mask": slice(12, 13)}
+PLANE_COUNT = 13
+
+
+def planes_from_images(images: dict[str, np.ndarray], mask: np.ndarray) -> np.ndarray:
+    """Domain images (k, h, w[, 3]) of a views folder and mask (k, h, w) -> premultiplied planes (k, 13, h, w) in [-1, 1].
+
+    color and albedo linear, normal unit, depth in world units. Coverage m is stored as 2m - 1.
+    """
+    from gdtool.images.color import srgb_from_linear
+
+    k, h, w = mask.shape
+    out = np.zeros((k, PLANE_COUNT, h, w), np.float32)
+    for domain, image in images.items():
+        if domain not in PLANES:
+            continue
+        if domain in ("color", "albedo"):
+            value = 2 * srgb_from_linear(np.clip(image, 0, 1)) - 1
+        elif domain == "depth":
+            value = np.clip((DISTANCE - image) / SLAB, -1, 1)
+        elif domain == "normal":
+            value = image
+        else:
+            value = 2 * np.clip(image, 0, 1) - 1
+        value = value[..., None] if value.ndim == 3 else value
+        out[:, PLANES[domain]] = np.moveaxis(value * mask[..., None], -1, 1)
+    out[:, PLANES["mask"]] = 2 * mask[:, None] - 1
+    return out
+
+
+def encode(planes: torch.Tensor, domains: tuple[int, ...], background: torch.Tensor) -> torch.Tensor:
+    """planes (b, k, 13, h, w), domains as indices, background (b,) encoded -> (b, d, k, 3, h, w) in [-1, 1]."""
+    mask = planes[:, :, PLANES["mask"]]
+    behind = (0.5 - 0.5 * mask) * background[:, None, None, None, None]
+    out = []
+    for i in domains:
+        domain = DOMAINS[i]
+        value = planes[:, :, PLANES[domain]]
+        if domain in ("color", "albedo"):
+            value = value + behind
+        elif domain in SCALARS:
+            value = torch.cat([value, value, mask], 2)
+        out.append(value)
+    return torch.stack(out, 1)
+
+
+def encode_condition(rgba: torch.Tensor, background: torch.Tensor) -> torch.Tensor:
+    """rgba (b, 4, h, w): premultiplied encoded color and coverage as 2m - 1 -> the same with color over the background."""
+    behind = (0.5 - 0.5 * rgba[:, 3:]) * background[:, None, None, None]
+    return torch.cat([rgba[:, :3] + behind, rgba[:, 3:]], 1)
+
+
+def coverage(images: dict[str, torch.Tensor], background: float) -> torch.Tensor:
+    """Coverage (…, h, w) in [0, 1] that the encoded domain images (…, 3, h, w) agree on.
+
+    From the scalar domains where there is one, else from the normals' length, else from how far color stands off the
+    background (which a subject of the background's own color defeats).
+    """
+    votes = [0.5 + 0.5 * images[d][..., 2, :, :] for d in SCALARS if d in images]
+    if "normal" in images:
+        votes.append(images["normal"].norm(dim=-3))
+    if not votes:
+        image = images.get("color", images.get("albedo"))
+        votes = [(image - background).abs().amax(-3) * 2]
+    return torch.stack(votes).mean(0).clamp(0, 1)
+
+
+def decode(images: dict[str, torch.Tensor], mask: torch.Tensor, background: float) -> dict[str, torch.Tensor]:
+    """Encoded images (…, 3, h, w) -> values inside the mask, whose coverage (…, h, w) they are divided by.
+
+    color, albedo sRGB (…, 3, h, w) in [0, 1]; normal unit; depth in world units (…, h, w); roughness, metallic (…, h, w).
+    Differentiable in images.
+    """
+    m = mask.clamp_min(0.1)
+    out = {}
+    for domain, x in images.items():
+        if domain in ("color", "albedo"):
+            value = (x - background * (1 - m.unsqueeze(-3))) / m.unsqueeze(-3)
+            out[domain] = (0.5 + 0.5 * value).clamp(0, 1)
+        elif domain == "normal":
+            square = (x * x).sum(-3, keepdim=True)
+            out[domain] = x * torch.rsqrt(square.clamp_min(1e-6))
+        else:
+            value = (0.5 * (x[..., 0, :, :] + x[..., 1, :, :]) / m).clamp(-1, 1)
+            out[domain] = DISTANCE - SLAB * value if domain == "depth" else 0.5 + 0.5 * value
+    return out

@@ -1,0 +1,55 @@
+"""What training minimises: the clean image's error, and the error of its rendering in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gdtool.cameras.camera import rig
+from gdtool.diffusion.config import DOMAINS, ModelConfig
+from gdtool.diffusion.encoding import PLANES, decode
+
+LIT = ("normal", "albedo", "roughness", "metallic")  # what the closed form is made of
+
+
+def linear(srgb: torch.Tensor) -> torch.Tensor:
+    """sRGB decoding, differentiable (IEC 61966-2-1)."""
+    high = ((srgb.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4
+    return torch.where(srgb <= 0.04045, srgb / 12.92, high)
+
+
+def view_directions(config: ModelConfig) -> torch.Tensor:
+    """(k, 3) from the object toward each camera of the rig."""
+    by_name = {camera.name: camera.backward for camera in rig("six", config.image_size)}
+    return torch.tensor(np.stack([by_name[name] for name in config.views]), dtype=torch.float32)
+
+
+def rendering_error(predicted: torch.Tensor, truth: torch.Tensor, order: dict[int, int], planes: torch.Tensor, lights: torch.Tensor, views: torch.Tensor,
+                    pixels: int, background: float, generator: torch.Generator) -> torch.Tensor:
+    """Mean squared difference of the closed-form renderings of predicted and true maps under the object's light.
+
+    predicted, truth (d, k, 3, h, w) encoded images of one object; order: index into DOMAINS to position along d; planes (k, 13, h, w); lights (16, 7);
+    views (k, 3). Radiance c is compared as c / (1 + c), or the few highlights would be all that counts. At random
+    foreground pixels, float32 throughout. 0 for an object that is not seen.
+    """
+    from gdtool.shading.closed_form import shade
+    from gdtool.shading.sg import SphericalGaussians
+
+    mask = 0.5 + 0.5 * planes[:, PLANES["mask"].start]
+    inside = torch.nonzero(mask > 0.9)
+    if len(inside) == 0:
+        return predicted.sum() * 0
+    chosen = inside[torch.randint(len(inside), (pixels,), generator=generator)]
+    k, row, column = chosen.unbind(1)
+    light = SphericalGaussians(lights[:, :3], lights[:, 3], lights[:, 4:])
+
+    def render(images: torch.Tensor) -> torch.Tensor:
+        picked = images[:, k, :, row, column].transpose(0, 1)  # (d, pixels, 3)
+        values = decode({d: picked[order[DOMAINS.index(d)]][..., None, None] for d in LIT}, mask[k, row, column][:, None, None], background)
+        flat = {d: x.flatten(1) for d, x in values.items()}
+        radiance = shade(flat["normal"], views[k], linear(flat["albedo"]), flat["roughness"][:, 0], flat["metallic"][:, 0], light)
+        return radiance / (1 + radiance)
+
+    with torch.no_grad():
+        target = render(truth.float())
+    return ((render(predicted.float()) - target) ** 2).mean()

@@ -1,0 +1,36 @@
+"""Sampled images as a views folder's content."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gdtool.cameras import Camera
+from gdtool.diffusion.encoding import coverage, decode
+from gdtool.folders.views import Views
+
+
+def sharpen(mask: torch.Tensor) -> torch.Tensor:
+    """A model's coverage is soft where it is unsure of the outline; a real outline is a pixel wide: twice the slope at one half."""
+    return ((mask - 0.5) * 2 + 0.5).clamp(0, 1)
+
+
+def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], background: float, domains: tuple[str, ...]) -> Views:
+    """Encoded images (k, 3, h, w) of one object -> Views of the asked domains with one mask per view, shared by all."""
+    from gdtool.images.color import linear_from_srgb
+
+    soft = coverage(images, background)
+    mask = sharpen(soft).numpy()
+    values = decode(images, soft, background)
+    out = {}
+    for domain in images:
+        if domain not in domains:
+            continue
+        value = values[domain].numpy()
+        if domain in ("color", "albedo"):
+            value = linear_from_srgb(np.moveaxis(value, 1, -1))
+        elif domain == "normal":
+            value = np.moveaxis(value, 1, -1)
+        inside = mask > 0
+        out[domain] = np.where(inside[..., None] if value.ndim == 4 else inside, value, 0).astype(np.float32)
+    return Views(cameras, out, mask.astype(np.float32))

@@ -1,0 +1,71 @@
+"""From a framed condition image to the images of all views and domains."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+
+import torch
+
+from gdtool.diffusion.attention import Layout
+from gdtool.diffusion.config import DOMAINS
+from gdtool.diffusion.encoding import BACKGROUND, encode_condition
+from gdtool.diffusion.model import Model
+from gdtool.diffusion.schedule import sample
+
+
+def precision_context(device: torch.device | str, precision: str):
+    """Autocast of the networks; lighting arithmetic stays out of it."""
+    kind = torch.device(device).type
+    return torch.autocast(kind, torch.bfloat16) if precision == "bfloat16" else nullcontext()
+
+
+@torch.no_grad()
+def sample_images(model: Model, rgba: torch.Tensor, *, domains: tuple[str, ...] = DOMAINS, steps: int = 8, guidance: float = 1.0,
+                  seed: int = 0, scheduler: str = "ddim", precision: str = "float32",
+                  progress: Callable = lambda iterable, total, label: iterable) -> dict[str, torch.Tensor]:
+    """Sample every view of the domains for a batch of objects.
+
+    rgba (b, 4, h, w): framed condition, premultiplied and encoded (data.condition_plane). Returns domain to encoded
+    images (b, k, 3, h, w) over the first of the configuration's backgrounds. Noise depends on seed alone: neither on the
+    batch nor on which domains are asked for. Where color is primary it is sampled even when it is not asked for.
+    """
+    config, device, b = model.config, rgba.device, len(rgba)
+    wanted = [d for d in config.domains if d in domains]
+    if config.cross_domain != "none" and "color" not in wanted:
+        wanted = ["color", *wanted]
+    indices = tuple(DOMAINS.index(d) for d in wanted)
+    views = torch.arange(len(config.views))
+    every = Layout(1, tuple(range(len(DOMAINS))), len(views))
+    noise = torch.randn(model.latent_shape(every), generator=torch.Generator().manual_seed(seed))
+    noise = noise.unflatten(0, (len(DOMAINS), len(views)))[list(indices)].flatten(0, 1).repeat(b, 1, 1, 1).to(device)
+
+    background = torch.full((b,), BACKGROUND[config.backgrounds[0]], device=device)
+    rgba = encode_condition(rgba, background)
+    guided = guidance != 1.0
+    layout = Layout(2 * b if guided else b, indices, len(views))
+    with precision_context(device, precision):
+        context = model.encoder(rgba)
+    single = Layout(b, indices, len(views))
+    condition = model.condition_latents(rgba, single, views)
+    if guided:  # second half of the batch: no embedding, no latent
+        context = torch.cat([context, torch.zeros_like(context)])
+        condition = torch.cat([condition, torch.zeros_like(condition)])
+    bar = iter(progress(range(steps), steps, "sampling"))
+
+    def denoise(x, t, i):
+        next(bar, None)
+        x = x.repeat(2, 1, 1, 1) if guided else x
+        times = torch.full((layout.objects,), t, device=device)
+        with precision_context(device, precision):
+            clean = model.predict_clean(x, condition, times, context, layout, views)
+        if guided:
+            with_condition, without = clean.chunk(2)
+            clean = without + guidance * (with_condition - without)
+        return clean
+
+    latents = sample(denoise, noise, config, steps, scheduler)
+    for _ in bar:
+        pass
+    images = model.codec.decode(latents).unflatten(0, (b, len(indices), len(views)))
+    return {d: images[:, j] for j, d in enumerate(wanted)}

@@ -1,0 +1,68 @@
+"""Noise: x_t = a_t x_0 + s_t e with a² + s² = 1, what a prediction says about x_0, and samplers apart from models."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+
+from gdtool.diffusion.config import ModelConfig
+
+
+def signal_and_noise(config: ModelConfig) -> tuple[torch.Tensor, torch.Tensor]:
+    """a and s for every timestep, (timesteps,) float32 each."""
+    n = config.timesteps
+    if config.noise_schedule == "scaled_linear":  # Stable Diffusion 1
+        beta = torch.linspace(0.00085**0.5, 0.012**0.5, n, dtype=torch.float64) ** 2
+        square = torch.cumprod(1 - beta, 0)
+    else:  # Nichol & Dhariwal 2021, without their offset; ends in pure noise, so sampling starts where training was
+        square = torch.cos((torch.arange(n, dtype=torch.float64) + 1) / n * math.pi / 2) ** 2
+    return square.sqrt().float(), (1 - square).sqrt().float()
+
+
+def clean_from_prediction(config: ModelConfig, prediction, noisy, a, s):
+    """x_0 from what the network predicts; a, s broadcast against noisy. epsilon at a = 0 says nothing: clamped."""
+    if config.prediction == "x":
+        return prediction
+    if config.prediction == "v":  # v = a e - s x_0
+        return a * noisy - s * prediction
+    return (noisy - s * prediction) / a.clamp_min(1e-4)
+
+
+def loss_weight(a: torch.Tensor, s: torch.Tensor, gamma: float, floor: float) -> torch.Tensor:
+    """Weight of the error of x_0: min-SNR (Hang et al. 2023) from above, floor from below."""
+    return (a * a / (s * s).clamp_min(1e-8)).clamp(max=gamma).clamp(min=floor)
+
+
+def timesteps(config: ModelConfig, steps: int) -> list[int]:
+    """Decreasing timesteps that start at the last one ("trailing", Lin et al. 2024)."""
+    return [max(round(config.timesteps * (1 - i / steps)) - 1, 0) for i in range(steps)]
+
+
+def sample(denoise: Callable[[torch.Tensor, int, int], torch.Tensor], noise: torch.Tensor, config: ModelConfig, steps: int,
+           scheduler: str) -> torch.Tensor:
+    """Integrate from noise to x_0.
+
+    denoise(x, timestep, step index) -> predicted x_0. scheduler: "ddim" (Song et al. 2021, deterministic) or "dpm", DPM-Solver++(2M)
+    (Lu et al. 2022, algorithm 2).
+    """
+    signal, deviation = signal_and_noise(config)
+    steps_at = timesteps(config, steps)
+    x, before, last_width = noise, None, math.inf
+    for i, t in enumerate(steps_at):
+        clean = denoise(x, t, i)
+        if i == len(steps_at) - 1:
+            return clean
+        a, s = float(signal[t]), float(deviation[t])
+        a_next, s_next = float(signal[steps_at[i + 1]]), float(deviation[steps_at[i + 1]])
+        direction, width = clean, math.inf
+        if a > 1e-6:
+            width = math.log(a_next / s_next) - math.log(a / s)  # half log-SNR
+            if scheduler == "dpm" and before is not None:
+                weight = width / (2 * last_width)  # 0 where the last step came out of pure noise
+                direction = (1 + weight) * clean - weight * before
+        # a_next x0 + s_next e with e from x and x0: DDIM, and DPM-Solver++ once x0 is extrapolated
+        x = a_next * direction + s_next * (x - a * direction) / s
+        before, last_width = clean, width
+    return x

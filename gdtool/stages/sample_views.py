@@ -1,0 +1,120 @@
+"""Make six views of an object, in six domains, from one picture of it.
+
+Takes an image with alpha, or one on a plain background that is then cut out, or any image with --mask. The subject is
+cropped and centred as in training. Writes color, normal, depth, albedo, roughness, metallic and masks of the default
+rig for reconstruct, at the model's own resolution. Use --no-crop when the picture is framed like the rig's front view
+already (an orthographic render of a normalised object).
+
+Example:
+  gdtool sample-views cat.png --seed 7
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from gdtool.core.errors import InputError, UsageError
+from gdtool.core.stage import Inputs, Output, SecondInput, Stage, file_option
+
+
+class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    steps: Annotated[int, Meta(ge=1, le=1000, description="Denoising steps.")] = 8
+    guidance: Annotated[float, Meta(ge=0, le=30, description="Classifier-free guidance; 1: none, and half the time.")] = 1.0
+    scheduler: Annotated[Literal["ddim", "dpm"], Meta(description="Sampler: DDIM or DPM-Solver++.")] = "ddim"
+    seed: Annotated[int, Meta(ge=0, description="Seed of the noise, the same for every object whatever the order.")] = 0
+    domains: Annotated[tuple[str, ...], Meta(description="Domains to write; color is made in any case, being the primary.")] = (
+        "color", "normal", "depth", "albedo", "roughness", "metallic")
+    mask: file_option("Image that is bright where the subject is.") = None
+    crop: Annotated[bool, Meta(description="Centre the subject and scale it as in training.")] = True
+    precision: Annotated[Literal["float32", "bfloat16"], Meta(description="Arithmetic of the networks.")] = "float32"
+
+
+def run(inputs: Inputs, options: Options, out: Output) -> None:
+    """Sample and write a views folder. Raises InputError for images and models that cannot be used."""
+    import torch
+
+    from gdtool.cameras import rig
+    from gdtool.diffusion.data import to_tensor_condition
+    from gdtool.diffusion.encoding import BACKGROUND
+    from gdtool.diffusion.result import views_from_images
+    from gdtool.diffusion.sampling import sample_images
+    from gdtool.diffusion.weights import load_model
+    from gdtool.folders.views import write_views
+    from gdtool.images.color import srgb_from_linear
+    from gdtool.images.io import write_png
+
+    torch.set_num_threads(out.threads)
+    with out.step("load"):
+        model = load_model(_model_folder(inputs)).to(out.device)
+    config = model.config
+    unknown = [d for d in options.domains if d not in config.domains]
+    if unknown or not options.domains:
+        raise UsageError("--domains", f"{unknown[0] if unknown else 'nothing'} is not a domain of this model",
+                         f"it has {','.join(config.domains)}")
+    with out.step("condition"):
+        condition = _condition(inputs, options, config.image_size, out)
+    with out.step("sample"):
+        rgba = to_tensor_condition(condition).to(out.device)
+        images = sample_images(model, rgba, domains=options.domains, steps=options.steps, guidance=options.guidance, seed=options.seed,
+                               scheduler=options.scheduler, precision=options.precision, progress=out.progress)
+    cameras = {camera.name: camera for camera in rig("six", config.image_size)}
+    views = views_from_images({d: x[0].cpu() for d, x in images.items()}, [cameras[name] for name in config.views],
+                              BACKGROUND[config.backgrounds[0]], options.domains)
+    with out.step("write"):
+        # what the model was shown, after cutting out and framing
+        write_png(out.path("condition/000.png"), srgb_from_linear_rgba(condition, srgb_from_linear))
+        write_views(out, views, conditions=1)
+
+
+def srgb_from_linear_rgba(image, srgb_from_linear):
+    import numpy as np
+
+    return np.concatenate([srgb_from_linear(np.clip(image[..., :3], 0, 1)), np.clip(image[..., 3:], 0, 1)], -1)
+
+
+def _model_folder(inputs: Inputs):
+    """Path of the given model, or of the one inside the package."""
+    from pathlib import Path
+
+    import gdtool.models
+
+    given = inputs.second["model"]
+    return given.path if given is not None else Path(gdtool.models.__file__).parent / "default"
+
+
+def _condition(inputs: Inputs, options: Options, size: int, out: Output):
+    """The framed picture (size, size, 4), linear color and straight alpha. Raises InputError without a usable subject."""
+    from pathlib import Path
+
+    import numpy as np
+
+    from gdtool.diffusion.framing import frame, whole_frame
+    from gdtool.images.color import linear_from_srgb
+    from gdtool.images.io import read_image
+    from gdtool.images.mask import foreground
+
+    image = read_image(inputs.main)
+    if min(image.shape[:2]) < 32:
+        raise InputError(inputs.main, f"is {image.shape[1]}x{image.shape[0]} pixels; the model needs 32 at least")
+    given = read_image(Path(options.mask)) if options.mask is not None else None
+    if given is not None and given.shape[:2] != image.shape[:2]:
+        raise InputError(options.mask, f"is {given.shape[1]}x{given.shape[0]}, the image {image.shape[1]}x{image.shape[0]}")
+    alpha = foreground(image, given)
+    if not (alpha > 0.5).any():
+        raise InputError(inputs.main, "shows no subject: its mask is empty", "give one with --mask")
+    edge = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
+    if options.crop and (edge > 0.5).any():
+        out.warn(f"{inputs.name}: the subject touches the border of the picture and may be cut off")
+    linear = image.dtype.kind == "f"
+    color = image[..., :3] if image.ndim == 3 and image.shape[2] >= 3 else np.repeat(image.reshape(*image.shape[:2], -1)[..., :1], 3, -1)
+    if not linear:
+        color = linear_from_srgb(color.astype(np.float32) / np.iinfo(image.dtype).max)
+    rgba = np.concatenate([color, alpha[..., None]], -1).astype(np.float32)
+    return frame(rgba, size) if options.crop else whole_frame(rgba, size)
+
+
+STAGE = Stage(name="sample-views", version=1, reads=("image-file",), writes="views", Options=Options, run=run,
+              second_inputs={"model": SecondInput("model", search=False, help="Model folder; the bundled model without it.")})

@@ -1,0 +1,137 @@
+"""Train the multi-view PBR diffusion model on rendered objects.
+
+Takes a dataset folder (or any views folders with all six domains) of render-dataset and writes a model folder for
+sample-views: weights, configuration, card, loss curve and validation images. Use it to train the small configuration
+on a processor, to go on from a model you have (--start), or, with --preset paper, to grow Stable Diffusion to six
+domains. Killed at any time, the same line goes on where it was.
+
+Example:
+  gdtool render-dataset procedural:0..99 --size 64 -o objects && gdtool train objects --minutes 60 -o my-model
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from gdtool.core.errors import InputError
+from gdtool.core.stage import Inputs, Output, SecondInput, Stage, file_option
+
+
+class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    preset: Annotated[Literal["small", "tiny", "paper"], Meta(description="Configuration to start from.")] = "small"
+    config: file_option("JSON file of changes to it: {\"model\": {...}, \"train\": {...}}.") = None
+    steps: Annotated[int, Meta(ge=1, description="Optimiser steps; without it the preset's.")] | None = None
+    minutes: Annotated[float, Meta(gt=0, description="Stop after so many minutes of training; the learning rate falls accordingly.")] | None = None
+    batch: Annotated[int, Meta(ge=1, description="Objects per step; without it the preset's.")] | None = None
+    seed: Annotated[int, Meta(ge=0, description="Seed of weights, data order and noise.")] = 0
+    held_out: Annotated[int, Meta(ge=0, description="Last objects of the data that are not trained on but shown in validation images.")] = 4
+    checkpoint_every: Annotated[int, Meta(ge=1, description="Steps between checkpoints.")] = 100
+    validate_every: Annotated[int, Meta(ge=1, description="Steps between validation images.")] = 500
+
+
+def run(inputs: Inputs, options: Options, out: Output) -> None:
+    """Train and write a model folder. Raises InputError for data or a configuration that does not fit."""
+    import shutil
+
+    import torch
+
+    from gdtool.diffusion.config import PRESETS
+    from gdtool.diffusion.curve import draw_curve
+    from gdtool.diffusion.data import Objects, decode_dataset
+    from gdtool.diffusion.model import Model, parameter_count
+    from gdtool.diffusion.report import card, validation_grid
+    from gdtool.diffusion.training import run_training
+    from gdtool.diffusion.weights import check_shapes, load_model, save_model
+    from gdtool.core.kinds import ModelContent
+    from gdtool.images.io import write_png
+
+    torch.set_num_threads(out.threads)
+    model_config, train_config = _configured(PRESETS[options.preset], options)
+    torch.manual_seed(options.seed)
+    model = Model(model_config)
+    start = inputs.second["start"]
+    if start is not None:
+        loaded = load_model(start.path)
+        check_shapes(start.path, loaded.state_dict(), model.state_dict())
+        model.load_state_dict(loaded.state_dict())
+    elif model_config.codec == "vae":
+        from gdtool.diffusion.pretrained import start_from_pretrained
+
+        start_from_pretrained(model)
+
+    with out.step("decode"):
+        folders, count = _objects(inputs)
+        objects = decode_dataset(folders, count, model_config, out.workspace, warn=out.warn)
+    held = min(options.held_out, len(objects) - 1)
+    used = len(objects) - held
+    shown = Objects(objects.planes[used:], objects.conditions[used:], objects.lights[used:], objects.names[used:])
+    objects = Objects(objects.planes[:used], objects.conditions[:used], objects.lights[:used], objects.names[:used])
+    (out.workspace / "validation").mkdir(exist_ok=True)
+
+    def validate(state) -> None:
+        if held:
+            grid = validation_grid(state, shown, train_config.precision)
+            write_png(out.workspace / "validation" / f"step_{state.step:06d}.png", grid)
+
+    with out.step("train"):
+        state = run_training(model, objects, train_config, out.workspace, seed=options.seed, minutes=options.minutes,
+                             checkpoint_every=options.checkpoint_every, validate_every=options.validate_every, validate=validate,
+                             device=out.device, progress=out.progress)
+    with out.step("validate"):
+        validate(state)
+    save_model(out.path, model_config, state.average)
+    shutil.copyfile(out.workspace / "loss.csv", out.path("loss.csv"))
+    write_png(out.path("loss.png"), draw_curve(out.workspace / "loss.csv"))
+    for picture in sorted((out.workspace / "validation").glob("*.png")):
+        shutil.copyfile(picture, out.path(f"validation/{picture.name}"))
+    facts = {"objects": used, "steps": state.step, "training_minutes": round(state.seconds / 60, 1), "batch": train_config.batch,
+             "parameters": parameter_count(model), "threads": out.threads, "device": out.device}
+    out.path("card.md").write_text(card(options.preset, model_config, train_config, facts))
+    out.content = ModelContent(preset=options.preset, image_size=model_config.image_size, domains=model_config.domains,
+                               parameters=parameter_count(model), steps=state.step,
+                               report={k: v for k, v in facts.items() if k not in ("parameters", "steps", "threads")})
+
+
+def _configured(preset, options: Options):
+    """The preset with the changes of --config and of the flags. Raises InputError naming what is wrong with the file."""
+    from pathlib import Path
+
+    parts = [msgspec.to_builtins(part) for part in preset]
+    if options.config is not None:
+        path = Path(options.config)
+        try:
+            changes = msgspec.json.decode(path.read_bytes(), type=dict[Literal["model", "train"], dict])
+        except FileNotFoundError:
+            raise InputError(path, "does not exist") from None
+        except msgspec.DecodeError as error:
+            raise InputError(path, str(error)) from None
+        for part, name in zip(parts, ("model", "train"), strict=True):
+            part.update(changes.get(name, {}))
+    flags = {"steps": options.steps, "batch": options.batch}
+    parts[1].update({name: value for name, value in flags.items() if value is not None})
+    if options.minutes is not None and options.steps is None:
+        parts[1]["steps"] = 10**9  # the minutes decide
+    try:
+        return tuple(msgspec.convert(part, type(own)) for part, own in zip(parts, preset, strict=True))
+    except msgspec.ValidationError as error:
+        raise InputError(options.config or "configuration", str(error)) from None
+
+
+def _objects(inputs: Inputs):
+    """The views folders among the sources, those of datasets opened one by one, and how many there are."""
+    from gdtool.core.folder import open_folder
+
+    paths = []
+    for source in inputs.all:
+        if source.kind == "dataset":
+            paths += [source.file(one.path) for one in source.content.objects]
+        else:
+            paths.append(source.path)
+    return (open_folder(path, ("views",), "train", check=False) for path in paths), len(paths)
+
+
+STAGE = Stage(name="train", version=1, reads=("dataset", "views"), writes="model", Options=Options, run=run, gathers=True,
+              second_inputs={"start": SecondInput("model", search=False, help="Model folder whose weights to start from.")})
