@@ -145,7 +145,7 @@ def extend_owners(uv: np.ndarray, faces: np.ndarray, face_idx: np.ndarray, rings
     """
     size = face_idx.shape[0]
     owner = np.pad(face_idx, 1, constant_values=-1)
-    texels, owners = [], []
+    texels, owners = [np.empty(0, np.int64)], [np.empty(0, np.int32)]
     for _ in range(rings):
         neighbour = np.full((size, size), -1, np.int32)
         # Straight neighbours last, so that they win over diagonal ones.

@@ -30,26 +30,31 @@ def _flatten(v: np.ndarray, n: np.ndarray) -> np.ndarray:
     return _unit(v - n * (n * v).sum(-1, keepdims=True))
 
 
+def edge_pairs(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where two of the triangles (t, 3) meet: half-edges one, two (m,), numbered 3 t + k from corner k to the next.
+
+    They run along the edge in opposite directions. Of an edge with more than two faces one pair is given at most.
+    """
+    start, end = faces.ravel(), np.roll(faces, -1, 1).ravel()
+    low, high, forward = np.minimum(start, end).astype(np.int64), np.maximum(start, end).astype(np.int64), start < end
+    key = (low * (high.max(initial=0) + 1) + high) * 2 + ~forward
+    order = np.argsort(key, kind="stable")
+    edge = key[order] // 2
+    pair = np.flatnonzero((edge[1:] == edge[:-1]) & (forward[order][1:] != forward[order][:-1]))
+    return order[pair], order[pair + 1]
+
+
 def _groups(vertex: np.ndarray, sign: np.ndarray) -> np.ndarray:
     """Group (t, 3) of each corner: corners of one vertex, connected by edges of triangles with one non-zero sign."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     count = len(vertex)
-    corner = np.arange(count * 3).reshape(count, 3)
-    start, end = vertex, np.roll(vertex, -1, 1)
-    start_corner, end_corner = corner, np.roll(corner, -1, 1)
-    low, high = np.minimum(start, end).ravel(), np.maximum(start, end).ravel()
-    forward = (start < end).ravel()
-    order = np.lexsort((np.arange(len(low)), ~forward, high, low))
-    same = (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])
-    # Two triangles meet at an edge when they run along it in opposite directions.
-    pair = np.flatnonzero(same & (forward[order][1:] != forward[order][:-1]))
-    one, two = order[pair], order[pair + 1]
+    one, two = edge_pairs(vertex)
     fits = (sign[one // 3] == sign[two // 3]) & (sign[one // 3] != 0)
     one, two = one[fits], two[fits]
-    a = np.concatenate([start_corner.ravel()[one], end_corner.ravel()[one]])
-    b = np.concatenate([end_corner.ravel()[two], start_corner.ravel()[two]])
+    following = np.arange(count * 3).reshape(count, 3)[:, [1, 2, 0]].ravel()
+    a, b = np.concatenate([one, following[one]]), np.concatenate([following[two], two])
     graph = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(count * 3, count * 3))
     return connected_components(graph, directed=False)[1].reshape(count, 3)
 

@@ -1,0 +1,202 @@
+"""Baking: what each texel of a mesh's map reads from the surface the mesh stands for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gdtool.texture.occlusion import openness
+from gdtool.texture.project_views import Sight, observe
+from gdtool.texture.raster import barycentric_at
+from gdtool.texture.reproject import Places, Source, reproject
+from gdtool.texture.target import Target, Texels, points_at
+from gdtool.texture.tangents import encode_tangent_space
+
+_TEXELS_AT_ONCE = 200_000
+
+# Looks the material of places up: dict of albedo (n, 3) linear, roughness (n,), metallic (n,), normal (n, 3) unit in
+# world axes, and alpha (n,) where the source has one.
+Lookup = Callable[[Places], dict[str, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class ViewsOfSource:
+    """Views of the source and what their cameras see of it.
+
+    images: domain (albedo linear, roughness, metallic, normal) to (k, h, w[, c]); mask (k, h, w).
+    """
+
+    sights: list[Sight]
+    images: dict[str, np.ndarray]
+    mask: np.ndarray
+
+
+@dataclass(frozen=True)
+class Baked:
+    """What the n texels read: values by name, float32. positions (n, 3) lie on the target, seen (n,) is the views' confidence."""
+
+    values: dict[str, np.ndarray]
+    positions: np.ndarray
+    normals: np.ndarray
+    seen: np.ndarray
+    report: dict[str, float] = field(default_factory=dict)
+
+
+def vertex_lookup(source: Source, attributes: dict[str, np.ndarray], normals: np.ndarray) -> Lookup:
+    """Lookup of attributes and unit normals (v, 3) per vertex of the source."""
+
+    def lookup(places: Places) -> dict[str, np.ndarray]:
+        out = {name: source.at(places.face_idx, places.barycentric, values) for name, values in attributes.items()}
+        normal = source.at(places.face_idx, places.barycentric, normals)
+        geometric = source.face_normals[places.face_idx]
+        # A vertex normal that points to the other side of its own face is damaged.
+        normal = np.where((normal * geometric).sum(1, keepdims=True) > 0, normal, geometric)
+        out["normal"] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+        return out
+
+    return lookup
+
+
+def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lookup, list[str]]:
+    """A lookup that reads the views where they see a place well, blended by their confidence into the given lookup.
+
+    Adds the entry "seen", the confidence (n,). Also returns the domains that come from views.
+    """
+    from gdtool.images.color import linear_from_srgb, srgb_from_linear
+
+    domains = [d for d in ("albedo", "roughness", "metallic", "normal") if d in views.images]
+    encoded = {}
+    for domain in domains:
+        image = views.images[domain]
+        image = srgb_from_linear(image) if domain == "albedo" else image
+        encoded[domain] = np.asarray(image if image.ndim == 4 else image[..., None], np.float32)
+    stack = np.concatenate(list(encoded.values()), -1)
+    channel = np.cumsum([0, *(image.shape[-1] for image in encoded.values())])
+
+    def looked(places: Places) -> dict[str, np.ndarray]:
+        out = dict(lookup(places))
+        points = source.at(places.face_idx, places.barycentric, source.vertices)
+        prior = [srgb_from_linear(out[d]) if d == "albedo" else out[d] for d in domains]
+        prior = np.concatenate([p if p.ndim == 2 else p[:, None] for p in prior], 1)
+        value, seen = observe(points, out["normal"], views.sights, stack, views.mask, prior)
+        for k, domain in enumerate(domains):
+            own, read = prior[:, channel[k]:channel[k + 1]], value[:, channel[k]:channel[k + 1]]
+            share = seen[:, None]
+            if domain == "normal":
+                length = np.linalg.norm(read, axis=1, keepdims=True)
+                read = read / np.maximum(length, 1e-6)
+                # A view's normal bends the surface's, it does not replace it: 60 degrees off is a mistake.
+                share = share * np.clip(((read * own).sum(1, keepdims=True) - 0.5) / 0.2, 0, 1)
+            mixed = own + share * (read - own)
+            if domain == "normal":
+                mixed /= np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-6)
+            out[domain] = linear_from_srgb(mixed) if domain == "albedo" else mixed if out[domain].ndim == 2 else mixed[:, 0]
+        out["seen"] = seen
+        return out
+
+    return looked, domains
+
+
+def _read(target: Target, source: Source, lookup: Lookup, reach: np.ndarray, face_idx: np.ndarray,
+          barycentric: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, Places]:
+    points, frames = points_at(target, face_idx, barycentric)
+    normals = frames[..., 2] / np.maximum(np.linalg.norm(frames[..., 2], axis=1, keepdims=True), 1e-12)
+    places = reproject(points, normals, reach[face_idx], source)
+    return lookup(places), points, frames, places
+
+
+def bake(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: np.ndarray, samples: int = 1,
+         threads: int = 1, progress: Callable = lambda iterable, total, label: iterable) -> Baked:
+    """Bake what lookup says of the source into the texels.
+
+    reach (t,) from reproject.vertex_reach. samples per texel (a square number) are taken where neighbouring texels
+    differ, one elsewhere. values has albedo, roughness, metallic, tangent_normal (n, 3) and whatever else lookup gives.
+    """
+
+    def run(part: slice):
+        values, points, frames, places = _read(target, source, lookup, reach, texels.face_idx[part], texels.barycentric[part])
+        values["tangent_normal"] = encode_tangent_space(frames, values["normal"])
+        smooth = frames[..., 2] / np.maximum(np.linalg.norm(frames[..., 2], axis=1, keepdims=True), 1e-12)
+        return {k: v.astype(np.float32) for k, v in values.items()}, points.astype(np.float32), smooth.astype(np.float32), places.by_ray
+
+    parts = [slice(s, min(s + _TEXELS_AT_ONCE, len(texels))) for s in range(0, len(texels), _TEXELS_AT_ONCE)]
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        done = list(progress(pool.map(run, parts), len(parts), "bake"))
+    values = {name: np.concatenate([one[0][name] for one in done]) for name in done[0][0]}
+    positions, normals = np.concatenate([one[1] for one in done]), np.concatenate([one[2] for one in done])
+    by_ray = np.concatenate([one[3] for one in done])
+    report = {"texels": texels.inside, "nearest_point_share": float(1 - by_ray[:texels.inside].mean())}
+    if samples > 1:
+        report["supersampled_share"] = _supersample(target, texels, source, lookup, reach, samples, values)
+    seen = values.pop("seen", np.zeros(len(texels), np.float32))
+    return Baked(values, positions, normals, seen, report)
+
+
+def varying(texels: Texels, values: dict[str, np.ndarray], tolerance: float = 0.03) -> np.ndarray:
+    """(m,) indices of the inside texels that differ from a neighbour by more than tolerance in anything."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    mask = texels.mask()
+    out = np.zeros_like(mask)
+    for name in ("albedo", "roughness", "metallic", "tangent_normal", "alpha"):
+        if name not in values:
+            continue
+        image = texels.image(values[name])
+        for channel in np.moveaxis(np.atleast_3d(image), -1, 0):
+            low = minimum_filter(np.where(mask, channel, np.inf), 3)
+            high = maximum_filter(np.where(mask, channel, -np.inf), 3)
+            out |= high - low > tolerance
+    return np.flatnonzero(out.ravel()[texels.texel[:texels.inside]])
+
+
+def _supersample(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: np.ndarray, samples: int,
+                 values: dict[str, np.ndarray]) -> float:
+    """Replace values of varying texels by means over a grid of samples within each; the share of texels that were."""
+    chosen = varying(texels, values)
+    side = int(round(samples**0.5))
+    texel = texels.texel[chosen]
+    for start in range(0, len(chosen), _TEXELS_AT_ONCE):
+        mine, at = chosen[start:start + _TEXELS_AT_ONCE], texel[start:start + _TEXELS_AT_ONCE]
+        face_idx = texels.face_idx[mine]
+        total: dict[str, np.ndarray] = {}
+        for k in range(side * side):
+            offset = (np.array([k % side, k // side]) + 0.5) / side
+            place = (np.stack([at % texels.size, at // texels.size], 1) + offset) / texels.size
+            barycentric = barycentric_at(target.uv, target.face_uvs, face_idx, place).astype(np.float32)
+            read, _, _, _ = _read(target, source, lookup, reach, face_idx, np.clip(barycentric, -1, 2))
+            for name, value in read.items():
+                total[name] = total.get(name, 0) + value / (side * side)
+        _, frames = points_at(target, face_idx, texels.barycentric[mine])
+        normal = total["normal"] / np.maximum(np.linalg.norm(total["normal"], axis=1, keepdims=True), 1e-6)
+        total["normal"], total["tangent_normal"] = normal, encode_tangent_space(frames, normal)
+        for name, value in total.items():
+            values[name][mine] = value
+    return len(chosen) / max(texels.inside, 1)
+
+
+def occlusion_tracer(target: Target, source: Source, reach: np.ndarray, normals: np.ndarray, rays: int, seed: int,
+                     threads: int = 1) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """trace(face_idx, barycentric) -> openness (n,) of the source at places on the target; normals (v, 3) of the source."""
+    lift = 5e-4 * float(np.ptp(source.vertices, axis=0).max())
+
+    def trace(face_idx: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
+        def run(part: slice) -> np.ndarray:
+            points, frames = points_at(target, face_idx[part], barycentric[part])
+            facing = frames[..., 2] / np.maximum(np.linalg.norm(frames[..., 2], axis=1, keepdims=True), 1e-12)
+            places = reproject(points, facing, reach[face_idx[part]], source)
+            at = source.at(places.face_idx, places.barycentric, source.vertices)
+            geometric = source.face_normals[places.face_idx]
+            smooth = source.at(places.face_idx, places.barycentric, normals)
+            smooth = np.where((smooth * geometric).sum(1, keepdims=True) > 0.2, smooth, geometric)
+            smooth = smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
+            return openness(at + geometric * lift, smooth, source.caster, rays, seed + part.start, lift=0.0)
+
+        parts = [slice(s, s + 50_000) for s in range(0, len(face_idx), 50_000)]
+        with ThreadPoolExecutor(max(1, threads)) as pool:
+            traced = list(pool.map(run, parts))
+        return np.concatenate(traced) if traced else np.zeros(0, np.float32)
+
+    return trace

@@ -1,0 +1,128 @@
+"""Maps as files hold them: packing, quantising, and what needs no map at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gdtool.texture.padding import fill_gutters
+from gdtool.texture.target import Texels
+
+# Smaller differences than this, in stored units, are no detail: one step of 8 bits and rounding.
+CONSTANT_RANGE = 1.5 / 255
+# 99.5 % of a normal map within this angle of straight up is flat: 8 bits store normals to 0.4 degrees.
+FLAT_DEGREES = 1.0
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Maps as stored, uint8 or uint16, (s, s, c), None where a factor or nothing takes their place.
+
+    base_color RGB(A) sRGB; orm R occlusion, G roughness, B metallic; normal tangent space, +Y up. factors: base_color
+    linear RGBA, roughness, metallic, what the material's factors have to be. has_occlusion: orm's R means something.
+    has_roughness_metallic: G and B do. skipped: (what, why).
+    """
+
+    size: int
+    base_color: np.ndarray | None
+    orm: np.ndarray | None
+    normal: np.ndarray | None
+    factors: dict[str, tuple[float, ...]]
+    has_occlusion: bool = False
+    has_roughness_metallic: bool = False
+    skipped: list[tuple[str, str]] = field(default_factory=list)
+
+
+def quantise(image: np.ndarray, bits: int) -> np.ndarray:
+    """[0, 1] floats to uint8 or uint16, to the nearest step."""
+    top, kind = (255, np.uint8) if bits == 8 else (65535, np.uint16)
+    return np.rint(np.clip(image, 0, 1) * top).astype(kind)
+
+
+def constant_of(values: np.ndarray, tolerance: float = CONSTANT_RANGE) -> np.ndarray | None:
+    """The middle of values (n,) or (n, c), float64, when no channel spans more than tolerance, else None."""
+    if not len(values):
+        return None
+    low, high = values.min(0).astype(np.float64), values.max(0).astype(np.float64)
+    return (low + high) / 2 if np.all(high - low <= tolerance) else None
+
+
+def flat_angle(tangent_normals: np.ndarray) -> float:
+    """Angle in degrees from straight up that 99.5 % of tangent-space normals (n, 3) stay within."""
+    sine = np.linalg.norm(tangent_normals[:, :2], axis=1)
+    angle = np.degrees(np.arctan2(sine, tangent_normals[:, 2]))
+    return float(np.percentile(angle, 99.5)) if len(angle) else 0.0
+
+
+def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.ndarray | None = None, bits: int = 8,
+              padding: int | None = None, normal_map: str = "auto") -> Maps:
+    """Maps of what texels read (bake.Baked.values): albedo, roughness, metallic, tangent_normal, perhaps alpha.
+
+    occlusion (n,) or None. normal_map "auto" leaves a flat map out. Gutters are filled over `padding` texels, everywhere
+    when None.
+    """
+    from gdtool.images.color import linear_from_srgb, srgb_from_linear
+
+    inside = slice(0, texels.inside)
+    skipped: list[tuple[str, str]] = []
+    layers: dict[str, np.ndarray] = {}
+    color = srgb_from_linear(np.clip(values["albedo"], 0, 1)).astype(np.float32)
+    alpha = np.clip(values["alpha"], 0, 1) if "alpha" in values else None
+    if alpha is not None and alpha[inside].min() >= 1 - CONSTANT_RANGE:
+        alpha = None
+    constant = constant_of(color[inside]) if alpha is None else None
+    if constant is None:
+        factors: dict[str, tuple[float, ...]] = {"base_color": (1.0, 1.0, 1.0, 1.0)}
+        layers["base_color"] = color if alpha is None else np.concatenate([color, alpha[:, None]], 1)
+    else:
+        factors = {"base_color": (*(round(float(x), 6) for x in linear_from_srgb(constant)), 1.0)}
+        skipped.append(("base_color map", "base color is constant: a factor says it"))
+    packed = np.ones((len(texels), 3), np.float32)
+    for channel, name in ((1, "roughness"), (2, "metallic")):
+        constant = constant_of(values[name][inside])
+        if constant is None:
+            factors[name] = (1.0,)
+            packed[:, channel] = values[name]
+        else:
+            factors[name] = (round(float(constant), 6),)
+    varies = any(packed[:, channel].min(initial=1) < 1 for channel in (1, 2))
+    if not varies:
+        skipped.append(("roughness and metallic map", "both are constant: factors say them"))
+    open_everywhere = occlusion is not None and occlusion[inside].min(initial=1) > 1 - 2 / 255
+    if open_everywhere:
+        skipped.append(("occlusion map", "nothing is occluded"))
+    has_occlusion = occlusion is not None and not open_everywhere
+    if has_occlusion:
+        packed[:, 0] = occlusion
+    if varies or has_occlusion:
+        layers["orm"] = packed
+    angle = flat_angle(values["tangent_normal"][inside])
+    if normal_map == "on" or (normal_map == "auto" and angle > FLAT_DEGREES):
+        layers["normal"] = values["tangent_normal"].astype(np.float32)
+    elif normal_map == "auto":
+        skipped.append(("normal map", f"would be flat: {angle:.2f} degrees"))
+    images = _filled(texels, layers, padding)
+    if "normal" in images:
+        normal = images["normal"]
+        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+        images["normal"] = normal * 0.5 + 0.5
+    stored = {name: quantise(image, bits) for name, image in images.items()}
+    return Maps(texels.size, stored.get("base_color"), stored.get("orm"), stored.get("normal"), factors,
+                has_occlusion, varies, skipped)
+
+
+def _filled(texels: Texels, layers: dict[str, np.ndarray], padding: int | None) -> dict[str, np.ndarray]:
+    """Images (s, s, c) of layers (n, c), gutters filled; all in one go, since they share one mask."""
+    if not layers:
+        return {}
+    image = fill_gutters(texels.image(np.concatenate(list(layers.values()), 1)), texels.mask(), padding)
+    ends = np.cumsum([0, *(values.shape[1] for values in layers.values())])
+    return {name: image[..., ends[k]:ends[k + 1]] for k, name in enumerate(layers)}
+
+
+def directx(normal: np.ndarray) -> np.ndarray:
+    """A stored normal map with its green channel turned: +Y down."""
+    out = normal.copy()
+    out[..., 1] = np.iinfo(normal.dtype).max - normal[..., 1]
+    return out

@@ -1,0 +1,149 @@
+"""Reading materials for points of a surface out of the views that see them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gdtool.cameras import Camera, project, rays
+
+# Below this cosine between normal and viewing direction a view has stretched its pixels too far to be read.
+GRAZING = 0.12
+_SUPERSAMPLE = 2
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What one camera sees of the surface, per pixel of its image.
+
+    low, high (h, w): nearest and farthest depth among the pixel's samples, inf and -inf where all miss;
+    clear (h, w): distance in pixels to the nearest silhouette or depth step, at least 0.5.
+    """
+
+    camera: Camera
+    low: np.ndarray
+    high: np.ndarray
+    clear: np.ndarray
+
+
+def sight_of(camera: Camera, caster, mask: np.ndarray) -> Sight:
+    """What a camera sees of a surface, by rays; mask (h, w) is the view's own coverage, whose border counts as silhouette."""
+    from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter
+
+    h, w, n = camera.height, camera.width, _SUPERSAMPLE
+    x, y = np.meshgrid((np.arange(w * n) + 0.5) / n, (np.arange(h * n) + 0.5) / n)
+    origins, directions = rays(camera, np.stack([x, y], -1))
+    hits = caster.first_hit(origins.reshape(-1, 3), directions.reshape(-1, 3))
+    along = -(directions.reshape(-1, 3) @ camera.backward)
+    miss = hits.face_idx < 0
+    depth = np.where(miss, np.inf, hits.distance * along)
+    samples = depth.reshape(h, n, w, n).swapaxes(1, 2).reshape(h, w, n * n)
+    missed = np.isinf(samples)
+    low, high = samples.min(-1), np.where(missed, -np.inf, samples).max(-1)
+    # A step: neighbouring pixels whose depths differ by more than a surface at 80 degrees would make them.
+    span = maximum_filter(np.where(np.isinf(high), camera.far, high), 3) - minimum_filter(np.where(np.isinf(low), camera.far, low), 3)
+    step = span > 2 * pixel_footprint(camera, np.where(np.isinf(low), camera.far, low)) * np.tan(np.radians(80))
+    edge = step | missed.any(-1) | (mask < 0.999)
+    edge = np.pad(edge, 1, constant_values=True)
+    return Sight(camera, low, high, np.maximum(distance_transform_edt(~edge)[1:-1, 1:-1], 0.5))
+
+
+def pixel_footprint(camera: Camera, depth: np.ndarray | float) -> np.ndarray | float:
+    """World size of a pixel at a depth along the viewing axis."""
+    return camera.pixel_size + 0 * depth if camera.projection == "orthographic" else depth / camera.fx
+
+
+def _toward(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """(n, 3) unit directions from points to the camera."""
+    if camera.projection == "orthographic":
+        return np.broadcast_to(camera.backward, points.shape)
+    out = camera.position - points
+    return out / np.linalg.norm(out, axis=1, keepdims=True)
+
+
+def _read(sight: Sight, stack: np.ndarray, mask: np.ndarray, points: np.ndarray, normals: np.ndarray,
+          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One view at the points that face it: their indices (m,), values (m, c), quality (m,) in [0, 1].
+
+    stack (h, w, c) straight values, mask (h, w). Bilinear over those of the four pixels that show this part of the
+    surface: inside the mask and at its depth. Never a background or a part in front.
+    """
+    camera = sight.camera
+    cosine = (normals * _toward(camera, points)).sum(1)
+    facing = np.flatnonzero(cosine > GRAZING)
+    pixel, depth = project(camera, points[facing])
+    h, w = mask.shape
+    seen = (pixel > 0).all(1) & (pixel[:, 0] < w) & (pixel[:, 1] < h) & (depth > 0)
+    facing, pixel, depth = facing[seen], pixel[seen] - 0.5, depth[seen]
+    cosine = cosine[facing]
+    slope = np.sqrt(np.maximum(1 - cosine**2, 0)) / cosine
+    tolerance = pixel_footprint(camera, depth) * (1.0 + 1.5 * slope)
+    corner = np.floor(pixel).astype(np.int64)
+    fraction = pixel - corner
+    weight_sum, clear = np.zeros(len(facing)), np.zeros(len(facing))
+    value = np.zeros((len(facing), stack.shape[-1]))
+    for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        column, row = np.clip(corner[:, 0] + dx, 0, w - 1), np.clip(corner[:, 1] + dy, 0, h - 1)
+        share = np.abs(1 - dx - fraction[:, 0]) * np.abs(1 - dy - fraction[:, 1])
+        here = (sight.low[row, column] >= depth - tolerance) & (sight.high[row, column] <= depth + tolerance)
+        weight = np.where(here, share * mask[row, column], 0)
+        weight_sum += weight
+        clear += weight * sight.clear[row, column]
+        value += weight[:, None] * stack[row, column]
+    read = weight_sum > 1e-3
+    facing, value, clear, weight_sum = facing[read], value[read], clear[read], weight_sum[read]
+    cosine = cosine[read]
+    value /= weight_sum[:, None]
+    away = np.clip(clear / weight_sum / 3.0, 0.1, 1.0)  # three pixels from a silhouette a view is as good as it gets
+    return facing, value, cosine * away * weight_sum
+
+
+def observe(points: np.ndarray, normals: np.ndarray, sights: list[Sight], stack: np.ndarray, mask: np.ndarray,
+            prior: np.ndarray | None = None, sharpness: float = 6.0) -> tuple[np.ndarray, np.ndarray]:
+    """What the views say about points (n, 3) of the surface with unit normals (n, 3).
+
+    stack (k, h, w, c) and mask (k, h, w) of the k sights. Views are weighted by facing, distance to silhouettes and
+    coverage; the best one counts far more than the next (its power is sharpness), so detail is not averaged away, and
+    the change from one view to another is smooth. A view that differs from all others and from prior (n, c) is left
+    out. Returns values (n, c) float32 and confidence (n,) float32 in [0, 1], 0 where no view sees the point.
+    """
+    count, channels = len(points), stack.shape[-1]
+    value = np.zeros((len(sights), count, channels), np.float32)
+    quality = np.zeros((len(sights), count), np.float32)
+    for k, sight in enumerate(sights):
+        seen, read, good = _read(sight, stack[k], mask[k], points, normals)
+        value[k, seen], quality[k, seen] = read, good
+    best = quality.max(0)
+    confidence = np.clip((best - 0.1) / 0.25, 0, 1)
+    share = quality / np.maximum(best, 1e-6)
+    _reject(value, share, prior)
+    weight = share**sharpness
+    total = weight.sum(0)
+    mean = np.einsum("kn,knc->nc", weight, value) / np.maximum(total, 1e-12)[:, None]
+    return mean.astype(np.float32), np.where(total > 0, confidence, 0).astype(np.float32)
+
+
+def _reject(value: np.ndarray, share: np.ndarray, prior: np.ndarray | None, tolerance: float = 0.15) -> None:
+    """Set share (k, n) to 0 where a view's value (k, n, c) is far from the median of all that see the point and prior.
+
+    Only where at least three opinions are there; what the seeing views agree on is never lost.
+    """
+    opinions = [np.where((share > 0)[..., None], value, np.nan)]
+    if prior is not None:
+        opinions.append(prior[None].astype(np.float32))
+    opinions = np.concatenate(opinions)
+    number = (~np.isnan(opinions[..., 0])).sum(0)
+    asked = np.flatnonzero(number >= 3)
+    if not len(asked):
+        return
+    # nanmedian is slow: NaN sorts last, so the median's place follows from the number of opinions.
+    ordered = np.sort(opinions[:, asked], axis=0)
+    middle = (number[asked] - 1) / 2
+    low, high = np.floor(middle).astype(int), np.ceil(middle).astype(int)
+    rows = np.arange(len(asked))
+    median = (ordered[low, rows] + ordered[high, rows]) / 2
+    far = np.abs(value[:, asked] - median[None]).max(-1) > tolerance
+    kept = np.where(far, 0, share[:, asked])
+    some = (kept > 0).any(0)
+    share[:, asked[some]] = kept[:, some]

@@ -1,0 +1,138 @@
+"""From a point on the mesh that is baked to the place on the source surface that it stands for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gdtool.geometry.normals import face_normals
+
+# A place on the source is on the right side when its face's normal agrees with the mesh's normal: dot product above this.
+AGREEMENT = 0.1
+_RETRIES = 4
+
+
+@dataclass(frozen=True)
+class Source:
+    """Triangles to bake from, with their ray caster (geometry.rays.RayCaster).
+
+    vertices (v, 3), faces (f, 3), face_normals (f, 3) unit.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    face_normals: np.ndarray
+    caster: object
+
+    @classmethod
+    def of(cls, vertices: np.ndarray, faces: np.ndarray) -> Source:
+        """Source of a triangle mesh."""
+        from gdtool.geometry.rays import RayCaster
+
+        caster = RayCaster(vertices, faces)
+        # The first query builds Embree's tree; later ones may come from several threads.
+        caster.first_hit(np.zeros((1, 3)), np.ones((1, 3)))
+        return cls(vertices, faces, face_normals(vertices, faces)[0], caster)
+
+    def at(self, face_idx: np.ndarray, barycentric: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Vertex values (v,) or (v, c), interpolated at places on faces: (n,) or (n, c)."""
+        corners = values[self.faces[face_idx]]
+        return np.einsum("nk,nk...->n...", barycentric.astype(corners.dtype, copy=False), corners)
+
+
+@dataclass(frozen=True)
+class Places:
+    """Places on a source: face_idx (n,), barycentric (n, 3) float32, and by_ray (n,) bool, False where by nearest point."""
+
+    face_idx: np.ndarray
+    barycentric: np.ndarray
+    by_ray: np.ndarray
+
+
+def vertex_reach(vertices: np.ndarray, faces: np.ndarray, source: Source) -> np.ndarray:
+    """How far from each triangle's points to look for the source, (t,): its cage.
+
+    Twice the largest distance of its corners to the source, and a share of its size for the bulge between them. A corner
+    that lies far out (a part that remeshing lost) does not count for more than the 99th percentile of all.
+    """
+    from gdtool.geometry.distance import closest_points
+
+    distance = closest_points(vertices, source.vertices, source.faces)[0]
+    distance = np.minimum(distance, np.percentile(distance, 99) + 1e-12)
+    corners = vertices[faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1).max(1)
+    extent = float(np.ptp(vertices, axis=0).max())
+    return 2 * distance[faces].max(1) + 0.3 * np.minimum(longest, np.percentile(longest, 99)) + 1e-4 * extent
+
+
+def _march(points: np.ndarray, directions: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source,
+           start: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """First face on the right side along each ray within reach: face_idx (n,) or -1, distance (n,), barycentric (n, 3)."""
+    count = len(points)
+    face, travelled = np.full(count, -1, np.int32), np.full(count, -start)
+    distance, barycentric = np.full(count, np.inf), np.zeros((count, 3), np.float32)
+    active = np.arange(count)
+    for _ in range(_RETRIES):
+        if not len(active):
+            break
+        hits = source.caster.first_hit(points[active] + directions[active] * travelled[active, None], directions[active])
+        hit = hits.face_idx >= 0
+        active, hit_face, hit_at = active[hit], hits.face_idx[hit], hits.barycentric[hit]
+        t = travelled[active] + hits.distance[hit]
+        near = t <= reach[active]
+        active, hit_face, hit_at, t = active[near], hit_face[near], hit_at[near], t[near]
+        agrees = (source.face_normals[hit_face] * normals[active]).sum(1) > AGREEMENT
+        found = active[agrees]
+        face[found], distance[found], barycentric[found] = hit_face[agrees], np.abs(t[agrees]), hit_at[agrees]
+        # The other side of a wall: step through it and look on.
+        active = active[~agrees]
+        travelled[active] = t[~agrees] + start
+    return face, distance, barycentric
+
+
+def _nearest_agreeing(points: np.ndarray, normals: np.ndarray, source: Source) -> tuple[np.ndarray, np.ndarray]:
+    """Nearest place whose face looks the same way as the normal: face_idx (n,), point (n, 3). Plain nearest if none does."""
+    from gdtool.geometry.distance import closest_points
+
+    _, face, point = closest_points(points, source.vertices, source.faces)
+    wrong = np.flatnonzero((source.face_normals[face] * normals).sum(1) <= AGREEMENT)
+    if not len(wrong):
+        return face, point
+    axis = np.abs(normals[wrong]).argmax(1)
+    sign = np.sign(normals[wrong, axis])
+    for k in range(3):
+        for s in (-1.0, 1.0):
+            mine = wrong[(axis == k) & (sign == s)]
+            # The normal's main component is at least 1/sqrt(3): faces within 75 degrees of the axis hold the agreeing ones.
+            subset = np.flatnonzero(source.face_normals[:, k] * s > 0.25)
+            if not len(mine) or not len(subset):
+                continue
+            _, sub_face, sub_point = closest_points(points[mine], source.vertices, source.faces[subset])
+            better = (source.face_normals[subset[sub_face]] * normals[mine]).sum(1) > AGREEMENT
+            face[mine[better]], point[mine[better]] = subset[sub_face[better]], sub_point[better]
+    return face, point
+
+
+def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source) -> Places:
+    """Where points (n, 3) with unit normals (n, 3) of the baked mesh lie on the source.
+
+    The nearest face along the normal, outward or inward within reach (n,), that looks the same way; the nearest such
+    place in any direction where the normal meets none. So nothing is read from the other side of a thin wall.
+    """
+    from gdtool.geometry.distance import barycentric_of
+
+    start = 2e-5 * float(np.ptp(source.vertices, axis=0).max())
+    out_face, out_distance, out_at = _march(points, normals, normals, reach, source, start)
+    # Inward only as far as outward already found something.
+    face, distance, barycentric = _march(points, -normals, normals, np.minimum(reach, out_distance), source, start)
+    outward = (out_face >= 0) & (out_distance < distance)
+    face = np.where(outward, out_face, face)
+    barycentric = np.where(outward[:, None], out_at, barycentric)
+    lost = np.flatnonzero(face < 0)
+    if len(lost):
+        face[lost], nearest = _nearest_agreeing(points[lost], normals[lost], source)
+        barycentric[lost] = barycentric_of(nearest, source.vertices[source.faces[face[lost]]])
+    by_ray = np.ones(len(points), bool)
+    by_ray[lost] = False
+    return Places(face, barycentric, by_ray)

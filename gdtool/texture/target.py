@@ -1,0 +1,116 @@
+"""The mesh that maps are baked for: its triangles, its shading frames, and its texels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gdtool.geometry.normals import face_normals
+from gdtool.texture.raster import extend_owners, rasterize_uv
+from gdtool.texture.tangents import corner_tangents, edge_pairs, frame_at
+
+CREASE_DEGREES = 45.0
+
+
+def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float = CREASE_DEGREES) -> np.ndarray:
+    """Shading normals (t, 3, 3) float64 of triangles' corners: smooth, but split along edges sharper than crease_degrees.
+
+    Faces weighted by their angle at the vertex (Thürmer & Wüthrich 1998).
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    normals, area = face_normals(vertices, faces)
+    count = len(faces)
+    one, two = edge_pairs(faces)
+    # A triangle without area has no direction of its own: it joins what it touches.
+    smooth = (normals[one // 3] * normals[two // 3]).sum(1) > np.cos(np.radians(crease_degrees))
+    smooth |= (area[one // 3] == 0) | (area[two // 3] == 0)
+    one, two = one[smooth], two[smooth]
+    following = np.arange(count * 3).reshape(count, 3)[:, [1, 2, 0]].ravel()
+    a, b = np.concatenate([one, following[one]]), np.concatenate([following[two], two])
+    graph = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(count * 3, count * 3))
+    group = connected_components(graph, directed=False)[1]
+    corners = vertices[faces]
+    before, after = np.roll(corners, 1, 1) - corners, np.roll(corners, -1, 1) - corners
+    scale = np.linalg.norm(before, axis=-1) * np.linalg.norm(after, axis=-1)
+    angle = np.arccos(np.clip((before * after).sum(-1) / np.maximum(scale, 1e-300), -1, 1)) * (area > 0)[:, None]
+    weighted = (normals[:, None] * angle[..., None]).reshape(-1, 3)
+    total = np.stack([np.bincount(group, weighted[:, k]) for k in range(3)], 1)[group]
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    own = np.repeat(normals, 3, 0)
+    out = np.where(length > 1e-12, total / np.maximum(length, 1e-300), own)
+    out[np.linalg.norm(out, axis=1) < 0.5] = (0.0, 1.0, 0.0)
+    return out.reshape(count, 3, 3)
+
+
+@dataclass(frozen=True)
+class Target:
+    """Triangles with texture coordinates and the frames that a normal map is encoded in.
+
+    vertices (v, 3), faces (t, 3), uv (c, 2) with (0, 0) at the image's top left, face_uvs (t, 3), normals (t, 3, 3) unit
+    and tangents (t, 3, 4) of the corners.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray
+    face_uvs: np.ndarray
+    normals: np.ndarray
+    tangents: np.ndarray
+
+    @classmethod
+    def of(cls, vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray,
+           crease_degrees: float = CREASE_DEGREES) -> Target:
+        """Target of a triangle mesh, with smooth normals split at creases and MikkTSpace tangents."""
+        normals = corner_normals(vertices, faces, crease_degrees)
+        own = np.arange(len(faces) * 3).reshape(-1, 3)
+        tangents = corner_tangents(vertices, faces, normals.reshape(-1, 3), uv, face_uvs, own)
+        return cls(vertices, faces, uv, face_uvs, normals, tangents)
+
+
+@dataclass(frozen=True)
+class Texels:
+    """The texels to bake: texel (n,) int64 row-major, face_idx (n,) int32, barycentric (n, 3) float32.
+
+    The first `inside` of them are owned by their triangle; the others lie just outside the charts, where the triangle
+    would go on, for lookups between texel centres at a chart's border.
+    """
+
+    size: int
+    texel: np.ndarray
+    face_idx: np.ndarray
+    barycentric: np.ndarray
+    inside: int
+
+    def __len__(self) -> int:
+        return len(self.texel)
+
+    def mask(self, inside_only: bool = False) -> np.ndarray:
+        """(size, size) bool: which texels these are."""
+        out = np.zeros(self.size * self.size, bool)
+        out[self.texel[:self.inside] if inside_only else self.texel] = True
+        return out.reshape(self.size, self.size)
+
+    def image(self, values: np.ndarray, fill: float = 0.0) -> np.ndarray:
+        """(size, size, …) image of values (n, …) of these texels."""
+        out = np.full((self.size * self.size, *values.shape[1:]), fill, values.dtype)
+        out[self.texel] = values
+        return out.reshape(self.size, self.size, *values.shape[1:])
+
+
+def texels_of(target: Target, size: int, rings: int = 2) -> Texels:
+    """Texels of a map of size x size that the target's charts cover, and `rings` of them around the charts."""
+    owner, barycentric = rasterize_uv(target.uv, target.face_uvs, size)
+    inside = np.flatnonzero(owner >= 0)
+    ring, ring_owner, ring_at = extend_owners(target.uv, target.face_uvs, owner, rings)
+    return Texels(size, np.concatenate([inside, ring]), np.concatenate([owner.ravel()[inside], ring_owner]),
+                  np.concatenate([barycentric.reshape(-1, 3)[inside], ring_at.astype(np.float32)]), len(inside))
+
+
+def points_at(target: Target, face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (n, 3) and tangent frames (n, 3, 3), columns tangent, bitangent, normal, at places on the target."""
+    weights = barycentric.astype(np.float64)
+    points = np.einsum("nk,nkc->nc", weights, target.vertices[target.faces[face_idx]])
+    return points, frame_at(target.normals[face_idx], target.tangents[face_idx], weights)
