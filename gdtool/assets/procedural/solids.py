@@ -1,0 +1,166 @@
+"""Signed distance functions, negative inside, and their closed triangle surface by marching cubes.
+
+A distance is a function of points (n, 3) float32 that returns (n,) float32; smooth blends after Quilez, "Smooth minimum".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from gdtool.assets.procedural.parts import Part, box_projected, rotation, signed_volume, unit
+
+Distance = Callable[[np.ndarray], np.ndarray]
+
+
+def _length(vectors: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+
+
+def ellipsoid(center: Sequence[float], radii: float | Sequence[float]) -> Distance:
+    """Ellipsoid; exact for a sphere, first-order near the surface otherwise."""
+    center, radii = np.asarray(center, np.float32), np.broadcast_to(np.asarray(radii, np.float32), 3)
+
+    def distance(points):
+        offset = (points - center) / radii
+        k0 = _length(offset)
+        return k0 * (k0 - 1) / np.maximum(_length(offset / radii), 1e-6)
+
+    return distance
+
+
+def limb(start: Sequence[float], end: Sequence[float], radius: float, end_radius: float | None = None) -> Distance:
+    """A capsule whose radius changes linearly from start to end."""
+    a, b = np.asarray(start, np.float32), np.asarray(end, np.float32)
+    grow = np.float32((radius if end_radius is None else end_radius) - radius)
+
+    def distance(points):
+        offset, axis = points - a, b - a
+        t = np.clip(offset @ axis / max(float(axis @ axis), 1e-9), 0, 1)
+        return _length(offset - t[:, None] * axis) - (radius + grow * t)
+
+    return distance
+
+
+def chain(points: Sequence[Sequence[float]], radii: Sequence[float], blend: float = 0.03) -> Distance:
+    """Limbs through consecutive points, blended."""
+    return blended([limb(points[i], points[i + 1], radii[i], radii[i + 1]) for i in range(len(points) - 1)], blend)
+
+
+def block(center: Sequence[float], half: Sequence[float], rounding: float = 0.02) -> Distance:
+    """A box with rounded edges; half are its half sides, rounding included."""
+    center = np.asarray(center, np.float32)
+    inner = np.maximum(np.asarray(half, np.float32) - rounding, 1e-3)
+
+    def distance(points):
+        q = np.abs(points - center) - inner
+        return _length(np.maximum(q, 0)) + np.minimum(q.max(axis=1), 0) - rounding
+
+    return distance
+
+
+def rod(center: Sequence[float], radius: float, half_length: float, axis: str = "y", rounding: float = 0.01) -> Distance:
+    """A cylinder along a coordinate axis with rounded rims."""
+    center, k = np.asarray(center, np.float32), "xyz".index(axis)
+    others = [i for i in range(3) if i != k]
+
+    def distance(points):
+        offset = points - center
+        radial = np.hypot(offset[:, others[0]], offset[:, others[1]]) - (radius - rounding)
+        along = np.abs(offset[:, k]) - (half_length - rounding)
+        outside = np.hypot(np.maximum(radial, 0), np.maximum(along, 0))
+        return outside + np.minimum(np.maximum(radial, along), 0) - rounding
+
+    return distance
+
+
+def ring(center: Sequence[float], radius: float, thickness: float, axis: str = "y") -> Distance:
+    """A torus about a coordinate axis."""
+    center, k = np.asarray(center, np.float32), "xyz".index(axis)
+    others = [i for i in range(3) if i != k]
+
+    def distance(points):
+        offset = points - center
+        return np.hypot(np.hypot(offset[:, others[0]], offset[:, others[1]]) - radius, offset[:, k]) - thickness
+
+    return distance
+
+
+def turned(shape: Distance, axis: str, degrees: float, about: Sequence[float] = (0, 0, 0)) -> Distance:
+    """The shape rotated about a point."""
+    matrix, about = rotation(axis, degrees).astype(np.float32), np.asarray(about, np.float32)
+    return lambda points: shape((points - about) @ matrix + about)
+
+
+def both_sides(shape: Distance) -> Distance:
+    """The shape and its mirror image in x; model it at x >= 0."""
+    return lambda points: shape(np.concatenate([np.abs(points[:, :1]), points[:, 1:]], axis=1))
+
+
+def blended(shapes: Sequence[Distance], width: float) -> Distance:
+    """Union whose joints are rounded over `width` (quadratic smooth minimum)."""
+
+    def distance(points):
+        total = shapes[0](points)
+        for shape in shapes[1:]:
+            other = shape(points)
+            overlap = np.maximum(width - np.abs(total - other), 0)
+            total = np.minimum(total, other) - overlap * overlap / (4 * max(width, 1e-6))
+        return total
+
+    return distance
+
+
+def carved(shape: Distance, hole: Distance, width: float = 0.02) -> Distance:
+    """The shape without the hole, the rim rounded over `width`."""
+    negative = blended([lambda points: -shape(points), hole], width)
+    return lambda points: -negative(points)
+
+
+def common(shapes: Sequence[Distance], width: float = 0.02) -> Distance:
+    """What all shapes share, edges rounded over `width`."""
+    negative = blended([lambda points, s=shape: -s(points) for shape in shapes], width)
+    return lambda points: -negative(points)
+
+
+def _axes(low: np.ndarray, high: np.ndarray, step: float) -> list[np.ndarray]:
+    # symmetric about the box centre, shifted off round numbers: a value of exactly zero makes degenerate triangles
+    counts = np.ceil((high - low) / step).astype(int) + 1
+    middle = (low + high) / 2 + step * np.array([0.0137, 0.0291, 0.0173])
+    return [(middle[i] + step * (np.arange(counts[i]) - (counts[i] - 1) / 2)).astype(np.float32) for i in range(3)]
+
+
+def _sampled(shape: Distance, axes: list[np.ndarray]) -> np.ndarray:
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    return shape(points).reshape([len(a) for a in axes])
+
+
+def polygonised(shape: Distance, resolution: int = 52, reach: float = 1.6) -> Part:
+    """The zero surface as a closed part; the longest side of its bounding box gets `resolution` cells.
+
+    The shape must lie inside the cube [-reach, reach]. Raises ValueError when it is empty.
+    """
+    from skimage.measure import marching_cubes
+
+    coarse = 2 * reach / 24
+    low, high = np.full(3, -reach), np.full(3, reach)
+    axes = _axes(low, high, coarse)
+    inside = np.argwhere(_sampled(shape, axes) < 0.9 * coarse)
+    if len(inside) == 0:
+        raise ValueError("the shape has no inside")
+    low = np.array([axes[i][inside[:, i].min()] for i in range(3)]) - coarse
+    high = np.array([axes[i][inside[:, i].max()] for i in range(3)]) + coarse
+    step = float((high - low).max() - 2 * coarse) / resolution
+    axes = _axes(low, high, step)
+    values = np.pad(_sampled(shape, axes), 1, constant_values=step)  # closed even where the box cuts the shape
+    values = np.where(np.abs(values) < 1e-4 * step, np.float32(1e-4 * step), values)
+    cells, faces, _, _ = marching_cubes(values, 0.0, allow_degenerate=True)
+    vertices = (cells - 1) * step + np.array([a[0] for a in axes])
+    offsets = 0.35 * step * np.eye(3, dtype=np.float32)
+    queries = vertices.astype(np.float32)
+    normals = unit(np.stack([shape(queries + o) - shape(queries - o) for o in offsets], -1).astype(float))
+    if signed_volume(vertices, faces) < 0:
+        faces = faces[:, ::-1]
+    return box_projected(Part(vertices.astype(float), normals, np.ascontiguousarray(faces, dtype=np.int32),
+                              np.zeros((len(vertices), 2))))
