@@ -1,58 +1,119 @@
-"""Ray queries by Embree (embreex)."""
+"""Ray queries against a triangle mesh with Embree; hits are refined in double precision."""
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
+# Rays handed to Embree at a time: few enough that a chunk stays in the cache, enough that threads are busy.
+CHUNK = 1 << 16
+
 
 @dataclass(frozen=True)
 class Hits:
-    """First hits: face_idx (n,) int32, -1 where a ray misses; distance (n,), inf there; barycentric (n, 3)."""
+    """First hits of n rays. face_idx (n,) int32, -1 = miss; distance (n,) along the given direction, inf at a miss;
+    barycentric (n, 3) weights of the face's corners, zero at a miss."""
 
     face_idx: np.ndarray
     distance: np.ndarray
     barycentric: np.ndarray
 
+    @property
+    def found(self) -> np.ndarray:
+        """(n,) bool."""
+        return self.face_idx >= 0
+
+
+def intersect_planes(origins: np.ndarray, directions: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances (n,) and barycentric weights (n, 3) where rays meet the planes of their triangles (n, 3, 3).
+
+    Möller & Trumbore 1997 in double precision; weights are clamped to the triangle, since Embree's watertight edges
+    may give a face whose exact weights are a rounding below zero. A ray inside its plane gives the nearest corner's.
+    """
+    a = triangles[:, 0]
+    e1, e2 = triangles[:, 1] - a, triangles[:, 2] - a
+    p = np.cross(directions, e2)
+    determinant = np.einsum("ij,ij->i", e1, p)
+    safe = np.where(determinant == 0, 1.0, determinant)
+    s = origins - a
+    u = np.einsum("ij,ij->i", s, p) / safe
+    q = np.cross(s, e1)
+    v = np.einsum("ij,ij->i", directions, q) / safe
+    distance = np.einsum("ij,ij->i", e2, q) / safe
+    flat = determinant == 0
+    if flat.any():
+        distance[flat] = -np.einsum("ij,ij->i", s[flat], directions[flat]) / np.einsum("ij,ij->i", directions[flat], directions[flat])
+        u[flat] = v[flat] = 0.0
+    weights = np.clip(np.stack([1.0 - u - v, u, v], 1), 0.0, 1.0)
+    return distance, weights / weights.sum(1, keepdims=True)
+
 
 class RayCaster:
-    """Embree's scene of one triangle mesh: vertices (v, 3), faces (f, 3)."""
+    """An Embree scene over one mesh.
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray):
-        from embreex import rtcore_scene
+    vertices (v, 3), faces (f, 3). The mesh is moved into a unit box before it is rounded to Embree's single precision,
+    so that neither a far origin nor an odd unit costs accuracy; all arguments and results are in the caller's frame.
+    """
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, threads: int | None = None):
         from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
 
-        self.vertices = np.ascontiguousarray(vertices, np.float64)
-        self.faces = np.ascontiguousarray(faces, np.int32)
-        self._scene = rtcore_scene.EmbreeScene()
-        self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(vertices, np.float32), self.faces)
+        self.vertices = np.asarray(vertices, np.float64)
+        self.faces = np.asarray(faces, np.int32)
+        self.threads = threads or len(os.sched_getaffinity(0))
+        used = self.vertices[np.unique(self.faces)] if len(self.faces) else np.zeros((1, 3))
+        low, high = used.min(0), used.max(0)
+        self.center = (low + high) / 2
+        extent = float((high - low).max())
+        self.scale = 1.0 / extent if extent > 0 else 1.0
+        self._scene = EmbreeScene(robust=True)
+        if len(self.faces):
+            local = ((self.vertices - self.center) * self.scale).astype(np.float32)
+            self._mesh = TriangleMesh(self._scene, local, np.ascontiguousarray(self.faces))
+
+    def _run(self, origins: np.ndarray, directions: np.ndarray, query: str, limits: np.ndarray | None) -> np.ndarray:
+        origins, directions = np.asarray(origins), np.asarray(directions)
+        out = np.full(len(origins), -1, np.int32)
+        if not len(self.faces) or not len(origins):
+            return out
+
+        def chunk(start: int) -> None:
+            part = slice(start, start + CHUNK)
+            local = np.ascontiguousarray((origins[part] - self.center) * self.scale, np.float32)
+            along = np.ascontiguousarray(directions[part], np.float32)
+            limit = None if limits is None else np.ascontiguousarray(limits[part] * self.scale, np.float32)
+            out[part] = self._scene.run(local, along, query=query, dists=limit)
+
+        starts = range(0, len(origins), CHUNK)
+        # One query builds Embree's tree, which must not happen on two threads at once.
+        chunk(0)
+        if len(starts) > 2 and self.threads > 1:
+            with ThreadPoolExecutor(self.threads) as pool:
+                list(pool.map(chunk, starts[1:]))
+        else:
+            for start in starts[1:]:
+                chunk(start)
+        return out
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
-        """First hit of each ray; distance and barycentric are recomputed in double precision from the face."""
+        """The nearest hit of each ray, from either side of a face. origins, directions (n, 3)."""
         origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
-        face_idx = self._scene.run(origins.astype(np.float32), directions.astype(np.float32)).astype(np.int32)
+        face_idx = self._run(origins, directions, "INTERSECT", None)
         distance = np.full(len(face_idx), np.inf)
         barycentric = np.zeros((len(face_idx), 3))
         hit = np.flatnonzero(face_idx >= 0)
         if len(hit):
-            a, b, c = (self.vertices[self.faces[face_idx[hit], i]] for i in range(3))
-            edge1, edge2, o, d = b - a, c - a, origins[hit], directions[hit]
-            # Möller & Trumbore 1997
-            p = np.cross(d, edge2)
-            determinant = (edge1 * p).sum(1)
-            determinant = np.where(np.abs(determinant) < 1e-300, 1e-300, determinant)
-            s = o - a
-            q = np.cross(s, edge1)
-            u = np.clip((s * p).sum(1) / determinant, 0, 1)
-            v = np.clip((d * q).sum(1) / determinant, 0, 1 - u)
-            distance[hit] = (edge2 * q).sum(1) / determinant
-            barycentric[hit] = np.stack([1 - u - v, u, v], -1)
+            triangles = self.vertices[self.faces[face_idx[hit]]]
+            distance[hit], barycentric[hit] = intersect_planes(origins[hit], directions[hit], triangles)
         return Hits(face_idx, distance, barycentric)
 
     def occluded(self, origins: np.ndarray, directions: np.ndarray, max_distance: float | np.ndarray = np.inf) -> np.ndarray:
-        """(n,) bool: whether anything lies within max_distance along each ray."""
-        o, d = np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions, np.float32)
-        if np.isscalar(max_distance) and not np.isfinite(max_distance):
-            return self._scene.run(o, d, query="OCCLUDED").astype(np.int32) != -1
-        return self._scene.run(o, d, query="DISTANCE") < max_distance
+        """(n,) bool: whether anything lies on each ray before max_distance (in units of the direction's length)."""
+        limits = None
+        if np.ndim(max_distance) or np.isfinite(max_distance):
+            limits = np.minimum(np.broadcast_to(np.asarray(max_distance, np.float64), (len(origins),)), 1e30 / self.scale)
+        return self._run(origins, directions, "OCCLUDED", limits) >= 0
