@@ -1,38 +1,69 @@
-"""Contact sheets: many small pictures in one, for the eye."""
+"""Contact sheets: many small images in one, with labels, for a human's glance."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-MARGIN = 4
+from gdtool.images.color import unit_range
+
+_MARGIN = 4  # pixels between cells
 
 
-def contact_sheet(rows, labels_top=(), labels_left=()) -> np.ndarray:
-    """One picture (h, w, 3) uint8 of rows of pictures, each (h, w), (h, w, 1 or 3) float in [0, 1] or uint8, or None."""
-    from PIL import Image, ImageDraw
+def contact_sheet(rows: Sequence[Sequence[np.ndarray | None]], labels_top: Sequence[str] = (), labels_left: Sequence[str] = ()) -> np.ndarray:
+    """Lay images out in a table -> (h, w, 3) uint8.
 
-    cells = [[None if image is None else _rgb(image) for image in row] for row in rows]
-    height = max(c.shape[0] for row in cells for c in row if c is not None)
-    width = max(c.shape[1] for row in cells for c in row if c is not None)
-    left, top = (70 if labels_left else 0), (16 if labels_top else 0)
-    columns = max(map(len, cells))
-    sheet = Image.new("RGB", (left + columns * (width + MARGIN), top + len(cells) * (height + MARGIN)), "white")
-    draw = ImageDraw.Draw(sheet)
-    for i, text in enumerate(labels_top):
-        draw.text((left + i * (width + MARGIN) + 2, 2), str(text), fill="black")
-    for j, row in enumerate(cells):
-        if j < len(labels_left):
-            draw.text((2, top + j * (height + MARGIN) + 2), str(labels_left[j]), fill="black")
-        for i, cell in enumerate(row):
-            if cell is not None:
-                sheet.paste(Image.fromarray(cell), (left + i * (width + MARGIN), top + j * (height + MARGIN)))
-    return np.asarray(sheet)
+    rows: images (h, w) or (h, w, 1..4), encoded as they are to be shown, float [0, 1] or integer; None leaves its cell
+    empty. Alpha is laid over white. Cells take the largest image's size; labels stand above the columns and left of the
+    rows in a font of about a twelfth of that.
+    """
+    cells = [[None if image is None else _shown(image) for image in row] for row in rows]
+    filled = [image for row in cells for image in row if image is not None]
+    if not filled:
+        raise ValueError("a contact sheet needs an image")
+    height, width = max(i.shape[0] for i in filled), max(i.shape[1] for i in filled)
+    text = int(np.clip(height // 12, 10, 40))
+    top = 2 * text if labels_top else _MARGIN
+    left = max(_text_width(label, text) for label in labels_left) + 2 * _MARGIN if labels_left else _MARGIN
+    columns = max(len(row) for row in cells)
+    sheet = np.full((top + len(cells) * (height + _MARGIN), left + columns * (width + _MARGIN), 3), 255, np.uint8)
+    for i, row in enumerate(cells):
+        for j, image in enumerate(row):
+            if image is not None:
+                y = top + i * (height + _MARGIN) + (height - image.shape[0]) // 2
+                x = left + j * (width + _MARGIN) + (width - image.shape[1]) // 2
+                sheet[y:y + image.shape[0], x:x + image.shape[1]] = image
+    labels = [(left + j * (width + _MARGIN), text // 3, label) for j, label in enumerate(labels_top)]
+    labels += [(_MARGIN, top + i * (height + _MARGIN) + (height - text) // 2, label) for i, label in enumerate(labels_left)]
+    return _with_text(sheet, labels, text)
 
 
-def _rgb(image: np.ndarray) -> np.ndarray:
-    image = np.asarray(image)
-    if image.dtype != np.uint8:
-        image = np.round(np.clip(np.nan_to_num(image), 0, 1) * 255).astype(np.uint8)
-    if image.ndim == 2:
-        image = image[..., None]
-    return np.broadcast_to(image[..., :3], (*image.shape[:2], 3)).copy()
+def _shown(image: np.ndarray) -> np.ndarray:
+    x = unit_range(image).astype(np.float32)
+    x = x.reshape(*x.shape[:2], -1)
+    if x.shape[2] in (2, 4):
+        alpha = x[..., -1:]
+        x = x[..., :-1] * alpha + 1 - alpha
+    if x.shape[2] == 1:
+        x = np.repeat(x, 3, -1)
+    return np.rint(np.clip(np.nan_to_num(x), 0, 1) * 255).astype(np.uint8)
+
+
+def _text_width(label: str, size: int) -> int:
+    import OpenImageIO as oiio
+
+    region = oiio.ImageBufAlgo.text_size(label, size)
+    return int(region.width) if region.defined else size * len(label) * 2 // 3
+
+
+def _with_text(sheet: np.ndarray, labels: list[tuple[int, int, str]], size: int) -> np.ndarray:
+    """sheet with labels (x, y of the top left corner, text); unlabelled where no font is found."""
+    import OpenImageIO as oiio
+
+    buffer = oiio.ImageBuf(sheet)
+    for x, y, label in labels:
+        oiio.ImageBufAlgo.render_text(buffer, x, y, label, size, "", (0.2, 0.2, 0.2, 1.0), "left", "top")
+    if buffer.has_error:
+        buffer.geterror()
+    return np.asarray(buffer.get_pixels("uint8"), np.uint8).reshape(sheet.shape)

@@ -1,75 +1,249 @@
-"""Images in and out by OpenImageIO: what is read is checked, what is written is read back."""
+"""Reading and writing image files through OpenImageIO, with the checks its readers leave out.
+
+Reading never applies a colour space: what is stored is returned. The limits keep a small file from asking for a large
+part of the machine's memory.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from gdtool.core.errors import InputError, OutputError, ResourceError
+from gdtool.core.errors import InputError, OutputError, ResourceError, from_os_error
+from gdtool.images.containers import check_container
 
-MAX_SIDE = 16384
+MAX_SIDE = 16384  # pixels
+MAX_BYTES = 1 << 30  # of decoded pixels
+
+_TYPES = {"uint8": ("uint8", np.uint8), "uint16": ("uint16", np.uint16), "half": ("float", np.float32),
+          "float": ("float", np.float32), "double": ("float", np.float32)}
 
 
-def read_image(path: Path | str) -> np.ndarray:
-    """(h, w, c) uint8, uint16 or float32 as stored, row 0 at the top, straight alpha. Raises InputError, ResourceError."""
+def read_image(path: str | Path) -> np.ndarray:
+    """Read an image as it is stored: (h, w, c) uint8, uint16 or float32, row 0 at the top, c = 1..4.
+
+    1 channel is grey, 2 grey and alpha, 3 RGB, 4 RGBA; alpha is straight (EXR's premultiplied colours are divided).
+    Palettes are expanded, EXIF rotation is applied. Raises InputError for what is not one whole still image in grey or
+    RGB, or holds values that are not finite; ResourceError beyond 16384 pixels a side or 1 GiB; OutputError when the
+    file cannot be read.
+    """
+    path = Path(path)
+    try:
+        with open(path, "rb") as file:
+            head = file.read(64)
+            check_container(path, head, file)
+    except IsADirectoryError:
+        raise InputError(path, "is a folder, not an image") from None
+    except FileNotFoundError:
+        raise InputError(path, "does not exist") from None
+    except OSError as error:
+        raise from_os_error(error, path) from None
+    with _plain_name(path) as name:
+        return _read(path, name)
+
+
+def decode_image(content: bytes, subject: str) -> np.ndarray:
+    """Read an image from memory, as read_image does; subject names it in errors."""
+    with tempfile.TemporaryDirectory(prefix="gdtool-") as folder:
+        # OpenImageIO's Python reader opens names only; without a suffix it goes by content.
+        path = Path(folder, "image")
+        path.write_bytes(content)
+        try:
+            return read_image(path)
+        except (InputError, ResourceError) as error:
+            raise type(error)(subject, error.fact, error.cure) from None
+
+
+def _read(path: Path, name: str) -> np.ndarray:
     import OpenImageIO as oiio
 
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(path, "does not exist")
+    oiio.attribute("limits:imagesize_MB", MAX_BYTES >> 20)
     config = oiio.ImageSpec()
     config["oiio:UnassociatedAlpha"] = 1
-    source = oiio.ImageInput.open(str(path), config)
+    source = oiio.ImageInput.open(name, config)
     if source is None:
-        raise InputError(path, f"is not an image that can be read ({oiio.geterror().strip().splitlines()[0][:120]})")
+        fact = oiio.geterror().replace(name, "").strip().split("\n")[0]
+        if "exceeds" in fact or "limit" in fact:
+            raise ResourceError(path, f"is larger than gdtool reads ({MAX_SIDE} pixels a side, {MAX_BYTES >> 30} GiB)", "scale it down")
+        raise InputError(path, f"is not an image that can be read ({_lower(fact) or 'unknown format'})")
     try:
         spec = source.spec()
-        if max(spec.width, spec.height) > MAX_SIDE:
-            raise ResourceError(path, f"is {spec.width}x{spec.height}, the limit is {MAX_SIDE} a side")
-        kind = {"uint8": "uint8", "uint16": "uint16"}.get(str(spec.format), "float")
+        _check_spec(path, spec)
+        if source.seek_subimage(1, 0):
+            raise InputError(path, "holds several images or an animation", "save the one that is meant as a still")
+        source.geterror()
+        source.seek_subimage(0, 0)
+        if str(spec.format) not in _TYPES:
+            raise InputError(path, f"stores {spec.format} pixels", "save it in 8 or 16 bits or as float")
+        kind, dtype = _TYPES[str(spec.format)]
         pixels = source.read_image(kind)
+        # A truncated file can come back as zeros with success: only the error flag tells.
         if pixels is None or source.has_error:
-            raise InputError(path, f"is cut or damaged ({source.geterror().strip()[:120]})")
+            fact = source.geterror().replace(name, "").strip().split("\n")[0]
+            raise InputError(path, f"is damaged or cut short ({_lower(fact) or 'the pixels cannot be read'})")
+        file_format = source.format_name()
     finally:
         source.close()
-    return np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
+    pixels = np.asarray(pixels, dtype).reshape(spec.height, spec.width, spec.nchannels)
+    pixels = _ordered_channels(path, pixels, list(spec.channelnames))
+    if dtype == np.float32:
+        _check_finite(path, pixels)
+        if file_format == "openexr" and pixels.shape[2] in (2, 4):
+            alpha = pixels[..., -1:]
+            pixels[..., :-1] = np.where(alpha > 0, pixels[..., :-1] / np.where(alpha > 0, alpha, 1), pixels[..., :-1])
+    return np.ascontiguousarray(_upright(pixels, spec.get_int_attribute("Orientation", 1)))
 
 
-def write_png(path: Path | str, image: np.ndarray, bits: int = 8) -> None:
-    """Write a PNG of (h, w[, c]) floats in [0, 1], or of uint8 or uint16 as they are. Raises OutputError."""
+def _lower(text: str) -> str:
+    return text[:1].lower() + text[1:]
+
+
+def _check_spec(path: Path, spec) -> None:
+    if spec.width > MAX_SIDE or spec.height > MAX_SIDE or spec.image_bytes() > MAX_BYTES:
+        raise ResourceError(path, f"is {spec.width}x{spec.height} pixels, more than {MAX_SIDE} a side or {MAX_BYTES >> 30} GiB",
+                            "scale it down")
+    if spec.depth > 1 or spec.deep:
+        raise InputError(path, "is a volume or a deep image", "flatten it")
+    spaces = {spec.get_string_attribute(key).lower() for key in ("jpeg:ColorSpace", "tiff:ColorSpace", "psd:ColorMode", "oiio:ColorSpace")}
+    if any("cmyk" in space or "ycck" in space or "ycbcrk" in space for space in spaces) or "C" in spec.channelnames[:1]:
+        raise InputError(path, "is in CMYK", "convert it to RGB")
+    if spec.get_int_attribute("oiio:Movie", 0):
+        raise InputError(path, "is an animation", "save one frame as a still")
+
+
+def _ordered_channels(path: Path, pixels: np.ndarray, names: list[str]) -> np.ndarray:
+    """The channels that make grey, grey and alpha, RGB or RGBA, out of whatever a multi-channel file holds besides."""
+    if {"R", "G", "B"} <= set(names):
+        wanted = ["R", "G", "B", *(["A"] if "A" in names else [])]
+        return pixels[..., [names.index(name) for name in wanted]]
+    if pixels.shape[2] <= 4:
+        return pixels
+    if "Y" in names:
+        return pixels[..., [names.index("Y")]]
+    raise InputError(path, f"has the channels {', '.join(names[:8])}", "save grey or RGB with or without alpha")
+
+
+def _check_finite(path: Path, pixels: np.ndarray) -> None:
+    bad = ~np.isfinite(pixels)
+    if bad.any():
+        row, column, channel = np.argwhere(bad)[0]
+        raise InputError(path, f"is not finite at row {row}, column {column} ({pixels[row, column, channel]})")
+
+
+def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Undo an EXIF orientation 1..8: the stored rows and columns, as the camera was held."""
+    flips = {2: (1,), 3: (0, 1), 4: (0,), 6: (0,), 7: (0, 1), 8: (1,)}
+    if orientation in (5, 6, 7, 8):
+        # 5 is a transpose; 6 turns clockwise: flip the rows, then transpose; 8 the other way; 7 over the other diagonal.
+        return np.flip(pixels, flips[orientation]).swapaxes(0, 1) if orientation != 5 else pixels.swapaxes(0, 1)
+    return np.flip(pixels, flips[orientation]) if orientation in flips else pixels
+
+
+def quantized(image: np.ndarray, bits: int = 8) -> np.ndarray:
+    """float [0, 1] (clipped) -> uint8 or uint16, rounded to nearest; unsigned integers as they are."""
     image = np.asarray(image)
-    if image.dtype.kind == "f":
-        top = 2**bits - 1
-        image = np.round(np.clip(np.nan_to_num(image), 0, 1) * top).astype(np.uint8 if bits == 8 else np.uint16)
-    _write(Path(path), image)
+    if image.dtype in (np.uint8, np.uint16):
+        return image
+    if not np.isfinite(image).all():
+        raise ValueError("an image to write is not finite")
+    top = (1 << bits) - 1
+    return np.rint(np.clip(image, 0, 1) * float(top)).astype(np.uint8 if bits == 8 else np.uint16)
 
 
-def write_exr(path: Path | str, image: np.ndarray) -> None:
-    """Write an EXR of (h, w[, c]) float32. Raises OutputError."""
-    _write(Path(path), np.asarray(image, np.float32))
+def write_png(path: str | Path, image: np.ndarray, bits: int = 8) -> None:
+    """Write (h, w) or (h, w, 1..4): float in [0, 1] at 8 or 16 bits, or uint8 and uint16 as they are; straight alpha.
+
+    No colour-space chunk is written: what the numbers mean is the folder format's business. The file is read again and
+    compared; raises OutputError when it cannot be written whole.
+    """
+    _write(Path(path), quantized(image, bits), "uint8" if quantized(image[:1, :1], bits).dtype == np.uint8 else "uint16")
 
 
-def _write(path: Path, image: np.ndarray) -> None:
+def write_exr(path: str | Path, image: np.ndarray) -> None:
+    """Write (h, w) or (h, w, 1, 3 or 4) as 32-bit float EXR, zip-compressed; alpha given straight, stored premultiplied.
+
+    Read again and compared; raises OutputError.
+    """
+    _write(Path(path), np.asarray(image, np.float32), "float")
+
+
+def encode_png(image: np.ndarray, bits: int = 8) -> bytes:
+    """The bytes of the file that write_png writes."""
+    with tempfile.TemporaryDirectory(prefix="gdtool-") as folder:
+        path = Path(folder, "image.png")
+        write_png(path, image, bits)
+        return path.read_bytes()
+
+
+def _write(path: Path, image: np.ndarray, kind: str) -> None:
     import OpenImageIO as oiio
 
-    image = np.ascontiguousarray(image if image.ndim == 3 else image[..., None])
-    height, width, channels = image.shape
-    spec = oiio.ImageSpec(width, height, channels, image.dtype.name if image.dtype.kind == "u" else "float")
-    spec["oiio:UnassociatedAlpha"] = 1
-    spec["png:compressionLevel"] = 3
-    if channels == 1:
-        spec.channelnames = ("Y",)
-    output = oiio.ImageOutput.create(str(path))
-    if output is None or not output.open(str(path), spec):
-        raise OutputError(path, f"cannot be written ({(output.geterror() if output else oiio.geterror()).strip()[:120]})")
-    good = output.write_image(image)
-    good = output.close() and good
-    if not good:
-        raise OutputError(path, f"cannot be written ({output.geterror().strip()[:120]})", "free some space or choose another -o")
+    pixels = np.ascontiguousarray(image.reshape(*image.shape[:2], -1))
+    height, width, channels = pixels.shape
+    names = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}[channels]
+    spec = oiio.ImageSpec(width, height, channels, kind)
+    spec.channelnames = names
+    stored = pixels
+    if kind == "float":
+        spec["compression"] = "zip"
+        if channels in (2, 4):
+            stored = np.concatenate([pixels[..., :-1] * pixels[..., -1:], pixels[..., -1:]], -1)
+    else:
+        spec["oiio:UnassociatedAlpha"] = 1
+        spec["png:compressionLevel"] = 6
     try:
-        back = read_image(path)
-    except InputError as error:
-        raise OutputError(path, f"was not written whole ({error.fact})", "free some space or choose another -o") from None
-    if not np.array_equal(back, image):
-        raise OutputError(path, "was not written as it should be", "free some space or choose another -o")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(path, "wb"):
+            pass  # a plain error when the place cannot be written
+    except OSError as error:
+        raise from_os_error(error, path) from None
+    with _plain_name(path, writing=True) as name:
+        target = oiio.ImageOutput.create(name)
+        good = target.open(name, spec) and target.write_image(stored) and target.close()
+        fact = target.geterror()
+    try:
+        same = good and np.array_equal(_again(path), stored)
+    except (InputError, ResourceError):
+        same = False
+    if not same:
+        with contextlib.suppress(OSError):
+            path.unlink()
+        raise OutputError(path, f"was not written whole ({_lower(fact.strip().splitlines()[0]) if fact.strip() else 'it reads back otherwise'})",
+                          "free some space or choose another -o")
+
+
+def _again(path: Path) -> np.ndarray:
+    """The stored pixels, before alpha is divided."""
+    import OpenImageIO as oiio
+
+    if path.suffix.lower() != ".exr":
+        return read_image(path)
+    with _plain_name(path) as name:
+        source = oiio.ImageInput.open(name)
+        if source is None:
+            raise InputError(path, "cannot be read again")
+        spec = source.spec()
+        pixels = source.read_image("float")
+        failed = source.has_error
+        source.close()
+    if pixels is None or failed:
+        raise InputError(path, "cannot be read again")
+    return np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)
+
+
+@contextlib.contextmanager
+def _plain_name(path: Path, writing: bool = False) -> Iterator[str]:
+    """A name that OpenImageIO takes: itself, or where it is not UTF-8 a link to it under another name."""
+    try:
+        str(path).encode()
+        yield str(path)
+    except UnicodeEncodeError:
+        with tempfile.TemporaryDirectory(prefix="gdtool-") as folder:
+            link = Path(folder, "image" + (path.suffix if writing else ""))
+            link.symlink_to(os.path.abspath(path))
+            yield str(link)
