@@ -186,11 +186,22 @@ def subdivided(corners: np.ndarray, subdivisions: int) -> np.ndarray:
 
 
 def _miter(outline: np.ndarray) -> np.ndarray:
-    """Per outline point the vector that moves its two sides outward by one unit."""
-    edge = unit(np.concatenate([np.roll(outline, -1, 0) - outline, np.zeros((len(outline), 1))], 1))[:, :2]
-    normal = np.stack([edge[:, 1], -edge[:, 0]], -1)
+    """Per outline point the vector that moves its two sides outward by one unit.
+
+    Points inside a straight side take their share of both ends' vectors, so that no point overtakes a corner.
+    """
+    step = np.roll(outline, -1, 0) - outline
+    length = np.maximum(np.linalg.norm(step, axis=1), 1e-12)
+    normal = np.stack([step[:, 1], -step[:, 0]], -1) / length[:, None]
     total = normal + np.roll(normal, 1, 0)
-    return 2 * total / np.maximum((total**2).sum(-1, keepdims=True), 0.4)
+    miter = 2 * total / np.maximum((total**2).sum(-1, keepdims=True), 0.4)
+    corner = np.flatnonzero((normal * np.roll(normal, 1, 0)).sum(-1) < np.cos(np.radians(0.5)))
+    if len(corner) < 3:
+        return miter
+    along = np.r_[0.0, np.cumsum(length)]
+    knots = np.r_[along[corner[-1]] - along[-1], along[corner], along[-1] + along[corner[0]]]
+    values = miter[np.r_[corner[-1], corner, corner[0]]]
+    return np.stack([np.interp(along[:-1], knots, values[:, k]) for k in range(2)], -1)
 
 
 def loft(profile: np.ndarray, outline: np.ndarray, crease_degrees: float = 38.0, boxed: bool = False,
