@@ -74,10 +74,6 @@ def _read(path: Path, name: str) -> np.ndarray:
     try:
         spec = source.spec()
         _check_spec(path, spec)
-        if source.seek_subimage(1, 0):
-            raise InputError(path, "holds several images or an animation", "save the one that is meant as a still")
-        source.geterror()
-        source.seek_subimage(0, 0)
         if str(spec.format) not in _TYPES:
             raise InputError(path, f"stores {spec.format} pixels", "save it in 8 or 16 bits or as float")
         kind, dtype = _TYPES[str(spec.format)]
@@ -87,6 +83,9 @@ def _read(path: Path, name: str) -> np.ndarray:
             fact = source.geterror().replace(name, "").strip().split("\n")[0]
             raise InputError(path, f"is damaged or cut short ({_lower(fact) or 'the pixels cannot be read'})")
         file_format = source.format_name()
+        if source.seek_subimage(1, 0):
+            raise InputError(path, "holds several images or an animation", "save the one that is meant as a still")
+        source.geterror()
     finally:
         source.close()
     pixels = np.asarray(pixels, dtype).reshape(spec.height, spec.width, spec.nchannels)
