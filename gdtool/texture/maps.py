@@ -126,3 +126,29 @@ def directx(normal: np.ndarray) -> np.ndarray:
     out = normal.copy()
     out[..., 1] = np.iinfo(normal.dtype).max - normal[..., 1]
     return out
+
+
+def contact_sheet_of(maps: Maps, width: int = 384) -> np.ndarray:
+    """(h, w, 3) uint8 picture of the maps side by side, channels of the packed one apart; factors as plain squares."""
+    from gdtool.images.color import srgb_from_linear
+    from gdtool.images.contact import contact_sheet
+
+    def small(image: np.ndarray) -> np.ndarray:
+        values = image.astype(np.float32) / np.iinfo(image.dtype).max
+        step = max(1, image.shape[0] // width)
+        cut = values.shape[0] // step * step
+        values = values[:cut, :cut].reshape(cut // step, step, cut // step, step, -1).mean((1, 3))
+        return values[..., :3] if values.shape[2] > 2 else values[..., 0]
+
+    def plain(value) -> np.ndarray:
+        return np.broadcast_to(np.asarray(value, np.float32), (64, 64, 3))
+
+    factors = maps.factors
+    tiles = {"base color": small(maps.base_color) if maps.base_color is not None else plain(srgb_from_linear(np.array(factors["base_color"][:3])))}
+    if maps.has_occlusion:
+        tiles["occlusion"] = small(maps.orm[..., :1])
+    for channel, name in ((1, "roughness"), (2, "metallic")):
+        tiles[name] = small(maps.orm[..., channel:channel + 1]) * factors[name][0] if maps.has_roughness_metallic else plain(factors[name][0])
+    if maps.normal is not None:
+        tiles["normal"] = small(maps.normal)
+    return contact_sheet([list(tiles.values())], labels_top=list(tiles))

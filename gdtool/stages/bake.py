@@ -1,0 +1,209 @@
+"""Mesh with texture coordinates to an engine-ready asset: maps from the surface it came from, .glb and quad .obj.
+
+Use it after unwrap. Base color, occlusion-roughness-metallic and tangent-space normals are read texel by texel from the
+surface: from its confident views where there are any (found along the provenance chain), else from its vertices, or from
+the textures of the model that was remeshed. Maps that would be constant become factors, a flat normal map is left out.
+
+Example:
+  gdtool bake cat.asset/atlas --size 2048
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from gdtool.core.errors import InputError
+from gdtool.core.kinds import AssetContent
+from gdtool.core.stage import Inputs, Output, SecondInput, Stage, file_option
+
+
+class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of bake."""
+
+    size: Annotated[int, Meta(ge=16, le=16384, description="width and height of the maps in texels")] = 2048
+    samples: Annotated[int, Meta(ge=1, le=64, description="samples per texel where neighbouring texels differ: 1, 4, 9, …")] = 1
+    ao: Annotated[bool, Meta(description="trace ambient occlusion")] = True
+    ao_rays: Annotated[int, Meta(ge=1, le=65536, description="rays per traced point of ambient occlusion")] = 64
+    padding: Annotated[int | None, Meta(ge=0, description="texels of gutter around charts; all that is free when not given")] = None
+    bits: Annotated[int, Meta(ge=8, le=16, multiple_of=8, description="bits per channel of the maps, 8 or 16")] = 8
+    normal_map: Annotated[Literal["auto", "on", "off"], Meta(description="auto leaves it out where it would be flat")] = "auto"
+    normal_convention: Annotated[Literal["opengl", "directx"], Meta(description="green channel of normal.png; .glb is always opengl")] = "opengl"
+    project_views: Annotated[bool, Meta(description="read materials from the views where they see the surface well")] = True
+    source_frame: Annotated[bool, Meta(description="write vertices in the source's own frame instead of the normalised one")] = False
+    model: file_option("model or mesh file, with its textures, to bake from instead of the surface") = None
+    seed: Annotated[int, Meta(ge=0, description="seed of the occlusion rays")] = 0
+
+
+def run(inputs: Inputs, options: Options, out: Output) -> None:
+    """Bake one atlas."""
+    from gdtool.texture.bake import bake, occlusion_tracer
+    from gdtool.texture.maps import make_maps
+    from gdtool.texture.occlusion import bake_occlusion
+    from gdtool.texture.reproject import vertex_reach
+    from gdtool.texture.target import texels_of
+
+    with out.step("read"):
+        mesh, matrix = _read_mesh(inputs)
+        origin = _read_origin(inputs, options, matrix, out)
+    with out.step("frames"):
+        target, face_idx = _target_of(mesh)
+        _check_overlap(target, inputs, out)
+    with out.step("rasterise"):
+        texels = texels_of(target, options.size)
+        if not texels.inside:
+            raise InputError(_path(inputs), "its texture coordinates cover no texel", "run gdtool unwrap")
+    with out.step("bake"):
+        reach = vertex_reach(target.vertices, target.faces, origin.source)
+        baked = bake(target, texels, origin.source, origin.lookup, reach, samples=options.samples, threads=out.threads, progress=out.progress)
+    occlusion = None
+    if options.ao:
+        with out.step("occlusion"):
+            trace = occlusion_tracer(target, origin.source, reach, origin.normals, options.ao_rays, options.seed, out.threads)
+            occlusion = bake_occlusion(target, texels, baked.positions, baked.normals, trace)
+    else:
+        out.skip("occlusion", "left out by --no-ao")
+    with out.step("maps"):
+        maps = make_maps(texels, baked.values, occlusion=occlusion, bits=options.bits, padding=options.padding, normal_map=options.normal_map)
+    for what, reason in maps.skipped:
+        out.skip(what, reason)
+    if options.normal_map == "off":
+        out.skip("normal map", "left out by --normal-map off")
+    report = {**baked.report, "seen_share": float((baked.seen[:texels.inside] > 0.5).mean()), "materials_from": origin.label}
+    with out.step("write"):
+        _write(out, options, inputs, mesh, target, face_idx, maps, origin, matrix, report)
+
+
+def _path(inputs: Inputs):
+    return getattr(inputs.main, "path", inputs.main)
+
+
+def _read_mesh(inputs: Inputs):
+    """The mesh to bake for, with texture coordinates, and the (4, 4) matrix from its frame to the source's."""
+    import numpy as np
+
+    from gdtool.folders.mesh import QuadMesh, read_mesh, read_obj
+
+    main = inputs.main
+    if hasattr(main, "content"):
+        mesh, matrix = read_mesh(main), np.array(main.content.source_from_world).reshape(4, 4)
+    elif isinstance(main, str):
+        raise InputError(main, "has no texture coordinates of its own to bake into", "run gdtool remesh and gdtool unwrap first")
+    else:
+        matrix = np.eye(4)
+        if main.suffix.lower() == ".obj":
+            mesh = read_obj(main)
+        else:
+            from gdtool.assets.load import load_scene
+
+            scene = load_scene(main)
+            uv = scene.uvs[0] if scene.uvs else None
+            faces = np.concatenate([scene.faces, np.full((len(scene.faces), 1), -1, np.int32)], 1)
+            mesh = QuadMesh(scene.vertices, faces, uv, None if uv is None else faces)
+    if mesh.uv is None:
+        raise InputError(_path(inputs), "has no texture coordinates", "run gdtool unwrap")
+    if np.abs(mesh.uv).max() > 64:
+        raise InputError(_path(inputs), f"has texture coordinates as large as {np.abs(mesh.uv).max():g}", "run gdtool unwrap")
+    return mesh, matrix
+
+
+def _read_origin(inputs: Inputs, options: Options, matrix, out: Output):
+    """What to bake from: the surface (with its views), a model named by --model, or the model that was remeshed."""
+    from pathlib import Path
+
+    from gdtool.core.folder import find_source
+    from gdtool.texture.origin import from_scene, from_surface
+
+    surface, views = inputs.second["surface"], inputs.second["views"]
+    if options.model is None and surface is not None:
+        from gdtool.folders.surface import read_surface
+        from gdtool.folders.views import read_views
+
+        read = None
+        if not options.project_views:
+            out.skip("views", "left out by --no-project-views")
+        elif views is None:
+            out.skip("views", "none along the provenance chain: materials come from the surface's vertices")
+        else:
+            read = read_views(views, ("albedo", "roughness", "metallic", "normal"))
+            for domain in ("albedo", "roughness", "metallic", "normal"):
+                if domain not in read.images:
+                    out.skip(f"{domain} views", "the views do not hold it: the surface's vertices serve")
+        return from_surface(read_surface(surface), read if read is not None and read.images else None)
+    named = options.model
+    if named is None and hasattr(inputs.main, "content"):
+        named = find_source(inputs.main)
+        if named is not None and not named.startswith("procedural:") and Path(named).suffix.lower() not in (".glb", ".gltf", ".obj", ".ply", ".stl"):
+            named = None
+    if named is None:
+        raise InputError(_path(inputs), "has no surface to bake from along its provenance chain", "name one with --surface or --model")
+    from gdtool.assets.load import load_scene
+
+    return from_scene(load_scene(named), matrix)
+
+
+def _target_of(mesh):
+    """The triangles to bake into, and the quad (t,) each comes from."""
+    import numpy as np
+
+    from gdtool.folders.mesh import triangulated
+    from gdtool.texture.target import Target
+
+    faces, face_idx = triangulated(mesh.faces)
+    # The same cut for the texture corners: cut a mesh whose faces are the corners' numbers.
+    second = np.zeros(len(faces), bool)
+    second[1:] = face_idx[1:] == face_idx[:-1]
+    corners = np.where(second[:, None], [0, 2, 3], [0, 1, 2])
+    face_uvs = np.take_along_axis(mesh.face_uvs[face_idx], corners, 1)
+    return Target.of(mesh.vertices, faces, mesh.uv, face_uvs), face_idx
+
+
+def _check_overlap(target, inputs: Inputs, out: Output) -> None:
+    from gdtool.texture.raster import owner_count
+
+    count = owner_count(target.uv, target.face_uvs, 512)
+    share = float((count > 1).sum() / max((count > 0).sum(), 1))
+    if share > 0.001:
+        out.warn(f"{inputs.name}: texture coordinates overlap on {100 * share:.1f} % of what they cover; the first face there is baked")
+    if target.uv.min() < -1e-6 or target.uv.max() > 1 + 1e-6:
+        out.warn(f"{inputs.name}: texture coordinates leave the unit square; what lies outside is not baked")
+
+
+def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx, maps, origin, matrix, report) -> None:
+    """Write the folder's files and set out.content."""
+    import dataclasses
+
+    from gdtool.assets.gltf_write import write_glb
+    from gdtool.geometry.frames import transform_points
+    from gdtool.images.io import write_png
+    from gdtool.texture import asset
+    from gdtool.texture.maps import contact_sheet_of, directx
+
+    if options.source_frame:
+        turn = matrix[:3, :3] / (matrix[:3, 0] ** 2).sum() ** 0.5
+        tangents = target.tangents.copy()
+        tangents[..., :3] = tangents[..., :3] @ turn.T
+        target = dataclasses.replace(target, vertices=transform_points(matrix, target.vertices), normals=target.normals @ turn.T, tangents=tangents)
+        mesh = dataclasses.replace(mesh, vertices=target.vertices)
+    files = {}
+    for name in ("base_color", "orm", "normal"):
+        image = getattr(maps, name)
+        if image is not None:
+            files[name] = f"{name}.png"
+            write_png(out.path(files[name]), directx(image) if name == "normal" and options.normal_convention == "directx" else image)
+    material = asset.material_of(maps, inputs.name, origin.alpha_mode, origin.alpha_cutoff, origin.double_sided)
+    write_glb(out.path("asset.glb"), asset.scene_of(target, maps, material, inputs.name))
+    normals_idx, normals = asset.corner_normals_of_quads(mesh, target, face_idx)
+    asset.write_obj(out.path("asset.obj"), mesh, normals_idx, normals, maps, files, inputs.name)
+    write_png(out.path("contact_sheet.png"), contact_sheet_of(maps))
+    out.content = AssetContent(
+        size=options.size, maps=files, factors=maps.factors, normal_convention=options.normal_convention,
+        frame="source" if options.source_frame else "normalised", source_from_world=tuple(float(x) for x in matrix.ravel()), report=report)
+
+
+STAGE = Stage(
+    name="bake", version=1, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run,
+    second_inputs={"surface": SecondInput("surface", help="The surface to bake from; found along the provenance chain without it."),
+                   "views": SecondInput("views", help="Views of it; found along the provenance chain without it.")})
