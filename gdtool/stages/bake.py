@@ -27,7 +27,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     samples: Annotated[int, Meta(ge=1, le=64, description="samples per texel where neighbouring texels differ: 1, 4, 9, …")] = 1
     ao: Annotated[bool, Meta(description="trace ambient occlusion")] = True
     ao_rays: Annotated[int, Meta(ge=1, le=65536, description="rays per traced point of ambient occlusion")] = 64
-    padding: Annotated[int | None, Meta(ge=0, description="texels of gutter around charts; all that is free when not given")] = None
+    padding: Annotated[int, Meta(ge=0, description="texels of gutter around charts; 0: all that is free")] = 0
     bits: Annotated[int, Meta(ge=8, le=16, multiple_of=8, description="bits per channel of the maps, 8 or 16")] = 8
     normal_map: Annotated[Literal["auto", "on", "off"], Meta(description="auto leaves it out where it would be flat")] = "auto"
     normal_convention: Annotated[Literal["opengl", "directx"], Meta(description="green channel of normal.png; .glb is always opengl")] = "opengl"
@@ -66,7 +66,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     else:
         out.skip("occlusion", "left out by --no-ao")
     with out.step("maps"):
-        maps = make_maps(texels, baked.values, occlusion=occlusion, bits=options.bits, padding=options.padding, normal_map=options.normal_map)
+        maps = make_maps(texels, baked.values, occlusion=occlusion, bits=options.bits, padding=options.padding or None, normal_map=options.normal_map)
     for what, reason in maps.skipped:
         out.skip(what, reason)
     if options.normal_map == "off":
