@@ -33,7 +33,7 @@ def _family(name: str) -> dict:
 def generate(seed: int, kind: str | None = None) -> Scene:
     """The object of a seed (>= 0); `kind` (see `kinds()`) forces what it is. Raises ValueError for an unknown kind.
 
-    The scene is normalised (bounding box centred, longest side 1), about 2,000 to 60,000 faces, up to about 30 materials.
+    The scene is normalised (bounding box centred, longest side 1), about 2,000 to 40,000 faces.
     """
     import numpy as np
 

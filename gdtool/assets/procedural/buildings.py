@@ -12,12 +12,10 @@ from gdtool.assets.procedural.parts import Part, ball, box, circle, cone, cylind
 def gable(width: float, height: float, depth: float, overhang: float = 0.0, power: float = 1.0) -> Part:
     """A roof with its ridge along z, from y = 0 to `height`."""
     w = width / 2 + overhang
-    t = np.linspace(0, 1, 6)
-    slope = np.stack([w * (1 - t), height * t**power], -1)
-    side = np.vstack([slope, slope[-2::-1] * np.array([-1, 1])])[::-1]
-    outline = np.vstack([subdivided(side[[0, -1]], 6)[:6][::-1] * 0 + np.linspace(side[-1], side[0], 7)[:-1], side[:-1]])
-    outline = outline - np.array([0, height * 0.4])
-    return extrusion(outline, depth + 2 * overhang, 0.01).turned("x", 90).moved(z=-(depth / 2 + overhang)).moved(y=-height * 0.4).scaled(1, -1, 1)
+    slope = np.stack([w * (1 - (t := np.linspace(0, 1, 6))), height * t**power], -1)
+    outline = np.vstack([slope, slope[-2::-1] * np.array([-1, 1]), np.stack([np.linspace(-w, w, 7)[1:-1], np.zeros(5)], -1)])
+    middle = np.array([0, 0.4 * height])  # an extrusion's outline goes around the origin
+    return extrusion(outline - middle, depth + 2 * overhang, 0.01).turned("x", -90).moved(0, middle[1], depth / 2 + overhang)
 
 
 def hip(width: float, height: float, depth: float, overhang: float = 0.05, top: float = 0.02) -> Part:
@@ -69,8 +67,8 @@ def house(rng) -> Assembly:
     if rng.uniform() < 0.6 and kind < 3:
         a.add(box(0.13, pitch * 0.8 + 0.2, 0.13, 0.01).moved(width * 0.25, tall + pitch * 0.55, -depth * 0.2), tiles.pick(rng, "wall"))
     if rng.uniform() < 0.4:
-        a.add_pair(cylinder(0.03, 0.4).moved(0.22 + abs(door) * 0, 0.2, depth / 2 + 0.25), frame)
-        a.add(gable(0.6, 0.2, 0.34, 0.02).moved(door * 0, 0.4, depth / 2 + 0.14), roof)
+        a.add_pair(cylinder(0.03, 0.4).moved(0.22, 0.2, depth / 2 + 0.25), frame)
+        a.add(gable(0.6, 0.2, 0.34, 0.02).moved(0, 0.4, depth / 2 + 0.14), roof)
     if rng.uniform() < 0.6:
         a.add(box(width * rng.uniform(1.2, 1.7), 0.05, depth * rng.uniform(1.3, 1.7)).moved(y=-0.02),
               tiles.pick(rng, "stone") if rng.uniform() < 0.5 else finishes.matte(rng, finishes.hsv(rng.uniform(0.2, 0.35), 0.6, 0.5)))
@@ -125,7 +123,7 @@ def tower(rng) -> Assembly:
     a, height = Assembly(), rng.uniform(1.1, 1.7)
     wall, roof = tiles.pick(rng, "wall"), tiles.pick(rng, "roof")
     r, top = rng.uniform(0.28, 0.4), rng.uniform(0.18, 0.26)
-    if pagoda := rng.uniform() < 0.35:
+    if rng.uniform() < 0.35:  # pagoda
         y, w = 0.0, rng.uniform(0.6, 0.9)
         for _ in range(int(rng.integers(3, 6))):
             a.add(box(w * 0.8, 0.26, w * 0.8, 0.01).moved(y=y + 0.13), wall)
@@ -159,7 +157,8 @@ def pyramid(rng) -> Assembly:
     a, stone = Assembly(), tiles.pick(rng, "stone")
     other = stone if rng.uniform() < 0.5 else tiles.pick(rng, "stone")
     if rng.uniform() < 0.25:
-        a.add(loft(refined([(0, 0), (1, 0), (0.01, rng.uniform(0.9, 1.4)), (0, rng.uniform(1.4, 1.41))], 0.08), rectangle(1.4, 1.4), boxed=True), stone)
+        peak = rng.uniform(0.8, 1.4)
+        a.add(loft(refined([(0, 0), (1, 0), (0.01, peak * 0.99), (0, peak)], 0.08), rectangle(1.4, 1.4), boxed=True), stone)
         return a
     steps, w, y = int(rng.integers(3, 9)), 1.0, 0.0
     rise, shrink = rng.uniform(0.55, 0.9) / steps, rng.uniform(0.3, 0.4)

@@ -7,14 +7,14 @@ import numpy as np
 from gdtool.assets.procedural import finishes, solids, tiles
 from gdtool.assets.procedural.assembly import Assembly
 from gdtool.assets.procedural.finishes import hsv
-from gdtool.assets.procedural.parts import ball, cone, loft, circle, refined, tube, cylinder
+from gdtool.assets.procedural.parts import ball, circle, cone, cylinder, extrusion, loft, refined, subdivided, tube
 
 BLACK = np.array([0.012, 0.011, 0.011])
 
 
 def fur_color(rng) -> np.ndarray:
     """Animal coats mostly, sometimes a toy's colour."""
-    return finishes.any_color(rng) if rng.uniform() < 0.35 else hsv(rng.uniform(0.02, 0.12), rng.uniform(0.05, 0.75), rng.uniform(0.12, 0.95))
+    return finishes.any_color(rng) if rng.uniform() < 0.35 else hsv(rng.uniform(0.02, 0.12), rng.uniform(0.05, 0.75), rng.uniform(0.2, 1.0) ** 0.7)
 
 
 def eyes(a: Assembly, rng, x: float, y: float, z: float, size: float, outward: float = 0.25) -> None:
@@ -86,7 +86,7 @@ def quadruped(rng) -> Assembly:
     paws = [solids.ellipsoid((spread * 1.05, bottom, z + 0.08), (foot * 1.2, foot * 0.75, foot * 1.7)) for z in (length * 0.65, -length * 0.75)]
     body.append(solids.both_sides(solids.blended(knees + paws, 0.04)))
     t = np.linspace(0, 1, 6)
-    lift, thick = rng.uniform(-0.5, 0.8), foot * rng.uniform(0.25, 0.8)
+    lift, thick = rng.uniform(-0.5, 0.8), max(foot * rng.uniform(0.3, 0.8), 0.045)  # thinner falls between the cells
     tail = np.stack([0 * t, girth * 0.3 + lift * t**1.5, -length * 1.05 - rng.uniform(0.15, 0.5) * t], -1)
     body.append(solids.chain(tail, thick * (1.2 - 0.5 * t)))
     trunk = rng.uniform() < 0.18
@@ -108,11 +108,11 @@ def quadruped(rng) -> Assembly:
         ears(a, rng, head, r, coat)
         if rng.uniform() < 0.2:
             horns(a, rng, head, r)
-    if rng.uniform() < 0.3:
+    if rng.uniform() < 0.3:  # a collar
         n = np.linspace(0, 2 * np.pi, 36, endpoint=False)
         mid = np.array([0, girth * 0.3 + 0.55 * (head[1] - girth * 0.3), length * 0.7 + 0.55 * (head[2] - length * 0.7)])
         radius = (girth * 0.6 + r * 0.6) / 2 + 0.03
-        a.add(tube(mid + radius * np.stack([np.cos(n), 0 * n, np.sin(n)], -1), 0.03, closed=True).turned("x", 0), tiles.pick(rng, "paint"))
+        a.add(tube(mid + radius * np.stack([np.cos(n), 0 * n, np.sin(n)], -1), 0.03, closed=True), tiles.pick(rng, "paint"))
     return a
 
 
@@ -295,12 +295,23 @@ def dragon(rng) -> Assembly:
         thick = np.interp(t, np.linspace(0, 1, 7), [0.12, 0.12, 0.2, 0.3, 0.24, 0.12, 0.04])
         back = np.array([0, 1, 0]) if t > 0.45 else np.array([0, 0.5, -0.85])
         a.add(cone(0.06, 0.16, 12).scaled(0.5, 1, 1).turned("x", 0 if t > 0.45 else -60).moved(*(at + 0.85 * thick * back)), spike)
-    wing = tiles.pick(rng, "skin")
-    span = rng.uniform(0.5, 0.85)
-    membrane = solids.both_sides(solids.blended([
-        solids.chain([(0.15, 0.25, 0.0), (0.3 + span * 0.4, 0.65, -0.2), (0.3 + span, 0.45, -0.35)], [0.05, 0.04, 0.03]),
-        solids.turned(solids.block((0.25 + span * 0.42, 0.3, -0.18), (span * 0.4, 0.24, 0.03), 0.02), "y", 18, (0.2, 0, -0.1))], 0.05))
-    a.add(solids.polygonised(membrane, 52), wing)
+    wing, span, rise = tiles.pick(rng, "skin"), rng.uniform(0.6, 0.95), rng.uniform(0.3, 0.6)
+    fingers = np.array([(0.45, 1.0), (1.0, 0.62), (0.9, 0.0), (0.5, -0.18)]) * np.array([span, rise])
+    rim = [(0.0, 0.1), tuple(fingers[0])]
+    for start, end in zip(fingers[:-1], fingers[1:]):  # the skin sags between the fingers
+        rim += [tuple(0.82 * (start + end) / 2 + 0.18 * np.array([0.4 * span, 0.3 * rise])), tuple(end)]
+    middle = np.array([0.42 * span, 0.35 * rise])
+    fold, lean = rng.uniform(-10, 35), rng.uniform(-25, 15)
+
+    def unfolded(part):
+        return part.turned("x", lean).turned("y", fold).moved(0.16, 0.2, -0.05)
+
+    skin = extrusion(subdivided(np.array(rim + [(0.0, -0.05)]) - middle, 4), 0.03, 0.004).moved(y=-0.015).turned("x", -90)
+    a.add_pair(unfolded(skin.moved(*middle)), wing)
+    wrist = np.array([0.45 * span, 0.97 * rise])
+    for start, end, thick in (((0.0, 0.08), wrist, 0.05), *((wrist, tip, 0.032) for tip in fingers[1:])):
+        path = np.c_[np.linspace(start, end, 4), np.zeros(4)]
+        a.add_pair(unfolded(tube(path, np.linspace(thick, 0.6 * thick, 4), outline=circle(10))), coat)
     eyes(a, rng, r * 0.6, head[1] + r * 0.35, head[2] + r * 0.6, r * 0.2, 0.6)
     horns(a, rng, (head[0], head[1], head[2] - 0.3 * r), r)
     return a

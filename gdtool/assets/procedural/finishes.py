@@ -56,7 +56,7 @@ def any_color(rng: np.random.Generator) -> np.ndarray:
     kind = rng.choice(7, p=[0.26, 0.2, 0.13, 0.18, 0.08, 0.07, 0.08])
     hue = rng.uniform()
     if kind == 0:
-        return hsv(hue, rng.uniform(0.7, 0.95), rng.uniform(0.6, 0.95))
+        return hsv(hue, rng.uniform(0.65, 0.92), rng.uniform(0.6, 0.95) * (0.75 if 0.2 < hue < 0.48 else 1.0))  # no neon greens
     if kind == 1:
         return hsv(hue, rng.uniform(0.3, 0.6), rng.uniform(0.4, 0.8))
     if kind == 2:

@@ -7,7 +7,7 @@ import numpy as np
 from gdtool.assets.procedural import finishes, solids, tiles
 from gdtool.assets.procedural.assembly import Assembly
 from gdtool.assets.procedural.buildings import gable
-from gdtool.assets.procedural.parts import ball, box, circle, cone, cylinder, extrusion, loft, rectangle, refined, tube
+from gdtool.assets.procedural.parts import ball, box, circle, cone, cylinder, loft, refined, smooth_curve, subdivided, tube
 
 
 def _leg(rng, height: float, size: float):
@@ -155,7 +155,7 @@ def chest(rng) -> Assembly:
                 a.add(box(np.hypot(side, h) * 0.86, 0.07, 0.03, 0.006).turned("z", np.degrees(np.arctan2(h, side))).moved(0, h / 2, half / 2).turned("y", turn), trim)
     elif kind == 1:  # treasure chest
         lid = loft(refined([(0, 0), (1, 0), (1, 1), (0, 1)], 0.12), circle(40), boxed=True).scaled(d / 2, w, d / 2).turned("z", 90).moved(w / 2, h, 0)
-        a.add(lid.scaled(1, 1, 1), finish)
+        a.add(lid, finish)
         for x in (-w * 0.35, 0, w * 0.35):
             a.add(loft(refined([(0, 0), (1, 0), (1, 1), (0, 1)], 0.3), circle(40), boxed=True).scaled(d / 2 + 0.015, 0.07, d / 2 + 0.015).turned("z", 90).moved(x + 0.035, h, 0), trim)
             a.add(box(0.07, h, d + 0.03, 0.006).moved(x, h / 2 + 0.01, 0), trim)
@@ -223,8 +223,6 @@ def extinguisher(rng) -> Assembly:
     a.add(box(0.05, 0.035, 0.34).turned("x", -15).moved(0, h + 0.17, 0.12), black)
     a.add(box(0.05, 0.03, 0.3).moved(0, h + 0.09, 0.12), black)
     path = np.array([(0.06, h + 0.05, 0), (r * 0.9, h + 0.02, 0), (r + 0.1, h * 0.7, 0), (r + 0.06, h * 0.35, 0.05)])
-    from gdtool.assets.procedural.parts import smooth_curve
-
     a.add(tube(smooth_curve(path, 24), 0.035), black)
     a.add(cone(0.08, 0.28, 24).moved(r + 0.06, h * 0.22, 0.05), black)
     label = [(0, 0), (r * 1.015, 0), (r * 1.015, h * 0.3), (0, h * 0.3)]
@@ -267,8 +265,6 @@ def tool(rng) -> Assembly:
         a.add(cone(0.12, 0.35, 24).turned("z", 90).moved(-0.12, length, 0), head)
     elif kind == 1:
         blade = np.array([(1.0, 0.0), (0.0, 0.28), (-1.0, 0.0), (0.0, -0.28)])
-        from gdtool.assets.procedural.parts import subdivided
-
         profile = refined([(0, 0), (0.12, 0.0), (0.1, 0.75), (0.005, 0.98), (0, 1.0)], 0.06)
         a.add(loft(profile * np.array([1.0, 1.3 * length]), subdivided(blade, 4)).moved(y=length * 0.35), head)
         a.add(box(0.5, 0.07, 0.1, 0.02).moved(y=length * 0.36), finishes.metal(rng))

@@ -7,7 +7,7 @@ import numpy as np
 from gdtool.assets.procedural import finishes, patterns, solids, tiles
 from gdtool.assets.procedural.assembly import Assembly
 from gdtool.assets.procedural.finishes import hsv
-from gdtool.assets.procedural.parts import ball, circle, cone, cylinder, loft, refined, smooth_curve, tube
+from gdtool.assets.procedural.parts import ball, circle, cylinder, loft, refined, smooth_curve, subdivided, tube
 
 
 def _green(rng) -> np.ndarray:
@@ -54,10 +54,12 @@ def bread(rng) -> Assembly:
         bump = patterns.noise_field(rng, 1.5, 1.5)
         a.add(solids.polygonised(lambda p: loaf(p) + np.float32(0.012) * bump(p), 60), finish)
     elif kind == 1:
-        w, h = rng.uniform(0.45, 0.55), rng.uniform(0.45, 0.6)
-        slice_ = solids.blended([solids.block((0, 0, 0), (w, h, 0.12), 0.06), solids.rod((w * 0.75, h * 0.85, 0), 0.27, 0.12, "z", 0.05), solids.rod((-w * 0.75, h * 0.85, 0), 0.27, 0.12, "z", 0.05)], 0.08)
-        a.add(solids.polygonised(slice_, 52), tiles.grained(rng, crust))
-        a.add(solids.polygonised(lambda p: slice_(p * np.array([1.12, 1.12, 0.9], np.float32)), 46), finishes.matte(rng, hsv(0.11, 0.3, 0.92)))
+        w, h, half = rng.uniform(0.42, 0.58), rng.uniform(0.4, 0.6), rng.uniform(0.08, 0.2)
+        ear = rng.uniform(0.18, 0.3)
+        outline = solids.blended([solids.block((0, 0, 0), (w, h, 9.0), 0.06), *[solids.rod((x * w * 0.75, h * 0.85, 0), ear, 9.0, "z") for x in (1, -1)]], 0.08)
+        a.add(solids.polygonised(solids.common([outline, lambda p: np.abs(p[:, 2]) - half], 0.04), 52), tiles.grained(rng, crust))
+        crumb = solids.common([lambda p: outline(p) + np.float32(0.05), lambda p: np.abs(p[:, 2]) - (half + 0.012)], 0.02)
+        a.add(solids.polygonised(crumb, 46), tiles.grained(rng, hsv(0.11, 0.3, 0.97)))
     else:
         a.add(ball(0.6, 0.38, 0.58, 44), finish)
         seed = finishes.matte(rng, hsv(0.12, 0.25, 0.92))
@@ -156,10 +158,8 @@ def burger(rng) -> Assembly:
         thick = rng.uniform(0.18, 0.26)
         ring = np.stack([0.4 * np.cos(w), 0 * w, 0.4 * np.sin(w)], -1)
         a.add(tube(ring, thick, closed=True, outline=circle(28)), finishes.matte(rng, hsv(0.085, 0.6, 0.75)))
-        half = np.stack([np.cos(np.linspace(0, 2 * np.pi, 28, endpoint=False)), np.maximum(np.sin(np.linspace(0, 2 * np.pi, 28, endpoint=False)), -0.05)], -1)
-        icing = tube(ring + np.array([0, 0.02, 0]), thick * 1.05 * (1 + 0.04 * np.sin(7 * w)), closed=True, outline=half[:, ::-1])
         top = solids.carved(solids.ring((0, 0, 0), 0.4, thick * 1.06), lambda p: p[:, 1] - 0.02 - 0.03 * np.sin(7 * np.arctan2(p[:, 2], p[:, 0])), 0.02)
-        a.add(solids.polygonised(top, 52) if rng.uniform() < 2 else icing, finishes.glossy(rng))
+        a.add(solids.polygonised(top, 52), tiles.pick(rng, "skin"))
         sprinkle = [finishes.plastic(rng) for _ in range(3)]
         for _ in range(int(rng.integers(0, 30))):
             w0, out = rng.uniform(0, 2 * np.pi), rng.uniform(-0.6, 0.6)
@@ -240,7 +240,7 @@ def potted(rng) -> Assembly:
         a.add(loft(stem * np.array([r * 0.62, tall]), ribs, crease_degrees=60).moved(y=h - 0.06), green)
         if rng.uniform() < 0.5:
             arm = np.array([(0, 0, 0), (0.3, 0.03, 0), (0.36, 0.12, 0), (0.36, 0.36, 0)])
-            a.add_pair(tube(smooth_curve(arm, 20) if False else arm, 0.09, outline=circle(22)).moved(r * 0.3, h + tall * 0.35, 0), green)
+            a.add_pair(tube(arm, 0.09, outline=circle(22)).moved(r * 0.3, h + tall * 0.35, 0), green)
         a.add(ball(0.08, 0.06, None, 20).moved(y=h + tall - 0.05), finishes.plastic(rng))
     else:
         petals = finishes.plastic(rng)
@@ -269,8 +269,6 @@ def rock(rng) -> Assembly:
         a.add(solids.polygonised(lambda p: (p @ cuts.T - offset).max(axis=1) * np.float32(0.7) + np.float32(0.3) * (np.linalg.norm(p, axis=1) - 0.65) + np.float32(0.03) * bump(p), 58), tiles.pick(rng, "stone"))
         return a
     crystal = finishes.glossy(rng, hsv(rng.uniform(), rng.uniform(0.4, 0.9), rng.uniform(0.5, 0.95))) if rng.uniform() < 0.6 else finishes.gradient(np.random.default_rng(rng.integers(2**32)))
-    from gdtool.assets.procedural.parts import subdivided
-
     for k in range(int(rng.integers(1, 8))):
         r, tall = rng.uniform(0.1, 0.2), rng.uniform(0.5, 1.2)
         gem = loft(refined([(0, 0), (r * 0.8, 0), (r, tall * 0.7), (0.01, tall), (0, tall * 1.002)], 0.1), subdivided(circle(6), 4), crease_degrees=25)

@@ -211,6 +211,7 @@ def loft(profile: np.ndarray, outline: np.ndarray, crease_degrees: float = 38.0,
     The first and the last row must have scale 0. inset moves the outline's sides inward by a length (bevels).
     """
     profile = np.asarray(profile, float)
+    profile = profile[np.r_[True, np.abs(np.diff(profile, axis=0)).max(axis=1) > 1e-9]]  # a doubled row has no faces
     inset = profile[:, 2] if profile.shape[1] > 2 else np.zeros(len(profile))
     flat = profile[:, 0, None, None] * outline - inset[:, None, None] * _miter(outline)
     if twist_degrees:

@@ -24,8 +24,8 @@ def ellipsoid(center: Sequence[float], radii: float | Sequence[float]) -> Distan
 
     def distance(points):
         offset = (points - center) / radii
-        k0 = _length(offset)
-        return k0 * (k0 - 1) / np.maximum(_length(offset / radii), 1e-6)
+        k0, k1 = _length(offset), _length(offset / radii)
+        return np.where(k1 > 1e-4, k0 * (k0 - 1) / np.maximum(k1, 1e-4), -radii.min())
 
     return distance
 
@@ -154,7 +154,7 @@ def polygonised(shape: Distance, resolution: int = 52, reach: float = 1.6) -> Pa
     step = float((high - low).max() - 2 * coarse) / resolution
     axes = _axes(low, high, step)
     values = np.pad(_sampled(shape, axes), 1, constant_values=step)  # closed even where the box cuts the shape
-    values = np.where(np.abs(values) < 1e-4 * step, np.float32(1e-4 * step), values)
+    values = np.where(np.abs(values) < 0.01 * step, np.float32(0.01 * step), values)  # keeps vertices apart: no slivers
     cells, faces, _, _ = marching_cubes(values, 0.0, allow_degenerate=True)
     vertices = (cells - 1) * step + np.array([a[0] for a in axes])
     offsets = 0.35 * step * np.eye(3, dtype=np.float32)
