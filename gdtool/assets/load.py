@@ -1,0 +1,67 @@
+"""One door to every model that gdtool reads."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from gdtool.assets.scene import Scene
+from gdtool.core.errors import InputError
+
+SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
+
+
+def load_scene(source: str | Path) -> Scene:
+    """Read a model: .glb, .gltf, .obj (with .mtl), .ply, .stl, or the generated object that "procedural:SEED" names.
+
+    The scene has faces, finite coordinates, indices in range, and is no point. Raises InputError, OutputError,
+    ResourceError.
+    """
+    if isinstance(source, str) and source.startswith("procedural:"):
+        from gdtool.assets.procedural import generate
+
+        seed = source.removeprefix("procedural:")
+        if not seed.isdigit():
+            raise InputError(source, "is not procedural:SEED")
+        return replace(generate(int(seed)), name="procedural-" + seed.zfill(6))
+    path = Path(source)
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        raise InputError(path, "is a folder, not a model")
+    if suffix not in SUFFIXES:
+        raise InputError(path, f"is not a model that gdtool reads ({', '.join(SUFFIXES)})")
+    if suffix in (".glb", ".gltf"):
+        from gdtool.assets.gltf_read import read_gltf as read
+    elif suffix == ".obj":
+        from gdtool.assets.obj_read import read_obj as read
+    else:
+        from gdtool.assets.scan_read import read_scan as read
+    return _checked(read(path), path)
+
+
+def _checked(scene: Scene, path: Path) -> Scene:
+    """The scene without faces that have no area. Raises InputError for what no stage can work on."""
+    if not len(scene.faces):
+        raise InputError(path, "has no faces")
+    if scene.faces.min() < 0 or scene.faces.max() >= len(scene.vertices):
+        raise InputError(path, f"a face refers to a vertex out of range (there are {len(scene.vertices)})")
+    used = scene.vertices[np.unique(scene.faces)]
+    if not np.isfinite(used).all():
+        raise InputError(path, f"vertex {int(np.argwhere(~np.isfinite(scene.vertices))[0][0])} is not finite")
+    low, high = used.min(0), used.max(0)
+    extent = float((high - low).max())
+    if not np.isfinite(extent) or extent > 1e100:
+        raise InputError(path, f"is {extent:.3g} units large", "scale it down")
+    if extent == 0:
+        raise InputError(path, "has all its vertices in one point")
+    corners = (scene.vertices[scene.faces] - low) / extent
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    if not (area > 1e-16).any():
+        raise InputError(path, "has only faces without area")
+    empty = area == 0
+    if empty.any():
+        scene = replace(scene, faces=scene.faces[~empty], material_idx=scene.material_idx[~empty],
+                        notes=(*scene.notes, f"{int(empty.sum())} faces without area are left out"))
+    return scene
