@@ -1,0 +1,197 @@
+"""Surface metrics on shapes whose answers are known."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from gdtool.cameras import camera_at, rig
+from gdtool.geometry import metrics
+from gdtool.geometry.rays import RayCaster
+
+
+def arrays(mesh):
+    return np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+
+
+def sphere(radius=0.5, center=(0, 0, 0), subdivisions=3):
+    vertices, faces = arrays(trimesh.creation.icosphere(subdivisions, radius))
+    return vertices + center, faces
+
+
+def cube(side=1.0, center=(0, 0, 0)):
+    vertices, faces = arrays(trimesh.creation.box((side,) * 3))
+    return vertices + center, faces
+
+
+def plane(height):
+    return np.array([[0, 0, height], [1, 0, height], [1, 1, height], [0, 1, height]], float), np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def measure(a, b, **options):
+    return metrics.surface_protocol(*a, *b, **{"samples": 20_000, "cells": 48, **options})
+
+
+def test_identical_surfaces():
+    found = measure(cube(), cube(), cameras=rig("six", 64))
+    for name in ("distance", "accuracy", "completeness", "hausdorff", "seen_distance", "flipped_share"):
+        assert found[name] == pytest.approx(0, abs=1e-7), name
+    assert found["normal_degrees"] == pytest.approx(0, abs=1e-4)
+    for name in ("f_score", "precision", "recall", "iou", "seen_f_score"):
+        assert found[name] == 1, name
+
+
+def test_parallel_planes():
+    found = measure(plane(0.03), plane(0))
+    assert found["accuracy"] == pytest.approx(0.03) and found["completeness"] == pytest.approx(0.03)
+    assert found["distance"] == pytest.approx(0.03) and found["hausdorff"] == pytest.approx(0.03)
+    assert found["f_score"] == 0 and found["normal_degrees"] == pytest.approx(0, abs=1e-4)
+    assert "iou" not in found  # an open truth has no volume
+    assert measure(plane(0.0099), plane(0))["f_score"] == 1
+
+
+def test_distances_are_in_units_of_the_truths_extent():
+    small = measure(sphere(0.45), sphere(0.5))
+    large = measure(sphere(45, (7, 0, 0)), sphere(50, (7, 0, 0)))
+    assert small["distance"] == pytest.approx(0.05, rel=0.01)
+    assert large["distance"] == pytest.approx(small["distance"], rel=1e-6)
+    assert small["iou"] == pytest.approx(0.9**3, rel=0.01) and large["iou"] == pytest.approx(small["iou"], rel=1e-3)
+
+
+def test_one_way_distances_of_half_a_square():
+    vertices, faces = plane(0)
+    half = measure((vertices * [0.5, 1, 1], faces), (vertices, faces))
+    assert half["accuracy"] == pytest.approx(0, abs=1e-12) and half["precision"] == 1
+    assert half["completeness"] == pytest.approx(0.125, rel=0.02)  # half of it is nearer than 0, the rest 0 to 0.5
+    assert half["recall"] == pytest.approx(0.51, abs=0.01)
+    assert half["f_score"] == pytest.approx(2 * half["recall"] / (1 + half["recall"]))
+
+
+def test_flipped_faces_are_told_apart_from_wrong_normals():
+    vertices, faces = cube()
+    found = measure((vertices, faces[:, ::-1]), (vertices, faces))
+    assert found["flipped_share"] == pytest.approx(1, abs=0.01) and found["normal_degrees"] == pytest.approx(0, abs=1e-4)
+    assert found["iou"] == 1  # the volume is the same
+
+
+def test_normal_angle_of_a_tilted_plane():
+    angle = np.radians(10)
+    turn = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    vertices, faces = plane(0)
+    found = measure((vertices @ turn.T, faces), (vertices, faces))
+    assert found["normal_degrees"] == pytest.approx(10, abs=1e-6)
+
+
+@pytest.mark.parametrize("offset, iou", [(0, 1), (0.25, 0.75 / 1.25), (0.5, 1 / 3)])
+def test_iou_of_offset_cubes_is_exact(offset, iou):
+    # The cube around the truth is 1.1 wide: 22 cells put borders on the faces of both cubes. What of the result lies
+    # outside it, beyond 0.55, is left out of the union.
+    beyond = max(0.0, offset - 0.05)
+    expected = (1 - offset) / (1 + offset - beyond)
+    assert metrics.volume_iou(*cube(1, (offset, 0, 0)), *cube(), cells=22) == pytest.approx(expected, abs=1e-9)
+    assert metrics._grid_iou(*cube(1, (offset, 0, 0)), *cube(), np.zeros(3), 2.0, 64) == pytest.approx(iou, abs=1e-9)
+
+
+def test_iou_of_shapes_apart_is_zero():
+    assert metrics.volume_iou(*cube(0.1, (5, 0, 0)), *cube(), cells=16) == 0
+
+
+def test_closed():
+    vertices, faces = cube()
+    assert metrics.is_closed(vertices, faces)
+    assert not metrics.is_closed(vertices, faces[1:])
+    assert metrics.is_closed(vertices[faces.ravel()], np.arange(faces.size).reshape(-1, 3))  # split at every corner
+    flipped = faces.copy()
+    flipped[0] = flipped[0, ::-1]
+    assert not metrics.is_closed(vertices, flipped)
+    two = np.concatenate([vertices, vertices + [1, 1, 0]])  # two cubes that share an edge
+    assert metrics.is_closed(two, np.concatenate([faces, faces + len(vertices)]))
+    assert not metrics.is_closed(*plane(0))
+
+
+def test_six_views_see_a_sphere_up_to_its_caps():
+    """Cameras on the equator see what faces at least one of them: from below by its azimuths, 45 or 90 degrees apart."""
+    radius, cameras = 0.5, rig("six", 64)
+    vertices, faces = sphere(radius, subdivisions=4)
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=(20000, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    caster = RayCaster(vertices, faces)
+    hits = caster.first_hit(direction * 2, -direction)
+    points = direction * (2 - hits.distance)[:, None]
+    found = metrics.seen(points, caster, cameras, metrics.SEEN_TOLERANCE)
+    # Every direction off the poles has a camera within 45 degrees of azimuth: the whole sphere faces one of them.
+    facing = np.max(direction @ np.stack([c.backward for c in cameras], 1), axis=1)
+    assert found[facing > 0.01].all()
+    one = metrics.seen(points, caster, cameras[:1], metrics.SEEN_TOLERANCE)
+    clear = np.abs(direction[:, 2]) > 0.08  # the tolerance blurs the horizon: 2 r sin(angle) < 2e-3 and the facets
+    assert (one == (direction[:, 2] > 0))[clear].all()
+    assert one.mean() == pytest.approx(0.5, abs=0.02)
+
+
+def test_seen_needs_the_picture_and_nothing_between():
+    vertices, faces = plane(0)
+    low, high = vertices - [0.5, 0.5, 0.2], vertices - [0.5, 0.5, -0.2]
+    both = np.concatenate([low, high * [0.5, 1, 1]]), np.concatenate([faces, faces + 4])
+    caster, camera = RayCaster(*both), rig("six", 64)[:1]
+    points = np.array([[0.4, 0, -0.2], [0.1, 0, -0.2], [0.1, 0, 0.2]])
+    assert metrics.seen(points, caster, camera, 1e-3).tolist() == [True, False, True]
+    near = [camera_at(0, name="near", size=64, half_width=0.3)]
+    assert metrics.seen(points, caster, near, 1e-3).tolist() == [False, False, True]
+
+
+def test_the_seen_part_leaves_the_hidden_error_out():
+    """A box without its bottom, seen from the six views: what is missing is not seen, so the seen part is perfect."""
+    vertices, faces = cube()
+    bottom = (vertices[faces][:, :, 1] < -0.49).all(1)
+    found = measure((vertices, faces[~bottom]), (vertices, faces), cameras=rig("six", 64))
+    assert found["completeness"] > 0.02
+    assert found["seen_distance"] == pytest.approx(0, abs=2e-4)
+    assert found["seen_share"] == pytest.approx(4 / 6, abs=0.02)
+
+
+def test_syncdreamer_identical_and_scaled():
+    same = metrics.syncdreamer_protocol(*sphere(), *sphere())
+    assert same["chamfer"] == 0 and same["iou"] == 1 and same["icp_scale"] == pytest.approx(1, abs=1e-6)
+    found = metrics.syncdreamer_protocol(*sphere(0.4), *sphere(0.5))
+    assert found["chamfer"] == pytest.approx(0.1, rel=0.03)
+    assert found["iou"] == pytest.approx(0.8**3, rel=0.03)
+    assert found["icp_scale"] == pytest.approx(1.25, rel=0.02) and found["icp_chamfer"] < 0.006 and found["icp_iou"] > 0.95
+
+
+def test_syncdreamer_scales_with_the_truth(monkeypatch):
+    monkeypatch.setattr(metrics, "SYNC_SIZE", 64)
+    a = metrics.syncdreamer_protocol(*sphere(0.4), *sphere(0.5))
+    b = metrics.syncdreamer_protocol(*sphere(40, (3, 2, 1)), *sphere(50, (3, 2, 1)))
+    assert b["chamfer"] == pytest.approx(a["chamfer"], rel=1e-3) and b["iou"] == pytest.approx(a["iou"], rel=1e-3)
+
+
+def test_syncdreamer_icp_undoes_a_similarity(monkeypatch):
+    monkeypatch.setattr(metrics, "SYNC_SIZE", 128)
+    rng = np.random.default_rng(0)
+    vertices, faces = arrays(trimesh.creation.box((1, 0.7, 0.4)))
+    vertices, faces = arrays(trimesh.Trimesh(vertices, faces).subdivide().subdivide())
+    vertices = vertices + 0.02 * rng.normal(size=vertices.shape)
+    angle = np.radians(6)
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    found = metrics.syncdreamer_protocol(0.93 * vertices @ turn.T + [0.02, -0.01, 0.03], faces, vertices, faces)
+    assert found["icp_chamfer"] < 0.3 * found["chamfer"] and found["icp_iou"] > 0.95
+    assert found["icp_scale"] == pytest.approx(1 / 0.93, rel=0.01)
+
+
+def test_similarity_is_recovered_exactly():
+    rng = np.random.default_rng(4)
+    points = rng.normal(size=(50, 3))
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    matrix = metrics.similarity(points, 1.7 * points @ turn.T + [1, 2, 3], np.ones(50))
+    np.testing.assert_allclose(matrix[:3], np.concatenate([1.7 * turn, [[1], [2], [3]]], 1), atol=1e-10)
+
+
+def test_voxel_downsample_means():
+    points = np.array([[0, 0, 0], [0.004, 0, 0], [0.5, 0, 0]])
+    np.testing.assert_allclose(metrics.voxel_downsample(points, 0.01), [[0.002, 0, 0], [0.5, 0, 0]])
+
+
+def test_an_unseen_result_gives_no_syncdreamer_figures():
+    far = cube(0.1, (50, 0, 0))
+    assert metrics.syncdreamer_protocol(*far, *cube()) == {}
