@@ -8,37 +8,40 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.fields.sights import WEAK, Sight, free_distance, hull_distance
-from gdtool.geometry.grids import Grid, band_cells, fine_points, grid_over
+from gdtool.cameras import project
+from gdtool.fields.sights import WEAK, Sight, free_distance, hull_distance, pixel_footprint
+from gdtool.geometry.grids import Grid, band_cells, dilate, fine_points, grid_over
 
 COARSE = 2  # fine steps a coarse step
 _CHUNK = 400_000
 
 
-def combined_distance(sights: list[Sight], points: np.ndarray, blend: float, limit: float) -> tuple[np.ndarray, np.ndarray]:
+def combined_distance(sights: list[Sight], points: np.ndarray, step: float, limit: float, noise: float = 0.0,
+                      outvoted: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Signed distance (n,) float32 of points (n, 3) by all views, clipped to +-limit, and whether it is measured (n,) bool.
 
     Outside where any view sees free space. The magnitude is that of the nearest surface among the views that agree
-    with the sign; estimates within about `blend` of it are averaged by their weights, so that views of one surface
-    agree to less than their noise. The silhouettes bound the distance from below. A distance is measured when a view
-    sees the surface there, or when the silhouettes of most views end there (flat tops and bottoms).
+    with the sign; estimates within about a third of a step of it are averaged by their weights. With noise (world
+    units by which the views disagree) the mean of all views that see the surface decides instead. The silhouettes
+    bound the distance from below. A distance is measured when a view sees the surface there, or when the silhouettes
+    of most views end there (flat tops and bottoms). outvoted: how many silhouettes may miss a point of the object.
     """
     out, measured = np.empty(len(points), np.float32), np.zeros(len(points), bool)
     deep = [s for s in sights if s.planes is not None]
     for start in range(0, len(points), _CHUNK):
         part = points[start:start + _CHUNK]
-        value, ending = np.full(len(part), -np.inf, np.float32), np.zeros(len(part), np.int32)
-        for sight in sights:
-            hull = hull_distance(sight, part)
-            np.maximum(value, hull, out=value)
-            ending += np.abs(hull) < limit / 3
+        hull = np.stack([hull_distance(sight, part) for sight in sights]).astype(np.float32)
+        ending = (np.abs(hull) < step).sum(0)
+        value = _vote(hull, outvoted)
         seen = 2 * ending > len(sights)
         if deep:
             pairs = [free_distance(sight, part) for sight in deep]
             free = np.clip(np.stack([v for v, _ in pairs]), -limit, limit).astype(np.float32)
             weight = np.stack([w for _, w in pairs]).astype(np.float32)
-            value = np.maximum(value, _nearest_surface(free, weight, blend, limit))
-            seen |= ((np.abs(free - value) < limit / 3) & (weight > WEAK)).any(0)
+            fused = _mean_surface(free, weight, limit) if noise else _nearest_surface(free, weight, step / 3, limit)
+            # Noisy views have noisy masks: a silhouette cuts only what is more than a pixel or so beside it.
+            value = np.maximum(value - (1.5 * step if noise else 0.0), fused)
+            seen |= ((np.abs(free - value) < step + noise) & (weight > WEAK)).any(0)
         out[start:start + _CHUNK] = np.clip(value, -limit, limit)
         measured[start:start + _CHUNK] = seen
     return out, measured
@@ -61,29 +64,70 @@ def _nearest_surface(value: np.ndarray, weight: np.ndarray, blend: float, limit:
     return (share * value).sum(0) / share.sum(0)
 
 
-def hull_bounds(sights: list[Sight], reach: float = 0.75, samples: int = 48) -> tuple[np.ndarray, np.ndarray]:
+def _vote(hull: np.ndarray, outvoted: int) -> np.ndarray:
+    """The largest distance (n,) of hull (k, n) after the outvoted largest ones."""
+    return hull.max(0) if outvoted == 0 else -np.partition(-hull, outvoted, axis=0)[outvoted]
+
+
+def silhouettes_outvoted(sights: list[Sight], samples: int = 56, reach: float = 0.75) -> int:
+    """How many silhouettes must be ignored at a point, at most, so that the common volume fills the masks.
+
+    0 for views of one object. Views that contradict one another leave a volume that is empty or too thin; then the
+    point is kept that all but one, two, … of them allow, until nine tenths of the typical mask are filled.
+    """
+    axis = np.linspace(-reach, reach, samples)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    hull = np.stack([hull_distance(s, points) for s in sights]).astype(np.float32)
+    half_cell = 0.87 * 2 * reach / (samples - 1)
+    for outvoted in range(max(len(sights) // 2, 1)):
+        inside = points[_vote(hull, outvoted) < half_cell]
+        if len(inside) and np.median([_filled(s, inside, half_cell) for s in sights]) > 0.9:
+            return outvoted
+    return max(len(sights) // 2 - 1, 0)
+
+
+def _filled(sight: Sight, points: np.ndarray, radius: float) -> float:
+    """Share of a view's mask that points, each of the given world radius, cover."""
+    pixels, depth = project(sight.camera, points)
+    h, w = sight.mask.shape
+    hit = np.zeros((h, w), bool)
+    inside = (pixels >= 0).all(1) & (pixels[:, 0] < w) & (pixels[:, 1] < h)
+    hit[pixels[inside, 1].astype(int), pixels[inside, 0].astype(int)] = True
+    grown = dilate(hit, int(np.ceil(radius / float(np.median(pixel_footprint(sight.camera, depth))))))
+    shown = sight.mask > 0.5
+    return float(grown[shown].mean())
+
+
+def _mean_surface(value: np.ndarray, weight: np.ndarray, limit: float) -> np.ndarray:
+    """Weighted mean (n,) of the truncated distances value (k, n) of the views that do not look at something nearer."""
+    share = np.where(value > -limit, weight, 0.0)
+    total = share.sum(0)
+    return np.where(total > 1e-3, (share * value).sum(0) / np.maximum(total, 1e-3), value.max(0))
+
+
+def hull_bounds(sights: list[Sight], outvoted: int = 0, reach: float = 0.75, samples: int = 48) -> tuple[np.ndarray, np.ndarray]:
     """Box (low, high) around the silhouettes' common cone, found on a coarse grid over [-reach, reach]^3."""
     step = 2 * reach / (samples - 1)
     axis = np.linspace(-reach, reach, samples)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    value = np.max([hull_distance(s, points) for s in sights], 0)
+    value = _vote(np.stack([hull_distance(s, points) for s in sights]), outvoted)
     near = points[value < step]
     if len(near) == 0:
         return np.full(3, -0.5), np.full(3, 0.5)
     return near.min(0) - step, near.max(0) + step
 
 
-def carve(sights: list[Sight], step: float) -> tuple[Grid, np.ndarray, np.ndarray]:
+def carve(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 0) -> tuple[Grid, np.ndarray, np.ndarray]:
     """Grid, its signed distances (a, b, c) float32 and where they are measured (a, b, c) bool.
 
-    Exact in a band around the surface and +-3 steps elsewhere.
+    Exact in a band around the surface and +-limit (3 steps, more with noise) elsewhere.
     """
-    limit = 3.0 * step
-    low, high = hull_bounds(sights)
+    limit = max(3.0 * step, 3.0 * noise)
+    low, high = hull_bounds(sights, outvoted)
     grid = grid_over(low, high, step, margin=2 * COARSE, multiple=COARSE)
     coarse_shape = tuple((n - 1) // COARSE + 1 for n in grid.shape)
     index = np.stack(np.meshgrid(*(np.arange(n) * COARSE for n in coarse_shape), indexing="ij"), -1).reshape(-1, 3)
-    coarse = combined_distance(sights, grid.points(index), step / 3, limit)[0].reshape(coarse_shape)
+    coarse = combined_distance(sights, grid.points(index), step, limit, noise, outvoted)[0].reshape(coarse_shape)
 
     touched = np.zeros(tuple(n - 1 for n in coarse_shape), bool)
     for sight in sights:
@@ -91,11 +135,11 @@ def carve(sights: list[Sight], step: float) -> tuple[Grid, np.ndarray, np.ndarra
             seen = np.floor(grid.locate(sight.points[sight.weight > 0]) / COARSE).astype(int)
             seen = seen[((seen >= 0) & (seen < touched.shape)).all(1)]
             touched[tuple(seen.T)] = True
-    fine = fine_points(band_cells(coarse < 0, touched), COARSE)
+    fine = fine_points(dilate(band_cells(coarse < 0, touched), int(round(noise / step))), COARSE)
     values = np.repeat(np.repeat(np.repeat(np.where(coarse < 0, -limit, limit), COARSE, 0), COARSE, 1), COARSE, 2)
     values = np.ascontiguousarray(values[:grid.shape[0], :grid.shape[1], :grid.shape[2]], np.float32)
     measured = np.zeros(grid.shape, bool)
-    values[fine], measured[fine] = combined_distance(sights, grid.points(np.argwhere(fine)), step / 3, limit)
+    values[fine], measured[fine] = combined_distance(sights, grid.points(np.argwhere(fine)), step, limit, noise, outvoted)
     return grid, values, measured
 
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.cameras import Camera
-from gdtool.fields.carve import carve, smooth_unseen
+from gdtool.fields.align import depth_corrections, disagreement
+from gdtool.fields.carve import carve, silhouettes_outvoted, smooth_unseen
 from gdtool.fields.refine import drop_debris, measured_planes, refine
 from gdtool.fields.sights import Sight, pixel_footprint, prepare
 from gdtool.geometry.grids import edge_counts, extract
@@ -42,18 +43,47 @@ def grid_step(cameras: list[Camera], resolution: int) -> float:
     return float(np.clip(0.8 * pixel, 1.0 / MAX_SAMPLES, 1.0 / 64))
 
 
-def fuse_views(sights: list[Sight], step: float) -> Shape:
-    """Mesh of the prepared views. Raises ValueError when the silhouettes have no common volume."""
-    grid, values, measured = carve(sights, step)
+def align_depth(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray | None, normal: np.ndarray | None,
+                step: float) -> tuple[list[Sight], float, float]:
+    """Prepared views whose surfaces were brought together where they disagree, the disagreement before and after.
+
+    Views that agree to a tenth of a step are left as they are.
+    """
+    sights = prepare_all(cameras, mask, depth, normal)
+    before = after = disagreement(sights)
+    if before < 0.1 * step:
+        return sights, before, after
+    depth = np.array(depth)
+    kept = [k for k in range(len(cameras)) if (mask[k] > 0.5).any()]
+    for reach, stiffness in ((0.08, 4.0), (0.06, 2.0), (0.04, 1.0), (0.03, 0.5)):
+        for k, change in zip(kept, depth_corrections(sights, reach, stiffness), strict=True):
+            depth[k] = np.where(depth[k] > 0, depth[k] + change, 0)
+        sights = prepare_all(cameras, mask, depth, normal)
+    return sights, before, disagreement(sights)
+
+
+def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 0) -> Shape:
+    """Mesh of the prepared views. noise: world units by which they disagree; outvoted: see silhouettes_outvoted.
+
+    Raises ValueError when the silhouettes have no common volume.
+    """
+    noise = 0.0 if noise < 0.1 * step else min(noise, 2 * step)
+    grid, values, measured = carve(sights, step, noise, outvoted)
     values = smooth_unseen(values, measured, 1.5)
+    if noise:
+        from scipy.ndimage import gaussian_filter
+
+        values = gaussian_filter(values, min(1.0 + noise / step, 2.5), truncate=2.5)
     vertices, faces = extract(values, grid)
     if len(faces) == 0:
         raise ValueError("the silhouettes have no common volume")
-    support = measured_planes(sights, vertices, vertex_normals(vertices, faces), 1.5 * step)[2]
+    reach = 1.5 * step + noise
+    support = measured_planes(sights, vertices, vertex_normals(vertices, faces), reach)[2]
     deep = any(s.planes is not None for s in sights)
     vertices, faces, dropped = drop_debris(vertices, faces, support if deep else np.ones(len(vertices)), step)
-    vertices = refine(vertices, faces, sights, step)
-    support = measured_planes(sights, vertices, vertex_normals(vertices, faces), 1.5 * step)[2]
+    if not noise and not outvoted:
+        vertices = refine(vertices, faces, sights, step, reach=reach)
+    support = measured_planes(sights, vertices, vertex_normals(vertices, faces), reach)[2]
     return Shape(vertices, faces, support, step, dropped)
 
 

@@ -31,7 +31,7 @@ def measured_planes(sights: list[Sight], vertices: np.ndarray, normals: np.ndarr
     return matrix, vector, total
 
 
-def refine(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: float, *, rounds: int = 2,
+def refine(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: float, *, reach: float, rounds: int = 2,
            smoothness: float = 0.05, iterations: int = 40) -> np.ndarray:
     """New positions (v, 3): least squares of distances to the measured planes and of the umbrella Laplacian.
 
@@ -45,7 +45,7 @@ def refine(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: f
     umbrella = (identity(len(vertices), format="csr", dtype=np.float32) - diags(1 / np.maximum(degree, 1)) @ graph).tocsr()
     start = vertices
     for _ in range(rounds):
-        matrix, vector, total = measured_planes(sights, vertices, vertex_normals(vertices, faces), 1.5 * step)
+        matrix, vector, total = measured_planes(sights, vertices, vertex_normals(vertices, faces), reach)
         unseen = np.exp(-10.0 * total)
         bending = diags((smoothness + unseen).astype(np.float32))
         energy = (umbrella.T @ bending @ umbrella).tocsr().astype(np.float32)

@@ -35,7 +35,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Reconstruct one views folder."""
     import numpy as np
 
-    from gdtool.fields.fusion import fuse_views, grid_step, is_closed_manifold, prepare_all
+    from gdtool.fields.fusion import align_depth, fuse_views, grid_step, is_closed_manifold, silhouettes_outvoted
     from gdtool.folders.surface import Surface, write_surface
     from gdtool.folders.views import read_views
     from gdtool.geometry.normals import vertex_normals
@@ -51,10 +51,17 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             out.skip(domain, "left out by --ignore" if domain in options.ignore else "the views do not hold it")
     _check_masks(folder.path, views, out)
 
+    step = grid_step(views.cameras, options.resolution)
+    with out.step("align"):
+        sights, before, noise = align_depth(views.cameras, views.mask, views.images.get("depth"), views.images.get("normal"), step)
+        outvoted = silhouettes_outvoted(sights)
+        if noise == before and "depth" in views.images:
+            out.skip("alignment of depth", f"the views agree to {noise / step:.3f} of a grid step")
+        if outvoted:
+            out.warn(f"the silhouettes contradict one another: up to {outvoted} of {len(sights)} are outvoted at a point")
     with out.step("fuse"):
-        sights = prepare_all(views.cameras, views.mask, views.images.get("depth"), views.images.get("normal"))
         try:
-            shape = fuse_views(sights, grid_step(views.cameras, options.resolution))
+            shape = fuse_views(sights, step, noise, outvoted)
         except ValueError as error:
             raise InputError(folder.path, str(error), "check the masks and cameras") from None
     with out.step("materials"):
@@ -63,6 +70,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     surface = Surface(shape.vertices, shape.faces, values["albedo"], values["roughness"][:, 0], values["metallic"][:, 0],
                       confidence, normals, None)
     report = {"seen_share": float((shape.support > 0.02).mean()), "pieces_dropped": shape.dropped, "grid_step": shape.step,
+              "disagreement_before": before, "disagreement": noise, "silhouettes_outvoted": outvoted,
               "mean_confidence": float(np.mean(confidence))}
     with out.step("write"):
         write_surface(out, surface, watertight=is_closed_manifold(shape.faces), method=options.method,
