@@ -62,13 +62,13 @@ def seen(points: np.ndarray, caster: RayCaster, cameras: Sequence[Camera], toler
 
 def surface_protocol(vertices: np.ndarray, faces: np.ndarray, true_vertices: np.ndarray, true_faces: np.ndarray, *,
                      cameras: Sequence[Camera] | None = None, samples: int = 100_000, seed: int = 0,
-                     threshold: float = 0.01) -> dict[str, float]:
+                     threshold: float = 0.01, cells: int = IOU_CELLS) -> dict[str, float]:
     """The "surface" protocol: distances from area-weighted samples of each surface to the other *surface*.
 
     Unit: the truth's largest extent. distance is the mean of accuracy (result to truth) and completeness (truth to
     result); precision and recall are the shares within the threshold, f_score their harmonic mean. normal_degrees is
     the mean angle between a sample's normal and that of the closest point, orientation left aside (0 to 90);
-    flipped_share is how many of these face the other way. iou is at 128^3 over the truth's box padded by a tenth, and
+    flipped_share is how many of these face the other way. iou is at cells^3 over the truth's box padded by a tenth, and
     only there when the truth is closed. With cameras the same over what they see of the truth, as seen_*: the truth's
     samples that they see, and the result's samples whose closest point on the truth they see.
     """
@@ -86,7 +86,7 @@ def surface_protocol(vertices: np.ndarray, faces: np.ndarray, true_vertices: np.
     out = _two_ways(accuracy, completeness, cosine, true_cosine, threshold)
     out["hausdorff"] = float(max(accuracy.max(), completeness.max()))
     if is_closed(true_vertices, true_faces):
-        out["iou"] = volume_iou(vertices, faces, true_vertices, true_faces)
+        out["iou"] = volume_iou(vertices, faces, true_vertices, true_faces, cells)
     if cameras:
         caster = RayCaster(true_vertices * extent, true_faces)
         tolerance = SEEN_TOLERANCE * extent
@@ -216,8 +216,8 @@ def align(points: np.ndarray, others: np.ndarray, steps: int = 60, count: int = 
 
     Pairs are taken both ways: with one way only, the best scale of a part is to shrink onto a point.
     """
-    rng = np.random.default_rng(0)
-    a, b = (part[rng.permutation(len(part))[:count]] for part in (points, others))
+    # Each with a generator of its own: of equal clouds equal points are drawn, which then stay where they are.
+    a, b = (part[np.random.default_rng(0).permutation(len(part))[:count]] for part in (points, others))
     total, last = np.eye(4), np.inf
     for _ in range(steps):
         moved = a @ total[:3, :3].T + total[:3, 3]
