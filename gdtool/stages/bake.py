@@ -43,14 +43,15 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.texture.maps import make_maps
     from gdtool.texture.occlusion import bake_occlusion
     from gdtool.texture.reproject import vertex_reach
-    from gdtool.texture.target import texels_of
+    from gdtool.texture.target import texel_width, texels_of
 
     with out.step("read"):
         mesh, matrix = _read_mesh(inputs)
-        origin = _read_origin(inputs, options, matrix, out)
     with out.step("frames"):
         target, face_idx = _target_of(mesh)
         _check_overlap(target, inputs, out)
+    with out.step("source"):
+        origin = _read_origin(inputs, options, matrix, texel_width(target, options.size), out)
     with out.step("rasterise"):
         texels = texels_of(target, options.size)
         if not texels.inside:
@@ -109,7 +110,7 @@ def _read_mesh(inputs: Inputs):
     return mesh, matrix
 
 
-def _read_origin(inputs: Inputs, options: Options, matrix, out: Output):
+def _read_origin(inputs: Inputs, options: Options, matrix, width: float, out: Output):
     """What to bake from: the surface (with its views), a model named by --model, or the model that was remeshed."""
     from pathlib import Path
 
@@ -141,7 +142,7 @@ def _read_origin(inputs: Inputs, options: Options, matrix, out: Output):
         raise InputError(_path(inputs), "has no surface to bake from along its provenance chain", "name one with --surface or --model")
     from gdtool.assets.load import load_scene
 
-    return from_scene(load_scene(named), matrix)
+    return from_scene(load_scene(named), matrix, width)
 
 
 def _target_of(mesh):

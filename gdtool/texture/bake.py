@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -100,6 +100,15 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
     return looked, domains
 
 
+def _mapped(run: Callable, parts: list, threads: int) -> Iterator:
+    """run(part) of each part, in order, on several threads."""
+    if threads <= 1:
+        yield from map(run, parts)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        yield from pool.map(run, parts)
+
+
 def _read(target: Target, source: Source, lookup: Lookup, reach: np.ndarray, face_idx: np.ndarray,
           barycentric: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, Places]:
     points, frames = points_at(target, face_idx, barycentric)
@@ -123,8 +132,7 @@ def bake(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: 
         return {k: v.astype(np.float32) for k, v in values.items()}, points.astype(np.float32), smooth.astype(np.float32), places.by_ray
 
     parts = [slice(s, min(s + _TEXELS_AT_ONCE, len(texels))) for s in range(0, len(texels), _TEXELS_AT_ONCE)]
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        done = list(progress(pool.map(run, parts), len(parts), "bake"))
+    done = list(progress(_mapped(run, parts, threads), len(parts), "bake"))
     values = {name: np.concatenate([one[0][name] for one in done]) for name in done[0][0]}
     positions, normals = np.concatenate([one[1] for one in done]), np.concatenate([one[2] for one in done])
     by_ray = np.concatenate([one[3] for one in done])
@@ -195,8 +203,7 @@ def occlusion_tracer(target: Target, source: Source, reach: np.ndarray, normals:
             return openness(at + geometric * lift, smooth, source.caster, rays, seed + part.start, lift=0.0)
 
         parts = [slice(s, s + 50_000) for s in range(0, len(face_idx), 50_000)]
-        with ThreadPoolExecutor(max(1, threads)) as pool:
-            traced = list(pool.map(run, parts))
+        traced = list(_mapped(run, parts, threads))
         return np.concatenate(traced) if traced else np.zeros(0, np.float32)
 
     return trace

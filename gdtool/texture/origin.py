@@ -58,25 +58,27 @@ def _views_are_finer(views: Views, source: Source) -> bool:
     return float(pixel_footprint(views.cameras[0], depth)) <= 1.5 * edge
 
 
-def from_scene(scene: Scene, source_from_world: np.ndarray) -> Origin:
-    """A model with its own textures, in its own frame; source_from_world (4, 4) takes the normalised frame there."""
-    from gdtool.shading.surface_points import surface_attributes
+def from_scene(scene: Scene, source_from_world: np.ndarray, texel_width: float = 0.0) -> Origin:
+    """A model with its own textures, in its own frame; source_from_world (4, 4) takes the normalised frame there.
+
+    texel_width is what a texel of the baked maps spans, in the normalised frame: finer textures are averaged over it.
+    """
+    from gdtool.shading.surface_points import SurfaceLookup
 
     matrix = invert_similarity(source_from_world)
     turn = matrix[:3, :3] / np.sqrt((matrix[:3, 0] ** 2).sum())
     source = Source.of(transform_points(matrix, scene.vertices), scene.faces)
     normals = scene.normals @ turn.T if scene.normals is not None else vertex_normals(source.vertices, source.faces)
 
+    points = SurfaceLookup(scene)
+    width = texel_width * np.sqrt((source_from_world[:3, 0] ** 2).sum())
+
     def lookup(places: Places) -> dict[str, np.ndarray]:
-        read = surface_attributes(scene, places.face_idx, places.barycentric)
-        normal = np.asarray(read["normal"]) @ turn.T
-        # Both sides of a face may be seen; a bake is for the outer one.
-        flip = (normal * source.face_normals[places.face_idx]).sum(1) < 0
-        normal[flip] *= -1
-        out = {name: np.asarray(read[name]).reshape(len(normal), -1).squeeze(-1) if name != "albedo" else np.asarray(read[name])
-               for name in ("albedo", "roughness", "metallic", "alpha")}
-        out["normal"] = normal
-        return out
+        read = points.attributes(places.face_idx, places.barycentric.astype(np.float64), np.full(len(places.face_idx), width))
+        normal = read["normal"] @ turn.T
+        # Files whose winding and normals disagree are common; the winding says which side is outside.
+        normal[(normal * source.face_normals[places.face_idx]).sum(1) < 0] *= -1
+        return {"albedo": read["albedo"], "roughness": read["roughness"], "metallic": read["metallic"], "alpha": read["alpha"], "normal": normal}
 
     modes = {material.alpha_mode for material in scene.materials}
     mode = next((m for m in ("BLEND", "MASK") if m in modes), "OPAQUE")

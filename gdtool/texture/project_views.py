@@ -95,7 +95,8 @@ def _read(sight: Sight, stack: np.ndarray, mask: np.ndarray, points: np.ndarray,
     facing, value, clear, weight_sum = facing[read], value[read], clear[read], weight_sum[read]
     cosine = cosine[read]
     value /= weight_sum[:, None]
-    away = np.clip(clear / weight_sum / 3.0, 0.1, 1.0)  # three pixels from a silhouette a view is as good as it gets
+    # Three pixels from a silhouette a view is as good as it gets; at it, still better than none.
+    away = np.clip(0.3 + 0.7 * (clear / weight_sum - 0.5) / 2.5, 0.3, 1.0)
     return facing, value, cosine * away * weight_sum
 
 
@@ -115,7 +116,7 @@ def observe(points: np.ndarray, normals: np.ndarray, sights: list[Sight], stack:
         seen, read, good = _read(sight, stack[k], mask[k], points, normals)
         value[k, seen], quality[k, seen] = read, good
     best = quality.max(0)
-    confidence = np.clip((best - 0.1) / 0.25, 0, 1)
+    confidence = np.clip((best - 0.04) / 0.11, 0, 1)
     share = quality / np.maximum(best, 1e-6)
     _reject(value, share, prior)
     weight = share**sharpness

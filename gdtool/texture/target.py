@@ -114,3 +114,11 @@ def points_at(target: Target, face_idx: np.ndarray, barycentric: np.ndarray) -> 
     weights = barycentric.astype(np.float64)
     points = np.einsum("nk,nkc->nc", weights, target.vertices[target.faces[face_idx]])
     return points, frame_at(target.normals[face_idx], target.tangents[face_idx], weights)
+
+
+def texel_width(target: Target, size: int) -> float:
+    """What a texel of a size x size map spans on the target, in its units: the square root of surface over texels."""
+    area = face_normals(target.vertices, target.faces)[1].sum()
+    u, v = (target.uv[target.face_uvs[:, k]] - target.uv[target.face_uvs[:, 0]] for k in (1, 2))
+    covered = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum()
+    return float(np.sqrt(area / max(covered, 1e-12)) / size)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gdtool.cameras import project, rays, rig
+from gdtool.cameras import rays, rig
 from gdtool.core.folder import open_folder
 from gdtool.core.kinds import AtlasContent
 from gdtool.core.manifest import MANIFEST, InputEntry, Manifest, encode, list_files
@@ -95,4 +95,3 @@ def write_atlas(path: Path, inputs: dict[str, Path], mesh: QuadMesh | None = Non
     return finish(path, "atlas", content, inputs)
 
 
-__all__ = ["make_chain", "project", "torus_views", "write_atlas"]

@@ -1,0 +1,160 @@
+"""gdtool bake by its command line: an atlas of a torus with the surface and views it came from."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gdtool.core.folder import open_folder
+from gdtool.folders.mesh import QuadMesh, write_obj
+from gdtool.images.io import read_image
+from tests.stages.bake_folders import make_chain, torus_atlas, write_atlas
+from tests.texture.shapes import albedo_of, psnr
+
+FAST = ("--size", 128, "--ao-rays", 16)
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory):
+    """Folders of a torus, made once; tests bake to places of their own."""
+    return make_chain(tmp_path_factory.mktemp("chain") / "ring.asset")
+
+
+def rendered_albedo(asset: Path, chain: Path) -> float:
+    """PSNR in sRGB of the asset's base colour at the pixels of the chain's views, foreground only."""
+    from gdtool.assets.load import load_scene
+    from gdtool.cameras import rays
+    from gdtool.geometry.rays import RayCaster
+    from gdtool.images.color import srgb_from_linear
+    from gdtool.shading.surface_points import SurfaceLookup
+    from tests.stages.bake_folders import torus_views
+
+    scene, views = load_scene(asset / "asset.glb"), torus_views()
+    lookup, caster = SurfaceLookup(scene), RayCaster(scene.vertices, scene.faces)
+    ours, theirs = [], []
+    for k, camera in enumerate(views.cameras):
+        origins, directions = rays(camera)
+        hits = caster.first_hit(origins.reshape(-1, 3), directions.reshape(-1, 3))
+        both = hits.found & (views.mask[k].ravel() > 0)
+        ours.append(lookup.attributes(hits.face_idx[both], hits.barycentric[both])["albedo"])
+        theirs.append(views.images["albedo"][k].reshape(-1, 3)[both])
+    return psnr(srgb_from_linear(np.concatenate(ours)), srgb_from_linear(np.concatenate(theirs)))
+
+
+def test_writes_a_folder_that_validates_and_skips_the_second_time(gdtool, chain, tmp_path):
+    done = gdtool("bake", chain, *FAST, "-o", "out")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "out\n"
+    check = gdtool("validate", "out")
+    assert check.returncode == 0, check.stderr + check.stdout
+    content = open_folder(tmp_path / "out").content
+    assert content.maps == {"base_color": "base_color.png", "orm": "orm.png", "normal": "normal.png"}
+    assert content.factors["metallic"] == (0.0,) and content.factors["base_color"] == (1, 1, 1, 1)
+    assert content.report["materials_from"].startswith("views: albedo")
+    before = (tmp_path / "out" / "asset.glb").read_bytes()
+    again = gdtool("bake", chain, *FAST, "-o", "out")
+    assert again.returncode == 0 and "up to date" in again.stderr
+    other = gdtool("bake", chain, *FAST, "-o", "twin")
+    assert other.returncode == 0 and (tmp_path / "twin" / "asset.glb").read_bytes() == before
+    assert rendered_albedo(tmp_path / "out", chain) > 28
+
+
+def test_views_serve_where_vertices_know_nothing(gdtool, tmp_path):
+    atlas = make_chain(tmp_path / "gray.asset", gray_vertices=True)
+    assert gdtool("bake", atlas, *FAST, "--no-ao", "-o", "with").returncode == 0
+    assert gdtool("bake", atlas, *FAST, "--no-ao", "--no-project-views", "-o", "without").returncode == 0
+    assert rendered_albedo(tmp_path / "with", atlas) > 26 > 20 > rendered_albedo(tmp_path / "without", atlas)
+    skipped = {skip.what: skip.reason for skip in open_folder(tmp_path / "without").manifest.skipped}
+    assert skipped["views"] == "left out by --no-project-views" and "occlusion" in skipped
+
+
+def test_without_views_the_vertices_serve_and_it_says_so(gdtool, tmp_path):
+    atlas = make_chain(tmp_path / "ring.asset", with_views=False)
+    done = gdtool("bake", *FAST, "--json", stdin=f"{atlas}\n")
+    assert done.returncode == 0, done.stderr
+    record = json.loads(done.stdout)
+    assert record["kind"] == "asset" and Path(record["folder"]) == atlas.parent / "asset"
+    assert any("none along the provenance chain" in skip for skip in record["skipped"])
+    base = read_image(atlas.parent / "asset" / "base_color.png")
+    assert base.shape == (128, 128, 3) and base.min() > 40  # no black, gutters included; albedo's darkest is 0.1
+
+
+def test_quads_stay_quads_and_the_options_do_what_they_say(gdtool, chain, tmp_path):
+    done = gdtool("bake", chain, *FAST, "--bits", 16, "--normal-convention", "directx", "-o", "dx")
+    assert done.returncode == 0, done.stderr
+    assert gdtool("bake", chain, *FAST, "--bits", 16, "-o", "gl").returncode == 0
+    dx, gl = (read_image(tmp_path / one / "normal.png") for one in ("dx", "gl"))
+    assert dx.dtype == np.uint16
+    np.testing.assert_array_equal(dx[..., 1], 65535 - gl[..., 1])
+    np.testing.assert_array_equal(dx[..., 0], gl[..., 0])
+    obj, library = (tmp_path / "gl" / "asset.obj").read_text().splitlines(), (tmp_path / "gl" / "asset.mtl").read_text()
+    mesh = torus_atlas()
+    assert sum(line.startswith("f ") and len(line.split()) == 5 for line in obj) == mesh.is_quad.sum() > 500
+    for line in ("map_Kd base_color.png", "map_Pr -imfchan g orm.png", "norm normal.png"):
+        assert line in library.splitlines()
+
+
+def test_source_frame_undoes_the_normalisation(gdtool, tmp_path):
+    from gdtool.assets.load import load_scene
+
+    atlas = make_chain(tmp_path / "ring.asset", with_views=False)
+    manifest = json.loads((atlas / "manifest.json").read_text())
+    turn = [[0, 0, 10, 3], [0, 10, 0, 4], [-10, 0, 0, 5], [0, 0, 0, 1]]
+    manifest["content"]["source_from_world"] = [float(x) for row in turn for x in row]
+    (atlas / "manifest.json").write_text(json.dumps(manifest))
+    assert gdtool("bake", atlas, *FAST, "--no-ao", "-o", "own").returncode == 0
+    done = gdtool("bake", atlas, *FAST, "--no-ao", "--source-frame", "-o", "source")
+    assert done.returncode == 0, done.stderr
+    own, source = (load_scene(tmp_path / one / "asset.glb") for one in ("own", "source"))
+    matrix = np.array(turn, float)
+    np.testing.assert_allclose(source.vertices, own.vertices @ matrix[:3, :3].T + matrix[:3, 3], atol=1e-4)
+    np.testing.assert_allclose(source.normals, own.normals @ matrix[:3, :3].T / 10, atol=1e-5)
+    assert open_folder(tmp_path / "source").content.frame == "source"
+
+
+def test_bakes_a_textured_model_that_was_remeshed(gdtool, chain, tmp_path):
+    # What bake writes is itself a model with textures: bake it again into another atlas.
+    assert gdtool("bake", chain, "--size", 256, "--no-ao", "-o", "first").returncode == 0
+    write_atlas(tmp_path / "again", {})
+    done = gdtool("bake", "again", *FAST, "--model", "first/asset.glb", "-o", "second")
+    assert done.returncode == 0, done.stderr
+    assert rendered_albedo(tmp_path / "second", chain) > 26
+    assert open_folder(tmp_path / "second").content.report["materials_from"] == "model"
+
+
+@pytest.mark.parametrize("fault, code, message", [
+    ("no uv", 3, "has no texture coordinates; run gdtool unwrap"),
+    ("no surface", 3, "has no surface to bake from along its provenance chain; name one with --surface or --model"),
+    ("no texel", 3, "cover no texel; run gdtool unwrap"),
+    ("not there", 3, "does not exist"),
+    ("size", 2, "--size"),
+])
+def test_bad_input_exits_with_one_line(gdtool, chain, tmp_path, fault, code, message):
+    mesh, surface, options = torus_atlas(), ("--surface", chain.parent / "surface"), ()
+    if fault == "no uv":
+        mesh = QuadMesh(mesh.vertices, mesh.faces)
+    elif fault == "no surface":
+        surface = ()
+    elif fault == "no texel":
+        mesh = QuadMesh(mesh.vertices, mesh.faces, mesh.uv * 1e-6, mesh.face_uvs)
+    elif fault == "size":
+        options = ("--size", 1)
+    if fault != "not there":
+        write_obj(tmp_path / "low.obj", mesh)
+    done = gdtool("bake", "low.obj", *surface, *options)
+    assert done.returncode == code and message in done.stderr, done.stderr
+    assert "Traceback" not in done.stderr and done.stdout == ""
+    if code == 3:
+        assert len(done.stderr.strip().splitlines()[-1:]) == 1
+    assert not (tmp_path / "low.asset" / "asset").exists()
+
+
+def test_overlapping_texture_coordinates_are_told(gdtool, chain, tmp_path):
+    mesh = torus_atlas()
+    half = len(mesh.faces) // 2
+    folded = mesh.face_uvs.copy()
+    folded[half:half * 2] = folded[:half]
+    write_atlas(tmp_path / "atlas", {"source": chain.parent / "surface"}, QuadMesh(mesh.vertices, mesh.faces[mesh.is_quad], mesh.uv, folded[mesh.is_quad]))
+    done = gdtool("bake", "atlas", *FAST, "--no-ao", "-o", "out")
+    assert done.returncode == 0 and "texture coordinates overlap on" in done.stderr
