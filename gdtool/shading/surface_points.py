@@ -1,0 +1,172 @@
+"""What a scene's surface is made of at given points of its triangles (glTF 2.0 metallic-roughness)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.assets.scene import Scene, Texture
+from gdtool.geometry.normals import face_normals
+from gdtool.shading.textures import TextureReader
+
+ATTRIBUTES = ("albedo", "roughness", "metallic", "normal", "geometric_normal", "alpha", "emissive")
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-30)
+
+
+class SurfaceLookup:
+    """Material lookup of one scene; textures' coarser levels and tangents are made when first needed."""
+
+    def __init__(self, scene: Scene):
+        self.scene = scene
+        self.face_normals, self.face_areas = face_normals(scene.vertices, scene.faces)
+        self._readers: dict[int, TextureReader] = {}
+        self._uv_areas: dict[int, np.ndarray] = {}
+        self._tangents: dict[int, np.ndarray] = {}
+
+    def alpha_faces(self) -> np.ndarray:
+        """(f,) bool: faces whose material is alpha-tested (MASK or BLEND)."""
+        tested = np.array([m.alpha_mode != "OPAQUE" for m in self.scene.materials] or [False])
+        return tested[self.scene.material_idx]
+
+    def _reader(self, texture: Texture) -> TextureReader:
+        if id(texture) not in self._readers:
+            self._readers[id(texture)] = TextureReader(texture)
+        return self._readers[id(texture)]
+
+    def _uv(self, texture: Texture) -> np.ndarray | None:
+        sets = self.scene.uvs
+        return sets[texture.uv_set] if texture.uv_set < len(sets) else None
+
+    def _density(self, texture: Texture, face_idx: np.ndarray) -> np.ndarray:
+        """Texels per world unit (n,) on faces, square root of the ratio of areas."""
+        if texture.uv_set not in self._uv_areas:
+            a, b, c = (self._uv(texture)[self.scene.faces[:, i]] for i in range(3))
+            u, v = b - a, c - a
+            area = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
+            self._uv_areas[texture.uv_set] = area / np.maximum(self.face_areas, 1e-300)
+        height, width = texture.image.shape[:2]
+        stretch = abs(texture.scale[0] * texture.scale[1]) * height * width
+        return np.sqrt(self._uv_areas[texture.uv_set][face_idx] * stretch)
+
+    def _read(self, texture: Texture | None, face_idx: np.ndarray, barycentric: np.ndarray, footprint) -> np.ndarray | None:
+        """(n, c) linear texels, or None where there is no texture or no such UV set."""
+        uv = None if texture is None else self._uv(texture)
+        if uv is None:
+            return None
+        at = np.einsum("nij,ni->nj", uv[self.scene.faces[face_idx]], barycentric)
+        width = None if footprint is None else footprint * self._density(texture, face_idx)
+        return self._reader(texture).read(at, width)
+
+    def shading_normals(self, face_idx: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
+        """(n, 3) unit interpolated vertex normals, the face's where there are none."""
+        flat = self.face_normals[face_idx]
+        if self.scene.normals is None:
+            return flat
+        smooth = np.einsum("nij,ni->nj", self.scene.normals[self.scene.faces[face_idx]], barycentric)
+        length = np.linalg.norm(smooth, axis=1, keepdims=True)
+        return np.where(length > 1e-6, smooth / np.maximum(length, 1e-6), flat)
+
+    def _tangent(self, texture: Texture, face_idx: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
+        """(n, 4) interpolated tangents: the file's, else MikkTSpace's for the texture's UV set."""
+        if self.scene.tangents is not None and texture.uv_set == 0:
+            corners = self.scene.tangents[self.scene.faces[face_idx]]
+        else:
+            if texture.uv_set not in self._tangents:
+                from gdtool.texture.tangents import corner_tangents
+
+                scene = self.scene
+                own = scene.normals is None
+                normals = self.face_normals if own else scene.normals
+                normal_idx = np.repeat(np.arange(len(scene.faces))[:, None], 3, 1) if own else None
+                self._tangents[texture.uv_set] = corner_tangents(scene.vertices, scene.faces, normals, self._uv(texture), scene.faces, normal_idx)
+            corners = self._tangents[texture.uv_set][face_idx]
+        out = np.einsum("nij,ni->nj", corners, barycentric)
+        out[:, 3] = np.where(corners[:, 0, 3] < 0, -1.0, 1.0)
+        return out
+
+    def _normal_mapped(self, texture: Texture, scale: float, texel: np.ndarray, normal: np.ndarray, tangent: np.ndarray) -> np.ndarray:
+        local = 2.0 * texel[:, :3] - 1.0
+        along, across = local[:, :1] * scale, local[:, 1:2] * scale
+        c, s = np.cos(texture.rotation), np.sin(texture.rotation)
+        if s != 0.0 or texture.scale[0] < 0 or texture.scale[1] < 0:
+            # The map's axes are turned against the UV's: bring the perturbation back to the UV's axes.
+            along, across = along * np.sign(texture.scale[0]), across * np.sign(texture.scale[1])
+            along, across = c * along + s * across, -s * along + c * across
+        bitangent = np.cross(normal, tangent[:, :3]) * tangent[:, 3:]
+        return _unit(along * tangent[:, :3] + across * bitangent + local[:, 2:3] * normal)
+
+    def alpha(self, face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Alpha (n,) and the alpha below which a point is not there (n,): 0 for OPAQUE, the cutoff for MASK, 0.5 for BLEND."""
+        scene = self.scene
+        alpha, cutoff = np.ones(len(face_idx), np.float32), np.zeros(len(face_idx), np.float32)
+        owner = scene.material_idx[face_idx]
+        for m in np.unique(owner):
+            material = scene.materials[m]
+            if material.alpha_mode == "OPAQUE":
+                continue
+            chosen = np.flatnonzero(owner == m)
+            value = np.full(len(chosen), material.base_color[3], np.float32)
+            texel = self._read(material.base_color_texture, face_idx[chosen], barycentric[chosen], None)
+            if texel is not None and texel.shape[1] in (2, 4):
+                value *= texel[:, -1]
+            if scene.colors is not None:
+                value *= np.einsum("ni,ni->n", scene.colors[scene.faces[face_idx[chosen]], 3], barycentric[chosen]).astype(np.float32)
+            alpha[chosen] = value
+            cutoff[chosen] = material.alpha_cutoff if material.alpha_mode == "MASK" else 0.5
+        return alpha, cutoff
+
+    def attributes(self, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None,
+                   directions: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """Attributes at n points: albedo, emissive (n, 3) linear, roughness, metallic, alpha (n,), normal and
+        geometric_normal (n, 3) unit, unlit (n,) bool; float32.
+
+        footprint (n,): width in world units that a point stands for; picks the texture level. directions (n, 3): rays
+        that see the points; normals are then turned to the seen side, as glTF asks for double-sided materials (and as
+        is done here for all, since files whose winding and normals disagree are common).
+        """
+        scene, n = self.scene, len(face_idx)
+        footprint = None if footprint is None else np.broadcast_to(footprint, (n,))
+        albedo, emissive = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
+        roughness, metallic = np.empty(n, np.float32), np.empty(n, np.float32)
+        alpha, unlit = np.ones(n, np.float32), np.zeros(n, bool)
+        vertex_normal = self.shading_normals(face_idx, barycentric)
+        normal = vertex_normal.copy()
+        owner = scene.material_idx[face_idx]
+        for m in np.unique(owner):
+            material = scene.materials[m]
+            at = np.flatnonzero(owner == m)
+            here = (face_idx[at], barycentric[at], None if footprint is None else footprint[at])
+            color = np.broadcast_to(np.asarray(material.base_color, np.float32), (len(at), 4)).copy()
+            texel = self._read(material.base_color_texture, *here)
+            if texel is not None:
+                color[:, :3] *= texel[:, :3] if texel.shape[1] >= 3 else texel[:, :1]
+                if texel.shape[1] in (2, 4):
+                    color[:, 3] *= texel[:, -1]
+            if scene.colors is not None:
+                color *= np.einsum("nij,ni->nj", scene.colors[scene.faces[here[0]]], here[1]).astype(np.float32)
+            albedo[at] = color[:, :3]
+            alpha[at] = color[:, 3] if material.alpha_mode != "OPAQUE" else 1.0
+            texel = self._read(material.metallic_roughness_texture, *here)
+            roughness[at] = material.roughness * (texel[:, 1] if texel is not None and texel.shape[1] >= 3 else 1.0)
+            metallic[at] = material.metallic * (texel[:, 2] if texel is not None and texel.shape[1] >= 3 else 1.0)
+            texel = self._read(material.emissive_texture, *here) if any(material.emissive) else None
+            emissive[at] = np.asarray(material.emissive, np.float32) * (texel[:, :3] if texel is not None else 1.0)
+            unlit[at] = material.unlit
+            texel = self._read(material.normal_texture, *here)
+            if texel is not None and texel.shape[1] >= 3:
+                tangent = self._tangent(material.normal_texture, *here[:2])
+                normal[at] = self._normal_mapped(material.normal_texture, material.normal_scale, texel, vertex_normal[at], tangent)
+        geometric = self.face_normals[face_idx]
+        if directions is not None:
+            geometric = np.where((geometric * directions).sum(1, keepdims=True) > 0, -geometric, geometric)
+            normal = np.where((vertex_normal * geometric).sum(1, keepdims=True) < 0, -normal, normal)
+        return {"albedo": np.clip(albedo, 0, 1), "roughness": np.clip(roughness, 0, 1), "metallic": np.clip(metallic, 0, 1),
+                "alpha": np.clip(alpha, 0, 1), "emissive": np.maximum(emissive, 0), "unlit": unlit,
+                "normal": normal.astype(np.float32), "geometric_normal": geometric.astype(np.float32)}
+
+
+def surface_attributes(scene: Scene, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """SurfaceLookup(scene).attributes for one call: see there."""
+    return SurfaceLookup(scene).attributes(np.asarray(face_idx), np.asarray(barycentric, np.float64), footprint)

@@ -1,0 +1,128 @@
+"""Texture lookup: wrap modes, bilinear filter, box-filtered levels, sRGB decoded before filtering."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.assets.scene import Texture
+from gdtool.images.color import linear_from_srgb, unit_range
+
+# Rows decoded at a time when the first level is built: bounds the memory of a 4k texture.
+BAND = 256
+
+
+def transform_uv(texture: Texture, uv: np.ndarray) -> np.ndarray:
+    """KHR_texture_transform: offset + rotation * (scale * uv); a positive angle turns uv counter-clockwise as drawn
+    with v down, so the picture turns clockwise. uv (n, 2)."""
+    if texture.rotation == 0.0 and texture.scale == (1.0, 1.0) and texture.offset == (0.0, 0.0):
+        return uv
+    c, s = np.cos(texture.rotation), np.sin(texture.rotation)
+    u, v = uv[:, 0] * texture.scale[0], uv[:, 1] * texture.scale[1]
+    return np.stack([c * u + s * v + texture.offset[0], -s * u + c * v + texture.offset[1]], 1)
+
+
+def wrap_index(index: np.ndarray, size: int, wrap: str) -> np.ndarray:
+    """Texel indices (n,) int64, any value, to [0, size) by a glTF wrap mode."""
+    if wrap == "clamp":
+        return np.clip(index, 0, size - 1)
+    if wrap == "mirror":
+        folded = index % (2 * size)
+        return np.where(folded < size, folded, 2 * size - 1 - folded)
+    return index % size
+
+
+class TextureReader:
+    """A texture's texels as linear float32, finest level as stored, coarser ones by 2x2 box averages made when asked."""
+
+    def __init__(self, texture: Texture):
+        self.texture = texture
+        image = texture.image if texture.image.ndim == 3 else texture.image[..., None]
+        self.colored = texture.encoding == "srgb"
+        self.levels: list[np.ndarray] = [np.ascontiguousarray(image)]
+        values = np.arange(256 if image.dtype == np.uint8 else 65536 if image.dtype == np.uint16 else 0)
+        self._linear = unit_range(values.astype(image.dtype)).astype(np.float32) if len(values) else None
+        self._table = linear_from_srgb(values.astype(image.dtype)).astype(np.float32) if len(values) and self.colored else self._linear
+
+    @property
+    def channels(self) -> int:
+        return self.levels[0].shape[-1]
+
+    @property
+    def depth(self) -> int:
+        """How many levels there can be: halving stops at the first odd side."""
+        height, width = self.levels[0].shape[:2]
+        return 1 + min((height & -height).bit_length() - 1, (width & -width).bit_length() - 1)
+
+    def decode(self, texels: np.ndarray) -> np.ndarray:
+        """Stored texels (..., c) of the finest level to linear float32; alpha is never sRGB."""
+        colors = texels.shape[-1] if texels.shape[-1] in (1, 3) else texels.shape[-1] - 1
+        if self._linear is None:
+            out = np.array(texels, np.float32)
+            if self.colored:
+                out[..., :colors] = linear_from_srgb(out[..., :colors])
+            return out
+        out = np.take(self._table, texels)
+        if self.colored and colors < texels.shape[-1]:
+            out[..., colors:] = np.take(self._linear, texels[..., colors:])
+        return out
+
+    def level(self, k: int) -> np.ndarray:
+        """(h / 2^k, w / 2^k, c): level 0 as stored, the others linear float32."""
+        while len(self.levels) <= k:
+            finer = self.levels[-1]
+            height, width, channels = finer.shape
+            coarse = np.empty((height // 2, width // 2, channels), np.float32)
+            for row in range(0, height, BAND):
+                band = finer[row:row + BAND]
+                band = self.decode(band) if len(self.levels) == 1 else band
+                pairs = band[0::2] + band[1::2]
+                coarse[row // 2:row // 2 + len(pairs)] = (pairs[:, 0::2] + pairs[:, 1::2]) * np.float32(0.25)
+            self.levels.append(coarse)
+        return self.levels[k]
+
+    def read(self, uv: np.ndarray, texels_per_sample: np.ndarray | None = None) -> np.ndarray:
+        """(n, c) linear float32 at uv (n, 2), texture transform included.
+
+        texels_per_sample (n,): width of what a sample stands for, in texels of the finest level; the nearest level at
+        least as sharp as that is read, so supersampling converges to the finest level's box average.
+        """
+        uv = transform_uv(self.texture, np.nan_to_num(np.asarray(uv, np.float64), posinf=0.0, neginf=0.0))
+        if texels_per_sample is None or self.depth == 1 or self.texture.filter == "nearest":
+            return self._read_level(uv, 0)
+        wanted = np.clip(np.floor(np.log2(np.maximum(texels_per_sample, 1.0)) + 0.25).astype(np.int64), 0, self.depth - 1)
+        low, high = int(wanted.min(initial=0)), int(wanted.max(initial=0))
+        if low == high:
+            return self._read_level(uv, low)
+        out = np.empty((len(uv), self.channels), np.float32)
+        for k in range(low, high + 1):
+            chosen = np.flatnonzero(wanted == k)
+            if len(chosen):
+                out[chosen] = self._read_level(uv[chosen], k)
+        return out
+
+    def _read_level(self, uv: np.ndarray, k: int) -> np.ndarray:
+        image = self.level(k)
+        height, width, channels = image.shape
+        flat = image.reshape(-1, channels)
+        # One period is enough for every wrap mode but clamp, and keeps huge coordinates exact enough.
+        period = {"repeat": 1.0, "mirror": 2.0}
+        u = uv[:, 0] % period[self.texture.wrap_u] if self.texture.wrap_u in period else np.clip(uv[:, 0], -1, 2)
+        v = uv[:, 1] % period[self.texture.wrap_v] if self.texture.wrap_v in period else np.clip(uv[:, 1], -1, 2)
+        x, y = u * width, v * height
+        if self.texture.filter == "nearest":
+            column = wrap_index(np.floor(x).astype(np.int64), width, self.texture.wrap_u)
+            row = wrap_index(np.floor(y).astype(np.int64), height, self.texture.wrap_v)
+            return self._texels(flat, row * width + column, k)
+        x, y = x - 0.5, y - 0.5
+        x0, y0 = np.floor(x), np.floor(y)
+        fx, fy = (x - x0).astype(np.float32)[:, None], (y - y0).astype(np.float32)[:, None]
+        x0, y0 = x0.astype(np.int64), y0.astype(np.int64)
+        left, right = (wrap_index(x0 + i, width, self.texture.wrap_u) for i in (0, 1))
+        top, bottom = (wrap_index(y0 + i, height, self.texture.wrap_v) * width for i in (0, 1))
+        upper = self._texels(flat, top + left, k) * (1 - fx) + self._texels(flat, top + right, k) * fx
+        lower = self._texels(flat, bottom + left, k) * (1 - fx) + self._texels(flat, bottom + right, k) * fx
+        return upper * (1 - fy) + lower * fy
+
+    def _texels(self, flat: np.ndarray, index: np.ndarray, k: int) -> np.ndarray:
+        texels = flat[index]
+        return self.decode(texels) if k == 0 else texels
