@@ -113,6 +113,7 @@ class MaterialReader:
     def _converted_maps(self, material: Material, record: SpecularGlossiness, diffuse_texture: Texture | None,
                         specular_texture: Texture | None, index: int) -> Material:
         from gdtool.images.color import linear_from_srgb, rgba, srgb_from_linear
+        from gdtool.images.io import quantized
 
         given = [t for t in (diffuse_texture, specular_texture) if t is not None]
         if len({_lookup(t) for t in given}) > 1:
@@ -121,25 +122,28 @@ class MaterialReader:
         height, width = max(t.image.shape[0] for t in given), max(t.image.shape[1] for t in given)
 
         def pixels(texture: Texture | None) -> np.ndarray:
-            if texture is None:
-                return np.ones((height, width, 4), np.float32)
-            image = rgba(texture.image)
+            image = np.full((1, 1, 4), 255, np.uint8) if texture is None else texture.image
             rows = np.arange(height) * image.shape[0] // height
             columns = np.arange(width) * image.shape[1] // width
-            image = image[rows][:, columns]
+            return image[rows][:, columns]
+
+        def linear(image: np.ndarray) -> np.ndarray:
+            image = rgba(image)
             return np.concatenate([linear_from_srgb(image[..., :3]), image[..., 3:]], -1)
 
-        diffuse = pixels(diffuse_texture) * np.array(record.diffuse_factor, np.float32)
-        gloss = pixels(specular_texture) * np.array([*record.specular_factor, record.glossiness_factor], np.float32)
-        metallic = _metallic(diffuse[..., :3], gloss[..., :3])
-        base = np.clip(_base_color(diffuse[..., :3], gloss[..., :3], metallic[..., None]), 0, 1)
-        encoded = np.concatenate([srgb_from_linear(base), diffuse[..., 3:]], -1)
-        surface = np.stack([np.ones_like(metallic), 1 - gloss[..., 3], metallic], -1)
-        from gdtool.images.io import quantized
-
+        diffuse, gloss = pixels(diffuse_texture), pixels(specular_texture)
+        diffuse_factor = np.array(record.diffuse_factor, np.float32)
+        gloss_factor = np.array([*record.specular_factor, record.glossiness_factor], np.float32)
+        encoded, surface = np.empty((height, width, 4), np.uint8), np.empty((height, width, 3), np.uint8)
+        for rows in np.array_split(np.arange(height), -(-height // 64)):  # a 4096² map whole would take gigabytes
+            d, g = (linear(x[rows]) * f for x, f in ((diffuse, diffuse_factor), (gloss, gloss_factor)))
+            metallic = _metallic(d[..., :3], g[..., :3])
+            base = np.clip(_base_color(d[..., :3], g[..., :3], metallic[..., None]), 0, 1)
+            encoded[rows] = quantized(np.concatenate([srgb_from_linear(base), d[..., 3:]], -1))
+            surface[rows] = quantized(np.stack([np.ones_like(metallic), 1 - g[..., 3], metallic], -1))
         return replace(material, base_color=(1.0, 1.0, 1.0, 1.0), metallic=1.0, roughness=1.0,
-                       base_color_texture=replace(given[0], image=quantized(encoded), encoding="srgb"),
-                       metallic_roughness_texture=replace(given[0], image=quantized(surface), encoding="linear"))
+                       base_color_texture=replace(given[0], image=encoded, encoding="srgb"),
+                       metallic_roughness_texture=replace(given[0], image=surface, encoding="linear"))
 
 
 def _lookup(texture: Texture) -> tuple:
@@ -152,7 +156,7 @@ def _unit(values: tuple[float, ...]) -> tuple[float, ...]:
 
 def _brightness(color: np.ndarray) -> np.ndarray:
     """Perceived brightness of linear RGB (..., 3)."""
-    return np.sqrt((np.square(color) * np.array([0.299, 0.587, 0.114])).sum(-1))
+    return np.sqrt(np.square(color) @ np.array([0.299, 0.587, 0.114], color.dtype))
 
 
 def _metallic(diffuse: np.ndarray, specular: np.ndarray) -> np.ndarray:

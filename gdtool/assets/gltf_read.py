@@ -46,7 +46,7 @@ def read_gltf(path: str | Path) -> Scene:
             part = _read_primitive(file, primitive, node.weights or mesh.weights, subject)
             if part is not None:
                 matrices = _joint_matrices(file, node, worlds, primitive, len(part.vertices), subject)
-                parts.append(_placed(part, worlds[index] if matrices is None else matrices))
+                parts.append(_compact(_placed(part, worlds[index] if matrices is None else matrices)))
     if not parts:
         raise file.refuse("has no faces", "export the model with its meshes")
     return _joined(file, parts)
@@ -245,6 +245,19 @@ def _placed(part: Part, matrix: np.ndarray) -> Part:
         direction = _unit(apply(linear, part.tangents[:, :3]))
         part.tangents = np.concatenate([direction, part.tangents[:, 3:] * (-1 if mirrored else 1)], 1)
     return part
+
+
+def _compact(part: Part) -> Part:
+    """The part without the vertices that no face refers to: primitives often share one long buffer."""
+    used, faces = np.unique(part.faces, return_inverse=True)
+    if len(used) == len(part.vertices):
+        return part
+
+    def pick(array: np.ndarray | None) -> np.ndarray | None:
+        return None if array is None else array[used]
+
+    return Part(part.vertices[used], faces.reshape(-1, 3), part.material, pick(part.normals), pick(part.tangents),
+                tuple(pick(uv) for uv in part.uvs), pick(part.colors))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
