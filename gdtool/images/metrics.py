@@ -47,6 +47,21 @@ def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
     return resize(np.asarray(image, np.float64), (height, width), order=1, anti_aliasing=True, mode="edge")
 
 
+def resized_views(images: dict[str, np.ndarray], mask: np.ndarray, height: int, width: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Views.images and Views.mask at another size: averages over the covered part of each new pixel; normals unit again."""
+    if mask.shape[1:] == (height, width):
+        return images, mask
+    small = np.stack([resized(one, height, width) for one in mask])
+    out = {}
+    for domain, stack in images.items():
+        weight = (mask[..., None], small[..., None]) if stack.ndim == 4 else (mask, small)
+        mean = np.stack([resized(one, height, width) for one in stack * weight[0]]) / np.maximum(weight[1], 1e-6)
+        if domain == "normal":
+            mean = mean / np.maximum(np.linalg.norm(mean, axis=-1, keepdims=True), 1e-12)
+        out[domain] = np.where(weight[1] > 0, mean, 0).astype(np.float32)
+    return out, small.astype(np.float32)
+
+
 def over_white(linear: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """(h, w, 3) sRGB-encoded over white, of linear straight color (h, w, 3) and coverage (h, w): as viewers composite."""
     return np.clip(srgb_from_linear(linear), 0, 1) * mask[..., None] + (1 - mask[..., None])
@@ -108,7 +123,7 @@ def views_metrics(images: dict[str, np.ndarray], mask: np.ndarray, true_images: 
                   true_mask: np.ndarray) -> dict[str, float]:
     """All figures of k views against k reference views, over the domains that both have (Views.images, Views.mask).
 
-    albedo is scored as color is; keys without a domain in them are told in docs/metrics.md.
+    Of albedo only the masked protocol is told: there is no published one.
     """
     shared = [domain for domain in true_images if domain in images]
     out = {"mask_iou": mask_iou(mask, true_mask)}
@@ -117,7 +132,7 @@ def views_metrics(images: dict[str, np.ndarray], mask: np.ndarray, true_images: 
         if domain in ("color", "albedo", "closed_form"):
             found = color_metrics(a, mask, b, true_mask)
             if domain != "color":  # base color has no published protocol: the foreground is what counts
-                found = {name.removesuffix("_masked"): value for name, value in found.items() if name.endswith("_masked")}
+                found = {name: value for name, value in found.items() if name.endswith("_masked")}
             out |= {f"{domain}_{name}": value for name, value in found.items()}
         elif domain == "normal":
             out["normal_degrees"] = normal_degrees(a, mask, b, true_mask)

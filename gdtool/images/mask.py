@@ -1,0 +1,155 @@
+"""Where the subject of a picture is: its alpha, a mask given with it, or its difference from a plain background."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.core.errors import InputError
+from gdtool.images.color import rgba, srgb_from_linear, unit_range
+
+WORKING_SIDE = 384  # pixels; larger pictures are segmented at this size
+_CURE = "give a mask with --mask, or cut the subject out (RGBA)"
+
+
+def foreground(image: np.ndarray, mask: np.ndarray | None = None, subject: object = "image") -> np.ndarray:
+    """Coverage (h, w) float32 in [0, 1] of a picture's subject.
+
+    image (h, w, c) as read_image gives it; mask (h, w[, c]) of the same size, brighter or more opaque is subject.
+    In this order: the mask; the picture's own alpha, unless it is opaque everywhere; segmentation against a background
+    that is plain (a smooth gradient and soft shadows are). Raises InputError, naming `subject`, for a picture or mask
+    without a subject, or a background that is not plain.
+    """
+    image = image.reshape(*image.shape[:2], -1)
+    if mask is not None:
+        coverage = _mask_coverage(mask)
+        if coverage.shape != image.shape[:2]:
+            raise InputError(subject, f"is {image.shape[1]}x{image.shape[0]}, its mask {coverage.shape[1]}x{coverage.shape[0]}")
+        if not (coverage > 0.5).any():
+            raise InputError(subject, "has an empty mask", "paint the subject white in it")
+        return coverage
+    if image.shape[2] in (2, 4):
+        alpha = np.clip(unit_range(image[..., -1]), 0, 1).astype(np.float32)
+        if not (alpha > 0.5).any():
+            raise InputError(subject, "is transparent everywhere", "save it with a visible subject")
+        if (alpha < 0.5).any():
+            return alpha
+    return _segmented(image, subject)
+
+
+def touches_border(coverage: np.ndarray) -> bool:
+    """Whether the subject reaches the picture's edge, and so may be cut off."""
+    return bool(max(coverage[0].max(), coverage[-1].max(), coverage[:, 0].max(), coverage[:, -1].max()) > 0.5)
+
+
+def _mask_coverage(mask: np.ndarray) -> np.ndarray:
+    pixels = np.clip(unit_range(mask), 0, 1).astype(np.float32).reshape(*mask.shape[:2], -1)
+    if pixels.shape[2] in (2, 4) and pixels[..., -1].min() < 0.5:
+        return pixels[..., -1]
+    return pixels[..., :1 if pixels.shape[2] < 3 else 3].mean(-1)
+
+
+def _segmented(image: np.ndarray, subject: object) -> np.ndarray:
+    """Coverage by the difference from a background model fitted to the border, its edge by random walks (Grady 2006)."""
+    from skimage.color import rgb2lab
+    from skimage.segmentation import random_walker
+    from skimage.transform import resize
+
+    color = rgba(image)[..., :3]
+    color = srgb_from_linear(np.clip(color, 0, 1)) if image.dtype.kind == "f" else color
+    height, width = color.shape[:2]
+    scale = min(1.0, WORKING_SIDE / max(height, width))
+    small = (max(8, round(height * scale)), max(8, round(width * scale)))
+    if scale < 1:
+        color = resize(color, small, order=1, anti_aliasing=True)
+    lab = rgb2lab(color)
+    background, spread = _background(lab, subject)
+    difference = lab - background
+    # A soft shadow darkens without changing hue: lightness below the background's counts for less.
+    weight = np.where(difference[..., :1] < 0, 0.5, 1.0) * (1, 0, 0) + (0, 1, 1)
+    distance = np.sqrt(np.square(difference * weight).sum(-1))
+    sure = max(5.0, 5 * spread)
+    labels = _trimap(distance, sure, spread)
+    if not (labels == 1).any():
+        raise InputError(subject, "shows no subject that stands off its background", _CURE)
+    share = float((labels == 1).mean())
+    if share > 0.95:
+        raise InputError(subject, "is filled by its subject, or its background is not plain", _CURE)
+    coverage = (labels == 1).astype(np.float64)
+    if (labels == 0).any() and (labels == 2).any():
+        coverage = random_walker(lab / 20, labels, beta=200, mode="cg_j", tol=1e-3, prob_tol=1.0, return_full_prob=True, channel_axis=-1)[0]
+    coverage = np.clip(_without_specks(coverage), 0, 1)
+    if (coverage > 0.5).mean() < 0.002:
+        raise InputError(subject, "shows no subject that stands off its background", _CURE)
+    if scale < 1:
+        coverage = resize(coverage, (height, width), order=1)
+    return np.clip(coverage, 0, 1).astype(np.float32)
+
+
+def _background(lab: np.ndarray, subject: object) -> tuple[np.ndarray, float]:
+    """Lab (h, w, 3) of the background everywhere, and its noise: a quadratic in x and y fitted to the border.
+
+    Pixels far from the fit are left out again and again, so a subject may touch some of the border. Raises InputError
+    where no such fit holds for more than half of it.
+    """
+    height, width = lab.shape[:2]
+    y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
+    basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)
+    ring = np.ones((height, width), bool)
+    inset = max(2, round(0.03 * min(height, width)))
+    ring[inset:-inset, inset:-inset] = False
+    samples, rows = lab[ring], basis[ring]
+    # A start that a subject on the border does not sway: the median color alone.
+    keep = np.linalg.norm(samples - np.median(samples, 0), axis=1)
+    keep = keep <= max(8.0, 3 * float(np.median(keep)))
+    spread = 0.0
+    for _ in range(10):
+        fit = np.linalg.lstsq(rows[keep], samples[keep], rcond=None)[0]
+        residual = np.linalg.norm(samples - rows @ fit, axis=1)
+        spread = float(np.median(residual[keep]))
+        again = residual <= max(3.0, 4 * spread)
+        if (again == keep).all():
+            break
+        keep = again
+        if keep.sum() < 50:
+            break
+    if keep.mean() < 0.5 or spread > 5:
+        raise InputError(subject, "has a background that is not plain", _CURE)
+    return basis @ fit, spread
+
+
+def _trimap(distance: np.ndarray, sure: float, spread: float) -> np.ndarray:
+    """Labels (h, w): 1 subject, 2 background, 0 to be decided. distance (h, w) is the colour difference from the background."""
+    from scipy import ndimage
+
+    near = distance < sure
+    regions, count = ndimage.label(near)
+    outside = np.zeros(count + 1, bool)
+    outside[np.unique(np.concatenate([regions[0], regions[-1], regions[:, 0], regions[:, -1]]))] = True
+    if count:
+        # An enclosed part is a hole only where it is the background to within its noise, and of some size: a pale
+        # part of the subject is not.
+        index = np.arange(1, count + 1)
+        mean = ndimage.mean(distance, regions, index)
+        area = ndimage.sum_labels(near, regions, index)
+        outside[1:] |= (mean < max(1.5, 2 * spread)) & (area > 0.001 * distance.size)
+    outside[0] = False
+    background = outside[regions]
+    inside = ndimage.binary_opening(~background, iterations=1)
+    labels = np.zeros(distance.shape, np.int32)
+    labels[ndimage.binary_erosion(background, iterations=2, border_value=1)] = 2
+    labels[ndimage.binary_erosion(inside & (distance > sure) | ndimage.binary_erosion(inside, iterations=3), iterations=1, border_value=1)] = 1
+    return labels
+
+
+def _without_specks(coverage: np.ndarray) -> np.ndarray:
+    """coverage without pieces smaller than a hundredth of the largest."""
+    from scipy import ndimage
+
+    pieces, count = ndimage.label(coverage > 0.5)
+    if count < 2:
+        return coverage
+    area = ndimage.sum_labels(np.ones_like(coverage), pieces, np.arange(count + 1))
+    area[0] = 0
+    small = area < 0.01 * area.max()
+    small[0] = False
+    return np.where(ndimage.binary_dilation(small[pieces], iterations=2) & ~(area >= 0.01 * area.max())[pieces], 0, coverage)
