@@ -28,7 +28,8 @@ def sobol(count: int, dimensions: int, seed: int) -> np.ndarray:
 class DirectLight:
     """An estimator of the light that points reflect toward the eye.
 
-    samples: directions a point draws from the light, and as many from its reflection. Each direction is weighted by the
+    samples: directions a point draws from the light, and as many from its reflection (a quarter of that for the extra
+    samples of refined pixels). Each direction is weighted by the
     balance heuristic (Veach 1997): f L cos / (n p_light + n p_reflection).
     """
 
@@ -45,15 +46,17 @@ class DirectLight:
     def radiance(self, points: Points) -> np.ndarray:
         """(n, 3) linear radiance toward the eye, emission included."""
         out = np.empty((len(points), 3), np.float32)
-        for start in range(0, len(points), max(1, PAIRS // self.samples)):
-            part = slice(start, start + max(1, PAIRS // self.samples))
-            out[part] = self._chunk(points, part)
+        k = max(1, self.samples // 4) if points.extra else self.samples
+        step = max(1, PAIRS // k)
+        for start in range(0, len(points), step):
+            part = slice(start, start + step)
+            out[part] = self._chunk(points, part, k)
         out += points.values["emissive"]
         unlit = points.values["unlit"]
         out[unlit] = points.values["albedo"][unlit]
         return out
 
-    def _chunk(self, points: Points, part: slice) -> np.ndarray:
+    def _chunk(self, points: Points, part: slice, k: int) -> np.ndarray:
         import torch
 
         from gdtool.shading.brdf import alpha_of, f0_of
@@ -64,7 +67,7 @@ class DirectLight:
         values = points.values
         normal, geometric, view = tensor(values["normal"]), tensor(values["geometric_normal"]), tensor(points.view)
         albedo, roughness, metallic = tensor(values["albedo"]), tensor(values["roughness"]), tensor(values["metallic"])
-        n, k = len(normal), self.samples
+        n = len(normal)
         runs = torch.from_numpy(self.rng.integers(0, POOL // k, n) * k)
         index = runs[:, None] + torch.arange(k)
         surface = _Surface(normal, view, albedo, roughness, metallic, alpha_of(roughness), f0_of(albedo, metallic, 0.04), self.brdf)

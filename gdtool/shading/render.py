@@ -23,7 +23,7 @@ BASE = 4
 # Alpha-tested layers that a ray passes at most.
 MAX_LAYERS = 32
 # A pixel whose samples differ by more than this (standard deviation) gets all samples.
-TOLERANCE = {"normal": 0.03, "albedo": 0.012, "roughness": 0.02, "metallic": 0.02, "color": 0.02}
+TOLERANCE = {"normal": 0.03, "albedo": 0.012, "roughness": 0.02, "metallic": 0.02}
 CHANNELS = {"normal": 3, "albedo": 3, "roughness": 1, "metallic": 1, "depth": 1, "emissive": 3}
 # Samples that are held at once: bounds the memory.
 BAND_SAMPLES = 1 << 20
@@ -50,6 +50,7 @@ class Points:
     view: np.ndarray
     depth: np.ndarray
     values: dict[str, np.ndarray]
+    extra: bool = False  # samples of a refined pixel, beyond BASE: there are more of them, so each needs less light
 
     def __len__(self) -> int:
         return len(self.pixel)
@@ -188,7 +189,9 @@ class Renderer:
         for start in range(0, len(chosen), max(1, BAND_SAMPLES // more)):
             part = chosen[start:start + max(1, BAND_SAMPLES // more)]
             again = np.repeat(part, more)
-            total.add(self.see(camera, again, np.tile(pattern[base:], (len(part), 1)), samples), again, shade)
+            points = self.see(camera, again, np.tile(pattern[base:], (len(part), 1)), samples)
+            points.extra = True
+            total.add(points, again, shade)
 
 
 class _Sums:
@@ -271,3 +274,19 @@ def render_color(scene: Scene, camera: Camera, environment: Environment, samples
     light = DirectLight(renderer, environment, light_samples, seed, brdf)
     images = renderer.buffers(camera, samples, lambda points: {"color": light.radiance(points)})
     return images.get("color", np.zeros((camera.height, camera.width, 3), np.float32)), images["mask"]
+
+
+def closed_form_image(frame: dict[str, np.ndarray], camera: Camera, lobes, brdf: str = "gltf") -> np.ndarray:
+    """(h, w, 3) unshadowed linear radiance of a view's own maps under spherical Gaussians; 0 where nothing is seen."""
+    import torch
+
+    from gdtool.shading.closed_form import shade
+
+    inside = frame["mask"] > 0
+    view = -rays(camera)[1][inside]
+    maps = [torch.tensor(x, dtype=torch.float32) for x in (frame["normal"][inside], view, frame["albedo"][inside],
+                                                           frame["roughness"][inside], frame["metallic"][inside])]
+    out = np.zeros((*inside.shape, 3), np.float32)
+    with torch.no_grad():
+        out[inside] = shade(*maps, lobes.to(torch.float32), brdf).numpy()
+    return out

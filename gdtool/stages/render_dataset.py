@@ -1,0 +1,264 @@
+"""Ground-truth views of PBR models: lit color, normal, depth, albedo, roughness, metallic and mask.
+
+Use it to make training data, to feed a model you already have into reconstruct, and to judge a finished asset: with
+--cameras it is rendered through the cameras of other views. Sources are .glb, .gltf, .obj, .ply or .stl files, and
+procedural:SEED or procedural:FIRST..LAST for generated objects. Faces are seen from both sides; BLEND materials are
+seen where alpha is at least one half.
+
+Example:
+  gdtool render-dataset procedural:0..9 -o data
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from gdtool.core.errors import InputError, UsageError
+from gdtool.core.folder import Folder
+from gdtool.core.kinds import DOMAINS
+from gdtool.core.stage import Inputs, Output, SecondInput, Stage, file_option
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from gdtool.assets.scene import Scene
+    from gdtool.cameras import Camera
+    from gdtool.shading.environment import Environment
+    from gdtool.shading.render import Renderer
+    from gdtool.shading.sg import SphericalGaussians
+
+ALL = (*DOMAINS, "closed_form")
+
+
+class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of render-dataset."""
+
+    size: Annotated[int, Meta(ge=16, le=4096, description="width and height of a view in pixels")] = 256
+    samples: Annotated[int, Meta(ge=1, le=1024, description="samples per pixel where something changes; 4 elsewhere")] = 16
+    light_samples: Annotated[int, Meta(ge=1, le=1024, description="directions per sample, from the light and from the reflection each")] = 8
+    light: file_option("random (seeded by the object's name), random:NUMBER, dark, mid, bright, or a lat-long .hdr or .exr file") = "random"
+    exposure: Annotated[float, Meta(gt=0, description="factor on the color; 1: a white card in the light's brightest direction has radiance 0.8")] = 1.0
+    rig: Annotated[Literal["six", "wonder3d", "turntable", "sphere"], Meta(description="where the cameras stand")] = "six"
+    views: Annotated[int, Meta(ge=1, le=1000, description="how many cameras, for turntable and sphere")] = 8
+    elevation: Annotated[float, Meta(ge=-89, le=89, description="of the turntable's cameras, degrees")] = 0.0
+    fov: Annotated[float, Meta(ge=0, le=120, description="across, degrees, for perspective cameras; 0: orthographic")] = 0.0
+    domains: Annotated[tuple[str, ...], Meta(description="what to write")] = ALL
+    normalize: Annotated[bool, Meta(description="centre the bounding box and scale its longest side to 1; see --cameras")] = True
+    condition_views: Annotated[int, Meta(ge=0, le=1000, description="pictures from the front at random elevation, projection and scale")] = 0
+    filter: Annotated[Literal["all", "complete-pbr"], Meta(description="complete-pbr: refuse a model when more than 5 % of its area lacks a base color or metallic-roughness texture")] = "all"
+    seed: Annotated[int, Meta(ge=0, description="seed of everything random, together with the object's name")] = 0
+
+
+def run(inputs: Inputs, options: Options, out: Output) -> None:
+    """Render one model."""
+    unknown = sorted(set(options.domains) - set(ALL))
+    if unknown:
+        raise UsageError("--domains", f"{unknown[0]!r} is no domain", f"choose from {', '.join(ALL)}")
+    import numpy as np
+    import torch
+
+    from gdtool.assets.load import load_scene
+    from gdtool.folders.views import Views, write_views
+    from gdtool.shading.render import Renderer
+
+    torch.set_num_threads(out.threads)
+    given: Folder | None = inputs.second.get("cameras")
+    source = inputs.main.file("asset.glb") if isinstance(inputs.main, Folder) else inputs.main
+    with out.step("read"):
+        scene = load_scene(source)
+    for note in scene.notes:
+        out.warn(note)
+    _filter(scene, inputs.name, options)
+    scene, source_from_world = _placed(scene, inputs, given, options)
+    cameras = _cameras(given, options)
+    rng = np.random.default_rng([options.seed, _number(inputs.name)])
+
+    with out.step("light"):
+        environment, lobes, light = _light(inputs, given, options)
+    with out.step("render"):
+        renderer = Renderer(scene, out.threads)
+        frames = [_view(renderer, camera, environment, lobes, options, k) for k, camera in enumerate(out.progress(cameras, len(cameras), "views"))]
+    wanted = [d for d in ALL if d in options.domains]
+    mask = np.stack([frame["mask"] for frame in frames])
+    if not mask.any():
+        raise InputError(inputs.name, "is not in the picture of any camera", "check --cameras, or leave out --no-normalize")
+    views = Views(cameras, {d: np.stack([frame[d] for frame in frames]) for d in wanted}, mask, light)
+
+    with out.step("conditions"):
+        if options.condition_views:
+            _write_conditions(out, renderer, environment, options, rng)
+    with out.step("write"):
+        generated = isinstance(inputs.main, str)
+        if generated:
+            from gdtool.assets.gltf_write import write_glb
+
+            write_glb(out.path("source.glb"), scene)
+        clipped = 0.0
+        if "color" in views.images:
+            clipped = float((views.images["color"][mask > 0] > 1).mean())
+        counts = renderer.counts
+        report = {"faces": len(scene.faces), "materials": len(scene.materials), "samples": counts.samples, "shadow_rays": counts.shadow_rays,
+                  "environment_scale": environment.scale, "closed_surface_share": float((mask > 0).mean()),
+                  **{f"light_fit_{k}": v for k, v in light["fit_error"].items()}}
+        write_views(out, views, source_from_world=source_from_world, exposure=options.exposure, environment=light["environment"],
+                    clipped_share=clipped, conditions=options.condition_views, model=generated, report=report)
+    _tell_skips(out, scene, renderer, options)
+
+
+def _number(text: str) -> int:
+    """A stable 64-bit number of a text."""
+    return int.from_bytes(hashlib.sha256(text.encode(errors="surrogateescape")).digest()[:8], "big")
+
+
+def _filter(scene: Scene, name: str, options: Options) -> None:
+    if options.filter == "all":
+        return
+    import numpy as np
+
+    from gdtool.geometry.normals import face_normals
+
+    complete = np.array([(m.base_color_texture is not None or scene.colors is not None) and m.metallic_roughness_texture is not None
+                         for m in scene.materials])
+    area = face_normals(scene.vertices, scene.faces)[1]
+    share = float(area[complete[scene.material_idx]].sum() / max(area.sum(), 1e-300))
+    if share < 0.95:
+        raise InputError(name, f"has complete PBR textures on {share:.0%} of its area only", "dropped by --filter complete-pbr")
+
+
+def _placed(scene: Scene, inputs: Inputs, given: Folder | None, options: Options) -> tuple[Scene, np.ndarray]:
+    """The scene in the frame of the views, and source_from_world.
+
+    --no-normalize leaves it where it is. With --cameras it is put where that folder's object was when it comes from the
+    same source, is left when it is an asset or its box is about normalised, and is normalised otherwise.
+    """
+    import dataclasses
+
+    import numpy as np
+
+    from gdtool.core import sources
+    from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
+
+    identity = np.eye(4)
+    own = unit_box(scene.vertices[np.unique(scene.faces)])
+    matrix = own if options.normalize else identity
+    if given is not None and options.normalize:
+        theirs = np.array(given.content.source_from_world).reshape(4, 4)
+        before = [entry.digest for entry in given.manifest.inputs if entry.role == "source"]
+        asset = _asset_of(inputs.main)
+        about_normal = abs(own[0, 0] - 1) < 0.1 and np.abs(own[:3, 3]).max() < 0.1
+        if asset is not None:
+            matrix = np.array(asset.content.source_from_world).reshape(4, 4) if asset.content.frame == "source" else identity
+        elif sources.digest(inputs.main) in before:
+            matrix = theirs
+        elif about_normal:
+            matrix = identity
+    if np.array_equal(matrix, identity):
+        return scene, identity
+    return dataclasses.replace(scene, vertices=transform_points(invert_similarity(matrix), scene.vertices)), matrix
+
+
+def _asset_of(source: Any) -> Folder | None:
+    """The asset folder that a source is, or that its file lies in."""
+    from gdtool.core.folder import is_folder, open_folder
+
+    if isinstance(source, Folder):
+        return source
+    if isinstance(source, Path) and is_folder(source.parent):
+        folder = open_folder(source.parent, check=False)
+        return folder if folder.kind == "asset" else None
+    return None
+
+
+def _cameras(given: Folder | None, options: Options) -> list[Camera]:
+    from gdtool.shading.rigs import sphere, turntable
+
+    if given is not None:
+        from gdtool.folders.records import read_cameras
+
+        return read_cameras(given.file("cameras.json"))
+    if options.rig == "turntable":
+        return turntable(options.views, options.size, options.elevation, options.fov)
+    if options.rig == "sphere":
+        return sphere(options.views, options.size, options.fov)
+    from gdtool.cameras.camera import SIX_VIEWS, rig
+
+    if options.fov:
+        return turntable(0, options.size, options.elevation, options.fov, SIX_VIEWS)
+    return rig(options.rig, options.size)
+
+
+def _light(inputs: Inputs, given: Folder | None, options: Options) -> tuple[Environment, SphericalGaussians, dict[str, Any]]:
+    """The environment, its spherical Gaussians, and the record of light.json."""
+    from gdtool.shading.studio import studio
+
+    source = options.light or "random"
+    if source == "random" and given is not None and given.content.environment.startswith(("random:", "dark", "mid", "bright")):
+        source = given.content.environment
+    if source == "random":
+        source = f"random:{(_number(inputs.name) + options.seed) % 10**9}"
+    return studio(source, options.seed)
+
+
+def _view(renderer: Renderer, camera: Camera, environment: Environment, lobes: SphericalGaussians, options: Options, k: int) -> dict[str, np.ndarray]:
+    from gdtool.shading.direct import DirectLight
+    from gdtool.shading.render import closed_form_image
+
+    shade = None
+    if "color" in options.domains:
+        light = DirectLight(renderer, environment, options.light_samples, options.seed * 1009 + k)
+        shade = lambda points: {"color": light.radiance(points) * options.exposure}  # noqa: E731
+    frame = renderer.buffers(camera, options.samples, shade)
+    if "closed_form" in options.domains:
+        frame["closed_form"] = closed_form_image(frame, camera, lobes) * options.exposure
+    return frame
+
+
+def _write_conditions(out: Output, renderer: Renderer, environment: Environment, options: Options, rng: np.random.Generator) -> None:
+    import numpy as np
+
+    from gdtool.folders.records import write_cameras
+    from gdtool.images.color import srgb_from_linear
+    from gdtool.images.io import write_png
+    from gdtool.shading.direct import DirectLight
+    from gdtool.shading.rigs import condition_camera
+
+    cameras = [condition_camera(rng, f"{i:03d}", options.size) for i in range(options.condition_views)]
+    for i, camera in enumerate(out.progress(cameras, len(cameras), "conditions")):
+        light = DirectLight(renderer, environment, options.light_samples, options.seed * 1009 + 500 + i)
+        frame = renderer.buffers(camera, options.samples, lambda points, light=light: {"color": light.radiance(points)})
+        color = srgb_from_linear(np.clip(frame.get("color", np.zeros((camera.height, camera.width, 3), np.float32)) * options.exposure, 0, 1))
+        write_png(out.path(f"condition/{camera.name}.png"), np.concatenate([color, frame["mask"][..., None]], -1))
+    write_cameras(out.path("condition.json"), cameras)
+
+
+def _tell_skips(out: Output, scene: Scene, renderer: Renderer, options: Options) -> None:
+    """What the scene did not need."""
+    textures = {"base color": "base_color_texture", "metallic-roughness": "metallic_roughness_texture", "normal": "normal_texture",
+                "emissive": "emissive_texture"}
+    for what, name in textures.items():
+        if all(getattr(material, name) is None for material in scene.materials):
+            out.skip(f"{what} lookups", "no material has such a texture")
+    if renderer.tested is None:
+        out.skip("alpha tests", "every material is opaque")
+    counts = renderer.counts
+    if counts.pixels_in_bounds < counts.pixels:
+        out.skip("rays", f"{1 - counts.pixels_in_bounds / counts.pixels:.0%} of the pixels lie outside the object's projected bounds")
+    if options.samples > 4:
+        out.skip("samples", f"{1 - counts.pixels_refined / max(counts.pixels_in_bounds, 1):.0%} of the pixels in bounds are even and got 4 of {options.samples}")
+    if counts.shadow_rays_below_horizon:
+        total = counts.shadow_rays + counts.shadow_rays_below_horizon
+        out.skip("shadow rays", f"{counts.shadow_rays_below_horizon / total:.0%} of the directions are below the horizon or carry no light")
+    for domain in ALL:
+        if domain not in options.domains:
+            out.skip(domain, "left out by --domains")
+
+
+STAGE = Stage(
+    name="render-dataset", version=1, reads=("model-file", "asset"), writes="views", Options=Options, run=run, dataset=True,
+    second_inputs={"cameras": SecondInput("views", search=False, help="Views folder whose cameras, frame and light are used again.")},
+)
