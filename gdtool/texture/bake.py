@@ -188,7 +188,7 @@ def _supersample(target: Target, texels: Texels, source: Source, lookup: Lookup,
 def occlusion_tracer(target: Target, source: Source, reach: np.ndarray, normals: np.ndarray, rays: int, seed: int,
                      threads: int = 1) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """trace(face_idx, barycentric) -> openness (n,) of the source at places on the target; normals (v, 3) of the source."""
-    lift = 5e-4 * float(np.ptp(source.vertices, axis=0).max())
+    lift = 5e-4 * source.extent
 
     def trace(face_idx: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
         def run(part: slice) -> np.ndarray:

@@ -34,7 +34,7 @@ class Origin:
 
 def from_surface(surface: Surface, views: Views | None) -> Origin:
     """A surface; views give material and normals where they see it well, its vertices elsewhere."""
-    source = Source.of(surface.vertices, surface.faces)
+    source = Source(surface.vertices, surface.faces)
     normals = surface.normals if surface.normals is not None else vertex_normals(surface.vertices, surface.faces)
     attributes = {"albedo": surface.albedo, "roughness": surface.roughness, "metallic": surface.metallic}
     lookup = vertex_lookup(source, attributes, normals.astype(np.float32))
@@ -67,7 +67,7 @@ def from_scene(scene: Scene, source_from_world: np.ndarray, texel_width: float =
 
     matrix = invert_similarity(source_from_world)
     turn = matrix[:3, :3] / np.sqrt((matrix[:3, 0] ** 2).sum())
-    source = Source.of(transform_points(matrix, scene.vertices), scene.faces)
+    source = Source(transform_points(matrix, scene.vertices), scene.faces)
     normals = scene.normals @ turn.T if scene.normals is not None else vertex_normals(source.vertices, source.faces)
 
     points = SurfaceLookup(scene)

@@ -159,5 +159,9 @@ def extend_owners(uv: np.ndarray, faces: np.ndarray, face_idx: np.ndarray, rings
         owners.append(found)
     texel, owned_by = np.concatenate(texels), np.concatenate(owners)
     centre = np.stack([texel % size + 0.5, texel // size + 0.5], 1) / size
-    barycentric = np.clip(barycentric_at(uv, faces, owned_by, centre), -farthest, 1 + farthest)
-    return texel, owned_by, barycentric / barycentric.sum(1, keepdims=True)
+    barycentric = barycentric_at(uv, faces, owned_by, centre)
+    within = np.clip(barycentric, 0, 1)
+    within /= within.sum(1, keepdims=True)
+    # A sliver goes on for many times its own width: hold what lies beyond it back, in the same direction.
+    beyond = np.abs(barycentric - within).max(1, keepdims=True)
+    return texel, owned_by, within + (barycentric - within) * np.minimum(1, farthest / np.maximum(beyond, 1e-12))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 
@@ -13,27 +14,51 @@ AGREEMENT = 0.1
 _RETRIES = 4
 
 
-@dataclass(frozen=True)
-class Source:
-    """Triangles to bake from, with their ray caster (geometry.rays.RayCaster).
+class Nearest:
+    """Closest points on some faces of a mesh; the tree is kept (libigl builds one per call otherwise).
 
-    vertices (v, 3), faces (f, 3), face_normals (f, 3) unit.
+    vertices (v, 3), faces (f, 3), chosen (m,) indices of the faces to look among, all when None.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
-    face_normals: np.ndarray
-    caster: object
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, chosen: np.ndarray | None = None):
+        import igl
 
-    @classmethod
-    def of(cls, vertices: np.ndarray, faces: np.ndarray) -> Source:
-        """Source of a triangle mesh."""
+        self._vertices = np.ascontiguousarray(vertices, np.float64)
+        self._faces = np.ascontiguousarray(faces if chosen is None else faces[chosen], np.int64)
+        self._chosen = chosen
+        self._tree = igl.AABB()
+        self._tree.init(self._vertices, self._faces)
+
+    def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """face_idx (n,) into all faces and the closest point (n, 3) to each of points (n, 3)."""
+        _, face, point = self._tree.squared_distance(self._vertices, self._faces, np.ascontiguousarray(points, np.float64))
+        face = face.reshape(-1)
+        return (face if self._chosen is None else self._chosen[face]).astype(np.int32), np.asarray(point).reshape(-1, 3).copy()
+
+
+class Source:
+    """Triangles to bake from: vertices (v, 3), faces (f, 3), face_normals (f, 3) unit, and what finds places on them."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray):
         from gdtool.geometry.rays import RayCaster
 
-        caster = RayCaster(vertices, faces)
+        self.vertices, self.faces = np.asarray(vertices, np.float64), faces
+        self.face_normals = face_normals(vertices, faces)[0]
+        self.extent = float(np.ptp(self.vertices, axis=0).max())
+        self.caster = RayCaster(vertices, faces)
         # The first query builds Embree's tree; later ones may come from several threads.
-        caster.first_hit(np.zeros((1, 3)), np.ones((1, 3)))
-        return cls(vertices, faces, face_normals(vertices, faces)[0], caster)
+        self.caster.first_hit(np.zeros((1, 3)), np.ones((1, 3)))
+        self.nearest = Nearest(self.vertices, faces)
+        self._facing: dict[tuple[int, float], Nearest | None] = {}
+        self._lock = Lock()
+
+    def facing(self, axis: int, sign: float) -> Nearest | None:
+        """Nearest among the faces within 75 degrees of a coordinate axis; None when there are none."""
+        with self._lock:
+            if (axis, sign) not in self._facing:
+                chosen = np.flatnonzero(self.face_normals[:, axis] * sign > 0.25)
+                self._facing[axis, sign] = Nearest(self.vertices, self.faces, chosen) if len(chosen) else None
+            return self._facing[axis, sign]
 
     def at(self, face_idx: np.ndarray, barycentric: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Vertex values (v,) or (v, c), interpolated at places on faces: (n,) or (n, c)."""
@@ -56,9 +81,7 @@ def vertex_reach(vertices: np.ndarray, faces: np.ndarray, source: Source) -> np.
     Twice the largest distance of its corners to the source, and a share of its size for the bulge between them. A corner
     that lies far out (a part that remeshing lost) does not count for more than the 99th percentile of all.
     """
-    from gdtool.geometry.distance import closest_points
-
-    distance = closest_points(vertices, source.vertices, source.faces)[0]
+    distance = np.linalg.norm(source.nearest.closest(vertices)[1] - vertices, axis=1)
     distance = np.minimum(distance, np.percentile(distance, 99) + 1e-12)
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1).max(1)
@@ -93,25 +116,44 @@ def _march(points: np.ndarray, directions: np.ndarray, normals: np.ndarray, reac
 
 def _nearest_agreeing(points: np.ndarray, normals: np.ndarray, source: Source) -> tuple[np.ndarray, np.ndarray]:
     """Nearest place whose face looks the same way as the normal: face_idx (n,), point (n, 3). Plain nearest if none does."""
-    from gdtool.geometry.distance import closest_points
-
-    _, face, point = closest_points(points, source.vertices, source.faces)
+    face, point = source.nearest.closest(points)
     wrong = np.flatnonzero((source.face_normals[face] * normals).sum(1) <= AGREEMENT)
     if not len(wrong):
         return face, point
+    # The normal's main component is at least 1/sqrt(3): the faces near that axis hold most of those that agree.
     axis = np.abs(normals[wrong]).argmax(1)
     sign = np.sign(normals[wrong, axis])
     for k in range(3):
         for s in (-1.0, 1.0):
             mine = wrong[(axis == k) & (sign == s)]
-            # The normal's main component is at least 1/sqrt(3): faces within 75 degrees of the axis hold the agreeing ones.
-            subset = np.flatnonzero(source.face_normals[:, k] * s > 0.25)
-            if not len(mine) or not len(subset):
+            among = source.facing(k, s) if len(mine) else None
+            if among is None:
                 continue
-            _, sub_face, sub_point = closest_points(points[mine], source.vertices, source.faces[subset])
-            better = (source.face_normals[subset[sub_face]] * normals[mine]).sum(1) > AGREEMENT
-            face[mine[better]], point[mine[better]] = subset[sub_face[better]], sub_point[better]
+            other_face, other_point = among.closest(points[mine])
+            better = (source.face_normals[other_face] * normals[mine]).sum(1) > AGREEMENT
+            face[mine[better]], point[mine[better]] = other_face[better], other_point[better]
     return face, point
+
+
+def _slide_off_edges(points: np.ndarray, normals: np.ndarray, source: Source, face: np.ndarray, barycentric: np.ndarray) -> None:
+    """Where a ray met a slanted face from afar, take the nearest place instead if it agrees; changes face, barycentric.
+
+    At a crease that remeshing cut off, the normal leads past the edge to a place well away from the nearest one.
+    """
+    from gdtool.geometry.distance import barycentric_of
+
+    slanted = np.flatnonzero((source.face_normals[face] * normals).sum(1) < 0.99)
+    if not len(slanted):
+        return
+    at = source.at(face[slanted], barycentric[slanted], source.vertices)
+    slanted = slanted[np.linalg.norm(at - points[slanted], axis=1) > 1e-4 * source.extent]
+    if not len(slanted):
+        return
+    nearest_face, nearest = source.nearest.closest(points[slanted])
+    agrees = (source.face_normals[nearest_face] * normals[slanted]).sum(1) > AGREEMENT
+    slanted, nearest_face, nearest = slanted[agrees], nearest_face[agrees], nearest[agrees]
+    face[slanted] = nearest_face
+    barycentric[slanted] = barycentric_of(nearest, source.vertices[source.faces[nearest_face]])
 
 
 def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source) -> Places:
@@ -122,7 +164,7 @@ def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source
     """
     from gdtool.geometry.distance import barycentric_of
 
-    start = 2e-5 * float(np.ptp(source.vertices, axis=0).max())
+    start = 2e-5 * source.extent
     out_face, out_distance, out_at = _march(points, normals, normals, reach, source, start)
     # Inward only as far as outward already found something.
     face, distance, barycentric = _march(points, -normals, normals, np.minimum(reach, out_distance), source, start)
@@ -133,6 +175,7 @@ def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source
     if len(lost):
         face[lost], nearest = _nearest_agreeing(points[lost], normals[lost], source)
         barycentric[lost] = barycentric_of(nearest, source.vertices[source.faces[face[lost]]])
+    _slide_off_edges(points, normals, source, face, barycentric)
     by_ray = np.ones(len(points), bool)
     by_ray[lost] = False
     return Places(face, barycentric, by_ray)

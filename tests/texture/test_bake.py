@@ -28,7 +28,7 @@ def torus_bake():
     uv, face_uvs = unwrapped(coarse, faces, 256)
     target = Target.of(coarse, faces, uv, face_uvs)
     texels = texels_of(target, 256)
-    source = Source.of(fine, triangles_of(fine_quads))
+    source = Source(fine, triangles_of(fine_quads))
     attributes = {"albedo": albedo_of(fine), "roughness": 0.5 + 0.3 * fine[:, 0], "metallic": np.full(len(fine), 0.25)}
     lookup = vertex_lookup(source, attributes, fine_normals)
     reach = vertex_reach(coarse, faces, source)
@@ -80,7 +80,7 @@ def test_thin_wall_does_not_bleed_through():
     vertices = np.array([[-0.5, 0, -0.5], [0.5, 0, -0.5], [0.5, 0, 0.5], [-0.5, 0, 0.5]])
     top, bottom = vertices + (0, 0.002, 0), vertices - (0, 0.002, 0)
     up, down = np.array([[0, 2, 1], [0, 3, 2]]), np.array([[4, 5, 6], [4, 6, 7]])
-    source = Source.of(np.concatenate([top, bottom]), np.concatenate([up, down]))
+    source = Source(np.concatenate([top, bottom]), np.concatenate([up, down]))
     albedo = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], 4, 0)
     lookup = vertex_lookup(source, {"albedo": albedo, "roughness": np.ones(8), "metallic": np.zeros(8)}, np.repeat([[0, 1.0, 0], [0, -1.0, 0]], 4, 0))
     for off in (-0.008, 0.008):
@@ -118,14 +118,14 @@ def test_openness_of_a_plane_a_corner_and_a_box():
     plane = np.array([[-50.0, 0, -50], [50, 0, -50], [50, 0, 50], [-50, 0, 50]])
     wall = np.array([[0.0, 0, -50], [0, 50, -50], [0, 50, 50], [0, 0, 50]])
     quad = np.array([[0, 2, 1], [0, 3, 2]])
-    source = Source.of(np.concatenate([plane, wall]), np.concatenate([quad, quad + 4]))
+    source = Source(np.concatenate([plane, wall]), np.concatenate([quad, quad + 4]))
     points = np.array([[0.05, 0, 0.0], [0.05, 0, 1.0], [0.05, 0, -1.0]])
     up = np.tile([0.0, 1, 0], (3, 1))
     # An infinite wall at right angles hides half of the cosine-weighted hemisphere.
     np.testing.assert_allclose(openness(points, up, source.caster, 4096, 0), 0.5, atol=0.01)
     np.testing.assert_allclose(openness(points + (25, 0, 0), up, source.caster, 64, 0, reach=1.0), 1)
     vertices, faces = sphere(2)
-    inside = Source.of(vertices, faces[:, ::-1])
+    inside = Source(vertices, faces[:, ::-1])
     assert openness(np.zeros((1, 3)), np.array([[0, 1.0, 0]]), inside.caster, 64, 0)[0] == 0
 
 

@@ -20,7 +20,7 @@ def at(source, places):
 
 def test_sphere_inside_and_outside_points_meet_it_along_the_normal():
     vertices, faces = sphere(5)
-    source = Source.of(vertices, faces)
+    source = Source(vertices, faces)
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(2000, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -33,7 +33,7 @@ def test_sphere_inside_and_outside_points_meet_it_along_the_normal():
 def test_thin_wall_is_never_crossed():
     # A plate 0.1 % thick; the baked mesh strays by several times that, to either side.
     vertices, faces = box((1.0, 1.0, 0.001))
-    source = Source.of(vertices, faces)
+    source = Source(vertices, faces)
     rng = np.random.default_rng(1)
     xy = rng.uniform(-0.45, 0.45, (3000, 2))
     for side in (1.0, -1.0):
@@ -47,7 +47,7 @@ def test_thin_wall_is_never_crossed():
 
 def test_nearest_point_serves_where_the_normal_misses_and_stays_on_its_side():
     vertices, faces = box((1.0, 1.0, 0.001))
-    source = Source.of(vertices, faces)
+    source = Source(vertices, faces)
     # Beside the plate: the normal meets nothing, the other side's rim is as near.
     points = np.array([[0.6, 0.1, 0.0005], [0.6, 0.1, -0.0005], [0.6, 0.1, -0.0006]])
     normals = np.array([[0.0, 0, 1], [0, 0, -1], [0, 0, 1]])
@@ -60,5 +60,5 @@ def test_reach_covers_the_distance_but_not_the_object():
     vertices, quads, _ = torus(300, 150)
     coarse, coarse_quads, _ = torus(40, 20, minor=0.145)
     faces = triangles_of(coarse_quads)
-    reach = vertex_reach(coarse, faces, Source.of(vertices, triangles_of(quads)))
+    reach = vertex_reach(coarse, faces, Source(vertices, triangles_of(quads)))
     assert reach.min() > 0.005 and reach.max() < 0.08
