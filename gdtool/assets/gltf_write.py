@@ -25,7 +25,7 @@ def write_glb(path: str | Path, scene: Scene, extras: dict[str, Any] | None = No
     Every metallicFactor and roughnessFactor is written out (the format's default metal is 1). Textures whose Texture
     shares one image array become one embedded PNG, so that occlusion and metallic-roughness can be one file. Colour
     textures are stored as sRGB and the others as linear, as the format demands. extras goes to asset.extras.
-    Tangents are written where the material has a normal map. Raises OutputError, ResourceError beyond 4 GiB.
+    Tangents are written where the material has a normal map, MikkTSpace's where the scene has none. Raises OutputError, ResourceError beyond 4 GiB.
     """
     content = glb_bytes(scene, extras)
     path = Path(path)
@@ -48,9 +48,9 @@ def glb_bytes(scene: Scene, extras: dict[str, Any] | None = None) -> bytes:
     for index in np.unique(scene.material_idx):
         material = scene.materials[index]
         faces = scene.faces[scene.material_idx == index]
-        used, local = np.unique(faces, return_inverse=True)
+        used, local, tangents = _split(scene, material, faces, uv_slots)
         primitives.append({
-            "attributes": _attributes(document, scene, material, used, uv_slots),
+            "attributes": _attributes(document, scene, used, tangents, uv_slots),
             "indices": document.accessor(local.reshape(-1), "SCALAR", _ELEMENT_ARRAY_BUFFER),
             "material": document.unique("materials", _material(document, material, uv_slots)),
         })
@@ -77,13 +77,36 @@ def _check(scene: Scene) -> None:
             raise ValueError("uvs of the scene to write are not finite")
 
 
-def _attributes(document: _Document, scene: Scene, material: Material, used: np.ndarray, uv_slots: list[int]) -> dict[str, int]:
+def _split(scene: Scene, material: Material, faces: np.ndarray, uv_slots: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Vertices (n,) that one primitive uses, its corners as positions among them, and tangents (n, 4) where it needs them.
+
+    A vertex stands more than once where its faces' tangents differ.
+    """
+    used, local = np.unique(faces, return_inverse=True)
+    if material.normal_texture is None or scene.normals is None:
+        return used, local, None
+    normals = _unit_normals(scene)
+    if scene.tangents is not None:
+        return used, local, _unit_tangents(scene.tangents[used], normals[used])
+    if material.normal_texture.uv_set not in uv_slots:
+        return used, local, None
+    from gdtool.texture.tangents import corner_tangents, weld
+
+    tangents = corner_tangents(scene.vertices, faces, normals, scene.uvs[material.normal_texture.uv_set], faces).reshape(-1, 4)
+    corner = faces.reshape(-1, 1)
+    split = weld(corner // 4096, corner % 4096, tangents)  # weld compares float32, which holds no large index
+    first = np.unique(split, return_index=True)[1]
+    used = corner[first, 0]
+    return used, split, _unit_tangents(tangents[first], normals[used])
+
+
+def _attributes(document: _Document, scene: Scene, used: np.ndarray, tangents: np.ndarray | None, uv_slots: list[int]) -> dict[str, int]:
     out = {"POSITION": document.accessor(np.asarray(scene.vertices, np.float32)[used], "VEC3", _ARRAY_BUFFER, bounds=True)}
     if scene.normals is not None:
         normals = _unit_normals(scene)[used]
         out["NORMAL"] = document.accessor(normals.astype(np.float32), "VEC3", _ARRAY_BUFFER)
-        if scene.tangents is not None and material.normal_texture is not None:
-            out["TANGENT"] = document.accessor(_unit_tangents(scene.tangents[used], normals), "VEC4", _ARRAY_BUFFER)
+        if tangents is not None:
+            out["TANGENT"] = document.accessor(tangents, "VEC4", _ARRAY_BUFFER)
     for slot, index in enumerate(uv_slots):
         out[f"TEXCOORD_{slot}"] = document.accessor(np.asarray(scene.uvs[index], np.float32)[used], "VEC2", _ARRAY_BUFFER)
     if scene.colors is not None:
