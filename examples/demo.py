@@ -23,7 +23,7 @@ STAGES = (
     ("bake", ("--size", "1024"), "views"),
     ("relight", ("--env", "mid", "--frames", "4"), None),
 )
-SHOWN = ("color_psnr_masked", "albedo_psnr_masked", "normal_degrees", "surface_distance", "volume_iou", "watertight")
+SHOWN = ("color_psnr_masked", "albedo_psnr_masked", "normal_degrees", "seen_distance", "surface_distance", "surface_iou")
 
 
 def gdtool(*arguments: str) -> str:
