@@ -7,13 +7,15 @@ import zlib
 from pathlib import Path
 from typing import BinaryIO
 
-from gdtool.core.errors import InputError
+from gdtool.core.errors import InputError, ResourceError
+
+MAX_SIDE = 16384  # pixels
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def check_container(path: Path, head: bytes, file: BinaryIO) -> None:
-    """Raise InputError for an empty, cut or animated file; head is its first 64 bytes, file is open for reading.
+    """Raise InputError for an empty, cut or animated file, ResourceError for a huge PNG; head is its first 64 bytes, file is open for reading.
 
     Decoders print to stderr or fill with grey where a file ends early, so this looks first.
     """
@@ -27,6 +29,14 @@ def check_container(path: Path, head: bytes, file: BinaryIO) -> None:
         raise InputError(path, "is a GIF", "save one frame as PNG")
     elif head[:4] == b"RIFF" and head[8:12] == b"WEBP" and head[12:16] == b"VP8X" and head[20] & 2:
         raise InputError(path, "is an animation", "save one frame as a still")
+
+
+def suffix_of(head: bytes) -> str:
+    """The suffix that the first bytes of an image call for: OpenImageIO tries the suffix's format first, and only then tells why it fails."""
+    if head[:4] == b"RIFF":
+        return ".webp" if head[8:12] == b"WEBP" else ""
+    signatures = {PNG: ".png", b"\xff\xd8\xff": ".jpg", b"II*\0": ".tif", b"MM\0*": ".tif", b"v/1\x01": ".exr", b"#?": ".hdr", b"BM": ".bmp"}
+    return next((suffix for signature, suffix in signatures.items() if head.startswith(signature)), "")
 
 
 def _check_png(path: Path, file: BinaryIO) -> None:
@@ -45,6 +55,8 @@ def _check_png(path: Path, file: BinaryIO) -> None:
             raise InputError(path, "is cut short (no end of the PNG)")
         if zlib.crc32(body, zlib.crc32(kind)) != struct.unpack(">I", crc)[0]:
             raise InputError(path, f"is damaged (bad checksum in the PNG's {kind.decode('latin-1')})")
+        if kind == b"IHDR" and length >= 8 and max(struct.unpack_from(">II", body)) > MAX_SIDE:
+            raise ResourceError(path, "is {}x{} pixels, more than {} a side".format(*struct.unpack_from(">II", body), MAX_SIDE), "scale it down")
         if kind == b"acTL" and length >= 4 and struct.unpack(">I", body[:4])[0] > 1:
             raise InputError(path, "is an animation", "save one frame as a still")
         if kind == b"IEND":

@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from gdtool.core.errors import InputError, OutputError, ResourceError, from_os_error
-from gdtool.images.containers import check_container
+from gdtool.images.containers import MAX_SIDE, check_container, suffix_of
 
-MAX_SIDE = 16384  # pixels
 MAX_BYTES = 1 << 30  # of decoded pixels
 
 _TYPES = {"uint8": ("uint8", np.uint8), "uint16": ("uint16", np.uint16), "half": ("float", np.float32),
@@ -50,8 +49,8 @@ def read_image(path: str | Path) -> np.ndarray:
 def decode_image(content: bytes, subject: str) -> np.ndarray:
     """Read an image from memory, as read_image does; subject names it in errors."""
     with tempfile.TemporaryDirectory(prefix="gdtool-") as folder:
-        # OpenImageIO's Python reader opens names only; without a suffix it goes by content.
-        path = Path(folder, "image")
+        # OpenImageIO's Python reader opens names only.
+        path = Path(folder, "image" + suffix_of(content))
         path.write_bytes(content)
         try:
             return read_image(path)
