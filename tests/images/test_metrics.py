@@ -109,10 +109,21 @@ def test_views_metrics_take_the_domains_that_both_have():
     images = {"color": noise((1, 256, 256, 3)), "albedo": noise((1, 256, 256, 3)), "roughness": noise((1, 256, 256)), "depth": noise((1, 256, 256))}
     found = metrics.views_metrics(images, mask, {k: v for k, v in images.items() if k != "depth"}, mask)
     assert found == pytest.approx({"mask_iou": 1, "color_psnr_published": 100, "color_ssim_published": 1, "color_psnr_masked": 100, "color_ssim_masked": 1,
-                                   "albedo_psnr": 100, "albedo_ssim": 1, "roughness_error": 0})
+                                   "albedo_psnr_masked": 100, "albedo_ssim_masked": 1, "roughness_error": 0})
 
 
 def test_nothing_in_common_gives_no_figure():
     mask = np.zeros((1, 256, 256), np.float32)
     normal = np.zeros((1, 256, 256, 3), np.float32)
     assert metrics.views_metrics({"normal": normal}, mask, {"normal": normal}, mask) == {"mask_iou": 1}
+
+
+def test_views_are_resized_over_what_they_cover():
+    """A half covered new pixel keeps the value of its covered half; a mean of normals is a unit vector."""
+    mask = np.zeros((1, 4, 4), np.float32)
+    mask[:, :, :1] = 1
+    normal = np.zeros((1, 4, 4, 3), np.float32)
+    normal[:, ::2, 0], normal[:, 1::2, 0] = (1, 0, 0), (0, 1, 0)
+    images, small = metrics.resized_views({"depth": 2 * mask, "normal": normal}, mask, 2, 2)
+    assert small[0].tolist() == [[0.5, 0]] * 2 and images["depth"][0].tolist() == [[2, 0]] * 2
+    np.testing.assert_allclose(images["normal"][0, 0], [[0.5**0.5, 0.5**0.5, 0], [0, 0, 0]], atol=1e-6)

@@ -1,0 +1,223 @@
+"""gdtool evaluate by its command line: an egg, its views, a surface and quads made from them, known errors put in."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from gdtool.cameras import rig
+from gdtool.core import sources
+from gdtool.core.errors import InputError, UsageError
+from gdtool.core.folder import open_folder
+from gdtool.core.kinds import MeshContent, RendersContent
+from gdtool.core.manifest import MANIFEST, InputEntry, encode, read_manifest
+from gdtool.folders.mesh import QuadMesh, write_mesh
+from gdtool.folders.surface import Surface, write_surface
+from gdtool.folders.views import Views, read_views, write_views
+from gdtool.images.io import write_png
+from gdtool.stages import evaluate
+from tests.stages.bake_folders import finish, fresh
+
+CENTER, SIZE = np.array([3.0, -2.0, 10.0]), 20.0
+MATRIX = np.array([[SIZE, 0, 0, 3], [0, SIZE, 0, -2], [0, 0, SIZE, 10], [0, 0, 0, 1]], float)
+
+
+def egg(subdivisions=3):
+    """Triangles with longest side 1 (along y), asymmetric, normalised frame."""
+    mesh = trimesh.creation.icosphere(subdivisions, 0.5)
+    vertices = np.asarray(mesh.vertices) * [0.6, 1, 0.8]
+    return vertices, np.asarray(mesh.faces, np.int32)
+
+
+def egg_views(vertices, faces, size=48):
+    """Six true views with all that is constant on an egg of one material."""
+    from gdtool.assets.scene import Material, Scene
+    from gdtool.shading.render import Renderer
+
+    scene = Scene(vertices, faces, (Material("egg", base_color=(0.5, 0.25, 0.1, 1), metallic=0.25, roughness=0.75),))
+    renderer, cameras = Renderer(scene), rig("six", size)
+    buffers = [renderer.buffers(camera) for camera in cameras]
+    images = {name: np.stack([one[name] for one in buffers]) for name in ("normal", "depth", "albedo", "roughness", "metallic")}
+    mask = np.stack([one["mask"] for one in buffers])
+    return Views(cameras, {"color": images["albedo"], **images}, mask)
+
+
+def write_egg_surface(path, inputs, scale=1.0, matrix=MATRIX):
+    vertices, faces = egg()
+    fill = lambda value: np.full(len(vertices), value, np.float32)  # noqa: E731
+    out = fresh(path)
+    surface = Surface(vertices * scale, faces, np.tile(np.float32((0.5, 0.25, 0.1)), (len(vertices), 1)), fill(0.65), fill(0.25), fill(1))
+    write_surface(out, surface, watertight=True, source_from_world=matrix)
+    return finish(path, "surface", out.content, inputs)
+
+
+@pytest.fixture
+def chain(tmp_path):
+    """egg.obj (in its own frame) → egg.asset/views → surface (5 % too small, roughness 0.1 too low)."""
+    vertices, faces = egg()
+    trimesh.Trimesh(vertices * SIZE + CENTER, faces, process=False).export(tmp_path / "egg.obj")
+    root = tmp_path / "egg.asset"
+    out = fresh(root / "views")
+    write_views(out, egg_views(vertices, faces), source_from_world=MATRIX)
+    finish(root / "views", "views", out.content, {})
+    manifest = read_manifest(root / "views")
+    source = InputEntry("source", "../../egg.obj", sources.digest(tmp_path / "egg.obj"))
+    (root / "views" / MANIFEST).write_bytes(encode(type(manifest)(**{**{f: getattr(manifest, f) for f in manifest.__struct_fields__}, "inputs": (source,)})))
+    write_egg_surface(root / "surface", {"source": root / "views"}, 0.95)
+    return root
+
+
+def measured(result, reference=None, **options):
+    """The stage itself, in this process: a command takes seconds to start, and test_the_command runs it."""
+    found, against = (None if x is None else sources.resolve(str(x), evaluate.READS, "test") for x in (result, reference))
+    return evaluate.evaluate(found, against, evaluate.Options(**{"samples": 2000, "syncdreamer": False, **options}))
+
+
+def test_the_truth_and_the_views_are_found_along_the_provenance(chain):
+    found = measured(chain / "surface")
+    assert all(isinstance(value, (bool, int, float, str)) for value in found.values())  # flat
+    assert found["result"] == "egg" and found["kind"] == "surface" and found["watertight"] and found["reference_watertight"]
+    assert found["vertices"] == len(egg()[0]) and found["faces"] == len(egg()[1]) and found["quads"] == 0
+    # 5 % of a radius of 0.3 to 0.5, some less along the normal: the frame of the model was undone.
+    assert 0.014 < found["surface_distance"] < 0.025
+    assert found["surface_iou"] == pytest.approx(0.95**3, abs=0.01)
+    assert found["surface_normal_degrees"] < 3 and found["surface_flipped_share"] == 0
+    assert found["seen_distance"] == pytest.approx(found["surface_distance"], rel=0.1) and 0.8 < found["seen_share"] <= 1
+
+
+def test_a_surface_is_rendered_through_the_cameras_of_its_views(chain):
+    found = measured(chain / "surface")
+    assert found["views"] == 6 and found["reference_views"] == "egg"
+    assert found["mask_iou"] == pytest.approx(0.95**2, abs=0.01)
+    assert found["depth_error"] == pytest.approx(0.02, abs=0.01)
+    true_size = write_egg_surface(chain / "exact", {"source": chain / "views"})
+    exact = measured(true_size)
+    assert exact["mask_iou"] > 0.999 and exact["albedo_psnr_masked"] > 45 and exact["depth_error"] < 1e-3
+    assert exact["roughness_error"] == pytest.approx(0.1, abs=0.005) and exact["metallic_error"] < 0.005
+    assert exact["normal_degrees"] < 3  # smooth against flat facets of 1/8 of a quarter circle
+    assert "albedo_psnr_masked" not in measured(true_size, render=False)
+
+
+def test_reference_by_name_in_each_form(chain, tmp_path):
+    surface = chain / "surface"
+    own = measured(surface)
+    by_file = measured(surface, tmp_path / "egg.obj")
+    assert by_file["surface_distance"] == own["surface_distance"]
+    by_views = measured(surface, chain / "views")
+    assert by_views["surface_distance"] == own["surface_distance"]
+    exact = write_egg_surface(chain / "exact", {})
+    by_surface = measured(surface, exact)
+    # surface.ply is float32: the samples fall on the same points but for rounding
+    assert by_surface["surface_distance"] == pytest.approx(own["surface_distance"], rel=1e-3)
+    by_box = measured(exact, tmp_path / "egg.obj", frame="box")
+    assert by_box["surface_distance"] < 1e-5 and by_box["surface_f_score"] == 1
+    moved = measured(exact, tmp_path / "egg.obj", frame="same")
+    assert moved["surface_distance"] > 0.1
+
+
+def test_a_result_from_a_picture_is_measured_in_the_unit_box(chain, tmp_path):
+    pictured = write_egg_surface(chain / "pictured", {}, matrix=np.eye(4))
+    assert measured(pictured, tmp_path / "egg.obj")["surface_distance"] < 1e-5
+
+
+def test_quads_and_their_seen_part(chain):
+    """A box of quads: counts, a closed shell, views found behind the surface."""
+    box = trimesh.creation.box((0.6, 1, 0.8))
+    corners = np.asarray(box.vertices)
+    quads = np.array([[i for i in range(8) if corners[i, a] * s > 0] for a in range(3) for s in (-1, 1)])
+    for row, (a, s) in zip(quads, ((a, s) for a in range(3) for s in (-1, 1)), strict=True):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        row[:] = row[np.argsort(s * np.arctan2(corners[row, c], corners[row, b]))]
+    out = fresh(chain / "mesh")
+    write_mesh(out, QuadMesh(corners, quads.astype(np.int32)))
+    content = MeshContent(vertices=8, quads=6, triangles=0, watertight=True, source_from_world=tuple(map(float, MATRIX.ravel())))
+    finish(chain / "mesh", "mesh", content, {"source": chain / "surface"})
+    found = measured(chain / "mesh")
+    assert (found["vertices"], found["quads"], found["faces"]) == (8, 6, 6) and found["watertight"]
+    assert found["surface_flipped_share"] == pytest.approx(0, abs=0.02)
+    assert found["surface_iou"] == pytest.approx(np.pi / 6 * 1.1**3 / 1.1**3, abs=0.02)  # an ellipsoid in its box
+    assert "seen_distance" in found and "albedo_psnr_masked" not in found  # a bare mesh has nothing to render
+    found = measured(chain / "mesh", chain / "surface")
+    assert found["surface_accuracy"] > 0.05
+
+
+def test_files_against_files_and_a_hole(tmp_path):
+    vertices, faces = egg()
+    trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "a.ply")
+    trimesh.Trimesh(vertices, faces[5:], process=False).export(tmp_path / "b.ply")
+    found = measured("b.ply", "a.ply")
+    assert not found["watertight"] and found["reference_watertight"] and found["faces"] == len(faces) - 5
+    assert found["surface_accuracy"] < 1e-6 < found["surface_completeness"]
+    back = measured("a.ply", "b.ply")
+    assert "surface_iou" not in back and not back["reference_watertight"]
+
+
+def shifted(views, path, **changes):
+    out = fresh(path)
+    write_views(out, replace(views, **changes))
+    return finish(path, "views", out.content, {})
+
+
+def test_views_against_views(chain, tmp_path):
+    truth = read_views(open_folder(chain / "views"))
+    images = dict(truth.images)
+    images["roughness"] = images["roughness"] - 0.2 * (truth.mask > 0)
+    images["depth"] = images["depth"] + 0.01 * (truth.mask > 0)
+    del images["metallic"]
+    other = shifted(truth, tmp_path / "other", images=images)
+    found = measured(other, chain / "views")
+    assert found["kind"] == "views" and found["views"] == 6 and found["mask_iou"] == 1
+    for name in ("color_psnr_published", "color_psnr_masked", "albedo_psnr_masked"):
+        assert found[name] == 100, name
+    assert found["color_ssim_published"] == pytest.approx(1) and found["normal_degrees"] < 0.01
+    assert found["roughness_error"] == pytest.approx(0.2, abs=0.003) and found["depth_error"] == pytest.approx(0.01, abs=1e-5)
+    assert "metallic_error" not in found and "surface_distance" not in found
+
+
+def test_views_of_another_size_and_of_other_cameras(chain, tmp_path):
+    vertices, faces = egg()
+    large = shifted(egg_views(vertices, faces, 96), tmp_path / "large")
+    found = measured(large, chain / "views")
+    assert found["mask_iou"] > 0.99 and found["normal_degrees"] < 1 and found["color_psnr_masked"] > 45
+    turned = shifted(replace(egg_views(vertices, faces), cameras=[replace(c, half_width=0.5) for c in rig("six", 48)]), tmp_path / "turned")
+    with pytest.raises(InputError, match="another camera"):
+        measured(turned, chain / "views")
+
+
+def test_renders_against_renders(tmp_path):
+    for name, level in (("a", 128), ("b", 154)):
+        out = fresh(tmp_path / name)
+        frame = np.full((64, 64, 4), level, np.uint8)
+        frame[..., 3] = 255
+        write_png(out.path("000.png"), frame)
+        finish(tmp_path / name, "renders", RendersContent(frames=1, environment="mid", light="mid"), {})
+    found = measured("a", "b")
+    assert found["color_psnr_masked"] == pytest.approx(-20 * np.log10(26 / 255), abs=0.01)
+
+
+def test_what_cannot_be_compared_is_said(chain, tmp_path):
+    with pytest.raises(UsageError, match="--reference"):
+        measured(tmp_path / "egg.obj")
+    with pytest.raises(InputError, match="run gdtool render-dataset"):
+        measured(chain / "views", tmp_path / "egg.obj")
+    with pytest.raises(UsageError, match="no other views"):
+        measured(chain / "views")
+
+
+def test_the_command(gdtool, chain):
+    """One flat JSON object with both protocols, the same each time; a table; bad ones among many."""
+    one, two = (gdtool("evaluate", chain / "surface", "--json", "--samples", 500) for _ in range(2))
+    assert one.returncode == 0 and one.stdout == two.stdout and one.stderr == ""
+    found = json.loads(one.stdout)
+    assert found["syncdreamer_chamfer"] > 0 and found["surface_distance"] > 0 and found["path"] == str(chain / "surface")
+    assert all(isinstance(value, (bool, int, float, str)) for value in found.values())
+
+    done = gdtool("evaluate", "--samples", 500, "--no-syncdreamer", stdin=f"{chain / 'surface'}\n{chain / 'nothing'}\n")
+    assert done.returncode == 1 and "does not exist" in done.stderr and "Traceback" not in done.stderr
+    assert done.stdout.startswith("egg (surface)") and "surface protocol" in done.stdout and "watertight" in done.stdout
+
+    done = gdtool("evaluate", "none.glb", "--reference", "egg.obj")
+    assert done.returncode == 3 and "none.glb: does not exist" in done.stderr and done.stdout == ""
+    assert gdtool("evaluate").returncode == 2
