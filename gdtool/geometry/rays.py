@@ -77,13 +77,16 @@ class RayCaster:
 
     def _run(self, origins: np.ndarray, directions: np.ndarray, query: str, limits: np.ndarray | None) -> np.ndarray:
         origins, directions = np.asarray(origins), np.asarray(directions)
+        if origins.dtype.kind != "f":
+            origins = origins.astype(np.float64)
         out = np.full(len(origins), -1, np.int32)
         if not len(self.faces) or not len(origins):
             return out
 
         def chunk(start: int) -> None:
             part = slice(start, start + CHUNK)
-            local = np.ascontiguousarray((origins[part] - self.center) * self.scale, np.float32)
+            center = self.center.astype(origins.dtype) if origins.dtype == np.float32 else self.center
+            local = np.ascontiguousarray((origins[part] - center) * origins.dtype.type(self.scale), np.float32)
             along = np.ascontiguousarray(directions[part], np.float32)
             limit = None if limits is None else np.ascontiguousarray(limits[part] * self.scale, np.float32)
             out[part] = self._scene.run(local, along, query=query, dists=limit)

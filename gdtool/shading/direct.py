@@ -1,7 +1,14 @@
-"""Direct light of an environment with shadows: multiple importance sampling of the light and the reflection, Embree visibility."""
+"""Direct light of an environment with shadows: multiple importance sampling of the light and the reflection, Embree visibility.
+
+Everything per pair of point and direction is a scalar: with Schlick's Fresnel, F = f0 + (1 − f0) w, reflected radiance is a
+linear combination of four sums over the directions, in which only w depends on them.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,50 +20,117 @@ if TYPE_CHECKING:
 
 # Directions drawn once from the light; each point takes its own run of them.
 POOL = 1 << 16
-# Point-times-direction pairs shaded at once.
-PAIRS = 1 << 19
+# Point-times-direction pairs shaded at once: few enough for the cache.
+PAIRS = 1 << 15
 MIN_SPECULAR_SHARE = 0.1
+# Normal maps may turn a normal away from the eye: such points are shaded as seen at grazing.
+MIN_VIEW_COSINE = 0.02
 
 
 def sobol(count: int, dimensions: int, seed: int) -> np.ndarray:
     """(count, dimensions) scrambled Sobol points in [0, 1); count a power of two keeps every aligned run stratified."""
-    from scipy.stats import qmc
+    import torch
 
-    return np.ascontiguousarray(qmc.Sobol(dimensions, scramble=True, seed=np.random.default_rng(seed)).random(count))
+    return torch.quasirandom.SobolEngine(dimensions, scramble=True, seed=seed).draw(count, dtype=torch.float64).numpy()
 
 
 class DirectLight:
     """An estimator of the light that points reflect toward the eye.
 
     samples: directions a point draws from the light, and as many from its reflection (a quarter of that for the extra
-    samples of refined pixels). Each direction is weighted by the
-    balance heuristic (Veach 1997): f L cos / (n p_light + n p_reflection).
+    samples of refined pixels). Each direction is weighted by the balance heuristic (Veach 1997):
+    f L cos / (n p_light + n p_reflection). shadows False leaves visibility out.
     """
 
-    def __init__(self, renderer: Renderer, environment: Environment, samples: int, seed: int = 0, brdf: str = "gltf"):
+    def __init__(self, renderer: Renderer, environment: Environment, samples: int, seed: int = 0, brdf: str = "gltf", shadows: bool = True):
         import torch
 
-        self.renderer, self.environment, self.samples, self.brdf = renderer, environment, max(1, samples), brdf
-        self.seed = seed
+        self.renderer, self.environment, self.brdf, self.shadows, self.seed = renderer, environment, brdf, shadows, seed
+        # Runs start at multiples of their length, a power of two, so that each is a stratified set of its own.
+        self.samples = 1 << max(0, round(math.log2(max(1, samples))))
         directions, radiance, density = environment.sample(sobol(POOL, 2, seed))
-        self.pool = tuple(torch.tensor(x, dtype=torch.float32) for x in (directions, radiance, density))
-        self.pattern = torch.tensor(sobol(POOL, 3, seed + 1), dtype=torch.float32)
-        self.rng = np.random.default_rng([seed, 7])
+
+        def tensor(x):
+            return torch.tensor(np.ascontiguousarray(x), dtype=torch.float32)
+
+        self.pool = (*(tensor(directions[:, i]) for i in range(3)), tensor(density), tensor(radiance))
+        self.pattern = tuple(tensor(x) for x in sobol(POOL, 3, seed + 1).T)
+        self.image, self.density = tensor(environment.image.reshape(-1, 3)), tensor(environment.pdf.reshape(-1))
+        self.calls = 0
+
+    def color(self, exposure: float = 1.0) -> Callable[[Points], dict[str, np.ndarray]]:
+        """The shading that Renderer.buffers takes for a color image."""
+        return lambda points: {"color": self.radiance(points) * np.float32(exposure)}
 
     def radiance(self, points: Points) -> np.ndarray:
         """(n, 3) linear radiance toward the eye, emission included."""
         out = np.empty((len(points), 3), np.float32)
         k = max(1, self.samples // 4) if points.extra else self.samples
         step = max(1, PAIRS // k)
-        for start in range(0, len(points), step):
+        self.calls += 1
+        rng = np.random.default_rng([self.seed, self.calls])
+        runs = rng.integers(0, POOL // k, (2, len(points)))
+
+        def shade(start: int) -> tuple[int, int]:
             part = slice(start, start + step)
-            out[part] = self._chunk(points, part, k)
+            out[part], cast, below = self._chunk(points, part, runs[:, part], k)
+            return cast, below
+
+        with ThreadPoolExecutor(self.renderer.caster.threads) as pool:
+            counted = list(pool.map(shade, range(0, len(points), step)))
+        counts = self.renderer.counts
+        counts.shadow_rays += sum(cast for cast, _ in counted)
+        counts.shadow_rays_below_horizon += sum(below for _, below in counted)
         out += points.values["emissive"]
         unlit = points.values["unlit"]
         out[unlit] = points.values["albedo"][unlit]
         return out
 
-    def _chunk(self, points: Points, part: slice, k: int) -> np.ndarray:
+    def _chunk(self, points: Points, part: slice, runs: np.ndarray, k: int) -> tuple[np.ndarray, int, int]:
+        import torch
+
+        surface = _Surface(points, part, self.brdf)
+        light_run, pattern_run = torch.from_numpy(runs[0]), torch.from_numpy(runs[1])
+
+        def run_of(pool, run):
+            return pool.reshape(POOL // k, k, *pool.shape[1:])[run]
+
+        x, y, z, p_light, light = (run_of(part, light_run) for part in self.pool)
+        first = self._gather(points, part, surface, (x, y, z), light, p_light, k)
+        direction = surface.sample(*(run_of(u, pattern_run) for u in self.pattern))
+        pixel = self._pixel(*direction)
+        second = self._gather(points, part, surface, direction, self.image[pixel], self.density[pixel], k)
+        return surface.combine(first[0] + second[0]).numpy(), first[1] + second[1], first[2] + second[2]
+
+    def _pixel(self, x, y, z):
+        """Environment.pixel_of in float32."""
+        import torch
+
+        height, width = self.environment.image.shape[:2]
+        row = (torch.acos(y.clamp(-1, 1)) * (height / math.pi)).long().clamp_max(height - 1)
+        column = ((torch.atan2(z, x) * (0.5 / math.pi) + 0.5) * width).long().clamp(0, width - 1)
+        return row * width + column
+
+    def _gather(self, points: Points, part: slice, surface: _Surface, direction, light, p_light, k: int):
+        """The four sums (n, 4, 3) over visible directions, shadow rays cast, and directions that needed none."""
+        import torch
+
+        terms, p_reflect, above = surface.evaluate(*direction)
+        weight = above / (k * (p_light + p_reflect)).clamp_min(1e-20)
+        flat = above.reshape(-1).nonzero()[:, 0]
+        if self.shadows and len(flat):
+            owner = (flat // k).numpy()
+            origins = surface.lifted(points, part, 2e-4 * self.renderer.extent)[owner]
+            rays = torch.stack([c.reshape(-1)[flat] for c in direction], 1).numpy()
+            weight.reshape(-1)[flat[torch.from_numpy(self.renderer.occluded(origins, rays))]] = 0.0
+        sums = torch.bmm(torch.stack([term * weight for term in terms], 1), light)
+        return sums, len(flat), above.numel() - len(flat)
+
+
+class _Surface:
+    """Reflection of n points: evaluated and sampled for k directions each, vectors as three (n, k) tensors."""
+
+    def __init__(self, points: Points, part: slice, brdf: str):
         import torch
 
         from gdtool.shading.brdf import alpha_of, f0_of
@@ -65,120 +139,99 @@ class DirectLight:
             return torch.as_tensor(np.ascontiguousarray(x[part]), dtype=torch.float32)
 
         values = points.values
-        normal, geometric, view = tensor(values["normal"]), tensor(values["geometric_normal"]), tensor(points.view)
-        albedo, roughness, metallic = tensor(values["albedo"]), tensor(values["roughness"]), tensor(values["metallic"])
-        n = len(normal)
-        runs = torch.from_numpy(self.rng.integers(0, POOL // k, n) * k)
-        index = runs[:, None] + torch.arange(k)
-        surface = _Surface(normal, view, albedo, roughness, metallic, alpha_of(roughness), f0_of(albedo, metallic, 0.04), self.brdf)
-
-        direction, light, p_light = (x[index] for x in self.pool)
-        value, p_reflect, cosine = surface.evaluate(direction)
-        weighted = value * light / (k * (p_light + p_reflect))[..., None]
-        total = self._visible(points, part, geometric, direction, weighted, cosine)
-
-        direction = surface.sample(self.pattern[index])
-        flat = direction.reshape(-1, 3).numpy()
-        pixel = torch.from_numpy(self.environment.pixel_of(flat)).reshape(n, k)
-        light, p_light = self._image()[0][pixel], self._image()[1][pixel]
-        value, p_reflect, cosine = surface.evaluate(direction)
-        weighted = value * light / (k * (p_light + p_reflect))[..., None]
-        return (total + self._visible(points, part, geometric, direction, weighted, cosine)).numpy()
-
-    def _image(self):
-        import torch
-
-        if not hasattr(self, "_tensors"):
-            self._tensors = (torch.tensor(self.environment.image.reshape(-1, 3), dtype=torch.float32),
-                             torch.tensor(self.environment.pdf.reshape(-1), dtype=torch.float32))
-        return self._tensors
-
-    def _visible(self, points: Points, part: slice, geometric, direction, weighted, cosine):
-        """Sum (n, 3) over directions (n, k, 3) of the weighted light that nothing blocks."""
-        import torch
-
-        above = (cosine > 0) & ((direction * geometric[:, None]).sum(-1) > 0) & (weighted.amax(-1) > 0)
-        flat = above.reshape(-1).nonzero()[:, 0]
-        counts = self.renderer.counts
-        counts.shadow_rays += len(flat)
-        counts.shadow_rays_below_horizon += above.numel() - len(flat)
-        owner = (flat // direction.shape[1]).numpy()
-        offset = 2e-4 * self.renderer.extent
-        origins = (points.position[part] + offset * geometric.numpy())[owner]
-        free = ~self.renderer.occluded(origins, direction.reshape(-1, 3)[flat].numpy())
-        lit = torch.zeros(above.numel(), dtype=torch.float32)
-        lit[flat[torch.from_numpy(free)]] = 1.0
-        return (weighted * lit.reshape(above.shape)[..., None]).sum(1)
-
-
-class _Surface:
-    """Reflection of n points: evaluated and sampled for k directions each."""
-
-    def __init__(self, normal, view, albedo, roughness, metallic, alpha, f0, brdf):
-        self.normal, self.view, self.brdf = normal, view, brdf
-        self.albedo, self.roughness, self.metallic, self.alpha, self.f0 = albedo, roughness, metallic, alpha, f0
-        # Normal maps may turn a normal away from the eye: shade such points as seen at grazing.
-        self.n_v = (normal * view).sum(-1).clamp_min(0.02)
-        diffuse = (albedo.amax(-1) * (1 - metallic))
-        reflect = f0.amax(-1) + (1 - f0.amax(-1)) * (1 - self.n_v) ** 5
+        self.brdf = brdf
+        normal, view, self.geometric_rows = tensor(values["normal"]), tensor(points.view), tensor(values["geometric_normal"])
+        self.albedo, self.metallic = tensor(values["albedo"]), tensor(values["metallic"])
+        roughness = tensor(values["roughness"])
+        self.f0 = f0_of(self.albedo, self.metallic, 0.04)
+        self.roughness, self.alpha = roughness[:, None], alpha_of(roughness)[:, None]
+        self.normal, self.view, self.geometric = ([c[:, None] for c in v.unbind(1)] for v in (normal, view, self.geometric_rows))
+        self.n_v_exact = (normal * view).sum(1)[:, None]
+        self.n_v = self.n_v_exact.clamp_min(MIN_VIEW_COSINE)
+        strongest = self.f0.amax(1)[:, None]
+        reflect = strongest + (1 - strongest) * (1 - self.n_v) ** 5
+        diffuse = (self.albedo.amax(1) * (1 - self.metallic))[:, None]
         self.share = (reflect / (reflect + diffuse).clamp_min(1e-6)).clamp(MIN_SPECULAR_SHARE, 1.0)
 
-    def evaluate(self, direction):
-        """BRDF times cosine (n, k, 3), density of sample() (n, k), and n·l (n, k)."""
-        import math
+    def lifted(self, points: Points, part: slice, offset: float) -> np.ndarray:
+        """(n, 3) float32 positions a little off the surface, on the seen side."""
+        return (points.position[part] + offset * self.geometric_rows.numpy()).astype(np.float32)
 
-        from gdtool.shading.brdf import ndf, reflectance
-        from gdtool.shading.sg import normalize
+    def evaluate(self, x, y, z):
+        """[D V c, D V c w, d c / π, d c w / π] with c = n·l and d the diffuse model's factor; density of sample(); and 1.0
+        where the direction is above the horizon of both the shading and the true normal."""
+        from gdtool.shading.brdf import disney_diffuse, ndf, visibility_gltf, visibility_paper
 
-        normal = self.normal[:, None]
-        n_l = (direction * normal).sum(-1)
-        half = normalize(direction + self.view[:, None])
-        n_h, v_h = (half * normal).sum(-1), (half * self.view[:, None]).sum(-1).clamp(0, 1)
-        n_v, alpha = self.n_v[:, None], self.alpha[:, None]
-        diffuse, specular = reflectance(self.brdf, self.albedo[:, None], self.roughness[:, None], self.metallic[:, None],
-                                        self.f0[:, None], n_l.clamp(0, 1), n_v, n_h, v_h)
-        value = (diffuse + specular) * n_l.clamp_min(0)[..., None]
-        # Visible normals (Heitz 2018): p = D G1(v) / (4 n·v), G1 of Smith.
-        a2 = alpha * alpha
-        g1 = 2 / (1 + ((a2 + (1 - a2) * n_v * n_v).sqrt() / n_v))
-        p_specular = ndf(alpha, n_h) * g1 / (4 * n_v)
-        density = self.share[:, None] * p_specular + (1 - self.share[:, None]) * n_l.clamp_min(0) / math.pi
-        return value, density, n_l
+        nx, ny, nz = self.normal
+        vx, vy, vz = self.view
+        gx, gy, gz = self.geometric
+        n_l = nx * x + ny * y + nz * z
+        l_v = vx * x + vy * y + vz * z
+        above = ((n_l > 0) & (gx * x + gy * y + gz * z > 0)).to(n_l.dtype)
+        cosine = n_l.clamp(0, 1)
+        # |l + v|² = 2 + 2 l·v, so the half vector itself is not needed.
+        n_h = ((n_l + self.n_v_exact) * (2 + 2 * l_v).clamp_min(1e-12).rsqrt()).clamp(0, 1)
+        v_h = (0.5 + 0.5 * l_v).clamp(0, 1).sqrt()
+        d = ndf(self.alpha, n_h)
+        if self.brdf == "gltf":
+            v = visibility_gltf(self.alpha, cosine, self.n_v)
+            diffuse = cosine * (1 / math.pi)
+        else:
+            v = visibility_paper(self.roughness, cosine, self.n_v)
+            diffuse = cosine * (1 / math.pi) * disney_diffuse(self.roughness, cosine, self.n_v.clamp(0, 1), v_h)
+        t = 1 - v_h
+        w = (t * t) * (t * t) * t
+        specular = d * v * cosine
+        # Visible normals (Heitz 2018): p = D G1(v) / (4 n·v) with Smith's G1.
+        a2 = self.alpha * self.alpha
+        g1 = 2 / (1 + (a2 + (1 - a2) * self.n_v * self.n_v).sqrt() / self.n_v)
+        density = d * (self.share * g1 / (4 * self.n_v)) + cosine * ((1 - self.share) * (1 / math.pi))
+        return (specular, specular * w, diffuse, diffuse * w), density, above
 
-    def sample(self, uniform):
-        """Directions (n, k, 3) from uniform (n, k, 3): visible normals mirrored, or cosine-weighted."""
-        import math
-
+    def sample(self, u, v, pick):
+        """Directions (three (n, k)) from uniform numbers: visible normals mirrored, or cosine-weighted."""
         import torch
 
-        from gdtool.shading.sg import normalize
-
-        tangent, bitangent = frame(self.normal)
-        local_view = torch.stack([(tangent * self.view).sum(-1), (bitangent * self.view).sum(-1), self.n_v], -1)
-        local_view = normalize(local_view)[:, None]
-        u, v, pick = uniform.unbind(-1)
+        (tx, ty, tz), (bx, by, bz) = frame(*self.normal)
+        (nx, ny, nz), (vx, vy, vz) = self.normal, self.view
+        a = self.alpha
+        ex, ey = tx * vx + ty * vy + tz * vz, bx * vx + by * vy + bz * vz
+        length = (ex * ex + ey * ey + self.n_v * self.n_v).rsqrt()
+        ex, ey, ez = ex * length, ey * length, self.n_v * length
+        # Spherical caps (Dupuy & Benyoub 2023).
+        sx, sy = a * ex, a * ey
+        length = (sx * sx + sy * sy + ez * ez).rsqrt()
+        sx, sy, sz = sx * length, sy * length, ez * length
         phi = 2 * math.pi * v
-        # Spherical-cap form of visible normals (Dupuy & Benyoub 2023).
-        alpha = self.alpha[:, None]
-        stretched = normalize(torch.stack([alpha * local_view[..., 0], alpha * local_view[..., 1], local_view[..., 2]], -1))
-        z = (1 - u) * (1 + stretched[..., 2]) - stretched[..., 2]
+        cos_phi, sin_phi = phi.cos(), phi.sin()
+        z = (1 - u) * (1 + sz) - sz
         ring = (1 - z * z).clamp_min(0).sqrt()
-        cap = torch.stack([ring * phi.cos(), ring * phi.sin(), z], -1) + stretched
-        micro = normalize(torch.stack([alpha * cap[..., 0], alpha * cap[..., 1], cap[..., 2].clamp_min(1e-6)], -1))
-        mirrored = 2 * (micro * local_view).sum(-1, keepdim=True) * micro - local_view
+        mx, my, mz = a * (ring * cos_phi + sx), a * (ring * sin_phi + sy), (z + sz).clamp_min(1e-6)
+        length = (mx * mx + my * my + mz * mz).rsqrt()
+        mx, my, mz = mx * length, my * length, mz * length
+        twice = 2 * (mx * ex + my * ey + mz * ez)
         radius = u.sqrt()
-        cosine = torch.stack([radius * phi.cos(), radius * phi.sin(), (1 - u).clamp_min(0).sqrt()], -1)
-        local = torch.where((pick < self.share[:, None])[..., None], mirrored, cosine)
-        world = local[..., :1] * tangent[:, None] + local[..., 1:2] * bitangent[:, None] + local[..., 2:] * self.normal[:, None]
-        return normalize(world)
+        glossy = pick < self.share
+        x = torch.where(glossy, twice * mx - ex, radius * cos_phi)
+        y = torch.where(glossy, twice * my - ey, radius * sin_phi)
+        z = torch.where(glossy, twice * mz - ez, (1 - u).clamp_min(0).sqrt())
+        return x * tx + y * bx + z * nx, x * ty + y * by + z * ny, x * tz + y * bz + z * nz
+
+    def combine(self, sums):
+        """(n, 3) radiance from the four sums (n, 4, 3)."""
+        diffuse = self.albedo * (1 - self.metallic)[:, None]
+        if self.brdf == "gltf":
+            diffuse = diffuse * (1 - self.f0) * (sums[:, 2] - sums[:, 3])
+        else:
+            diffuse = diffuse * sums[:, 2]
+        return self.f0 * sums[:, 0] + (1 - self.f0) * sums[:, 1] + diffuse
 
 
-def frame(normal):
-    """Tangent and bitangent (n, 3) of unit normals (Duff et al. 2017)."""
+def frame(x, y, z):
+    """Tangent and bitangent of unit normals, three components each (Duff et al. 2017)."""
     import torch
 
-    x, y, z = normal.unbind(-1)
     sign = torch.where(z < 0, -1.0, 1.0)
     a = -1 / (sign + z)
     b = x * y * a
-    return torch.stack([1 + sign * x * x * a, sign * b, -sign * x], -1), torch.stack([b, sign + y * y * a, -y], -1)
+    return (1 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)

@@ -24,7 +24,7 @@ BASE = 4
 MAX_LAYERS = 32
 # A pixel whose samples differ by more than this (standard deviation) gets all samples.
 TOLERANCE = {"normal": 0.03, "albedo": 0.012, "roughness": 0.02, "metallic": 0.02}
-CHANNELS = {"normal": 3, "albedo": 3, "roughness": 1, "metallic": 1, "depth": 1, "emissive": 3}
+DOMAINS = ("normal", "depth", "albedo", "roughness", "metallic")
 # Samples that are held at once: bounds the memory.
 BAND_SAMPLES = 1 << 20
 
@@ -163,7 +163,8 @@ class Renderer:
         return Points(pixel[hit], origins[hit] + directions * distance[:, None], -directions, depth, values)
 
     def buffers(self, camera: Camera, samples: int = 16, shade=None) -> dict[str, np.ndarray]:
-        """Domain images (h, w[, c]) float32 and "mask": see render_buffers. shade(points) -> dict of (n, 3) adds images."""
+        """Domain images (h, w[, c]) float32 and "mask": see render_buffers. shade(points) -> {"color": (n, 3)} adds an
+        image."""
         height, width = camera.height, camera.width
         top, bottom, left, right = self.window(camera)
         self.counts.pixels += height * width
@@ -174,7 +175,7 @@ class Renderer:
             stop = min(start + rows, bottom)
             pixel = (np.arange(start, stop)[:, None] * width + np.arange(left, right)[None]).ravel()
             self._band(camera, pixel, samples, total, shade)
-        return total.images(camera)
+        return total.images(camera, () if shade is None else ("color",))
 
     def _band(self, camera: Camera, pixel: np.ndarray, samples: int, total: _Sums, shade) -> None:
         base = min(BASE, samples)
@@ -204,11 +205,13 @@ class _Sums:
         self.squares: dict[str, np.ndarray] = {}
 
     def add(self, points: Points, asked: np.ndarray, shade) -> None:
+        self.asked += np.bincount(asked, minlength=self.pixels)
+        if not len(points):
+            return
         values = {k: points.values[k] for k in ("normal", "albedo", "roughness", "metallic")}
         values["depth"] = points.depth
         if shade is not None:
             values |= shade(points)
-        self.asked += np.bincount(asked, minlength=self.pixels)
         self.seen += np.bincount(points.pixel, minlength=self.pixels)
         for name, value in values.items():
             value = value.reshape(len(points), -1)
@@ -237,13 +240,13 @@ class _Sums:
                 chosen |= (variance > limit**2) & (self.seen > 0)
         return pixel[chosen[pixel]]
 
-    def images(self, camera: Camera) -> dict[str, np.ndarray]:
+    def images(self, camera: Camera, more: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
         shape = (camera.height, camera.width)
         out = {"mask": (self.seen / np.maximum(self.asked, 1)).reshape(shape).astype(np.float32)}
         count = np.maximum(self.seen, 1)[:, None]
-        for name, channels in CHANNELS.items():
-            if name not in self.sums and name != "emissive":
-                self.sums[name] = np.zeros((self.pixels, channels))
+        for name in (*DOMAINS, *more):
+            if name not in self.sums:
+                self.sums[name] = np.zeros((self.pixels, 3 if name in ("normal", "albedo", "color") else 1))
         for name, value in self.sums.items():
             mean = value / count
             if name == "normal":
@@ -272,8 +275,8 @@ def render_color(scene: Scene, camera: Camera, environment: Environment, samples
 
     renderer = Renderer(scene)
     light = DirectLight(renderer, environment, light_samples, seed, brdf)
-    images = renderer.buffers(camera, samples, lambda points: {"color": light.radiance(points)})
-    return images.get("color", np.zeros((camera.height, camera.width, 3), np.float32)), images["mask"]
+    images = renderer.buffers(camera, samples, light.color())
+    return images["color"], images["mask"]
 
 
 def closed_form_image(frame: dict[str, np.ndarray], camera: Camera, lobes, brdf: str = "gltf") -> np.ndarray:

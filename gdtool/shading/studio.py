@@ -16,9 +16,10 @@ from gdtool.shading.sg_fit import fit_error, fit_sg
 RANDOM_HEIGHT = 64
 
 
-def studio(source: str, seed: int = 0) -> tuple[Environment, SphericalGaussians, dict[str, Any]]:
+def studio(source: str, seed: int = 0, fit: bool = True) -> tuple[Environment, SphericalGaussians, dict[str, Any]]:
     """random:NUMBER, a bundled light's name, or a lat-long file -> the metered environment, its lobes, and the record of
-    light.json. A random studio is made of lobes, so nothing is fitted and the error is that of its pixels."""
+    light.json. A random studio is made of lobes, so nothing is fitted and the error is that of its pixels; without fit other lights have
+    no lobes and an empty error."""
     import torch
 
     if source.startswith("random:"):
@@ -31,7 +32,8 @@ def studio(source: str, seed: int = 0) -> tuple[Environment, SphericalGaussians,
         error = fit_error(environment, lobes)
     else:
         environment = load_environment(source).metered()
-        lobes, error = fit_sg(environment, seed=seed)
+        none = SphericalGaussians(torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3))
+        lobes, error = fit_sg(environment, seed=seed) if fit else (none, {})
     record = {"kind": "spherical_gaussians", "axes": lobes.axes.numpy(), "sharpness": lobes.sharpness.numpy(),
               "amplitudes": lobes.amplitudes.numpy(), "environment": environment.name, "fit_error": error}
     return environment, lobes, record

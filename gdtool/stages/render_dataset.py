@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from gdtool.assets.scene import Scene
     from gdtool.cameras import Camera
+    from gdtool.shading.direct import DirectLight
     from gdtool.shading.environment import Environment
     from gdtool.shading.render import Renderer
     from gdtool.shading.sg import SphericalGaussians
@@ -64,9 +65,11 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     from gdtool.assets.load import load_scene
     from gdtool.folders.views import Views, write_views
+    from gdtool.shading.direct import DirectLight
     from gdtool.shading.render import Renderer
 
-    torch.set_num_threads(out.threads)
+    # Shading runs in threads of its own, a chunk each; torch's own would only wait for each other.
+    torch.set_num_threads(1)
     given: Folder | None = inputs.second.get("cameras")
     source = inputs.main.file("asset.glb") if isinstance(inputs.main, Folder) else inputs.main
     with out.step("read"):
@@ -82,7 +85,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         environment, lobes, light = _light(inputs, given, options)
     with out.step("render"):
         renderer = Renderer(scene, out.threads)
-        frames = [_view(renderer, camera, environment, lobes, options, k) for k, camera in enumerate(out.progress(cameras, len(cameras), "views"))]
+        direct = DirectLight(renderer, environment, options.light_samples, options.seed)
+        frames = [_view(renderer, camera, direct, lobes, options) for camera in out.progress(cameras, len(cameras), "views")]
     wanted = [d for d in ALL if d in options.domains]
     mask = np.stack([frame["mask"] for frame in frames])
     if not mask.any():
@@ -91,7 +95,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     with out.step("conditions"):
         if options.condition_views:
-            _write_conditions(out, renderer, environment, options, rng)
+            _write_conditions(out, renderer, direct, options, rng)
     with out.step("write"):
         generated = isinstance(inputs.main, str)
         if generated:
@@ -204,34 +208,27 @@ def _light(inputs: Inputs, given: Folder | None, options: Options) -> tuple[Envi
     return studio(source, options.seed)
 
 
-def _view(renderer: Renderer, camera: Camera, environment: Environment, lobes: SphericalGaussians, options: Options, k: int) -> dict[str, np.ndarray]:
-    from gdtool.shading.direct import DirectLight
+def _view(renderer: Renderer, camera: Camera, direct: DirectLight, lobes: SphericalGaussians, options: Options) -> dict[str, np.ndarray]:
     from gdtool.shading.render import closed_form_image
 
-    shade = None
-    if "color" in options.domains:
-        light = DirectLight(renderer, environment, options.light_samples, options.seed * 1009 + k)
-        shade = lambda points: {"color": light.radiance(points) * options.exposure}  # noqa: E731
-    frame = renderer.buffers(camera, options.samples, shade)
+    frame = renderer.buffers(camera, options.samples, direct.color(options.exposure) if "color" in options.domains else None)
     if "closed_form" in options.domains:
         frame["closed_form"] = closed_form_image(frame, camera, lobes) * options.exposure
     return frame
 
 
-def _write_conditions(out: Output, renderer: Renderer, environment: Environment, options: Options, rng: np.random.Generator) -> None:
+def _write_conditions(out: Output, renderer: Renderer, direct: DirectLight, options: Options, rng: np.random.Generator) -> None:
     import numpy as np
 
     from gdtool.folders.records import write_cameras
     from gdtool.images.color import srgb_from_linear
     from gdtool.images.io import write_png
-    from gdtool.shading.direct import DirectLight
     from gdtool.shading.rigs import condition_camera
 
     cameras = [condition_camera(rng, f"{i:03d}", options.size) for i in range(options.condition_views)]
-    for i, camera in enumerate(out.progress(cameras, len(cameras), "conditions")):
-        light = DirectLight(renderer, environment, options.light_samples, options.seed * 1009 + 500 + i)
-        frame = renderer.buffers(camera, options.samples, lambda points, light=light: {"color": light.radiance(points)})
-        color = srgb_from_linear(np.clip(frame.get("color", np.zeros((camera.height, camera.width, 3), np.float32)) * options.exposure, 0, 1))
+    for camera in out.progress(cameras, len(cameras), "conditions"):
+        frame = renderer.buffers(camera, options.samples, direct.color(options.exposure))
+        color = srgb_from_linear(np.clip(frame["color"], 0, 1))
         write_png(out.path(f"condition/{camera.name}.png"), np.concatenate([color, frame["mask"][..., None]], -1))
     write_cameras(out.path("condition.json"), cameras)
 

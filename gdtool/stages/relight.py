@@ -1,0 +1,100 @@
+"""Pictures of an asset or a model under any light.
+
+Use it to see what bake made, to compare lights, and for turntables. Takes an asset folder or a .glb, .gltf, .obj, .ply
+or .stl file, and lights it by one of the bundled lights or by a lat-long .hdr or .exr image; with shadows (sampled) or
+without and free of noise (sg, sixteen spherical Gaussians fitted to the light).
+
+Example:
+  gdtool relight cat.asset/asset --env bright --views 8
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from gdtool.core.folder import Folder
+from gdtool.core.kinds import RendersContent
+from gdtool.core.stage import Inputs, Output, Stage, file_option
+
+
+class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of relight."""
+
+    env: file_option("dark, mid, bright, random:NUMBER, or a lat-long .hdr or .exr file") = "mid"
+    views: Annotated[int, Meta(ge=1, le=1000, description="1: from the front; more: a turntable")] = 1
+    elevation: Annotated[float, Meta(ge=-89, le=89, description="of the cameras, degrees")] = 10.0
+    fov: Annotated[float, Meta(ge=0, le=120, description="across, degrees; 0: orthographic")] = 30.0
+    size: Annotated[int, Meta(ge=16, le=8192, description="width and height in pixels")] = 512
+    light: Annotated[Literal["sampled", "sg"], Meta(description="sampled: direct light with shadows; sg: closed form, no shadows, no noise")] = "sampled"
+    samples: Annotated[int, Meta(ge=1, le=1024, description="samples per pixel where something changes; 4 elsewhere")] = 16
+    light_samples: Annotated[int, Meta(ge=1, le=1024, description="directions per sample, from the light and from the reflection each")] = 16
+    exposure: Annotated[float, Meta(gt=0, description="factor on the color; 1: a white card in the light's brightest direction has radiance 0.8")] = 1.0
+    brdf: Annotated[Literal["gltf", "paper"], Meta(description="reflection model; gltf is what engines use")] = "gltf"
+    seed: Annotated[int, Meta(ge=0, description="seed of everything random")] = 0
+
+
+def run(inputs: Inputs, options: Options, out: Output) -> None:
+    """Light one asset or model."""
+    import dataclasses
+
+    import numpy as np
+    import torch
+
+    from gdtool.assets.load import load_scene
+    from gdtool.folders.records import write_cameras
+    from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
+    from gdtool.images.color import srgb_from_linear
+    from gdtool.images.contact import contact_sheet
+    from gdtool.images.io import write_png
+    from gdtool.shading.direct import DirectLight
+    from gdtool.shading.render import Renderer, closed_form_image
+    from gdtool.shading.rigs import turntable
+    from gdtool.shading.studio import studio
+
+    torch.set_num_threads(1)  # shading runs in threads of its own
+    with out.step("read"):
+        scene = load_scene(inputs.main.file("asset.glb") if isinstance(inputs.main, Folder) else inputs.main)
+        matrix = unit_box(scene.vertices[np.unique(scene.faces)])
+        scene = dataclasses.replace(scene, vertices=transform_points(invert_similarity(matrix), scene.vertices))
+    for note in scene.notes:
+        out.warn(note)
+    with out.step("light"):
+        environment, lobes, record = studio(options.env or "mid", options.seed, fit=options.light == "sg")
+    cameras = turntable(options.views, options.size, options.elevation, options.fov)
+    frames, clipped = [], []
+    with out.step("render"):
+        renderer = Renderer(scene, out.threads)
+        color = None
+        if options.light == "sampled":
+            color = DirectLight(renderer, environment, options.light_samples, options.seed, options.brdf).color(options.exposure)
+        for camera in out.progress(cameras, len(cameras), "frames"):
+            frame = renderer.buffers(camera, options.samples, color)
+            if color is None:
+                frame["color"] = closed_form_image(frame, camera, lobes, options.brdf) * options.exposure
+            seen = frame["color"][frame["mask"] > 0]
+            clipped.append(float((seen > 1).mean()) if len(seen) else 0.0)
+            frames.append(np.concatenate([srgb_from_linear(np.clip(frame["color"], 0, 1)), frame["mask"][..., None]], -1))
+    with out.step("write"):
+        for camera, frame in zip(cameras, frames, strict=True):
+            write_png(out.path(f"{camera.name}.png"), frame)
+        write_cameras(out.path("cameras.json"), cameras)
+        columns = int(np.ceil(np.sqrt(len(frames))))
+        rows = [frames[i:i + columns] for i in range(0, len(frames), columns)]
+        write_png(out.path("contact_sheet.png"), contact_sheet(rows))
+    if options.light == "sg":
+        out.skip("shadows", "the closed form has none")
+    else:
+        out.skip("the light's fit by spherical Gaussians", "--light sampled does not use it")
+    if renderer.tested is None:
+        out.skip("alpha tests", "every material is opaque")
+    counts = renderer.counts
+    report = {"clipped_share": float(np.mean(clipped)), "environment_scale": environment.scale, "samples": counts.samples,
+              "shadow_rays": counts.shadow_rays, **{f"light_fit_{k}": v for k, v in record["fit_error"].items()}}
+    out.content = RendersContent(frames=len(frames), environment=environment.name, light=options.light, exposure=options.exposure,
+                                 source_from_world=tuple(float(x) for x in matrix.ravel()), report=report)
+
+
+STAGE = Stage(name="relight", version=1, reads=("asset", "model-file"), writes="renders", Options=Options, run=run)
