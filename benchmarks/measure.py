@@ -1,0 +1,93 @@
+"""Run gdtool commands as a user does, and say what each cost: seconds of wall clock and peak memory."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+
+class Failed(Exception):
+    """A command that did not succeed; its last line of stderr and exit code."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one command took. peak_mb: largest resident set of the process or of one of its children."""
+
+    seconds: float
+    peak_mb: float
+    stdout: str
+
+
+def command() -> str:
+    """The gdtool of this environment, else of the PATH."""
+    beside = Path(sys.executable).with_name("gdtool")
+    found = str(beside) if beside.exists() else shutil.which("gdtool")
+    if found is None:
+        sys.exit("gdtool is not installed; run make venv")
+    return found
+
+
+def gdtool(*arguments: str | Path, limit_seconds: float = 1800) -> Cost:
+    """Run `gdtool arguments`. Raises Failed."""
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        start = time.perf_counter()
+        process = subprocess.Popen([command(), *map(str, arguments)], stdout=out, stderr=err)
+        while True:  # wait4 is the only call that tells one child's memory
+            pid, status, usage = os.wait4(process.pid, os.WNOHANG)
+            seconds = time.perf_counter() - start
+            if pid:
+                break
+            if seconds > limit_seconds:
+                process.kill()
+            time.sleep(0.01)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        texts = []
+        for file in (out, err):
+            file.seek(0)
+            texts.append(file.read().decode(errors="replace"))
+    if process.returncode:
+        last = texts[1].strip().splitlines()[-1:] or ["no message"]
+        late = f" after {limit_seconds:.0f} s" if seconds > limit_seconds else ""
+        raise Failed(f"{arguments[0]} exited with {process.returncode}{late}: {last[0]}")
+    return Cost(seconds, usage.ru_maxrss / 1024, texts[0])
+
+
+def evaluate(result: Path, *arguments: str | Path) -> dict:
+    """The report of `gdtool evaluate result arguments`. Raises Failed."""
+    return json.loads(gdtool("evaluate", result, "--json", "--quiet", *arguments).stdout)
+
+
+def machine() -> str:
+    """Processor and cores, for the head of a report."""
+    model = next((line.split(":", 1)[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")), "?")
+    return f"{model}, {len(os.sched_getaffinity(0))} cores visible"
+
+
+def say(text: str) -> None:
+    """Progress, on stderr."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A Markdown table; the first column is left, the others right aligned."""
+    head = list(head)
+    lines = ["| " + " | ".join(head) + " |", "|---" + "|--:" * (len(head) - 1) + "|"]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def number(value: object, digits: int = 3) -> str:
+    """A figure for a table; a missing one is a dash."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
