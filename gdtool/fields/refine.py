@@ -95,15 +95,24 @@ def drop_debris(vertices: np.ndarray, faces: np.ndarray, support: np.ndarray, st
 
     The largest piece always stays.
     """
-    labels = components(faces, len(vertices))
-    count = int(labels.max()) + 1 if len(labels) else 0
-    if count <= 1:
-        return vertices, faces, 0
-    order = np.argsort(labels, kind="stable")
-    bounds = np.searchsorted(labels[order], np.arange(count + 1))
-    volume = np.array([signed_volume(vertices, faces[order[a:b]]) for a, b in zip(bounds[:-1], bounds[1:], strict=True)])
-    held = np.bincount(labels, support[faces].mean(1) > 0.02, count) / np.bincount(labels, minlength=count)
+    labels, volume = _pieces(vertices, faces)
+    held = np.bincount(labels, support[faces].mean(1) > 0.02) / np.bincount(labels)
     keep = (volume > (2 * step) ** 3) & (held > 0.2)
     keep[np.argmax(volume)] = True
     vertices, faces, _ = keep_faces(vertices, faces, keep[labels])
     return vertices, faces, int((~keep).sum())
+
+
+def keep_pieces(vertices: np.ndarray, faces: np.ndarray, step: float, share: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
+    """The pieces that hold more than share of the largest one's volume, and no bubbles."""
+    labels, volume = _pieces(vertices, faces)
+    vertices, faces, _ = keep_faces(vertices, faces, (volume > max(share * volume.max(), (2 * step) ** 3))[labels])
+    return vertices, faces
+
+
+def _pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Label (f,) of the piece of each face, and each piece's signed volume."""
+    labels = components(faces, len(vertices))
+    order = np.argsort(labels, kind="stable")
+    bounds = np.searchsorted(labels[order], np.arange(int(labels.max()) + 2))
+    return labels, np.array([signed_volume(vertices, faces[order[a:b]]) for a, b in zip(bounds[:-1], bounds[1:], strict=True)])

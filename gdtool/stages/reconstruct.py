@@ -19,22 +19,22 @@ from gdtool.core.errors import InputError, UsageError
 from gdtool.core.kinds import DOMAINS
 from gdtool.core.stage import Inputs, Output, Stage
 
-MATERIALS = ("albedo", "roughness", "metallic")
-
-
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of reconstruct."""
 
     method: Annotated[Literal["grid", "paper"], Meta(description="grid: carve and refine; paper: SDF and material networks")] = "grid"
     resolution: Annotated[int, Meta(ge=0, le=512, description="grid samples along a unit of length; 0: a little finer than the views' pixels")] = 0
+    steps: Annotated[int, Meta(ge=1, le=100_000, description="paper: optimisation steps of each phase")] = 300
+    root: Annotated[Literal["secant", "median"], Meta(description="paper: surface point between two samples of a ray")] = "secant"
+    brdf: Annotated[Literal["gltf", "paper"], Meta(description="paper: reflection model that color is fitted with")] = "gltf"
+    budget: Annotated[float, Meta(ge=0, description="paper: stop optimising after this many seconds; 0: never")] = 0.0
     ignore: Annotated[tuple[str, ...], Meta(description="domains to leave out, for example depth,normal")] = ()
     seed: Annotated[int, Meta(ge=0, description="seed of everything random")] = 0
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Reconstruct one views folder."""
-    import numpy as np
-
+    from gdtool.fields.appearance import appearance
     from gdtool.fields.fusion import align_depth, fuse_views, grid_step, is_closed_manifold, silhouettes_outvoted
     from gdtool.folders.surface import Surface, write_surface
     from gdtool.folders.views import read_views
@@ -64,17 +64,60 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             shape = fuse_views(sights, step, noise, outvoted)
         except ValueError as error:
             raise InputError(folder.path, str(error), "check the masks and cameras") from None
+    vertices, faces, figures, fit = shape.vertices, shape.faces, {}, None
+    if options.method == "paper":
+        vertices, faces, figures, fit = _fit(views, shape, options, out)
     with out.step("materials"):
-        normals = vertex_normals(shape.vertices, shape.faces)
-        values, confidence = _materials(views, shape, normals, out)
-    surface = Surface(shape.vertices, shape.faces, values["albedo"], values["roughness"][:, 0], values["metallic"][:, 0],
-                      confidence, normals, None)
+        normals = vertex_normals(vertices, faces)
+        look = appearance(views.cameras, views.mask, views.images, vertices, faces, normals, shape.step, views.light, options.seed)
+        for what, reason in look.skipped:
+            out.skip(what, reason)
+    if fit is not None:
+        _use_fit(fit, vertices, views, look, options, out)
+    surface = Surface(vertices, faces, look.albedo, look.roughness, look.metallic, look.confidence, normals, look.light)
     report = {"seen_share": float((shape.support > 0.02).mean()), "pieces_dropped": shape.dropped, "grid_step": shape.step,
               "disagreement_before": before, "disagreement": noise, "silhouettes_outvoted": outvoted,
-              "mean_confidence": float(np.mean(confidence))}
+              "mean_confidence": float(look.confidence.mean()), **look.figures, **figures}
     with out.step("write"):
-        write_surface(out, surface, watertight=is_closed_manifold(shape.faces), method=options.method,
+        write_surface(out, surface, watertight=is_closed_manifold(faces), method=options.method, field=fit is not None,
                       source_from_world=folder.content.source_from_world, report=report)
+
+
+def _fit(views, shape, options: Options, out: Output):
+    """The paper's networks, started from the grid's shape, and the mesh of their surface."""
+    from gdtool.fields.fusion import is_closed_manifold
+    from gdtool.fields.paper import PaperOptions, extract_network, fit_networks
+    from gdtool.fields.refine import keep_pieces
+
+    volume = 0 if "depth" in views.images else options.steps // 3
+    if not volume:
+        out.skip("volume start", "depth views say where the surface is")
+    settings = PaperOptions(options.steps, volume, options.steps, rule=options.root, brdf=options.brdf, seed=options.seed,
+                            budget=options.budget, device=out.device)
+    with out.step("networks"):
+        fit, figures = fit_networks(views.cameras, views.mask, views.images, shape.vertices, shape.faces, settings,
+                                    lambda count, label: out.progress(range(count), count, label))
+    with out.step("extract"):
+        vertices, faces = extract_network(fit.sdf, shape.step, out.device)
+        if len(faces):
+            vertices, faces = keep_pieces(vertices, faces, shape.step)
+    if not is_closed_manifold(faces):
+        out.warn("the networks' surface is not closed; the grid's is kept")
+        return shape.vertices, shape.faces, figures, None
+    return vertices, faces, figures, fit
+
+
+def _use_fit(fit, vertices, views, look, options: Options, out: Output) -> None:
+    """Put the material network's values, where views supervised it, and the fitted light into look; save the networks."""
+    from gdtool.fields.paper import light_record, network_materials, save_field
+
+    values = network_materials(fit.material, vertices, out.device)
+    supervised = [name for name in ("albedo", "roughness", "metallic") if name in views.images]
+    for name in supervised or ("albedo", "roughness", "metallic") if "color" in views.images else supervised:
+        setattr(look, name, values[name] if name == "albedo" else values[name][:, 0])
+    if "color" in views.images:
+        look.light = light_record(fit)
+    save_field(out.path("field.safetensors"), fit)
 
 
 def _check_masks(path, views, out: Output) -> None:
@@ -85,29 +128,6 @@ def _check_masks(path, views, out: Output) -> None:
     for name, good in zip(views.names, shown, strict=True):
         if not good:
             out.warn(f"view {name}: its mask is empty; the view is left out")
-
-
-def _materials(views, shape, normals, out: Output):
-    """Material values by name (v, c), and confidence (v,)."""
-    import numpy as np
-
-    from gdtool.fields.materials import confidence, fuse, observe, spread
-
-    seen = observe(views.cameras, views.mask, shape.vertices, shape.faces, normals, 0.5 * shape.step)
-    values, trust = {}, np.zeros(len(shape.vertices), np.float32)
-    fallback = {"albedo": "color", "roughness": None, "metallic": None}
-    constant = {"albedo": 0.5, "roughness": 0.5, "metallic": 0.0}
-    for name in MATERIALS:
-        source = name if name in views.images else fallback[name]
-        if source not in views.images:
-            values[name] = np.full((len(shape.vertices), 3 if name == "albedo" else 1), constant[name], np.float32)
-            continue
-        images = views.images[source]
-        value, weight, residual = fuse(images if images.ndim == 4 else images[..., None], views.mask, seen)
-        values[name] = np.clip(spread(value, weight, shape.faces), 0, 1)
-        if name == "albedo":
-            trust = confidence(weight, residual)
-    return values, trust
 
 
 STAGE = Stage(name="reconstruct", version=1, reads=("views",), writes="surface", Options=Options, run=run)
