@@ -27,7 +27,7 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     condition_alpha: bool = True  # the mask as fourth channel of the condition latent; patch codec only
     mirror_back: bool = True  # the view from behind gets the mirrored condition latent: its silhouette is exactly that
     # UNet, in Stable Diffusion's structure and key names.
-    channels: tuple[int, ...] = (64, 128, 160)
+    channels: tuple[int, ...] = (48, 128, 128)
     attention_levels: tuple[bool, ...] = (False, True, True)
     layers_per_block: int = 1
     heads: int = 0  # heads per attention; 0: as many as give head_width
@@ -71,7 +71,7 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     batch: int = 8
     accumulate: int = 1
     steps: int = 4000
-    phases: tuple[Phase, ...] = (Phase(share=0.6, domains=3, views=3), Phase(share=1.0))
+    phases: tuple[Phase, ...] = (Phase(share=0.8, domains=3, views=3), Phase(share=1.0, domains=6, views=4))
     warmup: int = 100
     decay: bool = True  # cosine to a twentieth of the learning rate over the run
     weight_decay: float = 1e-2
@@ -81,7 +81,7 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     ema: float = 0.999
     snr_gamma: float = 5.0  # min-SNR: a clean image's error is weighted by min(SNR, gamma) …
     snr_floor: float = 1.0  # … and at least by this, or a model that samples in few steps never learns the first one
-    pure_noise: float = 0.25  # share of samples at the last timestep
+    pure_noise: float = 0.4  # share of samples at the last timestep
     drop_embedding: float = 0.05
     drop_both: float = 0.05
     drop_latent: float = 0.05
