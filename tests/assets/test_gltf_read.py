@@ -1,0 +1,420 @@
+import base64
+import json
+
+import numpy as np
+import pytest
+
+from gdtool.assets.gltf_read import read_gltf
+from gdtool.assets.load import load_scene
+from gdtool.assets.scene import DEFAULT_MATERIAL
+from gdtool.core.errors import InputError, ResourceError
+from gdtool.images.io import encode_png
+from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, pack, quad
+
+
+def area_vector(scene) -> np.ndarray:
+    """Sum of the faces' area vectors: which way, and how much, a flat shape faces."""
+    a, b, c = (scene.vertices[scene.faces[:, i]] for i in range(3))
+    return np.cross(b - a, c - a).sum(0) / 2
+
+
+def with_textures(**textures: np.ndarray) -> Builder:
+    """A quad with a material `m` whose images are embedded; texture i is named by keyword order."""
+    builder = quad(name="m")
+    views = [builder.view(encode_png(image)) for image in textures.values()]
+    builder.document["images"] = [{"bufferView": view, "mimeType": "image/png"} for view in views]
+    builder.document["textures"] = [{"source": i} for i in range(len(views))]
+    return builder
+
+
+def test_quad(tmp_path):
+    scene = read_gltf(quad().write(tmp_path / "quad.glb"))
+    np.testing.assert_array_equal(scene.vertices, QUAD)
+    np.testing.assert_array_equal(scene.faces.ravel(), QUAD_FACES)
+    np.testing.assert_allclose(scene.normals, [[0, 0, 1]] * 4)
+    np.testing.assert_allclose(scene.uvs[0], [[0, 1], [1, 1], [1, 0], [0, 0]])
+    assert scene.materials == (DEFAULT_MATERIAL,) and scene.name == "quad" and scene.colors is None and scene.tangents is None
+
+
+def test_external_and_data_uris_equal_the_binary_chunk(tmp_path):
+    builder = quad()
+    truth = read_gltf(builder.write(tmp_path / "a.glb"))
+    for uri in ("its%20buffer.bin", "data:application/octet-stream;base64," + base64.b64encode(builder.binary).decode()):
+        (tmp_path / "its buffer.bin").write_bytes(builder.binary)
+        document = {**builder.document, "buffers": [{"byteLength": len(builder.binary), "uri": uri}]}
+        (tmp_path / "a.gltf").write_text(json.dumps(document))
+        scene = read_gltf(tmp_path / "a.gltf")
+        np.testing.assert_array_equal(scene.vertices, truth.vertices)
+        np.testing.assert_array_equal(scene.faces, truth.faces)
+
+
+@pytest.mark.parametrize("uri", ["/etc/passwd", "file:///etc/passwd", "http://example.com/x.bin", "C:/x.bin", "\\\\host\\x.bin", "missing.bin",
+                                 "data:application/octet-stream;base64,***"])
+def test_uris_that_are_not_relative_are_refused(tmp_path, uri):
+    builder = quad()
+    document = {**builder.document, "buffers": [{"byteLength": len(builder.binary), "uri": uri}]}
+    (tmp_path / "a.gltf").write_text(json.dumps(document))
+    with pytest.raises(InputError, match="buffer 0"):
+        read_gltf(tmp_path / "a.gltf")
+
+
+def test_sparse_overrides(tmp_path):
+    builder = quad()
+    where, values = builder.view(np.uint16([1, 3]).tobytes()), builder.view(np.float32([[5, 0, 0], [0, 7, 0]]).tobytes())
+    builder.document["accessors"][0]["sparse"] = {"count": 2, "indices": {"bufferView": where, "componentType": 5123}, "values": {"bufferView": values}}
+    scene = read_gltf(builder.write(tmp_path / "a.glb"))
+    np.testing.assert_array_equal(scene.vertices, [[0, 0, 0], [5, 0, 0], [1, 1, 0], [0, 7, 0]])
+    builder.document["accessors"][0]["sparse"]["count"] = 9
+    with pytest.raises(InputError, match="overrides 9 of its 4"):
+        read_gltf(builder.write(tmp_path / "a.glb"))
+
+
+def test_sparse_over_nothing_starts_from_zeros(tmp_path):
+    builder = quad()
+    where, values = builder.view(np.uint8([1, 2]).tobytes()), builder.view(np.float32([[1, 0, 0], [1, 1, 0]]).tobytes())
+    record = builder.document["accessors"][0]
+    del record["bufferView"]
+    record["sparse"] = {"count": 2, "indices": {"bufferView": where, "componentType": 5121}, "values": {"bufferView": values}}
+    np.testing.assert_array_equal(read_gltf(builder.write(tmp_path / "a.glb")).vertices[:3], QUAD[:3])
+
+
+def test_quantised_positions_are_numbers_and_normalised_are_fractions(tmp_path):
+    builder = Builder()
+    builder.document |= {"extensionsRequired": ["KHR_mesh_quantization"], "extensionsUsed": ["KHR_mesh_quantization"]}
+    builder.document["nodes"][0]["scale"] = [0.001, 0.001, 0.001]
+    attributes = {"POSITION": builder.add((QUAD * 1000).astype(np.int16)), "NORMAL": builder.add(np.int8([[0, 0, 127]] * 4), normalized=True),
+                  "TEXCOORD_0": builder.add((QUAD[:, :2] * 65535).astype(np.uint16), normalized=True)}
+    builder.primitive(attributes, builder.add(QUAD_FACES))
+    scene = read_gltf(builder.write(tmp_path / "a.glb"))
+    np.testing.assert_allclose(scene.vertices, QUAD, atol=1e-12)
+    np.testing.assert_allclose(scene.uvs[0], QUAD[:, :2])
+    np.testing.assert_allclose(scene.normals, [[0, 0, 1]] * 4)
+
+
+def test_the_lowest_signed_byte_is_minus_one(tmp_path):
+    builder = Builder()
+    builder.primitive({"POSITION": builder.add(np.int8([[-128, 0, 0], [127, 0, 0], [0, 127, 0]]), normalized=True)})
+    np.testing.assert_allclose(read_gltf(builder.write(tmp_path / "a.glb")).vertices, [[-1, 0, 0], [1, 0, 0], [0, 1, 0]])
+
+
+def test_interleaved_attributes(tmp_path):
+    builder = Builder()
+    rows = np.concatenate([QUAD, np.tile(np.float32([0, 0, 1]), (4, 1)), QUAD[:, :2]], 1)
+    view = builder.view(rows.tobytes(), byteStride=32)
+    for offset, kind in ((0, "VEC3"), (12, "VEC3"), (24, "VEC2")):
+        builder.document["accessors"].append({"bufferView": view, "byteOffset": offset, "componentType": 5126, "count": 4, "type": kind})
+    builder.primitive({"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2}, builder.add(QUAD_FACES))
+    scene = read_gltf(builder.write(tmp_path / "a.glb"))
+    np.testing.assert_array_equal(scene.vertices, QUAD)
+    np.testing.assert_array_equal(scene.uvs[0], QUAD[:, :2])
+
+
+@pytest.mark.parametrize(("mode", "indices"), [(4, [0, 1, 2, 0, 2, 3]), (5, [0, 1, 3, 2]), (6, [0, 1, 2, 3]), (5, [0, 1, 3, 2, 2])])
+def test_lists_strips_and_fans_face_one_way(tmp_path, mode, indices):
+    builder = Builder()
+    builder.primitive({"POSITION": builder.add(QUAD)}, builder.add(np.array(indices, np.uint8)), mode=mode)
+    scene = read_gltf(builder.write(tmp_path / "a.glb"))
+    np.testing.assert_allclose(area_vector(scene), [0, 0, 1])
+    assert len(scene.faces) == 2
+
+
+def test_no_indices(tmp_path):
+    builder = Builder()
+    builder.primitive({"POSITION": builder.add(QUAD[[0, 1, 2, 0, 2, 3]])})
+    np.testing.assert_allclose(area_vector(read_gltf(builder.write(tmp_path / "a.glb"))), [0, 0, 1])
+
+
+def test_points_and_lines_are_left_out_and_noted(tmp_path):
+    builder = quad()
+    builder.primitive({"POSITION": builder.add(QUAD)}, mode=1)
+    scene = read_gltf(builder.write(tmp_path / "a.glb"))
+    assert len(scene.faces) == 2 and any("lines" in note for note in scene.notes)
+
+
+def test_node_hierarchy(tmp_path):
+    builder = quad()
+    half = np.sqrt(0.5)
+    builder.document["nodes"] = [{"children": [1], "translation": [10, 0, 0]}, {"mesh": 0, "rotation": [0, half, 0, half], "scale": [2, 2, 2]}]
+    scene = read_gltf(builder.write(tmp_path / "a.glb"))
+    # a quarter turn about +Y takes +X to -Z and +Z to +X
+    np.testing.assert_allclose(scene.vertices, [[10, 0, 0], [10, 0, -2], [10, 2, -2], [10, 2, 0]], atol=1e-12)
+    np.testing.assert_allclose(scene.normals, [[1, 0, 0]] * 4, atol=1e-12)
+    matrix = np.eye(4)
+    matrix[:3, :3] = [[0, 0, 2], [0, 2, 0], [-2, 0, 0]]
+    builder.document["nodes"][1] = {"mesh": 0, "matrix": matrix.T.ravel().tolist()}  # columns first
+    np.testing.assert_allclose(read_gltf(builder.write(tmp_path / "b.glb")).vertices, scene.vertices, atol=1e-12)
+
+
+def test_a_mirroring_node_turns_the_winding_and_keeps_the_bitangent(tmp_path):
+    builder = quad(normalTexture={"index": 0})
+    builder.document["images"] = [{"bufferView": builder.view(encode_png(np.full((2, 2, 3), 0.5)))}]
+    builder.document["textures"] = [{"source": 0}]
+    builder.document["meshes"][0]["primitives"][0]["attributes"]["TANGENT"] = builder.add(np.tile(np.float32([1, 0, 0, 1]), (4, 1)))
+    builder.document["nodes"][0]["scale"] = [-1, 1, 1]
+    scene = read_gltf(builder.write(tmp_path / "a.glb"))
+    np.testing.assert_allclose(area_vector(scene), [0, 0, 1])
+    np.testing.assert_allclose(scene.normals, [[0, 0, 1]] * 4)
+    bitangent = scene.tangents[:, 3:] * np.cross(scene.normals, scene.tangents[:, :3])
+    np.testing.assert_allclose(scene.tangents[:, :3], [[-1, 0, 0]] * 4)
+    np.testing.assert_allclose(bitangent, [[0, 1, 0]] * 4)
+
+
+def test_uneven_scale_keeps_normals_upright(tmp_path):
+    builder = Builder()
+    slope = np.float32([[0, 1, 0], [1, 0, 0], [0, 1, 1]])
+    normal = np.tile(np.float32([1, 1, 0]) / np.float32(np.sqrt(2)), (3, 1))
+    builder.primitive({"POSITION": builder.add(slope), "NORMAL": builder.add(normal)})
+    builder.document["nodes"][0]["scale"] = [2, 1, 1]
+    scene = read_gltf(builder.write(tmp_path / "a.glb"))
+    edges = scene.vertices[1:] - scene.vertices[:1]
+    np.testing.assert_allclose(edges @ scene.normals[0], 0, atol=1e-7)
+    np.testing.assert_allclose(np.linalg.norm(scene.normals, axis=1), 1)
+
+
+def test_skins_stand_as_their_joints_do(tmp_path):
+    builder = quad()
+    weights, joints = np.zeros((4, 4), np.float32), np.zeros((4, 4), np.uint8)
+    weights[:, 0], joints[2:, 0] = 1, 1  # the upper edge follows the second joint
+    attributes = builder.document["meshes"][0]["primitives"][0]["attributes"]
+    attributes |= {"JOINTS_0": builder.add(joints), "WEIGHTS_0": builder.add(weights)}
+    inverse = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
+    inverse[1, 3, 1] = -1  # stored by columns: the second joint was bound at y = 1
+    builder.document["skins"] = [{"joints": [1, 2], "inverseBindMatrices": builder.add(inverse)}]
+    builder.document["nodes"] = [{"mesh": 0, "skin": 0, "translation": [100, 0, 0]}, {"children": [2]}, {"translation": [0, 3, 0]}]
+    builder.document["scenes"] = [{"nodes": [0, 1]}]
+    scene = read_gltf(builder.write(tmp_path / "a.glb"))
+    # the mesh's own node does not move a skinned mesh
+    np.testing.assert_allclose(scene.vertices, [[0, 0, 0], [1, 0, 0], [1, 3, 0], [0, 3, 0]])
+    builder.document["skins"][0]["joints"] = [1]
+    with pytest.raises(InputError, match="joint out of range"):
+        read_gltf(builder.write(tmp_path / "a.glb"))
+
+
+def test_morph_targets_at_their_default_weight(tmp_path):
+    builder = quad()
+    builder.document["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": builder.add(np.tile(np.float32([0, 0, 4]), (4, 1)))}]
+    builder.document["meshes"][0]["weights"] = [0.25]
+    np.testing.assert_allclose(read_gltf(builder.write(tmp_path / "a.glb")).vertices[:, 2], 1)
+    builder.document["nodes"][0]["weights"] = [0.5]
+    np.testing.assert_allclose(read_gltf(builder.write(tmp_path / "a.glb")).vertices[:, 2], 2)
+
+
+def test_primitives_with_and_without(tmp_path):
+    builder = quad(name="red", pbrMetallicRoughness={"baseColorFactor": [1, 0, 0, 1]})
+    colors = np.uint8([[255, 0, 0], [0, 255, 0], [0, 0, 255], [51, 51, 51]])
+    builder.primitive({"POSITION": builder.add(QUAD + np.float32([2, 0, 0])), "COLOR_0": builder.add(colors, normalized=True),
+                       "TEXCOORD_1": builder.add(QUAD[:, :2])}, builder.add(QUAD_FACES), material=0)
+    builder.primitive({"POSITION": builder.add(QUAD + np.float32([4, 0, 0]))}, builder.add(QUAD_FACES))
+    scene = load_scene(builder.write(tmp_path / "a.glb"))
+    assert [m.name for m in scene.materials] == ["red", "default"]
+    np.testing.assert_array_equal(scene.material_idx, [0, 0, 0, 0, 1, 1])
+    np.testing.assert_allclose(scene.normals, np.tile([0, 0, 1], (len(scene.vertices), 1)))  # flat where none are given
+    assert scene.uvs[0].shape == scene.uvs[1].shape == (len(scene.vertices), 2)
+    corner = scene.colors[scene.faces]
+    np.testing.assert_allclose(corner[0], 1)
+    np.testing.assert_allclose(corner[2], [[1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]])
+    np.testing.assert_allclose(corner[3, 2], [0.2, 0.2, 0.2, 1])
+
+
+def test_shared_buffers_bring_only_their_vertices(tmp_path):
+    builder = Builder()
+    positions = builder.add(np.random.default_rng(0).random((1000, 3)).astype(np.float32))
+    for k in range(3):
+        builder.primitive({"POSITION": positions}, builder.add(np.uint16([k, k + 10, k + 20])))
+    assert len(read_gltf(builder.write(tmp_path / "a.glb")).vertices) == 9
+
+
+def test_material_with_everything(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (4, 4, 4), np.uint8)
+    builder = with_textures(color=pixels, orm=pixels[..., :3], grey=pixels[..., :1])
+    builder.document["extensionsUsed"] = ["KHR_texture_transform", "KHR_materials_emissive_strength", "KHR_materials_ior", "KHR_materials_specular",
+                                          "KHR_materials_unlit", "KHR_materials_clearcoat"]
+    builder.document["samplers"] = [{"magFilter": 9728, "wrapS": 33071, "wrapT": 33648}]
+    builder.document["textures"][0]["sampler"] = 0
+    builder.document["materials"] = [{
+        "name": "all", "alphaMode": "MASK", "alphaCutoff": 0.25, "doubleSided": True, "emissiveFactor": [1, 0.5, 0],
+        "pbrMetallicRoughness": {
+            "baseColorFactor": [0.1, 0.2, 0.3, 0.4], "metallicFactor": 0.5, "roughnessFactor": 0.25,
+            "baseColorTexture": {"index": 0, "extensions": {"KHR_texture_transform": {"offset": [0.5, 0.25], "rotation": 1.5, "scale": [2, 3], "texCoord": 0}}},
+            "metallicRoughnessTexture": {"index": 1}},
+        "normalTexture": {"index": 2, "scale": 0.5}, "occlusionTexture": {"index": 1, "strength": 0.75}, "emissiveTexture": {"index": 2},
+        "extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": 4}, "KHR_materials_ior": {"ior": 1.3},
+                       "KHR_materials_specular": {"specularFactor": 0.5}, "KHR_materials_unlit": {}, "KHR_materials_clearcoat": {"clearcoatFactor": 1}}}]
+    scene = read_gltf(builder.write(tmp_path / "a.glb"))
+    m = scene.materials[0]
+    assert (m.name, m.base_color, m.metallic, m.roughness) == ("all", (0.1, 0.2, 0.3, 0.4), 0.5, 0.25)
+    assert (m.alpha_mode, m.alpha_cutoff, m.double_sided, m.unlit, m.ior, m.specular) == ("MASK", 0.25, True, True, 1.3, 0.5)
+    assert m.emissive == (4, 2, 0) and m.normal_scale == 0.5 and m.occlusion_strength == 0.75
+    t = m.base_color_texture
+    assert (t.encoding, t.offset, t.rotation, t.scale) == ("srgb", (0.5, 0.25), 1.5, (2, 3))
+    assert (t.wrap_u, t.wrap_v, t.filter) == ("clamp", "mirror", "nearest")
+    np.testing.assert_array_equal(t.image, pixels)
+    assert m.metallic_roughness_texture.encoding == "linear" and m.metallic_roughness_texture.wrap_u == "repeat"
+    assert m.occlusion_texture.image is m.metallic_roughness_texture.image
+    np.testing.assert_array_equal(m.normal_texture.image, np.repeat(pixels[..., :1], 3, -1))  # grey is grey in all colours
+    assert any("KHR_materials_clearcoat" in note for note in scene.notes)
+
+
+def test_defaults_of_a_bare_material(tmp_path):
+    m = read_gltf(quad(name="bare").write(tmp_path / "a.glb")).materials[0]
+    assert (m.base_color, m.metallic, m.roughness, m.alpha_mode, m.double_sided) == ((1, 1, 1, 1), 1, 1, "OPAQUE", False)
+
+
+def test_specular_glossiness_becomes_what_it_was(tmp_path):
+    builder = quad(extensions={"KHR_materials_pbrSpecularGlossiness": {
+        "diffuseFactor": [0.5, 0.25, 0.1, 1], "specularFactor": [0.04, 0.04, 0.04], "glossinessFactor": 0.7}})
+    dielectric = read_gltf(builder.write(tmp_path / "a.glb")).materials[0]
+    np.testing.assert_allclose(dielectric.base_color, [0.5, 0.25, 0.1, 1])
+    np.testing.assert_allclose([dielectric.metallic, dielectric.roughness], [0, 0.3])
+    builder.document["materials"][0]["extensions"]["KHR_materials_pbrSpecularGlossiness"] = {
+        "diffuseFactor": [0, 0, 0, 1], "specularFactor": [0.9, 0.6, 0.3], "glossinessFactor": 0.5}
+    metal = read_gltf(builder.write(tmp_path / "a.glb")).materials[0]
+    np.testing.assert_allclose(metal.base_color[:3], [0.9, 0.6, 0.3], atol=0.01)
+    np.testing.assert_allclose([metal.metallic, metal.roughness], [1, 0.5], atol=0.01)
+
+
+def test_specular_glossiness_maps(tmp_path):
+    diffuse = np.zeros((2, 2, 4), np.uint8)
+    diffuse[0] = (188, 120, 60, 255)
+    diffuse[1] = (0, 0, 0, 255)
+    gloss = np.zeros((4, 4, 4), np.uint8)
+    gloss[:2] = (57, 57, 57, 255)  # 0.04 in sRGB, full gloss
+    gloss[2:] = (230, 200, 150, 51)
+    builder = with_textures(diffuse=diffuse, gloss=gloss)
+    builder.document["materials"][0]["extensions"] = {"KHR_materials_pbrSpecularGlossiness": {
+        "diffuseTexture": {"index": 0}, "specularGlossinessTexture": {"index": 1}}}
+    m = read_gltf(builder.write(tmp_path / "a.glb")).materials[0]
+    color, surface = m.base_color_texture.image.astype(int), m.metallic_roughness_texture.image.astype(int)
+    assert color.shape == (4, 4, 4)
+    np.testing.assert_allclose(color[0, 0], [188, 120, 60, 255], atol=2)
+    np.testing.assert_allclose(color[3, 0], [230, 200, 150, 255], atol=3)
+    np.testing.assert_allclose(surface[0, 0, 1:], [0, 0], atol=3)
+    np.testing.assert_allclose(surface[3, 0, 1:], [204, 255], atol=3)
+
+
+def edited(change) -> bytes:
+    """A quad whose document `change` has edited."""
+    builder = quad(name="m")
+    change(builder)
+    return builder.glb()
+
+
+def set_in(*path, value):
+    def change(builder: Builder) -> None:
+        item = builder.document
+        for key in path[:-1]:
+            item = item[key]
+        item[path[-1]] = value
+    return change
+
+
+def nan_vertex(builder: Builder) -> None:
+    bad = QUAD.copy()
+    bad[2, 1] = np.nan
+    builder.document["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = builder.add(bad)
+
+
+def vertex_count(builder: Builder) -> None:
+    builder.document["meshes"][0]["primitives"][0]["attributes"]["NORMAL"] = builder.add(QUAD[:3])
+
+
+def index_out_of_range(builder: Builder) -> None:
+    builder.document["meshes"][0]["primitives"][0]["indices"] = builder.add(np.uint16([0, 1, 4]))
+
+
+@pytest.mark.parametrize(("content", "fact"), [
+    (edited(set_in("extensionsRequired", value=["KHR_texture_basisu"])), "KHR_texture_basisu"),
+    (edited(set_in("nodes", value=[{"mesh": 0, "children": [1]}, {"children": [0]}])), "cycle"),
+    (edited(set_in("nodes", value=[{"mesh": 0, "children": [0]}])), "tree"),
+    (edited(set_in("nodes", value=[{"children": [2]}, {"children": [2]}, {"mesh": 0}])), "two parents"),
+    (edited(set_in("nodes", 0, "children", value=[7])), "refers to node 7"),
+    (edited(set_in("nodes", 0, "rotation", value=[0, 0, 0, 0])), "quaternion"),
+    (edited(set_in("nodes", 0, "mesh", value=3)), "refers to mesh 3"),
+    (edited(set_in("asset", "version", value="1.0")), "glTF 1.0"),
+    (edited(set_in("asset", value={})), "version"),
+    (edited(set_in("accessors", 0, "count", value=5)), "past the end"),
+    (edited(set_in("accessors", 0, "byteOffset", value=8)), "past the end"),
+    (edited(set_in("accessors", 0, "count", value="four")), "accessors"),
+    (edited(set_in("accessors", 0, "componentType", value=5124)), "accessors"),
+    (edited(set_in("accessors", 0, "bufferView", value=99)), "buffer view 99"),
+    (edited(set_in("bufferViews", 0, "byteLength", value=10_000)), "past the end of its buffer"),
+    (edited(set_in("bufferViews", 0, "buffer", value=1)), "buffer 1"),
+    (edited(set_in("meshes", 0, "primitives", 0, "material", value=4)), "material 4"),
+    (edited(set_in("materials", 0, "normalTexture", value={"index": 0})), "texture 0"),
+    (edited(nan_vertex), "vertex 2 is not finite"),
+    (edited(vertex_count), "NORMAL has 3"),
+    (edited(index_out_of_range), "refers to vertex 4"),
+    (edited(set_in("nodes", value=[{}])), "has no faces"),
+    (quad().glb()[:-8], "says it has"),
+    (quad().glb() + b"\0\0\0\0", "says it has"),
+    (quad().glb()[:15], "cut short"),
+    (b"glTF" + b"\1\0\0\0" + quad().glb()[8:], "binary glTF 1"),
+    (pack(b"{]", b""), "is not glTF"),
+    (pack(b"[" * 100_000, b""), "is not"),
+    (b"", "is not glTF"),
+    (b"\xff\xfe{}", "is not glTF"),
+])
+def test_what_is_wrong_is_named(tmp_path, content, fact):
+    path = tmp_path / "x.glb"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=fact) as caught:
+        load_scene(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_an_accessor_beyond_memory_is_a_resource_error(tmp_path):
+    builder = quad()
+    del builder.document["accessors"][0]["bufferView"]
+    builder.document["accessors"][0]["count"] = 2**31
+    builder.document["accessors"][0]["type"] = "MAT4"
+    with pytest.raises(ResourceError, match="GiB"):
+        load_scene(builder.write(tmp_path / "x.glb"))
+
+
+def test_texture_coordinates_that_no_mesh_has(tmp_path):
+    builder = with_textures(color=np.zeros((2, 2, 3), np.uint8))
+    builder.document["materials"][0]["pbrMetallicRoughness"] = {"baseColorTexture": {"index": 0, "texCoord": 3}}
+    with pytest.raises(InputError, match="texture coordinates 3"):
+        load_scene(builder.write(tmp_path / "x.glb"))
+
+
+def test_a_broken_texture_is_named(tmp_path):
+    builder = quad(pbrMetallicRoughness={"baseColorTexture": {"index": 0}})
+    builder.document["images"] = [{"bufferView": builder.view(b"no picture here, just words of text"), "mimeType": "image/png"}]
+    builder.document["textures"] = [{"source": 0}]
+    with pytest.raises(InputError, match="x.glb: image 0: is not an image"):
+        load_scene(builder.write(tmp_path / "x.glb"))
+
+
+def test_draco(tmp_path):
+    codec = pytest.importorskip("DracoPy")
+    builder = Builder()
+    builder.document |= {"extensionsRequired": ["KHR_draco_mesh_compression"], "extensionsUsed": ["KHR_draco_mesh_compression"]}
+    packed = codec.encode(QUAD, QUAD_FACES.reshape(-1, 3).astype(np.uint32), quantization_bits=14)
+    view = builder.view(packed)
+    builder.document["accessors"] = [{"componentType": 5126, "count": 4, "type": "VEC3"}, {"componentType": 5125, "count": 6, "type": "SCALAR"}]
+    identity = codec.decode(packed).attributes[0]["unique_id"]
+    extension = {"KHR_draco_mesh_compression": {"bufferView": view, "attributes": {"POSITION": identity}}}
+    builder.primitive({"POSITION": 0}, 1, extensions=extension)
+    np.testing.assert_allclose(area_vector(read_gltf(builder.write(tmp_path / "a.glb"))), [0, 0, 1], atol=1e-3)
+    builder.binary = builder.binary[:6] + b"\xff" * (len(builder.binary) - 6)
+    with pytest.raises(InputError, match="Draco stream"):
+        read_gltf(builder.write(tmp_path / "b.glb"))
+
+
+def test_draco_without_its_package(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "DracoPy", None)
+    builder = Builder()
+    builder.document["accessors"] = [{"componentType": 5126, "count": 4, "type": "VEC3"}]
+    builder.primitive({"POSITION": 0}, extensions={"KHR_draco_mesh_compression": {"bufferView": builder.view(b"DRACO"), "attributes": {"POSITION": 0}}})
+    with pytest.raises(ResourceError, match="DracoPy"):
+        read_gltf(builder.write(tmp_path / "a.glb"))
+
+
+def test_meshopt_without_its_package(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "meshoptimizer", None)
+    builder = quad()
+    builder.document["bufferViews"][0]["extensions"] = {"EXT_meshopt_compression": {
+        "buffer": 0, "byteLength": 16, "byteStride": 12, "count": 4, "mode": "ATTRIBUTES"}}
+    with pytest.raises(ResourceError, match="meshoptimizer"):
+        read_gltf(builder.write(tmp_path / "a.glb"))
