@@ -91,6 +91,18 @@ def test_iou_of_offset_cubes_is_exact(offset, iou):
     assert metrics._grid_iou(*cube(1, (offset, 0, 0)), *cube(), np.zeros(3), 2.0, 64) == pytest.approx(iou, abs=1e-9)
 
 
+def test_occupancy_by_blocks_is_occupancy_by_cells():
+    """A torus and a ball that touch several blocks, against the same surface asked about at every cell."""
+    from gdtool.geometry.metrics import _cell_centers, inside, occupancy
+
+    vertices, faces = arrays(trimesh.creation.torus(0.35, 0.12))
+    ball = sphere(0.1, (0.3, 0.3, 0.3), 2)
+    both = np.concatenate([vertices, ball[0]]), np.concatenate([faces, ball[1] + len(vertices)])
+    center = np.array([0.02, 0.01, -0.03])
+    expected = inside(_cell_centers(32, 1.1) + center, *both).reshape(32, 32, 32)
+    assert (occupancy(*both, center, 1.1, 32) == expected).all() and 0.05 < expected.mean() < 0.2
+
+
 def test_iou_of_shapes_apart_is_zero():
     assert metrics.volume_iou(*cube(0.1, (5, 0, 0)), *cube(), cells=16) == 0
 
