@@ -1,0 +1,78 @@
+"""What makes quads out of triangles: engines that run in a killable child, and a construction that cannot fail.
+
+Every engine takes vertices (v, 3) in a unit box and faces (f, 3) and returns vertices and quads (q, 4), unchecked.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.geometry.quad_shape import subdivide
+from gdtool.geometry.repair import edges_of
+
+
+def run_instant_meshes(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float) -> tuple[np.ndarray, np.ndarray]:
+    """Instant Meshes (Jakob et al. 2015): a quarter as many mixed faces, then one regular subdivision to pure quads.
+
+    Its deterministic mode, so that equal input gives equal files.
+    """
+    import pynanoinstantmeshes
+
+    out, found = pynanoinstantmeshes.remesh(
+        np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.uint32), vertex_count=max(quads // 4, 4), rosy=4, posy=4,
+        creaseAngle=float(crease_degrees), align_to_boundaries=bool((edges_of(faces).count == 1).any()), smooth_iter=0, deterministic=True)
+    return np.asarray(out, np.float64), np.asarray(found, np.int64)
+
+
+def run_quadriflow(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float) -> tuple[np.ndarray, np.ndarray]:
+    """QuadriFlow (Huang et al. 2018) through pyQuadriFlow, an optional package. It ends the process on non-manifold input."""
+    from pyQuadriFlow import pyQuadriFlow
+
+    found = pyQuadriFlow.pyquadriflow(int(quads), 0, np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32),
+                                      crease_degrees > 0, False, False, False, False)
+    return np.asarray(found["vertices"], np.float64), np.asarray(found["faces"], np.int64)
+
+
+ENGINES = {"instant-meshes": "gdtool.geometry.quad_engines:run_instant_meshes", "quadriflow": "gdtool.geometry.quad_engines:run_quadriflow"}
+
+
+def pair_and_split(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[np.ndarray, np.ndarray]:
+    """Quads without any engine: triangles joined in pairs, best first, then every face cut into one quad per corner.
+
+    About quads / 2.2 triangles give exactly `quads` quads. Closed and manifold exactly where the triangles are.
+    """
+    edges = edges_of(faces)
+    edge_idx, pairs = edges.face_pairs()
+    ends = edges.ends[edge_idx]
+    tips = faces[pairs].sum(2) - ends.sum(1)[:, None]
+    corners = np.stack([ends[:, 0], tips[:, 0], ends[:, 1], tips[:, 1]], -1)
+    p = vertices[corners]
+    after, before = np.roll(p, -1, 1) - p, np.roll(p, 1, 1) - p
+    length = np.maximum(np.linalg.norm(after, axis=-1) * np.linalg.norm(before, axis=-1), 1e-300)
+    cosine = np.abs((after * before).sum(-1) / length).max(1)
+    a, b = (np.cross(vertices[faces[pairs[:, i], 1]] - vertices[faces[pairs[:, i], 0]],
+                     vertices[faces[pairs[:, i], 2]] - vertices[faces[pairs[:, i], 0]]) for i in range(2))
+    bend = (a * b).sum(1) / np.maximum(np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1), 1e-300)
+    usable = (bend > 0.5) & ~edges.turned[edge_idx] & (tips[:, 0] != tips[:, 1])
+    # Each pair spares two quads: three a triangle apart, four together.
+    wanted = max((3 * len(faces) - quads + 1) // 2, 0)
+    single = np.ones(len(faces), bool)
+    chosen = []
+    for i in np.flatnonzero(usable)[np.argsort(cosine[usable] + (1 - bend[usable]), kind="stable")].tolist():
+        if len(chosen) >= wanted:
+            break
+        f, g = pairs[i]
+        if single[f] and single[g]:
+            single[f] = single[g] = False
+            chosen.append(i)
+    chosen = np.array(chosen, np.int64)
+    mixed = np.full((int(single.sum()) + len(chosen), 4), -1, np.int64)
+    mixed[:int(single.sum()), :3] = faces[single]
+    if len(chosen):
+        first = faces[pairs[chosen, 0]]
+        # The first triangle with its tip in front: tip, one end, the other triangle's tip, the other end.
+        turn = np.argmax(first == tips[chosen, 0][:, None], 1)
+        row = np.arange(len(chosen))
+        mixed[int(single.sum()):] = np.stack([tips[chosen, 0], first[row, (turn + 1) % 3], tips[chosen, 1], first[row, (turn + 2) % 3]], -1)
+    out, found, _ = subdivide(vertices, mixed)
+    return out, found

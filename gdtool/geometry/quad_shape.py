@@ -1,0 +1,200 @@
+"""Shaping of a quad mesh: regular subdivision, relaxing on the surface it stands for, and repair of folded quads."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.geometry.features import Constraints, Features, closest_on_segments
+from gdtool.geometry.mesh_quality import corner_jacobians, valences
+from gdtool.geometry.repair import compact, edges_of
+
+
+class Surface:
+    """A triangle mesh that points are projected to; its search tree is built once."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray):
+        import igl
+
+        self.vertices, self.faces = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
+        self._tree = igl.AABB()
+        self._tree.init(self.vertices, self.faces)
+
+    def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distance (n,), face_idx (n,) and closest point (n, 3) for points (n, 3)."""
+        if not len(points):
+            return np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 3))
+        squared, face_idx, point = self._tree.squared_distance(self.vertices, self.faces, np.ascontiguousarray(points, np.float64))
+        return np.sqrt(np.maximum(squared, 0)), np.asarray(face_idx), np.asarray(point)
+
+
+def subdivide(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints | None = None):
+    """Each face cut into one quad per corner: quads into four, triangles into three.
+
+    faces (f, 4), -1 as fourth corner of triangles. Returns vertices (edge midpoints and face centres added behind the
+    old ones), faces (4 q + 3 t, 4), and the constraints with the paths halved.
+    """
+    edges = edges_of(faces)
+    used = faces >= 0
+    centre = np.where(used[..., None], vertices[np.where(used, faces, 0)], 0).sum(1) / used.sum(1)[:, None]
+    v, e = len(vertices), len(edges.ends)
+    out = np.concatenate([vertices, vertices[edges.ends].mean(1), centre])
+    # Half edges come in the order of used corners; the one before a corner is the previous of its face.
+    next_edge = np.full(faces.shape, -1, np.int64)
+    next_edge[used] = edges.half_edge_idx
+    previous_edge = np.roll(next_edge, 1, 1)
+    triangle = ~used[:, 3]
+    previous_edge[triangle, 0] = next_edge[triangle, 2]
+    face_idx = np.repeat(np.arange(len(faces)), used.sum(1))
+    quads = np.stack([faces[used], v + next_edge[used], v + e + face_idx, v + previous_edge[used]], -1)
+    if constraints is None:
+        return out, quads, None
+    width = v + 1
+    key = edges.ends[:, 0] * width + edges.ends[:, 1]
+    path = np.sort(constraints.path, 1)
+    edge_idx = np.searchsorted(key, path[:, 0] * width + path[:, 1])
+    curve, fixed = np.full(len(out), -1), np.zeros(len(out), bool)
+    curve[:v], fixed[:v] = constraints.curve, constraints.fixed
+    curve[v + edge_idx] = constraints.path_curve
+    halves = np.concatenate([np.stack([path[:, 0], v + edge_idx], -1), np.stack([path[:, 1], v + edge_idx], -1)])
+    return out, quads, Constraints(curve, fixed, halves, np.tile(constraints.path_curve, 2))
+
+
+def _average_matrix(pairs: np.ndarray, count: int):
+    from scipy.sparse import coo_matrix, diags
+
+    rows = np.concatenate([pairs[:, 0], pairs[:, 1]])
+    columns = np.concatenate([pairs[:, 1], pairs[:, 0]])
+    matrix = coo_matrix((np.ones(len(rows)), (rows, columns)), (count, count)).tocsr()
+    return diags(1 / np.maximum(np.asarray(matrix.sum(1)).ravel(), 1)) @ matrix
+
+
+def onto(vertices: np.ndarray, surface: Surface, features: Features, constraints: Constraints) -> np.ndarray:
+    """Vertices on the surface; those on a feature curve on that curve; fixed ones where they are."""
+    out = vertices.copy()
+    free = (constraints.curve < 0) & ~constraints.fixed
+    out[free] = surface.closest(vertices[free])[2]
+    held = constraints.curve >= 0
+    for curve in np.unique(constraints.curve[held]):
+        mine = np.flatnonzero(constraints.curve == curve)
+        out[mine] = closest_on_segments(vertices[mine], features.points, features.segments[features.curve == curve])[2]
+    return out
+
+
+def relax(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
+          iterations: int, strength: float = 0.6) -> np.ndarray:
+    """Vertices evened out along the surface: each moves toward the mean of its neighbours and back onto the surface."""
+    edges = edges_of(faces)
+    average = _average_matrix(edges.ends, len(vertices))
+    along = _average_matrix(constraints.path, len(vertices)) if len(constraints.path) else None
+    held = (constraints.curve >= 0) & ~constraints.fixed
+    boundary = np.zeros(len(vertices), bool)
+    boundary[edges.ends[edges.count != 2].ravel()] = True
+    still = constraints.fixed | (boundary & ~held)
+    for _ in range(iterations):
+        target = average @ vertices
+        if along is not None:
+            target[held] = (along @ vertices)[held]
+        moved = vertices + strength * (target - vertices)
+        moved[still] = vertices[still]
+        vertices = onto(moved, surface, features, constraints)
+    return vertices
+
+
+def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
+           least: float = 0.3, rounds: int = 12) -> np.ndarray:
+    """Vertices of folded and needle-like quads moved to the best of a few places near them.
+
+    A vertex moves only where the worst scaled Jacobian of its quads, against the surface's normals, gets better. Free
+    vertices stay on the surface, held ones slide along their curve; in the last rounds they may leave it.
+    """
+    edges = edges_of(faces)
+    ring, neighbours = _incidence(faces, len(vertices)), _neighbours(edges.ends, len(vertices))
+    boundary = np.zeros(len(vertices), bool)
+    boundary[edges.ends[edges.count != 2].ravel()] = True
+    vertices = vertices.copy()
+    normals = _normals_below(vertices, faces, surface)
+    angles = np.arange(8) * (np.pi / 4)
+    for turn in range(rounds):
+        bad = np.flatnonzero(corner_jacobians(vertices, faces, normals).min(1) < least)
+        if not len(bad):
+            break
+        loose = turn >= rounds - 4
+        for v in np.unique(faces[bad]).tolist():
+            held = constraints.curve[v] >= 0
+            if (constraints.fixed[v] and not loose) or (boundary[v] and not held):
+                continue
+            mine, here = ring[v], vertices[v].copy()
+            near = vertices[neighbours[v]]
+            mean = near.mean(0)
+            spread = np.linalg.norm(near - mean, axis=1).mean()
+            axes = np.linalg.svd(near - mean, full_matrices=False)[2]
+            # A ring of places in the plane of the neighbours finds a way out of most folds.
+            circle = np.cos(angles)[:, None] * axes[0] + np.sin(angles)[:, None] * axes[min(1, len(axes) - 1)]
+            places = np.concatenate([[mean, vertices[faces[mine]].mean((0, 1)), (mean + here) / 2],
+                                     here + 0.12 * spread * circle, here + 0.35 * spread * circle])
+            if held and not loose:
+                places = closest_on_segments(places, features.points, features.segments[features.curve == constraints.curve[v]])[2]
+            else:
+                places = surface.closest(places)[2]
+            places = np.concatenate([[here], places])
+            corners = np.tile(vertices[faces[mine]], (len(places), 1, 1, 1))
+            corners[:, faces[mine] == v] = places[:, None]
+            flat = corners.reshape(-1, 4, 3)
+            own = np.arange(len(flat) * 4).reshape(-1, 4)
+            got = corner_jacobians(flat.reshape(-1, 3), own, np.tile(normals[mine], (len(places), 1))).reshape(len(places), -1).min(1)
+            best = int(got.argmax())
+            if got[best] > got[0] + 1e-3:
+                vertices[v] = places[best]
+    return vertices
+
+
+def _normals_below(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> np.ndarray:
+    """(f, 3) unit normal of the surface under each quad, at its centre and half-way to its corners."""
+    from gdtool.geometry.normals import face_normals
+
+    corners = vertices[faces]
+    centre = corners.mean(1, keepdims=True)
+    points = np.concatenate([centre, (corners + centre) / 2], 1)
+    below = face_normals(surface.vertices, surface.faces)[0][surface.closest(points.reshape(-1, 3))[1]].reshape(len(faces), -1, 3).sum(1)
+    return below / np.maximum(np.linalg.norm(below, axis=1), 1e-300)[:, None]
+
+
+def _incidence(faces: np.ndarray, count: int) -> list[np.ndarray]:
+    corner = faces.ravel()
+    order = np.argsort(corner, kind="stable")
+    bounds = np.searchsorted(corner[order], np.arange(1, count))
+    return np.split(order // faces.shape[1], bounds)
+
+
+def _neighbours(ends: np.ndarray, count: int) -> list[np.ndarray]:
+    a, b = np.concatenate([ends[:, 0], ends[:, 1]]), np.concatenate([ends[:, 1], ends[:, 0]])
+    order = np.argsort(a, kind="stable")
+    return np.split(b[order], np.searchsorted(a[order], np.arange(1, count)))
+
+
+def remove_doublets(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Inner vertices of two edges removed, their two quads joined into one (Daniels et al. 2008, doublet collapse)."""
+    for _ in range(8):
+        valence, inner = valences(faces, len(vertices))
+        doublets = np.flatnonzero(inner & (valence == 2))
+        if not len(doublets):
+            break
+        ring = _incidence(faces, len(vertices))
+        dead = np.zeros(len(faces), bool)
+        faces = faces.copy()
+        touched: set[int] = set()
+        for v in doublets.tolist():
+            pair = ring[v]
+            if len(pair) != 2 or set(faces[pair].ravel().tolist()) & touched:
+                continue
+            one, two = faces[pair[0]].tolist(), faces[pair[1]].tolist()
+            opposite = one[(one.index(v) + 2) % 4], two[(two.index(v) + 2) % 4]
+            if opposite[0] == opposite[1]:
+                continue
+            touched.update(one, two)
+            faces[pair[0], one.index(v)] = opposite[1]
+            dead[pair[1]] = True
+        if not dead.any():
+            break
+        faces = faces[~dead]
+    return compact(vertices, faces)

@@ -1,0 +1,238 @@
+"""Triangles to quads: an engine in a child, its result judged, repaired and fitted to the surface, and a chain of fallbacks."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gdtool.core.child import ChildFailed, call
+from gdtool.geometry import repair
+from gdtool.geometry.features import Constraints, Features, find_features, trace
+from gdtool.geometry.mesh_quality import polygon_normals, valences
+from gdtool.geometry.normals import face_normals
+from gdtool.geometry.quad_engines import ENGINES, pair_and_split
+from gdtool.geometry.quad_shape import Surface, onto, relax, remove_doublets, subdivide, unfold
+from gdtool.geometry.sharpen import restore_creases
+from gdtool.geometry.simplify import simplify
+
+COUNT_TOLERANCE = 0.03
+_SMALL_PIECE_QUADS = 48
+_TRIES = 3
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked for: about `quads` faces; creases sharper than crease_degrees followed; limits of one engine run."""
+
+    quads: int = 20000
+    crease_degrees: float = 30.0
+    engine: str = "auto"
+    smooth_iterations: int = 5
+    restore_creases: bool = True
+    seconds: float = 120.0
+    memory_mb: int = 16000
+
+
+@dataclass
+class Record:
+    """What was done: the engine whose result was taken, what was tried before and why not, figures, seconds by step."""
+
+    engine: str = ""
+    failed: list[str] = field(default_factory=list)
+    figures: dict[str, float | int | bool | str] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def clock(self, name: str, start: float) -> None:
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[np.ndarray, np.ndarray, Record]:
+    """Quads (q, 4) on the surface of a clean triangle mesh (repair.clean), and the record of how.
+
+    vertices (v, 3) in a unit box, faces (f, 3). All faces are quads; closed and manifold where the input is.
+    """
+    record = Record()
+    start = time.perf_counter()
+    edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
+    surface_vertices, surface_faces = vertices, faces
+    spacing = _median_edge(vertices, faces)
+    if request.restore_creases and request.crease_degrees > 0 and spacing < 0.75 * edge:
+        sharp, sharp_faces, report = restore_creases(vertices, faces, request.crease_degrees)
+        if not repair.is_watertight(faces) or repair.is_watertight(sharp_faces):
+            surface_vertices, surface_faces = sharp, sharp_faces
+            record.figures["crease_vertices_restored"] = report["moved"]
+    record.clock("restore creases", start)
+    start = time.perf_counter()
+    needed = max(3 * request.quads, 20000)
+    surface_vertices, surface_faces, _, report = simplify(surface_vertices, surface_faces, needed, seconds=request.seconds)
+    record.figures.update(simplified_to=report["faces"], simplify_error=report["error"])
+    if "failed" in report:
+        record.failed.append(f"simplify: {report['failed']}")
+    record.clock("simplify", start)
+    parts = _pieces(surface_vertices, surface_faces, request.quads)
+    done, names = [], []
+    for part_vertices, part_faces, quads in parts:
+        found = None
+        if quads >= _SMALL_PIECE_QUADS and request.engine != "split":
+            found = _by_engines(part_vertices, part_faces, quads, edge, request, record)
+        if found is None:
+            start = time.perf_counter()
+            found = (*_by_splitting(part_vertices, part_faces, quads), "pair and split")
+            record.clock("fallback", start)
+        done.append(found[:2])
+        names.append(found[2])
+    record.engine = "; ".join(dict.fromkeys(names))
+    offset = np.cumsum([0] + [len(v) for v, _ in done])
+    return np.concatenate([v for v, _ in done]), np.concatenate([f + o for (_, f), o in zip(done, offset, strict=False)]), record
+
+
+def _median_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
+    step = max(len(faces) // 20000, 1)
+    few = faces[::step]
+    return float(np.median(np.linalg.norm(vertices[few] - vertices[np.roll(few, 1, 1)], axis=-1)))
+
+
+def _pieces(vertices: np.ndarray, faces: np.ndarray, quads: int) -> list[tuple[np.ndarray, np.ndarray, int]]:
+    """The large pieces as one mesh and the small ones as another, each with its share of the quads by area."""
+    count, piece = repair.components(faces)
+    area = face_normals(vertices, faces)[1]
+    share = np.bincount(piece, area, count) / area.sum()
+    small = (share * quads < _SMALL_PIECE_QUADS)[piece]
+    if small.all():
+        small[:] = False  # many like pieces: the engine may still do; the fallback takes what it loses
+    out = []
+    for which in (~small, small):
+        if which.any():
+            own = repair.compact(vertices, faces[which])
+            budget = int(round(quads * area[which].sum() / area.sum()))
+            out.append((*own, budget if not small[which].all() else max(budget, 1)))
+    if len(out) == 2:  # the asked count holds for the sum
+        few = _by_splitting_count(out[1][1], out[1][2])
+        out[0] = (*out[0][:2], max(quads - few, 4))
+    return out
+
+
+def _by_splitting_count(faces: np.ndarray, quads: int) -> int:
+    return max(quads, 12 * repair.components(faces)[0])
+
+
+def _by_splitting(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[np.ndarray, np.ndarray]:
+    """pair_and_split of the mesh brought to the right number of triangles; no piece is lost."""
+    import igl
+
+    quads = _by_splitting_count(faces, quads)
+    triangles = max(int(quads / 2.2), 4)
+    while len(faces) < triangles:
+        vertices, faces = (np.asarray(x) for x in igl.upsample(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64), 1))
+    pieces = repair.components(faces)[0]
+    out, out_faces, _, _ = simplify(vertices, faces, triangles)
+    if repair.components(out_faces)[0] == pieces and repair.is_manifold(out_faces) >= repair.is_manifold(faces):
+        vertices, faces = out, out_faces
+    return pair_and_split(vertices, faces, quads)
+
+
+def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float, request: Request,
+                record: Record) -> tuple[np.ndarray, np.ndarray, str] | None:
+    """The first engine's result that stands up to judgement, finished; None when none does."""
+    start = time.perf_counter()
+    features = find_features(vertices, faces, request.crease_degrees, 3 * edge) if request.crease_degrees > 0 else find_features(vertices, faces, 181.0, 3 * edge)
+    surface = Surface(vertices, faces)
+    record.clock("features", start)
+    for engine, subdivisions, degrees in _attempts(quads, request):
+        label = engine + (f", {subdivisions} subdivision" if subdivisions else "") + ("" if degrees else ", creases left out")
+        asked = float(quads)
+        for _ in range(_TRIES):
+            start = time.perf_counter()
+            try:
+                found = call(ENGINES[engine], vertices.astype(np.float32), faces.astype(np.int32), max(int(asked / 4**subdivisions), 16), degrees,
+                             seconds=request.seconds, memory_mb=request.memory_mb)
+            except ChildFailed as failure:
+                record.failed.append(f"{label}: {failure}")
+                record.clock("engine", start)
+                break
+            record.clock("engine", start)
+            start = time.perf_counter()
+            fault, quad_vertices, quad_faces = _judged(*found, vertices, faces)
+            count = len(quad_faces) * 4**subdivisions
+            off = count / quads - 1
+            if fault is None and abs(off) > COUNT_TOLERANCE:
+                asked *= quads / max(count, 1)
+                continue
+            if fault is None:
+                quad_vertices, quad_faces = _finished(quad_vertices, quad_faces, surface, features, subdivisions, request)
+                record.clock("fit", start)
+                fault = _strays(quad_vertices, quad_faces, surface, edge)
+            if fault is None:
+                return quad_vertices, quad_faces, label
+            record.failed.append(f"{label}: {fault}")
+            break
+        else:
+            record.failed.append(f"{label}: gave {count} faces for {quads}")
+    return None
+
+
+def _attempts(quads: int, request: Request) -> list[tuple[str, int, float]]:
+    """(engine, subdivisions after it, crease angle it is told), in the order to try.
+
+    A coarser mesh subdivided has a quarter of the irregular vertices; it fails where features are finer than its quads.
+    """
+    out = []
+    engines = ["instant-meshes"] if request.engine == "auto" else [request.engine]
+    for engine in engines:
+        if engine == "instant-meshes" and quads >= 3000:
+            out.append((engine, 1, request.crease_degrees))
+        out.append((engine, 0, request.crease_degrees))
+        out.append((engine, 0, 0.0))
+    if request.engine == "quadriflow":
+        out.append(("instant-meshes", 0, request.crease_degrees))
+    return out
+
+
+def _judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> tuple[str | None, np.ndarray, np.ndarray]:
+    """What is wrong with an engine's result, or None, and the result without its small defects."""
+    if quad_faces.ndim != 2 or quad_faces.shape[1] != 4 or not len(quad_faces):
+        return "no quads", quad_vertices, quad_faces
+    if quad_faces.min() < 0 or quad_faces.max() >= len(quad_vertices) or not np.isfinite(quad_vertices).all():
+        return "indices or coordinates out of range", quad_vertices, quad_faces
+    whole = (np.sort(quad_faces, 1)[:, 1:] != np.sort(quad_faces, 1)[:, :-1]).all(1)
+    quad_vertices, quad_faces = remove_doublets(*repair.compact(quad_vertices, quad_faces[whole]))
+    closed = repair.is_watertight(faces)
+    if closed and not repair.is_watertight(quad_faces):
+        return "not watertight, though the input is", quad_vertices, quad_faces
+    if not repair.is_manifold(quad_faces):
+        return "not manifold", quad_vertices, quad_faces
+    if repair.components(quad_faces)[0] != repair.components(faces)[0]:
+        return "pieces are lost or joined", quad_vertices, quad_faces
+    if closed and _euler(quad_faces) != _euler(faces):
+        return "handles are lost or added", quad_vertices, quad_faces
+    return None, quad_vertices, quad_faces
+
+
+def _euler(faces: np.ndarray) -> int:
+    return len(np.unique(faces[faces >= 0])) - len(repair.edges_of(faces).ends) + len(faces)
+
+
+def _finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, subdivisions: int,
+              request: Request) -> tuple[np.ndarray, np.ndarray]:
+    """The engine's quads drawn to creases, subdivided, evened out on the surface and unfolded."""
+    area = polygon_normals(vertices, faces)[1].sum()
+    vertices, constraints = trace(vertices, faces, features, (area / len(faces)) ** 0.5)
+    vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)
+    for _ in range(subdivisions):
+        vertices, faces, constraints = subdivide(vertices, faces, constraints)
+        vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)
+    return unfold(vertices, faces, surface, features, constraints), faces
+
+
+def _strays(vertices: np.ndarray, faces: np.ndarray, surface: Surface, edge: float) -> str | None:
+    """A fault when part of the surface has no quads near it (details that the quads are too coarse for)."""
+    from gdtool.folders.mesh import triangulated
+    from gdtool.geometry.distance import closest_points
+
+    step = max(len(surface.vertices) // 20000, 1)
+    distance = closest_points(surface.vertices[::step], vertices, triangulated(faces)[0])[0]
+    if distance.max() > 1.0 * edge:
+        return f"strays {distance.max() / edge:.2g} edge lengths from the surface"
+    return None

@@ -1,0 +1,249 @@
+"""Checks and repairs of triangle meshes before anything native sees them, and the topology that tells whether it worked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gdtool.core.errors import InputError
+
+# Welding joins vertices closer than this share of the longest side: far below any detail, far above rounding.
+WELD_SHARE = 1e-7
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Undirected edges of a mesh of triangles and quads.
+
+    ends (e, 2) vertices, lower first; count (e,) faces at it; turned (e,) bool: two faces walk it in one direction.
+    half_edge_idx (h,) into ends, half_face (h,) the face, half_ends (h, 2) the directed edge: one row a face corner.
+    """
+
+    ends: np.ndarray
+    count: np.ndarray
+    turned: np.ndarray
+    half_edge_idx: np.ndarray
+    half_face: np.ndarray
+    half_ends: np.ndarray
+
+    def face_pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Edges (k,) with exactly two faces, and those faces (k, 2)."""
+        order = np.argsort(self.half_edge_idx, kind="stable")
+        edge_idx = np.flatnonzero(self.count == 2)
+        first = (np.cumsum(self.count) - self.count)[edge_idx]
+        return edge_idx, self.half_face[order][np.stack([first, first + 1], -1)]
+
+
+def edges_of(faces: np.ndarray) -> Edges:
+    """Edges of faces (f, 3), or (f, 4) where a fourth corner of -1 marks a triangle."""
+    faces = np.asarray(faces, np.int64)
+    following = np.roll(faces, -1, 1)
+    if faces.shape[1] == 4:
+        triangle = faces[:, 3] < 0
+        following[triangle, 2] = faces[triangle, 0]
+    used = faces >= 0
+    half_ends = np.stack([faces[used], following[used]], -1)
+    half_face = np.repeat(np.arange(len(faces)), used.sum(1))
+    low, high = half_ends.min(1), half_ends.max(1)
+    width = int(high.max(initial=0)) + 1
+    key, half_edge_idx, count = np.unique(low * width + high, return_inverse=True, return_counts=True)
+    forward = np.bincount(half_edge_idx, half_ends[:, 0] < half_ends[:, 1], len(key))
+    turned = (count == 2) & (forward != 1)
+    return Edges(np.stack([key // width, key % width], -1), count, turned, half_edge_idx.ravel(), half_face, half_ends)
+
+
+def is_watertight(faces: np.ndarray) -> bool:
+    """Every edge has exactly two faces, which walk it in opposite directions."""
+    if not len(faces):
+        return False
+    edges = edges_of(faces)
+    return bool((edges.count == 2).all() and not edges.turned.any())
+
+
+def is_manifold(faces: np.ndarray) -> bool:
+    """No edge has more than two faces, and the faces around each vertex form one fan."""
+    if not len(faces):
+        return False
+    edges = edges_of(faces)
+    return bool((edges.count <= 2).all()) and not len(split_vertices(faces))
+
+
+def split_vertices(faces: np.ndarray) -> np.ndarray:
+    """Vertices (k,) whose faces form more than one fan (bow-ties)."""
+    return np.flatnonzero(_fans(faces)[1] > 1)
+
+
+def _fans(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The fan (f, c) each face corner belongs to (numbered over the mesh), and the number of fans at each vertex."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    edges = edges_of(faces)
+    used = np.asarray(faces) >= 0
+    corner_idx = np.full(faces.shape, -1, np.int64)
+    corner_idx[used] = np.arange(int(used.sum()))
+    vertex_of = np.asarray(faces)[used]
+    # Two faces at a manifold edge join their corners at both of its ends. The half edge of a corner starts there.
+    _, pairs = edges.face_pairs()
+    order = np.argsort(edges.half_edge_idx, kind="stable")
+    keep = edges.count == 2
+    first = (np.cumsum(edges.count) - edges.count)[keep]
+    one, two = order[first], order[first + 1]
+    after = np.roll(corner_idx, -1, 1)
+    if faces.shape[1] == 4:
+        triangle = np.asarray(faces)[:, 3] < 0
+        after[triangle, 2] = corner_idx[triangle, 0]
+    after = after[used]
+    rows, columns = [], []
+    for a in (one, after[one]):
+        for b in (two, after[two]):
+            same = vertex_of[a] == vertex_of[b]
+            rows.append(a[same])
+            columns.append(b[same])
+    rows, columns = np.concatenate(rows), np.concatenate(columns)
+    n = len(vertex_of)
+    _, label = connected_components(coo_matrix((np.ones(len(rows)), (rows, columns)), (n, n)), False)
+    _, first_of = np.unique(label, return_index=True)
+    fans = np.bincount(vertex_of[first_of], minlength=int(vertex_of.max()) + 1)
+    out = np.full(faces.shape, -1, np.int64)
+    out[used] = label
+    return out, fans
+
+
+def components(faces: np.ndarray) -> tuple[int, np.ndarray]:
+    """Number of pieces and the piece (f,) of each face; faces that share an edge are of one piece."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    edges = edges_of(faces)
+    n = len(faces)
+    graph = coo_matrix((np.ones(len(edges.half_face)), (edges.half_face, edges.half_edge_idx)), (n, len(edges.ends))).tocsr()
+    # Faces and edges as one bipartite graph: linear in the number of corners, whatever the edges' valence.
+    from scipy.sparse import bmat
+
+    count, label = connected_components(bmat([[None, graph], [graph.T, None]]), False)
+    label = label[:n]
+    names, label = np.unique(label, return_inverse=True)
+    return len(names), label.ravel()
+
+
+def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Without the vertices that no face uses."""
+    used = np.unique(faces[faces >= 0])
+    number = np.full(len(vertices) + 1, -1, np.int64)
+    number[used] = np.arange(len(used))
+    return vertices[used], number[faces]  # -1 picks the last entry, which stays -1
+
+
+def check(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> None:
+    """Raise InputError when there is nothing to work on, an index is out of range or a coordinate is not finite."""
+    if not len(faces):
+        raise InputError(subject, "has no faces")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(subject, f"a face refers to vertex {int(faces.max() if faces.min() >= 0 else faces.min())} of {len(vertices)}")
+    bad = ~np.isfinite(vertices).all(1)
+    if bad.any():
+        raise InputError(subject, f"vertex {int(np.argmax(bad))} is not finite ({int(bad.sum())} such)")
+
+
+def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> tuple[np.ndarray, np.ndarray, dict[str, int | bool]]:
+    """A manifold, consistently oriented mesh of the same shape, and what had to be done to it.
+
+    vertices (v, 3) float, faces (f, 3). A closed, manifold mesh passes unchanged except for unused vertices. Raises
+    InputError (see check), also when all faces have no area.
+    """
+    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
+    check(vertices, faces, subject)
+    report: dict[str, int | bool] = {}
+
+    def note(name: str, count: int) -> None:
+        if count:
+            report[name] = int(count)
+
+    extent = float(np.ptp(vertices[np.unique(faces)], 0).max())
+    if not extent > 0:
+        raise InputError(subject, "all its faces lie in one point")
+    area = _areas(vertices / extent, faces)
+    if not (area > 0).any():
+        raise InputError(subject, "no face has an area")
+    closed = is_watertight(faces)
+    if not closed:
+        # A closed mesh is left as its indices say: welding could join sheets that only touch.
+        welded = _weld(vertices, faces, extent * WELD_SHARE)
+        note("welded_vertices", len(np.unique(faces)) - len(np.unique(welded)))
+        faces = welded
+    repeated = (faces == np.roll(faces, 1, 1)).any(1)
+    note("degenerate_faces", repeated.sum())
+    faces = faces[~repeated]
+    _, first = np.unique(np.sort(faces, 1), axis=0, return_index=True)
+    note("duplicate_faces", len(faces) - len(first))
+    faces = faces[np.sort(first)]
+    if not len(faces):
+        raise InputError(subject, "no face has an area")
+    flat = _areas(vertices / extent, faces) == 0
+    if flat.any() and not is_watertight(faces):
+        # In a closed mesh a flat face is a seam that keeps it closed.
+        note("zero_area_faces", flat.sum())
+        faces = faces[~flat]
+    vertices, faces = compact(vertices, faces)
+    edges = edges_of(faces)
+    if (edges.count > 2).any() or edges.turned.any():
+        note("nonmanifold_edges", (edges.count > 2).sum())
+        note("turned_edges", edges.turned.sum())
+        vertices, faces = _split(vertices, faces)
+        faces = _oriented(vertices, faces)
+    fans, number = _fans(faces)
+    if (number > 1).any():
+        note("nonmanifold_vertices", (number > 1).sum())
+        vertices, faces = _one_vertex_per_fan(vertices, faces, fans)
+    if is_watertight(faces) and _volume(vertices, faces) < 0:
+        report["turned_inside_out"] = True
+        faces = faces[:, ::-1].copy()
+    return vertices, faces, report
+
+
+def _areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    a, b, c = (vertices[faces[:, i]] - vertices[faces[0, 0]] for i in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
+
+
+def _weld(vertices: np.ndarray, faces: np.ndarray, distance: float) -> np.ndarray:
+    """Faces with one index for vertices that round to the same place."""
+    grid = np.rint((vertices - vertices.min(0)) / distance)
+    _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    return first[inverse.ravel()][faces]
+
+
+def _split(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cut along edges of more than two faces, faces that walk an edge alike turned first where that helps."""
+    import igl
+
+    faces = np.asarray(igl.bfs_orient(np.ascontiguousarray(faces))[0])
+    vertices, faces, _ = igl.split_nonmanifold(np.ascontiguousarray(vertices), np.ascontiguousarray(faces))
+    return np.asarray(vertices), np.asarray(faces)
+
+
+def _oriented(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Each closed piece turned to face outward; open ones keep the majority of the directions they had."""
+    import igl
+
+    faces = np.asarray(igl.bfs_orient(np.ascontiguousarray(faces))[0]).copy()
+    count, piece = components(faces)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    centre = np.stack([np.bincount(piece, a[:, i], count) for i in range(3)], -1) / np.bincount(piece, minlength=count)[:, None]
+    volume = np.bincount(piece, np.einsum("ij,ij->i", a - centre[piece], np.cross(b - a, c - a)), count)
+    inward = (volume < 0)[piece]
+    faces[inward] = faces[inward][:, ::-1]
+    return faces
+
+
+def _one_vertex_per_fan(vertices: np.ndarray, faces: np.ndarray, fans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bow-tie vertices doubled, so that each fan of faces has its own."""
+    _, first, new = np.unique(fans, return_index=True, return_inverse=True)
+    return vertices[faces.ravel()[first]], new.reshape(faces.shape)

@@ -1,0 +1,213 @@
+"""Sharp edges: found where the surface turns, and restored where marching cubes has cut them off.
+
+Marching cubes replaces a crease by a bevel half a cell wide. The flat or gently curved parts on both sides still know
+where it was: vertices of the bevel move to where the planes of the sides meet, the least-squares point of Kobbelt et
+al. 2001 (Feature sensitive surface extraction), its rank cut to the number of sides.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.geometry.normals import face_normals, vertex_normals
+from gdtool.geometry.repair import edges_of
+
+_NEIGHBOURS = 24
+_FARTHEST_EDGES = 4.0  # sides are looked for within this many edge lengths
+_LARGEST_MOVE_EDGES = 1.75
+_LARGEST_RESIDUAL_EDGES = 0.12
+_JOIN_EDGES = 0.6  # rims of one bevel end up nearer to each other than this
+_LARGEST_SHARE = 0.25  # more bevel vertices than this: a rough surface, not a mechanical part
+
+
+def dihedral_degrees(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Edges (k, 2) with two faces, those faces (k, 2), and the angle (k,) between their normals; 0 beside zero-area faces."""
+    edges = edges_of(faces)
+    edge_idx, pairs = edges.face_pairs()
+    normals, area = face_normals(vertices, faces)
+    cosine = (normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(1)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    angle[(area[pairs] <= 0).any(1)] = 0
+    return edges.ends[edge_idx], pairs, angle
+
+
+def restore_creases(vertices: np.ndarray, faces: np.ndarray,
+                    crease_degrees: float = 30.0) -> tuple[np.ndarray, np.ndarray, dict[str, float | int]]:
+    """Bevels drawn out to the creases they cut off: vertices, faces and a report (moved, largest_move, bevel_share).
+
+    vertices (v, 3), faces (f, 3) fine enough for a bevel to be one cell wide. Creases that are sharp already, smooth
+    parts and rough surfaces stay as they are. The rims of a bevel are joined where that keeps the mesh manifold.
+    """
+    from scipy.spatial import cKDTree
+
+    report: dict[str, float | int] = {"moved": 0, "largest_move": 0.0, "bevel_share": 0.0}
+    ends, pairs, angle = dihedral_degrees(vertices, faces)
+    bent = angle > crease_degrees / 2
+    bevel = np.zeros(len(vertices), bool)
+    bevel[ends[bent].ravel()] = True
+    rough = np.zeros(len(faces), bool)
+    rough[pairs[bent].ravel()] = True
+    normals, area = face_normals(vertices, faces)
+    used = np.unique(faces)
+    report["bevel_share"] = float(bevel[used].mean())
+    side = np.flatnonzero(~rough & (area > 0))
+    if not bevel.any() or report["bevel_share"] > _LARGEST_SHARE or len(side) < _NEIGHBOURS:
+        return vertices, faces, report
+    length = np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1)
+    edge = np.median(length)  # of a grid's mesh all edges are about a cell
+    at = np.flatnonzero(bevel)
+    centroid = vertices[faces[side]].mean(1)
+    distance, near = cKDTree(centroid).query(vertices[at], k=_NEIGHBOURS, workers=2)
+    own = vertex_normals(vertices, faces)[at]
+    n, c = normals[side][near], centroid[near]
+    valid = (distance < _FARTHEST_EDGES * edge) & ((n * own[:, None]).sum(-1) > 0.1)
+    cluster, sides, spread = _sides(n, valid, crease_degrees * 0.8)
+    point, residual = _meeting_point(vertices[at], n, c, cluster, sides)
+    move = np.linalg.norm(point - vertices[at], axis=1)
+    good = (sides >= 2) & (spread > crease_degrees * 0.8) & (move < _LARGEST_MOVE_EDGES * edge) & (residual < _LARGEST_RESIDUAL_EDGES * edge)
+    out = vertices.copy()
+    out[at[good]] = point[good]
+    if not good.any():
+        return vertices, faces, report
+    report["moved"], report["largest_move"] = int(good.sum()), float(move[good].max())
+    moved = np.zeros(len(vertices), bool)
+    moved[at[good]] = True
+    return *collapse_bevels(out, faces, moved, _JOIN_EDGES * edge), report
+
+
+def _sides(normals: np.ndarray, valid: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Group k normals (p, k, 3) at each point into up to three sides.
+
+    Returns the side (p, k) of each, -1 where not valid; the number of sides (p,); the largest angle (p,) between two.
+    """
+    p, k = valid.shape
+    row = np.arange(p)
+    cosine_limit = np.cos(np.radians(degrees))
+
+    def masked(cosine: np.ndarray) -> np.ndarray:
+        return np.where(valid, cosine, 2.0)
+
+    mean = (normals * valid[..., None]).sum(1)
+    first = masked((normals * mean[:, None]).sum(-1)).argmin(1)
+    to_first = masked((normals * normals[row, first][:, None]).sum(-1))
+    second = to_first.argmin(1)
+    spread = np.degrees(np.arccos(np.clip(to_first[row, second], -1, 1)))
+    to_second = masked((normals * normals[row, second][:, None]).sum(-1))
+    nearest = np.where(valid, np.maximum(to_first, to_second), 2.0)
+    third = nearest.argmin(1)
+    has_second = to_first[row, second] < cosine_limit
+    has_third = has_second & (nearest[row, third] < cosine_limit)
+    to_third = np.where(has_third[:, None], (normals * normals[row, third][:, None]).sum(-1), -2.0)
+    to_second = np.where(has_second[:, None], to_second, -2.0)
+    cluster = np.stack([to_first, to_second, to_third], -1).argmax(-1)
+    cluster = np.where(valid, cluster, -1)
+    enough = valid.any(1)
+    return cluster, np.where(enough, 1 + has_second + has_third, 0), np.where(enough, spread, 0.0)
+
+
+def _meeting_point(points: np.ndarray, normals: np.ndarray, centroids: np.ndarray, cluster: np.ndarray,
+                   sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The point nearest to points (p, 3) where the sides' planes meet, and the rms distance (p,) to those planes."""
+    weight = np.zeros(cluster.shape)
+    for i in range(3):  # each side counts the same, however many of its faces are near
+        mine = cluster == i
+        weight += mine / np.maximum(mine.sum(1, keepdims=True), 1)
+    offset = (normals * (centroids - points[:, None])).sum(-1)
+    matrix = np.einsum("pk,pki,pkj->pij", weight, normals, normals)
+    value, vector = np.linalg.eigh(matrix)
+    # Rank = number of sides, unless three planes share a line.
+    rank_ok = np.stack([(sides == 3) & (value[:, 0] > 0.03 * value[:, 2]), (sides >= 2) & (value[:, 1] > 0.02 * value[:, 2]), sides >= 1], -1)
+    inverse = np.where(rank_ok, 1 / np.where(rank_ok, value, 1), 0)
+    right = np.einsum("pk,pki,pk->pi", weight, normals, offset)
+    move = np.einsum("pij,pj,pkj,pk->pi", vector, inverse, vector, right)
+    residual = np.sqrt((weight * (offset - (normals * move[:, None]).sum(-1)) ** 2).sum(1) / np.maximum(weight.sum(1), 1e-12))
+    return points + move, residual
+
+
+def collapse_bevels(vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Collapse edges shorter than `longest` between moved vertices: both rims of a bevel that became one crease.
+
+    vertices (v, 3), faces (f, 3), moved (v,) bool. An edge collapses only where the mesh stays manifold (link condition,
+    Dey et al. 1999) and no face with an area turns over. Returns compact vertices and faces.
+    """
+    from gdtool.geometry.repair import compact
+
+    corners = moved[faces]
+    near = np.flatnonzero(corners.any(1))
+    ring: dict[int, set[int]] = {}
+    local = {int(i): list(map(int, faces[i])) for i in near}
+    for i, face in local.items():
+        for v in face:
+            ring.setdefault(v, set()).add(i)
+    half = np.concatenate([faces[near][:, [i, (i + 1) % 3]] for i in range(3)])
+    half = np.unique(np.sort(half[moved[half].all(1)], 1), axis=0)
+    length = np.linalg.norm(vertices[half[:, 0]] - vertices[half[:, 1]], axis=1)
+    order = np.argsort(length, kind="stable")
+    order = order[length[order] < longest]
+    position = {v: vertices[v].tolist() for v in ring}
+    became: dict[int, int] = {}
+
+    def last(v: int) -> int:
+        while v in became:
+            v = became[v]
+        return v
+
+    tiny = (1e-3 * longest) ** 2
+    gone: set[int] = set()
+    for a, b in half[order].tolist():
+        a, b = last(a), last(b)
+        if a == b:
+            continue
+        if _squared(position[a], position[b]) > longest * longest:
+            continue
+        shared = ring[a] & ring[b]
+        around_a = {v for i in ring[a] for v in local[i]}
+        around_b = {v for i in ring[b] for v in local[i]}
+        if len(shared) != 2 or len(around_a & around_b) != 4:
+            continue
+        if _turns(a, b, shared, ring, local, position, tiny):
+            if _turns(b, a, shared, ring, local, position, tiny):
+                continue
+            a, b = b, a
+        for i in shared:
+            for v in local[i]:
+                ring[v].discard(i)
+            gone.add(i)
+        for i in ring[a]:
+            local[i] = [b if v == a else v for v in local[i]]
+            ring[b].add(i)
+        ring[a] = set()
+        became[a] = b
+    out = faces.copy()
+    keep = np.ones(len(faces), bool)
+    for i, face in local.items():
+        out[i] = face
+    keep[list(gone)] = False
+    return compact(vertices, out[keep])
+
+
+def _squared(a: list[float], b: list[float]) -> float:
+    return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
+
+
+def _vector_area(p: list[float], q: list[float], r: list[float]) -> tuple[float, float, float]:
+    ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+    vx, vy, vz = r[0] - p[0], r[1] - p[1], r[2] - p[2]
+    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+
+
+def _turns(a: int, b: int, shared: set[int], ring: dict, local: dict, position: dict, tiny: float) -> bool:
+    """Whether moving vertex a to b turns a face over that has an area."""
+    for i in ring[a]:
+        if i in shared:
+            continue
+        face = local[i]
+        x, y, z = _vector_area(*(position[v] for v in face))
+        before = x * x + y * y + z * z
+        if before <= tiny * tiny:
+            continue
+        p, q, r = _vector_area(*(position[b if v == a else v] for v in face))
+        after = p * p + q * q + r * r
+        if x * p + y * q + z * r <= 0.1 * (before * after) ** 0.5:
+            return True
+    return False

@@ -1,0 +1,150 @@
+"""Surface to clean quads: about as many as asked, along creases and flat parts, watertight where the surface is.
+
+Use it after reconstruct, or on any mesh file (.obj, .ply, .stl, .glb) whose triangles you want to edit, subdivide or
+animate. Bevels that marching cubes left are drawn out to the creases they cut off. A mesh that already meets the
+request is passed through. --triangles N decimates instead.
+
+Example:
+  gdtool remesh cat.asset/surface --faces 20000
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from gdtool.core.errors import InputError
+from gdtool.core.kinds import MeshContent
+from gdtool.core.stage import Inputs, Output, Stage
+
+
+class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of remesh."""
+
+    faces: Annotated[int, Meta(ge=16, le=2_000_000, description="quads to make, met within 3 %")] = 20000
+    triangles: Annotated[int, Meta(ge=0, le=10_000_000, description="decimate to this many triangles instead of making quads; 0: quads")] = 0
+    crease_angle: Annotated[float, Meta(ge=0, le=180, description="edges that turn by more degrees are kept sharp; 0: none")] = 30.0
+    restore_creases: Annotated[bool, Meta(description="draw out the bevels of marching cubes to sharp creases")] = True
+    engine: Annotated[Literal["auto", "instant-meshes", "quadriflow", "split"], Meta(
+        description="auto is instant-meshes with fallbacks; quadriflow needs pyQuadriFlow; split needs no engine")] = "auto"
+    smooth_iterations: Annotated[int, Meta(ge=0, le=100, description="rounds of evening out the quads on the surface")] = 5
+    seconds: Annotated[float, Meta(gt=0, description="time limit of one engine run, then the next is tried")] = 120.0
+    keep: Annotated[bool, Meta(description="pass a mesh through that already meets the request")] = True
+
+
+def run(inputs: Inputs, options: Options, out: Output) -> None:
+    """Remesh one surface or mesh file."""
+    import numpy as np
+
+    from gdtool.folders.mesh import QuadMesh, triangulated, write_mesh
+    from gdtool.geometry import mesh_quality, repair
+
+    with out.step("read"):
+        vertices, faces, matrix, quads = _read(inputs, out)
+    if quads is not None and options.keep and not options.triangles and _meets(quads, options):
+        out.skip("remeshing", f"the mesh already is {len(quads)} quads, closed and manifold")
+        found_vertices, found, engine, figures = vertices, quads, "passed through", {}
+    else:
+        with out.step("clean"):
+            vertices, faces, repairs = repair.clean(vertices, faces, _path(inputs))
+        if repairs:
+            out.warn(f"{inputs.name}: repaired " + ", ".join(f"{value} {name.replace('_', ' ')}" if not isinstance(value, bool)
+                                                             else name.replace("_", " ") for name, value in repairs.items()))
+        if not repair.is_watertight(faces):
+            out.warn(f"{inputs.name}: the surface is open; its boundaries are kept")
+        found_vertices, found, engine, figures = _decimated(vertices, faces, options, out) if options.triangles else _quads(vertices, faces, options, out)
+    with out.step("measure"):
+        figures |= mesh_quality.topology_figures(found_vertices, found) | mesh_quality.shape_figures(found_vertices, found)
+        if engine != "passed through":
+            figures |= mesh_quality.distance_figures(found_vertices, triangulated(found)[0], vertices, faces, 20000)
+    asked = options.triangles or options.faces
+    if engine != "passed through" and abs(len(found) / asked - 1) > 0.03 and (not options.triangles or len(found) > asked):
+        out.warn(f"{inputs.name}: {len(found)} faces, not the {asked} asked for")
+    with out.step("write"):
+        write_mesh(out, QuadMesh(found_vertices, found.astype(np.int32)))
+    is_quad = found[:, 3] >= 0
+    out.content = MeshContent(vertices=len(found_vertices), quads=int(is_quad.sum()), triangles=int((~is_quad).sum()),
+                              watertight=bool(figures["watertight"]), engine=engine, report=figures,
+                              source_from_world=tuple(float(x) for x in matrix.ravel()))
+
+
+def _path(inputs: Inputs):
+    return getattr(inputs.main, "path", inputs.main)
+
+
+def _read(inputs: Inputs, out: Output):
+    """Vertices and triangles in the normalised frame, the (4, 4) matrix back to the source's, and quads if it is all quads."""
+    import numpy as np
+
+    from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
+    from gdtool.geometry.repair import check, compact
+
+    main, quads = inputs.main, None
+    if hasattr(main, "content"):
+        from gdtool.folders.surface import read_surface
+
+        surface = read_surface(main)
+        return surface.vertices, surface.faces.astype(np.int64), np.array(main.content.source_from_world).reshape(4, 4), None
+    mesh = None
+    if not isinstance(main, str) and main.suffix.lower() == ".obj":
+        from gdtool.folders.mesh import read_obj, triangulated
+
+        mesh = read_obj(main)
+        vertices, faces = mesh.vertices, triangulated(mesh.faces)[0].astype(np.int64)
+        if (mesh.faces >= 0).all():
+            quads = mesh.faces.astype(np.int64)
+    else:
+        from gdtool.assets.load import load_scene
+
+        scene = load_scene(main)
+        for text in scene.notes:
+            out.warn(f"{inputs.name}: {text}")
+        vertices, faces = scene.vertices, scene.faces.astype(np.int64)
+    check(vertices, faces, _path(inputs))
+    used = np.unique(faces)
+    extent = float(np.ptp(vertices[used], 0).max())
+    if not 1e-150 < extent < 1e150:
+        raise InputError(_path(inputs), f"its longest side is {extent:g}, which cannot be computed with", "scale it")
+    matrix = unit_box(vertices[used])
+    vertices = transform_points(invert_similarity(matrix), vertices)
+    if quads is not None:
+        _, quads = compact(vertices, quads)
+    kept, faces = compact(vertices, faces)
+    return kept, faces, matrix, quads
+
+
+def _meets(quads, options: Options) -> bool:
+    from gdtool.geometry import repair
+
+    return abs(len(quads) / options.faces - 1) <= 0.03 and repair.is_watertight(quads) and repair.is_manifold(quads)
+
+
+def _decimated(vertices, faces, options: Options, out: Output):
+    import numpy as np
+
+    from gdtool.geometry.simplify import simplify
+
+    with out.step("simplify"):
+        vertices, faces, _, report = simplify(vertices, faces, options.triangles, seconds=options.seconds)
+    if "failed" in report:
+        out.warn(f"simplify: {report['failed']}")
+    figures = {"simplify_error": report["error"]}
+    return vertices, np.concatenate([faces, np.full((len(faces), 1), -1)], 1), report["method"], figures
+
+
+def _quads(vertices, faces, options: Options, out: Output):
+    from gdtool.geometry.quads import Request, remesh
+
+    request = Request(quads=options.faces, crease_degrees=options.crease_angle, engine=options.engine, seconds=options.seconds,
+                      smooth_iterations=options.smooth_iterations, restore_creases=options.restore_creases)
+    vertices, quads, record = remesh(vertices, faces, request)
+    for text in record.failed:
+        out.skip("a way of remeshing", text)
+    for name, seconds in record.seconds.items():
+        out.seconds[name] = out.seconds.get(name, 0.0) + seconds
+    return vertices, quads, record.engine, dict(record.figures)
+
+
+STAGE = Stage(name="remesh", version=1, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)
