@@ -1,0 +1,89 @@
+import struct
+
+import numpy as np
+import pytest
+
+from gdtool.assets.load import load_scene
+from gdtool.core.errors import InputError
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+
+
+def volume(scene) -> float:
+    a, b, c = (scene.vertices[scene.faces[:, i]] for i in range(3))
+    return float((a * np.cross(b, c)).sum() / 6)
+
+
+def stl(faces: np.ndarray) -> bytes:
+    rows = b"".join(struct.pack("<3f", 0, 0, 0) + CORNERS[face].tobytes() + b"\0\0" for face in faces)
+    return b"\0" * 80 + struct.pack("<I", len(faces)) + rows
+
+
+def ply(extra: str = "", rows: list[str] | None = None) -> str:
+    rows = rows or [" ".join(map(str, p)) for p in CORNERS]
+    faces = "\n".join("3 " + " ".join(map(str, face)) for face in FACES)
+    return (f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\nproperty float x\nproperty float y\nproperty float z\n{extra}"
+            f"element face {len(FACES)}\nproperty list uchar int vertex_indices\nend_header\n" + "\n".join(rows) + "\n" + faces + "\n")
+
+
+def test_stl_is_welded(tmp_path):
+    (tmp_path / "x.STL").write_bytes(stl(FACES))
+    scene = load_scene(tmp_path / "x.STL")
+    assert len(scene.vertices) == 4 and volume(scene) == pytest.approx(1 / 6)
+    assert scene.materials[0].roughness == 0.5 and scene.materials[0].metallic == 0
+
+
+def test_ply_with_colours_and_normals(tmp_path):
+    extra = "property float nx\nproperty float ny\nproperty float nz\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n"
+    rows = [" ".join(map(str, p)) + " 0 0 2 255 188 0" for p in CORNERS]
+    (tmp_path / "x.ply").write_text(ply(extra, rows))
+    scene = load_scene(tmp_path / "x.ply")
+    assert volume(scene) == pytest.approx(1 / 6)
+    np.testing.assert_allclose(scene.normals, [[0, 0, 1]] * 4)
+    np.testing.assert_allclose(scene.colors, [[1, 0.5028865, 0, 1]] * 4, atol=1e-6)
+    assert scene.materials[0].base_color == (1, 1, 1, 1)
+
+
+def test_plain_ply(tmp_path):
+    (tmp_path / "x.ply").write_text(ply())
+    scene = load_scene(tmp_path / "x.ply")
+    assert scene.colors is None and scene.normals is None and any("roughness 0.5" in note for note in scene.notes)
+
+
+@pytest.mark.parametrize(("name", "content", "fact"), [
+    ("x.stl", b"", "has no faces"),
+    ("x.stl", stl(FACES)[:100], "STL|has no faces"),
+    ("x.stl", stl(FACES[:0]), "has no faces"),
+    ("x.ply", b"ply\nformat nonsense\n", "PLY"),
+    ("x.ply", b"not a ply at all", "PLY"),
+    ("x.ply", ply().replace("3 0 2 1", "3 0 2 9").encode(), "out of range"),
+    ("x.ply", ply().replace("1.0 0.0 0.0", "nan 0.0 0.0").encode(), "not finite"),
+    ("x.fbx", b"Kaydara", "not a model that gdtool reads"),
+], ids=["empty", "cut", "no triangles", "header", "no ply", "index", "nan", "unknown"])
+def test_what_is_wrong_is_named(tmp_path, name, content, fact):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=fact) as caught:
+        load_scene(tmp_path / name)
+    assert name in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_missing_and_folder(tmp_path):
+    (tmp_path / "d.glb").mkdir()
+    for name, fact in (("none.ply", "does not exist"), ("none.glb", "does not exist"), ("d.glb", "is a folder")):
+        with pytest.raises(InputError, match=fact):
+            load_scene(tmp_path / name)
+
+
+def test_faces_without_area_are_left_out(tmp_path):
+    (tmp_path / "x.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 2 0 0\nf 1 2 3\nf 1 2 4\n")
+    scene = load_scene(tmp_path / "x.obj")
+    assert len(scene.faces) == len(scene.material_idx) == 1 and any("without area" in note for note in scene.notes)
+
+
+def test_procedural_objects_by_their_seed():
+    one, again = load_scene("procedural:7"), load_scene("procedural:7")
+    assert one.name == "procedural-000007"
+    np.testing.assert_array_equal(one.vertices, again.vertices)
+    with pytest.raises(InputError, match="procedural:SEED"):
+        load_scene("procedural:seven")
