@@ -1,0 +1,32 @@
+"""Renders a model from the front with gdtool: python show_in_gdtool.py MODEL OUT.png
+
+The frame and the sun of show_in_three.mjs and show_in_blender.py, shaded from the exact buffers with Lambert's law.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+
+from gdtool.assets.load import load_scene
+from gdtool.cameras import rig
+from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
+from gdtool.images.color import srgb_from_linear
+from gdtool.images.io import write_png
+from gdtool.shading.render import render_buffers
+
+
+def main(model: str, out: str) -> None:
+    scene = load_scene(model)
+    scene = replace(scene, vertices=transform_points(invert_similarity(unit_box(scene.vertices)), scene.vertices))
+    front = next(camera for camera in rig("six", 512) if camera.name == "front")
+    images = render_buffers(scene, front)
+    sun = np.maximum(images["normal"] @ (np.array([-1, 1, 1]) / np.sqrt(3)), 0)
+    color = images["albedo"] * (0.3 + sun[..., None])
+    write_png(out, np.concatenate([srgb_from_linear(np.clip(color, 0, 1)), images["mask"][..., None]], -1))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
