@@ -188,14 +188,15 @@ def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx
         tangents[..., :3] = tangents[..., :3] @ turn.T
         target = dataclasses.replace(target, vertices=transform_points(matrix, target.vertices), normals=target.normals @ turn.T, tangents=tangents)
         mesh = dataclasses.replace(mesh, vertices=target.vertices)
-    files = {}
-    for name in ("base_color", "orm", "normal"):
-        image = getattr(maps, name)
-        if image is not None:
-            files[name] = f"{name}.png"
-            write_png(out.path(files[name]), directx(image) if name == "normal" and options.normal_convention == "directx" else image)
     material = asset.material_of(maps, inputs.name, origin.alpha_mode, origin.alpha_cutoff, origin.double_sided)
     write_glb(out.path("asset.glb"), asset.scene_of(target, maps, material, inputs.name))
+    embedded = asset.embedded_maps(out.path("asset.glb").read_bytes())
+    files = {name: f"{name}.png" for name in embedded}
+    for name, content in embedded.items():
+        if name == "normal" and options.normal_convention == "directx":
+            write_png(out.path(files[name]), directx(maps.normal))
+        else:
+            out.path(files[name]).write_bytes(content)
     normals_idx, normals = asset.corner_normals_of_quads(mesh, target, face_idx)
     asset.write_obj(out.path("asset.obj"), mesh, normals_idx, normals, maps, files, inputs.name)
     write_png(out.path("contact_sheet.png"), contact_sheet_of(maps))

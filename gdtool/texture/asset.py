@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +48,26 @@ def scene_of(target: Target, maps: Maps, material: Material, name: str) -> Scene
     return Scene(vertices=target.vertices[position_idx[kept]], faces=place[vertex].reshape(-1, 3).astype(np.int32),
                  materials=(material,), normals=normals[kept], tangents=tangents[kept] if maps.normal is not None else None,
                  uvs=(np.asarray(target.uv, np.float64)[uv_idx[kept]],), name=name)
+
+
+def embedded_maps(glb: bytes) -> dict[str, bytes]:
+    """The PNGs of a .glb with one material, by map name: base_color, orm, normal.
+
+    The files beside the .glb are these bytes: encoding a large map takes longer than reading it from the surface.
+    """
+    length = struct.unpack_from("<I", glb, 12)[0]
+    document, binary = json.loads(glb[20:20 + length]), 20 + length + 8
+    material = document["materials"][0]
+    surface = material.get("pbrMetallicRoughness", {})
+    slots = {"base_color": surface.get("baseColorTexture"), "normal": material.get("normalTexture"),
+             "orm": surface.get("metallicRoughnessTexture") or material.get("occlusionTexture")}
+    out = {}
+    for name, slot in slots.items():
+        if slot is not None:
+            view = document["bufferViews"][document["images"][document["textures"][slot["index"]]["source"]]["bufferView"]]
+            start = binary + view.get("byteOffset", 0)
+            out[name] = glb[start:start + view["byteLength"]]
+    return out
 
 
 def write_obj(path: Path, mesh: QuadMesh, face_normals_idx: np.ndarray, normals: np.ndarray, maps: Maps, files: dict[str, str],

@@ -13,7 +13,7 @@ from gdtool.texture.project_views import Sight, observe
 from gdtool.texture.raster import barycentric_at
 from gdtool.texture.reproject import Places, Source, reproject
 from gdtool.texture.target import Target, Texels, points_at
-from gdtool.texture.tangents import encode_tangent_space
+from gdtool.texture.tangents import dot, encode_tangent_space, unit
 
 _TEXELS_AT_ONCE = 200_000
 
@@ -36,7 +36,9 @@ class ViewsOfSource:
 
 @dataclass(frozen=True)
 class Baked:
-    """What the n texels read: values by name, float32. positions (n, 3) lie on the target, seen (n,) is the views' confidence."""
+    """What the n texels read: values by name, float32, seen (n,) the views' confidence.
+
+    positions (n, 3) and unit normals (n, 3) are the target's own."""
 
     values: dict[str, np.ndarray]
     positions: np.ndarray
@@ -53,8 +55,7 @@ def vertex_lookup(source: Source, attributes: dict[str, np.ndarray], normals: np
         normal = source.at(places.face_idx, places.barycentric, normals)
         geometric = source.face_normals[places.face_idx]
         # A vertex normal that points to the other side of its own face is damaged.
-        normal = np.where((normal * geometric).sum(1, keepdims=True) > 0, normal, geometric)
-        out["normal"] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+        out["normal"] = unit(np.where(dot(normal, geometric)[:, None] > 0, normal, geometric))
         return out
 
     return lookup
@@ -86,13 +87,12 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
             own, read = prior[:, channel[k]:channel[k + 1]], value[:, channel[k]:channel[k + 1]]
             share = seen[:, None]
             if domain == "normal":
-                length = np.linalg.norm(read, axis=1, keepdims=True)
-                read = read / np.maximum(length, 1e-6)
+                read = unit(read)
                 # A view's normal bends the surface's, it does not replace it: 60 degrees off is a mistake.
-                share = share * np.clip(((read * own).sum(1, keepdims=True) - 0.5) / 0.2, 0, 1)
+                share = share * np.clip((dot(read, own)[:, None] - 0.5) / 0.2, 0, 1)
             mixed = own + share * (read - own)
             if domain == "normal":
-                mixed /= np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-6)
+                mixed = unit(mixed)
             out[domain] = linear_from_srgb(mixed) if domain == "albedo" else mixed if out[domain].ndim == 2 else mixed[:, 0]
         out["seen"] = seen
         return out
@@ -112,8 +112,7 @@ def _mapped(run: Callable, parts: list, threads: int) -> Iterator:
 def _read(target: Target, source: Source, lookup: Lookup, reach: np.ndarray, face_idx: np.ndarray,
           barycentric: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, Places]:
     points, frames = points_at(target, face_idx, barycentric)
-    normals = frames[..., 2] / np.maximum(np.linalg.norm(frames[..., 2], axis=1, keepdims=True), 1e-12)
-    places = reproject(points, normals, reach[face_idx], source)
+    places = reproject(points, unit(frames[..., 2]), reach[face_idx], source)
     return lookup(places), points, frames, places
 
 
@@ -122,20 +121,24 @@ def bake(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: 
     """Bake what lookup says of the source into the texels.
 
     reach (t,) from reproject.vertex_reach. samples per texel (a square number) are taken where neighbouring texels
-    differ, one elsewhere. values has albedo, roughness, metallic, tangent_normal (n, 3) and whatever else lookup gives.
+    differ, one elsewhere. values has albedo, roughness, metallic, tangent_normal (n, 3) and whatever else lookup gives besides normal.
     """
 
-    def run(part: slice):
-        values, points, frames, places = _read(target, source, lookup, reach, texels.face_idx[part], texels.barycentric[part])
-        values["tangent_normal"] = encode_tangent_space(frames, values["normal"])
-        smooth = frames[..., 2] / np.maximum(np.linalg.norm(frames[..., 2], axis=1, keepdims=True), 1e-12)
-        return {k: v.astype(np.float32) for k, v in values.items()}, points.astype(np.float32), smooth.astype(np.float32), places.by_ray
+    values: dict[str, np.ndarray] = {}
+    positions, normals = np.empty((len(texels), 3), np.float32), np.empty((len(texels), 3), np.float32)
+    by_ray = np.empty(len(texels), bool)
+
+    def run(part: slice) -> None:
+        read, points, frames, places = _read(target, source, lookup, reach, texels.face_idx[part], texels.barycentric[part])
+        read["tangent_normal"] = encode_tangent_space(frames, read.pop("normal"))
+        for name, value in read.items():
+            # setdefault is atomic: threads that come first at the same time agree on one array.
+            values.setdefault(name, np.empty((len(texels), *value.shape[1:]), np.float32))[part] = value
+        positions[part], normals[part], by_ray[part] = points, unit(frames[..., 2]), places.by_ray
 
     parts = [slice(s, min(s + _TEXELS_AT_ONCE, len(texels))) for s in range(0, len(texels), _TEXELS_AT_ONCE)]
-    done = list(progress(_mapped(run, parts, threads), len(parts), "bake"))
-    values = {name: np.concatenate([one[0][name] for one in done]) for name in done[0][0]}
-    positions, normals = np.concatenate([one[1] for one in done]), np.concatenate([one[2] for one in done])
-    by_ray = np.concatenate([one[3] for one in done])
+    for _ in progress(_mapped(run, parts, threads), len(parts), "bake"):
+        pass
     report = {"texels": texels.inside, "nearest_point_share": float(1 - by_ray[:texels.inside].mean())}
     if samples > 1:
         report["supersampled_share"] = _supersample(target, texels, source, lookup, reach, samples, values)
@@ -178,8 +181,7 @@ def _supersample(target: Target, texels: Texels, source: Source, lookup: Lookup,
             for name, value in read.items():
                 total[name] = total.get(name, 0) + value / (side * side)
         _, frames = points_at(target, face_idx, texels.barycentric[mine])
-        normal = total["normal"] / np.maximum(np.linalg.norm(total["normal"], axis=1, keepdims=True), 1e-6)
-        total["normal"], total["tangent_normal"] = normal, encode_tangent_space(frames, normal)
+        total["tangent_normal"] = encode_tangent_space(frames, unit(total.pop("normal")))
         for name, value in total.items():
             values[name][mine] = value
     return len(chosen) / max(texels.inside, 1)
@@ -193,13 +195,11 @@ def occlusion_tracer(target: Target, source: Source, reach: np.ndarray, normals:
     def trace(face_idx: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
         def run(part: slice) -> np.ndarray:
             points, frames = points_at(target, face_idx[part], barycentric[part])
-            facing = frames[..., 2] / np.maximum(np.linalg.norm(frames[..., 2], axis=1, keepdims=True), 1e-12)
-            places = reproject(points, facing, reach[face_idx[part]], source)
+            places = reproject(points, unit(frames[..., 2]), reach[face_idx[part]], source)
             at = source.at(places.face_idx, places.barycentric, source.vertices)
             geometric = source.face_normals[places.face_idx]
             smooth = source.at(places.face_idx, places.barycentric, normals)
-            smooth = np.where((smooth * geometric).sum(1, keepdims=True) > 0.2, smooth, geometric)
-            smooth = smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
+            smooth = unit(np.where(dot(smooth, geometric)[:, None] > 0.2, smooth, geometric))
             return openness(at + geometric * lift, smooth, source.caster, rays, seed + part.start, lift=0.0)
 
         parts = [slice(s, s + 50_000) for s in range(0, len(face_idx), 50_000)]

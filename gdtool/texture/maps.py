@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gdtool.texture.padding import fill_gutters
+from gdtool.texture.tangents import unit
 from gdtool.texture.target import Texels
 
 # Smaller differences than this, in stored units, are no detail: one step of 8 bits and rounding.
@@ -102,23 +103,15 @@ def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.nd
         layers["normal"] = values["tangent_normal"].astype(np.float32)
     elif normal_map == "auto":
         skipped.append(("normal map", f"would be flat: {angle:.2f} degrees"))
-    images = _filled(texels, layers, padding)
+    mask = texels.mask()
+    # One after the other: together they would need several times the memory.
+    images = {name: fill_gutters(texels.image(layer), mask, padding) for name, layer in layers.items()}
     if "normal" in images:
         normal = images["normal"]
-        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
-        images["normal"] = normal * 0.5 + 0.5
+        images["normal"] = unit(normal) * 0.5 + 0.5
     stored = {name: quantise(image, bits) for name, image in images.items()}
     return Maps(texels.size, stored.get("base_color"), stored.get("orm"), stored.get("normal"), factors,
                 has_occlusion, varies, skipped)
-
-
-def _filled(texels: Texels, layers: dict[str, np.ndarray], padding: int | None) -> dict[str, np.ndarray]:
-    """Images (s, s, c) of layers (n, c), gutters filled; all in one go, since they share one mask."""
-    if not layers:
-        return {}
-    image = fill_gutters(texels.image(np.concatenate(list(layers.values()), 1)), texels.mask(), padding)
-    ends = np.cumsum([0, *(values.shape[1] for values in layers.values())])
-    return {name: image[..., ends[k]:ends[k + 1]] for k, name in enumerate(layers)}
 
 
 def directx(normal: np.ndarray) -> np.ndarray:

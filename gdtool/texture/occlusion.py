@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gdtool.texture.tangents import dot, unit
 from gdtool.texture.target import Target, Texels, points_at, texels_of
 
 
@@ -57,7 +58,9 @@ def bake_occlusion(target: Target, texels: Texels, positions: np.ndarray, normal
     slot[coarse.texel] = np.arange(len(coarse))
     # What a coarse texel spans in space, from the distances between neighbours of one chart.
     spacing = _spacing(at, slot.reshape(coarse.size, coarse.size))
-    facing = frames[..., 2]
+    facing = unit(frames[..., 2])
+    at, facing = at.astype(np.float32), facing.astype(np.float32)
+    traced = _smoothed(traced, slot.reshape(coarse.size, coarse.size), at, facing, spacing)
     out = np.empty(len(texels), np.float32)
     helped = np.zeros(len(texels), bool)
     for start in range(0, len(texels), 500_000):
@@ -72,9 +75,7 @@ def bake_occlusion(target: Target, texels: Texels, positions: np.ndarray, normal
             k = slot[r * coarse.size + c]
             there = k >= 0
             share = np.abs(1 - dc - (u - c0)) * np.abs(1 - dr - (v - r0)) + 1e-3
-            apart = ((at[k] - positions[part]) ** 2).sum(1) / spacing**2
-            alike = np.clip((facing[k] * normals[part]).sum(1), 0, 1) ** 4
-            weight = np.where(there & (apart < 9), share * alike * np.exp(-0.5 * apart), 0)
+            weight = np.where(there, share * _kinship(at[k], facing[k], positions[part], normals[part], spacing), 0)
             total += weight
             value += weight * traced[k]
         helped[part] = total > 1e-5
@@ -82,6 +83,37 @@ def bake_occlusion(target: Target, texels: Texels, positions: np.ndarray, normal
     alone = np.flatnonzero(~helped)
     if len(alone):
         out[alone] = trace(texels.face_idx[alone], np.clip(texels.barycentric[alone], 0, 1))
+    return out
+
+
+def _kinship(at: np.ndarray, facing: np.ndarray, to: np.ndarray, normal: np.ndarray, spacing: float, reach: float = 3.0) -> np.ndarray:
+    """(n,) in [0, 1]: how much a place (n, 3) facing (n, 3) says about another one; 0 beyond reach spacings."""
+    offset = at - to
+    apart = dot(offset, offset) / spacing**2
+    alike = np.clip(dot(facing, normal), 0, 1)
+    return np.where(apart < reach**2, alike**4 * np.exp(-0.5 * apart), 0)
+
+
+def _smoothed(traced: np.ndarray, slot: np.ndarray, at: np.ndarray, facing: np.ndarray, spacing: float) -> np.ndarray:
+    """traced (m,) averaged over the 5 x 5 coarse texels around each, as far as they are of one piece of surface.
+
+    slot (s, s) is the index of each coarse texel, -1 where there is none. Takes out most of the noise of few rays.
+    """
+    row, column = np.nonzero(slot >= 0)
+    own = slot[row, column]
+    padded = np.pad(slot, 2, constant_values=-1)
+    total, value = np.ones(len(own), np.float32), traced[own].copy()
+    for dr in range(-2, 3):
+        for dc in range(-2, 3):
+            k = padded[row + 2 + dr, column + 2 + dc]
+            both = np.flatnonzero((k >= 0) & ((dr != 0) | (dc != 0)))
+            near, here = k[both], own[both]
+            # Wider than for interpolation: noise is to be averaged, and occlusion varies slowly.
+            weight = _kinship(at[near], facing[near], at[here], facing[here], 2 * spacing)
+            total[both] += weight
+            value[both] += weight * traced[near]
+    out = traced.copy()
+    out[own] = value / total
     return out
 
 

@@ -17,7 +17,6 @@ def push_pull(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     if not mask.any() or mask.all():
         return image.copy()
     filled = _fill(values, mask.astype(np.float32))
-    filled[mask] = values[mask]
     return filled[..., 0] if flat else filled
 
 
@@ -26,11 +25,13 @@ def _fill(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
     height, width = weight.shape
     if weight.min() > 0 or (height == 1 and width == 1):
         return values.copy()
-    pad = ((0, height % 2), (0, width % 2))
-    w = np.pad(weight, pad)
-    v = np.pad(values, (*pad, (0, 0))) * w[..., None]
+    w, v = weight, values * weight[..., None]
+    if height % 2 or width % 2:
+        pad = ((0, height % 2), (0, width % 2))
+        w, v = np.pad(w, pad), np.pad(v, (*pad, (0, 0)))
     pooled_w = w[0::2, 0::2] + w[1::2, 0::2] + w[0::2, 1::2] + w[1::2, 1::2]
     pooled_v = v[0::2, 0::2] + v[1::2, 0::2] + v[0::2, 1::2] + v[1::2, 1::2]
+    del v
     known = pooled_w > 0
     pooled_v[known] /= pooled_w[known][:, None]
     coarse = _fill(pooled_v, np.minimum(pooled_w, 1))

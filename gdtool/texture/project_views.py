@@ -7,10 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.cameras import Camera, project, rays
+from gdtool.texture.tangents import dot, unit
 
 # Below this cosine between normal and viewing direction a view has stretched its pixels too far to be read.
 GRAZING = 0.12
 _SUPERSAMPLE = 2
+# Views that differ by less, in stored units, agree.
+TOLERANCE = 0.15
 
 
 @dataclass(frozen=True)
@@ -58,8 +61,7 @@ def _toward(camera: Camera, points: np.ndarray) -> np.ndarray:
     """(n, 3) unit directions from points to the camera."""
     if camera.projection == "orthographic":
         return np.broadcast_to(camera.backward, points.shape)
-    out = camera.position - points
-    return out / np.linalg.norm(out, axis=1, keepdims=True)
+    return unit(camera.position - points)
 
 
 def _read(sight: Sight, stack: np.ndarray, mask: np.ndarray, points: np.ndarray, normals: np.ndarray,
@@ -70,11 +72,11 @@ def _read(sight: Sight, stack: np.ndarray, mask: np.ndarray, points: np.ndarray,
     surface: inside the mask and at its depth. Never a background or a part in front.
     """
     camera = sight.camera
-    cosine = (normals * _toward(camera, points)).sum(1)
+    cosine = dot(normals, _toward(camera, points))
     facing = np.flatnonzero(cosine > GRAZING)
     pixel, depth = project(camera, points[facing])
     h, w = mask.shape
-    seen = (pixel > 0).all(1) & (pixel[:, 0] < w) & (pixel[:, 1] < h) & (depth > 0)
+    seen = (pixel[:, 0] > 0) & (pixel[:, 1] > 0) & (pixel[:, 0] < w) & (pixel[:, 1] < h) & (depth > 0)
     facing, pixel, depth = facing[seen], pixel[seen] - 0.5, depth[seen]
     cosine = cosine[facing]
     slope = np.sqrt(np.maximum(1 - cosine**2, 0)) / cosine
@@ -112,39 +114,37 @@ def observe(points: np.ndarray, normals: np.ndarray, sights: list[Sight], stack:
     count, channels = len(points), stack.shape[-1]
     value = np.zeros((len(sights), count, channels), np.float32)
     quality = np.zeros((len(sights), count), np.float32)
+    low, high = np.full((count, channels), np.inf, np.float32), np.full((count, channels), -np.inf, np.float32)
+    if prior is not None:
+        low, high = prior.astype(np.float32), prior.astype(np.float32)
     for k, sight in enumerate(sights):
         seen, read, good = _read(sight, stack[k], mask[k], points, normals)
         value[k, seen], quality[k, seen] = read, good
+        low[seen], high[seen] = np.minimum(low[seen], read), np.maximum(high[seen], read)
     best = quality.max(0)
     confidence = np.clip((best - 0.04) / 0.11, 0, 1)
     share = quality / np.maximum(best, 1e-6)
-    _reject(value, share, prior)
+    disputed = np.flatnonzero((high - low > TOLERANCE).any(1))
+    if len(disputed):
+        share[:, disputed] = _without_outliers(value[:, disputed], share[:, disputed], None if prior is None else prior[disputed])
     weight = share**sharpness
     total = weight.sum(0)
     mean = np.einsum("kn,knc->nc", weight, value) / np.maximum(total, 1e-12)[:, None]
     return mean.astype(np.float32), np.where(total > 0, confidence, 0).astype(np.float32)
 
 
-def _reject(value: np.ndarray, share: np.ndarray, prior: np.ndarray | None, tolerance: float = 0.15) -> None:
-    """Set share (k, n) to 0 where a view's value (k, n, c) is far from the median of all that see the point and prior.
+def _without_outliers(value: np.ndarray, share: np.ndarray, prior: np.ndarray | None) -> np.ndarray:
+    """share (k, n), 0 where a view's value (k, n, c) is far from the median of all that see the point and prior (n, c).
 
-    Only where at least three opinions are there; what the seeing views agree on is never lost.
+    Only where at least three opinions are there, and one view at least stays.
     """
-    opinions = [np.where((share > 0)[..., None], value, np.nan)]
+    opinions = np.where((share > 0)[..., None], value, np.nan)
     if prior is not None:
-        opinions.append(prior[None].astype(np.float32))
-    opinions = np.concatenate(opinions)
+        opinions = np.concatenate([opinions, prior[None].astype(np.float32)])
     number = (~np.isnan(opinions[..., 0])).sum(0)
-    asked = np.flatnonzero(number >= 3)
-    if not len(asked):
-        return
     # nanmedian is slow: NaN sorts last, so the median's place follows from the number of opinions.
-    ordered = np.sort(opinions[:, asked], axis=0)
-    middle = (number[asked] - 1) / 2
-    low, high = np.floor(middle).astype(int), np.ceil(middle).astype(int)
-    rows = np.arange(len(asked))
-    median = (ordered[low, rows] + ordered[high, rows]) / 2
-    far = np.abs(value[:, asked] - median[None]).max(-1) > tolerance
-    kept = np.where(far, 0, share[:, asked])
-    some = (kept > 0).any(0)
-    share[:, asked[some]] = kept[:, some]
+    ordered = np.sort(opinions, axis=0)
+    middle, column = (np.maximum(number, 1) - 1) / 2, np.arange(len(number))
+    median = (ordered[np.floor(middle).astype(int), column] + ordered[np.ceil(middle).astype(int), column]) / 2
+    kept = np.where(np.abs(value - median[None]).max(-1) > TOLERANCE, 0, share)
+    return np.where((number >= 3) & (kept > 0).any(0), kept, share)

@@ -8,6 +8,7 @@ from threading import Lock
 import numpy as np
 
 from gdtool.geometry.normals import face_normals
+from gdtool.texture.tangents import dot
 
 # A place on the source is on the right side when its face's normal agrees with the mesh's normal: dot product above this.
 AGREEMENT = 0.1
@@ -105,7 +106,7 @@ def _march(points: np.ndarray, directions: np.ndarray, normals: np.ndarray, reac
         t = travelled[active] + hits.distance[hit]
         near = t <= reach[active]
         active, hit_face, hit_at, t = active[near], hit_face[near], hit_at[near], t[near]
-        agrees = (source.face_normals[hit_face] * normals[active]).sum(1) > AGREEMENT
+        agrees = dot(source.face_normals[hit_face], normals[active]) > AGREEMENT
         found = active[agrees]
         face[found], distance[found], barycentric[found] = hit_face[agrees], np.abs(t[agrees]), hit_at[agrees]
         # The other side of a wall: step through it and look on.
@@ -117,7 +118,7 @@ def _march(points: np.ndarray, directions: np.ndarray, normals: np.ndarray, reac
 def _nearest_agreeing(points: np.ndarray, normals: np.ndarray, source: Source) -> tuple[np.ndarray, np.ndarray]:
     """Nearest place whose face looks the same way as the normal: face_idx (n,), point (n, 3). Plain nearest if none does."""
     face, point = source.nearest.closest(points)
-    wrong = np.flatnonzero((source.face_normals[face] * normals).sum(1) <= AGREEMENT)
+    wrong = np.flatnonzero(dot(source.face_normals[face], normals) <= AGREEMENT)
     if not len(wrong):
         return face, point
     # The normal's main component is at least 1/sqrt(3): the faces near that axis hold most of those that agree.
@@ -130,7 +131,7 @@ def _nearest_agreeing(points: np.ndarray, normals: np.ndarray, source: Source) -
             if among is None:
                 continue
             other_face, other_point = among.closest(points[mine])
-            better = (source.face_normals[other_face] * normals[mine]).sum(1) > AGREEMENT
+            better = dot(source.face_normals[other_face], normals[mine]) > AGREEMENT
             face[mine[better]], point[mine[better]] = other_face[better], other_point[better]
     return face, point
 
@@ -142,15 +143,16 @@ def _slide_off_edges(points: np.ndarray, normals: np.ndarray, source: Source, fa
     """
     from gdtool.geometry.distance import barycentric_of
 
-    slanted = np.flatnonzero((source.face_normals[face] * normals).sum(1) < 0.99)
-    if not len(slanted):
-        return
-    at = source.at(face[slanted], barycentric[slanted], source.vertices)
-    slanted = slanted[np.linalg.norm(at - points[slanted], axis=1) > 1e-4 * source.extent]
+    cosine = dot(source.face_normals[face], normals)
+    slanted = np.flatnonzero(cosine < 0.99)
+    away = source.at(face[slanted], barycentric[slanted], source.vertices) - points[slanted]
+    # How far beside the nearest place the ray went, were the face a plane.
+    beside = np.sqrt(dot(away, away) * np.maximum(1 - cosine[slanted] ** 2, 0))
+    slanted = slanted[beside > 1e-4 * source.extent]
     if not len(slanted):
         return
     nearest_face, nearest = source.nearest.closest(points[slanted])
-    agrees = (source.face_normals[nearest_face] * normals[slanted]).sum(1) > AGREEMENT
+    agrees = dot(source.face_normals[nearest_face], normals[slanted]) > AGREEMENT
     slanted, nearest_face, nearest = slanted[agrees], nearest_face[agrees], nearest[agrees]
     face[slanted] = nearest_face
     barycentric[slanted] = barycentric_of(nearest, source.vertices[source.faces[nearest_face]])

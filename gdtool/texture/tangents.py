@@ -20,14 +20,20 @@ def weld(*columns: np.ndarray) -> np.ndarray:
     return np.unique(keys, return_inverse=True)[1].ravel()
 
 
-def _unit(v: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(v, axis=-1, keepdims=True)
+def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(...,) scalar products of vectors (..., c); numpy's sum over a short last axis takes several times as long."""
+    return np.einsum("...c,...c->...", a, b)
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    """Vectors (..., c) of length 1; those without length stay 0."""
+    length = np.sqrt(dot(v, v))[..., None]
     return v / np.where(length > 0, length, 1.0)
 
 
 def _flatten(v: np.ndarray, n: np.ndarray) -> np.ndarray:
     """v projected to the plane of n, unit."""
-    return _unit(v - n * (n * v).sum(-1, keepdims=True))
+    return unit(v - n * dot(n, v)[..., None])
 
 
 def edge_pairs(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -69,7 +75,7 @@ def corner_tangents(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray
     texture space get some tangent orthogonal to the normal and w = 1.
     """
     position = np.asarray(vertices, np.float64)[faces]
-    normal = _unit(np.asarray(normals, np.float64)[faces if face_normals_idx is None else face_normals_idx])
+    normal = unit(np.asarray(normals, np.float64)[faces if face_normals_idx is None else face_normals_idx])
     texture = np.asarray(uv, np.float64)[face_uvs] * (1, -1) + (0, 1)
     vertex = weld(position.reshape(-1, 3), normal.reshape(-1, 3), texture.reshape(-1, 2)).reshape(-1, 3)
 
@@ -85,10 +91,10 @@ def corner_tangents(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray
     tangent = _flatten(np.repeat(axis[:, None], 3, 1), normal)
     before = _flatten(np.roll(position, 1, 1) - position, normal)
     after = _flatten(np.roll(position, -1, 1) - position, normal)
-    angle = np.arccos(np.clip((before * after).sum(-1), -1, 1))
+    angle = np.arccos(np.clip(dot(before, after), -1, 1))
     weighted = (tangent * np.where(usable[:, None], angle, 0)[..., None]).reshape(-1, 3)
     total = np.stack([np.bincount(group.ravel(), weighted[:, k], group.max(initial=-1) + 1) for k in range(3)], 1)
-    frame = _unit(total)[group]
+    frame = unit(total)[group]
     handed = np.repeat(sign[:, None], 3, 1).astype(np.float64)
 
     # Corners of unusable triangles borrow from the first usable corner of their vertex.
@@ -114,8 +120,8 @@ def frame_at(normals: np.ndarray, tangents: np.ndarray, barycentric: np.ndarray)
     normals (n, 3, 3) and tangents (n, 3, 4) of the corners, barycentric (n, 3). Nothing is normalised after
     interpolation, as MikkTSpace asks: encoder and decoder then use the same basis.
     """
-    normal = (normals * barycentric[..., None]).sum(1)
-    tangent = (tangents[..., :3] * barycentric[..., None]).sum(1)
+    normal = np.einsum("nk,nkc->nc", barycentric, normals)
+    tangent = np.einsum("nk,nkc->nc", barycentric, tangents[..., :3])
     bitangent = tangents[:, :1, 3] * np.cross(normal, tangent)
     return np.stack([tangent, bitangent, normal], -1)
 
@@ -125,13 +131,13 @@ def encode_tangent_space(frames: np.ndarray, world: np.ndarray) -> np.ndarray:
     tangent, bitangent, normal = frames[..., 0], frames[..., 1], frames[..., 2]
     # Rows of the inverse, up to the determinant, which is positive or negative with the frame's handedness.
     rows = (np.cross(bitangent, normal), np.cross(normal, tangent), np.cross(tangent, bitangent))
-    determinant = (tangent * rows[0]).sum(-1)
-    local = np.stack([(row * world).sum(-1) for row in rows], -1)
+    determinant = dot(tangent, rows[0])
+    local = np.stack([dot(row, world) for row in rows], -1)
     safe = np.abs(determinant) > 1e-9
     local = np.where(safe[..., None], local * np.sign(determinant)[..., None], (0.0, 0.0, 1.0))
-    return _unit(local)
+    return unit(local)
 
 
 def decode_tangent_space(frames: np.ndarray, local: np.ndarray) -> np.ndarray:
     """World normals (n, 3), unit, of tangent-space normals (n, 3), +Y up, in frames (n, 3, 3)."""
-    return _unit((frames * local[..., None, :]).sum(-1))
+    return unit(np.einsum("...ck,...k->...c", frames, local))
