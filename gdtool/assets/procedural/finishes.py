@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.assets.procedural import patterns
+from gdtool.assets.procedural.parts import product
 from gdtool.assets.scene import Material, Texture
 
 # Normal-incidence reflectance of metals, linear: measured optical constants as tabulated at physicallybased.info
@@ -181,7 +182,7 @@ def banded(rng, color=None, axis=None, frequency=None) -> Finish:
     wobble, size = patterns.noise_field(rng, 2.0, 1.0), rng.choice([0.0, 0.08, 0.3])
     shift = rng.uniform()
     return _field("stripes", _table("stripes", layers, 0.012, wrap="mirror"),
-                  lambda s: 2 * frequency * (s.points @ direction) + size * wobble(s.points) + shift, _dirt(rng), clip=False)
+                  lambda s: 2 * frequency * (product(s.points, direction)) + size * wobble(s.points) + shift, _dirt(rng), clip=False)
 
 
 def gradient(rng, color=None, direction=None) -> Finish:
@@ -192,7 +193,7 @@ def gradient(rng, color=None, direction=None) -> Finish:
     roughness = rng.uniform(0.15, 0.8)
     material = _table("gradient", [(0, color, roughness, 0.0), (rng.uniform(0.3, 0.7), other, roughness, 0.0)], rng.uniform(0.2, 0.6))
     wobble = patterns.noise_field(rng, 2.0, 1.0)
-    return _field("gradient", material, lambda s: 0.5 + s.points @ axis + 0.04 * wobble(s.points), _dirt(rng))
+    return _field("gradient", material, lambda s: 0.5 + product(s.points, axis) + 0.04 * wobble(s.points), _dirt(rng))
 
 
 def marble(rng, color=None) -> Finish:
@@ -316,7 +317,7 @@ def gazing(rng, direction: np.ndarray, iris=None, white=None) -> Finish:
 
     def apply(shape: Shape) -> Look:
         sign = np.where(shape.points[:, 0] < 0, -1.0, 1.0)[:, None]  # the left eye is the mirror image of the right one
-        toward = (shape.normals * np.concatenate([sign, np.ones((len(sign), 2))], 1)) @ direction
+        toward = product(shape.normals * np.concatenate([sign, np.ones((len(sign), 2))], 1), direction)
         angle = np.degrees(np.arccos(np.clip(toward, -1, 1))) / 90.0
         return Look(material, np.stack([np.clip(angle, 0.004, 0.996), np.full(len(angle), 0.5)], -1))
 

@@ -7,7 +7,7 @@ import numpy as np
 from gdtool.assets.procedural import finishes, patterns, solids, tiles
 from gdtool.assets.procedural.assembly import Assembly
 from gdtool.assets.procedural.finishes import hsv
-from gdtool.assets.procedural.parts import ball, circle, cylinder, loft, refined, smooth_curve, subdivided, tube
+from gdtool.assets.procedural.parts import ball, circle, cylinder, loft, product, refined, smooth_curve, subdivided, tube
 
 
 def _green(rng) -> np.ndarray:
@@ -158,7 +158,13 @@ def burger(rng) -> Assembly:
         thick = rng.uniform(0.18, 0.26)
         ring = np.stack([0.4 * np.cos(w), 0 * w, 0.4 * np.sin(w)], -1)
         a.add(tube(ring, thick, closed=True, outline=circle(28)), finishes.matte(rng, hsv(0.085, 0.6, 0.75)))
-        top = solids.carved(solids.ring((0, 0, 0), 0.4, thick * 1.06), lambda p: p[:, 1] - 0.02 - 0.03 * np.sin(7 * np.arctan2(p[:, 2], p[:, 0])), 0.02)
+
+        def below_edge(p):
+            # On strided columns numpy's arctan2 picks its code by where the memory lies, and the last bit with it (numpy 1.26)
+            x, y, z = np.ascontiguousarray(p.T)
+            return y - 0.02 - 0.03 * np.sin(7 * np.arctan2(z, x))
+
+        top = solids.carved(solids.ring((0, 0, 0), 0.4, thick * 1.06), below_edge, 0.02)
         a.add(solids.polygonised(top, 52), tiles.pick(rng, "skin"))
         sprinkle = [finishes.plastic(rng) for _ in range(3)]
         for _ in range(int(rng.integers(0, 30))):
@@ -266,7 +272,7 @@ def rock(rng) -> Assembly:
         bump, cuts = patterns.noise_field(rng, 0.7, 3.0), rng.normal(size=(9, 3))
         cuts = (cuts / np.linalg.norm(cuts, axis=1, keepdims=True)).astype(np.float32)
         offset = rng.uniform(0.45, 0.75, 9).astype(np.float32)
-        a.add(solids.polygonised(lambda p: (p @ cuts.T - offset).max(axis=1) * np.float32(0.7) + np.float32(0.3) * (np.linalg.norm(p, axis=1) - 0.65) + np.float32(0.03) * bump(p), 58), tiles.pick(rng, "stone"))
+        a.add(solids.polygonised(lambda p: (product(p, cuts) - offset).max(axis=1) * np.float32(0.7) + np.float32(0.3) * (np.linalg.norm(p, axis=1) - 0.65) + np.float32(0.03) * bump(p), 58), tiles.pick(rng, "stone"))
         return a
     crystal = finishes.glossy(rng, hsv(rng.uniform(), rng.uniform(0.4, 0.9), rng.uniform(0.5, 0.95))) if rng.uniform() < 0.6 else finishes.gradient(np.random.default_rng(rng.integers(2**32)))
     for k in range(int(rng.integers(1, 8))):

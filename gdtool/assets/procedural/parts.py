@@ -38,7 +38,7 @@ class Part:
     def turned(self, axis: str, degrees: float) -> Part:
         """Rotated about the origin, right-handed, axis "x", "y" or "z"."""
         matrix = rotation(axis, degrees)
-        return replace(self, vertices=self.vertices @ matrix.T, normals=self.normals @ matrix.T)
+        return replace(self, vertices=product(self.vertices, matrix), normals=product(self.normals, matrix))
 
     def mirrored(self) -> Part:
         """The other hand: x negated."""
@@ -49,6 +49,14 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors (..., 3) scaled to length 1; a zero vector stays zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.maximum(length, 1e-30)
+
+
+def product(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """points (n, 3) by matrix (k, 3) transposed -> (n, k), or by a vector (3,) -> (n,).
+
+    Not by BLAS: its last bits depend on the number of threads, and a seed's object must not.
+    """
+    return np.einsum("ij,kj->ik" if matrix.ndim == 2 else "ij,j->i", points, matrix)
 
 
 def rotation(axis: str, degrees: float) -> np.ndarray:

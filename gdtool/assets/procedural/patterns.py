@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gdtool.assets.procedural.parts import product
+
 
 def noise_field(rng: np.random.Generator, frequency: float, octaves: float = 2.0, waves: int = 28) -> Callable:
     """A smooth random function of points (n, 3), about unit variance: a sum of sines from `frequency` up by `octaves`.
@@ -19,7 +21,7 @@ def noise_field(rng: np.random.Generator, frequency: float, octaves: float = 2.0
     phase = rng.uniform(0, 2 * np.pi, waves).astype(np.float32)
     weight = (1 / ratio).astype(np.float32)
     weight *= np.sqrt(2 / (weight**2).sum())
-    return lambda points: np.sin(points.astype(np.float32) @ vectors.T + phase) @ weight
+    return lambda points: product(np.sin(product(points.astype(np.float32), vectors) + phase), weight)
 
 
 def cell_field(rng: np.random.Generator, count: int) -> Callable:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from gdtool.assets.procedural.parts import Part, box_projected, rotation, signed_volume, unit
+from gdtool.assets.procedural.parts import Part, box_projected, product, rotation, signed_volume, unit
 
 Distance = Callable[[np.ndarray], np.ndarray]
 
@@ -37,7 +37,7 @@ def limb(start: Sequence[float], end: Sequence[float], radius: float, end_radius
 
     def distance(points):
         offset, axis = points - a, b - a
-        t = np.clip(offset @ axis / max(float(axis @ axis), 1e-9), 0, 1)
+        t = np.clip(product(offset, axis) / max(float(axis @ axis), 1e-9), 0, 1)
         return _length(offset - t[:, None] * axis) - (radius + grow * t)
 
     return distance
@@ -89,8 +89,8 @@ def ring(center: Sequence[float], radius: float, thickness: float, axis: str = "
 
 def turned(shape: Distance, axis: str, degrees: float, about: Sequence[float] = (0, 0, 0)) -> Distance:
     """The shape rotated about a point."""
-    matrix, about = rotation(axis, degrees).astype(np.float32), np.asarray(about, np.float32)
-    return lambda points: shape((points - about) @ matrix + about)
+    matrix, about = rotation(axis, -degrees).astype(np.float32), np.asarray(about, np.float32)
+    return lambda points: shape(product(points - about, matrix) + about)
 
 
 def both_sides(shape: Distance) -> Distance:

@@ -1,5 +1,8 @@
 """Facts that hold for every procedural object."""
 
+import os
+import subprocess
+import sys
 import time
 from functools import lru_cache
 
@@ -49,6 +52,15 @@ def test_a_seed_does_not_depend_on_what_was_made_before():
     generate(22)
     np.random.seed(0)
     assert same_array(alone.vertices, generate(21).vertices)
+
+
+def test_objects_do_not_depend_on_threads_or_hash_seed():
+    script = ("import hashlib\nfrom gdtool.assets.procedural import generate\nh = hashlib.sha256()\n"
+              "for seed, kind in ((246, 'burger'), (1, 'rock'), (2, 'quadruped'), (3, 'boat'), (4, 'bread')):\n"
+              "    s = generate(seed, kind)\n    [h.update(a.tobytes()) for a in (s.vertices, s.faces, s.normals, *s.uvs)]\nprint(h.hexdigest())")
+    digests = {subprocess.run([sys.executable, "-c", script], env={**os.environ, **extra}, capture_output=True, check=True).stdout
+               for extra in ({"OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "1"}, {"OMP_NUM_THREADS": "2", "PYTHONHASHSEED": "2"})}
+    assert len(digests) == 1
 
 
 @pytest.mark.parametrize("seed", SEEDS)
