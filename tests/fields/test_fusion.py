@@ -1,0 +1,107 @@
+"""The grid method on analytic solids: distance bounds, closedness, orientation, any subset of the domains."""
+
+import numpy as np
+import pytest
+
+from gdtool.fields.align import depth_corrections, disagreement
+from gdtool.fields.carve import silhouettes_outvoted
+from gdtool.fields.fusion import align_depth, fuse_views, grid_step, is_closed_manifold, prepare_all
+from gdtool.fields.sights import free_distance, hull_distance, silhouette_distance
+from gdtool.geometry.grids import components, signed_volume
+
+from .shapes import cube, sphere, torus, two_balls, views_of
+
+SIZE = 72
+
+
+@pytest.fixture(scope="module")
+def seen():
+    return {solid.__name__: views_of(solid, SIZE) for solid in (sphere, cube, torus, two_balls)}
+
+
+def reconstruct(cameras, images, mask, depth=True, normal=True):
+    step = grid_step(cameras, 0)
+    sights, _, noise = align_depth(cameras, mask, images["depth"] if depth else None, images["normal"] if normal else None, step)
+    return fuse_views(sights, step, noise, silhouettes_outvoted(sights))
+
+
+# Pixels are 0.02 wide here: the bounds are a tenth of one on average, two at the worst.
+@pytest.mark.parametrize("solid, volume", [(sphere, np.pi / 6), (cube, 1.0), (torus, 2 * np.pi ** 2 * 0.35 * 0.15 ** 2)])
+def test_all_domains_meet_the_analytic_surface(seen, solid, volume):
+    shape = reconstruct(*seen[solid.__name__])
+    error = np.abs(solid(shape.vertices))
+    assert is_closed_manifold(shape.faces)
+    assert error.mean() < 0.002 and error.max() < 0.04
+    assert signed_volume(shape.vertices, shape.faces) == pytest.approx(volume, rel=0.02)  # positive: wound outward
+
+
+@pytest.mark.parametrize("depth, normal, bound", [(True, False, 0.003), (False, True, 0.02), (False, False, 0.02)])
+def test_subsets_of_the_domains(seen, depth, normal, bound):
+    shape = reconstruct(*seen["torus"], depth=depth, normal=normal)
+    assert is_closed_manifold(shape.faces)
+    assert np.abs(torus(shape.vertices)).mean() < bound
+    euler = len(shape.vertices) - len(shape.faces) // 2
+    assert euler == 0  # one hole, as seen from the front
+
+
+def test_two_pieces_stay_two(seen):
+    shape = reconstruct(*seen["two_balls"])
+    assert components(shape.faces, len(shape.vertices)).max() == 1
+    assert np.abs(two_balls(shape.vertices)).mean() < 0.002
+
+
+def test_silhouette_distance_is_subpixel():
+    """A half-plane whose edge cuts pixels at 10.3: distances are exact to a hundredth of a pixel beside it."""
+    mask = np.zeros((32, 32), np.float32)
+    mask[:, :10], mask[:, 10] = 1, 0.3
+    distance = silhouette_distance(mask)
+    assert distance[16, 8] == pytest.approx(8.5 - 10.3, abs=0.1)
+    assert distance[16, 12] == pytest.approx(12.5 - 10.3, abs=0.1)
+
+
+def test_line_thinner_than_a_pixel_keeps_an_inside():
+    mask = np.zeros((16, 16), np.float32)
+    mask[:, 8] = 0.3
+    assert (silhouette_distance(mask) < 0).any()
+    assert (silhouette_distance(np.zeros((16, 16), np.float32)) > 8).all()
+
+
+def test_views_measure_distances_from_both_sides(seen):
+    cameras, images, mask = seen["sphere"]
+    front = prepare_all(cameras, mask, images["depth"], images["normal"])[0]
+    points = np.array([[0, 0, 0.55], [0, 0, 0.45], [0.1, 0.1, 0.5]])
+    value, weight = free_distance(front, points)
+    assert value == pytest.approx(sphere(points), abs=2e-3) and (weight > 0.5).all()
+    assert hull_distance(front, np.array([[0.6, 0, 0], [0, 0.4, 0]])) == pytest.approx([0.1, -0.1], abs=2e-3)
+
+
+def test_alignment_undoes_a_shift_of_depth(seen):
+    cameras, images, mask = seen["torus"]
+    depth = images["depth"].copy()
+    depth[0][mask[0] > 0] += 0.02
+    sights = prepare_all(cameras, mask, depth, images["normal"])
+    clean = disagreement(prepare_all(cameras, mask, images["depth"], images["normal"]))
+    assert disagreement(sights) > 5 * clean
+    change = depth_corrections(sights, 0.08, 2.0)[0]
+    assert change[mask[0] > 0.99].mean() < -0.008
+    after = align_depth(cameras, mask, depth, images["normal"], grid_step(cameras, 0))
+    assert after[2] < 0.4 * after[1]
+
+
+def test_views_that_contradict_one_another_still_close(seen):
+    cameras = seen["sphere"][0]
+    kinds = ["sphere", "torus", "two_balls", "cube", "torus", "two_balls"]
+    images = {n: np.stack([seen[kind][1][n][k] for k, kind in enumerate(kinds)]) for n in ("depth", "normal")}
+    shape = reconstruct(cameras, images, np.stack([seen[kind][2][k] for k, kind in enumerate(kinds)]))
+    assert is_closed_manifold(shape.faces) and np.isfinite(shape.vertices).all()
+    assert signed_volume(shape.vertices, shape.faces) > 0.01
+
+
+def test_flat_card_and_empty_views_close():
+    """A card a third of a pixel thick, edge-on in two views; one view shows nothing at all."""
+    card = lambda p: np.max(np.abs(p) - [0.5, 0.4, 0.003], -1)
+    cameras, images, mask = views_of(card, 48)
+    mask[4] = 0
+    shape = reconstruct(cameras, images, mask)
+    assert is_closed_manifold(shape.faces)
+    assert np.ptp(shape.vertices[:, 0]) > 0.9 and np.ptp(shape.vertices[:, 1]) > 0.7
