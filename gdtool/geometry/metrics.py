@@ -17,6 +17,7 @@ from gdtool.geometry.rays import RayCaster
 
 # What lies within this of the first hit counts as seen: half a pixel of 256 across 1.44, in units of the truth's size.
 SEEN_TOLERANCE = 2e-3
+SEEN_COSINE = 0.05  # flatter than that, a pixel spreads over twenty times its size
 IOU_CELLS, IOU_PAD, BLOCK = 128, 1.1, 4
 # syncdreamer: 16 cameras around at elevation 30, distance 1.5, a 35 mm lens on a 32 mm sensor.
 SYNC_VIEWS, SYNC_SIZE, SYNC_ELEVATION, SYNC_DISTANCE, SYNC_VOXEL, SYNC_CELLS = 16, 256, 30.0, 1.5, 0.01, 64
@@ -45,15 +46,20 @@ def is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
     return not np.bincount(index.reshape(-1), np.sign(end - start)).any()
 
 
-def seen(points: np.ndarray, caster: RayCaster, cameras: Sequence[Camera], tolerance: float) -> np.ndarray:
-    """(n,) bool: whether points (n, 3) on the caster's mesh are in the picture of any camera and nothing hides them."""
+def seen(points: np.ndarray, normals: np.ndarray, caster: RayCaster, cameras: Sequence[Camera], tolerance: float) -> np.ndarray:
+    """(n,) bool: whether points (n, 3) on the caster's mesh are in the picture of any camera and nothing hides them.
+
+    Faces are seen from both sides, but not edge-on: normals (n, 3).
+    """
     out = np.zeros(len(points), bool)
     for camera in cameras:
         left = np.flatnonzero(~out)
         pixels, depth = project(camera, points[left])
-        inside = (pixels >= 0).all(1) & (pixels[:, 0] <= camera.width) & (pixels[:, 1] <= camera.height) & (depth > 0)
-        left = left[inside]
-        origins, directions = camera_rays(camera, pixels[inside])
+        within = (pixels >= 0).all(1) & (pixels[:, 0] <= camera.width) & (pixels[:, 1] <= camera.height) & (depth > 0)
+        left = left[within]
+        origins, directions = camera_rays(camera, pixels[within])
+        facing = np.abs(np.einsum("ij,ij->i", normals[left], directions)) >= SEEN_COSINE
+        left, origins, directions = left[facing], origins[facing], directions[facing]
         distance = np.einsum("ij,ij->i", points[left] - origins, directions)
         # The first hit, not a query for anything between: the point's own face must not hide it.
         out[left] = caster.first_hit(origins, directions).distance >= distance - tolerance
@@ -69,8 +75,8 @@ def surface_protocol(vertices: np.ndarray, faces: np.ndarray, true_vertices: np.
     result); precision and recall are the shares within the threshold, f_score their harmonic mean. normal_degrees is
     the mean angle between a sample's normal and that of the closest point, orientation left aside (0 to 90);
     flipped_share is how many of these face the other way. iou is at cells^3 over the truth's box padded by a tenth, and
-    only there when the truth is closed. With cameras the same over what they see of the truth, as seen_*: the truth's
-    samples that they see, and the result's samples whose closest point on the truth they see.
+    only there when the truth is closed. With cameras the same over what they see, as seen_*: from the part of the truth
+    that they see to the result, and from the part of the result that they would see to the truth.
     """
     extent = float(np.ptp(true_vertices[np.unique(true_faces)], axis=0).max())
     vertices, true_vertices = vertices / extent, true_vertices / extent
@@ -88,15 +94,18 @@ def surface_protocol(vertices: np.ndarray, faces: np.ndarray, true_vertices: np.
     if is_closed(true_vertices, true_faces):
         out["iou"] = volume_iou(vertices, faces, true_vertices, true_faces, cells)
     if cameras:
-        caster = RayCaster(true_vertices * extent, true_faces)
-        tolerance = SEEN_TOLERANCE * extent
-        true_seen = seen(true_points * extent, caster, cameras, tolerance)
-        near_seen = seen(near_true * extent, caster, cameras, tolerance)
-        out["seen_share"] = float(true_seen.mean())
-        if true_seen.any() and near_seen.any():
-            part = _two_ways(accuracy[near_seen], completeness[true_seen], cosine[near_seen], true_cosine[true_seen], threshold)
-            out |= {f"seen_{name}": value for name, value in part.items()}
+        part = _seen(points, normals[face_idx], vertices, faces, cameras, extent)
+        true_part = _seen(true_points, true_normals[true_idx], true_vertices, true_faces, cameras, extent)
+        out["seen_share"] = float(true_part.mean())
+        if part.any() and true_part.any():
+            found = _two_ways(accuracy[part], completeness[true_part], cosine[part], true_cosine[true_part], threshold)
+            out |= {f"seen_{name}": value for name, value in found.items()}
     return out
+
+
+def _seen(points, normals, vertices, faces, cameras, extent: float) -> np.ndarray:
+    """seen() of points in units of the extent, for cameras in the caller's."""
+    return seen(points * extent, normals, RayCaster(vertices * extent, faces), cameras, SEEN_TOLERANCE * extent)
 
 
 def _two_ways(accuracy, completeness, cosine, true_cosine, threshold: float) -> dict[str, float]:
