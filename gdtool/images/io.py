@@ -189,6 +189,7 @@ def _write(path: Path, image: np.ndarray, kind: str) -> None:
     stored = pixels
     if kind == "float":
         spec["compression"] = "zip"
+        spec["DateTime"] = "1970:01:01 00:00:00"  # or the present time is written: equal images, unequal files
         if channels in (2, 4):
             stored = np.concatenate([pixels[..., :-1] * pixels[..., -1:], pixels[..., -1:]], -1)
     else:
