@@ -1,0 +1,230 @@
+"""Texture coordinates for a mesh of quads: charts, laid flat, packed; and the figures that tell how good they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gdtool.core.child import ChildFailed, call
+from gdtool.folders.mesh import triangulated
+from gdtool.geometry.repair import compact
+from gdtool.texture.raster import owner_count
+from gdtool.texture.unwrap_charts import Adjacency, bisect, find_charts
+from gdtool.texture.unwrap_flatten import flatten, singular_values, stretch
+from gdtool.texture.unwrap_pack import pack
+
+_JOINS = 60  # attempts to join two charts
+_JOIN_SHARE = 0.04  # charts smaller than this share of the area are joined to others
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked for. padding: texels between charts at `size`; seconds: limit of each native run."""
+
+    size: int = 2048
+    padding: int = 8
+    max_stretch: float = 1.1
+    good_stretch: float = 1.0015
+    max_cost: float = 2.0
+    seconds: float = 120.0
+
+
+@dataclass
+class Unwrapped:
+    """uv (c, 2) in [0, 1], (0, 0) at the image's top left; face_uvs (f, 4) into it, -1 with a triangle's fourth corner;
+    chart (f,); what failed on the way."""
+
+    uv: np.ndarray
+    face_uvs: np.ndarray
+    chart: np.ndarray
+    failed: list[str] = field(default_factory=list)
+
+
+def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapped:
+    """Texture coordinates of quads and triangles faces (f, 4); a quad lies in one chart, its corners flat together.
+
+    vertices (v, 3) finite. Charts are never mirrored and do not overlap; all have one texel density.
+    """
+    extent = float(np.ptp(vertices[np.unique(faces[faces >= 0])], 0).max())
+    unit = (vertices - vertices.mean(0)) / (extent if extent > 0 else 1.0)
+    label, failed = find_charts(unit, faces, seconds=request.seconds, max_cost=request.max_cost)
+    try:
+        flat, more = call("gdtool.texture.unwrap:flatten_all", unit, faces, label, request.good_stretch, request.max_stretch,
+                          seconds=request.seconds, memory_mb=8000)
+    except ChildFailed as failure:
+        flat, more = flatten_all(unit, faces, label, request.good_stretch, request.max_stretch, planes_only=True)
+        failed.append(f"flattening: {failure}; charts by the side they look at")
+    failed += more
+    places, _ = pack([(uv, triangles) for _, _, uv, triangles in flat], request.padding / request.size)
+    face_uvs = np.full(faces.shape, -1, np.int64)
+    chart = np.zeros(len(faces), np.int64)
+    offset = 0
+    for i, ((faces_idx, corners, _, _), uv) in enumerate(zip(flat, places, strict=True)):
+        face_uvs[faces_idx] = np.where(corners >= 0, corners + offset, -1)
+        chart[faces_idx] = i
+        offset += len(uv)
+    uv = np.concatenate(places)
+    return Unwrapped(np.clip(np.stack([uv[:, 0], 1 - uv[:, 1]], -1), 0, 1), face_uvs.astype(np.int32), chart, failed)
+
+
+def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good_stretch: float, max_stretch: float,
+                planes_only: bool = False) -> tuple[list, list[str]]:
+    """Each chart flat, cut further where it has to be: list of (faces_idx, corners (k, 4), uv (c, 2) v up, triangles).
+
+    corners are into uv. planes_only lays charts flat by projection alone, cutting until that works.
+    """
+    from gdtool.texture.unwrap_flatten import _plane
+
+    adjacency = Adjacency(vertices, faces)
+    order = np.argsort(label, kind="stable")
+    queue = [part for part in np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(part)][::-1]
+    out, cut = [], {}
+    while queue:
+        faces_idx = queue.pop()
+        points, corners = _own_corners(vertices, faces[faces_idx])
+        triangles, _ = triangulated(corners)
+        if planes_only:
+            uv, reason = _plane(points, triangles), "is not flat"
+        else:
+            uv, reason = flatten(points, triangles.astype(np.int64), good_stretch, max_stretch)
+        if uv is None and len(faces_idx) == 1:
+            uv = _alone(points, corners[0])
+        if uv is None:
+            cut[reason] = cut.get(reason, 0) + 1
+            half = bisect(adjacency, faces_idx)
+            if half.all() or not half.any():
+                half = np.arange(len(faces_idx)) < len(faces_idx) // 2
+            for part in (faces_idx[half], faces_idx[~half]):
+                own = np.full(len(faces), -1)
+                own[part] = 0
+                name = adjacency.connected(own)[part]
+                queue.extend(part[name == n] for n in np.unique(name))
+            continue
+        out.append((faces_idx, corners, uv, triangles))
+    if not planes_only:
+        out = _joined(vertices, faces, adjacency, out, good_stretch)
+    return out, [f"{count} charts were cut: a chart {reason}" for reason, count in cut.items()]
+
+
+def _joined(vertices: np.ndarray, faces: np.ndarray, adjacency: Adjacency, charts: list, good_stretch: float) -> list:
+    """Small charts joined to the neighbour with the longest common seam, as long as the two lie flat together well."""
+    total = adjacency.area.sum()
+    label = np.full(len(faces), -1)
+    parts = {}
+    for i, chart in enumerate(charts):
+        label[chart[0]] = i
+        parts[i] = chart
+    limit = 1 + 10 * (good_stretch - 1)
+    tried: set[tuple[int, int]] = set()
+    for _ in range(_JOINS):
+        a, b = label[adjacency.pairs].T
+        apart = a != b
+        pair = np.sort(np.stack([a, b], -1)[apart], 1)
+        if not len(pair):
+            break
+        key, inverse = np.unique(pair[:, 0] * len(charts) + pair[:, 1], return_inverse=True)
+        # Seams in the open count ten times those on creases (Adjacency.cost).
+        seam = np.bincount(inverse.ravel(), adjacency.cost[apart])
+        area = np.bincount(label, adjacency.area, len(charts))
+        one, two = key // len(charts), key % len(charts)
+        smaller = np.minimum(area[one], area[two])
+        worth = np.where(smaller < _JOIN_SHARE * total, seam / np.sqrt(smaller + 1e-300), 0)
+        for k in np.argsort(-worth, kind="stable").tolist():
+            if worth[k] > 0 and (int(one[k]), int(two[k])) not in tried:
+                break
+        else:
+            break
+        i, j = int(one[k]), int(two[k])
+        tried.add((i, j))
+        faces_idx = np.concatenate([parts[i][0], parts[j][0]])
+        points, corners = _own_corners(vertices, faces[faces_idx])
+        triangles, _ = triangulated(corners)
+        uv, _ = flatten(points, triangles.astype(np.int64), good_stretch, limit)
+        if uv is not None:
+            parts[i] = (faces_idx, corners, uv, triangles)
+            del parts[j]
+            label[label == j] = i
+            tried = {pair for pair in tried if i not in pair and j not in pair}
+    return list(parts.values())
+
+
+def _own_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A chart's own vertices, those where it touches itself doubled, and its faces (k, 4) into them."""
+    from gdtool.geometry.repair import _fans
+
+    points, corners = compact(vertices, faces)
+    fans, count = _fans(corners)
+    if (count > 1).any():
+        used = corners >= 0
+        _, first, new = np.unique(fans[used], return_index=True, return_inverse=True)
+        points = points[corners[used][first]]
+        corners = np.full(corners.shape, -1)
+        corners[used] = new.ravel()
+    return points, corners
+
+
+def _alone(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """One face on its own that will not lie flat (no area, or folded): a square or right triangle of its size."""
+    used = corners[corners >= 0]
+    size = max(float(np.ptp(points, 0).max()), 1e-6)
+    uv = np.zeros((len(points), 2))
+    uv[used] = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)[:len(used)] * size
+    return uv
+
+
+def figures(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, size: int = 1024) -> dict[str, float | int]:
+    """Charts, coverage and overlap of the unit square, L2 stretch, angle and area distortion, mirrored share, seam length.
+
+    Mirrored and overlap are shares of area; seam length is in diagonals of the bounding box, each seam counted once.
+    """
+    triangles, face_idx = triangulated(faces)
+    corners = corner_triangles(face_uvs, face_idx)
+    # One mesh whose vertices are the texture corners, so that singular values see both sides of a seam apart.
+    points = np.zeros((len(uv), 3))
+    points[corners.ravel()] = vertices[triangles.ravel()]
+    upward = np.stack([uv[:, 0], 1 - uv[:, 1]], -1)
+    values, area = singular_values(points, corners, upward)
+    a, b, c = (upward[corners[:, i]] for i in range(3))
+    flat = ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
+    use = (area > 1e-12 * area.sum()) & (np.abs(flat) > 1e-14)
+    weight = area[use] / area[use].sum()
+    ratio = np.abs(flat[use]) / np.abs(flat[use]).sum() / weight
+    count = owner_count(uv, corners, size)
+    label, seam = islands(vertices, faces, face_uvs)
+    return {
+        "charts": int(label.max()) + 1, "coverage": float((count > 0).mean()), "overlap": float((count > 1).sum() / max((count > 0).sum(), 1)),
+        "stretch": stretch(points, corners, upward), "area_distortion": float((weight * np.maximum(ratio, 1 / ratio)).sum()),
+        "angle_distortion": float((weight * np.minimum(values[use, 0] / np.maximum(values[use, 1], 1e-12), 100)).sum()),
+        "mirrored": float(area[flat < 0].sum() / area.sum()), "degenerate": float(1 - use.mean()),
+        "seam_length": seam / float(np.linalg.norm(np.ptp(vertices, 0))),
+    }
+
+
+def corner_triangles(face_uvs: np.ndarray, face_idx: np.ndarray) -> np.ndarray:
+    """Texture corners (t, 3) of the triangles that triangulated() cuts the faces into."""
+    second = np.zeros(len(face_idx), bool)
+    second[1:] = face_idx[1:] == face_idx[:-1]
+    return np.take_along_axis(face_uvs[face_idx], np.where(second[:, None], [0, 2, 3], [0, 1, 2]), 1).astype(np.int64)
+
+
+def islands(vertices: np.ndarray, faces: np.ndarray, face_uvs: np.ndarray) -> tuple[np.ndarray, float]:
+    """The chart (f,) of each face, joined wherever an edge has the same texture corners on both sides, and the length of
+    the edges that have not."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    from gdtool.geometry.repair import edges_of
+
+    edges = edges_of(faces)
+    order = np.argsort(edges.half_edge_idx, kind="stable")
+    edge_idx, pairs = edges.face_pairs()
+    first = (np.cumsum(edges.count) - edges.count)[edge_idx]
+    ends_uv = edges_of(face_uvs).half_ends  # in the same order of corners
+    one, two = ends_uv[order[first]], ends_uv[order[first + 1]]
+    backward = (edges.half_ends[order[first]][:, 0] != edges.half_ends[order[first + 1]][:, 0])
+    two = np.where(backward[:, None], two[:, ::-1], two)
+    joined = (one == two).all(1)
+    graph = coo_matrix((np.ones(int(joined.sum())), (pairs[joined, 0], pairs[joined, 1])), (len(faces), len(faces)))
+    ends = edges.ends[edge_idx[~joined]]
+    return connected_components(graph, False)[1], float(np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1).sum())

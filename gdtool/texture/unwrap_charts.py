@@ -1,0 +1,163 @@
+"""Which faces of a quad mesh share a chart: xatlas on a simplified proxy, brought back to whole quads and tidied."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.core.child import ChildFailed, call
+from gdtool.folders.mesh import triangulated
+from gdtool.geometry.mesh_quality import polygon_normals
+from gdtool.geometry.repair import edges_of
+
+_PROXY_TRIANGLES = 6000
+_CREASE_DEGREES = 30.0
+_SMALLEST_SHARE = 0.003  # of the area; a smaller chart joins a neighbour if it has one
+
+
+def run_xatlas(vertices: np.ndarray, triangles: np.ndarray, max_cost: float) -> np.ndarray:
+    """(t,) chart of each triangle, by xatlas; runs in a child, because xatlas can hang. Triangles it drops have chart -1."""
+    import xatlas
+
+    charts = xatlas.ChartOptions()
+    charts.max_cost = max_cost
+    pack = xatlas.PackOptions()
+    pack.resolution = 256
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(triangles, np.uint32))
+    atlas.generate(charts, pack)
+    out = np.full(len(triangles), -1, np.int64)
+    for i in range(atlas.get_mesh_chart_count(0)):
+        out[np.asarray(atlas.get_mesh_chart(0, i).faces, np.int64)] = i
+    return out
+
+
+class Adjacency:
+    """Faces (k, 2) that share an edge, with what a seam along that edge costs (k,): its length, a tenth of it on creases."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray):
+        edges = edges_of(faces)
+        edge_idx, self.pairs = edges.face_pairs()
+        self.ends = edges.ends[edge_idx]
+        normals, self.area = polygon_normals(vertices, faces)
+        cosine = (normals[self.pairs[:, 0]] * normals[self.pairs[:, 1]]).sum(1)
+        length = np.linalg.norm(vertices[self.ends[:, 0]] - vertices[self.ends[:, 1]], axis=1)
+        self.crease = cosine < np.cos(np.radians(_CREASE_DEGREES))
+        self.cost = length * np.where(self.crease, 0.1, 1.0) + 1e-12
+        self.normals, self.count = normals, len(faces)
+        # Where the two faces walk the edge in one direction (a turned face) a chart cannot go on.
+        turned = edges.turned[edge_idx]
+        self.pairs, self.cost, self.crease, self.ends = (x[~turned] for x in (self.pairs, self.cost, self.crease, self.ends))
+
+    def connected(self, label: np.ndarray) -> np.ndarray:
+        """Labels (f,) such that each is one connected set of faces: sets of one label that do not touch get their own."""
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.csgraph import connected_components
+
+        same = label[self.pairs[:, 0]] == label[self.pairs[:, 1]]
+        pairs = self.pairs[same]
+        graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (self.count, self.count))
+        return connected_components(graph, False)[1].astype(np.int64)
+
+    def votes(self, label: np.ndarray, own: np.ndarray | float) -> np.ndarray:
+        """(f,) the label around each face whose edges cost most to cut; own (f,) is added to the label it has."""
+        face = np.concatenate([self.pairs[:, 0], self.pairs[:, 1], np.arange(self.count)])
+        vote = np.concatenate([label[self.pairs[:, 1]], label[self.pairs[:, 0]], label])
+        weight = np.concatenate([self.cost, self.cost, np.broadcast_to(own, self.count)])
+        width = int(label.max()) + 1
+        key, inverse = np.unique(face * width + vote, return_inverse=True)
+        total = np.bincount(inverse.ravel(), weight)
+        order = np.lexsort((total, key // width))
+        last = np.append(np.flatnonzero(np.diff(key[order] // width)), len(order) - 1)
+        return key[order][last] % width
+
+
+def find_charts(vertices: np.ndarray, faces: np.ndarray, *, seconds: float, max_cost: float) -> tuple[np.ndarray, list[str]]:
+    """(f,) chart of each face, all connected, and what failed on the way.
+
+    vertices (v, 3) in a unit box, faces (f, 4). Without xatlas' help the faces go by the box side they look at.
+    """
+    from gdtool.geometry.distance import closest_points
+    from gdtool.geometry.simplify import simplify
+
+    failed: list[str] = []
+    adjacency = Adjacency(vertices, faces)
+    triangles, _ = triangulated(faces)
+    proxy_vertices, proxy, _, report = simplify(vertices, triangles.astype(np.int64), _PROXY_TRIANGLES)
+    if report["method"] == "vertex clustering":
+        proxy_vertices, proxy = vertices, triangles
+    try:
+        chart = call("gdtool.texture.unwrap_charts:run_xatlas", proxy_vertices.astype(np.float32), proxy.astype(np.int32), max_cost,
+                     seconds=seconds, memory_mb=8000)
+        centre = vertices[np.where(faces < 0, faces[:, :1], faces)].mean(1)
+        label = chart[closest_points(centre, proxy_vertices, proxy)[1]]
+        if (label < 0).all():
+            raise ChildFailed("xatlas made no charts")
+    except ChildFailed as failure:
+        failed.append(f"xatlas: {failure}")
+        axis = np.abs(adjacency.normals).argmax(1)
+        label = axis * 2 + (adjacency.normals[np.arange(len(faces)), axis] < 0)
+    label = np.where(label < 0, label.max() + 1, label)
+    return tidy(adjacency, label), failed
+
+
+def tidy(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> np.ndarray:
+    """Labels with short, straight seams that prefer creases, without islands too small to be a chart."""
+    first = label
+    typical = np.median(adjacency.cost)
+    parity = (np.arange(adjacency.count) * 2654435761 >> 7) % 2
+    for turn in range(rounds):
+        # Half of the faces at a time: neighbours that change at once would swap for ever.
+        voted = adjacency.votes(label, np.where(first == label, 0.4, 0.1) * typical)
+        changing = (voted != label) & (parity == turn % 2)
+        if not (voted != label).any():
+            break
+        label = np.where(changing, voted, label)
+    label = adjacency.connected(label)
+    smallest = _SMALLEST_SHARE * adjacency.area.sum()
+    for _ in range(20):
+        area = np.bincount(label, adjacency.area)
+        faces = np.bincount(label)
+        small = (area < smallest) | (faces < min(8, adjacency.count // 64))
+        # A small set goes whole to the neighbour with which it shares the most costly seam.
+        a, b = label[adjacency.pairs].T
+        apart = a != b
+        pair = np.concatenate([np.stack([a, b], -1)[apart], np.stack([b, a], -1)[apart]])
+        weight = np.concatenate([adjacency.cost[apart]] * 2)
+        mine = small[pair[:, 0]]
+        if not mine.any():
+            break
+        key, inverse = np.unique(pair[mine][:, 0] * len(area) + pair[mine][:, 1], return_inverse=True)
+        total = np.bincount(inverse.ravel(), weight[mine])
+        onto = np.arange(len(area))
+        for k in np.argsort(total, kind="stable").tolist():
+            onto[key[k] // len(area)] = key[k] % len(area)
+        # Two small neighbours must not swap: only toward the larger, or the lower number.
+        target = onto
+        swap = (target[target] == np.arange(len(area))) & (target > np.arange(len(area)))
+        onto = np.where(swap, np.arange(len(area)), target)
+        label = adjacency.connected(onto[label])
+    return label
+
+
+def bisect(adjacency: Adjacency, faces_idx: np.ndarray) -> np.ndarray:
+    """(k,) bool: a split of a chart's faces (k,) in two connected halves, between two faces far from each other."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import dijkstra
+
+    number = np.full(adjacency.count, -1)
+    number[faces_idx] = np.arange(len(faces_idx))
+    inside = (number[adjacency.pairs] >= 0).all(1)
+    pairs = number[adjacency.pairs[inside]]
+    # Across a crease is far: halves part there when they can.
+    size = np.sqrt(adjacency.area[faces_idx])
+    length = (size[pairs[:, 0]] + size[pairs[:, 1]]) / 2 * np.where(adjacency.crease[inside], 5.0, 1.0) + 1e-12
+    graph = coo_matrix((length, (pairs[:, 0], pairs[:, 1])), (len(faces_idx),) * 2).tocsr()
+
+    def far_from(start: int) -> tuple[int, np.ndarray]:
+        distance = dijkstra(graph, directed=False, indices=start)
+        return int(np.where(np.isfinite(distance), distance, -1).argmax()), distance
+
+    one, _ = far_from(0)
+    two, from_one = far_from(one)
+    _, from_two = far_from(two)
+    return from_two < from_one

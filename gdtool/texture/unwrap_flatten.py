@@ -1,0 +1,172 @@
+"""Charts laid flat: conformal start, then as isometric as they go, never folded, never mirrored."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.geometry.normals import face_normals
+from gdtool.geometry.repair import edges_of
+from gdtool.texture.raster import owner_count
+
+_SLIM_STEPS = (4, 4, 6, 8)
+
+
+def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, max_stretch: float) -> tuple[np.ndarray | None, str]:
+    """uv (v, 2), v up, at the scale of the surface, of one connected chart; or None and why it has to be cut.
+
+    vertices (v, 3), triangles (t, 3), a manifold with boundary. Least-squares conformal map (Lévy et al. 2002), or Tutte's
+    embedding where that folds, then SLIM (Rabinovich et al. 2017) on the symmetric Dirichlet energy until good_stretch.
+    """
+    edges = edges_of(triangles)
+    border = edges.count == 1
+    if not border.any():
+        return None, "closed"
+    uv = _plane(vertices, triangles)
+    if uv is not None and stretch(vertices, triangles, uv) < good_stretch:
+        return uv, ""
+    uv = _conformal(vertices, triangles, edges.ends[border])
+    if uv is None or not _upright(uv, triangles):
+        euler = len(vertices) - len(edges.ends) + len(triangles)
+        if euler != 1:
+            return None, "folds, and is no disk"
+        uv = _tutte(vertices, triangles)
+        if uv is None or not _upright(uv, triangles):
+            return None, "folds"
+    uv = _isometric(vertices, triangles, uv, good_stretch)
+    if stretch(vertices, triangles, uv) > max_stretch:
+        return None, "stretches"
+    if overlaps(uv, triangles):
+        return None, "overlaps itself"
+    return uv, ""
+
+
+def _areas(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    a, b, c = (uv[triangles[:, i]] for i in range(3))
+    return ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
+
+
+def _upright(uv: np.ndarray, triangles: np.ndarray) -> bool:
+    area = _areas(uv, triangles)
+    return bool(np.isfinite(area).all() and (area > 1e-10 * max(area.max(initial=0), 1e-300)).all())
+
+
+def _scaled(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    total, flat = face_normals(vertices, triangles)[1].sum(), _areas(uv, triangles).sum()
+    return (uv - uv.mean(0)) * (total / max(flat, 1e-300)) ** 0.5
+
+
+def _plane(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
+    """The chart seen along its mean normal, when all of it faces that way: exact for flat charts."""
+    normals, area = face_normals(vertices, triangles)
+    mean = (normals * area[:, None]).sum(0)
+    length = np.linalg.norm(mean)
+    if length < 1e-12:
+        return None
+    mean /= length
+    if (normals @ mean)[area > 0].min() < 0.3:
+        return None
+    x = np.cross([0.0, 1.0, 0.0] if abs(mean[1]) < 0.9 else [1.0, 0.0, 0.0], mean)
+    x /= np.linalg.norm(x)
+    uv = np.stack([vertices @ x, vertices @ np.cross(mean, x)], -1)
+    if not _upright(uv, triangles) or overlaps(uv, triangles):
+        return None
+    return _scaled(vertices, triangles, uv)
+
+
+def _conformal(vertices: np.ndarray, triangles: np.ndarray, border: np.ndarray) -> np.ndarray | None:
+    import igl
+
+    rim = np.unique(border)
+    one = rim[np.linalg.norm(vertices[rim] - vertices[rim].mean(0), axis=1).argmax()]
+    two = rim[np.linalg.norm(vertices[rim] - vertices[one], axis=1).argmax()]
+    if one == two:
+        return None
+    length = float(np.linalg.norm(vertices[two] - vertices[one]))
+    uv = np.asarray(igl.lscm(np.ascontiguousarray(vertices), np.ascontiguousarray(triangles, np.int64), np.array([one, two], np.int64),
+                             np.array([[0.0, 0.0], [length, 0.0]]))[0])
+    if not np.isfinite(uv).all():
+        return None
+    if _areas(uv, triangles).sum() < 0:
+        uv = uv * [1.0, -1.0]
+    return _scaled(vertices, triangles, uv)
+
+
+def _tutte(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
+    """Uniform-weight embedding onto a circle (Tutte 1963): never folds."""
+    import igl
+    from scipy.sparse import coo_matrix, diags
+    from scipy.sparse.linalg import spsolve
+
+    loops = igl.boundary_loop_all(np.ascontiguousarray(triangles, np.int64))
+    if len(loops) != 1:
+        return None
+    loop = np.array(loops[0])
+    steps = np.linalg.norm(vertices[np.roll(loop, -1)] - vertices[loop], axis=1) + 1e-9
+    angle = 2 * np.pi * np.concatenate([[0], np.cumsum(steps)[:-1]]) / steps.sum()
+    ends = edges_of(triangles).ends
+    n = len(vertices)
+    rows, columns = np.concatenate([ends[:, 0], ends[:, 1]]), np.concatenate([ends[:, 1], ends[:, 0]])
+    weights = coo_matrix((np.ones(len(rows)), (rows, columns)), (n, n)).tocsr()
+    laplacian = (diags(np.asarray(weights.sum(1)).ravel()) - weights).tocsr()
+    uv = np.zeros((n, 2))
+    uv[loop] = np.stack([np.cos(angle), np.sin(angle)], -1)
+    inner = np.setdiff1d(np.arange(n), loop)
+    if len(inner):
+        uv[inner] = spsolve(laplacian[inner][:, inner].tocsc(), -laplacian[inner][:, loop] @ uv[loop]).reshape(len(inner), 2)
+    if _areas(uv, triangles).sum() < 0:
+        uv = uv * [1.0, -1.0]
+    return _scaled(vertices, triangles, uv)
+
+
+def _isometric(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray, good_stretch: float) -> np.ndarray:
+    import igl
+
+    best = uv
+    if stretch(vertices, triangles, best) < good_stretch:
+        return best
+    start = np.concatenate([uv, np.zeros((len(uv), 1))], 1)
+    state = igl.slim_precompute(np.asfortranarray(vertices, np.float64), np.asfortranarray(triangles, np.int32), np.asfortranarray(start[:, :2]),
+                                igl.MappingEnergyType.SYMMETRIC_DIRICHLET, np.zeros(0, np.int32), np.zeros((0, 2), order="F"), 0.0)
+    before = stretch(vertices, triangles, best)
+    for steps in _SLIM_STEPS:
+        found = np.asarray(igl.slim_solve(state, steps))[:, :2]
+        if not np.isfinite(found).all() or not _upright(found, triangles):
+            break
+        best, now = _scaled(vertices, triangles, found), stretch(vertices, triangles, found)
+        if now < good_stretch or before - now < 2e-4:
+            break
+        before = now
+    return best
+
+
+def singular_values(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(t, 2) singular values, larger first, of the map from uv to the surface, and the triangles' areas (t,)."""
+    e1, e2 = vertices[triangles[:, 1]] - vertices[triangles[:, 0]], vertices[triangles[:, 2]] - vertices[triangles[:, 0]]
+    u1, u2 = uv[triangles[:, 1]] - uv[triangles[:, 0]], uv[triangles[:, 2]] - uv[triangles[:, 0]]
+    det = u1[:, 0] * u2[:, 1] - u1[:, 1] * u2[:, 0]
+    safe = np.where(np.abs(det) > 0, det, 1e-300)[:, None]
+    du = (e1 * u2[:, 1:] - e2 * u1[:, 1:]) / safe
+    dv = (e2 * u1[:, :1] - e1 * u2[:, :1]) / safe
+    a, b, c = (du * du).sum(1), (du * dv).sum(1), (dv * dv).sum(1)
+    root = np.sqrt((a - c) ** 2 + 4 * b * b)
+    values = np.sqrt(np.maximum(np.stack([(a + c + root) / 2, (a + c - root) / 2], -1), 0))
+    return values, np.linalg.norm(np.cross(e1, e2), axis=1) / 2
+
+
+def stretch(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> float:
+    """L2 stretch (Sander et al. 2001), 1 for an isometry, at the scale where the areas agree."""
+    values, area = singular_values(vertices, triangles, uv)
+    flat = np.abs(_areas(uv, triangles))
+    use = (area > 1e-12 * area.sum()) & (flat > 1e-14 * max(flat.sum(), 1e-300))
+    if not use.any():
+        return float("inf")
+    weight = area[use] / area[use].sum()
+    return float(np.sqrt((weight * (values[use] ** 2).sum(1) / 2).sum() * flat[use].sum() / area[use].sum()))
+
+
+def overlaps(uv: np.ndarray, triangles: np.ndarray, size: int = 512) -> bool:
+    """Whether any texel centre of a size x size grid around the chart lies in two of its triangles."""
+    low, extent = uv.min(0), float(np.ptp(uv, 0).max())
+    if not extent > 0:
+        return True
+    return bool((owner_count((uv - low) / extent, triangles, size) > 1).any())
