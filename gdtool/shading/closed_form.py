@@ -56,7 +56,7 @@ def shade_parts(normal: Tensor, view: Tensor, albedo: Tensor, roughness: Tensor,
     n_v = dot(normal, view).clamp(MIN_VIEW_COSINE, 1.0)
     light_cosine = dot(normal[..., None, :], lights.axes)
     received = cosine_integral(lights.sharpness, light_cosine)
-    irradiance = (received @ lights.amplitudes) * known
+    irradiance = (received[..., None] * lights.amplitudes).sum(-2) * known
     reflected = f0_of(albedo, metallic, f0)
     diffuse = albedo * ((1 - metallic) / math.pi)[..., None] * irradiance
     if brdf == "gltf":

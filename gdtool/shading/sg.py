@@ -13,6 +13,8 @@ from torch import Tensor
 
 # Beyond this a lobe is a point to float32; squares of it still fit.
 MAX_SHARPNESS = 1e12
+# Floor of what is divided by: its inverse, and products of that in gradients, stay finite in float32.
+_TINY = 1e-24
 
 
 @dataclass(frozen=True)
@@ -39,8 +41,8 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def normalize(v: Tensor) -> Tensor:
-    """v / |v|, and 0 with a finite gradient where v is 0."""
-    return v * torch.rsqrt(dot(v, v).clamp_min(torch.finfo(v.dtype).tiny))[..., None]
+    """v / |v|; shorter than 1e-12 stays short, with a finite gradient."""
+    return v * torch.rsqrt(dot(v, v).clamp_min(_TINY))[..., None]
 
 
 def lobe(axis: Tensor, sharpness: Tensor, v: Tensor) -> Tensor:
@@ -61,14 +63,14 @@ def product(axis1: Tensor, sharpness1: Tensor, axis2: Tensor, sharpness2: Tensor
     which does not cancel there. Wang et al. 2009, rearranged.
     """
     total = sharpness1 + sharpness2
-    safe = total.clamp_min(torch.finfo(total.dtype).tiny)
+    safe = total.clamp_min(_TINY)
     # Shares of the sum, so that no square of a sharpness over- or underflows.
     s1, s2 = sharpness1 / safe, sharpness2 / safe
     apart, along = axis1 - axis2, axis1 + axis2
     q = 0.5 * dot(apart, apart)
     near = 1 - 2 * s1 * s2 * q
     far = (s1 - s2) ** 2 + s1 * s2 * dot(along, along)
-    squared = torch.where(q < 1, near, far).clamp_min(torch.finfo(total.dtype).tiny)
+    squared = torch.where(q < 1, near, far).clamp_min(_TINY)
     ratio = torch.sqrt(squared)
     exponent = -2 * s1 * s2 * q / (1 + ratio) * total
     axis = normalize(s1[..., None] * axis1 + s2[..., None] * axis2)
