@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gdtool.texture.padding import push_pull
 from gdtool.texture.tangents import dot, unit
 from gdtool.texture.target import Target, Texels, points_at, texels_of
 
@@ -63,8 +64,8 @@ def bake_occlusion(target: Target, texels: Texels, positions: np.ndarray, normal
     traced = _smoothed(traced, slot.reshape(coarse.size, coarse.size), at, facing, spacing)
     out = np.empty(len(texels), np.float32)
     helped = np.zeros(len(texels), bool)
-    for start in range(0, len(texels), 500_000):
-        part = slice(start, start + 500_000)
+    for start in range(0, texels.inside, 500_000):
+        part = slice(start, min(start + 500_000, texels.inside))
         row, column = texels.texel[part] // size, texels.texel[part] % size
         u = (column + 0.5) * coarse.size / size - 0.5
         v = (row + 0.5) * coarse.size / size - 0.5
@@ -80,9 +81,12 @@ def bake_occlusion(target: Target, texels: Texels, positions: np.ndarray, normal
             value += weight * traced[k]
         helped[part] = total > 1e-5
         out[part] = np.where(total > 1e-5, value / np.maximum(total, 1e-12), 1)
-    alone = np.flatnonzero(~helped)
+    alone = np.flatnonzero(~helped[:texels.inside])
     if len(alone):
-        out[alone] = trace(texels.face_idx[alone], np.clip(texels.barycentric[alone], 0, 1))
+        out[alone] = trace(texels.face_idx[alone], texels.barycentric[alone])
+    # Beyond a crease the surface goes on in another direction: around charts the inside is continued instead.
+    image = texels.image(np.where(np.arange(len(texels)) < texels.inside, out, 0))
+    out[texels.inside:] = push_pull(image, texels.mask(inside_only=True)).ravel()[texels.texel[texels.inside:]]
     return out
 
 
