@@ -43,7 +43,7 @@ def to_bytes(x: np.ndarray) -> np.ndarray:
 
 
 def from_bytes(x: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(x)).float() / 127 - 1
+    return torch.from_numpy(np.array(x)).float() / 127 - 1  # a copy: memory maps are read-only
 
 
 def shrink(image: np.ndarray, size: int) -> np.ndarray:

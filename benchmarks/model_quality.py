@@ -1,0 +1,143 @@
+"""How good a model is on objects it was not trained on, beside two baselines; a Markdown table for its card.
+
+    gdtool render-dataset procedural:900000..900023 --size 64 --condition-views 3 -o held_out
+    python benchmarks/model_quality.py held_out --train objects -o docs/benchmarks
+
+Each object's front view is the picture. Figures are means over the five views the model has not seen, each picture
+weighing the same: color and albedo PSNR over white, full frame ("frame") and over the true foreground only
+("foreground"), in the stored encoding; SSIM of color over white; normals in degrees, depth as a share of the object's
+size, both where truth and result are foreground; roughness and metallic mean absolute error over the true foreground;
+overlap (intersection over union) of the silhouettes. Baselines: the mean of the training objects' views, and the
+training object whose front view is nearest (squared error of the picture over grey).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import gdtool.models
+from gdtool.cameras import rig
+from gdtool.core.folder import open_folder
+from gdtool.diffusion.data import decode_object
+from gdtool.diffusion.encoding import BACKGROUND, encode
+from gdtool.diffusion.result import views_from_images
+from gdtool.diffusion.sampling import sample_images
+from gdtool.diffusion.weights import load_model
+from gdtool.folders.views import Views, read_views
+from gdtool.images.color import srgb_from_linear
+from gdtool.images.metrics import normal_degrees, over_white, psnr, resized_views, scalar_error, ssim
+
+DEFAULT_MODEL = Path(gdtool.models.__file__).parent / "default"
+
+
+def views_folders(paths: list[Path]) -> list:
+    """The views folders among paths and in the datasets among them."""
+    found = []
+    for path in paths:
+        folder = open_folder(path, ("dataset", "views"), "model_quality", check=False)
+        if folder.kind == "dataset":
+            found += [open_folder(folder.file(one.path), ("views",), check=False) for one in folder.content.objects]
+        else:
+            found.append(folder)
+    return found
+
+
+def figures(result: Views, truth: Views) -> dict[str, float]:
+    """Errors of one object over the views that are not the front one."""
+    unseen = [k for k, name in enumerate(truth.names) if name != "front"]
+    order = [result.names.index(truth.names[k]) for k in unseen]
+    true, mask = {d: x[unseen] for d, x in truth.images.items()}, truth.mask[unseen]
+    own, own_mask = {d: x[order] for d, x in result.images.items()}, result.mask[order]
+    out: dict[str, list[float]] = {}
+    for k in range(len(unseen)):
+        full = mask[k] > 0.99
+        for domain in ("color", "albedo"):
+            a, b = over_white(own[domain][k], own_mask[k]), over_white(true[domain][k], mask[k])
+            out.setdefault(f"{domain}_psnr_frame", []).append(psnr(a, b))
+            if full.any():
+                a, b = (np.clip(srgb_from_linear(x[domain][k]), 0, 1) for x in (own, true))
+                out.setdefault(f"{domain}_psnr_foreground", []).append(psnr(a, b, full))
+            if domain == "color":
+                out.setdefault("color_ssim_frame", []).append(ssim(over_white(own[domain][k], own_mask[k]), over_white(true[domain][k], mask[k])))
+        a, b = own_mask[k] > 0.5, mask[k] > 0.5
+        out.setdefault("silhouette_overlap", []).append(float((a & b).sum() / max((a | b).sum(), 1)))
+    single = {name: float(np.mean(values)) for name, values in out.items()}
+    single["normal_degrees"] = normal_degrees(own["normal"], own_mask, true["normal"], mask)
+    both = (own_mask > 0.5) & (mask > 0.99)
+    single["depth_error"] = float(np.abs(own["depth"] - true["depth"])[both].mean()) if both.any() else float("nan")
+    for domain in ("roughness", "metallic"):
+        single[f"{domain}_error"] = scalar_error(own[domain], true[domain], mask)
+    return single
+
+
+def decoded(planes: torch.Tensor, config) -> Views:
+    """Views of one object from its encoded planes (k, 13, h, w)."""
+    indices = tuple(range(6))
+    images = encode(planes[None], indices, torch.zeros(1))[0]
+    cameras = {camera.name: camera for camera in rig("six", config.image_size)}
+    return views_from_images({d: images[i] for i, d in enumerate(config.domains)}, [cameras[n] for n in config.views], 0.0, config.domains)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("held_out", nargs="+", type=Path)
+    parser.add_argument("--model", type=Path, default=DEFAULT_MODEL)
+    parser.add_argument("--train", nargs="*", type=Path, default=[], help="what it was trained on, for the baselines")
+    parser.add_argument("--steps", default="1,4,8", help="denoising steps to measure")
+    parser.add_argument("--scheduler", default="ddim", choices=["ddim", "dpm"])
+    parser.add_argument("-o", "--output", type=Path, help="folder for model_quality.json and .md")
+    arguments = parser.parse_args()
+    model = load_model(arguments.model)
+    config = model.config
+    cameras = {camera.name: camera for camera in rig("six", config.image_size)}
+    table: dict[str, list[dict[str, float]]] = {}
+    seconds: dict[str, float] = {}
+    planes, pictures = [], []
+    for folder in views_folders(arguments.train):
+        one, conditions, _ = decode_object(folder, config)
+        planes.append(one.astype(np.float16))
+        pictures.append(conditions[0].astype(np.float16))
+    mean = torch.from_numpy(np.mean(planes, 0, dtype=np.float32)) if planes else None
+    for number, folder in enumerate(views_folders(arguments.held_out)):
+        truth = read_views(folder)
+        images, mask = resized_views(truth.images, truth.mask, config.image_size, config.image_size)
+        truth = Views([cameras[name] for name in truth.names], images, mask)
+        rgba = torch.from_numpy(decode_object(folder, config)[1][0])[None]
+        for steps in (int(s) for s in arguments.steps.split(",")):
+            start = time.perf_counter()
+            sampled = sample_images(model, rgba, steps=steps, scheduler=arguments.scheduler, seed=number)
+            result = views_from_images({d: x[0] for d, x in sampled.items()}, [cameras[n] for n in config.views],
+                                       BACKGROUND[config.backgrounds[0]], config.domains)
+            name = f"model, {steps} step{'s' * (steps > 1)}"
+            seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
+            table.setdefault(name, []).append(figures(result, truth))
+        if planes:
+            errors = [float(np.square(p.astype(np.float32) - rgba[0].numpy()).mean()) for p in pictures]
+            nearest = torch.from_numpy(planes[int(np.argmin(errors))].astype(np.float32))
+            table.setdefault("nearest training object", []).append(figures(decoded(nearest, config), truth))
+            table.setdefault("mean training object", []).append(figures(decoded(mean, config), truth))
+        print(f"{number + 1}: {folder.name}", flush=True)
+    count = len(next(iter(table.values())))
+    means = {name: {key: float(np.nanmean([row[key] for row in rows])) for key in rows[0]} for name, rows in table.items()}
+    for name in seconds:
+        means[name]["seconds"] = seconds[name] / count
+    lines = [f"{count} held-out objects, the five unseen views, {config.image_size} px:", "", "| | " + " | ".join(means) + " |",
+             "|---" * (len(means) + 1) + "|"]
+    keys = list(dict.fromkeys(key for row in means.values() for key in row))
+    lines += [f"| {key.replace('_', ' ')} | " + " | ".join(f"{row[key]:.3f}" if key in row else "" for row in means.values()) + " |" for key in keys]
+    text = "\n".join(lines) + "\n"
+    print(text)
+    if arguments.output:
+        arguments.output.mkdir(parents=True, exist_ok=True)
+        (arguments.output / "model_quality.md").write_text(text)
+        (arguments.output / "model_quality.json").write_text(json.dumps(means, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,82 @@
+"""What goes into the network comes out of it."""
+
+import numpy as np
+import pytest
+import torch
+
+from gdtool.diffusion.config import DOMAINS
+from gdtool.diffusion.encoding import coverage, decode, encode, planes_from_images
+from gdtool.diffusion.framing import FRONT_EXTENT, frame, whole_frame
+from tests.diffusion.spheres import sphere_views
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    views = sphere_views(3)
+    return views, torch.from_numpy(planes_from_images(views.images, views.mask))[None]
+
+
+@pytest.mark.parametrize("background", [1.0, 0.0, -1.0])
+def test_encode_then_decode_is_the_identity(sphere, background):
+    from gdtool.images.color import srgb_from_linear
+
+    views, planes = sphere
+    encoded = encode(planes, tuple(range(6)), torch.tensor([background]))[0]
+    images = {d: encoded[i] for i, d in enumerate(DOMAINS)}
+    mask = coverage(images, background)
+    np.testing.assert_allclose(mask, views.mask, atol=1e-6)
+    values = decode(images, mask, background)
+    inside = views.mask > 0
+    for domain in ("color", "albedo"):
+        expected = srgb_from_linear(views.images[domain])
+        np.testing.assert_allclose(np.moveaxis(values[domain].numpy(), 1, -1)[inside], expected[inside], atol=1e-5)
+    np.testing.assert_allclose(np.moveaxis(values["normal"].numpy(), 1, -1)[inside], views.images["normal"][inside], atol=1e-5)
+    for domain in ("depth", "roughness", "metallic"):
+        np.testing.assert_allclose(values[domain].numpy()[inside], views.images[domain][inside], atol=1e-5)
+
+
+def test_half_covered_pixels_keep_their_values(sphere):
+    views, _ = sphere
+    planes = torch.from_numpy(planes_from_images(views.images, 0.5 * views.mask))[None]
+    encoded = encode(planes, tuple(range(6)), torch.tensor([1.0]))[0]
+    images = {d: encoded[i] for i, d in enumerate(DOMAINS)}
+    mask = coverage(images, 1.0)
+    np.testing.assert_allclose(mask, 0.5 * views.mask, atol=1e-6)
+    inside = views.mask > 0
+    np.testing.assert_allclose(decode(images, mask, 1.0)["depth"].numpy()[inside], views.images["depth"][inside], atol=1e-5)
+
+
+@pytest.mark.parametrize("domains", [("normal",), ("color",), ("depth", "albedo")])
+def test_every_subset_has_a_mask(sphere, domains):
+    views, planes = sphere
+    encoded = encode(planes, tuple(DOMAINS.index(d) for d in domains), torch.tensor([1.0]))[0]
+    mask = coverage({d: encoded[i] for i, d in enumerate(domains)}, 1.0).numpy()
+    assert np.mean((mask > 0.5) == (views.mask > 0.5)) > 0.99
+
+
+def disc(size=200, radius=30, centre=(70, 120)):
+    y, x = np.mgrid[:size, :size] + 0.5
+    alpha = ((x - centre[0]) ** 2 + (y - centre[1]) ** 2 < radius**2).astype(np.float32)
+    return np.concatenate([np.broadcast_to([0.2, 0.4, 0.6], (size, size, 3)), alpha[..., None]], -1).astype(np.float32)
+
+
+def test_framing_centres_and_scales():
+    out = frame(disc(), 64)
+    rows, columns = np.nonzero(out[..., 3] > 0.5)
+    assert abs(rows.mean() - 31.5) < 0.3 and abs(columns.mean() - 31.5) < 0.3
+    assert abs((np.ptp(rows) + 1) - FRONT_EXTENT * 64) <= 1.5
+    np.testing.assert_allclose(out[out[..., 3] > 0.1][:, :3], np.broadcast_to([0.2, 0.4, 0.6], (int((out[..., 3] > 0.1).sum()), 3)), atol=1e-4)
+
+
+def test_framing_a_framed_front_view_changes_nothing():
+    views = sphere_views(1, size=64)
+    image = np.concatenate([views.images["color"][0], views.mask[0][..., None]], -1)
+    out = frame(image, 64)
+    assert np.abs(out[..., 3] - image[..., 3]).mean() < 0.01
+    np.testing.assert_allclose(whole_frame(image, 64), image, atol=1e-5)
+
+
+def test_whole_frame_pads_to_a_square():
+    image = np.ones((20, 40, 4), np.float32)
+    out = whole_frame(image, 40)
+    assert out[:10, :, 3].max() < 1e-5 and out[30:, :, 3].max() < 1e-5 and out[12:28, :, 3].min() > 0.99

@@ -1,0 +1,157 @@
+"""Training: data, augmentation, the loop, exact resume."""
+
+import csv
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from gdtool.core.errors import InputError
+from gdtool.diffusion.config import DOMAINS, PRESETS, Phase
+from gdtool.diffusion.data import LIGHTS, Objects, from_bytes, mirror, object_order, permute_colors, to_bytes
+from gdtool.diffusion.encoding import PLANES, planes_from_images
+from gdtool.diffusion.model import Model, class_labels
+from gdtool.diffusion.training import CHECKPOINT, choose, learning_rate, new_state, phase_at, run_training
+from tests.diffusion.spheres import LIGHT, sphere_views
+
+MODEL, TRAIN = PRESETS["tiny"]
+MODEL = msgspec.structs.replace(MODEL, channels=(8, 16), head_width=8, encoder_width=16, image_size=16)
+
+
+def spheres(count=4, size=16) -> Objects:
+    planes, conditions = [], []
+    for seed in range(count):
+        views = sphere_views(seed, size)
+        planes.append(planes_from_images(views.images, views.mask))
+        conditions.append(planes[-1][0][[0, 1, 2, 12]])
+    light = np.zeros((LIGHTS, 7), np.float32)
+    light[:, 2] = 1
+    light[:2] = np.concatenate([LIGHT["axes"], np.array(LIGHT["sharpness"])[:, None], LIGHT["amplitudes"]], 1)
+    return Objects(to_bytes(np.stack(planes)), to_bytes(np.stack(conditions))[:, None], np.stack([light] * count),
+                   tuple(f"sphere{i}" for i in range(count)))
+
+
+def test_bytes_keep_zero_exactly():
+    assert float(from_bytes(to_bytes(np.zeros(1)))) == 0.0
+    x = np.linspace(-1, 1, 101)
+    np.testing.assert_allclose(from_bytes(to_bytes(x)), x, atol=0.5 / 127 + 1e-6)
+
+
+def test_mirroring_swaps_sides_and_is_its_own_inverse():
+    objects = spheres(1, 32)
+    args = from_bytes(objects.planes[0]), from_bytes(objects.conditions[0, 0]), torch.from_numpy(objects.lights[0])
+    once = mirror(*args, MODEL.views)
+    for a, b in zip(args, mirror(*once, MODEL.views), strict=True):
+        torch.testing.assert_close(a, b)
+    right, left = (MODEL.views.index(v) for v in ("right", "left"))
+    albedo = once[0][:, PLANES["albedo"]]
+    # red is on +x before and on -x after; the right camera looks at +x
+    assert args[0][right, PLANES["albedo"]][0].max() > 0.2 > args[0][left, PLANES["albedo"]][0].max()
+    assert albedo[left, 0].max() > 0.2 > albedo[right, 0].max()
+    # normals still point toward the camera that sees them
+    x = once[0][right, PLANES["normal"].start]
+    assert x.min() >= 0 and x.max() > 0.9
+
+
+def test_permuted_colors_permute_the_light_as_well():
+    objects = spheres(1)
+    planes, rgba, light = from_bytes(objects.planes[0]), from_bytes(objects.conditions[0, 0]), torch.from_numpy(objects.lights[0])
+    new = permute_colors(planes, rgba, light, [2, 0, 1])
+    torch.testing.assert_close(new[0][:, 0], planes[:, 2])
+    torch.testing.assert_close(new[0][:, PLANES["albedo"].start], planes[:, PLANES["albedo"].start + 2])
+    torch.testing.assert_close(new[1][0], rgba[2])
+    torch.testing.assert_close(new[2][:, 4], light[:, 6])
+    torch.testing.assert_close(new[0][:, PLANES["normal"]], planes[:, PLANES["normal"]])
+
+
+def test_each_pass_shows_each_object_once():
+    seen = np.concatenate([object_order(6, step, 4, seed=1) for step in range(3)])
+    assert sorted(seen[:6]) == list(range(6)) == sorted(seen[6:])
+    assert (object_order(6, 1, 4, 1) == object_order(6, 1, 4, 1)).all()
+    assert (object_order(50, 0, 50, 1) != object_order(50, 0, 50, 2)).any()
+
+
+def test_steps_see_color_and_as_many_domains_and_views_as_the_phase_says():
+    for step in range(5):
+        drawn = choose(MODEL, Phase(domains=3, views=2), 0, step)
+        assert drawn.domains[0] == 0 and len(set(drawn.domains)) == 3 and len(drawn.views.unique()) == 2
+    assert choose(MODEL, Phase(), 0, 0).domains == tuple(range(6))
+
+
+def test_phases_and_rate_follow_progress():
+    train = msgspec.structs.replace(TRAIN, phases=(Phase(share=0.5, learning_rate=1.0), Phase(share=1.0, learning_rate=0.1)), warmup=10)
+    assert phase_at(0.49, train).learning_rate == 1.0 and phase_at(0.5, train).learning_rate == 0.1 and phase_at(1.0, train).learning_rate == 0.1
+    state = new_state(Model(MODEL), train)
+    assert learning_rate(state, 0.0, train) == pytest.approx(0.1)
+    state.step = 100
+    assert learning_rate(state, 0.0, train) == pytest.approx(1.0)
+
+
+def test_class_labels_tell_all_36_apart():
+    labels = class_labels(MODEL).flatten(0, 1)
+    assert labels.shape == (36, 18)
+    assert (torch.cdist(labels, labels) + torch.eye(36) > 0.5).all()
+
+
+def train(workspace, steps, **changes):
+    torch.manual_seed(0)
+    options = msgspec.structs.replace(TRAIN, steps=12, warmup=2, **changes)
+    workspace.mkdir(exist_ok=True)
+    stopped = {}
+
+    class Stop(Exception):
+        pass
+
+    def stop(state):
+        stopped["state"] = state
+        if state.step == steps:
+            raise Stop
+
+    try:
+        return run_training(Model(MODEL), spheres(), options, workspace, seed=3, checkpoint_every=4, validate_every=1, validate=stop)
+    except Stop:
+        return stopped["state"]
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_a_killed_run_resumes_bit_for_bit(tmp_path, precision):
+    whole = train(tmp_path / "a", None, precision=precision)
+    train(tmp_path / "b", 7, precision=precision)  # dies at step 7, its last checkpoint is of step 4
+    resumed = train(tmp_path / "b", None, precision=precision)
+    assert resumed.step == whole.step == 12
+    for (name, p), (_, q) in zip(whole.model.named_parameters(), resumed.model.named_parameters(), strict=True):
+        assert torch.equal(p, q), name
+        assert torch.equal(whole.average[name], resumed.average[name]), name
+    without_time = [[{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(open(tmp_path / w / "loss.csv"))] for w in "ab"]
+    assert without_time[0] == without_time[1] and len(without_time[0]) == 12
+
+
+def test_a_checkpoint_of_another_configuration_is_refused(tmp_path):
+    train(tmp_path / "a", 5)
+    with pytest.raises(InputError, match="another configuration"):
+        train(tmp_path / "a", None, clip=2.0)
+
+
+def test_a_damaged_checkpoint_is_named(tmp_path):
+    train(tmp_path / "a", 5)
+    path = tmp_path / "a" / CHECKPOINT
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match="safetensors"):
+        train(tmp_path / "a", None)
+
+
+def test_training_lowers_the_error(tmp_path):
+    torch.manual_seed(0)
+    options = msgspec.structs.replace(TRAIN, steps=60, batch=2, pbr_weight=0.0, phases=(Phase(learning_rate=3e-3),), precision="float32")
+    state = run_training(Model(MODEL), spheres(), options, tmp_path, seed=0)
+    rows = list(csv.DictReader(open(tmp_path / "loss.csv")))
+    first, last = (np.mean([float(r["loss"]) for r in part]) for part in (rows[:5], rows[-5:]))
+    assert state.step == 60 and last < 0.5 * first
+    assert all(float(rows[-1][d]) > 0 for d in DOMAINS)
+
+
+def test_minutes_end_a_run(tmp_path):
+    options = msgspec.structs.replace(TRAIN, steps=10**9, pbr_weight=0.0)
+    state = run_training(Model(MODEL), spheres(), options, tmp_path, seed=0, minutes=0.01)
+    assert 0.6 <= state.seconds < 5 and state.step >= 1

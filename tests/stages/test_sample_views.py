@@ -1,0 +1,159 @@
+"""gdtool sample-views with a model of a few thousand weights, made by one step of training."""
+
+import json
+import shutil
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file, save_file
+
+from gdtool.core.errors import InputError
+from gdtool.core.kinds import ModelContent
+from gdtool.core.manifest import MANIFEST, Manifest, encode, list_files
+from gdtool.diffusion.config import PRESETS
+from gdtool.diffusion.model import Model
+from gdtool.diffusion.weights import load_model, save_model
+from gdtool.images.io import read_image, write_png
+
+CONFIG = msgspec.structs.replace(PRESETS["tiny"][0], channels=(8, 16), head_width=8, encoder_width=16, image_size=16)
+
+
+def write_manifest(folder):
+    content = ModelContent(preset="tiny", image_size=16, domains=CONFIG.domains, parameters=1, steps=1)
+    (folder / MANIFEST).unlink(missing_ok=True)
+    manifest = Manifest(kind="model", name="tiny", stage="train", tool_version="0", content=content, files=list_files(folder))
+    (folder / MANIFEST).write_bytes(encode(manifest))
+
+
+@pytest.fixture(scope="module")
+def tiny_model(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tiny") / "model"
+    folder.mkdir()
+    torch.manual_seed(0)
+    model = Model(CONFIG)
+    torch.nn.init.normal_(model.unet.conv_out.weight, std=0.1)
+    save_model(lambda name: folder / name, CONFIG, model.state_dict())
+    write_manifest(folder)
+    return folder
+
+
+@pytest.fixture
+def picture(tmp_path):
+    y, x = np.mgrid[:80, :80]
+    alpha = ((x - 50) ** 2 + (y - 30) ** 2 < 20**2).astype(float)
+    rgba = np.stack([0.8 * alpha, 0.3 * alpha, x / 80 * alpha, alpha], -1)
+    write_png(tmp_path / "ball.png", rgba)
+    return tmp_path / "ball.png"
+
+
+def sample(gdtool, *arguments, **kwargs):
+    return gdtool("sample-views", *arguments, "--steps", 2, "--threads", 1, **kwargs)
+
+
+def test_a_picture_becomes_six_views_in_six_domains(gdtool, picture, tiny_model, tmp_path):
+    result = sample(gdtool, "ball.png", "--model", tiny_model)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout == "ball.asset/views\n"
+    views = tmp_path / "ball.asset/views"
+    for domain in ("color", "normal", "depth", "albedo", "roughness", "metallic", "mask"):
+        assert len(list((views / domain).glob("*"))) == 6, domain
+    assert read_image(views / "normal/back.png").dtype == np.uint16
+    assert (views / "contact_sheet.png").is_file()
+    assert gdtool("validate", views).returncode == 0
+    again = sample(gdtool, "ball.png", "--model", tiny_model)
+    assert "up to date" in again.stderr and again.stdout == "ball.asset/views\n"
+
+
+def bytes_of(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file() and p.name != MANIFEST}
+
+
+def test_an_object_does_not_depend_on_its_company(gdtool, picture, tiny_model, tmp_path):
+    shutil.copyfile(picture, tmp_path / "other.png")
+    assert sample(gdtool, "ball.png", "--model", tiny_model, "--seed", 5, "-o", "alone").returncode == 0
+    assert sample(gdtool, "other.png", "ball.png", "--model", tiny_model, "--seed", 5, "-o", "both").returncode == 0
+    assert bytes_of(tmp_path / "alone") == bytes_of(tmp_path / "both/ball.asset/views")
+    assert sample(gdtool, "ball.png", "--model", tiny_model, "--seed", 6, "-o", "else").returncode == 0
+    assert bytes_of(tmp_path / "else") != bytes_of(tmp_path / "alone")
+
+
+def test_a_subset_of_the_domains(gdtool, picture, tiny_model, tmp_path):
+    result = sample(gdtool, "ball.png", "--model", tiny_model, "--domains", "normal,depth", "--scheduler", "dpm", "--guidance", 2)
+    assert result.returncode == 0, result.stderr
+    content = json.loads((tmp_path / "ball.asset/views" / MANIFEST).read_text())["content"]
+    assert content["domains"] == ["normal", "depth"]
+    assert not (tmp_path / "ball.asset/views/color").exists()
+    wrong = sample(gdtool, "ball.png", "--model", tiny_model, "--domains", "normals")
+    assert wrong.returncode == 2 and "normals" in wrong.stderr
+
+
+def test_a_mask_file_says_what_the_subject_is(gdtool, tiny_model, tmp_path):
+    rng = np.random.default_rng(0)
+    write_png(tmp_path / "busy.png", rng.random((64, 64, 3)))
+    mask = np.zeros((64, 64))
+    mask[10:30, 20:50] = 1
+    write_png(tmp_path / "mask.png", mask)
+    assert sample(gdtool, "busy.png", "--model", tiny_model, "--mask", "mask.png").returncode == 0
+    seen = read_image(tmp_path / "busy.asset/views/condition/000.png")[..., 3] > 127
+    rows, columns = np.nonzero(seen)
+    # 30 x 20 pixels, centred, the longer side 0.694 of the frame
+    assert abs(np.ptp(columns) + 1 - 11) <= 1 and abs(rows.mean() - 7.5) < 0.6
+    write_png(tmp_path / "mask.png", np.zeros((64, 64)))
+    empty = sample(gdtool, "busy.png", "--model", tiny_model, "--mask", "mask.png", "-o", "none")
+    assert empty.returncode == 3 and "Traceback" not in empty.stderr
+    assert not (tmp_path / "none").exists()
+
+
+def test_bad_pictures_are_bad_input(gdtool, tiny_model, tmp_path):
+    (tmp_path / "text.png").write_text("not a picture")
+    write_png(tmp_path / "small.png", np.ones((8, 8, 4)))
+    write_png(tmp_path / "clear.png", np.zeros((64, 64, 4)))
+    for name in ("text.png", "small.png", "clear.png"):
+        result = sample(gdtool, name, "--model", tiny_model)
+        assert result.returncode == 3 and name.split(".")[0] in result.stderr and "Traceback" not in result.stderr, result.stderr
+
+
+def test_it_works_in_a_pipe(gdtool, picture, tiny_model):
+    result = sample(gdtool, "--model", tiny_model, stdin="ball.png\n")
+    assert result.returncode == 0 and result.stdout == "ball.asset/views\n"
+    assert sample(gdtool, "--model", tiny_model).returncode == 2
+
+
+@pytest.fixture
+def damaged(tiny_model, tmp_path):
+    shutil.copytree(tiny_model, tmp_path / "damaged")
+    return tmp_path / "damaged"
+
+
+def test_weights_of_the_wrong_shape_are_named(damaged):
+    weights = load_file(damaged / "model.safetensors")
+    weights["unet.conv_in.weight"] = weights["unet.conv_in.weight"][:4]
+    save_file(weights, damaged / "model.safetensors")
+    with pytest.raises(InputError, match=r"unet\.conv_in\.weight has shape \(4, "):
+        load_model(damaged)
+
+
+def test_weights_that_are_missing_unknown_or_nan_are_named(damaged):
+    whole = load_file(damaged / "model.safetensors")
+    for change, words in (({"unet.conv_out.bias": None}, "lacks tensor unet.conv_out.bias"),
+                          ({"surplus": np.zeros(3, np.float16)}, "surplus"),
+                          ({"unet.conv_out.bias": np.full_like(whole["unet.conv_out.bias"], np.nan)}, "unet.conv_out.bias holds NaN")):
+        save_file({k: v for k, v in (whole | change).items() if v is not None}, damaged / "model.safetensors")
+        with pytest.raises(InputError, match=words):
+            load_model(damaged)
+
+
+def test_a_cut_file_is_named_and_a_pickle_never_opened(gdtool, picture, damaged):
+    path = damaged / "model.safetensors"
+    path.write_bytes(path.read_bytes()[:-10])
+    write_manifest(damaged)
+    result = sample(gdtool, "ball.png", "--model", damaged)
+    assert result.returncode == 3 and "safetensors" in result.stderr
+    path.unlink()
+    (damaged / "model.ckpt").write_bytes(b"cos\nsystem\n(S'touch owned'\ntR.")
+    write_manifest(damaged)
+    result = sample(gdtool, "ball.png", "--model", damaged)
+    assert result.returncode == 3 and "pickle" in result.stderr
+    assert not (damaged.parent / "owned").exists()
