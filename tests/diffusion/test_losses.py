@@ -1,0 +1,74 @@
+"""Supervision by rendering: what it sees and what it does not."""
+
+import numpy as np
+import torch
+
+from gdtool.diffusion.config import PRESETS
+from gdtool.diffusion.encoding import encode, planes_from_images
+from gdtool.diffusion.losses import linear, rendering_error, view_directions
+from gdtool.images.color import linear_from_srgb
+from tests.diffusion.spheres import LIGHT, sphere_views
+
+CONFIG = PRESETS["tiny"][0]
+ORDER = {i: i for i in range(6)}
+
+
+def setting():
+    views = sphere_views(2, 16)
+    planes = torch.from_numpy(planes_from_images(views.images, views.mask))
+    truth = encode(planes[None], tuple(range(6)), torch.zeros(1))[0]
+    light = np.concatenate([LIGHT["axes"], np.array(LIGHT["sharpness"])[:, None], LIGHT["amplitudes"]], 1)
+    return planes, truth, torch.tensor(light, dtype=torch.float32)
+
+
+def error(predicted, truth, planes, light, pixels=64):
+    return rendering_error(predicted, truth, ORDER, planes, light, view_directions(CONFIG), pixels, 0.0, torch.Generator().manual_seed(0))
+
+
+def test_the_true_maps_have_no_error_and_changed_ones_have():
+    planes, truth, light = setting()
+    assert float(error(truth, truth, planes, light)) < 1e-12
+    for domain in (1, 3, 4, 5):
+        changed = truth.clone()
+        changed[domain] = changed[domain] * 0.5
+        if domain == 1:  # a shorter normal is the same normal: turn it
+            changed[1] = truth[1].flip(1)
+        assert float(error(changed, truth, planes, light)) > 1e-6, domain
+    for domain in (0, 2):  # color and depth do not enter
+        changed = truth.clone()
+        changed[domain] = 0
+        assert float(error(changed, truth, planes, light)) < 1e-12
+
+
+def test_gradients_are_finite_at_every_adversary_and_point_to_the_truth():
+    planes, truth, light = setting()
+    for start in (torch.zeros_like(truth), torch.ones_like(truth), -torch.ones_like(truth)):
+        predicted = start.requires_grad_()
+        error(predicted, truth, planes, light).backward()
+        assert torch.isfinite(predicted.grad).all()
+    predicted = truth.clone()
+    predicted[3] = predicted[3] * 0.5 + 0.3  # too bright
+    predicted.requires_grad_()
+    error(predicted, truth, planes, light).backward()
+    assert float(predicted.grad[3].sum()) > 0
+
+
+def test_an_empty_view_costs_nothing():
+    planes, truth, light = setting()
+    planes = planes.clone()
+    planes[:, 12] = -1
+    assert float(error(truth * 0.5, truth, planes, light)) == 0.0
+
+
+def test_decoding_of_srgb_is_that_of_images():
+    x = np.linspace(0, 1, 101)
+    np.testing.assert_allclose(linear(torch.from_numpy(x)), linear_from_srgb(x), atol=1e-12)
+    edge = torch.tensor([0.0], requires_grad=True)
+    linear(edge).sum().backward()
+    assert torch.isfinite(edge.grad).all()
+
+
+def test_view_directions_point_to_the_cameras():
+    directions = view_directions(CONFIG)
+    np.testing.assert_allclose(directions[CONFIG.views.index("right")], [1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(directions[CONFIG.views.index("back")], [0, 0, -1], atol=1e-6)

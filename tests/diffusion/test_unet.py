@@ -1,0 +1,148 @@
+"""The network's structure: Stable Diffusion's names, conditioning, and what starts unchanged."""
+
+import msgspec
+import pytest
+import torch
+
+from gdtool.core.errors import InputError
+from gdtool.diffusion.attention import Layout
+from gdtool.diffusion.config import PRESETS
+from gdtool.diffusion.model import Model
+from gdtool.diffusion.sampling import sample_images
+from gdtool.diffusion.unet import UNet
+from gdtool.diffusion.weights import load_stable_diffusion
+
+TINY = msgspec.structs.replace(PRESETS["tiny"][0], channels=(8, 16), head_width=8, encoder_width=16, image_size=16)
+PAPER = PRESETS["paper"][0]
+
+
+def test_the_paper_preset_has_stable_diffusions_keys_and_size():
+    with torch.device("meta"):
+        unet = UNet(PAPER, 4, 4, 32)
+    own = {name: tuple(p.shape) for name, p in unet.state_dict().items()}
+    for name, shape in {
+        "conv_in.weight": (320, 8, 3, 3),
+        "time_embedding.linear_1.weight": (1280, 320),
+        "class_embedding.linear_1.weight": (1280, 18),
+        "down_blocks.0.attentions.1.transformer_blocks.0.attn1.to_q.weight": (320, 320),
+        "down_blocks.1.resnets.0.conv_shortcut.weight": (640, 320, 1, 1),
+        "down_blocks.2.downsamplers.0.conv.weight": (1280, 1280, 3, 3),
+        "down_blocks.3.resnets.1.conv2.weight": (1280, 1280, 3, 3),
+        "mid_block.attentions.0.transformer_blocks.0.attn2.to_k.weight": (1280, 768),
+        "mid_block.resnets.1.time_emb_proj.weight": (1280, 1280),
+        "up_blocks.0.resnets.2.conv1.weight": (1280, 2560, 3, 3),
+        "up_blocks.1.attentions.2.transformer_blocks.0.ff.net.0.proj.weight": (10240, 1280),
+        "up_blocks.3.attentions.0.transformer_blocks.0.ff.net.2.weight": (320, 1280),
+        "up_blocks.3.resnets.0.conv1.weight": (320, 960, 3, 3),
+        "conv_norm_out.weight": (320,),
+        "conv_out.weight": (4, 320, 3, 3),
+    }.items():
+        assert own[name] == shape, name
+    new = ("cross_domain", "class_embedding")
+    original = sum(p.numel() for name, p in unet.named_parameters() if not any(part in name for part in new))
+    # Stable Diffusion 1's UNet has 859,520,964 parameters; ours has four more input channels
+    assert original == 859_520_964 + 4 * 320 * 9
+
+
+def small_stable_diffusion():
+    """A UNet as Stable Diffusion has it (4 input channels, no classes, no star), small, with its weights."""
+    config = msgspec.structs.replace(PAPER, channels=(8, 16, 16, 16), heads=2, norm_groups=4, encoder_width=12, gradient_checkpointing=False)
+    torch.manual_seed(0)
+    grown = UNet(config, 4, 4, 8)
+    plain = UNet(msgspec.structs.replace(config, cross_domain="none", multi_view=False), 4, 0, 8)
+    weights = {k: v for k, v in plain.state_dict().items() if "class_embedding" not in k}
+    return grown, plain, weights
+
+
+def test_pretrained_weights_start_unchanged():
+    """Loaded into the grown network, every image gets what the original network gives it: the new parts add nothing
+    (one view, so that multi-view attention is self-attention; class labels off)."""
+    grown, plain, weights = small_stable_diffusion()
+    new = load_stable_diffusion(grown, weights)
+    assert all("cross_domain" in name or "class_embedding" in name for name in new)
+    for network in (grown, plain):
+        for p in network.class_embedding.parameters():
+            torch.nn.init.zeros_(p)
+    layout, context, t = Layout(1, (0, 1, 2), 1), torch.randn(1, 1, 12), torch.tensor([500])
+    noisy, condition, label = torch.randn(3, 4, 8, 8), torch.randn(3, 4, 8, 8), torch.zeros(3, 18)
+    torch.testing.assert_close(grown(noisy, condition, t, label, context, layout),
+                               plain(noisy, torch.zeros(3, 0, 8, 8), t, label, context, layout), rtol=1e-5, atol=1e-5)
+
+
+def test_pretrained_weights_that_do_not_fit_are_named():
+    grown, _, weights = small_stable_diffusion()
+    with pytest.raises(InputError, match="conv_out.weight has shape"):
+        load_stable_diffusion(grown, {"conv_out.weight": torch.zeros(4, 9, 3, 3)})
+    with pytest.raises(InputError, match="encoder_hid_proj"):
+        load_stable_diffusion(grown, weights | {"encoder_hid_proj.weight": torch.zeros(1)})
+
+
+def tiny(**changes):
+    torch.manual_seed(0)
+    model = Model(msgspec.structs.replace(TINY, **changes)).eval()
+    for p in model.parameters():  # nothing at zero, so that every path shows
+        if p.ndim >= 2 and not p.any():
+            torch.nn.init.normal_(p, std=0.05)
+    return model
+
+
+def test_checkpointing_changes_no_gradient():
+    grads = []
+    for on in (False, True):
+        model = tiny(gradient_checkpointing=on).train()
+        layout, views = Layout(1, (0, 1), 2), torch.tensor([0, 3])
+        rgba = torch.randn(1, 4, 16, 16, generator=torch.Generator().manual_seed(1))
+        noisy = torch.randn(model.latent_shape(layout), generator=torch.Generator().manual_seed(2))
+        out = model.predict_clean(noisy, model.condition_latents(rgba, layout, views), torch.tensor([300]), model.encoder(rgba), layout, views)
+        out.square().sum().backward()
+        grads.append({n: p.grad for n, p in model.named_parameters() if p.grad is not None})
+    assert grads[0].keys() == grads[1].keys()
+    for name in grads[0]:
+        torch.testing.assert_close(grads[0][name], grads[1][name])
+
+
+def test_the_view_from_behind_gets_the_mirrored_condition():
+    model = tiny()
+    rgba = torch.randn(1, 4, 16, 16)
+    latent = model.condition_latents(rgba, Layout(1, (0, 2), 2), torch.tensor([0, 3])).view(2, 2, *model.codec.encode_condition(rgba).shape[1:])
+    torch.testing.assert_close(latent[1, 0], model.codec.encode_condition(rgba)[0])
+    torch.testing.assert_close(latent[1, 1], model.codec.encode_condition(rgba.flip(-1))[0])
+    torch.testing.assert_close(model.codec.decode(latent[:, 0, :48]), rgba[:, :3].expand(2, -1, -1, -1))
+
+
+def test_an_untrained_x_model_shows_the_condition_as_front_color():
+    torch.manual_seed(0)
+    model = Model(TINY).eval()
+    rgba = torch.rand(1, 4, 16, 16) * 2 - 1
+    rgba[:, 3] = 1.0
+    images = sample_images(model, rgba, steps=2)
+    torch.testing.assert_close(images["color"][0, 0], rgba[0, :3])
+    assert float(images["albedo"].abs().max()) == 0.0
+
+
+@pytest.mark.parametrize("guidance", [1.0, 2.5])
+def test_objects_of_a_batch_do_not_meet(guidance):
+    model = tiny()
+    rgba = torch.rand(2, 4, 16, 16) * 2 - 1
+    both = sample_images(model, rgba, steps=2, seed=4, guidance=guidance)
+    alone = sample_images(model, rgba[1:], steps=2, seed=4, guidance=guidance)
+    for domain in both:
+        torch.testing.assert_close(both[domain][1], alone[domain][0], rtol=1e-4, atol=1e-5)
+
+
+def test_domains_that_are_not_asked_for_are_not_computed():
+    model = tiny()
+    rgba = torch.rand(1, 4, 16, 16)
+    assert set(sample_images(model, rgba, steps=1, domains=("depth",))) == {"color", "depth"}
+    alone = tiny(cross_domain="none")
+    subset, whole = (sample_images(alone, rgba, steps=2, domains=d) for d in (("depth",), TINY.domains))
+    assert set(subset) == {"depth"}
+    torch.testing.assert_close(subset["depth"], whole["depth"], rtol=1e-4, atol=1e-5)
+
+
+def test_bfloat16_stays_near_float32():
+    model = tiny()
+    rgba = torch.rand(1, 4, 16, 16)
+    a, b = (sample_images(model, rgba, steps=2, precision=p) for p in ("float32", "bfloat16"))
+    for domain in a:
+        assert float((a[domain] - b[domain]).abs().mean()) < 2e-2
