@@ -54,7 +54,7 @@ def _check_png(path: Path, file: BinaryIO) -> None:
         if len(body) < length or len(crc) < 4:
             raise InputError(path, "is cut short (no end of the PNG)")
         if zlib.crc32(body, zlib.crc32(kind)) != struct.unpack(">I", crc)[0]:
-            raise InputError(path, f"is damaged (bad checksum in the PNG's {kind.decode('latin-1')})")
+            raise InputError(path, f"is damaged (bad checksum in the PNG's {kind.decode() if kind.isalpha() and kind.isascii() else 'chunks'})")
         if kind == b"IHDR" and length >= 8 and max(struct.unpack_from(">II", body)) > MAX_SIDE:
             raise ResourceError(path, "is {}x{} pixels, more than {} a side".format(*struct.unpack_from(">II", body), MAX_SIDE), "scale it down")
         if kind == b"acTL" and length >= 4 and struct.unpack(">I", body[:4])[0] > 1:

@@ -42,8 +42,11 @@ def read_image(path: str | Path) -> np.ndarray:
         raise InputError(path, "does not exist") from None
     except OSError as error:
         raise from_os_error(error, path) from None
-    with _plain_name(path) as name:
-        return _read(path, name)
+    with _plain_name(path) as name, _quiet() if suffix_of(head) == ".exr" else contextlib.nullcontext():
+        try:
+            return _read(path, name)
+        except UnicodeDecodeError:  # OpenImageIO's binding hands names and messages out of the file over as text
+            raise InputError(path, "is damaged (its header is not text where it should be)") from None
 
 
 def decode_image(content: bytes, subject: str) -> np.ndarray:
@@ -233,6 +236,24 @@ def _again(path: Path) -> np.ndarray:
     if pixels is None or failed:
         raise InputError(path, "cannot be read again")
     return np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Nothing reaches stderr: OpenEXR prints each fault that it also reports, and a user reads one line."""
+    try:
+        saved = os.dup(2)
+    except OSError:  # no stderr at all
+        yield
+        return
+    silent = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(silent, 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(silent)
 
 
 @contextlib.contextmanager

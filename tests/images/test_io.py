@@ -181,6 +181,18 @@ def test_exr_with_nan_names_the_pixel(tmp_path):
         read_image(tmp_path / "x.exr")
 
 
+@pytest.mark.parametrize("cut", [0.2, 0.5, 0.95])
+def test_truncated_exr_says_one_thing(tmp_path, cut, capfd):
+    write_exr(tmp_path / "x.exr", np.random.default_rng(9).random((64, 64, 3)))
+    content = (tmp_path / "x.exr").read_bytes()
+    (tmp_path / "x.exr").write_bytes(content[:int(len(content) * cut)])
+    with pytest.raises(InputError, match="damaged or cut short|cannot be read|can be read"):
+        read_image(tmp_path / "x.exr")
+    assert capfd.readouterr().err == ""
+    (tmp_path / "x.exr").write_bytes(content)
+    assert read_image(tmp_path / "x.exr").shape == (64, 64, 3)
+
+
 def test_several_pages_are_refused(tmp_path, picture):
     spec = oiio.ImageSpec(47, 33, 3, "uint8")
     path = str(tmp_path / "x.tif")
