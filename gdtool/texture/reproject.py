@@ -167,12 +167,12 @@ def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source
     from gdtool.geometry.distance import barycentric_of
 
     start = 2e-5 * source.extent
-    out_face, out_distance, out_at = _march(points, normals, normals, reach, source, start)
-    # Inward only as far as outward already found something.
-    face, distance, barycentric = _march(points, -normals, normals, np.minimum(reach, out_distance), source, start)
-    outward = (out_face >= 0) & (out_distance < distance)
-    face = np.where(outward, out_face, face)
-    barycentric = np.where(outward[:, None], out_at, barycentric)
+    face, distance, barycentric = _march(points, -normals, normals, reach, source, start)
+    # Two sheets that look the same way have a third between them: outward cannot be nearer than what is this near.
+    rest = np.flatnonzero(distance > 5e-4 * source.extent)
+    out_face, out_distance, out_at = _march(points[rest], normals[rest], normals[rest], np.minimum(reach, distance)[rest], source, start)
+    outward = (out_face >= 0) & (out_distance < distance[rest])
+    face[rest[outward]], barycentric[rest[outward]] = out_face[outward], out_at[outward]
     lost = np.flatnonzero(face < 0)
     if len(lost):
         face[lost], nearest = _nearest_agreeing(points[lost], normals[lost], source)
