@@ -8,6 +8,12 @@ from gdtool.shading.environment import Environment
 from gdtool.shading.lights import COUNT, fibonacci
 from gdtool.shading.sg import SphericalGaussians
 
+# Rows of the image that is fitted, and the logarithm of the sharpest lobe that its pixels can tell from a sharper one.
+ROWS = 32
+SHARPEST = float(np.log(250.0))
+# Diffuse color is nearly all irradiance: an error of 1 % there counts like one of about 5 % of the radiance.
+IRRADIANCE_WEIGHT = 30.0
+
 
 def fit_sg(environment: Environment, count: int = COUNT, seed: int = 0, steps: int = 300) -> tuple[SphericalGaussians, dict[str, float]]:
     """count lobes that fit the radiance by solid angle, and the fit's error (see fit_error).
@@ -18,7 +24,7 @@ def fit_sg(environment: Environment, count: int = COUNT, seed: int = 0, steps: i
     """
     import torch
 
-    small = environment.shrunk(32)
+    small = environment.shrunk(ROWS)
     d = small.directions.reshape(-1, 3)
     weight = np.repeat(small.solid_angles, small.image.shape[1])
     radiance = small.image.reshape(-1, 3).astype(np.float64)
@@ -39,17 +45,17 @@ def fit_sg(environment: Environment, count: int = COUNT, seed: int = 0, steps: i
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for _ in range(steps):
         axis = torch.nn.functional.normalize(parameters[0], dim=1)
-        s, amplitude = parameters[1].clamp(-1.0, 8.0).exp(), parameters[2].clamp(-12.0, 12.0).exp()
+        s, amplitude = parameters[1].clamp(-1.0, SHARPEST).exp(), parameters[2].clamp(-12.0, 12.0).exp()
         fitted = torch.exp(s * (directions @ axis.T - 1)) @ amplitude
         loss = (area[:, None] * (torch.sqrt(fitted + 0.01) - torch.sqrt(target + 0.01)) ** 2).sum()
-        loss = loss + ((transport @ fitted - irradiance) ** 2).mean() / (irradiance**2).mean()
+        loss = loss + IRRADIANCE_WEIGHT * ((transport @ fitted - irradiance) ** 2).mean() / (irradiance**2).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         schedule.step()
     with torch.no_grad():
         axis = torch.nn.functional.normalize(parameters[0], dim=1)
-        lobes = SphericalGaussians(axis.double(), parameters[1].clamp(-1, 8).exp().double(), parameters[2].clamp(-12, 12).exp().double() * mean)
+        lobes = SphericalGaussians(axis.double(), parameters[1].clamp(-1.0, SHARPEST).exp().double(), parameters[2].clamp(-12, 12).exp().double() * mean)
     return lobes, fit_error(environment, lobes)
 
 
@@ -60,7 +66,7 @@ def fit_error(environment: Environment, lobes: SphericalGaussians) -> dict[str, 
 
     from gdtool.shading.sg import cosine_integral, evaluate
 
-    small = environment.shrunk(32)
+    small = environment.shrunk(ROWS)
     d = torch.tensor(small.directions.reshape(-1, 3), dtype=torch.float64)
     weight = torch.tensor(np.repeat(small.solid_angles, small.image.shape[1]), dtype=torch.float64)[:, None]
     truth = torch.tensor(small.image.reshape(-1, 3), dtype=torch.float64)

@@ -1,0 +1,54 @@
+"""relight by the command line, on meshes made here."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from gdtool.images.io import read_image, write_exr
+
+SQUARE = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nf 1 2 3 4\n"
+FAST = ("--size", "32", "--samples", "4", "--light-samples", "8")
+
+
+@pytest.fixture
+def square(tmp_path):
+    (tmp_path / "square.obj").write_text(SQUARE)
+    return tmp_path / "square.obj"
+
+
+@pytest.mark.parametrize("light", ["sampled", "sg"])
+def test_writes_frames_that_validate_and_skips_when_up_to_date(gdtool, square, tmp_path, light):
+    done = gdtool("relight", square, *FAST, "--views", "3", "--light", light)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "square.asset/renders\n"
+    path = tmp_path / "square.asset/renders"
+    assert gdtool("validate", path).returncode == 0
+    content = json.loads((path / "manifest.json").read_text())["content"]
+    assert (content["frames"], content["environment"], content["light"]) == (3, "mid", light)
+    frame = read_image(path / "000.png")
+    assert frame.shape == (32, 32, 4) and frame[16, 16, 3] == 255 and frame[0, 0, 3] == 0 and frame[16, 16, :3].min() > 0
+    assert "up to date" in gdtool("relight", square, *FAST, "--views", "3", "--light", light).stderr
+
+
+def test_light_from_one_side_falls_on_that_side(gdtool, square, tmp_path):
+    """The square faces +Z, three quarters across the image; light from there must reach its front and not its back."""
+    image = np.zeros((32, 64, 3), np.float32)
+    image[12:20, 44:52] = (20, 10, 5)
+    write_exr(tmp_path / "front.exr", image)
+    done = gdtool("relight", square, *FAST, "--views", "2", "--env", "front.exr", "--elevation", "0")
+    assert done.returncode == 0, done.stderr
+    front, back = (read_image(tmp_path / f"square.asset/renders/{k:03d}.png")[16, 16].astype(int) for k in (0, 1))
+    assert front[0] > front[1] > front[2] > 60 and back[:3].max() < 5
+
+
+def test_works_in_a_pipe_and_bad_input_exits_3(gdtool, square, tmp_path):
+    done = gdtool("relight", *FAST, "--light", "sg", stdin=f"{square}\n")
+    assert done.returncode == 0 and done.stdout == "square.asset/renders\n"
+    (tmp_path / "bad.glb").write_bytes(b"glTF")
+    bad = gdtool("relight", "bad.glb", *FAST)
+    assert bad.returncode == 3 and "bad.glb" in bad.stderr and "Traceback" not in bad.stderr
+    assert gdtool("relight", square, *FAST, "--env", "none.exr", "-o", "x").returncode == 3
+    assert not (tmp_path / "x").exists()

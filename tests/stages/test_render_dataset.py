@@ -1,0 +1,129 @@
+"""render-dataset by the command line, on meshes made here."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+
+from gdtool.core.folder import open_folder
+from gdtool.folders.records import read_cameras
+from gdtool.folders.views import read_views
+
+FAST = ("--size", "32", "--samples", "4", "--light-samples", "4")
+
+# A box 0.4 x 1.2 x 0.8 away from the origin; quads wound outward.
+BOX = """
+v 3.0 1.0 2.0
+v 3.4 1.0 2.0
+v 3.4 2.2 2.0
+v 3.0 2.2 2.0
+v 3.0 1.0 2.8
+v 3.4 1.0 2.8
+v 3.4 2.2 2.8
+v 3.0 2.2 2.8
+f 5 6 7 8
+f 2 1 4 3
+f 6 2 3 7
+f 1 5 8 4
+f 8 7 3 4
+f 1 2 6 5
+"""
+
+
+@pytest.fixture
+def box(tmp_path):
+    (tmp_path / "box.obj").write_text(BOX)
+    return tmp_path / "box.obj"
+
+
+def manifest(path) -> dict:
+    return json.loads((path / "manifest.json").read_text())
+
+
+def test_writes_a_folder_that_validates_with_all_it_should_hold(gdtool, box, tmp_path):
+    done = gdtool("render-dataset", box, *FAST, "--condition-views", "3")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "box.asset/views\n"
+    path = tmp_path / "box.asset" / "views"
+    assert gdtool("validate", path).returncode == 0
+    content = manifest(path)["content"]
+    assert content["conditions"] == 3 and content["light"] and content["environment"].startswith("random:")
+    assert {s["what"] for s in manifest(path)["skipped"]} >= {"base color lookups", "alpha tests", "rays"}
+    assert len(read_cameras(path / "condition.json")) == 3 and len(list((path / "condition").glob("*.png"))) == 3
+    views = read_views(open_folder(path))
+    assert set(views.images) == {"color", "normal", "depth", "albedo", "roughness", "metallic", "closed_form"}
+    # The box, normalised: its front face spans 1/3 x 1 and lies 1/3 in front of the centre.
+    matrix = np.array(content["source_from_world"]).reshape(4, 4)
+    assert matrix[0, 0] == pytest.approx(1.2) and np.allclose(matrix[:3, 3], (3.2, 1.6, 2.4))
+    front = views.mask[0].sum() * views.cameras[0].pixel_size ** 2
+    assert front == pytest.approx(1 / 3, rel=0.1)
+    assert np.allclose(views.images["normal"][0, 16, 16], (0, 0, 1), atol=1e-4)
+    assert np.allclose(views.images["normal"][2, 16, 16], (1, 0, 0), atol=1e-4)
+    assert views.images["depth"][0, 16, 16] == pytest.approx(2 - 1 / 3, abs=1e-5)
+    assert (views.images["color"][views.mask > 0] > 0).any()
+
+
+def test_second_run_is_up_to_date_and_same_seed_means_same_files(gdtool, box, tmp_path):
+    assert gdtool("render-dataset", box, *FAST).returncode == 0
+    again = gdtool("render-dataset", box, *FAST)
+    assert again.returncode == 0 and "up to date" in again.stderr
+    assert gdtool("render-dataset", box, *FAST, "-o", "other").returncode == 0
+    files = {p.relative_to(tmp_path / "other") for p in (tmp_path / "other").rglob("*") if p.is_file()} - {*map(type(box), ["manifest.json"])}
+    assert len(files) > 40
+    for file in files:
+        one, two = ((tmp_path / root / file).read_bytes() for root in ("box.asset/views", "other"))
+        assert hashlib.sha256(one).digest() == hashlib.sha256(two).digest(), file
+
+
+def test_bad_inputs_exit_3_with_one_line(gdtool, tmp_path):
+    (tmp_path / "empty.obj").write_text("v 0 0 0\n")
+    (tmp_path / "text.glb").write_text("not a model")
+    for name in ("empty.obj", "text.glb", "missing.glb"):
+        done = gdtool("render-dataset", name, *FAST)
+        assert done.returncode == 3 and name.split(".")[0] in done.stderr and "Traceback" not in done.stderr
+        assert done.stdout == "" and not (tmp_path / name.replace(name[-4:], ".asset") / "views").exists()
+
+
+def test_pipes_stream_and_one_bad_source_among_many(gdtool, box, tmp_path):
+    done = gdtool("render-dataset", "-o", "data", *FAST, "--domains", "normal,depth", stdin=f"{box}\nmissing.obj\nprocedural:3\n")
+    assert done.returncode == 1 and "missing.obj" in done.stderr
+    assert done.stdout.splitlines() == ["data/box.asset/views", "data/procedural-000003.asset/views"]
+    assert manifest(tmp_path / "data/procedural-000003.asset/views")["content"]["model"]
+    assert (tmp_path / "data/procedural-000003.asset/views/source.glb").is_file()
+    assert gdtool("render-dataset", *FAST).returncode == 2
+
+
+def test_cameras_of_other_views_are_used_with_their_frame(gdtool, box, tmp_path):
+    assert gdtool("render-dataset", box, *FAST, "--rig", "turntable", "--views", "3", "--fov", "40").returncode == 0
+    views = tmp_path / "box.asset" / "views"
+    # The same source again: the same pixels. Its normalised copy as another file: left where it is.
+    again = gdtool("render-dataset", box, "--cameras", views, *FAST, "-o", "again")
+    assert again.returncode == 0, again.stderr
+    matrix = np.array(manifest(views)["content"]["source_from_world"]).reshape(4, 4)
+    lines = []
+    for line in BOX.strip().splitlines():
+        if line.startswith("v "):
+            point = (np.array([float(x) for x in line.split()[1:]]) - matrix[:3, 3]) / matrix[0, 0]
+            # 5 % smaller, as a reconstruction may be: it must not be scaled up again
+            line = "v " + " ".join(f"{0.95 * x:.6f}" for x in point)
+        lines.append(line)
+    (tmp_path / "copy.obj").write_text("\n".join(lines))
+    assert gdtool("render-dataset", "copy.obj", "--cameras", views, *FAST, "-o", "copied").returncode == 0
+    first, same, copied = (read_views(open_folder(tmp_path / p)) for p in ("box.asset/views", "again", "copied"))
+    assert [c.name for c in same.cameras] == ["000", "001", "002"] and same.cameras[0].projection == "perspective"
+    for domain in first.images:
+        assert np.array_equal(first.images[domain], same.images[domain]), domain
+    assert copied.mask.sum() == pytest.approx(first.mask.sum() * 0.95**2, rel=0.05)
+
+
+def test_named_lights_rigs_and_filter(gdtool, box, tmp_path):
+    assert gdtool("render-dataset", box, *FAST, "--light", "bright", "--rig", "sphere", "--views", "2").returncode == 0
+    content = manifest(tmp_path / "box.asset/views")["content"]
+    assert content["environment"] == "bright" and len(content["views"]) == 2
+    dropped = gdtool("render-dataset", box, *FAST, "--filter", "complete-pbr", "-o", "kept")
+    assert dropped.returncode == 3 and "complete" in dropped.stderr and not (tmp_path / "kept").exists()
+    assert gdtool("render-dataset", box, *FAST, "--domains", "colour").returncode == 2
+    assert gdtool("render-dataset", box, *FAST, "--light", "none.hdr").returncode == 3
