@@ -103,7 +103,7 @@ def find_charts(vertices: np.ndarray, faces: np.ndarray, *, seconds: float, max_
 def tidy(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> np.ndarray:
     """Labels with short, straight seams that prefer creases, without islands too small to be a chart."""
     first = label
-    typical = np.median(adjacency.cost)
+    typical = np.median(adjacency.cost) if len(adjacency.cost) else 0.0
     parity = (np.arange(adjacency.count) * 2654435761 >> 7) % 2
     for turn in range(rounds):
         # Half of the faces at a time: neighbours that change at once would swap for ever.

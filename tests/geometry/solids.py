@@ -1,0 +1,63 @@
+"""Closed and open meshes of known shape, made in code."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def cube(side: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Twelve triangles, outward, centred."""
+    vertices = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    return (vertices - 0.5) * side, np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])
+
+
+def marching(field, n: int, half: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Zero set of field(x, y, z), negative inside, on an n^3 grid over ±half; outward."""
+    from skimage.measure import marching_cubes
+
+    line = np.linspace(-half, half, n)
+    vertices, faces, _, _ = marching_cubes(field(*np.meshgrid(line, line, line, indexing="ij")), 0.0)
+    return vertices * (line[1] - line[0]) - half, faces.astype(np.int64)
+
+
+def sphere(n: int = 32, radius: float = 0.8, centre=(0.0, 0.0, 0.0)) -> tuple[np.ndarray, np.ndarray]:
+    return marching(lambda x, y, z: np.sqrt((x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2) - radius, n, 1.03)
+
+
+def torus(n: int = 40) -> tuple[np.ndarray, np.ndarray]:
+    return marching(lambda x, y, z: np.hypot(np.hypot(x, z) - 0.65, y) - 0.28, n, 1.03)
+
+
+def bored_box(n: int = 56) -> tuple[np.ndarray, np.ndarray]:
+    """A box of half sides 0.8, 0.6, 0.5 with a bore of radius 0.3 along z: twelve straight creases and two circles."""
+    def field(x, y, z):
+        return np.maximum(np.maximum(np.maximum(abs(x) - 0.8, abs(y) - 0.6), abs(z) - 0.5), 0.3 - np.hypot(x, y))
+
+    return marching(field, n, 1.03)
+
+
+def plane(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
+    """Open square of side 1 in z = 0, facing +z."""
+    line = np.linspace(-0.5, 0.5, n + 1)
+    x, y = np.meshgrid(line, line)
+    i = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
+    faces = np.concatenate([np.stack([i, i + 1, i + n + 2], -1), np.stack([i, i + n + 2, i + n + 1], -1)])
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], -1), faces
+
+
+def joined(*meshes) -> tuple[np.ndarray, np.ndarray]:
+    offset = np.cumsum([0] + [len(v) for v, _ in meshes])
+    return np.concatenate([v for v, _ in meshes]), np.concatenate([f + o for (_, f), o in zip(meshes, offset, strict=False)])
+
+
+def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    if faces.shape[1] == 4:
+        faces = np.concatenate([faces[:, :3], faces[:, [0, 2, 3]]])
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
+
+
+def write_obj(path, vertices, faces) -> None:
+    lines = ["v %.17g %.17g %.17g" % tuple(p) for p in vertices] + ["f " + " ".join(str(i + 1) for i in face) for face in faces.tolist()]
+    path.write_text("\n".join(lines) + "\n")

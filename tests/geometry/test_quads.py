@@ -1,0 +1,143 @@
+"""Quads: count, topology, creases, and that a way through is found whatever the engine does."""
+
+import numpy as np
+import pytest
+
+from gdtool.core.child import ChildFailed
+from gdtool.folders.mesh import triangulated
+from gdtool.geometry import quads, repair
+from gdtool.geometry.features import find_features
+from gdtool.geometry.mesh_quality import distance_figures, scaled_jacobian, shape_figures, topology_figures
+from gdtool.geometry.quad_engines import pair_and_split
+from gdtool.geometry.quad_shape import remove_doublets, subdivide
+from gdtool.geometry.sharpen import restore_creases
+from tests.geometry.solids import bored_box, cube, joined, plane, sphere, torus, volume
+
+
+def whole(faces):
+    return faces.min() >= 0 and repair.is_watertight(faces) and repair.is_manifold(faces)
+
+
+def test_grid_figures():
+    line = np.arange(5.0)
+    x, y = np.meshgrid(line, line)
+    i = (np.arange(4)[:, None] * 5 + np.arange(4)).ravel()
+    faces = np.stack([i, i + 1, i + 6, i + 5], -1)
+    vertices = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1)
+    figures = topology_figures(vertices, faces) | shape_figures(vertices, faces)
+    assert figures["irregular_share"] == 0 and figures["boundary_edges"] == 16 and figures["jacobian_min"] == pytest.approx(1)
+    vertices[6] += [1.5, 1.5, 0]  # past the opposite corner: folded
+    assert scaled_jacobian(vertices, faces).min() < 0
+
+
+def test_subdivision_of_a_cube_is_regular_but_for_eight_corners():
+    vertices, faces = cube()
+    quad = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    out, found, _ = subdivide(vertices, quad)
+    assert len(found) == 24 and whole(found) and volume(out, found) == pytest.approx(1)
+    assert topology_figures(out, found)["irregular_share"] == pytest.approx(8 / 26)
+    mixed = np.concatenate([np.concatenate([faces, np.full((12, 1), -1)], 1)[[1, 2]], quad[2:]])
+    assert len(subdivide(vertices, mixed)[1]) == 2 * 3 + 4 * 4
+
+
+def test_doublet_is_removed():
+    # A quad whose middle vertex 4 has two edges only: the pair around it is one quad.
+    faces = np.array([[0, 1, 2, 4], [0, 4, 2, 3], [1, 0, 3, 2]])
+    _, out = remove_doublets(np.arange(15.0).reshape(5, 3), faces)
+    assert len(out) == 2
+
+
+def test_pairing_gives_the_asked_count_exactly():
+    vertices, faces = sphere(24)
+    for count in (3 * len(faces) - 500, int(2.2 * len(faces))):
+        out, found = pair_and_split(vertices, faces, count)
+        assert abs(len(found) - count) <= 1 and whole(found) and volume(out, found) > 0
+
+
+def test_bevels_of_marching_cubes_become_creases():
+    vertices, faces = bored_box()
+    sharp, sharp_faces, report = restore_creases(vertices, faces)
+    assert report["moved"] > 300 and repair.is_watertight(sharp_faces) and repair.is_manifold(sharp_faces)
+    corner = np.array([0.8, 0.6, 0.5])
+    before, after = (np.linalg.norm(v - corner, axis=1).min() for v in (vertices, sharp))
+    assert after < 0.2 * before
+    features = find_features(sharp, sharp_faces, 30.0, 0.15)
+    length = np.linalg.norm(features.points[features.segments[:, 0]] - features.points[features.segments[:, 1]], axis=1).sum()
+    assert length == pytest.approx(4 * (1.6 + 1.2 + 1.0) + 2 * 2 * np.pi * 0.3, rel=0.05)
+
+
+def test_smooth_and_sharp_meshes_are_left_alone():
+    for vertices, faces in (sphere(32), cube()):
+        assert restore_creases(vertices, faces)[2]["moved"] == 0
+
+
+def test_sphere():
+    vertices, faces = sphere(48)
+    out, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=1000))
+    assert record.engine.startswith("instant-meshes") and whole(found)
+    assert abs(len(found) / 1000 - 1) <= 0.03
+    assert np.abs(np.linalg.norm(out, axis=1) - 0.4).max() < 2e-3
+    assert shape_figures(out, found)["jacobian_min"] > 0.2
+
+
+def test_torus_keeps_its_hole():
+    vertices, faces = torus()
+    out, found, _ = quads.remesh(vertices / 2, faces, quads.Request(quads=1500))
+    assert whole(found) and len(out) == len(found)  # Euler characteristic 0: E = 2F, V = F
+    assert volume(out, found) == pytest.approx(2 * np.pi**2 * 0.65 * 0.28**2 / 8, rel=0.02)
+
+
+def test_creases_lie_on_quad_edges():
+    vertices, faces = bored_box()
+    out, found, _ = quads.remesh(vertices / 2, faces, quads.Request(quads=2500))
+    assert whole(found) and abs(len(found) / 2500 - 1) <= 0.03
+    triangles, _ = triangulated(found)
+    line = np.linspace(-0.37, 0.37, 50)
+    from gdtool.geometry.distance import closest_points
+
+    truth = np.concatenate([np.stack([line, 0 * line + 0.3 * s, 0 * line + 0.25 * t], -1) for s in (-1, 1) for t in (-1, 1)])
+    assert np.median(closest_points(truth, out, triangles)[0]) < 1e-3  # marching cubes cuts these edges off by 8e-3
+
+
+def test_coarse_cube_is_filled_with_quads():
+    out, found, _ = quads.remesh(*cube(), quads.Request(quads=600))
+    assert whole(found) and abs(len(found) / 600 - 1) <= 0.03 and volume(out, found) == pytest.approx(1, rel=0.02)
+
+
+def test_open_plane_stays_open_and_flat():
+    out, found, _ = quads.remesh(*plane(), quads.Request(quads=400))
+    assert repair.is_manifold(found) and np.abs(out[:, 2]).max() < 1e-9
+    area = distance_figures(out, triangulated(found)[0], *plane(), 2000)
+    assert area["hausdorff"] < 0.03  # less than an edge length: the boundary is where it was
+
+
+def test_small_piece_is_not_lost():
+    vertices, faces = joined(sphere(40, 0.7), sphere(40, 0.05, (0.9, 0.9, 0.9)))
+    out, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=1000))
+    assert repair.components(found)[0] == 2 and whole(found) and "pair and split" in record.engine
+    assert np.linalg.norm(out - 0.45, axis=1).min() < 0.05
+
+
+@pytest.mark.parametrize("failure", ["died of SIGSEGV", "ended with exit code 0 and no result"])
+def test_dead_engine_is_replaced(monkeypatch, failure):
+    def dead(*_, **__):
+        raise ChildFailed(failure)
+
+    monkeypatch.setattr(quads, "call", dead)
+    vertices, faces = torus()
+    _, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=900))
+    assert record.engine == "pair and split" and any(failure in text for text in record.failed)
+    assert whole(found) and abs(len(found) / 900 - 1) <= 0.03
+
+
+def test_torn_output_is_not_believed(monkeypatch):
+    monkeypatch.setattr(quads, "call", lambda *_, **__: (np.eye(4)[:, :3], np.array([[0, 1, 2, 3]])))
+    vertices, faces = sphere(24)
+    _, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=300))
+    assert whole(found) and any("not watertight" in text for text in record.failed)
+
+
+def test_equal_input_gives_equal_quads():
+    vertices, faces = sphere(24)
+    one, two = (quads.remesh(vertices / 2, faces, quads.Request(quads=500)) for _ in range(2))
+    assert (one[0] == two[0]).all() and (one[1] == two[1]).all()

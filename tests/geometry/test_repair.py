@@ -1,0 +1,106 @@
+"""Repair: what is whole passes unchanged, what is broken becomes manifold, what is hopeless is refused."""
+
+import numpy as np
+import pytest
+
+from gdtool.core.errors import InputError
+from gdtool.geometry import repair
+from tests.geometry.solids import cube, joined, plane, torus, volume
+
+
+def test_cube_is_watertight_and_passes_unchanged():
+    vertices, faces = cube(2.0)
+    assert repair.is_watertight(faces) and repair.is_manifold(faces)
+    out_vertices, out_faces, report = repair.clean(vertices, faces)
+    assert report == {} and (out_vertices == vertices).all() and (out_faces == faces).all()
+    assert volume(out_vertices, out_faces) == pytest.approx(8)
+
+
+def test_plane_is_manifold_and_not_watertight():
+    _, faces = plane(3)
+    edges = repair.edges_of(faces)
+    assert (edges.count == 1).sum() == 12
+    assert repair.is_manifold(faces) and not repair.is_watertight(faces)
+
+
+def test_torus_has_euler_characteristic_zero():
+    vertices, faces = torus()
+    assert len(vertices) - len(repair.edges_of(faces).ends) + len(faces) == 0
+
+
+def test_quads_and_triangles_share_edges():
+    faces = np.array([[0, 1, 2, 3], [1, 4, 2, -1]])
+    edges = repair.edges_of(faces)
+    assert len(edges.ends) == 6 and edges.count.max() == 2 and not edges.turned.any()
+    assert edges.face_pairs()[1].tolist() == [[0, 1]]
+
+
+def test_soup_is_welded():
+    vertices, faces = cube()
+    soup, soup_faces = vertices[faces].reshape(-1, 3), np.arange(36).reshape(-1, 3)
+    out_vertices, out_faces, report = repair.clean(soup, soup_faces)
+    assert len(out_vertices) == 8 and repair.is_watertight(out_faces) and report == {"welded_vertices": 28}
+
+
+def test_two_cubes_at_one_edge_become_two_manifolds():
+    one, two = cube(), cube()
+    vertices, faces = joined(one, (two[0] + [1, 1, 0], two[1]))
+    _, first, inverse = np.unique(vertices.round(6), axis=0, return_index=True, return_inverse=True)
+    shared = first[inverse.ravel()][faces]
+    assert not repair.is_manifold(shared)
+    out_vertices, out_faces, report = repair.clean(vertices, shared)
+    assert report["nonmanifold_edges"] == 1
+    assert repair.is_watertight(out_faces) and repair.is_manifold(out_faces) and repair.components(out_faces)[0] == 2
+    assert volume(out_vertices, out_faces) == pytest.approx(2)
+
+
+def test_bow_tie_is_parted():
+    one, two = cube(), cube()
+    vertices, faces = joined(one, (two[0] + 1, two[1]))
+    _, first, inverse = np.unique(vertices.round(6), axis=0, return_index=True, return_inverse=True)
+    shared = first[inverse.ravel()][faces]
+    assert repair.is_watertight(shared) and not repair.is_manifold(shared) and len(repair.split_vertices(shared)) == 1
+    out_vertices, out_faces, report = repair.clean(vertices, shared)
+    assert report == {"nonmanifold_vertices": 1} and repair.is_manifold(out_faces) and len(out_vertices) == 16
+
+
+def test_turned_faces_are_turned_back():
+    vertices, faces = cube()
+    faces[3] = faces[3][::-1]
+    out_vertices, out_faces, report = repair.clean(vertices, faces)
+    assert report["turned_edges"] == 3 and repair.is_watertight(out_faces) and volume(out_vertices, out_faces) == pytest.approx(1)
+
+
+def test_inside_out_is_turned():
+    vertices, faces = cube()
+    out_vertices, out_faces, report = repair.clean(vertices, faces[:, ::-1])
+    assert report == {"turned_inside_out": True} and volume(out_vertices, out_faces) == pytest.approx(1)
+
+
+def test_duplicate_and_flat_faces_go():
+    vertices, faces = plane(2)
+    vertices = np.concatenate([vertices, [[0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0]]])
+    n = len(vertices)
+    more = np.concatenate([faces, faces[:2], [[n - 3, n - 2, n - 1], [0, 0, 1]]])
+    _, out, report = repair.clean(vertices, more)
+    assert len(out) == 8 and report["duplicate_faces"] == 2 and report["zero_area_faces"] == 1 and report["degenerate_faces"] == 1
+
+
+@pytest.mark.parametrize("vertices, faces, fact", [
+    (np.zeros((3, 3)), np.zeros((0, 3), int), "no faces"),
+    (np.eye(3), np.array([[0, 1, 3]]), "refers to vertex 3 of 3"),
+    (np.eye(3), np.array([[0, 1, -1]]), "refers to vertex -1"),
+    (np.array([[0, 0, 0], [1, 0, 0], [0, np.nan, 0.0]]), np.array([[0, 1, 2]]), "vertex 2 is not finite"),
+    (np.ones((3, 3)), np.array([[0, 1, 2]]), "one point"),
+    (np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]]), np.array([[0, 1, 2]]), "no face has an area"),
+])
+def test_refused(vertices, faces, fact):
+    with pytest.raises(InputError, match=fact):
+        repair.clean(vertices, faces, "x.obj")
+
+
+@pytest.mark.parametrize("scale", [1e-20, 1e20])
+def test_scale_does_not_matter(scale):
+    vertices, faces = cube(scale)
+    soup, soup_faces = vertices[faces].reshape(-1, 3), np.arange(36).reshape(-1, 3)
+    assert len(repair.clean(soup, soup_faces)[0]) == 8

@@ -1,0 +1,89 @@
+"""gdtool remesh on files and folders: a valid folder, up to date the second time, bad input refused in one line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gdtool.core.folder import open_folder
+from gdtool.folders.mesh import read_mesh
+from gdtool.geometry import repair
+from tests.geometry.solids import cube, joined, sphere, write_obj
+
+
+def content(path):
+    return json.loads(Path(path, "manifest.json").read_text())["content"]
+
+
+def test_obj_to_quads_in_its_normalised_frame(gdtool, tmp_path):
+    vertices, faces = sphere(32)
+    write_obj(tmp_path / "ball.obj", vertices * 100 + [5, 0, 0], faces)
+    run = gdtool("remesh", "ball.obj", "--faces", 600)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout == "ball.asset/mesh\n"
+    folder = open_folder(tmp_path / "ball.asset/mesh")
+    mesh = read_mesh(folder)
+    assert abs(len(mesh.faces) / 600 - 1) <= 0.03 and mesh.is_quad.all() and repair.is_watertight(mesh.faces)
+    assert np.ptp(mesh.vertices, 0).max() == pytest.approx(1, abs=0.02)
+    assert folder.content.watertight and folder.content.triangles == 0
+    matrix = np.array(folder.content.source_from_world).reshape(4, 4)
+    assert matrix[:3, 3] == pytest.approx([5, 0, 0], abs=0.1) and matrix[0, 0] == pytest.approx(160, rel=0.01)
+    assert folder.content.report["distance_mean"] < 0.01
+    again = gdtool("remesh", "ball.obj", "--faces", 600)
+    assert again.stdout == run.stdout and "up to date" in again.stderr
+    stale = gdtool("remesh", "ball.obj", "--faces", 700)
+    assert "600" in stale.stderr and "700" in stale.stderr
+    assert gdtool("validate", "ball.asset/mesh").returncode == 0
+
+
+def test_triangles_only_decimates(gdtool, tmp_path):
+    write_obj(tmp_path / "ball.obj", *sphere(24))
+    assert gdtool("remesh", "ball.obj", "--triangles", 300).returncode == 0
+    found = content(tmp_path / "ball.asset/mesh")
+    assert found["quads"] == 0 and 250 <= found["triangles"] <= 300 and found["watertight"]
+
+
+def test_mesh_that_meets_the_request_is_passed_through(gdtool, tmp_path):
+    from tests.texture.shapes import torus
+
+    vertices, quads, _ = torus(40, 20)
+    write_obj(tmp_path / "ring.obj", vertices, quads)
+    run = gdtool("remesh", "ring.obj", "--faces", 800, "-v")
+    assert run.returncode == 0 and "already is 800 quads" in run.stderr
+    found = content(tmp_path / "ring.asset/mesh")
+    assert found["engine"] == "passed through" and found["quads"] == 800
+
+
+def test_broken_mesh_is_repaired_and_says_so(gdtool, tmp_path):
+    one, two = sphere(20, 0.4, (-0.5, 0, 0)), sphere(20, 0.4, (0.5, 0, 0))
+    vertices, faces = joined(one, two)
+    faces = np.concatenate([faces, faces[:3], [[7, 7, 8]]])
+    faces[10] = faces[10][::-1]
+    write_obj(tmp_path / "two.obj", vertices, faces)
+    run = gdtool("remesh", "two.obj", "--faces", 500)
+    assert run.returncode == 0 and "duplicate faces" in run.stderr
+    found = content(tmp_path / "two.asset/mesh")
+    assert found["watertight"] and found["report"]["pieces"] == 2
+
+
+@pytest.mark.parametrize("scale", [1e-20, 1e20])
+def test_huge_and_tiny_coordinates_are_normalised(gdtool, tmp_path, scale):
+    vertices, faces = cube(scale)
+    write_obj(tmp_path / "cube.obj", vertices, faces)
+    run = gdtool("remesh", "cube.obj", "--faces", 200)
+    assert run.returncode == 0, run.stderr
+    assert content(tmp_path / "cube.asset/mesh")["watertight"]
+
+
+@pytest.mark.parametrize("text, fact", [
+    ("v 0 0 0\n", "no faces"),
+    ("v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "not finite"),
+    ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "out of range"),
+    ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no face has an area"),
+])
+def test_bad_mesh_is_refused(gdtool, tmp_path, text, fact):
+    (tmp_path / "bad.obj").write_text(text)
+    run = gdtool("remesh", "bad.obj")
+    assert run.returncode == 3 and fact in run.stderr and run.stdout == ""
+    assert "Traceback" not in run.stderr and not [p for p in (tmp_path / "bad.asset").rglob("*") if p.is_file()]

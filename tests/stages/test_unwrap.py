@@ -1,0 +1,77 @@
+"""gdtool unwrap: a valid atlas of whole quads, up to date the second time, own texture coordinates kept."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gdtool.core.folder import open_folder
+from gdtool.folders.mesh import QuadMesh, read_mesh, write_obj
+from tests.texture.shapes import torus
+
+
+def content(path):
+    return json.loads(Path(path, "manifest.json").read_text())["content"]
+
+
+@pytest.fixture
+def ring(tmp_path):
+    vertices, quads, _ = torus(32, 16)
+    write_obj(tmp_path / "ring.obj", QuadMesh(vertices, quads.astype(np.int32)))
+    return vertices, quads
+
+
+def test_atlas_of_quads(gdtool, tmp_path, ring):
+    run = gdtool("unwrap", "ring.obj", "--size", 512, "--mip-safe", 128)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout == "ring.asset/atlas\n"
+    folder = open_folder(tmp_path / "ring.asset/atlas")
+    mesh = read_mesh(folder)
+    assert len(mesh.faces) == len(ring[1]) and mesh.is_quad.all() and mesh.uv is not None
+    found = folder.content
+    assert found.padding == 4 and found.quads == 512 and found.watertight and found.charts == found.report["charts"]
+    assert found.report["overlap"] == 0 and found.report["mirrored"] == 0 and found.coverage > 0.3
+    for picture in ("layout.png", "checkerboard.png"):
+        assert folder.file(picture).stat().st_size > 1000
+    assert "up to date" in gdtool("unwrap", "ring.obj", "--size", 512, "--mip-safe", 128).stderr
+    assert gdtool("validate", "ring.asset/atlas").returncode == 0
+
+
+def test_own_coordinates_are_kept_unless_redo(gdtool, tmp_path):
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
+    uv = np.array([[0.1, 0.9], [0.4, 0.9], [0.4, 0.6], [0.1, 0.6]])
+    quad = np.array([[0, 1, 2, 3]], np.int32)
+    write_obj(tmp_path / "leaf.obj", QuadMesh(vertices, quad, uv, quad))
+    assert gdtool("unwrap", "leaf.obj").returncode == 0
+    assert read_mesh(open_folder(tmp_path / "leaf.asset/atlas")).uv == pytest.approx(uv)
+    assert content(tmp_path / "leaf.asset/atlas")["report"]["kept"]
+    assert gdtool("unwrap", "leaf.obj", "--redo").returncode == 0
+    assert content(tmp_path / "leaf.asset/atlas")["coverage"] > 0.9
+
+
+def test_overlapping_coordinates_are_replaced(gdtool, tmp_path):
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0], [2, 1, 0.0]])
+    faces = np.array([[0, 1, 2, 3], [1, 4, 5, 2]], np.int32)
+    uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0.0]])
+    write_obj(tmp_path / "twice.obj", QuadMesh(vertices, faces, uv, np.array([[0, 1, 2, 3], [0, 1, 2, 3]], np.int32)))
+    run = gdtool("unwrap", "twice.obj")
+    assert run.returncode == 0 and "overlap" in run.stderr
+    assert content(tmp_path / "twice.asset/atlas")["report"]["overlap"] == 0
+
+
+@pytest.mark.parametrize("text, fact", [
+    ("v 0 0 0\n", "no faces"),
+    ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no face has an area"),
+    ("v 0 0 0\nv 1 0 0\nv 0 inf 0\nf 1 2 3\n", "not finite"),
+])
+def test_bad_mesh_is_refused(gdtool, tmp_path, text, fact):
+    (tmp_path / "bad.obj").write_text(text)
+    run = gdtool("unwrap", "bad.obj")
+    assert run.returncode == 3 and fact in run.stderr and "Traceback" not in run.stderr
+
+
+def test_wrong_kind_names_the_stage_that_makes_the_right_one(gdtool, tmp_path, ring):
+    gdtool("unwrap", "ring.obj")
+    run = gdtool("unwrap", "ring.asset/atlas")
+    assert run.returncode == 3 and "holds atlas" in run.stderr and "gdtool remesh" in run.stderr

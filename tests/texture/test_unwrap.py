@@ -1,0 +1,140 @@
+"""Unwrap: quads stay whole, nothing overlaps, nothing is mirrored, and a dead child is survived."""
+
+import numpy as np
+import pytest
+
+from gdtool.core.child import ChildFailed
+from gdtool.texture import unwrap, unwrap_charts
+from gdtool.texture.raster import owner_count
+from gdtool.texture.unwrap_flatten import flatten, stretch
+from gdtool.texture.unwrap_pack import pack, upright_box
+from tests.geometry.solids import cube
+from tests.texture.shapes import torus
+
+CUBE_QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+SMALL = unwrap.Request(size=512, padding=4)
+
+
+def box(n: int = 6):
+    """A cube of side 1 with n x n quads a side."""
+    from gdtool.geometry.quad_shape import subdivide
+
+    vertices, quads = cube()[0], CUBE_QUADS
+    while len(quads) < 6 * n * n:
+        vertices, quads, _ = subdivide(vertices, quads)
+    return vertices, quads
+
+
+def checked(vertices, faces, result, size=512):
+    """The figures, after what must always hold."""
+    assert np.isfinite(result.uv).all() and result.uv.min() >= 0 and result.uv.max() <= 1
+    assert ((result.face_uvs >= 0) == (faces >= 0)).all() and result.face_uvs.max() == len(result.uv) - 1
+    figures = unwrap.figures(vertices, faces, result.uv, result.face_uvs, size)
+    assert figures["overlap"] == 0 and figures["mirrored"] == 0
+    return figures
+
+
+def test_box_unfolds_without_stretch():
+    vertices, faces = box()
+    result = unwrap.unwrap(vertices, faces, SMALL)
+    figures = checked(vertices, faces, result)
+    assert figures["charts"] <= 6 and figures["stretch"] == pytest.approx(1, abs=2e-3) and figures["coverage"] > 0.4
+    # Seams run along creases: the twelve edges and no more, sqrt(3) is the diagonal.
+    assert figures["seam_length"] <= 12 / 3**0.5 + 1e-6
+
+
+def test_torus_has_even_density_and_gap():
+    vertices, faces, _ = torus(48, 24)
+    result = unwrap.unwrap(vertices, faces, SMALL)
+    figures = checked(vertices, faces, result)
+    assert figures["stretch"] < 1.1 and figures["area_distortion"] < 1.3 and figures["charts"] <= 16
+    # Charts stay 4 texels of 512 apart: growing each by a texel and a half makes none meet.
+    from scipy.ndimage import binary_dilation
+
+    from gdtool.folders.mesh import triangulated
+
+    _, face_idx = triangulated(faces)
+    corners = unwrap.corner_triangles(result.face_uvs, face_idx)
+    grown = np.zeros((512, 512), int)
+    for chart in range(result.chart.max() + 1):
+        mask = owner_count(result.uv, corners[result.chart[face_idx] == chart], 512) > 0
+        grown += binary_dilation(mask, np.ones((3, 3)), 1)
+    assert grown.max() == 1
+
+
+def test_two_pieces_and_triangles_mixed():
+    one, quads = box(2)
+    two, triangles = cube(0.3)
+    vertices = np.concatenate([one, two + 2])
+    faces = np.concatenate([quads, np.concatenate([triangles + len(one), np.full((12, 1), -1)], 1)])
+    checked(vertices, faces, unwrap.unwrap(vertices, faces, SMALL))
+
+
+def test_open_square_fills_the_texture():
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
+    result = unwrap.unwrap(vertices, np.array([[0, 1, 2, 3]]), SMALL)
+    assert checked(vertices, np.array([[0, 1, 2, 3]]), result)["coverage"] > 0.95
+
+
+def test_degenerate_and_turned_faces_survive():
+    vertices, faces = box(2)
+    faces = faces.copy()
+    faces[3] = faces[3][::-1]
+    vertices = vertices.copy()
+    vertices[faces[7, 1]] = vertices[faces[7, 0]]
+    result = unwrap.unwrap(vertices, faces, SMALL)
+    assert np.isfinite(result.uv).all() and unwrap.figures(vertices, faces, result.uv, result.face_uvs)["overlap"] == 0
+
+
+def test_dead_xatlas_leaves_box_projection(monkeypatch):
+    def dead(*_, **__):
+        raise ChildFailed("took longer than 1 s")
+
+    monkeypatch.setattr(unwrap_charts, "call", dead)
+    monkeypatch.setattr(unwrap, "call", dead)
+    vertices, faces, _ = torus(24, 12)
+    result = unwrap.unwrap(vertices, faces, SMALL)
+    checked(vertices, faces, result)
+    assert len(result.failed) >= 2 and "took longer" in result.failed[0]
+
+
+def test_cylinder_side_is_developable():
+    angle = np.linspace(0, 1.6 * np.pi, 25)
+    x, z = np.meshgrid(angle, np.linspace(0, 1, 5))
+    vertices = np.stack([np.sin(x.ravel()), z.ravel(), np.cos(x.ravel())], -1)
+    i = (np.arange(4)[:, None] * 25 + np.arange(24)).ravel()
+    triangles = np.concatenate([np.stack([i, i + 1, i + 26], -1), np.stack([i, i + 26, i + 25], -1)])
+    uv, reason = flatten(vertices, triangles, 1.001, 1.05)
+    assert reason == "" and stretch(vertices, triangles, uv) < 1.001
+
+
+def test_stretch_of_known_maps():
+    vertices, triangles = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    assert stretch(vertices, triangles, 7 * vertices[:, :2]) == pytest.approx(1)
+    # Stretched by two one way: sqrt((a + 1/a) / 2) with a = 2.
+    assert stretch(vertices, triangles, vertices[:, :2] * [2, 1]) == pytest.approx((2.5 / 2) ** 0.5)
+
+
+def test_closed_mesh_cannot_lie_flat():
+    vertices, triangles = cube()
+    assert flatten(vertices, triangles, 1.001, 1.1) == (None, "closed")
+
+
+def test_four_squares_pack_tight_and_turned_ones_are_set_upright():
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
+    turn = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
+    assert np.ptp(upright_box(square @ turn), 0) == pytest.approx([1, 1], abs=1e-3)
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    places, scale = pack([(square @ turn * s, triangles) for s in (1, 1, 1, 1)], 0.01)
+    for uv in places:
+        assert uv.min() >= 0 and uv.max() <= 1
+        assert np.cross(uv[1] - uv[0], uv[3] - uv[0]) > 0  # turned, never mirrored
+        assert np.linalg.norm(uv[1] - uv[0]) == pytest.approx(scale)
+    assert 4 * scale**2 > 0.8
+    assert (owner_count(np.concatenate(places), np.concatenate([triangles + 4 * i for i in range(4)]), 512) <= 1).all()
+
+
+def test_thousands_of_charts_go_on_shelves():
+    triangle, faces = np.array([[0, 0], [1, 0], [0, 1.0]]), np.array([[0, 1, 2]])
+    places, _ = pack([(triangle, faces)] * 1000, 0.004)
+    assert min(uv.min() for uv in places) >= 0 and max(uv.max() for uv in places) <= 1
