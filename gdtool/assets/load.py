@@ -64,4 +64,19 @@ def _checked(scene: Scene, path: Path) -> Scene:
     if empty.any():
         scene = replace(scene, faces=scene.faces[~empty], material_idx=scene.material_idx[~empty],
                         notes=(*scene.notes, f"{int(empty.sum())} faces without area are left out"))
-    return scene
+    return _with_sound_normals(scene)
+
+
+def _with_sound_normals(scene: Scene) -> Scene:
+    """The scene with the faces' own normals where a given one has no length."""
+    if scene.normals is None:
+        return scene
+    bad = np.linalg.norm(scene.normals, axis=1) < 0.5
+    bad[np.setdiff1d(np.arange(len(bad)), scene.faces)] = False
+    if not bad.any():
+        return scene
+    from gdtool.geometry.normals import vertex_normals
+
+    normals = scene.normals.copy()
+    normals[bad] = vertex_normals(scene.vertices, scene.faces)[bad]
+    return replace(scene, normals=normals, notes=(*scene.notes, f"{int(bad.sum())} normals without a direction are replaced by the faces'"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -122,7 +123,9 @@ def _scene(path: Path, vertices: np.ndarray, colors: list, uvs: np.ndarray, norm
     if (unique[:, 1] >= 0).any():
         coordinates = (np.where(unique[:, 1:2] >= 0, uvs[unique[:, 1]], 0.0),)
     elif any(m.base_color_texture or m.metallic_roughness_texture or m.normal_texture for m in materials):
-        raise InputError(path, "has textures but no texture coordinates")
+        notes.append("has textures but no texture coordinates: the textures are left out")
+        materials = tuple(replace(m, base_color_texture=None, metallic_roughness_texture=None, normal_texture=None, emissive_texture=None)
+                          for m in materials)
     return Scene(
         vertices=vertices[unique[:, 0]],
         faces=corner_idx.reshape(-1)[faces].astype(np.int32),

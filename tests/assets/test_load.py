@@ -81,6 +81,23 @@ def test_faces_without_area_are_left_out(tmp_path):
     assert len(scene.faces) == len(scene.material_idx) == 1 and any("without area" in note for note in scene.notes)
 
 
+def test_normals_without_a_direction_are_the_faces_own(tmp_path):
+    (tmp_path / "x.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 0\nvn 0 0 3\nf 1//1 2//2 3//2\n")
+    scene = load_scene(tmp_path / "x.obj")
+    np.testing.assert_allclose(scene.normals, [[0, 0, 1]] * 3)
+    assert any("without a direction" in note for note in scene.notes)
+
+
+def test_textures_without_coordinates_are_left_out(tmp_path):
+    from gdtool.images.io import write_png
+
+    write_png(tmp_path / "c.png", np.ones((4, 4, 3)))
+    (tmp_path / "x.mtl").write_text("newmtl a\nmap_Kd c.png\n")
+    (tmp_path / "x.obj").write_text("mtllib x.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    scene = load_scene(tmp_path / "x.obj")
+    assert scene.materials[0].base_color_texture is None and any("no texture coordinates" in note for note in scene.notes)
+
+
 def test_procedural_objects_by_their_seed():
     one, again = load_scene("procedural:7"), load_scene("procedural:7")
     assert one.name == "procedural-000007"
