@@ -1,7 +1,9 @@
 """How good a model is on objects it was not trained on, beside two baselines; a Markdown table for its card.
 
     gdtool render-dataset procedural:900000..900023 --size 64 --condition-views 3 -o held_out
-    python benchmarks/model_quality.py held_out --train objects -o docs/benchmarks
+    python benchmarks/model_quality.py held_out --model my-model --train objects -o docs/benchmarks --install
+
+--install puts the model, with the table in its card, where the package finds its bundled model.
 
 Each object's front view is the picture. Figures are means over the five views the model has not seen, each picture
 weighing the same: color and albedo PSNR over white, full frame ("frame") and over the true foreground only
@@ -15,15 +17,19 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import time
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import torch
 
 import gdtool.models
 from gdtool.cameras import rig
 from gdtool.core.folder import open_folder
+from gdtool.core.manifest import MANIFEST, list_files
+from gdtool.core.manifest import encode as encode_manifest
 from gdtool.diffusion.data import decode_object
 from gdtool.diffusion.encoding import BACKGROUND, encode
 from gdtool.diffusion.result import views_from_images
@@ -92,6 +98,8 @@ def main() -> None:
     parser.add_argument("--steps", default="1,4,8", help="denoising steps to measure")
     parser.add_argument("--scheduler", default="ddim", choices=["ddim", "dpm"])
     parser.add_argument("-o", "--output", type=Path, help="folder for model_quality.json and .md")
+    parser.add_argument("--install", action="store_true", help="make it the bundled model")
+    parser.add_argument("--note", default="", help="a line for the card: what the data were, how long it took")
     arguments = parser.parse_args()
     model = load_model(arguments.model)
     config = model.config
@@ -137,6 +145,22 @@ def main() -> None:
         arguments.output.mkdir(parents=True, exist_ok=True)
         (arguments.output / "model_quality.md").write_text(text)
         (arguments.output / "model_quality.json").write_text(json.dumps(means, indent=1) + "\n")
+    if arguments.install:
+        install(arguments.model, text, arguments.note)
+
+
+def install(source: Path, table: str, note: str) -> None:
+    """Copy a model folder into the package: weights, configuration, loss curve and card; its inputs are not shipped."""
+    folder = open_folder(source, ("model",))
+    if source.resolve() != DEFAULT_MODEL.resolve():
+        DEFAULT_MODEL.mkdir(exist_ok=True)
+        for name in ("config.json", "model.safetensors", "loss.csv", "loss.png", "card.md"):
+            shutil.copyfile(source / name, DEFAULT_MODEL / name)
+    card = (DEFAULT_MODEL / "card.md").read_text().split("## Measured quality")[0].rstrip()
+    (DEFAULT_MODEL / "card.md").write_text(f"{card}\n\n## Measured quality\n\n{note}\n\n{table}")
+    (DEFAULT_MODEL / MANIFEST).unlink(missing_ok=True)
+    manifest = msgspec.structs.replace(folder.manifest, inputs=(), name="default", files=list_files(DEFAULT_MODEL))
+    (DEFAULT_MODEL / MANIFEST).write_bytes(encode_manifest(manifest))
 
 
 if __name__ == "__main__":

@@ -92,12 +92,14 @@ def main() -> None:
     parser.add_argument("places", nargs="+", type=Path, metavar="FOLDER_OR_MODEL")
     parser.add_argument("--all", action="store_true", help="models without metallic-roughness textures too")
     parser.add_argument("--no-relight", dest="relight", action="store_false", help="leave the last stage out")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the folders of every model here, to look at")
     parser.add_argument("-o", "--output", type=Path, help="write the table here, besides stdout")
     given = parser.parse_args()
     records = []
     for model in models_under(given.places, given.all):
         with tempfile.TemporaryDirectory() as folder:
-            records.append(roundtrip(model, Path(folder), given.relight))
+            place = given.keep / model.stem if given.keep else Path(folder)
+            records.append(roundtrip(model, place, given.relight))
         asset = records[-1].get("asset", {})
         say(f"{records[-1]['model']}: seen {number(asset.get('seen_distance'))}, whole {number(asset.get('surface_distance'))}, albedo "
             f"{number(asset.get('albedo_psnr_masked'))} dB, {records[-1]['seconds']:.0f} s {records[-1].get('failed', '')}")
