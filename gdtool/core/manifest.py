@@ -93,7 +93,11 @@ def file_sha256(path: Path) -> str:
 
 def encode(manifest: Manifest) -> bytes:
     """The bytes of manifest.json: indented, in field order, one trailing newline."""
-    return msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n"
+    try:
+        return msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n"
+    except UnicodeEncodeError:
+        # A file name that is not UTF-8: Python holds its bytes as lone surrogates, which json writes as \udcXX.
+        return json.dumps(msgspec.to_builtins(manifest), indent=1).encode() + b"\n"
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

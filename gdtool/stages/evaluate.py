@@ -162,8 +162,8 @@ def read_geometry(source: Source) -> Geometry:
         scene = _load(source.file("asset.glb"))
         quads = int(read_obj(source.file("asset.obj")).is_quad.sum())
         return Geometry(scene.vertices, scene.faces, quads, matrix, source.content.frame == "source")
-    scene = _load(source.file("source.glb"))  # views
-    return Geometry(scene.vertices, scene.faces, 0, matrix, True)
+    scene = _load(source.file("source.glb"))  # of views: as they show it
+    return Geometry(scene.vertices, scene.faces, 0, matrix)
 
 
 def _load(path: Path | str) -> Scene:

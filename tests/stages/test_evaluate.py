@@ -117,6 +117,20 @@ def test_reference_by_name_in_each_form(chain, tmp_path):
     assert moved["surface_distance"] > 0.1
 
 
+def test_views_that_carry_their_model_are_a_reference(chain, tmp_path):
+    """source.glb stands in the frame of the views."""
+    from gdtool.assets.gltf_write import write_glb
+    from gdtool.assets.scene import Scene
+
+    vertices, faces = egg()
+    out = fresh(tmp_path / "carrying")
+    write_views(out, read_views(open_folder(chain / "views")), source_from_world=MATRIX, model=True)
+    write_glb(out.path("source.glb"), Scene(vertices, faces))
+    finish(tmp_path / "carrying", "views", out.content, {})
+    found = measured(write_egg_surface(chain / "exact", {}), tmp_path / "carrying", render=False)
+    assert found["surface_distance"] < 1e-5 and "seen_distance" in found
+
+
 def test_a_result_from_a_picture_is_measured_in_the_unit_box(chain, tmp_path):
     pictured = write_egg_surface(chain / "pictured", {}, matrix=np.eye(4))
     assert measured(pictured, tmp_path / "egg.obj")["surface_distance"] < 1e-5

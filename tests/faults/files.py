@@ -1,0 +1,43 @@
+"""Files that a user's machine may hold, made in code."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gdtool.folders.mesh import QuadMesh, write_obj
+
+CUBE = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float) - 0.5
+QUADS = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]], np.int32)
+
+
+def quad_cube(path: Path, cells: int) -> Path:
+    """A closed cube of 6 cells² quads as .obj: remesh passes it through when that is what it is asked for."""
+    index: dict[tuple[int, int, int], int] = {}
+    quads = []
+    for axis in range(3):
+        for side in (0, cells):
+            for i in range(cells):
+                for j in range(cells):
+                    ring = [(i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)]
+                    ring = ring if side else ring[::-1]
+                    corners = []
+                    for u, v in ring:
+                        corner = [0, 0, 0]
+                        corner[axis], corner[(axis + 1) % 3], corner[(axis + 2) % 3] = side, u, v
+                        corners.append(index.setdefault(tuple(corner), len(index)))
+                    quads.append(corners)
+    write_obj(path, QuadMesh(np.array(list(index), float) / cells, np.array(quads, np.int32)))
+    return path
+
+
+def lines_of(stderr: str) -> list[str]:
+    """The error lines; there is never a traceback."""
+    assert "Traceback" not in stderr, stderr
+    return [line for line in stderr.splitlines() if line.startswith("gdtool: ")]
+
+
+def leftovers(folder: Path) -> list[str]:
+    """What runs leave behind when they must not: partial folders, workspaces, locks."""
+    return sorted(str(p) for p in folder.rglob(".*") if p.suffix in (".partial", ".work", ".lock", ".old"))

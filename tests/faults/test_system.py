@@ -1,0 +1,185 @@
+"""What the system does to a run: a full disk, a place that cannot be written, signals, a second process, a lost reader."""
+
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from gdtool.core.folder import open_folder
+from tests.faults.files import leftovers, lines_of, quad_cube
+
+CELLS = 60
+FACES = 6 * CELLS**2  # what quad_cube has: remesh passes it through, so its run is reading, checking and writing
+REMESH = [sys.executable, "-m", "gdtool", "remesh", "--faces", str(FACES)]
+
+
+def start(*arguments, **kwargs):
+    return subprocess.Popen([*REMESH, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **kwargs)
+
+
+@pytest.fixture
+def cube(tmp_path):
+    return quad_cube(tmp_path / "cube.obj", CELLS).name
+
+
+def tree(folder):
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def small_files():
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+
+
+def test_a_full_disk_exits_4_and_keeps_the_old_result(tmp_path, cube):
+    quad_cube(tmp_path / "old.obj", 4)
+    made = subprocess.run([*REMESH[:-1], "96", "old.obj", "-o", "out", "-q"], capture_output=True, text=True)
+    assert made.returncode == 0, made.stderr
+    before = tree(tmp_path / "out")
+    process = start(cube, "-o", "out", preexec_fn=small_files)
+    out, errors = process.communicate()
+    assert process.returncode == 4 and out == "", errors
+    (told,) = lines_of(errors)
+    assert "too large" in told and "; " in told
+    assert tree(tmp_path / "out") == before and leftovers(tmp_path) == []
+
+
+@pytest.mark.parametrize("command", [
+    ["render-dataset", "cube.obj", "--size", "64", "--samples", "1", "--domains", "normal,depth"],
+    ["evaluate", "cube.obj", "--reference", "cube.obj", "--samples", "200", "--no-syncdreamer"],
+])
+def test_a_full_disk_of_every_writer(tmp_path, cube, command):
+    """Pictures fail to be written as meshes do; a command that writes nothing does not care."""
+    done = subprocess.run([sys.executable, "-m", "gdtool", *command, "-q"], capture_output=True, text=True, preexec_fn=lambda: resource.setrlimit(
+        resource.RLIMIT_FSIZE, (600, 600)) or signal.signal(signal.SIGXFSZ, signal.SIG_IGN))
+    if command[0] == "evaluate":
+        assert done.returncode == 0, done.stderr
+    else:
+        assert done.returncode == 4 and len(lines_of(done.stderr)) == 1 and leftovers(tmp_path) == [], done.stderr
+        assert not (tmp_path / "cube.asset/views").exists()
+
+
+def test_places_that_cannot_be_written(tmp_path, cube):
+    """A file in the way of the folder's parents; root may write anywhere, so permissions are tried only by others."""
+    (tmp_path / "file").write_text("mine")
+    for output, code in (("file", 2), ("file/below", 4)):
+        process = start(cube, "-o", output, "-q")
+        errors = process.communicate()[1]
+        assert process.returncode == code and len(lines_of(errors)) == 1, errors
+    assert (tmp_path / "file").read_text() == "mine"
+    done = subprocess.run([*REMESH, cube, "-o", "/proc/gdtool", "-q"], capture_output=True, text=True)
+    assert done.returncode == 4 and len(lines_of(done.stderr)) == 1, done.stderr
+    if os.geteuid():
+        (tmp_path / "locked").mkdir(mode=0o500)
+        done = subprocess.run([*REMESH, cube, "-o", "locked/out", "-q"], capture_output=True, text=True)
+        assert done.returncode == 4 and "permission" in done.stderr, done.stderr
+
+
+def test_output_that_is_the_input(tmp_path, cube, gdtool):
+    assert gdtool("remesh", cube, "--faces", FACES, "-q").returncode == 0
+    before = tree(tmp_path / "cube.asset/mesh")
+    done = gdtool("unwrap", "cube.asset/mesh", "-o", "cube.asset/mesh", "-q")
+    assert done.returncode == 2 and "both source and output" in done.stderr
+    assert tree(tmp_path / "cube.asset/mesh") == before
+
+
+@pytest.mark.parametrize("sign, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_stopped_then_completed(tmp_path, cube, sign, code):
+    process = start(cube)
+    while not list(tmp_path.glob("cube.asset/.mesh.*.partial")):
+        assert process.poll() is None
+        time.sleep(0.005)
+    process.send_signal(sign)
+    errors = process.communicate()[1]
+    assert process.returncode == code and lines_of(errors) == [], errors
+    assert leftovers(tmp_path) == [] and not (tmp_path / "cube.asset/mesh").exists()
+    process = start(cube, "-q")
+    assert process.communicate()[0] == "cube.asset/mesh\n" and process.returncode == 0
+
+
+def killed_at_random(tmp_path, cube, times, seed):
+    """Kill forced runs over an older result; after each kill the folder is whole, and the next run finishes."""
+    quad_cube(tmp_path / "old.obj", 4)
+    assert subprocess.run([*REMESH[:-1], "96", "old.obj", "-o", "out", "-q"]).returncode == 0
+    old, new = open_folder(tmp_path / "out").manifest.digest, None
+    begin = time.perf_counter()
+    assert subprocess.run([*REMESH, cube, "-o", "alone", "-q"], capture_output=True).returncode == 0
+    usual = time.perf_counter() - begin
+    new = open_folder(tmp_path / "alone").manifest.digest
+    rng = random.Random(seed)
+    for _ in range(times):
+        process = start(cube, "-o", "out", "--force", "-q")
+        time.sleep(usual * (0.2 + 0.9 * rng.random()))
+        process.kill()
+        process.communicate()
+        assert open_folder(tmp_path / "out").manifest.digest in (old, new)  # raises when a file is missing or cut
+    process = start(cube, "-o", "out", "-q")
+    process.communicate()
+    assert process.returncode == 0 and open_folder(tmp_path / "out").manifest.digest == new and leftovers(tmp_path) == []
+
+
+def test_killed_at_random_moments(tmp_path, cube):
+    killed_at_random(tmp_path, cube, 5, 0)
+
+
+@pytest.mark.slow
+def test_killed_at_fifty_random_moments(tmp_path, cube):
+    killed_at_random(tmp_path, cube, 50, 1)
+
+
+def test_two_processes_on_one_output(tmp_path, cube):
+    both = [start(cube), start(cube)]
+    ends = [process.communicate() for process in both]
+    assert [process.returncode for process in both] == [0, 0], ends
+    assert [out for out, _ in ends] == ["cube.asset/mesh\n"] * 2
+    assert sum("up to date" in errors for _, errors in ends) == 1
+    open_folder(tmp_path / "cube.asset/mesh")
+    assert leftovers(tmp_path) == []
+
+
+def test_empty_stdin_fails_the_pipe(gdtool):
+    for command in ("render-dataset", "sample-views", "reconstruct", "remesh", "unwrap", "bake", "relight", "evaluate", "validate"):
+        done = gdtool(command)
+        assert done.returncode == 2 and len(lines_of(done.stderr)) == 1 and done.stdout == "", command
+    pipe = f"{sys.executable} -m gdtool reconstruct nothing | {sys.executable} -m gdtool remesh | {sys.executable} -m gdtool unwrap"
+    done = subprocess.run(["bash", "-c", pipe], capture_output=True, text=True)
+    assert done.returncode == 2 and done.stdout == "" and "Traceback" not in done.stderr
+
+
+def test_a_reader_that_leaves(tmp_path, cube):
+    """`| head -1`: the command ends with 141 when it next has something to say, and says nothing about it."""
+    for i in range(4):
+        quad_cube(tmp_path / f"c{i}.obj", 4)
+    names = " ".join(f"c{i}.obj" for i in range(4))
+    pipe = f"{' '.join(REMESH[:-1])} 96 -q {names} | head -1; echo ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", pipe], capture_output=True, text=True)
+    first, code = done.stdout.split()
+    # When head is slow to leave, all four lines fit into the pipe: then nothing broke.
+    assert first == "c0.asset/mesh" and code in ("141", "0") and done.stderr == "", done.stderr
+    process = start("c3.obj", cube, "--force", "-q")
+    process.stdout.readline()
+    process.stdout.close()
+    assert process.wait() == 141 and process.stderr.read() == "" and leftovers(tmp_path) == []
+
+
+def test_no_home_no_tmp_no_user(tmp_path, cube):
+    bare = {"PATH": os.environ.get("PATH", ""), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([*REMESH, cube], capture_output=True, text=True, env=bare)
+    assert done.returncode == 0 and done.stdout == "cube.asset/mesh\n", done.stderr
+    done = subprocess.run([sys.executable, "-m", "gdtool", "render-dataset", cube, "--size", "32", "--domains", "normal", "-o", "views"],
+                          capture_output=True, text=True, env={**bare, "HOME": "/nowhere", "TMPDIR": "/nowhere"})
+    assert done.returncode == 0, done.stderr
+
+
+def test_too_little_memory_exits_5(tmp_path, cube):
+    """A limit that Python and numpy fit in, but not a picture of 4096² in doubles."""
+    limit = 1_500 * 2**20
+    command = [sys.executable, "-m", "gdtool", "evaluate", cube, "--reference", cube, "--samples", "10000000", "--no-syncdreamer", "-q"]
+    done = subprocess.run(command, capture_output=True, text=True, preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
+                          env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
+    assert done.returncode == 5 and "Traceback" not in done.stderr and "memory" in done.stderr, done.stderr
