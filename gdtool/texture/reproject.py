@@ -148,7 +148,7 @@ def _slide_off_edges(points: np.ndarray, normals: np.ndarray, source: Source, fa
     away = source.at(face[slanted], barycentric[slanted], source.vertices) - points[slanted]
     # How far beside the nearest place the ray went, were the face a plane.
     beside = np.sqrt(dot(away, away) * np.maximum(1 - cosine[slanted] ** 2, 0))
-    slanted = slanted[beside > 1e-4 * source.extent]
+    slanted = slanted[beside > 2e-5 * source.extent]
     if not len(slanted):
         return
     nearest_face, nearest = source.nearest.closest(points[slanted])
