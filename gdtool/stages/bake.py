@@ -15,7 +15,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from gdtool.core.errors import InputError
+from gdtool.core.errors import InputError, ResourceError
 from gdtool.core.kinds import AssetContent
 from gdtool.core.stage import Inputs, Output, SecondInput, Stage, file_option
 
@@ -46,7 +46,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.texture.target import texel_width, texels_of
 
     with out.step("read"):
-        mesh, matrix = _read_mesh(inputs)
+        mesh, matrix = _read_mesh(inputs, options)
+        _check_memory(inputs, options.size)
     with out.step("frames"):
         target, face_idx = _target_of(mesh)
         _check_overlap(target, inputs, out)
@@ -81,11 +82,31 @@ def _path(inputs: Inputs):
     return getattr(inputs.main, "path", inputs.main)
 
 
-def _read_mesh(inputs: Inputs):
-    """The mesh to bake for, with texture coordinates, and the (4, 4) matrix from its frame to the source's."""
+def _check_memory(inputs: Inputs, size: int) -> None:
+    """Raise ResourceError when the maps will not fit into memory, rather than be killed half-way."""
+    from pathlib import Path
+
+    needed = 220 * size * size  # bytes per texel, measured between 1024 and 2048 on atlases that are 60 % covered
+    try:
+        free = next(int(line.split()[1]) * 1024 for line in Path("/proc/meminfo").read_text().splitlines() if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        return
+    if needed > free:
+        raise ResourceError(inputs.name, f"maps of {size} texels need about {needed / 2**30:.0f} GB of memory, {free / 2**30:.0f} GB are free", "lower --size")
+
+
+def _read_mesh(inputs: Inputs, options: Options):
+    """The mesh to bake for, in the normalised frame and with texture coordinates, and the (4, 4) matrix to its source's frame.
+
+    A file may be in either frame: one that fills the unit box is taken to be normalised, like the surface it is baked
+    from; another one to be in the source's frame.
+    """
+    import dataclasses
+
     import numpy as np
 
     from gdtool.folders.mesh import QuadMesh, read_mesh, read_obj
+    from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
 
     main = inputs.main
     if hasattr(main, "content"):
@@ -93,7 +114,6 @@ def _read_mesh(inputs: Inputs):
     elif isinstance(main, str):
         raise InputError(main, "has no texture coordinates of its own to bake into", "run gdtool remesh and gdtool unwrap first")
     else:
-        matrix = np.eye(4)
         if main.suffix.lower() == ".obj":
             mesh = read_obj(main)
         else:
@@ -105,6 +125,13 @@ def _read_mesh(inputs: Inputs):
             mesh = QuadMesh(scene.vertices, faces, uv, None if uv is None else faces)
     if mesh.uv is None:
         raise InputError(_path(inputs), "has no texture coordinates", "run gdtool unwrap")
+    if not hasattr(main, "content"):
+        own = unit_box(mesh.vertices)
+        surface = inputs.second["surface"] if options.model is None else None
+        matrix = np.array(surface.content.source_from_world).reshape(4, 4) if surface is not None else own
+        normalised = np.abs(own[:3, 3]).max() < 0.02 and abs(own[0, 0] - 1) < 0.05
+        if surface is None or not normalised:
+            mesh = dataclasses.replace(mesh, vertices=transform_points(invert_similarity(matrix), mesh.vertices))
     if np.abs(mesh.uv).max() > 64:
         raise InputError(_path(inputs), f"has texture coordinates as large as {np.abs(mesh.uv).max():g}", "run gdtool unwrap")
     return mesh, matrix
@@ -121,6 +148,7 @@ def _read_origin(inputs: Inputs, options: Options, matrix, width: float, out: Ou
     if options.model is None and surface is not None:
         from gdtool.folders.surface import read_surface
         from gdtool.folders.views import read_views
+        from gdtool.texture.origin import material_field
 
         read = None
         if not options.project_views:
@@ -132,7 +160,9 @@ def _read_origin(inputs: Inputs, options: Options, matrix, width: float, out: Ou
             for domain in ("albedo", "roughness", "metallic", "normal"):
                 if domain not in read.images:
                     out.skip(f"{domain} views", "the views do not hold it: the surface's vertices serve")
-        return from_surface(read_surface(surface), read if read is not None and read.images else None)
+        known = surface.content.field and not (read and {"albedo", "roughness", "metallic"} <= set(read.images))
+        field = material_field(surface.file("field.safetensors"), out.device) if known else None
+        return from_surface(read_surface(surface), read if read is not None and read.images else None, field)
     named = options.model
     if named is None and hasattr(inputs.main, "content"):
         named = find_source(inputs.main)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -32,22 +34,64 @@ class Origin:
     double_sided: bool = False
 
 
-def from_surface(surface: Surface, views: Views | None) -> Origin:
-    """A surface; views give material and normals where they see it well, its vertices elsewhere."""
+def material_field(path: Path, device: str = "cpu") -> Callable[[np.ndarray], dict[str, np.ndarray]]:
+    """The material network of a surface's field.safetensors: points (n, 3) to albedo (n, 3), roughness (n,), metallic (n,).
+
+    Raises InputError for a file that is damaged or holds another network.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    from gdtool.core.errors import InputError
+    from gdtool.fields.networks import MaterialNetwork
+    from gdtool.fields.paper import network_materials
+
+    network = MaterialNetwork()
+    try:
+        tensors = load_file(str(path))
+        network.load_state_dict({name.removeprefix("material."): value for name, value in tensors.items() if name.startswith("material.")})
+    except (SafetensorError, RuntimeError, OSError) as error:
+        raise InputError(path, f"is not the material field that gdtool writes ({str(error).splitlines()[0]})", "run gdtool reconstruct again") from None
+    network = network.to(device).eval()
+
+    def at(points: np.ndarray) -> dict[str, np.ndarray]:
+        out = network_materials(network, points, device)
+        return {name: value if name == "albedo" else value[:, 0] for name, value in out.items()}
+
+    return at
+
+
+def from_surface(surface: Surface, views: Views | None, field: Callable[[np.ndarray], dict[str, np.ndarray]] | None = None) -> Origin:
+    """A surface; views give material and normals where they see it well, its vertices elsewhere.
+
+    field (material_field) takes the vertices' place for the materials that no view shows.
+    """
     source = Source(surface.vertices, surface.faces)
     normals = surface.normals if surface.normals is not None else vertex_normals(surface.vertices, surface.faces)
     attributes = {"albedo": surface.albedo, "roughness": surface.roughness, "metallic": surface.metallic}
     lookup = vertex_lookup(source, attributes, normals.astype(np.float32))
-    if views is None:
-        return Origin(source, lookup, normals, "vertices")
-    images = dict(views.images)
+    images = dict(views.images) if views is not None else {}
+    label = "vertices"
+    if field is not None:
+        shown = [name for name in ("albedo", "roughness", "metallic") if name not in images]
+        if shown:
+            lookup, label = _with_field(lookup, source, field, shown), "field: " + " ".join(shown)
     if "normal" in images and not _views_are_finer(views, source):
         del images["normal"]
     if not images:
-        return Origin(source, lookup, normals, "vertices")
+        return Origin(source, lookup, normals, label)
     sights = [sight_of(camera, source.caster, mask) for camera, mask in zip(views.cameras, views.mask, strict=True)]
     lookup, domains = with_views(lookup, source, ViewsOfSource(sights, images, views.mask))
-    return Origin(source, lookup, normals, "views: " + " ".join(domains))
+    label = ("" if label == "vertices" else label + ", ") + "views: " + " ".join(domains)
+    return Origin(source, lookup, normals, label)
+
+
+def _with_field(lookup: Lookup, source: Source, field: Callable[[np.ndarray], dict[str, np.ndarray]], names: list[str]) -> Lookup:
+    def looked(places: Places) -> dict[str, np.ndarray]:
+        read = field(source.at(places.face_idx, places.barycentric, source.vertices))
+        return {**lookup(places), **{name: read[name] for name in names}}
+
+    return looked
 
 
 def _views_are_finer(views: Views, source: Source) -> bool:

@@ -123,6 +123,51 @@ def test_bakes_a_textured_model_that_was_remeshed(gdtool, chain, tmp_path):
     assert open_folder(tmp_path / "second").content.report["materials_from"] == "model"
 
 
+def test_a_mesh_file_in_either_frame_finds_the_surface(gdtool, tmp_path):
+    from gdtool.assets.load import load_scene
+
+    make_chain(tmp_path / "ring.asset", with_views=False)
+    manifest = json.loads((tmp_path / "ring.asset/surface/manifest.json").read_text())
+    manifest["content"]["source_from_world"] = [100.0, 0, 0, 7, 0, 100, 0, 0, 0, 0, 100, 0, 0, 0, 0, 1]
+    (tmp_path / "ring.asset/surface/manifest.json").write_text(json.dumps(manifest))
+    mesh = torus_atlas()
+    write_obj(tmp_path / "normalised.obj", mesh)
+    write_obj(tmp_path / "source.obj", QuadMesh(mesh.vertices * 100 + (7, 0, 0), mesh.faces, mesh.uv, mesh.face_uvs))
+    maps = []
+    for name in ("normalised", "source"):
+        done = gdtool("bake", f"{name}.obj", "--surface", "ring.asset/surface", *FAST, "--no-ao", "-o", name)
+        assert done.returncode == 0, done.stderr
+        maps.append(read_image(tmp_path / name / "base_color.png").astype(int))
+        assert np.abs(load_scene(tmp_path / name / "asset.glb").vertices).max() < 0.6
+    assert np.abs(maps[0] - maps[1]).max() <= 1
+
+
+def test_maps_that_do_not_fit_are_refused_with_the_figure(gdtool, chain, monkeypatch):
+    from gdtool.core.errors import ResourceError
+    from gdtool.core.stage import Inputs
+    from gdtool.stages.bake import _check_memory
+
+    monkeypatch.setattr(Path, "read_text", lambda self, *_: "MemTotal: 9 kB\nMemAvailable:   1048576 kB\n")
+    _check_memory(Inputs(chain, "ring"), 2048)
+    with pytest.raises(ResourceError, match=r"4096 texels need about 3 GB of memory, 1 GB are free; lower --size"):
+        _check_memory(Inputs(chain, "ring"), 4096)
+
+
+def test_broken_faces_do_not_stop_it(gdtool, chain, tmp_path):
+    mesh = torus_atlas()
+    faces, uvs = mesh.faces.copy(), mesh.face_uvs.copy()
+    faces[3, 1] = faces[3, 0]  # two corners in one place
+    faces[5, :3] = faces[5, 0]  # and three
+    uvs[7] = uvs[7, 0]  # no area in the map
+    faces[9], uvs[9] = faces[8], uvs[8]  # twice the same
+    faces[11], uvs[11] = faces[11][[0, 3, 2, 1]], uvs[11][[0, 3, 2, 1]]  # inside out
+    write_atlas(tmp_path / "atlas", {"source": chain.parent / "surface"}, QuadMesh(mesh.vertices, faces, mesh.uv, uvs))
+    done = gdtool("bake", "atlas", *FAST, "-o", "out")
+    assert done.returncode == 0, done.stderr
+    assert gdtool("validate", "out").returncode == 0
+    assert rendered_albedo(tmp_path / "out", chain) > 25
+
+
 @pytest.mark.parametrize("fault, code, message", [
     ("no uv", 3, "has no texture coordinates; run gdtool unwrap"),
     ("no surface", 3, "has no surface to bake from along its provenance chain; name one with --surface or --model"),
