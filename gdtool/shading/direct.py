@@ -56,7 +56,6 @@ class DirectLight:
         self.pool = (*(tensor(directions[:, i]) for i in range(3)), tensor(density), tensor(radiance))
         self.pattern = tuple(tensor(x) for x in sobol(POOL, 3, seed + 1).T)
         self.image, self.density = tensor(environment.image.reshape(-1, 3)), tensor(environment.pdf.reshape(-1))
-        self.calls = 0
 
     def color(self, exposure: float = 1.0) -> Callable[[Points], dict[str, np.ndarray]]:
         """The shading that Renderer.buffers takes for a color image."""
@@ -65,11 +64,16 @@ class DirectLight:
     def radiance(self, points: Points) -> np.ndarray:
         """(n, 3) linear radiance toward the eye, emission included."""
         out = np.empty((len(points), 3), np.float32)
-        k = max(1, self.samples // 4) if points.extra else self.samples
+        from gdtool.shading.render import BASE
+
+        extra = len(points) > 0 and int(points.sample[0]) >= BASE
+        k = max(1, self.samples // 4) if extra else self.samples
         step = max(1, PAIRS // k)
-        self.calls += 1
-        rng = np.random.default_rng([self.seed, self.calls])
-        runs = rng.integers(0, POOL // k, (2, len(points)))
+        # The samples of a pixel take neighbouring runs of the pool, which together are one larger stratified set.
+        together = int(points.sample.max(initial=0)) - BASE + 1 if extra else BASE
+        block = min(1 << max(0, together - 1).bit_length(), POOL // k)
+        within = (points.sample - BASE if extra else points.sample) % block
+        runs = np.stack([_scrambled(points.pixel, self.seed * 4 + 2 * extra + which) % (POOL // k // block) * block + within for which in (0, 1)])
 
         def shade(start: int) -> tuple[int, int]:
             part = slice(start, start + step)
@@ -127,6 +131,15 @@ class DirectLight:
         return sums, len(flat), above.numel() - len(flat)
 
 
+def _scrambled(index: np.ndarray, seed: int) -> np.ndarray:
+    """Well-mixed non-negative integers from (n,) indices: the finaliser of SplitMix64 (Steele et al. 2014)."""
+    with np.errstate(over="ignore"):
+        x = index.astype(np.uint64) + np.uint64((seed * 0x9E3779B97F4A7C15) % 2**64)
+        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        return ((x ^ (x >> np.uint64(31))) >> np.uint64(1)).astype(np.int64)
+
+
 class _Surface:
     """Reflection of n points: evaluated and sampled for k directions each, vectors as three (n, k) tensors."""
 
@@ -143,7 +156,7 @@ class _Surface:
         normal, view, self.geometric_rows = tensor(values["normal"]), tensor(points.view), tensor(values["geometric_normal"])
         self.albedo, self.metallic = tensor(values["albedo"]), tensor(values["metallic"])
         roughness = tensor(values["roughness"])
-        self.f0 = f0_of(self.albedo, self.metallic, 0.04)
+        self.f0 = f0_of(self.albedo, self.metallic, tensor(values["f0"])[:, None])
         self.roughness, self.alpha = roughness[:, None], alpha_of(roughness)[:, None]
         self.normal, self.view, self.geometric = ([c[:, None] for c in v.unbind(1)] for v in (normal, view, self.geometric_rows))
         self.n_v_exact = (normal * view).sum(1)[:, None]

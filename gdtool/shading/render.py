@@ -42,15 +42,16 @@ def pixel_pattern(count: int) -> np.ndarray:
 
 @dataclass
 class Points:
-    """Seen points, one a sample: pixel (n,) flat index, position (n, 3), view (n, 3) unit toward the eye, and the
-    attributes of SurfaceLookup."""
+    """Seen points, one a sample: pixel (n,) flat index, which sample of the pixel (n,), position (n, 3), view (n, 3) unit
+    toward the eye, depth (n,), and the attributes of SurfaceLookup. Samples from BASE on are those of refined pixels:
+    there are more of them, so each needs less light."""
 
     pixel: np.ndarray
+    sample: np.ndarray
     position: np.ndarray
     view: np.ndarray
     depth: np.ndarray
     values: dict[str, np.ndarray]
-    extra: bool = False  # samples of a refined pixel, beyond BASE: there are more of them, so each needs less light
 
     def __len__(self) -> int:
         return len(self.pixel)
@@ -140,9 +141,9 @@ class Renderer:
         low, high = np.floor(pixels.min(0)).astype(int), np.ceil(pixels.max(0)).astype(int)
         return (max(low[1], 0), min(high[1], camera.height), max(low[0], 0), min(high[0], camera.width))
 
-    def see(self, camera: Camera, pixel: np.ndarray, offsets: np.ndarray, samples: int) -> Points:
-        """Points that samples at pixel (n,) + offsets (n, 2) see; samples per pixel sets the texture footprint."""
-        position = np.stack([pixel % camera.width, pixel // camera.width], 1) + offsets
+    def see(self, camera: Camera, pixel: np.ndarray, sample: np.ndarray, pattern: np.ndarray) -> Points:
+        """Points that samples at pixel (n,) + pattern[sample] see; the pattern's length sets the texture footprint."""
+        position = np.stack([pixel % camera.width, pixel // camera.width], 1) + pattern[sample]
         origins, directions = rays(camera, position)
         along = -(directions @ camera.backward)
         if camera.projection == "orthographic":
@@ -157,10 +158,10 @@ class Renderer:
         distance = distance[hit]
         depth = distance * along[hit] - back
         width = camera.pixel_size if camera.projection == "orthographic" else depth / camera.fx
-        footprint = width / np.sqrt(samples) * np.ones(len(hit))
+        footprint = width / np.sqrt(len(pattern)) * np.ones(len(hit))
         values = self.lookup.attributes(face_idx, barycentric, footprint, directions)
         self.counts.samples += len(pixel)
-        return Points(pixel[hit], origins[hit] + directions * distance[:, None], -directions, depth, values)
+        return Points(pixel[hit], sample[hit], origins[hit] + directions * distance[:, None], -directions, depth, values)
 
     def buffers(self, camera: Camera, samples: int = 16, shade=None) -> dict[str, np.ndarray]:
         """Domain images (h, w[, c]) float32 and "mask": see render_buffers. shade(points) -> {"color": (n, 3)} adds an
@@ -180,8 +181,9 @@ class Renderer:
     def _band(self, camera: Camera, pixel: np.ndarray, samples: int, total: _Sums, shade) -> None:
         base = min(BASE, samples)
         pattern = pixel_pattern(samples)
-        points = self.see(camera, np.repeat(pixel, base), np.tile(pattern[:base], (len(pixel), 1)), base)
-        total.add(points, np.repeat(pixel, base), shade)
+        asked = np.repeat(pixel, base)
+        points = self.see(camera, asked, np.tile(np.arange(base), len(pixel)), pattern[:base])
+        total.add(points, asked, shade)
         if samples <= base or not len(points):
             return
         chosen = total.uneven(pixel, camera.width, camera.height)
@@ -190,9 +192,7 @@ class Renderer:
         for start in range(0, len(chosen), max(1, BAND_SAMPLES // more)):
             part = chosen[start:start + max(1, BAND_SAMPLES // more)]
             again = np.repeat(part, more)
-            points = self.see(camera, again, np.tile(pattern[base:], (len(part), 1)), samples)
-            points.extra = True
-            total.add(points, again, shade)
+            total.add(self.see(camera, again, np.tile(np.arange(base, samples), len(part)), pattern), again, shade)
 
 
 class _Sums:

@@ -120,7 +120,8 @@ class SurfaceLookup:
     def attributes(self, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None,
                    directions: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Attributes at n points: albedo, emissive (n, 3) linear, roughness, metallic, alpha (n,), normal and
-        geometric_normal (n, 3) unit, unlit (n,) bool; float32.
+        geometric_normal (n, 3) unit, f0 (n,) of the dielectric part at normal incidence (KHR_materials_ior, _specular),
+        unlit (n,) bool; float32.
 
         footprint (n,): width in world units that a point stands for; picks the texture level. directions (n, 3): rays
         that see the points; normals are then turned to the seen side, as glTF asks for double-sided materials (and as
@@ -130,7 +131,7 @@ class SurfaceLookup:
         footprint = None if footprint is None else np.broadcast_to(footprint, (n,))
         albedo, emissive = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
         roughness, metallic = np.empty(n, np.float32), np.empty(n, np.float32)
-        alpha, unlit = np.ones(n, np.float32), np.zeros(n, bool)
+        alpha, unlit, f0 = np.ones(n, np.float32), np.zeros(n, bool), np.empty(n, np.float32)
         vertex_normal = self.shading_normals(face_idx, barycentric)
         normal = vertex_normal.copy()
         owner = scene.material_idx[face_idx]
@@ -154,6 +155,7 @@ class SurfaceLookup:
             texel = self._read(material.emissive_texture, *here) if any(material.emissive) else None
             emissive[at] = np.asarray(material.emissive, np.float32) * (texel[:, :3] if texel is not None else 1.0)
             unlit[at] = material.unlit
+            f0[at] = min(((material.ior - 1) / (material.ior + 1)) ** 2 * material.specular, 1.0)
             texel = self._read(material.normal_texture, *here)
             if texel is not None and texel.shape[1] >= 3:
                 tangent = self._tangent(material.normal_texture, *here[:2])
@@ -163,7 +165,7 @@ class SurfaceLookup:
             geometric = np.where((geometric * directions).sum(1, keepdims=True) > 0, -geometric, geometric)
             normal = np.where((vertex_normal * geometric).sum(1, keepdims=True) < 0, -normal, normal)
         return {"albedo": np.clip(albedo, 0, 1), "roughness": np.clip(roughness, 0, 1), "metallic": np.clip(metallic, 0, 1),
-                "alpha": np.clip(alpha, 0, 1), "emissive": np.maximum(emissive, 0), "unlit": unlit,
+                "alpha": np.clip(alpha, 0, 1), "emissive": np.maximum(emissive, 0), "unlit": unlit, "f0": f0,
                 "normal": normal.astype(np.float32), "geometric_normal": geometric.astype(np.float32)}
 
 
