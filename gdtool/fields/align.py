@@ -47,7 +47,7 @@ def _matches(sights: list[Sight], reach: float, stride: int):
         for j, second in enumerate(sights):
             if i == j or second.planes is None:
                 continue
-            distance, weight, normal = tangent_distance(second, points)
+            distance, weight, normal, _ = tangent_distance(second, points)
             same = (np.abs(distance) < reach) & (weight > 0.1) & ((normal * normals).sum(1) > 0.8)
             if same.any():
                 yield _Match(i, j, points[same], distance[same], np.minimum(weight, own)[same], normal[same],

@@ -9,39 +9,43 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.cameras import project
-from gdtool.fields.sights import WEAK, Sight, free_distance, hull_distance, pixel_footprint
+from gdtool.fields.sights import WEAK, Sight, hull_distance, pixel_footprint, tangent_distance
 from gdtool.geometry.grids import Grid, band_cells, dilate, fine_points, grid_over
 
 COARSE = 2  # fine steps a coarse step
+UNSEEN, ROUGHLY, SMOOTHLY = 0, 1, 2  # how a sample of the grid is known
 _CHUNK = 400_000
 
 
 def combined_distance(sights: list[Sight], points: np.ndarray, step: float, limit: float, noise: float = 0.0,
                       outvoted: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distance (n,) float32 of points (n, 3) by all views, clipped to +-limit, and whether it is measured (n,) bool.
+    """Signed distance (n,) float32 of points (n, 3) by all views, clipped to +-limit, and how it was measured (n,) uint8.
 
     Outside where any view sees free space. The magnitude is that of the nearest surface among the views that agree
     with the sign; estimates within about a third of a step of it are averaged by their weights. With noise (world
     units by which the views disagree) the mean of all views that see the surface decides instead. The silhouettes
-    bound the distance from below. A distance is measured when a view sees the surface there, or when the silhouettes
-    of most views end there (flat tops and bottoms). outvoted: how many silhouettes may miss a point of the object.
+    bound the distance from below. Measured SMOOTHLY where a view sees one smooth surface, or where the silhouettes of
+    most views end (flat tops and bottoms); ROUGHLY where only a pixel at an edge tells; else UNSEEN. outvoted: how many
+    silhouettes may miss a point of the object.
     """
-    out, measured = np.empty(len(points), np.float32), np.zeros(len(points), bool)
+    out, measured = np.empty(len(points), np.float32), np.zeros(len(points), np.uint8)
     deep = [s for s in sights if s.planes is not None]
     for start in range(0, len(points), _CHUNK):
         part = points[start:start + _CHUNK]
         hull = np.stack([hull_distance(sight, part) for sight in sights]).astype(np.float32)
         ending = (np.abs(hull) < step).sum(0)
         value = _vote(hull, outvoted)
-        seen = 2 * ending > len(sights)
+        seen = np.where(2 * ending > len(sights), SMOOTHLY, UNSEEN)
         if deep:
-            pairs = [free_distance(sight, part) for sight in deep]
-            free = np.clip(np.stack([v for v, _ in pairs]), -limit, limit).astype(np.float32)
-            weight = np.stack([w for _, w in pairs]).astype(np.float32)
+            found = [tangent_distance(sight, part) for sight in deep]
+            free = np.clip(np.stack([f[0] for f in found]), -limit, limit).astype(np.float32)
+            weight = np.stack([f[1] for f in found]).astype(np.float32)
+            smooth = np.stack([f[3] for f in found])
             fused = _mean_surface(free, weight, limit) if noise else _nearest_surface(free, weight, step / 3, limit)
             # Noisy views have noisy masks: a silhouette cuts only what is more than a pixel or so beside it.
             value = np.maximum(value - (1.5 * step if noise else 0.0), fused)
-            seen |= ((np.abs(free - value) < step + noise) & (weight > WEAK)).any(0)
+            close = (np.abs(free - value) < step + noise) & (weight > WEAK)
+            seen = np.maximum(seen, np.where((close & smooth).any(0), SMOOTHLY, np.where(close.any(0), ROUGHLY, UNSEEN)))
         out[start:start + _CHUNK] = np.clip(value, -limit, limit)
         measured[start:start + _CHUNK] = seen
     return out, measured
@@ -118,7 +122,7 @@ def hull_bounds(sights: list[Sight], outvoted: int = 0, reach: float = 0.75, sam
 
 
 def carve(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 0) -> tuple[Grid, np.ndarray, np.ndarray]:
-    """Grid, its signed distances (a, b, c) float32 and where they are measured (a, b, c) bool.
+    """Grid, its signed distances (a, b, c) float32 and how each is known (a, b, c) uint8.
 
     Exact in a band around the surface and +-limit (3 steps, more with noise) elsewhere.
     """
@@ -138,21 +142,23 @@ def carve(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 
     fine = fine_points(dilate(band_cells(coarse < 0, touched), int(round(noise / step))), COARSE)
     values = np.repeat(np.repeat(np.repeat(np.where(coarse < 0, -limit, limit), COARSE, 0), COARSE, 1), COARSE, 2)
     values = np.ascontiguousarray(values[:grid.shape[0], :grid.shape[1], :grid.shape[2]], np.float32)
-    measured = np.zeros(grid.shape, bool)
+    measured = np.zeros(grid.shape, np.uint8)
     values[fine], measured[fine] = combined_distance(sights, grid.points(np.argwhere(fine)), step, limit, noise, outvoted)
     return grid, values, measured
 
 
-def smooth_unseen(values: np.ndarray, measured: np.ndarray, radius: float, rounds: int = 3) -> np.ndarray:
-    """Signed distances with the unmeasured part smoothed: fins and ridges left by the edges of what views see go.
+def smooth_unseen(values: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Signed distances with the unseen part smoothed: fins and ridges left by the edges of what views see go.
 
-    radius in steps: the Gaussian's sigma. Measured samples and their neighbours keep their values.
+    What only edge pixels tell is smoothed by one step, since pixels decide it at random; smooth surfaces stay.
     """
     from scipy.ndimage import gaussian_filter
 
-    held = gaussian_filter(measured.astype(np.float32), 1.0, truncate=2.0)
-    loose = np.clip(1.0 - 4.0 * held, 0.0, 1.0)
-    out = values
-    for _ in range(rounds):
-        out = out + loose * (gaussian_filter(out, radius, mode="nearest", truncate=2.5) - out)
+    def loose(known: np.ndarray) -> np.ndarray:
+        return np.clip(1.0 - 4.0 * gaussian_filter(known.astype(np.float32), 1.0, truncate=2.0), 0.0, 1.0)
+
+    out = values + loose(measured == SMOOTHLY) * (gaussian_filter(values, 1.0, mode="nearest", truncate=2.5) - values)
+    unseen = loose(measured > UNSEEN)
+    for _ in range(3):
+        out = out + unseen * (gaussian_filter(out, 1.5, mode="nearest", truncate=2.5) - out)
     return out

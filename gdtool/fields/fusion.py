@@ -43,6 +43,13 @@ def grid_step(cameras: list[Camera], resolution: int) -> float:
     return float(np.clip(0.8 * pixel, 1.0 / MAX_SAMPLES, 1.0 / 64))
 
 
+def depth_for(cameras: list[Camera], mask: np.ndarray, normal: np.ndarray) -> np.ndarray | None:
+    """Depth (k, h, w) from normals and silhouettes alone; None where that is not possible (perspective cameras)."""
+    from gdtool.fields.integrate import depth_from_normals
+
+    return depth_from_normals(cameras, mask, normal, prepare_all(cameras, mask, None, None))
+
+
 def align_depth(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray | None, normal: np.ndarray | None,
                 step: float) -> tuple[list[Sight], float, float]:
     """Prepared views whose surfaces were brought together where they disagree, the disagreement before and after.
@@ -69,7 +76,7 @@ def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: i
     """
     noise = 0.0 if noise < 0.1 * step else min(noise, 2 * step)
     grid, values, measured = carve(sights, step, noise, outvoted)
-    values = smooth_unseen(values, measured, 1.5)
+    values = smooth_unseen(values, measured)
     if noise:
         from scipy.ndimage import gaussian_filter
 

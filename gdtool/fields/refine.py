@@ -7,7 +7,7 @@ import numpy as np
 from gdtool.fields.materials import neighbour_matrix
 from gdtool.fields.sights import WEAK, Sight, hull_distance, tangent_distance
 from gdtool.geometry.grids import components, keep_faces, signed_volume
-from gdtool.geometry.normals import vertex_normals
+from gdtool.geometry.normals import face_normals, vertex_normals
 
 
 def measured_planes(sights: list[Sight], vertices: np.ndarray, normals: np.ndarray, reach: float):
@@ -21,7 +21,7 @@ def measured_planes(sights: list[Sight], vertices: np.ndarray, normals: np.ndarr
     for sight in sights:
         if sight.planes is None:
             continue
-        distance, weight, normal = tangent_distance(sight, vertices)
+        distance, weight, normal, _ = tangent_distance(sight, vertices)
         same = (np.abs(distance) < reach) & (weight > WEAK) & ((normal * normals).sum(1) > 0.5)
         weight = np.where(same, weight, 0.0).astype(np.float32)
         distance = np.where(same, distance, 0.0).astype(np.float32)
@@ -59,7 +59,7 @@ def refine(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: f
         move = conjugate_gradients(apply, right, diagonal, iterations)
         length = np.linalg.norm(move, axis=1, keepdims=True)
         vertices = vertices + move * np.minimum(1.0, step / np.maximum(length, 1e-12))
-    return _inside_silhouettes(vertices, start, sights, 0.25 * step)
+    return _unfold(_inside_silhouettes(vertices, start, sights, 0.25 * step), start, faces)
 
 
 def conjugate_gradients(apply, right: np.ndarray, diagonal: np.ndarray, iterations: int) -> np.ndarray:
@@ -88,6 +88,21 @@ def _inside_silhouettes(vertices: np.ndarray, start: np.ndarray, sights: list[Si
     for sight in sights:
         out = np.maximum(out, hull_distance(sight, vertices) - np.maximum(hull_distance(sight, start), 0))
     return np.where((out > slack)[:, None], start, vertices)
+
+
+def _unfold(vertices: np.ndarray, start: np.ndarray, faces: np.ndarray, rounds: int = 6) -> np.ndarray:
+    """Vertices of faces that turned over on the way from start go back, with their neighbours, until none has."""
+    before, _ = face_normals(start, faces)
+    for _ in range(rounds):
+        after, _ = face_normals(vertices, faces)
+        turned = (before * after).sum(1) < 0
+        if not turned.any():
+            break
+        back = np.zeros(len(vertices), bool)
+        back[faces[turned]] = True
+        back[faces[back[faces].any(1)]] = True
+        vertices = np.where(back[:, None], start, vertices)
+    return vertices
 
 
 def drop_debris(vertices: np.ndarray, faces: np.ndarray, support: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, int]:

@@ -15,6 +15,7 @@ from gdtool.cameras import Camera, project, rays
 
 CURTAIN_REACH = 3  # pixels around an occluding contour in which free space is measured from the contour
 WEAK = 0.01  # weight of a distance that is only a bound
+_ROUGH = 0.3  # what a single pixel's plane counts beside one of four pixels that agree
 _NEIGHBOURS = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
 
 
@@ -204,12 +205,12 @@ def free_distance(sight: Sight, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     The distance is to the tangent planes behind the four pixels around the point, or to the nearest pixel's where
     they belong to different surfaces.
     """
-    value, weight, _ = tangent_distance(sight, points)
+    value, weight, _, _ = tangent_distance(sight, points)
     return value, weight
 
 
-def tangent_distance(sight: Sight, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """free_distance, and the unit normal (n, 3) of the plane it was measured to."""
+def tangent_distance(sight: Sight, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """free_distance, the unit normal (n, 3) of the plane it was measured to, and where the surface there is smooth (n,)."""
     pixels, depth = project(sight.camera, points)
     h, w = sight.mask.shape
     column = np.clip(pixels[:, 0].astype(np.int64), 0, w - 1)
@@ -219,8 +220,8 @@ def tangent_distance(sight: Sight, points: np.ndarray) -> tuple[np.ndarray, np.n
     mixed = bilinear(weighted, pixels)
     single = sight.rough.reshape(-1)[nearest] | (mixed[:, 4] <= 0)
     mixed[single] = weighted.reshape(-1, 5)[nearest[single]]
-    weight = mixed[:, 4]
-    scale = 1.0 / np.maximum(weight, 1e-12)
+    weight = np.where(single, _ROUGH * mixed[:, 4], mixed[:, 4])
+    scale = 1.0 / np.maximum(mixed[:, 4], 1e-12)
     value = (np.einsum("ij,ij->i", mixed[:, :3], points.astype(np.float32)) - mixed[:, 3]) * scale
     curtain = sight.curtain.reshape(-1)[nearest] * pixel_footprint(sight.camera, depth)
     bounded = (value > curtain) | ((value > 0) & sight.broken.reshape(-1)[nearest])
@@ -228,7 +229,7 @@ def tangent_distance(sight: Sight, points: np.ndarray) -> tuple[np.ndarray, np.n
     weight = np.where(bounded, np.minimum(weight, WEAK), weight)
     inside = (pixels[:, 0] >= 0) & (pixels[:, 0] < w) & (pixels[:, 1] >= 0) & (pixels[:, 1] < h)
     known = (weight > 0) & inside & (depth > 0)
-    return np.where(known, value, -np.inf), np.where(known, weight, 0.0), mixed[:, :3] * scale[:, None]
+    return np.where(known, value, -np.inf), np.where(known, weight, 0.0), mixed[:, :3] * scale[:, None], known & ~single & ~bounded
 
 
 def bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:

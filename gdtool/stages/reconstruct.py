@@ -53,9 +53,10 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     step = grid_step(views.cameras, options.resolution)
     with out.step("align"):
-        sights, before, noise = align_depth(views.cameras, views.mask, views.images.get("depth"), views.images.get("normal"), step)
+        depth = _depth(views, out)
+        sights, before, noise = align_depth(views.cameras, views.mask, depth, views.images.get("normal"), step)
         outvoted = silhouettes_outvoted(sights)
-        if noise == before and "depth" in views.images:
+        if noise == before and depth is not None:
             out.skip("alignment of depth", f"the views agree to {noise / step:.3f} of a grid step")
         if outvoted:
             out.warn(f"the silhouettes contradict one another: up to {outvoted} of {len(sights)} are outvoted at a point")
@@ -118,6 +119,19 @@ def _use_fit(fit, vertices, views, look, options: Options, out: Output) -> None:
     if "color" in views.images:
         look.light = light_record(fit)
     save_field(out.path("field.safetensors"), fit)
+
+
+def _depth(views, out: Output):
+    """Depth views (k, h, w); without them, what the normals and silhouettes give; None without either."""
+    from gdtool.fields.fusion import depth_for
+
+    if "depth" in views.images or "normal" not in views.images:
+        return views.images.get("depth")
+    with out.step("integrate normals"):
+        depth = depth_for(views.cameras, views.mask, views.images["normal"])
+    if depth is None:
+        out.skip("integration of normals", "cameras are perspective; the silhouettes alone give the shape")
+    return depth
 
 
 def _check_masks(path, views, out: Output) -> None:
