@@ -3,6 +3,7 @@
     python benchmarks/pipeline.py                              two procedural objects; writes docs/benchmarks/pipeline.*
     python benchmarks/pipeline.py --seeds 5 --models DIR       more of them, and models of your own
     python benchmarks/pipeline.py --ways model --qualities default -o /tmp/report
+    python benchmarks/pipeline.py --ways image --model MY_MODEL       another model than the bundled one
 
 The procedural objects come from seeds that the bundled model is not trained on. The truth is the model itself; for the
 image to asset way the image is a picture of it, from the front at a random elevation, as photographs are. Evaluation is
@@ -40,12 +41,12 @@ FIGURES = (("surface_distance", "distance, 1e-3", 1e3), ("seen_distance", "seen,
            ("metallic_error", "metallic", 1), ("normal_degrees", "normal °", 1))
 
 
-def walk(way: str, quality: str, source: str, truth: str, folder: Path, record: dict) -> None:
+def walk(way: str, quality: str, source: str, truth: str, model: list[str], folder: Path, record: dict) -> None:
     """Take one source through all stages of a way; `record` gets each stage's cost and error as they come. Raises Failed."""
     options, place, whole = QUALITIES[quality], source, 0.0
     for stage in WAYS[way]:
         target = folder / stage
-        cost = gdtool(stage, place, "-o", target, "--quiet", *options.get(stage, ()))
+        cost = gdtool(stage, place, "-o", target, "--quiet", *options.get(stage, ()), *(model if stage == "sample-views" else ()))
         place, whole = str(target), whole + cost.seconds
         record[stage] = {"seconds": cost.seconds, "peak_mb": cost.peak_mb, **errors(stage, way, target, truth, folder)}
         say(f"    {stage:<15}{cost.seconds:8.1f} s {cost.peak_mb:7.0f} MB  " +
@@ -79,7 +80,7 @@ def picture_of(truth: str, folder: Path) -> Path:
     return views / "condition" / "000.png"
 
 
-def measure(ways: list[str], qualities: list[str], sources: list[str], publish) -> list[dict]:
+def measure(ways: list[str], qualities: list[str], sources: list[str], model: list[str], publish) -> list[dict]:
     """One record per way, quality and source; publish(records) after each."""
     records: list[dict] = []
     for truth in sources:
@@ -91,7 +92,7 @@ def measure(ways: list[str], qualities: list[str], sources: list[str], publish) 
                 with tempfile.TemporaryDirectory() as folder:
                     try:
                         source = str(picture_of(truth, Path(folder))) if way == "image" else truth
-                        walk(way, quality, source, truth, Path(folder), stages)
+                        walk(way, quality, source, truth, model, Path(folder), stages)
                     except Failed as error:
                         record["failed"] = str(error)
                         say(f"    failed: {error}")
@@ -172,6 +173,7 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--seeds", type=int, default=2, help="number of procedural objects (default 2)")
     parser.add_argument("--models", type=Path, action="append", default=[], metavar="DIR", help="also every model in this folder")
+    parser.add_argument("--model", type=Path, metavar="DIR", help="model folder for sample-views (default the bundled one)")
     parser.add_argument("--ways", default=",".join(WAYS), help="which of model,image (default both)")
     parser.add_argument("--qualities", default=",".join(QUALITIES), help="which of fast,default,fine (default all)")
     parser.add_argument("-o", "--output", type=Path, default=Path(__file__).parents[1] / "docs" / "benchmarks", help="folder of the report")
@@ -194,7 +196,7 @@ def main() -> None:
         (given.output / "pipeline.json").write_text(json.dumps({"machine": machine(), "records": records}, indent=1) + "\n")
         (given.output / "pipeline.md").write_text(markdown(records))
 
-    records = measure(given.ways, given.qualities, sources, publish)
+    records = measure(given.ways, given.qualities, sources, ["--model", str(given.model)] if given.model else [], publish)
     plot(records, given.output / "pipeline.png")
     say(f"{given.output / 'pipeline.md'}")
 
