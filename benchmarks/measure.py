@@ -72,6 +72,12 @@ def machine() -> str:
     return f"{model}, {len(os.sched_getaffinity(0))} cores visible"
 
 
+def busy() -> str:
+    """A sentence for the report when the machine had other work as the benchmark began, else nothing."""
+    load, cores = os.getloadavg()[0], len(os.sched_getaffinity(0))
+    return f"Other work ran meanwhile (load {load:.1f} on {cores} cores as it began): the times are upper bounds." if load > 0.6 * cores else ""
+
+
 def say(text: str) -> None:
     """Progress, on stderr."""
     print(text, file=sys.stderr, flush=True)

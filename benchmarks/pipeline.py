@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 from statistics import median
 
-from measure import Failed, evaluate, gdtool, machine, number, say, table
+from measure import Failed, busy, evaluate, gdtool, machine, number, say, table
 
 FIRST_SEED = 3_000_000
 MODEL_SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
@@ -116,12 +116,12 @@ def summary(records: list[dict]) -> list[dict]:
     return rows
 
 
-def markdown(records: list[dict]) -> str:
+def markdown(records: list[dict], remark: str = "") -> str:
     """The report that stands in docs/benchmarks/pipeline.md."""
     rows = summary(records)
     text = ["# Pipeline: time against error", "", f"By `make bench` on {machine()}. Medians over the sources; peak memory is the largest process's.",
             "Distance is the mean of both directions to the true surface, largest extent 1; seen: over what the six views see;",
-            "pictures are compared inside the object. The whole's errors are the baked asset's. `docs/metrics.md` defines each figure.", ""]
+            "pictures are compared inside the object. The whole's errors are the baked asset's. `docs/metrics.md` defines each figure.", remark, ""]
     for way in WAYS:
         for quality in QUALITIES:
             group = [row for row in rows if (row["way"], row["quality"]) == (way, quality)]
@@ -192,9 +192,11 @@ def main() -> None:
     sources += [str(path) for folder in given.models for path in sorted(folder.rglob("*")) if path.suffix.lower() in MODEL_SUFFIXES]
     given.output.mkdir(parents=True, exist_ok=True)
 
+    remark = busy()
+
     def publish(records: list[dict]) -> None:
-        (given.output / "pipeline.json").write_text(json.dumps({"machine": machine(), "records": records}, indent=1) + "\n")
-        (given.output / "pipeline.md").write_text(markdown(records))
+        (given.output / "pipeline.json").write_text(json.dumps({"machine": machine(), "remark": remark, "records": records}, indent=1) + "\n")
+        (given.output / "pipeline.md").write_text(markdown(records, remark))
 
     records = measure(given.ways, given.qualities, sources, ["--model", str(given.model)] if given.model else [], publish)
     plot(records, given.output / "pipeline.png")

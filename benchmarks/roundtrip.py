@@ -15,7 +15,7 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from measure import Failed, evaluate, gdtool, machine, number, say, table
+from measure import Failed, busy, evaluate, gdtool, machine, number, say, table
 
 STAGES = (("render-dataset", ()), ("reconstruct", ()), ("remesh", ("--faces", "20000")), ("unwrap", ()), ("bake", ("--size", "2048")), ("relight", ()))
 SEEN_LIMIT, WHOLE_LIMIT, ALBEDO_LIMIT = 0.004, 0.015, 22.0
@@ -65,7 +65,7 @@ def passes(record: dict) -> bool:
             and asset.get("albedo_psnr_masked", 0) >= ALBEDO_LIMIT and bool(asset.get("watertight")))
 
 
-def report(records: list[dict]) -> str:
+def report(records: list[dict], remark: str = "") -> str:
     """The table, with the shares that pass."""
     rows = []
     for record in records:
@@ -81,7 +81,7 @@ def report(records: list[dict]) -> str:
     head = ["model", "surface seen", "seen", "whole", "closed", "albedo dB", "roughness", "metallic", "normal °", "quads", "seconds", "MB", "failed"]
     return "\n".join([
         "# Round trip: model to asset, against the model", "",
-        f"By `benchmarks/roundtrip.py` on {machine()}. Distances: mean of both directions, largest extent of the truth 1.", "",
+        f"By `benchmarks/roundtrip.py` on {machine()}. Distances: mean of both directions, largest extent of the truth 1.", remark, "",
         table(head, rows), "",
         f"Of {count} models: {near} within {SEEN_LIMIT} seen and {WHOLE_LIMIT} whole, {closed} closed, {colored} with albedo ≥ {ALBEDO_LIMIT:.0f} dB, "
         f"{sum(map(passes, records))} all of it.", ""])
@@ -95,7 +95,7 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the folders of every model here, to look at")
     parser.add_argument("-o", "--output", type=Path, help="write the table here, besides stdout")
     given = parser.parse_args()
-    records = []
+    records, remark = [], busy()
     for model in models_under(given.places, given.all):
         with tempfile.TemporaryDirectory() as folder:
             place = given.keep / model.stem if given.keep else Path(folder)
@@ -104,8 +104,8 @@ def main() -> None:
         say(f"{records[-1]['model']}: seen {number(asset.get('seen_distance'))}, whole {number(asset.get('surface_distance'))}, albedo "
             f"{number(asset.get('albedo_psnr_masked'))} dB, {records[-1]['seconds']:.0f} s {records[-1].get('failed', '')}")
         if given.output:
-            given.output.write_text(report(records))
-    print(report(records))
+            given.output.write_text(report(records, remark))
+    print(report(records, remark))
 
 
 if __name__ == "__main__":
