@@ -68,11 +68,11 @@ class Phase(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a model is trained; `steps` are optimiser steps, `batch` counts objects per step over all accumulations."""
 
-    batch: int = 8
+    batch: int = 4
     accumulate: int = 1
     steps: int = 4000
-    phases: tuple[Phase, ...] = (Phase(share=0.8, domains=3, views=3), Phase(share=1.0, domains=6, views=4))
-    warmup: int = 100
+    phases: tuple[Phase, ...] = (Phase(share=0.85, domains=3, views=3), Phase(share=1.0, domains=6, views=4))
+    warmup: int = 50
     decay: bool = True  # cosine to a twentieth of the learning rate over the run
     weight_decay: float = 1e-2
     betas: tuple[float, float] = (0.9, 0.999)
@@ -113,7 +113,7 @@ PRESETS: dict[str, tuple[ModelConfig, TrainConfig]] = {
                     condition_skip=False, gradient_checkpointing=True, encoder="clip", encoder_width=768,
                     prediction="epsilon", noise_schedule="scaled_linear", backgrounds=("white", "black", "grey"),
                     pretrained="lambdalabs/sd-image-variations-diffusers"),
-        TrainConfig(batch=512, accumulate=64, steps=50_000, decay=False, class_rate=10.0, ema=0.9999, snr_floor=0.0,
+        TrainConfig(batch=512, accumulate=64, steps=50_000, warmup=100, decay=False, class_rate=10.0, ema=0.9999, snr_floor=0.0,
                     pure_noise=0.0, hue=False, mirror=False,
                     phases=(Phase(share=0.6, domains=1, views=6, learning_rate=1e-4),
                             Phase(share=1.0, domains=6, views=6, learning_rate=5e-5))),

@@ -15,7 +15,7 @@ from gdtool.diffusion.encoding import BACKGROUND, encode
 from gdtool.diffusion.sampling import sample_images
 
 
-def validation_grid(state, objects: Objects, precision: str, steps: int = 6) -> np.ndarray:
+def validation_grid(state, objects: Objects, precision: str, steps: int = 4) -> np.ndarray:
     """Picture (h, w, 3) in [0, 1]: for each object the condition, the true views and the sampled ones, a row per domain.
 
     The averaged weights are what is shown, the encoded images as the network has them (0 is grey).
@@ -67,8 +67,8 @@ One picture to {len(model.views)} orthographic views of {model.image_size} x {mo
 {table}
 | machine | {machine()} |
 
-Weights are the exponential average, stored in half precision. The measured quality is below when it has been measured
-(`python benchmarks/model_quality.py`).
+Weights are the exponential average, stored in half precision. `python benchmarks/model_quality.py --install` measures the
+model on held-out objects, adds the table below and makes it the bundled one.
 
 ## Configuration
 

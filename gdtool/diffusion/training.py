@@ -240,9 +240,9 @@ def run_training(model: Model, objects: Objects, train: TrainConfig, workspace: 
             record = train_step(state, objects, train, seed, minutes, device)
             state.seconds += time.perf_counter() - start
             writer.writerow({k: (f"{v:.6g}" if isinstance(v, float) else v) for k, v in record.items()} | {"seconds": f"{state.seconds:.1f}"})
+            file.flush()
             next(bar, None)
             if state.step % checkpoint_every == 0:
-                file.flush()
                 save_checkpoint(state, workspace, identity)
             if state.step % validate_every == 0:
                 validate(state)
