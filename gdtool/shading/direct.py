@@ -43,19 +43,15 @@ class DirectLight:
     """
 
     def __init__(self, renderer: Renderer, environment: Environment, samples: int, seed: int = 0, brdf: str = "gltf", shadows: bool = True):
-        import torch
-
         self.renderer, self.environment, self.brdf, self.shadows, self.seed = renderer, environment, brdf, shadows, seed
         # Runs start at multiples of their length, a power of two, so that each is a stratified set of its own.
         self.samples = 1 << max(0, round(math.log2(max(1, samples))))
         directions, radiance, density = environment.sample(sobol(POOL, 2, seed))
 
-        def tensor(x):
-            return torch.tensor(np.ascontiguousarray(x), dtype=torch.float32)
-
-        self.pool = (*(tensor(directions[:, i]) for i in range(3)), tensor(density), tensor(radiance))
-        self.pattern = tuple(tensor(x) for x in sobol(POOL, 3, seed + 1).T)
-        self.image, self.density = tensor(environment.image.reshape(-1, 3)), tensor(environment.pdf.reshape(-1))
+        self.pool = tuple(tensor_of(x) for x in (*directions.T, density, radiance))
+        self.pattern = tuple(tensor_of(x) for x in sobol(POOL, 3, seed + 1).T)
+        self.irradiance = IrradianceMap(environment)
+        self.image, self.density = tensor_of(environment.image.reshape(-1, 3)), tensor_of(environment.pdf.reshape(-1))
 
     def color(self, exposure: float = 1.0) -> Callable[[Points], dict[str, np.ndarray]]:
         """The shading that Renderer.buffers takes for a color image."""
@@ -67,13 +63,17 @@ class DirectLight:
         from gdtool.shading.render import BASE
 
         extra = len(points) > 0 and int(points.sample[0]) >= BASE
-        k = max(1, self.samples // 4) if extra else self.samples
+        k = max(min(2, self.samples), self.samples // 4) if extra else self.samples
         step = max(1, PAIRS // k)
-        # The samples of a pixel take neighbouring runs of the pool, which together are one larger stratified set.
+        # The samples of a pixel take neighbouring runs of the pool, which together are one larger stratified set. Which of
+        # them a sample takes is turned by the pixel's own number: a run's place in its block fixes its strata.
         together = int(points.sample.max(initial=0)) - BASE + 1 if extra else BASE
         block = min(1 << max(0, together - 1).bit_length(), POOL // k)
         within = (points.sample - BASE if extra else points.sample) % block
-        runs = np.stack([_scrambled(points.pixel, self.seed * 4 + 2 * extra + which) % (POOL // k // block) * block + within for which in (0, 1)])
+        runs = np.empty((2, len(points)), np.int64)
+        for which in (0, 1):
+            number = _scrambled(points.pixel, self.seed * 4 + 2 * extra + which)
+            runs[which] = (number // block) % (POOL // k // block) * block + (within ^ (number % block))
 
         def shade(start: int) -> tuple[int, int]:
             part = slice(start, start + step)
@@ -104,7 +104,8 @@ class DirectLight:
         direction = surface.sample(*(run_of(u, pattern_run) for u in self.pattern))
         pixel = self._pixel(*direction)
         second = self._gather(points, part, surface, direction, self.image[pixel], self.density[pixel], k)
-        return surface.combine(first[0] + second[0]).numpy(), first[1] + second[1], first[2] + second[2]
+        received = tensor_of(self.irradiance.lookup(points.values["normal"][part]))
+        return surface.combine(first[0] + second[0], received).numpy(), first[1] + second[1], first[2] + second[2]
 
     def _pixel(self, x, y, z):
         """Environment.pixel_of in float32."""
@@ -116,19 +117,55 @@ class DirectLight:
         return row * width + column
 
     def _gather(self, points: Points, part: slice, surface: _Surface, direction, light, p_light, k: int):
-        """The four sums (n, 4, 3) over visible directions, shadow rays cast, and directions that needed none."""
+        """The four sums over visible directions and the diffuse one over all (n, 5, 3), shadow rays cast, and directions
+        that needed none."""
         import torch
 
         terms, p_reflect, above = surface.evaluate(*direction)
-        weight = above / (k * (p_light + p_reflect)).clamp_min(1e-20)
+        everything = 1 / (k * (p_light + p_reflect)).clamp_min(1e-20)
+        weight = above * everything
         flat = above.reshape(-1).nonzero()[:, 0]
         if self.shadows and len(flat):
             owner = (flat // k).numpy()
             origins = surface.lifted(points, part, 2e-4 * self.renderer.extent)[owner]
             rays = torch.stack([c.reshape(-1)[flat] for c in direction], 1).numpy()
             weight.reshape(-1)[flat[torch.from_numpy(self.renderer.occluded(origins, rays))]] = 0.0
-        sums = torch.bmm(torch.stack([term * weight for term in terms], 1), light)
+        sums = torch.bmm(torch.stack([*(term * weight for term in terms), terms[2] * everything], 1), light)
         return sums, len(flat), above.numel() - len(flat)
+
+
+class IrradianceMap:
+    """∫ L max(0, n·l) dl of an environment for normals on a lat-long grid, read bilinearly."""
+
+    def __init__(self, environment: Environment, height: int = 48):
+        small = environment.shrunk(64)
+        # Grid points lie on pixel centres in angle.
+        theta = (np.arange(height) + 0.5) / height * np.pi
+        phi = ((np.arange(2 * height) + 0.5) / (2 * height) - 0.5) * 2 * np.pi
+        ring = np.sin(theta)[:, None]
+        normals = np.stack([ring * np.cos(phi), np.broadcast_to(np.cos(theta)[:, None], (height, 2 * height)), ring * np.sin(phi)], -1)
+        weighted = (small.image * small.solid_angles[:, None, None]).reshape(-1, 3).astype(np.float32)
+        cosine = normals.reshape(-1, 3).astype(np.float32) @ small.directions.reshape(-1, 3).T.astype(np.float32)
+        self.values = (np.maximum(cosine, 0) @ weighted).reshape(height, 2 * height, 3)
+
+    def lookup(self, normals: np.ndarray) -> np.ndarray:
+        """(n, 3) from unit normals (n, 3)."""
+        height, width = self.values.shape[:2]
+        y = np.clip(np.arccos(np.clip(normals[:, 1], -1, 1)) * np.float32(height / np.pi) - 0.5, 0, height - 1)
+        x = (np.arctan2(normals[:, 2], normals[:, 0]) * np.float32(0.5 / np.pi) + np.float32(0.5)) * width - 0.5
+        y0, x0 = np.minimum(y.astype(np.int64), height - 2), np.floor(x).astype(np.int64)
+        fy, fx = (y - y0)[:, None], (x - x0)[:, None]
+        left, right = x0 % width, (x0 + 1) % width
+        upper = self.values[y0, left] * (1 - fx) + self.values[y0, right] * fx
+        lower = self.values[y0 + 1, left] * (1 - fx) + self.values[y0 + 1, right] * fx
+        return (upper * (1 - fy) + lower * fy).astype(np.float32)
+
+
+def tensor_of(x: np.ndarray):
+    """A float32 tensor of an array."""
+    import torch
+
+    return torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)
 
 
 def _scrambled(index: np.ndarray, seed: int) -> np.ndarray:
@@ -144,12 +181,10 @@ class _Surface:
     """Reflection of n points: evaluated and sampled for k directions each, vectors as three (n, k) tensors."""
 
     def __init__(self, points: Points, part: slice, brdf: str):
-        import torch
-
         from gdtool.shading.brdf import alpha_of, f0_of
 
         def tensor(x):
-            return torch.as_tensor(np.ascontiguousarray(x[part]), dtype=torch.float32)
+            return tensor_of(x[part])
 
         values = points.values
         self.brdf = brdf
@@ -230,13 +265,17 @@ class _Surface:
         z = torch.where(glossy, twice * mz - ez, (1 - u).clamp_min(0).sqrt())
         return x * tx + y * bx + z * nx, x * ty + y * by + z * ny, x * tz + y * bz + z * nz
 
-    def combine(self, sums):
-        """(n, 3) radiance from the four sums (n, 4, 3)."""
-        diffuse = self.albedo * (1 - self.metallic)[:, None]
+    def combine(self, sums, irradiance):
+        """(n, 3) radiance from the sums (n, 5, 3) and the unshadowed irradiance (n, 3).
+
+        Diffuse light is the known irradiance times the share of it that the samples found visible: where nothing is in
+        the way that is free of noise, and in full shadow it is 0.
+        """
+        share = sums[:, 2] / sums[:, 4].clamp_min(1e-20)
+        received = irradiance * share if self.brdf == "gltf" else sums[:, 2] * math.pi
+        diffuse = self.albedo * (1 - self.metallic)[:, None] * (received / math.pi)
         if self.brdf == "gltf":
-            diffuse = diffuse * (1 - self.f0) * (sums[:, 2] - sums[:, 3])
-        else:
-            diffuse = diffuse * sums[:, 2]
+            diffuse = (1 - self.f0) * (diffuse - self.albedo * (1 - self.metallic)[:, None] * sums[:, 3]).clamp_min(0)
         return self.f0 * sums[:, 0] + (1 - self.f0) * sums[:, 1] + diffuse
 
 

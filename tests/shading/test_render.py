@@ -213,3 +213,17 @@ def test_skipping_even_pixels_changes_nothing_that_counts():
     assert few < 0.8 * 16 * 64 * 64
     assert np.abs(adaptive["albedo"] - full["albedo"])[full["mask"] > 0].mean() < 2e-3
     assert np.abs(adaptive["mask"] - full["mask"]).max() < 0.1
+
+
+def test_light_is_unbiased_at_few_directions():
+    """The mean of many cheap renderings is the expensive one, in the open, in half shadow and on refined pixels."""
+    light = Environment((np.random.default_rng(5).random((16, 32, 3)) ** 8).astype(np.float32) * 5)
+    one = sphere(0.25, 24)
+    scene = Scene(vertices=np.concatenate([one.vertices + (0.2, 0, 0.1), one.vertices - (0.2, 0, 0.1)]), materials=one.materials,
+                  faces=np.concatenate([one.faces, one.faces + len(one.vertices)]), normals=np.concatenate([one.normals] * 2))
+    camera = rig("six", 24)[1]
+    best, mask = render_color(scene, camera, light, samples=16, light_samples=256, seed=50)
+    cheap = np.mean([render_color(scene, camera, light, samples=16, light_samples=8, seed=s)[0] for s in range(12)], 0)
+    inside = mask == 1
+    assert cheap[inside].mean() == pytest.approx(best[inside].mean(), rel=0.01)
+    assert np.abs(cheap - best)[inside].mean() < 0.03 * best[inside].mean()
