@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import msgspec
@@ -81,11 +80,11 @@ def load_model(folder: Path):
 
 def save_model(path_of, config: ModelConfig, tensors: dict[str, torch.Tensor]) -> None:
     """Write config.json and model.safetensors in half precision; path_of maps a name to where it is written."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     Path(path_of("config.json")).write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=1) + b"\n")
     half = {name: tensor.detach().to("cpu", torch.float16).contiguous() for name, tensor in tensors.items()}
-    save_file(half, str(path_of(WEIGHTS)))
+    Path(path_of(WEIGHTS)).write_bytes(save(half))  # save_file would make it readable by its owner only
 
 
 def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
@@ -109,6 +108,3 @@ def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
     unet.load_state_dict(own)
     return sorted(set(own) - set(tensors))
 
-
-def write_json(path: Path, value) -> None:
-    path.write_text(json.dumps(value, indent=1) + "\n")
