@@ -23,6 +23,10 @@ test: venv
 stress: venv
 	$(BIN)/python -m pytest -m slow
 
+# Ten minutes of damaged files for every reader; what breaks one stays as a test.
+fuzz: venv
+	$(BIN)/python -m tests.faults.fuzz 10
+
 bench: venv
 	$(BIN)/python benchmarks/pipeline.py
 

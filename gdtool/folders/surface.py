@@ -76,6 +76,24 @@ def write_surface_ply(path: Path, surface: Surface) -> None:
         file.write(face.tobytes())
 
 
+def _layout(header: list[str]) -> tuple[dict[str, int], np.dtype, np.dtype]:
+    """Counts by element, and the records of vertices and faces. Raises ValueError, IndexError or KeyError."""
+    counts: dict[str, int] = {}
+    fields, element, list_types = [], "", ("", "")
+    for line in header:
+        words = line.split()
+        if words[:1] == ["element"]:
+            element, counts[words[1]] = words[1], int(words[2])
+        elif words[:2] == ["property", "list"] and element == "face":
+            list_types = (words[2], words[3])
+        elif words[:1] == ["property"] and element == "vertex":
+            fields.append((words[2], _PLY_TYPES[words[1]]))
+    if list(counts) != ["vertex", "face"] or min(counts.values()) < 0 or not fields:
+        raise ValueError(counts)
+    face = [("count", _PLY_TYPES[list_types[0]]), ("idx", _PLY_TYPES[list_types[1]], 3)]
+    return counts, np.dtype(fields), np.dtype(face)
+
+
 def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertex records and faces of a binary little-endian PLY of triangles. Raises InputError."""
     content = path.read_bytes()
@@ -83,19 +101,10 @@ def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     header = content[:end].decode("ascii", "replace").split("\n") if end >= 0 else []
     if not header or header[0].strip() != "ply" or "format binary_little_endian 1.0" not in header:
         raise InputError(path, "is not a binary little-endian PLY")
-    counts, fields, element, list_types = {}, [], "", None
-    for line in header:
-        words = line.split()
-        if words[:1] == ["element"]:
-            element, counts[words[1]] = words[1], int(words[2])
-        elif words[:2] == ["property", "list"] and element == "face":
-            list_types = words[2:4]
-        elif words[:1] == ["property"] and element == "vertex" and words[1] in _PLY_TYPES:
-            fields.append((words[2], _PLY_TYPES[words[1]]))
-    if list_types is None or list(counts) != ["vertex", "face"] or any(t not in _PLY_TYPES for t in list_types):
-        raise InputError(path, "needs one vertex element and then one face element with one list")
-    vertex_type = np.dtype(fields)
-    face_type = np.dtype([("count", _PLY_TYPES[list_types[0]]), ("idx", _PLY_TYPES[list_types[1]], 3)])
+    try:
+        counts, vertex_type, face_type = _layout(header)
+    except (ValueError, IndexError, KeyError):  # a word missing, no number, a type or a property twice
+        raise InputError(path, "needs one vertex element of numbers and then one face element with one list") from None
     body = content[end + len(b"end_header\n"):]
     size = counts["vertex"] * vertex_type.itemsize
     if len(body) != size + counts["face"] * face_type.itemsize:

@@ -1,0 +1,225 @@
+"""Readers against damaged files: whatever the bytes, they answer with a value or with an error of ours (`make fuzz`).
+
+    python tests/faults/fuzz.py [MINUTES] [READER ...]
+
+Prints what every reader did, and writes each file that made one do anything else to tests/faults/crashes/, where
+tests/faults/test_fuzz.py reads it again ever after. Each reader runs in a child, which a crash may take with it.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from gdtool.core.errors import GdtoolError
+
+CRASHES = Path(__file__).parent / "crashes"
+SLOW_SECONDS = 20.0  # a file of a few kilobytes that takes longer is a hang
+
+
+def mutated(content: bytes, rng: np.random.Generator) -> bytes:
+    """A few bytes changed, numbers put to their limits, pieces cut, doubled or moved."""
+    out = bytearray(content)
+    for _ in range(int(rng.integers(1, 6))):
+        if not out:
+            break
+        at = int(rng.integers(len(out)))
+        kind = rng.integers(6)
+        if kind == 0:
+            out[at] ^= 1 << int(rng.integers(8))
+        elif kind == 1:
+            out[at] = int(rng.choice([0, 1, 34, 44, 45, 58, 91, 123, 127, 128, 255]))
+        elif kind == 2:
+            out[at:at + 4] = rng.choice([b"\0\0\0\0", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\0\0\xc0\x7f"])
+        elif kind == 3:
+            del out[at:at + int(rng.integers(1, 40))]
+        elif kind == 4:
+            out[at:at] = out[at:at + int(rng.integers(1, 40))]
+        else:
+            del out[at:]
+    return bytes(out)
+
+
+def read_picture(path: Path) -> None:
+    from gdtool.images.io import read_image
+
+    read_image(path)
+
+
+def read_model(path: Path) -> None:
+    from gdtool.assets.load import load_scene
+
+    load_scene(path)
+
+
+def read_quads(path: Path) -> None:
+    from gdtool.folders.mesh import read_obj
+
+    read_obj(path)
+
+
+def read_points(path: Path) -> None:
+    from gdtool.folders.surface import _read_ply
+
+    _read_ply(path)
+
+
+def read_record(path: Path) -> None:
+    from gdtool.core.manifest import decode, read_json
+
+    decode(read_json(path), path)
+
+
+def read_cameras(path: Path) -> None:
+    from gdtool.folders.records import read_cameras
+
+    read_cameras(path)
+
+
+def read_weights(path: Path) -> None:
+    from gdtool.diffusion.weights import read_tensors
+
+    read_tensors(path)
+
+
+def picture_seed(name: str) -> bytes:
+    from gdtool.images.io import write_exr, write_png
+
+    with tempfile.TemporaryDirectory() as folder:
+        image = np.random.default_rng(0).random((9, 7, 4)).astype(np.float32)
+        path = Path(folder, name)
+        write_png(path, image) if name.endswith("png") else write_exr(path, image)
+        return path.read_bytes()
+
+
+def glb_seed() -> bytes:
+    from gdtool.assets.gltf_write import glb_bytes
+    from gdtool.assets.scene import Material, Scene, Texture
+
+    image = np.full((4, 4, 3), 200, np.uint8)
+    return glb_bytes(Scene(np.eye(3), np.array([[0, 1, 2]], np.int32), (Material(base_color_texture=Texture(image, "srgb")),),
+                           uvs=(np.array([[0, 0], [1, 0], [0, 1.0]]),)))
+
+
+def text_seed(kind: str) -> bytes:
+    from gdtool.cameras import rig
+    from gdtool.core.kinds import MeshContent
+    from gdtool.core.manifest import FileEntry, InputEntry, Manifest, encode
+    from gdtool.folders.records import write_cameras
+
+    if kind == "obj":
+        return b"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nf 1/1 2/2 3/3 4/1\nf -1/1 -2/2 -3/3\n"
+    if kind == "json":
+        content = MeshContent(vertices=8, quads=6, triangles=0, watertight=True)
+        return encode(Manifest(kind="mesh", name="x", stage="remesh", content=content, inputs=(InputEntry("source", "../a.obj", "0" * 64),),
+                               files=(FileEntry("mesh.obj", 3, "1" * 64),)))
+    with tempfile.TemporaryDirectory() as folder:
+        write_cameras(Path(folder, "c.json"), rig("six", 8)[:2])
+        return Path(folder, "c.json").read_bytes()
+
+
+def ply_seed() -> bytes:
+    vertex = np.eye(3, dtype="<f4").tobytes()
+    face = b"\3" + np.array([0, 1, 2], "<i4").tobytes()
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    return (header + "element face 1\nproperty list uchar int vertex_indices\nend_header\n").encode() + vertex + face
+
+
+def weights_seed() -> bytes:
+    from safetensors.numpy import save
+
+    return save({"a.weight": np.ones((2, 3), np.float32), "b.bias": np.zeros(4, np.float32)})
+
+
+# Name: file suffix, what reads it, a good file.
+READERS: dict[str, tuple[str, Callable[[Path], None], Callable[[], bytes]]] = {
+    "png": (".png", read_picture, lambda: picture_seed("x.png")),
+    "exr": (".exr", read_picture, lambda: picture_seed("x.exr")),
+    "glb": (".glb", read_model, glb_seed),
+    "obj": (".obj", read_model, lambda: text_seed("obj")),
+    "ply": (".ply", read_model, ply_seed),
+    "quads": (".obj", read_quads, lambda: text_seed("obj")),
+    "surface": (".ply", read_points, ply_seed),
+    "manifest": (".json", read_record, lambda: text_seed("json")),
+    "cameras": (".json", read_cameras, lambda: text_seed("cameras")),
+    "weights": (".safetensors", read_weights, weights_seed),
+}
+
+
+def attempt(name: str, path: Path) -> str:
+    """What a reader did with a file: "read", "refused", or the exception that is a bug of ours."""
+    try:
+        READERS[name][1](path)
+    except GdtoolError:
+        return "refused"
+    except Exception as error:  # the very thing that is looked for
+        return f"{type(error).__name__}: {error}"
+    return "read"
+
+
+def child(name: str, seed: int, seconds: float, rounds: int, folder: str) -> None:
+    """Mutate and read, in this process. The file at work lies in folder, so that the parent finds it after a crash."""
+    rng = np.random.default_rng(seed)
+    suffix, _, make = READERS[name]
+    good = make()
+    path = Path(folder, name + suffix)
+    path.write_bytes(good)
+    assert attempt(name, path) == "read", f"{name}: the good file is not read: {attempt(name, path)}"
+    end, count = time.monotonic() + seconds, {"read": 0, "refused": 0}
+    for _ in range(rounds):
+        if time.monotonic() > end:
+            break
+        path.write_bytes(mutated(good, rng))
+        start = time.monotonic()
+        what = attempt(name, path)
+        if what not in count or time.monotonic() - start > SLOW_SECONDS:
+            print(what if what not in count else f"took {time.monotonic() - start:.0f} s", flush=True)
+            sys.exit(3)
+        count[what] += 1
+    print(f"{count['read']} read, {count['refused']} refused")
+
+
+def fuzz(name: str, seed: int, seconds: float, rounds: int = 10**9) -> tuple[str, bytes | None]:
+    """What became of one child, and the file that broke it or None."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "tests.faults.fuzz", "--child", name, str(seed), str(seconds), str(rounds), folder]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=seconds + 120, cwd=Path(__file__).parents[2])
+            said, code = (done.stdout + done.stderr[-400:]).strip(), done.returncode
+        except subprocess.TimeoutExpired:
+            said, code = "hangs", -1
+        if code == 0:
+            return said, None
+        file = Path(folder, name + READERS[name][0])
+        return f"exit {code}: {said}", file.read_bytes() if file.exists() else b""
+
+
+def main(arguments: list[str]) -> int:
+    minutes = float(arguments[0]) if arguments else 10.0
+    names = arguments[1:] or list(READERS)
+    broken = 0
+    for i, name in enumerate(names):
+        end = time.monotonic() + 60 * minutes / len(names)
+        seed = time.time_ns() + i
+        while time.monotonic() < end:
+            said, file = fuzz(name, seed, end - time.monotonic())
+            print(f"{name}: {said}", flush=True)
+            if file is not None:
+                CRASHES.mkdir(exist_ok=True)
+                (CRASHES / f"{name}-{seed}{READERS[name][0]}").write_bytes(file)
+                broken += 1
+            seed += 1
+    return 1 if broken else 0
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--child"]:
+        child(sys.argv[2], int(sys.argv[3]), float(sys.argv[4]), int(sys.argv[5]), sys.argv[6])
+    else:
+        sys.exit(main(sys.argv[1:]))
