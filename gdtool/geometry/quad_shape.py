@@ -101,7 +101,7 @@ def relax(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: F
 
 
 def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
-           least: float = 0.3, rounds: int = 12) -> np.ndarray:
+           least: float = 0.3, rounds: int = 24) -> np.ndarray:
     """Vertices of folded and needle-like quads moved to the best of a few places near them.
 
     A vertex moves only where the worst scaled Jacobian of its quads, against the surface's normals, gets better. Free
@@ -113,12 +113,14 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
     boundary[edges.ends[edges.count != 2].ravel()] = True
     vertices = vertices.copy()
     normals = _normals_below(vertices, faces, surface)
-    angles = np.arange(8) * (np.pi / 4)
     for turn in range(rounds):
         bad = np.flatnonzero(corner_jacobians(vertices, faces, normals).min(1) < least)
         if not len(bad):
             break
-        loose = turn >= rounds - 4
+        loose = turn >= rounds // 2
+        # Another ring of places each time: steps of the golden angle and of sizes that differ.
+        angles = np.arange(8) * (np.pi / 4) + turn * 2.4
+        near_reach, far_reach = (0.12, 0.35) if turn % 3 == 0 else (0.05, 0.2) if turn % 3 == 1 else (0.25, 0.6)
         for v in np.unique(faces[bad]).tolist():
             held = constraints.curve[v] >= 0
             if (constraints.fixed[v] and not loose) or (boundary[v] and not held):
@@ -131,7 +133,7 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
             # A ring of places in the plane of the neighbours finds a way out of most folds.
             circle = np.cos(angles)[:, None] * axes[0] + np.sin(angles)[:, None] * axes[min(1, len(axes) - 1)]
             places = np.concatenate([[mean, vertices[faces[mine]].mean((0, 1)), (mean + here) / 2],
-                                     here + 0.12 * spread * circle, here + 0.35 * spread * circle])
+                                     here + near_reach * spread * circle, here + far_reach * spread * circle])
             if held and not loose:
                 places = closest_on_segments(places, features.points, features.segments[features.curve == constraints.curve[v]])[2]
             else:
@@ -170,6 +172,39 @@ def _neighbours(ends: np.ndarray, count: int) -> list[np.ndarray]:
     a, b = np.concatenate([ends[:, 0], ends[:, 1]]), np.concatenate([ends[:, 1], ends[:, 0]])
     order = np.argsort(a, kind="stable")
     return np.split(b[order], np.searchsorted(a[order], np.arange(1, count)))
+
+
+def fill_holes(vertices: np.ndarray, faces: np.ndarray, longest: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    """Quads (f, 4) with boundary loops of an even number of edges, at most `longest`, closed by quads around a new vertex."""
+    edges = edges_of(faces)
+    half = edges.half_ends[edges.count[edges.half_edge_idx] == 1]
+    if not len(half):
+        return vertices, faces
+    following = {}
+    for a, b in half.tolist():
+        if a in following:  # two holes meet here: which way on is not said
+            following[a] = None
+        else:
+            following[a] = b
+    new_points, new_faces, seen = [], [], set()
+    for start in following:
+        loop, v = [], start
+        while v is not None and v not in seen and len(loop) <= longest:
+            seen.add(v)
+            loop.append(v)
+            v = following.get(v)
+        if v != start or len(loop) % 2 or not 4 <= len(loop) <= longest:
+            continue
+        loop = loop[::-1]  # the hole's faces walk its edges the other way
+        if len(loop) == 4:
+            new_faces.append(loop)
+            continue
+        centre = len(vertices) + len(new_points)
+        new_points.append(vertices[loop].mean(0))
+        new_faces.extend([centre, loop[i - 1], loop[i], loop[(i + 1) % len(loop)]] for i in range(0, len(loop), 2))
+    if not new_faces:
+        return vertices, faces
+    return np.concatenate([vertices, *(p[None] for p in new_points)]), np.concatenate([faces, np.array(new_faces, faces.dtype)])
 
 
 def remove_doublets(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,13 +13,14 @@ from gdtool.geometry.features import Constraints, Features, find_features, trace
 from gdtool.geometry.mesh_quality import polygon_normals, valences
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_engines import ENGINES, pair_and_split
-from gdtool.geometry.quad_shape import Surface, onto, relax, remove_doublets, subdivide, unfold
+from gdtool.geometry.quad_shape import Surface, fill_holes, onto, relax, remove_doublets, subdivide, unfold
 from gdtool.geometry.sharpen import restore_creases
 from gdtool.geometry.simplify import simplify
 
 COUNT_TOLERANCE = 0.03
 _SMALL_PIECE_QUADS = 48
 _TRIES = 3
+_HANDLES = "handles are lost or added"
 
 
 @dataclass(frozen=True)
@@ -56,17 +57,18 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
     record = Record()
     start = time.perf_counter()
     edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
+    closed = repair.is_watertight(faces)
     surface_vertices, surface_faces = vertices, faces
     spacing = _median_edge(vertices, faces)
     if request.restore_creases and request.crease_degrees > 0 and spacing < 0.75 * edge:
-        sharp, sharp_faces, report = restore_creases(vertices, faces, request.crease_degrees)
-        if not repair.is_watertight(faces) or repair.is_watertight(sharp_faces):
-            surface_vertices, surface_faces = sharp, sharp_faces
-            record.figures["crease_vertices_restored"] = report["moved"]
+        surface_vertices, surface_faces, report = restore_creases(vertices, faces, request.crease_degrees)
+        record.figures["crease_vertices_restored"] = report["moved"]
     record.clock("restore creases", start)
     start = time.perf_counter()
     needed = max(3 * request.quads, 20000)
-    surface_vertices, surface_faces, _, report = simplify(surface_vertices, surface_faces, needed, seconds=request.seconds)
+    surface_vertices, surface_faces, _, report = simplify(surface_vertices, surface_faces, needed, seconds=request.seconds, closed=closed)
+    if closed and not repair.is_watertight(surface_faces):
+        surface_vertices, surface_faces, _, report = simplify(vertices, faces, needed, seconds=request.seconds, closed=closed)
     record.figures.update(simplified_to=report["faces"], simplify_error=report["error"])
     if "failed" in report:
         record.failed.append(f"simplify: {report['failed']}")
@@ -79,7 +81,7 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
             found = _by_engines(part_vertices, part_faces, quads, edge, request, record)
         if found is None:
             start = time.perf_counter()
-            found = (*_by_splitting(part_vertices, part_faces, quads), "pair and split")
+            found = (*_fitted(*_by_splitting(part_vertices, part_faces, quads), part_vertices, part_faces, edge, request), "pair and split")
             record.clock("fallback", start)
         done.append(found[:2])
         names.append(found[2])
@@ -133,16 +135,27 @@ def _by_splitting(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[
     return pair_and_split(vertices, faces, quads)
 
 
+def _fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarray, faces: np.ndarray, edge: float,
+            request: Request) -> tuple[np.ndarray, np.ndarray]:
+    """What pair_and_split made, evened out on the surface; only its vertices move."""
+    features = find_features(vertices, faces, request.crease_degrees or 181.0, 3 * edge)
+    surface = Surface(vertices, faces)
+    traced, constraints = trace(quad_vertices, quad_faces, features, edge)
+    traced = relax(onto(traced, surface, features, constraints), quad_faces, surface, features, constraints, request.smooth_iterations)
+    return unfold(traced, quad_faces, surface, features, constraints), quad_faces
+
+
 def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float, request: Request,
                 record: Record) -> tuple[np.ndarray, np.ndarray, str] | None:
     """The first engine's result that stands up to judgement, finished; None when none does."""
     start = time.perf_counter()
-    features = find_features(vertices, faces, request.crease_degrees, 3 * edge) if request.crease_degrees > 0 else find_features(vertices, faces, 181.0, 3 * edge)
+    features = find_features(vertices, faces, request.crease_degrees or 181.0, 3 * edge)
     surface = Surface(vertices, faces)
     record.clock("features", start)
-    for engine, subdivisions, degrees in _attempts(quads, request):
+    second_best = None
+    for engine, subdivisions, factor, degrees in _attempts(quads, request):
         label = engine + (f", {subdivisions} subdivision" if subdivisions else "") + ("" if degrees else ", creases left out")
-        asked = float(quads)
+        asked = quads * factor
         for _ in range(_TRIES):
             start = time.perf_counter()
             try:
@@ -158,23 +171,32 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
             count = len(quad_faces) * 4**subdivisions
             off = count / quads - 1
             if fault is None and abs(off) > COUNT_TOLERANCE:
-                asked *= quads / max(count, 1)
+                asked *= quads / max(count, 1) * factor
                 continue
             if fault is None:
                 quad_vertices, quad_faces = _finished(quad_vertices, quad_faces, surface, features, subdivisions, request)
                 record.clock("fit", start)
-                fault = _strays(quad_vertices, quad_faces, surface, edge)
+                fault = _strays(quad_vertices, quad_faces, surface, edge, 1.0 if subdivisions else 2.0)
+            elif fault == _HANDLES and not subdivisions and second_best is None and abs(off) <= COUNT_TOLERANCE:
+                second_best = quad_vertices, quad_faces, f"{label}, {fault}"
             if fault is None:
                 return quad_vertices, quad_faces, label
             record.failed.append(f"{label}: {fault}")
             break
         else:
             record.failed.append(f"{label}: gave {count} faces for {quads}")
+    if second_best is not None:
+        # Closed and manifold, but a gap or tunnel finer than the quads was bridged or filled: still better than no engine.
+        start = time.perf_counter()
+        quad_vertices, quad_faces = _finished(*second_best[:2], surface, features, 0, request)
+        record.clock("fit", start)
+        if _strays(quad_vertices, quad_faces, surface, edge, 2.0) is None:
+            return quad_vertices, quad_faces, second_best[2]
     return None
 
 
-def _attempts(quads: int, request: Request) -> list[tuple[str, int, float]]:
-    """(engine, subdivisions after it, crease angle it is told), in the order to try.
+def _attempts(quads: int, request: Request) -> list[tuple[str, int, float, float]]:
+    """(engine, subdivisions after it, factor on the count, crease angle it is told), in the order to try.
 
     A coarser mesh subdivided has a quarter of the irregular vertices; it fails where features are finer than its quads.
     """
@@ -182,11 +204,13 @@ def _attempts(quads: int, request: Request) -> list[tuple[str, int, float]]:
     engines = ["instant-meshes"] if request.engine == "auto" else [request.engine]
     for engine in engines:
         if engine == "instant-meshes" and quads >= 3000:
-            out.append((engine, 1, request.crease_degrees))
-        out.append((engine, 0, request.crease_degrees))
-        out.append((engine, 0, 0.0))
+            out.append((engine, 1, 1.0, request.crease_degrees))
+        out.append((engine, 0, 1.0, request.crease_degrees))
+        # Where a seam of the engine's fields fails, it often holds at a slightly different density.
+        out.append((engine, 0, 1.02, request.crease_degrees))
+        out.append((engine, 0, 0.98, 0.0))
     if request.engine == "quadriflow":
-        out.append(("instant-meshes", 0, request.crease_degrees))
+        out.append(("instant-meshes", 0, 1.0, request.crease_degrees))
     return out
 
 
@@ -197,8 +221,12 @@ def _judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndar
     if quad_faces.min() < 0 or quad_faces.max() >= len(quad_vertices) or not np.isfinite(quad_vertices).all():
         return "indices or coordinates out of range", quad_vertices, quad_faces
     whole = (np.sort(quad_faces, 1)[:, 1:] != np.sort(quad_faces, 1)[:, :-1]).all(1)
-    quad_vertices, quad_faces = remove_doublets(*repair.compact(quad_vertices, quad_faces[whole]))
+    quad_vertices, quad_faces = repair.compact(quad_vertices, quad_faces[whole])
     closed = repair.is_watertight(faces)
+    if closed:
+        quad_vertices, quad_faces = fill_holes(quad_vertices, quad_faces)
+    quad_vertices, quad_faces = remove_doublets(*repair.one_vertex_per_fan(quad_vertices, quad_faces))
+    quad_vertices, quad_faces = _without_crumbs(quad_vertices, quad_faces, repair.components(faces)[0])
     if closed and not repair.is_watertight(quad_faces):
         return "not watertight, though the input is", quad_vertices, quad_faces
     if not repair.is_manifold(quad_faces):
@@ -206,8 +234,20 @@ def _judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndar
     if repair.components(quad_faces)[0] != repair.components(faces)[0]:
         return "pieces are lost or joined", quad_vertices, quad_faces
     if closed and _euler(quad_faces) != _euler(faces):
-        return "handles are lost or added", quad_vertices, quad_faces
+        return _HANDLES, quad_vertices, quad_faces
     return None, quad_vertices, quad_faces
+
+
+def _without_crumbs(vertices: np.ndarray, faces: np.ndarray, pieces: int) -> tuple[np.ndarray, np.ndarray]:
+    """Without the smallest pieces beyond the number there should be, if they are crumbs that an engine broke off."""
+    count, piece = repair.components(faces)
+    if count <= pieces:
+        return vertices, faces
+    size = np.bincount(piece)
+    keep = np.argsort(-size, kind="stable")[:pieces]
+    if size[keep].sum() < 0.98 * len(faces):
+        return vertices, faces
+    return repair.compact(vertices, faces[np.isin(piece, keep)])
 
 
 def _euler(faces: np.ndarray) -> int:
@@ -226,13 +266,13 @@ def _finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, feature
     return unfold(vertices, faces, surface, features, constraints), faces
 
 
-def _strays(vertices: np.ndarray, faces: np.ndarray, surface: Surface, edge: float) -> str | None:
+def _strays(vertices: np.ndarray, faces: np.ndarray, surface: Surface, edge: float, limit: float) -> str | None:
     """A fault when part of the surface has no quads near it (details that the quads are too coarse for)."""
     from gdtool.folders.mesh import triangulated
     from gdtool.geometry.distance import closest_points
 
     step = max(len(surface.vertices) // 20000, 1)
     distance = closest_points(surface.vertices[::step], vertices, triangulated(faces)[0])[0]
-    if distance.max() > 1.0 * edge:
+    if distance.max() > limit * edge:
         return f"strays {distance.max() / edge:.2g} edge lengths from the surface"
     return None

@@ -71,10 +71,10 @@ def is_manifold(faces: np.ndarray) -> bool:
 
 def split_vertices(faces: np.ndarray) -> np.ndarray:
     """Vertices (k,) whose faces form more than one fan (bow-ties)."""
-    return np.flatnonzero(_fans(faces)[1] > 1)
+    return np.flatnonzero(corner_fans(faces)[1] > 1)
 
 
-def _fans(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def corner_fans(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The fan (f, c) each face corner belongs to (numbered over the mesh), and the number of fans at each vertex."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -130,10 +130,13 @@ def components(faces: np.ndarray) -> tuple[int, np.ndarray]:
 
 def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Without the vertices that no face uses."""
-    used = np.unique(faces[faces >= 0])
-    number = np.full(len(vertices) + 1, -1, np.int64)
-    number[used] = np.arange(len(used))
-    return vertices[used], number[faces]  # -1 picks the last entry, which stays -1
+    used = np.zeros(len(vertices) + 1, bool)
+    used[faces.ravel()] = True
+    used[-1] = False  # where -1, a triangle's fourth corner, points
+    if used[:-1].all():
+        return vertices, np.array(faces, np.int64)
+    number = np.where(used, np.cumsum(used) - 1, -1)
+    return vertices[used[:-1]], number[faces]
 
 
 def check(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> None:
@@ -161,21 +164,32 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
         if count:
             report[name] = int(count)
 
-    extent = float(np.ptp(vertices[np.unique(faces)], 0).max())
+    extent = float(np.ptp(compact(vertices, faces)[0], 0).max())
     if not extent > 0:
         raise InputError(subject, "all its faces lie in one point")
     area = _areas(vertices / extent, faces)
     if not (area > 0).any():
         raise InputError(subject, "no face has an area")
+    repeated = (faces == np.roll(faces, 1, 1)).any(1)
+    note("degenerate_faces", repeated.sum())
+    faces = faces[~repeated]
+    if not len(faces):
+        raise InputError(subject, "no face has an area")
     closed = is_watertight(faces)
+    if closed:
+        vertices, faces = compact(vertices, faces)
+    if closed and _vertices_manifold(faces):
+        if _volume(vertices, faces) < 0:
+            report["turned_inside_out"] = True
+            faces = faces[:, ::-1].copy()
+        return vertices, faces, report
     if not closed:
         # A closed mesh is left as its indices say: welding could join sheets that only touch.
         welded = _weld(vertices, faces, extent * WELD_SHARE)
         note("welded_vertices", len(np.unique(faces)) - len(np.unique(welded)))
-        faces = welded
-    repeated = (faces == np.roll(faces, 1, 1)).any(1)
-    note("degenerate_faces", repeated.sum())
-    faces = faces[~repeated]
+        repeated = (welded == np.roll(welded, 1, 1)).any(1)
+        note("degenerate_faces", repeated.sum() + report.get("degenerate_faces", 0))
+        faces = welded[~repeated]
     _, first = np.unique(np.sort(faces, 1), axis=0, return_index=True)
     note("duplicate_faces", len(faces) - len(first))
     faces = faces[np.sort(first)]
@@ -193,14 +207,20 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
         note("turned_edges", edges.turned.sum())
         vertices, faces = _split(vertices, faces)
         faces = _oriented(vertices, faces)
-    fans, number = _fans(faces)
+    fans, number = corner_fans(faces)
     if (number > 1).any():
         note("nonmanifold_vertices", (number > 1).sum())
-        vertices, faces = _one_vertex_per_fan(vertices, faces, fans)
+        vertices, faces = one_vertex_per_fan(vertices, faces, fans)
     if is_watertight(faces) and _volume(vertices, faces) < 0:
         report["turned_inside_out"] = True
         faces = faces[:, ::-1].copy()
     return vertices, faces, report
+
+
+def _vertices_manifold(faces: np.ndarray) -> bool:
+    import igl
+
+    return bool(np.all(igl.is_vertex_manifold(np.ascontiguousarray(faces, np.int64))))
 
 
 def _areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -243,7 +263,11 @@ def _oriented(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return faces
 
 
-def _one_vertex_per_fan(vertices: np.ndarray, faces: np.ndarray, fans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bow-tie vertices doubled, so that each fan of faces has its own."""
-    _, first, new = np.unique(fans, return_index=True, return_inverse=True)
-    return vertices[faces.ravel()[first]], new.reshape(faces.shape)
+def one_vertex_per_fan(vertices: np.ndarray, faces: np.ndarray, fans: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Bow-tie vertices doubled, so that each fan of faces (f, 3) or (f, 4) has its own; compact."""
+    fans = corner_fans(faces)[0] if fans is None else fans
+    used = faces >= 0
+    _, first, new = np.unique(fans[used], return_index=True, return_inverse=True)
+    out = np.full(faces.shape, -1, np.int64)
+    out[used] = new.ravel()
+    return vertices[faces[used][first]], out

@@ -13,6 +13,7 @@ from gdtool.geometry.normals import face_normals, vertex_normals
 from gdtool.geometry.repair import edges_of
 
 _NEIGHBOURS = 24
+_RINGS = 5  # of faces around a bevel, among which the sides are
 _FARTHEST_EDGES = 4.0  # sides are looked for within this many edge lengths
 _LARGEST_MOVE_EDGES = 1.75
 _LARGEST_RESIDUAL_EDGES = 0.12
@@ -48,9 +49,14 @@ def restore_creases(vertices: np.ndarray, faces: np.ndarray,
     rough = np.zeros(len(faces), bool)
     rough[pairs[bent].ravel()] = True
     normals, area = face_normals(vertices, faces)
-    used = np.unique(faces)
+    used = np.zeros(len(vertices), bool)
+    used[faces.ravel()] = True
     report["bevel_share"] = float(bevel[used].mean())
-    side = np.flatnonzero(~rough & (area > 0))
+    near_bevel, marked = np.zeros(len(faces), bool), bevel.copy()
+    for _ in range(_RINGS):
+        near_bevel = marked[faces].any(1)
+        marked[faces[near_bevel].ravel()] = True
+    side = np.flatnonzero(near_bevel & ~rough & (area > 0))
     if not bevel.any() or report["bevel_share"] > _LARGEST_SHARE or len(side) < _NEIGHBOURS:
         return vertices, faces, report
     length = np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1)
@@ -58,7 +64,7 @@ def restore_creases(vertices: np.ndarray, faces: np.ndarray,
     at = np.flatnonzero(bevel)
     centroid = vertices[faces[side]].mean(1)
     distance, near = cKDTree(centroid).query(vertices[at], k=_NEIGHBOURS, workers=2)
-    own = vertex_normals(vertices, faces)[at]
+    own = vertex_normals(vertices, faces[near_bevel])[at]
     n, c = normals[side][near], centroid[near]
     valid = (distance < _FARTHEST_EDGES * edge) & ((n * own[:, None]).sum(-1) > 0.1)
     cluster, sides, spread = _sides(n, valid, crease_degrees * 0.8)

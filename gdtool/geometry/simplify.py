@@ -48,13 +48,13 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
 
 
 def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attributes: np.ndarray | None = None, *,
-             seconds: float = 120.0) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, dict[str, float | int | str]]:
+             seconds: float = 120.0, closed: bool | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, dict[str, float | int | str]]:
     """A mesh of about target_faces triangles of the same shape and topology.
 
     vertices (v, 3), faces (f, 3), attributes (v, a) or None. Returns vertices, faces, attributes (read at the closest
     point of the input) and a report: faces, method, and error, the largest distance of the result's vertices and of the
     input's vertices (at most 20,000 of them) to the other surface, in units of the input. A closed, manifold
-    input stays so. Raises InputError for an input that repair.check refuses.
+    input stays so (closed says whether it is, where that is known). Raises InputError as repair.check does.
     """
     repair.check(vertices, faces)
     target_faces = max(int(target_faces), 4)
@@ -64,7 +64,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     if not extent > 0:
         raise InputError("mesh", "all its faces lie in one point")
     unit = (vertices - centre) / extent
-    closed = repair.is_watertight(faces)
+    closed = repair.is_watertight(faces) if closed is None else closed
     reasons, found, method = [], None, ""
     # The quick collapse tears a closed mesh now and then (a handful of edges with four faces); MeshLab's takes four times as long.
     for name, arguments in (("collapse", (target_faces, 5.0)), ("collapse_topology", (target_faces,))):

@@ -151,17 +151,9 @@ def _joined(vertices: np.ndarray, faces: np.ndarray, adjacency: Adjacency, chart
 
 def _own_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A chart's own vertices, those where it touches itself doubled, and its faces (k, 4) into them."""
-    from gdtool.geometry.repair import _fans
+    from gdtool.geometry.repair import one_vertex_per_fan
 
-    points, corners = compact(vertices, faces)
-    fans, count = _fans(corners)
-    if (count > 1).any():
-        used = corners >= 0
-        _, first, new = np.unique(fans[used], return_index=True, return_inverse=True)
-        points = points[corners[used][first]]
-        corners = np.full(corners.shape, -1)
-        corners[used] = new.ravel()
-    return points, corners
+    return one_vertex_per_fan(*compact(vertices, faces))
 
 
 def _alone(points: np.ndarray, corners: np.ndarray) -> np.ndarray:

@@ -164,7 +164,7 @@ def stretch(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> floa
     return float(np.sqrt((weight * (values[use] ** 2).sum(1) / 2).sum() * flat[use].sum() / area[use].sum()))
 
 
-def overlaps(uv: np.ndarray, triangles: np.ndarray, size: int = 512) -> bool:
+def overlaps(uv: np.ndarray, triangles: np.ndarray, size: int = 1024) -> bool:
     """Whether any texel centre of a size x size grid around the chart lies in two of its triangles."""
     low, extent = uv.min(0), float(np.ptp(uv, 0).max())
     if not extent > 0:

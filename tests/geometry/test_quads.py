@@ -131,7 +131,9 @@ def test_dead_engine_is_replaced(monkeypatch, failure):
 
 
 def test_torn_output_is_not_believed(monkeypatch):
-    monkeypatch.setattr(quads, "call", lambda *_, **__: (np.eye(4)[:, :3], np.array([[0, 1, 2, 3]])))
+    # Three quads at one edge.
+    book = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [1, 0, 6, 7]])
+    monkeypatch.setattr(quads, "call", lambda *_, **__: (np.random.default_rng(0).random((8, 3)), book))
     vertices, faces = sphere(24)
     _, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=300))
     assert whole(found) and any("not watertight" in text for text in record.failed)
