@@ -11,6 +11,7 @@ from gdtool.cameras import rays, rig
 from gdtool.core.folder import open_folder
 from gdtool.core.kinds import AtlasContent
 from gdtool.core.manifest import MANIFEST, InputEntry, Manifest, encode, list_files
+from gdtool.core.sources import digest
 from gdtool.core.stage import Output
 from gdtool.folders.mesh import QuadMesh, write_mesh
 from gdtool.folders.surface import Surface, write_surface
@@ -20,8 +21,9 @@ from tests.texture.shapes import albedo_of, torus, triangles_of, unwrapped
 
 
 def finish(path: Path, kind: str, content, inputs: dict[str, Path]) -> Path:
-    """Write the manifest of a folder made from inputs (role to folder)."""
-    entries = tuple(InputEntry(role, os.path.relpath(p, path), open_folder(p).manifest.digest) for role, p in inputs.items())
+    """Write the manifest of a folder made from inputs (role to folder or file)."""
+    sources = {role: open_folder(p) if p.is_dir() else p for role, p in inputs.items()}
+    entries = tuple(InputEntry(role, os.path.relpath(inputs[role], path), digest(source)) for role, source in sources.items())
     manifest = Manifest(kind=kind, name=path.parent.name.removesuffix(".asset"), stage="test", content=content, inputs=entries, files=list_files(path))
     (path / MANIFEST).write_bytes(encode(manifest))
     return path

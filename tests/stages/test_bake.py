@@ -121,6 +121,11 @@ def test_bakes_a_textured_model_that_was_remeshed(gdtool, chain, tmp_path):
     assert done.returncode == 0, done.stderr
     assert rendered_albedo(tmp_path / "second", chain) > 26
     assert open_folder(tmp_path / "second").content.report["materials_from"] == "model"
+    # Remeshed from a model file, an atlas has that file at the start of its chain.
+    write_atlas(tmp_path / "remeshed", {"source": tmp_path / "first" / "asset.glb"})
+    done = gdtool("bake", "remeshed", *FAST, "-o", "third")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "third" / "asset.glb").read_bytes() == (tmp_path / "second" / "asset.glb").read_bytes()
 
 
 def test_a_mesh_file_in_either_frame_finds_the_surface(gdtool, tmp_path):
