@@ -1,6 +1,6 @@
 """Readers against damaged files: whatever the bytes, they answer with a value or with an error of ours (`make fuzz`).
 
-    python tests/faults/fuzz.py [MINUTES] [READER ...]
+    python -m tests.faults.fuzz [MINUTES] [READER ...]
 
 Prints what every reader did, and writes each file that made one do anything else to tests/faults/crashes/, where
 tests/faults/test_fuzz.py reads it again ever after. Each reader runs in a child, which a crash may take with it.
