@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import msgspec
 from msgspec import Meta
@@ -61,15 +61,11 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     if unknown:
         raise UsageError("--domains", f"{unknown[0]!r} is no domain", f"choose from {', '.join(ALL)}")
     import numpy as np
-    import torch
 
     from gdtool.assets.load import load_scene
     from gdtool.folders.views import Views, write_views
-    from gdtool.shading.direct import DirectLight
     from gdtool.shading.render import Renderer
 
-    # Shading runs in threads of its own, a chunk each; torch's own would only wait for each other.
-    torch.set_num_threads(1)
     given: Folder | None = inputs.second.get("cameras")
     source = inputs.main.file("asset.glb") if isinstance(inputs.main, Folder) else inputs.main
     with out.step("read"):
@@ -81,12 +77,15 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     cameras = _cameras(given, options)
     rng = np.random.default_rng([options.seed, _number(inputs.name)])
 
-    with out.step("light"):
-        environment, lobes, light = _light(inputs, given, options)
+    lit = bool(options.condition_views) or not {"color", "closed_form"}.isdisjoint(options.domains)
+    renderer = Renderer(scene, out.threads)
+    lamps = light = None
+    if lit:
+        with out.step("light"):
+            lamps = _light(renderer, inputs, given, options)
+            light = lamps.record
     with out.step("render"):
-        renderer = Renderer(scene, out.threads)
-        direct = DirectLight(renderer, environment, options.light_samples, options.seed)
-        frames = [_view(renderer, camera, direct, lobes, options) for camera in out.progress(cameras, len(cameras), "views")]
+        frames = [_view(renderer, camera, lamps, options) for camera in out.progress(cameras, len(cameras), "views")]
     wanted = [d for d in ALL if d in options.domains]
     mask = np.stack([frame["mask"] for frame in frames])
     if not mask.any():
@@ -95,7 +94,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     with out.step("conditions"):
         if options.condition_views:
-            _write_conditions(out, renderer, direct, options, rng)
+            _write_conditions(out, renderer, lamps.direct, options, rng)
     with out.step("write"):
         generated = isinstance(inputs.main, str)
         if generated:
@@ -107,11 +106,12 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             clipped = float((views.images["color"][mask > 0] > 1).mean())
         counts = renderer.counts
         report = {"faces": len(scene.faces), "materials": len(scene.materials), "samples": counts.samples, "shadow_rays": counts.shadow_rays,
-                  "environment_scale": environment.scale, "closed_surface_share": float((mask > 0).mean()),
-                  **{f"light_fit_{k}": v for k, v in light["fit_error"].items()}}
-        write_views(out, views, source_from_world=source_from_world, exposure=options.exposure, environment=light["environment"],
+                  "foreground_share": float((mask > 0).mean())}
+        if light is not None:
+            report |= {"environment_scale": lamps.environment.scale, **{f"light_fit_{k}": v for k, v in light["fit_error"].items()}}
+        write_views(out, views, source_from_world=source_from_world, exposure=options.exposure, environment=light["environment"] if light else "",
                     clipped_share=clipped, conditions=options.condition_views, model=generated, report=report)
-    _tell_skips(out, scene, renderer, options)
+    _tell_skips(out, scene, renderer, options, lamps is None)
 
 
 def _number(text: str) -> int:
@@ -196,24 +196,40 @@ def _cameras(given: Folder | None, options: Options) -> list[Camera]:
     return rig(options.rig, options.size)
 
 
-def _light(inputs: Inputs, given: Folder | None, options: Options) -> tuple[Environment, SphericalGaussians, dict[str, Any]]:
-    """The environment, its spherical Gaussians, and the record of light.json."""
+class _Lamps(NamedTuple):
+    """The light of one object in the forms it is used in; record is that of light.json."""
+
+    environment: Environment
+    lobes: SphericalGaussians
+    record: dict[str, Any]
+    direct: DirectLight
+
+
+def _light(renderer: Renderer, inputs: Inputs, given: Folder | None, options: Options) -> _Lamps:
+    import torch
+
+    from gdtool.shading.direct import DirectLight
     from gdtool.shading.studio import studio
 
+    # Shading runs in threads of its own, a chunk each; torch's own would only wait for each other.
+    torch.set_num_threads(1)
     source = options.light or "random"
-    if source == "random" and given is not None and given.content.environment.startswith(("random:", "dark", "mid", "bright")):
-        source = given.content.environment
+    if source == "random" and given is not None:
+        theirs = given.content.environment
+        # A light that a name brings back is used again; a file is not here to be read.
+        source = theirs if theirs.startswith("random:") or theirs in ("dark", "mid", "bright") else source
     if source == "random":
         source = f"random:{(_number(inputs.name) + options.seed) % 10**9}"
-    return studio(source, options.seed)
+    environment, lobes, record = studio(source, options.seed)
+    return _Lamps(environment, lobes, record, DirectLight(renderer, environment, options.light_samples, options.seed))
 
 
-def _view(renderer: Renderer, camera: Camera, direct: DirectLight, lobes: SphericalGaussians, options: Options) -> dict[str, np.ndarray]:
-    from gdtool.shading.render import closed_form_image
-
-    frame = renderer.buffers(camera, options.samples, direct.color(options.exposure) if "color" in options.domains else None)
+def _view(renderer: Renderer, camera: Camera, lamps: _Lamps | None, options: Options) -> dict[str, np.ndarray]:
+    frame = renderer.buffers(camera, options.samples, lamps.direct.color(options.exposure) if "color" in options.domains else None)
     if "closed_form" in options.domains:
-        frame["closed_form"] = closed_form_image(frame, camera, lobes) * options.exposure
+        from gdtool.shading.render import closed_form_image
+
+        frame["closed_form"] = closed_form_image(frame, camera, lamps.lobes) * options.exposure
     return frame
 
 
@@ -233,7 +249,7 @@ def _write_conditions(out: Output, renderer: Renderer, direct: DirectLight, opti
     write_cameras(out.path("condition.json"), cameras)
 
 
-def _tell_skips(out: Output, scene: Scene, renderer: Renderer, options: Options) -> None:
+def _tell_skips(out: Output, scene: Scene, renderer: Renderer, options: Options, unlit: bool) -> None:
     """What the scene did not need."""
     textures = {"base color": "base_color_texture", "metallic-roughness": "metallic_roughness_texture", "normal": "normal_texture",
                 "emissive": "emissive_texture"}
@@ -242,6 +258,8 @@ def _tell_skips(out: Output, scene: Scene, renderer: Renderer, options: Options)
             out.skip(f"{what} lookups", "no material has such a texture")
     if renderer.tested is None:
         out.skip("alpha tests", "every material is opaque")
+    if unlit:
+        out.skip("light", "neither color, closed_form nor condition images are asked for")
     counts = renderer.counts
     if counts.pixels_in_bounds < counts.pixels:
         out.skip("rays", f"{1 - counts.pixels_in_bounds / counts.pixels:.0%} of the pixels lie outside the object's projected bounds")

@@ -88,11 +88,14 @@ def test_bad_inputs_exit_3_with_one_line(gdtool, tmp_path):
 
 
 def test_pipes_stream_and_one_bad_source_among_many(gdtool, box, tmp_path):
+    # Without color no light is made, and that is said.
     done = gdtool("render-dataset", "-o", "data", *FAST, "--domains", "normal,depth", stdin=f"{box}\nmissing.obj\nprocedural:3\n")
     assert done.returncode == 1 and "missing.obj" in done.stderr
     assert done.stdout.splitlines() == ["data/box.asset/views", "data/procedural-000003.asset/views"]
     assert manifest(tmp_path / "data/procedural-000003.asset/views")["content"]["model"]
     assert (tmp_path / "data/procedural-000003.asset/views/source.glb").is_file()
+    assert "light" in {s["what"] for s in manifest(tmp_path / "data/box.asset/views")["skipped"]}
+    assert read_views(open_folder(tmp_path / "data/box.asset/views")).light is None
     assert gdtool("render-dataset", *FAST).returncode == 2
 
 
@@ -111,7 +114,7 @@ def test_cameras_of_other_views_are_used_with_their_frame(gdtool, box, tmp_path)
             line = "v " + " ".join(f"{0.95 * x:.6f}" for x in point)
         lines.append(line)
     (tmp_path / "copy.obj").write_text("\n".join(lines))
-    assert gdtool("render-dataset", "copy.obj", "--cameras", views, *FAST, "-o", "copied").returncode == 0
+    assert gdtool("render-dataset", "copy.obj", "--cameras", views, *FAST, "--domains", "normal", "-o", "copied").returncode == 0
     first, same, copied = (read_views(open_folder(tmp_path / p)) for p in ("box.asset/views", "again", "copied"))
     assert [c.name for c in same.cameras] == ["000", "001", "002"] and same.cameras[0].projection == "perspective"
     for domain in first.images:
