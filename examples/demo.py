@@ -21,7 +21,7 @@ STAGES = (
     ("remesh", ("--faces", "20000"), "surface"),
     ("unwrap", (), None),
     ("bake", ("--size", "1024"), "views"),
-    ("relight", ("--env", "mid", "--frames", "4"), None),
+    ("relight", ("--env", "mid", "--views", "4"), None),
 )
 SHOWN = ("color_psnr_masked", "albedo_psnr_masked", "normal_degrees", "seen_distance", "surface_distance", "surface_iou")
 

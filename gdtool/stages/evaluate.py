@@ -92,9 +92,11 @@ def evaluate(result: Source, reference: Source | None, options: Options, views: 
         report |= _surfaces(geometry, against, options, views)
     elif reference is not None and not (options.render and _has_material(result)):
         raise InputError(_place(reference), "holds no model to measure the geometry against", "name the model itself with --reference")
-    if options.render and views is not None and _has_material(result):
-        report["reference_views"] = views.name
-        report |= _rendered(result, views)
+    # Views named as the reference are the truth of the pictures; those along the provenance may have been generated.
+    pictures = reference if _kind(reference) == "views" else views
+    if options.render and pictures is not None and _has_material(result):
+        report["reference_views"] = pictures.name
+        report |= _rendered(result, pictures)
     elif against is None:
         raise UsageError(name_of(result), "was not made from a known model", "name one with --reference")
     return report

@@ -100,6 +100,14 @@ def test_a_surface_is_rendered_through_the_cameras_of_its_views(chain):
     assert "albedo_psnr_masked" not in measured(true_size, render=False)
 
 
+def test_views_named_as_the_reference_come_before_those_along_the_provenance(chain, tmp_path):
+    truth = read_views(open_folder(chain / "views"))
+    rougher = shifted(truth, tmp_path / "rougher", images={**truth.images, "roughness": truth.images["roughness"] + 0.15 * (truth.mask > 0)})
+    exact = write_egg_surface(chain / "exact", {"source": chain / "views"})
+    assert measured(exact)["roughness_error"] == pytest.approx(0.1, abs=0.005)
+    assert measured(exact, rougher)["roughness_error"] == pytest.approx(0.25, abs=0.005)
+
+
 def test_reference_by_name_in_each_form(chain, tmp_path):
     surface = chain / "surface"
     own = measured(surface)
