@@ -11,6 +11,7 @@ from gdtool.fields.align import depth_corrections, disagreement
 from gdtool.fields.carve import carve, silhouettes_outvoted, smooth_unseen
 from gdtool.fields.refine import drop_debris, measured_planes, refine
 from gdtool.fields.sights import Sight, pixel_footprint, prepare
+from gdtool.fields.thin import near_points, restore_thin
 from gdtool.geometry.grids import edge_counts, extract
 from gdtool.geometry.normals import vertex_normals
 
@@ -76,7 +77,10 @@ def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: i
     """
     noise = 0.0 if noise < 0.1 * step else min(noise, 2 * step)
     grid, values, measured = carve(sights, step, noise, outvoted)
+    carved, thin = values, np.zeros((0, 3))
     values = smooth_unseen(values, measured)
+    if not noise and not outvoted:
+        values, thin = restore_thin(values, carved, grid, sights)
     if noise:
         from scipy.ndimage import gaussian_filter
 
@@ -89,7 +93,9 @@ def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: i
     deep = any(s.planes is not None for s in sights)
     vertices, faces, dropped = drop_debris(vertices, faces, support if deep else np.ones(len(vertices)), step)
     if not noise and not outvoted:
-        vertices = refine(vertices, faces, sights, step, reach=reach)
+        # A sheet's two sides would both be drawn onto its one measured surface.
+        moved = refine(vertices, faces, sights, step, reach=reach)
+        vertices = np.where(near_points(vertices, thin, 2 * step)[:, None], vertices, moved)
     support = measured_planes(sights, vertices, vertex_normals(vertices, faces), reach)[2]
     return Shape(vertices, faces, support, step, dropped)
 

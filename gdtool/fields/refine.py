@@ -10,6 +10,9 @@ from gdtool.geometry.grids import components, keep_faces, signed_volume
 from gdtool.geometry.normals import face_normals, vertex_normals
 
 
+_SEEN_FACES = 24  # faces that views measured, enough for a piece to be real
+
+
 def measured_planes(sights: list[Sight], vertices: np.ndarray, normals: np.ndarray, reach: float):
     """Quadratic data term of each vertex: matrix (v, 3, 3) and vector (v, 3) of sum w (n·u + s)^2, and sum w (v,).
 
@@ -111,8 +114,9 @@ def drop_debris(vertices: np.ndarray, faces: np.ndarray, support: np.ndarray, st
     The largest piece always stays.
     """
     labels, volume = _pieces(vertices, faces)
-    held = np.bincount(labels, support[faces].mean(1) > 0.02) / np.bincount(labels)
-    keep = (volume > (2 * step) ** 3) & (held > 0.2)
+    held = np.bincount(labels, support[faces].mean(1) > 0.02)
+    # Of a plate seen edge-on only the rim has support: a few faces say that it is there.
+    keep = (volume > (2 * step) ** 3) & ((held > 0.2 * np.bincount(labels)) | (held >= _SEEN_FACES))
     keep[np.argmax(volume)] = True
     vertices, faces, _ = keep_faces(vertices, faces, keep[labels])
     return vertices, faces, int((~keep).sum())
