@@ -101,11 +101,12 @@ def relax(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: F
 
 
 def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
-           least: float = 0.3, rounds: int = 24) -> np.ndarray:
+           least: float = 0.3, rounds: int = 24, most_visits: int = 6000) -> np.ndarray:
     """Vertices of folded and needle-like quads moved to the best of a few places near them.
 
     A vertex moves only where the worst scaled Jacobian of its quads, against the surface's normals, gets better. Free
-    vertices stay on the surface, held ones slide along their curve; in the last rounds they may leave it.
+    vertices stay on the surface, held ones slide along their curve; in the last rounds they may leave it. most_visits
+    bounds the work (a count, not a time: equal input gives equal output).
     """
     edges = edges_of(faces)
     ring, neighbours = _incidence(faces, len(vertices)), _neighbours(edges.ends, len(vertices))
@@ -118,10 +119,14 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
         if not len(bad):
             break
         loose = turn >= rounds // 2
+        touched = np.unique(faces[bad])
+        most_visits -= len(touched)
+        if most_visits < 0:
+            break
         # Another ring of places each time: steps of the golden angle and of sizes that differ.
         angles = np.arange(8) * (np.pi / 4) + turn * 2.4
         near_reach, far_reach = (0.12, 0.35) if turn % 3 == 0 else (0.05, 0.2) if turn % 3 == 1 else (0.25, 0.6)
-        for v in np.unique(faces[bad]).tolist():
+        for v in touched.tolist():
             held = constraints.curve[v] >= 0
             if (constraints.fixed[v] and not loose) or (boundary[v] and not held):
                 continue

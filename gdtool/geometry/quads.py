@@ -129,9 +129,14 @@ def _by_splitting(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[
     while len(faces) < triangles:
         vertices, faces = (np.asarray(x) for x in igl.upsample(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64), 1))
     pieces = repair.components(faces)[0]
-    out, out_faces, _, _ = simplify(vertices, faces, triangles)
-    if repair.components(out_faces)[0] == pieces and repair.is_manifold(out_faces) >= repair.is_manifold(faces):
-        vertices, faces = out, out_faces
+    # A collapse that loses pieces is tried again more gently before the mesh is taken as it is.
+    for target in (triangles, 2 * triangles, 4 * triangles):
+        if target >= len(faces):
+            break
+        out, out_faces, _, _ = simplify(vertices, faces, target)
+        if repair.components(out_faces)[0] == pieces and repair.is_manifold(out_faces) >= repair.is_manifold(faces):
+            vertices, faces = out, out_faces
+            break
     return pair_and_split(vertices, faces, quads)
 
 

@@ -117,7 +117,7 @@ def _joined(vertices: np.ndarray, faces: np.ndarray, adjacency: Adjacency, chart
         parts[i] = chart
     limit = 1 + 10 * (good_stretch - 1)
     tried: set[tuple[int, int]] = set()
-    for _ in range(_JOINS):
+    for _ in range(_JOINS if len(faces) < 10000 else _JOINS // 2):
         a, b = label[adjacency.pairs].T
         apart = a != b
         pair = np.sort(np.stack([a, b], -1)[apart], 1)

@@ -164,8 +164,9 @@ def stretch(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> floa
     return float(np.sqrt((weight * (values[use] ** 2).sum(1) / 2).sum() * flat[use].sum() / area[use].sum()))
 
 
-def overlaps(uv: np.ndarray, triangles: np.ndarray, size: int = 1024) -> bool:
-    """Whether any texel centre of a size x size grid around the chart lies in two of its triangles."""
+def overlaps(uv: np.ndarray, triangles: np.ndarray) -> bool:
+    """Whether any texel centre of a grid around the chart, finer than its triangles, lies in two of them."""
+    size = int(np.clip(32 * len(triangles) ** 0.5, 64, 1024))
     low, extent = uv.min(0), float(np.ptp(uv, 0).max())
     if not extent > 0:
         return True

@@ -8,7 +8,8 @@ from gdtool.texture.raster import owner_count
 
 _TURNS = 4
 _FINE = 3  # cells of the supersampled mask in a cell of the square
-_MOST_BY_RASTER = 400
+_MOST_BY_RASTER = 160
+_MANY = 48  # with more charts than these a coarser grid and fewer tries bound the time
 _STARTS = 12  # orders tried on the coarse grid
 
 
@@ -73,12 +74,14 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, cells: int = 4
         return [boxed[0][0] * scale + gap], scale
     if len(charts) > _MOST_BY_RASTER:
         return _shelves(boxed, gap)
-    starts = max(min(_STARTS, 300 // len(charts)), 1)
+    many = len(charts) > _MANY
+    cells = min(cells, 288) if many else cells
+    starts = max(min(_STARTS, 200 // len(charts)), 1)
     ranked = _search(boxed, area, gap, _way(boxed, starts))
     found, share = None, 0.0
-    for coarse, order, contact in ranked[:2]:
+    for coarse, order, contact in ranked[:1 if many else 2]:
         # The fine grid wastes less at the rims, so it may take more than the coarse one did.
-        for step in (0.05, 0.035, 0.02, 0.01, 0.0, -0.01, -0.02, -0.04, -0.08):
+        for step in (0.03, 0.0, -0.04, -0.1) if many else (0.06, 0.05, 0.042, 0.035, 0.028, 0.02, 0.01, 0.0, -0.02, -0.05, -0.1):
             if coarse + step <= share:
                 break
             again = _place(boxed, order, ((coarse + step) / area) ** 0.5, gap, cells, contact)

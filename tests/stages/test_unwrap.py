@@ -71,7 +71,8 @@ def test_bad_mesh_is_refused(gdtool, tmp_path, text, fact):
     assert run.returncode == 3 and fact in run.stderr and "Traceback" not in run.stderr
 
 
-def test_wrong_kind_names_the_stage_that_makes_the_right_one(gdtool, tmp_path, ring):
-    gdtool("unwrap", "ring.obj")
-    run = gdtool("unwrap", "ring.asset/atlas")
+def test_wrong_kind_names_the_stage_that_makes_the_right_one(gdtool, tmp_path):
+    (tmp_path / "leaf.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n")
+    assert gdtool("unwrap", "leaf.obj").returncode == 0
+    run = gdtool("unwrap", "leaf.asset/atlas")
     assert run.returncode == 3 and "holds atlas" in run.stderr and "gdtool remesh" in run.stderr
