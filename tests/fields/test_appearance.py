@@ -1,0 +1,81 @@
+"""Materials fused from views, and light recovered from color, where the answers are known."""
+
+import numpy as np
+import pytest
+import torch
+
+from gdtool.fields.light import fit_amplitudes, materials_from_color, recover_light
+from gdtool.fields.materials import Observations, confidence, fuse, spread
+from gdtool.shading.closed_form import shade
+from gdtool.shading.lights import fibonacci
+from gdtool.shading.sg import SphericalGaussians
+
+
+def directions(count, seed=0):
+    v = np.random.default_rng(seed).standard_normal((count, 3))
+    return v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+def lit(normals, view, albedo, roughness, metallic, light):
+    tensors = (torch.as_tensor(x, dtype=torch.float32) for x in (normals, view, albedo, roughness, metallic))
+    return shade(*tensors, SphericalGaussians.from_record(light)).numpy()
+
+
+LIGHT = {"kind": "spherical_gaussians", "axes": fibonacci(16).tolist(), "sharpness": [12.0] * 16,
+         "amplitudes": np.random.default_rng(3).uniform(0, 1.5, (16, 3)).tolist()}
+
+
+def test_light_of_known_materials_is_recovered():
+    normals, view = directions(3000), directions(3000, 1)
+    view = np.where((normals * view).sum(1, keepdims=True) < 0, -view, view)
+    albedo, roughness, metallic = np.full((3000, 3), 0.6), np.full(3000, 0.5), np.zeros(3000)
+    color = lit(normals, view, albedo, roughness, metallic, LIGHT)
+    found, residual = recover_light(normals, view, color, albedo, roughness, metallic, np.ones(3000))
+    assert residual < 0.01
+    again = lit(normals, view, albedo, roughness, metallic, found)
+    assert np.abs(again - color).mean() < 0.01 * color.mean()
+
+
+def test_shadowed_samples_do_not_darken_the_light():
+    response = np.repeat(np.eye(2)[np.arange(400) % 2][:, None], 3, 1)  # every sample sees one of two lobes
+    color = np.full((400, 3), 0.8)
+    color[:60] = 0.05
+    amplitudes, _ = fit_amplitudes(response, color)
+    assert amplitudes == pytest.approx(np.full((2, 3), 0.8), abs=0.03)
+
+
+def test_albedo_from_color_under_a_known_light():
+    normals = directions(2000)
+    albedo = 0.2 + 0.5 * (normals[:, :1] > 0) * np.array([[1.0, 0.6, 0.3]])
+    color = lit(normals, normals, albedo, np.full(2000, 0.5), np.zeros(2000), LIGHT)
+    samples = (np.arange(2000), normals, color)
+    found, roughness, metallic, _, _ = materials_from_color(normals, color, np.ones(2000), np.ones(2000), samples, LIGHT)
+    assert metallic == 0.0
+    assert np.abs(found - albedo).mean() < 0.03
+
+
+def test_one_wrong_view_loses_against_three():
+    images = np.full((4, 4, 4, 1), 0.5, np.float32)
+    images[0] = 1.0
+    seen = Observations(np.ones((4, 5), np.float32), np.full((4, 5, 2), 2.0))
+    value, weight, residual = fuse(images, np.ones((4, 4, 4), np.float32), seen)
+    assert value[:, 0] == pytest.approx(np.full(5, 0.5), abs=0.02)
+    assert weight == pytest.approx(np.full(5, 4.0)) and (residual > 0.05).all()
+
+
+def test_spread_fills_the_unseen_and_keeps_the_seen():
+    """A strip of vertices: seen at both ends, linear in between."""
+    n = 21
+    low, high = np.arange(n), np.arange(n) + n
+    faces = np.concatenate([np.stack([low[:-1], low[1:], high[:-1]], 1), np.stack([low[1:], high[1:], high[:-1]], 1)])
+    values = np.zeros((2 * n, 1))
+    weight = np.zeros(2 * n)
+    values[[n - 1, 2 * n - 1]], weight[[0, n, n - 1, 2 * n - 1]] = 1.0, 1.0
+    out = spread(values, weight, faces)[:, 0]
+    assert abs(out[0]) < 0.02 and abs(out[n - 1] - 1) < 0.02
+    assert out[:n] == pytest.approx(np.linspace(0, 1, n), abs=0.08)
+
+
+def test_confidence_grows_with_views_and_falls_with_their_quarrel():
+    c = confidence(np.array([0.0, 0.2, 2.0, 2.0]), np.array([0.0, 0.0, 0.0, 0.2]))
+    assert c[0] == 0 and c[0] < c[1] < c[2] <= 1 and c[3] < 0.2
