@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.geometry.features import Constraints, Features, closest_on_segments
-from gdtool.geometry.mesh_quality import corner_jacobians, valences
+from gdtool.geometry.mesh_quality import corner_jacobians, polygon_normals, scaled_jacobian, valences
 from gdtool.geometry.repair import compact, edges_of
 
 
@@ -101,7 +101,7 @@ def relax(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: F
 
 
 def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
-           least: float = 0.3, rounds: int = 24, most_visits: int = 6000) -> np.ndarray:
+           least: float = 0.3, rounds: int = 12, most_visits: int = 6000) -> np.ndarray:
     """Vertices of folded and needle-like quads moved to the best of a few places near them.
 
     A vertex moves only where the worst scaled Jacobian of its quads, against the surface's normals, gets better. Free
@@ -114,18 +114,16 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
     boundary[edges.ends[edges.count != 2].ravel()] = True
     vertices = vertices.copy()
     normals = _normals_below(vertices, faces, surface)
+    angles = np.arange(8) * (np.pi / 4)
     for turn in range(rounds):
-        bad = np.flatnonzero(corner_jacobians(vertices, faces, normals).min(1) < least)
+        bad = np.flatnonzero(np.minimum(corner_jacobians(vertices, faces, normals).min(1), scaled_jacobian(vertices, faces)) < least)
         if not len(bad):
             break
-        loose = turn >= rounds // 2
+        loose = turn >= rounds - 4
         touched = np.unique(faces[bad])
         most_visits -= len(touched)
         if most_visits < 0:
             break
-        # Another ring of places each time: steps of the golden angle and of sizes that differ.
-        angles = np.arange(8) * (np.pi / 4) + turn * 2.4
-        near_reach, far_reach = (0.12, 0.35) if turn % 3 == 0 else (0.05, 0.2) if turn % 3 == 1 else (0.25, 0.6)
         for v in touched.tolist():
             held = constraints.curve[v] >= 0
             if (constraints.fixed[v] and not loose) or (boundary[v] and not held):
@@ -138,7 +136,7 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
             # A ring of places in the plane of the neighbours finds a way out of most folds.
             circle = np.cos(angles)[:, None] * axes[0] + np.sin(angles)[:, None] * axes[min(1, len(axes) - 1)]
             places = np.concatenate([[mean, vertices[faces[mine]].mean((0, 1)), (mean + here) / 2],
-                                     here + near_reach * spread * circle, here + far_reach * spread * circle])
+                                     here + 0.12 * spread * circle, here + 0.35 * spread * circle])
             if held and not loose:
                 places = closest_on_segments(places, features.points, features.segments[features.curve == constraints.curve[v]])[2]
             else:
@@ -148,7 +146,10 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
             corners[:, faces[mine] == v] = places[:, None]
             flat = corners.reshape(-1, 4, 3)
             own = np.arange(len(flat) * 4).reshape(-1, 4)
-            got = corner_jacobians(flat.reshape(-1, 3), own, np.tile(normals[mine], (len(places), 1))).reshape(len(places), -1).min(1)
+            # Against the surface's normal and the quad's own: a quad may be folded in one and not in the other.
+            flat = flat.reshape(-1, 3)
+            below = corner_jacobians(flat, own, np.tile(normals[mine], (len(places), 1)))
+            got = np.minimum(below, corner_jacobians(flat, own, polygon_normals(flat, own)[0])).reshape(len(places), -1).min(1)
             best = int(got.argmax())
             if got[best] > got[0] + 1e-3:
                 vertices[v] = places[best]
