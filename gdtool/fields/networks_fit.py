@@ -64,7 +64,8 @@ def start(seed: int, device: str) -> Fit:
     return Fit(sdf, material, light, torch.tensor(float(np.log(60.0)), device=device, requires_grad=True))
 
 
-def fit_distances(fit: Fit, sample: Callable[[int], tuple[np.ndarray, np.ndarray]], steps: int, batch: int, track) -> float:
+def fit_distances(fit: Fit, sample: Callable[[int], tuple[np.ndarray, np.ndarray]], steps: int, batch: int, track,
+                  out_of_time: Callable[[], bool]) -> float:
     """Fit the SDF network to known distances: sample(n) gives points (n, 3) and distances (n,). Returns the last mean error."""
     device = fit.light.device
     optimiser = torch.optim.Adam(fit.sdf.parameters(), lr=1e-3)
@@ -81,6 +82,8 @@ def fit_distances(fit: Fit, sample: Callable[[int], tuple[np.ndarray, np.ndarray
         optimiser.step()
         schedule.step()
         error = 0.95 * error + 0.05 * float(gap.detach().mean()) if error else float(gap.detach().mean())
+        if out_of_time():
+            break
     return error
 
 

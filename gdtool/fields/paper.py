@@ -140,11 +140,15 @@ def fit_networks(cameras: list[Camera], mask: np.ndarray, images: dict[str, np.n
         pick = rng.integers(0, len(points), n)
         return points[pick], distances[pick]
 
-    error = fit_distances(fit, sample, options.distance_steps, 4096, track)
+    def over(share: float) -> bool:
+        return bool(options.budget) and time.monotonic() - began > share * options.budget
+
+    # A third of the budget goes to the start at most: the views are what is to be fitted.
+    error = fit_distances(fit, sample, options.distance_steps, 4096, track, lambda: over(0.33))
     pixels = gather_pixels(cameras, mask, images, vertices, faces, options.device)
     done = train(fit, pixels, volume_steps=options.volume_steps, surface_steps=options.surface_steps, batch=options.batch,
                  seed=options.seed, rule=options.rule, brdf=options.brdf, track=track,
-                 out_of_time=lambda: bool(options.budget) and time.monotonic() - began > options.budget)
+                 out_of_time=lambda: over(1.0))
     figures = {"distance_error": error, "steps": done}
     if fit.history:
         figures |= {f"loss_{name}": value for name, value in fit.history[-1].items() if name != "step"}

@@ -40,7 +40,7 @@ def grid_over(low: np.ndarray, high: np.ndarray, step: float, margin: int, multi
 
 
 def dilate(mask: np.ndarray, steps: int) -> np.ndarray:
-    """Boolean grid (a, b, c) grown by a cube of the given half-size."""
+    """Boolean grid or image grown by a cube or square of the given half-size."""
     from scipy.ndimage import maximum_filter
 
     return mask if steps < 1 else maximum_filter(mask, size=2 * steps + 1, mode="constant", cval=0)
@@ -110,7 +110,7 @@ def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 
 def components(faces: np.ndarray, vertex_count: int) -> np.ndarray:
-    """Label (f,) of the edge-connected... vertex-connected piece each face belongs to, from 0."""
+    """Label (f,) of the connected piece each face belongs to, from 0."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
