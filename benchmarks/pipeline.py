@@ -147,8 +147,9 @@ def plot(records: list[dict], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    panels = [("surface_distance", "distance to the true surface", True), ("albedo_psnr_masked", "albedo PSNR, dB", False)]
-    figure, axes = plt.subplots(1, len(panels), figsize=(10, 4), layout="constrained")
+    panels = [("surface_distance", "distance to the true surface", True), ("seen_distance", "over the part that the views see", True),
+              ("albedo_psnr_masked", "albedo PSNR, dB", False)]
+    figure, axes = plt.subplots(1, len(panels), figsize=(14, 4), layout="constrained")
     rows = summary(records)
     for axis, (name, label, logarithmic) in zip(axes, panels):
         for color, way in (("tab:blue", "model"), ("tab:orange", "image")):
@@ -162,6 +163,7 @@ def plot(records: list[dict], path: Path) -> None:
             for seconds, value, quality in middle:
                 axis.annotate(quality, (seconds, value), textcoords="offset points", xytext=(5, 5), fontsize=8)
         axis.set(xscale="log", yscale="log" if logarithmic else "linear", xlabel="seconds", ylabel=label)
+        axis.margins(0.15)
         axis.grid(alpha=0.3, which="both")
         if axis.get_legend_handles_labels()[0]:
             axis.legend()
