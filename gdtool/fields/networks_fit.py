@@ -189,7 +189,12 @@ def train(fit: Fit, pixels: Pixels, *, volume_steps: int, surface_steps: int, ba
                   {"params": [fit.light], "lr": 1e-2}, {"params": [fit.sharpness], "lr": 5e-3}]
     optimiser = torch.optim.Adam(parameters)
     steps = volume_steps + surface_steps
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda k: 0.05 + 0.95 * 0.5 * (1 + np.cos(np.pi * k / max(steps, 1))))
+
+    def rate(k: int) -> float:
+        # Adam's first steps move every weight by the full rate: without a warm-up they undo the fitted start.
+        return min(1.0, (k + 1) / 30) * (0.05 + 0.475 * (1 + float(np.cos(np.pi * k / max(steps, 1)))))
+
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, rate)
     hits, misses = (torch.nonzero(x)[:, 0].cpu() for x in (pixels.inside, ~pixels.inside))
     done = 0
     for k in track(steps, "networks"):
