@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime
 import itertools
@@ -145,10 +146,9 @@ def run_one(stage: Stage, given: list[Source], options: Any, flags: dict[str, st
     digests = [(role, sources.digest(one)) for role, one in roles]
     keyed = option_record(options, None)
     key = digest_of([stage.name, stage.version, keyed, digests])
-    target.parent.mkdir(parents=True, exist_ok=True)
     recorded = option_record(options, target)
     start = time.perf_counter()
-    with locked(target):
+    with _parents(target), locked(target):
         clear_stale(target, key)
         reason = "asked by --force" if settings.force else stale_reason(target, stage, key, recorded, digests)
         if reason is None:
@@ -186,6 +186,21 @@ def run_one(stage: Stage, given: list[Source], options: Any, flags: dict[str, st
     seconds = time.perf_counter() - start
     log.say(f"{target}: done in {seconds:.1f} s" + (f", skipped {len(out.skipped)}" if out.skipped else ""))
     return Result(target, stage.writes, "done", seconds, tuple(f"{s.what}: {s.reason}" for s in out.skipped))
+
+
+@contextlib.contextmanager
+def _parents(target: Path) -> Iterator[None]:
+    """Make the folders above target; what stays empty, because the run failed, goes again."""
+    made = [folder for folder in target.parents if not folder.exists()]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    finally:
+        for folder in made:
+            try:
+                folder.rmdir()
+            except OSError:
+                break
 
 
 def _record(out: Output, start: float) -> RunRecord:

@@ -116,7 +116,7 @@ def test_one_bad_source_among_many():
     done = toy("bad.png", "good.png")
     assert done.returncode == 1 and done.stdout == "good.asset/renders\n"
     assert "gdtool: bad.png: is bad; give a good one" in done.stderr.splitlines() and "Traceback" not in done.stderr
-    assert toy("bad.png").returncode == 3
+    assert toy("bad.png").returncode == 3 and not Path("bad.asset").exists()
     assert toy("bad.png", "--debug").stderr.count("Traceback") == 1
 
 
