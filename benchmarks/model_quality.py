@@ -121,7 +121,7 @@ def main() -> None:
             start = time.perf_counter()
             sampled = sample_images(model, rgba, steps=steps, scheduler=arguments.scheduler, seed=number)
             result = views_from_images({d: x[0] for d, x in sampled.items()}, [cameras[n] for n in config.views],
-                                       BACKGROUND[config.backgrounds[0]], config.domains)
+                                       BACKGROUND[config.backgrounds[0]], config.domains, (0.5 + 0.5 * rgba[0, 3]).numpy())
             name = f"model, {steps} step{'s' * (steps > 1)}"
             seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
             table.setdefault(name, []).append(figures(result, truth))

@@ -15,13 +15,27 @@ def sharpen(mask: torch.Tensor) -> torch.Tensor:
     return ((mask - 0.5) * 2 + 0.5).clamp(0, 1)
 
 
-def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], background: float, domains: tuple[str, ...]) -> Views:
-    """Encoded images (k, 3, h, w) of one object -> Views of the asked domains with one mask per view, shared by all."""
+def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], background: float, domains: tuple[str, ...],
+                      picture_alpha: np.ndarray | None = None) -> Views:
+    """Encoded images (k, 3, h, w) of one object -> Views of the asked domains with one mask per view, shared by all.
+
+    picture_alpha (h, w): coverage of the framed picture. It is the front view's silhouette, and mirrored the back's
+    (both orthographic), so neither is guessed; the front color, nearly the picture itself, is divided by it.
+    """
     from gdtool.images.color import linear_from_srgb
 
     soft = coverage(images, background)
     mask = sharpen(soft).numpy()
     values = decode(images, soft, background)
+    if picture_alpha is not None:
+        known = np.ascontiguousarray(picture_alpha, np.float32)
+        for k, camera in enumerate(cameras):
+            if camera.name == "back":
+                mask[k] = known[:, ::-1]
+            elif camera.name == "front":
+                mask[k] = known
+                if "color" in images:
+                    values["color"][k] = decode({"color": images["color"][k]}, torch.from_numpy(known), background)["color"]
     out = {}
     for domain in images:
         if domain not in domains:

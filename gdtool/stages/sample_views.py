@@ -62,7 +62,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
                                scheduler=options.scheduler, precision=options.precision, progress=out.progress)
     cameras = {camera.name: camera for camera in rig("six", config.image_size)}
     views = views_from_images({d: x[0].cpu() for d, x in images.items()}, [cameras[name] for name in config.views],
-                              BACKGROUND[config.backgrounds[0]], options.domains)
+                              BACKGROUND[config.backgrounds[0]], options.domains, condition[..., 3])
     with out.step("write"):
         # what the model was shown, after cutting out and framing
         write_png(out.path("condition/000.png"), srgb_from_linear_rgba(condition, srgb_from_linear))

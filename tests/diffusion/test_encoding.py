@@ -80,3 +80,20 @@ def test_whole_frame_pads_to_a_square():
     image = np.ones((20, 40, 4), np.float32)
     out = whole_frame(image, 40)
     assert out[:10, :, 3].max() < 1e-5 and out[30:, :, 3].max() < 1e-5 and out[12:28, :, 3].min() > 0.99
+
+
+def test_the_pictures_silhouette_is_the_front_views_and_mirrored_the_backs(sphere):
+    """Whatever the network guessed: here a sphere everywhere, and a picture that shows a slanted shape."""
+    from gdtool.cameras import rig
+    from gdtool.diffusion.result import views_from_images
+
+    views, planes = sphere
+    encoded = encode(planes, tuple(range(6)), torch.tensor([0.0]))[0]
+    alpha = np.tril(np.ones((32, 32), np.float32))
+    out = views_from_images({d: encoded[i] for i, d in enumerate(DOMAINS)}, rig("six", 32), 0.0, DOMAINS, alpha)
+    names = list(out.names)
+    np.testing.assert_array_equal(out.mask[names.index("front")], alpha)
+    np.testing.assert_array_equal(out.mask[names.index("back")], alpha[:, ::-1])
+    np.testing.assert_allclose(out.mask[names.index("right")], views.mask[names.index("right")], atol=1e-6)
+    assert all(np.isfinite(image).all() for image in out.images.values())
+    assert (out.images["depth"][names.index("front")][alpha == 0] == 0).all()
