@@ -25,6 +25,30 @@ def disagreement(sights: list[Sight], reach: float = 0.06, stride: int = 3) -> f
     return float(np.median(gaps)) if len(gaps) else 0.0
 
 
+def agreement(sights: list[Sight], reach: float = 0.04, stride: int = 3) -> float:
+    """Share of the points that should be seen by another view, facing it, that it has within reach (world units).
+
+    True views give 0.6 and more (the rest is occluded there), views of different things nearly 0. 1 when no view faces
+    what another shows.
+    """
+    confirmed = asked = 0
+    for i, first in enumerate(sights):
+        if first.planes is None:
+            continue
+        chosen = np.zeros(first.mask.shape, bool)
+        chosen[::stride, ::stride] = True
+        chosen &= (first.weight > 0.1) & ~first.broken
+        points, normals = first.points[chosen].astype(np.float64), first.planes[chosen][:, :3]
+        for j, second in enumerate(sights):
+            facing = normals @ second.camera.backward > 0.5
+            if i == j or second.planes is None or not facing.any():
+                continue
+            distance, weight, _, _ = tangent_distance(second, points[facing])
+            confirmed += int(((weight > 0.1) & (np.abs(distance) < reach)).sum())
+            asked += int(facing.sum())
+    return confirmed / asked if asked else 1.0
+
+
 class _Match:
     """Points of view i measured against view j: rows of the linear system."""
 

@@ -19,6 +19,10 @@ from gdtool.core.errors import InputError, UsageError
 from gdtool.core.kinds import DOMAINS
 from gdtool.core.stage import Inputs, Output, Stage
 
+# Below this share of points that another view confirms, depth and normals say less of the shape than the silhouettes do.
+LEAST_AGREEMENT = 0.25
+
+
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of reconstruct."""
 
@@ -35,7 +39,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Reconstruct one views folder."""
     from gdtool.fields.appearance import appearance
-    from gdtool.fields.fusion import align_depth, fuse_views, grid_step, is_closed_manifold, silhouettes_outvoted
+    from gdtool.fields.align import agreement
+    from gdtool.fields.fusion import align_depth, fuse_views, grid_step, is_closed_manifold, prepare_all, silhouettes_outvoted
     from gdtool.folders.surface import Surface, write_surface
     from gdtool.folders.views import read_views
     from gdtool.geometry.normals import vertex_normals
@@ -55,6 +60,10 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     with out.step("align"):
         depth = _depth(views, out)
         sights, before, noise = align_depth(views.cameras, views.mask, depth, views.images.get("normal"), step)
+        agreed = agreement(sights)
+        if agreed < LEAST_AGREEMENT:
+            out.warn(f"depth and normals do not fit together (a view confirms {agreed:.0%} of another's points); the silhouettes alone give the shape")
+            sights, noise = prepare_all(views.cameras, views.mask, None, None), 0.0
         outvoted = silhouettes_outvoted(sights)
         if noise == before and depth is not None:
             out.skip("alignment of depth", f"the views agree to {noise / step:.3f} of a grid step")
@@ -77,7 +86,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         _use_fit(fit, vertices, views, look, options, out)
     surface = Surface(vertices, faces, look.albedo, look.roughness, look.metallic, look.confidence, normals, look.light)
     report = {"seen_share": float((shape.support > 0.02).mean()), "pieces_dropped": shape.dropped, "grid_step": shape.step,
-              "disagreement_before": before, "disagreement": noise, "silhouettes_outvoted": outvoted,
+              "disagreement_before": before, "disagreement": noise, "agreement": agreed, "silhouettes_outvoted": outvoted,
               "mean_confidence": float(look.confidence.mean()), **look.figures, **figures}
     with out.step("write"):
         write_surface(out, surface, watertight=is_closed_manifold(faces), method=options.method, field=fit is not None,
@@ -144,4 +153,4 @@ def _check_masks(path, views, out: Output) -> None:
             out.warn(f"view {name}: its mask is empty; the view is left out")
 
 
-STAGE = Stage(name="reconstruct", version=2, reads=("views",), writes="surface", Options=Options, run=run)
+STAGE = Stage(name="reconstruct", version=3, reads=("views",), writes="surface", Options=Options, run=run)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.fields.align import depth_corrections, disagreement
+from gdtool.fields.align import agreement, depth_corrections, disagreement
 from gdtool.fields.carve import silhouettes_outvoted
 from gdtool.fields.fusion import align_depth, depth_for, fuse_views, grid_step, is_closed_manifold, prepare_all
 from gdtool.fields.sights import free_distance, hull_distance, silhouette_distance
@@ -109,3 +109,13 @@ def test_flat_card_and_empty_views_close():
     # As thin as the grid can hold, and without a hole.
     assert np.abs(shape.vertices[:, 2]).max() < 1.2 * shape.step
     assert len(shape.vertices) - len(shape.faces) // 2 == 2
+
+
+def test_true_views_confirm_one_another_and_noise_does_not(seen):
+    cameras, images, mask = seen["torus"]
+    normal = images["normal"]
+    assert agreement(prepare_all(cameras, mask, images["depth"], normal)) > 0.6
+    rng = np.random.default_rng(0)
+    blocks = np.kron(rng.uniform(1.5, 2.5, (len(cameras), SIZE // 12, SIZE // 12)), np.ones((12, 12)))
+    assert agreement(prepare_all(cameras, mask, np.where(mask > 0.5, blocks, 0).astype(np.float32), normal)) < 0.25
+    assert agreement(prepare_all(cameras, mask, None, None)) == 1.0
