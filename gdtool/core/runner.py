@@ -204,10 +204,21 @@ def _parents(target: Path) -> Iterator[None]:
 
 
 def _record(out: Output, start: float) -> RunRecord:
-    peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 1024
     finished = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     seconds = {name: round(value, 4) for name, value in out.seconds.items()}
-    return RunRecord(seconds, round(time.perf_counter() - start, 4), round(peak, 1), finished)
+    return RunRecord(seconds, round(time.perf_counter() - start, 4), round(_peak_memory_mb(), 1), finished)
+
+
+def _peak_memory_mb() -> float:
+    """Largest resident set of this process or of one of its children."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    try:
+        # Not RUSAGE_SELF: that counts what the process was before it became gdtool, a large parent say.
+        status = Path("/proc/self/status").read_text()
+        own = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 1024
+    except (OSError, StopIteration):
+        own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return max(own, children)
 
 
 def write_dataset_index(root: Path, results: list[Result]) -> Path:

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import resource
 import sys
 from pathlib import Path
 
@@ -37,7 +38,9 @@ def stand_in(tmp_path, monkeypatch):
 def test_a_command_is_timed_and_weighed(stand_in):
     cost = measure.gdtool("remesh", "x", "--faces", "5")
     assert json.loads(cost.stdout)["arguments"] == ["remesh", "x", "--faces", "5"]
-    assert 0.2 <= cost.seconds < 20 and 80 < cost.peak_mb < 400
+    # The kernel counts what a process was before it became the command: here all of pytest.
+    own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    assert 0.2 <= cost.seconds < 20 and 80 < cost.peak_mb < 400 + own
 
 
 def test_what_fails_says_why(stand_in):

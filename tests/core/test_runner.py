@@ -29,6 +29,11 @@ def run(*arguments, options=None, **settings):
     return list(run_all(STAGE, arguments, options or Options(), {}, Settings(**settings)))
 
 
+def listen_to_interrupts():
+    """A shell starts background jobs deaf to SIGINT, and the tests may be one."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def leftovers(folder="."):
     return [p.name for p in Path(folder).rglob(".*")]
 
@@ -174,7 +179,7 @@ def test_interrupted_leaves_nothing(sign, code):
     Path("cat.png").write_bytes(b"cat")
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen([sys.executable, "-m", "tests.core.toy", "cat.png", "--repeat", "500", "--pause", "0.02"], env=env,
-                               stderr=subprocess.PIPE)
+                               stderr=subprocess.PIPE, preexec_fn=listen_to_interrupts)
     while not list(Path(".").glob("cat.asset/.renders.*.partial/000.png")):
         time.sleep(0.01)
     process.send_signal(sign)

@@ -18,7 +18,13 @@ FACES = 6 * CELLS**2  # what quad_cube has: remesh passes it through, so its run
 REMESH = [sys.executable, "-m", "gdtool", "remesh", "--faces", str(FACES)]
 
 
+def listen_to_interrupts():
+    """A shell starts background jobs deaf to SIGINT, and the tests may be one."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def start(*arguments, **kwargs):
+    kwargs.setdefault("preexec_fn", listen_to_interrupts)
     return subprocess.Popen([*REMESH, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **kwargs)
 
 
