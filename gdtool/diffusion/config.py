@@ -50,6 +50,7 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     prediction: Literal["epsilon", "v", "x"] = "x"
     timesteps: int = 1000
     noise_schedule: Literal["scaled_linear", "cosine"] = "cosine"
+    sampling_steps: int = 50  # denoising steps of sample-views when none are asked for: what measured best for this model
     # encoded background of color and albedo while training; sampling uses the first
     backgrounds: tuple[Literal["white", "grey", "black"], ...] = ("grey",)
     # where the pretrained parts of the paper's configuration live: a local folder or a hub id
@@ -97,13 +98,14 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 PRESETS: dict[str, tuple[ModelConfig, TrainConfig]] = {
     # a few thousand weights: what the tests train
     "tiny": (
-        ModelConfig(image_size=32, patch=4, channels=(16, 32), attention_levels=(False, True), head_width=16,
+        ModelConfig(sampling_steps=2, image_size=32, patch=4, channels=(16, 32), attention_levels=(False, True), head_width=16,
                     norm_groups=4, encoder_width=32, encoder_layers=1),
         TrainConfig(batch=2, steps=20, warmup=2, pbr_pixels=64, ema=0.9,
                     phases=(Phase(share=0.5, domains=2, views=2), Phase(share=1.0))),
     ),
     # what a laptop trains over lunch, and what the bundled model is
-    "small": (ModelConfig(), TrainConfig()),
+    # While it is trained for minutes and not for days, its first prediction is its best (docs/benchmarks/model_quality.md).
+    "small": (ModelConfig(sampling_steps=1), TrainConfig()),
     # METHOD section 1: Stable Diffusion Image Variations grown to six domains; 30,000 multi-view steps, then 20,000
     # with attention across the domains, batch 512
     "paper": (

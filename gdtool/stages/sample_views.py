@@ -21,7 +21,7 @@ from gdtool.core.stage import Inputs, Output, SecondInput, Stage, file_option
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    steps: Annotated[int, Meta(ge=1, le=1000, description="Denoising steps.")] = 8
+    steps: Annotated[int, Meta(ge=1, le=1000, description="Denoising steps; without it what measured best for the model.")] | None = None
     guidance: Annotated[float, Meta(ge=0, le=30, description="Classifier-free guidance; 1: none, and half the time.")] = 1.0
     scheduler: Annotated[Literal["ddim", "dpm"], Meta(description="Sampler: DDIM or DPM-Solver++.")] = "ddim"
     seed: Annotated[int, Meta(ge=0, description="Seed of the noise, the same for every object whatever the order.")] = 0
@@ -58,7 +58,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         condition = _condition(inputs, options, config.image_size, out)
     with out.step("sample"):
         rgba = to_tensor_condition(condition).to(out.device)
-        images = sample_images(model, rgba, domains=options.domains, steps=options.steps, guidance=options.guidance, seed=options.seed,
+        images = sample_images(model, rgba, domains=options.domains, steps=options.steps or config.sampling_steps, guidance=options.guidance, seed=options.seed,
                                scheduler=options.scheduler, precision=options.precision, progress=out.progress)
     cameras = {camera.name: camera for camera in rig("six", config.image_size)}
     views = views_from_images({d: x[0].cpu() for d, x in images.items()}, [cameras[name] for name in config.views],
