@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import msgspec
 
+import gdtool
 from gdtool import __version__
 from gdtool.core import log, sources
 from gdtool.core.errors import GdtoolError, InputError, ResourceError, UsageError, from_os_error
@@ -75,6 +76,8 @@ def second_inputs(stage: Stage, source: Source, given: dict[str, str | None]) ->
         elif wanted.search and isinstance(source, Folder):
             found = find_ancestor(source, wanted.kind)
             out[flag] = open_folder(found.path) if found else None
+        elif wanted.default:
+            out[flag] = open_folder(Path(gdtool.__file__).parent / wanted.default, (wanted.kind,), stage.name)
         else:
             out[flag] = None
         if out[flag] is None and wanted.required:

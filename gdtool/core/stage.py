@@ -28,12 +28,16 @@ def file_option(description: str) -> Any:
 
 @dataclass(frozen=True)
 class SecondInput:
-    """An input beside the source: a flag, and when search is set found along the provenance chain without it."""
+    """An input beside the source: a flag, and when search is set found along the provenance chain without it.
+
+    default: a folder that ships with gdtool, as "package/folder", taken when neither gives one.
+    """
 
     kind: str
     required: bool = False
     search: bool = True
     help: str = ""
+    default: str = ""
 
 
 @dataclass(frozen=True)

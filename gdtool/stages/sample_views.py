@@ -48,7 +48,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     torch.set_num_threads(out.threads)
     with out.step("load"):
-        model = load_model(_model_folder(inputs)).to(out.device)
+        model = load_model(inputs.second["model"].path).to(out.device)
     config = model.config
     unknown = [d for d in options.domains if d not in config.domains]
     if unknown or not options.domains:
@@ -73,16 +73,6 @@ def srgb_from_linear_rgba(image, srgb_from_linear):
     import numpy as np
 
     return np.concatenate([srgb_from_linear(np.clip(image[..., :3], 0, 1)), np.clip(image[..., 3:], 0, 1)], -1)
-
-
-def _model_folder(inputs: Inputs):
-    """Path of the given model, or of the one inside the package."""
-    from pathlib import Path
-
-    import gdtool.models
-
-    given = inputs.second["model"]
-    return given.path if given is not None else Path(gdtool.models.__file__).parent / "default"
 
 
 def _condition(inputs: Inputs, options: Options, size: int, out: Output):
@@ -117,4 +107,5 @@ def _condition(inputs: Inputs, options: Options, size: int, out: Output):
 
 
 STAGE = Stage(name="sample-views", version=1, reads=("image-file",), writes="views", Options=Options, run=run,
-              second_inputs={"model": SecondInput("model", search=False, help="Model folder; the bundled model without it.")})
+              second_inputs={"model": SecondInput("model", search=False, default="models/default",
+                                              help="Model folder; the bundled model without it.")})

@@ -215,3 +215,12 @@ def test_two_processes_on_one_output_do_not_mix():
     assert [process.returncode for process in both] == [0, 0]
     assert sum("up to date" in text for text in errors) == 1
     assert len(open_folder(Path("cat.asset/renders")).manifest.files) == 20 and leftovers() == []
+
+
+def test_a_folder_that_ships_with_gdtool_is_an_input_like_any_other():
+    """A new bundled model makes old views stale: it is among the inputs that the key is made of."""
+    from gdtool.core.runner import second_inputs
+    from gdtool.stages.sample_views import STAGE as sample_views
+
+    found = second_inputs(sample_views, Path("cat.png"), {"model": None})["model"]
+    assert found.kind == "model" and found.name == "default"
