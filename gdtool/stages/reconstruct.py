@@ -21,6 +21,8 @@ from gdtool.core.stage import Inputs, Output, Stage
 
 # Below this share of points that another view confirms, depth and normals say less of the shape than the silhouettes do.
 LEAST_AGREEMENT = 0.25
+# Below this share of normals that fit the slope of the depth they describe another surface (a broken normal map, say).
+LEAST_FITTING_NORMALS = 0.5
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -58,8 +60,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     step = grid_step(views.cameras, options.resolution)
     with out.step("align"):
+        normal = _normals(views, out)
         depth = _depth(views, out)
-        sights, before, noise = align_depth(views.cameras, views.mask, depth, views.images.get("normal"), step)
+        sights, before, noise = align_depth(views.cameras, views.mask, depth, normal, step)
         agreed = agreement(sights)
         if agreed < LEAST_AGREEMENT:
             out.warn(f"depth and normals do not fit together (a view confirms {agreed:.0%} of another's points); the silhouettes alone give the shape")
@@ -130,6 +133,20 @@ def _use_fit(fit, vertices, views, look, options: Options, out: Output) -> None:
     save_field(out.path("field.safetensors"), fit)
 
 
+def _normals(views, out: Output):
+    """Normal views (k, h, w, 3); None where there are none, or where they contradict the depth."""
+    from gdtool.fields.align import normals_fit_depth
+
+    normal, depth = views.images.get("normal"), views.images.get("depth")
+    if normal is None or depth is None:
+        return normal
+    fit = normals_fit_depth(views.cameras, views.mask, depth, normal)
+    if fit < LEAST_FITTING_NORMALS:
+        out.warn(f"only {fit:.0%} of the normals fit the slope of the depth; they are left out of the shape")
+        return None
+    return normal
+
+
 def _depth(views, out: Output):
     """Depth views (k, h, w); without them, what the normals and silhouettes give; None without either."""
     from gdtool.fields.fusion import depth_for
@@ -153,4 +170,4 @@ def _check_masks(path, views, out: Output) -> None:
             out.warn(f"view {name}: its mask is empty; the view is left out")
 
 
-STAGE = Stage(name="reconstruct", version=3, reads=("views",), writes="surface", Options=Options, run=run)
+STAGE = Stage(name="reconstruct", version=4, reads=("views",), writes="surface", Options=Options, run=run)

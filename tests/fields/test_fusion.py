@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.fields.align import agreement, depth_corrections, disagreement
+from gdtool.fields.align import agreement, depth_corrections, disagreement, normals_fit_depth
 from gdtool.fields.carve import silhouettes_outvoted
 from gdtool.fields.fusion import align_depth, depth_for, fuse_views, grid_step, is_closed_manifold, prepare_all
 from gdtool.fields.sights import free_distance, hull_distance, silhouette_distance
@@ -119,3 +119,11 @@ def test_true_views_confirm_one_another_and_noise_does_not(seen):
     blocks = np.kron(rng.uniform(1.5, 2.5, (len(cameras), SIZE // 12, SIZE // 12)), np.ones((12, 12)))
     assert agreement(prepare_all(cameras, mask, np.where(mask > 0.5, blocks, 0).astype(np.float32), normal)) < 0.25
     assert agreement(prepare_all(cameras, mask, None, None)) == 1.0
+
+
+def test_normals_of_another_surface_are_found_out(seen):
+    for name in ("sphere", "cube", "torus"):
+        cameras, images, mask = seen[name]
+        assert normals_fit_depth(cameras, mask, images["depth"], images["normal"]) > 0.9
+    assert normals_fit_depth(cameras, mask, images["depth"], np.roll(images["normal"], 1, -1)) < 0.5
+    assert normals_fit_depth(cameras, mask, images["depth"], -images["normal"]) == 0.0
