@@ -77,6 +77,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             shape = fuse_views(sights, step, noise, outvoted)
         except ValueError as error:
             raise InputError(folder.path, str(error), "check the masks and cameras") from None
+    _check_cameras(folder, views.cameras, shape.vertices)
     vertices, faces, figures, fit = shape.vertices, shape.faces, {}, None
     if options.method == "paper":
         vertices, faces, figures, fit = _fit(views, shape, options, out)
@@ -158,6 +159,15 @@ def _depth(views, out: Output):
     if depth is None:
         out.skip("integration of normals", "cameras are perspective; the silhouettes alone give the shape")
     return depth
+
+
+def _check_cameras(folder, cameras, vertices) -> None:
+    """Raises InputError for a camera that has a part of the surface behind it."""
+    from gdtool.cameras import project
+
+    for camera in cameras:
+        if project(camera, vertices)[1].min() <= 0:
+            raise InputError(folder.file("cameras.json"), f"camera {camera.name!r} is inside the object or looks away from it", "check the poses")
 
 
 def _check_masks(path, views, out: Output) -> None:
