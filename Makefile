@@ -40,8 +40,8 @@ MINUTES ?= 600
 RENDER := $(BIN)/gdtool render-dataset --size 64 --samples 8 --light-samples 6
 
 data: venv
-	$(RENDER) --condition-views 4 procedural:0..$(OBJECTS) -o $(DATA)/objects
-	$(RENDER) --condition-views 3 procedural:900000..900023 -o $(DATA)/held_out
+	$(RENDER) --condition-views 3 procedural:0..$(OBJECTS) -o $(DATA)/objects
+	$(RENDER) --condition-views 3 procedural:900000..900019 -o $(DATA)/held_out
 
 model: data
 	$(BIN)/gdtool train $(DATA)/objects --minutes $(MINUTES) -o $(DATA)/model

@@ -25,6 +25,13 @@ def disagreement(sights: list[Sight], reach: float = 0.06, stride: int = 3) -> f
     return float(np.median(gaps)) if len(gaps) else 0.0
 
 
+def _sparse(sight: Sight, stride: int) -> np.ndarray:
+    """(h, w) bool: every stride-th pixel along both axes that has a surface worth comparing."""
+    chosen = np.zeros(sight.mask.shape, bool)
+    chosen[::stride, ::stride] = True
+    return chosen & (sight.weight > 0.1) & ~sight.broken
+
+
 def agreement(sights: list[Sight], reach: float = 0.04, stride: int = 3) -> float:
     """Share of the points that should be seen by another view, facing it, that it has within reach (world units).
 
@@ -35,9 +42,7 @@ def agreement(sights: list[Sight], reach: float = 0.04, stride: int = 3) -> floa
     for i, first in enumerate(sights):
         if first.planes is None:
             continue
-        chosen = np.zeros(first.mask.shape, bool)
-        chosen[::stride, ::stride] = True
-        chosen &= (first.weight > 0.1) & ~first.broken
+        chosen = _sparse(first, stride)
         points, normals = first.points[chosen].astype(np.float64), first.planes[chosen][:, :3]
         for j, second in enumerate(sights):
             facing = normals @ second.camera.backward > 0.5
@@ -82,9 +87,7 @@ def _matches(sights: list[Sight], reach: float, stride: int):
     for i, first in enumerate(sights):
         if first.planes is None:
             continue
-        chosen = np.zeros(first.mask.shape, bool)
-        chosen[::stride, ::stride] = True
-        chosen &= (first.weight > 0.1) & ~first.broken
+        chosen = _sparse(first, stride)
         points = first.points[chosen].astype(np.float64)
         normals = first.planes[chosen][:, :3]
         own = first.weight[chosen]
