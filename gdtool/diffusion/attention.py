@@ -183,3 +183,28 @@ class Transformer(nn.Module):
         for block in self.transformer_blocks:
             tokens = block(tokens, context, layout)
         return x + self.proj_out(tokens.transpose(1, 2).reshape(n, c, h, w))
+
+
+class RowAttention(nn.Module):
+    """Attention along the rows that all views of a domain share, for levels whose images are too large to attend whole.
+
+    With orthographic cameras at one elevation a point's height is the same in every view: epipolar lines are rows
+    (Era3D, Li et al. 2024). A row costs views x side tokens, not views x side². Starts as the identity.
+    """
+
+    def __init__(self, width: int, heads: int, side: int, groups: int):
+        super().__init__()
+        self.norm = nn.GroupNorm(groups, width, eps=1e-6)
+        self.position = nn.Parameter(torch.randn(side, width) * 0.1)
+        self.attn = Attention(width, heads)
+        nn.init.zeros_(self.attn.to_out[0].weight)
+        nn.init.zeros_(self.attn.to_out[0].bias)
+
+    def forward(self, x: torch.Tensor, layout: Layout) -> torch.Tensor:
+        """x (b d k, c, h, w) -> the same shape."""
+        n, c, h, w = x.shape
+        tokens = self.norm(x).permute(0, 2, 3, 1) + self.position.to(x.dtype)  # (n, h, w, c)
+        groups = layout.objects * len(layout.domains)
+        rows = tokens.reshape(groups, layout.views, h, w, c).transpose(1, 2).reshape(groups * h, layout.views * w, c)
+        out = self.attn(rows).reshape(groups, h, layout.views, w, c).transpose(1, 2).reshape(n, h, w, c)
+        return x + out.permute(0, 3, 1, 2)

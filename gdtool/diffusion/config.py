@@ -40,6 +40,7 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     gradient_checkpointing: bool = False
     # attention across the images of an object
     multi_view: bool = True
+    row_attention: tuple[bool, ...] = ()  # levels with attention along the rows that the views share; (): none
     cross_domain: Literal["none", "one_way", "two_way"] = "two_way"
     # image encoder: "clip" is one projected embedding as one token, "patch" a small transformer over the image's patches
     encoder: Literal["clip", "patch"] = "patch"
@@ -48,6 +49,9 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     encoder_patch: int = 8
     # noise
     prediction: Literal["epsilon", "v", "x"] = "x"
+    # scale of the network's noisy input: "unit" is variance preserving; "shrunk" is the linear estimate of x_0 from it, so
+    # that pure noise, which says nothing, comes in as nothing (x-prediction only)
+    noisy_input: Literal["unit", "shrunk"] = "unit"
     timesteps: int = 1000
     noise_schedule: Literal["scaled_linear", "cosine"] = "cosine"
     sampling_steps: int = 50  # denoising steps of sample-views when none are asked for: what measured best for this model
@@ -64,15 +68,18 @@ class Phase(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     domains: int = 6
     views: int = 6
     learning_rate: float = 1e-3
+    batch: int = 0  # objects per step of this phase; 0: the run's
 
 
 class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a model is trained; `steps` are optimiser steps, `batch` counts objects per step over all accumulations."""
 
-    batch: int = 4
+    batch: int = 8
     accumulate: int = 1
     steps: int = 4000
-    phases: tuple[Phase, ...] = (Phase(share=0.85, domains=3, views=3), Phase(share=1.0, domains=6, views=4))
+    # The last phase sees all images at once, as sampling does; few objects then, so that a step costs about the same.
+    phases: tuple[Phase, ...] = (Phase(share=0.6, domains=3, views=3), Phase(share=0.8, domains=6, views=3, batch=4),
+                                 Phase(share=1.0, domains=6, views=6, batch=2))
     warmup: int = 50
     decay: bool = True  # cosine to a twentieth of the learning rate over the run
     weight_decay: float = 1e-2
@@ -82,7 +89,7 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     ema: float = 0.999
     snr_gamma: float = 5.0  # min-SNR: a clean image's error is weighted by min(SNR, gamma) …
     snr_floor: float = 1.0  # … and at least by this, or a model that samples in few steps never learns the first one
-    pure_noise: float = 0.4  # share of samples at the last timestep
+    pure_noise: float = 0.6  # share of samples at the last timestep
     drop_embedding: float = 0.05
     drop_both: float = 0.05
     drop_latent: float = 0.05
@@ -99,13 +106,13 @@ PRESETS: dict[str, tuple[ModelConfig, TrainConfig]] = {
     # a few thousand weights: what the tests train
     "tiny": (
         ModelConfig(sampling_steps=2, image_size=32, patch=4, channels=(16, 32), attention_levels=(False, True), head_width=16,
-                    norm_groups=4, encoder_width=32, encoder_layers=1),
+                    norm_groups=4, encoder_width=32, encoder_layers=1, row_attention=(True, False), noisy_input="shrunk"),
         TrainConfig(batch=2, steps=20, warmup=2, pbr_pixels=64, ema=0.9,
                     phases=(Phase(share=0.5, domains=2, views=2), Phase(share=1.0))),
     ),
     # what a laptop trains over lunch, and what the bundled model is
     # While it is trained for minutes and not for days, its first prediction is its best (docs/benchmarks/model_quality.md).
-    "small": (ModelConfig(sampling_steps=1), TrainConfig()),
+    "small": (ModelConfig(sampling_steps=1, row_attention=(True, False, False), noisy_input="shrunk"), TrainConfig()),
     # METHOD section 1: Stable Diffusion Image Variations grown to six domains; 30,000 multi-view steps, then 20,000
     # with attention across the domains, batch 512
     "paper": (

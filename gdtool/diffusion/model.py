@@ -12,7 +12,7 @@ from gdtool.diffusion.attention import Layout
 from gdtool.diffusion.codec import make_codec
 from gdtool.diffusion.config import DOMAINS, ModelConfig
 from gdtool.diffusion.encoder import make_encoder
-from gdtool.diffusion.schedule import clean_from_prediction, signal_and_noise
+from gdtool.diffusion.schedule import clean_from_prediction, input_scale, signal_and_noise
 from gdtool.diffusion.unet import UNet
 
 
@@ -59,8 +59,8 @@ class Model(nn.Module):
     def predict_clean(self, noisy, condition, t, context, layout: Layout, view_idx: torch.Tensor) -> torch.Tensor:
         """Predicted x_0 (n, c, h, w), float32. t (b,): all images of an object share their timestep."""
         label = self.labels[list(layout.domains)][:, view_idx].flatten(0, 1).repeat(layout.objects, 1)
-        out = self.unet(noisy, condition, t, label, context, layout, view_idx).float()
         a, s = self.levels(t, layout)
+        out = self.unet(noisy * input_scale(self.config, a, s), condition, t, label, context, layout, view_idx).float()
         return clean_from_prediction(self.config, out, noisy, a, s)
 
     def levels(self, t: torch.Tensor, layout: Layout) -> tuple[torch.Tensor, torch.Tensor]:

@@ -30,6 +30,16 @@ def clean_from_prediction(config: ModelConfig, prediction, noisy, a, s):
     return (noisy - s * prediction) / a.clamp_min(1e-4)
 
 
+DATA_VARIANCE = 0.25  # of encoded images (most pixels are background), as in Karras et al. 2022
+
+
+def input_scale(config: ModelConfig, a, s):
+    """Factor on x_t before the network: 1, or for "shrunk" that of the best linear estimate of x_0 from x_t."""
+    if config.noisy_input == "unit":
+        return 1.0
+    return a * DATA_VARIANCE / (a * a * DATA_VARIANCE + s * s)
+
+
 def loss_weight(a: torch.Tensor, s: torch.Tensor, gamma: float, floor: float) -> torch.Tensor:
     """Weight of the error of x_0: min-SNR (Hang et al. 2023) from above, floor from below."""
     return (a * a / (s * s).clamp_min(1e-8)).clamp(max=gamma).clamp(min=floor)

@@ -149,14 +149,14 @@ def losses(model: Model, batch: Batch, step: Step, train: TrainConfig) -> dict[s
 
 
 def train_step(state: State, objects: Objects, train: TrainConfig, seed: int, minutes: float | None, device: str) -> dict[str, float]:
-    """One optimiser step over `batch` objects in `accumulate` parts; updates state."""
+    """One optimiser step over the phase's objects in `accumulate` parts; updates state."""
     config, progress = state.model.config, progress_of(state, train, minutes)
     phase = phase_at(progress, train)
     step = choose(config, phase, seed, state.step)
     rate = learning_rate(state, progress, train)
     for group in state.optimizer.param_groups:
         group["lr"] = rate * group["rate"]
-    idx = object_order(len(objects), state.step, train.batch, seed)
+    idx = object_order(len(objects), state.step, phase.batch or train.batch, seed)
     sums: dict[str, float] = {}
     for part in np.array_split(idx, train.accumulate):
         batch = draw(objects, part, config, train, step.choices)

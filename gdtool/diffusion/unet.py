@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
-from gdtool.diffusion.attention import Layout, Transformer
+from gdtool.diffusion.attention import Layout, RowAttention, Transformer
 from gdtool.diffusion.config import CLASS_WIDTH, DOMAINS, ModelConfig
 
 
@@ -77,14 +77,15 @@ class Upsample(nn.Module):
 
 
 class Block(nn.Module):
-    """Residual blocks with a transformer after each (or none), then a change of resolution (or none)."""
+    """Residual blocks with attention along rows and a transformer after each (or neither), then a change of resolution (or none)."""
 
     def __init__(self, inputs: list[int], width: int, side: int, config: ModelConfig, *, attention: bool, embedding: int,
-                 down: bool = False, up: bool = False):
+                 rows: bool = False, down: bool = False, up: bool = False):
         super().__init__()
         heads = config.heads or max(width // config.head_width, 1)
         self.resnets = nn.ModuleList(
             Resnet(n, width, embedding, config.norm_groups, config.time_scale_shift) for n in inputs)
+        self.row_attentions = nn.ModuleList(RowAttention(width, heads, side, config.norm_groups) for _ in inputs) if rows else None
         self.attentions = nn.ModuleList(
             Transformer(width, heads, config.encoder_width, side if config.position_embedding else None,
                         config.norm_groups, config) for _ in inputs) if attention else None
@@ -111,9 +112,11 @@ class UNet(nn.Module):
         last = len(widths) - 1
         self.down_blocks, skips, previous = nn.ModuleList(), [width0], width0
         sides = [side >> i for i in range(len(widths))]
+        rows = config.row_attention or (False,) * len(widths)
         for i, width in enumerate(widths):
             inputs = [previous] + [width] * (config.layers_per_block - 1)
-            self.down_blocks.append(Block(inputs, width, sides[i], attention=config.attention_levels[i], down=i < last, **common))
+            self.down_blocks.append(
+                Block(inputs, width, sides[i], attention=config.attention_levels[i], rows=rows[i], down=i < last, **common))
             skips += [width] * (config.layers_per_block + (i < last))
             previous = width
         self.mid_block = Block([previous, previous], previous, sides[-1], attention=True, **common)
@@ -124,7 +127,8 @@ class UNet(nn.Module):
             for _ in range(config.layers_per_block + 1):
                 inputs.append(previous + skips.pop())
                 previous = width
-            self.up_blocks.append(Block(inputs, width, sides[i], attention=config.attention_levels[i], up=i > 0, **common))
+            self.up_blocks.append(
+                Block(inputs, width, sides[i], attention=config.attention_levels[i], rows=rows[i], up=i > 0, **common))
         self.conv_norm_out = nn.GroupNorm(config.norm_groups, width0)
         self.conv_out = nn.Conv2d(width0, latent_channels, 3, padding=1)
         self.latent_channels = latent_channels
@@ -143,19 +147,18 @@ class UNet(nn.Module):
         x = self.conv_in(torch.cat([noisy, condition], 1))
         skips = [x]
         for block in self.down_blocks:
-            for j, resnet in enumerate(block.resnets):
-                x = self._layer(resnet, block.attentions and block.attentions[j], x, embedding, context, layout)
+            for j in range(len(block.resnets)):
+                x = self._layer(block, j, x, embedding, context, layout)
                 skips.append(x)
             if block.downsamplers:
                 x = block.downsamplers[0](x)
                 skips.append(x)
-        middle = self.mid_block
-        x = self._layer(middle.resnets[0], middle.attentions[0], x, embedding, context, layout)
-        x = self._layer(middle.resnets[1], None, x, embedding, context, layout)
+        for j in range(2):
+            x = self._layer(self.mid_block, j, x, embedding, context, layout)
         for block in self.up_blocks:
-            for j, resnet in enumerate(block.resnets):
+            for j in range(len(block.resnets)):
                 x = torch.cat([x, skips.pop()], 1)
-                x = self._layer(resnet, block.attentions and block.attentions[j], x, embedding, context, layout)
+                x = self._layer(block, j, x, embedding, context, layout)
             if block.upsamplers:
                 x = block.upsamplers[0](x)
         out = self.conv_out(F.silu(self.conv_norm_out(x)))
@@ -165,10 +168,14 @@ class UNet(nn.Module):
             out = out + gate[:, None, None, None] * condition[:, : self.latent_channels]
         return out
 
-    def _layer(self, resnet, attention, x, embedding, context, layout):
+    def _layer(self, block, j, x, embedding, context, layout):
         def run(x, embedding, context):
-            x = resnet(x, embedding)
-            return x if attention is None else attention(x, context, layout)
+            x = block.resnets[j](x, embedding)
+            if block.row_attentions:
+                x = block.row_attentions[j](x, layout)
+            if block.attentions and j < len(block.attentions):
+                x = block.attentions[j](x, context, layout)
+            return x
 
         if self.config.gradient_checkpointing and self.training:
             return checkpoint(run, x, embedding, context, use_reentrant=False)

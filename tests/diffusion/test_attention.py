@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gdtool.diffusion.attention import Attention, CrossDomainAttention, Layout, TransformerBlock
+from gdtool.diffusion.attention import Attention, CrossDomainAttention, Layout, RowAttention, TransformerBlock
 
 
 def block(cross_domain="two_way", multi_view=True):
@@ -112,3 +112,17 @@ def test_views_can_be_permuted():
     order = [2, 0, 1]
     direct = network(x.flatten(0, 1), context, layout).view(2, 3, 4, 16)[:, order]
     torch.testing.assert_close(network(x[:, order].flatten(0, 1), context, layout).view(2, 3, 4, 16), direct)
+
+
+def test_row_attention_starts_as_nothing_and_reads_the_same_row_of_its_domains_views():
+    torch.manual_seed(0)
+    layout, network = Layout(1, (0, 1), 3), RowAttention(16, 2, 4, 4).double()
+    x = torch.randn(layout.images, 16, 5, 4, dtype=torch.float64)
+    assert torch.equal(network(x, layout), x)
+    torch.nn.init.normal_(network.attn.to_out[0].weight)
+    network.norm = torch.nn.Identity()  # its statistics are the whole image's
+    changed = x.clone()
+    changed[1, :, 2, 3] += 1.0  # color, view 1, row 2
+    moved = (network(x, layout) - network(changed, layout)).abs().amax(1)  # (images, rows, columns)
+    assert (moved[:3, 2] > 0).all()
+    assert (moved[:3, [0, 1, 3, 4]] == 0).all() and (moved[3:] == 0).all()

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gdtool.diffusion.config import ModelConfig
-from gdtool.diffusion.schedule import clean_from_prediction, loss_weight, sample, signal_and_noise, timesteps
+from gdtool.diffusion.schedule import DATA_VARIANCE, clean_from_prediction, input_scale, loss_weight, sample, signal_and_noise, timesteps
 
 CONFIG = ModelConfig()
 SD = msgspec.structs.replace(CONFIG, noise_schedule="scaled_linear")
@@ -32,6 +32,15 @@ def test_each_prediction_gives_back_the_clean_image(prediction):
     clean, noise, a, s = torch.randn(5), torch.randn(5), torch.tensor(0.6), torch.tensor(0.8)
     target = {"x": clean, "epsilon": noise, "v": a * noise - s * clean}[prediction]
     torch.testing.assert_close(clean_from_prediction(config, target, a * clean + s * noise, a, s), clean)
+
+
+def test_the_shrunk_input_is_the_best_linear_estimate():
+    config = msgspec.structs.replace(CONFIG, noisy_input="shrunk")
+    generator = torch.Generator().manual_seed(0)
+    clean = torch.randn(100_000, generator=generator, dtype=torch.float64) * DATA_VARIANCE**0.5
+    noisy = 0.6 * clean + 0.8 * torch.randn(100_000, generator=generator, dtype=torch.float64)
+    assert input_scale(config, 0.6, 0.8) == pytest.approx(float((clean * noisy).sum() / noisy.square().sum()), rel=0.02)
+    assert input_scale(config, 0.0, 1.0) == 0 and input_scale(CONFIG, 0.0, 1.0) == 1
 
 
 def test_min_snr_weight():

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
+from gdtool.diffusion import training
 from gdtool.diffusion.config import DOMAINS, PRESETS, Phase
-from gdtool.diffusion.data import LIGHTS, Objects, from_bytes, mirror, object_order, permute_colors, to_bytes
+from gdtool.diffusion.data import LIGHTS, Objects, draw, from_bytes, mirror, object_order, permute_colors, to_bytes
 from gdtool.diffusion.encoding import PLANES, planes_from_images
 from gdtool.diffusion.model import Model, class_labels
 from gdtool.diffusion.training import CHECKPOINT, choose, learning_rate, new_state, phase_at, run_training
@@ -77,6 +78,14 @@ def test_steps_see_color_and_as_many_domains_and_views_as_the_phase_says():
         drawn = choose(MODEL, Phase(domains=3, views=2), 0, step)
         assert drawn.domains[0] == 0 and len(set(drawn.domains)) == 3 and len(drawn.views.unique()) == 2
     assert choose(MODEL, Phase(), 0, 0).domains == tuple(range(6))
+
+
+def test_a_phase_may_have_a_batch_of_its_own(monkeypatch):
+    drawn = []
+    monkeypatch.setattr(training, "draw", lambda objects, idx, *rest: drawn.append(len(idx)) or draw(objects, idx, *rest))
+    train = msgspec.structs.replace(TRAIN, phases=(Phase(share=1.0, domains=1, views=1, batch=3),))
+    training.train_step(new_state(Model(MODEL), train), spheres(), train, 0, None, "cpu")
+    assert sum(drawn) == 3 != TRAIN.batch
 
 
 def test_phases_and_rate_follow_progress():
