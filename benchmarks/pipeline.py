@@ -27,11 +27,11 @@ WAYS = {
     "image": ("sample-views", "reconstruct", "remesh", "unwrap", "bake", "relight"),
 }
 QUALITIES = {
-    "fast": {"render-dataset": ["--size", "128", "--samples", "4", "--light-samples", "4"], "sample-views": ["--steps", "4"],
+    "fast": {"render-dataset": ["--size", "128", "--samples", "4", "--light-samples", "4"], "sample-views": ["--steps", "1", "--precision", "bfloat16"],
              "remesh": ["--faces", "5000"], "unwrap": ["--size", "512"], "bake": ["--size", "512", "--ao-rays", "16"],
              "relight": ["--size", "256"]},
     "default": {},
-    "fine": {"render-dataset": ["--size", "512", "--samples", "32"], "sample-views": ["--steps", "25"],
+    "fine": {"render-dataset": ["--size", "512", "--samples", "32"], "sample-views": ["--steps", "8"],
              "remesh": ["--faces", "50000"], "unwrap": ["--size", "4096"], "bake": ["--size", "4096", "--samples", "4"],
              "relight": ["--size", "1024"]},
 }

@@ -42,7 +42,8 @@ def load_scene(source: str | Path) -> Scene:
 
 
 def _checked(scene: Scene, path: Path) -> Scene:
-    """The scene without faces that have no area. Raises InputError for what no stage can work on."""
+    """The scene without faces of which two corners coincide; those whose three lie on a line stay, being seams that keep a
+    mesh closed. Raises InputError for what no stage can work on."""
     if not len(scene.faces):
         raise InputError(path, "has no faces")
     if scene.faces.min() < 0 or scene.faces.max() >= len(scene.vertices):
@@ -60,10 +61,10 @@ def _checked(scene: Scene, path: Path) -> Scene:
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     if not (area > 1e-16).any():
         raise InputError(path, "has only faces without area")
-    empty = area == 0
+    empty = (corners == np.roll(corners, -1, axis=1)).all(2).any(1)
     if empty.any():
         scene = replace(scene, faces=scene.faces[~empty], material_idx=scene.material_idx[~empty],
-                        notes=(*scene.notes, f"{int(empty.sum())} faces without area are left out"))
+                        notes=(*scene.notes, f"{int(empty.sum())} faces with two corners in one place are left out"))
     return _with_sound_normals(scene)
 
 

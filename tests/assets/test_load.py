@@ -75,10 +75,16 @@ def test_missing_and_folder(tmp_path):
             load_scene(tmp_path / name)
 
 
-def test_faces_without_area_are_left_out(tmp_path):
-    (tmp_path / "x.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 2 0 0\nf 1 2 3\nf 1 2 4\n")
+def test_faces_with_coinciding_corners_are_left_out_and_flat_seams_keep_a_body_closed(tmp_path):
+    from gdtool.geometry.metrics import is_closed
+
+    # a tetrahedron with a vertex in the middle of edge 1-2, which only one of the edge's two faces uses
+    faces = ["1 5 4", "5 2 4", "1 3 2", "2 3 4", "1 4 3", "1 2 5"]
+    vertices = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nv .5 0 0\nv 1 0 0\n"
+    (tmp_path / "x.obj").write_text(vertices + "".join(f"f {face}\n" for face in [*faces, "2 6 4"]))
     scene = load_scene(tmp_path / "x.obj")
-    assert len(scene.faces) == len(scene.material_idx) == 1 and any("without area" in note for note in scene.notes)
+    assert len(scene.faces) == len(scene.material_idx) == 6 and any("two corners in one place" in note for note in scene.notes)
+    assert is_closed(scene.vertices, scene.faces) and not is_closed(scene.vertices, scene.faces[:-1])
 
 
 def test_normals_without_a_direction_are_the_faces_own(tmp_path):
