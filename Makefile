@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: venv demo test stress fuzz bench schemas docs-check model data clean
+.PHONY: venv demo test stress hub-test fuzz bench schemas docs-check model data clean
 
 venv: .venv/.done
 
@@ -21,6 +21,11 @@ test: venv
 
 stress: venv
 	$(BIN)/python -m pytest -m slow
+
+# Stable Diffusion's parts, with diffusers and transformers installed (the tests make their own small weights).
+hub-test: venv
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[hub]"
+	$(BIN)/python -m pytest tests/diffusion/test_pretrained.py
 
 # Ten minutes of damaged files for every reader; what breaks one stays as a test.
 fuzz: venv
