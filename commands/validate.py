@@ -9,9 +9,10 @@ from pathlib import Path
 import click
 
 from gdtool.core import sources
+from gdtool.core.errors import InputError, ResourceError
 from gdtool.stages import validate as stage
 
-from ._common import help_of, report_text, set_verbosity, verbosity_options
+from ._common import help_of, report, report_text, set_verbosity, verbosity_options
 
 SHOWN = 10  # the first faults are enough to start mending
 
@@ -21,10 +22,16 @@ SHOWN = 10  # the first faults are enough to start mending
 @verbosity_options
 def command(paths, as_json, quiet, verbose, debug):
     set_verbosity(quiet, verbose)
-    bad = 0
+    code = 0
     for text in sources.incoming(paths):
-        found = list(stage.faults(Path(text)))
-        bad += bool(found)
+        try:
+            found = list(stage.faults(Path(text)))
+        except ResourceError as error:
+            report(error)
+            code = error.exit_code
+            continue
+        if found and not code:
+            code = InputError.exit_code
         if as_json:
             print(json.dumps({"path": text, "valid": not found, "faults": found}), flush=True)
             continue
@@ -35,4 +42,4 @@ def command(paths, as_json, quiet, verbose, debug):
         if not found:
             click.get_binary_stream("stdout").write(b"valid: " + os.fsencode(text) + b"\n")
             click.get_binary_stream("stdout").flush()
-    return 3 if bad else 0
+    return code

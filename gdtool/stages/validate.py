@@ -12,19 +12,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from gdtool.core.errors import GdtoolError, InputError
+from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder, is_folder, open_folder
 from gdtool.core.kinds import CONTENTS
 
 
 def faults(path: Path) -> Iterator[str]:
-    """What is wrong with a folder or a .glb/.gltf, one line each; nothing when it is right."""
+    """What is wrong with a folder or a .glb/.gltf, one line each; nothing when it is right.
+
+    Raises ResourceError where that cannot be told here: a package or memory is missing.
+    """
     if path.suffix.lower() in (".glb", ".gltf"):
         yield from _read(lambda: _check_scene(path))
         return
     try:
         folder = open_folder(path)
-    except GdtoolError as error:
+    except InputError as error:
         yield str(error)
         return
     listed = {entry.path for entry in folder.manifest.files}
@@ -36,7 +39,7 @@ def faults(path: Path) -> Iterator[str]:
 def _read(check: Callable[[], Iterator[str]]) -> Iterator[str]:
     try:
         yield from check()
-    except GdtoolError as error:
+    except InputError as error:
         yield str(error)
 
 
