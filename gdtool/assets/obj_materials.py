@@ -9,11 +9,10 @@ import numpy as np
 
 from gdtool.assets.scene import DEFAULT_MATERIAL, Material, Texture
 from gdtool.core.errors import GdtoolError
+from gdtool.core.sources import TEXTURE_PLACES
 
 _OPTION_WORDS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-bm": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-mm": 2, "-texres": 1, "-type": 1,
                  "-o": 3, "-s": 3, "-t": 3}
-# Where a texture is looked for when it is not beside its library; the last is Google Scanned Objects' layout.
-_TEXTURE_PLACES = ("", "textures", "../textures", "../materials/textures")
 _CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}
 
 
@@ -140,7 +139,7 @@ def _image(words: list[str], folder: Path, images: dict[Path, np.ndarray | None]
             taken += 1
         i += 1 + taken
     name = " ".join(words[i:])
-    path = next((found for found in (_beside(folder / place, name) for place in _TEXTURE_PLACES) if found.is_file()), _beside(folder, name))
+    path = next((found for found in (_beside(folder / place, name) for place in TEXTURE_PLACES) if found.is_file()), _beside(folder, name))
     if path not in images:
         from gdtool.images.io import read_image
 

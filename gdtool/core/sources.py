@@ -60,6 +60,10 @@ def _lines() -> Iterator[str]:
             yield line
 
 
+# Where an .obj's texture is looked for: beside its library, or as in Google Scanned Objects' layout, which is the last.
+TEXTURE_PLACES = ("", "textures", "../textures", "../materials/textures")
+
+
 def resolve(text: str, kinds: tuple[str, ...], reader: str, allow_missing: bool = False) -> Source:
     """Open what a source names. Raises InputError when it is missing or of the wrong kind."""
     if text.startswith("procedural:"):
@@ -122,7 +126,8 @@ def _sidecars(path: Path) -> list[Path]:
                     for line in library.read_text(errors="replace").splitlines():
                         words = line.split()
                         if len(words) > 1 and words[0].lower().startswith(("map_", "bump", "norm")):
-                            out.append(library.parent / words[-1])
+                            names = {words[-1], line.split(maxsplit=1)[1].strip()}  # a name may hold spaces or follow options
+                            out += [library.parent / place / name for place in TEXTURE_PLACES for name in sorted(names)]
             return out
     except (OSError, ValueError, AttributeError):
         return []  # the reader will say what is wrong with it
