@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: venv demo test stress hub-test fuzz bench schemas docs-check model data clean
+.PHONY: venv demo test stress extras-test fuzz bench schemas docs-check model data clean
 
 venv: .venv/.done
 
@@ -22,10 +22,10 @@ test: venv
 stress: venv
 	$(BIN)/python -m pytest -m slow
 
-# Stable Diffusion's parts, with diffusers and transformers installed (the tests make their own small weights).
-hub-test: venv
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[hub]"
-	$(BIN)/python -m pytest tests/diffusion/test_pretrained.py
+# What needs optional packages: Stable Diffusion's parts (diffusers, transformers; the tests make their own small weights), OpenUSD.
+extras-test: venv
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[hub,usd]"
+	$(BIN)/python -m pytest tests/diffusion/test_pretrained.py tests/stages/test_bake_usd.py
 
 # Ten minutes of damaged files for every reader; what breaks one stays as a test.
 fuzz: venv

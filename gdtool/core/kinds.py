@@ -109,6 +109,7 @@ class AssetContent(Content, frozen=True, kw_only=True):
     size: Annotated[int, Meta(ge=1, description="texture size in texels")]
     maps: Annotated[dict[str, str], Meta(description="map name to file; a map that is constant is a factor instead")]
     factors: Annotated[dict[str, tuple[float, ...]], Meta(description="factors written to the material, linear")]
+    usd: Annotated[str, Meta(description="the OpenUSD file, if one was asked for")] = ""
     normal_convention: Literal["opengl", "directx"] = "opengl"
     frame: Annotated[Literal["normalised", "source"], Meta(description="frame that the vertices are in")] = "normalised"
 

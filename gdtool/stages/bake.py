@@ -1,4 +1,4 @@
-"""Mesh with texture coordinates to an engine-ready asset: maps from the surface it came from, .glb and quad .obj.
+"""Mesh with texture coordinates to an engine-ready asset: maps from the surface it came from, .glb, quad .obj, OpenUSD.
 
 Use it after unwrap. Base color, occlusion-roughness-metallic and tangent-space normals are read texel by texel from the
 surface: from its confident views where there are any (found along the provenance chain), else from its vertices, or from
@@ -32,6 +32,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     normal_map: Annotated[Literal["auto", "on", "off"], Meta(description="auto leaves it out where it would be flat")] = "auto"
     normal_convention: Annotated[Literal["opengl", "directx"], Meta(description="green channel of normal.png; .glb is always opengl")] = "opengl"
     project_views: Annotated[bool, Meta(description="read materials from the views where they see the surface well")] = True
+    usd: Annotated[Literal["none", "usda", "usdz"], Meta(description="write OpenUSD with UsdPreviewSurface as well (needs usd-core)")] = "none"
     source_frame: Annotated[bool, Meta(description="write vertices in the source's own frame instead of the normalised one")] = False
     model: file_option("model or mesh file, with its textures, to bake from instead of the surface") = None
     seed: Annotated[int, Meta(ge=0, description="seed of the occlusion rays")] = 0
@@ -45,6 +46,10 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.texture.reproject import vertex_reach
     from gdtool.texture.target import texel_width, texels_of
 
+    if options.usd != "none":
+        from gdtool.texture.usd import require
+
+        require()
     with out.step("read"):
         mesh, matrix = _read_mesh(inputs, options)
         _check_memory(inputs, options.size)
@@ -229,9 +234,14 @@ def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx
             out.path(files[name]).write_bytes(content)
     normals_idx, normals = asset.corner_normals_of_quads(mesh, target, face_idx)
     asset.write_obj(out.path("asset.obj"), mesh, normals_idx, normals, maps, files, inputs.name)
+    usd = f"asset.{options.usd}" if options.usd != "none" else ""
+    if usd:
+        from gdtool.texture.usd import write_usd
+
+        write_usd(out.path(usd), mesh, normals_idx, normals, maps, files, options.normal_convention, origin.alpha_mode, origin.alpha_cutoff, origin.double_sided)
     write_png(out.path("contact_sheet.png"), contact_sheet_of(maps))
     out.content = AssetContent(
-        size=options.size, maps=files, factors=maps.factors, normal_convention=options.normal_convention,
+        size=options.size, maps=files, usd=usd, factors=maps.factors, normal_convention=options.normal_convention,
         frame="source" if options.source_frame else "normalised", source_from_world=tuple(float(x) for x in matrix.ravel()), report=report)
 
 

@@ -58,7 +58,7 @@ def _needed(folder: Folder) -> set[str]:
     if folder.kind in ("mesh", "atlas"):
         return {"mesh.obj"}
     if folder.kind == "asset":
-        return {"asset.glb", "asset.obj", "asset.mtl"} | set(content.maps.values())
+        return {"asset.glb", "asset.obj", "asset.mtl"} | set(content.maps.values()) | ({content.usd} if content.usd else set())
     if folder.kind == "renders":
         return {f"{i:03d}.png" for i in range(content.frames)}
     if folder.kind == "model":
