@@ -13,6 +13,7 @@ from gdtool.geometry.grids import Grid, sample_trilinear
 HALF_THICKNESS = 0.6  # steps: over half, so that a sheet between two layers of samples has one inside
 _LOST = 0.5  # steps outside the surface at which a point counts as lost
 _DEPTH = 0.8  # steps below a seen surface at which there has to be an inside
+_CHUNK = 4096  # points whose cubes of samples are held at once, some 35 KB each
 _REGION = 8  # pixels: fewer that touch are noise at an edge
 
 
@@ -56,15 +57,17 @@ def restore_thin(values: np.ndarray, before: np.ndarray, grid: Grid, sights: lis
     if len(points) == 0:
         return values, points
     out = values.copy()
-    around = _around(points, grid, 2)[0].ravel()
-    out.ravel()[around] = np.minimum(out.ravel()[around], before.ravel()[around])
+    for start in range(0, len(points), _CHUNK):
+        around = _around(points[start:start + _CHUNK], grid, 2)[0].ravel()
+        out.ravel()[around] = np.minimum(out.ravel()[around], before.ravel()[around])
     points, normals, sizes = lost_points(out, before, grid, sights)
-    if len(points):
-        index, place = _around(points, grid, 3)
-        offset = place - points[:, None]
-        height = np.einsum("nkj,nj->nk", offset, normals)
-        lateral = np.linalg.norm(offset - height[..., None] * normals[:, None], axis=2)
-        slab = np.maximum(np.abs(height) - HALF_THICKNESS * grid.step, lateral - 0.9 * sizes[:, None])
+    for start in range(0, len(points), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        index, place = _around(points[part], grid, 3)
+        offset = place - points[part, None]
+        height = np.einsum("nkj,nj->nk", offset, normals[part])
+        lateral = np.linalg.norm(offset - height[..., None] * normals[part, None], axis=2)
+        slab = np.maximum(np.abs(height) - HALF_THICKNESS * grid.step, lateral - 0.9 * sizes[part, None])
         np.minimum.at(out.ravel(), index.ravel(), slab.ravel().astype(np.float32))
     return out, points
 
