@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: venv demo test stress extras-test fuzz bench schemas docs-check model data clean
+.PHONY: venv demo test stress extras-test fuzz bench bench-reconstruct schemas docs-check model data clean
 
 venv: .venv/.done
 
@@ -33,6 +33,10 @@ fuzz: venv
 
 bench: venv
 	$(BIN)/python benchmarks/pipeline.py
+
+# Reconstruction beside its peers, on procedural objects and on every model under MODELS (a folder); an hour and more.
+bench-reconstruct: venv
+	$(BIN)/python benchmarks/reconstruct.py $(if $(MODELS),--models $(MODELS) --limit 12) --seeds 5 --wavelengths 0.0625,0.125,0.25
 
 docs-check: venv
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python tests/tools/docs_check.py

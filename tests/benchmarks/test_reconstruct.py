@@ -1,0 +1,63 @@
+"""The reconstruction benchmark's own arithmetic: the disturbance, the peers, the tables."""
+
+import sys
+from argparse import Namespace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gdtool.folders.views import Views
+from tests.fields.shapes import sphere, views_of
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+
+import peers  # noqa: E402
+import perturbation  # noqa: E402
+import reconstruct  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def ball():
+    cameras, images, mask = views_of(sphere, 64, 1)
+    return Views(cameras, images, mask)
+
+
+def test_the_disturbance_has_the_size_it_says(ball):
+    how = perturbation.Perturbation(seed=3)
+    found, again = perturbation.perturbed(ball, how), perturbation.perturbed(ball, how)
+    other = perturbation.perturbed(ball, perturbation.Perturbation(seed=4))
+    inner = (ball.mask > 0.99) & (found.mask > 0.99)
+    change = (found.images["depth"] - ball.images["depth"])[inner]
+    assert 0.005 < change.std() < 0.03
+    angle = np.degrees(np.arccos(np.clip((found.images["normal"] * ball.images["normal"]).sum(-1)[inner], -1, 1)))
+    assert 3 < np.sqrt((angle**2).mean()) < 7
+    assert np.allclose(np.linalg.norm(found.images["normal"][inner], axis=-1), 1, atol=1e-4)
+    assert (found.images["depth"] == again.images["depth"]).all() and (found.images["depth"] != other.images["depth"]).any()
+    for k in range(6):  # a pixel more or less on both sides
+        assert abs((found.mask[k, 32] > 0.5).sum() - (ball.mask[k, 32] > 0.5).sum()) == 2
+    assert (found.images["depth"][found.mask > 0.5] > 0.5).all()  # a grown mask's new pixels have values
+
+
+@pytest.mark.parametrize("name", ["carved hull", "capped Poisson"])
+def test_peers_find_a_ball(ball, name):
+    method = peers.available().get(name)
+    if method is None:
+        pytest.skip("its package is not installed")
+    vertices, faces = method(ball, 48) if name == "carved hull" else method(ball, 5)
+    radius = np.linalg.norm(vertices, axis=1)
+    assert np.abs(np.median(radius) - 0.5) < 0.01
+    corners = vertices[faces]
+    assert np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() > 0  # outward
+
+
+def test_report_names_what_is_missed_and_who_is_better(tmp_path):
+    records = [{"model": "cat", "source": "cat.glb", "method": m, "case": c, "distance": d, "iou": 0.99, "seconds": 3.0, "watertight": True}
+               for m, c, d in ((reconstruct.OURS, "clean", 5e-4), (reconstruct.OURS, "perturbed 0 0.125", 9e-3), ("carved hull", "clean", 6e-4),
+                               ("carved hull", "perturbed 0 0.125", 4e-3))]
+    text = reconstruct.markdown(records, Namespace(size=64, seeds=1, wavelengths=[0.125]), "")
+    assert "clean: median distance 0.0005, wanted ≤ 0.0007: holds" in text
+    assert "perturbed: median distance 0.009, wanted ≤ 0.0022: **missed**" in text
+    assert text.count("| yes |") == 1 and text.count("| NO |") == 1
+    reconstruct.plot(records, tmp_path / "plot.png")
+    assert (tmp_path / "plot.png").stat().st_size > 1000
