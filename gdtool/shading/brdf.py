@@ -34,10 +34,13 @@ def f0_of(albedo: Tensor, metallic: Tensor, f0: float | Tensor) -> Tensor:
 
 
 def fresnel(f0: Tensor, cosine: Tensor) -> Tensor:
-    """Schlick 1994: f0 + (1 − f0)(1 − c)^5; f0 (..., 3), cosine (...)."""
-    x = 1 - cosine.clamp(0.0, 1.0)
+    """Schlick 1994: f0 + (1 − f0)(1 − c)^5; f0 (..., 3), cosine (...). Within 2 ulp of f0's range: what rounding took
+    from 1 − c, exact by Sterbenz's lemma, goes back in before the fifth power makes it five times larger."""
+    c = cosine.clamp(0.0, 1.0)
+    x = 1 - c
+    lost = ((1 - x) - c).detach()
     x2 = x * x
-    weight = (x2 * x2 * x)[..., None]
+    weight = (x2 * x2 * (x + 5 * lost))[..., None]
     return f0 + (1 - f0) * weight
 
 

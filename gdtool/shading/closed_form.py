@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gdtool.shading.brdf import (Brdf, alpha_of, clamp_cosine, f0_of, fresnel, ndf, visibility)
-from gdtool.shading.sg import SphericalGaussians, cosine_integral, dot, integral, normalize, product
+from gdtool.shading.sg import MAX_SHARPNESS, SphericalGaussians, cosine_integral, dot, integral, normalize, product
 
 # The mirror-direction forms divide by n·o; grazing pixels are few and nothing closed-form is good there.
 MIN_VIEW_COSINE = 0.05
@@ -75,21 +75,22 @@ def _specular(normal: Tensor, view: Tensor, n_v: Tensor, roughness: Tensor, f0: 
     # The lobe as an SG: about n in half vectors, about the mirror direction in light directions.
     sharpness_h = 2 / alpha2
     peak = 1 / cosine_integral(sharpness_h, torch.ones_like(sharpness_h))
+    light_sharpness = lights.sharpness.clamp_max(MAX_SHARPNESS)
     mirror = normalize(2 * dot(normal, view)[..., None] * normal - view)
     warped = (sharpness_h / (4 * n_v))[..., None]
-    axis, sharpness, exponent = product(mirror[..., None, :], warped, lights.axes, lights.sharpness)
+    axis, sharpness, exponent = product(mirror[..., None, :], warped, lights.axes, light_sharpness)
     overlap = torch.exp(exponent) * cosine_integral(sharpness, dot(axis, normal[..., None, :]))
     by_lobe = (peak * visibility(brdf, roughness, n_v, n_v))[..., None] * overlap
 
     # The light as a point of its own width: GGX with the light's spread added, times the energy that arrives.
     half = normalize(view[..., None, :] + lights.axes)
     n_h, v_h = dot(half, normal[..., None, :]), dot(half, view[..., None, :]).clamp(MIN_VIEW_COSINE, 1.0)
-    spread = (1 + 1 / (v_h * v_h)) / (4 * lights.sharpness.clamp_min(0.1))
+    spread = (1 + 1 / (v_h * v_h)) / (4 * light_sharpness.clamp_min(0.1))
     filtered = torch.sqrt((alpha2[..., None] + spread).clamp_max(1.0))
-    mean_cosine = clamp_cosine(received / integral(lights.sharpness))
+    mean_cosine = clamp_cosine(received / integral(light_sharpness))
     by_light = ndf(filtered, n_h) * visibility(brdf, roughness[..., None], mean_cosine, n_v[..., None]) * received
 
-    x = 2 * lights.sharpness * (alpha2 * n_v)[..., None]
+    x = 2 * light_sharpness * (alpha2 * n_v)[..., None]
     weight = x / (1 + x)
     lobes = (1 - weight)[..., None] * by_lobe[..., None] * fresnel(f0, n_v)[..., None, :]
     lobes = lobes + weight[..., None] * by_light[..., None] * fresnel(f0[..., None, :], v_h)
