@@ -15,10 +15,10 @@ from gdtool.diffusion.encoding import BACKGROUND, encode
 from gdtool.diffusion.sampling import sample_images
 
 
-def validation_grid(state, objects: Objects, precision: str, steps: int = 4) -> np.ndarray:
+def validation_grid(state, objects: Objects, precision: str) -> np.ndarray:
     """Picture (h, w, 3) in [0, 1]: for each object the condition, the true views and the sampled ones, a row per domain.
 
-    The averaged weights are what is shown, the encoded images as the network has them (0 is grey).
+    Sampled in as many steps as the model asks for, four at most. The averaged weights are what is shown, the encoded images as the network has them (0 is grey).
     """
     model, config = state.model, state.model.config
     device = next(model.parameters()).device
@@ -30,7 +30,7 @@ def validation_grid(state, objects: Objects, precision: str, steps: int = 4) -> 
     background = BACKGROUND[config.backgrounds[0]]
     for i in range(len(objects)):
         rgba = from_bytes(objects.conditions[i, i % objects.conditions.shape[1]])[None]
-        images = sample_images(model, rgba.to(device), steps=steps, seed=i, precision=precision)
+        images = sample_images(model, rgba.to(device), steps=min(config.sampling_steps, 4), seed=i, precision=precision)
         truth = encode(from_bytes(objects.planes[i])[None], indices, torch.tensor([background]))[0]
         blocks = [_tile(truth), _tile(torch.stack([images[d][0].float().cpu() for d in config.domains]))]
         shown = np.full((blocks[0].shape[0], config.image_size, 3), 0.5, np.float32)
