@@ -10,6 +10,7 @@ from gdtool.geometry.repair import edges_of
 from gdtool.geometry.sharpen import dihedral_degrees
 
 _CORNER_TURN_DEGREES = 50.0
+_STRAIGHT = 0.35  # the sine of a quad's corner below which features may not hold both its sides
 
 
 @dataclass(frozen=True)
@@ -279,3 +280,29 @@ def _ordered(segments: np.ndarray) -> list[int]:
         walk.append(current)
         if current == start or len(walk) > len(segments) + 1:
             return walk
+
+
+def untied(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints) -> Constraints:
+    """Without what holds three corners of a quad in a row: the middle one is let off its curve, the path is open there.
+
+    A quad with a straight angle has no area beside it to give; a crease cut short by half a quad is the smaller fault.
+    """
+    from gdtool.geometry.mesh_quality import corner_jacobians, polygon_normals
+
+    curve, fixed, path = constraints.curve.copy(), constraints.fixed.copy(), np.sort(constraints.path, 1)
+    width = len(vertices) + 1
+    alive = np.ones(len(path), bool)
+    used = faces[:, 3] >= 0
+    corner = faces[used]
+    after, before = np.roll(corner, -1, 1), np.roll(corner, 1, 1)
+    straight = corner_jacobians(vertices, corner, polygon_normals(vertices, corner)[0]) < _STRAIGHT
+
+    def on_path(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.isin(np.minimum(a, b) * width + np.maximum(a, b), (path[:, 0] * width + path[:, 1])[alive])
+
+    between = on_path(corner, after) & on_path(before, corner)
+    # At a corner of the features the angle is the surface's; only one that is straight or folded has to go.
+    release = np.unique(corner[between & (straight | ~fixed[corner])])
+    curve[release], fixed[release] = -1, False
+    alive &= ~np.isin(path, release).any(1)
+    return Constraints(curve, fixed, constraints.path[alive], constraints.path_curve[alive])

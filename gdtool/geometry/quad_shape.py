@@ -87,9 +87,7 @@ def relax(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: F
     average = _average_matrix(edges.ends, len(vertices))
     along = _average_matrix(constraints.path, len(vertices)) if len(constraints.path) else None
     held = (constraints.curve >= 0) & ~constraints.fixed
-    boundary = np.zeros(len(vertices), bool)
-    boundary[edges.ends[edges.count != 2].ravel()] = True
-    still = constraints.fixed | (boundary & ~held)
+    still = still_vertices(faces, len(vertices), constraints)
     for _ in range(iterations):
         target = average @ vertices
         if along is not None:
@@ -98,6 +96,14 @@ def relax(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: F
         moved[still] = vertices[still]
         vertices = onto(moved, surface, features, constraints)
     return vertices
+
+
+def still_vertices(faces: np.ndarray, count: int, constraints: Constraints) -> np.ndarray:
+    """(v,) bool: vertices that may not move: corners of features, and boundaries that no curve leads."""
+    edges = edges_of(faces)
+    boundary = np.zeros(count, bool)
+    boundary[edges.ends[edges.count != 2].ravel()] = True
+    return constraints.fixed | (boundary & (constraints.curve < 0))
 
 
 def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
@@ -113,7 +119,7 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
     boundary = np.zeros(len(vertices), bool)
     boundary[edges.ends[edges.count != 2].ravel()] = True
     vertices = vertices.copy()
-    normals = _normals_below(vertices, faces, surface)
+    normals = normals_below(vertices, faces, surface)
     angles = np.arange(8) * (np.pi / 4)
     for turn in range(rounds):
         bad = np.flatnonzero(np.minimum(corner_jacobians(vertices, faces, normals).min(1), scaled_jacobian(vertices, faces)) < least)
@@ -156,7 +162,7 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
     return vertices
 
 
-def _normals_below(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> np.ndarray:
+def normals_below(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> np.ndarray:
     """(f, 3) unit normal of the surface under each quad, at its centre and half-way to its corners."""
     from gdtool.geometry.normals import face_normals
 

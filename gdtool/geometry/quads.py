@@ -9,10 +9,11 @@ import numpy as np
 
 from gdtool.core.child import ChildFailed, call
 from gdtool.geometry import repair
-from gdtool.geometry.features import Constraints, Features, find_features, trace
+from gdtool.geometry.features import Constraints, Features, find_features, trace, untied
 from gdtool.geometry.mesh_quality import polygon_normals, valences
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_engines import ENGINES, pair_and_split
+from gdtool.geometry.quad_relax import ease, square_up
 from gdtool.geometry.quad_shape import Surface, fill_holes, onto, relax, remove_doublets, subdivide, unfold
 from gdtool.geometry.sharpen import restore_creases
 from gdtool.geometry.simplify import simplify
@@ -146,8 +147,9 @@ def _fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndar
     features = find_features(vertices, faces, request.crease_degrees or 181.0, 3 * edge)
     surface = Surface(vertices, faces)
     traced, constraints = trace(quad_vertices, quad_faces, features, edge)
+    constraints = untied(traced, quad_faces, constraints)
     traced = relax(onto(traced, surface, features, constraints), quad_faces, surface, features, constraints, request.smooth_iterations)
-    return unfold(traced, quad_faces, surface, features, constraints), quad_faces
+    return _shaped(traced, quad_faces, surface, features, constraints, request), quad_faces
 
 
 def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float, request: Request,
@@ -264,11 +266,22 @@ def _finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, feature
     """The engine's quads drawn to creases, subdivided, evened out on the surface and unfolded."""
     area = polygon_normals(vertices, faces)[1].sum()
     vertices, constraints = trace(vertices, faces, features, (area / len(faces)) ** 0.5)
+    constraints = untied(vertices, faces, constraints)
     vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)
     for _ in range(subdivisions):
         vertices, faces, constraints = subdivide(vertices, faces, constraints)
         vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)
-    return unfold(vertices, faces, surface, features, constraints), faces
+    return _shaped(vertices, faces, surface, features, constraints, request), faces
+
+
+def _shaped(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
+            request: Request) -> np.ndarray:
+    """The quads squared up, then the few that stay folded or thin unfolded one vertex at a time."""
+    vertices = square_up(vertices, faces, surface, features, constraints, request.smooth_iterations)
+    constraints = untied(vertices, faces, constraints)
+    vertices = square_up(vertices, faces, surface, features, constraints, request.smooth_iterations)
+    vertices = unfold(vertices, faces, surface, features, constraints)
+    return ease(vertices, faces, surface, features, constraints)[0]
 
 
 def _strays(vertices: np.ndarray, faces: np.ndarray, surface: Surface, edge: float, limit: float) -> str | None:

@@ -10,6 +10,8 @@ import numpy as np
 
 # Rays handed to Embree at a time: few enough that a chunk stays in the cache, enough that threads are busy.
 CHUNK = 1 << 16
+# Corners above which a mesh is not tested for being convex: the test's time is their number squared.
+MAX_CONVEX = 20_000
 
 
 @dataclass(frozen=True)
@@ -120,3 +122,27 @@ class RayCaster:
         if np.ndim(max_distance) or np.isfinite(max_distance):
             limits = np.minimum(np.broadcast_to(np.asarray(max_distance, np.float64), (len(origins),)), 1e30 / self.scale)
         return self._run(origins, directions, "OCCLUDED", limits) >= 0
+
+
+def is_convex(vertices: np.ndarray, faces: np.ndarray, tolerance: float = 1e-6) -> bool:
+    """Whether all faces lie on the hull of their corners, so that none hides another from outside.
+
+    Each face's plane must have everything on one side (to tolerance, of the longest side). A scatter of faces is
+    tested first: nearly every mesh that is not convex fails there.
+    """
+    from gdtool.geometry.normals import face_normals
+
+    used = np.unique(faces)
+    if not len(used) or len(used) > MAX_CONVEX:
+        return False
+    points = vertices[used]
+    extent = float((points.max(0) - points.min(0)).max())
+    normals, areas = face_normals(vertices, faces)
+    solid = np.flatnonzero(areas > 1e-12 * extent**2)
+    for chosen in (solid[:: max(1, len(solid) // 64)], solid):
+        for start in range(0, len(chosen), 512):
+            part = chosen[start:start + 512]
+            height = normals[part] @ points.T - np.einsum("ij,ij->i", normals[part], vertices[faces[part, 0]])[:, None]
+            if (np.minimum(height.max(1), -height.min(1)) > tolerance * extent).any():
+                return False
+    return True

@@ -26,7 +26,7 @@ def dihedral_degrees(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarra
     edges = edges_of(faces)
     edge_idx, pairs = edges.face_pairs()
     normals, area = face_normals(vertices, faces)
-    cosine = (normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(1)
+    cosine = np.einsum("ki,ki->k", normals[pairs[:, 0]], normals[pairs[:, 1]])
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     angle[(area[pairs] <= 0).any(1)] = 0
     return edges.ends[edge_idx], pairs, angle

@@ -1,0 +1,54 @@
+"""Squaring quads: folds undone on the surface, straight corners let off their curves."""
+
+import numpy as np
+
+from gdtool.geometry.features import Constraints, Features, untied
+from gdtool.geometry.mesh_quality import scaled_jacobian
+from gdtool.geometry.quad_relax import ease, square_up
+from gdtool.geometry.quad_shape import Surface
+from tests.geometry.solids import plane
+
+NO_FEATURES = Features(np.zeros((0, 3)), np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
+def grid(n=8):
+    line = np.linspace(-0.5, 0.5, n + 1)
+    x, y = np.meshgrid(line, line)
+    i = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
+    return np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1), np.stack([i, i + 1, i + n + 2, i + n + 1], -1)
+
+
+def test_folded_quads_are_turned_over_again_and_stay_on_the_surface():
+    vertices, quads = grid()
+    bent = vertices.copy()
+    bent[40] += [0.19, 0.17, 0]  # past its neighbour
+    assert scaled_jacobian(bent, quads).min() < 0
+    out = square_up(bent, quads, Surface(*plane()), NO_FEATURES, Constraints.none(len(vertices)), 20)
+    assert scaled_jacobian(out, quads).min() > 0.8 and np.abs(out[:, 2]).max() < 1e-12
+    rim = np.abs(vertices[:, :2]).max(1) > 0.49
+    assert np.array_equal(out[rim], vertices[rim])
+
+
+def test_middle_of_three_corners_in_a_row_is_let_off_its_curve():
+    vertices, quads = grid()
+    path = np.array([[38, 39], [39, 40], [40, 49], [49, 50]])  # straight, then round a quad's corner at 40
+    curve = np.full(len(vertices), -1)
+    curve[[39, 40, 49]] = 0
+    fixed = np.zeros(len(vertices), bool)
+    fixed[[38, 50]] = True
+    found = untied(vertices, quads, Constraints(curve, fixed, path, np.zeros(4, np.int64)))
+    assert found.curve[40] == -1 and found.curve[49] == -1 and found.curve[39] == 0
+    assert found.path.tolist() == [[38, 39]] and found.fixed[[38, 50]].all()
+    fixed[[40, 49]] = True  # true corners of the surface, square here: they stay
+    assert len(untied(vertices, quads, Constraints(curve, fixed, path, np.zeros(4, np.int64))).path) == 4
+
+
+def test_a_corner_pinned_in_the_wrong_place_is_eased():
+    vertices, quads = grid()
+    bent = vertices.copy()
+    bent[40] = bent[50] + [0.01, 0.01, 0]
+    fixed = np.zeros(len(vertices), bool)
+    fixed[40] = True
+    pinned = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
+    out, left = ease(bent, quads, Surface(*plane()), NO_FEATURES, pinned)
+    assert scaled_jacobian(out, quads).min() >= 0.2 and not left.fixed[40]
