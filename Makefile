@@ -34,9 +34,25 @@ fuzz: venv
 bench: venv
 	$(BIN)/python benchmarks/pipeline.py
 
+# Remesh and unwrap beside their peers, over solids and the models in $(ASSETS): about half an hour.
+ASSETS ?= ../shared/assets/mesh/odedstein
+bench-assets: venv
+	$(BIN)/python benchmarks/remesh.py $(wildcard $(ASSETS))
+	$(BIN)/python benchmarks/unwrap.py $(wildcard $(ASSETS))
+
 # Reconstruction beside its peers, on procedural objects and on every model under MODELS (a folder); an hour and more.
 bench-reconstruct: venv
 	$(BIN)/python benchmarks/reconstruct.py $(if $(MODELS),--models $(MODELS) --limit 12) --seeds 5 --wavelengths 0.0625,0.125,0.25
+
+# Time against error of rendering and relighting; set MODEL (textured) and ENV (lat-long).
+MODEL ?= procedural:3
+ENV ?= mid
+
+bench-render: venv
+	$(BIN)/python benchmarks/render.py $(MODEL) $(ENV)
+
+bench-relight: venv
+	$(BIN)/python benchmarks/relight.py $(MODEL) $(ENV)
 
 docs-check: venv
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python tests/tools/docs_check.py

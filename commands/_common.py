@@ -142,6 +142,16 @@ def build_options(struct: type, values: dict[str, Any]) -> Any:
         raise UsageError("options", str(error)) from None
 
 
+def shard_of(text: str | None) -> tuple[int, int]:
+    """The I and N of I/N. Raises UsageError."""
+    if text is None:
+        return 1, 1
+    part, _, parts = text.partition("/")
+    if not (part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
+        raise UsageError(f"--shard {text}", "is not I/N with I from 1 to N")
+    return int(part), int(parts)
+
+
 def help_of(text: str) -> str:
     """A module docstring as click help: pasted examples keep their line breaks."""
     return text.replace("Example:\n", "\b\nExample:\n").replace("Examples:\n", "\b\nExamples:\n")
@@ -157,9 +167,10 @@ def stage_command(stage: Stage, help: str) -> click.Command:
 
         set_verbosity(values["quiet"], values["verbose"])
         arguments = values["sources"]
+        shard = shard_of(values.get("shard"))
         settings = Settings(
-            output=Path(values["output"]) if values["output"] else None, several=len(arguments) > 1, dry_run=values["dry_run"],
-            force=values["force"], threads=values["threads"], device=values["device"],
+            output=Path(values["output"]) if values["output"] else None, several=len(arguments) > 1 or shard[1] > 1, dry_run=values["dry_run"],
+            force=values["force"], threads=values["threads"], device=values["device"], shard=shard,
         )
         flags = {flag: values["second_" + flag] for flag in stage.second_inputs}
         options = build_options(stage.Options, values)
@@ -190,6 +201,9 @@ def stage_command(stage: Stage, help: str) -> click.Command:
         second = stage.second(flag)
         text = second.help or f"The {second.kind} to use" + ("; found along the provenance chain without it." if second.search else ".")
         params.append(click.Option([f"--{flag}", f"second_{flag}"], metavar="PATH", help=text))
+    if stage.dataset:
+        text = "Only every Nth source from the Ith on, for job arrays that share -o: 1/N to N/N."
+        params.append(click.Option(["--shard"], metavar="I/N", help=text))
     params += [
         click.Option(["-o", "--output"], metavar="DIR", help="Output folder; for several sources the parent of NAME.asset/KIND."),
         click.Option(["-n", "--dry-run"], is_flag=True, help="Print what would be made."),

@@ -39,6 +39,8 @@ class Settings:
     force: bool = False
     threads: int = 0
     device: str = "cpu"
+    # Which part of the sources, counted from 1, and of how many.
+    shard: tuple[int, int] = (1, 1)
 
 
 @dataclass(frozen=True)
@@ -248,6 +250,9 @@ def run_all(stage: Stage, arguments: tuple[str, ...], options: Any, flags: dict[
             settings: Settings) -> Iterator[Result | GdtoolError]:
     """Run a stage on every source, as they arrive; a source that fails yields its error and the rest go on."""
     stream = sources.incoming(arguments)
+    part, parts = settings.shard
+    if parts > 1:
+        stream = itertools.islice(stream, part - 1, None, parts)
     if stage.gathers:
         given = [sources.resolve(text, stage.reads, stage.name) for text in stream]
         yield run_one(stage, given, options, flags, settings)
@@ -271,4 +276,6 @@ def run_all(stage: Stage, arguments: tuple[str, ...], options: Any, flags: dict[
         except GdtoolError as error:
             yield error
     if stage.dataset and several and settings.output is not None and done and not settings.dry_run:
-        write_dataset_index(settings.output, done)
+        # Shards share the index.
+        with locked(settings.output):
+            write_dataset_index(settings.output, done)

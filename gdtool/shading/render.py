@@ -1,7 +1,8 @@
 """Images of a scene by Embree: exact buffers of its geometry and material, and lit color.
 
 A pixel is a box: its value is the mean over samples spread evenly inside it. Every pixel of the object's projected
-bounds gets BASE samples; those where coverage, normal or material changes get all that were asked for.
+bounds gets BASE samples; their number is doubled as long as coverage, or a mean that is not yet known to TOLERANCE, asks
+for more, up to the number that is allowed.
 
 Transparency: MASK as glTF says; BLEND is seen where alpha >= 0.5 and not there below, since a buffer has one surface.
 Faces are seen from both sides, whatever the material's doubleSided says.
@@ -9,42 +10,56 @@ Faces are seen from both sides, whatever the material's doubleSided says.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from gdtool.assets.scene import Scene
 from gdtool.cameras import Camera, project, rays
-from gdtool.geometry.rays import RayCaster
+from gdtool.geometry.rays import RayCaster, is_convex
 from gdtool.shading.environment import Environment
 from gdtool.shading.surface_points import SurfaceLookup
 
 BASE = 4
+# Samples up to which pixels beside the object's outline are held to be partly covered, whatever their samples say.
+EDGE = 8
 # Alpha-tested layers that a ray passes at most.
 MAX_LAYERS = 32
-# A pixel whose samples differ by more than this (standard deviation) gets all samples.
-TOLERANCE = {"normal": 0.03, "albedo": 0.012, "roughness": 0.02, "metallic": 0.02}
+# Standard error of a pixel's mean as a picture stores it (sRGB, (n + 1) / 2) above which it gets more samples.
+TOLERANCE = 0.006
+STORED = {"normal": 0.5, "albedo": None, "roughness": 1.0, "metallic": 1.0, "color": None}
 DOMAINS = ("normal", "depth", "albedo", "roughness", "metallic")
 # Samples that are held at once: bounds the memory.
-BAND_SAMPLES = 1 << 20
+BAND_SAMPLES = 1 << 19
 
 
 def pixel_pattern(count: int) -> np.ndarray:
-    """(count, 2) points in [0, 1)² of the R2 sequence (Roberts 2018): every prefix is spread evenly, sums to the centre."""
+    """(count, 2) points in [0, 1)² of the R2 sequence (Roberts 2018): every prefix is spread evenly."""
     ratio = 1.32471795724474602596
     out = (0.5 + np.arange(count)[:, None] * np.array([1 / ratio, 1 / ratio**2])) % 1.0
-    # The base prefix is centred, so that a plane's average is its value at the pixel's centre.
-    out[:BASE] += 0.5 - out[:BASE].mean(0)
-    if count > BASE:
-        out[BASE:] += (0.5 - out[BASE:].mean(0)) * 0.5
+    # What a pass adds is centred, so that a plane's average is its value at the pixel's centre.
+    start, stop = 0, BASE
+    while start < count:
+        out[start:stop] += 0.5 - out[start:stop].mean(0)
+        start, stop = stop, 2 * stop
     return np.clip(out, 0, 1 - 1e-9)
+
+
+@dataclass(frozen=True)
+class Goal:
+    """When to stop before all samples are taken: after seconds, or when the color's error, estimated from what the last
+    samples changed, is psnr dB (of 1, sRGB, over the covered pixels)."""
+
+    seconds: float | None = None
+    psnr: float | None = None
 
 
 @dataclass
 class Points:
     """Seen points, one a sample: pixel (n,) flat index, which sample of the pixel (n,), position (n, 3), view (n, 3) unit
-    toward the eye, depth (n,), and the attributes of SurfaceLookup. Samples from BASE on are those of refined pixels:
-    there are more of them, so each needs less light."""
+    toward the eye, depth (n,), and the attributes of SurfaceLookup. The samples of a pixel follow each other; together is
+    how many a pixel that is seen in full has once these are added."""
 
     pixel: np.ndarray
     sample: np.ndarray
@@ -52,6 +67,7 @@ class Points:
     view: np.ndarray
     depth: np.ndarray
     values: dict[str, np.ndarray]
+    together: int = 1
 
     def __len__(self) -> int:
         return len(self.pixel)
@@ -67,7 +83,13 @@ class Counts:
     samples: int = 0
     shadow_rays: int = 0
     shadow_rays_below_horizon: int = 0
-    notes: dict[str, float] = field(default_factory=dict)
+    shadow_rays_convex: int = 0
+    estimated_psnr: float | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def spend(self, what: str, since: float) -> None:
+        """Add the seconds since a time of time.perf_counter."""
+        self.seconds[what] = self.seconds.get(what, 0.0) + time.perf_counter() - since
 
 
 class Renderer:
@@ -87,6 +109,7 @@ class Renderer:
         used = scene.vertices[np.unique(scene.faces)]
         self.bounds = np.stack([used.min(0), used.max(0)])
         self.extent = float((self.bounds[1] - self.bounds[0]).max()) or 1.0
+        self.convex = self.tested is None and is_convex(scene.vertices, scene.faces)
         self.counts = Counts()
 
     def trace(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -132,6 +155,13 @@ class Renderer:
             origin = origin[through] + directions[active] * (hits.distance[found][through] + 1e-5 * self.extent)[:, None]
         return out
 
+    def may_be_hidden(self, position: np.ndarray, geometric_normal: np.ndarray) -> np.ndarray | None:
+        """(n,) bool: whether anything can lie in front of points, or None where all may; no point on the outside of a
+        convex scene is hidden from any direction above its horizon."""
+        if not self.convex:
+            return None
+        return ((position - self.bounds.mean(0)) * geometric_normal).sum(1) <= 0
+
     def window(self, camera: Camera) -> tuple[int, int, int, int]:
         """Rows and columns (top, bottom, left, right) of the object's projected bounds."""
         used = self.scene.vertices if len(self.scene.vertices) < 200_000 else _corners(self.bounds)
@@ -141,8 +171,8 @@ class Renderer:
         low, high = np.floor(pixels.min(0)).astype(int), np.ceil(pixels.max(0)).astype(int)
         return (max(low[1], 0), min(high[1], camera.height), max(low[0], 0), min(high[0], camera.width))
 
-    def see(self, camera: Camera, pixel: np.ndarray, sample: np.ndarray, pattern: np.ndarray) -> Points:
-        """Points that samples at pixel (n,) + pattern[sample] see; the pattern's length sets the texture footprint."""
+    def see(self, camera: Camera, pixel: np.ndarray, sample: np.ndarray, pattern: np.ndarray, together: int) -> Points:
+        """Points that samples at pixel (n,) + pattern[sample] see; together, how many a pixel has, sets the footprint."""
         position = np.stack([pixel % camera.width, pixel // camera.width], 1) + pattern[sample]
         origins, directions = rays(camera, position)
         along = -(directions @ camera.backward)
@@ -152,47 +182,58 @@ class Renderer:
             origins = origins + camera.backward * back
         else:
             back = 0.0
+        at = time.perf_counter()
         face_idx, distance, barycentric = self.trace(origins, directions)
+        self.counts.spend("rays", at)
         hit = np.flatnonzero(face_idx >= 0)
         face_idx, barycentric, directions = face_idx[hit], barycentric[hit], directions[hit]
         distance = distance[hit]
         depth = distance * along[hit] - back
         width = camera.pixel_size if camera.projection == "orthographic" else depth / camera.fx
-        footprint = width / np.sqrt(len(pattern)) * np.ones(len(hit))
+        footprint = width / np.sqrt(together) * np.ones(len(hit))
         values = self.lookup.attributes(face_idx, barycentric, footprint, directions)
         self.counts.samples += len(pixel)
-        return Points(pixel[hit], sample[hit], origins[hit] + directions * distance[:, None], -directions, depth, values)
+        return Points(pixel[hit], sample[hit], origins[hit] + directions * distance[:, None], -directions, depth, values, together)
 
-    def buffers(self, camera: Camera, samples: int = 16, shade=None) -> dict[str, np.ndarray]:
+    def buffers(self, camera: Camera, samples: int = 16, shade=None, goal: Goal = Goal()) -> dict[str, np.ndarray]:
         """Domain images (h, w[, c]) float32 and "mask": see render_buffers. shade(points) -> {"color": (n, 3)} adds an
-        image."""
+        image. samples: the most that a pixel gets."""
+        begun = time.perf_counter()
         height, width = camera.height, camera.width
         top, bottom, left, right = self.window(camera)
         self.counts.pixels += height * width
         self.counts.pixels_in_bounds += max(bottom - top, 0) * max(right - left, 0)
-        total = _Sums(height * width)
-        rows = max(1, BAND_SAMPLES // max(1, (right - left) * BASE))
-        for start in range(top, bottom, rows):
-            stop = min(start + rows, bottom)
-            pixel = (np.arange(start, stop)[:, None] * width + np.arange(left, right)[None]).ravel()
-            self._band(camera, pixel, samples, total, shade)
+        total, pattern = _Sums(height * width), pixel_pattern(samples)
+        pixel = (np.arange(top, bottom)[:, None] * width + np.arange(left, right)[None]).ravel()
+        done, taken = 0, 0
+        tolerance = TOLERANCE if goal.psnr is None else min(TOLERANCE, 0.5 * 10 ** (-goal.psnr / 20))
+        while len(pixel) and done < samples:
+            count = min(max(2 * done, BASE), samples)
+            more = count - done
+            step = max(1, BAND_SAMPLES // more)
+            for start in range(0, len(pixel), step):
+                part = pixel[start:start + step]
+                asked = np.repeat(part, more)
+                at = time.perf_counter()
+                points = self.see(camera, asked, np.tile(np.arange(done, count), len(part)), pattern, count)
+                total.add(points, asked, shade)
+                self.counts.spend("samples", at)
+            self.counts.pixels_refined += len(pixel) if done == BASE else 0
+            taken += len(pixel) * more
+            change = total.change()
+            done = count
+            if done >= samples or not total.seen.any():
+                break
+            if goal.psnr is not None and done > BASE and change is not None and change >= goal.psnr:
+                break
+            pixel, error = total.uneven(pixel, width, height, tolerance, done)
+            if goal.seconds is not None:
+                spent = time.perf_counter() - begun
+                room = int((goal.seconds - spent) / spent * taken / done) if goal.seconds > spent else 0
+                if room < len(pixel):
+                    pixel = np.sort(pixel[np.argsort(-error, kind="stable")[:room]])
+        self.counts.estimated_psnr = total.change()
         return total.images(camera, () if shade is None else ("color",))
-
-    def _band(self, camera: Camera, pixel: np.ndarray, samples: int, total: _Sums, shade) -> None:
-        base = min(BASE, samples)
-        pattern = pixel_pattern(samples)
-        asked = np.repeat(pixel, base)
-        points = self.see(camera, asked, np.tile(np.arange(base), len(pixel)), pattern[:base])
-        total.add(points, asked, shade)
-        if samples <= base or not len(points):
-            return
-        chosen = total.uneven(pixel, camera.width, camera.height)
-        self.counts.pixels_refined += len(chosen)
-        more = samples - base
-        for start in range(0, len(chosen), max(1, BAND_SAMPLES // more)):
-            part = chosen[start:start + max(1, BAND_SAMPLES // more)]
-            again = np.repeat(part, more)
-            total.add(self.see(camera, again, np.tile(np.arange(base, samples), len(part)), pattern), again, shade)
 
 
 class _Sums:
@@ -203,6 +244,7 @@ class _Sums:
         self.asked, self.seen = np.zeros(pixels), np.zeros(pixels)
         self.sums: dict[str, np.ndarray] = {}
         self.squares: dict[str, np.ndarray] = {}
+        self.before: np.ndarray | None = None
 
     def add(self, points: Points, asked: np.ndarray, shade) -> None:
         self.asked += np.bincount(asked, minlength=self.pixels)
@@ -213,32 +255,60 @@ class _Sums:
         if shade is not None:
             values |= shade(points)
         self.seen += np.bincount(points.pixel, minlength=self.pixels)
+        # The samples of a pixel follow each other.
+        starts = np.flatnonzero(np.diff(points.pixel, prepend=-1))
+        owner = points.pixel[starts]
         for name, value in values.items():
-            value = value.reshape(len(points), -1)
+            value = value.reshape(len(points), -1).astype(np.float64)
             if name not in self.sums:
                 self.sums[name] = np.zeros((self.pixels, value.shape[1]))
-                self.squares[name] = np.zeros(self.pixels)
-            for c in range(value.shape[1]):
-                self.sums[name][:, c] += np.bincount(points.pixel, value[:, c], self.pixels)
-            if name in TOLERANCE:
-                self.squares[name] += np.bincount(points.pixel, np.einsum("ij,ij->i", value, value, dtype=np.float64), self.pixels)
+                self.squares[name] = np.zeros((self.pixels, value.shape[1]))
+            self.sums[name][owner] += np.add.reduceat(value, starts)
+            if name in STORED:
+                self.squares[name][owner] += np.add.reduceat(value * value, starts)
 
-    def uneven(self, pixel: np.ndarray, width: int, height: int) -> np.ndarray:
-        """Of the pixels given, those partly covered, beside covered ones, or whose samples differ."""
-        partly = (self.seen > 0) & (self.seen < self.asked)
-        covered = np.pad((self.seen > 0).reshape(height, width), 1)
-        around = np.zeros((height, width), bool)
-        for dy in range(3):
-            for dx in range(3):
-                around |= covered[dy:dy + height, dx:dx + width]
-        chosen = partly | ((self.seen == 0) & around.ravel())
-        count = np.maximum(self.seen, 1)
-        for name, limit in TOLERANCE.items():
+    def error(self, name: str, pixel: np.ndarray) -> np.ndarray:
+        """Squared standard error (n,) of the means of pixels (n,), as a picture stores them, mean over the channels."""
+        count = np.maximum(self.seen[pixel], 1)[:, None]
+        mean = self.sums[name][pixel] / count
+        variance = np.maximum(self.squares[name][pixel] / count - mean * mean, 0)
+        slope = _srgb_slope(mean) if STORED[name] is None else STORED[name]
+        return (variance / count * slope**2).mean(1)
+
+    def change(self) -> float | None:
+        """The color's error in dB as the last change of the means tells it: half of the samples against all of them."""
+        if "color" not in self.sums:
+            return None
+        covered = np.flatnonzero(self.seen)
+        mean = np.clip(self.sums["color"] / np.maximum(self.seen, 1)[:, None], 0, 1)
+        out = None
+        if self.before is not None and len(covered):
+            moved = ((_srgb(mean[covered]) - _srgb(self.before[covered])) ** 2).mean(1)
+            # A pixel that got nothing new is as good as its samples say.
+            self.moved[covered] = np.where(self.asked[covered] > self.asked_before[covered], moved, self.moved[covered])
+            out = float(-10 * np.log10(max(self.moved[covered].mean(), 1e-10)))
+        elif len(covered):
+            self.moved = np.zeros(self.pixels)
+            self.moved[covered] = self.error("color", covered)
+        self.before, self.asked_before = mean, self.asked.copy()
+        return out
+
+    def uneven(self, pixel: np.ndarray, width: int, height: int, tolerance: float, done: int) -> tuple[np.ndarray, np.ndarray]:
+        """Of the pixels given, those partly covered, those at the outline as long as few samples (done) may have missed
+        what covers them, and those whose mean is not known to tolerance; and how badly each is known."""
+        seen = self.seen[pixel]
+        partly = (seen > 0) & (seen < self.asked[pixel])
+        if done <= EDGE:
+            covered = (self.seen > 0).reshape(height, width)
+            whole = (self.seen == self.asked).reshape(height, width) & covered
+            partly |= ((seen == 0) & _beside(covered)[pixel]) | ((seen > 0) & _beside(~whole)[pixel])
+        worst = np.zeros(len(pixel))
+        some = np.flatnonzero(seen > 0)
+        for name in STORED:
             if name in self.sums:
-                mean = self.sums[name] / count[:, None]
-                variance = self.squares[name] / count - np.einsum("ij,ij->i", mean, mean)
-                chosen |= (variance > limit**2) & (self.seen > 0)
-        return pixel[chosen[pixel]]
+                worst[some] = np.maximum(worst[some], self.error(name, pixel[some]))
+        chosen = partly | (worst > tolerance**2)
+        return pixel[chosen], np.where(partly, 1.0, worst)[chosen]
 
     def images(self, camera: Camera, more: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
         shape = (camera.height, camera.width)
@@ -255,6 +325,23 @@ class _Sums:
             image = mean.reshape(*shape, -1).astype(np.float32)
             out[name] = image if image.shape[2] == 3 else image[..., 0]
         return out
+
+
+def _beside(inside: np.ndarray) -> np.ndarray:
+    """(h * w,) bool: pixels that are inside (h, w), or have a neighbour of eight that is."""
+    padded = np.pad(inside, 1)
+    rows = padded[:-2] | padded[1:-1] | padded[2:]
+    return (rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]).ravel()
+
+
+def _srgb(x: np.ndarray) -> np.ndarray:
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def _srgb_slope(x: np.ndarray) -> np.ndarray:
+    """Derivative of the sRGB curve; 0 beyond 1, where a picture is clipped."""
+    inside = np.clip(x, 0.0031308, 1)
+    return np.where(x > 1, 0.0, np.where(x <= 0.0031308, 12.92, 1.055 / 2.4 * inside ** (1 / 2.4 - 1)))
 
 
 def _corners(bounds: np.ndarray) -> np.ndarray:

@@ -1,8 +1,9 @@
 """Pictures of an asset or a model under any light.
 
 Use it to see what bake made, to compare lights, and for turntables. Takes an asset folder or a .glb, .gltf, .obj, .ply
-or .stl file, and lights it by one of the bundled lights or by a lat-long .hdr or .exr image; with shadows (sampled) or
-without and free of noise (sg, sixteen spherical Gaussians fitted to the light).
+or .stl file, and lights it by one of the bundled lights or by a lat-long .hdr or .exr image (--env). --light says how:
+sampled becomes exact with more samples, prefiltered is quick and close, sg is what training and reconstruction compute
+with. --budget and --target-psnr say how long to go on instead of --samples.
 
 Example:
   gdtool relight cat.asset/asset --env bright --views 8
@@ -15,9 +16,13 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from gdtool.core.errors import UsageError
 from gdtool.core.folder import Folder
 from gdtool.core.kinds import RendersContent
 from gdtool.core.stage import Inputs, Output, Stage, file_option
+
+# Samples per pixel at which a view ends that was to end by itself.
+OPEN_ENDED = 4096
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -28,9 +33,11 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     elevation: Annotated[float, Meta(ge=-89, le=89, description="of the cameras, degrees")] = 10.0
     fov: Annotated[float, Meta(ge=0, le=120, description="across, degrees; 0: orthographic")] = 30.0
     size: Annotated[int, Meta(ge=16, le=8192, description="width and height in pixels")] = 512
-    light: Annotated[Literal["sampled", "sg"], Meta(description="sampled: direct light with shadows; sg: closed form, no shadows, no noise")] = "sampled"
-    samples: Annotated[int, Meta(ge=1, le=1024, description="samples per pixel where something changes; 4 elsewhere")] = 16
-    light_samples: Annotated[int, Meta(ge=1, le=1024, description="directions per sample, from the light and from the reflection each")] = 16
+    light: Annotated[Literal["sampled", "prefiltered", "sg"], Meta(description="how --env lights: sampled, exact direct light with shadows; prefiltered, the light averaged over reflection lobes, shadows from a few rays; sg, closed form of sixteen spherical Gaussians, no shadows")] = "sampled"
+    samples: Annotated[int, Meta(ge=1, le=4096, description="the most samples per pixel; pixels whose mean is known get fewer, at least 4")] = 64
+    light_samples: Annotated[int, Meta(ge=0, le=1024, description="directions per sample, from the light and from the reflection each; 0, prefiltered only: no shadows")] = 4
+    budget: Annotated[float, Meta(gt=0, description="seconds for the rendering of all views, up to 4096 samples per pixel; the pictures then depend on the machine")] | None = None
+    target_psnr: Annotated[float, Meta(ge=10, le=60, description="dB, estimated while rendering, at which a view is done, up to 4096 samples per pixel")] | None = None
     exposure: Annotated[float, Meta(gt=0, description="factor on the color; 1: a white card in the light's brightest direction has radiance 0.8")] = 1.0
     brdf: Annotated[Literal["gltf", "paper"], Meta(description="reflection model; gltf is what engines use")] = "gltf"
     seed: Annotated[int, Meta(ge=0, description="seed of everything random")] = 0
@@ -38,7 +45,14 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Light one asset or model."""
+    if options.budget is not None and options.target_psnr is not None:
+        raise UsageError("--budget and --target-psnr", "exclude each other", "give one")
+    if options.light == "sampled" and not options.light_samples:
+        raise UsageError("--light-samples 0", "leaves --light sampled without light", "use --light prefiltered")
+    if options.light == "sg" and (options.budget, options.target_psnr) != (None, None):
+        raise UsageError("--light sg", "is free of noise", "leave out --budget and --target-psnr")
     import dataclasses
+    import time
 
     import numpy as np
     import torch
@@ -50,8 +64,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.images.contact import contact_sheet
     from gdtool.images.io import write_png
     from gdtool.shading.direct import DirectLight
-    from gdtool.shading.render import Renderer, closed_form_image
+    from gdtool.shading.render import Goal, Renderer, closed_form_image
     from gdtool.shading.rigs import turntable
+    from gdtool.shading.savings import savings
     from gdtool.shading.studio import studio
 
     torch.set_num_threads(1)  # shading runs in threads of its own
@@ -67,11 +82,18 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     frames, clipped = [], []
     with out.step("render"):
         renderer = Renderer(scene, out.threads)
-        color = None
-        if options.light == "sampled":
-            color = DirectLight(renderer, environment, options.light_samples, options.seed, options.brdf).color(options.exposure)
-        for camera in out.progress(cameras, len(cameras), "frames"):
-            frame = renderer.buffers(camera, options.samples, color)
+        direct = color = None
+        if options.light != "sg":
+            direct = DirectLight(renderer, environment, options.light_samples, options.seed, options.brdf, mode=options.light)
+            color = direct.color(options.exposure)
+        open_ended = options.budget is not None or options.target_psnr is not None
+        samples = OPEN_ENDED if open_ended else options.samples
+        reached, begun = [], time.perf_counter()
+        for number, camera in enumerate(out.progress(cameras, len(cameras), "frames")):
+            # Each view gets an even part of what is left of the budget.
+            left = None if options.budget is None else max(0.0, options.budget - (time.perf_counter() - begun)) / (len(cameras) - number)
+            frame = renderer.buffers(camera, samples, color, Goal(left, options.target_psnr))
+            reached.append(renderer.counts.estimated_psnr)
             if color is None:
                 frame["color"] = closed_form_image(frame, camera, lobes, options.brdf) * options.exposure
             seen = frame["color"][frame["mask"] > 0]
@@ -87,14 +109,18 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     if options.light == "sg":
         out.skip("shadows", "the closed form has none")
     else:
-        out.skip("the light's fit by spherical Gaussians", "--light sampled does not use it")
-    if renderer.tested is None:
-        out.skip("alpha tests", "every material is opaque")
+        out.skip("the light's fit by spherical Gaussians", f"--light {options.light} does not use it")
+    for what, why, seconds in savings(renderer, samples, direct):
+        out.skip(what, why, seconds)
+    known = [x for x in reached if x is not None]
+    if options.target_psnr is not None and (not known or min(known) < options.target_psnr):
+        out.warn(f"--target-psnr {options.target_psnr:g} was not reached by {samples} samples per pixel")
     counts = renderer.counts
     report = {"clipped_share": float(np.mean(clipped)), "environment_scale": environment.scale, "samples": counts.samples,
-              "shadow_rays": counts.shadow_rays, **{f"light_fit_{k}": v for k, v in record["fit_error"].items()}}
+              "shadow_rays": counts.shadow_rays, **({"estimated_psnr": min(known)} if known else {}),
+              **{f"light_fit_{k}": v for k, v in record["fit_error"].items()}}
     out.content = RendersContent(frames=len(frames), environment=environment.name, light=options.light, exposure=options.exposure,
                                  source_from_world=tuple(float(x) for x in matrix.ravel()), report=report)
 
 
-STAGE = Stage(name="relight", version=1, reads=("asset", "model-file"), writes="renders", Options=Options, run=run)
+STAGE = Stage(name="relight", version=2, reads=("asset", "model-file"), writes="renders", Options=Options, run=run)

@@ -40,8 +40,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Options of render-dataset."""
 
     size: Annotated[int, Meta(ge=16, le=4096, description="width and height of a view in pixels")] = 256
-    samples: Annotated[int, Meta(ge=1, le=1024, description="samples per pixel where something changes; 4 elsewhere")] = 16
-    light_samples: Annotated[int, Meta(ge=1, le=1024, description="directions per sample, from the light and from the reflection each")] = 8
+    samples: Annotated[int, Meta(ge=1, le=1024, description="the most samples per pixel; pixels whose mean is known get fewer, at least 4")] = 16
+    light_samples: Annotated[int, Meta(ge=1, le=1024, description="directions per sample, from the light and from the reflection each")] = 4
     light: file_option("random (seeded by the object's name), random:NUMBER, dark, mid, bright, or a lat-long .hdr or .exr file") = "random"
     exposure: Annotated[float, Meta(gt=0, description="factor on the color; 1: a white card in the light's brightest direction has radiance 0.8")] = 1.0
     rig: Annotated[Literal["six", "wonder3d", "turntable", "sphere"], Meta(description="where the cameras stand")] = "six"
@@ -111,7 +111,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             report |= {"environment_scale": lamps.environment.scale, **{f"light_fit_{k}": v for k, v in light["fit_error"].items()}}
         write_views(out, views, source_from_world=source_from_world, exposure=options.exposure, environment=light["environment"] if light else "",
                     clipped_share=clipped, conditions=options.condition_views, model=generated, report=report)
-    _tell_skips(out, scene, renderer, options, lamps is None)
+    _tell_skips(out, renderer, options, lamps)
 
 
 def _number(text: str) -> int:
@@ -249,31 +249,20 @@ def _write_conditions(out: Output, renderer: Renderer, direct: DirectLight, opti
     write_cameras(out.path("condition.json"), cameras)
 
 
-def _tell_skips(out: Output, scene: Scene, renderer: Renderer, options: Options, unlit: bool) -> None:
+def _tell_skips(out: Output, renderer: Renderer, options: Options, lamps: _Lamps | None) -> None:
     """What the scene did not need."""
-    textures = {"base color": "base_color_texture", "metallic-roughness": "metallic_roughness_texture", "normal": "normal_texture",
-                "emissive": "emissive_texture"}
-    for what, name in textures.items():
-        if all(getattr(material, name) is None for material in scene.materials):
-            out.skip(f"{what} lookups", "no material has such a texture")
-    if renderer.tested is None:
-        out.skip("alpha tests", "every material is opaque")
-    if unlit:
+    from gdtool.shading.savings import savings
+
+    if lamps is None:
         out.skip("light", "neither color, closed_form nor condition images are asked for")
-    counts = renderer.counts
-    if counts.pixels_in_bounds < counts.pixels:
-        out.skip("rays", f"{1 - counts.pixels_in_bounds / counts.pixels:.0%} of the pixels lie outside the object's projected bounds")
-    if options.samples > 4:
-        out.skip("samples", f"{1 - counts.pixels_refined / max(counts.pixels_in_bounds, 1):.0%} of the pixels in bounds are even and got 4 of {options.samples}")
-    if counts.shadow_rays_below_horizon:
-        total = counts.shadow_rays + counts.shadow_rays_below_horizon
-        out.skip("shadow rays", f"{counts.shadow_rays_below_horizon / total:.0%} of the directions are below the horizon or carry no light")
+    for what, why, seconds in savings(renderer, options.samples, None if lamps is None else lamps.direct):
+        out.skip(what, why, seconds)
     for domain in ALL:
         if domain not in options.domains:
             out.skip(domain, "left out by --domains")
 
 
 STAGE = Stage(
-    name="render-dataset", version=1, reads=("model-file", "asset"), writes="views", Options=Options, run=run, dataset=True,
+    name="render-dataset", version=2, reads=("model-file", "asset"), writes="views", Options=Options, run=run, dataset=True,
     second_inputs={"cameras": SecondInput("views", search=False, help="Views folder whose cameras, frame and light are used again.")},
 )

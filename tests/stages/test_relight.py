@@ -19,7 +19,7 @@ def square(tmp_path):
     return tmp_path / "square.obj"
 
 
-@pytest.mark.parametrize("light", ["sampled", "sg"])
+@pytest.mark.parametrize("light", ["sampled", "prefiltered", "sg"])
 def test_writes_frames_that_validate_and_skips_when_up_to_date(gdtool, square, tmp_path, light):
     done = gdtool("relight", square, *FAST, "--views", "3", "--light", light)
     assert done.returncode == 0, done.stderr
@@ -52,3 +52,17 @@ def test_works_in_a_pipe_and_bad_input_exits_3(gdtool, square, tmp_path):
     assert bad.returncode == 3 and "bad.glb" in bad.stderr and "Traceback" not in bad.stderr
     assert gdtool("relight", square, *FAST, "--env", "none.exr", "-o", "x").returncode == 3
     assert not (tmp_path / "x").exists()
+
+
+def test_a_target_or_a_budget_instead_of_samples(gdtool, square, tmp_path):
+    """A target in reach is met and estimated; one out of reach in so little time is not, and the picture is there."""
+    small = ("--size", "32", "--light-samples", "2")
+    for target in (25, 45):
+        assert gdtool("relight", square, *small, "--target-psnr", str(target), "-o", f"t{target}").returncode == 0
+    few, many = (json.loads((tmp_path / f"t{t}/manifest.json").read_text())["content"]["report"] for t in (25, 45))
+    assert few["estimated_psnr"] >= 25 and many["estimated_psnr"] >= 45 and many["samples"] > few["samples"]
+    assert gdtool("relight", square, *small, "--budget", "0.3", "-o", "b").returncode == 0
+    assert read_image(tmp_path / "b/000.png")[16, 16, :3].min() > 0
+    assert gdtool("relight", square, *small, "--budget", "1", "--target-psnr", "40", "-o", "c").returncode == 2
+    assert gdtool("relight", square, *small, "--light", "sg", "--budget", "1", "-o", "c").returncode == 2
+    assert gdtool("relight", square, "--light-samples", "0", "-o", "c").returncode == 2

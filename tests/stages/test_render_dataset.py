@@ -130,3 +130,27 @@ def test_named_lights_rigs_and_filter(gdtool, box, tmp_path):
     assert dropped.returncode == 3 and "complete" in dropped.stderr and not (tmp_path / "kept").exists()
     assert gdtool("render-dataset", box, *FAST, "--domains", "colour").returncode == 2
     assert gdtool("render-dataset", box, *FAST, "--light", "none.hdr").returncode == 3
+
+
+def test_shards_share_the_sources_and_the_index(gdtool, box, tmp_path):
+    for name in "abcde":
+        (tmp_path / f"{name}.obj").write_text(BOX if name != "c" else "v 0 0 0\n")
+    sources = [tmp_path / f"{name}.obj" for name in "abcde"]
+    fast = (*FAST, "--domains", "normal", "-o", "data")
+    first = gdtool("render-dataset", *sources, *fast, "--shard", "1/2")
+    # Bad files are reported and the rest goes on.
+    assert first.returncode == 1 and "c.obj" in first.stderr
+    assert first.stdout.splitlines() == ["data/a.asset/views", "data/e.asset/views"]
+    second = gdtool("render-dataset", *sources, *fast, "--shard", "2/2")
+    assert second.returncode == 0 and second.stdout.splitlines() == ["data/b.asset/views", "data/d.asset/views"]
+    listed = [one["path"] for one in manifest(tmp_path / "data")["content"]["objects"]]
+    assert listed == [f"{name}.asset/views" for name in "abde"]
+    for wrong in ("0/2", "3/2", "2", "a/b"):
+        assert gdtool("render-dataset", *sources, *fast, "--shard", wrong).returncode == 2
+
+
+def test_skips_say_what_they_saved(gdtool, box, tmp_path):
+    assert gdtool("render-dataset", box, *FAST).returncode == 0
+    saved = {s["what"]: s.get("saved_seconds") for s in manifest(tmp_path / "box.asset/views")["skipped"]}
+    assert {"rays", "normal lookups", "shadow rays of convex objects", "shadow rays"} <= set(saved)
+    assert all(saved[what] > 0 for what in ("rays", "normal lookups", "shadow rays of convex objects", "shadow rays"))

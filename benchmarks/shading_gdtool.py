@@ -1,0 +1,63 @@
+"""One rendering by gdtool for benchmarks/render.py and relight.py: prints its seconds, writes its images.
+
+  python benchmarks/shading_gdtool.py MODEL ENV OUT.npz --views front,right --size 512 --samples 16 --light sampled --light-samples 4
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import time
+
+import numpy as np
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name in ("model", "env", "out"):
+        parser.add_argument(name)
+    parser.add_argument("--views", default="front_right")
+    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--samples", type=int, default=16)
+    parser.add_argument("--light", choices=["none", "sampled", "prefiltered", "sg"], default="none")
+    parser.add_argument("--light-samples", type=int, default=4)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--converged", action="store_true", help="every pixel gets all samples")
+    asked = parser.parse_args()
+    import torch
+
+    torch.set_num_threads(1)
+    from gdtool.assets.load import load_scene
+    from gdtool.cameras import rig
+    from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
+    from gdtool.shading import render
+    from gdtool.shading.direct import DirectLight
+    from gdtool.shading.studio import studio
+
+    scene = load_scene(asked.model)
+    matrix = unit_box(scene.vertices[np.unique(scene.faces)])
+    scene = dataclasses.replace(scene, vertices=transform_points(invert_similarity(matrix), scene.vertices))
+    if asked.converged:
+        render.BASE = asked.samples
+    environment, lobes, _ = studio(asked.env, asked.seed, fit=asked.light == "sg")
+    wall, processor = time.perf_counter(), time.process_time()
+    renderer = render.Renderer(scene, len(os.sched_getaffinity(0)))
+    color = None
+    if asked.light in ("sampled", "prefiltered"):
+        color = DirectLight(renderer, environment, asked.light_samples, asked.seed, mode=asked.light).color()
+    cameras = {camera.name: camera for camera in rig("six", asked.size)}
+    frames = []
+    for name in asked.views.split(","):
+        frame = renderer.buffers(cameras[name], asked.samples, color)
+        if asked.light == "sg":
+            frame["color"] = render.closed_form_image(frame, cameras[name], lobes)
+        frames.append(frame)
+    seconds = {"wall s": time.perf_counter() - wall, "cpu s": time.process_time() - processor}
+    np.savez(asked.out, **{key: np.stack([frame[key] for frame in frames]) for key in frames[0]})
+    print(json.dumps({**seconds, "rays": renderer.counts.samples + renderer.counts.shadow_rays}))
+
+
+if __name__ == "__main__":
+    main()
