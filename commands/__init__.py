@@ -11,6 +11,7 @@ COMMANDS = {
     "render-dataset": "Render ground-truth views of PBR models.",
     "train": "Train the multi-view PBR diffusion model.",
     "sample-views": "Sample six views in six domains from one image.",
+    "import-views": "Turn another program's pictures into views.",
     "reconstruct": "Turn views into a closed surface with materials.",
     "remesh": "Turn a surface into quads.",
     "unwrap": "Give a mesh texture coordinates.",

@@ -17,6 +17,7 @@ from gdtool.core.manifest import digest_of, file_sha256
 PROCEDURAL = re.compile(r"procedural:(\d+)(?:\.\.(\d+))?$")
 
 Source = Folder | Path | str  # a str is procedural:SEED
+PICTURES = "pictures"  # a kind of source: a folder of another program, without a manifest
 
 
 def expand(text: str) -> Iterator[str]:
@@ -72,6 +73,8 @@ def resolve(text: str, kinds: tuple[str, ...], reader: str, allow_missing: bool 
         return text
     path = Path(text)
     folder_kinds = tuple(kind for kind in kinds if not kind.endswith("-file"))
+    if PICTURES in kinds and path.is_dir() and not is_folder(path):
+        return path
     if path.is_dir() or path.name == "manifest.json":
         if not folder_kinds and not is_folder(path):
             raise InputError(path, f"is a folder, but {reader} reads {_words(kinds)}")
@@ -93,7 +96,7 @@ def name_of(source: Source) -> str:
         return source.name
     if isinstance(source, str):
         return "procedural-" + source.split(":")[1].zfill(6)
-    return source.stem
+    return source.resolve().name if source.is_dir() else source.stem
 
 
 def digest(source: Source) -> str:
@@ -104,6 +107,9 @@ def digest(source: Source) -> str:
         from gdtool.assets.procedural import VERSION
 
         return digest_of(["procedural", VERSION, source])
+    if source.is_dir():
+        files = sorted(path for path in source.rglob("*") if path.is_file())
+        return digest_of([[path.relative_to(source).as_posix(), file_sha256(path)] for path in files])
     return digest_of([file_sha256(path) for path in (source, *_sidecars(source)) if path.is_file()])
 
 

@@ -149,7 +149,7 @@ def test_two_processes_on_one_output(tmp_path, cube):
 
 
 def test_empty_stdin_fails_the_pipe(gdtool):
-    for command in ("render-dataset", "sample-views", "reconstruct", "remesh", "unwrap", "bake", "relight", "evaluate", "validate"):
+    for command in ("render-dataset", "sample-views", "import-views", "reconstruct", "remesh", "unwrap", "bake", "relight", "evaluate", "validate"):
         done = gdtool(command)
         assert done.returncode == 2 and len(lines_of(done.stderr)) == 1 and done.stdout == "", command
     pipe = f"{sys.executable} -m gdtool reconstruct nothing | {sys.executable} -m gdtool remesh | {sys.executable} -m gdtool unwrap"

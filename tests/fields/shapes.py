@@ -39,20 +39,24 @@ def material(points):
     return 0.5 + 0.3 * np.sin(4 * points), 0.5 + 0.3 * np.sin(3 * points[..., 1]), (points[..., 0] > 0) * 1.0
 
 
-def views_of(distance, size=96, samples=2):
-    """cameras, images by domain and mask (6, h, w): samples^2 rays a pixel, averaged over the covered ones."""
-    cameras, images, masks = rig("six", size), {}, []
+def views_of(distance, size=96, samples=2, cameras=None):
+    """cameras (of the default rig without any), images by domain and mask (k, h, w): samples^2 rays a pixel, averaged
+    over the covered ones. Solids lie within 0.9 of the origin, cameras outside."""
+    cameras, images, masks = cameras or rig("six", size), {}, []
     for camera in cameras:
         total, cover = {}, np.zeros((size, size))
         for i in range(samples):
             for j in range(samples):
                 x, y = np.meshgrid(np.arange(size) + (i + 0.5) / samples, np.arange(size) + (j + 0.5) / samples)
                 origins, directions = rays(camera, np.stack([x, y], -1))
-                depth = np.full((size, size), 1.0)
+                # Along the ray, which of a perspective camera is longer than the depth.
+                far = np.linalg.norm(camera.position) + 1
+                along = np.full((size, size), far - 2)
                 for _ in range(160):
-                    depth = np.minimum(depth + distance(origins + depth[..., None] * directions), 4.0)
-                points = origins + depth[..., None] * directions
-                hit = (depth < 3) & (np.abs(distance(points)) < 1e-4)
+                    along = np.minimum(along + distance(origins + along[..., None] * directions), far + 1)
+                points = origins + along[..., None] * directions
+                depth = along * -(directions @ camera.backward)
+                hit = (along < far) & (np.abs(distance(points)) < 1e-4)
                 normal = gradient(distance, points)
                 albedo, roughness, metallic = material(points)
                 color = albedo * (0.25 + 0.75 * np.clip(normal @ LIGHT, 0, 1))[..., None]

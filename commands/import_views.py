@@ -1,0 +1,7 @@
+"""`gdtool import-views`: options and help come from the stage."""
+
+from gdtool.stages import import_views as stage
+
+from ._common import stage_command
+
+command = stage_command(stage.STAGE, help=stage.__doc__)

@@ -1,0 +1,59 @@
+"""Readers of other programs' pictures: each turns a folder into cameras and images in gdtool's conventions.
+
+An adapter is a module with `recognises(folder) -> bool` and `read(folder) -> Pictures`; ADAPTERS lists them in the order
+in which they are asked. Add a module and its name, and `gdtool import-views` reads one format more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from gdtool.cameras import Camera
+from gdtool.core.errors import InputError
+
+ADAPTERS = ("wonder3d", "nerf", "plain")
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """What an adapter read: one image size, any subset of the domains.
+
+    images: domain to (k, h, w, 3) or (k, h, w) float32 as folders.views.Views holds them (linear colors, normals in
+    world axes, depth along the axis); mask (k, h, w). up: the world axis that points up, "y" or "z".
+    """
+
+    cameras: list[Camera]
+    images: dict[str, np.ndarray]
+    mask: np.ndarray
+    up: str = "y"
+
+
+def adapter(folder: Path, name: str = "auto") -> ModuleType:
+    """The adapter of that name, or the first that recognises the folder. Raises InputError."""
+    for known in ADAPTERS if name == "auto" else (name,):
+        module = import_module(f"{__name__}.{known}")
+        if module.recognises(folder):
+            return module
+    wanted = "a Wonder3D output, a transforms.json or a cameras.json with pictures" if name == "auto" else import_module(f"{__name__}.{name}").LOOKS_LIKE
+    raise InputError(folder, f"does not hold {wanted}", "see gdtool import-views --help")
+
+
+def linear_color(image: np.ndarray) -> np.ndarray:
+    """(h, w, 3) linear float32 of a picture as read_image gives it: integers are sRGB, floats linear."""
+    from gdtool.images.color import linear_from_srgb, unit_range
+
+    image = np.repeat(image, 3, -1)[..., :3] if image.shape[-1] < 3 else image[..., :3]
+    return (linear_from_srgb(unit_range(image)) if image.dtype.kind == "u" else np.clip(image, 0, 1)).astype(np.float32)
+
+
+def stacked(parts: list[np.ndarray], paths: list[Path]) -> np.ndarray:
+    """Images of one size as one array. Raises InputError naming the first of another size."""
+    for part, path in zip(parts, paths, strict=True):
+        if part.shape != parts[0].shape:
+            raise InputError(path, f"is {part.shape[1]}x{part.shape[0]}, {paths[0].name} {parts[0].shape[1]}x{parts[0].shape[0]}", "views have one size")
+    return np.stack(parts)

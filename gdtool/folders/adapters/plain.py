@@ -1,0 +1,75 @@
+"""A plain folder: cameras.json in gdtool's own form, and pictures as <domain>/<view>.<suffix> or, colors, <view>.<suffix>.
+
+What schemas/views.md says of encodings holds, except that any readable image format will do and that a view without a
+mask/<view> is masked by its color's alpha, else by its difference from a plain background.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gdtool.core.errors import InputError
+from gdtool.core.kinds import DOMAINS
+from gdtool.folders.adapters import Pictures, linear_color, stacked
+from gdtool.folders.records import read_cameras
+
+LOOKS_LIKE = "a cameras.json"
+_SUFFIXES = (".png", ".exr", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
+
+
+def recognises(folder: Path) -> bool:
+    return (folder / "cameras.json").is_file()
+
+
+def read(folder: Path) -> Pictures:
+    """Every domain that all views have."""
+    from gdtool.images.color import decode_normal, unit_range
+    from gdtool.images.io import read_image
+    from gdtool.images.mask import foreground
+
+    cameras = read_cameras(folder / "cameras.json")
+    images, masks, first = {}, None, ""
+    for domain in DOMAINS:
+        paths = [_find(folder, domain, camera.name) for camera in cameras]
+        if not all(paths):
+            continue
+        stored = [read_image(path).reshape(*_size(path, camera, read_image(path)), -1) for path, camera in zip(paths, cameras, strict=True)]
+        first = first or domain
+        if domain == "color":
+            masks = stored
+            images[domain] = stacked([linear_color(image) for image in stored], paths)
+        elif domain == "albedo":
+            images[domain] = stacked([linear_color(image) for image in stored], paths)
+        elif domain == "normal":
+            images[domain] = decode_normal(stacked([unit_range(image[..., :3]).astype(np.float32) for image in stored], paths))
+        elif domain == "depth" and any(image.dtype.kind != "f" for image in stored):
+            raise InputError(paths[0], "is not floating point: depth is in world units", "write it as .exr")
+        else:
+            images[domain] = stacked([unit_range(image[..., 0]).astype(np.float32) for image in stored], paths)
+    if not images:
+        raise InputError(folder, "has no domain with a picture of every view in cameras.json", f"for example color/{cameras[0].name}.png")
+    mask = []
+    for k, camera in enumerate(cameras):
+        given = _find(folder, "mask", camera.name)
+        if given is None and masks is None:
+            raise InputError(folder / "mask", f"has no picture of {camera.name}, and there is no color to tell the subject by")
+        if given is None:
+            mask.append(foreground(masks[k], subject=_find(folder, "color", camera.name)))
+        else:
+            stored = read_image(given)
+            _size(given, camera, stored)
+            mask.append(unit_range(stored.reshape(camera.height, camera.width, -1)[..., 0]).astype(np.float32))
+    return Pictures(cameras, images, np.stack(mask))
+
+
+def _find(folder: Path, domain: str, view: str) -> Path | None:
+    places = [folder / domain / view] + ([folder / view] if domain == "color" else [])
+    return next((place.with_name(place.name + suffix) for place in places for suffix in _SUFFIXES if place.with_name(place.name + suffix).is_file()), None)
+
+
+def _size(path: Path, camera, image: np.ndarray) -> tuple[int, int]:
+    if image.shape[:2] != (camera.height, camera.width):
+        raise InputError(path, f"is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}")
+    return image.shape[:2]
