@@ -165,9 +165,44 @@ def stretch(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> floa
 
 
 def overlaps(uv: np.ndarray, triangles: np.ndarray) -> bool:
-    """Whether any texel centre of a grid around the chart, finer than its triangles, lies in two of them."""
-    size = int(np.clip(32 * len(triangles) ** 0.5, 64, 1024))
-    low, extent = uv.min(0), float(np.ptp(uv, 0).max())
+    """Whether a chart whose triangles are all upright covers a place twice.
+
+    It does where its rim crosses itself, however little; a grid finer than its triangles finds what winds around twice.
+    """
+    extent = float(np.ptp(uv, 0).max())
     if not extent > 0:
         return True
-    return bool((owner_count((uv - low) / extent, triangles, size) > 1).any())
+    edges = edges_of(triangles)
+    if rim_crosses(uv, edges.ends[edges.count == 1]):
+        return True
+    size = int(np.clip(32 * len(triangles) ** 0.5, 64, 1024))
+    return bool((owner_count((uv - uv.min(0)) / extent, triangles, size) > 1).any())
+
+
+def rim_crosses(uv: np.ndarray, ends: np.ndarray, at_once: int = 2_000_000) -> bool:
+    """Whether two segments (s, 2) of points (v, 2) that share no end cross. Sweep over u, exact to rounding."""
+    low, high = uv[ends].min(1), uv[ends].max(1)
+    order = np.argsort(low[:, 0], kind="stable")
+    ends, low, high = ends[order], low[order], high[order]
+    # Each with those behind it in order that begin before it ends.
+    number = np.searchsorted(low[:, 0], high[:, 0], "right") - np.arange(len(ends)) - 1
+    total = np.cumsum(number)
+    start = 0
+    while start < len(ends):
+        base = total[start - 1] if start else 0
+        stop = max(start + 1, int(np.searchsorted(total, base + at_once, "right")))
+        one = np.repeat(np.arange(start, stop), number[start:stop])
+        two = one + 1 + np.arange(len(one)) - np.repeat(total[start:stop] - number[start:stop] - base, number[start:stop])
+        near = (low[one, 1] <= high[two, 1]) & (low[two, 1] <= high[one, 1])
+        one, two = ends[one[near]], ends[two[near]]
+        apart = (one[:, 0] != two[:, 0]) & (one[:, 0] != two[:, 1]) & (one[:, 1] != two[:, 0]) & (one[:, 1] != two[:, 1])
+        a, b, c, d = uv[one[apart, 0]], uv[one[apart, 1]], uv[two[apart, 0]], uv[two[apart, 1]]
+        if ((_side(a, b, c) * _side(a, b, d) < 0) & (_side(c, d, a) * _side(c, d, b) < 0)).any():
+            return True
+        start = stop
+    return False
+
+
+def _side(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """On which side of the line from a to b the point c lies, each (n, 2): -1, 0, 1."""
+    return np.sign((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])

@@ -138,3 +138,19 @@ def test_thousands_of_charts_go_on_shelves():
     triangle, faces = np.array([[0, 0], [1, 0], [0, 1.0]]), np.array([[0, 1, 2]])
     places, _ = pack([(triangle, faces)] * 1000, 0.004)
     assert min(uv.min() for uv in places) >= 0 and max(uv.max() for uv in places) <= 1
+
+
+def test_a_rim_that_crosses_by_a_hair_is_found():
+    from gdtool.texture.unwrap_flatten import overlaps, rim_crosses
+
+    square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    ends = np.array([[0, 1], [1, 2], [2, 3], [3, 0]])
+    assert not rim_crosses(square, ends) and rim_crosses(square[[0, 2, 1, 3]], ends)
+    # A strip of upright triangles bent almost into a ring: its ends pass each other by a millionth.
+    for turn, crosses in ((2 * np.pi - 1e-6, False), (2 * np.pi + 1e-6, True)):
+        angle = np.repeat(np.linspace(0, turn, 65), 2)
+        radius = np.tile([1.0, 2.0], 65)
+        uv = np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
+        i = np.arange(64)[:, None] * 2
+        strip = np.concatenate([i + [0, 1, 3], i + [0, 3, 2]])
+        assert overlaps(uv, strip) is crosses
