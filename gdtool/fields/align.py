@@ -6,13 +6,21 @@ enough to find, for every view, the smooth change of depth that brings its surfa
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from itertools import combinations
+
 import numpy as np
 
 from gdtool.cameras import Camera, project, rays
-from gdtool.fields.sights import Sight, bilinear, tangent_distance
+from gdtool.fields.sights import Sight, hull_distance, pixel_footprint, tangent_distance
 
-CONTROL = 7  # control points along a side of a view's correction
-_PRIOR = 0.03  # world units: how large a correction is expected to be
+CONTROL = 11  # control points along a side of a view's correction
+LARGEST = 0.06  # world units: no correction is larger
+PRIOR_SIZE = 0.01  # world units: how large a correction is expected to be
+PRIOR = 0.02  # what that expectation counts beside the matches
+SLOPE_LENGTH = 0.2  # world units over which normals go wrong by as much as depth does
+SLOPES, RIMS, EXTENTS = 1.0, 0.01, 0.3  # what the other evidence counts; rims lie beside curved outlines, so they only settle silhouettes
+RIM_COSINE = 0.15  # normals this square to an axis belong to the outline
 
 
 def disagreement(sights: list[Sight], reach: float = 0.06, stride: int = 3) -> float:
@@ -127,15 +135,69 @@ def _bending() -> np.ndarray:
     return np.array(rows)
 
 
-def depth_corrections(sights: list[Sight], reach: float, stiffness: float = 1.0, stride: int = 3) -> list[np.ndarray | None]:
-    """For each view a smooth image (h, w) to add to its depth, so that the views' surfaces meet; None without depth.
+@dataclass(frozen=True)
+class Corrections:
+    """What to change so that the views meet: control (k, CONTROL^2), world units to add to the depth of each view, and
+    edge (k,), world units that each silhouette is too small all around."""
 
-    One robust linear least squares over control grids: rows say that a point of one view, moved along its ray, lies
-    on another view's plane, moved along its own; priors keep corrections small and smooth.
+    control: np.ndarray
+    edge: np.ndarray
+
+    @classmethod
+    def none(cls, count: int) -> Corrections:
+        """Nothing to change."""
+        return cls(np.zeros((count, CONTROL * CONTROL)), np.zeros(count))
+
+    def depth(self, k: int, shape: tuple[int, int]) -> np.ndarray:
+        """Image (h, w) to add to the depth of view k."""
+        h, w = shape
+        x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
+        weights, places = _control_weights(np.stack([x, y], -1).reshape(-1, 2), shape)
+        image = (self.control[k][places] * weights).sum(1).reshape(h, w)
+        return np.clip(image, -LARGEST, LARGEST)
+
+
+class _System:
+    """Rows of a linear least squares over the control values of all views and the offset of every silhouette."""
+
+    def __init__(self, count: int):
+        self.count, self.unknowns = count, count * (CONTROL * CONTROL + 1)
+        self.rows: list[tuple] = []
+
+    def add(self, coefficients: np.ndarray, places: np.ndarray, target: np.ndarray, weight: np.ndarray) -> None:
+        """coefficients (n, c) at unknowns places (n, c) shall sum to target (n,)."""
+        self.rows.append((coefficients, places, target, weight))
+
+    def of_view(self, k: int, control: np.ndarray) -> np.ndarray:
+        return control + k * CONTROL * CONTROL
+
+    def edge(self, k: int) -> int:
+        return self.count * CONTROL * CONTROL + k
+
+    def solve(self, prior: np.ndarray) -> Corrections:
+        from scipy.sparse import coo_matrix, diags
+
+        matrix, vector = prior.copy(), np.zeros(self.unknowns)
+        for coefficients, places, target, weight in self.rows:
+            row = np.repeat(np.arange(len(target)), places.shape[1])
+            part = coo_matrix((coefficients.ravel(), (row, places.ravel())), shape=(len(target), self.unknowns)).tocsr()
+            matrix += (part.T @ diags(weight) @ part).toarray()
+            vector += part.T @ (weight * target)
+        found = np.linalg.solve(matrix, vector)
+        size = self.count * CONTROL * CONTROL
+        return Corrections(found[:size].reshape(self.count, -1), found[size:])
+
+
+def corrections(sights: list[Sight], slopes: list[tuple], before: Corrections, reach: float, stiffness: float = 1.0,
+                stride: int = 3) -> Corrections:
+    """The whole correction of views that `before` has already been applied to, by one robust linear least squares.
+
+    A point of one view, moved along its ray, lies on another view's plane, moved along its own; the corrected depth
+    rises as the normals say (slopes: see slope_rows, of the views as they were given); what one view sees edge-on lies
+    on its silhouette; two silhouettes reach equally far along the direction that both show at full length. Priors keep
+    corrections small and smooth. What all views of a point get wrong in common is found by the last three alone.
     """
-    size = CONTROL * CONTROL
-    count = len(sights) * size
-    matrix, vector = np.zeros((count, count)), np.zeros(count)
+    system, size = _System(len(sights)), CONTROL * CONTROL
     total = 0.0
     for m in _matches(sights, reach, stride):
         weight = m.weight / (1 + (m.distance / (0.5 * reach)) ** 2) ** 2
@@ -146,26 +208,117 @@ def depth_corrections(sights: list[Sight], reach: float, stiffness: float = 1.0,
         slope_here = -(m.normal @ sights[m.i].camera.backward)[:, None]
         slope_there = (m.normal @ sights[m.j].camera.backward)[:, None]
         coefficients = np.concatenate([w_here * slope_here, w_there * slope_there], 1)
-        places = np.concatenate([c_here + m.i * size, c_there + m.j * size], 1)
-        outer = coefficients[:, :, None] * coefficients[:, None, :] * weight[:, None, None]
-        np.add.at(matrix, (places[:, :, None], places[:, None, :]), outer)
-        np.add.at(vector, places, -coefficients * (weight * m.distance)[:, None])
+        places = np.concatenate([system.of_view(m.i, c_here), system.of_view(m.j, c_there)], 1)
+        done = (before.control[m.i][c_here] * w_here).sum(1) * slope_here[:, 0] + (before.control[m.j][c_there] * w_there).sum(1) * slope_there[:, 0]
+        system.add(coefficients, places, done - m.distance, weight)
     if total == 0:
-        return [None if s.planes is None else np.zeros(s.mask.shape) for s in sights]
+        return before
     per_view = total / len(sights)
+    unit = PRIOR * per_view / size  # a control's prior: what a match of one view's average control counts, times PRIOR
+    for k, (coefficients, places, target, weight) in enumerate(slopes):
+        share = SLOPES * PRIOR * SLOPE_LENGTH**2 * per_view / max(weight.sum(), 1e-12)
+        system.add(coefficients, system.of_view(k, places), target, share * weight)
+    _add_rims(system, sights, before, reach, per_view)
+    _add_extents(system, sights, before, per_view)
+    prior = np.zeros((system.unknowns, system.unknowns))
     bending = _bending()
-    prior = (stiffness * 2.0 * bending.T @ bending + 0.02 * np.eye(size)) * per_view / size
-    for k in range(len(sights)):
-        matrix[k * size:(k + 1) * size, k * size:(k + 1) * size] += prior
-    solution = np.linalg.solve(matrix, vector).reshape(len(sights), CONTROL, CONTROL)
-    out = []
-    for sight, control in zip(sights, solution, strict=True):
-        if sight.planes is None:
-            out.append(None)
+    one = stiffness * PRIOR * bending.T @ bending * per_view / size + unit * np.eye(size)
+    for k, sight in enumerate(sights):
+        prior[k * size:(k + 1) * size, k * size:(k + 1) * size] = one
+        foot = float(np.median(pixel_footprint(sight.camera, np.linalg.norm(sight.camera.position))))
+        prior[system.edge(k), system.edge(k)] = PRIOR * per_view * (PRIOR_SIZE / foot) ** 2
+    return system.solve(prior)
+
+
+def slope_rows(sight: Sight, stride: int = 2, apart: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What the normals say of a view's depth correction: coefficients (n, 8) and control indices (n, 8) of its slope, the
+    slope that fits (n,) and weights (n,). Across `apart` pixels, where the surface is smooth."""
+    h, w = sight.mask.shape
+    good = (sight.weight > 0.1) & ~sight.rough & ~sight.broken
+    normal, parts = sight.planes[..., :3], []
+    for axis in (0, 1):
+        ahead = [slice(None, -apart) if a == axis else slice(None) for a in (0, 1)]
+        behind = [slice(apart, None) if a == axis else slice(None) for a in (0, 1)]
+        middle = [slice(apart // 2, -(apart // 2)) if a == axis else slice(None) for a in (0, 1)]
+        first, second, between = tuple(ahead), tuple(behind), tuple(middle)
+        chosen = good[first] & good[second] & good[between]
+        chosen[np.arange(chosen.shape[0]) % stride > 0] = False
+        chosen[:, np.arange(chosen.shape[1]) % stride > 0] = False
+        step = (sight.points[second] - sight.points[first])[chosen].astype(np.float64)
+        n = normal[between][chosen].astype(np.float64)
+        facing = n @ sight.camera.backward
+        across = np.linalg.norm(step - np.outer(step @ sight.camera.backward, sight.camera.backward), axis=1)
+        slope = (n * step).sum(1) / np.maximum(facing * across, 1e-9)
+        keep = (np.abs(slope) < 0.5) & (facing > 0.3)
+        row, column = (x[keep] for x in np.nonzero(chosen))
+        place = np.stack([column, row], 1) + 0.5
+        there = place + apart * np.eye(2)[1 - axis]
+        w_a, c_a = _control_weights(place, (h, w))
+        w_b, c_b = _control_weights(there, (h, w))
+        scale = 1 / across[keep][:, None]
+        # Height over the plane must vanish: moved apart by more depth, the far end sinks.
+        parts.append((np.concatenate([-w_a * scale, w_b * scale], 1), np.concatenate([c_a, c_b], 1), slope[keep], facing[keep] ** 2))
+    return tuple(np.concatenate(x) for x in zip(*parts, strict=True))
+
+
+def _add_rims(system: _System, sights: list[Sight], before: Corrections, reach: float, per_view: float) -> None:
+    """Points whose normal is square to another view's axis and that lie at its silhouette's edge: they lie on it."""
+    for i, first in enumerate(sights):
+        if first.planes is None:
             continue
-        h, w = sight.mask.shape
-        x, y = np.meshgrid((np.arange(w) + 0.5) / w, (np.arange(h) + 0.5) / h)
-        place = np.stack([x, y], -1).reshape(-1, 2) * (CONTROL - 1) + 0.5
-        image = bilinear(control[..., None].astype(np.float32), place)[:, 0].reshape(h, w)
-        out.append(np.clip(image, -2 * _PRIOR, 2 * _PRIOR))
-    return out
+        chosen = _sparse(first, 1) & ~first.rough
+        points, normals = first.points[chosen].astype(np.float64), first.planes[chosen][:, :3].astype(np.float64)
+        for j, second in enumerate(sights):
+            if i == j:
+                continue
+            square = np.abs(normals @ second.camera.backward) < RIM_COSINE
+            p, n = points[square], normals[square]
+            if len(p) == 0:
+                continue
+            distance = hull_distance(second, p)
+            with np.errstate(invalid="ignore"):  # -inf on both sides of a picture's border that cuts the object
+                outward = (hull_distance(second, p + 0.01 * n) - distance) / 0.01
+            near = (np.abs(distance) < reach) & (outward > 0.9) & np.isfinite(distance)
+            if not near.any():
+                continue
+            p, n, distance = p[near], n[near], distance[near]
+            weights, control = _control_weights(project(first.camera, p)[0], first.mask.shape)
+            slope = -(n @ first.camera.backward)
+            coefficients = np.concatenate([weights * slope[:, None], np.full((len(p), 1), -1.0)], 1)
+            places = np.concatenate([system.of_view(i, control), np.full((len(p), 1), system.edge(j))], 1)
+            done = (before.control[i][control] * weights).sum(1) * slope - before.edge[j]
+            weight = 1 / (1 + (distance / (0.5 * reach)) ** 2) ** 2
+            system.add(coefficients, places, done - distance, weight * RIMS * per_view / max(len(p), 100))
+
+
+def _add_extents(system: _System, sights: list[Sight], before: Corrections, per_view: float) -> None:
+    """Along the direction square to both axes two orthographic silhouettes reach equally far."""
+    outlines = [_outline(s) for s in sights]
+    for i, j in combinations(range(len(sights)), 2):
+        if outlines[i] is None or outlines[j] is None:
+            continue
+        along = np.cross(sights[i].camera.backward, sights[j].camera.backward)
+        length = np.linalg.norm(along)
+        if length < 0.1:  # nearly opposite: their silhouettes are one, mirrored; the others tie them
+            continue
+        foot = sights[i].camera.pixel_size
+        for sign in (1, -1):
+            gap = float((outlines[i] @ along).max() - (outlines[j] @ along).max()) / length if sign > 0 else \
+                -float((outlines[i] @ along).min() - (outlines[j] @ along).min()) / length
+            if abs(gap) < 8 * foot:  # more is no matter of the edge
+                coefficients, places = np.array([[1.0, -1.0]]), np.array([[system.edge(i), system.edge(j)]])
+                system.add(coefficients, places, np.array([before.edge[i] - before.edge[j] - gap]), np.array([EXTENTS * per_view]))
+
+
+def _outline(sight: Sight) -> np.ndarray | None:
+    """World points (n, 3) of an orthographic silhouette's contour; None when it is cut off or perspective."""
+    from skimage.measure import find_contours
+
+    if sight.cropped or sight.camera.projection != "orthographic":
+        return None
+    lines = find_contours(-np.pad(sight.silhouette, 1, constant_values=1.0), 0.0)
+    if not lines:
+        return None
+    place = np.concatenate(lines) - 0.5
+    origins, _ = rays(sight.camera, place[:, ::-1])
+    return origins

@@ -17,6 +17,7 @@ from gdtool.geometry.grids import Grid, band_cells, dilate, fine_points, grid_ov
 
 COARSE = 2  # fine steps a coarse step
 UNSEEN, ROUGHLY, SMOOTHLY = 0, 1, 2  # how a sample of the grid is known
+SLACK = 0.5  # steps that noisy silhouettes cut too little
 _CHUNK = 1 << 16  # samples at a time: their arrays stay in the cache
 
 
@@ -46,8 +47,8 @@ def combined_distance(sights: list[Sight], points: np.ndarray, step: float, limi
             weight = np.stack([f[1] for f in found]).astype(np.float32)
             smooth = np.stack([f[3] for f in found])
             fused = _mean_surface(free, weight, limit) if noise else _nearest_surface(free, weight, step / 3, limit)
-            # Noisy views have noisy masks: a silhouette cuts only what is more than a pixel or so beside it.
-            value = np.maximum(value - (1.5 * step if noise else 0.0), fused)
+            # Noisy views have noisy masks, even after their edges were brought together.
+            value = np.maximum(value - (SLACK * step if noise else 0.0), fused)
             close = (np.abs(free - value) < step + noise) & (weight > WEAK)
             seen = np.maximum(seen, np.where((close & smooth).any(0), SMOOTHLY, np.where(close.any(0), ROUGHLY, UNSEEN)))
         out[start:start + _CHUNK] = np.clip(value, -limit, limit)

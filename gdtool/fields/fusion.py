@@ -7,14 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.cameras import Camera
-from gdtool.fields.align import depth_corrections, disagreement
+from gdtool.fields.align import Corrections, corrections, disagreement, slope_rows
 from gdtool.fields.carve import carve, silhouettes_outvoted, smooth_unseen
 from gdtool.fields.refine import drop_debris, measured_planes, refine
-from gdtool.fields.sights import Sight, pixel_footprint, prepare
+from gdtool.fields.sights import Sight, pixel_footprint, prepare, with_edge
 from gdtool.fields.thin import near_points, restore_thin
 from gdtool.geometry.grids import edge_counts, extract
 from gdtool.geometry.normals import vertex_normals
 
+LEAST_NOISE = 0.3  # grid steps: of views that had to be brought together
 MAX_SAMPLES = 320  # along the longest side: 33 million samples, 0.6 GB at the peak
 
 
@@ -61,13 +62,17 @@ def align_depth(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray | Non
     before = after = disagreement(sights)
     if before < 0.1 * step:
         return sights, before, after
-    depth = np.array(depth)
     kept = [k for k in range(len(cameras)) if (mask[k] > 0.5).any()]
-    for reach, stiffness in ((0.08, 4.0), (0.06, 2.0), (0.04, 1.0), (0.03, 0.5)):
-        for k, change in zip(kept, depth_corrections(sights, reach, stiffness), strict=True):
-            depth[k] = np.where(depth[k] > 0, depth[k] + change, 0)
-        sights = prepare_all(cameras, mask, depth, normal)
-    return sights, before, disagreement(sights)
+    slopes = [slope_rows(sight) for sight in sights]
+    found = Corrections.none(len(sights))
+    for reach, stiffness in ((0.08, 4.0), (0.06, 1.0), (0.04, 0.3), (0.03, 0.3)):
+        found = corrections(sights, slopes, found, reach, stiffness)
+        changed = np.array(depth)
+        for place, k in enumerate(kept):
+            changed[k] = np.where(depth[k] > 0, depth[k] + found.depth(place, mask[k].shape), 0)
+        sights = [with_edge(sight, edge) for sight, edge in zip(prepare_all(cameras, mask, changed, normal), found.edge, strict=True)]
+    # What the views got wrong in common is not seen in their disagreement.
+    return sights, before, max(disagreement(sights), LEAST_NOISE * step)
 
 
 def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 0) -> Shape:

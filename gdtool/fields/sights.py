@@ -7,7 +7,7 @@ answer for any number of points. Positive means outside: a point that any view s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -142,6 +142,12 @@ def prepare(camera: Camera, mask: np.ndarray, depth: np.ndarray | None = None,
     weight = np.where(valid, np.clip(cosine, 0.05, 1.0) ** 2 * mask ** 2, 0.0).astype(np.float32)
     return Sight(camera, mask, silhouette, cropped, planes, weight, ~smooth | ~valid, broken,
                  _curtain(points, normal, valid, foot), points.astype(np.float32))
+
+
+def with_edge(sight: Sight, edge: float) -> Sight:
+    """The view with its silhouette grown all around by edge (world units at the origin's distance; negative shrinks it)."""
+    foot = float(pixel_footprint(sight.camera, float(np.linalg.norm(sight.camera.position))))
+    return replace(sight, silhouette=(sight.silhouette - edge / foot).astype(np.float32))
 
 
 def _shifted(image: np.ndarray, shift: tuple[int, int], fill) -> np.ndarray:

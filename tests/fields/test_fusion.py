@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.fields.align import agreement, depth_corrections, disagreement, normals_fit_depth
+from gdtool.fields.align import Corrections, agreement, corrections, disagreement, normals_fit_depth, slope_rows
 from gdtool.fields.carve import silhouettes_outvoted
 from gdtool.fields.fusion import align_depth, depth_for, fuse_views, grid_step, is_closed_manifold, prepare_all
 from gdtool.fields.sights import free_distance, hull_distance, silhouette_distance
@@ -83,10 +83,38 @@ def test_alignment_undoes_a_shift_of_depth(seen):
     sights = prepare_all(cameras, mask, depth, images["normal"])
     clean = disagreement(prepare_all(cameras, mask, images["depth"], images["normal"]))
     assert disagreement(sights) > 5 * clean
-    change = depth_corrections(sights, 0.08, 2.0)[0]
-    assert change[mask[0] > 0.99].mean() < -0.008
+    found = corrections(sights, [slope_rows(s) for s in sights], Corrections.none(len(sights)), 0.08, 2.0)
+    assert found.depth(0, mask[0].shape)[mask[0] > 0.99].mean() < -0.008
     after = align_depth(cameras, mask, depth, images["normal"], grid_step(cameras, 0))
     assert after[2] < 0.4 * after[1]
+
+
+def test_silhouettes_that_were_grown_or_shrunk_are_found_out(seen):
+    """Half of the masks a pixel too large, half too small, and every depth bent: each view's share is told apart."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    cameras, images, mask = seen["torus"]
+    grown = np.array([1, -1, 1, -1, -1, 1])
+    wrong = np.stack([(maximum_filter if g > 0 else minimum_filter)(m, 3) for g, m in zip(grown, mask, strict=True)])
+    bend = np.stack([0.01 * np.sin(np.arange(SIZE) / 9 + k) for k in range(6)])[:, None, :]
+    depth = np.where(images["depth"] > 0, images["depth"] + bend, 0).astype(np.float32)
+    sights = prepare_all(cameras, wrong, depth, images["normal"])
+    slopes, found = [slope_rows(s) for s in sights], Corrections.none(6)
+    found = corrections(sights, slopes, found, 0.08, 1.0)
+    pixel = cameras[0].pixel_size
+    # What all have in common stays open to within a part of a pixel; the difference is two pixels.
+    assert np.abs(found.edge / pixel + grown).max() < 0.5
+    assert (found.edge[grown < 0].min() - found.edge[grown > 0].max()) / pixel > 1.5
+
+
+def test_slopes_say_how_the_depth_bends(seen):
+    cameras, images, mask = seen["sphere"]
+    ramp = 0.02 * np.linspace(-1, 1, SIZE)[None, :]
+    sight = prepare_all(cameras[:1], mask[:1], np.where(mask[:1] > 0, images["depth"][:1] + ramp, 0).astype(np.float32), images["normal"][:1])[0]
+    _, _, slope, weight = slope_rows(sight)
+    across = np.average(slope[: len(slope) // 2], weights=weight[: len(slope) // 2])  # down the rows first, then along them
+    along = np.average(slope[len(slope) // 2:], weights=weight[len(slope) // 2:])
+    assert abs(across) < 0.004 and along == pytest.approx(-0.04 / (SIZE * cameras[0].pixel_size), abs=0.006)
 
 
 def test_views_that_contradict_one_another_still_close(seen):
