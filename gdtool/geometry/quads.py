@@ -67,9 +67,14 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
     record.clock("restore creases", start)
     start = time.perf_counter()
     needed = max(3 * request.quads, 20000)
-    surface_vertices, surface_faces, _, report = simplify(surface_vertices, surface_faces, needed, seconds=request.seconds, closed=closed)
-    if closed and not repair.is_watertight(surface_faces):
-        surface_vertices, surface_faces, _, report = simplify(vertices, faces, needed, seconds=request.seconds, closed=closed)
+    restored = surface_vertices is not vertices
+    found = simplify(surface_vertices, surface_faces, needed, seconds=request.seconds, closed=closed, thorough=not restored)
+    if restored and (found[3]["method"] == "none" and "failed" in found[3] or closed and not repair.is_watertight(found[1])):
+        # Bevels drawn out where there is no crease make folds that the collapse tears.
+        record.failed.append("creases restored: the result cannot be simplified")
+        record.figures["crease_vertices_restored"] = 0
+        found = simplify(vertices, faces, needed, seconds=request.seconds, closed=closed)
+    surface_vertices, surface_faces, _, report = found
     record.figures.update(simplified_to=report["faces"], simplify_error=report["error"])
     if "failed" in report:
         record.failed.append(f"simplify: {report['failed']}")

@@ -48,13 +48,14 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
 
 
 def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attributes: np.ndarray | None = None, *,
-             seconds: float = 120.0, closed: bool | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, dict[str, float | int | str]]:
+             seconds: float = 120.0, closed: bool | None = None, thorough: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, dict[str, float | int | str]]:
     """A mesh of about target_faces triangles of the same shape and topology.
 
     vertices (v, 3), faces (f, 3), attributes (v, a) or None. Returns vertices, faces, attributes (read at the closest
     point of the input) and a report: faces, method, and error, the largest distance of the result's vertices and of the
     input's vertices (at most 20,000 of them) to the other surface, in units of the input. A closed, manifold
-    input stays so (closed says whether it is, where that is known). Raises InputError as repair.check does.
+    input stays so (closed says whether it is, where that is known); without `thorough` it is given back as it is where
+    only the slow way would keep it closed. Raises InputError as repair.check does.
     """
     repair.check(vertices, faces)
     target_faces = max(int(target_faces), 4)
@@ -70,6 +71,8 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     # another; MeshLab's takes ten times as long.
     for name, arguments in (("collapse", (target_faces, 5.0)), ("collapse", (target_faces, 3.0)), ("collapse", (target_faces, 8.0)),
                             ("collapse_topology", (target_faces,))):
+        if name == "collapse_topology" and not thorough:
+            break
         try:
             out = call(f"gdtool.geometry.simplify:{name}", unit, faces.astype(np.int32), *arguments, seconds=seconds, memory_mb=16000)
         except ChildFailed as failure:

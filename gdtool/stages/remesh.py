@@ -24,6 +24,9 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Options of remesh."""
 
     faces: Annotated[int, Meta(ge=16, le=2_000_000, description="quads to make, met within 3 %")] = 20000
+    quad_size: Annotated[float, Meta(ge=0, le=1, description="mean side of the quads, as a share of the longest side, instead of --faces; 0: --faces")] = 0.0
+    max_deviation: Annotated[float, Meta(ge=0, le=1, description="the fewest quads, up to --faces, that stay within this share of the longest "
+                                         "side of the surface; 0: --faces")] = 0.0
     triangles: Annotated[int, Meta(ge=0, le=10_000_000, description="decimate to this many triangles instead of making quads; 0: quads")] = 0
     crease_angle: Annotated[float, Meta(ge=0, le=180, description="edges that turn by more degrees are kept sharp; 0: none")] = 30.0
     restore_creases: Annotated[bool, Meta(description="draw out the bevels of marching cubes to sharp creases")] = True
@@ -43,7 +46,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     with out.step("read"):
         vertices, faces, matrix, quads = _read(inputs, out)
-    if quads is not None and options.keep and not options.triangles and _meets(quads, options):
+    options = _counted(vertices, faces, options, out)
+    if quads is not None and options.keep and not options.triangles and not options.max_deviation and _meets(quads, options):
         out.skip("remeshing", f"the mesh already is {len(quads)} quads, closed and manifold")
         found_vertices, found, engine, figures = vertices, quads, "passed through", {}
     else:
@@ -59,7 +63,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         figures |= mesh_quality.topology_figures(found_vertices, found) | mesh_quality.shape_figures(found_vertices, found)
         if engine != "passed through":
             figures |= mesh_quality.distance_figures(found_vertices, triangulated(found)[0], vertices, faces, 20000)
-    asked = options.triangles or options.faces
+    asked = options.triangles or (len(found) if options.max_deviation else options.faces)
     if engine != "passed through" and abs(len(found) / asked - 1) > 0.03 and (not options.triangles or len(found) > asked):
         out.warn(f"{inputs.name}: {len(found)} faces, not the {asked} asked for")
     with out.step("write"):
@@ -68,6 +72,19 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     out.content = MeshContent(vertices=len(found_vertices), quads=int(is_quad.sum()), triangles=int((~is_quad).sum()),
                               watertight=bool(figures["watertight"]), engine=engine, report=figures,
                               source_from_world=tuple(float(x) for x in matrix.ravel()))
+
+
+def _counted(vertices, faces, options: Options, out: Output) -> Options:
+    """Options with --quad-size turned into a number of faces."""
+    from gdtool.geometry.normals import face_normals
+
+    if not options.quad_size or options.triangles:
+        return options
+    lowest, highest = 16, 2_000_000
+    asked = round(face_normals(vertices, faces)[1].sum() / options.quad_size**2)
+    if not lowest <= asked <= highest:
+        out.warn(f"--quad-size {options.quad_size:g} asks for {asked} faces; {lowest} to {highest} can be made")
+    return msgspec.structs.replace(options, faces=min(max(asked, lowest), highest))
 
 
 def _path(inputs: Inputs):
@@ -135,11 +152,17 @@ def _decimated(vertices, faces, options: Options, out: Output):
 
 
 def _quads(vertices, faces, options: Options, out: Output):
+    from gdtool.geometry.quad_count import coarsest
     from gdtool.geometry.quads import Request, remesh
 
     request = Request(quads=options.faces, crease_degrees=options.crease_angle, engine=options.engine, seconds=options.seconds,
                       smooth_iterations=options.smooth_iterations, restore_creases=options.restore_creases)
-    vertices, quads, record = remesh(vertices, faces, request)
+    if options.max_deviation:
+        vertices, quads, record, reached = coarsest(vertices, faces, request, options.max_deviation)
+        if reached > options.max_deviation:
+            out.warn(f"{reached:.2g} from the surface with {len(quads)} quads, farther than --max-deviation; allow more --faces")
+    else:
+        vertices, quads, record = remesh(vertices, faces, request)
     for text in record.failed:
         out.skip("a way of remeshing", text)
     for name, seconds in record.seconds.items():
@@ -147,4 +170,4 @@ def _quads(vertices, faces, options: Options, out: Output):
     return vertices, quads, record.engine, dict(record.figures)
 
 
-STAGE = Stage(name="remesh", version=2, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)
+STAGE = Stage(name="remesh", version=3, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)

@@ -87,3 +87,16 @@ def test_bad_mesh_is_refused(gdtool, tmp_path, text, fact):
     run = gdtool("remesh", "bad.obj")
     assert run.returncode == 3 and fact in run.stderr and run.stdout == ""
     assert "Traceback" not in run.stderr and not [p for p in (tmp_path / "bad.asset").rglob("*") if p.is_file()]
+
+
+def test_count_by_the_size_of_quads_or_by_their_distance(gdtool, tmp_path):
+    write_obj(tmp_path / "ball.obj", *sphere(32))
+    run = gdtool("remesh", "ball.obj", "--quad-size", 0.06, "-o", "sized")
+    assert run.returncode == 0, run.stderr
+    assert abs(content(tmp_path / "sized")["quads"] * 0.06**2 / np.pi - 1) < 0.06  # the sphere of diameter 1 has area pi
+    run = gdtool("remesh", "ball.obj", "--faces", 3000, "--max-deviation", 0.008, "-o", "near")
+    assert run.returncode == 0 and "farther" not in run.stderr, run.stderr
+    near = content(tmp_path / "near")
+    assert near["quads"] < 1500 and near["watertight"] and near["report"]["hausdorff"] < 0.012
+    run = gdtool("remesh", "ball.obj", "--faces", 100, "--max-deviation", 0.0001, "-o", "far")
+    assert run.returncode == 0 and "farther than --max-deviation" in run.stderr
