@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: venv demo test stress extras-test fuzz bench bench-reconstruct schemas docs-check model data clean
+.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-reconstruct bench-render bench-relight schemas docs-check model data clean
 
 venv: .venv/.done
 

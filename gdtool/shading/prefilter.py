@@ -126,7 +126,8 @@ class Prefiltered:
 
         n_v = (normal * view).sum(1)
         mirror = 2 * n_v[:, None] * normal - view
-        # Measured: 1 − r² is nearer the integral than mirror direction or Lagarde's (1 − r)(√(1 − r) + r) up to r = 0.5.
+        # Tried under two lights: nearer the integral than the mirror direction; Lagarde's (1 − r)(√(1 − r) + r) is better from
+        # r = 0.3 (studio) or 0.5 (mid) on, and worse below.
         toward = 1 - roughness**2
         middle = torch.nn.functional.normalize(torch.lerp(normal, mirror, toward[:, None]), dim=1)
         below, above, fraction = _levels(roughness)
