@@ -108,7 +108,7 @@ def observe(points: np.ndarray, normals: np.ndarray, sights: list[Sight], stack:
 
     stack (k, h, w, c) and mask (k, h, w) of the k sights. Views are weighted by facing, distance to silhouettes and
     coverage; the best one counts far more than the next (its power is sharpness), so detail is not averaged away, and
-    the change from one view to another is smooth. A view that differs from all others and from prior (n, c) is left
+    the change from one view to another is smooth. A view that differs from all others and from prior (n, c) fades
     out. Returns values (n, c) float32 and confidence (n,) float32 in [0, 1], 0 where no view sees the point.
     """
     count, channels = len(points), stack.shape[-1]
@@ -126,17 +126,18 @@ def observe(points: np.ndarray, normals: np.ndarray, sights: list[Sight], stack:
     share = quality / np.maximum(best, 1e-6)
     disputed = np.flatnonzero((high - low > TOLERANCE).any(1))
     if len(disputed):
-        share[:, disputed] = _without_outliers(value[:, disputed], share[:, disputed], None if prior is None else prior[disputed])
+        share[:, disputed] = _fade_outliers(value[:, disputed], share[:, disputed], None if prior is None else prior[disputed])
     weight = share**sharpness
     total = weight.sum(0)
     mean = np.einsum("kn,knc->nc", weight, value) / np.maximum(total, 1e-12)[:, None]
     return mean.astype(np.float32), np.where(total > 0, confidence, 0).astype(np.float32)
 
 
-def _without_outliers(value: np.ndarray, share: np.ndarray, prior: np.ndarray | None) -> np.ndarray:
-    """share (k, n), 0 where a view's value (k, n, c) is far from the median of all that see the point and prior (n, c).
+def _fade_outliers(value: np.ndarray, share: np.ndarray, prior: np.ndarray | None) -> np.ndarray:
+    """share (k, n), less where a view's value (k, n, c) is far from the median of all that see the point and prior (n, c).
 
-    Only where at least three opinions are there, and one view at least stays.
+    Only where at least three opinions are there. The loss is gradual, from half the tolerance to twice it, so that a
+    view on which the others gain does not end in an edge on the surface; a trace stays, so that one view always counts.
     """
     opinions = np.where((share > 0)[..., None], value, np.nan)
     if prior is not None:
@@ -146,5 +147,5 @@ def _without_outliers(value: np.ndarray, share: np.ndarray, prior: np.ndarray | 
     ordered = np.sort(opinions, axis=0)
     middle, column = (np.maximum(number, 1) - 1) / 2, np.arange(len(number))
     median = (ordered[np.floor(middle).astype(int), column] + ordered[np.ceil(middle).astype(int), column]) / 2
-    kept = np.where(np.abs(value - median[None]).max(-1) > TOLERANCE, 0, share)
-    return np.where((number >= 3) & (kept > 0).any(0), kept, share)
+    away = np.abs(value - median[None]).max(-1) / TOLERANCE
+    return np.where(number >= 3, share * np.clip((2 - away) / 1.5, 0.05, 1), share)
