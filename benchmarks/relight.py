@@ -1,18 +1,20 @@
-"""Relighting, time against error: gdtool's three kinds of light and their knobs.
+"""Relighting, time against error: gdtool's three kinds of light and their knobs, beside Cycles and Mitsuba.
 
-  python benchmarks/relight.py MODEL.glb ENV.hdr [-o docs/benchmarks] [--size 512]
+  python benchmarks/relight.py MODEL.glb ENV.hdr [--peers-python PYTHON] [-o docs/benchmarks] [--size 512]
+
+PYTHON is one that can import bpy, mitsuba or both; what it lacks is left out. About 10 minutes on two cores. A killed run goes
+on where it was.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-import tempfile
 from pathlib import Path
 
-import numpy as np
 from measure import say
-from shading import errors, in_child, write
+from shading import HERE, Job, comparison, has, run, write
+from shading_scene import exported
 
 SETTINGS = [("sg", 4, 0), *(("prefiltered", s, k) for s, k in ((4, 0), (4, 2), (16, 4))),
             *(("sampled", s, k) for s, k in ((4, 4), (16, 4), (64, 4), (256, 4)))]
@@ -24,25 +26,44 @@ def main() -> None:
     parser.add_argument("env")
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks"))
     parser.add_argument("--size", type=int, default=512)
-    parser.add_argument("--reference", type=int, default=256, help="samples per pixel of the references")
+    parser.add_argument("--view", default="front_right")
+    parser.add_argument("--peers-python", type=Path)
+    parser.add_argument("--reference", type=int, default=512, help="samples per pixel of gdtool's reference")
     asked = parser.parse_args()
-    rows = []
-    with tempfile.TemporaryDirectory() as place:
-        truth, out = f"{place}/truth.npz", f"{place}/out.npz"
-        common = ("--size", asked.size)
+    scene = exported(asked.model, asked.env, asked.output / ".relight")
+    own = (sys.executable, str(HERE / "shading_gdtool.py"), asked.model, asked.env, "{out}", "--size", str(asked.size), "--views", asked.view)
+    references = {"gdtool": (*own, "--samples", str(asked.reference), "--light", "sampled", "--light-samples", "8", "--seed", "77", "--converged")}
+    jobs = [Job(f"gdtool {light}", s, (*own, "--samples", str(s), "--light", light, "--light-samples", str(k)), "gdtool", {"directions": k})
+            for light, s, k in SETTINGS]
+    python = asked.peers_python
+    if has(python, "mitsuba"):
+        mitsuba = (str(python), str(HERE / "shading_mitsuba.py"), scene["scene"], "{out}", "--size", str(asked.size), "--views", asked.view)
+        references["Mitsuba"] = (*mitsuba, "--samples", "4096", "--seed", "77")
+        jobs += [Job("Mitsuba", s, (*mitsuba, "--samples", str(s)), "Mitsuba") for s in (4, 16, 64, 256)]
+    if has(python, "bpy"):
+        cycles = (str(python), str(HERE / "shading_blender.py"), scene["model"], scene["light"], "{out}", "--size", str(asked.size),
+                  "--half-width", str(scene["half_width"]), "--views", f"{asked.view}={scene['azimuths'][asked.view]:g}", "--light")
+        references["Cycles"] = (*cycles, "--samples", "1024", "--seed", "77")
+        jobs += [Job("Cycles", s, (*cycles, "--samples", str(s)), "Cycles") for s in (16, 64)]
+        jobs += [Job("Cycles, denoised", s, (*cycles, "--samples", str(s), "--denoise"), "Cycles") for s in (4, 16, 64)]
+    missing = [name for name, module in (("Mitsuba", "mitsuba"), ("Cycles", "bpy")) if not has(python, module)]
+    if missing:
+        say(f"without {' and '.join(missing)}: see --peers-python")
 
-        def add(method: str, samples: int, directions: int | None, cost: dict | None) -> None:
-            if cost is not None:
-                rows.append({"method": method, "samples": samples, "directions": directions, **cost, **errors(dict(np.load(out)), dict(np.load(truth)))})
-                say(str(rows[-1]))
+    def finish(rows: list[dict], head: list[str]) -> None:
+        note = [f"Without {' and '.join(missing)}."] if missing else []
+        peers = ["Mitsuba", "Cycles", "Cycles, denoised"]
+        quick = [row for row in rows if row["method"] == "gdtool prefiltered" and row["color"] >= 30]
+        best = min(quick, key=lambda row: row["wall s"], default=None)
+        findings = [*note, f"Model {asked.model} ({scene['faces']} triangles) under {asked.env}, {asked.size}², {asked.view}.", "",
+                    *comparison(rows, "color", 40, ["gdtool sampled"], peers), *comparison(rows, "color inside", 35, ["gdtool sampled"], peers),
+                    "* prefiltered: " + (f"{best['color']:.1f} dB in {best['wall s']:.2f} s ({best['cpu s']:.2f} s of processor)." if best else "30 dB are not reached.")]
+        write(asked.output, "relight", "Relighting", rows, head,
+              ["method", "samples", "directions", "wall s", "cpu s", "color", "color inside", "runs"], [("whole picture", "color"), ("inside", "color inside")], findings)
 
-        say("reference")
-        in_child(sys.executable, "shading_gdtool.py", asked.model, asked.env, truth, *common, "--samples", asked.reference, "--light", "sampled",
-                 "--light-samples", 16, "--seed", 77, "--converged")
-        for light, samples, directions in SETTINGS:
-            add(f"gdtool {light}", samples, directions, in_child(sys.executable, "shading_gdtool.py", asked.model, asked.env, out, *common,
-                                                                 "--samples", samples, "--light", light, "--light-samples", directions))
-    write(asked.output, "relight", "Relighting", rows, ["method", "samples", "directions", "wall s", "cpu s", "color"], "cpu s", "color")
+    key = {"model": asked.model, "env": asked.env, "size": asked.size, "view": asked.view, "reference": asked.reference,
+           "jobs": [" ".join(job.command) for job in jobs]}
+    run(asked.output, "relight", references, jobs, key, finish)
 
 
 if __name__ == "__main__":

@@ -1,21 +1,23 @@
-"""Six views, time against error: the buffers and the lit color of render-dataset by samples.
+"""Six views, time against error: the buffers and the lit color of render-dataset by samples, beside Cycles and Mitsuba.
 
-  python benchmarks/render.py MODEL.glb ENV.hdr [-o docs/benchmarks] [--size 512]
+  python benchmarks/render.py MODEL.glb ENV.hdr [--peers-python PYTHON] [-o docs/benchmarks] [--size 512]
+
+PYTHON is one that can import bpy, mitsuba or both; what it lacks is left out. All views are timed; errors are of the views of
+--scored, since references are slow. About 15 minutes on two cores. A killed run goes on where it was.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-import tempfile
 from pathlib import Path
 
-import numpy as np
 from measure import say
-from shading import errors, in_child, write
+from shading import HERE, Job, comparison, has, run, write
+from shading_scene import exported
 
 VIEWS = "front,front_right,right,back,left,front_left"
-DOMAINS = ["normal", "depth", "albedo", "roughness", "metallic"]
+BUFFERS = ("normal", "albedo", "roughness", "metallic")
 
 
 def main() -> None:
@@ -25,27 +27,54 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks"))
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--views", default=VIEWS)
-    parser.add_argument("--reference", type=int, default=256, help="samples per pixel of the references")
+    parser.add_argument("--scored", default="front_right", help="views that errors are taken of")
+    parser.add_argument("--peers-python", type=Path)
+    parser.add_argument("--reference", type=int, default=256, help="samples per pixel of gdtool's reference and of Cycles' buffers")
     asked = parser.parse_args()
-    rows = []
-    with tempfile.TemporaryDirectory() as place:
-        truth, out = f"{place}/truth.npz", f"{place}/out.npz"
-        common = ("--size", asked.size, "--views", asked.views)
+    scene = exported(asked.model, asked.env, asked.output / ".render")
+    own = (sys.executable, str(HERE / "shading_gdtool.py"), asked.model, asked.env, "{out}", "--size", str(asked.size))
+    references, jobs = {}, []
 
-        def add(method: str, samples: int, cost: dict | None) -> None:
-            if cost is not None:
-                found = errors(dict(np.load(out)), dict(np.load(truth)))
-                rows.append({"method": method, "samples": samples, **cost, **found, "worst buffer": min(found[d] for d in DOMAINS if d in found)})
-                say(str(rows[-1]))
+    def views(of: str, azimuths: bool = False) -> tuple[str, ...]:
+        return ("--views", ",".join(f"{v}={scene['azimuths'][v]:g}" if azimuths else v for v in of.split(",")))
 
-        say("reference")
-        own = (sys.executable, "shading_gdtool.py", asked.model, asked.env)
-        in_child(*own, truth, *common, "--samples", asked.reference, "--light", "sampled", "--light-samples", 8, "--seed", 77, "--converged")
-        for samples in (4, 8, 16, 32, 64):
-            add("gdtool buffers", samples, in_child(*own, out, *common, "--samples", samples))
-        for samples in (4, 16, 64):
-            add("gdtool with color", samples, in_child(*own, out, *common, "--samples", samples, "--light", "sampled"))
-    write(asked.output, "render", "Six views", rows, ["method", "samples", "wall s", "cpu s", *DOMAINS, "worst buffer", "color"], "cpu s", "worst buffer")
+    references["gdtool"] = (*own, *views(asked.scored), "--samples", str(asked.reference), "--light", "sampled", "--light-samples", "8", "--seed", "77", "--converged")
+    jobs += [Job("gdtool buffers", s, (*own, *views(asked.views), "--samples", str(s)), "gdtool") for s in (4, 8, 16, 32, 64)]
+    jobs += [Job("gdtool color", s, (*own, *views(asked.views), "--samples", str(s), "--light", "sampled", "--light-samples", str(k)), "gdtool", {"directions": k})
+             for s, k in ((4, 4), (16, 4), (64, 4))]
+    python = asked.peers_python
+    if has(python, "mitsuba"):
+        mitsuba = (str(python), str(HERE / "shading_mitsuba.py"), scene["scene"], "{out}", "--size", str(asked.size))
+        references["Mitsuba"] = (*mitsuba, *views(asked.scored), "--samples", "2048", "--seed", "77")
+        jobs += [Job("Mitsuba color", s, (*mitsuba, *views(asked.views), "--samples", str(s)), "Mitsuba") for s in (4, 16, 64, 256)]
+    if has(python, "bpy"):
+        cycles = (str(python), str(HERE / "shading_blender.py"), scene["model"], scene["light"], "{out}", "--size", str(asked.size),
+                  "--half-width", str(scene["half_width"]))
+        everything = views(asked.views, True)
+        references["Cycles buffers"] = (*cycles, *views(asked.scored, True), "--samples", str(asked.reference), "--seed", "77", "--buffers")
+        references["Cycles color"] = (*cycles, *views(asked.scored, True), "--samples", "512", "--seed", "77", "--light")
+        jobs += [Job("Cycles buffers", s, (*cycles, *everything, "--samples", str(s), "--buffers"), "Cycles buffers") for s in (4, 16, 64)]
+        jobs += [Job("Cycles color", s, (*cycles, *everything, "--samples", str(s), "--light"), "Cycles color") for s in (4, 16)]
+        jobs += [Job("Cycles color, denoised", s, (*cycles, *everything, "--samples", str(s), "--light", "--denoise"), "Cycles color") for s in (4, 16)]
+    missing = [name for name, module in (("Mitsuba", "mitsuba"), ("Cycles", "bpy")) if not has(python, module)]
+    if missing:
+        say(f"without {' and '.join(missing)}: see --peers-python")
+
+    def finish(rows: list[dict], head: list[str]) -> None:
+        for row in rows:
+            if "color" not in row or not row["method"].startswith("Cycles"):
+                row["worst buffer"] = min((row[d] for d in BUFFERS if d in row), default=None)
+        note = [f"Without {' and '.join(missing)}."] if missing else []
+        findings = [*note, f"Model {asked.model} ({scene['faces']} triangles) under {asked.env}, {len(asked.views.split(','))} views of {asked.size}²; errors of {asked.scored}.", "",
+                    *comparison(rows, "worst buffer", 45, ["gdtool buffers"], ["Cycles buffers"]),
+                    *comparison(rows, "color", 40, ["gdtool color"], ["Mitsuba color", "Cycles color", "Cycles color, denoised"])]
+        write(asked.output, "render", "Six views", rows, head,
+              ["method", "samples", "directions", "wall s", "cpu s", *BUFFERS, "depth", "worst buffer", "color", "color inside", "runs"],
+              [("buffers, the worst one", "worst buffer"), ("lit color", "color")], findings)
+
+    key = {"model": asked.model, "env": asked.env, "size": asked.size, "views": asked.views, "scored": asked.scored, "reference": asked.reference,
+           "jobs": [" ".join(job.command) for job in jobs]}
+    run(asked.output, "render", references, jobs, key, finish)
 
 
 if __name__ == "__main__":

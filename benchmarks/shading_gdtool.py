@@ -1,4 +1,4 @@
-"""One rendering by gdtool for benchmarks/render.py and relight.py: prints its seconds, writes its images.
+"""Views by gdtool for benchmarks/render.py and relight.py: prints its seconds, writes its images.
 
   python benchmarks/shading_gdtool.py MODEL ENV OUT.npz --views front,right --size 512 --samples 16 --light sampled --light-samples 4
 """
@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import os
 import time
@@ -27,18 +26,16 @@ def main() -> None:
     parser.add_argument("--converged", action="store_true", help="every pixel gets all samples")
     asked = parser.parse_args()
     import torch
+    from shading_scene import normalised
 
     torch.set_num_threads(1)
     from gdtool.assets.load import load_scene
     from gdtool.cameras import rig
-    from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
     from gdtool.shading import render
     from gdtool.shading.direct import DirectLight
     from gdtool.shading.studio import studio
 
-    scene = load_scene(asked.model)
-    matrix = unit_box(scene.vertices[np.unique(scene.faces)])
-    scene = dataclasses.replace(scene, vertices=transform_points(invert_similarity(matrix), scene.vertices))
+    scene = normalised(load_scene(asked.model))
     if asked.converged:
         render.BASE = asked.samples
     environment, lobes, _ = studio(asked.env, asked.seed, fit=asked.light == "sg")
@@ -53,9 +50,11 @@ def main() -> None:
         frame = renderer.buffers(cameras[name], asked.samples, color)
         if asked.light == "sg":
             frame["color"] = render.closed_form_image(frame, cameras[name], lobes)
+        if "color" in frame:
+            frame["color"] = frame["color"] * frame["mask"][..., None]
         frames.append(frame)
     seconds = {"wall s": time.perf_counter() - wall, "cpu s": time.process_time() - processor}
-    np.savez(asked.out, **{key: np.stack([frame[key] for frame in frames]) for key in frames[0]})
+    np.savez(asked.out, names=np.array(asked.views.split(",")), **{key: np.stack([frame[key] for frame in frames]) for key in frames[0]})
     print(json.dumps({**seconds, "rays": renderer.counts.samples + renderer.counts.shadow_rays}))
 
 

@@ -76,6 +76,8 @@ class RayCaster:
         if len(self.faces):
             local = ((self.vertices - self.center) * self.scale).astype(np.float32)
             self._mesh = TriangleMesh(self._scene, local, np.ascontiguousarray(self.faces))
+            # The first query builds Embree's tree, which must not happen on two threads at once.
+            self._scene.run(np.full((1, 3), 9, np.float32), np.full((1, 3), 1, np.float32), query="OCCLUDED")
 
     def _run(self, origins: np.ndarray, directions: np.ndarray, query: str, limits: np.ndarray | None) -> np.ndarray:
         origins, directions = np.asarray(origins), np.asarray(directions)
@@ -94,13 +96,11 @@ class RayCaster:
             out[part] = self._scene.run(local, along, query=query, dists=limit)
 
         starts = range(0, len(origins), CHUNK)
-        # One query builds Embree's tree, which must not happen on two threads at once.
-        chunk(0)
         if len(starts) > 2 and self.threads > 1:
             with ThreadPoolExecutor(self.threads) as pool:
-                list(pool.map(chunk, starts[1:]))
+                list(pool.map(chunk, starts))
         else:
-            for start in starts[1:]:
+            for start in starts:
                 chunk(start)
         return out
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -83,18 +82,12 @@ class DirectLight:
         if self.mode == "prefiltered" and len(points):
             self.prefiltered.prepare(points.values["roughness"])
 
-        def gather(start: int) -> tuple[int, int, int]:
+        at, counted = time.perf_counter(), np.zeros(3, np.int64)
+        for start in range(0, len(points), step):
             part = slice(start, start + step)
-            return self._chunk(points, part, None if runs is None else runs[:, part], sums[part])
-
-        at = time.perf_counter()
-        with ThreadPoolExecutor(self.renderer.caster.threads) as pool:
-            counted = list(pool.map(gather, range(0, len(points), step)))
-        counts = self.renderer.counts
-        counts.spend("directions", at)
-        counts.shadow_rays += sum(c[0] for c in counted)
-        counts.shadow_rays_below_horizon += sum(c[1] for c in counted)
-        counts.shadow_rays_convex += sum(c[2] for c in counted)
+            counted += self._chunk(points, part, None if runs is None else runs[:, part], sums[part])
+        cast, below, convex = counted.tolist()
+        self.renderer.counts.spend("directions", at, shadow_rays=cast, shadow_rays_below_horizon=below, shadow_rays_convex=convex)
         out = self._combined(points, sums)
         out += points.values["emissive"]
         unlit = points.values["unlit"]
@@ -108,7 +101,7 @@ class DirectLight:
         two, four, eight of them. Which block of runs that is, and where in it the pixel begins, is drawn by its number.
         """
         k = self.samples
-        block = min(1 << max(0, int(points.sample.max(initial=0))).bit_length(), max(1, POOL // k // 16))
+        block = min(1 << max(0, points.together - 1).bit_length(), max(1, POOL // k // 16))
         out = np.empty((2, len(points)), np.int64)
         for which in (0, 1):
             number = _scrambled(points.pixel + (points.sample // block) * 0x5851F42D, self.seed * 2 + which)

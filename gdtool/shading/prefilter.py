@@ -90,8 +90,10 @@ class IrradianceMap:
         ring = np.sin(theta)[:, None]
         normals = np.stack([ring * np.cos(phi), np.broadcast_to(np.cos(theta)[:, None], (height, 2 * height)), ring * np.sin(phi)], -1)
         weighted = (small.image * small.solid_angles[:, None, None]).reshape(-1, 3).astype(np.float32)
-        cosine = normals.reshape(-1, 3).astype(np.float32) @ small.directions.reshape(-1, 3).T.astype(np.float32)
-        self.values = (np.maximum(cosine, 0) @ weighted).reshape(height, 2 * height, 3)
+        toward = small.directions.reshape(-1, 3).T.astype(np.float32)
+        # A few normals at a time: what lies between the two products stays in the cache.
+        parts = [np.maximum(part @ toward, 0) @ weighted for part in np.array_split(normals.reshape(-1, 3).astype(np.float32), height)]
+        self.values = np.concatenate(parts).reshape(height, 2 * height, 3)
 
     def lookup(self, normals: np.ndarray) -> np.ndarray:
         """(n, 3) from unit normals (n, 3)."""
@@ -212,12 +214,14 @@ def _sum_of_samples(pyramid: LightPyramid, normal, a2: float):
     density = a2 / (math.pi * ((1 - cosine**2) + a2 * cosine**2) ** 2) / 4
     # A half vector at angle θ reflects the normal to 2 θ.
     up, ring = 2 * cosine**2 - 1, 2 * cosine * (1 - cosine**2).clamp_min(0).sqrt()
-    weight = up.clamp_min(0)[None]
-    n = [c[:, None] for c in normal.unbind(1)]
-    tangent, bitangent = frame(*n)
-    direction = [t * (ring * phi.cos())[None] + b * (ring * phi.sin())[None] + c * up[None] for t, b, c in zip(tangent, bitangent, n, strict=True)]
-    angle = (2 / (LOBE_SAMPLES * density)).expand(len(normal), -1)
-    return (pyramid.mean(*direction, angle) * weight[..., None]).sum(1) / weight.sum()
+    weight, angle = up.clamp_min(0)[None], (2 / (LOBE_SAMPLES * density))[None]
+    out = []
+    for part in normal.split(1024):
+        n = [c[:, None] for c in part.unbind(1)]
+        tangent, bitangent = frame(*n)
+        direction = [t * (ring * phi.cos())[None] + b * (ring * phi.sin())[None] + c * up[None] for t, b, c in zip(tangent, bitangent, n, strict=True)]
+        out.append((pyramid.mean(*direction, angle.expand(len(part), -1)) * weight[..., None]).sum(1))
+    return torch.cat(out) / weight.sum()
 
 
 def read_octahedral(image, x, y, z):

@@ -10,7 +10,9 @@ Faces are seen from both sides, whatever the material's doubleSided says.
 
 from __future__ import annotations
 
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,8 +32,8 @@ MAX_LAYERS = 32
 TOLERANCE = 0.006
 STORED = {"normal": 0.5, "albedo": None, "roughness": 1.0, "metallic": 1.0, "color": None}
 DOMAINS = ("normal", "depth", "albedo", "roughness", "metallic")
-# Samples that are held at once: bounds the memory.
-BAND_SAMPLES = 1 << 19
+# Samples that a thread works on at once: few enough for the cache. What is held at once is that many for each thread.
+BAND_SAMPLES = 1 << 15
 
 
 def pixel_pattern(count: int) -> np.ndarray:
@@ -86,10 +88,14 @@ class Counts:
     shadow_rays_convex: int = 0
     estimated_psnr: float | None = None
     seconds: dict[str, float] = field(default_factory=dict)
+    lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
-    def spend(self, what: str, since: float) -> None:
-        """Add the seconds since a time of time.perf_counter."""
-        self.seconds[what] = self.seconds.get(what, 0.0) + time.perf_counter() - since
+    def spend(self, what: str, since: float, **more: int) -> None:
+        """Add the seconds since a time of time.perf_counter, and to other counts by name; threads may call at once."""
+        with self.lock:
+            self.seconds[what] = self.seconds.get(what, 0.0) + time.perf_counter() - since
+            for name, count in more.items():
+                setattr(self, name, getattr(self, name) + count)
 
 
 class Renderer:
@@ -111,6 +117,7 @@ class Renderer:
         self.extent = float((self.bounds[1] - self.bounds[0]).max()) or 1.0
         self.convex = self.tested is None and is_convex(scene.vertices, scene.faces)
         self.counts = Counts()
+        self.pool = ThreadPoolExecutor(self.caster.threads)
 
     def trace(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """First hits that are there after the alpha test: face_idx (n,), distance (n,), barycentric (n, 3)."""
@@ -184,7 +191,7 @@ class Renderer:
             back = 0.0
         at = time.perf_counter()
         face_idx, distance, barycentric = self.trace(origins, directions)
-        self.counts.spend("rays", at)
+        self.counts.spend("rays", at, samples=len(pixel))
         hit = np.flatnonzero(face_idx >= 0)
         face_idx, barycentric, directions = face_idx[hit], barycentric[hit], directions[hit]
         distance = distance[hit]
@@ -192,7 +199,6 @@ class Renderer:
         width = camera.pixel_size if camera.projection == "orthographic" else depth / camera.fx
         footprint = width / np.sqrt(together) * np.ones(len(hit))
         values = self.lookup.attributes(face_idx, barycentric, footprint, directions)
-        self.counts.samples += len(pixel)
         return Points(pixel[hit], sample[hit], origins[hit] + directions * distance[:, None], -directions, depth, values, together)
 
     def buffers(self, camera: Camera, samples: int = 16, shade=None, goal: Goal = Goal()) -> dict[str, np.ndarray]:
@@ -211,13 +217,17 @@ class Renderer:
             count = min(max(2 * done, BASE), samples)
             more = count - done
             step = max(1, BAND_SAMPLES // more)
-            for start in range(0, len(pixel), step):
-                part = pixel[start:start + step]
-                asked = np.repeat(part, more)
-                at = time.perf_counter()
-                points = self.see(camera, asked, np.tile(np.arange(done, count), len(part)), pattern, count)
-                total.add(points, asked, shade)
-                self.counts.spend("samples", at)
+            at = time.perf_counter()
+
+            def look(part: np.ndarray, first: int = done, count: int = count) -> tuple[np.ndarray, Points, dict]:
+                asked = np.repeat(part, count - first)
+                points = self.see(camera, asked, np.tile(np.arange(first, count), len(part)), pattern, count)
+                return asked, points, shade(points) if shade is not None and len(points) else {}
+
+            for group in _batches([pixel[start:start + step] for start in range(0, len(pixel), step)], 4 * self.caster.threads):
+                for found in self.pool.map(look, group):
+                    total.add(*found)
+            self.counts.spend("samples", at)
             self.counts.pixels_refined += len(pixel) if done == BASE else 0
             taken += len(pixel) * more
             change = total.change()
@@ -246,14 +256,13 @@ class _Sums:
         self.squares: dict[str, np.ndarray] = {}
         self.before: np.ndarray | None = None
 
-    def add(self, points: Points, asked: np.ndarray, shade) -> None:
+    def add(self, asked: np.ndarray, points: Points, shaded: dict[str, np.ndarray]) -> None:
         self.asked += np.bincount(asked, minlength=self.pixels)
         if not len(points):
             return
         values = {k: points.values[k] for k in ("normal", "albedo", "roughness", "metallic")}
         values["depth"] = points.depth
-        if shade is not None:
-            values |= shade(points)
+        values |= shaded
         self.seen += np.bincount(points.pixel, minlength=self.pixels)
         # The samples of a pixel follow each other.
         starts = np.flatnonzero(np.diff(points.pixel, prepend=-1))
@@ -325,6 +334,11 @@ class _Sums:
             image = mean.reshape(*shape, -1).astype(np.float32)
             out[name] = image if image.shape[2] == 3 else image[..., 0]
         return out
+
+
+def _batches(parts: list, size: int) -> list[list]:
+    """The parts in runs of at most size."""
+    return [parts[i:i + size] for i in range(0, len(parts), size)]
 
 
 def _beside(inside: np.ndarray) -> np.ndarray:

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 
 from gdtool.assets.scene import Scene, Texture
 from gdtool.geometry.normals import face_normals
-from gdtool.shading.textures import TextureReader
+from gdtool.shading.textures import TextureReader, same_layout
 
 ATTRIBUTES = ("albedo", "roughness", "metallic", "normal", "geometric_normal", "alpha", "emissive")
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
-    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-30)
+    return v / np.maximum(np.sqrt(np.einsum("ij,ij->i", v, v)), 1e-30)[:, None]
+
+
+def _interpolated(values: np.ndarray, corners: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
+    """(n, c) values (v, c) at the corners (n, 3), by barycentric weights (n, 3)."""
+    out = np.take(values, corners[:, 0], axis=0) * barycentric[:, :1]
+    for i in (1, 2):
+        out += np.take(values, corners[:, i], axis=0) * barycentric[:, i:i + 1]
+    return out
 
 
 class SurfaceLookup:
@@ -21,7 +31,8 @@ class SurfaceLookup:
     def __init__(self, scene: Scene):
         self.scene = scene
         self.face_normals, self.face_areas = face_normals(scene.vertices, scene.faces)
-        self._readers: dict[int, TextureReader] = {}
+        self._readers: dict[tuple[int, ...], TextureReader] = {}
+        self._lock = threading.RLock()
         self._uv_areas: dict[int, np.ndarray] = {}
         self._tangents: dict[int, np.ndarray] = {}
 
@@ -30,10 +41,12 @@ class SurfaceLookup:
         tested = np.array([m.alpha_mode != "OPAQUE" for m in self.scene.materials] or [False])
         return tested[self.scene.material_idx]
 
-    def _reader(self, texture: Texture) -> TextureReader:
-        if id(texture) not in self._readers:
-            self._readers[id(texture)] = TextureReader(texture)
-        return self._readers[id(texture)]
+    def _reader(self, *textures: Texture) -> TextureReader:
+        key = tuple(id(t) for t in textures)
+        with self._lock:
+            if key not in self._readers:
+                self._readers[key] = TextureReader(*textures)
+            return self._readers[key]
 
     def _uv(self, texture: Texture) -> np.ndarray | None:
         sets = self.scene.uvs
@@ -41,50 +54,70 @@ class SurfaceLookup:
 
     def _density(self, texture: Texture, face_idx: np.ndarray) -> np.ndarray:
         """Texels per world unit (n,) on faces, square root of the ratio of areas."""
+        with self._lock:
+            self._measure_uv(texture)
+        height, width = texture.image.shape[:2]
+        stretch = abs(texture.scale[0] * texture.scale[1]) * height * width
+        return np.sqrt(self._uv_areas[texture.uv_set][face_idx] * stretch)
+
+    def _measure_uv(self, texture: Texture) -> None:
         if texture.uv_set not in self._uv_areas:
             a, b, c = (self._uv(texture)[self.scene.faces[:, i]] for i in range(3))
             u, v = b - a, c - a
             area = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
             self._uv_areas[texture.uv_set] = area / np.maximum(self.face_areas, 1e-300)
-        height, width = texture.image.shape[:2]
-        stretch = abs(texture.scale[0] * texture.scale[1]) * height * width
-        return np.sqrt(self._uv_areas[texture.uv_set][face_idx] * stretch)
 
-    def _read(self, texture: Texture | None, face_idx: np.ndarray, barycentric: np.ndarray, footprint) -> np.ndarray | None:
-        """(n, c) linear texels, or None where there is no texture or no such UV set."""
-        uv = None if texture is None else self._uv(texture)
-        if uv is None:
-            return None
-        at = np.einsum("nij,ni->nj", uv[self.scene.faces[face_idx]], barycentric)
-        width = None if footprint is None else footprint * self._density(texture, face_idx)
-        return self._reader(texture).read(at, width)
+    def _read(self, textures: dict[str, Texture | None], face_idx: np.ndarray, barycentric: np.ndarray, footprint) -> dict[str, np.ndarray]:
+        """By name (n, c) linear texels of the textures that there are and whose UV set there is; those of one layout are
+        looked up at once."""
+        together: dict[tuple, list[str]] = {}
+        for name, texture in textures.items():
+            if texture is not None and self._uv(texture) is not None:
+                together.setdefault(same_layout(texture), []).append(name)
+        out, places = {}, {}
+        for names in together.values():
+            texture = textures[names[0]]
+            if texture.uv_set not in places:
+                places[texture.uv_set] = _interpolated(self._uv(texture), self.scene.faces[face_idx], barycentric)
+            width = None if footprint is None else footprint * self._density(texture, face_idx)
+            reader = self._reader(*(textures[name] for name in names))
+            texels = reader.read(places[texture.uv_set], width)
+            out |= {name: texels[:, part] for name, part in zip(names, reader.parts, strict=True)}
+        return out
 
     def shading_normals(self, face_idx: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
         """(n, 3) unit interpolated vertex normals, the face's where there are none."""
         flat = self.face_normals[face_idx]
         if self.scene.normals is None:
             return flat
-        smooth = np.einsum("nij,ni->nj", self.scene.normals[self.scene.faces[face_idx]], barycentric)
-        length = np.linalg.norm(smooth, axis=1, keepdims=True)
+        smooth = _interpolated(self.scene.normals, self.scene.faces[face_idx], barycentric)
+        length = np.sqrt(np.einsum("ij,ij->i", smooth, smooth))[:, None]
         return np.where(length > 1e-6, smooth / np.maximum(length, 1e-6), flat)
 
     def _tangent(self, texture: Texture, face_idx: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
         """(n, 4) interpolated tangents: the file's, else MikkTSpace's for the texture's UV set."""
         if self.scene.tangents is not None and texture.uv_set == 0:
-            corners = self.scene.tangents[self.scene.faces[face_idx]]
+            faces = self.scene.faces[face_idx]
+            out = _interpolated(self.scene.tangents, faces, barycentric)
+            out[:, 3] = np.where(self.scene.tangents[faces[:, 0], 3] < 0, -1.0, 1.0)
+            return out
         else:
-            if texture.uv_set not in self._tangents:
-                from gdtool.texture.tangents import corner_tangents
-
-                scene = self.scene
-                own = scene.normals is None
-                normals = self.face_normals if own else scene.normals
-                normal_idx = np.repeat(np.arange(len(scene.faces))[:, None], 3, 1) if own else None
-                self._tangents[texture.uv_set] = corner_tangents(scene.vertices, scene.faces, normals, self._uv(texture), scene.faces, normal_idx)
+            with self._lock:
+                self._make_tangents(texture)
             corners = self._tangents[texture.uv_set][face_idx]
         out = np.einsum("nij,ni->nj", corners, barycentric)
         out[:, 3] = np.where(corners[:, 0, 3] < 0, -1.0, 1.0)
         return out
+
+    def _make_tangents(self, texture: Texture) -> None:
+        if texture.uv_set not in self._tangents:
+            from gdtool.texture.tangents import corner_tangents
+
+            scene = self.scene
+            own = scene.normals is None
+            normals = self.face_normals if own else scene.normals
+            normal_idx = np.repeat(np.arange(len(scene.faces))[:, None], 3, 1) if own else None
+            self._tangents[texture.uv_set] = corner_tangents(scene.vertices, scene.faces, normals, self._uv(texture), scene.faces, normal_idx)
 
     def _normal_mapped(self, texture: Texture, scale: float, texel: np.ndarray, normal: np.ndarray, tangent: np.ndarray) -> np.ndarray:
         local = 2.0 * texel[:, :3] - 1.0
@@ -108,7 +141,7 @@ class SurfaceLookup:
                 continue
             chosen = np.flatnonzero(owner == m)
             value = np.full(len(chosen), material.base_color[3], np.float32)
-            texel = self._read(material.base_color_texture, face_idx[chosen], barycentric[chosen], None)
+            texel = self._read({"color": material.base_color_texture}, face_idx[chosen], barycentric[chosen], None).get("color")
             if texel is not None and texel.shape[1] in (2, 4):
                 value *= texel[:, -1]
             if scene.colors is not None:
@@ -140,23 +173,25 @@ class SurfaceLookup:
             at = np.flatnonzero(owner == m)
             here = (face_idx[at], barycentric[at], None if footprint is None else footprint[at])
             color = np.broadcast_to(np.asarray(material.base_color, np.float32), (len(at), 4)).copy()
-            texel = self._read(material.base_color_texture, *here)
+            texels = self._read({"color": material.base_color_texture, "surface": material.metallic_roughness_texture, "normal": material.normal_texture,
+                                 "emissive": material.emissive_texture if any(material.emissive) else None}, *here)
+            texel = texels.get("color")
             if texel is not None:
                 color[:, :3] *= texel[:, :3] if texel.shape[1] >= 3 else texel[:, :1]
                 if texel.shape[1] in (2, 4):
                     color[:, 3] *= texel[:, -1]
             if scene.colors is not None:
-                color *= np.einsum("nij,ni->nj", scene.colors[scene.faces[here[0]]], here[1]).astype(np.float32)
+                color *= _interpolated(scene.colors, scene.faces[here[0]], here[1]).astype(np.float32)
             albedo[at] = color[:, :3]
             alpha[at] = color[:, 3] if material.alpha_mode != "OPAQUE" else 1.0
-            texel = self._read(material.metallic_roughness_texture, *here)
+            texel = texels.get("surface")
             roughness[at] = material.roughness * (texel[:, 1] if texel is not None and texel.shape[1] >= 3 else 1.0)
             metallic[at] = material.metallic * (texel[:, 2] if texel is not None and texel.shape[1] >= 3 else 1.0)
-            texel = self._read(material.emissive_texture, *here) if any(material.emissive) else None
+            texel = texels.get("emissive")
             emissive[at] = np.asarray(material.emissive, np.float32) * (texel[:, :3] if texel is not None else 1.0)
             unlit[at] = material.unlit
             f0[at] = min(((material.ior - 1) / (material.ior + 1)) ** 2 * material.specular, 1.0)
-            texel = self._read(material.normal_texture, *here)
+            texel = texels.get("normal")
             if texel is not None and texel.shape[1] >= 3:
                 tangent = self._tangent(material.normal_texture, *here[:2])
                 normal[at] = self._normal_mapped(material.normal_texture, material.normal_scale, texel, vertex_normal[at], tangent)

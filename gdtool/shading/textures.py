@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 
 from gdtool.assets.scene import Texture
@@ -31,17 +33,30 @@ def wrap_index(index: np.ndarray, size: int, wrap: str) -> np.ndarray:
     return index % size
 
 
-class TextureReader:
-    """A texture's texels as linear float32, finest level as stored, coarser ones by 2x2 box averages made when asked."""
+def same_layout(texture: Texture) -> tuple:
+    """What textures must share to be read at once: equal keys mean equal texels and weights at every uv."""
+    return (texture.uv_set, texture.offset, texture.rotation, texture.scale, texture.wrap_u, texture.wrap_v, texture.filter,
+            texture.image.shape[:2], texture.image.dtype.str)
 
-    def __init__(self, texture: Texture):
-        self.texture = texture
-        image = texture.image if texture.image.ndim == 3 else texture.image[..., None]
-        self.colored = texture.encoding == "srgb"
-        self.levels: list[np.ndarray] = [np.ascontiguousarray(image)]
-        values = np.arange(256 if image.dtype == np.uint8 else 65536 if image.dtype == np.uint16 else 0)
-        self._linear = unit_range(values.astype(image.dtype)).astype(np.float32) if len(values) else None
-        self._table = linear_from_srgb(values.astype(image.dtype)).astype(np.float32) if len(values) and self.colored else self._linear
+
+class TextureReader:
+    """Texels of textures of one layout, side by side as linear float32: channels of the first, then of the next.
+
+    The finest level is as stored, coarser ones are 2x2 box averages made when asked. Threads may read at once.
+    """
+
+    def __init__(self, *textures: Texture):
+        self.texture = textures[0]
+        images = [t.image if t.image.ndim == 3 else t.image[..., None] for t in textures]
+        ends = np.cumsum([image.shape[2] for image in images])
+        self.parts = [slice(int(end) - image.shape[2], int(end)) for image, end in zip(images, ends, strict=True)]
+        self.colored = [t.encoding == "srgb" for t in textures]
+        self.levels: list[np.ndarray] = [np.ascontiguousarray(images[0] if len(images) == 1 else np.concatenate(images, 2))]
+        dtype = images[0].dtype
+        values = np.arange(256 if dtype == np.uint8 else 65536 if dtype == np.uint16 else 0)
+        self._linear = unit_range(values.astype(dtype)).astype(np.float32) if len(values) else None
+        self._table = linear_from_srgb(values.astype(dtype)).astype(np.float32) if len(values) and any(self.colored) else self._linear
+        self._lock = threading.Lock()
 
     @property
     def channels(self) -> int:
@@ -55,19 +70,20 @@ class TextureReader:
 
     def decode(self, texels: np.ndarray) -> np.ndarray:
         """Stored texels (..., c) of the finest level to linear float32; alpha is never sRGB."""
-        colors = texels.shape[-1] if texels.shape[-1] in (1, 3) else texels.shape[-1] - 1
-        if self._linear is None:
-            out = np.array(texels, np.float32)
-            if self.colored:
-                out[..., :colors] = linear_from_srgb(out[..., :colors])
-            return out
-        out = np.take(self._table, texels)
-        if self.colored and colors < texels.shape[-1]:
-            out[..., colors:] = np.take(self._linear, texels[..., colors:])
+        out = np.array(texels, np.float32) if self._linear is None else np.take(self._linear, texels)
+        for part, colored in zip(self.parts, self.colored, strict=True):
+            if colored:
+                count = part.stop - part.start
+                colors = slice(part.start, part.stop if count in (1, 3) else part.stop - 1)
+                out[..., colors] = linear_from_srgb(out[..., colors]) if self._linear is None else np.take(self._table, texels[..., colors])
         return out
 
     def level(self, k: int) -> np.ndarray:
         """(h / 2^k, w / 2^k, c): level 0 as stored, the others linear float32."""
+        with self._lock:
+            return self._made(k)
+
+    def _made(self, k: int) -> np.ndarray:
         while len(self.levels) <= k:
             finer = self.levels[-1]
             height, width, channels = finer.shape
@@ -119,10 +135,17 @@ class TextureReader:
         x0, y0 = x0.astype(np.int64), y0.astype(np.int64)
         left, right = (wrap_index(x0 + i, width, self.texture.wrap_u) for i in (0, 1))
         top, bottom = (wrap_index(y0 + i, height, self.texture.wrap_v) * width for i in (0, 1))
-        upper = self._texels(flat, top + left, k) * (1 - fx) + self._texels(flat, top + right, k) * fx
-        lower = self._texels(flat, bottom + left, k) * (1 - fx) + self._texels(flat, bottom + right, k) * fx
-        return upper * (1 - fy) + lower * fy
+        upper = _between(self._texels(flat, top + left, k), self._texels(flat, top + right, k), fx)
+        return _between(upper, _between(self._texels(flat, bottom + left, k), self._texels(flat, bottom + right, k), fx), fy)
 
     def _texels(self, flat: np.ndarray, index: np.ndarray, k: int) -> np.ndarray:
-        texels = flat[index]
+        texels = np.take(flat, index, axis=0)
         return self.decode(texels) if k == 0 else texels
+
+
+def _between(a: np.ndarray, b: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    """a + fraction (b − a), in the place of b."""
+    b -= a
+    b *= fraction
+    b += a
+    return b
