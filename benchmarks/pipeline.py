@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 from statistics import median
 
-from measure import Failed, busy, evaluate, gdtool, machine, number, say, table
+from measure import Failed, busy, evaluate, gdtool, machine, number, say, seconds_axis, table
 
 FIRST_SEED = 3_000_000
 MODEL_SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
@@ -162,7 +162,8 @@ def plot(records: list[dict], path: Path) -> None:
             axis.plot([m[0] for m in middle], [m[1] for m in middle], "o-", color=color, label=f"{way} to asset")
             for seconds, value, quality in middle:
                 axis.annotate(quality, (seconds, value), textcoords="offset points", xytext=(5, 5), fontsize=8)
-        axis.set(xscale="log", yscale="log" if logarithmic else "linear", xlabel="seconds", ylabel=label)
+        seconds_axis(axis)
+        axis.set(yscale="log" if logarithmic else "linear", ylabel=label)
         axis.margins(0.15)
         axis.grid(alpha=0.3, which="both")
         if axis.get_legend_handles_labels()[0]:
