@@ -69,16 +69,17 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     if options.ao:
         with out.step("occlusion"):
             trace = occlusion_tracer(target, origin.source, reach, origin.normals, options.ao_rays, options.seed, out.threads)
-            occlusion = bake_occlusion(target, texels, baked.positions, baked.normals, trace)
+            occlusion = bake_occlusion(target, texels, trace, threads=out.threads)
     else:
         out.skip("occlusion", "left out by --no-ao")
     with out.step("maps"):
-        maps = make_maps(texels, baked.values, occlusion=occlusion, bits=options.bits, padding=options.padding or None, normal_map=options.normal_map)
+        maps = make_maps(texels, baked.values, occlusion=occlusion, bits=options.bits, padding=options.padding or None, normal_map=options.normal_map,
+                         threads=out.threads)
     for what, reason in maps.skipped:
         out.skip(what, reason)
     if options.normal_map == "off":
         out.skip("normal map", "left out by --normal-map off")
-    report = {**baked.report, "seen_share": float((baked.seen[:texels.inside] > 0.5).mean()), "materials_from": origin.label}
+    report = {**baked.report, "seen_share": 0.0 if baked.seen is None else float((baked.seen[:texels.inside] > 0.5).mean()), "materials_from": origin.label}
     with out.step("write"):
         _write(out, options, inputs, mesh, target, face_idx, maps, origin, matrix, report)
 

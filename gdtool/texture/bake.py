@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from gdtool.texture.occlusion import openness
 from gdtool.texture.project_views import Sight, observe
-from gdtool.texture.raster import barycentric_at
+from gdtool.texture.raster import Barycentrics
 from gdtool.texture.reproject import Places, Source, reproject
-from gdtool.texture.target import Target, Texels, points_at
+from gdtool.texture.target import TEXELS_AT_ONCE, Target, Texels, mapped, surface_at
 from gdtool.texture.tangents import dot, encode_tangent_space, unit
-
-_TEXELS_AT_ONCE = 200_000
 
 # Looks the material of places up: dict of albedo (n, 3) linear, roughness (n,), metallic (n,), normal (n, 3) unit in
 # world axes, and alpha (n,) where the source has one.
@@ -36,14 +33,10 @@ class ViewsOfSource:
 
 @dataclass(frozen=True)
 class Baked:
-    """What the n texels read: values by name, float32, seen (n,) the views' confidence.
-
-    positions (n, 3) and unit normals (n, 3) are the target's own."""
+    """What the n texels read: values by name, float32; seen (n,) the views' confidence, None without views."""
 
     values: dict[str, np.ndarray]
-    positions: np.ndarray
-    normals: np.ndarray
-    seen: np.ndarray
+    seen: np.ndarray | None
     report: dict[str, float] = field(default_factory=dict)
 
 
@@ -100,20 +93,12 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
     return looked, domains
 
 
-def _mapped(run: Callable, parts: list, threads: int) -> Iterator:
-    """run(part) of each part, in order, on several threads."""
-    if threads <= 1:
-        yield from map(run, parts)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        yield from pool.map(run, parts)
-
-
 def _read(target: Target, source: Source, lookup: Lookup, reach: np.ndarray, face_idx: np.ndarray,
-          barycentric: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, Places]:
-    points, frames = points_at(target, face_idx, barycentric)
-    places = reproject(points, unit(frames[..., 2]), reach[face_idx], source)
-    return lookup(places), points, frames, places
+          barycentric: np.ndarray) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, ...], Places]:
+    """What lookup says of the places that stand for places on the target; what surface_at says; and the places."""
+    frame = surface_at(target, face_idx, barycentric)
+    places = reproject(frame[0], unit(frame[1]), reach[face_idx], source)
+    return lookup(places), frame, places
 
 
 def bake(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: np.ndarray, samples: int = 1,
@@ -123,27 +108,28 @@ def bake(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: 
     reach (t,) from reproject.vertex_reach. samples per texel (a square number) are taken where neighbouring texels
     differ, one elsewhere. values has albedo, roughness, metallic, tangent_normal (n, 3) and whatever else lookup gives besides normal.
     """
-
+    reach = reach.astype(np.float32)
     values: dict[str, np.ndarray] = {}
-    positions, normals = np.empty((len(texels), 3), np.float32), np.empty((len(texels), 3), np.float32)
     by_ray = np.empty(len(texels), bool)
 
     def run(part: slice) -> None:
-        read, points, frames, places = _read(target, source, lookup, reach, texels.face_idx[part], texels.barycentric[part])
-        read["tangent_normal"] = encode_tangent_space(frames, read.pop("normal"))
+        read, frame, places = _read(target, source, lookup, reach, texels.face_idx[part], texels.barycentric[part])
+        read["tangent_normal"] = encode_tangent_space(*frame[1:], read.pop("normal"))
         for name, value in read.items():
             # setdefault is atomic: threads that come first at the same time agree on one array.
-            values.setdefault(name, np.empty((len(texels), *value.shape[1:]), np.float32))[part] = value
-        positions[part], normals[part], by_ray[part] = points, unit(frames[..., 2]), places.by_ray
+            if name not in values:
+                values.setdefault(name, np.empty((len(texels), *value.shape[1:]), np.float32))
+            values[name][part] = value
+        by_ray[part] = places.by_ray
 
-    parts = [slice(s, min(s + _TEXELS_AT_ONCE, len(texels))) for s in range(0, len(texels), _TEXELS_AT_ONCE)]
-    for _ in progress(_mapped(run, parts, threads), len(parts), "bake"):
+    parts = [slice(s, min(s + TEXELS_AT_ONCE, len(texels))) for s in range(0, len(texels), TEXELS_AT_ONCE)]
+    for _ in progress(mapped(run, parts, threads), len(parts), "bake"):
         pass
     report = {"texels": texels.inside, "nearest_point_share": float(1 - by_ray[:texels.inside].mean())}
     if samples > 1:
         report["supersampled_share"] = _supersample(target, texels, source, lookup, reach, samples, values)
-    seen = values.pop("seen", np.zeros(len(texels), np.float32))
-    return Baked(values, positions, normals, seen, report)
+    seen = values.pop("seen", None)
+    return Baked(values, seen, report)
 
 
 def varying(texels: Texels, values: dict[str, np.ndarray], tolerance: float = 0.03) -> np.ndarray:
@@ -167,21 +153,20 @@ def _supersample(target: Target, texels: Texels, source: Source, lookup: Lookup,
                  values: dict[str, np.ndarray]) -> float:
     """Replace values of varying texels by means over a grid of samples within each; the share of texels that were."""
     chosen = varying(texels, values)
-    side = int(round(samples**0.5))
+    side, barycentrics = int(round(samples**0.5)), Barycentrics(target.uv, target.face_uvs)
     texel = texels.texel[chosen]
-    for start in range(0, len(chosen), _TEXELS_AT_ONCE):
-        mine, at = chosen[start:start + _TEXELS_AT_ONCE], texel[start:start + _TEXELS_AT_ONCE]
+    for start in range(0, len(chosen), TEXELS_AT_ONCE):
+        mine, at = chosen[start:start + TEXELS_AT_ONCE], texel[start:start + TEXELS_AT_ONCE]
         face_idx = texels.face_idx[mine]
         total: dict[str, np.ndarray] = {}
         for k in range(side * side):
             offset = (np.array([k % side, k // side]) + 0.5) / side
-            place = (np.stack([at % texels.size, at // texels.size], 1) + offset) / texels.size
-            barycentric = barycentric_at(target.uv, target.face_uvs, face_idx, place).astype(np.float32)
-            read, _, _, _ = _read(target, source, lookup, reach, face_idx, np.clip(barycentric, -1, 2))
+            barycentric = barycentrics.at(face_idx, (at % texels.size + offset[0]) / texels.size, (at // texels.size + offset[1]) / texels.size)
+            read, _, _ = _read(target, source, lookup, reach, face_idx, np.clip(barycentric, -1, 2).astype(np.float32))
             for name, value in read.items():
                 total[name] = total.get(name, 0) + value / (side * side)
-        _, frames = points_at(target, face_idx, texels.barycentric[mine])
-        total["tangent_normal"] = encode_tangent_space(frames, unit(total.pop("normal")))
+        frame = surface_at(target, face_idx, texels.barycentric[mine])
+        total["tangent_normal"] = encode_tangent_space(*frame[1:], unit(total.pop("normal")))
         for name, value in total.items():
             values[name][mine] = value
     return len(chosen) / max(texels.inside, 1)
@@ -194,16 +179,16 @@ def occlusion_tracer(target: Target, source: Source, reach: np.ndarray, normals:
 
     def trace(face_idx: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
         def run(part: slice) -> np.ndarray:
-            points, frames = points_at(target, face_idx[part], barycentric[part])
-            places = reproject(points, unit(frames[..., 2]), reach[face_idx[part]], source)
+            points, facing, _, _ = surface_at(target, face_idx[part], barycentric[part])
+            places = reproject(points, unit(facing), reach[face_idx[part]], source)
             at = source.at(places.face_idx, places.barycentric, source.vertices)
             geometric = source.face_normals[places.face_idx]
             smooth = source.at(places.face_idx, places.barycentric, normals)
             smooth = unit(np.where(dot(smooth, geometric)[:, None] > 0.2, smooth, geometric))
             return openness(at + geometric * lift, smooth, source.caster, rays, seed + part.start, lift=0.0)
 
-        parts = [slice(s, s + 50_000) for s in range(0, len(face_idx), 50_000)]
-        traced = list(_mapped(run, parts, threads))
+        parts = [slice(s, s + 8192) for s in range(0, len(face_idx), 8192)]
+        traced = list(mapped(run, parts, threads))
         return np.concatenate(traced) if traced else np.zeros(0, np.float32)
 
     return trace

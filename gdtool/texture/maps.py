@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gdtool.texture.padding import fill_gutters
+from gdtool.texture.padding import Gutters
 from gdtool.texture.tangents import unit
-from gdtool.texture.target import Texels
+from gdtool.texture.target import Texels, mapped
 
 # Smaller differences than this, in stored units, are no detail: one step of 8 bits and rounding.
 CONSTANT_RANGE = 1.5 / 255
@@ -38,7 +38,9 @@ class Maps:
 def quantise(image: np.ndarray, bits: int) -> np.ndarray:
     """[0, 1] floats to uint8 or uint16, to the nearest step."""
     top, kind = (255, np.uint8) if bits == 8 else (65535, np.uint16)
-    return np.rint(np.clip(image, 0, 1) * top).astype(kind)
+    scaled = np.clip(image, 0, 1)
+    scaled *= image.dtype.type(top)
+    return np.rint(scaled, out=scaled).astype(kind)
 
 
 def constant_of(values: np.ndarray, tolerance: float = CONSTANT_RANGE) -> np.ndarray | None:
@@ -51,13 +53,15 @@ def constant_of(values: np.ndarray, tolerance: float = CONSTANT_RANGE) -> np.nda
 
 def flat_angle(tangent_normals: np.ndarray) -> float:
     """Angle in degrees from straight up that 99.5 % of tangent-space normals (n, 3) stay within."""
-    sine = np.linalg.norm(tangent_normals[:, :2], axis=1)
-    angle = np.degrees(np.arctan2(sine, tangent_normals[:, 2]))
-    return float(np.percentile(angle, 99.5)) if len(angle) else 0.0
+    if not len(tangent_normals):
+        return 0.0
+    # The component that is straight up falls as the angle grows: its percentile is the angle's, and needs no sine.
+    up = float(np.percentile(tangent_normals[:, 2], 0.5))
+    return float(np.degrees(np.arccos(np.clip(up, -1, 1))))
 
 
 def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.ndarray | None = None, bits: int = 8,
-              padding: int | None = None, normal_map: str = "auto") -> Maps:
+              padding: int | None = None, normal_map: str = "auto", threads: int = 1) -> Maps:
     """Maps of what texels read (bake.Baked.values): albedo, roughness, metallic, tangent_normal, perhaps alpha.
 
     occlusion (n,) or None. normal_map "auto" leaves a flat map out. Gutters are filled over `padding` texels, everywhere
@@ -67,27 +71,27 @@ def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.nd
 
     inside = slice(0, texels.inside)
     skipped: list[tuple[str, str]] = []
-    layers: dict[str, np.ndarray] = {}
-    color = srgb_from_linear(np.clip(values["albedo"], 0, 1)).astype(np.float32)
+    layers: dict[str, list[np.ndarray]] = {}
+    color = [srgb_from_linear(np.clip(values["albedo"][:, k], 0, 1)) for k in range(3)]
     alpha = np.clip(values["alpha"], 0, 1) if "alpha" in values else None
     if alpha is not None and alpha[inside].min() >= 1 - CONSTANT_RANGE:
         alpha = None
-    constant = constant_of(color[inside]) if alpha is None else None
-    if constant is None:
+    constants = [constant_of(channel[inside]) for channel in color] if alpha is None else [None]
+    if any(constant is None for constant in constants):
         factors: dict[str, tuple[float, ...]] = {"base_color": (1.0, 1.0, 1.0, 1.0)}
-        layers["base_color"] = color if alpha is None else np.concatenate([color, alpha[:, None]], 1)
+        layers["base_color"] = color if alpha is None else [*color, alpha]
     else:
-        factors = {"base_color": (*(round(float(x), 6) for x in linear_from_srgb(constant)), 1.0)}
+        factors = {"base_color": (*(round(float(x), 6) for x in linear_from_srgb(np.array(constants))), 1.0)}
         skipped.append(("base_color map", "base color is constant: a factor says it"))
-    packed = np.ones((len(texels), 3), np.float32)
+    packed = [None, None, None]
     for channel, name in ((1, "roughness"), (2, "metallic")):
         constant = constant_of(values[name][inside])
         if constant is None:
             factors[name] = (1.0,)
-            packed[:, channel] = values[name]
+            packed[channel] = values[name]
         else:
             factors[name] = (round(float(constant), 6),)
-    varies = any(packed[:, channel].min(initial=1) < 1 for channel in (1, 2))
+    varies = any(channel is not None for channel in packed)
     if not varies:
         skipped.append(("roughness and metallic map", "both are constant: factors say them"))
     open_everywhere = occlusion is not None and occlusion[inside].min(initial=1) > 1 - 2 / 255
@@ -95,23 +99,36 @@ def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.nd
         skipped.append(("occlusion map", "nothing is occluded"))
     has_occlusion = occlusion is not None and not open_everywhere
     if has_occlusion:
-        packed[:, 0] = occlusion
+        packed[0] = occlusion
     if varies or has_occlusion:
-        layers["orm"] = packed
+        ones = np.ones(len(texels), np.float32)
+        layers["orm"] = [ones if channel is None else channel for channel in packed]
     angle = flat_angle(values["tangent_normal"][inside])
     if normal_map == "on" or (normal_map == "auto" and angle > FLAT_DEGREES):
-        layers["normal"] = values["tangent_normal"].astype(np.float32)
+        layers["normal"] = list(np.moveaxis(values["tangent_normal"], -1, 0))
     elif normal_map == "auto":
         skipped.append(("normal map", f"would be flat: {angle:.2f} degrees"))
-    mask = texels.mask()
-    # One after the other: together they would need several times the memory.
-    images = {name: fill_gutters(texels.image(layer), mask, padding) for name, layer in layers.items()}
-    if "normal" in images:
-        normal = images["normal"]
-        images["normal"] = unit(normal) * 0.5 + 0.5
-    stored = {name: quantise(image, bits) for name, image in images.items()}
+    gutters = Gutters(texels.mask(), padding)
+    stored = {name: _stored(texels, layer, gutters, bits, threads, direction=name == "normal") for name, layer in layers.items()}
     return Maps(texels.size, stored.get("base_color"), stored.get("orm"), stored.get("normal"), factors,
                 has_occlusion, varies, skipped)
+
+
+def _stored(texels: Texels, layer: list[np.ndarray], gutters: Gutters, bits: int, threads: int, direction: bool = False) -> np.ndarray:
+    """(s, s, c) uint8 or uint16 of channels (n,) in [0, 1], gutters filled; direction: of a unit vector, stored as 0.5 n + 0.5."""
+    def plane(channel: np.ndarray) -> np.ndarray:
+        return gutters.fill(texels.image(channel))
+
+    out = np.empty((texels.size, texels.size, len(layer)), np.uint8 if bits == 8 else np.uint16)
+    if not direction:
+        for k, image in enumerate(mapped(plane, layer, threads)):
+            out[..., k] = quantise(image, bits)
+        return out
+    planes = list(mapped(plane, layer, threads))
+    for row in range(0, texels.size, 64):
+        normal = unit(np.stack([image[row:row + 64] for image in planes], -1))
+        out[row:row + 64] = quantise(normal * np.float32(0.5) + np.float32(0.5), bits)
+    return out
 
 
 def directx(normal: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from gdtool.geometry.normals import vertex_normals
 from gdtool.texture.bake import Lookup, ViewsOfSource, vertex_lookup, with_views
 from gdtool.texture.project_views import pixel_footprint, sight_of
 from gdtool.texture.reproject import Places, Source
+from gdtool.texture.tangents import dot
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,7 @@ def from_scene(scene: Scene, source_from_world: np.ndarray, texel_width: float =
 
     matrix = invert_similarity(source_from_world)
     turn = matrix[:3, :3] / np.sqrt((matrix[:3, 0] ** 2).sum())
+    turn, unturned = turn.astype(np.float32), bool(np.allclose(turn, np.eye(3), atol=1e-9))
     source = Source(transform_points(matrix, scene.vertices), scene.faces)
     normals = scene.normals @ turn.T if scene.normals is not None else vertex_normals(source.vertices, source.faces)
 
@@ -119,9 +121,12 @@ def from_scene(scene: Scene, source_from_world: np.ndarray, texel_width: float =
 
     def lookup(places: Places) -> dict[str, np.ndarray]:
         read = points.attributes(places.face_idx, places.barycentric.astype(np.float64), np.full(len(places.face_idx), width))
-        normal = read["normal"] @ turn.T
+        # einsum: a product of so thin matrices by BLAS keeps a second thread busy with waiting.
+        normal = read["normal"] if unturned else np.einsum("nk,ck->nc", read["normal"], turn)
         # Files whose winding and normals disagree are common; the winding says which side is outside.
-        normal[(normal * source.face_normals[places.face_idx]).sum(1) < 0] *= -1
+        inward = dot(normal, source.face_normals_32[places.face_idx]) < 0
+        if inward.any():
+            normal[inward] *= -1
         return {"albedo": read["albedo"], "roughness": read["roughness"], "metallic": read["metallic"], "alpha": read["alpha"], "normal": normal}
 
     modes = {material.alpha_mode for material in scene.materials}

@@ -5,64 +5,93 @@ from __future__ import annotations
 import numpy as np
 
 
-def push_pull(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Fill the texels outside mask from those inside, near ones counting most; those inside stay as they are.
+class Gutters:
+    """Fills the texels outside a mask (h, w) from those inside; the mask's levels are made once for all channels.
 
-    image (h, w, c) or (h, w) float, mask (h, w) bool. Averages of what is known are pushed up a pyramid, and pulled down
-    into what is not (Gortler et al. 1996, "The Lumigraph", section 3.5). An all-empty mask gives the image back.
+    Averages of what is known are pushed up a pyramid, and pulled down into what is not (Gortler et al. 1996, "The
+    Lumigraph", section 3.5). Beyond `padding` texels from the mask all become the channel's mean inside; None: no limit.
     """
-    flat = image.ndim == 2
-    values = np.ascontiguousarray(image[..., None] if flat else image, np.float32)
-    mask = np.asarray(mask, bool)
-    if not mask.any() or mask.all():
-        return image.copy()
-    filled = _fill(values, mask.astype(np.float32))
-    return filled[..., 0] if flat else filled
+
+    def __init__(self, mask: np.ndarray, padding: int | None = None):
+        self.mask = np.asarray(mask, bool)
+        self._empty = ~self.mask
+        self._far = None
+        if padding is not None and self.mask.any():
+            from scipy.ndimage import distance_transform_edt
+
+            self._far = distance_transform_edt(self._empty) > padding
+        # Above the finest level, where a texel is known or not: weights, and what the sums of a level are divided by.
+        self._weights: list[np.ndarray] = []
+        self._inverse: list[np.ndarray] = []
+        weight = self.mask.astype(np.float32)
+        while self.mask.any() and weight.min() == 0 and weight.size > 1:
+            known = _summed(weight)
+            self._inverse.append(np.divide(1, known, out=np.zeros_like(known), where=known > 0))
+            weight = np.minimum(known, 1)
+            self._weights.append(weight)
+
+    def fill(self, channel: np.ndarray, background: float | None = None) -> np.ndarray:
+        """channel (h, w) float32, 0 outside the mask, is filled and given back. background takes the mean's place."""
+        if not self._weights:
+            return channel
+        if self._far is not None and background is None:
+            background = float(channel[self.mask].mean())
+        levels = [_summed(channel) * self._inverse[0]]
+        for weight, inverse in zip(self._weights, self._inverse[1:], strict=False):
+            levels.append(_summed(levels[-1] * weight) * inverse)
+        filled = levels.pop()
+        while levels:
+            value, weight = levels.pop(), self._weights[len(levels)]
+            value *= weight
+            value += (1 - weight) * _doubled(filled, value.shape)
+            filled = value
+        np.copyto(channel, _doubled(filled, channel.shape), where=self._empty)
+        if self._far is not None:
+            channel[self._far] = background
+        return channel
 
 
-def _fill(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """values (h, w, c) where weight (h, w) in [0, 1] is 1, blended toward the coarser level's fill where it is less."""
-    height, width = weight.shape
-    if weight.min() > 0 or (height == 1 and width == 1):
-        return values.copy()
-    w, v = weight, values * weight[..., None]
+def _summed(image: np.ndarray) -> np.ndarray:
+    """Sums over 2 x 2 texels of (h, w); an odd last row or column counts alone."""
+    height, width = image.shape
     if height % 2 or width % 2:
-        pad = ((0, height % 2), (0, width % 2))
-        w, v = np.pad(w, pad), np.pad(v, (*pad, (0, 0)))
-    pooled_w = w[0::2, 0::2] + w[1::2, 0::2] + w[0::2, 1::2] + w[1::2, 1::2]
-    pooled_v = v[0::2, 0::2] + v[1::2, 0::2] + v[0::2, 1::2] + v[1::2, 1::2]
-    del v
-    known = pooled_w > 0
-    pooled_v[known] /= pooled_w[known][:, None]
-    coarse = _fill(pooled_v, np.minimum(pooled_w, 1))
-    row, column = np.nonzero(weight < 1)
-    return _blend(values, weight, coarse, row, column)
+        image = np.pad(image, ((0, height % 2), (0, width % 2)))
+    rows = image[0::2] + image[1::2]
+    return rows[:, 0::2] + rows[:, 1::2]
 
 
-def _blend(values: np.ndarray, weight: np.ndarray, coarse: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """values with texels (row, column) blended toward the bilinear lookup of the level above, by what weight leaves."""
-    out = values.copy()
-    last_row, last_column = coarse.shape[0] - 1, coarse.shape[1] - 1
-    # A texel's centre lies a quarter of a coarse texel from its parent's: weights 9, 3, 3, 1 sixteenths.
-    r0, c0 = row // 2, column // 2
-    r1 = np.clip(r0 + np.where(row % 2, 1, -1), 0, last_row)
-    c1 = np.clip(c0 + np.where(column % 2, 1, -1), 0, last_column)
-    looked = (9 * coarse[r0, c0] + 3 * coarse[r1, c0] + 3 * coarse[r0, c1] + coarse[r1, c1]) / 16
-    share = weight[row, column][:, None]
-    out[row, column] = share * out[row, column] + (1 - share) * looked
-    return out
+def _doubled(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """image (h, w) at twice the size, cut to shape, between texels linear: a texel's centre lies a quarter of a coarse
+    texel from its parent's, so weights are three quarters and one."""
+    for axis in (0, 1):
+        image = np.moveaxis(image, axis, 0)
+        out = np.empty((2 * len(image), *image.shape[1:]), image.dtype)
+        near, other = image * np.float32(0.75), image * np.float32(0.25)
+        out[0::2], out[1::2] = near, near
+        out[2::2] += other[:-1]
+        out[1:-1:2] += other[1:]
+        out[0] += other[0]
+        out[-1] += other[-1]
+        image = np.moveaxis(out, 0, axis)
+    return image[:shape[0], :shape[1]]
 
 
-def fill_gutters(image: np.ndarray, mask: np.ndarray, padding: int | None = None, background: float | np.ndarray | None = None) -> np.ndarray:
+def push_pull(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """(h, w, c) or (h, w) float32: image with the texels outside mask (h, w) filled from those inside, which stay as they
+    are. An all-empty mask gives the image back."""
+    return fill_gutters(image, mask)
+
+
+def fill_gutters(image: np.ndarray, mask: np.ndarray, padding: int | None = None, background: float | None = None) -> np.ndarray:
     """Fill `padding` texels around the charts (all texels when None); farther ones get background (default: the mean).
 
     image (h, w, c) or (h, w) float, mask (h, w) bool of the texels that are known.
     """
-    filled = push_pull(image, mask)
-    if padding is None or not mask.any() or mask.all():
-        return filled
-    from scipy.ndimage import distance_transform_edt
-
-    far = distance_transform_edt(~mask) > padding
-    filled[far] = image[mask].mean(0) if background is None else background
-    return filled
+    mask = np.asarray(mask, bool)
+    if not mask.any() or mask.all():
+        return image.copy()
+    gutters = Gutters(mask, padding)
+    out = np.empty(image.shape, np.float32)
+    for k in np.ndindex(image.shape[2:]):
+        out[(..., *k)] = gutters.fill(np.where(mask, image[(..., *k)], 0).astype(np.float32), background)
+    return out

@@ -14,8 +14,9 @@ import numpy as np
 SUBTEXEL_BITS = 12
 _ONE = 1 << SUBTEXEL_BITS
 _FARTHEST_UV = 64.0  # keeps edge functions far below 2**63 for every size up to 65536
-_SPANS_AT_ONCE = 2_000_000
-_TEXELS_AT_ONCE = 8_000_000
+# Few enough that what is computed of them stays in the cache.
+_SPANS_AT_ONCE = 65_536
+_TEXELS_AT_ONCE = 131_072
 
 
 def _snapped(uv: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -86,29 +87,40 @@ def owned_texels(uv: np.ndarray, faces: np.ndarray, size: int) -> Iterator[tuple
             yield face[span].astype(np.int32), row[span].astype(np.int32), (left[span] + offset).astype(np.int32)
 
 
-def barycentric_at(uv: np.ndarray, faces: np.ndarray, face_idx: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates (n, 3) float64 of texture points at (n, 2) in triangles face_idx (n,); linear beyond them.
+class Barycentrics:
+    """Barycentric coordinates of texture points in triangles; what they need of each triangle is kept.
 
-    Triangles without area give their first corner.
+    uv (v, 2), faces (t, 3) into uv. Triangles without area give their first corner.
     """
-    a, b, c = (np.asarray(uv, np.float64)[faces[:, i]] for i in range(3))
-    e1, e2 = b - a, c - a
-    det = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
-    inverse = np.where(det == 0, 0.0, 1.0 / np.where(det == 0, 1.0, det))
-    from_b = np.stack([e2[:, 1], -e2[:, 0]], 1) * inverse[:, None]
-    from_c = np.stack([-e1[:, 1], e1[:, 0]], 1) * inverse[:, None]
-    offset = at - a[face_idx]
-    wb = (offset * from_b[face_idx]).sum(1)
-    wc = (offset * from_c[face_idx]).sum(1)
-    return np.stack([1 - wb - wc, wb, wc], 1)
+
+    def __init__(self, uv: np.ndarray, faces: np.ndarray):
+        a, b, c = (np.asarray(uv, np.float64)[faces[:, i]] for i in range(3))
+        e1, e2 = b - a, c - a
+        det = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
+        inverse = np.where(det == 0, 0.0, 1.0 / np.where(det == 0, 1.0, det))
+        self._of_face = np.stack([a[:, 0], a[:, 1], e2[:, 1] * inverse, -e2[:, 0] * inverse, -e1[:, 1] * inverse, e1[:, 0] * inverse], 1)
+
+    def at(self, face_idx: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """(n, 3) float64 of texture points u, v (n,) in triangles face_idx (n,); linear beyond them."""
+        face = np.take(self._of_face, face_idx, axis=0)
+        u, v = u - face[:, 0], v - face[:, 1]
+        out = np.empty((len(face), 3))
+        out[:, 1] = u * face[:, 2] + v * face[:, 3]
+        out[:, 2] = u * face[:, 4] + v * face[:, 5]
+        out[:, 0] = 1 - out[:, 1] - out[:, 2]
+        return out
+
+    def at_centres(self, face_idx: np.ndarray, texel: np.ndarray, size: int) -> np.ndarray:
+        """(n, 3) float64 at the centres of texels (n,), row-major, of a size x size map."""
+        row, column = np.divmod(texel, size)
+        return self.at(face_idx, (column + 0.5) / size, (row + 0.5) / size)
 
 
-def rasterize_uv(uv: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Owner of each texel and the place of its centre in the owner.
+def owners_of(uv: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
+    """(size * size,) int32: the triangle that owns each texel, -1 where none covers its centre; the first where several do.
 
-    uv (v, 2) with (0, 0) at the image's top left, faces (t, 3). Returns face_idx (size, size) int32, -1 where no
-    triangle covers the texel's centre, and barycentric (size, size, 3) float32, 0 there. Where triangles overlap, the
-    first one owns the texel. Raises ValueError for coordinates that are not finite or beyond ±64.
+    uv (v, 2) with (0, 0) at the image's top left, faces (t, 3). Raises ValueError for coordinates that are not finite or
+    beyond ±64.
     """
     owner = np.full(size * size, -1, np.int32)
     for face, row, column in owned_texels(uv, faces, size):
@@ -116,26 +128,41 @@ def rasterize_uv(uv: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarr
         free = owner[texel] < 0
         # Reversed, because of several assignments to one element the last one stays.
         owner[texel[free][::-1]] = face[free][::-1]
+    return owner
+
+
+def rasterize_uv(uv: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Owner of each texel and the place of its centre in the owner.
+
+    Returns face_idx (size, size) int32 as owners_of says, and barycentric (size, size, 3) float32, 0 where none is.
+    """
+    owner = owners_of(uv, faces, size)
     covered = np.flatnonzero(owner >= 0)
     barycentric = np.zeros((size * size, 3), np.float32)
-    for start in range(0, len(covered), 1_000_000):
-        texel = covered[start:start + 1_000_000]
-        centre = np.stack([texel % size + 0.5, texel // size + 0.5], 1) / size
-        inside = barycentric_at(uv, faces, owner[texel], centre)
-        inside = np.clip(inside, 0, 1)  # snapping moves corners by up to 1/8192 of a texel
-        barycentric[texel] = inside / inside.sum(1, keepdims=True)
+    barycentric[covered] = centres_in(Barycentrics(uv, faces), owner[covered], covered, size)
     return owner.reshape(size, size), barycentric.reshape(size, size, 3)
+
+
+def centres_in(barycentrics: Barycentrics, owner: np.ndarray, texel: np.ndarray, size: int) -> np.ndarray:
+    """(n, 3) float32: where the centres of texels (n,) lie in the triangles (n,) that own them."""
+    out = np.empty((len(texel), 3), np.float32)
+    for start in range(0, len(texel), _TEXELS_AT_ONCE):
+        part = slice(start, start + _TEXELS_AT_ONCE)
+        # Snapping moves corners by up to 1/8192 of a texel.
+        inside = np.clip(barycentrics.at_centres(owner[part], texel[part], size), 0, 1)
+        out[part] = inside / (inside[:, 0] + inside[:, 1] + inside[:, 2])[:, None]
+    return out
 
 
 def owner_count(uv: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
     """(size, size) int32: how many triangles cover each texel centre; above 1 where texture coordinates overlap."""
     count = np.zeros(size * size, np.int32)
     for _, row, column in owned_texels(uv, faces, size):
-        count += np.bincount(row.astype(np.int64) * size + column, minlength=size * size).astype(np.int32)
+        np.add.at(count, row.astype(np.int64) * size + column, 1)
     return count.reshape(size, size)
 
 
-def extend_owners(uv: np.ndarray, faces: np.ndarray, face_idx: np.ndarray, rings: int,
+def extend_owners(barycentrics: Barycentrics, face_idx: np.ndarray, rings: int,
                   farthest: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Texels just outside the charts and where they would lie if the triangle beside them went on.
 
@@ -145,21 +172,30 @@ def extend_owners(uv: np.ndarray, faces: np.ndarray, face_idx: np.ndarray, rings
     """
     size = face_idx.shape[0]
     owner = np.pad(face_idx, 1, constant_values=-1)
+    flat, wide = owner.ravel(), size + 2
     texels, owners = [np.empty(0, np.int64)], [np.empty(0, np.int32)]
+    covered = owner >= 0
     for _ in range(rings):
-        neighbour = np.full((size, size), -1, np.int32)
+        rows = covered.copy()
+        rows[1:] |= covered[:-1]
+        rows[:-1] |= covered[1:]
+        near = rows.copy()
+        near[:, 1:] |= rows[:, :-1]
+        near[:, :-1] |= rows[:, 1:]
+        near &= ~covered
+        near[[0, -1]], near[:, [0, -1]] = False, False
+        new = np.flatnonzero(near)
+        found = np.full(len(new), -1, np.int32)
         # Straight neighbours last, so that they win over diagonal ones.
-        for dy, dx in ((-1, -1), (-1, 1), (1, -1), (1, 1), (-1, 0), (1, 0), (0, -1), (0, 1)):
-            seen = owner[1 + dy:1 + dy + size, 1 + dx:1 + dx + size]
-            neighbour = np.where(seen >= 0, seen, neighbour)
-        new = np.flatnonzero(((owner[1:-1, 1:-1] < 0) & (neighbour >= 0)).ravel())
-        found = neighbour.ravel()[new]
-        owner[1 + new // size, 1 + new % size] = found
-        texels.append(new)
+        for step in (-wide - 1, -wide + 1, wide - 1, wide + 1, -1, 1, -wide, wide):
+            seen = flat[new + step]
+            found = np.where(seen >= 0, seen, found)
+        flat[new] = found
+        covered |= near
+        texels.append((new // wide - 1) * size + new % wide - 1)
         owners.append(found)
     texel, owned_by = np.concatenate(texels), np.concatenate(owners)
-    centre = np.stack([texel % size + 0.5, texel // size + 0.5], 1) / size
-    barycentric = barycentric_at(uv, faces, owned_by, centre)
+    barycentric = barycentrics.at_centres(owned_by, texel, size)
     within = np.clip(barycentric, 0, 1)
     within /= within.sum(1, keepdims=True)
     # A sliver goes on for many times its own width: hold what lies beyond it back, in the same direction.

@@ -41,14 +41,13 @@ class Source:
     """Triangles to bake from: vertices (v, 3), faces (f, 3), face_normals (f, 3) unit, and what finds places on them."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
-        from gdtool.geometry.rays import RayCaster
+        from gdtool.geometry.quick_rays import QuickCaster
 
         self.vertices, self.faces = np.asarray(vertices, np.float64), faces
         self.face_normals = face_normals(vertices, faces)[0]
+        self.face_normals_32 = self.face_normals.astype(np.float32)
         self.extent = float(np.ptp(self.vertices, axis=0).max())
-        self.caster = RayCaster(vertices, faces)
-        # The first query builds Embree's tree; later ones may come from several threads.
-        self.caster.first_hit(np.zeros((1, 3)), np.ones((1, 3)))
+        self.caster = QuickCaster(vertices, faces)
         self.nearest = Nearest(self.vertices, faces)
         self._facing: dict[tuple[int, float], Nearest | None] = {}
         self._lock = Lock()
@@ -93,25 +92,28 @@ def vertex_reach(vertices: np.ndarray, faces: np.ndarray, source: Source) -> np.
 def _march(points: np.ndarray, directions: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source,
            start: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """First face on the right side along each ray within reach: face_idx (n,) or -1, distance (n,), barycentric (n, 3)."""
-    count = len(points)
-    face, travelled = np.full(count, -1, np.int32), np.full(count, -start)
-    distance, barycentric = np.full(count, np.inf), np.zeros((count, 3), np.float32)
-    active = np.arange(count)
-    for _ in range(_RETRIES):
+    face, t, barycentric = source.caster.quick_hits(points - directions * points.dtype.type(start), directions)
+    t -= np.float32(start)
+    near = (face >= 0) & (t <= reach)
+    agrees = dot(source.face_normals_32[face], normals) > AGREEMENT
+    # The other side of a wall: step through it and look on.
+    active = np.flatnonzero(near & ~agrees)
+    good = near & agrees
+    if not good.all():
+        face[~good] = -1
+    distance = np.where(good, np.abs(t), np.float32(np.inf))
+    travelled = t[active] + start
+    for _ in range(_RETRIES - 1):
         if not len(active):
             break
-        hits = source.caster.first_hit(points[active] + directions[active] * travelled[active, None], directions[active])
-        hit = hits.face_idx >= 0
-        active, hit_face, hit_at = active[hit], hits.face_idx[hit], hits.barycentric[hit]
-        t = travelled[active] + hits.distance[hit]
-        near = t <= reach[active]
+        hit_face, t, hit_at = source.caster.quick_hits(points[active] + directions[active] * travelled[:, None], directions[active])
+        t += travelled
+        near = (hit_face >= 0) & (t <= reach[active])
         active, hit_face, hit_at, t = active[near], hit_face[near], hit_at[near], t[near]
-        agrees = dot(source.face_normals[hit_face], normals[active]) > AGREEMENT
+        agrees = dot(source.face_normals_32[hit_face], normals[active]) > AGREEMENT
         found = active[agrees]
         face[found], distance[found], barycentric[found] = hit_face[agrees], np.abs(t[agrees]), hit_at[agrees]
-        # The other side of a wall: step through it and look on.
-        active = active[~agrees]
-        travelled[active] = t[~agrees] + start
+        active, travelled = active[~agrees], t[~agrees] + start
     return face, distance, barycentric
 
 
@@ -143,7 +145,7 @@ def _slide_off_edges(points: np.ndarray, normals: np.ndarray, source: Source, fa
     """
     from gdtool.geometry.distance import barycentric_of
 
-    cosine = dot(source.face_normals[face], normals)
+    cosine = dot(source.face_normals_32[face], normals)
     slanted = np.flatnonzero(cosine < 0.99)
     away = source.at(face[slanted], barycentric[slanted], source.vertices) - points[slanted]
     # How far beside the nearest place the ray went, were the face a plane.

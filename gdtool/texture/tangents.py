@@ -114,28 +114,31 @@ def corner_tangents(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray
     return np.concatenate([frame, np.where(handed < 0, -1.0, 1.0)[..., None]], -1).astype(np.float32)
 
 
-def frame_at(normals: np.ndarray, tangents: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
-    """Interpolated tangent frames (n, 3, 3), columns tangent, bitangent, normal, as viewers interpolate them.
+def frames_of(normal: np.ndarray, tangent: np.ndarray, sign: np.ndarray) -> np.ndarray:
+    """Tangent frames (n, 3, 3), columns tangent, bitangent, normal, of interpolated normals and tangents (n, 3), sign (n,).
 
-    normals (n, 3, 3) and tangents (n, 3, 4) of the corners, barycentric (n, 3). Nothing is normalised after
-    interpolation, as MikkTSpace asks: encoder and decoder then use the same basis.
+    Nothing is normalised after interpolation, as MikkTSpace asks: encoder and decoder then use the same basis.
     """
-    normal = np.einsum("nk,nkc->nc", barycentric, normals)
-    tangent = np.einsum("nk,nkc->nc", barycentric, tangents[..., :3])
-    bitangent = tangents[:, :1, 3] * np.cross(normal, tangent)
-    return np.stack([tangent, bitangent, normal], -1)
+    return np.stack([tangent, np.cross(normal, tangent) * sign[:, None], normal], -1)
 
 
-def encode_tangent_space(frames: np.ndarray, world: np.ndarray) -> np.ndarray:
-    """Unit tangent-space normals (n, 3), +Y up, that decode to the unit world normals (n, 3) in frames (n, 3, 3)."""
-    tangent, bitangent, normal = frames[..., 0], frames[..., 1], frames[..., 2]
-    # Rows of the inverse, up to the determinant, which is positive or negative with the frame's handedness.
-    rows = (np.cross(bitangent, normal), np.cross(normal, tangent), np.cross(tangent, bitangent))
-    determinant = dot(tangent, rows[0])
-    local = np.stack([dot(row, world) for row in rows], -1)
-    safe = np.abs(determinant) > 1e-9
-    local = np.where(safe[..., None], local * np.sign(determinant)[..., None], (0.0, 0.0, 1.0))
-    return unit(local)
+def encode_tangent_space(normal: np.ndarray, tangent: np.ndarray, sign: np.ndarray, world: np.ndarray) -> np.ndarray:
+    """Unit tangent-space normals (n, 3), +Y up, that decode to the unit world normals (n, 3) in interpolated frames.
+
+    normal and tangent (n, 3) need be neither unit nor orthogonal, the bitangent is sign (n,) · cross(normal, tangent).
+    """
+    across = np.empty_like(normal)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        across[:, k] = normal[:, i] * tangent[:, j] - normal[:, j] * tangent[:, i]
+    nn, tt, nt = dot(normal, normal), dot(tangent, tangent), dot(normal, tangent)
+    along, up = dot(world, tangent), dot(world, normal)
+    # The frame's inverse, up to a positive factor: the dual of each axis from the others' products.
+    out = np.stack([along * nn - up * nt, sign * dot(world, across), up * tt - along * nt], -1)
+    lost = nn * tt - nt * nt <= 1e-9
+    if lost.any():
+        out[lost] = (0.0, 0.0, 1.0)
+    return unit(out)
 
 
 def decode_tangent_space(frames: np.ndarray, local: np.ndarray) -> np.ndarray:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from gdtool.geometry.normals import face_normals
-from gdtool.texture.raster import extend_owners, rasterize_uv
-from gdtool.texture.tangents import corner_tangents, edge_pairs, frame_at
+from gdtool.texture.raster import Barycentrics, centres_in, extend_owners, owners_of
+from gdtool.texture.tangents import corner_tangents, edge_pairs, frames_of
 
 CREASE_DEGREES = 45.0
+# Texels at a time: few enough that what is computed of them stays in the cache.
+TEXELS_AT_ONCE = 32_768
 
 
 def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float = CREASE_DEGREES) -> np.ndarray:
@@ -69,10 +74,15 @@ class Target:
         tangents = corner_tangents(vertices, faces, normals.reshape(-1, 3), uv, face_uvs, own)
         return cls(vertices, faces, uv, face_uvs, normals, tangents)
 
+    @cached_property
+    def packed(self) -> np.ndarray:
+        """(t, 3, 10) float32 of the corners: position, normal, tangent with its handedness. One gather reads all."""
+        return np.concatenate([self.vertices[self.faces], self.normals, self.tangents], -1).astype(np.float32)
+
 
 @dataclass(frozen=True)
 class Texels:
-    """The texels to bake: texel (n,) int64 row-major, face_idx (n,) int32, barycentric (n, 3) float32.
+    """The texels to bake: texel (n,) integers row-major, face_idx (n,) int32, barycentric (n, 3) float32.
 
     The first `inside` of them are owned by their triangle; the others lie just outside the charts, where the triangle
     would go on, for lookups between texel centres at a chart's border.
@@ -102,18 +112,42 @@ class Texels:
 
 def texels_of(target: Target, size: int, rings: int = 2) -> Texels:
     """Texels of a map of size x size that the target's charts cover, and `rings` of them around the charts."""
-    owner, barycentric = rasterize_uv(target.uv, target.face_uvs, size)
-    inside = np.flatnonzero(owner >= 0)
-    ring, ring_owner, ring_at = extend_owners(target.uv, target.face_uvs, owner, rings)
-    return Texels(size, np.concatenate([inside, ring]), np.concatenate([owner.ravel()[inside], ring_owner]),
-                  np.concatenate([barycentric.reshape(-1, 3)[inside], ring_at.astype(np.float32)]), len(inside))
+    barycentrics = Barycentrics(target.uv, target.face_uvs)
+    owner = owners_of(target.uv, target.face_uvs, size)
+    inside = np.flatnonzero(owner >= 0).astype(np.int32 if size <= 32768 else np.int64)
+    ring, ring_owner, ring_at = extend_owners(barycentrics, owner.reshape(size, size), rings)
+    face_idx = np.concatenate([owner[inside], ring_owner])
+    at = np.empty((len(face_idx), 3), np.float32)
+    at[:len(inside)] = centres_in(barycentrics, face_idx[:len(inside)], inside, size)
+    at[len(inside):] = ring_at
+    return Texels(size, np.concatenate([inside, ring.astype(inside.dtype)]), face_idx, at, len(inside))
+
+
+def mapped(run: Callable, parts: list, threads: int) -> Iterator:
+    """run(part) of each part, in order, on several threads."""
+    if threads <= 1:
+        yield from map(run, parts)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        yield from pool.map(run, parts)
+
+
+def surface_at(target: Target, face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Positions (n, 3), normals (n, 3), tangents (n, 3) and handedness (n,) at places on the target, float32.
+
+    Normals and tangents as viewers interpolate them, not normalised (see tangents.frames_of)."""
+    packed, weights = target.packed, barycentric.astype(np.float32, copy=False)
+    at = np.take(packed, face_idx, axis=0)
+    out = at[:, 0] * weights[:, :1]
+    for k in (1, 2):
+        out += at[:, k] * weights[:, k:k + 1]
+    return out[:, :3], out[:, 3:6], out[:, 6:9], at[:, 0, 9]
 
 
 def points_at(target: Target, face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions (n, 3) and tangent frames (n, 3, 3), columns tangent, bitangent, normal, at places on the target."""
-    weights = barycentric.astype(np.float64)
-    points = np.einsum("nk,nkc->nc", weights, target.vertices[target.faces[face_idx]])
-    return points, frame_at(target.normals[face_idx], target.tangents[face_idx], weights)
+    points, normal, tangent, sign = surface_at(target, face_idx, barycentric)
+    return points, frames_of(normal, tangent, sign)
 
 
 def texel_width(target: Target, size: int) -> float:

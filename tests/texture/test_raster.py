@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from gdtool.texture.raster import SUBTEXEL_BITS, barycentric_at, extend_owners, owner_count, rasterize_uv
+from gdtool.texture.raster import SUBTEXEL_BITS, Barycentrics, extend_owners, owner_count, rasterize_uv
 
 
 def grid(n: int, low: float, high: float, jitter: float = 0.0, seed: int = 0):
@@ -96,7 +96,7 @@ def test_tiny_triangles_own_nothing_and_nothing_breaks():
     uv = np.array([[0.5, 0.5], [0.5, 0.5], [0.5, 0.5], [0.3, 0.3], [0.7, 0.7]])
     faces = np.array([[0, 1, 2], [0, 3, 4]])
     assert (rasterize_uv(uv, faces, 64)[0] == -1).all()
-    assert np.isfinite(barycentric_at(uv, faces, np.array([0, 1]), np.array([[0.5, 0.5], [0.1, 0.2]]))).all()
+    assert np.isfinite(Barycentrics(uv, faces).at(np.array([0, 1]), np.array([0.5, 0.1]), np.array([0.5, 0.2]))).all()
     assert rasterize_uv(uv, np.empty((0, 3), int), 8)[0].max() == -1
 
 
@@ -112,7 +112,7 @@ def test_extended_owners_go_on_linearly():
     uv = np.array([[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     face_idx, _ = rasterize_uv(uv, faces, 32)
-    texel, owner, barycentric = extend_owners(uv, faces, face_idx, rings=2)
+    texel, owner, barycentric = extend_owners(Barycentrics(uv, faces), face_idx, rings=2)
     inside = face_idx >= 0
     ring = np.zeros(32 * 32, bool)
     ring[texel] = True

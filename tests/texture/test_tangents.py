@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gdtool.texture.tangents import corner_tangents, decode_tangent_space, encode_tangent_space, frame_at
+from gdtool.texture.tangents import corner_tangents, decode_tangent_space, encode_tangent_space, frames_of
 
 
 def plane(n=4, turned=0.0):
@@ -84,10 +84,13 @@ def test_encoding_decodes_to_the_same_normal_in_skewed_and_mirrored_frames():
     tangents = np.concatenate([rng.normal(size=(count, 3, 3)) * 0.2 + (1, 0, 0), np.ones((count, 3, 1))], -1)
     tangents[::2, :, 3] = -1
     weights = rng.dirichlet((1, 1, 1), count)
-    frames = frame_at(normals, tangents, weights)
+    normal, tangent = np.einsum("nk,nkc->nc", weights, normals), np.einsum("nk,nkc->nc", weights, tangents[..., :3])
+    sign = tangents[:, 0, 3]
+    frames = frames_of(normal, tangent, sign)
     world = rng.normal(size=(count, 3)) + (0, 0, 2.0)
     world /= np.linalg.norm(world, axis=1, keepdims=True)
-    local = encode_tangent_space(frames, world)
+    local = encode_tangent_space(normal, tangent, sign, world)
     np.testing.assert_allclose(decode_tangent_space(frames, local), world, atol=1e-9)
-    flat = encode_tangent_space(frames, frames[..., 2] / np.linalg.norm(frames[..., 2], axis=1, keepdims=True))
+    flat = encode_tangent_space(normal, tangent, sign, normal / np.linalg.norm(normal, axis=1, keepdims=True))
     np.testing.assert_allclose(flat, np.tile([0, 0, 1.0], (count, 1)), atol=1e-9)
+    np.testing.assert_array_equal(encode_tangent_space(normal[:1], normal[:1], sign[:1], world[:1]), [[0, 0, 1]])  # no frame at all
