@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 # Directions drawn once from the light; each point takes its own run of them.
 POOL = 1 << 16
-# Point-times-direction pairs shaded at once: few enough for the cache.
-PAIRS = 1 << 15
+# Point-times-direction pairs shaded at once: many enough that calls cost little beside them.
+PAIRS = 1 << 17
 # Sums of a point: of visible directions reflection, its part w, diffuse, its part w; of all directions the first three;
 # known without directions reflection, its part w, diffuse.
 SUMS = 10
@@ -124,14 +124,16 @@ class DirectLight:
         light_run, pattern_run = torch.from_numpy(runs[0]), torch.from_numpy(runs[1])
 
         def run_of(pool, run):
-            return pool.reshape(POOL // k, k, *pool.shape[1:])[run]
+            return pool.reshape(POOL // k, k, *pool.shape[1:]).index_select(0, run)
 
         x, y, z, p_light, light = (run_of(part, light_run) for part in self.pool)
         first = self._gather(points, part, surface, (x, y, z), light, p_light, k)
         direction = surface.sample(*(run_of(u, pattern_run) for u in self.pattern))
         pixel = self._pixel(*direction)
+        flat = pixel.reshape(-1)
         terms, p_reflect, above = evaluated = surface.evaluate(*direction)
-        second = self._gather(points, part, surface, direction, self.image[pixel], self.density[pixel], k, evaluated)
+        second = self._gather(points, part, surface, direction, self.image.index_select(0, flat).view(*pixel.shape, 3),
+                              self.density.index_select(0, flat).view_as(pixel), k, evaluated)
         result[:, :7] = first[0] + second[0]
         return first[1] + second[1], first[2] + second[2], first[3] + second[3]
 

@@ -83,6 +83,8 @@ class IrradianceMap:
     """∫ L max(0, n·l) dl of an environment for normals on a lat-long grid, read bilinearly."""
 
     def __init__(self, environment: Environment, height: int = 48):
+        import torch
+
         small = environment.shrunk(64)
         # The first and last row are the poles: half a row away from one, its own value would be 0.7 % off under a studio.
         theta = np.arange(height) / (height - 1) * np.pi
@@ -94,18 +96,18 @@ class IrradianceMap:
         # A few normals at a time: what lies between the two products stays in the cache.
         parts = [np.maximum(part @ toward, 0) @ weighted for part in np.array_split(normals.reshape(-1, 3).astype(np.float32), height)]
         self.values = np.concatenate(parts).reshape(height, 2 * height, 3)
+        # A column more on each side, from the other one.
+        self.wrapped = torch.from_numpy(np.concatenate([self.values[:, -1:], self.values, self.values[:, :1]], 1))
 
     def lookup(self, normals: np.ndarray) -> np.ndarray:
-        """(n, 3) from unit normals (n, 3)."""
+        """(n, 3) from unit normals (n, 3), arrays."""
+        import torch
+
         height, width = self.values.shape[:2]
-        y = np.clip(np.arccos(np.clip(normals[:, 1], -1, 1)) * np.float32((height - 1) / np.pi), 0, height - 1)
-        x = (np.arctan2(normals[:, 2], normals[:, 0]) * np.float32(0.5 / np.pi) + np.float32(0.5)) * width - 0.5
-        y0, x0 = np.minimum(y.astype(np.int64), height - 2), np.floor(x).astype(np.int64)
-        fy, fx = (y - y0)[:, None], (x - x0)[:, None]
-        left, right = x0 % width, (x0 + 1) % width
-        upper = self.values[y0, left] * (1 - fx) + self.values[y0, right] * fx
-        lower = self.values[y0 + 1, left] * (1 - fx) + self.values[y0 + 1, right] * fx
-        return (upper * (1 - fy) + lower * fy).astype(np.float32)
+        nx, ny, nz = torch.as_tensor(np.ascontiguousarray(normals), dtype=torch.float32).unbind(1)
+        y = torch.acos(ny.clamp(-1, 1)) * ((height - 1) / math.pi)
+        x = (torch.atan2(nz, nx) * (0.5 / math.pi) + 0.5) * width + 0.5
+        return _bilinear(self.wrapped, y, x).numpy()
 
 
 class Prefiltered:

@@ -7,7 +7,7 @@ import threading
 import numpy as np
 
 from gdtool.assets.scene import Texture
-from gdtool.images.color import linear_from_srgb, unit_range
+from gdtool.images.color import linear_from_srgb
 
 # Rows decoded at a time when the first level is built: bounds the memory of a 4k texture.
 BAND = 256
@@ -53,9 +53,9 @@ class TextureReader:
         self.colored = [t.encoding == "srgb" for t in textures]
         self.levels: list[np.ndarray] = [np.ascontiguousarray(images[0] if len(images) == 1 else np.concatenate(images, 2))]
         dtype = images[0].dtype
-        values = np.arange(256 if dtype == np.uint8 else 65536 if dtype == np.uint16 else 0)
-        self._linear = unit_range(values.astype(dtype)).astype(np.float32) if len(values) else None
-        self._table = linear_from_srgb(values.astype(dtype)).astype(np.float32) if len(values) and any(self.colored) else self._linear
+        top = {"u1": 255, "u2": 65535}.get(dtype.str[1:])
+        self._unit = np.float32(1.0 if top is None else 1.0 / top)
+        self._table = None if top is None else linear_from_srgb(np.arange(top + 1, dtype=dtype)).astype(np.float32)
         self._lock = threading.Lock()
 
     @property
@@ -70,13 +70,28 @@ class TextureReader:
 
     def decode(self, texels: np.ndarray) -> np.ndarray:
         """Stored texels (..., c) of the finest level to linear float32; alpha is never sRGB."""
-        out = np.array(texels, np.float32) if self._linear is None else np.take(self._linear, texels)
-        for part, colored in zip(self.parts, self.colored, strict=True):
+        out = np.empty(texels.shape, np.float32)
+        for channels, colored in self._channels():
             if colored:
-                count = part.stop - part.start
-                colors = slice(part.start, part.stop if count in (1, 3) else part.stop - 1)
-                out[..., colors] = linear_from_srgb(out[..., colors]) if self._linear is None else np.take(self._table, texels[..., colors])
+                values = texels[..., channels]
+                out[..., channels] = linear_from_srgb(values) if self._table is None else np.take(self._table, values)
+            else:
+                np.multiply(texels[..., channels], self._unit, out=out[..., channels], dtype=np.float32, casting="same_kind")
         return out
+
+    def _channels(self) -> list[tuple[slice, bool]]:
+        """Runs of channels that are all sRGB, or all not."""
+        runs: list[tuple[slice, bool]] = []
+        for part, colored in zip(self.parts, self.colored, strict=True):
+            last = part.stop if part.stop - part.start in (1, 3) else part.stop - 1
+            for run, srgb in ((slice(part.start, last), colored), (slice(last, part.stop), False)):
+                if run.start == run.stop:
+                    continue
+                if runs and runs[-1][1] == srgb:
+                    runs[-1] = (slice(runs[-1][0].start, run.stop), srgb)
+                else:
+                    runs.append((run, srgb))
+        return runs
 
     def level(self, k: int) -> np.ndarray:
         """(h / 2^k, w / 2^k, c): level 0 as stored, the others linear float32."""
@@ -89,10 +104,17 @@ class TextureReader:
             height, width, channels = finer.shape
             coarse = np.empty((height // 2, width // 2, channels), np.float32)
             for row in range(0, height, BAND):
-                band = finer[row:row + BAND]
-                band = self.decode(band) if len(self.levels) == 1 else band
-                pairs = band[0::2] + band[1::2]
-                coarse[row // 2:row // 2 + len(pairs)] = (pairs[:, 0::2] + pairs[:, 1::2]) * np.float32(0.25)
+                band, out = finer[row:row + BAND], coarse[row // 2:(row + BAND) // 2]
+                for channels, colored in self._channels() if len(self.levels) == 1 else [(slice(None), False)]:
+                    values = band[..., channels]
+                    if colored:
+                        values = linear_from_srgb(values).astype(np.float32) if self._table is None else np.take(self._table, values)
+                        pairs, unit = values[0::2] + values[1::2], np.float32(0.25)
+                    else:
+                        # Sums of four stay exact as they are stored: decoding is left for the quarter.
+                        pairs = np.add(values[0::2], values[1::2], dtype=np.uint32 if values.dtype == np.uint16 else np.uint16 if values.dtype == np.uint8 else np.float32)
+                        unit = np.float32(0.25) * (self._unit if len(self.levels) == 1 else np.float32(1))
+                    np.multiply(pairs[:, 0::2] + pairs[:, 1::2], unit, out=out[..., channels], casting="same_kind", dtype=np.float32)
             self.levels.append(coarse)
         return self.levels[k]
 

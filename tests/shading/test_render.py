@@ -10,7 +10,7 @@ import pytest
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.cameras import camera_at, rays, rig
 from gdtool.shading.environment import Environment
-from gdtool.shading.render import Renderer, render_buffers, render_color
+from gdtool.shading.render import Renderer, pixel_pattern, render_buffers, render_color
 from gdtool.shading.surface_points import surface_attributes
 
 GREY = Material(base_color=(0.5, 0.25, 0.125, 1.0), metallic=0.0, roughness=0.5)
@@ -67,6 +67,23 @@ def test_coverage_of_a_quad_that_cuts_pixels():
     row = out["mask"][32]
     assert row[21] == pytest.approx(0.25, abs=0.05) and row[42] == pytest.approx(0.25, abs=0.05)
     assert (row[22:42] == 1).all() and not row[:21].any() and not row[43:].any()
+
+
+def test_every_pass_of_a_pixels_samples_tells_something_new():
+    """Coverage by half planes: the error falls faster than the root of their number, and no sample lies on another."""
+    rng = np.random.default_rng(0)
+    angle, offset = rng.random(400) * 2 * np.pi, rng.uniform(-0.5, 0.5, 400)
+    grid = np.stack(np.meshgrid(*[(np.arange(200) + 0.5) / 200] * 2), -1).reshape(-1, 2)
+
+    def covered(points):
+        return ((points - 0.5) @ np.stack([np.cos(angle), np.sin(angle)]) < offset).mean(0)
+
+    pattern, truth = pixel_pattern(64), covered(grid)
+    assert len(np.unique(pattern, axis=0)) == 64 and pattern.min() >= 0 and pattern.max() < 1
+    for count in (4, 8, 16, 32, 64):
+        assert np.allclose(pattern[:count].mean(0), 0.5, atol=1e-3)
+        error = np.sqrt(((covered(pattern[:count]) - truth) ** 2).mean())
+        assert error < 0.12 * (4 / count) ** 0.72
 
 
 def four_colors() -> Texture:
