@@ -1,49 +1,41 @@
-"""Time and error of baking at several map sizes, on a torus whose material and normals are known in closed form.
+"""Time and memory against error of bake, beside Blender's Cycles in the same run, on the peers' bake case and public models.
 
-  python benchmarks/bake.py [--sizes 512,1024,2048] [--threads 2]
+    python benchmarks/bake.py [MODEL_OR_FOLDER ...] [--peers-python PATH] [-o docs/benchmarks] [--minutes 10] [--sizes 1024,2048,4096]
 
-Seconds are wall clock and, beside it, of the processor: on a busy machine only the second can be compared. Errors are
-against the true material at the nearest point of the torus, before the maps are quantised; occlusion has no closed form
-and is compared with 1024 rays per texel on a sample of texels.
+Writes bake.md, bake.json and bake.png (the maps side by side) after every row. Models without a texture or with several
+are taken like others; those that cannot be remeshed are named. The sizes are swept on the peers' case, the others have
+2048². Errors: benchmarks/bake_score.py. --peers-python is a Python that has bpy; without it Blender is left out. What does
+not start within --minutes is named, not run; the quad meshes are made before the clock starts, and kept.
 """
 
 from __future__ import annotations
 
 import argparse
-import resource
+import json
+import os
+import subprocess
+import tempfile
 import time
+from pathlib import Path
 
 import numpy as np
+from bake_cases import Case, case_of, read_low
+from bake_score import Truth, scored
+from fine_meshes import models_in
+from measure import busy, machine, number, say, table
 
-MAJOR, MINOR = 0.35, 0.14
-
-
-def torus(around: int, across: int, minor: float = MINOR):
-    """vertices (v, 3), triangles (f, 3), normals (v, 3)."""
-    a, b = np.meshgrid(np.arange(around) * 2 * np.pi / around, np.arange(across) * 2 * np.pi / across, indexing="ij")
-    normals = np.stack([np.cos(b) * np.sin(a), np.sin(b), np.cos(b) * np.cos(a)], -1).reshape(-1, 3)
-    centre = MAJOR * np.stack([np.sin(a), 0 * a, np.cos(a)], -1).reshape(-1, 3)
-    idx = np.arange(around * across).reshape(around, across)
-    quads = np.stack([idx, np.roll(idx, -1, 0), np.roll(np.roll(idx, -1, 0), -1, 1), np.roll(idx, -1, 1)], -1).reshape(-1, 4)
-    return centre + minor * normals, np.stack([quads[:, :3], quads[:, [0, 2, 3]]], 1).reshape(-1, 3), normals
+PEER = Path(__file__).with_name("bake_blender.py")
+COLUMNS = ("model", "way", "size", "bake s", "bake cpu", "occlusion s", "png s", "peak MB", "albedo dB", "roughness dB", "metallic dB", "normal deg", "missed",
+           "8-bit albedo dB", "8-bit roughness dB", "8-bit normal deg", "seam albedo", "seam roughness", "unfilled", "occlusion rms")
 
 
-def true_place(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest points of the torus (n, 3) and its normals there (n, 3)."""
-    ring = points * (1, 0, 1)
-    ring = MAJOR * ring / np.linalg.norm(ring, axis=1, keepdims=True)
-    normals = (points - ring) / np.linalg.norm(points - ring, axis=1, keepdims=True)
-    return ring + MINOR * normals, normals
-
-
-def albedo_of(points: np.ndarray) -> np.ndarray:
-    """(n, 3) linear in [0.05, 0.95]."""
-    x, y, z = points.T
-    return np.stack([0.5 + 0.4 * np.sin(29 * x + 2 * y), 0.5 + 0.4 * np.sin(28 * z - 3 * x), 0.45 + 0.35 * np.cos(31 * y + 4 * z)], -1)
+def peak_mb() -> float:
+    """The largest this process has been."""
+    return next(int(line.split()[1]) / 1024 for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
 
 
 class Clock:
-    """Seconds since the last question: wall clock, and of the processor."""
+    """Seconds since the last question: of the wall, and of the processor."""
 
     def __init__(self):
         self.wall, self.processor = time.perf_counter(), time.process_time()
@@ -54,59 +46,163 @@ class Clock:
         return self.wall - before[0], self.processor - before[1]
 
 
-def measure(size: int, threads: int) -> dict[str, float]:
-    """One row of the table."""
-    import xatlas
-
-    from gdtool.texture.bake import bake, occlusion_tracer, vertex_lookup
+def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
+    """In a child: bake as the stage does, steps timed; the maps before they are stored go to out (.npz)."""
+    from gdtool.assets.load import load_scene
+    from gdtool.images.io import encode_pngs
+    from gdtool.stages.bake import target_of
+    from gdtool.texture.bake import bake, occlusion_tracer
     from gdtool.texture.maps import make_maps
     from gdtool.texture.occlusion import bake_occlusion
-    from gdtool.texture.reproject import Source, vertex_reach
-    from gdtool.texture.target import Target, texels_of
+    from gdtool.texture.origin import from_scene
+    from gdtool.texture.reproject import vertex_reach
+    from gdtool.texture.target import texel_width, texels_of
 
-    fine, fine_faces, fine_normals = torus(700, 360)
-    coarse, faces, _ = torus(142, 71, minor=MINOR + 0.0004)  # 20,000 triangles, a little off the surface
-    _, face_uvs, uv = xatlas.parametrize(coarse.astype(np.float32), faces.astype(np.uint32))
-    uv, face_uvs = np.asarray(uv, np.float64) * (1, -1) + (0, 1), face_uvs.astype(np.int64)
-    clock = Clock()
-    target = Target.of(coarse, faces, uv, face_uvs)
+    threads = len(os.sched_getaffinity(0))
+    scene, mesh = load_scene(case.glb), read_low(case)
+    target = target_of(mesh)[0]
+    origin = from_scene(scene, np.eye(4), texel_width(target, size))
+    cost, clock = {}, Clock()
     texels = texels_of(target, size)
-    source = Source(fine, fine_faces)
-    reach = vertex_reach(coarse, faces, source)
-    prepared = clock()
-    attributes = {"albedo": albedo_of(fine), "roughness": 0.5 + 0.3 * np.sin(20 * fine[:, 0]), "metallic": (fine[:, 1] > 0) * 1.0}
-    baked = bake(target, texels, source, vertex_lookup(source, attributes, fine_normals), reach, threads=threads)
-    read = clock()
-    trace = occlusion_tracer(target, source, reach, fine_normals, 64, 0, threads)
-    occlusion = bake_occlusion(target, texels, baked.positions, baked.normals, trace)
-    shadowed = clock()
-    make_maps(texels, baked.values, occlusion=occlusion, normal_map="on")
-    filled = clock()
+    reach = vertex_reach(target.vertices, target.faces, origin.source)
+    baked = bake(target, texels, origin.source, origin.lookup, reach, threads=threads)
+    wall, processor = clock()
+    kept = {name: texels.image(baked.values[name]) for name in ("albedo", "roughness", "metallic", "tangent_normal")} if out else {}
+    traced, trace = None, None
+    clock()
+    if occlusion:
+        trace = occlusion_tracer(target, origin.source, reach, origin.normals, 64, 0, threads)
+        traced = bake_occlusion(target, texels, trace, threads=threads)
+        cost["occlusion s"], cost["occlusion cpu"] = clock()
+    maps = make_maps(texels, baked.values, occlusion=traced, normal_map="on", threads=threads)
+    more = clock()
+    cost |= {"bake s": wall + more[0], "bake cpu": processor + more[1]}
+    images = [image for image in (maps.base_color, maps.orm, maps.normal) if image is not None]
+    encode_pngs(images, threads=threads)
+    cost["png s"], cost["png cpu"] = clock()
+    cost["peak MB"] = peak_mb()
+    cost["unfilled"] = int(sum((~np.isfinite(v)).reshape(len(texels), -1).any(1)[:texels.inside].sum() for v in baked.values.values()))
+    if occlusion:
+        some = np.random.default_rng(0).integers(0, texels.inside, 2000)
+        many = occlusion_tracer(target, origin.source, reach, origin.normals, 1024, 9, threads)(texels.face_idx[some], texels.barycentric[some])
+        cost["occlusion rms"] = float(np.sqrt(np.mean((traced[some] - many) ** 2)))
+    if out:
+        np.savez(out, **{name: image for name, image in kept.items() if name != "tangent_normal"}, normal=kept["tangent_normal"] * 0.5 + 0.5)
+    return cost
 
-    from gdtool.texture.tangents import decode_tangent_space
-    from gdtool.texture.target import points_at
 
-    inside = slice(0, texels.inside)
-    at, normals = true_place(baked.positions[inside].astype(np.float64))
-    some = np.random.default_rng(0).integers(0, texels.inside, 20_000)
-    decoded = decode_tangent_space(points_at(target, texels.face_idx[some], texels.barycentric[some])[1], baked.values["tangent_normal"][some])
-    angle = np.degrees(np.arccos(np.clip((decoded * normals[some]).sum(1), -1, 1)))
-    many = occlusion_tracer(target, source, reach, fine_normals, 1024, 9, threads)(texels.face_idx[some[:2000]], texels.barycentric[some[:2000]])
-    error = lambda a, b: -10 * np.log10(np.mean((a - b) ** 2))  # noqa: E731
-    return {"size": size, "prepare s": prepared[0], "bake s": read[0], "bake cpu s": read[1], "occlusion s": shadowed[0],
-            "occlusion cpu s": shadowed[1], "maps s": filled[0], "maps cpu s": filled[1],
-            "albedo dB": error(baked.values["albedo"][inside], albedo_of(at)),
-            "roughness dB": error(baked.values["roughness"][inside], 0.5 + 0.3 * np.sin(20 * at[:, 0])), "normal deg": float(angle.mean()),
-            "occlusion rms": float(np.sqrt(np.mean((occlusion[some[:2000]] - many) ** 2))),
-            "peak MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
+def blender(python: Path, case: Case, size: int, samples: int, occlusion: int, out: Path, limit: float) -> dict[str, float]:
+    """Cost of Blender's bake; its maps go to out (.npz). Raises RuntimeError."""
+    from gdtool.folders.mesh import triangulated
+    from gdtool.stages.bake import target_of
+
+    mesh = read_low(case)
+    target, low = target_of(mesh)[0], out.with_name("low.npz")
+    np.savez(low, vertices=mesh.vertices, triangles=triangulated(mesh.faces)[0], uv=target.uv[target.face_uvs] * (1, -1) + (0, 1))
+    done = subprocess.run([python, PEER, case.glb, low, out, "--size", str(size), "--samples", str(samples), "--occlusion", str(occlusion)],
+                          capture_output=True, text=True, timeout=limit, check=False)
+    said = [line for line in done.stdout.splitlines() if line.startswith("cost ")]
+    if done.returncode or not said:
+        raise RuntimeError((done.stderr.strip().splitlines() or ["no message"])[-1])
+    found = json.loads(said[0][5:])
+    shadow = found["seconds"].pop("occlusion", (None, None))
+    return {"bake s": sum(w for w, _ in found["seconds"].values()), "bake cpu": sum(c for _, c in found["seconds"].values()),
+            "occlusion s": shadow[0], "peak MB": found["peak_mb"]}
+
+
+def small(image: np.ndarray, width: int = 256) -> np.ndarray:
+    """(h, w, 3) of a map at about the width, as a screen shows it."""
+    step = max(1, image.shape[0] // width)
+    image = image[: width * step, : width * step].reshape(width, step, width, step, -1).mean((1, 3))
+    return np.broadcast_to(image, (width, width, 3))
+
+
+def shown(maps: dict[str, np.ndarray]) -> list[np.ndarray]:
+    """Base color, roughness and normal of a bake, small."""
+    from gdtool.images.color import srgb_from_linear
+
+    return [small(srgb_from_linear(np.clip(maps["albedo"], 0, 1))), small(maps["roughness"]), small(maps["normal"])]
+
+
+def write(out: Path, rows: list[dict], sheet: list, names: list[str], note: str) -> None:
+    """The reports of what there is so far."""
+    from gdtool.images.contact import contact_sheet
+    from gdtool.images.io import write_png
+
+    out.mkdir(parents=True, exist_ok=True)
+    text = table(COLUMNS, ([number(row.get(name, "failed" if name == "size" and "failed" in row else None), 4) for name in COLUMNS] for row in rows))
+    failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows if "failed" in row)
+    head = f"# Bake\n\n`python benchmarks/bake.py`, {machine()}. {note}\n\nbake: rasterising, reading, gutters and storing; seconds of the wall and of the " \
+        "processor. Errors before storing, and after 8 bits. seam: difference across seams over the difference across other edges.\n\n"
+    (out / "bake.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![maps](bake.png)\n")
+    (out / "bake.json").write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")
+    if sheet:
+        kinds = ["base color", "roughness", "normal"]
+        write_png(out / "bake.png", contact_sheet(sheet, labels_top=kinds + ([f"{kind}, Blender" for kind in kinds] if len(sheet[0]) > 3 else []),
+                                                  labels_left=names))
+
+
+def main() -> None:
+    from gdtool.core.child import ChildFailed, call
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("models", nargs="*", type=Path)
+    parser.add_argument("-o", "--out", type=Path, default=Path("docs/benchmarks"))
+    parser.add_argument("--peers-python", type=Path)
+    parser.add_argument("--sizes", default="1024,2048,4096", help="of the peers' case")
+    parser.add_argument("--samples", default="1,16", help="Blender's, on the peers' case")
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--limit", type=int, default=12, help="models at most")
+    parser.add_argument("--kept", type=Path, default=Path("out/bench_meshes"))
+    asked = parser.parse_args()
+    os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # the children import this file
+    note, rows, sheet, names, cases = busy(), [], [], [], []
+    for source in ["part", *models_in(asked.models)]:
+        if len(cases) > asked.limit:
+            break
+        try:
+            say(f"{source}: quad mesh")
+            cases.append(case_of(source, asked.kept))
+        except Exception as failure:  # a model that cannot be prepared is a row of the table, not the end of it
+            rows.append({"model": str(getattr(source, "name", source)), "way": "prepare", "failed": str(failure)})
+    end = time.monotonic() + 60 * asked.minutes
+    for case in cases:
+        part = case.name == "part"
+        runs = [("ours", int(size), 0) for size in (asked.sizes.split(",") if part else ["2048"])]
+        if asked.peers_python:
+            runs += [("Blender", 2048, int(samples)) for samples in (asked.samples.split(",") if part else ["1"])]
+        truth, pictures = Truth(case), {}
+        for way, size, samples in runs:
+            row = {"model": case.name, "way": way + (f", {samples} samples" if samples else ""), "size": size}
+            rows.append(row)
+            if time.monotonic() > end:
+                row["failed"] = f"not started within {asked.minutes:g} minutes"
+                continue
+            say(f"{case.name}: {row['way']} at {size}")
+            with tempfile.TemporaryDirectory() as folder:
+                at = Path(folder, "maps.npz")
+                try:
+                    # Cost is taken without the maps kept for scoring, which need memory of their own.
+                    if way == "ours":
+                        row |= call("bake:ours", case, size, True, "", seconds=200, memory_mb=12000)
+                        call("bake:ours", case, size, False, str(at), seconds=200, memory_mb=12000)
+                    else:
+                        row |= blender(asked.peers_python, case, size, samples, 0, at, 200)
+                    with np.load(at) as found:
+                        maps = dict(found)
+                    corners = {name: maps.pop(name) for name in list(maps) if name.startswith("corner_")}
+                    row |= scored(truth, maps, corners or None)
+                    if size == 2048:
+                        pictures.setdefault(way, shown(maps))
+                except (ChildFailed, RuntimeError, subprocess.TimeoutExpired) as failure:
+                    row["failed"] = str(failure)
+            write(asked.out, rows, [*sheet, sum(pictures.values(), [])] if pictures else sheet, [*names, case.name], note)
+        if pictures:
+            sheet.append(sum(pictures.values(), []) + [None] * (3 * (1 + bool(asked.peers_python)) - 3 * len(pictures)))
+            names.append(case.name)
+    write(asked.out, rows, sheet, names, note)
+    print((asked.out / "bake.md").read_text())
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", default="512,1024,2048")
-    parser.add_argument("--threads", type=int, default=2)
-    asked = parser.parse_args()
-    for number, row in enumerate(measure(int(size), asked.threads) for size in asked.sizes.split(",")):
-        if not number:
-            print("| " + " | ".join(row) + " |\n|" + "---|" * len(row))
-        print("| " + " | ".join(f"{value:g}" if name == "size" else f"{value:.3g}" for name, value in row.items()) + " |", flush=True)
+    main()

@@ -54,7 +54,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         mesh, matrix = _read_mesh(inputs, options)
         _check_memory(inputs, options.size)
     with out.step("frames"):
-        target, face_idx = _target_of(mesh)
+        target, face_idx = target_of(mesh)
         _check_overlap(target, inputs, out)
     with out.step("source"):
         origin = _read_origin(inputs, options, matrix, texel_width(target, options.size), out)
@@ -181,7 +181,7 @@ def _read_origin(inputs: Inputs, options: Options, matrix, width: float, out: Ou
     return from_scene(load_scene(named), matrix, width)
 
 
-def _target_of(mesh):
+def target_of(mesh):
     """The triangles to bake into, and the quad (t,) each comes from."""
     import numpy as np
 
