@@ -42,7 +42,7 @@ def same_layout(texture: Texture) -> tuple:
 class TextureReader:
     """Texels of textures of one layout, side by side as linear float32: channels of the first, then of the next.
 
-    The finest level is as stored, coarser ones are 2x2 box averages made when asked. Threads may read at once.
+    The finest level is as stored, coarser ones are box averages of about 2x2, made when asked. Threads may read at once.
     """
 
     def __init__(self, *textures: Texture):
@@ -64,9 +64,8 @@ class TextureReader:
 
     @property
     def depth(self) -> int:
-        """How many levels there can be: halving stops at the first odd side."""
-        height, width = self.levels[0].shape[:2]
-        return 1 + min((height & -height).bit_length() - 1, (width & -width).bit_length() - 1)
+        """How many levels there can be, down to one texel."""
+        return max(self.levels[0].shape[:2]).bit_length()
 
     def decode(self, texels: np.ndarray) -> np.ndarray:
         """Stored texels (..., c) of the finest level to linear float32; alpha is never sRGB."""
@@ -94,40 +93,54 @@ class TextureReader:
         return runs
 
     def level(self, k: int) -> np.ndarray:
-        """(h / 2^k, w / 2^k, c): level 0 as stored, the others linear float32."""
+        """(h // 2^k, w // 2^k, c), at least 1: level 0 as stored, the others linear float32."""
         with self._lock:
             return self._made(k)
 
     def _made(self, k: int) -> np.ndarray:
         while len(self.levels) <= k:
-            finer = self.levels[-1]
+            finer, first = self.levels[-1], len(self.levels) == 1
             height, width, channels = finer.shape
-            coarse = np.empty((height // 2, width // 2, channels), np.float32)
-            for row in range(0, height, BAND):
-                band, out = finer[row:row + BAND], coarse[row // 2:(row + BAND) // 2]
-                for channels, colored in self._channels() if len(self.levels) == 1 else [(slice(None), False)]:
-                    values = band[..., channels]
-                    if colored:
-                        values = linear_from_srgb(values).astype(np.float32) if self._table is None else np.take(self._table, values)
-                        pairs, unit = values[0::2] + values[1::2], np.float32(0.25)
-                    else:
-                        # Sums of four stay exact as they are stored: decoding is left for the quarter.
-                        pairs = np.add(values[0::2], values[1::2], dtype=np.uint32 if values.dtype == np.uint16 else np.uint16 if values.dtype == np.uint8 else np.float32)
-                        unit = np.float32(0.25) * (self._unit if len(self.levels) == 1 else np.float32(1))
-                    np.multiply(pairs[:, 0::2] + pairs[:, 1::2], unit, out=out[..., channels], casting="same_kind", dtype=np.float32)
+            coarse = np.empty((max(height // 2, 1), max(width // 2, 1), channels), np.float32)
+            halved = self._halved_even if height % 2 == width % 2 == 0 else self._halved_odd
+            for row in range(0, len(coarse), BAND // 2):
+                halved(finer, coarse[row:row + BAND // 2], row, first)
             self.levels.append(coarse)
         return self.levels[k]
+
+    def _halved_even(self, finer: np.ndarray, out: np.ndarray, row: int, first: bool) -> None:
+        """Means of 2x2 texels into out, rows of the coarser level from row on. first: finer is as stored."""
+        band = finer[2 * row:2 * (row + len(out))]
+        for channels, colored in self._channels() if first else [(slice(None), False)]:
+            values = band[..., channels]
+            if colored:
+                values = linear_from_srgb(values).astype(np.float32) if self._table is None else np.take(self._table, values)
+                pairs, unit = values[0::2] + values[1::2], np.float32(0.25)
+            else:
+                # Sums of four stay exact as they are stored: decoding is left for the quarter.
+                pairs = np.add(values[0::2], values[1::2], dtype=np.uint32 if values.dtype == np.uint16 else np.uint16 if values.dtype == np.uint8 else np.float32)
+                unit = np.float32(0.25) * (self._unit if first else np.float32(1))
+            np.multiply(pairs[:, 0::2] + pairs[:, 1::2], unit, out=out[..., channels], casting="same_kind", dtype=np.float32)
+
+    def _halved_odd(self, finer: np.ndarray, out: np.ndarray, row: int, first: bool) -> None:
+        """The same where a side is odd: a coarser texel is wider than two, and takes its share of a third."""
+        rows, columns = _shares(finer.shape[0])[:, row:row + len(out)], _shares(finer.shape[1])
+        band = finer[2 * row:2 * (row + len(out)) + 1]
+        band = self.decode(band) if first else band
+        across = sum(share[:, None] * band[:, tap::2][:, :len(share)] for tap, share in enumerate(columns))
+        out[...] = sum(share[:, None, None] * across[tap::2][:len(share)] for tap, share in enumerate(rows))
 
     def read(self, uv: np.ndarray, texels_per_sample: np.ndarray | None = None) -> np.ndarray:
         """(n, c) linear float32 at uv (n, 2), texture transform included.
 
         texels_per_sample (n,): width of what a sample stands for, in texels of the finest level; the nearest level at
-        least as sharp as that is read, so supersampling converges to the finest level's box average.
+        least as sharp as that is read, so supersampling converges to the finest level's box average. NaN counts as 0.
         """
         uv = transform_uv(self.texture, np.nan_to_num(np.asarray(uv, np.float64), posinf=0.0, neginf=0.0))
         if texels_per_sample is None or self.depth == 1 or self.texture.filter == "nearest":
             return self._read_level(uv, 0)
-        wanted = np.clip(np.floor(np.log2(np.maximum(texels_per_sample, 1.0)) + 0.25).astype(np.int64), 0, self.depth - 1)
+        # fmax passes over NaN; the clip comes first, since infinity is no integer.
+        wanted = np.clip(np.floor(np.log2(np.fmax(texels_per_sample, 1.0)) + 0.25), 0, self.depth - 1).astype(np.int64)
         low, high = int(wanted.min(initial=0)), int(wanted.max(initial=0))
         if low == high:
             return self._read_level(uv, low)
@@ -163,6 +176,17 @@ class TextureReader:
     def _texels(self, flat: np.ndarray, index: np.ndarray, k: int) -> np.ndarray:
         texels = np.take(flat, index, axis=0)
         return self.decode(texels) if k == 0 else texels
+
+
+def _shares(size: int) -> np.ndarray:
+    """(taps, max(size // 2, 1)) float32: how much of a coarser texel i the finer ones 2i, 2i + 1, … are, by area."""
+    half = size // 2
+    if half == 0:
+        return np.ones((1, 1), np.float32)
+    if size % 2 == 0:
+        return np.full((2, half), 0.5, np.float32)
+    i = np.arange(half)
+    return (np.stack([half - i, np.full(half, half), i + 1]) / size).astype(np.float32)
 
 
 def _between(a: np.ndarray, b: np.ndarray, fraction: np.ndarray) -> np.ndarray:

@@ -54,11 +54,13 @@ MATERIALS = {"plaster": Material(base_color=(0.7, 0.5, 0.3, 1), metallic=0.0, ro
 @pytest.mark.parametrize("brdf", ["gltf", "paper"])
 @pytest.mark.parametrize("material", MATERIALS)
 @pytest.mark.parametrize("light", ["mid", "bright"])
-def test_sampled_light_agrees_with_the_converged(material, light, brdf):
+@pytest.mark.parametrize("known", [False, True], ids=["plain", "known irradiance"])
+def test_sampled_light_agrees_with_the_converged(material, light, brdf, known):
+    """Both estimates: the plain one, and the one that is used, with the unshadowed irradiance as a control variate."""
     renderer, environment = Renderer(stage(MATERIALS[material]), 1), bundled(light).shrunk(64)
     reference = [picture(renderer, environment, 1000 + k, 1024, brdf, known=False) for k in range(4)]
     error = np.std(reference, 0, ddof=1) / 2
-    draws = np.stack([picture(renderer, environment, seed, 16, brdf, known=False) for seed in range(DRAWS)])
+    draws = np.stack([picture(renderer, environment, seed, 16, brdf, known=known) for seed in range(DRAWS)])
     assert z_test(draws, np.mean(reference, 0), error) > SIGNIFICANCE
 
 

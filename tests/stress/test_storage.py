@@ -31,11 +31,37 @@ def test_texture_levels():
     top = reader.depth - 1
     reader.level(top)
     reader.levels = [np.full_like(reader.levels[0], 0), *(np.full_like(x, k) for k, x in enumerate(reader.levels) if k)]
-    widths = np.concatenate([[0.0, 1e-30, math.nan], np.geomspace(0.1, 1e9, 4001)])
+    widths = np.concatenate([[0.0, 1e-30, math.nan, math.inf], np.geomspace(0.1, 1e9, 4001)])
     got = reader.read(np.full((len(widths), 2), 0.5), widths)[:, 0]
-    wanted = np.array([0.0, 0, 0, *(float(mpmath.log(w, 2)) + 0.25 for w in widths[3:])])
+    wanted = np.array([0.0, 0, 0, 1e9, *(float(mpmath.log(w, 2)) + 0.25 for w in widths[4:])])
     low, high = (np.clip(np.floor(wanted + d), 0, top) for d in (-0.01, 0.01))
     assert ((got == low) | (got == high)).all()
+
+
+@pytest.mark.parametrize("encoding", ["linear", "srgb"])
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (3, 3), (5, 8), (7, 1), (13, 6), (255, 257), (640, 2)])
+def test_levels_of_any_size_are_means_by_area(size, encoding):
+    """Each level against the one before, averaged by exact areas in float64; so the last is the mean of the whole."""
+    image = np.random.default_rng(0).integers(0, 256, (*size, 4), np.uint8)
+    reader = TextureReader(Texture(image, encoding))
+    finer = reader.decode(image).astype(np.float64)
+    mean = finer.mean((0, 1))
+    for k in range(1, reader.depth):
+        height, width = (max(n // 2, 1) for n in finer.shape[:2])
+        wanted = by_area(by_area(finer, height).swapaxes(0, 1), width).swapaxes(0, 1)
+        got = reader.level(k)
+        assert got.shape == (height, width, 4)
+        np.testing.assert_allclose(got, wanted, atol=2e-7)
+        finer = got.astype(np.float64)
+    np.testing.assert_allclose(finer.reshape(-1, 4), mean[None], atol=1e-6)
+
+
+def by_area(values: np.ndarray, count: int) -> np.ndarray:
+    """(count, ...) means of `values` (n, ...) over equal parts of its rows, rows cut where the parts' borders are."""
+    borders = np.arange(count + 1)[:, None] * (len(values) / count)
+    row = np.arange(len(values))
+    covered = np.clip(np.minimum(borders[1:], row + 1) - np.maximum(borders[:-1], row), 0, None)
+    return np.tensordot(covered * (count / len(values)), values, 1)
 
 
 @pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
