@@ -61,7 +61,7 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     threads = len(os.sched_getaffinity(0))
     scene, mesh = load_scene(case.glb), read_low(case)
     target = target_of(mesh)[0]
-    origin = from_scene(scene, np.eye(4), texel_width(target, size))
+    origin = from_scene(scene, np.eye(4), lambda detail: texel_width(target, size))
     cost, clock = {}, Clock()
     texels = texels_of(target, size)
     reach = vertex_reach(target.vertices, target.faces, origin.source)

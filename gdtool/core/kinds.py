@@ -110,6 +110,7 @@ class AssetContent(Content, frozen=True, kw_only=True):
     maps: Annotated[dict[str, str], Meta(description="map name to file; a map that is constant is a factor instead")]
     factors: Annotated[dict[str, tuple[float, ...]], Meta(description="factors written to the material, linear")]
     usd: Annotated[str, Meta(description="the OpenUSD file, if one was asked for")] = ""
+    lods: Annotated[tuple[str, ...], Meta(description="coarser levels on the same maps, finest first, if they were asked for")] = ()
     normal_convention: Literal["opengl", "directx"] = "opengl"
     frame: Annotated[Literal["normalised", "source"], Meta(description="frame that the vertices are in")] = "normalised"
 

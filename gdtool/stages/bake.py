@@ -3,9 +3,10 @@
 Use it after unwrap. Base color, occlusion-roughness-metallic and tangent-space normals are read texel by texel from the
 surface: from its confident views where there are any (found along the provenance chain), else from its vertices, or from
 the textures of the model that was remeshed. Maps that would be constant become factors, a flat normal map is left out.
+Without --size a texel is as fine as the source's detail: a texel of its textures, half a pixel of its views.
 
 Example:
-  gdtool bake cat.asset/atlas --size 2048
+  gdtool bake cat.asset/atlas --size 2048 --lods 4
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from gdtool.core.stage import Inputs, Output, SecondInput, Stage, file_option
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of bake."""
 
-    size: Annotated[int, Meta(ge=16, le=16384, description="width and height of the maps in texels")] = 2048
+    size: Annotated[int, Meta(ge=16, le=16384, description="width and height of the maps in texels; without it what the source's detail needs, 256 to 4096")] | None = None
     samples: Annotated[int, Meta(ge=1, le=64, description="samples per texel where neighbouring texels differ: 1, 4, 9, …")] = 1
     ao: Annotated[bool, Meta(description="trace ambient occlusion")] = True
     ao_rays: Annotated[int, Meta(ge=1, le=65536, description="rays per traced point of ambient occlusion")] = 64
@@ -32,6 +33,9 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     normal_map: Annotated[Literal["auto", "on", "off"], Meta(description="auto leaves it out where it would be flat")] = "auto"
     normal_convention: Annotated[Literal["opengl", "directx"], Meta(description="green channel of normal.png; .glb is always opengl")] = "opengl"
     project_views: Annotated[bool, Meta(description="read materials from the views where they see the surface well")] = True
+    height: Annotated[bool, Meta(description="write height.png as well: where the source lies above the mesh, 16 bits")] = False
+    confidence: Annotated[bool, Meta(description="write confidence.png as well: how sure each texel is")] = False
+    lods: Annotated[int, Meta(ge=1, le=8, description="levels of detail, the full one counted; each has half the triangles of the one before, all share the maps")] = 1
     usd: Annotated[Literal["none", "usda", "usdz"], Meta(description="write OpenUSD with UsdPreviewSurface as well (needs usd-core)")] = "none"
     source_frame: Annotated[bool, Meta(description="write vertices in the source's own frame instead of the normalised one")] = False
     model: file_option("model or mesh file, with its textures, to bake from instead of the surface") = None
@@ -44,7 +48,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.texture.maps import make_maps
     from gdtool.texture.occlusion import bake_occlusion
     from gdtool.texture.reproject import vertex_reach
-    from gdtool.texture.target import texel_width, texels_of
+    from gdtool.texture.target import size_for, texels_of
 
     if options.usd != "none":
         from gdtool.texture.usd import require
@@ -52,19 +56,21 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         require()
     with out.step("read"):
         mesh, matrix = _read_mesh(inputs, options)
-        _check_memory(inputs, options.size)
     with out.step("frames"):
         target, face_idx = target_of(mesh)
         _check_overlap(target, inputs, out)
     with out.step("source"):
-        origin = _read_origin(inputs, options, matrix, texel_width(target, options.size), out)
+        origin = _read_origin(inputs, options, matrix, target, out)
+    size = options.size or size_for(target, origin.detail)
+    _check_memory(inputs, size)
     with out.step("rasterise"):
-        texels = texels_of(target, options.size)
+        texels = texels_of(target, size)
         if not texels.inside:
             raise InputError(_path(inputs), "its texture coordinates cover no texel", "run gdtool unwrap")
     with out.step("bake"):
         reach = vertex_reach(target.vertices, target.faces, origin.source)
-        baked = bake(target, texels, origin.source, origin.lookup, reach, samples=options.samples, threads=out.threads, progress=out.progress)
+        baked = bake(target, texels, origin.source, origin.lookup, reach, samples=options.samples, threads=out.threads, progress=out.progress,
+                     height=options.height, confidence=options.confidence)
     occlusion = None
     if options.ao:
         with out.step("occlusion"):
@@ -79,9 +85,32 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         out.skip(what, reason)
     if options.normal_map == "off":
         out.skip("normal map", "left out by --normal-map off")
-    report = {**baked.report, "seen_share": 0.0 if baked.seen is None else float((baked.seen[:texels.inside] > 0.5).mean()), "materials_from": origin.label}
+    report = {**baked.report, "seen_share": 0.0 if baked.seen is None else float((baked.seen[:texels.inside] > 0.5).mean()),
+              "materials_from": origin.label, "detail": origin.detail}
+    levels = []
+    if options.lods > 1:
+        with out.step("levels of detail"):
+            levels = _levels(target, options.lods, out, report)
     with out.step("write"):
-        _write(out, options, inputs, mesh, target, face_idx, maps, origin, matrix, report)
+        _write(out, options, inputs, mesh, target, face_idx, maps, origin, matrix, report, levels)
+
+
+def _levels(target, count: int, out: Output, report: dict) -> list:
+    """The coarser targets, finest first; what they cost in place goes to report."""
+    from gdtool.texture.lods import coarser, drift
+    from gdtool.texture.target import mapped
+
+    counts = [max(len(target.faces) >> k, 4) for k in range(1, count)]
+    levels = []
+    # Each is a child process of its own: threads only wait for them.
+    for wanted, (level, why) in zip(counts, mapped(lambda n: coarser(target, n), counts, out.threads), strict=True):
+        if level is None:
+            out.skip(f"level of {wanted} triangles", why)
+            continue
+        levels.append(level)
+        report[f"lod{len(levels)}_triangles"] = len(level.faces)
+        report |= {f"lod{len(levels)}_{name}": value for name, value in drift(level, target).items()}
+    return levels
 
 
 def _path(inputs: Inputs):
@@ -92,7 +121,7 @@ def _check_memory(inputs: Inputs, size: int) -> None:
     """Raise ResourceError when the maps will not fit into memory, rather than be killed half-way."""
     from pathlib import Path
 
-    needed = 220 * size * size  # bytes per texel, measured between 1024 and 2048 on atlases that are 60 % covered
+    needed = 130 * size * size  # bytes per texel, measured by benchmarks/bake.py at 2048 and 4096 on an atlas that is 72 % covered
     try:
         free = next(int(line.split()[1]) * 1024 for line in Path("/proc/meminfo").read_text().splitlines() if line.startswith("MemAvailable"))
     except (OSError, StopIteration):
@@ -143,7 +172,7 @@ def _read_mesh(inputs: Inputs, options: Options):
     return mesh, matrix
 
 
-def _read_origin(inputs: Inputs, options: Options, matrix, width: float, out: Output):
+def _read_origin(inputs: Inputs, options: Options, matrix, target, out: Output):
     """What to bake from: the surface (with its views), a model named by --model, or the model that was remeshed."""
     from pathlib import Path
 
@@ -177,8 +206,9 @@ def _read_origin(inputs: Inputs, options: Options, matrix, width: float, out: Ou
     if named is None:
         raise InputError(_path(inputs), "has no surface to bake from along its provenance chain", "name one with --surface or --model")
     from gdtool.assets.load import load_scene
+    from gdtool.texture.target import size_for, texel_width
 
-    return from_scene(load_scene(named), matrix, width)
+    return from_scene(load_scene(named), matrix, lambda detail: texel_width(target, options.size or size_for(target, detail)))
 
 
 def target_of(mesh):
@@ -208,41 +238,28 @@ def _check_overlap(target, inputs: Inputs, out: Output) -> None:
         out.warn(f"{inputs.name}: texture coordinates leave the unit square; what lies outside is not baked")
 
 
-def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx, maps, origin, matrix, report) -> None:
+def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx, maps, origin, matrix, report, levels) -> None:
     """Write the folder's files and set out.content."""
     import dataclasses
 
-    from gdtool.assets.gltf_write import write_glb
     from gdtool.geometry.frames import transform_points
-    from gdtool.images.io import write_png
-    from gdtool.texture import asset
-    from gdtool.texture.maps import contact_sheet_of, directx
+    from gdtool.texture.asset import write_models
 
     if options.source_frame:
         turn = matrix[:3, :3] / (matrix[:3, 0] ** 2).sum() ** 0.5
-        tangents = target.tangents.copy()
-        tangents[..., :3] = tangents[..., :3] @ turn.T
-        target = dataclasses.replace(target, vertices=transform_points(matrix, target.vertices), normals=target.normals @ turn.T, tangents=tangents)
-        mesh = dataclasses.replace(mesh, vertices=target.vertices)
-    material = asset.material_of(maps, inputs.name, origin.alpha_mode, origin.alpha_cutoff, origin.double_sided)
-    write_glb(out.path("asset.glb"), asset.scene_of(target, maps, material, inputs.name))
-    embedded = asset.embedded_maps(out.path("asset.glb").read_bytes())
-    files = {name: f"{name}.png" for name in embedded}
-    for name, content in embedded.items():
-        if name == "normal" and options.normal_convention == "directx":
-            write_png(out.path(files[name]), directx(maps.normal))
-        else:
-            out.path(files[name]).write_bytes(content)
-    normals_idx, normals = asset.corner_normals_of_quads(mesh, target, face_idx)
-    asset.write_obj(out.path("asset.obj"), mesh, normals_idx, normals, maps, files, inputs.name)
-    usd = f"asset.{options.usd}" if options.usd != "none" else ""
-    if usd:
-        from gdtool.texture.usd import write_usd
 
-        write_usd(out.path(usd), mesh, normals_idx, normals, maps, files, options.normal_convention, origin.alpha_mode, origin.alpha_cutoff, origin.double_sided)
-    write_png(out.path("contact_sheet.png"), contact_sheet_of(maps))
+        def moved(one):
+            tangents = one.tangents.copy()
+            tangents[..., :3] = tangents[..., :3] @ turn.T
+            return dataclasses.replace(one, vertices=transform_points(matrix, one.vertices), normals=one.normals @ turn.T, tangents=tangents)
+
+        target, levels = moved(target), [moved(level) for level in levels]
+        mesh = dataclasses.replace(mesh, vertices=target.vertices)
+    usd = f"asset.{options.usd}" if options.usd != "none" else ""
+    files = write_models(out.path, target, mesh, face_idx, maps, origin, inputs.name, options.normal_convention, usd, levels)
     out.content = AssetContent(
-        size=options.size, maps=files, usd=usd, factors=maps.factors, normal_convention=options.normal_convention,
+        size=maps.size, maps=files, usd=usd, factors=maps.factors, normal_convention=options.normal_convention,
+        lods=tuple(f"asset_lod{k}.glb" for k in range(1, len(levels) + 1)),
         frame="source" if options.source_frame else "normalised", source_from_world=tuple(float(x) for x in matrix.ravel()), report=report)
 
 

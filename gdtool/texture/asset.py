@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -13,6 +15,14 @@ from gdtool.folders.mesh import QuadMesh
 from gdtool.texture.maps import Maps
 from gdtool.texture.tangents import weld
 from gdtool.texture.target import Target
+
+
+class Drawn(Protocol):
+    """How a surface is drawn, as texture.origin.Origin says."""
+
+    alpha_mode: str
+    alpha_cutoff: float
+    double_sided: bool
 
 
 def material_of(maps: Maps, name: str, alpha_mode: str = "OPAQUE", alpha_cutoff: float = 0.5, double_sided: bool = False) -> Material:
@@ -26,7 +36,8 @@ def material_of(maps: Maps, name: str, alpha_mode: str = "OPAQUE", alpha_cutoff:
         name=name, base_color=maps.factors["base_color"], metallic=maps.factors["metallic"][0], roughness=maps.factors["roughness"][0],
         alpha_mode=alpha_mode, alpha_cutoff=alpha_cutoff, double_sided=double_sided,
         base_color_texture=texture(maps.base_color, "srgb"), metallic_roughness_texture=orm if maps.has_roughness_metallic else None,
-        normal_texture=texture(maps.normal, "linear"), occlusion_texture=orm if maps.has_occlusion else None)
+        normal_texture=texture(maps.normal, "linear"), occlusion_texture=orm if maps.has_occlusion else None,
+        emissive=maps.factors.get("emissive", (0.0, 0.0, 0.0)), emissive_texture=texture(maps.emissive, "srgb"))
 
 
 def scene_of(target: Target, maps: Maps, material: Material, name: str) -> Scene:
@@ -51,7 +62,7 @@ def scene_of(target: Target, maps: Maps, material: Material, name: str) -> Scene
 
 
 def embedded_maps(glb: bytes) -> dict[str, bytes]:
-    """The PNGs of a .glb with one material, by map name: base_color, orm, normal.
+    """The PNGs of a .glb with one material, by map name: base_color, orm, normal, emissive.
 
     The files beside the .glb are these bytes: encoding a large map takes longer than reading it from the surface.
     """
@@ -60,6 +71,7 @@ def embedded_maps(glb: bytes) -> dict[str, bytes]:
     material = document["materials"][0]
     surface = material.get("pbrMetallicRoughness", {})
     slots = {"base_color": surface.get("baseColorTexture"), "normal": material.get("normalTexture"),
+             "emissive": material.get("emissiveTexture"),
              "orm": surface.get("metallicRoughnessTexture") or material.get("occlusionTexture")}
     out = {}
     for name, slot in slots.items():
@@ -95,6 +107,8 @@ def _word(name: str) -> str:
 def material_library(maps: Maps, files: dict[str, str]) -> str:
     """Text of the .mtl: the classic fields, and the physically based ones (Pr, Pm, norm) that newer readers know.
 
+    The normal map is named twice: Blender's importer leaves norm out, and takes map_Bump for a normal map of strength -bm.
+
     Scalar maps are channels of the packed map: -imfchan is the format's own way to say which (Wavefront MTL 4.2).
     """
     r, g, b, a = maps.factors["base_color"]
@@ -107,7 +121,11 @@ def material_library(maps: Maps, files: dict[str, str]) -> str:
     if "orm" in files and maps.has_roughness_metallic:
         lines += [f"map_Pr -imfchan g {files['orm']}", f"map_Pm -imfchan b {files['orm']}"]
     if "normal" in files:
-        lines.append(f"norm {files['normal']}")
+        lines += [f"norm {files['normal']}", f"map_Bump -bm 1 {files['normal']}"]
+    if "emissive" in maps.factors:
+        lines.append("Ke " + " ".join(f"{x:.6g}" for x in maps.factors["emissive"]))
+    if "emissive" in files:
+        lines.append(f"map_Ke {files['emissive']}")
     return "\n".join(lines) + "\n"
 
 
@@ -124,3 +142,41 @@ def corner_normals_of_quads(mesh: QuadMesh, target: Target, face_idx: np.ndarray
     normals = np.zeros((idx.max() + 1, 3))
     normals[idx] = corners.reshape(-1, 3)
     return np.where(mesh.is_quad[:, None] | (np.arange(4) < 3), idx.reshape(-1, 4), -1), normals
+
+
+def write_models(path: Callable[[str], Path], target: Target, mesh: QuadMesh, face_idx: np.ndarray, maps: Maps, surface: Drawn,
+                 name: str, convention: str, usd: str, levels: list[Target]) -> dict[str, str]:
+    """Write asset.glb, asset.obj, the maps, OpenUSD where usd names a suffix, and asset_lod1.glb and on; the maps' files.
+
+    path(file name) says where. face_idx (t,) is the quad of each triangle. The coarser levels refer to the maps' files.
+    """
+    from gdtool.assets.gltf_write import write_glb
+    from gdtool.images.io import write_png
+    from gdtool.texture.maps import contact_sheet_of, directx
+
+    material = material_of(maps, name, surface.alpha_mode, surface.alpha_cutoff, surface.double_sided)
+    write_glb(path("asset.glb"), scene_of(target, maps, material, name))
+    embedded = embedded_maps(path("asset.glb").read_bytes())
+    files = {key: f"{key}.png" for key in embedded}
+    for key, content in embedded.items():
+        path(files[key]).write_bytes(content)
+    beside = {id(image): files[key] for key, image in (("base_color", maps.base_color), ("orm", maps.orm), ("normal", maps.normal),
+                                                       ("emissive", maps.emissive)) if key in files}
+    if "normal" in files and convention == "directx":
+        write_png(path(files["normal"]), directx(maps.normal))
+        if levels:
+            write_png(path("normal_opengl.png"), maps.normal)
+            beside[id(maps.normal)] = "normal_opengl.png"
+    for k, level in enumerate(levels, 1):
+        write_glb(path(f"asset_lod{k}.glb"), scene_of(level, maps, material, name), beside=beside)
+    for key, image in maps.extra.items():
+        files[key] = f"{key}.png"
+        write_png(path(files[key]), image)
+    normals_idx, normals = corner_normals_of_quads(mesh, target, face_idx)
+    write_obj(path("asset.obj"), mesh, normals_idx, normals, maps, files, name)
+    if usd:
+        from gdtool.texture.usd import write_usd
+
+        write_usd(path(usd), mesh, normals_idx, normals, maps, files, convention, surface.alpha_mode, surface.alpha_cutoff, surface.double_sided)
+    write_png(path("contact_sheet.png"), contact_sheet_of(maps))
+    return files

@@ -88,6 +88,8 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
                 mixed = unit(mixed)
             out[domain] = linear_from_srgb(mixed) if domain == "albedo" else mixed if out[domain].ndim == 2 else mixed[:, 0]
         out["seen"] = seen
+        if "confidence" in out:
+            out["confidence"] = seen + (1 - seen) * out["confidence"]
         return out
 
     return looked, domains
@@ -102,11 +104,13 @@ def _read(target: Target, source: Source, lookup: Lookup, reach: np.ndarray, fac
 
 
 def bake(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: np.ndarray, samples: int = 1,
-         threads: int = 1, progress: Callable = lambda iterable, total, label: iterable) -> Baked:
+         threads: int = 1, progress: Callable = lambda iterable, total, label: iterable, height: bool = False, confidence: bool = False) -> Baked:
     """Bake what lookup says of the source into the texels.
 
     reach (t,) from reproject.vertex_reach. samples per texel (a square number) are taken where neighbouring texels
-    differ, one elsewhere. values has albedo, roughness, metallic, tangent_normal (n, 3) and whatever else lookup gives besides normal.
+    differ, one elsewhere. values has albedo, roughness, metallic, tangent_normal (n, 3) and whatever else lookup gives besides
+    normal; where they are asked for height (n,), how far above the target, along its normal, the source lies, and the
+    lookup's confidence (n,), 0 where the normal leads to nothing and the nearest point serves.
     """
     reach = reach.astype(np.float32)
     values: dict[str, np.ndarray] = {}
@@ -115,6 +119,11 @@ def bake(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: 
     def run(part: slice) -> None:
         read, frame, places = _read(target, source, lookup, reach, texels.face_idx[part], texels.barycentric[part])
         read["tangent_normal"] = encode_tangent_space(*frame[1:], read.pop("normal"))
+        if height:
+            read["height"] = dot(source.at(places.face_idx, places.barycentric, source.vertices) - frame[0], unit(frame[1]))
+        certain = read.pop("confidence", None)
+        if confidence:
+            read["confidence"] = np.where(places.by_ray, certain, 0)
         for name, value in read.items():
             # setdefault is atomic: threads that come first at the same time agree on one array.
             if name not in values:
@@ -163,6 +172,7 @@ def _supersample(target: Target, texels: Texels, source: Source, lookup: Lookup,
             offset = (np.array([k % side, k // side]) + 0.5) / side
             barycentric = barycentrics.at(face_idx, (at % texels.size + offset[0]) / texels.size, (at // texels.size + offset[1]) / texels.size)
             read, _, _ = _read(target, source, lookup, reach, face_idx, np.clip(barycentric, -1, 2).astype(np.float32))
+            read.pop("confidence", None)
             for name, value in read.items():
                 total[name] = total.get(name, 0) + value / (side * side)
         frame = surface_at(target, face_idx, texels.barycentric[mine])

@@ -14,15 +14,18 @@ from gdtool.texture.target import Texels, mapped
 CONSTANT_RANGE = 1.5 / 255
 # 99.5 % of a normal map within this angle of straight up is flat: 8 bits store normals to 0.4 degrees.
 FLAT_DEGREES = 1.0
+HEIGHT_BITS = 16  # a step of 8 bits is a visible terrace
 
 
 @dataclass(frozen=True)
 class Maps:
     """Maps as stored, uint8 or uint16, (s, s, c), None where a factor or nothing takes their place.
 
-    base_color RGB(A) sRGB; orm R occlusion, G roughness, B metallic; normal tangent space, +Y up. factors: base_color
-    linear RGBA, roughness, metallic, what the material's factors have to be. has_occlusion: orm's R means something.
-    has_roughness_metallic: G and B do. skipped: (what, why).
+    base_color RGB(A) sRGB; orm R occlusion, G roughness, B metallic; normal tangent space, +Y up; emissive RGB sRGB; extra:
+    grey maps that no material refers to, height and confidence. factors: base_color linear RGBA, roughness, metallic,
+    emissive linear RGB where anything shines, what the material's factors have to be; height, the distance that 0 and 1
+    of that map stand for below and above the surface. has_occlusion: orm's R means something. has_roughness_metallic: G
+    and B do. skipped: (what, why).
     """
 
     size: int
@@ -32,6 +35,8 @@ class Maps:
     factors: dict[str, tuple[float, ...]]
     has_occlusion: bool = False
     has_roughness_metallic: bool = False
+    emissive: np.ndarray | None = None
+    extra: dict[str, np.ndarray] = field(default_factory=dict)
     skipped: list[tuple[str, str]] = field(default_factory=list)
 
 
@@ -62,7 +67,8 @@ def flat_angle(tangent_normals: np.ndarray) -> float:
 
 def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.ndarray | None = None, bits: int = 8,
               padding: int | None = None, normal_map: str = "auto", threads: int = 1) -> Maps:
-    """Maps of what texels read (bake.Baked.values): albedo, roughness, metallic, tangent_normal, perhaps alpha.
+    """Maps of what texels read (bake.Baked.values): albedo, roughness, metallic, tangent_normal, perhaps alpha, emissive
+    (n, 3) linear, height (n,) in the target's units, confidence (n,) in [0, 1].
 
     occlusion (n,) or None. normal_map "auto" leaves a flat map out. Gutters are filled over `padding` texels, everywhere
     when None.
@@ -108,10 +114,24 @@ def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.nd
         layers["normal"] = list(np.moveaxis(values["tangent_normal"], -1, 0))
     elif normal_map == "auto":
         skipped.append(("normal map", f"would be flat: {angle:.2f} degrees"))
+    if "emissive" in values and (top := float(values["emissive"][inside].max(initial=0))) > CONSTANT_RANGE:
+        shining = [srgb_from_linear(np.clip(values["emissive"][:, k] / top, 0, 1)) for k in range(3)]
+        constants = [constant_of(channel[inside]) for channel in shining]
+        if any(constant is None for constant in constants):
+            factors["emissive"], layers["emissive"] = (round(top, 6),) * 3, shining
+        else:
+            factors["emissive"] = tuple(round(float(x) * top, 6) for x in linear_from_srgb(np.array(constants)))
+            skipped.append(("emissive map", "emission is constant: a factor says it"))
+    if "height" in values:
+        reach = max(float(np.abs(values["height"][inside]).max(initial=0)), 1e-6)
+        factors["height"], layers["height"] = (reach,), [0.5 + 0.5 * values["height"] / np.float32(reach)]
+    if "confidence" in values:
+        layers["confidence"] = [values["confidence"]]
     gutters = Gutters(texels.mask(), padding)
-    stored = {name: _stored(texels, layer, gutters, bits, threads, direction=name == "normal") for name, layer in layers.items()}
-    return Maps(texels.size, stored.get("base_color"), stored.get("orm"), stored.get("normal"), factors,
-                has_occlusion, varies, skipped)
+    stored = {name: _stored(texels, layers.pop(name), gutters, HEIGHT_BITS if name == "height" else bits, threads, direction=name == "normal")
+              for name in list(layers)}
+    return Maps(texels.size, stored.get("base_color"), stored.get("orm"), stored.get("normal"), factors, has_occlusion, varies,
+                stored.get("emissive"), {name: stored[name] for name in ("height", "confidence") if name in stored}, skipped)
 
 
 def _stored(texels: Texels, layer: list[np.ndarray], gutters: Gutters, bits: int, threads: int, direction: bool = False) -> np.ndarray:
@@ -161,4 +181,7 @@ def contact_sheet_of(maps: Maps, width: int = 384) -> np.ndarray:
         tiles[name] = small(maps.orm[..., channel:channel + 1]) * factors[name][0] if maps.has_roughness_metallic else plain(factors[name][0])
     if maps.normal is not None:
         tiles["normal"] = small(maps.normal)
+    if maps.emissive is not None:
+        tiles["emissive"] = small(maps.emissive)
+    tiles |= {name: small(image) for name, image in maps.extra.items()}
     return contact_sheet([list(tiles.values())], labels_top=list(tiles))

@@ -23,7 +23,8 @@ from gdtool.texture.tangents import dot
 class Origin:
     """A source in the normalised frame, its material lookup, its vertex normals (v, 3), and how its surface is drawn.
 
-    label says where materials come from, for the report.
+    label says where materials come from, for the report. detail is the width of the finest detail that the source holds,
+    in the normalised frame: a texel of its textures, half a pixel of its views or half an edge of its mesh.
     """
 
     source: Source
@@ -33,6 +34,7 @@ class Origin:
     alpha_mode: str = "OPAQUE"
     alpha_cutoff: float = 0.5
     double_sided: bool = False
+    detail: float = 0.0
 
 
 def material_field(path: Path, device: str = "cpu") -> Callable[[np.ndarray], dict[str, np.ndarray]]:
@@ -69,7 +71,7 @@ def from_surface(surface: Surface, views: Views | None, field: Callable[[np.ndar
     """
     source = Source(surface.vertices, surface.faces)
     normals = surface.normals if surface.normals is not None else vertex_normals(surface.vertices, surface.faces)
-    attributes = {"albedo": surface.albedo, "roughness": surface.roughness, "metallic": surface.metallic}
+    attributes = {"albedo": surface.albedo, "roughness": surface.roughness, "metallic": surface.metallic, "confidence": surface.confidence}
     lookup = vertex_lookup(source, attributes, normals.astype(np.float32))
     images = dict(views.images) if views is not None else {}
     label = "vertices"
@@ -79,12 +81,13 @@ def from_surface(surface: Surface, views: Views | None, field: Callable[[np.ndar
             lookup, label = _with_field(lookup, source, field, shown), "field: " + " ".join(shown)
     if "normal" in images and not _views_are_finer(views, source):
         del images["normal"]
+    detail = 0.5 * _edge(source)
     if not images:
-        return Origin(source, lookup, normals, label)
+        return Origin(source, lookup, normals, label, detail=detail)
     sights = [sight_of(camera, source.caster, mask) for camera, mask in zip(views.cameras, views.mask, strict=True)]
     lookup, domains = with_views(lookup, source, ViewsOfSource(sights, images, views.mask))
     label = ("" if label == "vertices" else label + ", ") + "views: " + " ".join(domains)
-    return Origin(source, lookup, normals, label)
+    return Origin(source, lookup, normals, label, detail=min(detail, 0.5 * _view_pixel(views)))
 
 
 def _with_field(lookup: Lookup, source: Source, field: Callable[[np.ndarray], dict[str, np.ndarray]], names: list[str]) -> Lookup:
@@ -97,16 +100,54 @@ def _with_field(lookup: Lookup, source: Source, field: Callable[[np.ndarray], di
 
 def _views_are_finer(views: Views, source: Source) -> bool:
     """Whether a view's pixel is no larger than the surface's typical edge, so that its normals can hold more detail."""
+    return _view_pixel(views) <= 1.5 * _edge(source)
+
+
+def _edge(source: Source) -> float:
+    """Typical edge of the source's triangles."""
     corners = source.vertices[source.faces]
-    edge = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1)))
-    depth = (views.cameras[0].near + views.cameras[0].far) / 2
-    return float(pixel_footprint(views.cameras[0], depth)) <= 1.5 * edge
+    return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1)))
 
 
-def from_scene(scene: Scene, source_from_world: np.ndarray, texel_width: float = 0.0) -> Origin:
+def _view_pixel(views: Views) -> float:
+    """What a view's pixel spans in the middle of its depth range."""
+    camera = views.cameras[0]
+    return float(pixel_footprint(camera, (camera.near + camera.far) / 2))
+
+
+def texture_detail(scene: Scene) -> float | None:
+    """What a texel of a scene's finest textures spans on its surface, in its units: the median over the area that has
+    textures; None where nothing has."""
+    from gdtool.geometry.normals import face_normals
+
+    area = face_normals(scene.vertices, scene.faces)[1]
+    widths, weights = [], []
+    for index in np.unique(scene.material_idx):
+        material, faces = scene.materials[index], scene.material_idx == index
+        textures = (material.base_color_texture, material.metallic_roughness_texture, material.normal_texture, material.emissive_texture)
+        found = [t for t in textures if t is not None and t.uv_set < len(scene.uvs) and scene.uvs[t.uv_set] is not None]
+        if not found:
+            continue
+        density = np.zeros(int(faces.sum()))
+        for texture in found:
+            u, v = (scene.uvs[texture.uv_set][scene.faces[faces][:, k]] - scene.uvs[texture.uv_set][scene.faces[faces][:, 0]] for k in (1, 2))
+            texels = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) * abs(texture.scale[0] * texture.scale[1]) * np.prod(texture.image.shape[:2], dtype=float)
+            density = np.maximum(density, texels)
+        there = (density > 0) & (area[faces] > 0)
+        widths.append(np.sqrt(area[faces][there] / density[there]))
+        weights.append(area[faces][there])
+    if not widths or not sum(map(len, widths)):
+        return None
+    width, weight = np.concatenate(widths), np.concatenate(weights)
+    order = np.argsort(width)
+    return float(width[order][np.searchsorted(np.cumsum(weight[order]), weight.sum() / 2)])
+
+
+def from_scene(scene: Scene, source_from_world: np.ndarray, texel_width: Callable[[float], float] = lambda detail: 0.0) -> Origin:
     """A model with its own textures, in its own frame; source_from_world (4, 4) takes the normalised frame there.
 
-    texel_width is what a texel of the baked maps spans, in the normalised frame: finer textures are averaged over it.
+    texel_width(detail) is what a texel of the baked maps spans, in the normalised frame, when the model's detail (see
+    Origin) is known: finer textures are averaged over it.
     """
     from gdtool.shading.surface_points import SurfaceLookup
 
@@ -117,7 +158,10 @@ def from_scene(scene: Scene, source_from_world: np.ndarray, texel_width: float =
     normals = scene.normals @ turn.T if scene.normals is not None else vertex_normals(source.vertices, source.faces)
 
     points = SurfaceLookup(scene)
-    width = texel_width * np.sqrt((source_from_world[:3, 0] ** 2).sum())
+    own = texture_detail(scene)
+    # Vertex colors, or nothing but factors: the mesh says how fine it is.
+    detail = 0.5 * _edge(source) if own is None else own / float(np.sqrt((source_from_world[:3, 0] ** 2).sum()))
+    width = texel_width(detail) * np.sqrt((source_from_world[:3, 0] ** 2).sum())
 
     def lookup(places: Places) -> dict[str, np.ndarray]:
         read = points.attributes(places.face_idx, places.barycentric.astype(np.float64), np.full(len(places.face_idx), width))
@@ -127,9 +171,12 @@ def from_scene(scene: Scene, source_from_world: np.ndarray, texel_width: float =
         inward = dot(normal, source.face_normals_32[places.face_idx]) < 0
         if inward.any():
             normal[inward] *= -1
-        return {"albedo": read["albedo"], "roughness": read["roughness"], "metallic": read["metallic"], "alpha": read["alpha"], "normal": normal}
+        out = {name: read[name] for name in kept}
+        return {**out, "confidence": np.ones(len(normal), np.float32), "normal": normal}
 
     modes = {material.alpha_mode for material in scene.materials}
     mode = next((m for m in ("BLEND", "MASK") if m in modes), "OPAQUE")
+    shines = any(max(material.emissive) > 0 for material in scene.materials)
+    kept = ["albedo", "roughness", "metallic", *(["alpha"] if mode != "OPAQUE" else []), *(["emissive"] if shines else [])]
     cutoffs = [m.alpha_cutoff for m in scene.materials if m.alpha_mode == "MASK"]
-    return Origin(source, lookup, normals, "model", mode, cutoffs[0] if cutoffs else 0.5, any(m.double_sided for m in scene.materials))
+    return Origin(source, lookup, normals, "model", mode, cutoffs[0] if cutoffs else 0.5, any(m.double_sided for m in scene.materials), detail)

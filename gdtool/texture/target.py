@@ -156,3 +156,9 @@ def texel_width(target: Target, size: int) -> float:
     u, v = (target.uv[target.face_uvs[:, k]] - target.uv[target.face_uvs[:, 0]] for k in (1, 2))
     covered = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum()
     return float(np.sqrt(area / max(covered, 1e-12)) / size)
+
+
+def size_for(target: Target, detail: float, least: int = 256, most: int = 4096) -> int:
+    """The power of two at which a texel of the map spans about detail, in the target's units: up to a tenth more."""
+    wanted = texel_width(target, 1) / max(detail, 1e-9) / 1.1
+    return int(np.clip(2 ** np.ceil(np.log2(max(wanted, 1))), least, most))

@@ -115,6 +115,9 @@ def _material(stage, maps: Maps, files: dict[str, str], convention: str, alpha_m
     feed("roughness", types.Float, orm if maps.has_roughness_metallic else None, "g", roughness)
     feed("metallic", types.Float, orm if maps.has_roughness_metallic else None, "b", metallic)
     surface.CreateInput("useSpecularWorkflow", types.Int).Set(0)
+    if "emissive" in maps.factors:
+        shine = texture("emissive", "sRGB", (*maps.factors["emissive"], 1.0)) if "emissive" in files else None
+        feed("emissiveColor", types.Color3f, shine, "rgb", Gf.Vec3f(*maps.factors["emissive"]))
     if maps.has_occlusion and orm is not None:
         feed("occlusion", types.Float, orm, "r")
     if "normal" in files:
