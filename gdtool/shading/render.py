@@ -24,7 +24,8 @@ from gdtool.shading.environment import Environment
 from gdtool.shading.surface_points import SurfaceLookup
 
 BASE = 4
-# Samples up to which pixels beside the object's outline are held to be partly covered, whatever their samples say.
+# Samples up to which pixels beside the object's outline, or beside an uneven pixel, get more whatever their own say: what
+# makes the other one uneven may reach in between theirs.
 EDGE = 8
 # Alpha-tested layers that a ray passes at most.
 MAX_LAYERS = 32
@@ -332,8 +333,8 @@ class _Sums:
         return out
 
     def uneven(self, pixel: np.ndarray, width: int, height: int, tolerance: float, done: int) -> tuple[np.ndarray, np.ndarray]:
-        """Of the pixels given, those partly covered, those at the outline as long as few samples (done) may have missed
-        what covers them, and those whose mean is not known to tolerance; and how badly each is known."""
+        """Of the pixels given, those partly covered, those whose mean is not known to tolerance, and as long as few samples
+        (done) may have missed something those at the outline and beside any of the others; and how badly each is known."""
         seen = self.seen[pixel]
         partly = (seen > 0) & (seen < self.asked[pixel])
         if done <= EDGE:
@@ -346,6 +347,10 @@ class _Sums:
             if name in self.sums:
                 worst[some] = np.maximum(worst[some], self.error(name, pixel[some]))
         chosen = partly | (worst > tolerance**2)
+        if done <= EDGE:
+            found = np.zeros(width * height, bool)
+            found[pixel[chosen]] = True
+            chosen |= (seen > 0) & _beside(found.reshape(height, width))[pixel]
         return pixel[chosen], np.where(partly, 1.0, worst)[chosen]
 
     def images(self, camera: Camera, more: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
