@@ -22,10 +22,10 @@ test: venv
 stress: venv
 	$(BIN)/python -m pytest -m slow
 
-# What needs optional packages: Stable Diffusion's parts (diffusers, transformers; the tests make their own small weights), OpenUSD.
+# What needs optional packages: Stable Diffusion's parts (diffusers, transformers; the tests make their own small weights), OpenUSD, Ray.
 extras-test: venv
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[hub,usd]"
-	$(BIN)/python -m pytest tests/diffusion/test_pretrained.py tests/stages/test_bake_usd.py
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[hub,usd,ray]"
+	$(BIN)/python -m pytest tests/diffusion/test_pretrained.py tests/stages/test_bake_usd.py tests/stages/test_ray.py
 
 # Ten minutes of damaged files for every reader; what breaks one stays as a test.
 fuzz: venv

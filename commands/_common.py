@@ -170,7 +170,7 @@ def stage_command(stage: Stage, help: str) -> click.Command:
         shard = shard_of(values.get("shard"))
         settings = Settings(
             output=Path(values["output"]) if values["output"] else None, several=len(arguments) > 1 or shard[1] > 1, dry_run=values["dry_run"],
-            force=values["force"], threads=values["threads"], device=values["device"], shard=shard,
+            force=values["force"], threads=values["threads"], device=values["device"], shard=shard, ray=values.get("ray"),
         )
         flags = {flag: values["second_" + flag] for flag in stage.second_inputs}
         options = build_options(stage.Options, values)
@@ -204,6 +204,8 @@ def stage_command(stage: Stage, help: str) -> click.Command:
     if stage.dataset:
         text = "Only every Nth source from the Ith on, for job arrays that share -o: 1/N to N/N."
         params.append(click.Option(["--shard"], metavar="I/N", help=text))
+        text = "Fan out on the Ray cluster at ADDRESS, a source a task; local: on this machine's cores. Nodes share the folders. Needs gdtool[ray]."
+        params.append(click.Option(["--ray"], metavar="ADDRESS", help=text))
     params += [
         click.Option(["-o", "--output"], metavar="DIR", help="Output folder; for several sources the parent of NAME.asset/KIND."),
         click.Option(["-n", "--dry-run"], is_flag=True, help="Print what would be made."),

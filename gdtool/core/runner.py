@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime
+import functools
 import itertools
 import os
 import resource
@@ -41,6 +42,8 @@ class Settings:
     device: str = "cpu"
     # Which part of the sources, counted from 1, and of how many.
     shard: tuple[int, int] = (1, 1)
+    # A Ray cluster to fan out on, for stages that make datasets.
+    ray: str | None = None
 
 
 @dataclass(frozen=True)
@@ -246,6 +249,29 @@ def write_dataset_index(root: Path, results: list[Result]) -> Path:
     return root
 
 
+def _attempt(stage: Stage, text: str, *, options: Any, flags: dict[str, str | None], settings: Settings) -> Result | GdtoolError:
+    """The result of one source, or what was wrong with it."""
+    try:
+        source = sources.resolve(text, stage.reads, stage.name, allow_missing=settings.dry_run)
+        return run_one(stage, [source], options, flags, settings)
+    except OSError as error:
+        return from_os_error(error, text)
+    except GdtoolError as error:
+        return error
+
+
+def _on_cluster(work: functools.partial, stream: Iterator[str], settings: Settings) -> Iterator[Result | GdtoolError]:
+    """One source a task; a task takes the cores that --threads says, one without it."""
+    from gdtool.core import cluster
+
+    threads = settings.threads or 1
+    work.keywords["settings"] = dataclasses.replace(settings, threads=threads, ray=None)
+    for result in cluster.each(settings.ray, work, stream, threads):
+        if isinstance(result, Result):
+            log.say(f"{result.path}: {result.status}" + (f" in {result.seconds:.1f} s" if result.status == "done" else ""))
+        yield result
+
+
 def run_all(stage: Stage, arguments: tuple[str, ...], options: Any, flags: dict[str, str | None],
             settings: Settings) -> Iterator[Result | GdtoolError]:
     """Run a stage on every source, as they arrive; a source that fails yields its error and the rest go on."""
@@ -264,18 +290,13 @@ def run_all(stage: Stage, arguments: tuple[str, ...], options: Any, flags: dict[
         several = len(first) > 1
         stream = itertools.chain(first, stream)
     settings = dataclasses.replace(settings, several=several)
+    work = functools.partial(_attempt, stage, options=options, flags=flags, settings=settings)
     done: list[Result] = []
-    for text in stream:
-        try:
-            source = sources.resolve(text, stage.reads, stage.name, allow_missing=settings.dry_run)
-            result = run_one(stage, [source], options, flags, settings)
+    for result in _on_cluster(work, stream, settings) if settings.ray else map(work, stream):
+        if isinstance(result, Result):
             done.append(result)
-            yield result
-        except OSError as error:
-            yield from_os_error(error, text)
-        except GdtoolError as error:
-            yield error
+        yield result
     if stage.dataset and several and settings.output is not None and done and not settings.dry_run:
-        # Shards share the index.
+        # Shards share the index. A cluster's results come in any order.
         with locked(settings.output):
             write_dataset_index(settings.output, done)

@@ -49,6 +49,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     elevation: Annotated[float, Meta(ge=-89, le=89, description="of the turntable's cameras, degrees")] = 0.0
     fov: Annotated[float, Meta(ge=0, le=120, description="across, degrees, for perspective cameras; 0: orthographic")] = 0.0
     domains: Annotated[tuple[str, ...], Meta(description="what to write")] = ALL
+    brdf: Annotated[Literal["gltf", "paper"], Meta(description="reflection model of color and closed_form; gltf is what engines use")] = "gltf"
     normalize: Annotated[bool, Meta(description="centre the bounding box and scale its longest side to 1; see --cameras")] = True
     condition_views: Annotated[int, Meta(ge=0, le=1000, description="pictures from the front at random elevation, projection and scale")] = 0
     filter: Annotated[Literal["all", "complete-pbr"], Meta(description="complete-pbr: refuse a model when more than 5 % of its area lacks a base color or metallic-roughness texture")] = "all"
@@ -221,7 +222,7 @@ def _light(renderer: Renderer, inputs: Inputs, given: Folder | None, options: Op
     if source == "random":
         source = f"random:{(_number(inputs.name) + options.seed) % 10**9}"
     environment, lobes, record = studio(source, options.seed)
-    return _Lamps(environment, lobes, record, DirectLight(renderer, environment, options.light_samples, options.seed))
+    return _Lamps(environment, lobes, record, DirectLight(renderer, environment, options.light_samples, options.seed, options.brdf))
 
 
 def _view(renderer: Renderer, camera: Camera, lamps: _Lamps | None, options: Options) -> dict[str, np.ndarray]:
@@ -229,7 +230,7 @@ def _view(renderer: Renderer, camera: Camera, lamps: _Lamps | None, options: Opt
     if "closed_form" in options.domains:
         from gdtool.shading.render import closed_form_image
 
-        frame["closed_form"] = closed_form_image(frame, camera, lamps.lobes) * options.exposure
+        frame["closed_form"] = closed_form_image(frame, camera, lamps.lobes, options.brdf) * options.exposure
     return frame
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -17,6 +19,12 @@ FAST = ("--size", "32", "--samples", "4", "--light-samples", "8")
 def square(tmp_path):
     (tmp_path / "square.obj").write_text(SQUARE)
     return tmp_path / "square.obj"
+
+
+@pytest.fixture
+def gdtool(gdtool_here):
+    """Within this process, but for the tests that ask for the command itself."""
+    return gdtool_here
 
 
 @pytest.mark.parametrize("light", ["sampled", "prefiltered", "sg"])
@@ -44,8 +52,20 @@ def test_light_from_one_side_falls_on_that_side(gdtool, square, tmp_path):
     assert front[0] > front[1] > front[2] > 60 and back[:3].max() < 5
 
 
+@pytest.mark.parametrize("light", ["sampled", "prefiltered", "sg"])
+def test_either_reflection_model(gdtool, square, tmp_path, light):
+    """A rough dielectric seen from the front differs by Disney's diffuse; both are finite, and recorded."""
+    frames = {}
+    for brdf in ("gltf", "paper"):
+        assert gdtool("relight", square, *FAST, "--views", "1", "--light", light, "--brdf", brdf, "-o", brdf).returncode == 0
+        assert json.loads((tmp_path / brdf / "manifest.json").read_text())["options"]["brdf"] == brdf
+        frames[brdf] = read_image(tmp_path / brdf / "000.png").astype(int)
+    assert (frames["gltf"] != frames["paper"]).any() and np.abs(frames["gltf"] - frames["paper"]).max() < 60
+
+
 def test_works_in_a_pipe_and_bad_input_exits_3(gdtool, square, tmp_path):
-    done = gdtool("relight", *FAST, "--light", "sg", stdin=f"{square}\n")
+    # The command itself, with a true pipe.
+    done = subprocess.run([sys.executable, "-m", "gdtool", "relight", *FAST, "--light", "sg"], input=f"{square}\n", capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout == "square.asset/renders\n"
     (tmp_path / "bad.glb").write_bytes(b"glTF")
     bad = gdtool("relight", "bad.glb", *FAST)

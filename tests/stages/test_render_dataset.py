@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -39,6 +43,16 @@ def box(tmp_path):
     return tmp_path / "box.obj"
 
 
+@pytest.fixture
+def gdtool(gdtool_here):
+    """Within this process, but for the tests that ask for the command itself."""
+    return gdtool_here
+
+
+def command(*arguments) -> list[str]:
+    return [sys.executable, "-m", "gdtool", "render-dataset", *map(str, arguments)]
+
+
 def manifest(path) -> dict:
     return json.loads((path / "manifest.json").read_text())
 
@@ -51,7 +65,9 @@ def test_writes_a_folder_that_validates_with_all_it_should_hold(gdtool, box, tmp
     assert gdtool("validate", path).returncode == 0
     content = manifest(path)["content"]
     assert content["conditions"] == 3 and content["light"] and content["environment"].startswith("random:")
-    assert {s["what"] for s in manifest(path)["skipped"]} >= {"base color lookups", "alpha tests", "rays"}
+    saved = {s["what"]: s.get("saved_seconds") for s in manifest(path)["skipped"]}
+    assert set(saved) >= {"base color lookups", "alpha tests"}
+    assert all(saved[what] > 0 for what in ("rays", "normal lookups", "shadow rays of convex objects", "shadow rays"))
     assert len(read_cameras(path / "condition.json")) == 3 and len(list((path / "condition").glob("*.png"))) == 3
     views = read_views(open_folder(path))
     assert set(views.images) == {"color", "normal", "depth", "albedo", "roughness", "metallic", "closed_form"}
@@ -89,7 +105,7 @@ def test_bad_inputs_exit_3_with_one_line(gdtool, tmp_path):
 
 def test_pipes_stream_and_one_bad_source_among_many(gdtool, box, tmp_path):
     # Without color no light is made, and that is said.
-    done = gdtool("render-dataset", "-o", "data", *FAST, "--domains", "normal,depth", stdin=f"{box}\nmissing.obj\nprocedural:3\n")
+    done = subprocess.run(command("-o", "data", *FAST, "--domains", "normal,depth"), input=f"{box}\nmissing.obj\nprocedural:3\n", capture_output=True, text=True)
     assert done.returncode == 1 and "missing.obj" in done.stderr
     assert done.stdout.splitlines() == ["data/box.asset/views", "data/procedural-000003.asset/views"]
     assert manifest(tmp_path / "data/procedural-000003.asset/views")["content"]["model"]
@@ -149,8 +165,40 @@ def test_shards_share_the_sources_and_the_index(gdtool, box, tmp_path):
         assert gdtool("render-dataset", *sources, *fast, "--shard", wrong).returncode == 2
 
 
-def test_skips_say_what_they_saved(gdtool, box, tmp_path):
-    assert gdtool("render-dataset", box, *FAST).returncode == 0
-    saved = {s["what"]: s.get("saved_seconds") for s in manifest(tmp_path / "box.asset/views")["skipped"]}
-    assert {"rays", "normal lookups", "shadow rays of convex objects", "shadow rays"} <= set(saved)
-    assert all(saved[what] > 0 for what in ("rays", "normal lookups", "shadow rays of convex objects", "shadow rays"))
+def test_goes_on_after_a_kill(gdtool, box, tmp_path):
+    """Killed while it works on the second of three: the first is kept, nothing half-written is left or listed."""
+    for name in "abc":
+        (tmp_path / f"{name}.obj").write_text(BOX)
+    arguments = (*(tmp_path / f"{name}.obj" for name in "abc"), *FAST, "--domains", "normal", "-o", "data")
+    process = subprocess.Popen(command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    assert process.stdout.readline() == b"data/a.asset/views\n"
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    before = (tmp_path / "data/a.asset/views/manifest.json").read_bytes()
+    again = gdtool("render-dataset", *arguments)
+    assert again.returncode == 0 and "a.asset/views: up to date" in again.stderr, again.stderr
+    assert (tmp_path / "data/a.asset/views/manifest.json").read_bytes() == before
+    assert [one["path"] for one in manifest(tmp_path / "data")["content"]["objects"]] == [f"{name}.asset/views" for name in "abc"]
+    assert not [path for path in (tmp_path / "data").rglob(".*")]
+    assert gdtool("validate", tmp_path / "data").returncode == 0
+
+
+def test_either_reflection_model(gdtool, box, tmp_path):
+    """closed_form and color follow --brdf; what is not lit does not."""
+    views = {}
+    for brdf in ("gltf", "paper"):
+        assert gdtool("render-dataset", box, *FAST, "--light", "mid", "--brdf", brdf, "--domains", "color,closed_form,normal", "-o", brdf).returncode == 0
+        assert manifest(tmp_path / brdf)["options"]["brdf"] == brdf
+        views[brdf] = read_views(open_folder(tmp_path / brdf))
+    one, two = (views[brdf].images for brdf in ("gltf", "paper"))
+    assert np.array_equal(one["normal"], two["normal"])
+    for domain in ("color", "closed_form"):
+        difference = np.abs(one[domain] - two[domain])[views["gltf"].mask > 0]
+        assert 1e-3 < difference.max() and difference.mean() < 0.1, domain
+
+
+def test_without_ray_or_its_cluster_that_is_said(gdtool, box, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    done = gdtool("render-dataset", box, *FAST, "--ray", "local")
+    assert done.returncode == 5 and "gdtool[ray]" in done.stderr and done.stdout == ""

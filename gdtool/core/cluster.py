@@ -1,0 +1,95 @@
+"""Many sources on a Ray cluster: one task each, as many in flight as the cluster has cores for."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from gdtool.core.errors import GdtoolError, ResourceError
+
+# Tasks waiting on top of those that run, so that no core waits for this process; more would only take memory.
+AHEAD = 2
+
+
+def each(address: str, work: Callable[[str], Any], texts: Iterator[str], cores: int) -> Iterator[Any]:
+    """work(text) for every text, on the cluster at address, results as they come (not in the order of texts).
+
+    address: "local" starts Ray on this machine; else what `ray start` printed, "auto", or ray://HOST:PORT. cores: of each
+    task. work is pickled; it runs in this process's working folder, which all nodes must see. It returns its errors; a
+    text whose worker dies (a native crash, no memory) gives a GdtoolError. Raises ResourceError without Ray or cluster.
+    """
+    ray = _connected(address)
+    try:
+        task = ray.remote(num_cpus=cores, max_retries=1)(_within)
+        folder = os.getcwd()
+        waiting: dict[Any, str] = {}
+        for text in texts:
+            waiting[task.remote(folder, work, text)] = text
+            full = len(waiting) >= _room(ray, cores)
+            while full or _any_done(ray, waiting):
+                yield _next(ray, waiting)
+                full = len(waiting) >= _room(ray, cores)
+        while waiting:
+            yield _next(ray, waiting)
+    finally:
+        # Also when the reader stops early: tasks that nobody waits for end with their driver.
+        ray.shutdown()
+
+
+def _connected(address: str) -> Any:
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    try:
+        import ray
+    except ImportError:
+        raise ResourceError("--ray", "needs the package ray", "pip install 'gdtool[ray]'") from None
+    try:
+        _knock(address)
+        ray.init(None if address == "local" else address, log_to_driver=False, logging_level="ERROR",
+                 **({"include_dashboard": False} if address == "local" else {}))
+    except (RuntimeError, ValueError, OverflowError, OSError) as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ResourceError(f"--ray {address}", f"no cluster answers ({reason[:100]})", "start one with `ray start --head`, or use --ray local") from None
+    return ray
+
+
+def _knock(address: str) -> None:
+    """OSError when nobody listens at HOST:PORT: Ray itself tries for minutes, and then ends the process."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
+
+
+def _room(ray: Any, cores: int) -> int:
+    """How many tasks may be in flight now; a cluster may grow."""
+    return max(int(ray.cluster_resources().get("CPU", 1)) // cores, 1) + AHEAD
+
+
+def _any_done(ray: Any, waiting: dict[Any, str]) -> bool:
+    return bool(waiting) and bool(ray.wait(list(waiting), num_returns=1, timeout=0)[0])
+
+
+def _next(ray: Any, waiting: dict[Any, str]) -> Any:
+    (done,), _ = ray.wait(list(waiting), num_returns=1)
+    text = waiting.pop(done)
+    try:
+        return ray.get(done)
+    except ray.exceptions.RayError as error:
+        lines = (str(error).strip() or type(error).__name__).splitlines()
+        # A traceback says it on its last line, Ray itself on its first.
+        reason = lines[-1 if isinstance(error, ray.exceptions.RayTaskError) else 0]
+        return GdtoolError(text, f"its worker on the cluster failed ({reason[:120]})", "run it alone to see why")
+
+
+def _within(folder: str, work: Callable[[str], Any], text: str) -> Any:
+    """What a worker does: everything relative is meant from the driver's folder."""
+    from gdtool.core import log
+
+    log.level = log.QUIET
+    try:
+        os.chdir(folder)
+    except OSError:
+        return ResourceError(folder, "is not there on a node of the cluster", "work in a folder that all nodes share")
+    return work(text)
