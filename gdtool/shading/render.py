@@ -208,7 +208,8 @@ class Renderer:
         low, high = np.floor(pixels.min(0)).astype(int), np.ceil(pixels.max(0)).astype(int)
         return (max(low[1], 0), min(high[1], camera.height), max(low[0], 0), min(high[0], camera.width))
 
-    def see(self, camera: Camera, pixel: np.ndarray, sample: np.ndarray, pattern: np.ndarray, together: int) -> Points:
+    def see(self, camera: Camera, pixel: np.ndarray, sample: np.ndarray, pattern: np.ndarray, together: int,
+            emission: bool = True) -> Points:
         """Points that samples at pixel (n,) + pattern[sample] see; together, how many a pixel has, sets the footprint."""
         position = np.stack([pixel % camera.width, pixel // camera.width], 1) + pattern[sample]
         origins, directions = rays(camera, position)
@@ -228,7 +229,7 @@ class Renderer:
         depth = distance * along[hit] - back
         width = camera.pixel_size if camera.projection == "orthographic" else depth / camera.fx
         footprint = width / np.sqrt(together) * np.ones(len(hit))
-        values = self.lookup.attributes(face_idx, barycentric, footprint, directions)
+        values = self.lookup.attributes(face_idx, barycentric, footprint, directions, emission)
         return Points(pixel[hit], sample[hit], origins[hit] + directions * distance[:, None], -directions, depth, values, together)
 
     def buffers(self, camera: Camera, samples: int = 16, shade=None, goal: Goal = Goal()) -> dict[str, np.ndarray]:
@@ -251,7 +252,7 @@ class Renderer:
 
             def look(part: np.ndarray, first: int = done, count: int = count) -> tuple[np.ndarray, Points, dict]:
                 asked = np.repeat(part, count - first)
-                points = self.see(camera, asked, np.tile(np.arange(first, count), len(part)), pattern, count)
+                points = self.see(camera, asked, np.tile(np.arange(first, count), len(part)), pattern, count, shade is not None)
                 return asked, points, shade(points) if shade is not None and len(points) else {}
 
             for group in _batches([pixel[start:start + step] for start in range(0, len(pixel), step)], 4 * self.caster.threads):

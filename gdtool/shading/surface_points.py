@@ -151,14 +151,15 @@ class SurfaceLookup:
         return alpha, cutoff
 
     def attributes(self, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None,
-                   directions: np.ndarray | None = None) -> dict[str, np.ndarray]:
+                   directions: np.ndarray | None = None, emission: bool = True) -> dict[str, np.ndarray]:
         """Attributes at n points: albedo, emissive (n, 3) linear, roughness, metallic, alpha (n,), normal and
         geometric_normal (n, 3) unit, f0 (n,) of the dielectric part at normal incidence (KHR_materials_ior, _specular),
         unlit (n,) bool; float32.
 
         footprint (n,): width in world units that a point stands for; picks the texture level. directions (n, 3): rays
         that see the points; normals are then turned to the seen side, as glTF asks for double-sided materials (and as
-        is done here for all, since files whose winding and normals disagree are common).
+        is done here for all, since files whose winding and normals disagree are common). Without emission it is 0, and
+        not looked up.
         """
         scene, n = self.scene, len(face_idx)
         footprint = None if footprint is None else np.broadcast_to(footprint, (n,))
@@ -168,13 +169,14 @@ class SurfaceLookup:
         vertex_normal = self.shading_normals(face_idx, barycentric)
         normal = vertex_normal.copy()
         owner = scene.material_idx[face_idx]
-        for m in np.unique(owner):
+        present = np.flatnonzero(np.bincount(owner))
+        for m in present:
             material = scene.materials[m]
-            at = np.flatnonzero(owner == m)
+            at = slice(None) if len(present) == 1 else np.flatnonzero(owner == m)
             here = (face_idx[at], barycentric[at], None if footprint is None else footprint[at])
-            color = np.broadcast_to(np.asarray(material.base_color, np.float32), (len(at), 4)).copy()
+            color = np.broadcast_to(np.asarray(material.base_color, np.float32), (len(here[0]), 4)).copy()
             texels = self._read({"color": material.base_color_texture, "surface": material.metallic_roughness_texture, "normal": material.normal_texture,
-                                 "emissive": material.emissive_texture if any(material.emissive) else None}, *here)
+                                 "emissive": material.emissive_texture if emission and any(material.emissive) else None}, *here)
             texel = texels.get("color")
             if texel is not None:
                 color[:, :3] *= texel[:, :3] if texel.shape[1] >= 3 else texel[:, :1]
@@ -188,7 +190,7 @@ class SurfaceLookup:
             roughness[at] = material.roughness * (texel[:, 1] if texel is not None and texel.shape[1] >= 3 else 1.0)
             metallic[at] = material.metallic * (texel[:, 2] if texel is not None and texel.shape[1] >= 3 else 1.0)
             texel = texels.get("emissive")
-            emissive[at] = np.asarray(material.emissive, np.float32) * (texel[:, :3] if texel is not None else 1.0)
+            emissive[at] = np.asarray(material.emissive if emission else (0, 0, 0), np.float32) * (texel[:, :3] if texel is not None else 1.0)
             unlit[at] = material.unlit
             f0[at] = min(((material.ior - 1) / (material.ior + 1)) ** 2 * material.specular, 1.0)
             texel = texels.get("normal")
@@ -197,10 +199,12 @@ class SurfaceLookup:
                 normal[at] = self._normal_mapped(material.normal_texture, material.normal_scale, texel, vertex_normal[at], tangent)
         geometric = self.face_normals[face_idx]
         if directions is not None:
-            geometric = np.where((geometric * directions).sum(1, keepdims=True) > 0, -geometric, geometric)
-            normal = np.where((vertex_normal * geometric).sum(1, keepdims=True) < 0, -normal, normal)
-        return {"albedo": np.clip(albedo, 0, 1), "roughness": np.clip(roughness, 0, 1), "metallic": np.clip(metallic, 0, 1),
-                "alpha": np.clip(alpha, 0, 1), "emissive": np.maximum(emissive, 0), "unlit": unlit, "f0": f0,
+            geometric *= np.where(np.einsum("ij,ij->i", geometric, directions) > 0, -1.0, 1.0)[:, None]
+            normal *= np.where(np.einsum("ij,ij->i", vertex_normal, geometric) < 0, -1.0, 1.0)[:, None]
+        for values in (albedo, roughness, metallic, alpha):
+            np.clip(values, 0, 1, out=values)
+        return {"albedo": albedo, "roughness": roughness, "metallic": metallic,
+                "alpha": alpha, "emissive": np.maximum(emissive, 0), "unlit": unlit, "f0": f0,
                 "normal": normal.astype(np.float32), "geometric_normal": geometric.astype(np.float32)}
 
 
