@@ -14,13 +14,15 @@ from gdtool.geometry.repair import edges_of
 def run_instant_meshes(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float) -> tuple[np.ndarray, np.ndarray]:
     """Instant Meshes (Jakob et al. 2015): a quarter as many mixed faces, then one regular subdivision to pure quads.
 
-    Its deterministic mode, so that equal input gives equal files.
+    Its deterministic mode, so that equal input gives equal files. Intrinsic smoothing leaves a tenth fewer irregular
+    vertices, but its quads keep to creases less well.
     """
     import pynanoinstantmeshes
 
     out, found = pynanoinstantmeshes.remesh(
         np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.uint32), vertex_count=max(quads // 4, 4), rosy=4, posy=4,
-        creaseAngle=float(crease_degrees), align_to_boundaries=bool((edges_of(faces).count == 1).any()), smooth_iter=0, deterministic=True)
+        creaseAngle=float(crease_degrees), align_to_boundaries=bool((edges_of(faces).count == 1).any()), extrinsic=True,
+        smooth_iter=0, deterministic=True)
     return np.asarray(out, np.float64), np.asarray(found, np.int64)
 
 

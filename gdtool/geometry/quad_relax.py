@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.geometry.features import Constraints, Features
-from gdtool.geometry.mesh_quality import corner_jacobians, scaled_jacobian
-from gdtool.geometry.quad_shape import Surface, normals_below, onto, relax, still_vertices, unfold
+from gdtool.geometry.mesh_quality import corner_jacobians, polygon_normals, scaled_jacobian
+from gdtool.geometry.quad_shape import Slide, Surface, normals_below, relax, still_vertices, unfold
 
 _CORNER = np.array([1, 1j, -1, -1j])
 _SQUARE_SHARE = 0.4  # of the way from the nearest rectangle to the nearest square
 _POOR = 0.6  # quads with a smaller scaled Jacobian pull harder
-_NORMALS_EVERY = 4
+_NORMALS_EVERY = 6
 
 
 def square_up(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
@@ -27,6 +27,7 @@ def square_up(vertices: np.ndarray, faces: np.ndarray, surface: Surface, feature
     still = still_vertices(faces, len(vertices), constraints)
     flat = faces.ravel()
     best, best_rank = vertices, None
+    slide = Slide(surface, features, constraints)
     for turn in range(iterations + 1):
         if turn % _NORMALS_EVERY == 0:
             normals = normals_below(vertices, faces, surface)
@@ -43,8 +44,31 @@ def square_up(vertices: np.ndarray, faces: np.ndarray, surface: Surface, feature
         target = np.stack([np.bincount(flat, shares * asked[:, i], len(vertices)) for i in range(3)], -1) / total[:, None]
         moved = vertices + strength * (target - vertices)
         moved[still] = vertices[still]
-        vertices = onto(moved, surface, features, constraints)
-    return best
+        vertices = slide.step(moved, vertices, turn == iterations - 1)
+    return slide.exact(best)
+
+
+def balance(vertices: np.ndarray, faces: np.ndarray, surface: Surface, constraints: Constraints) -> np.ndarray:
+    """Vertices moved off the surface by the mean height of it above their quads, so that as much of it lies above as below.
+
+    A quad whose corners lie on a curved surface lies beneath it everywhere: half of its error is that it does. Features
+    and boundaries stay where they are, and so do quads that do not run along the surface.
+    """
+    free = (constraints.curve < 0) & ~still_vertices(faces, len(vertices), constraints)
+    normals, area = polygon_normals(vertices, faces)
+    corners = vertices[faces]
+    # Of the two triangles that the quad is cut into: centroids and middles of the inner edges.
+    a, b, c, d = (corners[:, i] for i in range(4))
+    samples = np.stack([(a + b + c) / 3, (a + c + d) / 3, (a + c) / 2, (a + b) / 2, (b + c) / 2, (c + d) / 2, (d + a) / 2], 1)
+    weight = np.array([3, 3, 2, 1, 1, 1, 1]) / 12
+    _, face_idx, point = surface.closest(samples.reshape(-1, 3))
+    height = np.einsum("qki,qi->qk", point.reshape(samples.shape) - samples, normals)
+    along = np.einsum("qki,qi->qk", surface.normals[face_idx].reshape(samples.shape), normals) > 0.9
+    mean = np.where(along.all(1) & (np.abs(height).max(1) < 0.1 * np.sqrt(area)), height @ weight, 0.0)
+    flat, shares = faces.ravel(), np.repeat(area, 4)
+    total = np.maximum(np.bincount(flat, shares, len(vertices)), 1e-300)
+    move = np.stack([np.bincount(flat, shares * np.repeat(mean * normals[:, i], 4), len(vertices)) for i in range(3)], -1) / total[:, None]
+    return np.where(free[:, None], vertices + move, vertices)
 
 
 def _rectangles(corners: np.ndarray, normals: np.ndarray) -> np.ndarray:

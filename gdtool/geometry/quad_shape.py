@@ -6,7 +6,11 @@ import numpy as np
 
 from gdtool.geometry.features import Constraints, Features, closest_on_segments
 from gdtool.geometry.mesh_quality import corner_jacobians, polygon_normals, scaled_jacobian, valences
+from gdtool.geometry.normals import face_normals
 from gdtool.geometry.repair import compact, edges_of
+
+_EXACT_EVERY = 3  # steps between two searches for the closest point; the others stay in its plane
+_BENT_COSINE = 0.97  # between a quad's normal and that of the surface below its centre
 
 
 class Surface:
@@ -18,6 +22,7 @@ class Surface:
         self.vertices, self.faces = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
         self._tree = igl.AABB()
         self._tree.init(self.vertices, self.faces)
+        self.normals = face_normals(self.vertices, self.faces)[0]
 
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Distance (n,), face_idx (n,) and closest point (n, 3) for points (n, 3)."""
@@ -70,14 +75,48 @@ def _average_matrix(pairs: np.ndarray, count: int):
 
 def onto(vertices: np.ndarray, surface: Surface, features: Features, constraints: Constraints) -> np.ndarray:
     """Vertices on the surface; those on a feature curve on that curve; fixed ones where they are."""
-    out = vertices.copy()
-    free = (constraints.curve < 0) & ~constraints.fixed
-    out[free] = surface.closest(vertices[free])[2]
-    held = constraints.curve >= 0
-    for curve in np.unique(constraints.curve[held]):
-        mine = np.flatnonzero(constraints.curve == curve)
-        out[mine] = closest_on_segments(vertices[mine], features.points, features.segments[features.curve == curve])[2]
-    return out
+    return Slide(surface, features, constraints).exact(vertices)
+
+
+class Slide:
+    """Brings vertices that move in small steps back: exactly, or to the plane or line that they were on last."""
+
+    def __init__(self, surface: Surface, features: Features, constraints: Constraints):
+        self._surface, self._features = surface, features
+        self._free = np.flatnonzero((constraints.curve < 0) & ~constraints.fixed)
+        held = np.flatnonzero(constraints.curve >= 0)
+        order = held[np.argsort(constraints.curve[held], kind="stable")]
+        self._held = np.split(order, np.flatnonzero(np.diff(constraints.curve[order])) + 1) if len(order) else []
+        self._curves = [features.segments[features.curve == constraints.curve[mine[0]]] for mine in self._held]
+        self._lines: list[np.ndarray] = []
+        self._normals: np.ndarray | None = None
+        self._steps = 0
+
+    def exact(self, vertices: np.ndarray) -> np.ndarray:
+        """Vertices on the surface; those on a feature curve on that curve; fixed ones where they are."""
+        out = vertices.copy()
+        _, face_idx, point = self._surface.closest(vertices[self._free])
+        out[self._free] = point
+        self._normals = self._surface.normals[face_idx]
+        self._lines = []
+        for mine, segments in zip(self._held, self._curves, strict=True):
+            _, segment, point = closest_on_segments(vertices[mine], self._features.points, segments)
+            out[mine] = point
+            line = np.diff(self._features.points[segments[segment]], axis=1)[:, 0]
+            self._lines.append(line / np.maximum(np.linalg.norm(line, axis=1), 1e-300)[:, None])
+        return out
+
+    def step(self, moved: np.ndarray, vertices: np.ndarray, last: bool) -> np.ndarray:
+        """Where `moved` (v, 3) goes that came from `vertices` on the surface; exact in the last step and every few."""
+        self._steps += 1
+        if last or self._normals is None or self._steps % _EXACT_EVERY == 0:
+            return self.exact(moved)
+        out = moved.copy()
+        way = moved[self._free] - vertices[self._free]
+        out[self._free] -= np.einsum("ni,ni->n", way, self._normals)[:, None] * self._normals
+        for mine, line in zip(self._held, self._lines, strict=True):
+            out[mine] = vertices[mine] + np.einsum("ni,ni->n", moved[mine] - vertices[mine], line)[:, None] * line
+        return out
 
 
 def relax(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
@@ -88,13 +127,14 @@ def relax(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: F
     along = _average_matrix(constraints.path, len(vertices)) if len(constraints.path) else None
     held = (constraints.curve >= 0) & ~constraints.fixed
     still = still_vertices(faces, len(vertices), constraints)
-    for _ in range(iterations):
+    slide = Slide(surface, features, constraints)
+    for turn in range(iterations):
         target = average @ vertices
         if along is not None:
             target[held] = (along @ vertices)[held]
         moved = vertices + strength * (target - vertices)
         moved[still] = vertices[still]
-        vertices = onto(moved, surface, features, constraints)
+        vertices = slide.step(moved, vertices, turn == iterations - 1)
     return vertices
 
 
@@ -163,13 +203,13 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
 
 
 def normals_below(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> np.ndarray:
-    """(f, 3) unit normal of the surface under each quad, at its centre and half-way to its corners."""
-    from gdtool.geometry.normals import face_normals
-
+    """(f, 3) unit normal of the surface under each quad: at its centre, of one beside which it is bent also half-way to its corners."""
     corners = vertices[faces]
     centre = corners.mean(1, keepdims=True)
-    points = np.concatenate([centre, (corners + centre) / 2], 1)
-    below = face_normals(surface.vertices, surface.faces)[0][surface.closest(points.reshape(-1, 3))[1]].reshape(len(faces), -1, 3).sum(1)
+    below = surface.normals[surface.closest(centre[:, 0])[1]]
+    bent = np.flatnonzero((below * polygon_normals(vertices, faces)[0]).sum(1) < _BENT_COSINE)
+    inner = ((corners[bent] + centre[bent]) / 2).reshape(-1, 3)
+    below[bent] += surface.normals[surface.closest(inner)[1]].reshape(len(bent), 4, 3).sum(1)
     return below / np.maximum(np.linalg.norm(below, axis=1), 1e-300)[:, None]
 
 

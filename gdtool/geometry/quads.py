@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,8 +14,9 @@ from gdtool.geometry.features import Constraints, Features, find_features, trace
 from gdtool.geometry.mesh_quality import polygon_normals, valences
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_engines import ENGINES, pair_and_split
-from gdtool.geometry.quad_relax import ease, square_up
+from gdtool.geometry.quad_relax import balance, ease, square_up
 from gdtool.geometry.quad_shape import Surface, fill_holes, onto, relax, remove_doublets, subdivide, unfold
+from gdtool.geometry.quad_topology import cancel_irregular
 from gdtool.geometry.sharpen import restore_creases
 from gdtool.geometry.simplify import simplify
 
@@ -59,41 +61,60 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
     start = time.perf_counter()
     edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
     closed = repair.is_watertight(faces)
-    surface_vertices, surface_faces = vertices, faces
-    spacing = _median_edge(vertices, faces)
-    if request.restore_creases and request.crease_degrees > 0 and spacing < 0.75 * edge:
-        surface_vertices, surface_faces, report = restore_creases(vertices, faces, request.crease_degrees)
+    fine_vertices, fine_faces = vertices, faces
+    if request.restore_creases and request.crease_degrees > 0 and _median_edge(vertices, faces) < 0.75 * edge:
+        fine_vertices, fine_faces, report = restore_creases(vertices, faces, request.crease_degrees)
         record.figures["crease_vertices_restored"] = report["moved"]
     record.clock("restore creases", start)
+    # Where a child has one core, this process can use another: the search tree of the input, then the deviation from it.
+    with ThreadPoolExecutor(1) as beside:
+        fine = beside.submit(Surface, fine_vertices, fine_faces)
+        coarse = _simplified(vertices, faces, fine_vertices, fine_faces, closed, request, record)
+        if record.figures.get("crease_vertices_restored") == 0 and fine_vertices is not vertices:
+            fine = beside.submit(Surface, vertices, faces)
+        error = beside.submit(_deviation, fine, coarse) if coarse[1] is not faces else None
+        done, names = [], []
+        for part_vertices, part_faces, quads in _pieces(*coarse, request.quads):
+            found = None
+            if quads >= _SMALL_PIECE_QUADS and request.engine != "split":
+                found = _by_engines(part_vertices, part_faces, quads, edge, request, record, fine)
+            if found is None:
+                start = time.perf_counter()
+                found = (*_fitted(*_by_splitting(part_vertices, part_faces, quads), part_vertices, part_faces, edge, request, fine.result()),
+                         "pair and split")
+                record.clock("fallback", start)
+            done.append(found[:2])
+            names.append(found[2])
+        record.figures["simplify_error"] = error.result() if error is not None else 0.0
+    record.engine = "; ".join(dict.fromkeys(names))
+    offset = np.cumsum([0] + [len(v) for v, _ in done])
+    return np.concatenate([v for v, _ in done]), np.concatenate([f + o for (_, f), o in zip(done, offset, strict=False)]), record
+
+
+def _simplified(vertices: np.ndarray, faces: np.ndarray, restored_vertices: np.ndarray, restored_faces: np.ndarray, closed: bool,
+                request: Request, record: Record) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with its creases restored as coarse as the quads need, or the mesh as it was where that cannot be done."""
     start = time.perf_counter()
     needed = max(3 * request.quads, 20000)
-    restored = surface_vertices is not vertices
-    found = simplify(surface_vertices, surface_faces, needed, seconds=request.seconds, closed=closed, thorough=not restored)
+    restored = restored_vertices is not vertices
+    found = simplify(restored_vertices, restored_faces, needed, seconds=request.seconds, closed=closed, thorough=not restored, measured=False)
     if restored and (found[3]["method"] == "none" and "failed" in found[3] or closed and not repair.is_watertight(found[1])):
         # Bevels drawn out where there is no crease make folds that the collapse tears.
         record.failed.append("creases restored: the result cannot be simplified")
         record.figures["crease_vertices_restored"] = 0
-        found = simplify(vertices, faces, needed, seconds=request.seconds, closed=closed)
-    surface_vertices, surface_faces, _, report = found
-    record.figures.update(simplified_to=report["faces"], simplify_error=report["error"])
+        found = simplify(vertices, faces, needed, seconds=request.seconds, closed=closed, measured=False)
+    report = found[3]
+    record.figures["simplified_to"] = report["faces"]
     if "failed" in report:
         record.failed.append(f"simplify: {report['failed']}")
     record.clock("simplify", start)
-    parts = _pieces(surface_vertices, surface_faces, request.quads)
-    done, names = [], []
-    for part_vertices, part_faces, quads in parts:
-        found = None
-        if quads >= _SMALL_PIECE_QUADS and request.engine != "split":
-            found = _by_engines(part_vertices, part_faces, quads, edge, request, record)
-        if found is None:
-            start = time.perf_counter()
-            found = (*_fitted(*_by_splitting(part_vertices, part_faces, quads), part_vertices, part_faces, edge, request), "pair and split")
-            record.clock("fallback", start)
-        done.append(found[:2])
-        names.append(found[2])
-    record.engine = "; ".join(dict.fromkeys(names))
-    offset = np.cumsum([0] + [len(v) for v, _ in done])
-    return np.concatenate([v for v, _ in done]), np.concatenate([f + o for (_, f), o in zip(done, offset, strict=False)]), record
+    return found[:2]
+
+
+def _deviation(fine: Future, coarse: tuple[np.ndarray, np.ndarray], limit: int = 20000) -> float:
+    """Largest distance of the vertices of the input and of the simplified mesh to the other, at most `limit` of each."""
+    one, two = fine.result(), Surface(*coarse)
+    return float(max(b.closest(a.vertices[::max(len(a.vertices) // limit, 1)])[0].max() for a, b in ((one, two), (two, one))))
 
 
 def _median_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
@@ -147,46 +168,56 @@ def _by_splitting(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[
 
 
 def _fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarray, faces: np.ndarray, edge: float,
-            request: Request) -> tuple[np.ndarray, np.ndarray]:
+            request: Request, fine: Surface) -> tuple[np.ndarray, np.ndarray]:
     """What pair_and_split made, evened out on the surface; only its vertices move."""
     features = find_features(vertices, faces, request.crease_degrees or 181.0, 3 * edge)
     surface = Surface(vertices, faces)
     traced, constraints = trace(quad_vertices, quad_faces, features, edge)
     constraints = untied(traced, quad_faces, constraints)
     traced = relax(onto(traced, surface, features, constraints), quad_faces, surface, features, constraints, request.smooth_iterations)
-    return _shaped(traced, quad_faces, surface, features, constraints, request), quad_faces
+    return _shaped(traced, quad_faces, surface, features, constraints, request, fine), quad_faces
 
 
 def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float, request: Request,
-                record: Record) -> tuple[np.ndarray, np.ndarray, str] | None:
-    """The first engine's result that stands up to judgement, finished; None when none does."""
-    start = time.perf_counter()
-    features = find_features(vertices, faces, request.crease_degrees or 181.0, 3 * edge)
-    surface = Surface(vertices, faces)
-    record.clock("features", start)
+                record: Record, fine: Future) -> tuple[np.ndarray, np.ndarray, str] | None:
+    """The first engine's result that stands up to judgement, finished; None when none does. fine: the input's Surface."""
+    features = surface = None
     second_best = None
-    for engine, subdivisions, factor, degrees in _attempts(quads, request):
+    for engine, subdivisions, factors, degrees in _attempts(quads, request):
         label = engine + (f", {subdivisions} subdivision" if subdivisions else "") + ("" if degrees else ", creases left out")
-        asked = quads * factor
+        asked = [quads * factor for factor in factors]
         for _ in range(_TRIES):
             start = time.perf_counter()
-            try:
-                found = call(ENGINES[engine], vertices.astype(np.float32), faces.astype(np.int32), max(int(asked / 4**subdivisions), 16), degrees,
-                             seconds=request.seconds, memory_mb=request.memory_mb)
-            except ChildFailed as failure:
-                record.failed.append(f"{label}: {failure}")
-                record.clock("engine", start)
-                break
+            with ThreadPoolExecutor(len(asked)) as pool:
+                running = [pool.submit(call, ENGINES[engine], vertices.astype(np.float32), faces.astype(np.int32),
+                                       max(int(number / 4**subdivisions), 16), degrees, seconds=request.seconds, memory_mb=request.memory_mb)
+                           for number in asked]
+                if features is None:
+                    features = find_features(vertices, faces, request.crease_degrees or 181.0, 3 * edge)
+                    surface = Surface(vertices, faces)
+                results = []
+                for number, future in zip(asked, running, strict=True):
+                    try:
+                        results.append((number, *_judged(*future.result(), vertices, faces)))
+                    except ChildFailed as failure:
+                        record.failed.append(f"{label}: {failure}")
             record.clock("engine", start)
+            if not results:
+                break
             start = time.perf_counter()
-            fault, quad_vertices, quad_faces = _judged(*found, vertices, faces)
+
+            def rank(result: tuple) -> tuple:
+                off = abs(len(result[3]) * 4**subdivisions / quads - 1)
+                return result[1] is not None, max(off, COUNT_TOLERANCE), _irregular(result[3])
+
+            number, fault, quad_vertices, quad_faces = min(results, key=rank)
             count = len(quad_faces) * 4**subdivisions
             off = count / quads - 1
             if fault is None and abs(off) > COUNT_TOLERANCE:
-                asked *= quads / max(count, 1) * factor
+                asked = [number * quads / max(count, 1)]
                 continue
             if fault is None:
-                quad_vertices, quad_faces = _finished(quad_vertices, quad_faces, surface, features, subdivisions, request)
+                quad_vertices, quad_faces = _finished(quad_vertices, quad_faces, surface, features, subdivisions, request, fine.result())
                 record.clock("fit", start)
                 fault = _strays(quad_vertices, quad_faces, surface, edge, 1.0 if subdivisions else 2.0)
             elif fault == _HANDLES and not subdivisions and second_best is None and abs(off) <= COUNT_TOLERANCE:
@@ -200,15 +231,20 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
     if second_best is not None:
         # Closed and manifold, but a gap or tunnel finer than the quads was bridged or filled: still better than no engine.
         start = time.perf_counter()
-        quad_vertices, quad_faces = _finished(*second_best[:2], surface, features, 0, request)
+        quad_vertices, quad_faces = _finished(*second_best[:2], surface, features, 0, request, fine.result())
         record.clock("fit", start)
         if _strays(quad_vertices, quad_faces, surface, edge, 2.0) is None:
             return quad_vertices, quad_faces, second_best[2]
     return None
 
 
-def _attempts(quads: int, request: Request) -> list[tuple[str, int, float, float]]:
-    """(engine, subdivisions after it, factor on the count, crease angle it is told), in the order to try.
+def _irregular(faces: np.ndarray) -> int:
+    valence, inner = valences(faces, int(faces.max(initial=0)) + 1)
+    return int((valence[inner] != 4).sum())
+
+
+def _attempts(quads: int, request: Request) -> list[tuple[str, int, tuple[float, ...], float]]:
+    """(engine, subdivisions after it, factors on the count to try side by side, crease angle it is told), in the order to try.
 
     A coarser mesh subdivided has a quarter of the irregular vertices; it fails where features are finer than its quads.
     """
@@ -216,13 +252,13 @@ def _attempts(quads: int, request: Request) -> list[tuple[str, int, float, float
     engines = ["instant-meshes"] if request.engine == "auto" else [request.engine]
     for engine in engines:
         if engine == "instant-meshes" and quads >= 3000:
-            out.append((engine, 1, 1.0, request.crease_degrees))
-        out.append((engine, 0, 1.0, request.crease_degrees))
+            out.append((engine, 1, (0.995, 1.015, 1.035), request.crease_degrees))
+        out.append((engine, 0, (1.0,), request.crease_degrees))
         # Where a seam of the engine's fields fails, it often holds at a slightly different density.
-        out.append((engine, 0, 1.02, request.crease_degrees))
-        out.append((engine, 0, 0.98, 0.0))
+        out.append((engine, 0, (1.02,), request.crease_degrees))
+        out.append((engine, 0, (0.98,), 0.0))
     if request.engine == "quadriflow":
-        out.append(("instant-meshes", 0, 1.0, request.crease_degrees))
+        out.append(("instant-meshes", 0, (1.0,), request.crease_degrees))
     return out
 
 
@@ -238,7 +274,8 @@ def _judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndar
     if closed:
         quad_vertices, quad_faces = fill_holes(quad_vertices, quad_faces)
     quad_vertices, quad_faces = remove_doublets(*repair.one_vertex_per_fan(quad_vertices, quad_faces))
-    quad_vertices, quad_faces = _without_crumbs(quad_vertices, quad_faces, repair.components(faces)[0])
+    quad_vertices, quad_faces = cancel_irregular(quad_vertices, quad_faces)
+    quad_vertices, quad_faces = repair.without_crumbs(quad_vertices, quad_faces, repair.components(faces)[0])
     if closed and not repair.is_watertight(quad_faces):
         return "not watertight, though the input is", quad_vertices, quad_faces
     if not repair.is_manifold(quad_faces):
@@ -250,24 +287,12 @@ def _judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndar
     return None, quad_vertices, quad_faces
 
 
-def _without_crumbs(vertices: np.ndarray, faces: np.ndarray, pieces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Without the smallest pieces beyond the number there should be, if they are crumbs that an engine broke off."""
-    count, piece = repair.components(faces)
-    if count <= pieces:
-        return vertices, faces
-    size = np.bincount(piece)
-    keep = np.argsort(-size, kind="stable")[:pieces]
-    if size[keep].sum() < 0.98 * len(faces):
-        return vertices, faces
-    return repair.compact(vertices, faces[np.isin(piece, keep)])
-
-
 def _euler(faces: np.ndarray) -> int:
     return len(np.unique(faces[faces >= 0])) - len(repair.edges_of(faces).ends) + len(faces)
 
 
 def _finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, subdivisions: int,
-              request: Request) -> tuple[np.ndarray, np.ndarray]:
+              request: Request, fine: Surface) -> tuple[np.ndarray, np.ndarray]:
     """The engine's quads drawn to creases, subdivided, evened out on the surface and unfolded."""
     area = polygon_normals(vertices, faces)[1].sum()
     vertices, constraints = trace(vertices, faces, features, (area / len(faces)) ** 0.5)
@@ -276,17 +301,18 @@ def _finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, feature
     for _ in range(subdivisions):
         vertices, faces, constraints = subdivide(vertices, faces, constraints)
         vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)
-    return _shaped(vertices, faces, surface, features, constraints, request), faces
+    return _shaped(vertices, faces, surface, features, constraints, request, fine), faces
 
 
 def _shaped(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
-            request: Request) -> np.ndarray:
-    """The quads squared up, then the few that stay folded or thin unfolded one vertex at a time."""
+            request: Request, fine: Surface) -> np.ndarray:
+    """The quads squared up, then the few that stay folded or thin unfolded one vertex at a time; last, balanced about `fine`."""
     vertices = square_up(vertices, faces, surface, features, constraints, request.smooth_iterations)
     constraints = untied(vertices, faces, constraints)
-    vertices = square_up(vertices, faces, surface, features, constraints, request.smooth_iterations)
+    vertices = square_up(vertices, faces, surface, features, constraints, 3 * request.smooth_iterations)
     vertices = unfold(vertices, faces, surface, features, constraints)
-    return ease(vertices, faces, surface, features, constraints)[0]
+    vertices, constraints = ease(vertices, faces, surface, features, constraints)
+    return balance(vertices, faces, fine, constraints) if request.smooth_iterations else vertices
 
 
 def _strays(vertices: np.ndarray, faces: np.ndarray, surface: Surface, edge: float, limit: float) -> str | None:

@@ -18,6 +18,7 @@ class Edges:
 
     ends (e, 2) vertices, lower first; count (e,) faces at it; turned (e,) bool: two faces walk it in one direction.
     half_edge_idx (h,) into ends, half_face (h,) the face, half_ends (h, 2) the directed edge: one row a face corner.
+    order (h,) the half edges edge by edge, those of one edge as they come.
     """
 
     ends: np.ndarray
@@ -26,13 +27,13 @@ class Edges:
     half_edge_idx: np.ndarray
     half_face: np.ndarray
     half_ends: np.ndarray
+    order: np.ndarray
 
     def face_pairs(self) -> tuple[np.ndarray, np.ndarray]:
         """Edges (k,) with exactly two faces, and those faces (k, 2)."""
-        order = np.argsort(self.half_edge_idx, kind="stable")
         edge_idx = np.flatnonzero(self.count == 2)
         first = (np.cumsum(self.count) - self.count)[edge_idx]
-        return edge_idx, self.half_face[order][np.stack([first, first + 1], -1)]
+        return edge_idx, self.half_face[self.order[np.stack([first, first + 1], -1)]]
 
 
 def edges_of(faces: np.ndarray) -> Edges:
@@ -42,15 +43,37 @@ def edges_of(faces: np.ndarray) -> Edges:
     if faces.shape[1] == 4:
         triangle = faces[:, 3] < 0
         following[triangle, 2] = faces[triangle, 0]
-    used = faces >= 0
-    half_ends = np.stack([faces[used], following[used]], -1)
-    half_face = np.repeat(np.arange(len(faces)), used.sum(1))
-    low, high = half_ends.min(1), half_ends.max(1)
+    if faces.min(initial=0) < 0:
+        used = faces >= 0
+        half_ends = np.stack([faces[used], following[used]], -1)
+        half_face = np.repeat(np.arange(len(faces)), used.sum(1))
+    else:
+        half_ends = np.stack([faces.ravel(), following.ravel()], -1)
+        half_face = np.arange(len(half_ends)) // faces.shape[1]
+    low, high = np.minimum(half_ends[:, 0], half_ends[:, 1]), np.maximum(half_ends[:, 0], half_ends[:, 1])
     width = int(high.max(initial=0)) + 1
-    key, half_edge_idx, count = np.unique(low * width + high, return_inverse=True, return_counts=True)
-    forward = np.bincount(half_edge_idx, half_ends[:, 0] < half_ends[:, 1], len(key))
+    order = _counting_order(high, width)
+    order = order[_counting_order(low[order], width)]
+    ends = np.stack([low[order], high[order]], -1)
+    new = np.ones(len(ends), bool)
+    new[1:] = (ends[1:] != ends[:-1]).any(1)
+    first = np.flatnonzero(new)
+    count = np.diff(first, append=len(ends))
+    half_edge_idx = np.empty(len(ends), np.int64)
+    half_edge_idx[order] = np.cumsum(new) - 1
+    forward = np.bincount(half_edge_idx, half_ends[:, 0] < half_ends[:, 1], len(first))
     turned = (count == 2) & (forward != 1)
-    return Edges(np.stack([key // width, key % width], -1), count, turned, half_edge_idx.ravel(), half_face, half_ends)
+    return Edges(ends[first], count, turned, half_edge_idx, half_face, half_ends, order)
+
+
+def _counting_order(keys: np.ndarray, width: int) -> np.ndarray:
+    """What np.argsort(keys, kind="stable") gives for keys (n,) below width, in linear time: as a sparse matrix' rows."""
+    from scipy.sparse import csr_array
+
+    if width > 2**31 - 1 or len(keys) > 2**31 - 1:
+        return np.argsort(keys, kind="stable")
+    where = keys.astype(np.int32), np.arange(len(keys), dtype=np.int32)
+    return csr_array((np.ones(len(keys), bool), where), (width, max(len(keys), 1))).indices
 
 
 def is_watertight(faces: np.ndarray) -> bool:
@@ -74,8 +97,11 @@ def split_vertices(faces: np.ndarray) -> np.ndarray:
     return np.flatnonzero(corner_fans(faces)[1] > 1)
 
 
-def corner_fans(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The fan (f, c) each face corner belongs to (numbered over the mesh), and the number of fans at each vertex."""
+def corner_fans(faces: np.ndarray, mates: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """The fan (f, c) each face corner belongs to (numbered over the mesh), and the number of fans at each vertex.
+
+    Fans go on across edges of exactly two faces, and across mates (k, 2), pairs of half edges that belong together.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -85,11 +111,11 @@ def corner_fans(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     corner_idx[used] = np.arange(int(used.sum()))
     vertex_of = np.asarray(faces)[used]
     # Two faces at a manifold edge join their corners at both of its ends. The half edge of a corner starts there.
-    _, pairs = edges.face_pairs()
-    order = np.argsort(edges.half_edge_idx, kind="stable")
     keep = edges.count == 2
     first = (np.cumsum(edges.count) - edges.count)[keep]
-    one, two = order[first], order[first + 1]
+    one, two = edges.order[first], edges.order[first + 1]
+    if mates is not None:
+        one, two = np.concatenate([one, mates[:, 0]]), np.concatenate([two, mates[:, 1]])
     after = np.roll(corner_idx, -1, 1)
     if faces.shape[1] == 4:
         triangle = np.asarray(faces)[:, 3] < 0
@@ -109,6 +135,81 @@ def corner_fans(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     out = np.full(faces.shape, -1, np.int64)
     out[used] = label
     return out, fans
+
+
+def unpinched(vertices: np.ndarray, faces: np.ndarray, rounds: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """A closed triangle mesh two sheets of which share an edge, with a copy of the edge and its ends for each sheet.
+
+    faces (f, 3). Faces on both sides of one wedge of the inside stay together; crumbs that come off are dropped. Edges of
+    an odd number of faces, or of more one way than the other, are left.
+    """
+    edges = edges_of(faces)
+    pinched = np.flatnonzero((edges.count > 2) & (edges.count % 2 == 0))
+    if not len(pinched):
+        return one_vertex_per_fan(vertices, faces)
+    first = np.cumsum(edges.count) - edges.count
+    mates = []
+    for edge in pinched.tolist():
+        half = edges.order[first[edge]:first[edge] + edges.count[edge]]
+        a, b = vertices[edges.ends[edge]]
+        along = b - a
+        x = np.cross(along, [1.0, 0.0, 0.0] if abs(along[0]) < 0.9 * np.linalg.norm(along) else [0.0, 1.0, 0.0])
+        y = np.cross(along, x)
+        tip = vertices[faces[edges.half_face[half]].sum(1) - edges.ends[edge].sum()] - a
+        angle = np.arctan2(tip @ y / max(np.linalg.norm(y), 1e-300), tip @ x / max(np.linalg.norm(x), 1e-300))
+        half = half[np.argsort(angle, kind="stable")]
+        forward = edges.half_ends[half, 0] == edges.ends[edge, 0]
+        if 2 * int(forward.sum()) != len(half):
+            continue
+        # About the edge the inside begins at a backward face and ends at the next forward one.
+        depth = np.cumsum(np.where(forward, -1, 1))
+        half = np.roll(half, -(int(depth.argmin()) + 1))
+        forward = edges.half_ends[half, 0] == edges.ends[edge, 0]
+        opened: list[int] = []
+        for h, closes in zip(half.tolist(), forward.tolist(), strict=True):
+            if closes:
+                mates.append((opened.pop(), h))
+            else:
+                opened.append(h)
+    pairs = np.array(mates, np.int64).reshape(-1, 2)
+    pieces = components(faces)[0]
+    out, found = without_crumbs(*one_vertex_per_fan(vertices, faces, corner_fans(faces, pairs)[0]), pieces)
+    if rounds and (edges_of(found).count > 2).any():
+        # Two sheets with both ends in common besides: a vertex of its own in the middle of each tells them apart.
+        return unpinched(*_halved(vertices, faces, edges, pairs), rounds - 1)
+    return out, found
+
+
+def _halved(vertices: np.ndarray, faces: np.ndarray, edges: Edges, mates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each pair of half edges (k, 2) with a vertex of its own in the middle, its two triangles cut in two."""
+    touched, more, points = set(), [], []
+    faces = faces.copy()
+    for pair in mates.tolist():
+        own = edges.half_face[pair].tolist()
+        if touched & set(own) or own[0] == own[1]:
+            continue  # the next round
+        touched.update(own)
+        middle = len(vertices) + len(points)
+        points.append(vertices[edges.half_ends[pair[0]]].mean(0))
+        for h, f in zip(pair, own, strict=True):
+            a, b = edges.half_ends[h]
+            more.append(np.where(faces[f] == a, middle, faces[f]))
+            faces[f] = np.where(faces[f] == b, middle, faces[f])
+    if not points:
+        return vertices, faces
+    return np.concatenate([vertices, points]), np.concatenate([faces, more])
+
+
+def without_crumbs(vertices: np.ndarray, faces: np.ndarray, pieces: int) -> tuple[np.ndarray, np.ndarray]:
+    """Without the smallest pieces beyond the number there should be, if they are crumbs: 2 % of the faces or less."""
+    count, piece = components(faces)
+    if count <= pieces:
+        return vertices, faces
+    size = np.bincount(piece)
+    keep = np.argsort(-size, kind="stable")[:pieces]
+    if size[keep].sum() < 0.98 * len(faces):
+        return vertices, faces
+    return compact(vertices, faces[np.isin(piece, keep)])
 
 
 def components(faces: np.ndarray) -> tuple[int, np.ndarray]:

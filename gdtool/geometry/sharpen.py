@@ -42,13 +42,14 @@ def restore_creases(vertices: np.ndarray, faces: np.ndarray,
     from scipy.spatial import cKDTree
 
     report: dict[str, float | int] = {"moved": 0, "largest_move": 0.0, "bevel_share": 0.0}
-    ends, pairs, angle = dihedral_degrees(vertices, faces)
-    bent = angle > crease_degrees / 2
-    bevel = np.zeros(len(vertices), bool)
-    bevel[ends[bent].ravel()] = True
-    rough = np.zeros(len(faces), bool)
-    rough[pairs[bent].ravel()] = True
     normals, area = face_normals(vertices, faces)
+    bevel, rough = np.zeros(len(vertices), bool), np.zeros(len(faces), bool)
+    # Only faces with both ends of a bent edge among their corners can have one: few of a fine mesh.
+    few = np.flatnonzero(_maybe_bent(normals, faces, len(vertices), crease_degrees / 2)[faces].sum(1) > 1)
+    ends, pairs, angle = dihedral_degrees(vertices, faces[few])
+    bent = angle > crease_degrees / 2
+    bevel[ends[bent].ravel()] = True
+    rough[few[pairs[bent].ravel()]] = True
     used = np.zeros(len(vertices), bool)
     used[faces.ravel()] = True
     report["bevel_share"] = float(bevel[used].mean())
@@ -59,8 +60,8 @@ def restore_creases(vertices: np.ndarray, faces: np.ndarray,
     side = np.flatnonzero(near_bevel & ~rough & (area > 0))
     if not bevel.any() or report["bevel_share"] > _LARGEST_SHARE or len(side) < _NEIGHBOURS:
         return vertices, faces, report
-    length = np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1)
-    edge = np.median(length)  # of a grid's mesh all edges are about a cell
+    sampled = vertices[faces[::max(len(faces) // 20000, 1)]]
+    edge = np.median(np.linalg.norm(sampled - np.roll(sampled, 1, 1), axis=-1))  # of a grid's mesh all edges are about a cell
     at = np.flatnonzero(bevel)
     centroid = vertices[faces[side]].mean(1)
     distance, near = cKDTree(centroid).query(vertices[at], k=_NEIGHBOURS, workers=2)
@@ -79,6 +80,22 @@ def restore_creases(vertices: np.ndarray, faces: np.ndarray,
     moved = np.zeros(len(vertices), bool)
     moved[at[good]] = True
     return *collapse_bevels(out, faces, moved, _JOIN_EDGES * edge), report
+
+
+def _maybe_bent(normals: np.ndarray, faces: np.ndarray, count: int, degrees: float) -> np.ndarray:
+    """(v,) bool: vertices that may have two faces whose normals differ by more than `degrees`; none that has is left out.
+
+    Of d unit normals two of which are a chord c apart the mean is no longer than sqrt(1 - c^2 / (2 d)): the variance is
+    the mean squared distance of the pairs, and each other normal is at least c / 2 from one of the two.
+    """
+    valid = (normals != 0).any(1).astype(np.float64)
+    total, number = np.zeros((count, 3)), np.zeros(count)
+    for i in range(3):
+        number += np.bincount(faces[:, i], valid, count)
+        for axis in range(3):
+            total[:, axis] += np.bincount(faces[:, i], normals[:, axis], count)
+    chord = 2 * np.sin(np.radians(degrees) / 2)
+    return number**2 - (total * total).sum(1) > 0.99 * chord**2 / 2 * number - 1e-9
 
 
 def _sides(normals: np.ndarray, valid: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

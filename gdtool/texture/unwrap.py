@@ -209,7 +209,7 @@ def islands(vertices: np.ndarray, faces: np.ndarray, face_uvs: np.ndarray) -> tu
     from gdtool.geometry.repair import edges_of
 
     edges = edges_of(faces)
-    order = np.argsort(edges.half_edge_idx, kind="stable")
+    order = edges.order
     edge_idx, pairs = edges.face_pairs()
     first = (np.cumsum(edges.count) - edges.count)[edge_idx]
     ends_uv = edges_of(face_uvs).half_ends  # in the same order of corners

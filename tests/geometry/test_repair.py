@@ -104,3 +104,38 @@ def test_scale_does_not_matter(scale):
     vertices, faces = cube(scale)
     soup, soup_faces = vertices[faces].reshape(-1, 3), np.arange(36).reshape(-1, 3)
     assert len(repair.clean(soup, soup_faces)[0]) == 8
+
+
+def test_sheets_that_meet_in_an_edge_are_parted():
+    import numpy as np
+
+    from gdtool.geometry import repair
+    from tests.geometry.solids import cube
+
+    vertices, faces = cube()
+    # Two cubes side by side along one edge, which then has four faces.
+    shift = np.array([1.0, 1.0, 0])
+    assert np.ptp(vertices, 0).tolist() == [1, 1, 1]
+    both = np.concatenate([vertices, vertices + shift])
+    _, joined = np.unique(both, axis=0, return_inverse=True)
+    points = np.unique(both, axis=0)
+    pinched = joined.ravel()[np.concatenate([faces, faces + 8])]
+    assert len(points) == 14 and not repair.is_watertight(pinched)
+    out, parted = repair.unpinched(points, pinched)
+    assert repair.is_watertight(parted) and repair.is_manifold(parted)
+    assert repair.components(parted)[0] == 2 and len(out) == 16
+
+
+def test_edges_count_as_sorting_does():
+    import numpy as np
+
+    from gdtool.geometry import repair
+
+    rng = np.random.default_rng(0)
+    faces = rng.integers(0, 40, (300, 4))
+    faces[::3, 3] = -1
+    edges = repair.edges_of(faces)
+    half = np.sort(edges.half_ends, 1)
+    ends, inverse, count = np.unique(half, axis=0, return_inverse=True, return_counts=True)
+    assert (edges.ends == ends).all() and (edges.count == count).all() and (edges.half_edge_idx == inverse.ravel()).all()
+    assert (edges.order == np.argsort(inverse.ravel(), kind="stable")).all()
