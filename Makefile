@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-reconstruct bench-render bench-relight schemas docs-check model data clean
+.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-reconstruct bench-render bench-relight bench-throughput schemas docs-check model data clean
 
 venv: .venv/.done
 
@@ -40,9 +40,10 @@ bench-assets: venv
 	$(BIN)/python benchmarks/remesh.py $(wildcard $(ASSETS))
 	$(BIN)/python benchmarks/unwrap.py $(wildcard $(ASSETS))
 
-# Reconstruction beside its peers, on procedural objects and on every model under MODELS (a folder); an hour and more.
+# Reconstruction beside its peers, on public models in ../shared/assets (where there are any) and procedural objects: a quarter
+# of an hour. ARGS=--all for every disturbance and budget of every model (hours), ARGS="--models DIR" for models of your own.
 bench-reconstruct: venv
-	$(BIN)/python benchmarks/reconstruct.py $(if $(MODELS),--models $(MODELS) --limit 12) --seeds 5 --wavelengths 0.0625,0.125,0.25
+	$(BIN)/python benchmarks/reconstruct.py $(ARGS)
 
 # Time against error of rendering and relighting; set MODEL (textured) and ENV (lat-long).
 MODEL ?= procedural:3
@@ -53,6 +54,10 @@ bench-render: venv
 
 bench-relight: venv
 	$(BIN)/python benchmarks/relight.py $(MODEL) $(ENV)
+
+# Objects per core-minute of render-dataset, by cores and by objects; goes on where it was.
+bench-throughput: venv
+	$(BIN)/python benchmarks/throughput.py
 
 docs-check: venv
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python tests/tools/docs_check.py

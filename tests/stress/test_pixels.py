@@ -35,14 +35,18 @@ def picture(renderer: Renderer, environment, seed: int, directions: int, brdf: s
     return renderer.buffers(CAMERA, SAMPLES, DirectLight(renderer, environment, directions, seed, brdf, **options).color())["color"].astype(np.float64)
 
 
-def z_test(draws: np.ndarray, reference: np.ndarray, reference_error: np.ndarray) -> float:
-    """The smallest p of all pixels' two-sided t-tests, corrected for their number (Šidák 1967)."""
+def z_test(draws: np.ndarray, reference: np.ndarray, reference_error: np.ndarray, bias: float = 0.0) -> float:
+    """The smallest p of all pixels' two-sided t-tests, corrected for their number (Šidák 1967).
+
+    bias: share of the reference by which an estimate that is not unbiased may be off.
+    """
     count = len(draws)
     mean, variance = draws.mean(0), draws.var(0, ddof=1)
     # float32 sums differ by rounding where there is no noise at all.
     error = np.sqrt(variance / count + reference_error**2 + (1e-5 * reference) ** 2)
     seen = reference > 0
-    p = 2 * student.sf(np.abs(mean - reference)[seen] / error[seen], count - 1)
+    off = np.maximum(np.abs(mean - reference) - bias * reference, 0)
+    p = 2 * student.sf(off[seen] / error[seen], count - 1)
     return 1 - (1 - float(p.min())) ** int(seen.sum())
 
 
@@ -51,17 +55,17 @@ MATERIALS = {"plaster": Material(base_color=(0.7, 0.5, 0.3, 1), metallic=0.0, ro
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("brdf", ["gltf", "paper"])
+@pytest.mark.parametrize("brdf, known", [("gltf", False), ("gltf", True), ("paper", False)], ids=["gltf", "gltf known irradiance", "paper"])
 @pytest.mark.parametrize("material", MATERIALS)
 @pytest.mark.parametrize("light", ["mid", "bright"])
-@pytest.mark.parametrize("known", [False, True], ids=["plain", "known irradiance"])
 def test_sampled_light_agrees_with_the_converged(material, light, brdf, known):
-    """Both estimates: the plain one, and the one that is used, with the unshadowed irradiance as a control variate."""
+    """The plain estimate is unbiased; the one that is used for glTF's Lambert, the known irradiance times the visible share,
+    is a ratio of two estimates, off by up to 0.1 % where a pixel is half in shadow."""
     renderer, environment = Renderer(stage(MATERIALS[material]), 1), bundled(light).shrunk(64)
     reference = [picture(renderer, environment, 1000 + k, 1024, brdf, known=False) for k in range(4)]
     error = np.std(reference, 0, ddof=1) / 2
     draws = np.stack([picture(renderer, environment, seed, 16, brdf, known=known) for seed in range(DRAWS)])
-    assert z_test(draws, np.mean(reference, 0), error) > SIGNIFICANCE
+    assert z_test(draws, np.mean(reference, 0), error, 2e-3 if known else 0.0) > SIGNIFICANCE
 
 
 def test_the_test_finds_a_bias_of_two_percent():
