@@ -34,11 +34,16 @@ fuzz: venv
 bench: venv
 	$(BIN)/python benchmarks/pipeline.py
 
-# Remesh and unwrap beside their peers, over solids and the models in $(ASSETS): about half an hour.
+# Remesh and unwrap beside their peers, over solids and the models in $(ASSETS): about half an hour. Bake over the textured
+# models in $(TEXTURED), twenty minutes more; with PEERS_PYTHON, a Python that has bpy, beside Blender.
 ASSETS ?= ../shared/assets/mesh/odedstein
+TEXTURED ?= ../shared/assets/glb ../shared/assets/gltf
+PEERS_PYTHON ?=
 bench-assets: venv
 	$(BIN)/python benchmarks/remesh.py $(wildcard $(ASSETS))
 	$(BIN)/python benchmarks/unwrap.py $(wildcard $(ASSETS))
+	$(BIN)/python benchmarks/bake.py $(wildcard $(TEXTURED)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
+	$(BIN)/python benchmarks/asset.py $(wildcard $(TEXTURED)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
 
 # Reconstruction beside its peers, on public models in ../shared/assets (where there are any) and procedural objects: a quarter
 # of an hour. ARGS=--all for every disturbance and budget of every model (hours), ARGS="--models DIR" for models of your own.

@@ -2,8 +2,8 @@
 
     python benchmarks/bake.py [MODEL_OR_FOLDER ...] [--peers-python PATH] [-o docs/benchmarks] [--minutes 10] [--sizes 1024,2048,4096]
 
-Writes bake.md, bake.json and bake.png (the maps side by side) after every row. Models without a texture or with several
-are taken like others; those that cannot be remeshed are named. The sizes are swept on the peers' case, the others have
+Writes bake.md, bake.json and bake.png (the maps side by side) after every row. Models that have
+neither a texture nor colors are left out; those that cannot be remeshed are named. The sizes are swept on the peers' case, the others have
 2048². Errors: benchmarks/bake_score.py. --peers-python is a Python that has bpy; without it Blender is left out. What does
 not start within --minutes is named, not run; the quad meshes are made before the clock starts, and kept.
 """
@@ -27,6 +27,19 @@ from measure import busy, machine, number, say, table
 PEER = Path(__file__).with_name("bake_blender.py")
 COLUMNS = ("model", "way", "size", "bake s", "bake cpu", "occlusion s", "png s", "peak MB", "albedo dB", "roughness dB", "metallic dB", "normal deg", "missed",
            "8-bit albedo dB", "8-bit roughness dB", "8-bit normal deg", "seam albedo", "seam roughness", "unfilled", "occlusion rms")
+
+
+def has_detail(path: Path) -> bool:
+    """Whether a model can be read and has textures or colors to bake."""
+    from gdtool.assets.load import load_scene
+    from gdtool.core.errors import GdtoolError
+
+    try:
+        scene = load_scene(path)
+    except GdtoolError as error:
+        say(f"{path.name}: left out: {error}")
+        return False
+    return scene.colors is not None or any(m.base_color_texture is not None for m in scene.materials)
 
 
 def peak_mb() -> float:
@@ -157,7 +170,7 @@ def main() -> None:
     asked = parser.parse_args()
     os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # the children import this file
     note, rows, sheet, names, cases = busy(), [], [], [], []
-    for source in ["part", *models_in(asked.models)]:
+    for source in ["part", *filter(has_detail, models_in(asked.models))]:
         if len(cases) > asked.limit:
             break
         try:

@@ -61,6 +61,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         _check_overlap(target, inputs, out)
     with out.step("source"):
         origin = _read_origin(inputs, options, matrix, target, out)
+        few = slice(None, None, max(1, len(target.faces) // 5000))
+        if origin.source.turn_to(target.vertices[target.faces[few]].mean(1), target.normals[few].mean(1)):
+            out.warn(f"{inputs.name}: what it is baked from is inside out beside it; the faces are taken the other way round")
     size = options.size or size_for(target, origin.detail)
     _check_memory(inputs, size)
     with out.step("rasterise"):

@@ -194,7 +194,8 @@ def occlusion_tracer(target: Target, source: Source, reach: np.ndarray, normals:
             at = source.at(places.face_idx, places.barycentric, source.vertices)
             geometric = source.face_normals[places.face_idx]
             smooth = source.at(places.face_idx, places.barycentric, normals)
-            smooth = unit(np.where(dot(smooth, geometric)[:, None] > 0.2, smooth, geometric))
+            side = dot(smooth, geometric)[:, None]
+            smooth = unit(np.where(np.abs(side) > 0.2, smooth * np.sign(side), geometric))
             return openness(at + geometric * lift, smooth, source.caster, rays, seed + part.start, lift=0.0)
 
         parts = [slice(s, s + 8192) for s in range(0, len(face_idx), 8192)]

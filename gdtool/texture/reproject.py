@@ -60,6 +60,16 @@ class Source:
                 self._facing[axis, sign] = Nearest(self.vertices, self.faces, chosen) if len(chosen) else None
             return self._facing[axis, sign]
 
+    def turn_to(self, points: np.ndarray, normals: np.ndarray) -> bool:
+        """Turn all faces round where the source is inside out: where nine in ten of those nearest to points (n, 3) look away
+        from normals (n, 3). Returns whether it was."""
+        face, _ = self.nearest.closest(points)
+        if not len(face) or (dot(self.face_normals[face], normals) < 0).mean() < 0.9:
+            return False
+        self.face_normals, self.face_normals_32 = -self.face_normals, -self.face_normals_32
+        self._facing.clear()
+        return True
+
     def at(self, face_idx: np.ndarray, barycentric: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Vertex values (v,) or (v, c), interpolated at places on faces: (n,) or (n, c)."""
         corners = values[self.faces[face_idx]]

@@ -1,0 +1,164 @@
+"""The finished asset against the model it was made from, and against itself in Blender.
+
+    python benchmarks/asset.py [MODEL_OR_FOLDER ...] [--peers-python PATH] [-o docs/benchmarks] [--minutes 10]
+
+Each case of bake_cases.py (a model, and the quad mesh that gdtool's remesh and unwrap made of it) is baked by `gdtool bake`
+as a user runs it, 2048², with three coarser levels. Source and asset are then rendered alike from twelve azimuths under three
+lights, and compared: masked PSNR of the lit pictures (docs/metrics.md). With --peers-python (a Python that has bpy) Blender
+loads asset.glb and renders it from two sides, its base color without light and the whole lit; both are compared with gdtool's
+own pictures of the asset. Writes asset.md, asset.json and asset.png after every row.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from bake import has_detail
+from bake_cases import Case, case_of, read_low
+from fine_meshes import models_in
+from measure import Failed, busy, gdtool, machine, number, say, table
+
+LIGHTS = ("dark", "mid", "bright")
+VIEWS = 12
+PEER_VIEWS = "front_right,back"
+PEER = Path(__file__).with_name("shading_blender.py")
+OWN = Path(__file__).with_name("shading_gdtool.py")
+COLUMNS = ("model", "seconds", "peak MB", *LIGHTS, "worst view", "base color dB", "roughness", "metallic", "normal deg", "lod3 drift", "Blender base color dB", "Blender lit dB")
+
+
+def lit(scene, light: str, size: int, samples: int, threads: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Views.images of a scene under a light (color linear, and the material buffers, (k, h, w[, c])), and its coverage."""
+    from gdtool.shading.direct import DirectLight
+    from gdtool.shading.render import Renderer
+    from gdtool.shading.rigs import turntable
+    from gdtool.shading.studio import studio
+
+    renderer = Renderer(scene, threads)
+    color = DirectLight(renderer, studio(light, 0, fit=False)[0], 8, 0, mode="prefiltered").color()
+    frames = [renderer.buffers(camera, samples, color) for camera in turntable(VIEWS, size, 10.0)]
+    stacked = {name: np.stack([frame[name] for frame in frames]) for name in frames[0]}
+    return stacked, stacked.pop("mask")
+
+
+def relit(case: Case, asset: Path, size: int, samples: int) -> tuple[dict[str, float], list[np.ndarray]]:
+    """Errors of the asset's pictures, and one picture of each for the sheet."""
+    from gdtool.assets.load import load_scene
+    from gdtool.images.metrics import color_metrics, over_white, views_metrics
+
+    threads, out, pictures, worst = len(os.sched_getaffinity(0)), {}, [], 100.0
+    truth, result = load_scene(case.glb), load_scene(asset / "asset.glb")
+    for light in LIGHTS:
+        (true, true_mask), (ours, mask) = lit(truth, light, size, samples, threads), lit(result, light, size, samples, threads)
+        each = [color_metrics(ours["color"][k:k + 1], mask[k:k + 1], true["color"][k:k + 1], true_mask[k:k + 1])["psnr_masked"] for k in range(VIEWS)]
+        out[light], worst = float(np.mean(each)), min(worst, *each)
+        pictures += [over_white(true["color"][1], true_mask[1]), over_white(ours["color"][1], mask[1])]
+    buffers = views_metrics({k: ours[k] for k in ("albedo", "roughness", "metallic", "normal")}, mask, {k: true[k] for k in ("albedo", "roughness", "metallic", "normal")}, true_mask)
+    out |= {"worst view": worst, "base color dB": buffers["albedo_psnr_masked"], "roughness": buffers["roughness_error"],
+            "metallic": buffers["metallic_error"], "normal deg": buffers["normal_degrees"]}
+    return out, pictures
+
+
+def beside_blender(python: Path, asset: Path, folder: Path, size: int, samples: int) -> tuple[dict[str, float], list[np.ndarray]]:
+    """How near gdtool's pictures of the asset are to Blender's, over the pixels that both see in full."""
+    from shading_scene import exported
+
+    from gdtool.images.color import srgb_from_linear
+    from gdtool.images.metrics import FULL, over_white, psnr
+
+    scene = exported(str(asset / "asset.glb"), "mid", folder)
+    common = ["--size", str(size), "--samples", str(samples)]
+    views = ",".join(f"{view}={scene['azimuths'][view]:g}" for view in PEER_VIEWS.split(","))
+    for command in ([python, PEER, scene["model"], scene["light"], folder / "blender.npz", "--views", views, "--half-width", str(scene["half_width"]), "--light", "--buffers", *common],
+                    [sys.executable, OWN, scene["model"], "mid", folder / "own.npz", "--views", PEER_VIEWS, "--light", "sampled", "--light-samples", "8", *common]):
+        done = subprocess.run([str(part) for part in command], capture_output=True, text=True, timeout=200, check=False)
+        if done.returncode:
+            raise Failed((done.stderr.strip().splitlines() or ["no message"])[-1])
+    theirs, own = (dict(np.load(folder / name)) for name in ("blender.npz", "own.npz"))
+    where = (theirs["mask"] > FULL) & (own["mask"] > FULL)
+    stored = {name: [np.clip(srgb_from_linear(one[name]), 0, 1) for one in (theirs, own)] for name in ("albedo", "color")}
+    pictures = [over_white(one["color"][0] / np.maximum(one["mask"][0], 1e-3)[..., None], one["mask"][0]) for one in (own, theirs)]
+    return {"Blender base color dB": psnr(*stored["albedo"], where), "Blender lit dB": psnr(*stored["color"], where)}, pictures
+
+
+def baked(case: Case, folder: Path) -> tuple[Path, dict[str, float]]:
+    """The asset folder, and what the command cost."""
+    from gdtool.folders.mesh import write_obj
+
+    low, out = folder / f"{case.name}.obj", folder / "asset"
+    write_obj(low, read_low(case))
+    cost = gdtool("bake", low, "--model", case.glb, "--size", 2048, "--lods", 4, "-o", out, "--quiet")
+    report = json.loads((out / "manifest.json").read_text())["content"]["report"]
+    return out, {"seconds": cost.seconds, "peak MB": cost.peak_mb, "lod3 drift": report.get("lod3_drift_mean")}
+
+
+def write(out: Path, rows: list[dict], sheet: list, note: str) -> None:
+    """The reports of what there is so far."""
+    from gdtool.images.contact import contact_sheet
+    from gdtool.images.io import write_png
+
+    out.mkdir(parents=True, exist_ok=True)
+    text = table(COLUMNS, ([number(row.get(name, "failed" if name == "seconds" and "failed" in row else None), 3) for name in COLUMNS] for row in rows))
+    failed = "\n".join(f"- {row['model']}: {row['failed']}" for row in rows if "failed" in row)
+    head = f"# Finished asset\n\n`python benchmarks/asset.py`, {machine()}. {note}\n\n`gdtool bake --size 2048 --lods 4` of the model's quad mesh: seconds and memory of the " \
+        f"whole command; masked PSNR of lit pictures against the model's, mean of {VIEWS} views under {', '.join(LIGHTS)}, and the worst; the buffers' errors; how far " \
+        "the coarsest level (an eighth) slid on its maps, share of the extent; gdtool's pictures of the asset against Blender's.\n\n"
+    (out / "asset.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![source and asset](asset.png)\n")
+    (out / "asset.json").write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")
+    if sheet:
+        wide = max(len(row) for row in sheet)
+        names = [f"{what}, {light}" for light in LIGHTS for what in ("source", "asset")] + ["asset", "in Blender"]
+        write_png(out / "asset.png", contact_sheet([row + [None] * (wide - len(row)) for row in sheet], labels_top=names[:wide],
+                                                   labels_left=[row["model"] for row in rows if "mid" in row]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("models", nargs="*", type=Path)
+    parser.add_argument("-o", "--out", type=Path, default=Path("docs/benchmarks"))
+    parser.add_argument("--peers-python", type=Path)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--limit", type=int, default=12, help="models at most")
+    parser.add_argument("--size", type=int, default=256, help="of the pictures")
+    parser.add_argument("--samples", type=int, default=8)
+    parser.add_argument("--kept", type=Path, default=Path("out/bench_meshes"))
+    asked = parser.parse_args()
+    import torch
+
+    torch.set_num_threads(1)  # shading runs in threads of its own
+    note, rows, sheet = busy(), [], []
+    end = time.monotonic() + 60 * asked.minutes
+    for source in ["part", *list(filter(has_detail, models_in(asked.models)))[:asked.limit]]:
+        row: dict = {"model": source if source == "part" else source.stem}
+        rows.append(row)
+        if time.monotonic() > end:
+            row["failed"] = f"not started within {asked.minutes:g} minutes"
+            continue
+        say(row["model"])
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                case = case_of(source, asked.kept)
+                asset, cost = baked(case, Path(folder))
+                row |= cost
+                errors, pictures = relit(case, asset, asked.size, asked.samples)
+                row |= errors
+                sheet.append(pictures)
+                if asked.peers_python:
+                    found, more = beside_blender(asked.peers_python, asset, Path(folder, "peer"), 2 * asked.size, 4 * asked.samples)
+                    row |= found
+                    sheet[-1] = pictures + [image[::2, ::2] for image in more]
+            except Exception as failure:  # a model that fails is a row of the table, not the end of it
+                row["failed"] = f"{type(failure).__name__}: {failure}"
+        write(asked.out, rows, sheet, note)
+    print((asked.out / "asset.md").read_text())
+
+
+if __name__ == "__main__":
+    main()
