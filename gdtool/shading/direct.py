@@ -1,6 +1,6 @@
 """Direct light of an environment with shadows: multiple importance sampling of the light and the reflection, Embree visibility.
 
-Everything per pair of point and direction is a scalar: with Schlick's Fresnel, F = f0 + (1 − f0) w, reflected radiance is a
+Everything per pair of point and direction is a scalar: with Schlick's Fresnel, F = f0 + (f90 − f0) w, reflected radiance is a
 linear combination of four sums over the directions, in which only w depends on them.
 
 Diffuse light that nothing hides is known without rays and without noise: irradiance from a table. The sampled directions
@@ -80,7 +80,10 @@ class DirectLight:
         sums = np.zeros((len(points), SUMS, 3), np.float32)
         runs = self._runs(points) if k else None
         if self.mode == "prefiltered" and len(points):
-            self.prefiltered.prepare(points.values["roughness"])
+            from gdtool.shading.prefilter import lobe_roughness
+
+            n_v = np.einsum("ij,ij->i", points.values["normal"], points.view)
+            self.prefiltered.prepare(lobe_roughness(tensor_of(points.values["roughness"]), tensor_of(n_v)))
 
         at, counted = time.perf_counter(), np.zeros(3, np.int64)
         for start in range(0, len(points), step):
@@ -177,8 +180,10 @@ class DirectLight:
         values = points.values
         albedo, metallic = values["albedo"], values["metallic"][:, None]
         f0 = values["f0"][:, None] * (1 - metallic) + albedo * metallic
+        # How much reflection grows toward grazing: to 1, or to what KHR_materials_specular leaves of a dielectric's.
+        growth = values["f90"][:, None] * (1 - metallic) + metallic - f0
         n_v = np.einsum("ij,ij->i", values["normal"], points.view)
-        reflect = [f0 * sums[:, i] + (1 - f0) * sums[:, i + 1] for i in (0, 4, 7)]
+        reflect = [f0 * sums[:, i] + growth * sums[:, i + 1] for i in (0, 4, 7)]
         diffuse = [sums[:, i] for i in (2, 6, 9)]
         starts = np.flatnonzero(np.diff(points.pixel, prepend=-1))
         owner = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(points)))
@@ -189,16 +194,17 @@ class DirectLight:
 
             seen = [1.0, 1.0] if not self.samples else [_share(*x, starts)[owner] for x in (reflect, diffuse)]
             cosine, roughness = tensor_of(n_v), tensor_of(values["roughness"])
-            factor = 1 - fresnel_loss(cosine) if self.brdf == "gltf" else disney_mean(roughness, cosine.clamp(0, 1))
-            specular, received = reflect[2] * seen[0], diffuse[2] * seen[1] * torch.as_tensor(factor).numpy()[:, None]
+            if self.brdf == "gltf":
+                factor = 1 - f0 - growth * torch.as_tensor(fresnel_loss(cosine)).numpy()[:, None]
+            else:
+                factor = torch.as_tensor(disney_mean(roughness, cosine.clamp(0, 1))).numpy()[:, None]
+            specular, received = reflect[2] * seen[0], diffuse[2] * seen[1] * factor
         else:
             specular, received = reflect[0], diffuse[0]
             if self.known and self.brdf == "gltf":
                 received = received + _share(*diffuse, starts)[owner] * (diffuse[2] - diffuse[1])
             if self.brdf == "gltf":
-                received = received - sums[:, 3]
-        if self.brdf == "gltf":
-            received = (1 - f0) * received
+                received = (1 - f0) * received - growth * sums[:, 3]
         return (specular + np.maximum(albedo * (1 - metallic) * received, 0)).astype(np.float32)
 
 

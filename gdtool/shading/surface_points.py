@@ -153,7 +153,7 @@ class SurfaceLookup:
     def attributes(self, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None,
                    directions: np.ndarray | None = None, emission: bool = True) -> dict[str, np.ndarray]:
         """Attributes at n points: albedo, emissive (n, 3) linear, roughness, metallic, alpha (n,), normal and
-        geometric_normal (n, 3) unit, f0 (n,) of the dielectric part at normal incidence (KHR_materials_ior, _specular),
+        geometric_normal (n, 3) unit, f0 and f90 (n,) of the dielectric part at normal and at grazing incidence (KHR_materials_ior, _specular),
         unlit (n,) bool; float32.
 
         footprint (n,): width in world units that a point stands for; picks the texture level. directions (n, 3): rays
@@ -165,7 +165,8 @@ class SurfaceLookup:
         footprint = None if footprint is None else np.broadcast_to(footprint, (n,))
         albedo, emissive = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
         roughness, metallic = np.empty(n, np.float32), np.empty(n, np.float32)
-        alpha, unlit, f0 = np.ones(n, np.float32), np.zeros(n, bool), np.empty(n, np.float32)
+        alpha, unlit = np.ones(n, np.float32), np.zeros(n, bool)
+        f0, f90 = np.empty(n, np.float32), np.empty(n, np.float32)
         vertex_normal = self.shading_normals(face_idx, barycentric)
         normal = vertex_normal.copy()
         owner = scene.material_idx[face_idx]
@@ -193,6 +194,7 @@ class SurfaceLookup:
             emissive[at] = np.asarray(material.emissive if emission else (0, 0, 0), np.float32) * (texel[:, :3] if texel is not None else 1.0)
             unlit[at] = material.unlit
             f0[at] = min(((material.ior - 1) / (material.ior + 1)) ** 2 * material.specular, 1.0)
+            f90[at] = min(material.specular, 1.0)
             texel = texels.get("normal")
             if texel is not None and texel.shape[1] >= 3:
                 tangent = self._tangent(material.normal_texture, *here[:2])
@@ -204,7 +206,7 @@ class SurfaceLookup:
         for values in (albedo, roughness, metallic, alpha):
             np.clip(values, 0, 1, out=values)
         return {"albedo": albedo, "roughness": roughness, "metallic": metallic,
-                "alpha": alpha, "emissive": np.maximum(emissive, 0), "unlit": unlit, "f0": f0,
+                "alpha": alpha, "emissive": np.maximum(emissive, 0), "unlit": unlit, "f0": f0, "f90": f90,
                 "normal": normal.astype(np.float32), "geometric_normal": geometric.astype(np.float32)}
 
 
