@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-reconstruct bench-render bench-relight bench-throughput schemas docs-check model data clean
+.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-reconstruct bench-render bench-relight bench-sheets bench-throughput schemas docs-check model data clean
 
 venv: .venv/.done
 
@@ -22,10 +22,10 @@ test: venv
 stress: venv
 	$(BIN)/python -m pytest -m slow
 
-# What needs optional packages: Stable Diffusion's parts (diffusers, transformers; the tests make their own small weights), OpenUSD, Ray.
+# What needs optional packages: Stable Diffusion's parts (diffusers, transformers; the tests make their own small weights), OpenUSD, Ray, meshopt (built: needs a C++ compiler).
 extras-test: venv
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[hub,usd,ray]"
-	$(BIN)/python -m pytest tests/diffusion/test_pretrained.py tests/stages/test_bake_usd.py tests/stages/test_ray.py
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[hub,usd,ray,meshopt]"
+	$(BIN)/python -m pytest tests/diffusion/test_pretrained.py tests/stages/test_bake_usd.py tests/stages/test_ray.py tests/assets/test_meshopt.py
 
 # Ten minutes of damaged files for every reader; what breaks one stays as a test.
 fuzz: venv
@@ -50,15 +50,20 @@ bench-assets: venv
 bench-reconstruct: venv
 	$(BIN)/python benchmarks/reconstruct.py $(ARGS)
 
-# Time against error of rendering and relighting; set MODEL (textured) and ENV (lat-long).
+# Time against error of rendering and relighting; set MODEL (textured), ENV (lat-long) and PEERS_PYTHON, a Python that can
+# import bpy, mitsuba or both (and OpenImageIO). A quarter of an hour each on two cores with both peers.
 MODEL ?= procedural:3
 ENV ?= mid
 
 bench-render: venv
-	$(BIN)/python benchmarks/render.py $(MODEL) $(ENV)
+	$(BIN)/python benchmarks/render.py $(MODEL) $(ENV) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
 
 bench-relight: venv
-	$(BIN)/python benchmarks/relight.py $(MODEL) $(ENV)
+	$(BIN)/python benchmarks/relight.py $(MODEL) $(ENV) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
+
+# MODELS (files) under LIGHTS (by commas) as gdtool and the peers render them, side by side, in out/sheets, to look at.
+bench-sheets: venv
+	$(BIN)/python benchmarks/contact_sheets.py $(or $(MODELS),procedural:1 procedural:2 procedural:3) --lights $(or $(LIGHTS),dark,mid,bright) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON)) -o out/sheets
 
 # Objects per core-minute of render-dataset, by cores and by objects; goes on where it was.
 bench-throughput: venv

@@ -101,9 +101,15 @@ class Environment:
             current = replace(self, image=mass / total)
         return current
 
+    def cut(self, height: int) -> Environment:
+        """The same light in at least so many rows, pixels repeated: sums by their middles err by 1.6 % with 8 rows, .02 % with 64."""
+        times = max(-(-height // self.image.shape[0]), 1)
+        across = max(-(-2 * height // self.image.shape[1]), 1)
+        return self if times == across == 1 else replace(self, image=self.image.repeat(times, 0).repeat(across, 1))
+
     def irradiance(self, normals: np.ndarray) -> np.ndarray:
         """(n, 3) ∫ L max(0, n·l) dl, by the pixels of a shrunk copy."""
-        small = self.shrunk(32)
+        small = self.shrunk(32).cut(32)
         weighted = (small.image * small.solid_angles[:, None, None]).reshape(-1, 3)
         return np.maximum(normals @ small.directions.reshape(-1, 3).T, 0) @ weighted
 

@@ -7,9 +7,12 @@ import pytest
 
 from gdtool.assets.gltf_read import read_gltf
 from gdtool.cameras import camera_at
-from gdtool.shading.render import render_buffers
+from gdtool.core.errors import InputError
+from gdtool.shading.direct import DirectLight
+from gdtool.shading.environment import Environment
+from gdtool.shading.render import Renderer, render_buffers
 from gdtool.shading.surface_points import surface_attributes
-from tests.assets.gltf_files import QUAD, QUAD_FACES, quad
+from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad
 from tests.assets.test_gltf_read import with_textures
 
 CORNER = np.array([0]), np.array([[1.0, 0.0, 0.0]])
@@ -76,4 +79,142 @@ def test_ior_and_specular_set_the_reflectance_at_normal_incidence(tmp_path):
     builder = quad(extensions={"KHR_materials_ior": {"ior": 2.0}, "KHR_materials_specular": {"specularFactor": 0.5}})
     builder.document["extensionsUsed"] = ["KHR_materials_ior", "KHR_materials_specular"]
     scene = read_gltf(builder.write(tmp_path / "a.glb"))
-    assert float(surface_attributes(scene, *CORNER)["f0"][0]) == pytest.approx(0.5 * (1 / 3) ** 2)
+    out = surface_attributes(scene, *CORNER)
+    assert float(out["f0"][0]) == pytest.approx(0.5 * (1 / 3) ** 2) and float(out["f90"][0]) == 0.5
+
+
+def seen(scene, *, azimuth=0.0, elevation=0.0, size=32, light=1.0, samples=16) -> dict[str, np.ndarray]:
+    """A view of the scene under a uniform light, without shadows."""
+    renderer = Renderer(scene, 1)
+    direct = DirectLight(renderer, Environment(np.full((8, 16, 3), light, np.float32), "uniform"), samples, 0, shadows=False)
+    return renderer.buffers(camera_at(azimuth, elevation, name="v", size=size), 4, direct.color())
+
+
+def centred(builder) -> object:
+    """The quad about the origin."""
+    builder.document["nodes"] = [{"mesh": 0, "translation": [-0.5, -0.5, 0]}]
+    return builder
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 80.0])
+def test_specular_zero_reflects_nothing_also_at_grazing_angles(tmp_path, azimuth):
+    """KHR_materials_specular scales f90 too: a white one is then a plain Lambert surface, 1 in a furnace at every angle."""
+    material = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 0.3}}
+    got = []
+    for specular in (0.0, 1.0):
+        builder = centred(quad(**material, extensions={"KHR_materials_specular": {"specularFactor": specular}}))
+        builder.document["extensionsUsed"] = ["KHR_materials_specular"]
+        images = seen(read_gltf(builder.write(tmp_path / "a.glb")), azimuth=azimuth, samples=64)
+        got.append(images["color"][images["mask"] == 1].mean())
+    assert got[0] == pytest.approx(1.0, abs=5e-3)
+    if azimuth:
+        assert got[1] > got[0] + 0.05  # as METHOD says of the whole dielectric's sum
+
+
+def test_unlit_shows_its_base_color_whatever_the_light(tmp_path):
+    builder = centred(quad(pbrMetallicRoughness={"baseColorFactor": [0.25, 0.5, 1, 1]}, extensions={"KHR_materials_unlit": {}}))
+    builder.document["extensionsUsed"] = ["KHR_materials_unlit"]
+    scene = read_gltf(builder.write(tmp_path / "a.glb"))
+    for light in (0.0, 7.0):
+        images = seen(scene, light=light)
+        np.testing.assert_allclose(images["color"][images["mask"] == 1], np.broadcast_to([0.25, 0.5, 1], ((images["mask"] == 1).sum(), 3)), atol=1e-6)
+
+
+def test_emission_is_factor_times_texture_times_strength(tmp_path):
+    builder = with_textures(glow=np.full((2, 2, 3), 188, np.uint8))  # sRGB 188 is 0.503 linear
+    builder.document["extensionsUsed"] = ["KHR_materials_emissive_strength"]
+    builder.document["materials"] = [{"emissiveFactor": [1, 0.5, 0], "emissiveTexture": {"index": 0}, "extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": 4}},
+                                      "pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1]}}]
+    images = seen(read_gltf(centred(builder).write(tmp_path / "a.glb")), light=0.0)
+    linear = ((188 / 255 + 0.055) / 1.055) ** 2.4
+    np.testing.assert_allclose(images["color"][images["mask"] == 1].mean(0), [4 * linear, 2 * linear, 0], rtol=1e-4)
+
+
+@pytest.mark.parametrize("mode, alpha, visible", [("OPAQUE", 0.1, 1), ("MASK", 0.3, 1), ("MASK", 0.2, 0), ("BLEND", 0.6, 1), ("BLEND", 0.4, 0)])
+def test_alpha_of_factor_texture_and_vertices_multiplies(tmp_path, mode, alpha, visible):
+    """Cutoff 0.25 for MASK; BLEND is seen from one half on; alpha is never sRGB."""
+    pixels = np.full((2, 2, 4), 255, np.uint8)
+    pixels[..., 3] = 204  # 0.8
+    builder = with_textures(color=pixels)
+    builder.document["materials"] = [{"alphaMode": mode, **({"alphaCutoff": 0.25} if mode == "MASK" else {}),
+                                      "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, alpha / 0.4], "baseColorTexture": {"index": 0}}}]
+    if alpha / 0.4 > 1:
+        builder.document["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"][3] = 1
+    vertex = np.tile(np.float32([1, 1, 1, 0.5 if alpha / 0.4 <= 1 else alpha / 0.8]), (4, 1))
+    builder.document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = builder.add(vertex)
+    scene = read_gltf(centred(builder).write(tmp_path / "a.glb"))
+    if mode != "OPAQUE":
+        assert float(surface_attributes(scene, *CORNER)["alpha"][0]) == pytest.approx(alpha, abs=1e-6)
+    assert render_buffers(scene, camera_at(0.0, 0.0, name="v", size=32), 4)["mask"].max() == visible
+
+
+@pytest.mark.parametrize("wrap, at", [(10497, 1), (33071, 3), (33648, 2)])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_samplers_wrap_each_axis(tmp_path, wrap, at, axis):
+    """1.375 of a four-texel row: the second again, the last for clamping, the third coming back for mirroring."""
+    builder = with_textures(color=PIXELS)
+    builder.document["samplers"] = [{"magFilter": 9728, "wrapS" if axis == 0 else "wrapT": wrap}]
+    builder.document["textures"][0]["sampler"] = 0
+    builder.document["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
+    place = [0.125, 0.125]
+    place[axis] = 1.375
+    builder.document["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = builder.add(np.tile(np.float32(place), (4, 1)))
+    got = surface_attributes(read_gltf(builder.write(tmp_path / "a.glb")), *CORNER)["albedo"][0]
+    np.testing.assert_allclose(got, texel(*((0, at) if axis == 0 else (at, 0))), atol=1e-6)
+
+
+def test_filters_blend_linear_values_or_take_the_nearest(tmp_path):
+    """Between the texels 0 and 255, a quarter of the way: nearest gives black, linear a quarter of white, in linear light."""
+    pixels = np.zeros((1, 2, 3), np.uint8)
+    pixels[0, 1] = 255
+    got = {}
+    for name, code in (("nearest", 9728), ("linear", 9729)):
+        builder = with_textures(color=pixels)
+        builder.document["samplers"] = [{"magFilter": code, "wrapS": 33071}]
+        builder.document["textures"][0]["sampler"] = 0
+        builder.document["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
+        builder.document["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = builder.add(np.tile(np.float32([0.375, 0.5]), (4, 1)))
+        got[name] = float(surface_attributes(read_gltf(builder.write(tmp_path / "a.glb")), *CORNER)["albedo"][0, 0])
+    assert got == {"nearest": 0.0, "linear": pytest.approx(0.25, abs=1e-6)}
+
+
+def test_small_pictures_read_coarser_levels_of_any_size(tmp_path):
+    """A fine checker of odd size, a sample to dozens of texels: grey by its levels, where the finest alone would be black or white."""
+    checker = (np.indices((301, 299)).sum(0) % 2 * 255).astype(np.uint8)[..., None].repeat(3, 2)
+    builder = with_textures(color=checker)
+    builder.document["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
+    images = render_buffers(read_gltf(centred(builder).write(tmp_path / "a.glb")), camera_at(0.0, 0.0, name="v", size=16), 4)
+    inside = images["albedo"][images["mask"] == 1]
+    assert len(inside) > 80 and np.abs(inside - 0.5).max() < 0.02
+
+
+def test_quantised_attributes_by_their_extension(tmp_path):
+    """KHR_mesh_quantization: bytes and shorts for every attribute, normalised or not, and a node that undoes the scale."""
+    plain = read_gltf(quad(name="m").write(tmp_path / "a.glb"))
+    builder = Builder()
+    builder.document |= {"extensionsUsed": ["KHR_mesh_quantization", "KHR_texture_transform"], "extensionsRequired": ["KHR_mesh_quantization"]}
+    attributes = {"POSITION": builder.add((QUAD * 1000).astype(np.uint16)), "NORMAL": builder.add(np.tile(np.int8([0, 0, 127]), (4, 1)), normalized=True),
+                  "TANGENT": builder.add(np.tile(np.int16([32767, 0, 0, -32767]), (4, 1)), normalized=True),
+                  "TEXCOORD_0": builder.add(np.rint((QUAD[:, :2] * (1, -1) + (0, 1)) * 65535).astype(np.uint16), normalized=True),
+                  "TEXCOORD_1": builder.add((QUAD[:, :2] * 100).astype(np.int8))}
+    builder.primitive(attributes, builder.add(QUAD_FACES.astype(np.uint8)))
+    builder.document["nodes"] = [{"mesh": 0, "scale": [1e-3, 1e-3, 1e-3]}]
+    scene = read_gltf(builder.write(tmp_path / "b.glb"))
+    np.testing.assert_allclose(scene.vertices, plain.vertices, atol=1e-9)
+    np.testing.assert_allclose(scene.normals, plain.normals, atol=1e-6)
+    np.testing.assert_allclose(scene.uvs[0], plain.uvs[0], atol=1e-5)
+    np.testing.assert_allclose(scene.uvs[1], QUAD[:, :2] * 100)
+    np.testing.assert_allclose(scene.tangents, np.tile([1.0, 0, 0, -1], (4, 1)), atol=1e-6)
+    np.testing.assert_array_equal(scene.faces, plain.faces)
+
+
+def test_optional_extensions_are_listed_and_required_ones_refused_each_by_name(tmp_path):
+    names = ["KHR_materials_transmission", "MY_own_thing"]
+    builder = quad()
+    builder.document["extensionsUsed"] = names
+    notes = read_gltf(builder.write(tmp_path / "a.glb")).notes
+    assert all(any(name in note and "ignored" in note for note in notes) for name in names)
+    for name in names:
+        builder.document["extensionsRequired"] = [name]
+        with pytest.raises(InputError, match=name):
+            read_gltf(builder.write(tmp_path / "b.glb"))

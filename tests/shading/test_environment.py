@@ -7,6 +7,7 @@ import pytest
 
 from gdtool.core.errors import InputError
 from gdtool.shading.environment import BUNDLED, METERED_WHITE, Environment, load_environment
+from gdtool.shading.prefilter import IrradianceMap
 from gdtool.shading.lights import direction, paint, random_lobes
 from gdtool.shading.sg_fit import fit_sg
 from gdtool.shading.studio import studio
@@ -86,3 +87,19 @@ def test_what_is_no_environment(tmp_path):
         load_environment(tmp_path / "black.exr")
     write_exr(tmp_path / "good.exr", np.full((32, 64, 3), 2.0, np.float32))
     assert np.allclose(load_environment(tmp_path / "good.exr").metered().image, 1.0, rtol=0.01)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), (3, 7), (8, 16), (64, 128), (300, 100)])
+def test_irradiance_does_not_depend_on_how_coarse_the_image_is(size):
+    """White all around gives π, and light from above π (1 + n·y) / 2, in the table and by the sum."""
+    normals = np.random.default_rng(0).normal(size=(200, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    image = np.ones((*size, 3), np.float32)
+    for up in (False, True):
+        if up and size[0] % 2:
+            continue
+        image[size[0] // 2:] = 0 if up else 1
+        light = Environment(image.copy())
+        wanted = np.pi * (0.5 * (1 + normals[:, 1]) if up else np.ones(200))
+        for got in (light.irradiance(normals), IrradianceMap(light).lookup(normals)):
+            np.testing.assert_allclose(got, np.broadcast_to(wanted[:, None], (200, 3)), atol=0.008 * np.pi)

@@ -1,0 +1,71 @@
+"""EXT_meshopt_compression by the package meshoptimizer, which also packs here (make extras-test)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gdtool.assets.gltf_read import read_gltf
+from gdtool.core.errors import InputError
+from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder
+
+meshoptimizer = pytest.importorskip("meshoptimizer", reason="the extra meshopt is not installed")
+
+
+def packed(builder: Builder, content: bytes, count: int, stride: int, mode: str, accessor: dict, **extra) -> int:
+    """An accessor over a compressed view."""
+    source = builder.view(content)
+    where = builder.document["bufferViews"][source]
+    extension = {"buffer": 0, "byteOffset": where["byteOffset"], "byteLength": len(content), "byteStride": stride, "count": count, "mode": mode, **extra}
+    builder.document["bufferViews"][source] = {"buffer": 0, "byteLength": count * stride, "extensions": {"EXT_meshopt_compression": extension}}
+    builder.document["accessors"].append({"bufferView": source, "count": count, **accessor})
+    return len(builder.document["accessors"]) - 1
+
+
+def scene_of(tmp_path, index_type=np.uint32, mode="TRIANGLES", normals=None):
+    builder = Builder()
+    builder.document |= {"extensionsUsed": ["EXT_meshopt_compression"], "extensionsRequired": ["EXT_meshopt_compression"]}
+    attributes = {"POSITION": packed(builder, bytes(meshoptimizer.encode_vertex_buffer(QUAD, 4, 12)), 4, 12, "ATTRIBUTES", {"componentType": 5126, "type": "VEC3"})}
+    if normals is not None:
+        content = bytes(meshoptimizer.encode_vertex_buffer(normals.view(np.float32), 4, 4))
+        attributes["NORMAL"] = packed(builder, content, 4, 4, "ATTRIBUTES", {"componentType": 5120, "type": "VEC3", "normalized": True}, filter="OCTAHEDRAL")
+    encode = meshoptimizer.encode_index_buffer if mode == "TRIANGLES" else meshoptimizer.encode_index_sequence
+    content = bytes(encode(QUAD_FACES.astype(np.uint32), len(QUAD_FACES), len(QUAD)))
+    size = np.dtype(index_type).itemsize
+    indices = packed(builder, content, len(QUAD_FACES), size, mode, {"componentType": {2: 5123, 4: 5125}[size], "type": "SCALAR"})
+    builder.primitive(attributes, indices)
+    return read_gltf(builder.write(tmp_path / "a.glb"))
+
+
+@pytest.mark.parametrize("index_type", [np.uint16, np.uint32])
+@pytest.mark.parametrize("mode", ["TRIANGLES", "INDICES"])
+def test_vertices_and_indices(tmp_path, index_type, mode):
+    scene = scene_of(tmp_path, index_type, mode)
+    np.testing.assert_array_equal(scene.vertices, QUAD)
+    corners = scene.vertices[scene.faces]  # the codec may turn a face about its corners
+    np.testing.assert_allclose(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), [[0, 0, 1]] * 2)
+    assert sorted(map(sorted, scene.faces.tolist())) == [[0, 1, 2], [0, 2, 3]]
+
+
+def test_octahedral_normals(tmp_path):
+    """Stored x, y and one; the filter makes z of what is left."""
+    stored = np.array([[0, 0, 127, 0], [127, 0, 127, 0], [0, -127, 127, 0], [0, 0, 127, 0]], np.int8)
+    scene = scene_of(tmp_path, normals=stored)
+    np.testing.assert_allclose(scene.normals, [[0, 0, 1], [1, 0, 0], [0, -1, 0], [0, 0, 1]], atol=1e-6)
+
+
+def test_exponents(tmp_path):
+    """A float as a 24-bit whole number and an 8-bit exponent of two: 4 · 2⁻² is 1."""
+    stored = ((QUAD * 4).astype(np.int64) | (0x100 - 2) << 24).astype(np.uint32)
+    builder = Builder()
+    content = bytes(meshoptimizer.encode_vertex_buffer(stored.view(np.float32), 4, 12))
+    builder.primitive({"POSITION": packed(builder, content, 4, 12, "ATTRIBUTES", {"componentType": 5126, "type": "VEC3"}, filter="EXPONENTIAL")},
+                      builder.add(QUAD_FACES))
+    np.testing.assert_array_equal(read_gltf(builder.write(tmp_path / "a.glb")).vertices, QUAD)
+
+
+def test_a_damaged_stream_is_named(tmp_path, monkeypatch):
+    good = meshoptimizer.encode_vertex_buffer
+    monkeypatch.setattr(meshoptimizer, "encode_vertex_buffer", lambda *a: bytes(good(*a))[:6])
+    with pytest.raises(InputError, match="meshopt stream"):
+        scene_of(tmp_path)
