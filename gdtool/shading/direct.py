@@ -170,7 +170,10 @@ class DirectLight:
             weight.reshape(-1)[flat[torch.from_numpy(self.renderer.occluded(origins, rays))]] = 0.0
         else:
             flat = flat[:0]
-        sums = torch.bmm(torch.stack([*(term * weight for term in terms), *(term * everything for term in terms[:3])], 1), light)
+        # Only prefiltered light asks what share of the reflection is visible.
+        kept = slice(0, 3) if self.mode == "prefiltered" else slice(2, 3)
+        parts = torch.bmm(torch.stack([*(term * weight for term in terms), *(term * everything for term in terms[kept])], 1), light)
+        sums = parts if self.mode == "prefiltered" else torch.cat([parts[:, :4], torch.zeros(len(parts), 2, 3), parts[:, 4:]], 1)
         return sums, len(flat), above.numel() - lit, lit - len(flat) if self.shadows else 0
 
     def _combined(self, points: Points, sums: np.ndarray) -> np.ndarray:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -103,8 +105,12 @@ class TextureReader:
             height, width, channels = finer.shape
             coarse = np.empty((max(height // 2, 1), max(width // 2, 1), channels), np.float32)
             halved = self._halved_even if height % 2 == width % 2 == 0 else self._halved_odd
-            for row in range(0, len(coarse), BAND // 2):
-                halved(finer, coarse[row:row + BAND // 2], row, first)
+            bands = range(0, len(coarse), BAND // 2)
+            if len(bands) > 1:
+                with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+                    list(pool.map(lambda row: halved(finer, coarse[row:row + BAND // 2], row, first), bands))
+            else:
+                halved(finer, coarse, 0, first)
             self.levels.append(coarse)
         return self.levels[k]
 
