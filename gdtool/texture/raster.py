@@ -158,7 +158,7 @@ def owner_count(uv: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
     """(size, size) int32: how many triangles cover each texel centre; above 1 where texture coordinates overlap."""
     count = np.zeros(size * size, np.int32)
     for _, row, column in owned_texels(uv, faces, size):
-        np.add.at(count, row.astype(np.int64) * size + column, 1)
+        count += np.bincount(row.astype(np.int64) * size + column, minlength=size * size).astype(np.int32)
     return count.reshape(size, size)
 
 

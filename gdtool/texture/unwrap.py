@@ -14,8 +14,8 @@ from gdtool.texture.unwrap_charts import Adjacency, bisect, find_charts
 from gdtool.texture.unwrap_flatten import flatten, singular_values, stretch
 from gdtool.texture.unwrap_pack import pack
 
-_JOINS = 60  # attempts to join two charts
-_JOIN_SHARE = 0.04  # charts smaller than this share of the area are joined to others
+_JOINS = 14  # attempts to join two charts
+_JOIN_SHARE = 0.02  # charts smaller than this share of the area are joined to others
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Request:
     size: int = 2048
     padding: int = 8
     max_stretch: float = 1.1
-    good_stretch: float = 1.0015
+    good_stretch: float = 1.002
     max_cost: float = 2.0
     seconds: float = 120.0
 
@@ -115,9 +115,9 @@ def _joined(vertices: np.ndarray, faces: np.ndarray, adjacency: Adjacency, chart
     for i, chart in enumerate(charts):
         label[chart[0]] = i
         parts[i] = chart
-    limit = 1 + 10 * (good_stretch - 1)
+    limit = 1 + 2 * (good_stretch - 1)
     tried: set[tuple[int, int]] = set()
-    for _ in range(_JOINS if len(faces) < 10000 else _JOINS // 2):
+    for _ in range(_JOINS):
         a, b = label[adjacency.pairs].T
         apart = a != b
         pair = np.sort(np.stack([a, b], -1)[apart], 1)

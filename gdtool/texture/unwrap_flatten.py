@@ -175,7 +175,7 @@ def overlaps(uv: np.ndarray, triangles: np.ndarray) -> bool:
     edges = edges_of(triangles)
     if rim_crosses(uv, edges.ends[edges.count == 1]):
         return True
-    size = int(np.clip(32 * len(triangles) ** 0.5, 64, 1024))
+    size = int(np.clip(10 * len(triangles) ** 0.5, 64, 512))
     return bool((owner_count((uv - uv.min(0)) / extent, triangles, size) > 1).any())
 
 

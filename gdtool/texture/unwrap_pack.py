@@ -6,7 +6,7 @@ import numpy as np
 
 from gdtool.texture.raster import owner_count
 
-_TURNS = 4
+_SLANTS = (0.0,)  # radians, besides quarter turns
 _FINE = 3  # cells of the supersampled mask in a cell of the square
 _MOST_BY_RASTER = 160
 _MANY = 48  # with more charts than these a coarser grid and fewer tries bound the time
@@ -32,6 +32,14 @@ def upright_box(uv: np.ndarray) -> np.ndarray:
     if np.ptp(turned[:, 0]) < np.ptp(turned[:, 1]):
         turned = _turn(turned, 1)
     return turned - turned.min(0)
+
+
+def _turned(uv: np.ndarray, radians: float) -> np.ndarray:
+    if not radians:
+        return uv
+    c, s = np.cos(radians), np.sin(radians)
+    uv = uv @ np.array([[c, -s], [s, c]])
+    return uv - uv.min(0)
 
 
 def _turn(uv: np.ndarray, quarter: int) -> np.ndarray:
@@ -60,11 +68,86 @@ def _mask(uv: np.ndarray, triangles: np.ndarray, cells_per_unit: float, gap: flo
     return out.reshape(span[1], _FINE, span[0], _FINE).any((1, 3))
 
 
-def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, cells: int = 448) -> tuple[list[np.ndarray], float]:
+class _Shapes:
+    """Charts as masks at one resolution, at each turn, with the spectra that correlate them with what is taken.
+
+    cells_per_unit: cells per unit of surface; gap: cells between charts; side: the largest square they are packed in.
+    """
+
+    def __init__(self, boxed: list, cells_per_unit: float, gap: float, side: int):
+        from scipy.fft import next_fast_len, rfft2
+
+        self.fft_side = next_fast_len(side + 1, real=True)
+        self.uv, self.masks, self.spectra = [], [], []
+        for uv, triangles in boxed:
+            upright = [_turned(uv, turn) for turn in _SLANTS]
+            upright = [(at, _mask(at, triangles, cells_per_unit, gap / 2)) for at in upright]
+            uvs, masks = [], []
+            for at, mask in upright:
+                h, w = mask.shape
+                at = at * cells_per_unit + gap / 2
+                # As np.rot90 turns the mask: its rows are v, its columns u.
+                uvs += [at, np.stack([at[:, 1], w - at[:, 0]], -1), np.stack([w - at[:, 0], h - at[:, 1]], -1), np.stack([h - at[:, 1], at[:, 0]], -1)]
+                masks += [np.rot90(mask, quarter) for quarter in range(4)]
+            padded = np.zeros((len(masks), self.fft_side, self.fft_side), np.float32)
+            for at, mask in zip(padded, masks, strict=True):
+                if max(mask.shape) <= side:  # place() passes over the others
+                    at[:mask.shape[0], :mask.shape[1]] = mask
+            self.uv.append(uvs)
+            self.masks.append(masks)
+            self.spectra.append(np.conj(rfft2(padded, workers=2)))
+
+    def place(self, order: list[int], side: int, contact: float, turns: list[int] | None = None) -> list[tuple[int, int, int]] | None:
+        """(turn, x, y) of each chart in a square of so many cells, or None when one finds no place.
+
+        Each goes where it stays low; contact weighs touching others and the walls against that. turns: the only one
+        to try for each chart.
+        """
+        from scipy.fft import irfft2, rfft2
+
+        m = self.fft_side
+        taken = np.zeros((m, m), np.float32)
+        out: list[tuple[int, int, int] | None] = [None] * len(order)
+        both = np.zeros((2, m, m), np.float32)
+        for i in order:
+            walls = np.pad(taken[:side, :side], 1, constant_values=1) > 0
+            both[0] = taken
+            both[1, :side, :side] = walls[:-2, 1:-1] | walls[2:, 1:-1] | walls[1:-1, :-2] | walls[1:-1, 2:]
+            spectrum = rfft2(both, workers=2)
+            # Circular correlation: what wraps around lies beyond the places where the mask fits.
+            tried = range(len(self.masks[i])) if turns is None else [turns[i]]
+            found = irfft2(spectrum[:, None] * self.spectra[i][tried], (m, m), workers=2)
+            best = None
+            for at, turn in enumerate(tried):
+                mask = self.masks[i][turn]
+                h, w = mask.shape
+                if max(h, w) > side:
+                    continue
+                free = found[0, at, :side - h + 1, :side - w + 1] < 0.5
+                if not free.any():
+                    continue
+                touching = np.rint(found[1, at, :side - h + 1, :side - w + 1])
+                far = (np.arange(side - h + 1)[:, None] + h + 0.25 * (np.arange(side - w + 1) + w)) / side
+                cost = np.where(free, far - contact * touching / (2 * (h + w)), np.inf)
+                k = int(cost.argmin())
+                if best is None or cost.flat[k] < best[0] - 1e-9:
+                    y, x = divmod(k, cost.shape[1])
+                    best = float(cost.flat[k]), turn, x, y
+            if best is None:
+                return None
+            _, turn, x, y = best
+            mask = self.masks[i][turn]
+            taken[y:y + mask.shape[0], x:x + mask.shape[1]] += mask
+            out[i] = turn, x, y
+        return out
+
+
+def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, cells: int = 512) -> tuple[list[np.ndarray], float]:
     """Places for charts: their uv (v, 2) in [0, 1], v up, all at one scale, and that scale (uv per unit of surface).
 
     charts: uv at the scale of the surface and triangles of each. gap: smallest distance between charts, and half of it
-    to the border, in uv. Several orders and weights are tried on a coarse grid, the best of them on a fine one.
+    to the border, in uv. Several orders and weights are tried on a coarse grid, the best of them on a fine one; the
+    charts keep their resolution, what is sought is the smallest square that holds them.
     """
     boxed = [(upright_box(uv), triangles) for uv, triangles in charts]
     area = sum(float(np.abs(np.cross(uv[t[:, 1]] - uv[t[:, 0]], uv[t[:, 2]] - uv[t[:, 0]])).sum()) / 2 for uv, t in boxed)
@@ -76,21 +159,36 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, cells: int = 4
         return _shelves(boxed, gap)
     many = len(charts) > _MANY
     cells = min(cells, 288) if many else cells
-    starts = max(min(_STARTS, 200 // len(charts)), 1)
-    ranked = _search(boxed, area, gap, _way(boxed, starts))
-    found, share = None, 0.0
-    for coarse, order, contact in ranked[:1 if many else 2]:
-        # The fine grid wastes less at the rims, so it may take more than the coarse one did.
-        for step in (0.03, 0.0, -0.04, -0.1) if many else (0.06, 0.05, 0.042, 0.035, 0.028, 0.02, 0.01, 0.0, -0.02, -0.05, -0.1):
-            if coarse + step <= share:
-                break
-            again = _place(boxed, order, ((coarse + step) / area) ** 0.5, gap, cells, contact)
-            if again is not None:
-                found, share = again, coarse + step
-                break
-    if found is None:
+    ways = _way(boxed, max(min(_STARTS, 300 // len(charts)), 2))
+    for lowest in (0.45, 0.15):
+        ranked = _search(boxed, area, gap, ways, cells * 5 // 16, lowest)
+        if ranked:
+            break
+    else:
         return _shelves(boxed, gap)
-    return found, (share / area) ** 0.5
+    share = ranked[0][0]
+    # At this resolution the square that the coarse grid found has `cells` cells a side.
+    side_most = int(cells * 1.06)
+    shapes = _Shapes(boxed, cells * (share / area) ** 0.5, gap * side_most, side_most)
+    best, best_side = None, side_most + 1
+    for _, order, contact, turns in ranked[:2 if many else 4]:
+        side = min(best_side - 1, side_most) if best is not None else int(cells * 0.98)
+        failed = 0
+        while side <= side_most and side < best_side:
+            found = shapes.place(order, side, contact, turns)
+            if found is not None:
+                best, best_side, side = found, side, side - max(cells // 128, 1)
+                if failed:
+                    break
+            elif best is not None:
+                break
+            else:
+                failed += 1
+                side += max(cells // 100, 1)
+    if best is None:
+        return _shelves(boxed, gap)
+    places = [(shapes.uv[i][turn] + [x, y]) / best_side for i, (turn, x, y) in enumerate(best)]
+    return places, (share / area) ** 0.5 * cells / best_side
 
 
 def _way(boxed: list, starts: int) -> list[tuple[list[int], float]]:
@@ -105,65 +203,31 @@ def _way(boxed: list, starts: int) -> list[tuple[list[int], float]]:
     return out
 
 
-def _search(boxed: list, area: float, gap: float, ways: list, cells: int = 160) -> list[tuple[float, list[int], float]]:
-    """Ways to pack with the largest share of the square each reached on a coarse grid, best first."""
-    best = 0.02
+def _search(boxed: list, area: float, gap: float, ways: list, cells: int,
+            lowest: float) -> list[tuple[float, list[int], float, list[int]]]:
+    """Ways to pack on a coarse grid, best first: share of the square, order, weight of contact, turn of each chart.
+
+    None that stays below the share `lowest`.
+    """
+    side_most = int(cells * (0.66 / lowest) ** 0.5)
+    shapes = _Shapes(boxed, cells * (0.66 / area) ** 0.5, gap * cells, side_most)
     ranked = []
+    best_side = side_most
     for order, contact in ways:
-        share, step = best, 0.16 if best < 0.1 else 0.02
-        reached = 0.0
-        while True:
-            if _place(boxed, order, ((share + step) / area) ** 0.5, gap, cells, contact) is not None:
-                share = reached = share + step
-            elif step > 0.02:
-                step /= 2
-            else:
+        # Down in large steps while it goes, then up or down in small ones.
+        side, reached = min(best_side, cells), None
+        step = max(cells // 32, 1)
+        while side <= side_most and not (ranked and side > 1.04 * best_side):
+            reached = shapes.place(order, side, contact)
+            if reached is not None:
                 break
-        ranked.append((reached or best - 0.02, order, contact))
-        best = max(best, reached)
+            side += step
+        while reached is not None and (smaller := shapes.place(order, side - 2, contact)) is not None:
+            side, reached = side - 2, smaller
+        if reached is not None:
+            ranked.append((0.66 * (cells / side) ** 2, order, contact, [turn for turn, _, _ in reached]))
+            best_side = min(best_side, side)
     return sorted(ranked, key=lambda way: -way[0])
-
-
-def _place(boxed: list, order: list[int], scale: float, gap: float, cells: int, contact: float) -> list[np.ndarray] | None:
-    """All charts at one scale, or None when one finds no place. contact weighs touching others against staying low."""
-    from scipy.fft import irfft2, rfft2
-
-    taken = np.zeros((cells, cells), np.float32)
-    out: list[np.ndarray | None] = [None] * len(boxed)
-    half_gap = gap / 2 * cells
-    for i in order:
-        uv, triangles = boxed[i]
-        upright = _mask(uv, triangles, scale * cells, half_gap)
-        if max(upright.shape) > cells:
-            return None
-        walls = np.pad(taken, 1, constant_values=1) > 0
-        beside = walls[:-2, 1:-1] | walls[2:, 1:-1] | walls[1:-1, :-2] | walls[1:-1, 2:]
-        taken_spectrum, beside_spectrum = rfft2(taken), rfft2(beside.astype(np.float32))
-        best = None
-        for quarter in range(_TURNS):
-            mask = np.rot90(upright, quarter)
-            h, w = mask.shape
-            # Circular correlation: what wraps around lies beyond the places where the mask fits.
-            spectrum = np.conj(rfft2(mask.astype(np.float32), (cells, cells)))
-            free = irfft2(taken_spectrum * spectrum, (cells, cells))[:cells - h + 1, :cells - w + 1] < 0.5
-            if not free.any():
-                continue
-            touching = irfft2(beside_spectrum * spectrum, (cells, cells))[:cells - h + 1, :cells - w + 1]
-            far = (np.arange(cells - h + 1)[:, None] + h + 0.25 * (np.arange(cells - w + 1) + w)) / cells
-            cost = np.where(free, far - contact * np.rint(touching) / (2 * (h + w)), np.inf)
-            k = int(cost.argmin())
-            if best is None or cost.flat[k] < best[0] - 1e-9:
-                best = (float(cost.flat[k]), quarter, mask, *divmod(k, cost.shape[1]))
-        if best is None:
-            return None
-        _, quarter, mask, y, x = best
-        taken[y:y + mask.shape[0], x:x + mask.shape[1]] += mask
-        at = uv * (scale * cells) + half_gap
-        h, w = upright.shape
-        # As np.rot90 turns the mask: its rows are v, its columns u.
-        at = (at, np.stack([at[:, 1], w - at[:, 0]], -1), np.stack([w - at[:, 0], h - at[:, 1]], -1), np.stack([h - at[:, 1], at[:, 0]], -1))[quarter]
-        out[i] = (at + [x, y]) / cells
-    return out
 
 
 def _shelves(boxed: list, gap: float) -> tuple[list[np.ndarray], float]:
