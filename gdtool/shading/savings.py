@@ -26,6 +26,9 @@ def savings(renderer: Renderer, samples: int, light: DirectLight | None) -> list
     if absent:
         each = _lookup_seconds() * taken
         out += [(f"{what} lookups", "no material has such a texture", each) for what in absent]
+    flat = [what for what, name in TEXTURES.items() if what not in absent
+            and all(t is None or renderer.lookup.constant(t) is not None for t in (getattr(m, name) for m in scene.materials))]
+    out += [(f"{what} lookups", "the texture is one value everywhere", _lookup_seconds() * taken) for what in flat]
     if renderer.tested is None:
         out.append(("alpha tests", "every material is opaque", _lookup_seconds() * taken))
     if counts.pixels_in_bounds < counts.pixels:

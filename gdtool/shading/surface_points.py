@@ -32,6 +32,8 @@ class SurfaceLookup:
         self.scene = scene
         self.face_normals, self.face_areas = face_normals(scene.vertices, scene.faces)
         self._readers: dict[tuple[int, ...], TextureReader] = {}
+        self._constants: dict[int, np.ndarray | None] = {}
+        self.skip_constant = True
         self._lock = threading.RLock()
         self._uv_areas: dict[int, np.ndarray] = {}
         self._tangents: dict[int, np.ndarray] = {}
@@ -47,6 +49,15 @@ class SurfaceLookup:
             if key not in self._readers:
                 self._readers[key] = TextureReader(*textures)
             return self._readers[key]
+
+    def constant(self, texture: Texture) -> np.ndarray | None:
+        """(c,) linear value of a texture whose texels are all the same: a factor that was stored as a map."""
+        if id(texture) not in self._constants:
+            texels = texture.image.reshape(-1, 1 if texture.image.ndim == 2 else texture.image.shape[2])
+            scatter = texels[:: max(1, len(texels) // 64)]
+            same = bool((scatter == texels[0]).all() and (texels == texels[0]).all())
+            self._constants[id(texture)] = TextureReader(texture).decode(texels[:1])[0] if same else None
+        return self._constants[id(texture)]
 
     def _uv(self, texture: Texture) -> np.ndarray | None:
         sets = self.scene.uvs
@@ -71,10 +82,16 @@ class SurfaceLookup:
         """By name (n, c) linear texels of the textures that there are and whose UV set there is; those of one layout are
         looked up at once."""
         together: dict[tuple, list[str]] = {}
+        out: dict[str, np.ndarray] = {}
         for name, texture in textures.items():
-            if texture is not None and self._uv(texture) is not None:
+            if texture is None or self._uv(texture) is None:
+                continue
+            value = self.constant(texture) if self.skip_constant else None
+            if value is None:
                 together.setdefault(same_layout(texture), []).append(name)
-        out, places = {}, {}
+            else:
+                out[name] = np.broadcast_to(value, (len(face_idx), len(value)))
+        places = {}
         for names in together.values():
             texture = textures[names[0]]
             if texture.uv_set not in places:
