@@ -76,7 +76,7 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     target = target_of(mesh)[0]
     origin = from_scene(scene, np.eye(4), lambda detail: texel_width(target, size))
     cost, clock = {}, Clock()
-    texels = texels_of(target, size)
+    texels = texels_of(target, size, threads=threads)
     reach = vertex_reach(target.vertices, target.faces, origin.source)
     baked = bake(target, texels, origin.source, origin.lookup, reach, threads=threads)
     wall, processor = clock()

@@ -67,7 +67,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     size = options.size or size_for(target, origin.detail)
     _check_memory(inputs, size)
     with out.step("rasterise"):
-        texels = texels_of(target, size)
+        texels = texels_of(target, size, threads=out.threads)
         if not texels.inside:
             raise InputError(_path(inputs), "its texture coordinates cover no texel", "run gdtool unwrap")
     with out.step("bake"):

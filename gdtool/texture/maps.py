@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -48,11 +49,12 @@ def quantise(image: np.ndarray, bits: int) -> np.ndarray:
     return np.rint(scaled, out=scaled).astype(kind)
 
 
-def constant_of(values: np.ndarray, tolerance: float = CONSTANT_RANGE) -> np.ndarray | None:
-    """The middle of values (n,) or (n, c), float64, when no channel spans more than tolerance, else None."""
+def constant_of(values: np.ndarray, tolerance: float = CONSTANT_RANGE, encoding: Callable = lambda x: x) -> np.ndarray | None:
+    """The middle of values (n,) or (n, c), float64, when no channel spans more than tolerance, else None; both as encoding,
+    which is monotonic, has them."""
     if not len(values):
         return None
-    low, high = values.min(0).astype(np.float64), values.max(0).astype(np.float64)
+    low, high = (encoding(np.clip(end, 0, 1).astype(np.float64)) for end in (values.min(0), values.max(0)))
     return (low + high) / 2 if np.all(high - low <= tolerance) else None
 
 
@@ -78,11 +80,11 @@ def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.nd
     inside = slice(0, texels.inside)
     skipped: list[tuple[str, str]] = []
     layers: dict[str, list[np.ndarray]] = {}
-    color = [srgb_from_linear(np.clip(values["albedo"][:, k], 0, 1)) for k in range(3)]
+    color = [values["albedo"][:, k] for k in range(3)]
     alpha = np.clip(values["alpha"], 0, 1) if "alpha" in values else None
     if alpha is not None and alpha[inside].min() >= 1 - CONSTANT_RANGE:
         alpha = None
-    constants = [constant_of(channel[inside]) for channel in color] if alpha is None else [None]
+    constants = [constant_of(channel[inside], encoding=srgb_from_linear) for channel in color] if alpha is None else [None]
     if any(constant is None for constant in constants):
         factors: dict[str, tuple[float, ...]] = {"base_color": (1.0, 1.0, 1.0, 1.0)}
         layers["base_color"] = color if alpha is None else [*color, alpha]
@@ -115,8 +117,8 @@ def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.nd
     elif normal_map == "auto":
         skipped.append(("normal map", f"would be flat: {angle:.2f} degrees"))
     if "emissive" in values and (top := float(values["emissive"][inside].max(initial=0))) > CONSTANT_RANGE:
-        shining = [srgb_from_linear(np.clip(values["emissive"][:, k] / top, 0, 1)) for k in range(3)]
-        constants = [constant_of(channel[inside]) for channel in shining]
+        shining = [values["emissive"][:, k] / np.float32(top) for k in range(3)]
+        constants = [constant_of(channel[inside], encoding=srgb_from_linear) for channel in shining]
         if any(constant is None for constant in constants):
             factors["emissive"], layers["emissive"] = (round(top, 6),) * 3, shining
         else:
@@ -128,23 +130,30 @@ def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.nd
     if "confidence" in values:
         layers["confidence"] = [values["confidence"]]
     gutters = Gutters(texels.mask(), padding)
-    stored = {name: _stored(texels, layers.pop(name), gutters, HEIGHT_BITS if name == "height" else bits, threads, direction=name == "normal")
+    # Alpha, the fourth channel, is never sRGB.
+    encodings = {name: [srgb_from_linear] * 3 + [None] * (len(layers[name]) - 3) for name in ("base_color", "emissive") if name in layers}
+    stored = {name: _stored(texels, layers.pop(name), gutters, HEIGHT_BITS if name == "height" else bits, threads, name == "normal", encodings.get(name))
               for name in list(layers)}
     return Maps(texels.size, stored.get("base_color"), stored.get("orm"), stored.get("normal"), factors, has_occlusion, varies,
                 stored.get("emissive"), {name: stored[name] for name in ("height", "confidence") if name in stored}, skipped)
 
 
-def _stored(texels: Texels, layer: list[np.ndarray], gutters: Gutters, bits: int, threads: int, direction: bool = False) -> np.ndarray:
-    """(s, s, c) uint8 or uint16 of channels (n,) in [0, 1], gutters filled; direction: of a unit vector, stored as 0.5 n + 0.5."""
-    def plane(channel: np.ndarray) -> np.ndarray:
-        return gutters.fill(texels.image(channel))
+def _stored(texels: Texels, layer: list[np.ndarray], gutters: Gutters, bits: int, threads: int, direction: bool = False,
+            encodings: list[Callable | None] | None = None) -> np.ndarray:
+    """(s, s, c) uint8 or uint16 of channels (n,) in [0, 1], gutters filled; direction: of a unit vector, stored as 0.5 n + 0.5.
+
+    encodings: what each channel is put through first, nothing for None."""
+    def plane(layered: tuple[np.ndarray, Callable | None]) -> np.ndarray:
+        channel, encoding = layered
+        return gutters.fill(texels.image(channel if encoding is None else encoding(np.clip(channel, 0, 1))))
 
     out = np.empty((texels.size, texels.size, len(layer)), np.uint8 if bits == 8 else np.uint16)
+    layered = list(zip(layer, encodings or [None] * len(layer), strict=True))
     if not direction:
-        for k, image in enumerate(mapped(plane, layer, threads)):
+        for k, image in enumerate(mapped(plane, layered, threads)):
             out[..., k] = quantise(image, bits)
         return out
-    planes = list(mapped(plane, layer, threads))
+    planes = list(mapped(plane, layered, threads))
     for row in range(0, texels.size, 64):
         normal = unit(np.stack([image[row:row + 64] for image in planes], -1))
         out[row:row + 64] = quantise(normal * np.float32(0.5) + np.float32(0.5), bits)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -157,14 +157,16 @@ def from_scene(scene: Scene, source_from_world: np.ndarray, texel_width: Callabl
     source = Source(transform_points(matrix, scene.vertices), scene.faces)
     normals = scene.normals @ turn.T if scene.normals is not None else vertex_normals(source.vertices, source.faces)
 
-    points = SurfaceLookup(scene)
+    # Single precision places a texel of a 16384² texture within 1/1000 of itself, in half the time.
+    points = SurfaceLookup(replace(scene, normals=None if scene.normals is None else scene.normals.astype(np.float32),
+                                   uvs=tuple(None if uv is None else uv.astype(np.float32) for uv in scene.uvs)))
     own = texture_detail(scene)
     # Vertex colors, or nothing but factors: the mesh says how fine it is.
     detail = 0.5 * _edge(source) if own is None else own / float(np.sqrt((source_from_world[:3, 0] ** 2).sum()))
     width = texel_width(detail) * np.sqrt((source_from_world[:3, 0] ** 2).sum())
 
     def lookup(places: Places) -> dict[str, np.ndarray]:
-        read = points.attributes(places.face_idx, places.barycentric.astype(np.float64), np.full(len(places.face_idx), width))
+        read = points.attributes(places.face_idx, places.barycentric, np.full(len(places.face_idx), width, np.float32))
         # einsum: a product of so thin matrices by BLAS keeps a second thread busy with waiting.
         normal = read["normal"] if unturned else np.einsum("nk,ck->nc", read["normal"], turn)
         # Files whose winding and normals disagree are common; the winding says which side is outside.

@@ -110,7 +110,7 @@ class Texels:
         return out.reshape(self.size, self.size, *values.shape[1:])
 
 
-def texels_of(target: Target, size: int, rings: int = 2) -> Texels:
+def texels_of(target: Target, size: int, rings: int = 2, threads: int = 1) -> Texels:
     """Texels of a map of size x size that the target's charts cover, and `rings` of them around the charts."""
     barycentrics = Barycentrics(target.uv, target.face_uvs)
     owner = owners_of(target.uv, target.face_uvs, size)
@@ -118,7 +118,12 @@ def texels_of(target: Target, size: int, rings: int = 2) -> Texels:
     ring, ring_owner, ring_at = extend_owners(barycentrics, owner.reshape(size, size), rings)
     face_idx = np.concatenate([owner[inside], ring_owner])
     at = np.empty((len(face_idx), 3), np.float32)
-    at[:len(inside)] = centres_in(barycentrics, face_idx[:len(inside)], inside, size)
+
+    def place(part: slice) -> None:
+        at[part] = centres_in(barycentrics, face_idx[part], inside[part], size)
+
+    for _ in mapped(place, [slice(s, min(s + 4 * TEXELS_AT_ONCE, len(inside))) for s in range(0, len(inside), 4 * TEXELS_AT_ONCE)], threads):
+        pass
     at[len(inside):] = ring_at
     return Texels(size, np.concatenate([inside, ring.astype(inside.dtype)]), face_idx, at, len(inside))
 
