@@ -17,8 +17,8 @@ import numpy as np
 from measure import busy, machine, number, say, table
 
 HERE = Path(__file__).resolve().parent
-# Runs shorter than this, in seconds, are repeated: the table has the median.
-SHORT, REPEATS = 5.0, 3
+# Runs shorter than this, in seconds, are repeated if asked for: the table has the median.
+SHORT = 5.0
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def errors(images: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> d
     return out
 
 
-def run(folder: Path, name: str, references: dict[str, tuple[str, ...]], jobs: list[Job], key: dict, finish) -> list[dict]:
+def run(folder: Path, name: str, references: dict[str, tuple[str, ...]], jobs: list[Job], key: dict, finish, repeats: int = 3) -> list[dict]:
     """The rows of all jobs, interleaved over their repeats, kept in folder/name.json as they come.
 
     references: name to command; {out} in a command is where it writes its images, which stay in folder/.name until all is
@@ -124,7 +124,7 @@ def run(folder: Path, name: str, references: dict[str, tuple[str, ...]], jobs: l
         if not path.exists():
             say(f"reference of {which}")
             in_child(tuple(part.replace("{out}", str(path)) for part in command))
-    for repeat in range(REPEATS):
+    for repeat in range(repeats):
         for job in jobs:
             done, truth = runs.setdefault(job.name, []), place / f"reference-{job.reference}.npz"
             if len(done) > repeat or not truth.exists() or (done and done[0]["wall s"] > SHORT):
