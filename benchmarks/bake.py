@@ -146,7 +146,8 @@ def write(out: Path, rows: list[dict], sheet: list, names: list[str], note: str)
     text = table(COLUMNS, ([number(row.get(name, "failed" if name == "size" and "failed" in row else None), 4) for name in COLUMNS] for row in rows))
     failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows if "failed" in row)
     head = f"# Bake\n\n`python benchmarks/bake.py`, {machine()}. {note}\n\nbake: rasterising, reading, gutters and storing; seconds of the wall and of the " \
-        "processor. Errors before storing, and after 8 bits. seam: difference across seams over the difference across other edges.\n\n"
+        "processor. Errors before storing, and after 8 bits. seam: how much more the two sides of seams " \
+        "differ than in the model, over the same at other edges.\n\n"
     (out / "bake.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![maps](bake.png)\n")
     (out / "bake.json").write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")
     if sheet:

@@ -10,7 +10,7 @@ import numpy as np
 from bake_cases import Case, read_low
 
 CHOSEN = 150_000  # texels that are scored
-SEAM_POINTS = 60_000
+SEAM_POINTS = 20_000
 
 
 class Truth:
@@ -18,30 +18,44 @@ class Truth:
 
     def __init__(self, case: Case):
         from gdtool.assets.load import load_scene
+        from gdtool.shading.surface_points import SurfaceLookup
         from gdtool.stages.bake import target_of
 
         self.scene = load_scene(case.glb)
         self.target = target_of(read_low(case))[0]
+        self._lookup = SurfaceLookup(self.scene)
         self._of: dict[int, dict] = {}
+        self._seams: dict[int, Seams] = {}
+
+    def material(self, points: np.ndarray) -> dict[str, np.ndarray]:
+        """albedo (n, 3) sRGB, roughness, metallic (n,) and normal (n, 3) of the model nearest to points (n, 3)."""
+        from gdtool.geometry.distance import barycentric_of, closest_points
+        from gdtool.images.color import srgb_from_linear
+
+        _, near, at = closest_points(points, self.scene.vertices, self.scene.faces)
+        read = self._lookup.attributes(near, barycentric_of(at, self.scene.vertices[self.scene.faces[near]]))
+        return {**read, "albedo": srgb_from_linear(read["albedo"])}
+
+    def seams(self, size: int) -> Seams:
+        """Made once for a size."""
+        if size not in self._seams:
+            self._seams[size] = Seams(self, size)
+        return self._seams[size]
 
     def at(self, size: int) -> dict[str, np.ndarray]:
         """texel (n,), face_idx (n,), barycentric (n, 3), and albedo (sRGB), roughness, metallic, normal of the model there."""
         if size not in self._of:
-            from gdtool.geometry.distance import barycentric_of, closest_points
-            from gdtool.images.color import srgb_from_linear
-            from gdtool.shading.surface_points import SurfaceLookup
             from gdtool.texture.target import texels_of
 
-            texels, target, scene = texels_of(self.target, size, rings=0), self.target, self.scene
+            texels, target = texels_of(self.target, size, rings=0), self.target
             chosen = np.sort(np.random.default_rng(0).choice(texels.inside, min(CHOSEN, texels.inside), replace=False))
             face_idx, barycentric = texels.face_idx[chosen], texels.barycentric[chosen].astype(np.float64)
             points = np.einsum("nk,nkc->nc", barycentric, target.vertices[target.faces[face_idx]])
-            _, near, at = closest_points(points, scene.vertices, scene.faces)
-            read = SurfaceLookup(scene).attributes(near, barycentric_of(at, scene.vertices[scene.faces[near]]))
+            read = self.material(points)
             # Models whose winding and normals disagree are common: outside is where the mesh that is baked has it.
             side = np.where((read["normal"] * target.normals[face_idx].mean(1)).sum(1) < 0, -1.0, 1.0)
             self._of[size] = {"texel": texels.texel[chosen], "face_idx": face_idx, "barycentric": barycentric, "covered": texels.inside / size**2,
-                              "albedo": srgb_from_linear(read["albedo"]), "normal": _unit(read["normal"].astype(np.float64)) * side[:, None],
+                              "albedo": read["albedo"], "normal": _unit(read["normal"].astype(np.float64)) * side[:, None],
                               "roughness": read["roughness"], "metallic": read["metallic"]}
         return self._of[size]
 
@@ -76,36 +90,43 @@ def texel_errors(truth: Truth, size: int, maps: dict[str, np.ndarray], corners: 
     return out
 
 
-def seam_ratio(truth: Truth, image: np.ndarray) -> float | None:
-    """Mean difference between the two sides of charts' seams over that between the two sides of other edges.
+class Seams:
+    """Points to either side of the charts' seams and of other edges, and the model's material there."""
 
-    image (s, s, c) as stored, in [0, 1]. At points along the edges the map is read bilinearly one texel to either side.
-    None where there are no seams or nothing varies.
-    """
-    from gdtool.texture.tangents import edge_pairs
-    from gdtool.texture.target import texel_width
+    def __init__(self, truth: Truth, size: int):
+        from gdtool.texture.tangents import edge_pairs
+        from gdtool.texture.target import texel_width
 
-    target, size = truth.target, image.shape[0]
-    one, two = edge_pairs(target.faces)
-    start = [target.uv[target.face_uvs[half // 3, half % 3]] for half in (one, two)]
-    end = [target.uv[target.face_uvs[half // 3, (half % 3 + 1) % 3]] for half in (one, two)]
-    seam = (np.abs(start[0] - end[1]).max(1) > 1e-9) | (np.abs(end[0] - start[1]).max(1) > 1e-9)
-    width, rng = texel_width(target, size), np.random.default_rng(1)
-    # A crease is a step of the material's surroundings, not of the map: edges as flat as the seams' are compared.
-    across = (target.normals[one // 3].mean(1) * target.normals[two // 3].mean(1)).sum(1) > 0.9
-    means = []
-    for chosen in (np.flatnonzero(seam & across), np.flatnonzero(~seam & across)):
-        if not len(chosen):
+        target, rng = truth.target, np.random.default_rng(1)
+        one, two = edge_pairs(target.faces)
+        start = [target.uv[target.face_uvs[half // 3, half % 3]] for half in (one, two)]
+        end = [target.uv[target.face_uvs[half // 3, (half % 3 + 1) % 3]] for half in (one, two)]
+        seam = (np.abs(start[0] - end[1]).max(1) > 1e-9) | (np.abs(end[0] - start[1]).max(1) > 1e-9)
+        self.sides = []
+        for chosen in (np.flatnonzero(seam), np.flatnonzero(~seam)):
+            if not len(chosen):
+                self.sides = []
+                break
+            pick, along = rng.choice(chosen, SEAM_POINTS), rng.uniform(0.1, 0.9, SEAM_POINTS)
+            pair = [_beside(target, half[pick], t, texel_width(target, size)) for half, t in ((one, along), (two, 1 - along))]
+            read = [truth.material(points) for _, points in pair]
+            self.sides.append(([uv for uv, _ in pair], {name: np.abs(read[0][name] - read[1][name]).mean() for name in ("albedo", "roughness")}))
+
+    def ratio(self, name: str, image: np.ndarray) -> float | None:
+        """How much more the two sides of seams differ in the map (s, s, c) than in the model, over the same for other edges.
+
+        The map is read bilinearly a texel to either side. Creases and parts' borders, where charts like to end, are steps of
+        the model: its own difference at the same points is what is divided by. None where there are no seams.
+        """
+        if not self.sides:
             return None
-        pick = rng.choice(chosen, SEAM_POINTS)
-        along = rng.uniform(0.1, 0.9, SEAM_POINTS)
-        sides = [_beside(target, half[pick], t, width) for half, t in ((one, along), (two, 1 - along))]
-        means.append(np.abs(bilinear(image, sides[0]) - bilinear(image, sides[1])).mean())
-    return float(means[0] / means[1]) if means[1] > 1e-4 else None
+        step = 0.5 / 255
+        more = [(np.abs(bilinear(image, uv[0]) - bilinear(image, uv[1])).mean() + step) / (true[name] + step) for uv, true in self.sides]
+        return float(more[0] / more[1])
 
 
-def _beside(target, half: np.ndarray, along: np.ndarray, width: float) -> np.ndarray:
-    """Texture coordinates (n, 2) of points `width` inside the triangles of half-edges (n,), `along` (n,) the edge."""
+def _beside(target, half: np.ndarray, along: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Texture coordinates (n, 2) and positions (n, 3) `width` inside the triangles of half-edges (n,), `along` (n,) the edge."""
     face, k = half // 3, half % 3
     corners = target.vertices[target.faces[face]]
     at = np.arange(len(face))
@@ -113,10 +134,9 @@ def _beside(target, half: np.ndarray, along: np.ndarray, width: float) -> np.nda
     length = np.maximum(np.linalg.norm(b - a, axis=1), 1e-12)
     height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / length
     inward = np.minimum(width / np.maximum(height, 1e-12), 0.5)
-    uv = target.uv[target.face_uvs[face]]
     weight = np.zeros((len(face), 3))
     weight[at, k], weight[at, (k + 1) % 3], weight[at, (k + 2) % 3] = (1 - along) * (1 - inward), along * (1 - inward), inward
-    return np.einsum("nk,nkc->nc", weight, uv)
+    return np.einsum("nk,nkc->nc", weight, target.uv[target.face_uvs[face]]), np.einsum("nk,nkc->nc", weight, corners)
 
 
 def bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
@@ -140,5 +160,6 @@ def scored(truth: Truth, maps: dict[str, np.ndarray], corners: dict[str, np.ndar
     stored = texel_errors(truth, size, after, corners)
     out: dict[str, float | None] = texel_errors(truth, size, before, corners)
     out |= {f"8-bit {name}": stored[name] for name in ("albedo dB", "roughness dB", "normal deg")}
-    out["seam albedo"], out["seam roughness"] = seam_ratio(truth, after["albedo"]), seam_ratio(truth, after["roughness"][..., None])
+    out["seam albedo"] = truth.seams(size).ratio("albedo", after["albedo"])
+    out["seam roughness"] = truth.seams(size).ratio("roughness", after["roughness"][..., None])
     return out
