@@ -20,11 +20,13 @@ class Failed(Exception):
 
 @dataclass(frozen=True)
 class Cost:
-    """What one command took. peak_mb: largest resident set of the process or of one of its children."""
+    """What one command took. peak_mb: largest resident set of the process or of one of its children; cpu_seconds: of the
+    process and its children, user and system, over all threads."""
 
     seconds: float
     peak_mb: float
     stdout: str
+    cpu_seconds: float = 0.0
 
 
 def command() -> str:
@@ -58,7 +60,7 @@ def gdtool(*arguments: str | Path, limit_seconds: float = 1800) -> Cost:
         last = texts[1].strip().splitlines()[-1:] or ["no message"]
         late = f" after {limit_seconds:.0f} s" if seconds > limit_seconds else ""
         raise Failed(f"{arguments[0]} exited with {process.returncode}{late}: {last[0]}")
-    return Cost(seconds, usage.ru_maxrss / 1024, texts[0])
+    return Cost(seconds, usage.ru_maxrss / 1024, texts[0], usage.ru_utime + usage.ru_stime)
 
 
 def evaluate(result: Path, *arguments: str | Path) -> dict:

@@ -1,7 +1,7 @@
-"""What a user would run instead of `gdtool reconstruct`: capped screened Poisson and a carved hull, on the same views.
+"""What a user would run instead of `gdtool reconstruct`: screened Poisson, plain and capped, and a hull, plain and carved.
 
-Both are classical and quick. A carved hull is the weighted truncated distance to the depth views cut by the silhouettes;
-capped Poisson is screened Poisson on the views' points and on those points of the carved hull's top and bottom that no
+All are classical and quick. A carved hull is the weighted truncated distance to the depth views cut by the silhouettes;
+a hull the silhouettes alone, which is all that views without depth give; capped Poisson is screened Poisson on the views' points and on those points of the carved hull's top and bottom that no
 view sees, without which it balloons there. Each gives vertices (v, 3) and faces (f, 3).
 """
 
@@ -48,6 +48,8 @@ def carved_field(views: Views, samples: int, truncation: float = 4.0) -> tuple[n
             foot = camera.pixel_size if camera.projection == "orthographic" else 1 / camera.fx
             beside = map_coordinates(silhouettes[k], place, order=1, mode="nearest") * foot
             hull[:, j] = np.maximum(hull[:, j], np.clip(beside, -limit, limit).reshape(samples, samples))
+            if "depth" not in views.images:
+                continue
             row, column = (np.rint(p).astype(int).clip(0, views.mask.shape[1] - 1) for p in place)
             front = views.images["depth"][k][row, column] - depth
             facing = np.clip(views.images["normal"][k][row, column] @ camera.backward, 0.05, 1)
@@ -68,8 +70,27 @@ def carved_hull(views: Views, samples: int = 128) -> tuple[np.ndarray, np.ndarra
     return vertices * step + axis[0] - step, faces
 
 
-def capped_poisson(views: Views, depth: int = 7, threads: int = 2) -> tuple[np.ndarray, np.ndarray]:
+def hull(views: Views, samples: int = 128) -> tuple[np.ndarray, np.ndarray]:
+    """What the silhouettes alone give."""
+    return carved_hull(Views(views.cameras, {}, views.mask, None), samples)
+
+
+def screened_poisson(points: np.ndarray, normals: np.ndarray, depth: int, threads: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of points (n, 3) with normals (n, 3), on an octree of the given depth."""
     import pymeshlab
+
+    mesh = pymeshlab.MeshSet()
+    mesh.add_mesh(pymeshlab.Mesh(points, v_normals_matrix=normals))
+    mesh.generate_surface_reconstruction_screened_poisson(depth=depth, preclean=True, threads=threads)
+    return mesh.current_mesh().vertex_matrix(), mesh.current_mesh().face_matrix()
+
+
+def poisson(views: Views, depth: int = 7, threads: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """Of the views' points alone; where no view looks it balloons."""
+    return screened_poisson(*cloud(views), depth, threads)
+
+
+def capped_poisson(views: Views, depth: int = 7, threads: int = 2) -> tuple[np.ndarray, np.ndarray]:
     from scipy.spatial import cKDTree
 
     from gdtool.geometry.distance import sample_surface
@@ -81,17 +102,16 @@ def capped_poisson(views: Views, depth: int = 7, threads: int = 2) -> tuple[np.n
     caps, face_idx, _ = sample_surface(vertices, faces, 60_000, np.random.default_rng(0))
     cap_normals = face_normals(vertices, faces)[0][face_idx]
     unseen = (cKDTree(points).query(caps)[0] > 2.5 * 2 * REACH / samples) & (np.abs(cap_normals[:, 1]) > 0.5)
-    mesh = pymeshlab.MeshSet()
-    mesh.add_mesh(pymeshlab.Mesh(np.concatenate([points, caps[unseen]]), v_normals_matrix=np.concatenate([normals, cap_normals[unseen]])))
-    mesh.generate_surface_reconstruction_screened_poisson(depth=depth, preclean=True, threads=threads)
-    return mesh.current_mesh().vertex_matrix(), mesh.current_mesh().face_matrix()
+    return screened_poisson(np.concatenate([points, caps[unseen]]), np.concatenate([normals, cap_normals[unseen]]), depth, threads)
 
 
-def available() -> dict:
-    """Name to function of the peers whose packages are installed."""
+def available(deep: bool = True) -> dict:
+    """Name to function of the peers whose packages are installed; without deep, of those that need silhouettes alone."""
     from importlib.util import find_spec
 
-    found = {"carved hull": carved_hull}
+    if not deep:
+        return {"hull": hull}
+    found = {"carved hull": carved_hull, "hull": hull}
     if find_spec("pymeshlab"):
-        found["capped Poisson"] = capped_poisson
+        found |= {"capped Poisson": capped_poisson, "Poisson": poisson}
     return found

@@ -1,50 +1,61 @@
 """How near `gdtool reconstruct` comes to the truth, on exact and on disturbed views, beside what else a user could run.
 
-    python benchmarks/reconstruct.py                                        eight procedural objects
-    python benchmarks/reconstruct.py --models ../shared/assets/gso --limit 12 --seeds 5 --wavelengths 0.0625,0.125,0.25
-    python benchmarks/reconstruct.py --procedural 1 --size 128 --budgets 2,5 --keep /tmp/views -o /tmp/report
+    python benchmarks/reconstruct.py                    public models in --assets and procedural ones: a quarter of an hour
+    python benchmarks/reconstruct.py --all              every model with five seeds at three wavelengths: hours
+    python benchmarks/reconstruct.py --models DIR --limit 12 --procedural 0
+    python benchmarks/reconstruct.py --sheet /tmp/objects.png --only bunny,spot
+    python benchmarks/reconstruct.py --assets none --procedural 1 --size 128 --budgets 2,5 -o /tmp/report
 
 Every model is rendered by `gdtool render-dataset`; the disturbed views are benchmarks/perturbation.py's. Ours runs by the
 command line, so that its seconds hold start-up, reading and writing; a peer's are the algorithm alone. Errors are the
 "surface" protocol of docs/metrics.md; materials are compared where the surface is met from four held-out cameras, and
-lit by a held-out light. Nothing else should run meanwhile.
+lit by a held-out light. Rows are kept as they are measured: a run that was stopped goes on where it was, --fresh begins
+anew. Nothing else should run meanwhile.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
-from statistics import median
 
 import numpy as np
 import peers
-from measure import Failed, busy, gdtool, machine, number, say, table
+from measure import Failed, busy, gdtool, machine, number, say
 from perturbation import Perturbation, perturbed
+from reconstruct_looks import MATERIALS, looks, sheet
+from reconstruct_report import COLUMNS, OURS, kind, markdown, plot
 
-OURS = "gdtool"
 FIRST_SEED = 3_000_000  # procedural objects that the bundled model has not seen
 MODEL_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 LEFT_OUT = ("_col.obj",)  # collision shapes beside the models
-LIMITS = {"clean": {"distance": 7e-4, "iou": 0.990, "seen_normal_degrees": 3.0, "seconds": 20.0},
-          "perturbed": {"distance": 2.2e-3, "iou": 0.955, "seen_normal_degrees": 7.0, "seconds": 60.0},
-          "materials": {"albedo_psnr": 30.0, "roughness_error": 0.06, "metallic_error": 0.06}}
-COLUMNS = (("distance", "Chamfer, 1e-3", 1e3), ("seen_distance", "seen, 1e-3", 1e3), ("iou", "IoU", 1), ("seen_normal_degrees", "normal ° seen", 1),
-           ("normal_degrees", "normal °", 1), ("seconds", "seconds", 1), ("peak_mb", "MB", 1), ("watertight", "closed", 1))
-MATERIALS = (("albedo_psnr", "albedo dB", 1), ("relit_psnr", "relit dB", 1), ("roughness_error", "roughness", 1), ("metallic_error", "metallic", 1))
+# Of ../shared/assets: twelve Google Scanned Objects, then smooth, thin, flat and sharp-edged solids.
+SUITE = (*(f"gso/vima/{n}.obj" for n in ("mario_figure", "porcelain_cup", "c_clamp", "toy_train", "lion_figure", "dinosaur_figure", "bull_figure",
+                                         "can_opener", "alarm_clock", "hammer")),
+         "gso/aloha/Granimals_20_Wooden_ABC_Blocks_Wagon/meshes/model.obj", "gso/libero/glazed_rim_porcelain_ramekin/glazed_rim_porcelain_ramekin.obj",
+         *(f"mesh/odedstein/{n}/{n}.obj" for n in ("bunny", "spot", "penguin", "wingnut", "torus")),
+         *(f"mesh/trimesh/{n}" for n in ("fandisk.obj", "plate_holes.STL", "cycloidal.ply", "featuretype.STL")))
+SEEDS, WAVELENGTHS = 5, (1 / 16, 1 / 8, 1 / 4)  # of --all; the default takes one pair a model, each in turn
+DEFAULT_DISTURBED, DEFAULT_BUDGETED, DEFAULT_COLOR = 10, 2, 4  # models
+ALWAYS = ("carved hull", "capped Poisson")  # peers run on every model; the others, which are worse, on the first of the default
 
 
 def models(given: argparse.Namespace) -> list[tuple[str, str]]:
-    """Name and source of every model to take."""
-    found = [(f"procedural:{FIRST_SEED + i}",) * 2 for i in range(given.procedural)]
+    """Name and source of every model to take, procedural ones mixed in evenly."""
+    found = [given.assets / path for path in SUITE if (given.assets / path).exists()]
     for place in given.models:
         paths = [place] if place.is_file() else sorted(p for p in place.rglob("*") if p.suffix.lower() in MODEL_SUFFIXES)
-        paths = [p for p in paths if not p.name.endswith(LEFT_OUT)][: given.limit or None]
-        found += [((p.parent.parent.name if p.stem == "model" else p.stem), str(p)) for p in paths]
-    return found
+        found += [p for p in paths if not p.name.endswith(LEFT_OUT)][: given.limit or None]
+    named = [((p.parent.parent.name if p.stem == "model" else p.stem), str(p)) for p in found]
+    for i in range(given.procedural):
+        named.insert(4 * i, (f"procedural:{FIRST_SEED + i}",) * 2)
+    return [(name, source) for name, source in named if not given.only or name in given.only]
 
 
 def publish(path: Path, views, cause: Path) -> Path:
@@ -61,79 +72,127 @@ def publish(path: Path, views, cause: Path) -> Path:
     return path
 
 
-def measured(vertices: np.ndarray, faces: np.ndarray, truth, cameras) -> dict:
-    """Errors of one result against the true scene, in the frame of the views."""
+def measured(vertices: np.ndarray, faces: np.ndarray, truth, views, surface=None) -> dict:
+    """Errors of one result against the true scene, in the frame of the exact views; with surface its materials' too."""
     from gdtool.geometry.metrics import is_closed, surface_protocol
 
     if len(faces) == 0:
         return {"failed": "nothing came out"}
-    found = surface_protocol(vertices, faces, truth.vertices, truth.faces, cameras=cameras, samples=50_000)
-    return {name: float(found[name]) for name, _, _ in COLUMNS if name in found} | {"watertight": is_closed(vertices, faces)}
+    found = surface_protocol(vertices, faces, truth.vertices, truth.faces, cameras=views.cameras, samples=40_000)
+    out = {name: float(found[name]) for name, _, _ in COLUMNS if name in found} | {"watertight": is_closed(vertices, faces)}
+    out |= {"shown_normal_degrees": normals_beside(vertices, faces, views)}
+    return out | (looks(surface, truth) if surface is not None else {})
 
 
-def looks(surface, truth, size: int = 192) -> dict:
-    """Albedo dB, roughness and metallic errors and the dB of a relit picture, seen by four cameras that the result was not made from."""
-    import torch
+def normals_beside(vertices: np.ndarray, faces: np.ndarray, views) -> float:
+    """Mean degrees between a mesh's normals and the normal views (exact ones) where they are wholly covered.
 
-    from gdtool.cameras import camera_at, rays
+    A scan's few facets are shaded by smooth normals, which the views show: these, not the facets, are what can be known.
+    """
+    from gdtool.cameras import rays
+    from gdtool.geometry.normals import face_normals
     from gdtool.geometry.rays import RayCaster
-    from gdtool.images.color import srgb_from_linear
-    from gdtool.shading.closed_form import shade
-    from gdtool.shading.sg import SphericalGaussians
-    from gdtool.shading.surface_points import surface_attributes
 
-    light = SphericalGaussians(torch.tensor([[0.48, 0.64, 0.6], [-0.8, 0.36, 0.48], [0.0, 0.6, -0.8]]), torch.tensor([20.0, 6.0, 4.0]),
-                               torch.tensor([[3.0, 2.8, 2.5], [0.6, 0.8, 1.0], [0.7, 0.6, 0.6]]))
-    ours, true = RayCaster(surface.vertices, surface.faces), RayCaster(truth.vertices, truth.faces)
-    error = {name: [] for name, _, _ in MATERIALS}
-    for i in range(4):
-        camera = camera_at(22.5 + 90 * i, 20.0, name=str(i), size=size)
-        origins, directions = (x.reshape(-1, 3) for x in rays(camera))
-        hits, true_hits = ours.first_hit(origins, directions), true.first_hit(origins, directions)
-        both = hits.found & true_hits.found
-        both[both] = np.abs(hits.distance[both] - true_hits.distance[both]) < 0.01
-        if not both.any():
-            continue
-        corner, share = surface.faces[hits.face_idx[both]], hits.barycentric[both][..., None]
-        mine = {n: (np.asarray(getattr(surface, n)).reshape(len(surface.vertices), -1)[corner] * share).sum(1)
-                for n in ("albedo", "roughness", "metallic", "normals")}
-        found = surface_attributes(truth, true_hits.face_idx[both], true_hits.barycentric[both])
-        theirs = {n: np.asarray(found[n]).reshape(both.sum(), -1) for n in ("albedo", "roughness", "metallic", "normal")}
-        toward = torch.as_tensor(np.ascontiguousarray(-directions[both], np.float32))
-        pictures = []
-        for one, normal in ((mine, mine["normals"]), (theirs, theirs["normal"])):
-            normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-            lit = shade(torch.as_tensor(np.float32(normal)), toward, torch.as_tensor(np.float32(one["albedo"])), torch.as_tensor(np.float32(one["roughness"][:, 0])),
-                        torch.as_tensor(np.float32(one["metallic"][:, 0])), light)
-            pictures.append(srgb_from_linear(np.clip(lit.numpy(), 0, 1)))
-        squares = lambda a, b: float(np.mean((np.asarray(a, np.float64) - b) ** 2))  # noqa: E731
-        error["albedo_psnr"].append(squares(srgb_from_linear(np.clip(mine["albedo"], 0, 1)), srgb_from_linear(np.clip(theirs["albedo"], 0, 1))))
-        error["relit_psnr"].append(squares(*pictures))
-        for name in ("roughness", "metallic"):
-            error[f"{name}_error"].append(float(np.abs(mine[name] - theirs[name]).mean()))
-    return {name: (float(-10 * np.log10(max(np.mean(e), 1e-10))) if name.endswith("psnr") else float(np.mean(e))) for name, e in error.items() if e}
+    caster, normals, angles = RayCaster(vertices, faces), face_normals(vertices, faces)[0], []
+    for camera, cover, shown in zip(views.cameras, views.mask, views.images["normal"], strict=True):
+        whole = (cover > 0.99).ravel()
+        origins, directions = (x.reshape(-1, 3)[whole] for x in rays(camera))
+        hits = caster.first_hit(origins, directions)
+        cosine = (normals[hits.face_idx] * shown.reshape(-1, 3)[whole]).sum(1)[hits.found]
+        angles.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    return float(np.concatenate(angles).mean())
 
 
-def attempt(method: str, case: str, run) -> dict:
-    """A record of one run; a failure is named in it."""
-    record = {"method": method, "case": case}
-    try:
-        record |= run()
-    except (Failed, ValueError, RuntimeError) as error:
-        record["failed"] = str(error)
-    say(f"    {case:<22}{method:<18}" + (record.get("failed") or "  ".join(
-        f"{head} {number(record[name] * factor)}" for name, head, factor in (*COLUMNS, *MATERIALS) if name in record)))
-    return record
+def skips(views) -> list[dict]:
+    """CPU seconds of the grid method with a step left out and done, and how far the result moves (world units)."""
+    from gdtool.fields.align import disagreement
+    from gdtool.fields.carve import carve, combined_distance
+    from gdtool.fields.fusion import align_depth, bring_together, grid_step, prepare_all
+
+    depth, normal = views.images["depth"], views.images["normal"]
+    step = grid_step(views.cameras, 0)
+    sights = prepare_all(views.cameras, views.mask, depth, normal)
+
+    def timed(function):
+        start = time.process_time()
+        return function(), time.process_time() - start
+
+    (_, before, after), checked = timed(lambda: align_depth(views.cameras, views.mask, depth, normal, step))
+    found = []
+    if before == after:
+        (moved, _), forced = timed(lambda: bring_together(views.cameras, views.mask, depth, normal, sights))
+        found.append({"what": "alignment of views that agree", "done": checked + forced, "skipped": checked, "change": abs(disagreement(moved) - before)})
+    (grid, values, _), band = timed(lambda: carve(sights, step))
+    limit = 3 * step
+    points = np.stack(np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij"), -1).reshape(-1, 3)
+    (dense, _), whole = timed(lambda: combined_distance(sights, grid.points(points), step, limit))
+    near = np.abs(dense.reshape(grid.shape)) < step
+    change = float(np.abs(dense.reshape(grid.shape) - values)[near].max())
+    found.append({"what": "samples away from the surface", "done": whole, "skipped": band, "change": change})
+    return found
 
 
-def measure(name: str, source: str, folder: Path, given: argparse.Namespace) -> list[dict]:
-    """All runs on one model."""
+def cases_of(index: int, given: argparse.Namespace) -> list[str]:
+    """Which views of the index-th model are reconstructed: clean, color, perturbed SEED WAVELENGTH."""
+    cases = ["clean"] if given.clean else []
+    if given.seeds:
+        cases += [f"perturbed {seed} {wavelength:g}" for wavelength in given.wavelengths for seed in range(given.seeds)]
+    elif index < DEFAULT_DISTURBED:
+        cases.append(f"perturbed {index % SEEDS} {WAVELENGTHS[index % len(WAVELENGTHS)]:g}")
+    return cases + (["color"] if given.all or index < DEFAULT_COLOR else [])
+
+
+class Bench:
+    """The rows measured so far, in a file, and how to measure one more."""
+
+    def __init__(self, given: argparse.Namespace):
+        from gdtool.stages.reconstruct import STAGE
+
+        self.given, self.path = given, given.output / "reconstruct.json"
+        self.head = {"machine": machine(), "remark": busy(), "size": given.size, "version": STAGE.version, "options": given.options, "complete": False}
+        self.records: list[dict] = []
+        if self.path.exists() and not given.fresh:
+            kept = json.loads(self.path.read_text())
+            if not kept.get("complete") and all(kept.get(k) == self.head[k] for k in ("machine", "size", "version", "options")):
+                self.records, self.head["remark"] = kept["records"], kept["remark"] or self.head["remark"]
+                say(f"going on after {len(self.records)} rows of {self.path}")
+
+    def has(self, model: str, case: str, method: str) -> bool:
+        return any((r["model"], r["case"], r["method"]) == (model, case, method) for r in self.records)
+
+    def save(self, complete: bool = False) -> None:
+        self.head["complete"] = complete
+        beside = self.path.with_suffix(".part")
+        beside.write_text(json.dumps(self.head | {"records": self.records}, indent=1) + "\n")
+        os.replace(beside, self.path)
+        (self.given.output / "reconstruct.md").write_text(markdown(self.records, self.given, self.head["remark"]))
+
+
+def tasks(index: int, case: str, given: argparse.Namespace) -> dict:
+    """Method to the options of ours, or to the function of a peer."""
+    kept = ["--ignore", "normal,depth,albedo,roughness,metallic"] if case == "color" else []
+    found: dict = {OURS: [*kept, *given.options]}
+    if case != "color" and (given.all or index < DEFAULT_BUDGETED):
+        found |= {f"{OURS} {budget:g} s": [*given.options, "--budget", f"{budget:g}"] for budget in given.budgets}
+    if given.peers:
+        every = given.all or index < DEFAULT_COLOR
+        found |= {m: f for m, f in peers.available(deep=case != "color").items() if every or m in ALWAYS}
+    return found
+
+
+def measure(index: int, name: str, source: str, folder: Path, bench: Bench, pool) -> list[tuple[str, list]]:
+    """All runs on one model; rows for the contact sheet."""
     from gdtool.assets.load import load_scene
     from gdtool.core.folder import open_folder
     from gdtool.folders.surface import read_surface
     from gdtool.folders.views import read_views
     from gdtool.geometry.frames import invert_similarity, transform_points
 
+    given = bench.given
+    todo = {case: {m: t for m, t in tasks(index, case, given).items() if not bench.has(name, case, m)} for case in cases_of(index, given)}
+    todo = {case: methods for case, methods in todo.items() if methods}
+    if not todo:
+        return []
     say(name)
     clean = folder / "views"
     gdtool("render-dataset", source, "-o", clean, "--size", str(given.size), "--samples", "4", "--light-samples", "4", "--quiet")
@@ -141,126 +200,48 @@ def measure(name: str, source: str, folder: Path, given: argparse.Namespace) -> 
     views, truth = read_views(opened), load_scene(source)
     to_views = invert_similarity(np.array(opened.content.source_from_world).reshape(4, 4))
     truth = replace(truth, vertices=transform_points(to_views, truth.vertices))  # a scale and a shift: its normals stay
-    cases = {"clean": (clean, views)} if given.clean else {}
-    for wavelength in given.wavelengths:
-        for seed in range(given.seeds):
-            case = f"perturbed {seed} {wavelength:g}"
-            disturbed = perturbed(views, Perturbation(seed, wavelength))
-            cases[case] = publish(folder / case.replace(" ", "_"), disturbed, clean), disturbed
-
-    def ours(place: Path, *options: str, materials: bool = False) -> dict:
-        target = folder / "surface"
-        cost = gdtool("reconstruct", place, "-o", target, "--force", "--quiet", *options, *given.options)
-        surface = read_surface(open_folder(target))
-        return measured(surface.vertices, surface.faces, truth, views.cameras) | {"seconds": cost.seconds, "peak_mb": cost.peak_mb} | (
-            looks(surface, truth) if materials else {})
-
-    def peer(method, views) -> dict:
-        start = time.perf_counter()
-        vertices, faces = method(views)
-        seconds = time.perf_counter() - start
-        return measured(vertices, faces, truth, views.cameras) | {"seconds": seconds}
-
-    records = []
-    for case, (place, arrays) in cases.items():
-        records.append(attempt(OURS, case, lambda place=place, case=case: ours(place, materials=case == "clean")))
-        for budget in given.budgets:
-            records.append(attempt(f"{OURS} {budget:g} s", case, lambda place=place, budget=budget: ours(place, "--budget", str(budget))))
-        for method, function in peers.available().items() if given.peers else ():
-            records.append(attempt(method, case, lambda function=function, arrays=arrays: peer(function, arrays)))
-    return [{"model": name, "source": source, **record} for record in records]
-
-
-def kind(record: dict) -> str:
-    """clean or perturbed."""
-    return record["case"].split()[0]
-
-
-def middle(records: list[dict], name: str) -> float | None:
-    """Median of a figure over the records that have it."""
-    values = [float(r[name]) for r in records if name in r]
-    return median(values) if values else None
-
-
-def summary(records: list[dict], case: str) -> str:
-    """Medians by method."""
-    chosen = [r for r in records if kind(r) == case]
+    # How far the views' own normals are from the facets of the truth: nothing made from them can be much nearer.
+    shown = normals_beside(truth.vertices, truth.faces, views)
     rows = []
-    for method in dict.fromkeys(r["method"] for r in chosen):
-        part = [r for r in chosen if r["method"] == method]
-        cells = [f"{sum(bool(r.get('watertight')) for r in part)} of {len(part)}" if name == "watertight" else
-                 number(None if (value := middle(part, name)) is None else value * factor) for name, _, factor in (*COLUMNS, *MATERIALS)]
-        rows.append([method, *cells, str(sum("failed" in r for r in part))])
-    return table(["method", *(head for _, head, _ in (*COLUMNS, *MATERIALS)), "failed"], rows)
-
-
-def by_model(records: list[dict], case: str) -> str:
-    """Our median Chamfer of every model beside the best peer's, and what the worst is."""
-    rows = []
-    for model in dict.fromkeys(r["model"] for r in records):
-        part = [r for r in records if r["model"] == model and kind(r) == case]
-        mine = [r for r in part if r["method"] == OURS]
-        others = {m: middle([r for r in part if r["method"] == m], "distance") for m in {r["method"] for r in part} if not m.startswith(OURS)}
-        others = {m: value for m, value in others.items() if value is not None}
-        best = min(others, key=others.get) if others else ""
-        own = middle(mine, "distance")
-        rows.append([model, *(number(None if (v := middle(mine, n)) is None else v * f) for n, _, f in COLUMNS[:6]),
-                     number(others[best] * 1e3) if best else "–", best, "" if own is None or not best else "yes" if own <= others[best] else "NO"])
-    return table(["model", *(head for _, head, _ in COLUMNS[:6]), "best peer, 1e-3", "which", "not worse"], rows)
-
-
-def verdict(records: list[dict]) -> str:
-    """A line for each limit of the issue."""
-    lines = []
-    for case, limits in LIMITS.items():
-        mine = [r for r in records if r["method"] == OURS and kind(r) == ("clean" if case == "materials" else case)]
-        for name, limit in limits.items():
-            value = middle(mine, name)
-            if value is not None:
-                good = value >= limit if name in ("iou", "albedo_psnr") else value <= limit
-                lines.append(f"- {case}: median {name} {number(value)}, wanted {'≥' if name in ('iou', 'albedo_psnr') else '≤'} {limit:g}: "
-                             + ("holds" if good else "**missed**"))
-    return "\n".join(lines)
-
-
-def markdown(records: list[dict], given: argparse.Namespace, remark: str) -> str:
-    """The report."""
-    count = len({r["model"] for r in records})
-    parts = ["# Reconstruction: six views to a surface", "",
-             f"By `benchmarks/reconstruct.py` on {machine()}; {count} models, views of {given.size}², {given.seeds} seeds of the disturbance, "
-             f"wavelengths {', '.join(f'{w:g}' for w in given.wavelengths)} of the picture. Medians. {remark}", "",
-             "Chamfer: point to surface, mean of both directions, largest extent of the truth 1. IoU: closed truths only.", "", verdict(records), ""]
-    for case, title in (("clean", "Exact views"), ("perturbed", "Disturbed views")):
-        if any(kind(r) == case for r in records):
-            parts += [f"## {title}", "", summary(records, case), "", by_model(records, case), ""]
-    failed = [f"- {r['model']}, {r['case']}, {r['method']}: {r['failed']}" for r in records if "failed" in r]
-    return "\n".join([*parts, *(["## Failed", "", *failed, ""] if failed else []), "![time against error](reconstruct.png)", ""])
-
-
-def plot(records: list[dict], path: Path) -> None:
-    """Time against Chamfer and IoU, medians by method."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    cases = [case for case in ("clean", "perturbed") if any(kind(r) == case for r in records)]
-    figure, axes = plt.subplots(2, len(cases), figsize=(6 * len(cases), 7), layout="constrained", squeeze=False)
-    for column, case in enumerate(cases):
-        for row, (name, label) in enumerate((("distance", "Chamfer"), ("iou", "IoU"))):
-            axis = axes[row, column]
-            for method in dict.fromkeys(r["method"] for r in records):
-                part = [r for r in records if r["method"] == method and kind(r) == case]
-                seconds, value = middle(part, "seconds"), middle(part, name)
-                if seconds is not None and value is not None:
-                    axis.plot(seconds, value, "o" if method.startswith(OURS) else "s", label=method, markersize=9)
-            if name in LIMITS[case]:
-                axis.axhline(LIMITS[case][name], color="grey", linestyle=":")
-            axis.set(xscale="log", xlabel="seconds", ylabel=label, title=case, yscale="log" if name == "distance" else "linear")
-            if axis.has_data():
-                axis.legend(fontsize=8)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    for case, methods in todo.items():
+        arrays, place = views, clean
+        if kind({"case": case}) == "perturbed":
+            arrays = perturbed(views, Perturbation(int(case.split()[1]), float(case.split()[2])))
+            place = publish(folder / case.replace(" ", "_"), arrays, clean)
+        elif case == "color":
+            arrays = replace(views, images={"color": views.images["color"]})
+        made = []
+        for method, how in methods.items():
+            record, mesh, surface = {"model": name, "source": source, "method": method, "case": case, "views_normal_degrees": shown}, None, None
+            try:
+                if callable(how):
+                    wall, cpu = time.perf_counter(), time.process_time()
+                    mesh = how(arrays)
+                    record |= {"seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
+                else:
+                    cost = gdtool("reconstruct", place, "-o", folder / "surface", "--force", "--quiet", *how)
+                    surface = read_surface(open_folder(folder / "surface"))
+                    mesh = surface.vertices, surface.faces
+                    record |= {"seconds": cost.seconds, "cpu_seconds": cost.cpu_seconds, "peak_mb": cost.peak_mb}
+            except (Failed, ValueError, RuntimeError) as error:
+                record["failed"] = str(error)
+            if case == "clean" and method == OURS and index < DEFAULT_COLOR:
+                record["skips"] = skips(arrays)
+            surface = surface if case == "clean" and method == OURS else None
+            made.append((record, mesh, surface))
+        # After the runs, so that measuring does not slow them.
+        found = [pool.submit(measured, *mesh, truth, views, surface) if mesh else None for _, mesh, surface in made]
+        for (record, _, _), errors in zip(made, found, strict=True):
+            record |= errors.result() if errors else {}
+            say(f"    {case:<22}{record['method']:<18}" + (record.get("failed") or "  ".join(
+                f"{head} {number(record[n] * factor)}" for n, head, factor in (*COLUMNS, *MATERIALS) if n in record)))
+            bench.records.append(record)
+        bench.save()
+        own = [m for r, m, _ in made if r["method"] == OURS]
+        others = sorted((r.get("distance", np.inf), i) for i, (r, _, _) in enumerate(made) if not r["method"].startswith(OURS))
+        if given.sheet and own and kind({"case": case}) != "color":
+            rows.append((f"{name} {case}", [(truth.vertices, truth.faces), own[0], made[others[0][1]][1] if others else None]))
+    return rows
 
 
 def arguments() -> argparse.Namespace:
@@ -268,37 +249,46 @@ def arguments() -> argparse.Namespace:
         return [float(part) for part in text.split(",") if part]
 
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--procedural", type=int, default=8, help="number of procedural objects (default 8)")
+    parser.add_argument("--assets", type=Path, default=Path(__file__).parents[2] / "shared" / "assets", help="folder that holds the models of the suite")
+    parser.add_argument("--procedural", type=int, default=6, help="number of procedural objects (default 6)")
     parser.add_argument("--models", type=Path, action="append", default=[], metavar="DIR", help="also every model in this folder")
     parser.add_argument("--limit", type=int, default=0, help="at most this many models of a folder")
+    parser.add_argument("--only", type=lambda t: t.split(","), default=[], help="of all these, the models of these names")
+    parser.add_argument("--all", action="store_true", help="five seeds at three wavelengths, budgets, color alone and all peers on every model")
     parser.add_argument("--size", type=int, default=256, help="width and height of the views (default 256)")
-    parser.add_argument("--seeds", type=int, default=1, help="disturbances of every model and wavelength (default 1)")
-    parser.add_argument("--wavelengths", type=numbers, default=[1 / 8], help="of the disturbance, shares of the picture (default 0.125)")
-    parser.add_argument("--budgets", type=numbers, default=[], help="also run ours with --budget of these seconds")
+    parser.add_argument("--seeds", type=int, default=0, help="disturbances of every model and wavelength (default: one of either a model, in turn)")
+    parser.add_argument("--wavelengths", type=numbers, default=list(WAVELENGTHS), help="with --seeds: of the disturbance, shares of the picture")
+    parser.add_argument("--budgets", type=numbers, default=[5, 10, 20], help="also run ours with --budget of these seconds (default 5,10,20)")
     parser.add_argument("--no-clean", dest="clean", action="store_false", help="leave the exact views out")
     parser.add_argument("--no-peers", dest="peers", action="store_false", help="leave the peers out")
+    parser.add_argument("--fresh", action="store_true", help="measure every row anew")
+    parser.add_argument("--sheet", type=Path, metavar="PNG", help="write pictures of the truth, ours and the best peer of each model")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep (and find again) the folders of every model here")
     parser.add_argument("--option", dest="options", action="append", default=[], help="further option of gdtool reconstruct, as --option=--method=paper")
     parser.add_argument("-o", "--output", type=Path, default=Path(__file__).parents[1] / "docs" / "benchmarks", help="folder of the report")
-    return parser.parse_args()
+    given = parser.parse_args()
+    if given.all:
+        given.seeds, given.budgets = given.seeds or SEEDS, [5, 10, 20, 40, 60, 120]
+    return given
 
 
 def main() -> None:
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # Poisson's threads would burn a core waiting
     given = arguments()
     given.output.mkdir(parents=True, exist_ok=True)
-    remark, records = busy(), []
-    for name, source in models(given):
-        with tempfile.TemporaryDirectory() as folder:
-            place = given.keep / name.replace(":", "-") if given.keep else Path(folder)
-            try:
-                records += measure(name, source, place, given)
-            except Failed as error:
-                say(f"{name}: left out: {error}")
-                continue
-        (given.output / "reconstruct.json").write_text(json.dumps({"machine": machine(), "remark": remark, "records": records}, indent=1) + "\n")
-        (given.output / "reconstruct.md").write_text(markdown(records, given, remark))
-    plot(records, given.output / "reconstruct.png")
-    print(markdown(records, given, remark))
+    bench, rows = Bench(given), []
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:  # a fork of a process with OpenMP threads can hang
+        for index, (name, source) in enumerate(models(given)):
+            with tempfile.TemporaryDirectory() as folder:
+                try:
+                    rows += measure(index, name, source, given.keep / name.replace(":", "-") if given.keep else Path(folder), bench, pool)
+                except Failed as error:
+                    say(f"{name}: left out: {error}")
+            if rows and given.sheet:
+                sheet(rows, ["truth", OURS, "best peer"], given.sheet)
+    plot(bench.records, given.output / "reconstruct.png")
+    bench.save(complete=True)
+    print(markdown(bench.records, given, bench.head["remark"]))
 
 
 if __name__ == "__main__":

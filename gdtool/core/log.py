@@ -15,6 +15,14 @@ def say(text: str, at: int = NORMAL) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
+def status(text: str) -> None:
+    """How a step gets on: a line on stderr when verbose, else, on a terminal, a line that the next one replaces."""
+    if level >= VERBOSE:
+        say(f"    {text}", at=VERBOSE)
+    elif level == NORMAL and sys.stderr.isatty():
+        print(f"\r\033[K  {text}", end="\r", file=sys.stderr, flush=True)
+
+
 def progress(iterable: Iterable, total: int | None = None, label: str = "") -> Iterator:
     """Iterate with a bar on stderr; silent when quiet or when stderr is not a terminal."""
     from tqdm import tqdm

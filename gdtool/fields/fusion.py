@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from gdtool.cameras import Camera
 from gdtool.fields.align import Corrections, corrections, disagreement, slope_rows
 from gdtool.fields.carve import carve, silhouettes_outvoted, smooth_unseen
+from gdtool.fields.clock import Clock
 from gdtool.fields.refine import drop_debris, measured_planes, refine
 from gdtool.fields.sights import Sight, pixel_footprint, prepare, with_edge
 from gdtool.fields.thin import near_points, restore_thin
@@ -17,6 +19,18 @@ from gdtool.geometry.normals import vertex_normals
 
 LEAST_NOISE = 0.3  # grid steps: of views that had to be brought together
 MAX_SAMPLES = 320  # along the longest side: 33 million samples, 0.6 GB at the peak
+# Rounds of bringing views together: how far apart two surfaces may lie to be taken for one (world units), and how stiff
+# the corrections are. The last is repeated while the disagreement falls by PLATEAU of itself.
+ROUNDS = ((0.08, 4.0), (0.06, 1.0), (0.04, 0.3), (0.03, 0.3))
+MORE_ROUNDS, PLATEAU = 4, 0.05
+DRAFT = 2.0  # grid steps of the draft that is made first when time is short
+# Of the draft's seconds: what materials and writing take at the same step. Fusing grows with the step to the power -2.4
+# (the narrow band to -2, where the surface may lie to -3), the rest with the number of vertices.
+AFTER, FUSING, SURFACE = 1.2, 2.4, 2.0
+
+
+def _silent(text: str) -> None:
+    """Tell nobody."""
 
 
 @dataclass(frozen=True)
@@ -53,26 +67,61 @@ def depth_for(cameras: list[Camera], mask: np.ndarray, normal: np.ndarray) -> np
 
 
 def align_depth(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray | None, normal: np.ndarray | None,
-                step: float) -> tuple[list[Sight], float, float]:
+                step: float, clock: Clock | None = None, tell: Callable[[str], None] = _silent) -> tuple[list[Sight], float, float]:
     """Prepared views whose surfaces were brought together where they disagree, the disagreement before and after.
 
     Views that agree to a tenth of a step are left as they are.
     """
     sights = prepare_all(cameras, mask, depth, normal)
-    before = after = disagreement(sights)
+    before = disagreement(sights)
     if before < 0.1 * step:
-        return sights, before, after
+        return sights, before, before
+    sights, after = bring_together(cameras, mask, depth, normal, sights, clock, tell)
+    # What the views got wrong in common is not seen in their disagreement.
+    return sights, before, max(after, LEAST_NOISE * step)
+
+
+def bring_together(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray, normal: np.ndarray | None, sights: list[Sight],
+                   clock: Clock | None = None, tell: Callable[[str], None] = _silent) -> tuple[list[Sight], float]:
+    """Corrected views and their disagreement. sights: the views as they were given, prepared.
+
+    Rounds go on until the disagreement falls no more, or until half of the clock's time is spent; each leaves whole
+    views.
+    """
+    clock = clock or Clock()
     kept = [k for k in range(len(cameras)) if (mask[k] > 0.5).any()]
     slopes = [slope_rows(sight) for sight in sights]
-    found = Corrections.none(len(sights))
-    for reach, stiffness in ((0.08, 4.0), (0.06, 1.0), (0.04, 0.3), (0.03, 0.3)):
+    found, after = Corrections.none(len(sights)), disagreement(sights)
+    for count, (reach, stiffness) in enumerate((*ROUNDS, *[ROUNDS[-1]] * MORE_ROUNDS), 1):
         found = corrections(sights, slopes, found, reach, stiffness)
         changed = np.array(depth)
         for place, k in enumerate(kept):
             changed[k] = np.where(depth[k] > 0, depth[k] + found.depth(place, mask[k].shape), 0)
         sights = [with_edge(sight, edge) for sight, edge in zip(prepare_all(cameras, mask, changed, normal), found.edge, strict=True)]
-    # What the views got wrong in common is not seen in their disagreement.
-    return sights, before, max(disagreement(sights), LEAST_NOISE * step)
+        previous, after = after, disagreement(sights)
+        tell(f"round {count}: views disagree by {after:.5f}, {previous:.5f} before")
+        plateau = count >= len(ROUNDS) and after > (1 - PLATEAU) * previous
+        if plateau or clock.left() < clock.spent():
+            break
+    return sights, after
+
+
+def fuse_within(sights: list[Sight], step: float, noise: float, outvoted: int, clock: Clock) -> tuple[Shape, str]:
+    """fuse_views at the finest step that the clock has time for, and what was left out for it ("" for nothing).
+
+    With an end in sight a draft is made first, which tells how quick the machine is and is the result when nothing finer
+    can be done in time.
+    """
+    if not clock.limited:
+        return fuse_views(sights, step, noise, outvoted), ""
+    began = clock.spent()
+    draft = fuse_views(sights, DRAFT * step, noise, outvoted)
+    seconds = clock.spent() - began
+    for coarser in (1.0, 1.4):
+        finer = DRAFT / coarser
+        if seconds * (finer**FUSING + AFTER * finer**SURFACE) <= clock.left():
+            return fuse_views(sights, coarser * step, noise, outvoted), "" if coarser == 1 else f"at {coarser} of its step"
+    return draft, f"at {DRAFT:g} of its step"
 
 
 def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 0) -> Shape:

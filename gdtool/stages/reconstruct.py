@@ -15,6 +15,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from gdtool.core import log
 from gdtool.core.errors import InputError, UsageError
 from gdtool.core.kinds import DOMAINS
 from gdtool.core.stage import Inputs, Output, Stage
@@ -33,7 +34,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     steps: Annotated[int, Meta(ge=1, le=100_000, description="paper: optimisation steps of each phase")] = 300
     root: Annotated[Literal["secant", "median"], Meta(description="paper: surface point between two samples of a ray")] = "secant"
     brdf: Annotated[Literal["gltf", "paper"], Meta(description="paper: reflection model that color is fitted with")] = "gltf"
-    budget: Annotated[float, Meta(ge=0, description="paper: stop optimising after this many seconds; 0: never")] = 0.0
+    budget: Annotated[float, Meta(ge=0, description="seconds to be done in: grid takes a coarser grid, paper stops optimising; 0: as long as it helps")] = 0.0
     ignore: Annotated[tuple[str, ...], Meta(description="domains to leave out, for example depth,normal")] = ()
     seed: Annotated[int, Meta(ge=0, description="seed of everything random")] = 0
 
@@ -42,7 +43,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Reconstruct one views folder."""
     from gdtool.fields.appearance import appearance
     from gdtool.fields.align import agreement
-    from gdtool.fields.fusion import align_depth, fuse_views, grid_step, is_closed_manifold, prepare_all, silhouettes_outvoted
+    from gdtool.fields.clock import Clock
+    from gdtool.fields.fusion import align_depth, fuse_within, grid_step, is_closed_manifold, prepare_all, silhouettes_outvoted
     from gdtool.folders.surface import Surface, write_surface
     from gdtool.folders.views import read_views
     from gdtool.geometry.normals import vertex_normals
@@ -50,7 +52,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     unknown = sorted(set(options.ignore) - set(DOMAINS))
     if unknown:
         raise UsageError("--ignore", f"{unknown[0]!r} is no domain", f"choose from {', '.join(DOMAINS)}")
-    folder = inputs.main
+    folder, clock = inputs.main, Clock(options.budget if options.method == "grid" else 0.0)
     with out.step("read"):
         views = read_views(folder, tuple(d for d in DOMAINS if d not in options.ignore))
     for domain in DOMAINS:
@@ -62,7 +64,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     with out.step("align"):
         normal = _normals(views, out)
         depth = _depth(views, out)
-        sights, before, noise = align_depth(views.cameras, views.mask, depth, normal, step)
+        sights, before, noise = align_depth(views.cameras, views.mask, depth, normal, step, clock, log.status)
         agreed = agreement(sights)
         if agreed < LEAST_AGREEMENT:
             out.warn(f"depth and normals do not fit together (a view confirms {agreed:.0%} of another's points); the silhouettes alone give the shape")
@@ -74,9 +76,11 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             out.warn(f"the silhouettes contradict one another: up to {outvoted} of {len(sights)} are outvoted at a point")
     with out.step("fuse"):
         try:
-            shape = fuse_views(sights, step, noise, outvoted)
+            shape, coarser = fuse_within(sights, step, noise, outvoted, clock)
         except ValueError as error:
             raise InputError(folder.path, str(error), "check the masks and cameras") from None
+    if coarser:
+        out.skip("the whole grid", f"--budget has no time for it: the surface is taken {coarser}")
     _check_cameras(folder, views.cameras, shape.vertices)
     vertices, faces, figures, fit = shape.vertices, shape.faces, {}, None
     if options.method == "paper":
@@ -180,4 +184,4 @@ def _check_masks(path, views, out: Output) -> None:
             out.warn(f"view {name}: its mask is empty; the view is left out")
 
 
-STAGE = Stage(name="reconstruct", version=5, reads=("views",), writes="surface", Options=Options, run=run)
+STAGE = Stage(name="reconstruct", version=6, reads=("views",), writes="surface", Options=Options, run=run)
