@@ -1,4 +1,4 @@
-"""Renders a .glb from the front in Blender: python show_in_blender.py MODEL.glb OUT.png   (pip install bpy)
+"""Renders a .glb from the front in Blender: python show_in_blender.py MODEL.glb OUT.png [unlit]   (pip install bpy)
 
 Orthographic, half-width 0.72 of the longest side, the object's middle in the picture's, sun from the upper left, as
 show_in_three.mjs does it: the two pictures and gdtool's own front view show the same object the same way round.
@@ -15,9 +15,25 @@ from mathutils import Vector
 SIZE = 512
 
 
-def main(model: str, out: str) -> None:
+def unlit() -> None:
+    """Every material shines with its base color, and with nothing else."""
+    for material in bpy.data.materials:
+        tree = material.node_tree
+        shader = next((n for n in tree.nodes if n.type == "BSDF_PRINCIPLED"), None) if tree else None
+        if shader:
+            emission, source = tree.nodes.new("ShaderNodeEmission"), shader.inputs["Base Color"]
+            emission.inputs[0].default_value = tuple(source.default_value)
+            if source.links:
+                tree.links.new(source.links[0].from_socket, emission.inputs[0])
+            end = next(n for n in tree.nodes if n.type == "OUTPUT_MATERIAL")
+            tree.links.new(emission.outputs[0], end.inputs[0])
+
+
+def main(model: str, out: str, mode: str = "lit") -> None:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.import_scene.gltf(filepath=model)
+    if mode == "unlit":
+        unlit()
     scene = bpy.context.scene
     corners = [obj.matrix_world @ Vector(corner) for obj in scene.objects if obj.type == "MESH" for corner in obj.bound_box]
     low = Vector(tuple(min(c[i] for c in corners) for i in range(3)))
@@ -52,4 +68,4 @@ def main(model: str, out: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[-2:])
+    main(*sys.argv[1:])

@@ -1,4 +1,4 @@
-"""Renders a model from the front with gdtool: python show_in_gdtool.py MODEL OUT.png
+"""Renders a model from the front with gdtool: python show_in_gdtool.py MODEL OUT.png [unlit]
 
 The frame and the sun of show_in_three.mjs and show_in_blender.py, shaded from the exact buffers with Lambert's law.
 """
@@ -18,13 +18,13 @@ from gdtool.images.io import write_png
 from gdtool.shading.render import render_buffers
 
 
-def main(model: str, out: str) -> None:
+def main(model: str, out: str, mode: str = "lit") -> None:
     scene = load_scene(model)
     scene = replace(scene, vertices=transform_points(invert_similarity(unit_box(scene.vertices)), scene.vertices))
     front = next(camera for camera in rig("six", 512) if camera.name == "front")
     images = render_buffers(scene, front)
     sun = np.maximum(images["normal"] @ (np.array([-1, 1, 1]) / np.sqrt(3)), 0)
-    color = images["albedo"] * (0.3 + sun[..., None])
+    color = images["albedo"] * (1.0 if mode == "unlit" else 0.3 + sun[..., None])
     write_png(out, np.concatenate([srgb_from_linear(np.clip(color, 0, 1)), images["mask"][..., None]], -1))
 
 

@@ -1,4 +1,4 @@
-// Renders a .glb from the front with three.js in headless Chromium: node show_in_three.mjs MODEL.glb OUT.png
+// Renders a .glb from the front with three.js in headless Chromium: node show_in_three.mjs MODEL.glb OUT.png [unlit]
 // Needs npm packages three and playwright-core (npm install in this folder, or NODE_PATH) and a Chromium: CHROMIUM, else
 // /usr/bin/chromium. Orthographic, half-width 0.72 of the longest side, sun from the upper left, like show_in_blender.py.
 import { createServer } from 'node:http';
@@ -6,7 +6,7 @@ import { readFileSync } from 'node:fs';
 import { createRequire } from 'node:module';
 import { dirname, extname, join, normalize } from 'node:path';
 
-const [model, out] = process.argv.slice(2);
+const [model, out, mode] = process.argv.slice(2);
 const require = createRequire(import.meta.url);
 const paths = [process.cwd(), import.meta.dirname, ...(process.env.NODE_PATH ?? '').split(':').filter(Boolean)];
 const three = dirname(dirname(require.resolve('three', { paths })));
@@ -33,7 +33,7 @@ const browser = await chromium.launch({
 try {
   const page = await browser.newPage({ viewport: { width: 512, height: 512 } });
   page.on('console', (message) => console.error(message.text()));
-  await page.goto(`http://127.0.0.1:${server.address().port}/`);
+  await page.goto(`http://127.0.0.1:${server.address().port}/${mode === 'unlit' ? '?unlit' : ''}`);
   await page.waitForFunction(() => window.done, null, { timeout: 60_000 });
   const done = await page.evaluate(() => window.done);
   console.log(JSON.stringify(done));

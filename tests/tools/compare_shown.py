@@ -1,0 +1,71 @@
+"""Base color of an asset as three.js and Blender show it, against gdtool: python compare_shown.py ASSET.glb [--peers-python PATH]
+
+Runs the show_in_* scripts of this folder without light and prints the PSNR in dB over the pixels that both pictures cover in
+full. three.js needs what show_in_three.mjs says; Blender a Python that has bpy. What is not there is named and left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+HERE = Path(__file__).parent
+
+
+def picture(command: list, out: Path) -> np.ndarray | str:
+    """The (h, w, 4) picture in [0, 1] that a command writes to out, or why there is none."""
+    from gdtool.images.io import read_image
+
+    try:
+        done = subprocess.run([*map(str, command), str(out), "unlit"], capture_output=True, text=True, timeout=300, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return str(error)
+    if done.returncode or not out.exists():
+        return (done.stderr.strip().splitlines() or ["no picture"])[-1]
+    return read_image(out).astype(np.float64) / 255
+
+
+def inner(coverage: np.ndarray) -> np.ndarray:
+    """(h, w) bool: pixels that are covered in full, as are their neighbours; multisampling may call an edge whole."""
+    from scipy.ndimage import binary_erosion
+
+    return binary_erosion(coverage > 0.999, iterations=2)
+
+
+def main() -> None:
+    from gdtool.images.metrics import psnr
+
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("asset", type=Path)
+    parser.add_argument("--peers-python", type=Path)
+    parser.add_argument("--keep", type=Path, help="folder for the pictures")
+    asked = parser.parse_args()
+    asset = asked.asset.resolve()
+    with tempfile.TemporaryDirectory() as folder:
+        place = asked.keep or Path(folder)
+        place.mkdir(parents=True, exist_ok=True)
+        ours = picture([sys.executable, HERE / "show_in_gdtool.py", asset], place.resolve() / "gdtool.png")
+        if isinstance(ours, str):
+            sys.exit(ours)
+        others = {"three.js": ["node", HERE / "show_in_three.mjs", asset]}
+        if asked.peers_python:
+            others["Blender"] = [asked.peers_python, HERE / "show_in_blender.py", asset]
+        found: dict[str, float | str] = {}
+        for name, command in others.items():
+            theirs = picture(command, place.resolve() / f"{name}.png")
+            if not isinstance(theirs, str):
+                where = inner(ours[..., 3]) & inner(theirs[..., 3])
+                found[name] = round(psnr(theirs[..., :3], ours[..., :3], where), 2)
+            else:
+                found[name] = theirs
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
