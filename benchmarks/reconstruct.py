@@ -3,7 +3,7 @@
     python benchmarks/reconstruct.py                    public models in --assets and procedural ones: a quarter of an hour
     python benchmarks/reconstruct.py --all              every model with five seeds at three wavelengths: hours
     python benchmarks/reconstruct.py --models DIR --limit 12 --procedural 0
-    python benchmarks/reconstruct.py --sheet /tmp/objects.png --only bunny,spot
+    python benchmarks/reconstruct.py --sheet /tmp/objects.png --only bunny,spot --cases clean --budgets '' -o /tmp/report
     python benchmarks/reconstruct.py --assets none --procedural 1 --size 128 --budgets 2,5 -o /tmp/report
 
 Every model is rendered by `gdtool render-dataset`; the disturbed views are benchmarks/perturbation.py's. Ours runs by the
@@ -134,12 +134,12 @@ def skips(views) -> list[dict]:
 
 def cases_of(index: int, given: argparse.Namespace) -> list[str]:
     """Which views of the index-th model are reconstructed: clean, color, perturbed SEED WAVELENGTH."""
-    cases = ["clean"] if given.clean else []
     if given.seeds:
-        cases += [f"perturbed {seed} {wavelength:g}" for wavelength in given.wavelengths for seed in range(given.seeds)]
-    elif index < DEFAULT_DISTURBED:
-        cases.append(f"perturbed {index % SEEDS} {WAVELENGTHS[index % len(WAVELENGTHS)]:g}")
-    return cases + (["color"] if given.all or index < DEFAULT_COLOR else [])
+        disturbed = [f"perturbed {seed} {wavelength:g}" for wavelength in given.wavelengths for seed in range(given.seeds)]
+    else:
+        disturbed = [f"perturbed {index % SEEDS} {WAVELENGTHS[index % len(WAVELENGTHS)]:g}"] if index < DEFAULT_DISTURBED else []
+    cases = ["clean", *disturbed, *(["color"] if given.all or index < DEFAULT_COLOR else [])]
+    return [case for case in cases if kind({"case": case}) in given.cases]
 
 
 class Bench:
@@ -259,7 +259,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=0, help="disturbances of every model and wavelength (default: one of either a model, in turn)")
     parser.add_argument("--wavelengths", type=numbers, default=list(WAVELENGTHS), help="with --seeds: of the disturbance, shares of the picture")
     parser.add_argument("--budgets", type=numbers, default=[5, 10, 20], help="also run ours with --budget of these seconds (default 5,10,20)")
-    parser.add_argument("--no-clean", dest="clean", action="store_false", help="leave the exact views out")
+    parser.add_argument("--cases", type=lambda t: t.split(","), default=["clean", "perturbed", "color"], help="which views: clean,perturbed,color (default all)")
     parser.add_argument("--no-peers", dest="peers", action="store_false", help="leave the peers out")
     parser.add_argument("--fresh", action="store_true", help="measure every row anew")
     parser.add_argument("--sheet", type=Path, metavar="PNG", help="write pictures of the truth, ours and the best peer of each model")
