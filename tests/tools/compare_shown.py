@@ -1,7 +1,7 @@
-"""Base color of an asset as three.js and Blender show it, against gdtool: python compare_shown.py ASSET.glb [--peers-python PATH]
+"""An asset as three.js and Blender show it, against gdtool: python compare_shown.py ASSET.glb [--peers-python PATH]
 
-Runs the show_in_* scripts of this folder without light and prints the PSNR in dB over the pixels that both pictures cover in
-full. three.js needs what show_in_three.mjs says; Blender a Python that has bpy. What is not there is named and left out.
+Runs the show_in_* scripts of this folder and prints the PSNR in dB over the pixels that both pictures cover in full: of the
+base color without light, and in three.js of the asset lit by an environment (benchmarks/asset.py has Blender's). three.js needs what show_in_three.mjs says; Blender a Python that has bpy. What is not there is named and left out.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import numpy as np
 HERE = Path(__file__).parent
 
 
-def picture(command: list, out: Path) -> np.ndarray | str:
+def picture(command: list, out: Path, mode: str | Path) -> np.ndarray | str:
     """The (h, w, 4) picture in [0, 1] that a command writes to out, or why there is none."""
     from gdtool.images.io import read_image
 
     try:
-        done = subprocess.run([*map(str, command), str(out), "unlit"], capture_output=True, text=True, timeout=300, check=False)
+        done = subprocess.run([*map(str, command), str(out), str(mode)], capture_output=True, text=True, timeout=300, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
         return str(error)
     if done.returncode or not out.exists():
@@ -39,31 +39,35 @@ def inner(coverage: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
+    from gdtool.images.io import write_exr
     from gdtool.images.metrics import psnr
+    from gdtool.shading.studio import studio
 
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("asset", type=Path)
     parser.add_argument("--peers-python", type=Path)
+    parser.add_argument("--env", default="mid")
     parser.add_argument("--keep", type=Path, help="folder for the pictures")
     asked = parser.parse_args()
     asset = asked.asset.resolve()
     with tempfile.TemporaryDirectory() as folder:
         place = asked.keep or Path(folder)
         place.mkdir(parents=True, exist_ok=True)
-        ours = picture([sys.executable, HERE / "show_in_gdtool.py", asset], place.resolve() / "gdtool.png")
-        if isinstance(ours, str):
-            sys.exit(ours)
-        others = {"three.js": ["node", HERE / "show_in_three.mjs", asset]}
+        place = place.resolve()
+        light = place / "light.exr"
+        write_exr(light, studio(asked.env, 0, fit=False)[0].image.astype(np.float32))
+        own, three = [sys.executable, HERE / "show_in_gdtool.py", asset], ["node", HERE / "show_in_three.mjs", asset]
+        pairs = {"three.js, base color": (three, "unlit", "unlit"), "three.js, lit": (three, light, asked.env)}
         if asked.peers_python:
-            others["Blender"] = [asked.peers_python, HERE / "show_in_blender.py", asset]
+            pairs["Blender, base color"] = ([asked.peers_python, HERE / "show_in_blender.py", asset], "unlit", "unlit")
         found: dict[str, float | str] = {}
-        for name, command in others.items():
-            theirs = picture(command, place.resolve() / f"{name}.png")
-            if not isinstance(theirs, str):
-                where = inner(ours[..., 3]) & inner(theirs[..., 3])
-                found[name] = round(psnr(theirs[..., :3], ours[..., :3], where), 2)
-            else:
-                found[name] = theirs
+        for name, (command, mode, own_mode) in pairs.items():
+            ours, theirs = picture(own, place / f"gdtool_{own_mode}.png", own_mode), picture(command, place / f"{name}.png", mode)
+            if isinstance(ours, str) or isinstance(theirs, str):
+                found[name] = ours if isinstance(ours, str) else theirs
+                continue
+            where = inner(ours[..., 3]) & inner(theirs[..., 3])
+            found[name] = round(psnr(theirs[..., :3], ours[..., :3], where), 2)
     print(json.dumps(found))
 
 

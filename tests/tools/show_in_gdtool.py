@@ -1,6 +1,7 @@
-"""Renders a model from the front with gdtool: python show_in_gdtool.py MODEL OUT.png [unlit]
+"""Renders a model from the front with gdtool: python show_in_gdtool.py MODEL OUT.png [unlit|ENV]
 
-The frame and the sun of show_in_three.mjs and show_in_blender.py, shaded from the exact buffers with Lambert's law.
+The frame and the sun of show_in_three.mjs and show_in_blender.py, shaded from the exact buffers with Lambert's law; or
+lit by an environment as `gdtool relight` does.
 """
 
 from __future__ import annotations
@@ -15,17 +16,21 @@ from gdtool.cameras import rig
 from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
 from gdtool.images.color import srgb_from_linear
 from gdtool.images.io import write_png
-from gdtool.shading.render import render_buffers
+from gdtool.shading.render import render_buffers, render_color
+from gdtool.shading.studio import studio
 
 
 def main(model: str, out: str, mode: str = "lit") -> None:
     scene = load_scene(model)
     scene = replace(scene, vertices=transform_points(invert_similarity(unit_box(scene.vertices)), scene.vertices))
     front = next(camera for camera in rig("six", 512) if camera.name == "front")
-    images = render_buffers(scene, front)
-    sun = np.maximum(images["normal"] @ (np.array([-1, 1, 1]) / np.sqrt(3)), 0)
-    color = images["albedo"] * (1.0 if mode == "unlit" else 0.3 + sun[..., None])
-    write_png(out, np.concatenate([srgb_from_linear(np.clip(color, 0, 1)), images["mask"][..., None]], -1))
+    if mode in ("lit", "unlit"):
+        images = render_buffers(scene, front)
+        sun = np.maximum(images["normal"] @ (np.array([-1, 1, 1]) / np.sqrt(3)), 0)
+        color, mask = images["albedo"] * (1.0 if mode == "unlit" else 0.3 + sun[..., None]), images["mask"]
+    else:
+        color, mask = render_color(scene, front, studio(mode, 0, fit=False)[0])
+    write_png(out, np.concatenate([srgb_from_linear(np.clip(color, 0, 1)), mask[..., None]], -1))
 
 
 if __name__ == "__main__":

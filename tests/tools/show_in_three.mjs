@@ -1,4 +1,4 @@
-// Renders a .glb from the front with three.js in headless Chromium: node show_in_three.mjs MODEL.glb OUT.png [unlit]
+// Renders a .glb from the front with three.js in headless Chromium: node show_in_three.mjs MODEL.glb OUT.png [unlit|LIGHT.exr]
 // Needs npm packages three and playwright-core (npm install in this folder, or NODE_PATH) and a Chromium: CHROMIUM, else
 // /usr/bin/chromium. Orthographic, half-width 0.72 of the longest side, sun from the upper left, like show_in_blender.py.
 import { createServer } from 'node:http';
@@ -15,7 +15,7 @@ const { chromium } = require(require.resolve('playwright-core', { paths }));
 const types = { '.html': 'text/html', '.js': 'text/javascript', '.glb': 'model/gltf-binary' };
 const server = createServer((request, response) => {
   const path = normalize(new URL(request.url, 'http://localhost').pathname);
-  const file = path === '/' ? join(import.meta.dirname, 'show_in_three.html') : path === '/model.glb' ? model
+  const file = path === '/' ? join(import.meta.dirname, 'show_in_three.html') : path === '/model.glb' ? model : path === '/light.exr' ? mode
     : path.startsWith('/three/') ? join(three, path.slice(7)) : null;
   try {
     const body = readFileSync(file);
@@ -33,7 +33,7 @@ const browser = await chromium.launch({
 try {
   const page = await browser.newPage({ viewport: { width: 512, height: 512 } });
   page.on('console', (message) => console.error(message.text()));
-  await page.goto(`http://127.0.0.1:${server.address().port}/${mode === 'unlit' ? '?unlit' : ''}`);
+  await page.goto(`http://127.0.0.1:${server.address().port}/${!mode ? '' : mode === 'unlit' ? '?unlit' : '?light'}`);
   await page.waitForFunction(() => window.done, null, { timeout: 60_000 });
   const done = await page.evaluate(() => window.done);
   console.log(JSON.stringify(done));
