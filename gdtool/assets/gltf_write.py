@@ -19,16 +19,17 @@ _FILTERS = {"linear": (9729, 9987), "nearest": (9728, 9984)}  # magnification; m
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 
-def write_glb(path: str | Path, scene: Scene, extras: dict[str, Any] | None = None, beside: dict[int, str] | None = None) -> None:
+def write_glb(path: str | Path, scene: Scene, extras: dict[str, Any] | None = None, made: dict[int, str | bytes] | None = None) -> None:
     """Write a .glb: one node, one mesh, a primitive per material in use; the same scene gives the same bytes.
 
     Every metallicFactor and roughnessFactor is written out (the format's default metal is 1). Textures whose Texture
     shares one image array become one embedded PNG, so that occlusion and metallic-roughness can be one file. Colour
     textures are stored as sRGB and the others as linear, as the format demands. extras goes to asset.extras.
-    beside: by id of an image array, the name of the PNG file beside the .glb that holds it already, which is then referred to.
+    made: by id of an image array, its PNG where there is one already: the bytes, or the name of the file beside the .glb that
+    holds it, which is then referred to.
     Tangents are written where the material has a normal map, MikkTSpace's where the scene has none. Raises OutputError, ResourceError beyond 4 GiB.
     """
-    content = glb_bytes(scene, extras, beside)
+    content = glb_bytes(scene, extras, made)
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -40,10 +41,10 @@ def write_glb(path: str | Path, scene: Scene, extras: dict[str, Any] | None = No
         raise OutputError(path, "was not written whole (it reads back otherwise)", "free some space or choose another -o")
 
 
-def glb_bytes(scene: Scene, extras: dict[str, Any] | None = None, beside: dict[int, str] | None = None) -> bytes:
+def glb_bytes(scene: Scene, extras: dict[str, Any] | None = None, made: dict[int, str | bytes] | None = None) -> bytes:
     """The content of the file that write_glb writes."""
     _check(scene)
-    document = _Document(beside or {})
+    document = _Document(made or {})
     uv_slots = [i for i, uv in enumerate(scene.uvs) if uv is not None]
     primitives = []
     for index in np.unique(scene.material_idx):
@@ -184,8 +185,8 @@ def _unless_one(name: str, value: float) -> dict[str, float]:
 class _Document:
     """The JSON and binary halves of a GLB while they grow."""
 
-    def __init__(self, beside: dict[int, str]) -> None:
-        self._beside = beside
+    def __init__(self, made: dict[int, str | bytes]) -> None:
+        self._made = made
         self.json: dict[str, Any] = {"asset": {"version": "2.0", "generator": f"gdtool {__version__}"}, "scene": 0}
         self.binary = bytearray()
         self.extensions: set[str] = set()
@@ -239,10 +240,11 @@ class _Document:
         if key not in self._images:
             from gdtool.images.io import encode_png
 
-            if id(texture.image) in self._beside and not convert:
-                item: dict[str, Any] = {"uri": self._beside[id(texture.image)], "mimeType": "image/png"}
-            else:
-                item = {"bufferView": self.view(encode_png(_encoded(texture.image, texture.encoding, encoding))), "mimeType": "image/png"}
+            made = None if convert else self._made.get(id(texture.image))
+            item: dict[str, Any] = {"uri": made, "mimeType": "image/png"}
+            if not isinstance(made, str):
+                content = encode_png(_encoded(texture.image, texture.encoding, encoding)) if made is None else made
+                item = {"bufferView": self.view(content), "mimeType": "image/png"}
             # the array stays referenced, so that its id stays its own
             self._images[key] = texture.image, self._append("images", item)
         return self._images[key][1]

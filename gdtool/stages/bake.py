@@ -259,7 +259,7 @@ def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx
         target, levels = moved(target), [moved(level) for level in levels]
         mesh = dataclasses.replace(mesh, vertices=target.vertices)
     usd = f"asset.{options.usd}" if options.usd != "none" else ""
-    files = write_models(out.path, target, mesh, face_idx, maps, origin, inputs.name, options.normal_convention, usd, levels)
+    files = write_models(out.path, target, mesh, face_idx, maps, origin, inputs.name, options.normal_convention, usd, levels, out.threads)
     out.content = AssetContent(
         size=maps.size, maps=files, usd=usd, factors=maps.factors, normal_convention=options.normal_convention,
         lods=tuple(f"asset_lod{k}.glb" for k in range(1, len(levels) + 1)),
@@ -267,6 +267,6 @@ def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx
 
 
 STAGE = Stage(
-    name="bake", version=2, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run,
+    name="bake", version=3, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run,
     second_inputs={"surface": SecondInput("surface", help="The surface to bake from; found along the provenance chain without it."),
                    "views": SecondInput("views", help="Views of it; found along the provenance chain without it.")})

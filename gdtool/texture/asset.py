@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
@@ -59,27 +57,6 @@ def scene_of(target: Target, maps: Maps, material: Material, name: str) -> Scene
     return Scene(vertices=target.vertices[position_idx[kept]], faces=place[vertex].reshape(-1, 3).astype(np.int32),
                  materials=(material,), normals=normals[kept], tangents=tangents[kept] if maps.normal is not None else None,
                  uvs=(np.asarray(target.uv, np.float64)[uv_idx[kept]],), name=name)
-
-
-def embedded_maps(glb: bytes) -> dict[str, bytes]:
-    """The PNGs of a .glb with one material, by map name: base_color, orm, normal, emissive.
-
-    The files beside the .glb are these bytes: encoding a large map takes longer than reading it from the surface.
-    """
-    length = struct.unpack_from("<I", glb, 12)[0]
-    document, binary = json.loads(glb[20:20 + length]), 20 + length + 8
-    material = document["materials"][0]
-    surface = material.get("pbrMetallicRoughness", {})
-    slots = {"base_color": surface.get("baseColorTexture"), "normal": material.get("normalTexture"),
-             "emissive": material.get("emissiveTexture"),
-             "orm": surface.get("metallicRoughnessTexture") or material.get("occlusionTexture")}
-    out = {}
-    for name, slot in slots.items():
-        if slot is not None:
-            view = document["bufferViews"][document["images"][document["textures"][slot["index"]]["source"]]["bufferView"]]
-            start = binary + view.get("byteOffset", 0)
-            out[name] = glb[start:start + view["byteLength"]]
-    return out
 
 
 def write_obj(path: Path, mesh: QuadMesh, face_normals_idx: np.ndarray, normals: np.ndarray, maps: Maps, files: dict[str, str],
@@ -145,30 +122,31 @@ def corner_normals_of_quads(mesh: QuadMesh, target: Target, face_idx: np.ndarray
 
 
 def write_models(path: Callable[[str], Path], target: Target, mesh: QuadMesh, face_idx: np.ndarray, maps: Maps, surface: Drawn,
-                 name: str, convention: str, usd: str, levels: list[Target]) -> dict[str, str]:
+                 name: str, convention: str, usd: str, levels: list[Target], threads: int = 1) -> dict[str, str]:
     """Write asset.glb, asset.obj, the maps, OpenUSD where usd names a suffix, and asset_lod1.glb and on; the maps' files.
 
     path(file name) says where. face_idx (t,) is the quad of each triangle. The coarser levels refer to the maps' files.
     """
     from gdtool.assets.gltf_write import write_glb
-    from gdtool.images.io import write_png
+    from gdtool.images.io import encode_pngs, write_png
     from gdtool.texture.maps import contact_sheet_of, directx
 
     material = material_of(maps, name, surface.alpha_mode, surface.alpha_cutoff, surface.double_sided)
-    write_glb(path("asset.glb"), scene_of(target, maps, material, name))
-    embedded = embedded_maps(path("asset.glb").read_bytes())
-    files = {key: f"{key}.png" for key in embedded}
-    for key, content in embedded.items():
-        path(files[key]).write_bytes(content)
-    beside = {id(image): files[key] for key, image in (("base_color", maps.base_color), ("orm", maps.orm), ("normal", maps.normal),
-                                                       ("emissive", maps.emissive)) if key in files}
-    if "normal" in files and convention == "directx":
-        write_png(path(files["normal"]), directx(maps.normal))
-        if levels:
-            write_png(path("normal_opengl.png"), maps.normal)
+    shown = {key: image for key, image in (("base_color", maps.base_color), ("orm", maps.orm), ("normal", maps.normal), ("emissive", maps.emissive))
+             if image is not None}
+    # Encoding a large map takes as long as baking it: once, for the .glb and for the file beside it.
+    encoded = dict(zip(shown, encode_pngs(list(shown.values()), threads=threads), strict=True))
+    write_glb(path("asset.glb"), scene_of(target, maps, material, name), made={id(shown[key]): content for key, content in encoded.items()})
+    files, beside = {key: f"{key}.png" for key in shown}, {id(image): f"{key}.png" for key, image in shown.items()}
+    for key, content in encoded.items():
+        if key == "normal" and convention == "directx":
+            write_png(path(files[key]), directx(maps.normal))
+            if not levels:
+                continue
             beside[id(maps.normal)] = "normal_opengl.png"
+        path(beside[id(shown[key])]).write_bytes(content)
     for k, level in enumerate(levels, 1):
-        write_glb(path(f"asset_lod{k}.glb"), scene_of(level, maps, material, name), beside=beside)
+        write_glb(path(f"asset_lod{k}.glb"), scene_of(level, maps, material, name), made=beside)
     for key, image in maps.extra.items():
         files[key] = f"{key}.png"
         write_png(path(files[key]), image)

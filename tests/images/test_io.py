@@ -9,7 +9,7 @@ import OpenImageIO as oiio
 import pytest
 
 from gdtool.core.errors import InputError, OutputError, ResourceError
-from gdtool.images.io import decode_image, encode_png, read_image, write_exr, write_png
+from gdtool.images.io import decode_image, encode_png, encode_pngs, read_image, write_exr, write_png
 from tests.images.png import GREY, GREY_ALPHA, PALETTE, RGB, RGBA, adam7, chunk, png, scanlines
 
 
@@ -239,3 +239,8 @@ except OutputError:
     path = tmp_path / ("x.png" if writer == "write_png" else "x.exr")
     assert subprocess.run([sys.executable, "-c", code, path]).returncode == 44
     assert not path.exists()
+
+
+def test_several_are_encoded_as_each_would_be(picture):
+    images = [picture, picture[..., :1], picture.astype(np.uint16) * 257]
+    assert encode_pngs(images, threads=3) == [encode_png(image) for image in images] == encode_pngs(images)
