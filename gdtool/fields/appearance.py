@@ -25,9 +25,13 @@ class Appearance:
 
 
 def appearance(cameras, mask: np.ndarray, images: dict[str, np.ndarray], vertices: np.ndarray, faces: np.ndarray,
-               normals: np.ndarray, step: float, light: dict | None, seed: int) -> Appearance:
-    """Fuse the material views; recover the light from color; take from color what no material view gives."""
-    from gdtool.fields.light import ambient_occlusion, color_samples, materials_from_color, recover_light
+               normals: np.ndarray, step: float, light: dict | None, seed: int,
+               shadows: bool = True) -> Appearance:
+    """Fuse the material views; recover the light from color; take from color what no material view gives.
+
+    shadows: whether color is explained with what the surface hides from the light, or as if nothing were hidden.
+    """
+    from gdtool.fields.light import color_samples, materials_from_color, recover_light, unoccluded, visibility
 
     rng = np.random.default_rng(seed)
     seen = observe(cameras, mask, vertices, faces, normals, 0.5 * step)
@@ -54,13 +58,13 @@ def appearance(cameras, mask: np.ndarray, images: dict[str, np.ndarray], vertice
         out.skipped.append(("light", "too few pixels of color are seen and not clipped"))
         out.albedo = fused.get("color", out.albedo)
         return out
-    occlusion = ambient_occlusion(vertices, faces, normals, 0.5 * step, rng)
+    reaches = visibility(vertices, faces, normals, 0.5 * step, rng) if shadows else unoccluded(normals)
     if "albedo" in fused:
         vertex, view, color = samples
         out.light, residual = recover_light(normals[vertex], view, color, out.albedo[vertex], out.roughness[vertex],
-                                            out.metallic[vertex], occlusion[vertex], light)
+                                            out.metallic[vertex], reaches.at(vertex), light)
     else:
-        albedo, roughness, metallic, out.light, residual = materials_from_color(normals, fused["color"], weight, np.maximum(occlusion, 0.15),
+        albedo, roughness, metallic, out.light, residual = materials_from_color(normals, fused["color"], weight, reaches,
                                                                                 samples, light)
         out.albedo = spread(albedo, weight, faces)
         # A roughness or metallic view, where there is one, says more than the single number found.

@@ -7,6 +7,8 @@ what is left to the albedo, and occlusion (a few rays against the surface) keeps
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from gdtool.fields.materials import Observations, toward_camera
@@ -15,6 +17,8 @@ from gdtool.fields.sights import bilinear
 SAMPLES = 4000
 SHARPNESS = (4.0, 12.0)
 _CLIPPED = 0.97
+LEAST_VISIBLE = 0.05  # light that bounces into the deepest hollow
+_PRIOR = 0.25  # rays
 MEAN_ALBEDO = 0.45  # light and albedo are only known up to a factor; this is where it is put
 
 
@@ -38,8 +42,8 @@ def color_samples(cameras, color: np.ndarray, mask: np.ndarray, seen: Observatio
     return vertex[pick], view[pick], value[pick]
 
 
-def _response(normals, view, albedo, roughness, metallic, axes, sharpness, occlusion) -> np.ndarray:
-    """Color (n, 3, k) of n points under each lobe alone, white and of amplitude 1; occlusion (n,) dims all."""
+def _response(normals, view, albedo, roughness, metallic, axes, sharpness, seen: Visibility) -> np.ndarray:
+    """Color (n, 3, k) of n points under each lobe alone, white and of amplitude 1, as far as its light arrives."""
     import torch
 
     from gdtool.shading.closed_form import shade
@@ -53,7 +57,7 @@ def _response(normals, view, albedo, roughness, metallic, axes, sharpness, occlu
         for axis, width in zip(axes, sharpness, strict=True):
             lobe = SphericalGaussians(tensor(axis[None]), tensor([width]), torch.ones(1, 3))
             out.append(shade(tensor(normals), tensor(view), tensor(albedo), tensor(roughness), tensor(metallic), lobe).numpy())
-    return np.stack(out, -1) * occlusion[:, None, None]
+    return np.stack(out, -1) * seen.of_lobes(axes, sharpness)[:, None]
 
 
 def fit_amplitudes(response: np.ndarray, color: np.ndarray, rounds: int = 4) -> tuple[np.ndarray, float]:
@@ -80,7 +84,7 @@ def fit_amplitudes(response: np.ndarray, color: np.ndarray, rounds: int = 4) -> 
     return amplitudes, float(np.abs(residual).mean())
 
 
-def recover_light(normals, view, color, albedo, roughness, metallic, occlusion, known: dict | None = None) -> tuple[dict, float]:
+def recover_light(normals, view, color, albedo, roughness, metallic, seen: Visibility, known: dict | None = None) -> tuple[dict, float]:
     """A record of light.json that explains color (n, 3) of points with known materials, and its relative residual.
 
     known: a light whose axes and sharpness to keep. Else sixteen lobes spread evenly, of the sharpness that fits best.
@@ -93,16 +97,38 @@ def recover_light(normals, view, color, albedo, roughness, metallic, occlusion, 
         shapes = [(fibonacci(16), np.full(16, width)) for width in SHARPNESS]
     best = None
     for axes, sharpness in shapes:
-        amplitudes, residual = fit_amplitudes(_response(normals, view, albedo, roughness, metallic, axes, sharpness, occlusion), color)
+        amplitudes, residual = fit_amplitudes(_response(normals, view, albedo, roughness, metallic, axes, sharpness, seen), color)
         if best is None or residual < best[1]:
             best = ({"kind": "spherical_gaussians", "axes": axes.tolist(), "sharpness": sharpness.tolist(),
                      "amplitudes": amplitudes.tolist()}, residual)
     return best
 
 
-def ambient_occlusion(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, offset: float, rng: np.random.Generator,
-                      rays: int = 16) -> np.ndarray:
-    """Share (v,) of the cosine-weighted hemisphere that the surface itself leaves open."""
+@dataclass(frozen=True)
+class Visibility:
+    """What the surface leaves open: directions (v, r, 3) over each vertex' hemisphere, by the cosine; open (v, r) bool."""
+
+    directions: np.ndarray
+    open: np.ndarray
+
+    def at(self, vertex: np.ndarray) -> Visibility:
+        """That of the vertices of these indices."""
+        return Visibility(self.directions[vertex], self.open[vertex])
+
+    def of_lobes(self, axes: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
+        """Share (v, k) of each lobe's light that arrives; of a lobe behind the horizon, of all light."""
+        share = self.open.mean(1, keepdims=True) + np.zeros((1, len(axes)))
+        for k, (axis, width) in enumerate(zip(axes, sharpness, strict=True)):
+            weight = np.exp(width * (self.directions @ np.asarray(axis, np.float32) - 1))
+            total = weight.sum(1)
+            # A few rays see a sharp lobe badly: the share of all light stands in for what they miss.
+            share[:, k] = ((weight * self.open).sum(1) + _PRIOR * share[:, k]) / (total + _PRIOR)
+        return np.maximum(share, LEAST_VISIBLE)
+
+
+def visibility(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, offset: float, rng: np.random.Generator,
+               rays: int = 16) -> Visibility:
+    """Which of rays directions from each vertex meet the surface again; offset: world units they start off it."""
     from gdtool.geometry.rays import RayCaster
 
     caster = RayCaster(vertices, faces)
@@ -112,17 +138,22 @@ def ambient_occlusion(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarr
     bitangent = np.cross(normals, tangent)
     turn = rng.random(len(vertices))
     origins = vertices + offset * normals
-    open_share = np.zeros(len(vertices))
+    directions, free = np.empty((len(vertices), rays, 3), np.float32), np.empty((len(vertices), rays), bool)
     for k in range(rays):
         radius = np.sqrt((k + 0.5) / rays)
         angle = 2 * np.pi * (turn + k * 0.618034)
         direction = (radius * np.cos(angle)[:, None] * tangent + radius * np.sin(angle)[:, None] * bitangent
                      + np.sqrt(1 - radius ** 2) * normals)
-        open_share += ~caster.occluded(origins, np.ascontiguousarray(direction))
-    return open_share / rays
+        directions[:, k], free[:, k] = direction, ~caster.occluded(origins, np.ascontiguousarray(direction))
+    return Visibility(directions, free)
 
 
-def materials_from_color(normals: np.ndarray, color: np.ndarray, weight: np.ndarray, occlusion: np.ndarray, samples,
+def unoccluded(normals: np.ndarray) -> Visibility:
+    """That of points (v, 3) that nothing hides: all light arrives."""
+    return Visibility(np.asarray(normals, np.float32)[:, None], np.ones((len(normals), 1), bool))
+
+
+def materials_from_color(normals: np.ndarray, color: np.ndarray, weight: np.ndarray, seen: Visibility, samples,
                          light: dict | None) -> tuple[np.ndarray, float, float, dict, float]:
     """Albedo (v, 3), one roughness, one metallic, the light and its residual, from fused color (v, 3) alone.
 
@@ -136,7 +167,7 @@ def materials_from_color(normals: np.ndarray, color: np.ndarray, weight: np.ndar
 
     vertex, view, value = samples
     grey = np.full((len(vertex), 3), MEAN_ALBEDO)
-    shaded = occlusion[vertex]
+    shaded = seen.at(vertex)
     best = None
     for roughness, metallic in ((0.25, 0.0), (0.5, 0.0), (0.8, 0.0), (0.3, 1.0), (0.6, 1.0)):
         fixed = (np.full(len(vertex), roughness), np.full(len(vertex), metallic), shaded)
@@ -149,14 +180,18 @@ def materials_from_color(normals: np.ndarray, color: np.ndarray, weight: np.ndar
         if best is None or residual + 0.03 * metallic < best[0]:
             best = (residual + 0.03 * metallic, roughness, metallic, found, residual)
     _, roughness, metallic, found, residual = best
-    lights = SphericalGaussians.from_record(found)
     count = len(normals)
+    unit_color, base = np.zeros((count, 3)), np.zeros((count, 3))
+    arrives = seen.of_lobes(np.asarray(found["axes"]), np.asarray(found["sharpness"]))
+    n = torch.as_tensor(np.ascontiguousarray(normals), dtype=torch.float32)
+    white, black, rough = torch.ones(count, 3), torch.zeros(count, 3), torch.full((count,), roughness)
     with torch.no_grad():
-        n = torch.as_tensor(normals, dtype=torch.float32)
-        diffuse, specular = shade_parts(n, n, torch.ones(count, 3), torch.full((count,), roughness), torch.full((count,), metallic), lights)
-        dull = shade_parts(n, n, torch.zeros(count, 3), torch.full((count,), roughness), torch.zeros(count), lights)[1]
-    unit_color = (specular if metallic else diffuse).numpy() * occlusion[:, None]
-    base = 0.0 if metallic else dull.numpy() * occlusion[:, None]
+        for k in range(len(found["axes"])):
+            lobe = SphericalGaussians.from_record({name: value if name == "kind" else value[k:k + 1] for name, value in found.items()})
+            diffuse, specular = shade_parts(n, n, white, rough, torch.full((count,), metallic), lobe)
+            unit_color += (specular if metallic else diffuse).numpy() * arrives[:, k:k + 1]
+            if not metallic:
+                base += shade_parts(n, n, black, rough, torch.zeros(count), lobe)[1].numpy() * arrives[:, k:k + 1]
     floor = 0.05 * unit_color.mean()
     albedo = np.maximum(color - base, 0.1 * color) / np.maximum(unit_color, floor)
     if light is None:

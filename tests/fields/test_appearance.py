@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gdtool.fields.light import fit_amplitudes, materials_from_color, recover_light
+from gdtool.fields.light import Visibility, fit_amplitudes, materials_from_color, recover_light, unoccluded, visibility
 from gdtool.fields.materials import Observations, confidence, fuse, spread
 from gdtool.shading.closed_form import shade
 from gdtool.shading.lights import fibonacci
@@ -30,7 +30,7 @@ def test_light_of_known_materials_is_recovered():
     view = np.where((normals * view).sum(1, keepdims=True) < 0, -view, view)
     albedo, roughness, metallic = np.full((3000, 3), 0.6), np.full(3000, 0.5), np.zeros(3000)
     color = lit(normals, view, albedo, roughness, metallic, LIGHT)
-    found, residual = recover_light(normals, view, color, albedo, roughness, metallic, np.ones(3000))
+    found, residual = recover_light(normals, view, color, albedo, roughness, metallic, unoccluded(normals))
     assert residual < 0.01
     again = lit(normals, view, albedo, roughness, metallic, found)
     assert np.abs(again - color).mean() < 0.01 * color.mean()
@@ -49,7 +49,7 @@ def test_albedo_from_color_under_a_known_light():
     albedo = 0.2 + 0.5 * (normals[:, :1] > 0) * np.array([[1.0, 0.6, 0.3]])
     color = lit(normals, normals, albedo, np.full(2000, 0.5), np.zeros(2000), LIGHT)
     samples = (np.arange(2000), normals, color)
-    found, roughness, metallic, _, _ = materials_from_color(normals, color, np.ones(2000), np.ones(2000), samples, LIGHT)
+    found, roughness, metallic, _, _ = materials_from_color(normals, color, np.ones(2000), unoccluded(normals), samples, LIGHT)
     assert metallic == 0.0
     assert np.abs(found - albedo).mean() < 0.03
 
@@ -79,3 +79,37 @@ def test_spread_fills_the_unseen_and_keeps_the_seen():
 def test_confidence_grows_with_views_and_falls_with_their_quarrel():
     c = confidence(np.array([0.0, 0.2, 2.0, 2.0]), np.array([0.0, 0.0, 0.0, 0.2]))
     assert c[0] == 0 and c[0] < c[1] < c[2] <= 1 and c[3] < 0.2
+
+
+def test_a_wall_hides_the_light_behind_it_alone():
+    """Points on a floor beside a high wall at x = 0: light from beyond the wall does not arrive, light from this side does."""
+    floor = np.array([[0.0, 0, -9], [9, 0, -9], [9, 0, 9], [0, 0, 9]])
+    wall = np.array([[0.0, 0, -9], [0, 9, -9], [0, 9, 9], [0, 0, 9]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
+    points = np.array([[0.05, 0.0, 0.0], [0.1, 0.0, 1.0]])
+    mesh = np.concatenate([floor, wall, points])
+    normals = np.tile([0.0, 1.0, 0.0], (len(mesh), 1))
+    seen = visibility(mesh, faces, normals, 1e-3, np.random.default_rng(0), rays=64).at(np.array([8, 9]))
+    axes = np.array([[-0.8, 0.6, 0.0], [0.8, 0.6, 0.0], [0.0, 1.0, 0.0]])
+    share = seen.of_lobes(axes, np.full(3, 12.0))
+    assert (share[:, 0] < 0.15).all() and (share[:, 1] > 0.95).all()
+    assert share[:, 2] == pytest.approx(0.5, abs=0.15)
+    assert unoccluded(normals).of_lobes(axes, np.full(3, 12.0)) == pytest.approx(1.0)
+
+
+def test_shadow_stays_out_of_the_albedo():
+    """One albedo, half the points in the shadow of one lobe: with visibility it comes back even, without it does not."""
+    normals = directions(2000)
+    rng = np.random.default_rng(4)
+    rays = directions(2000 * 64, 5).reshape(2000, 64, 3)
+    rays = np.where((rays * normals[:, None]).sum(-1, keepdims=True) < 0, -rays, rays).astype(np.float32)
+    dark = rng.random(2000) < 0.5
+    seen = Visibility(rays, ~(dark[:, None] & (rays[..., 0] > 0.2)))
+    arrives = seen.of_lobes(np.array(LIGHT["axes"]), np.array(LIGHT["sharpness"]))
+    color = sum(lit(normals, normals, np.full((2000, 3), 0.5), np.full(2000, 0.8), np.zeros(2000),
+                    {n: v if n == "kind" else v[k:k + 1] for n, v in LIGHT.items()}) * arrives[:, k:k + 1] for k in range(16))
+    uneven = []
+    for visible in (seen, unoccluded(normals)):
+        albedo = materials_from_color(normals, color, np.ones(2000), visible, (np.arange(2000), normals, color), LIGHT)[0]
+        uneven.append(float(albedo.std() / albedo.mean()))
+    assert uneven[0] < 0.1 and uneven[1] > 2 * uneven[0]
