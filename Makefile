@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-reconstruct bench-render bench-relight bench-sheets bench-throughput schemas docs-check model data clean
+.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-reconstruct bench-render bench-relight bench-sample bench-sheets bench-throughput schemas docs-check model data clean
 
 venv: .venv/.done
 
@@ -34,14 +34,17 @@ fuzz: venv
 bench: venv
 	$(BIN)/python benchmarks/pipeline.py
 
-# Remesh and unwrap beside their peers, over solids and the models in $(ASSETS): about half an hour. Bake over the textured
+# Remesh and unwrap beside their peers, over solids and the models in $(MESHES): a quarter of an hour. Bake over the textured
 # models in $(TEXTURED), twenty minutes more; with PEERS_PYTHON, a Python that has bpy, beside Blender.
-ASSETS ?= ../shared/assets/mesh/odedstein
+ASSETS ?= ../shared/assets/mesh
+MESHES ?= $(foreach name,bunny/bunny wingnut/wingnut torus/torus penguin/penguin spot/spot fish/fish,$(ASSETS)/odedstein/$(name).obj) \
+	$(foreach name,animal potion nascar,$(ASSETS)/threestudio/$(name).obj) \
+	$(foreach name,fandisk.obj cycloidal.ply featuretype.STL,$(ASSETS)/trimesh/$(name))
 TEXTURED ?= ../shared/assets/glb ../shared/assets/gltf
 PEERS_PYTHON ?=
 bench-assets: venv
-	$(BIN)/python benchmarks/remesh.py $(wildcard $(ASSETS))
-	$(BIN)/python benchmarks/unwrap.py $(wildcard $(ASSETS))
+	$(BIN)/python benchmarks/remesh.py $(wildcard $(MESHES)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
+	$(BIN)/python benchmarks/unwrap.py $(wildcard $(MESHES)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
 	$(BIN)/python benchmarks/bake.py $(wildcard $(TEXTURED)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
 	$(BIN)/python benchmarks/asset.py $(wildcard $(TEXTURED)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
 
@@ -68,6 +71,11 @@ bench-sheets: venv
 # Objects per core-minute of render-dataset, by cores and by objects; goes on where it was.
 bench-throughput: venv
 	$(BIN)/python benchmarks/throughput.py
+
+# Time against error of sampling, and how well sampled views fit one another and their truth: about a quarter of an hour.
+bench-sample: venv
+	$(BIN)/python benchmarks/sample.py $(if $(HELD_OUT),$(HELD_OUT))
+	$(if $(HELD_OUT),$(BIN)/python benchmarks/consistency.py $(HELD_OUT))
 
 docs-check: venv
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python tests/tools/docs_check.py

@@ -84,7 +84,7 @@ def marched(field: Callable, triangles: int, half: float = 1.06) -> tuple[np.nda
         line = np.linspace(-half, half, n).astype(np.float32)
         values = np.concatenate([field(*np.meshgrid(line[i:i + 16], line, line, indexing="ij")) for i in range(0, n, 16)])
         vertices, faces, _, _ = marching_cubes(values, 0.0)
-        return vertices * float(line[1] - line[0]) - half, faces[:, ::-1].astype(np.int64)
+        return vertices * float(line[1] - line[0]) - half, faces.astype(np.int64)
 
     n = 64
     return at(int(np.ceil(n * (1.02 * triangles / len(at(n)[1])) ** 0.5)))
@@ -129,7 +129,7 @@ def solidified(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple
     inside[~beside] = _nearest_sign(index[~beside], index[beside], inside[beside], coarse.reshape(blocks), block[~beside])
     values[tuple(index.T)] = np.where(inside, -distance, distance)
     found, out, _, _ = marching_cubes(values, 0.0)
-    return found * step + low, out[:, ::-1].astype(np.int64)
+    return found * step + low, out.astype(np.int64)
 
 
 def _nearest_sign(asked: np.ndarray, known: np.ndarray, inside: np.ndarray, coarse: np.ndarray, block: np.ndarray) -> np.ndarray:
@@ -182,8 +182,15 @@ def of_model(path: Path, triangles: int, folder: Path) -> Fine:
 def _kept(path: Path, make: Callable) -> tuple[np.ndarray, np.ndarray]:
     if path.exists():
         with np.load(path) as found:
-            return found["vertices"], found["faces"]
+            return found["vertices"], _outward(found["vertices"], found["faces"])
     vertices, faces = make()
+    faces = _outward(vertices, faces)
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(path, vertices=vertices.astype(np.float64), faces=faces.astype(np.int64))
     return vertices, faces
+
+
+def _outward(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Faces of a closed mesh, all turned if they face inward."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return faces if np.einsum("ij,ij->", a, np.cross(b, c)) >= 0 else faces[:, ::-1].copy()

@@ -1,8 +1,10 @@
 """Time against error of remesh, its knobs swept, beside the engines alone, from marching-cubes meshes of a million faces.
 
-    python benchmarks/remesh.py [MODEL_OR_FOLDER ...] [-o docs/benchmarks] [--solids part,bracket,knobs,rings] [--faces 20000] [--input 1000000]
+    python benchmarks/remesh.py [MODEL_OR_FOLDER ...] [-o docs/benchmarks] [--faces 20000] [--input 1000000] [--peers-python PYTHON]
 
-Writes remesh.md, remesh.json and remesh.png. Every run is a child process with a time limit; seconds are of its wall clock
+Writes remesh.md, remesh.json, remesh.png and the wireframes remesh_sheet.png, row by row: killed, it goes on where it was. The
+knobs are swept on the solids of --sweep; the slow peers (QuadriFlow, Blender's through a Python that has bpy) run on the
+models of --slow-on; everything else on everything. Models get --model-input triangles. Every run is a child process with a time limit; seconds are of its wall clock
 and of the processor, from arrays in memory to arrays in memory. Lengths are shares of the bounding box' diagonal. A crease
 of the truth is recalled where a sharp edge (30 degrees) of the result is within 0.2 % of the diagonal.
 """
@@ -13,6 +15,8 @@ import argparse
 import json
 import os
 import resource
+import subprocess
+import tempfile
 import time
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,11 +24,15 @@ from pathlib import Path
 import numpy as np
 from fine_meshes import SOLIDS, Fine, models_in, of_model, of_solid
 from measure import busy, machine, number, say, table
+from rows import Rows
+from wireframe import file_name, sheet, wireframe
 
 WAYS = {
     "ours": {}, "ours, not restored": {"restore_creases": False}, "ours, not smoothed": {"smooth_iterations": 0},
     "ours, smoothed 20": {"smooth_iterations": 20}, "ours, no engine": {"engine": "split"},
 }
+BLENDER = "Blender QuadriFlow"
+SLOW = ("QuadriFlow", BLENDER)
 PEERS = {"Instant Meshes": "pynanoinstantmeshes", "QuadriFlow": "pyQuadriFlow"}
 COLUMNS = ("model", "way", "seconds", "processor", "peak MB", "quads", "watertight", "irregular", "jacobian", "least", "zero area", "mean",
            "hausdorff", "crease mean", "crease recall")
@@ -93,22 +101,52 @@ def score(fine: Fine, vertices: np.ndarray, quads: np.ndarray) -> dict:
     return out | ({} if fine.creases is None else crease_figures(fine.creases, vertices, triangles, diagonal))
 
 
-def measure(fine: Fine, quads: int, limit: float, ways: list[str]) -> list[dict]:
-    """A row for each way; one that fails says why."""
-    from gdtool.core.child import ChildFailed, call
+def blender(fine: Fine, quads: int, python: Path, limit: float) -> tuple:
+    """Blender's QuadriFlow through another Python. Raises ChildFailed."""
+    from gdtool.core.child import ChildFailed
 
-    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        given, made = Path(folder) / "in.npz", Path(folder) / "out.npz"
+        np.savez(given, vertices=fine.vertices, faces=np.concatenate([fine.faces, np.full((len(fine.faces), 1), -1)], 1))
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        try:
+            done = subprocess.run([python, Path(__file__).with_name("mesh_blender.py"), "quadriflow", given, made, str(quads)],
+                                  capture_output=True, text=True, timeout=limit, check=False)
+        except subprocess.TimeoutExpired:
+            raise ChildFailed(f"took longer than {limit:g} s") from None
+        if not made.exists():
+            raise ChildFailed((done.stderr.strip() or done.stdout.strip() or "no result").splitlines()[-1][:120])
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        with np.load(made) as found:
+            cost = {"seconds": float(found["seconds"]), "processor": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime}
+            return found["vertices"], found["faces"], cost, BLENDER
+
+
+def measure(fine: Fine, ways: list[str], asked: argparse.Namespace, rows: Rows) -> None:
+    """A row for each way that has none yet; one that fails says why. Keeps a wireframe, and our quads for unwrap.py."""
+    from gdtool.core.child import ChildFailed, call
+    from gdtool.images.io import write_png
+
     for way in ways:
+        if rows.has(fine.name, way):
+            continue
         say(f"{fine.name}: {way}")
         try:
-            if way in PEERS:
-                found = call("remesh:peer", fine.vertices, fine.faces, quads, way, seconds=limit, memory_mb=16000)
+            if way == BLENDER:
+                found = blender(fine, asked.faces, asked.peers_python, asked.limit)
+            elif way in PEERS:
+                found = call("remesh:peer", fine.vertices, fine.faces, asked.faces, way, seconds=asked.limit, memory_mb=16000)
             else:
-                found = call("remesh:ours", fine.vertices, fine.faces, quads, WAYS[way], seconds=limit, memory_mb=16000)
-            rows.append({"model": fine.name, "way": way, "engine": found[3], **found[2], **score(fine, *found[:2])})
+                found = call("remesh:ours", fine.vertices, fine.faces, asked.faces, WAYS[way], seconds=asked.limit, memory_mb=16000)
+            row = {"model": fine.name, "way": way, "engine": found[3], **found[2], **score(fine, *found[:2])}
+            if way == "ours":
+                np.savez(asked.kept / f"{fine.name}_{asked.faces}_quads.npz", vertices=found[0], faces=found[1])
+            if way in ("ours", "Instant Meshes", BLENDER):
+                (asked.kept / "pictures").mkdir(parents=True, exist_ok=True)
+                write_png(asked.kept / "pictures" / file_name(fine.name, way), wireframe(found[0], found[1]))
         except ChildFailed as failure:
-            rows.append({"model": fine.name, "way": way, "failed": str(failure)})
-    return rows
+            row = {"model": fine.name, "way": way, "failed": str(failure)}
+        rows.add(row)
 
 
 def plot(rows: list[dict], path: Path) -> None:
@@ -135,31 +173,53 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, default=Path("docs/benchmarks"))
     parser.add_argument("--solids", default=",".join(SOLIDS))
     parser.add_argument("--faces", type=int, default=20_000)
-    parser.add_argument("--input", type=int, default=1_000_000, help="triangles of each input")
+    parser.add_argument("--input", type=int, default=1_000_000, help="triangles of each solid")
+    parser.add_argument("--model-input", type=int, default=400_000, help="triangles of each model")
+    parser.add_argument("--sweep", default="part,knobs", help="solids that the knobs are swept on")
+    parser.add_argument("--slow-on", default="part,knobs", help="models that the slow peers run on")
+    parser.add_argument("--peers-python", type=Path, help="a Python that has bpy; without it Blender is left out")
     parser.add_argument("--kept", type=Path, default=Path("out/bench_meshes"), help="folder for the inputs once made")
-    parser.add_argument("--limit", type=float, default=180.0, help="seconds for one run")
+    parser.add_argument("--limit", type=float, default=60.0, help="seconds for one run")
     parser.add_argument("--only", default="", help="comma list of ways; all of them when empty")
     asked = parser.parse_args()
     os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # the children import this file
-    ways = [way for way in (*WAYS, *(name for name, package in PEERS.items() if find_spec(package)))
-            if not asked.only or way in asked.only.split(",")]
-    note, rows = busy(), []
-    for name in filter(None, asked.solids.split(",")):
-        rows += measure(of_solid(name, asked.input, asked.kept), asked.faces, asked.limit, ways)
-    for path in models_in(asked.models):
-        try:
-            fine = of_model(path, asked.input, asked.kept)
-        except Exception as failure:  # a broken model is a row of the table, not the end of it
-            rows.append({"model": path.name, "way": "read", "failed": str(failure)})
-            continue
-        rows += measure(fine, asked.faces, asked.limit, ways)
-    asked.out.mkdir(parents=True, exist_ok=True)
-    text = table(COLUMNS, ([number(row.get(name, "failed" if name == "quads" and "failed" in row else None)) for name in COLUMNS] for row in rows))
-    failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows if "failed" in row)
-    head = f"# Remesh: {asked.faces} quads from {asked.input} triangles\n\n`python benchmarks/remesh.py`, {machine()}. {note}\n\n"
-    (asked.out / "remesh.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![time against error](remesh.png)\n")
-    (asked.out / "remesh.json").write_text(json.dumps({"machine": machine(), "faces": asked.faces, "input": asked.input, "rows": rows}, indent=1) + "\n")
-    plot(rows, asked.out / "remesh.png")
+    if not asked.peers_python:
+        say("Blender is left out: no --peers-python")
+    note = busy()
+    rows = Rows(asked.out / "remesh.json", {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept")})
+
+    def ways(name: str) -> list[str]:
+        out = [way for way in WAYS if way == "ours" or name in asked.sweep.split(",")]
+        out += [way for way, package in PEERS.items() if find_spec(package) and (way not in SLOW or name in asked.slow_on.split(","))]
+        out += [BLENDER] if asked.peers_python and name in asked.slow_on.split(",") else []
+        return [way for way in out if not asked.only or way in asked.only.split(",")]
+
+    def report(complete: bool) -> str:
+        rows.write(complete)
+        text = table(COLUMNS, ([number(row.get(name, "failed" if name == "quads" and "failed" in row else None)) for name in COLUMNS]
+                               for row in rows.rows))
+        failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows.rows if "failed" in row)
+        head = (f"# Remesh: {asked.faces} quads from {asked.input} triangles of solids, {asked.model_input} of models\n\n"
+                f"`make bench-assets`, {machine()}. {note}\n\n")
+        (asked.out / "remesh.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "")
+                                             + "\n![time against error](remesh.png)\n\n![wireframes](remesh_sheet.png)\n")
+        plot(rows.rows, asked.out / "remesh.png")
+        sheet(asked.kept / "pictures", list(dict.fromkeys(row["model"] for row in rows.rows)), ["ours", "Instant Meshes", BLENDER],
+              asked.out / "remesh_sheet.png")
+        return text
+
+    sources = [*filter(None, asked.solids.split(",")), *models_in(asked.models)]
+    text = ""
+    for source in sources:
+        name = source if isinstance(source, str) else source.stem
+        if not all(rows.has(name, way) for way in ways(name)) and not rows.has(name, "read"):
+            try:
+                fine = of_solid(source, asked.input, asked.kept) if isinstance(source, str) else of_model(source, asked.model_input, asked.kept)
+            except Exception as failure:  # a broken model is a row of the table, not the end of it
+                rows.add({"model": name, "way": "read", "failed": str(failure)})
+            else:
+                measure(fine, ways(name), asked, rows)
+        text = report(source is sources[-1])
     print(text)
 
 

@@ -1,9 +1,10 @@
 """Time against coverage of unwrap, its knobs swept, beside xatlas alone, on quad meshes that remesh made.
 
-    python benchmarks/unwrap.py [MODEL_OR_FOLDER ...] [-o docs/benchmarks] [--solids part,bracket,knobs,rings] [--faces 20000]
+    python benchmarks/unwrap.py [MODEL_OR_FOLDER ...] [-o docs/benchmarks] [--faces 20000] [--peers-python PYTHON]
 
-Writes unwrap.md, unwrap.json and unwrap.png. Models that are quads already are taken as they are; others are remeshed
-first. All leave two texels between charts at 1024. Every run is a child process with a time limit; mirrored is a share of
+Writes unwrap.md, unwrap.json, unwrap.png and the layouts unwrap_sheet.png, row by row: killed, it goes on where it was. Models
+that are quads already are taken as they are; others as remesh.py left them, or are remeshed first. The knobs are swept and
+brute force is tried on the models of --sweep. All leave two texels between charts at 1024. Every run is a child process with a time limit; mirrored is a share of
 the area, overlap a share of what is covered.
 """
 
@@ -13,6 +14,8 @@ import argparse
 import json
 import os
 import resource
+import subprocess
+import tempfile
 import time
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,9 +23,13 @@ from pathlib import Path
 import numpy as np
 from fine_meshes import SOLIDS, models_in, of_model, of_solid
 from measure import busy, machine, number, say, table
+from rows import Rows
+from wireframe import file_name, sheet
 
 SIZE, PADDING = 1024, 2
-WAYS = {"ours": {}, "ours, stretch 1.005": {"good_stretch": 1.005}, "ours, cost 1": {"max_cost": 1.0}, "ours, cost 4": {"max_cost": 4.0}}
+WAYS = {"ours": {}, "ours, stretch 1.001": {"good_stretch": 1.001}, "ours, stretch 1.005": {"good_stretch": 1.005}, "ours, cost 1": {"max_cost": 1.0}, "ours, cost 4": {"max_cost": 4.0}}
+BLENDER = "Blender Smart UV"
+BRUTE = "xatlas, brute force"
 PEERS = {"xatlas": False, "xatlas, brute force": True}
 COLUMNS = ("model", "way", "seconds", "processor", "charts", "coverage", "overlap", "stretch", "area_distortion", "angle_distortion", "mirrored",
            "seam_length")
@@ -57,27 +64,60 @@ def _cost(start: float) -> dict[str, float]:
     return {"seconds": time.perf_counter() - start, "processor": sum(u.ru_utime + u.ru_stime for u in both)}
 
 
-def measure(name: str, vertices: np.ndarray, faces: np.ndarray, limit: float, ways: list[str]) -> list[dict]:
-    """A row for each way; one that fails says why. faces (f, 4)."""
+def blender(vertices: np.ndarray, faces: np.ndarray, python: Path, limit: float) -> tuple:
+    """Blender's Smart UV project through another Python. Raises ChildFailed."""
+    from gdtool.core.child import ChildFailed
+
+    with tempfile.TemporaryDirectory() as folder:
+        given, made = Path(folder) / "in.npz", Path(folder) / "out.npz"
+        np.savez(given, vertices=vertices, faces=faces)
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        try:
+            done = subprocess.run([python, Path(__file__).with_name("mesh_blender.py"), "smart", given, made, str(PADDING / SIZE)],
+                                  capture_output=True, text=True, timeout=limit, check=False)
+        except subprocess.TimeoutExpired:
+            raise ChildFailed(f"took longer than {limit:g} s") from None
+        if not made.exists():
+            raise ChildFailed((done.stderr.strip() or done.stdout.strip() or "no result").splitlines()[-1][:120])
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        with np.load(made) as found:
+            cost = {"seconds": float(found["seconds"]), "processor": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime}
+            return found["uv"] * (1, -1) + (0, 1), found["face_uvs"], cost
+
+
+def measure(name: str, vertices: np.ndarray, faces: np.ndarray, ways: list[str], asked: argparse.Namespace, rows: Rows) -> None:
+    """A row for each way that has none yet; one that fails says why. faces (f, 4). Keeps pictures of the layouts."""
     from gdtool.core.child import ChildFailed, call
     from gdtool.folders.mesh import triangulated
-    from gdtool.texture.unwrap import figures
+    from gdtool.images.io import write_png
+    from gdtool.texture.unwrap import figures, islands
+    from gdtool.texture.unwrap_preview import checkerboard, layout
 
-    rows = []
     triangles = triangulated(faces)[0].astype(np.int64)
     for way in ways:
+        if rows.has(name, way):
+            continue
         say(f"{name}: {way}")
         try:
-            if way in PEERS:
-                uv, face_uvs, cost = call("unwrap:peer", vertices, triangles, PEERS[way], seconds=limit, memory_mb=16000)
-                found = figures(vertices, np.concatenate([triangles, np.full((len(triangles), 1), -1)], 1), uv, face_uvs, SIZE)
+            mine = faces
+            if way == BLENDER:
+                uv, face_uvs, cost = blender(vertices, faces, asked.peers_python, asked.limit)
+            elif way in PEERS:
+                mine = np.concatenate([triangles, np.full((len(triangles), 1), -1)], 1)
+                uv, face_uvs, cost = call("unwrap:peer", vertices, triangles, PEERS[way], seconds=asked.limit, memory_mb=16000)
             else:
-                uv, face_uvs, cost = call("unwrap:ours", vertices, faces, WAYS[way], seconds=limit, memory_mb=16000)
-                found = figures(vertices, faces, uv, face_uvs, SIZE)
-            rows.append({"model": name, "way": way, **cost, **found})
+                uv, face_uvs, cost = call("unwrap:ours", vertices, faces, WAYS[way], seconds=asked.limit, memory_mb=16000)
+            row = {"model": name, "way": way, **cost, **figures(vertices, mine, uv, face_uvs, SIZE)}
+            if way in ("ours", "xatlas", BLENDER):
+                chart = islands(vertices, mine, face_uvs)[0]
+                (asked.kept / "pictures").mkdir(parents=True, exist_ok=True)
+                write_png(asked.kept / "pictures" / file_name(name, f"{way} layout"), layout(mine, uv, face_uvs, chart, 420))
+                if way == "ours":
+                    board = checkerboard(vertices, mine, uv, face_uvs, chart)
+                    write_png(asked.kept / "pictures" / file_name(name, "ours checkerboard"), board[::2, :board.shape[1] // 2:2])
         except ChildFailed as failure:
-            rows.append({"model": name, "way": way, "failed": str(failure)})
-    return rows
+            row = {"model": name, "way": way, "failed": str(failure)}
+        rows.add(row)
 
 
 def quads_of(source: str | Path, faces: int, triangles: int, kept: Path) -> tuple[str, np.ndarray, np.ndarray]:
@@ -96,6 +136,7 @@ def quads_of(source: str | Path, faces: int, triangles: int, kept: Path) -> tupl
         with np.load(at) as found:
             return name, found["vertices"], found["faces"]
     fine = of_solid(source, triangles, kept) if isinstance(source, str) else of_model(source, triangles, kept)
+    say(f"{name}: remeshed first")
     vertices, quads, _ = remesh(fine.vertices, fine.faces, Request(quads=faces))
     np.savez(at, vertices=vertices, faces=quads)
     return name, vertices, quads
@@ -125,28 +166,50 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, default=Path("docs/benchmarks"))
     parser.add_argument("--solids", default=",".join(SOLIDS))
     parser.add_argument("--faces", type=int, default=20_000)
-    parser.add_argument("--input", type=int, default=200_000, help="triangles that remesh gets")
+    parser.add_argument("--input", type=int, default=400_000, help="triangles that remesh gets")
     parser.add_argument("--kept", type=Path, default=Path("out/bench_meshes"), help="folder for the inputs once made")
-    parser.add_argument("--limit", type=float, default=120.0, help="seconds for one run")
+    parser.add_argument("--sweep", default="part,spot", help="models that the knobs are swept on")
+    parser.add_argument("--peers-python", type=Path, help="a Python that has bpy; without it Blender is left out")
+    parser.add_argument("--limit", type=float, default=60.0, help="seconds for one run")
     parser.add_argument("--only", default="", help="comma list of ways; all of them when empty")
     asked = parser.parse_args()
     os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # the children import this file
-    ways = [way for way in (*WAYS, *(PEERS if find_spec("xatlas") else ())) if not asked.only or way in asked.only.split(",")]
-    note, rows = busy(), []
-    for source in [*filter(None, asked.solids.split(",")), *models_in(asked.models)]:
-        try:
-            name, vertices, faces = quads_of(source, asked.faces, asked.input, asked.kept)
-        except Exception as failure:  # a broken model is a row of the table, not the end of it
-            rows.append({"model": str(getattr(source, "name", source)), "way": "read", "failed": str(failure)})
-            continue
-        rows += measure(name, vertices, faces, asked.limit, ways)
-    asked.out.mkdir(parents=True, exist_ok=True)
-    text = table(COLUMNS, ([number(row.get(name, "failed" if name == "charts" and "failed" in row else None), 4) for name in COLUMNS] for row in rows))
-    failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows if "failed" in row)
-    head = f"# Unwrap: about {asked.faces} quads\n\n`python benchmarks/unwrap.py`, {machine()}. {note}\n\n"
-    (asked.out / "unwrap.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![time against coverage](unwrap.png)\n")
-    (asked.out / "unwrap.json").write_text(json.dumps({"machine": machine(), "faces": asked.faces, "rows": rows}, indent=1) + "\n")
-    plot(rows, asked.out / "unwrap.png")
+    if not asked.peers_python:
+        say("Blender is left out: no --peers-python")
+    note = busy()
+    rows = Rows(asked.out / "unwrap.json", {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept")})
+
+    def ways(name: str) -> list[str]:
+        swept = name in asked.sweep.split(",")
+        out = [way for way in WAYS if way == "ours" or swept]
+        out += [way for way in PEERS if find_spec("xatlas") and (way != BRUTE or swept)] + ([BLENDER] if asked.peers_python else [])
+        return [way for way in out if not asked.only or way in asked.only.split(",")]
+
+    def report(complete: bool) -> str:
+        rows.write(complete)
+        text = table(COLUMNS, ([number(row.get(name, "failed" if name == "charts" and "failed" in row else None), 4) for name in COLUMNS]
+                               for row in rows.rows))
+        failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows.rows if "failed" in row)
+        head = f"# Unwrap: about {asked.faces} quads\n\n`make bench-assets`, {machine()}. {note}\n\n"
+        (asked.out / "unwrap.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "")
+                                             + "\n![time against coverage](unwrap.png)\n\n![layouts](unwrap_sheet.png)\n")
+        plot(rows.rows, asked.out / "unwrap.png")
+        sheet(asked.kept / "pictures", list(dict.fromkeys(row["model"] for row in rows.rows)),
+              ["ours layout", "ours checkerboard", "xatlas layout", f"{BLENDER} layout"], asked.out / "unwrap_sheet.png")
+        return text
+
+    sources = [*filter(None, asked.solids.split(",")), *models_in(asked.models)]
+    text = ""
+    for source in sources:
+        name = source if isinstance(source, str) else source.stem
+        if not all(rows.has(name, way) for way in ways(name)) and not rows.has(name, "read"):
+            try:
+                name, vertices, faces = quads_of(source, asked.faces, asked.input, asked.kept)
+            except Exception as failure:  # a broken model is a row of the table, not the end of it
+                rows.add({"model": name, "way": "read", "failed": str(failure)})
+            else:
+                measure(name, vertices, faces, ways(name), asked, rows)
+        text = report(source is sources[-1])
     print(text)
 
 
