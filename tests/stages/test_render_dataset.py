@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -182,6 +183,27 @@ def test_goes_on_after_a_kill(gdtool, box, tmp_path):
     assert [one["path"] for one in manifest(tmp_path / "data")["content"]["objects"]] == [f"{name}.asset/views" for name in "abc"]
     assert not [path for path in (tmp_path / "data").rglob(".*")]
     assert gdtool("validate", tmp_path / "data").returncode == 0
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_number_of_objects(monkeypatch):
+    """Resident memory after twelve rounds over five objects is that after four: what a run took is given back, or used again."""
+    from gdtool.core import log
+    from gdtool.core.runner import Settings, run_all
+    from gdtool.stages.render_dataset import STAGE, Options
+
+    monkeypatch.setattr(log, "level", log.QUIET)
+    options = Options(size=32, samples=4, domains=("normal", "albedo"))
+
+    def rounds(count: int) -> float:
+        for _ in range(count):
+            results = list(run_all(STAGE, ("procedural:0..4",), options, {}, Settings(output=Path("data"), several=True, force=True, threads=2)))
+            assert [r.status for r in results] == ["done"] * 5
+        with open("/proc/self/statm") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+    settled = rounds(4)
+    assert rounds(8) < settled + 20
 
 
 def test_either_reflection_model(gdtool, box, tmp_path):

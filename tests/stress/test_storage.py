@@ -118,6 +118,13 @@ def test_texels_around_a_shared_vertex_have_one_owner(place):
     np.testing.assert_array_equal(rasterize_uv(uv, faces, 12)[0], exact_owner(uv, faces, 12))
 
 
+def test_what_is_not_finite_is_not_stored(tmp_path):
+    for bad in (np.nan, np.inf):
+        with pytest.raises(ValueError, match="finite"):
+            write_png(tmp_path / "x.png", np.full((2, 2), bad, np.float32))
+    assert not (tmp_path / "x.png").exists()
+
+
 @pytest.mark.parametrize("bits", [8, 16])
 def test_quantisation_is_within_half_a_step(bits, tmp_path):
     top = 2**bits - 1
