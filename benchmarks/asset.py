@@ -31,7 +31,9 @@ VIEWS = 12
 PEER_VIEWS = "front_right,back"
 PEER = Path(__file__).with_name("shading_blender.py")
 OWN = Path(__file__).with_name("shading_gdtool.py")
-COLUMNS = ("model", "seconds", "peak MB", *LIGHTS, "worst view", "base color dB", "roughness", "metallic", "normal deg", "lod3 drift", "Blender base color dB", "Blender lit dB")
+COLUMNS = ("model", "seconds", "peak MB", *LIGHTS, "worst view", "base color dB", "roughness", "metallic", "normal deg", "lod3 drift",
+           "Blender base color dB", "Blender lit dB")
+BUFFERS = ("albedo", "roughness", "metallic", "normal")
 
 
 def lit(scene, light: str, size: int, samples: int, threads: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
@@ -60,7 +62,7 @@ def relit(case: Case, asset: Path, size: int, samples: int) -> tuple[dict[str, f
         each = [color_metrics(ours["color"][k:k + 1], mask[k:k + 1], true["color"][k:k + 1], true_mask[k:k + 1])["psnr_masked"] for k in range(VIEWS)]
         out[light], worst = float(np.mean(each)), min(worst, *each)
         pictures += [over_white(true["color"][1], true_mask[1]), over_white(ours["color"][1], mask[1])]
-    buffers = views_metrics({k: ours[k] for k in ("albedo", "roughness", "metallic", "normal")}, mask, {k: true[k] for k in ("albedo", "roughness", "metallic", "normal")}, true_mask)
+    buffers = views_metrics({k: ours[k] for k in BUFFERS}, mask, {k: true[k] for k in BUFFERS}, true_mask)
     out |= {"worst view": worst, "base color dB": buffers["albedo_psnr_masked"], "roughness": buffers["roughness_error"],
             "metallic": buffers["metallic_error"], "normal deg": buffers["normal_degrees"]}
     return out, pictures
@@ -76,8 +78,10 @@ def beside_blender(python: Path, asset: Path, folder: Path, size: int, samples: 
     scene = exported(str(asset / "asset.glb"), "mid", folder)
     common = ["--size", str(size), "--samples", str(samples)]
     views = ",".join(f"{view}={scene['azimuths'][view]:g}" for view in PEER_VIEWS.split(","))
-    for command in ([python, PEER, scene["model"], scene["light"], folder / "blender.npz", "--views", views, "--half-width", str(scene["half_width"]), "--light", "--buffers", *common],
-                    [sys.executable, OWN, scene["model"], "mid", folder / "own.npz", "--views", PEER_VIEWS, "--light", "sampled", "--light-samples", "8", *common]):
+    for command in ([python, PEER, scene["model"], scene["light"], folder / "blender.npz", "--views", views, "--half-width", scene["half_width"],
+                     "--light", "--buffers", *common],
+                    [sys.executable, OWN, scene["model"], "mid", folder / "own.npz", "--views", PEER_VIEWS, "--light", "sampled",
+                     "--light-samples", "8", *common]):
         done = subprocess.run([str(part) for part in command], capture_output=True, text=True, timeout=200, check=False)
         if done.returncode:
             raise Failed((done.stderr.strip().splitlines() or ["no message"])[-1])
@@ -107,9 +111,10 @@ def write(out: Path, rows: list[dict], sheet: list, note: str) -> None:
     out.mkdir(parents=True, exist_ok=True)
     text = table(COLUMNS, ([number(row.get(name, "failed" if name == "seconds" and "failed" in row else None), 3) for name in COLUMNS] for row in rows))
     failed = "\n".join(f"- {row['model']}: {row['failed']}" for row in rows if "failed" in row)
-    head = f"# Finished asset\n\n`python benchmarks/asset.py`, {machine()}. {note}\n\n`gdtool bake --size 2048 --lods 4` of the model's quad mesh: seconds and memory of the " \
-        f"whole command; masked PSNR of lit pictures against the model's, mean of {VIEWS} views under {', '.join(LIGHTS)}, and the worst; the buffers' errors; how far " \
-        "the coarsest level (an eighth) slid on its maps, share of the extent; gdtool's pictures of the asset against Blender's.\n\n"
+    head = f"# Finished asset\n\n`python benchmarks/asset.py`, {machine()}. {note}\n\n`gdtool bake --size 2048 --lods 4` of the model's quad mesh: " \
+        f"seconds and memory of the whole command; masked PSNR of lit pictures against the model's, mean of {VIEWS} views under " \
+        f"{', '.join(LIGHTS)}, and the worst; the buffers' errors; how far the coarsest level (an eighth) slid on its maps, share of the " \
+        "extent; gdtool's pictures of the asset against Blender's.\n\n"
     (out / "asset.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![source and asset](asset.png)\n")
     (out / "asset.json").write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")
     if sheet:

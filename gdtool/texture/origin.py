@@ -131,16 +131,17 @@ def texture_detail(scene: Scene) -> float | None:
         density = np.zeros(int(faces.sum()))
         for texture in found:
             u, v = (scene.uvs[texture.uv_set][scene.faces[faces][:, k]] - scene.uvs[texture.uv_set][scene.faces[faces][:, 0]] for k in (1, 2))
-            texels = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) * abs(texture.scale[0] * texture.scale[1]) * np.prod(texture.image.shape[:2], dtype=float)
-            density = np.maximum(density, texels)
+            height, width = texture.image.shape[:2]
+            covered = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) * abs(texture.scale[0] * texture.scale[1])
+            density = np.maximum(density, covered * height * width)
         there = (density > 0) & (area[faces] > 0)
         widths.append(np.sqrt(area[faces][there] / density[there]))
         weights.append(area[faces][there])
     if not widths or not sum(map(len, widths)):
         return None
-    width, weight = np.concatenate(widths), np.concatenate(weights)
-    order = np.argsort(width)
-    return float(width[order][np.searchsorted(np.cumsum(weight[order]), weight.sum() / 2)])
+    spans, weight = np.concatenate(widths), np.concatenate(weights)
+    order = np.argsort(spans)
+    return float(spans[order][np.searchsorted(np.cumsum(weight[order]), weight.sum() / 2)])
 
 
 def from_scene(scene: Scene, source_from_world: np.ndarray, texel_width: Callable[[float], float] = lambda detail: 0.0) -> Origin:

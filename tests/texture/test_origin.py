@@ -99,3 +99,17 @@ def test_the_field_serves_where_views_show_no_material(surface, tmp_path):
     (tmp_path / "bad.safetensors").write_bytes(b"\x08\0\0\0\0\0\0\0{}      ")
     with pytest.raises(InputError, match="is not the material field"):
         material_field(tmp_path / "bad.safetensors")
+
+
+def test_detail_is_a_texel_of_the_finest_texture():
+    from gdtool.assets.scene import Material, Scene, Texture
+    from gdtool.texture.origin import texture_detail
+
+    vertices, faces = np.array([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    uv = np.array([[0.0, 1], [1, 1], [1, 0], [0, 0]])
+    image = lambda size: Texture(np.zeros((size, size, 3), np.uint8))  # noqa: E731
+    for material, expected in ((Material(base_color_texture=image(64)), 2 / 64), (Material(base_color_texture=image(64), normal_texture=image(256)), 2 / 256),
+                               (Material(), None)):
+        assert texture_detail(Scene(vertices, faces, (material,), uvs=(uv,))) == (None if expected is None else pytest.approx(expected))
+    # Repeated four times along each side, it is four times as fine.
+    assert texture_detail(Scene(vertices, faces, (Material(base_color_texture=image(64)),), uvs=(4 * uv,))) == pytest.approx(2 / 256)
