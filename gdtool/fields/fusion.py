@@ -24,9 +24,9 @@ MAX_SAMPLES = 320  # along the longest side: 33 million samples, 0.6 GB at the p
 ROUNDS = ((0.08, 4.0), (0.06, 1.0), (0.04, 0.3), (0.03, 0.3))
 MORE_ROUNDS, PLATEAU = 4, 0.05
 DRAFT = 2.0  # grid steps of the draft that is made first when time is short
-# Of the draft's seconds: what materials and writing take at the same step. Fusing grows with the step to the power -2.4
+# What materials solved from color (the slowest way) and writing take of a draft's seconds at the same step. Fusing grows with the step to the power -2.4
 # (the narrow band to -2, where the surface may lie to -3), the rest with the number of vertices.
-AFTER, FUSING, SURFACE = 1.2, 2.4, 2.0
+AFTER, FUSING, SURFACE = 1.5, 2.4, 2.0
 
 
 def _silent(text: str) -> None:

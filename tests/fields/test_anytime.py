@@ -68,7 +68,7 @@ def test_the_finest_grid_that_there_is_time_for(ring):
     cameras, images, mask = ring
     step = grid_step(cameras, 0)
     sights = prepare_all(cameras, mask, images["depth"], images["normal"])
-    steps = [fuse_within(sights, step, 0.0, 0, Clock(budget, Ticking()))[0].step / step for budget in (5, 9, 60)]
+    steps = [fuse_within(sights, step, 0.0, 0, Clock(budget, Ticking()))[0].step / step for budget in (5, 10, 60)]
     assert steps == pytest.approx([2.0, 1.4, 1.0])
     shape, coarser = fuse_within(sights, step, 0.0, 0, Clock())
     whole = fuse_views(sights, step)
