@@ -153,7 +153,8 @@ class Bench:
         if self.path.exists() and not given.fresh:
             kept = json.loads(self.path.read_text())
             if not kept.get("complete") and all(kept.get(k) == self.head[k] for k in ("machine", "size", "version", "options")):
-                self.records, self.head["remark"] = kept["records"], kept["remark"] or self.head["remark"]
+                self.records = [r for r in kept["records"] if "failed" not in r]  # what failed is tried once more
+                self.head["remark"] = kept["remark"] or self.head["remark"]
                 say(f"going on after {len(self.records)} rows of {self.path}")
 
     def has(self, model: str, case: str, method: str) -> bool:

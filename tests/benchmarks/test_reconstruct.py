@@ -87,8 +87,10 @@ def test_rows_that_were_measured_are_not_measured_again(tmp_path):
     given = Namespace(output=tmp_path, size=64, options=[], fresh=False)
     bench = reconstruct.Bench(given)
     bench.records.append({"model": "cat", "source": "cat.glb", "case": "clean", "method": "gdtool", "distance": 1e-3})
+    bench.records.append({"model": "dog", "source": "dog.glb", "case": "clean", "method": "gdtool", "failed": "killed"})
     bench.save()
     again = reconstruct.Bench(given)
+    assert not again.has("dog", "clean", "gdtool")
     assert again.has("cat", "clean", "gdtool") and not again.has("cat", "clean", "carved hull")
     assert not reconstruct.Bench(Namespace(output=tmp_path, size=128, options=[], fresh=False)).records  # of other views
     again.save(complete=True)
