@@ -11,7 +11,7 @@ import numpy as np
 from gdtool.core.child import ChildFailed, call
 from gdtool.geometry import repair
 from gdtool.geometry.features import Constraints, Features, find_features, trace, untied
-from gdtool.geometry.mesh_quality import polygon_normals, valences
+from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian, valences
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_engines import ENGINES, pair_and_split
 from gdtool.geometry.quad_relax import balance, ease, square_up
@@ -23,6 +23,7 @@ from gdtool.geometry.simplify import simplify
 COUNT_TOLERANCE = 0.03
 _SMALL_PIECE_QUADS = 48
 _TRIES = 3
+_CLOSE_EDGES, _LEAST_JACOBIAN = 0.45, 0.2  # nearer and squarer than this, a result is taken without a look at others
 _HANDLES = "handles are lost or added"
 
 
@@ -210,16 +211,29 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
                 off = abs(len(result[3]) * 4**subdivisions / quads - 1)
                 return result[1] is not None, max(off, COUNT_TOLERANCE), _irregular(result[3])
 
-            number, fault, quad_vertices, quad_faces = min(results, key=rank)
+            results.sort(key=rank)
+            number, fault, quad_vertices, quad_faces = results[0]
             count = len(quad_faces) * 4**subdivisions
             off = count / quads - 1
             if fault is None and abs(off) > COUNT_TOLERANCE:
                 asked = [number * quads / max(count, 1)]
                 continue
             if fault is None:
-                quad_vertices, quad_faces = _finished(quad_vertices, quad_faces, surface, features, subdivisions, request, fine.result())
+                # The others of the right count are finished too, until one has no thin quad and leaves no corner out.
+                best = None
+                for result in [r for r in results if rank(r)[:2] == (False, COUNT_TOLERANCE)]:
+                    quad_vertices, quad_faces = _finished(*result[2:], surface, features, subdivisions, request, fine.result())
+                    far = _farthest(quad_vertices, quad_faces, surface) / edge
+                    least = float(scaled_jacobian(quad_vertices, quad_faces).min())
+                    good = far < _CLOSE_EDGES and least > _LEAST_JACOBIAN
+                    if best is None or good or far - 2 * least < best[0]:
+                        best = far - 2 * least, far, quad_vertices, quad_faces
+                    if good or not subdivisions:
+                        break
                 record.clock("fit", start)
-                fault = _strays(quad_vertices, quad_faces, surface, edge, 1.0 if subdivisions else 2.0)
+                _, far, quad_vertices, quad_faces = best
+                limit = 1.0 if subdivisions else 2.0
+                fault = f"strays {far:.2g} edge lengths from the surface" if far > limit else None
             elif fault == _HANDLES and not subdivisions and second_best is None and abs(off) <= COUNT_TOLERANCE:
                 second_best = quad_vertices, quad_faces, f"{label}, {fault}"
             if fault is None:
@@ -233,7 +247,7 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
         start = time.perf_counter()
         quad_vertices, quad_faces = _finished(*second_best[:2], surface, features, 0, request, fine.result())
         record.clock("fit", start)
-        if _strays(quad_vertices, quad_faces, surface, edge, 2.0) is None:
+        if _farthest(quad_vertices, quad_faces, surface) < 2 * edge:
             return quad_vertices, quad_faces, second_best[2]
     return None
 
@@ -315,13 +329,10 @@ def _shaped(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features:
     return balance(vertices, faces, fine, constraints) if request.smooth_iterations else vertices
 
 
-def _strays(vertices: np.ndarray, faces: np.ndarray, surface: Surface, edge: float, limit: float) -> str | None:
-    """A fault when part of the surface has no quads near it (details that the quads are too coarse for)."""
+def _farthest(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> float:
+    """How far the surface is from the quads at most: large where they are too coarse for a detail or leave out a corner."""
     from gdtool.folders.mesh import triangulated
     from gdtool.geometry.distance import closest_points
 
     step = max(len(surface.vertices) // 20000, 1)
-    distance = closest_points(surface.vertices[::step], vertices, triangulated(faces)[0])[0]
-    if distance.max() > limit * edge:
-        return f"strays {distance.max() / edge:.2g} edge lengths from the surface"
-    return None
+    return float(closest_points(surface.vertices[::step], vertices, triangulated(faces)[0])[0].max())
