@@ -1,7 +1,31 @@
-"""`gdtool train`: options and help come from the stage."""
+"""`gdtool train`: options and help come from the stage; --plan, and the processes of torchrun that follow the first."""
+
+import os
+
+import click
 
 from gdtool.stages import train as stage
 
-from ._common import stage_command
+from ._common import build_options, stage_command
 
 command = stage_command(stage.STAGE, help=stage.__doc__)
+command.params.append(click.Option(["--plan"], is_flag=True, help="Tell memory, FLOPs and time of the training, computed from its structure; no data."))
+_train = command.callback
+
+
+def _invoke(*, plan: bool, **values):
+    if plan:
+        click.echo(stage.plan(build_options(stage.Options, values), values["as_json"]))
+        return 0
+    if int(os.environ.get("WORLD_SIZE", "1")) < 2:
+        return _train(**values)
+    if os.environ.get("RANK", "0") != "0":
+        stage.follow(values["threads"])
+        return 0
+    code = _train(**values)
+    if code == 0:  # after a failure torchrun ends the others
+        stage.dismiss()
+    return code
+
+
+command.callback = _invoke

@@ -77,7 +77,9 @@ def second_inputs(stage: Stage, source: Source, given: dict[str, str | None]) ->
     for flag in stage.second_inputs:
         wanted = stage.second(flag)
         if given.get(flag):
-            out[flag] = sources.resolve(given[flag], (wanted.kind,), f"--{flag} of {stage.name}")
+            kinds = (wanted.kind, sources.PICTURES) if wanted.foreign else (wanted.kind,)
+            place = sources.hub_folder(given[flag]) if wanted.foreign else given[flag]
+            out[flag] = sources.resolve(place, kinds, f"--{flag} of {stage.name}")
         elif wanted.search and isinstance(source, Folder):
             found = find_ancestor(source, wanted.kind)
             out[flag] = open_folder(found.path) if found else None

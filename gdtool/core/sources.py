@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import unquote
 
-from gdtool.core.errors import InputError, UsageError
+from gdtool.core.errors import InputError, ResourceError, UsageError
 from gdtool.core.folder import Folder, is_folder, open_folder
 from gdtool.core.manifest import digest_of, file_sha256
 
@@ -88,6 +88,27 @@ def resolve(text: str, kinds: tuple[str, ...], reader: str, allow_missing: bool 
 
 def _words(kinds: tuple[str, ...]) -> str:
     return " or ".join(kind.replace("-file", " files") for kind in kinds)
+
+
+HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+$")
+
+
+def hub_folder(text: str) -> str:
+    """The folder that a Hugging Face hub id names, downloaded once; any other text, and what exists here, is itself.
+
+    Raises ResourceError without huggingface_hub, InputError for what the hub does not give.
+    """
+    if Path(text).exists() or not HUB_ID.match(text):
+        return text
+    try:
+        from huggingface_hub import snapshot_download
+    except ImportError:
+        raise ResourceError(text, "does not exist here, and huggingface_hub is not installed to ask the hub for it",
+                            "pip install 'gdtool[hub]', or give a local folder") from None
+    try:
+        return snapshot_download(text, allow_patterns=["*.json", "*.safetensors"])
+    except Exception as error:  # of several libraries: no network, no such id, no permission
+        raise InputError(text, f"is no folder here, and the hub does not give it ({type(error).__name__})") from None
 
 
 def name_of(source: Source) -> str:

@@ -30,7 +30,8 @@ def file_option(description: str) -> Any:
 class SecondInput:
     """An input beside the source: a flag, and when search is set found along the provenance chain without it.
 
-    default: a folder that ships with gdtool, as "package/folder", taken when neither gives one.
+    default: a folder that ships with gdtool, as "package/folder", taken when neither gives one. foreign: a folder of another
+    program, or an id of the Hugging Face hub, will do as well, and arrives as a Path.
     """
 
     kind: str
@@ -38,6 +39,7 @@ class SecondInput:
     search: bool = True
     help: str = ""
     default: str = ""
+    foreign: bool = False
 
 
 @dataclass(frozen=True)

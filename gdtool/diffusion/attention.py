@@ -108,6 +108,21 @@ class CrossDomainAttention(Attention):
         return torch.stack(out, 1).flatten(0, 2)
 
 
+class JointAttention(Attention):
+    """Wonder3D's: the tokens of all domains of a view are one sequence. Starts as (nearly) nothing: no weights in to_out."""
+
+    def __init__(self, width: int, heads: int):
+        super().__init__(width, heads)
+        nn.init.zeros_(self.to_out[0].weight)
+
+    def forward(self, x: torch.Tensor, layout: Layout) -> torch.Tensor:
+        """x (b d k, t, c) -> the same shape, to be added to x."""
+        t, c = x.shape[1:]
+        sets = x.view(layout.objects, len(layout.domains), layout.views, t, c).transpose(1, 2)
+        out = super().forward(sets.reshape(layout.objects * layout.views, -1, c))
+        return out.view(sets.shape).transpose(1, 2).reshape(x.shape)
+
+
 class GatedLinear(nn.Module):
     """GEGLU (Shazeer 2020)."""
 
@@ -137,7 +152,11 @@ class TransformerBlock(nn.Module):
         self.multi_view = multi_view
         self.norm1 = nn.LayerNorm(width)
         self.attn1 = Attention(width, heads)
-        if cross_domain != "none":
+        self.joint = {"joint": "mid", "joint_last": "last"}.get(cross_domain)
+        if self.joint:
+            self.add_module(f"norm_joint_{self.joint}", nn.LayerNorm(width))
+            self.add_module(f"attn_joint_{self.joint}", JointAttention(width, heads))
+        if cross_domain in ("one_way", "two_way"):
             self.norm_cross_domain = nn.LayerNorm(width)
             self.attn_cross_domain = CrossDomainAttention(width, heads, cross_domain == "two_way")
         else:
@@ -157,10 +176,13 @@ class TransformerBlock(nn.Module):
         x = x + self.attn1(own).reshape(images, t, c)
         if self.attn_cross_domain is not None:
             x = x + self.attn_cross_domain(self.norm_cross_domain(x), layout)
+        if self.joint == "mid":
+            x = x + self.attn_joint_mid(self.norm_joint_mid(x), layout)
         # All images of an object read the same embedding: its keys and values are computed once per object.
         read = self.attn2(self.norm2(x).reshape(layout.objects, -1, c), context)
         x = x + read.reshape(images, t, c)
-        return x + self.ff(self.norm3(x))
+        x = x + self.ff(self.norm3(x))
+        return x + self.attn_joint_last(self.norm_joint_last(x), layout) if self.joint == "last" else x
 
 
 class Transformer(nn.Module):

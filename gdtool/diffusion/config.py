@@ -41,7 +41,10 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     # attention across the images of an object
     multi_view: bool = True
     row_attention: tuple[bool, ...] = ()  # levels with attention along the rows that the views share; (): none
-    cross_domain: Literal["none", "one_way", "two_way"] = "two_way"
+    # a star around color, or Wonder3D's attention over all domains of a view, in the middle or at the end of each block
+    cross_domain: Literal["none", "one_way", "two_way", "joint", "joint_last"] = "two_way"
+    # what tells an image its view and domain, and the cameras: ours, or Wonder3D's numbers verbatim
+    convention: Literal["gdtool", "wonder3d"] = "gdtool"
     # image encoder: "clip" is one projected embedding as one token, "patch" a small transformer over the image's patches
     encoder: Literal["clip", "patch"] = "patch"
     encoder_width: int = 192
@@ -127,4 +130,14 @@ PRESETS: dict[str, tuple[ModelConfig, TrainConfig]] = {
                     phases=(Phase(share=0.6, domains=1, views=6, learning_rate=1e-4),
                             Phase(share=1.0, domains=6, views=6, learning_rate=5e-5))),
     ),
+}
+
+# What the paper's claims are measured against: each a change of the configuration, nothing else.
+ABLATIONS: dict[str, tuple[dict, dict]] = {
+    "none": ({}, {}),
+    "no_cross_domain": ({"cross_domain": "none"}, {}),  # each domain is sampled as if it were alone
+    "one_way": ({"cross_domain": "one_way"}, {}),  # color reads the other domains, they never hear of color
+    "two_way": ({"cross_domain": "two_way"}, {}),
+    "no_pbr": ({}, {"pbr_weight": 0.0}),  # no supervision by rendering
+    "color_normal": ({"domains": ("color", "normal")}, {"pbr_weight": 0.0}),  # Wonder3D's set; nothing to render from
 }

@@ -6,7 +6,7 @@ Every choice of a step comes from a generator seeded by (seed, step), so a resum
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -157,10 +157,10 @@ def object_order(count: int, step: int, batch: int, seed: int) -> np.ndarray:
     return np.array([orders[epoch][position % count] for epoch, position in zip(epochs, positions, strict=True)])
 
 
-def draw(objects: Objects, idx: np.ndarray, config: ModelConfig, train: TrainConfig, generator: np.random.Generator) -> Batch:
-    """Batch of the objects idx with random condition images, mirrored and with permuted color channels."""
+def draw(objects: Objects, idx: np.ndarray, config: ModelConfig, train: TrainConfig, generators: Sequence[np.random.Generator]) -> Batch:
+    """Batch of the objects idx with random condition images, mirrored and with permuted color channels; a generator each."""
     planes, rgba, lights = [], [], []
-    for i in idx:
+    for i, generator in zip(idx, generators, strict=True):
         tilted = generator.random() < train.tilted and objects.conditions.shape[1] > 1
         pick = int(generator.integers(1, objects.conditions.shape[1])) if tilted else 0
         one = (from_bytes(objects.planes[i]), from_bytes(objects.conditions[i, pick]), torch.from_numpy(np.array(objects.lights[i])))

@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from gdtool.cameras.camera import SIX_VIEWS
+from gdtool.diffusion import wonder3d
 from gdtool.diffusion.attention import Layout
 from gdtool.diffusion.codec import make_codec
 from gdtool.diffusion.config import DOMAINS, ModelConfig
@@ -22,6 +23,8 @@ def class_labels(config: ModelConfig) -> torch.Tensor:
 
     The elevation of a photograph is not known when sampling, so it is 0 in training as well and the network infers it.
     """
+    if config.convention == "wonder3d":
+        return wonder3d.class_labels(config)
     azimuth = dict(SIX_VIEWS)
     raw = torch.zeros(len(DOMAINS), len(config.views), 3 + len(DOMAINS))
     for k, view in enumerate(config.views):

@@ -1,7 +1,9 @@
 """The training loop, top to bottom: draw, noise, predict, compare, step, average, write down.
 
-A run is a pure function of data, configuration and seed: each step's choices come from (seed, step), and a checkpoint
-holds all else (weights, their average, the optimiser's moments), so that a resumed run is bit for bit the unbroken one.
+A run is a pure function of data, configuration and seed: each step's choices come from (seed, step) and those of each
+of its objects from (seed, step, place in the batch), so that it does not matter how a batch is split over accumulations
+and processes; a checkpoint holds all else (weights, their average, the optimiser's moments), so that a resumed run is
+bit for bit the unbroken one. Several processes: torchrun starts them, distributed.py holds what they do differently.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import numpy as np
 import torch
 
 from gdtool.core.errors import InputError
+from gdtool.diffusion import distributed
 from gdtool.diffusion.attention import Layout
 from gdtool.diffusion.config import DOMAINS, ModelConfig, Phase, TrainConfig
 from gdtool.diffusion.data import Batch, Objects, draw, object_order
@@ -40,6 +43,7 @@ class State:
     model: Model
     optimizer: torch.optim.Optimizer
     average: dict[str, torch.Tensor]
+    objective: torch.nn.Module
     step: int = 0
     seconds: float = 0.0
     history: list[dict[str, float]] = field(default_factory=list)
@@ -47,16 +51,33 @@ class State:
 
 @dataclass(frozen=True)
 class Step:
-    """The random choices of one step that all its objects share."""
+    """The random choices of one step that all its objects share, and what its objects draw theirs from."""
 
     domains: tuple[int, ...]
     views: torch.Tensor
-    generator: torch.Generator
-    choices: np.random.Generator
+    seed: int
+    number: int
+
+    def choices(self, place: int) -> tuple[np.random.Generator, torch.Generator]:
+        """The generators of the object at this place of the step's batch."""
+        choices = np.random.default_rng((self.seed, 3, self.number, place))
+        return choices, torch.Generator().manual_seed(int(choices.integers(2**62)))
+
+
+class Objective(torch.nn.Module):
+    """losses() as a module: what DDP and FSDP wrap, so that their hooks see the forward pass."""
+
+    def __init__(self, model: Model, train: TrainConfig):
+        super().__init__()
+        self.model, self.train_config = model, train
+
+    def forward(self, batch: Batch, step: Step, generators: list[torch.Generator]) -> dict[str, torch.Tensor]:
+        return losses(self.model, batch, step, generators, self.train_config)
 
 
 def new_state(model: Model, train: TrainConfig) -> State:
-    """AdamW; matrices decay, vectors do not; the class embedding has its own learning rate."""
+    """AdamW; matrices decay, vectors do not; the class embedding has its own learning rate. Wrapped for all processes."""
+    objective = distributed.wrap(Objective(model, train))
     groups: dict[tuple[bool, float], list] = {}
     for name, p in model.named_parameters():
         rate = train.class_rate if ".class_embedding." in f".{name}" else 1.0
@@ -64,7 +85,8 @@ def new_state(model: Model, train: TrainConfig) -> State:
     optimizer = torch.optim.AdamW(
         [{"params": ps, "weight_decay": train.weight_decay if decays else 0.0, "rate": rate} for (decays, rate), ps in groups.items()],
         lr=1.0, betas=train.betas, fused=True)
-    return State(model, optimizer, {name: p.detach().clone() for name, p in model.named_parameters()})
+    average = {name: distributed.local(p).clone() for name, p in model.named_parameters()}
+    return State(model, optimizer, average, objective)
 
 
 def progress_of(state: State, train: TrainConfig, minutes: float | None) -> float:
@@ -84,7 +106,6 @@ def learning_rate(state: State, progress: float, train: TrainConfig) -> float:
 def choose(config: ModelConfig, phase: Phase, seed: int, step: int) -> Step:
     """Which domains and views a step sees: color always where it is primary and more than one domain is drawn."""
     choices = np.random.default_rng((seed, 2, step))
-    generator = torch.Generator().manual_seed(int(choices.integers(2**62)))
     own = [DOMAINS.index(d) for d in config.domains]
     if phase.domains >= len(own):
         domains = tuple(own)
@@ -93,35 +114,36 @@ def choose(config: ModelConfig, phase: Phase, seed: int, step: int) -> Step:
     else:
         domains = (0, *sorted(choices.permutation(own[1:])[: phase.domains - 1].tolist()))
     views = torch.from_numpy(np.sort(choices.permutation(len(config.views))[: phase.views]))
-    return Step(domains, views, generator, choices)
+    return Step(domains, views, seed, step)
 
 
-def losses(model: Model, batch: Batch, step: Step, train: TrainConfig) -> dict[str, torch.Tensor]:
-    """The objective of one micro-batch and its parts by name."""
+def losses(model: Model, batch: Batch, step: Step, generators: list[torch.Generator], train: TrainConfig) -> dict[str, torch.Tensor]:
+    """The objective of one micro-batch and its parts by name; every figure is a mean over its objects.
+
+    generators: one for each object, from which all that is random about it comes.
+    """
     config, b, device = model.config, len(batch.planes), batch.planes.device
     layout = Layout(b, step.domains, len(step.views))
     n = layout.images // b
 
-    def random(*shape):
-        return torch.rand(*shape, generator=step.generator)
-
-    background = torch.tensor([BACKGROUND[config.backgrounds[int(i)]] for i in step.choices.integers(len(config.backgrounds), size=b)])
-    background = background.to(device)
+    # per object: timestep, whether it is the last one, what is dropped, background
+    dice = torch.stack([torch.rand(4, generator=generator) for generator in generators])
+    background = torch.tensor([BACKGROUND[config.backgrounds[int(x * len(config.backgrounds))]] for x in dice[:, 3]], device=device)
     planes = batch.planes[:, step.views]
     truth = encode(planes, step.domains, background)  # (b, d, k, 3, h, w)
     clean = model.codec.encode(truth.flatten(0, 2))
     rgba = encode_condition(batch.condition, background)
 
     # One timestep per object: sampling never sees anything else.
-    t = (random(b) * config.timesteps).long()
-    t = torch.where(random(b) < train.pure_noise, config.timesteps - 1, t).to(device)
-    noise = torch.randn(clean.shape, generator=step.generator).to(device)
+    t = (dice[:, 0] * config.timesteps).long()
+    t = torch.where(dice[:, 1] < train.pure_noise, config.timesteps - 1, t).to(device)
+    noise = torch.cat([torch.randn(n, *clean.shape[1:], generator=generator) for generator in generators]).to(device)
     a, s = model.levels(t, layout)
     noisy = a * clean + s * noise
 
-    dice = random(b).to(device)
-    embedding_off = dice < train.drop_embedding + train.drop_both
-    latent_off = (dice >= train.drop_embedding) & (dice < train.drop_embedding + train.drop_both + train.drop_latent)
+    drop = dice[:, 2].to(device)
+    embedding_off = drop < train.drop_embedding + train.drop_both
+    latent_off = (drop >= train.drop_embedding) & (drop < train.drop_embedding + train.drop_both + train.drop_latent)
     with precision_context(device, train.precision):
         context = model.encoder(rgba) * ~embedding_off[:, None, None]
         condition = model.condition_latents(rgba, layout, step.views) * ~latent_off.repeat_interleave(n)[:, None, None, None]
@@ -141,9 +163,9 @@ def losses(model: Model, batch: Batch, step: Step, train: TrainConfig) -> dict[s
         rendered = [
             snr[i].clamp(max=train.snr_gamma)
             * rendering_error(images[i], truth[i], order, planes[i], batch.lights[i], directions, train.pbr_pixels,
-                              float(background[i]), step.generator)
+                              float(background[i]), generators[i])
             for i in near.tolist()]
-        parts["rendering"] = torch.stack(rendered).mean().detach()
+        parts["rendering"] = (torch.stack(rendered).sum() / b).detach()
         total = total + train.pbr_weight * torch.stack(rendered).sum() / b
     return {"loss": total, **parts}
 
@@ -157,24 +179,32 @@ def train_step(state: State, objects: Objects, train: TrainConfig, seed: int, mi
     for group in state.optimizer.param_groups:
         group["lr"] = rate * group["rate"]
     idx = object_order(len(objects), state.step, phase.batch or train.batch, seed)
-    sums: dict[str, float] = {}
-    for part in np.array_split(idx, train.accumulate):
-        batch = draw(objects, part, config, train, step.choices)
+    places, sums = np.arange(len(idx)), {}
+    # Every process takes its share of each part of the batch; its gradients' mean is what the processes agree on.
+    if len(idx) < distributed.size():
+        raise InputError("batch", f"of {len(idx)} objects is less than one for each of {distributed.size()} processes", "raise --batch")
+    count = min(train.accumulate, len(idx) // distributed.size())
+    parts_of = [distributed.share_of(part) for part in np.array_split(places, count)]
+    for number, part in enumerate(parts_of):
+        choices, generators = zip(*(step.choices(int(place)) for place in part), strict=True)
+        batch = draw(objects, idx[part], config, train, choices)
         batch = Batch(batch.planes.to(device), batch.condition.to(device), batch.lights.to(device))
-        parts = losses(state.model, batch, step, train)
-        share = len(part) / len(idx)
-        (parts["loss"] * share).backward()
+        with distributed.synchronised(state.objective, number == len(parts_of) - 1):
+            parts = state.objective(batch, step, list(generators))
+            share = len(part) / len(idx)
+            (parts["loss"] * share * distributed.size()).backward()
         for name, value in parts.items():
             sums[name] = sums.get(name, 0.0) + float(value.detach()) * share
-    norm = torch.nn.utils.clip_grad_norm_(state.model.parameters(), train.clip)
+    sums = distributed.total(sums)
+    norm = distributed.local(torch.nn.utils.clip_grad_norm_(state.model.parameters(), train.clip), whole=True)
     if bool(torch.isfinite(norm)):  # a step that is not finite is left out rather than the whole run lost
         state.optimizer.step()
     state.optimizer.zero_grad(set_to_none=True)
     state.step += 1
     keep = min(train.ema, (1 + state.step) / (10 + state.step))
     names = list(state.average)
-    own = dict(state.model.named_parameters())
-    torch._foreach_lerp_([state.average[n] for n in names], [own[n].detach() for n in names], 1 - keep)
+    own = {name: distributed.local(p) for name, p in state.model.named_parameters()}
+    torch._foreach_lerp_([state.average[n] for n in names], [own[n] for n in names], 1 - keep)
     return {"step": state.step, "rate": rate, "norm": float(norm), **sums}
 
 
@@ -184,10 +214,12 @@ def save_checkpoint(state: State, workspace: Path, identity: str) -> None:
 
     tensors = {}
     for name, p in state.model.named_parameters():
-        tensors[f"model/{name}"] = p.detach()
-        tensors[f"average/{name}"] = state.average[name]
+        tensors[f"model/{name}"] = distributed.whole(p.detach())
+        tensors[f"average/{name}"] = distributed.whole(state.average[name], p)
         for key, value in state.optimizer.state.get(p, {}).items():
-            tensors[f"{key}/{name}"] = value
+            tensors[f"{key}/{name}"] = distributed.whole(value)
+    if distributed.rank() != 0:
+        return
     tensors = {name: x.cpu().contiguous() for name, x in tensors.items()}
     record = json.dumps({"step": state.step, "seconds": state.seconds, "identity": identity})
     partial = workspace / f".{CHECKPOINT}.partial"
@@ -206,11 +238,11 @@ def load_checkpoint(state: State, workspace: Path, identity: str) -> bool:
         raise InputError(path, "belongs to a run with another configuration", "remove it or train with the same options")
     with torch.no_grad():
         for name, p in state.model.named_parameters():
-            p.copy_(tensors[f"model/{name}"])
-            state.average[name].copy_(tensors[f"average/{name}"])
+            p.copy_(distributed.sharded(tensors[f"model/{name}"], p))
+            state.average[name].copy_(distributed.local(distributed.sharded(tensors[f"average/{name}"], p)))
             if f"exp_avg/{name}" in tensors:
-                state.optimizer.state[p] = {key: tensors[f"{key}/{name}"].to(p.device if key != "step" else "cpu")
-                                            for key in ("step", "exp_avg", "exp_avg_sq")}
+                state.optimizer.state[p] = {"step": tensors[f"step/{name}"]} | {
+                    key: distributed.sharded(tensors[f"{key}/{name}"].to(p.device), p) for key in ("exp_avg", "exp_avg_sq")}
     state.step, state.seconds = record["step"], record["seconds"]
     return True
 
@@ -218,35 +250,40 @@ def load_checkpoint(state: State, workspace: Path, identity: str) -> bool:
 def run_training(model: Model, objects: Objects, train: TrainConfig, workspace: Path, *, seed: int, minutes: float | None = None,
                  checkpoint_every: int = 200, validate_every: int = 1000, validate: Callable[[State], None] = lambda state: None,
                  device: str = "cpu", progress=lambda iterable, total, label: iterable) -> State:
-    """Train until the steps or the minutes are spent; resumes from workspace. Writes workspace/loss.csv as it goes."""
+    """Train until the steps or the minutes are spent; resumes from workspace. The first process writes workspace/loss.csv."""
     identity = msgspec.json.encode([model.config, train, seed, len(objects)]).decode()
     torch.manual_seed(seed)
     state = new_state(model.to(device).train(), train)
     state.average = {name: x.to(device) for name, x in state.average.items()}
     resumed = load_checkpoint(state, workspace, identity)
-    columns = ["step", "seconds", "loss", "rate", "norm", *model.config.domains, "rendering"]
     log_path = workspace / "loss.csv"
-    kept = []
-    if resumed and log_path.is_file():  # rows after the checkpoint will be written again
-        with open(log_path, newline="") as file:
-            kept = [row for row in csv.DictReader(file) if int(row["step"]) <= state.step]
-    with open(log_path, "w", newline="") as file:
-        writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore")
-        writer.writeheader()
-        writer.writerows(kept)
+    with open(log_path if distributed.rank() == 0 else os.devnull, "r+" if resumed and log_path.is_file() else "w", newline="") as file:
+        writer = _continued(file, state.step if resumed else 0, model.config.domains)
         bar = iter(progress(range(state.step, train.steps), train.steps, "training"))
         while progress_of(state, train, minutes) < 1:
             start = time.perf_counter()
             record = train_step(state, objects, train, seed, minutes, device)
-            state.seconds += time.perf_counter() - start
+            state.seconds += distributed.total({"s": time.perf_counter() - start})["s"] / distributed.size()
             writer.writerow({k: (f"{v:.6g}" if isinstance(v, float) else v) for k, v in record.items()} | {"seconds": f"{state.seconds:.1f}"})
             file.flush()
             next(bar, None)
             if state.step % checkpoint_every == 0:
                 save_checkpoint(state, workspace, identity)
-            if state.step % validate_every == 0:
+            if state.step % validate_every == 0 and not distributed.is_sharded(state.model) and distributed.rank() == 0:
                 validate(state)
         for _ in bar:
             break
     save_checkpoint(state, workspace, identity)
-    return state
+    return distributed.gathered(state)
+
+
+def _continued(file, step: int, domains: tuple[str, ...]) -> csv.DictWriter:
+    """A writer of the log that keeps the rows up to step; rows after a checkpoint will be written again."""
+    columns = ["step", "seconds", "loss", "rate", "norm", *domains, "rendering"]
+    kept = [row for row in csv.DictReader(file) if int(row["step"]) <= step] if step else []
+    file.seek(0)
+    file.truncate() if file.name != os.devnull else None
+    writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore")
+    writer.writeheader()
+    writer.writerows(kept)
+    return writer

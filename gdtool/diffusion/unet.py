@@ -15,6 +15,7 @@ from torch.utils.checkpoint import checkpoint
 
 from gdtool.diffusion.attention import Layout, RowAttention, Transformer
 from gdtool.diffusion.config import CLASS_WIDTH, DOMAINS, ModelConfig
+from gdtool.diffusion.wonder3d import LABEL_WIDTH
 
 
 def sinusoid(t: torch.Tensor, width: int) -> torch.Tensor:
@@ -107,7 +108,7 @@ class UNet(nn.Module):
         embedding = 4 * width0
         self.conv_in = nn.Conv2d(latent_channels + condition_channels, width0, 3, padding=1)
         self.time_embedding = Embedding(width0, embedding)
-        self.class_embedding = Embedding(CLASS_WIDTH, embedding)
+        self.class_embedding = Embedding(LABEL_WIDTH if config.convention == "wonder3d" else CLASS_WIDTH, embedding)
         common = dict(config=config, embedding=embedding)
         last = len(widths) - 1
         self.down_blocks, skips, previous = nn.ModuleList(), [width0], width0

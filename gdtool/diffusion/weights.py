@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import msgspec
@@ -21,7 +22,8 @@ def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
     if not path.is_file():
         pickles = [p for pattern in PICKLES for p in path.parent.glob(pattern)]
         if pickles:
-            raise InputError(pickles[0], "is a pickle, which can run code and is never opened", "convert it to safetensors")
+            raise InputError(pickles[0], "is a pickle, which can run code and is never opened",
+                             f"convert it: python -m gdtool.diffusion.convert {shlex.quote(str(pickles[0]))}")
         raise InputError(path, "does not exist", "gdtool train writes it")
     try:
         with safe_open(path, "pt") as file:

@@ -20,13 +20,15 @@ from gdtool.core.errors import InputError, UsageError
 from gdtool.core.stage import Inputs, Output, SecondInput, Stage, file_option
 
 
+EVERY = ("color", "normal", "depth", "albedo", "roughness", "metallic")
+
+
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     steps: Annotated[int, Meta(ge=1, le=1000, description="Denoising steps; without it what measured best for the model.")] | None = None
     guidance: Annotated[float, Meta(ge=0, le=30, description="Classifier-free guidance; 1: none, and half the time.")] = 1.0
     scheduler: Annotated[Literal["ddim", "dpm"], Meta(description="Sampler: DDIM or DPM-Solver++.")] = "ddim"
     seed: Annotated[int, Meta(ge=0, description="Seed of the noise, the same for every object whatever the order.")] = 0
-    domains: Annotated[tuple[str, ...], Meta(description="Domains to write; color is made in any case, being the primary.")] = (
-        "color", "normal", "depth", "albedo", "roughness", "metallic")
+    domains: Annotated[tuple[str, ...], Meta(description="Domains to write; color is made in any case, being the primary.")] = EVERY
     mask: file_option("Image that is bright where the subject is.") = None
     crop: Annotated[bool, Meta(description="Centre the subject and scale it as in training.")] = True
     precision: Annotated[Literal["float32", "bfloat16"], Meta(description="Arithmetic of the networks.")] = "float32"
@@ -39,6 +41,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.cameras import rig
     from gdtool.diffusion.data import to_tensor_condition
     from gdtool.diffusion.encoding import BACKGROUND
+    from gdtool.diffusion import wonder3d
     from gdtool.diffusion.result import views_from_images
     from gdtool.diffusion.sampling import sample_images
     from gdtool.diffusion.weights import load_model
@@ -48,21 +51,27 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     torch.set_num_threads(out.threads)
     with out.step("load"):
-        model = load_model(inputs.second["model"].path).to(out.device)
+        chosen = inputs.second["model"]
+        folder = getattr(chosen, "path", chosen)
+        model = (wonder3d.load if wonder3d.recognises(folder) else load_model)(folder).to(out.device)
     config = model.config
-    unknown = [d for d in options.domains if d not in config.domains]
-    if unknown or not options.domains:
+    # Without --domains: all that the model has.
+    domains = config.domains if options.domains == EVERY else options.domains
+    unknown = [d for d in domains if d not in config.domains]
+    if unknown or not domains:
         raise UsageError("--domains", f"{unknown[0] if unknown else 'nothing'} is not a domain of this model",
                          f"it has {','.join(config.domains)}")
     with out.step("condition"):
-        condition = _condition(inputs, options, config.image_size, out)
+        condition = _condition(inputs, options, config, out)
     with out.step("sample"):
         rgba = to_tensor_condition(condition).to(out.device)
-        images = sample_images(model, rgba, domains=options.domains, steps=options.steps or config.sampling_steps, guidance=options.guidance, seed=options.seed,
+        images = sample_images(model, rgba, domains=domains, steps=options.steps or config.sampling_steps, guidance=options.guidance, seed=options.seed,
                                scheduler=options.scheduler, precision=options.precision, progress=out.progress)
-    cameras = {camera.name: camera for camera in rig("six", config.image_size)}
+    if config.convention == "wonder3d" and "normal" in images:
+        images["normal"] = wonder3d.premultiplied_normals(images["normal"])
+    cameras = {camera.name: camera for camera in rig("wonder3d" if config.convention == "wonder3d" else "six", config.image_size)}
     views = views_from_images({d: x[0].cpu() for d, x in images.items()}, [cameras[name] for name in config.views],
-                              BACKGROUND[config.backgrounds[0]], options.domains, condition[..., 3])
+                              BACKGROUND[config.backgrounds[0]], domains, condition[..., 3])
     with out.step("write"):
         # what the model was shown, after cutting out and framing
         write_png(out.path("condition/000.png"), srgb_from_linear_rgba(condition, srgb_from_linear))
@@ -75,15 +84,16 @@ def srgb_from_linear_rgba(image, srgb_from_linear):
     return np.concatenate([srgb_from_linear(np.clip(image[..., :3], 0, 1)), np.clip(image[..., 3:], 0, 1)], -1)
 
 
-def _condition(inputs: Inputs, options: Options, size: int, out: Output):
+def _condition(inputs: Inputs, options: Options, config, out: Output):
     """The framed picture (size, size, 4), linear color and straight alpha. Raises InputError without a usable subject."""
     from pathlib import Path
 
     import numpy as np
 
-    from gdtool.diffusion.framing import frame, whole_frame
+    from gdtool.diffusion.framing import FRONT_EXTENT, frame, whole_frame
     from gdtool.images.color import linear_from_srgb
     from gdtool.images.io import read_image
+    from gdtool.diffusion import wonder3d
     from gdtool.images.mask import foreground
 
     image = read_image(inputs.main)
@@ -103,9 +113,10 @@ def _condition(inputs: Inputs, options: Options, size: int, out: Output):
     if not linear:
         color = linear_from_srgb(color.astype(np.float32) / np.iinfo(image.dtype).max)
     rgba = np.concatenate([color, alpha[..., None]], -1).astype(np.float32)
-    return frame(rgba, size) if options.crop else whole_frame(rgba, size)
+    extent = wonder3d.EXTENT if config.convention == "wonder3d" else FRONT_EXTENT
+    return frame(rgba, config.image_size, extent) if options.crop else whole_frame(rgba, config.image_size)
 
 
 STAGE = Stage(name="sample-views", version=1, reads=("image-file",), writes="views", Options=Options, run=run,
-              second_inputs={"model": SecondInput("model", search=False, default="models/default",
-                                              help="Model folder; the bundled model without it.")})
+              second_inputs={"model": SecondInput("model", search=False, default="models/default", foreign=True,
+                                              help="Model folder of gdtool train, or Wonder3D v1 as a folder or hub id; the bundled model without it.")})

@@ -3,7 +3,9 @@
 Takes a dataset folder (or any views folders with all six domains) of render-dataset and writes a model folder for
 sample-views: weights, configuration, card, loss curve and validation images. Use it to train the small configuration
 on a processor, to go on from a model you have (--start), or, with --preset paper, to grow Stable Diffusion to six
-domains. Killed at any time, the same line goes on where it was.
+domains. Killed at any time, the same line goes on where it was. Sources may be .tar files of views folders, plain or in
+WebDataset's naming. `torchrun --nproc_per_node N -m gdtool train …` trains in N processes (GDTOOL_SHARD=1 splits the
+weights as well). --plan tells what a configuration costs, without data.
 
 Example:
   gdtool render-dataset procedural:0..99 --size 64 -o objects && gdtool train objects --minutes 60 -o my-model
@@ -22,6 +24,8 @@ from gdtool.core.stage import Inputs, Output, SecondInput, Stage, file_option
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     preset: Annotated[Literal["small", "tiny", "paper"], Meta(description="Configuration to start from.")] = "small"
+    ablation: Annotated[Literal["none", "no_cross_domain", "one_way", "two_way", "no_pbr", "color_normal"],
+                        Meta(description="Part of the method to leave out or change; color_normal: Wonder3D's two domains.")] = "none"
     config: file_option("JSON file of changes to it: {\"model\": {...}, \"train\": {...}}.") = None
     steps: Annotated[int, Meta(ge=1, description="Optimiser steps; without it the preset's.")] | None = None
     minutes: Annotated[float, Meta(gt=0, description="Stop after so many minutes of training; the learning rate falls accordingly.")] | None = None
@@ -38,32 +42,20 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     import torch
 
-    from gdtool.diffusion.config import PRESETS
+    from gdtool.diffusion import distributed
     from gdtool.diffusion.curve import draw_curve
     from gdtool.diffusion.data import Objects, decode_dataset
-    from gdtool.diffusion.model import Model, parameter_count
+    from gdtool.diffusion.model import parameter_count
     from gdtool.diffusion.report import card, validation_grid
-    from gdtool.diffusion.training import run_training
-    from gdtool.diffusion.weights import check_shapes, load_model, save_model
+    from gdtool.diffusion.weights import save_model
     from gdtool.core.kinds import ModelContent
     from gdtool.images.io import write_png
 
     torch.set_num_threads(out.threads)
-    model_config, train_config = _configured(PRESETS[options.preset], options)
-    torch.manual_seed(options.seed)
-    model = Model(model_config)
+    model_config, train_config = configured(options)
     start = inputs.second["start"]
-    if start is not None:
-        loaded = load_model(start.path)
-        check_shapes(start.path, loaded.state_dict(), model.state_dict())
-        model.load_state_dict(loaded.state_dict())
-    elif model_config.codec == "vae":
-        from gdtool.diffusion.pretrained import start_from_pretrained
-
-        start_from_pretrained(model)
-
     with out.step("decode"):
-        folders, count = _objects(inputs)
+        folders, count = _objects(inputs, out.workspace)
         objects = decode_dataset(folders, count, model_config, out.workspace, warn=out.warn)
     held = min(options.held_out, len(objects) - 1)
     used = len(objects) - held
@@ -76,10 +68,12 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             grid = validation_grid(state, shown, train_config.precision)
             write_png(out.workspace / "validation" / f"step_{state.step:06d}.png", grid)
 
+    distributed.start()
+    order = {"model": model_config, "train": train_config, "start": start and start.path, "workspace": out.workspace.absolute(), "used": used,
+             "seed": options.seed, "minutes": options.minutes, "checkpoint_every": options.checkpoint_every, "device": out.device}
+    distributed.send(order)
     with out.step("train"):
-        state = run_training(model, objects, train_config, out.workspace, seed=options.seed, minutes=options.minutes,
-                             checkpoint_every=options.checkpoint_every, validate_every=options.validate_every, validate=validate,
-                             device=out.device, progress=out.progress)
+        state = _train(order, objects, validate_every=options.validate_every, validate=validate, progress=out.progress)
     with out.step("validate"):
         validate(state)
     save_model(out.path, model_config, state.average)
@@ -88,18 +82,78 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     for picture in sorted((out.workspace / "validation").glob("*.png")):
         shutil.copyfile(picture, out.path(f"validation/{picture.name}"))
     facts = {"objects": used, "steps": state.step, "training_minutes": round(state.seconds / 60, 1), "batch": train_config.batch,
-             "parameters": parameter_count(model), "threads": out.threads, "device": out.device}
+             "parameters": parameter_count(state.model), "threads": out.threads, "device": out.device,
+             "processes": distributed.size(), "ablation": options.ablation}
     out.path("card.md").write_text(card(options.preset, model_config, train_config, facts))
     out.content = ModelContent(preset=options.preset, image_size=model_config.image_size, domains=model_config.domains,
-                               parameters=parameter_count(model), steps=state.step,
+                               parameters=parameter_count(state.model), steps=state.step,
                                report={k: v for k, v in facts.items() if k not in ("parameters", "steps", "threads")})
 
 
-def _configured(preset, options: Options):
-    """The preset with the changes of --config and of the flags. Raises InputError naming what is wrong with the file."""
+def _train(order: dict, objects, **how):
+    """What every process does: the same model, the same data, its own part of each batch."""
+    import torch
+
+    from gdtool.diffusion.model import Model
+    from gdtool.diffusion.training import run_training
+    from gdtool.diffusion.weights import check_shapes, load_model
+
+    torch.manual_seed(order["seed"])
+    model = Model(order["model"])
+    if order["start"] is not None:
+        loaded = load_model(order["start"])
+        check_shapes(order["start"], loaded.state_dict(), model.state_dict())
+        model.load_state_dict(loaded.state_dict())
+    elif order["model"].codec == "vae":
+        from gdtool.diffusion.pretrained import start_from_pretrained
+
+        start_from_pretrained(model)
+    return run_training(model, objects, order["train"], order["workspace"], seed=order["seed"], minutes=order["minutes"],
+                        checkpoint_every=order["checkpoint_every"], device=order["device"], **how)
+
+
+def follow(threads: int) -> None:
+    """What a process of torchrun that is not the first does: wait for the first one's order, and train with it."""
+    import torch
+
+    from gdtool.diffusion import distributed
+    from gdtool.diffusion.data import Objects, decode_dataset
+
+    if threads:
+        torch.set_num_threads(threads)
+    order = distributed.receive()
+    if order is not None:
+        every = decode_dataset((), 0, order["model"], order["workspace"])
+        used = order["used"]
+        _train(order, Objects(every.planes[:used], every.conditions[:used], every.lights[:used], every.names[:used]))
+    distributed.release()
+
+
+def dismiss() -> None:
+    """The first process lets the others go, also where it had nothing to do."""
+    from gdtool.diffusion import distributed
+
+    distributed.release()
+
+
+def plan(options: Options, as_json: bool) -> str:
+    """What the training would cost, as text or as one JSON object."""
+    from gdtool.diffusion.plan import plan_of, text_of
+
+    report = plan_of(*configured(options))
+    return msgspec.json.encode(report).decode() if as_json else text_of(report)
+
+
+def configured(options: Options):
+    """The preset with the changes of the ablation, of --config and of the flags. Raises InputError for a bad file."""
     from pathlib import Path
 
+    from gdtool.diffusion.config import ABLATIONS, PRESETS
+
+    preset = PRESETS[options.preset]
     parts = [msgspec.to_builtins(part) for part in preset]
+    for part, changes in zip(parts, ABLATIONS[options.ablation], strict=True):
+        part.update(changes)
     if options.config is not None:
         path = Path(options.config)
         try:
@@ -120,18 +174,30 @@ def _configured(preset, options: Options):
         raise InputError(options.config or "configuration", str(error)) from None
 
 
-def _objects(inputs: Inputs):
-    """The views folders among the sources, those of datasets opened one by one, and how many there are."""
+def _objects(inputs: Inputs, workspace):
+    """The views folders among the sources, those of datasets and archives opened one by one, and how many there are."""
+    import itertools
+    from pathlib import Path
+
     from gdtool.core.folder import open_folder
 
-    paths = []
+    parts, total = [], 0
+
+    def opened(paths):
+        return (open_folder(path, ("views",), "train", check=False) for path in paths)
+
     for source in inputs.all:
-        if source.kind == "dataset":
-            paths += [source.file(one.path) for one in source.content.objects]
-        else:
-            paths.append(source.path)
-    return (open_folder(path, ("views",), "train", check=False) for path in paths), len(paths)
+        if isinstance(source, Path):
+            from gdtool.diffusion.archives import object_count, views_of
+
+            total += object_count(source)
+            parts.append(views_of(source, workspace))
+            continue
+        paths = [source.path] if source.kind == "views" else [source.file(one.path) for one in source.content.objects]
+        total += len(paths)
+        parts.append(opened(paths))
+    return itertools.chain.from_iterable(parts), total
 
 
-STAGE = Stage(name="train", version=1, reads=("dataset", "views"), writes="model", Options=Options, run=run, gathers=True,
+STAGE = Stage(name="train", version=2, reads=("dataset", "views", "archive-file"), writes="model", Options=Options, run=run, gathers=True,
               second_inputs={"start": SecondInput("model", search=False, help="Model folder whose weights to start from.")})

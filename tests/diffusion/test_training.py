@@ -152,7 +152,8 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
 
 def test_training_lowers_the_error(tmp_path):
     torch.manual_seed(0)
-    options = msgspec.structs.replace(TRAIN, steps=60, batch=2, pbr_weight=0.0, phases=(Phase(learning_rate=3e-3),), precision="float32")
+    options = msgspec.structs.replace(TRAIN, steps=60, batch=2, pbr_weight=0.0, pure_noise=1.0, phases=(Phase(learning_rate=3e-3),),
+                                    precision="float32")
     state = run_training(Model(MODEL), spheres(), options, tmp_path, seed=0)
     rows = list(csv.DictReader(open(tmp_path / "loss.csv")))
     first, last = (np.mean([float(r["loss"]) for r in part]) for part in (rows[:5], rows[-5:]))

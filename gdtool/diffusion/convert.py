@@ -1,0 +1,52 @@
+"""Pickled weights to safetensors, isolated: python -m gdtool.diffusion.convert FILE_OR_FOLDER …
+
+A pickle can run code. Here only tensors are rebuilt (torch.load with weights_only), in a child process with limits on
+time and memory whose one result is the safetensors file, written beside the pickle, which stays.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+PICKLES = (".bin", ".pt", ".pth", ".ckpt")
+NAMES = {"pytorch_model.bin": "model.safetensors"}  # transformers names the two differently
+
+
+def convert(source: str, target: str) -> int:
+    """Write the tensors of a pickle as safetensors; returns how many. Runs in the child."""
+    import torch
+    from safetensors.torch import save_file
+
+    tensors = torch.load(source, map_location="cpu", weights_only=True)
+    tensors = tensors.get("state_dict", tensors)
+    kept = {name: x.detach().clone().contiguous() for name, x in tensors.items() if isinstance(x, torch.Tensor)}
+    if not kept:
+        raise ValueError("holds no tensors")
+    partial = Path(f"{target}.partial")
+    save_file(kept, partial, metadata={"format": "pt"})
+    partial.chmod(0o644)
+    partial.replace(target)
+    return len(kept)
+
+
+def main(arguments: list[str]) -> int:
+    from gdtool.core.child import ChildFailed, call
+
+    paths = [p for a in arguments for p in (sorted(Path(a).rglob("*")) if Path(a).is_dir() else [Path(a)]) if p.suffix in PICKLES]
+    if not paths:
+        print("convert: names no .bin, .pt, .pth or .ckpt file", file=sys.stderr)
+        return 2
+    for path in paths:
+        target = path.with_name(NAMES.get(path.name, path.stem + ".safetensors"))
+        try:
+            count = call("gdtool.diffusion.convert:convert", str(path), str(target), seconds=600, memory_mb=20000)
+        except ChildFailed as error:
+            print(f"convert: {path}: is not a pickle of tensors alone ({str(error).splitlines()[-1][:200]})", file=sys.stderr)
+            return 3
+        print(f"{target}: {count} tensors", file=sys.stderr)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,71 @@
+"""What --plan computes without data or numbers, against what a small step does."""
+
+import msgspec
+import pytest
+import torch
+from torch.profiler import ProfilerActivity, profile
+from torch.utils.flop_counter import FlopCounterMode
+
+from gdtool.diffusion.attention import Layout
+from gdtool.diffusion.config import PRESETS, Phase
+from gdtool.diffusion.model import Model, parameter_count
+from gdtool.diffusion.plan import plan_of, step_cost
+
+CONFIG = msgspec.structs.replace(PRESETS["tiny"][0], image_size=32, channels=(32, 64), encoder_width=32)
+
+
+def measured_step(config, objects, count):
+    torch.manual_seed(0)
+    model = Model(config).train()
+    layout, views = Layout(objects, (0, 1, 2), 2), torch.arange(2)
+    rgba = torch.rand(objects, 4, 32, 32)
+    noisy = torch.randn(model.latent_shape(layout))
+    condition = model.condition_latents(rgba, layout, views)
+    with count:
+        out = model.predict_clean(noisy, condition, torch.full((objects,), 500), model.encoder(rgba), layout, views)
+        (out - noisy).square().mean().backward()
+    return model
+
+
+@pytest.mark.parametrize("checkpointing", [False, True])
+def test_flops_are_those_of_a_real_step(checkpointing):
+    config = msgspec.structs.replace(CONFIG, gradient_checkpointing=checkpointing)
+    counter = FlopCounterMode(display=False)
+    measured_step(config, 2, counter)
+    planned = step_cost(config, 3, 2, 2, fused=False, dtype=torch.float32)["flops"]
+    assert planned == counter.get_total_flops() > 1e8
+
+
+@pytest.mark.parametrize("checkpointing", [False, True])
+def test_memory_is_what_the_profiler_sees(checkpointing):
+    """The allocator's own events of a real step, their running sum's maximum, less the gradients that stay."""
+    config = msgspec.structs.replace(CONFIG, gradient_checkpointing=checkpointing)
+    profiler = profile(activities=[ProfilerActivity.CPU], profile_memory=True)
+    model = measured_step(config, 2, profiler)
+    live = peak = 0
+    for event in sorted((e for e in profiler.profiler.kineto_results.events() if e.name() == "[memory]"), key=lambda e: e.start_ns()):
+        live += event.nbytes()
+        peak = max(peak, live)
+    gradients = sum(p.numel() * 4 for p in model.parameters() if p.grad is not None)
+    planned = step_cost(config, 3, 2, 2, fused=False, dtype=torch.float32)["bytes"]
+    assert planned == pytest.approx(peak - gradients, rel=0.2)
+
+
+def test_a_plan_adds_up():
+    train = msgspec.structs.replace(PRESETS["tiny"][1], batch=4, accumulate=2, steps=10,
+                                    phases=(Phase(share=0.5, domains=1, views=2), Phase(domains=6, views=6)))
+    plan = plan_of(CONFIG, train)
+    assert plan["weights"] == parameter_count(Model(CONFIG)) and plan["weights_bytes"] == 20 * plan["weights"]
+    assert [p["steps"] for p in plan["phases"]] == [5, 5] and plan["phases"][1]["objects_at_once"] == 2
+    assert plan["phases"][1]["flops_per_step"] > 10 * plan["phases"][0]["flops_per_step"]
+    hours = plan["hours"]["H100 80 GB"]
+    total = sum(p["steps"] * p["flops_per_step"] for p in plan["phases"])
+    assert hours["1"] == pytest.approx(total / (989e12 * plan["utilisation"]) / 3600)
+    assert hours["1"] / 8 < hours["8"]
+
+
+def test_the_command_needs_no_data(gdtool):
+    result = gdtool("train", "--plan", "--preset", "tiny", "--json")
+    assert result.returncode == 0, result.stderr
+    plan = msgspec.json.decode(result.stdout)
+    assert plan["weights"] > 1000 and set(plan["hours"]["A100 80 GB"]) == {"1", "8", "fits"}
