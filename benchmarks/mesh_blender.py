@@ -56,7 +56,8 @@ def main() -> None:
         mesh.vertices.foreach_get("co", points)
         mesh.loops.foreach_get("vertex_index", vertex)
         loops = corners(mesh)
-        np.savez(target, vertices=points.reshape(-1, 3).astype(np.float64), faces=np.where(loops < 0, -1, vertex[loops]).astype(np.int64), seconds=seconds)
+        found = np.where(loops < 0, -1, vertex[loops]).astype(np.int64)
+        np.savez(target, vertices=points.reshape(-1, 3).astype(np.float64), faces=found, seconds=seconds)
         return
     bpy.ops.object.mode_set(mode="EDIT")
     bpy.ops.mesh.select_all(action="SELECT")
@@ -71,7 +72,8 @@ def main() -> None:
     keyed = np.concatenate([vertex[:, None], np.round(uv.reshape(-1, 2) * 2**20)], 1)
     _, first, inverse = np.unique(keyed, axis=0, return_index=True, return_inverse=True)
     loops = corners(mesh)
-    np.savez(target, uv=uv.reshape(-1, 2)[first].astype(np.float64), face_uvs=np.where(loops < 0, -1, inverse.ravel()[loops]).astype(np.int64), seconds=seconds)
+    face_uvs = np.where(loops < 0, -1, inverse.ravel()[loops]).astype(np.int64)
+    np.savez(target, uv=uv.reshape(-1, 2)[first].astype(np.float64), face_uvs=face_uvs, seconds=seconds)
 
 
 main()

@@ -4,8 +4,8 @@
 
 Writes remesh.md, remesh.json, remesh.png and the wireframes remesh_sheet.png, row by row: killed, it goes on where it was. The
 knobs are swept on the solids of --sweep; the slow peers (QuadriFlow, Blender's through a Python that has bpy) run on the
-models of --slow-on; everything else on everything. Models get --model-input triangles. Every run is a child process with a time limit; seconds are of its wall clock
-and of the processor, from arrays in memory to arrays in memory. Lengths are shares of the bounding box' diagonal. A crease
+models of --slow-on; everything else on everything. Models get --model-input triangles. Every run is a child process with a
+time limit; seconds are of its wall clock and of the processor, from arrays in memory to arrays in memory. Lengths are shares of the bounding box' diagonal. A crease
 of the truth is recalled where a sharp edge (30 degrees) of the result is within 0.2 % of the diagonal.
 """
 

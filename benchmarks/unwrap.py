@@ -4,8 +4,8 @@
 
 Writes unwrap.md, unwrap.json, unwrap.png and the layouts unwrap_sheet.png, row by row: killed, it goes on where it was. Models
 that are quads already are taken as they are; others as remesh.py left them, or are remeshed first. The knobs are swept and
-brute force is tried on the models of --sweep. All leave two texels between charts at 1024. Every run is a child process with a time limit; mirrored is a share of
-the area, overlap a share of what is covered.
+brute force is tried on the models of --sweep. All leave two texels between charts at 1024. Every run is a child process with
+a time limit; mirrored is a share of the area, overlap a share of what is covered.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from rows import Rows
 from wireframe import file_name, sheet
 
 SIZE, PADDING = 1024, 2
-WAYS = {"ours": {}, "ours, stretch 1.001": {"good_stretch": 1.001}, "ours, stretch 1.005": {"good_stretch": 1.005}, "ours, cost 1": {"max_cost": 1.0}, "ours, cost 4": {"max_cost": 4.0}}
+WAYS = {"ours": {}, "ours, stretch 1.001": {"good_stretch": 1.001}, "ours, stretch 1.005": {"good_stretch": 1.005},
+        "ours, cost 1": {"max_cost": 1.0}, "ours, cost 4": {"max_cost": 4.0}}
 BLENDER = "Blender Smart UV"
 BRUTE = "xatlas, brute force"
 PEERS = {"xatlas": False, "xatlas, brute force": True}

@@ -87,7 +87,8 @@ class _Shapes:
                 h, w = mask.shape
                 at = at * cells_per_unit + gap / 2
                 # As np.rot90 turns the mask: its rows are v, its columns u.
-                uvs += [at, np.stack([at[:, 1], w - at[:, 0]], -1), np.stack([w - at[:, 0], h - at[:, 1]], -1), np.stack([h - at[:, 1], at[:, 0]], -1)]
+                u, v = at.T
+                uvs += [at, np.stack([v, w - u], -1), np.stack([w - u, h - v], -1), np.stack([h - v, u], -1)]
                 masks += [np.rot90(mask, quarter) for quarter in range(4)]
             padded = np.zeros((len(masks), self.fft_side, self.fft_side), np.float32)
             for at, mask in zip(padded, masks, strict=True):

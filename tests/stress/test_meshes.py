@@ -85,7 +85,8 @@ def survives(gdtool, source, faces: int = 200) -> None:
         return
     mesh = read_mesh(open_folder(Path(source).with_name("made") / "mesh"))
     assert np.isfinite(mesh.vertices).all() and mesh.is_quad.all() and repair.is_manifold(mesh.faces)
-    for stage in (("unwrap", "made/mesh", "--size", 256, "--padding", 1), ("unwrap", source, "--redo", "--size", 256, "--padding", 1, "-o", "made/own")):
+    small = "--size", 256, "--padding", 1
+    for stage in (("unwrap", "made/mesh", *small), ("unwrap", source, "--redo", *small, "-o", "made/own")):
         run = gdtool(*stage)
         assert run.returncode in (0, 3) and "Traceback" not in run.stderr, run.stderr[-500:]
         if run.returncode == 0:
