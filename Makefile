@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-reconstruct bench-render bench-relight bench-sample bench-sheets bench-throughput schemas docs-check model data clean
+.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-materials bench-reconstruct bench-render bench-relight bench-sample bench-sheets bench-throughput schemas docs-check model data clean
 
 venv: .venv/.done
 
@@ -47,6 +47,10 @@ bench-assets: venv
 	$(BIN)/python benchmarks/unwrap.py $(wildcard $(MESHES)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
 	$(BIN)/python benchmarks/bake.py $(wildcard $(TEXTURED)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
 	$(BIN)/python benchmarks/asset.py $(wildcard $(TEXTURED)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
+
+# Materials of reconstructed surfaces, from material views and from color alone, with and without visibility.
+bench-materials: venv
+	$(BIN)/python benchmarks/materials.py $(ARGS)
 
 # Reconstruction beside its peers, on public models in ../shared/assets (where there are any) and procedural objects: a quarter
 # of an hour. ARGS=--all for every disturbance and budget of every model (hours), ARGS="--models DIR" for models of your own.
