@@ -10,7 +10,8 @@ import pytest
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.cameras import camera_at, rays, rig
 from gdtool.shading.environment import Environment
-from gdtool.shading.render import Renderer, pixel_pattern, render_buffers, render_color
+from gdtool.shading.pattern import pixel_pattern
+from gdtool.shading.render import Renderer, render_buffers, render_color
 from gdtool.shading.surface_points import surface_attributes
 
 GREY = Material(base_color=(0.5, 0.25, 0.125, 1.0), metallic=0.0, roughness=0.5)
