@@ -3,7 +3,8 @@
   python benchmarks/contact_sheets.py MODEL... --lights mid,a.hdr,b.hdr --peers-python PYTHON -o out/sheets
 
 Writes a sheet a light: a row a model, and the PSNR of gdtool's picture against each peer's. The renderers' scenes are close and not
-the same: Mitsuba has neither emission nor alpha. Pictures that are there already are kept, so a killed run goes on. Do not publish
+the same: Mitsuba has neither emission nor alpha, and vertex colors in place of a texture, not over it; Blender poses rigged models as their
+animation begins. Pictures that are there already are kept, so a killed run goes on. Do not publish
 sheets of models whose licence does not allow it.
 """
 
