@@ -161,8 +161,8 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, cells: int = 5
     many = len(charts) > _MANY
     cells = min(cells, 288) if many else cells
     ways = _way(boxed, max(min(_STARTS, 300 // len(charts)), 2))
-    for lowest in (0.45, 0.15):
-        ranked = _search(boxed, area, gap, ways, cells * 5 // 16, lowest)
+    for lowest, tried in ((0.45, ways), (0.15, ways[:3])):
+        ranked = _search(boxed, area, gap, tried, cells * 5 // 16, lowest)
         if ranked:
             break
     else:
@@ -214,19 +214,25 @@ def _search(boxed: list, area: float, gap: float, ways: list, cells: int,
     shapes = _Shapes(boxed, cells * (0.66 / area) ** 0.5, gap * cells, side_most)
     ranked = []
     best_side = side_most
-    for order, contact in ways:
-        # Down in large steps while it goes, then up or down in small ones.
+    for turn, (order, contact) in enumerate(ways):
+        if turn == 2 and not ranked:
+            break  # ill-shaped charts: the others would not do either
         side, reached = min(best_side, cells), None
-        step = max(cells // 32, 1)
+        step = max(int(0.03 * cells if lowest > 0.4 else 0.12 * cells), 1)
         while side <= side_most and not (ranked and side > 1.04 * best_side):
             reached = shapes.place(order, side, contact)
             if reached is not None:
                 break
             side += step
-        while reached is not None and (smaller := shapes.place(order, side - 2, contact)) is not None:
-            side, reached = side - 2, smaller
+        step = max(step // 2, 2)
+        while reached is not None and step >= 2:
+            smaller = shapes.place(order, side - step, contact)
+            if smaller is None:
+                step //= 2
+            else:
+                side, reached = side - step, smaller
         if reached is not None:
-            ranked.append((0.66 * (cells / side) ** 2, order, contact, [turn for turn, _, _ in reached]))
+            ranked.append((0.66 * (cells / side) ** 2, order, contact, [placed[0] for placed in reached]))
             best_side = min(best_side, side)
     return sorted(ranked, key=lambda way: -way[0])
 
