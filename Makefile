@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-materials bench-reconstruct bench-render bench-relight bench-sample bench-sheets bench-throughput schemas docs-check model data clean
+.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-materials bench-reconstruct bench-render bench-relight bench-sheets bench-throughput schemas docs-check model data clean
 
 venv: .venv/.done
 
@@ -75,11 +75,6 @@ bench-sheets: venv
 # Objects per core-minute of render-dataset, by cores and by objects; goes on where it was.
 bench-throughput: venv
 	$(BIN)/python benchmarks/throughput.py
-
-# Time against error of sampling, and how well sampled views fit one another and their truth: about a quarter of an hour.
-bench-sample: venv
-	$(BIN)/python benchmarks/sample.py $(if $(HELD_OUT),$(HELD_OUT))
-	$(if $(HELD_OUT),$(BIN)/python benchmarks/consistency.py $(HELD_OUT))
 
 docs-check: venv
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python tests/tools/docs_check.py

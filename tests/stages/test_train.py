@@ -52,7 +52,7 @@ def test_a_killed_training_goes_on_where_it_was(gdtool, spheres, tmp_path):
     assert gdtool(*line, "-o", "whole").returncode == 0
     process = subprocess.Popen([sys.executable, "-m", "gdtool", *line, "-o", "killed"], cwd=tmp_path, stderr=subprocess.DEVNULL,
                                env={**os.environ, "OMP_NUM_THREADS": "1"})
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 240  # the machine may be busy
     while not list(tmp_path.glob(".*/checkpoint.safetensors")) + list(tmp_path.glob("*/checkpoint.safetensors")):
         assert process.poll() is None and time.monotonic() < deadline, "no checkpoint was written"
         time.sleep(0.02)
