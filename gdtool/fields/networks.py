@@ -39,6 +39,7 @@ class SdfNetwork(nn.Module):
     def __init__(self, radius: float = 0.4, layers: int = 8, width: int = WIDTH, skip: int = 4):
         super().__init__()
         self.skip = skip
+        self.register_buffer("window", torch.ones(ENCODED), persistent=False)
         sizes = [(ENCODED if k == 0 else width, width - ENCODED if k == skip - 1 else width) for k in range(layers)]
         self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in sizes)
         self.last = nn.Linear(width, 1)
@@ -62,12 +63,31 @@ class SdfNetwork(nn.Module):
 
     def forward(self, points: Tensor) -> Tensor:
         """Signed distance (...) of points (..., 3), negative inside."""
-        x = encoded = encode(points)
+        x = encoded = encode(points) * self.window
         for k, layer in enumerate(self.hidden):
             if k == self.skip:
                 x = torch.cat([x, encoded], -1) / math.sqrt(2)
             x = nn.functional.softplus(layer(x), beta=100)
         return self.last(x)[..., 0]
+
+    def show_frequencies(self, count: float) -> None:
+        """Let the first count frequencies of the encoding through, the next one in part, and no other."""
+        share = (count - torch.arange(FREQUENCIES, device=self.window.device)).clamp(0, 1).repeat_interleave(3)
+        self.window[3:3 + 6 * FREQUENCIES] = torch.cat([share, share])
+
+    def turn_outward(self) -> bool:
+        """Change the sign of a field that is negative on the box of side 2 around the object; says whether it was.
+
+        Fitting alone gets a field that starts inside out around only slowly: every value has to pass through zero.
+        """
+        corners = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * 3)
+        corners = corners[corners.abs().amax(1) > 0].to(self.window.device)
+        with torch.no_grad():
+            turned = bool(self(corners).median() < 0)
+            if turned:
+                self.last.weight.neg_()
+                self.last.bias.neg_()
+        return turned
 
     def with_gradient(self, points: Tensor, create_graph: bool = True) -> tuple[Tensor, Tensor]:
         """Signed distance (...) and its gradient (..., 3)."""

@@ -6,6 +6,7 @@ explicit surface points. Whatever the views hold is used, whatever they do not i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -13,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gdtool.fields.networks import MaterialNetwork, SdfNetwork
+from gdtool.fields.networks import FREQUENCIES, MaterialNetwork, SdfNetwork
 from gdtool.fields.surface_sampling import (first_crossing, implicit_points, median_of_cdf, neus_weights, secant_root, unit)
 from gdtool.shading.closed_form import shade
 from gdtool.shading.lights import fibonacci
@@ -21,6 +22,7 @@ from gdtool.shading.sg import SphericalGaussians
 
 SAMPLES, NARROW = 64, 8  # along a ray, and between the crossing's two ends
 LIGHTS = 16
+DISTANCE_RATE = 2e-3  # of Adam, at its highest, while distances are fitted
 WEIGHTS = {"depth": 10.0, "normal": 1.0, "color": 1.0, "material": 1.0, "mask": 1.0, "eikonal": 0.1}
 
 
@@ -64,37 +66,54 @@ def start(seed: int, device: str) -> Fit:
     return Fit(sdf, material, light, torch.tensor(float(np.log(60.0)), device=device, requires_grad=True))
 
 
-def fit_distances(fit: Fit, sample: Callable[[int], tuple[np.ndarray, np.ndarray]], steps: int, batch: int, track,
-                  out_of_time: Callable[[], bool]) -> float:
-    """Fit the SDF network to known distances: sample(n) gives points (n, 3) and distances (n,). Returns the last mean error."""
+def one_cycle(progress: float, warm: float = 0.1) -> float:
+    """Factor of the learning rate: up in a line to 1 at warm, then down to 0 at progress 1 along a cosine."""
+    if progress < warm:
+        return max(progress / warm, 0.01)
+    return 0.5 * (1 + math.cos(math.pi * min((progress - warm) / (1 - warm), 1.0)))
+
+
+def fit_distances(fit: Fit, sample: Callable[[int], tuple[Tensor, Tensor]], steps: int, batch: int, track,
+                  spent: Callable[[], float], half_share: float = 0.0) -> float:
+    """Fit the SDF network to known distances: sample(n) gives points (n, 3) and distances (n,). Returns the last mean error.
+
+    spent() is the share of the time that is gone: the schedule follows it where it is ahead of the steps, so that it ends
+    with a small rate whatever the machine. half_share: of the schedule, with layers in bfloat16; their last digit is a
+    few thousandths of the object, so the rest has to be float32. Frequencies are let in one by one over the first half.
+    """
     device = fit.light.device
-    optimiser = torch.optim.Adam(fit.sdf.parameters(), lr=1e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2e-3, total_steps=max(steps, 4), pct_start=0.2)
+    optimiser = torch.optim.Adam(fit.sdf.parameters(), lr=0.0)
     error = 0.0
-    for _ in track(steps, "fit distances"):
-        points, distances = (torch.as_tensor(x, dtype=torch.float32, device=device) for x in sample(batch))
-        gap = (fit.sdf(points) - distances).abs()
+    fit.sdf.turn_outward()
+    for k in track(steps, "fit distances"):
+        progress = max(k / steps, spent())
+        if progress >= 1:
+            break
+        optimiser.param_groups[0]["lr"] = DISTANCE_RATE * one_cycle(progress)
+        fit.sdf.show_frequencies(3 + (FREQUENCIES - 3) * 2 * progress)
+        points, distances = sample(batch)
+        with torch.autocast(device.type, torch.bfloat16, enabled=progress < half_share):
+            found = fit.sdf(points)
+        gap = (found.float() - distances).abs()
         # Far from the surface the sign and the rough size are enough.
         loss = (gap / (1 + 10 * distances.abs())).mean()
         optimiser.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(fit.sdf.parameters(), 1.0)
         optimiser.step()
-        schedule.step()
         error = 0.95 * error + 0.05 * float(gap.detach().mean()) if error else float(gap.detach().mean())
-        if out_of_time():
-            break
+    fit.sdf.show_frequencies(FREQUENCIES)
     return error
 
 
 def find_surface(sdf: SdfNetwork, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, rule: str = "secant",
-                 sharpness: float = 300.0) -> tuple[Tensor, Tensor, Tensor]:
+                 sharpness: float = 300.0, samples: int = SAMPLES) -> tuple[Tensor, Tensor, Tensor]:
     """Depth along rays (n,) of the first crossing, whether there is one (n,), and the point of least distance (n, 3).
 
     rule: "median" of the CDF of eight samples between the crossing's ends, or "secant" through them.
     """
     with torch.no_grad():
-        share = torch.linspace(0, 1, SAMPLES, device=origins.device)
+        share = torch.linspace(0, 1, samples, device=origins.device)
         t = near[:, None] + (far - near)[:, None] * share
         values = sdf(origins[:, None] + t[..., None] * directions[:, None])
         found, idx = first_crossing(values)
@@ -136,10 +155,11 @@ def volume_losses(fit: Fit, pixels: Pixels, chosen: Tensor) -> dict[str, Tensor]
     return losses
 
 
-def surface_losses(fit: Fit, pixels: Pixels, chosen: Tensor, rule: str, brdf: str) -> dict[str, Tensor]:
+def surface_losses(fit: Fit, pixels: Pixels, chosen: Tensor, rule: str, brdf: str,
+                   samples: int = SAMPLES) -> dict[str, Tensor]:
     """Losses at explicit surface points, and of rays that hit where the mask is empty or miss where it is full."""
     origins, directions, inside = pixels.origins[chosen], pixels.directions[chosen], pixels.inside[chosen]
-    depth, found, closest = find_surface(fit.sdf, origins, directions, pixels.near[chosen], pixels.far[chosen], rule)
+    depth, found, closest = find_surface(fit.sdf, origins, directions, pixels.near[chosen], pixels.far[chosen], rule, samples=samples)
     losses: dict[str, Tensor] = {}
     wrong = found != inside
     if wrong.any():
@@ -150,7 +170,6 @@ def surface_losses(fit: Fit, pixels: Pixels, chosen: Tensor, rule: str, brdf: st
         return losses
     here = origins[good] + depth[good, None] * directions[good]
     value, gradient = fit.sdf.with_gradient(here)
-    value = fit.sdf(here)
     points = implicit_points(here, directions[good], value, gradient)
     normal = unit(gradient)
     wanted = {name: v[chosen][good] for name, v in pixels.values.items()}
@@ -181,31 +200,34 @@ def tone(radiance: Tensor) -> Tensor:
 
 
 def train(fit: Fit, pixels: Pixels, *, volume_steps: int, surface_steps: int, batch: int, seed: int, rule: str, brdf: str, track,
-          out_of_time: Callable[[], bool]) -> int:
-    """Volume start, then explicit surface; returns the steps done. out_of_time() true ends it early."""
+          spent: Callable[[], float], samples: int = SAMPLES) -> int:
+    """Volume start, then explicit surface; returns the steps done. spent(): share of the time that is gone, as in fit_distances."""
     generator = torch.Generator().manual_seed(seed)
     device = fit.light.device
     parameters = [{"params": fit.sdf.parameters(), "lr": 2e-4}, {"params": fit.material.parameters(), "lr": 2e-3},
                   {"params": [fit.light], "lr": 1e-2}, {"params": [fit.sharpness], "lr": 5e-3}]
     optimiser = torch.optim.Adam(parameters)
+    highest = [group["lr"] for group in parameters]
     steps = volume_steps + surface_steps
 
-    def rate(k: int) -> float:
-        # Adam's first steps move every weight by the full rate: without a warm-up they undo the fitted start.
-        return min(1.0, (k + 1) / 30) * (0.05 + 0.475 * (1 + float(np.cos(np.pi * k / max(steps, 1)))))
-
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, rate)
     hits, misses = (torch.nonzero(x)[:, 0].cpu() for x in (pixels.inside, ~pixels.inside))
-    done = 0
+    done, gone = 0, spent()
     for k in track(steps, "networks"):
-        volume = k < volume_steps
+        # The clock counts from where this began; the start before it has spent its own share.
+        progress = max(k / steps, (spent() - gone) / max(1 - gone, 1e-6))
+        if progress >= 1:
+            break
+        # Adam's first steps move every weight by the full rate: without a warm-up they undo the fitted start.
+        for group, rate in zip(optimiser.param_groups, highest, strict=True):
+            group["lr"] = rate * min(1.0, (k + 1) / 30) * max(one_cycle(progress, 0.0), 0.02)
+        volume = progress < volume_steps / steps
         size = batch // 4 if volume else batch
         share = size * 3 // 4 if len(misses) else size
         pick = hits[torch.randint(len(hits), (share,), generator=generator)]
         if len(misses):
             pick = torch.cat([pick, misses[torch.randint(len(misses), (size - share,), generator=generator)]])
         pick = pick.to(device)
-        losses = volume_losses(fit, pixels, pick) if volume else surface_losses(fit, pixels, pick, rule, brdf)
+        losses = volume_losses(fit, pixels, pick) if volume else surface_losses(fit, pixels, pick, rule, brdf, samples)
         if not volume:
             around = (torch.rand(size // 4, 3, generator=generator) * 1.1 - 0.55).to(device)
             losses["eikonal"] = losses.get("eikonal", 0.0) + ((fit.sdf.with_gradient(around)[1].norm(dim=-1) - 1) ** 2).mean()
@@ -214,10 +236,7 @@ def train(fit: Fit, pixels: Pixels, *, volume_steps: int, surface_steps: int, ba
         loss.backward()
         torch.nn.utils.clip_grad_norm_([p for group in parameters for p in group["params"]], 1.0)
         optimiser.step()
-        schedule.step()
         done = k + 1
         if k % 20 == 0 or done == steps:
             fit.history.append({"step": float(done), **{name: float(value.detach()) for name, value in losses.items()}})
-        if out_of_time():
-            break
     return done

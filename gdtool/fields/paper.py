@@ -11,13 +11,21 @@ import numpy as np
 from gdtool.cameras import Camera, rays
 from gdtool.geometry.grids import band_cells, extract, fine_points, grid_over
 
-_REACH = 0.08  # world units around the first geometry in which a ray looks for the surface
+# World units around the first geometry in which a ray looks for the surface, and its samples there: by whether depth
+# shaped it, or only normals and silhouettes did.
+_MEASURED, _BOUNDED = (0.03, 24), (0.08, 64)
+POOL = 150_000  # points whose distances are known
+START_SHARE = 0.33  # of the budget, at most: the views are what is to be fitted
+HALF_SHARE = 0.6  # of the start, in bfloat16
 _RIM = 16  # pixels beside the silhouette whose rays must miss
 
 
 @dataclass(frozen=True)
 class PaperOptions:
-    """How long and how. steps of the three phases; rule "median" or "secant"; budget in seconds, 0: none."""
+    """How long and how. steps of the three phases; rule "median" or "secant"; budget in seconds, 0: none.
+
+    precision "bfloat16": of the networks' layers while distances are first fitted.
+    """
 
     distance_steps: int = 400
     volume_steps: int = 0
@@ -28,6 +36,7 @@ class PaperOptions:
     seed: int = 0
     budget: float = 0.0
     device: str = "cpu"
+    precision: str = "float32"
 
 
 def distance_pool(vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -44,7 +53,7 @@ def distance_pool(vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.r
 
 
 def gather_pixels(cameras: list[Camera], mask: np.ndarray, images: dict[str, np.ndarray], vertices: np.ndarray, faces: np.ndarray,
-                  device: str):
+                  device: str, reach: float):
     """Pixels of all views for networks_fit: those fully inside, and those outside near the silhouette."""
     import torch
     from scipy.ndimage import distance_transform_edt
@@ -65,9 +74,12 @@ def gather_pixels(cameras: list[Camera], mask: np.ndarray, images: dict[str, np.
         hit = caster.first_hit(origins, directions)
         middle = -(origins * directions).sum(1)
         half = np.sqrt(np.maximum(radius ** 2 - ((origins + middle[:, None] * directions) ** 2).sum(1), 1e-4))
-        found = hit.face_idx >= 0
-        near = np.where(found & inside[chosen], hit.distance - _REACH, middle - half)
-        far = np.where(found & inside[chosen], hit.distance + _REACH, middle + half)
+        found = (hit.face_idx >= 0) & inside[chosen]
+        place = np.where(found, hit.distance, 0.0)
+        place[~found] = closest_approach(origins[~found], directions[~found], (middle - half)[~found], (middle + half)[~found], vertices)
+        # A ray that has to miss passes the surface at some distance: a wider part of it is watched.
+        around = np.where(found, reach, max(2 * reach, 0.06))
+        near, far = place - around, place + around
         row = {"origins": origins, "directions": directions, "inside": inside[chosen], "near": near, "far": far}
         for name, stack in images.items():
             value = stack[k][chosen]
@@ -79,6 +91,18 @@ def gather_pixels(cameras: list[Camera], mask: np.ndarray, images: dict[str, np.
                                     dtype=torch.bool if name == "inside" else torch.float32) for name, value in parts.items()}
     fixed = ("origins", "directions", "inside", "near", "far")
     return Pixels(*(joined[name] for name in fixed), {n: v for n, v in joined.items() if n not in fixed})
+
+
+def closest_approach(origins: np.ndarray, directions: np.ndarray, near: np.ndarray, far: np.ndarray, vertices: np.ndarray,
+                     samples: int = 32) -> np.ndarray:
+    """Where along rays (n, 3) between near and far (n,) one of samples points is nearest to a vertex: distances (n,)."""
+    from scipy.spatial import cKDTree
+
+    share = (np.arange(samples) + 0.5) / samples
+    along = near[:, None] + (far - near)[:, None] * share
+    points = origins[:, None] + along[..., None] * directions[:, None]
+    distance = cKDTree(vertices[::4]).query(points.reshape(-1, 3), workers=-1)[0].reshape(along.shape)
+    return np.take_along_axis(along, distance.argmin(1)[:, None], 1)[:, 0]
 
 
 def evaluate_sdf(sdf, points: np.ndarray, device: str, chunk: int = 1 << 17) -> np.ndarray:
@@ -129,26 +153,29 @@ def fit_networks(cameras: list[Camera], mask: np.ndarray, images: dict[str, np.n
 
     Returns the Fit and a dict of figures (errors, steps done, whether the budget ended it).
     """
+    import torch
+
     from gdtool.fields.networks_fit import fit_distances, start, train
 
     rng = np.random.default_rng(options.seed)
     began = time.monotonic()
     fit = start(options.seed, options.device)
-    points, distances = distance_pool(vertices, faces, 120_000, rng)
+    pool = distance_pool(vertices, faces, POOL, rng)
+    points, distances = (torch.as_tensor(x, dtype=torch.float32, device=options.device) for x in pool)
 
     def sample(n: int):
-        pick = rng.integers(0, len(points), n)
+        pick = torch.as_tensor(rng.integers(0, len(points), n), device=options.device)
         return points[pick], distances[pick]
 
-    def over(share: float) -> bool:
-        return bool(options.budget) and time.monotonic() - began > share * options.budget
+    def spent(share: float) -> float:
+        return (time.monotonic() - began) / (share * options.budget) if options.budget else 0.0
 
-    # A third of the budget goes to the start at most: the views are what is to be fitted.
-    error = fit_distances(fit, sample, options.distance_steps, 4096, track, lambda: over(0.33))
-    pixels = gather_pixels(cameras, mask, images, vertices, faces, options.device)
+    error = fit_distances(fit, sample, options.distance_steps, 4096, track, lambda: spent(START_SHARE),
+                          HALF_SHARE if options.precision == "bfloat16" else 0.0)
+    reach, samples = _MEASURED if "depth" in images else _BOUNDED
+    pixels = gather_pixels(cameras, mask, images, vertices, faces, options.device, reach)
     done = train(fit, pixels, volume_steps=options.volume_steps, surface_steps=options.surface_steps, batch=options.batch,
-                 seed=options.seed, rule=options.rule, brdf=options.brdf, track=track,
-                 out_of_time=lambda: over(1.0))
+                 seed=options.seed, rule=options.rule, brdf=options.brdf, track=track, spent=lambda: spent(1.0), samples=samples)
     figures = {"distance_error": error, "steps": done}
     if fit.history:
         figures |= {f"loss_{name}": value for name, value in fit.history[-1].items() if name != "step"}

@@ -32,10 +32,11 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     method: Annotated[Literal["grid", "paper"], Meta(description="grid: carve and refine; paper: SDF and material networks")] = "grid"
     resolution: Annotated[int, Meta(ge=0, le=512, description="grid samples along a unit of length; 0: a little finer than the views' pixels")] = 0
-    steps: Annotated[int, Meta(ge=1, le=100_000, description="paper: optimisation steps of each phase")] = 300
+    steps: Annotated[int, Meta(ge=1, le=100_000, description="paper: the most optimisation steps of each phase")] = 1000
+    precision: Annotated[Literal["float32", "bfloat16"], Meta(description="paper: of the networks' layers while the first shape is fitted; the end is always float32")] = "float32"
     root: Annotated[Literal["secant", "median"], Meta(description="paper: surface point between two samples of a ray")] = "secant"
     brdf: Annotated[Literal["gltf", "paper"], Meta(description="paper: reflection model that color is fitted with")] = "gltf"
-    budget: Annotated[float, Meta(ge=0, description="seconds to be done in: grid takes a coarser grid, paper stops optimising; 0: as long as it helps")] = 0.0
+    budget: Annotated[float, Meta(ge=0, description="seconds to be done in: grid takes a coarser grid, paper shortens its schedule; 0: as long as it helps")] = 0.0
     ignore: Annotated[tuple[str, ...], Meta(description="domains to leave out, for example depth,normal")] = ()
     seed: Annotated[int, Meta(ge=0, description="seed of everything random")] = 0
 
@@ -118,7 +119,7 @@ def _fit(views, shape, options: Options, out: Output):
     if not volume:
         out.skip("volume start", "depth views say where the surface is")
     settings = PaperOptions(options.steps, volume, options.steps, rule=options.root, brdf=options.brdf, seed=options.seed,
-                            budget=options.budget, device=out.device)
+                            budget=options.budget, device=out.device, precision=options.precision)
     with out.step("networks"):
         fit, figures = fit_networks(views.cameras, views.mask, views.images, shape.vertices, shape.faces, settings,
                                     lambda count, label: out.progress(range(count), count, label))
@@ -191,4 +192,4 @@ def _check_masks(path, views, out: Output) -> None:
             out.warn(f"view {name}: its mask is empty; the view is left out")
 
 
-STAGE = Stage(name="reconstruct", version=6, reads=("views",), writes="surface", Options=Options, run=run)
+STAGE = Stage(name="reconstruct", version=7, reads=("views",), writes="surface", Options=Options, run=run)
