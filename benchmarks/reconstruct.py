@@ -39,7 +39,7 @@ LEFT_OUT = ("_col.obj",)  # collision shapes beside the models
 SUITE = (*(f"gso/vima/{n}.obj" for n in ("mario_figure", "porcelain_cup", "toy_train", "lion_figure", "dinosaur_figure", "bull_figure", "can_opener", "hammer")),
          "gso/aloha/Granimals_20_Wooden_ABC_Blocks_Wagon/meshes/model.obj", "gso/libero/glazed_rim_porcelain_ramekin/glazed_rim_porcelain_ramekin.obj",
          *(f"mesh/odedstein/{n}/{n}.obj" for n in ("bunny", "spot", "penguin", "torus")),
-         *(f"mesh/trimesh/{n}" for n in ("fandisk.obj", "plate_holes.STL", "featuretype.STL")))
+         *(f"mesh/trimesh/{n}" for n in ("fandisk.obj", "plate_holes.STL", "cycloidal.ply", "featuretype.STL")))
 SEEDS, WAVELENGTHS = 5, (1 / 16, 1 / 8, 1 / 4)  # of --all; the default takes one pair a model, each in turn
 DEFAULT_DISTURBED, DEFAULT_BUDGETED, DEFAULT_COLOR = 10, 2, 4  # models
 ALWAYS = ("carved hull", "capped Poisson")  # peers run on every model; the others, which are worse, on the first of the default
