@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from pathlib import Path
 
 import click
@@ -40,6 +41,6 @@ def command(paths, as_json, quiet, verbose, debug):
         if len(found) > SHOWN:
             report_text(f"{text}: {len(found) - SHOWN} more faults (--json lists all)")
         if not found:
-            click.get_binary_stream("stdout").write(b"valid: " + os.fsencode(text) + b"\n")
-            click.get_binary_stream("stdout").flush()
+            sys.stdout.buffer.write(b"valid: " + os.fsencode(text) + b"\n")
+            sys.stdout.buffer.flush()
     return code

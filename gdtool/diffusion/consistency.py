@@ -31,7 +31,7 @@ def rerendered_psnr(views: Views, count: int = 4000, seed: int = 0) -> float:
     """
     import torch
 
-    from gdtool.fields.light import recover_light
+    from gdtool.fields.light import recover_light, unoccluded
     from gdtool.images.color import srgb_from_linear
     from gdtool.images.metrics import psnr
     from gdtool.shading.closed_form import shade
@@ -44,7 +44,7 @@ def rerendered_psnr(views: Views, count: int = 4000, seed: int = 0) -> float:
     toward = toward[inside][rows].astype(np.float32)
     fit, test = slice(0, len(rows) // 2), slice(len(rows) // 2, None)
     args = [pick["normal"], toward, pick["color"], pick["albedo"], pick["roughness"], pick["metallic"]]
-    light, _ = recover_light(*(x[fit] for x in args), np.ones(len(rows) // 2, np.float32))
+    light, _ = recover_light(*(x[fit] for x in args), unoccluded(pick["normal"][fit]))
     lobes = SphericalGaussians(*(torch.tensor(np.array(light[name]), dtype=torch.float32) for name in ("axes", "sharpness", "amplitudes")))
     n, v, c, a, r, m = (torch.from_numpy(x[test]) for x in args)
     rendered = shade(n, v, a, r, m, lobes).clamp(0, 1).numpy()

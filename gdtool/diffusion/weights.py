@@ -23,7 +23,7 @@ def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
         pickles = [p for pattern in PICKLES for p in path.parent.glob(pattern)]
         if pickles:
             raise InputError(pickles[0], "is a pickle, which can run code and is never opened",
-                             f"convert it: python -m gdtool.diffusion.convert {shlex.quote(str(pickles[0]))}")
+                             f"convert it to safetensors: python -m gdtool.diffusion.convert {shlex.quote(str(pickles[0]))}")
         raise InputError(path, "does not exist", "gdtool train writes it")
     try:
         with safe_open(path, "pt") as file:

@@ -114,7 +114,7 @@ def test_a_pickle_is_refused_and_the_line_it_names_converts_it(tmp_path):
     torch.save(tensors, tmp_path / "diffusion_pytorch_model.bin")
     with pytest.raises(InputError) as error:
         read_tensors(tmp_path / "diffusion_pytorch_model.safetensors")
-    command = str(error.value).partition("convert it: ")[2].split()
+    command = str(error.value).partition("convert it to safetensors: ")[2].split()
     assert command[:3] == ["python", "-m", "gdtool.diffusion.convert"]
     done = subprocess.run([sys.executable, *command[1:]], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
