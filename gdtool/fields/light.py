@@ -187,7 +187,7 @@ def materials_from_color(normals: np.ndarray, color: np.ndarray, weight: np.ndar
     white, black, rough = torch.ones(count, 3), torch.zeros(count, 3), torch.full((count,), roughness)
     with torch.no_grad():
         for k in range(len(found["axes"])):
-            lobe = SphericalGaussians.from_record({name: value if name == "kind" else value[k:k + 1] for name, value in found.items()})
+            lobe = SphericalGaussians.from_record({name: found[name][k:k + 1] for name in ("axes", "sharpness", "amplitudes")})
             diffuse, specular = shade_parts(n, n, white, rough, torch.full((count,), metallic), lobe)
             unit_color += (specular if metallic else diffuse).numpy() * arrives[:, k:k + 1]
             if not metallic:
