@@ -11,9 +11,11 @@ from gdtool.folders.mesh import triangulated
 from gdtool.geometry.repair import compact
 from gdtool.texture.raster import owner_count
 from gdtool.texture.unwrap_charts import Adjacency, bisect, find_charts
+from gdtool.texture.unwrap_cut import cut_to_pack
 from gdtool.texture.unwrap_flatten import flatten, singular_values, stretch
-from gdtool.texture.unwrap_pack import pack
+from gdtool.texture.unwrap_pack import best_packed, pack
 
+_MORE_CHARTS, _MOST_CUT = 12, 40  # charts that cutting for packing adds, and ends with, at most
 _JOINS = 14  # attempts to join two charts
 _JOIN_SHARE = 0.02  # charts smaller than this share of the area are joined to others
 
@@ -56,6 +58,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
         flat, more = flatten_all(unit, faces, label, request.good_stretch, request.max_stretch, planes_only=True)
         failed.append(f"flattening: {failure}; charts by the side they look at")
     failed += more
+    flat = _cut_to_pack(Adjacency(unit, faces), flat, request.padding / request.size)
     places, _ = pack([(uv, triangles) for _, _, uv, triangles in flat], request.padding / request.size)
     face_uvs = np.full(faces.shape, -1, np.int64)
     chart = np.zeros(len(faces), np.int64)
@@ -66,6 +69,16 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
         offset += len(uv)
     uv = np.concatenate(places)
     return Unwrapped(np.clip(np.stack([uv[:, 0], 1 - uv[:, 1]], -1), 0, 1), face_uvs.astype(np.int32), chart, failed)
+
+
+def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float) -> list:
+    """The charts, cut further where that fills the square better."""
+    most = min(len(flat) + _MORE_CHARTS, _MOST_CUT)
+    variants = [flat, cut_to_pack(adjacency, flat, most, rings=False), cut_to_pack(adjacency, flat, most, rings=True)]
+    variants = [one for i, one in enumerate(variants) if all(len(one) != len(before) for before in variants[:i])]
+    if len(variants) > 1:
+        flat = variants[best_packed([[(uv, triangles) for _, _, uv, triangles in one] for one in variants], gap)]
+    return flat
 
 
 def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good_stretch: float, max_stretch: float,

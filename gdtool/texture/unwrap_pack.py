@@ -6,11 +6,11 @@ import numpy as np
 
 from gdtool.texture.raster import owner_count
 
-_SLANTS = (0.0,)  # radians, besides quarter turns
 _FINE = 3  # cells of the supersampled mask in a cell of the square
 _MOST_BY_RASTER = 160
 _MANY = 48  # with more charts than these a coarser grid and fewer tries bound the time
-_STARTS = 12  # orders tried on the coarse grid
+_GAIN = 0.02
+_TRIES = 1500  # charts placed in search of better orders
 
 
 def upright_box(uv: np.ndarray) -> np.ndarray:
@@ -32,14 +32,6 @@ def upright_box(uv: np.ndarray) -> np.ndarray:
     if np.ptp(turned[:, 0]) < np.ptp(turned[:, 1]):
         turned = _turn(turned, 1)
     return turned - turned.min(0)
-
-
-def _turned(uv: np.ndarray, radians: float) -> np.ndarray:
-    if not radians:
-        return uv
-    c, s = np.cos(radians), np.sin(radians)
-    uv = uv @ np.array([[c, -s], [s, c]])
-    return uv - uv.min(0)
 
 
 def _turn(uv: np.ndarray, quarter: int) -> np.ndarray:
@@ -69,34 +61,27 @@ def _mask(uv: np.ndarray, triangles: np.ndarray, cells_per_unit: float, gap: flo
 
 
 class _Shapes:
-    """Charts as masks at one resolution, at each turn, with the spectra that correlate them with what is taken.
+    """Charts as masks at one resolution, at each quarter turn, as sets of bits to test places with.
 
     cells_per_unit: cells per unit of surface; gap: cells between charts; side: the largest square they are packed in.
+    A set of cells is one integer, the cell (x, y) its bit y * (side + 1) + x: shifting moves it, and all places of a
+    chart are tested by one shift per run of its cells.
     """
 
     def __init__(self, boxed: list, cells_per_unit: float, gap: float, side: int):
-        from scipy.fft import next_fast_len, rfft2
-
-        self.fft_side = next_fast_len(side + 1, real=True)
-        self.uv, self.masks, self.spectra = [], [], []
+        self.stride, self.uv, self.shapes, self.runs, self.bits = side + 1, [], [], [], []
         for uv, triangles in boxed:
-            upright = [_turned(uv, turn) for turn in _SLANTS]
-            upright = [(at, _mask(at, triangles, cells_per_unit, gap / 2)) for at in upright]
-            uvs, masks = [], []
-            for at, mask in upright:
-                h, w = mask.shape
-                at = at * cells_per_unit + gap / 2
-                # As np.rot90 turns the mask: its rows are v, its columns u.
-                u, v = at.T
-                uvs += [at, np.stack([v, w - u], -1), np.stack([w - u, h - v], -1), np.stack([h - v, u], -1)]
-                masks += [np.rot90(mask, quarter) for quarter in range(4)]
-            padded = np.zeros((len(masks), self.fft_side, self.fft_side), np.float32)
-            for at, mask in zip(padded, masks, strict=True):
-                if max(mask.shape) <= side:  # place() passes over the others
-                    at[:mask.shape[0], :mask.shape[1]] = mask
-            self.uv.append(uvs)
-            self.masks.append(masks)
-            self.spectra.append(np.conj(rfft2(padded, workers=2)))
+            mask = _mask(uv, triangles, cells_per_unit, gap / 2)
+            h, w = mask.shape
+            at = uv * cells_per_unit + gap / 2
+            # As np.rot90 turns the mask: its rows are v, its columns u.
+            u, v = at.T
+            masks = [np.rot90(mask, quarter) for quarter in range(4)]
+            self.uv.append([at, np.stack([v, w - u], -1), np.stack([w - u, h - v], -1), np.stack([h - v, u], -1)])
+            self.shapes.append([turned.shape for turned in masks])
+            small = max(h, w) <= side  # place() passes over the others
+            self.runs.append([_runs(turned, self.stride) if small else [] for turned in masks])
+            self.bits.append([_bits(turned, self.stride) if small else 0 for turned in masks])
 
     def place(self, order: list[int], side: int, contact: float, turns: list[int] | None = None) -> list[tuple[int, int, int]] | None:
         """(turn, x, y) of each chart in a square of so many cells, or None when one finds no place.
@@ -104,43 +89,103 @@ class _Shapes:
         Each goes where it stays low; contact weighs touching others and the walls against that. turns: the only one
         to try for each chart.
         """
-        from scipy.fft import irfft2, rfft2
-
-        m = self.fft_side
-        taken = np.zeros((m, m), np.float32)
+        stride, taken = self.stride, 0
         out: list[tuple[int, int, int] | None] = [None] * len(order)
-        both = np.zeros((2, m, m), np.float32)
+        line = (1 << side) - 1
+        border = line | line << (side - 1) * stride | _every(1 | 1 << side - 1, side, stride)
         for i in order:
-            walls = np.pad(taken[:side, :side], 1, constant_values=1) > 0
-            both[0] = taken
-            both[1, :side, :side] = walls[:-2, 1:-1] | walls[2:, 1:-1] | walls[1:-1, :-2] | walls[1:-1, 2:]
-            spectrum = rfft2(both, workers=2)
-            # Circular correlation: what wraps around lies beyond the places where the mask fits.
-            tried = range(len(self.masks[i])) if turns is None else [turns[i]]
-            found = irfft2(spectrum[:, None] * self.spectra[i][tried], (m, m), workers=2)
+            walls = taken << 1 | taken >> 1 | taken << stride | taken >> stride | border
+            windows = [taken]  # of level k: from here on 2**k cells of the row, any taken
             best = None
-            for at, turn in enumerate(tried):
-                mask = self.masks[i][turn]
-                h, w = mask.shape
+            for turn in range(4) if turns is None else [turns[i]]:
+                h, w = self.shapes[i][turn]
                 if max(h, w) > side:
                     continue
-                free = found[0, at, :side - h + 1, :side - w + 1] < 0.5
-                if not free.any():
+                hit = 0
+                for level, one, two in self.runs[i][turn]:
+                    while len(windows) <= level:
+                        windows.append(windows[-1] | windows[-1] >> (1 << len(windows) - 1))
+                    hit |= windows[level] >> one
+                    if two > one:
+                        hit |= windows[level] >> two
+                free = _every((1 << side - w + 1) - 1, side - h + 1, stride) & ~hit
+                # Only where it is stopped above and to the left, or above and to the right.
+                corners = free & ~(free << stride) & ~(free << 1 & free >> 1)
+                if not corners:
                     continue
-                touching = np.rint(found[1, at, :side - h + 1, :side - w + 1])
-                far = (np.arange(side - h + 1)[:, None] + h + 0.25 * (np.arange(side - w + 1) + w)) / side
-                cost = np.where(free, far - contact * touching / (2 * (h + w)), np.inf)
-                k = int(cost.argmin())
-                if best is None or cost.flat[k] < best[0] - 1e-9:
-                    y, x = divmod(k, cost.shape[1])
-                    best = float(cost.flat[k]), turn, x, y
+                places = _places(corners)
+                y, x = np.divmod(places, stride)
+                far = (y + h + 0.25 * (x + w)) / side
+                most = contact * self.bits[i][turn].bit_count() / (2 * (h + w))
+                for k in np.argsort(far, kind="stable").tolist():
+                    if best is not None and far[k] - min(contact, most) >= best[0] - 1e-9:
+                        break
+                    touching = (self.bits[i][turn] << int(places[k]) & walls).bit_count()
+                    cost = float(far[k]) - contact * touching / (2 * (h + w))
+                    if best is None or cost < best[0] - 1e-9:
+                        best = cost, turn, int(x[k]), int(y[k])
             if best is None:
                 return None
             _, turn, x, y = best
-            mask = self.masks[i][turn]
-            taken[y:y + mask.shape[0], x:x + mask.shape[1]] += mask
+            taken |= self.bits[i][turn] << y * stride + x
             out[i] = turn, x, y
         return out
+
+
+def _every(row: int, count: int, stride: int) -> int:
+    """The bits of one row repeated in `count` rows."""
+    out, have = row, 1
+    while have < count:
+        more = min(have, count - have)
+        out |= (out & (1 << more * stride) - 1) << have * stride
+        have += more
+    return out
+
+
+def _bits(mask: np.ndarray, stride: int) -> int:
+    """A mask (h, w) bool as one integer, rows `stride` bits apart."""
+    rows = np.zeros((mask.shape[0], stride), bool)
+    rows[:, :mask.shape[1]] = mask
+    return int.from_bytes(np.packbits(rows, bitorder="little").tobytes(), "little")
+
+
+def _places(bits: int) -> np.ndarray:
+    """The numbers of the bits that are set."""
+    return np.flatnonzero(np.unpackbits(np.frombuffer(bits.to_bytes(bits.bit_length() // 8 + 1, "little"), np.uint8), bitorder="little"))
+
+
+def _runs(mask: np.ndarray, stride: int) -> list[tuple[int, int, int]]:
+    """(level, one, two) of each run of cells in the rows of mask (h, w): 2**level cells from one and from two cover it."""
+    padded = np.zeros((mask.shape[0], mask.shape[1] + 2), np.int8)
+    padded[:, 1:-1] = mask
+    step = np.diff(padded, axis=1)
+    row, start = np.nonzero(step > 0)
+    length = np.nonzero(step < 0)[1] - start
+    level = np.frexp(length)[1] - 1
+    one = row * stride + start
+    return list(zip(level.tolist(), one.tolist(), (one + length - (1 << level)).tolist(), strict=True))
+
+
+def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float) -> int:
+    """Which of several ways to cut one surface into charts packs best, by a short search; each later one has to gain more
+    than the seams it adds are worth, _GAIN of the square."""
+    best, best_share = 0, 0.0
+    for i, charts in enumerate(variants):
+        if not 1 < len(charts) <= _MOST_BY_RASTER or any(charts is earlier for earlier in variants[:i]):
+            continue
+        boxed, area = _boxed(charts)
+        ranked = _search(boxed, area, gap, 160, 0, 0.3)
+        share = ranked[0][0] if ranked else 0.0
+        if share > best_share + (_GAIN if best_share else 0.0):
+            best, best_share = i, share
+    return best
+
+
+def _boxed(charts: list) -> tuple[list, float]:
+    """Charts set upright, and their area."""
+    boxed = [(upright_box(uv), triangles) for uv, triangles in charts]
+    area = sum(float(np.abs(np.cross(uv[t[:, 1]] - uv[t[:, 0]], uv[t[:, 2]] - uv[t[:, 0]])).sum()) / 2 for uv, t in boxed)
+    return boxed, max(area, 1e-300)
 
 
 def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, cells: int = 512) -> tuple[list[np.ndarray], float]:
@@ -150,9 +195,7 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, cells: int = 5
     to the border, in uv. Several orders and weights are tried on a coarse grid, the best of them on a fine one; the
     charts keep their resolution, what is sought is the smallest square that holds them.
     """
-    boxed = [(upright_box(uv), triangles) for uv, triangles in charts]
-    area = sum(float(np.abs(np.cross(uv[t[:, 1]] - uv[t[:, 0]], uv[t[:, 2]] - uv[t[:, 0]])).sum()) / 2 for uv, t in boxed)
-    area = max(area, 1e-300)
+    boxed, area = _boxed(charts)
     if len(charts) == 1:
         scale = (1 - 2 * gap) / max(float(np.ptp(boxed[0][0], 0).max()), 1e-300)
         return [boxed[0][0] * scale + gap], scale
@@ -160,9 +203,9 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, cells: int = 5
         return _shelves(boxed, gap)
     many = len(charts) > _MANY
     cells = min(cells, 288) if many else cells
-    ways = _way(boxed, max(min(_STARTS, 300 // len(charts)), 2))
-    for lowest, tried in ((0.45, ways), (0.15, ways[:3])):
-        ranked = _search(boxed, area, gap, tried, cells * 5 // 16, lowest)
+    tries = max(_TRIES // len(charts), 8)
+    for lowest, tried in ((0.45, tries), (0.3, tries), (0.12, 0)):
+        ranked = _search(boxed, area, gap, cells * 5 // 16, tried, lowest)
         if ranked:
             break
     else:
@@ -192,49 +235,54 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, cells: int = 5
     return places, (share / area) ** 0.5 * cells / best_side
 
 
-def _way(boxed: list, starts: int) -> list[tuple[list[int], float]]:
-    """Orders to place the charts in, largest first and shuffled near that, each with a weight of contact against height."""
-    rng = np.random.default_rng(0)  # the same for each mesh: results do not depend on chance
-    size = np.array([float(np.prod(np.ptp(uv, 0) + 1e-12)) for uv, _ in boxed])
-    longest = np.array([float(np.ptp(uv, 0).max()) for uv, _ in boxed])
-    out = []
-    for i in range(starts):
-        rank = (size, longest)[i % 2] * np.exp((0.0 if i < 2 else 0.4) * rng.standard_normal(len(boxed)))
-        out.append((np.argsort(-rank, kind="stable").tolist(), (0.5, 1.0, 0.3)[i % 3]))
-    return out
+def _first_ways(boxed: list) -> list[tuple[list[int], float]]:
+    """Orders to place the charts in, largest first, each with a weight of contact against height."""
+    size = [float(np.prod(np.ptp(uv, 0) + 1e-12)) for uv, _ in boxed]
+    longest = [float(np.ptp(uv, 0).max()) for uv, _ in boxed]
+    return [(np.argsort(-np.array(rank), kind="stable").tolist(), contact) for contact in (0.5, 1.0, 0.3) for rank in (size, longest)]
 
 
-def _search(boxed: list, area: float, gap: float, ways: list, cells: int,
-            lowest: float) -> list[tuple[float, list[int], float, list[int]]]:
+def _search(boxed: list, area: float, gap: float, cells: int, tries: int, lowest: float) -> list[tuple[float, list[int], float, list[int]]]:
     """Ways to pack on a coarse grid, best first: share of the square, order, weight of contact, turn of each chart.
 
-    None that stays below the share `lowest`.
+    None that stays below the share `lowest`. From the best of a few orders on, small changes of the best are tried.
     """
     side_most = int(cells * (0.66 / lowest) ** 0.5)
     shapes = _Shapes(boxed, cells * (0.66 / area) ** 0.5, gap * cells, side_most)
-    ranked = []
-    best_side = side_most
-    for turn, (order, contact) in enumerate(ways):
-        if turn == 2 and not ranked:
-            break  # ill-shaped charts: the others would not do either
-        side, reached = min(best_side, cells), None
-        step = max(int(0.03 * cells if lowest > 0.4 else 0.12 * cells), 1)
-        while side <= side_most and not (ranked and side > 1.04 * best_side):
-            reached = shapes.place(order, side, contact)
-            if reached is not None:
-                break
-            side += step
-        step = max(step // 2, 2)
-        while reached is not None and step >= 2:
+    ranked: list[tuple[int, list[int], float, list[int]]] = []
+
+    def shrunk(order: list[int], contact: float, side: int, found: list) -> None:
+        step = max(int(0.03 * cells), 2)
+        while step:
             smaller = shapes.place(order, side - step, contact)
             if smaller is None:
                 step //= 2
             else:
-                side, reached = side - step, smaller
-        if reached is not None:
-            ranked.append((0.66 * (cells / side) ** 2, order, contact, [placed[0] for placed in reached]))
-            best_side = min(best_side, side)
-    return sorted(ranked, key=lambda way: -way[0])
+                side, found = side - step, smaller
+        ranked.append((side, order, contact, [placed[0] for placed in found]))
+        ranked.sort(key=lambda way: way[0])
+
+    for turn, (order, contact) in enumerate(_first_ways(boxed)):
+        if turn == 2 and not ranked:
+            return []  # ill-shaped charts: the others would not do either
+        side, found = (int(0.9 * cells), None) if not ranked else (ranked[0][0] - 1, None)
+        while found is None and side <= (side_most if not ranked else ranked[0][0]):
+            found = shapes.place(order, side, contact)
+            side += 0 if found is not None else max(int((0.04 if lowest > 0.2 else 0.12) * cells), 1)
+        if found is not None:
+            shrunk(order, contact, side, found)
+    rng = np.random.default_rng(0)  # the same for each mesh: results do not depend on chance
+    for _ in range(tries):
+        side, order, contact, _ = ranked[0]
+        order = list(order)
+        for _ in range(int(rng.integers(1, 4))):
+            one, two = int(rng.integers(len(order))), int(rng.integers(len(order)))
+            order.insert(two, order.pop(one))
+        contact = float(np.clip(contact * rng.choice([0.6, 1.0, 1.0, 1.6]), 0.15, 2.0))
+        found = shapes.place(order, side - 1, contact)
+        if found is not None:
+            shrunk(order, contact, side - 1, found)
+    return [(0.66 * (cells / side) ** 2, *way) for side, *way in ranked]
 
 
 def _shelves(boxed: list, gap: float) -> tuple[list[np.ndarray], float]:

@@ -154,3 +154,44 @@ def test_a_rim_that_crosses_by_a_hair_is_found():
         i = np.arange(64)[:, None] * 2
         strip = np.concatenate([i + [0, 1, 3], i + [0, 3, 2]])
         assert overlaps(uv, strip) is crosses
+
+
+def ring_of_quads(around=96, across=10):
+    """A flat ring, inner radius half the outer: vertices, quads, and the chart that it is."""
+    angle, radius = np.meshgrid(np.linspace(0, 2 * np.pi, around, endpoint=False), np.linspace(0.25, 0.5, across + 1))
+    uv = np.stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()], -1)
+    row, column = (x.ravel() for x in np.mgrid[:across, :around])
+    after = (column + 1) % around
+    quads = np.stack([row * around + column, (row + 1) * around + column, (row + 1) * around + after, row * around + after], -1)
+    return np.concatenate([uv, np.zeros((len(uv), 1))], 1), quads, uv
+
+
+def test_a_ring_is_cut_into_arcs_that_keep_their_coordinates():
+    from gdtool.folders.mesh import triangulated
+    from gdtool.texture.unwrap_charts import Adjacency
+    from gdtool.texture.unwrap_cut import cut_to_pack
+
+    vertices, quads, uv = ring_of_quads()
+    chart = (np.arange(len(quads)), quads, uv, triangulated(quads)[0])
+    adjacency = Adjacency(vertices, quads)
+    assert len(cut_to_pack(adjacency, [chart], 1, rings=True)) == 1
+    parts = cut_to_pack(adjacency, [chart], 40, rings=True)
+    assert len(parts) >= 4
+    assert sorted(np.concatenate([part[0] for part in parts])) == list(range(len(quads)))
+    for faces_idx, corners, own, _ in parts:
+        np.testing.assert_array_equal(own[corners], uv[quads[faces_idx]])
+    # A filled square is not cut.
+    square = np.stack(np.meshgrid(np.linspace(0, 1, 11), np.linspace(0, 1, 11)), -1).reshape(-1, 2)
+    i = (np.arange(10)[:, None] * 11 + np.arange(10)).ravel()
+    faces = np.stack([i, i + 1, i + 12, i + 11], -1)
+    flat = np.concatenate([square, np.zeros((121, 1))], 1)
+    assert len(cut_to_pack(Adjacency(flat, faces), [(np.arange(100), faces, square, triangulated(faces)[0])], 40, rings=True)) == 1
+
+
+def test_two_rings_fill_the_square_better_once_cut():
+    vertices, quads, _ = ring_of_quads()
+    both = np.concatenate([vertices, vertices + (2, 0, 0)])
+    faces = np.concatenate([quads, quads + len(vertices)])
+    found = checked(both, faces, unwrap.unwrap(both, faces, SMALL))
+    # Two whole rings cannot cover more than 2 * 0.75 pi / 4 of the square around the two of them, which is 1.707 of their width.
+    assert found["coverage"] > 0.45 > 2 * 0.75 * np.pi / 4 / 1.707**2

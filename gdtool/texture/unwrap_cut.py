@@ -1,0 +1,92 @@
+"""Flat charts cut where that makes them pack better: rings into arcs, thin arms off."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.folders.mesh import triangulated
+from gdtool.geometry.repair import edges_of
+from gdtool.texture.unwrap_charts import Adjacency
+
+_ANGLES = np.radians(np.arange(0, 180, 15.0))
+_OFFSETS = np.linspace(0.06, 0.94, 23)
+_WELL_FILLED = 0.62  # of its smallest upright rectangle: such a chart stays whole
+_WORTH = 0.15  # of the rectangle, that a cut has to save
+_WORTH_OF_A_RING = -0.05  # halves of a ring save nothing, their halves do
+_TRIED = 16  # lines, best first
+_SEEN = 1000  # faces of a chart that its rectangles are taken around
+_SMALLEST = 0.004  # of all area, that a part has to have
+
+
+def cut_to_pack(adjacency: Adjacency, charts: list, most: int, rings: bool) -> list:
+    """Charts (faces_idx, corners, uv, triangles) with the ill-shaped ones cut along straight lines of their plane, as far
+    as the quads allow; at most `most` in all. Texture coordinates stay: parts of what is flat are flat.
+
+    rings: cut those with a hole as well, which makes many charts of one.
+    """
+    smallest = _SMALLEST * adjacency.area.sum()
+    out, queue = [], list(charts)
+    while queue:
+        chart = queue.pop()
+        halves = _halves(adjacency, chart, smallest, rings) if len(out) + len(queue) + 2 <= most else None
+        if halves is None:
+            out.append(chart)
+        else:
+            queue += [_part(chart, half) for half in halves]
+    return out
+
+
+def _halves(adjacency: Adjacency, chart: tuple, smallest: float, rings: bool) -> list[np.ndarray] | None:
+    """Two masks (k,) of the chart's faces, each connected, whose rectangles are smallest together; None to leave it whole."""
+    faces_idx, corners, uv, triangles = chart
+    area = adjacency.area[faces_idx]
+    if area.sum() < 2 * smallest:
+        return None
+    centre = uv[np.where(corners < 0, corners[:, :1], corners)].mean(1)
+    # Rectangles around the faces' centres: their rims lie half a face farther out.
+    rim = float(np.sqrt(area.mean()))
+    across = np.stack([centre @ (np.cos(a), np.sin(a)) for a in _ANGLES])
+    few = slice(None, None, -(-len(area) // _SEEN))
+    quarter = len(_ANGLES) // 2
+
+    def rectangle(of: np.ndarray) -> float:
+        span = np.ptp(across[:, few][:, of[few]], 1) + rim
+        return float((span[:quarter] * span[quarter:]).min())
+
+    whole = rectangle(np.ones(len(area), bool))
+    if area.sum() > _WELL_FILLED * whole:
+        return None
+    found = []
+    for row in across:
+        for share in _OFFSETS:
+            half = row < row.min() + share * np.ptp(row)
+            if half[few].any() and not half[few].all() and min(area[half].sum(), area[~half].sum()) >= smallest:
+                found.append((rectangle(half) + rectangle(~half), half))
+    found.sort(key=lambda one: one[0])
+    edges = edges_of(triangles)
+    ring = rings and len(uv) - len(edges.ends) + len(triangles) < 1
+    for cost, half in found[:_TRIED]:
+        if cost > (1 - (_WORTH_OF_A_RING if ring else _WORTH)) * whole:
+            return None
+        parts = [part for side in (half, ~half) for part in _pieces(adjacency, faces_idx, side)]
+        # A line across a ring leaves two arcs on one side: three parts are well, crumbs are not.
+        if len(parts) <= 3 and min(area[part].sum() for part in parts) >= smallest:
+            return parts
+    return None
+
+
+def _pieces(adjacency: Adjacency, faces_idx: np.ndarray, side: np.ndarray) -> list[np.ndarray]:
+    """The connected parts of a side (k,) of faces (k,), as masks (k,)."""
+    own = np.full(adjacency.count, -1)
+    own[faces_idx[side]] = 0
+    number = np.where(side, adjacency.connected(own)[faces_idx], -1)
+    return [number == n for n in np.unique(number[side])]
+
+
+def _part(chart: tuple, half: np.ndarray) -> tuple:
+    faces_idx, corners, uv, _ = chart
+    used, local = np.unique(corners[half], return_inverse=True)
+    local = local.reshape(-1, 4)
+    if used[0] < 0:
+        used, local = used[1:], local - 1
+    return faces_idx[half], local, uv[used], triangulated(local)[0]
