@@ -5,28 +5,27 @@
 Writes unwrap.md, unwrap.json, unwrap.png and the layouts unwrap_sheet.png, row by row: killed, it goes on where it was. Models
 that are quads already are taken as they are; others as remesh.py left them, or are remeshed first. The knobs are swept and
 brute force is tried on the models of --sweep. All leave two texels between charts at 1024. Every run is a child process with
-a time limit; mirrored is a share of the area, overlap a share of what is covered.
+a time limit, and what did not begin within --minutes is left for the next time; mirrored is a share of the area, overlap
+counts texels of 4096² with more than one owner.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import resource
-import subprocess
-import tempfile
 import time
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-from fine_meshes import SOLIDS, models_in, of_model, of_solid
+from fine_meshes import models_in, of_model, of_solid
 from measure import busy, machine, number, say, table
+from mesh_runs import arguments, blender, cost_since, plot
 from rows import Rows
 from wireframe import file_name, sheet
 
 SIZE, PADDING = 1024, 2
+FINE = 4096  # where overlaps are looked for
 WAYS = {"ours": {}, "ours, stretch 1.001": {"good_stretch": 1.001}, "ours, stretch 1.005": {"good_stretch": 1.005},
         "ours, cost 1": {"max_cost": 1.0}, "ours, cost 4": {"max_cost": 4.0}}
 BLENDER = "Blender Smart UV"
@@ -42,7 +41,7 @@ def ours(vertices: np.ndarray, faces: np.ndarray, options: dict) -> tuple:
 
     start = time.perf_counter()
     out = unwrap(vertices, faces, Request(size=SIZE, padding=PADDING, **options))
-    return out.uv, out.face_uvs.astype(np.int64), _cost(start)
+    return out.uv, out.face_uvs.astype(np.int64), cost_since(start)
 
 
 def peer(vertices: np.ndarray, triangles: np.ndarray, brute_force: bool) -> tuple:
@@ -55,35 +54,24 @@ def peer(vertices: np.ndarray, triangles: np.ndarray, brute_force: bool) -> tupl
     atlas.add_mesh(np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(triangles, np.uint32))
     atlas.generate(xatlas.ChartOptions(), pack)
     _, face_uvs, uv = atlas[0]
-    cost = _cost(start)
+    cost = cost_since(start)
     corners = np.concatenate([face_uvs.astype(np.int64), np.full((len(face_uvs), 1), -1)], 1)
     return np.asarray(uv, np.float64) * (1, -1) + (0, 1), corners, cost
 
 
-def _cost(start: float) -> dict[str, float]:
-    both = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return {"seconds": time.perf_counter() - start, "processor": sum(u.ru_utime + u.ru_stime for u in both)}
+def smart_project(vertices: np.ndarray, faces: np.ndarray, asked: argparse.Namespace) -> tuple:
+    """Blender's texture coordinates, faces into them, cost."""
+    found, cost = blender("smart", vertices, faces, PADDING / SIZE, asked.peers_python, asked.limit)
+    return found["uv"] * (1, -1) + (0, 1), found["face_uvs"], cost
 
 
-def blender(vertices: np.ndarray, faces: np.ndarray, python: Path, limit: float) -> tuple:
-    """Blender's Smart UV project through another Python. Raises ChildFailed."""
-    from gdtool.core.child import ChildFailed
+def overlapping(faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray) -> int:
+    """Texels of FINE² that more than one triangle owns."""
+    from gdtool.folders.mesh import triangulated
+    from gdtool.texture.raster import owner_count
+    from gdtool.texture.unwrap import corner_triangles
 
-    with tempfile.TemporaryDirectory() as folder:
-        given, made = Path(folder) / "in.npz", Path(folder) / "out.npz"
-        np.savez(given, vertices=vertices, faces=faces)
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        try:
-            done = subprocess.run([python, Path(__file__).with_name("mesh_blender.py"), "smart", given, made, str(PADDING / SIZE)],
-                                  capture_output=True, text=True, timeout=limit, check=False)
-        except subprocess.TimeoutExpired:
-            raise ChildFailed(f"took longer than {limit:g} s") from None
-        if not made.exists():
-            raise ChildFailed((done.stderr.strip() or done.stdout.strip() or "no result").splitlines()[-1][:120])
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        with np.load(made) as found:
-            cost = {"seconds": float(found["seconds"]), "processor": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime}
-            return found["uv"] * (1, -1) + (0, 1), found["face_uvs"], cost
+    return int((owner_count(uv, corner_triangles(face_uvs, triangulated(faces)[1]), FINE) > 1).sum())
 
 
 def measure(name: str, vertices: np.ndarray, faces: np.ndarray, ways: list[str], asked: argparse.Namespace, rows: Rows) -> None:
@@ -96,19 +84,19 @@ def measure(name: str, vertices: np.ndarray, faces: np.ndarray, ways: list[str],
 
     triangles = triangulated(faces)[0].astype(np.int64)
     for way in ways:
-        if rows.has(name, way):
+        if rows.has(name, way) or time.monotonic() > asked.end:
             continue
         say(f"{name}: {way}")
         try:
             mine = faces
             if way == BLENDER:
-                uv, face_uvs, cost = blender(vertices, faces, asked.peers_python, asked.limit)
+                uv, face_uvs, cost = smart_project(vertices, faces, asked)
             elif way in PEERS:
                 mine = np.concatenate([triangles, np.full((len(triangles), 1), -1)], 1)
                 uv, face_uvs, cost = call("unwrap:peer", vertices, triangles, PEERS[way], seconds=asked.limit, memory_mb=16000)
             else:
                 uv, face_uvs, cost = call("unwrap:ours", vertices, faces, WAYS[way], seconds=asked.limit, memory_mb=16000)
-            row = {"model": name, "way": way, **cost, **figures(vertices, mine, uv, face_uvs, SIZE)}
+            row = {"model": name, "way": way, **cost, **figures(vertices, mine, uv, face_uvs, SIZE), "overlap": overlapping(mine, uv, face_uvs)}
             if way in ("ours", "xatlas", BLENDER):
                 chart = islands(vertices, mine, face_uvs)[0]
                 (asked.kept / "pictures").mkdir(parents=True, exist_ok=True)
@@ -143,42 +131,18 @@ def quads_of(source: str | Path, faces: int, triangles: int, kept: Path) -> tupl
     return name, vertices, quads
 
 
-def plot(rows: list[dict], path: Path) -> None:
-    """Processor seconds against coverage, a colour per way."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(7, 4.5), dpi=110)
-    for way in dict.fromkeys(row["way"] for row in rows):
-        mine = [row for row in rows if row["way"] == way and "coverage" in row]
-        axes.scatter([row["processor"] for row in mine], [1 - row["coverage"] for row in mine], label=way, s=22)
-    axes.set(xscale="log", xlabel="seconds of the processor", ylabel="share of the texture that no chart covers")
-    axes.legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("models", nargs="*", type=Path)
-    parser.add_argument("-o", "--out", type=Path, default=Path("docs/benchmarks"))
-    parser.add_argument("--solids", default=",".join(SOLIDS))
-    parser.add_argument("--faces", type=int, default=20_000)
+    parser = arguments(__doc__, "what is unwrapped besides the solids", "a Python that has bpy; without it Blender is left out")
     parser.add_argument("--input", type=int, default=400_000, help="triangles that remesh gets")
-    parser.add_argument("--kept", type=Path, default=Path("out/bench_meshes"), help="folder for the inputs once made")
     parser.add_argument("--sweep", default="part,spot", help="models that the knobs are swept on")
-    parser.add_argument("--peers-python", type=Path, help="a Python that has bpy; without it Blender is left out")
-    parser.add_argument("--limit", type=float, default=60.0, help="seconds for one run")
-    parser.add_argument("--only", default="", help="comma list of ways; all of them when empty")
     asked = parser.parse_args()
+    settings = {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept", "minutes")}
+    asked.end = time.monotonic() + 60 * asked.minutes
     os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # the children import this file
     if not asked.peers_python:
         say("Blender is left out: no --peers-python")
     note = busy()
-    rows = Rows(asked.out / "unwrap.json", {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept")})
+    rows = Rows(asked.out / "unwrap.json", settings)
 
     def ways(name: str) -> list[str]:
         swept = name in asked.sweep.split(",")
@@ -194,24 +158,31 @@ def main() -> None:
         head = f"# Unwrap: about {asked.faces} quads\n\n`make bench-assets`, {machine()}. {note}\n\n"
         (asked.out / "unwrap.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "")
                                              + "\n![time against coverage](unwrap.png)\n\n![layouts](unwrap_sheet.png)\n")
-        plot(rows.rows, asked.out / "unwrap.png")
+        shares = [row | {"uncovered": 1 - row["coverage"]} for row in rows.rows if "coverage" in row]
+        plot(shares, asked.out / "unwrap.png", "uncovered", "share of the texture that no chart covers", False)
         sheet(asked.kept / "pictures", list(dict.fromkeys(row["model"] for row in rows.rows)),
               ["ours layout", "ours checkerboard", "xatlas layout", f"{BLENDER} layout"], asked.out / "unwrap_sheet.png")
         return text
 
     sources = [*filter(None, asked.solids.split(",")), *models_in(asked.models)]
+
+    def finished(name: str) -> bool:
+        return rows.has(name, "read") or all(rows.has(name, way) for way in ways(name))
+
+    names = [source if isinstance(source, str) else source.stem for source in sources]
     text = ""
-    for source in sources:
-        name = source if isinstance(source, str) else source.stem
-        if not all(rows.has(name, way) for way in ways(name)) and not rows.has(name, "read"):
+    for name, source in zip(names, sources, strict=True):
+        if not finished(name) and time.monotonic() < asked.end:
             try:
-                name, vertices, faces = quads_of(source, asked.faces, asked.input, asked.kept)
+                _, vertices, faces = quads_of(source, asked.faces, asked.input, asked.kept)
             except Exception as failure:  # a broken model is a row of the table, not the end of it
                 rows.add({"model": name, "way": "read", "failed": str(failure)})
             else:
                 measure(name, vertices, faces, ways(name), asked, rows)
-        text = report(source is sources[-1])
+        text = report(all(map(finished, names)))
     print(text)
+    if not all(map(finished, names)):
+        say(f"not all began within {asked.minutes:g} minutes: run it again and it goes on")
 
 
 if __name__ == "__main__":

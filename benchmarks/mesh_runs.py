@@ -1,0 +1,74 @@
+"""What remesh.py and unwrap.py share: the cost of a child, Blender's operators through another Python, arguments, the plot."""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from fine_meshes import SOLIDS
+
+
+def cost_since(start: float) -> dict[str, float]:
+    """In a child process: seconds since start (of time.perf_counter), and of the processor and peak memory in all."""
+    both = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return {"seconds": time.perf_counter() - start, "processor": sum(u.ru_utime + u.ru_stime for u in both),
+            "peak MB": max(u.ru_maxrss for u in both) / 1024}
+
+
+def blender(way: str, vertices: np.ndarray, faces: np.ndarray, argument: object, python: Path, limit: float) -> tuple[dict[str, np.ndarray], dict]:
+    """What mesh_blender.py makes of vertices (v, 3) and faces (f, 4), and its cost. Raises ChildFailed."""
+    from gdtool.core.child import ChildFailed
+
+    with tempfile.TemporaryDirectory() as folder:
+        given, made = Path(folder, "in.npz"), Path(folder, "out.npz")
+        np.savez(given, vertices=vertices, faces=faces)
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        try:
+            done = subprocess.run([python, Path(__file__).with_name("mesh_blender.py"), way, given, made, str(argument)],
+                                  capture_output=True, text=True, timeout=limit, check=False)
+        except subprocess.TimeoutExpired:
+            raise ChildFailed(f"took longer than {limit:g} s") from None
+        if not made.exists():
+            raise ChildFailed((done.stderr.strip() or done.stdout.strip() or "no result").splitlines()[-1][:120])
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        with np.load(made) as found:
+            out = dict(found)
+        return out, {"seconds": float(out.pop("seconds")), "processor": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime}
+
+
+def arguments(text: str, models: str, peers: str) -> argparse.ArgumentParser:
+    """The parser with what both ask for."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("models", nargs="*", type=Path, help=models)
+    parser.add_argument("-o", "--out", type=Path, default=Path("docs/benchmarks"))
+    parser.add_argument("--solids", default=",".join(SOLIDS))
+    parser.add_argument("--faces", type=int, default=20_000)
+    parser.add_argument("--kept", type=Path, default=Path("out/bench_meshes"), help="folder for the inputs once made")
+    parser.add_argument("--peers-python", type=Path, help=peers)
+    parser.add_argument("--limit", type=float, default=60.0, help="seconds for one run")
+    parser.add_argument("--minutes", type=float, default=12.0, help="a run that did not begin by then is left for the next time")
+    parser.add_argument("--only", default="", help="comma list of ways; all of them when empty")
+    return parser
+
+
+def plot(rows: list[dict], path: Path, error: str, label: str, logarithmic: bool) -> None:
+    """Processor seconds against an error of the rows that have it, a mark per model, a colour per way."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7, 4.5), dpi=110)
+    for way in dict.fromkeys(row["way"] for row in rows):
+        mine = [row for row in rows if row["way"] == way and error in row]
+        axes.scatter([row["processor"] for row in mine], [row[error] for row in mine], label=way, s=22)
+    axes.set(xscale="log", yscale="log" if logarithmic else "linear", xlabel="seconds of the processor", ylabel=label)
+    axes.legend(fontsize=7)
+    figure.tight_layout()
+    figure.savefig(path)
+    plt.close(figure)
