@@ -83,6 +83,7 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     # The last phase sees all images at once, as sampling does; few objects then, so that a step costs about the same.
     phases: tuple[Phase, ...] = (Phase(share=0.6, domains=3, views=3), Phase(share=0.8, domains=6, views=3, batch=4),
                                  Phase(share=1.0, domains=6, views=6, batch=2))
+    optimizer: Literal["adamw", "muon"] = "adamw"  # muon: for the matrices inside the network
     warmup: int = 50
     decay: bool = True  # cosine to a twentieth of the learning rate over the run
     weight_decay: float = 1e-2

@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -29,6 +30,7 @@ from gdtool.diffusion.data import Batch, Objects, draw, object_order
 from gdtool.diffusion.encoding import BACKGROUND, encode, encode_condition
 from gdtool.diffusion.losses import rendering_error, view_directions
 from gdtool.diffusion.model import Model
+from gdtool.diffusion.optimizer import MOMENTS, make_optimizer, restore_moments
 from gdtool.diffusion.sampling import precision_context
 from gdtool.diffusion.schedule import loss_weight
 from gdtool.diffusion.weights import read_tensors
@@ -41,7 +43,7 @@ class State:
     """Everything that changes while training."""
 
     model: Model
-    optimizer: torch.optim.Optimizer
+    optimizer: Any  # torch.optim.Optimizer, or what is as one: optimizer.py
     average: dict[str, torch.Tensor]
     objective: torch.nn.Module
     step: int = 0
@@ -76,15 +78,9 @@ class Objective(torch.nn.Module):
 
 
 def new_state(model: Model, train: TrainConfig) -> State:
-    """AdamW; matrices decay, vectors do not; the class embedding has its own learning rate. Wrapped for all processes."""
+    """The state before the first step; wrapped for all processes."""
     objective = distributed.wrap(Objective(model, train))
-    groups: dict[tuple[bool, float], list] = {}
-    for name, p in model.named_parameters():
-        rate = train.class_rate if ".class_embedding." in f".{name}" else 1.0
-        groups.setdefault((p.ndim >= 2, rate), []).append(p)
-    optimizer = torch.optim.AdamW(
-        [{"params": ps, "weight_decay": train.weight_decay if decays else 0.0, "rate": rate} for (decays, rate), ps in groups.items()],
-        lr=1.0, betas=train.betas, fused=True)
+    optimizer = make_optimizer(model, train)
     average = {name: distributed.local(p).clone() for name, p in model.named_parameters()}
     return State(model, optimizer, average, objective)
 
@@ -240,9 +236,10 @@ def load_checkpoint(state: State, workspace: Path, identity: str) -> bool:
         for name, p in state.model.named_parameters():
             p.copy_(distributed.sharded(tensors[f"model/{name}"], p))
             state.average[name].copy_(distributed.local(distributed.sharded(tensors[f"average/{name}"], p)))
-            if f"exp_avg/{name}" in tensors:
-                state.optimizer.state[p] = {"step": tensors[f"step/{name}"]} | {
-                    key: distributed.sharded(tensors[f"{key}/{name}"].to(p.device), p) for key in ("exp_avg", "exp_avg_sq")}
+            moments = {key: tensors[f"{key}/{name}"] for key in MOMENTS if f"{key}/{name}" in tensors}
+            if moments:
+                restore_moments(state.optimizer, p, {
+                    key: value if key == "step" else distributed.sharded(value.to(p.device), p) for key, value in moments.items()})
     state.step, state.seconds = record["step"], record["seconds"]
     return True
 

@@ -2,8 +2,8 @@
 
 Takes a dataset folder (or any views folders with all six domains) of render-dataset and writes a model folder for
 sample-views: weights, configuration, card, loss curve and validation images. Use it to train the small configuration
-on a processor, to go on from a model you have (--start), or, with --preset paper, to grow Stable Diffusion to six
-domains. Killed at any time, the same line goes on where it was. Sources may be .tar files of views folders, plain or in
+on a processor, to go on from a model you have (--start; with --size, at a larger size), or, with --preset paper, to
+grow Stable Diffusion to six domains. Killed at any time, the same line goes on where it was. Sources may be .tar files of views folders, plain or in
 WebDataset's naming. `torchrun --nproc_per_node N -m gdtool train …` trains in N processes (GDTOOL_SHARD=1 splits the
 weights as well). --plan tells what a configuration costs, without data.
 
@@ -27,6 +27,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     ablation: Annotated[Literal["none", "no_cross_domain", "one_way", "two_way", "no_pbr", "color_normal"],
                         Meta(description="Part of the method to leave out or change; color_normal: Wonder3D's two domains.")] = "none"
     config: file_option("JSON file of changes to it: {\"model\": {...}, \"train\": {...}}.") = None
+    size: Annotated[int, Meta(ge=16, le=1024, description="Width and height of a view in pixels, patches in proportion, so at the same cost; a smaller model of --start is grown to it.")] | None = None
     steps: Annotated[int, Meta(ge=1, description="Optimiser steps; without it the preset's.")] | None = None
     minutes: Annotated[float, Meta(gt=0, description="Stop after so many minutes of training; the learning rate falls accordingly.")] | None = None
     batch: Annotated[int, Meta(ge=1, description="Objects per step; without it the preset's.")] | None = None
@@ -101,9 +102,12 @@ def _train(order: dict, objects, **how):
     torch.manual_seed(order["seed"])
     model = Model(order["model"])
     if order["start"] is not None:
+        from gdtool.diffusion.grow import grown
+
         loaded = load_model(order["start"])
-        check_shapes(order["start"], loaded.state_dict(), model.state_dict())
-        model.load_state_dict(loaded.state_dict())
+        tensors = grown(loaded.state_dict(), loaded.config, order["model"])
+        check_shapes(order["start"], tensors, model.state_dict())
+        model.load_state_dict(tensors)
     elif order["model"].codec == "vae":
         from gdtool.diffusion.pretrained import start_from_pretrained
 
@@ -169,9 +173,14 @@ def configured(options: Options):
     if options.minutes is not None and options.steps is None:
         parts[1]["steps"] = 10**9  # the minutes decide
     try:
-        return tuple(msgspec.convert(part, type(own)) for part, own in zip(parts, preset, strict=True))
+        model, train = (msgspec.convert(part, type(own)) for part, own in zip(parts, preset, strict=True))
     except msgspec.ValidationError as error:
         raise InputError(options.config or "configuration", str(error)) from None
+    if options.size is not None:
+        from gdtool.diffusion.grow import resized
+
+        model = resized(model, options.size)
+    return model, train
 
 
 def _objects(inputs: Inputs, workspace):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion import training
+from gdtool.diffusion import optimizer, training
 from gdtool.diffusion.config import DOMAINS, PRESETS, Phase
 from gdtool.diffusion.data import LIGHTS, Objects, draw, from_bytes, mirror, object_order, permute_colors, to_bytes
 from gdtool.diffusion.encoding import PLANES, planes_from_images
@@ -134,6 +134,37 @@ def test_a_killed_run_resumes_bit_for_bit(tmp_path, precision):
         assert torch.equal(whole.average[name], resumed.average[name]), name
     without_time = [[{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(open(tmp_path / w / "loss.csv"))] for w in "ab"]
     assert without_time[0] == without_time[1] and len(without_time[0]) == 12
+
+
+def test_a_killed_run_with_muon_resumes_bit_for_bit(tmp_path, monkeypatch):
+    monkeypatch.setattr(optimizer, "SMALLEST", 8)
+    whole = train(tmp_path / "a", None, optimizer="muon")
+    assert len(whole.optimizer.matrices) > 20
+    train(tmp_path / "b", 7, optimizer="muon")
+    resumed = train(tmp_path / "b", None, optimizer="muon")
+    for (name, p), (_, q) in zip(whole.model.named_parameters(), resumed.model.named_parameters(), strict=True):
+        assert torch.equal(p, q), name
+    adam = train(tmp_path / "c", None)
+    name, p = next((n, p) for n, p in whole.model.named_parameters() if any(p is q for q in whole.optimizer.matrices))
+    assert not torch.equal(p, dict(adam.model.named_parameters())[name])
+
+
+def test_muon_moves_a_matrix_alike_in_all_its_directions(monkeypatch):
+    monkeypatch.setattr(optimizer, "SMALLEST", 8)
+    model = Model(MODEL)
+    own = optimizer.make_optimizer(model, msgspec.structs.replace(TRAIN, optimizer="muon", weight_decay=0.0))
+    for group in own.param_groups:
+        group["lr"] = 1e-3 * group["rate"]
+    p = own.matrices[0]
+    before = p.detach().clone()
+    generator = torch.Generator().manual_seed(0)
+    # a gradient that is nearly of rank one: AdamW would move the same way everywhere
+    p.grad = torch.outer(torch.randn(p.shape[0], generator=generator), torch.randn(p[0].numel(), generator=generator)).view(p.shape)
+    p.grad += 0.05 * torch.randn(p.shape, generator=generator)
+    own.step()
+    given, moved = (torch.linalg.svdvals(x.flatten(1)) for x in (p.grad, p.detach() - before))
+    middle = len(given) // 2
+    assert given[0] / given[middle] > 20 and moved[0] / moved[middle] < 3  # Newton-Schulz brings singular values near 1
 
 
 def test_a_checkpoint_of_another_configuration_is_refused(tmp_path):

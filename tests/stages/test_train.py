@@ -104,3 +104,17 @@ def test_a_start_of_another_shape_is_refused(gdtool, spheres, tmp_path):
     save_file(weights, tmp_path / "first/model.safetensors")
     result = gdtool("train", spheres, *TINY, "--steps", 1, "--start", "first", "-o", "second")
     assert result.returncode == 3 and "first" in result.stderr
+
+
+def test_a_small_model_is_grown_to_a_larger_size(gdtool, spheres, tmp_path):
+    assert gdtool("train", spheres, *TINY, "--steps", 2, "--held-out", 0, "-o", "small").returncode == 0
+    large = write_spheres(tmp_path / "large", size=32)
+    done = gdtool("train", large, *TINY, "--start", "small", "--size", 32, "--steps", 1, "--held-out", 0, "-o", "grown")
+    assert done.returncode == 0, done.stderr
+    config = json.loads((tmp_path / "grown/config.json").read_text())
+    assert (config["image_size"], config["patch"], config["encoder_patch"]) == (32, 8, 16)
+    weights = load_file(tmp_path / "grown/model.safetensors")["unet.conv_in.weight"]
+    pixels = weights.astype(np.float32).reshape(8, 7, 8, 8, 3, 3)
+    assert np.abs(pixels[:, :, 0::2] - pixels[:, :, 1::2]).max() < 0.01 * np.abs(pixels).max() + 0.01  # one small step away
+    bad = gdtool("train", large, *TINY, "--size", 24, "--steps", 1, "-o", "bad")
+    assert bad.returncode == 3 and "neither a multiple" in bad.stderr
