@@ -1,11 +1,11 @@
 """Time and memory against error of bake, beside Blender's Cycles in the same run, on the peers' bake case and public models.
 
-    python benchmarks/bake.py [MODEL_OR_FOLDER ...] [--peers-python PATH] [-o docs/benchmarks] [--minutes 10] [--sizes 1024,2048,4096]
+    python benchmarks/bake.py [MODEL_OR_FOLDER ...] [--peers-python PATH] [-o docs/benchmarks] [--minutes 12] [--sizes 1024,2048,4096]
 
-Writes bake.md, bake.json and bake.png (the maps side by side) after every row. Models that have
-neither a texture nor colors are left out; those that cannot be remeshed are named. The sizes are swept on the peers' case, the others have
-2048². Errors: benchmarks/bake_score.py. --peers-python is a Python that has bpy; without it Blender is left out. What does
-not start within --minutes is named, not run; the quad meshes are made before the clock starts, and kept.
+Writes bake.md, bake.json and bake.png (the maps side by side) row by row: killed, or out of --minutes, it goes on where it
+was. Models that have neither a texture nor colors are left out; those that cannot be remeshed are named. The sizes are swept
+on the peers' case, the others have 2048². Errors: benchmarks/bake_score.py; along the charts' rims at the mip level of 256
+texels, which is what unwrap leaves room for: bake_mips.py. --peers-python is a Python that has bpy; without it Blender is left out.
 """
 
 from __future__ import annotations
@@ -20,13 +20,18 @@ from pathlib import Path
 
 import numpy as np
 from bake_cases import Case, case_of, read_low
+from bake_mips import rim_error
 from bake_score import Truth, scored
 from fine_meshes import models_in
 from measure import busy, machine, number, say, table
+from rows import Rows
+from wireframe import file_name
 
 PEER = Path(__file__).with_name("bake_blender.py")
 COLUMNS = ("model", "way", "size", "bake s", "bake cpu", "occlusion s", "png s", "peak MB", "albedo dB", "roughness dB", "metallic dB", "normal deg", "missed",
-           "8-bit albedo dB", "8-bit roughness dB", "8-bit normal deg", "seam albedo", "seam roughness", "unfilled", "occlusion rms")
+           "8-bit albedo dB", "8-bit roughness dB", "8-bit normal deg", "seam albedo", "seam roughness", "unfilled", "rim at 256 dB", "occlusion rms")
+MIP = 256
+KINDS = ("base color", "roughness", "normal")
 
 
 def has_detail(path: Path) -> bool:
@@ -100,7 +105,10 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
         many = occlusion_tracer(target, origin.source, reach, origin.normals, 1024, 9, threads)(texels.face_idx[some], texels.barycentric[some])
         cost["occlusion rms"] = float(np.sqrt(np.mean((traced[some] - many) ** 2)))
     if out:
-        np.savez(out, **{name: image for name, image in kept.items() if name != "tangent_normal"}, normal=kept["tangent_normal"] * 0.5 + 0.5)
+        kept["normal"] = kept.pop("tangent_normal") * 0.5 + 0.5
+        if maps.base_color is not None:
+            kept["stored"] = maps.base_color  # with its gutters
+        np.savez(out, **kept)
     return cost
 
 
@@ -130,92 +138,119 @@ def small(image: np.ndarray, width: int = 256) -> np.ndarray:
     return np.broadcast_to(image, (width, width, 3))
 
 
-def shown(maps: dict[str, np.ndarray]) -> list[np.ndarray]:
-    """Base color, roughness and normal of a bake, small."""
+def show(maps: dict[str, np.ndarray], at: Path) -> None:
+    """Base color, roughness and normal of a bake side by side, small, as a picture to put the sheet together from."""
     from gdtool.images.color import srgb_from_linear
-
-    return [small(srgb_from_linear(np.clip(maps["albedo"], 0, 1))), small(maps["roughness"]), small(maps["normal"])]
-
-
-def write(out: Path, rows: list[dict], sheet: list, names: list[str], note: str) -> None:
-    """The reports of what there is so far."""
-    from gdtool.images.contact import contact_sheet
     from gdtool.images.io import write_png
 
-    out.mkdir(parents=True, exist_ok=True)
-    text = table(COLUMNS, ([number(row.get(name, "failed" if name == "size" and "failed" in row else None), 4) for name in COLUMNS] for row in rows))
-    failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows if "failed" in row)
+    at.parent.mkdir(parents=True, exist_ok=True)
+    images = small(srgb_from_linear(np.clip(maps["albedo"], 0, 1))), small(maps["roughness"]), small(maps["normal"])
+    write_png(at, np.clip(np.concatenate(images, 1), 0, 1))
+
+
+def picture(name: str, way: str) -> str:
+    return file_name(name, f"bake {way}")
+
+
+def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
+    """The reports of what there is so far."""
+    from gdtool.images.contact import contact_sheet
+    from gdtool.images.io import read_image, write_png
+
+    rows.write(complete)
+    text = table(COLUMNS, ([number(row.get(name, "failed" if name == "size" and "failed" in row else None), 4) for name in COLUMNS] for row in rows.rows))
+    failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows.rows if "failed" in row)
     head = f"# Bake\n\n`python benchmarks/bake.py`, {machine()}. {note}\n\nbake: rasterising, reading, gutters and storing; seconds of the wall and of the " \
         "processor. Errors before storing, and after 8 bits. seam: how much more the two sides of seams " \
-        "differ than in the model, over the same at other edges.\n\n"
+        "differ than in the model, over the same at other edges. rim: the base color along the charts' rims in the mip level of " \
+        f"{MIP} texels, against each chart alone.\n\n"
     (out / "bake.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![maps](bake.png)\n")
-    (out / "bake.json").write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")
-    if sheet:
-        kinds = ["base color", "roughness", "normal"]
-        write_png(out / "bake.png", contact_sheet(sheet, labels_top=kinds + ([f"{kind}, Blender" for kind in kinds] if len(sheet[0]) > 3 else []),
-                                                  labels_left=names))
+    names = list(dict.fromkeys(row["model"] for row in rows.rows))
+    sheet = []
+    for name in names:
+        line: list[np.ndarray | None] = []
+        for way in ("ours", "Blender"):
+            at = kept / "pictures" / picture(name, way)
+            line += np.split(read_image(at)[..., :3].astype(np.float32) / 255, 3, 1) if at.exists() else [None] * 3
+        sheet.append(line)
+    whole = [i for i, line in enumerate(sheet) if line[0] is not None]
+    if whole:
+        write_png(out / "bake.png", contact_sheet([sheet[i] for i in whole], labels_top=[*KINDS, *(f"{kind}, Blender" for kind in KINDS)],
+                                                  labels_left=[names[i] for i in whole]))
+
+
+def run(case: Case, truth: Truth, way: str, size: int, samples: int, asked: argparse.Namespace) -> dict:
+    """Cost and errors of one bake."""
+    from gdtool.core.child import ChildFailed, call
+    from gdtool.images.color import linear_from_srgb
+
+    with tempfile.TemporaryDirectory() as folder:
+        at = Path(folder, "maps.npz")
+        try:
+            # Cost is taken without the maps kept for scoring, which need memory of their own.
+            if way == "ours":
+                row = call("bake:ours", case, size, True, "", seconds=200, memory_mb=12000)
+                call("bake:ours", case, size, False, str(at), seconds=200, memory_mb=12000)
+            else:
+                row = blender(asked.peers_python, case, size, samples, 0, at, 200)
+        except (ChildFailed, RuntimeError, subprocess.TimeoutExpired) as failure:
+            return {"failed": str(failure)}
+        with np.load(at) as found:
+            maps = dict(found)
+    stored = maps.pop("stored", None)
+    with_gutters = maps["albedo"] if stored is None else linear_from_srgb(stored[..., :3] / np.float32(255))
+    corners = {name: maps.pop(name) for name in list(maps) if name.startswith("corner_")}
+    row |= scored(truth, maps, corners or None) | {f"rim at {MIP} dB": rim_error(truth.target, with_gutters, MIP)}
+    if size == 2048 and samples <= 1:
+        show(maps, asked.kept / "pictures" / picture(case.name, way))
+    return row
 
 
 def main() -> None:
-    from gdtool.core.child import ChildFailed, call
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="*", type=Path)
     parser.add_argument("-o", "--out", type=Path, default=Path("docs/benchmarks"))
     parser.add_argument("--peers-python", type=Path)
     parser.add_argument("--sizes", default="1024,2048,4096", help="of the peers' case")
     parser.add_argument("--samples", default="1,16", help="Blender's, on the peers' case")
-    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--minutes", type=float, default=12.0, help="a run that did not begin by then is left for the next time")
     parser.add_argument("--limit", type=int, default=12, help="models at most")
     parser.add_argument("--kept", type=Path, default=Path("out/bench_meshes"))
     asked = parser.parse_args()
     os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # the children import this file
-    note, rows, sheet, names, cases = busy(), [], [], [], []
-    for source in ["part", *filter(has_detail, models_in(asked.models))]:
-        if len(cases) > asked.limit:
-            break
-        try:
-            say(f"{source}: quad mesh")
-            cases.append(case_of(source, asked.kept))
-        except Exception as failure:  # a model that cannot be prepared is a row of the table, not the end of it
-            rows.append({"model": str(getattr(source, "name", source)), "way": "prepare", "failed": str(failure)})
-    end = time.monotonic() + 60 * asked.minutes
-    for case in cases:
-        part = case.name == "part"
-        runs = [("ours", int(size), 0) for size in (asked.sizes.split(",") if part else ["2048"])]
+    end, note, left = time.monotonic() + 60 * asked.minutes, busy(), 0
+    rows = Rows(asked.out / "bake.json", {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept", "minutes")})
+    sources = ["part", *list(filter(has_detail, models_in(asked.models)))[:asked.limit]]
+    for source in sources:
+        name = source if isinstance(source, str) else source.stem
+        runs = [("ours", int(size), 0) for size in (asked.sizes.split(",") if source == "part" else ["2048"])]
         if asked.peers_python:
-            runs += [("Blender", 2048, int(samples)) for samples in (asked.samples.split(",") if part else ["1"])]
-        truth, pictures = Truth(case), {}
-        for way, size, samples in runs:
-            row = {"model": case.name, "way": way + (f", {samples} samples" if samples else ""), "size": size}
-            rows.append(row)
+            runs += [("Blender", 2048, int(samples)) for samples in (asked.samples.split(",") if source == "part" else ["1"])]
+        labels = [f"{way}, {samples} samples" if samples else f"{way}, {size}" for way, size, samples in runs]
+        todo = [one for one in zip(runs, labels, strict=True) if not rows.has(name, one[1])]
+        if not todo or rows.has(name, "prepare"):
+            continue
+        if time.monotonic() > end:
+            left += len(todo)
+            continue
+        try:
+            say(f"{name}: quad mesh")
+            case = case_of(source, asked.kept)
+            truth = Truth(case)
+        except Exception as failure:  # a model that cannot be prepared is a row of the table, not the end of it
+            rows.add({"model": name, "way": "prepare", "failed": str(failure)})
+            continue
+        for (way, size, samples), label in todo:
             if time.monotonic() > end:
-                row["failed"] = f"not started within {asked.minutes:g} minutes"
+                left += 1
                 continue
-            say(f"{case.name}: {row['way']} at {size}")
-            with tempfile.TemporaryDirectory() as folder:
-                at = Path(folder, "maps.npz")
-                try:
-                    # Cost is taken without the maps kept for scoring, which need memory of their own.
-                    if way == "ours":
-                        row |= call("bake:ours", case, size, True, "", seconds=200, memory_mb=12000)
-                        call("bake:ours", case, size, False, str(at), seconds=200, memory_mb=12000)
-                    else:
-                        row |= blender(asked.peers_python, case, size, samples, 0, at, 200)
-                    with np.load(at) as found:
-                        maps = dict(found)
-                    corners = {name: maps.pop(name) for name in list(maps) if name.startswith("corner_")}
-                    row |= scored(truth, maps, corners or None)
-                    if size == 2048:
-                        pictures.setdefault(way, shown(maps))
-                except (ChildFailed, RuntimeError, subprocess.TimeoutExpired) as failure:
-                    row["failed"] = str(failure)
-            write(asked.out, rows, [*sheet, sum(pictures.values(), [])] if pictures else sheet, [*names, case.name], note)
-        if pictures:
-            sheet.append(sum(pictures.values(), []) + [None] * (3 * (1 + bool(asked.peers_python)) - 3 * len(pictures)))
-            names.append(case.name)
-    write(asked.out, rows, sheet, names, note)
+            say(f"{name}: {label}")
+            rows.add({"model": name, "way": label, "size": size} | run(case, truth, way, size, samples, asked))
+            write(asked.out, rows, False, asked.kept, note)
+    write(asked.out, rows, not left, asked.kept, note)
     print((asked.out / "bake.md").read_text())
+    if left:
+        say(f"{left} did not begin within {asked.minutes:g} minutes: run it again and it goes on")
 
 
 if __name__ == "__main__":

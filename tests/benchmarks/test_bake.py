@@ -58,3 +58,16 @@ def test_a_perfect_bake_scores_so_and_errors_are_found(case):
     assert worse["seam albedo"] > 3 and worse["albedo dB"] < 26
     assert worse["roughness dB"] == pytest.approx(20) and worse["normal deg"] == pytest.approx(np.degrees(0.1), rel=0.01)
     assert worse["seam roughness"] == pytest.approx(1)
+
+
+def test_what_lies_beside_charts_is_seen_along_their_rims_at_a_coarse_level(case):
+    from bake_mips import rim_error
+
+    target, maps = Truth(case).target, perfect(case)
+    gutter = np.ones((SIZE, SIZE), bool)
+    from gdtool.texture.raster import owners_of
+
+    gutter.ravel()[owners_of(target.uv, target.face_uvs, SIZE) >= 0] = False
+    good = rim_error(target, maps["albedo"], 32)
+    black = np.where(gutter[..., None], 0.0, maps["albedo"])
+    assert good > 35 > 25 > rim_error(target, black, 32)
