@@ -93,6 +93,9 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     ema: float = 0.999
     snr_gamma: float = 5.0  # min-SNR: a clean image's error is weighted by min(SNR, gamma) …
     snr_floor: float = 1.0  # … and at least by this, or a model that samples in few steps never learns the first one
+    # of each domain's values in the error, in the order of DOMAINS; the coverage beside the scalars' always weighs 1. Depth's
+    # spread inside an object is a tenth of the others', so at 1 it is not learned. Patch codec only.
+    domain_weights: tuple[float, float, float, float, float, float] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
     pure_noise: float = 0.6  # share of samples at the last timestep
     drop_embedding: float = 0.05
     drop_both: float = 0.05

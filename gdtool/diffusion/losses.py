@@ -7,7 +7,7 @@ import torch
 
 from gdtool.cameras.camera import rig
 from gdtool.diffusion.config import DOMAINS, ModelConfig
-from gdtool.diffusion.encoding import PLANES, decode
+from gdtool.diffusion.encoding import PLANES, SCALARS, decode
 
 LIT = ("normal", "albedo", "roughness", "metallic")  # what the closed form is made of
 
@@ -16,6 +16,24 @@ def linear(srgb: torch.Tensor) -> torch.Tensor:
     """sRGB decoding, differentiable (IEC 61966-2-1)."""
     high = ((srgb.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4
     return torch.where(srgb <= 0.04045, srgb / 12.92, high)
+
+
+def squared_error(predicted: torch.Tensor, clean: torch.Tensor, objects: int, domains: tuple[int, ...], config: ModelConfig,
+                  weights: tuple[float, ...]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean squared error of latents (b d k, c, h, w) per object and domain, (b, d): with each domain's values weighted, and plain.
+
+    weights: one for each of DOMAINS; the coverage in a scalar domain's third channel weighs 1. The VAE's latents have no
+    such channels and are weighted as a whole.
+    """
+    square = (predicted - clean).float().square()
+    if config.codec == "patch":
+        per_channel = square.unflatten(1, (3, -1)).mean((2, 3, 4))  # (n, 3)
+        factor = torch.tensor([[weights[i], weights[i], 1.0 if DOMAINS[i] in SCALARS else weights[i]] for i in domains], device=square.device)
+    else:
+        per_channel = square.mean((1, 2, 3))[:, None]
+        factor = torch.tensor([[weights[i]] for i in domains], device=square.device)
+    per_channel = per_channel.unflatten(0, (objects, len(domains), -1))  # (b, d, k, channels)
+    return (per_channel * factor[:, None]).mean((2, 3)), per_channel.mean((2, 3))
 
 
 def view_directions(config: ModelConfig) -> torch.Tensor:

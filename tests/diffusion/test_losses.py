@@ -3,9 +3,10 @@
 import numpy as np
 import torch
 
+from gdtool.diffusion.codec import make_codec
 from gdtool.diffusion.config import PRESETS
 from gdtool.diffusion.encoding import encode, planes_from_images
-from gdtool.diffusion.losses import linear, rendering_error, view_directions
+from gdtool.diffusion.losses import linear, rendering_error, squared_error, view_directions
 from gdtool.images.color import linear_from_srgb
 from tests.diffusion.spheres import LIGHT, sphere_views
 
@@ -72,3 +73,20 @@ def test_view_directions_point_to_the_cameras():
     directions = view_directions(CONFIG)
     np.testing.assert_allclose(directions[CONFIG.views.index("right")], [1, 0, 0], atol=1e-6)
     np.testing.assert_allclose(directions[CONFIG.views.index("back")], [0, 0, -1], atol=1e-6)
+
+
+def test_a_weighted_domain_counts_more_and_its_coverage_does_not():
+    codec = make_codec(CONFIG)
+    _, truth, _ = setting()
+    truth = torch.nn.functional.interpolate(truth.flatten(0, 1), size=CONFIG.image_size)
+    clean, weights = codec.encode(truth), (1.0, 2.0, 8.0, 1.0, 1.0, 0.5)
+
+    def both(channel, domain):
+        changed = truth.clone()
+        changed[domain * 6: domain * 6 + 6, channel] += 0.3
+        return (x[0, domain] for x in squared_error(codec.encode(changed), clean, 1, tuple(range(6)), CONFIG, weights))
+
+    for domain, channel, factor in ((0, 0, 1), (1, 2, 2), (2, 0, 8), (2, 1, 8), (2, 2, 1), (5, 0, 0.5), (5, 2, 1)):
+        weighted, plain = both(channel, domain)
+        torch.testing.assert_close(plain, torch.tensor(0.03))
+        torch.testing.assert_close(weighted, factor * plain)
