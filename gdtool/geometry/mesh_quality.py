@@ -7,30 +7,61 @@ import numpy as np
 from gdtool.geometry.repair import components, edges_of
 
 
+def columns_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(3, c, f) coordinates of the corners of faces (f, c): whole rows to compute with, several times faster than (f, c, 3)."""
+    return np.ascontiguousarray(vertices.T).take(np.ascontiguousarray(faces.T), axis=1)
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross product of a (3, ...) and b (3, ...)."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
 def polygon_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit normals (f, 3) and areas (f,) of faces (f, 4), -1 as fourth corner of triangles (Newell's vector area)."""
-    corners = np.where(faces < 0, faces[:, :1], faces)
-    p = vertices[corners]
-    vector = np.cross(p[:, 2] - p[:, 0], p[:, 3] - p[:, 1]) / 2
     triangle = faces[:, 3] < 0
-    vector[triangle] = np.cross(p[triangle, 1] - p[triangle, 0], p[triangle, 2] - p[triangle, 0]) / 2
-    area = np.linalg.norm(vector, axis=1)
-    return vector / np.maximum(area, 1e-300)[:, None], area
+    # A triangle is a quad whose fourth corner is its first.
+    p = columns_of(vertices, np.where(triangle[:, None], faces[:, [0, 1, 2, 0]], faces) if triangle.any() else faces)
+    normal, area = _normal_of(p)
+    return np.ascontiguousarray(normal.T), area
+
+
+def _normal_of(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals (3, q) and areas (q,) of quads with corners (3, 4, q)."""
+    vector = cross(p[:, 2] - p[:, 0], p[:, 3] - p[:, 1])
+    length = np.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+    return vector / np.maximum(length, 1e-300), length / 2
 
 
 def corner_jacobians(vertices: np.ndarray, quads: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(q, 4) scaled Jacobian at each corner: sine of its angle seen along the face normal, 1 square, <= 0 folded."""
-    p = vertices[quads]
-    after, before = np.roll(p, -1, 1) - p, np.roll(p, 1, 1) - p
-    length = np.linalg.norm(after, axis=-1) * np.linalg.norm(before, axis=-1)
-    return (np.cross(after, before) * normals[:, None]).sum(-1) / np.maximum(length, 1e-300)
+    return _corner_sines(columns_of(vertices, quads), normals.T).T
+
+
+def _corner_sines(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(4, q) scaled Jacobians of quads with corners (3, 4, q) about normals (3, q)."""
+    after = np.empty_like(p)
+    np.subtract(p[:, 1:], p[:, :-1], out=after[:, :-1])
+    np.subtract(p[:, 0], p[:, -1], out=after[:, -1])
+    length = np.sqrt(after[0] * after[0] + after[1] * after[1] + after[2] * after[2])
+    before = after[:, [3, 0, 1, 2]]
+    turn = cross(before, after)
+    along = turn[0] * normals[0] + turn[1] * normals[1] + turn[2] * normals[2]
+    return along / np.maximum(length * length[[3, 0, 1, 2]], 1e-300)
+
+
+def worst_jacobian(vertices: np.ndarray, quads: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(q,) smallest scaled Jacobian of each quad, about its own normal and about `normals` (q, 3): the worse of both."""
+    p = columns_of(vertices, quads)
+    return np.minimum(_corner_sines(p, _normal_of(p)[0]).min(0), _corner_sines(p, normals.T).min(0))
 
 
 def scaled_jacobian(vertices: np.ndarray, quads: np.ndarray) -> np.ndarray:
     """(q,) smallest scaled Jacobian of each quad's corners."""
     if not len(quads):
         return np.zeros(0)
-    return corner_jacobians(vertices, quads, polygon_normals(vertices, quads)[0]).min(1)
+    p = columns_of(vertices, quads)
+    return _corner_sines(p, _normal_of(p)[0]).min(0)
 
 
 def valences(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

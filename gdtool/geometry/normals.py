@@ -7,10 +7,14 @@ import numpy as np
 
 def face_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit normals (f, 3) and areas (f,) of triangles; zero-area faces have normal 0."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    cross = np.cross(b - a, c - a)
-    length = np.linalg.norm(cross, axis=1)
-    return cross / np.maximum(length, 1e-300)[:, None], length / 2
+    # A row per coordinate: several times faster than (f, 3) products.
+    x, y, z = np.ascontiguousarray(vertices.T)
+    a, b, c = (np.ascontiguousarray(faces[:, i]) for i in range(3))
+    ux, uy, uz, wx, wy, wz = x[b] - x[a], y[b] - y[a], z[b] - z[a], x[c] - x[a], y[c] - y[a], z[c] - z[a]
+    nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    over = 1 / np.maximum(length, 1e-300)
+    return np.stack([nx * over, ny * over, nz * over], -1), length / 2
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -8,7 +8,28 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.geometry.quad_shape import subdivide
-from gdtool.geometry.repair import edges_of
+from gdtool.geometry.repair import compact, components, edges_of, is_manifold, is_watertight
+
+_FACES_PER_QUAD = 4
+
+
+def run_on_few(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float) -> tuple[np.ndarray, np.ndarray]:
+    """Instant Meshes on a mesh collapsed to what its quads can show, where that keeps the topology: half the time.
+
+    It cuts long edges itself, so its cost follows the vertices that it is given more than those that it makes.
+    """
+    from gdtool.geometry.simplify import collapse
+
+    if len(faces) > _FACES_PER_QUAD * quads:
+        few_vertices, few = compact(*collapse(vertices, faces, _FACES_PER_QUAD * quads, 5.0))
+        if _topology(few) == _topology(faces):
+            vertices, faces = few_vertices, few
+    return run_instant_meshes(vertices, faces, quads, crease_degrees)
+
+
+def _topology(faces: np.ndarray) -> tuple[bool, bool, int, int]:
+    """Watertight, manifold, pieces, Euler number."""
+    return is_watertight(faces), is_manifold(faces), components(faces)[0], int(faces.max()) + 1 - len(edges_of(faces).ends) + len(faces)
 
 
 def run_instant_meshes(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float) -> tuple[np.ndarray, np.ndarray]:
@@ -35,7 +56,8 @@ def run_quadriflow(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_d
     return np.asarray(found["vertices"], np.float64), np.asarray(found["faces"], np.int64)
 
 
-ENGINES = {"instant-meshes": "gdtool.geometry.quad_engines:run_instant_meshes", "quadriflow": "gdtool.geometry.quad_engines:run_quadriflow"}
+ENGINES = {"instant-meshes": "gdtool.geometry.quad_engines:run_instant_meshes", "on few": "gdtool.geometry.quad_engines:run_on_few",
+           "quadriflow": "gdtool.geometry.quad_engines:run_quadriflow"}
 
 
 def pair_and_split(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[np.ndarray, np.ndarray]:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.geometry.features import Constraints, Features
-from gdtool.geometry.mesh_quality import corner_jacobians, polygon_normals, scaled_jacobian
+from gdtool.geometry.mesh_quality import columns_of, cross, polygon_normals, scaled_jacobian, worst_jacobian
 from gdtool.geometry.quad_shape import Slide, Surface, normals_below, relax, still_vertices, unfold
 
-_CORNER = np.array([1, 1j, -1, -1j])
 _SQUARE_SHARE = 0.4  # of the way from the nearest rectangle to the nearest square
 _POOR = 0.6  # quads with a smaller scaled Jacobian pull harder
 _NORMALS_EVERY = 6
@@ -25,23 +24,23 @@ def square_up(vertices: np.ndarray, faces: np.ndarray, surface: Surface, feature
     if not len(faces) or not iterations:
         return vertices
     still = still_vertices(faces, len(vertices), constraints)
-    flat = faces.ravel()
+    flat = faces.T.ravel()
     best, best_rank = vertices, None
     slide = Slide(surface, features, constraints)
     for turn in range(iterations + 1):
         if turn % _NORMALS_EVERY == 0:
             normals = normals_below(vertices, faces, surface)
-        quality = np.minimum(corner_jacobians(vertices, faces, normals).min(1), scaled_jacobian(vertices, faces))
+        quality = worst_jacobian(vertices, faces, normals)
         rank = (-int((quality < 0.2).sum()), float(quality.mean()))
         if best_rank is None or rank > best_rank:
             best, best_rank = vertices, rank
         if turn == iterations:
             break
         weight = 1 + 6 * np.clip(_POOR - quality, 0, 1)
-        asked = _rectangles(vertices[faces], normals).reshape(-1, 3)
-        shares = np.repeat(weight, 4)
+        asked = _rectangles(columns_of(vertices, faces), normals.T).reshape(3, -1)
+        shares = np.tile(weight, 4)
         total = np.maximum(np.bincount(flat, shares, len(vertices)), 1e-300)
-        target = np.stack([np.bincount(flat, shares * asked[:, i], len(vertices)) for i in range(3)], -1) / total[:, None]
+        target = np.stack([np.bincount(flat, shares * asked[i], len(vertices)) for i in range(3)], -1) / total[:, None]
         moved = vertices + strength * (target - vertices)
         moved[still] = vertices[still]
         vertices = slide.step(moved, vertices, turn == iterations - 1)
@@ -71,31 +70,37 @@ def balance(vertices: np.ndarray, faces: np.ndarray, surface: Surface, constrain
     return np.where(free[:, None], vertices + move, vertices)
 
 
-def _rectangles(corners: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(q, 4, 3) corners of the rectangle nearest to each quad (q, 4, 3), counter-clockwise about normals (q, 3)."""
-    centre = corners.mean(1, keepdims=True)
-    offset = corners - centre
-    x = offset[:, 0] - np.einsum("qi,qi->q", offset[:, 0], normals)[:, None] * normals
-    length = np.sqrt(np.einsum("qi,qi->q", x, x))
-    other = np.cross(normals, np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
-    x = np.where((length > 1e-12)[:, None], x, other)
-    x /= np.maximum(np.sqrt(np.einsum("qi,qi->q", x, x)), 1e-300)[:, None]
-    y = np.cross(normals, x)
-    z = np.einsum("qki,qi->qk", offset, x) + 1j * np.einsum("qki,qi->qk", offset, y)
-    size = np.sqrt((np.abs(z) ** 2).mean(1))
+def _rectangles(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(3, 4, q) corners of the rectangle nearest to each quad with corners (3, 4, q), counter-clockwise about normals (3, q)."""
+    centre = p.mean(1, keepdims=True)
+    offset = p - centre
+    x = offset[:, 0] - (offset[:, 0] * normals).sum(0) * normals
+    length = np.sqrt((x * x).sum(0))
+    flat = length <= 1e-12
+    if flat.any():
+        aside = np.where(np.abs(normals[0]) < 0.9, np.array([[1.0], [0.0], [0.0]]), np.array([[0.0], [1.0], [0.0]]))
+        x = np.where(flat, cross(normals, aside), x)
+        length = np.sqrt((x * x).sum(0))
+    x /= np.maximum(length, 1e-300)
+    y = cross(normals, x)
+    z = np.empty(offset.shape[1:], np.complex128)
+    z.real = offset[0] * x[0] + offset[1] * x[1] + offset[2] * x[2]
+    z.imag = offset[0] * y[0] + offset[1] * y[1] + offset[2] * y[2]
+    size = np.sqrt((z.real**2 + z.imag**2).mean(0))
     # The nearest square; one that is folded has hardly any, so it gets the size it takes up.
-    a = (z * np.conj(_CORNER)).mean(1)
+    a = (z[0] - 1j * z[1] - z[2] + 1j * z[3]) / 4
     strength = np.abs(a)
     a = np.where(strength > 1e-9 * size, a / np.maximum(strength, 1e-300), 1) * np.maximum(strength, 0.5 * size)
-    square = a[:, None] * _CORNER
-    # The nearest rectangle: diagonals of one length that keep their directions.
-    one, two = (z[:, 0] - z[:, 2]) / 2, (z[:, 1] - z[:, 3]) / 2
-    half = (np.abs(one) + np.abs(two)) / 2
-    one_way, two_way = one / np.maximum(np.abs(one), 1e-300), two / np.maximum(np.abs(two), 1e-300)
-    upright = (np.conj(one_way) * two_way).imag > 0.5
-    diagonals = np.stack([one_way, two_way, -one_way, -two_way], -1) * half[:, None]
-    asked = np.where(upright[:, None], (1 - _SQUARE_SHARE) * diagonals + _SQUARE_SHARE * square, square)
-    return centre + asked.real[..., None] * x[:, None] + asked.imag[..., None] * y[:, None]
+    # The nearest rectangle: diagonals of one length that keep their directions. A rectangle's corners lie opposite in pairs.
+    one, two = (z[0] - z[2]) / 2, (z[1] - z[3]) / 2
+    one_length, two_length = np.abs(one), np.abs(two)
+    half = (one_length + two_length) / 2
+    one, two = one / np.maximum(one_length, 1e-300), two / np.maximum(two_length, 1e-300)
+    upright = (np.conj(one) * two).imag > 0.5
+    first = np.where(upright, (1 - _SQUARE_SHARE) * one * half + _SQUARE_SHARE * a, a)
+    second = np.where(upright, (1 - _SQUARE_SHARE) * two * half + _SQUARE_SHARE * 1j * a, 1j * a)
+    first, second = (w.real * x + w.imag * y for w in (first, second))
+    return centre + np.stack([first, second, -first, -second], 1)
 
 
 def ease(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.geometry.features import Constraints, Features, closest_on_segments
-from gdtool.geometry.mesh_quality import corner_jacobians, polygon_normals, scaled_jacobian, valences
+from gdtool.geometry.mesh_quality import polygon_normals, valences, worst_jacobian
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.repair import compact, edges_of
 
 _EXACT_EVERY = 3  # steps between two searches for the closest point; the others stay in its plane
+_LET_OFF_BELOW = 0.22  # a vertex leaves its feature for a quad with a smaller scaled Jacobian only
 _BENT_COSINE = 0.97  # between a quad's normal and that of the surface below its centre
 
 
@@ -70,7 +71,7 @@ def _average_matrix(pairs: np.ndarray, count: int):
     rows = np.concatenate([pairs[:, 0], pairs[:, 1]])
     columns = np.concatenate([pairs[:, 1], pairs[:, 0]])
     matrix = coo_matrix((np.ones(len(rows)), (rows, columns)), (count, count)).tocsr()
-    return diags(1 / np.maximum(np.asarray(matrix.sum(1)).ravel(), 1)) @ matrix
+    return (diags(1 / np.maximum(np.asarray(matrix.sum(1)).ravel(), 1)) @ matrix).tocsr()
 
 
 def onto(vertices: np.ndarray, surface: Surface, features: Features, constraints: Constraints) -> np.ndarray:
@@ -126,6 +127,8 @@ def relax(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: F
     average = _average_matrix(edges.ends, len(vertices))
     along = _average_matrix(constraints.path, len(vertices)) if len(constraints.path) else None
     held = (constraints.curve >= 0) & ~constraints.fixed
+    if along is not None:
+        held &= np.diff(along.indptr) == 2  # where a path breaks off its end would draw back, and leave the feature bare
     still = still_vertices(faces, len(vertices), constraints)
     slide = Slide(surface, features, constraints)
     for turn in range(iterations):
@@ -162,10 +165,10 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
     normals = normals_below(vertices, faces, surface)
     angles = np.arange(8) * (np.pi / 4)
     for turn in range(rounds):
-        bad = np.flatnonzero(np.minimum(corner_jacobians(vertices, faces, normals).min(1), scaled_jacobian(vertices, faces)) < least)
+        loose = turn >= rounds - 4
+        bad = np.flatnonzero(worst_jacobian(vertices, faces, normals) < (_LET_OFF_BELOW if loose else least))
         if not len(bad):
             break
-        loose = turn >= rounds - 4
         touched = np.unique(faces[bad])
         most_visits -= len(touched)
         if most_visits < 0:
@@ -194,8 +197,7 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
             own = np.arange(len(flat) * 4).reshape(-1, 4)
             # Against the surface's normal and the quad's own: a quad may be folded in one and not in the other.
             flat = flat.reshape(-1, 3)
-            below = corner_jacobians(flat, own, np.tile(normals[mine], (len(places), 1)))
-            got = np.minimum(below, corner_jacobians(flat, own, polygon_normals(flat, own)[0])).reshape(len(places), -1).min(1)
+            got = worst_jacobian(flat, own, np.tile(normals[mine], (len(places), 1))).reshape(len(places), -1).min(1)
             best = int(got.argmax())
             if got[best] > got[0] + 1e-3:
                 vertices[v] = places[best]

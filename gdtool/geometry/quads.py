@@ -14,6 +14,7 @@ from gdtool.geometry.features import Constraints, Features, find_features, trace
 from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian, valences
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_engines import ENGINES, pair_and_split
+from gdtool.geometry.quad_paths import crossed, cut_along_features, held_at_centres
 from gdtool.geometry.quad_relax import balance, ease, square_up
 from gdtool.geometry.quad_shape import Surface, fill_holes, onto, relax, remove_doublets, subdivide, unfold
 from gdtool.geometry.quad_topology import cancel_irregular
@@ -23,7 +24,7 @@ from gdtool.geometry.simplify import simplify
 COUNT_TOLERANCE = 0.03
 _SMALL_PIECE_QUADS = 48
 _TRIES = 3
-_CLOSE_EDGES, _LEAST_JACOBIAN = 0.45, 0.2  # nearer and squarer than this, a result is taken without a look at others
+_CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a result is taken without a look at others
 _HANDLES = "handles are lost or added"
 
 
@@ -190,9 +191,9 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
         for _ in range(_TRIES):
             start = time.perf_counter()
             with ThreadPoolExecutor(len(asked)) as pool:
-                running = [pool.submit(call, ENGINES[engine], vertices.astype(np.float32), faces.astype(np.int32),
-                                       max(int(number / 4**subdivisions), 16), degrees, seconds=request.seconds, memory_mb=request.memory_mb)
-                           for number in asked]
+                way = ENGINES["on few" if engine == "instant-meshes" and subdivisions else engine]
+                running = [pool.submit(call, way, vertices.astype(np.float32), faces.astype(np.int32), max(int(number / 4**subdivisions), 16),
+                                       degrees, seconds=request.seconds, memory_mb=request.memory_mb) for number in asked]
                 if features is None:
                     features = find_features(vertices, faces, request.crease_degrees or 181.0, 3 * edge)
                     surface = Surface(vertices, faces)
@@ -266,7 +267,7 @@ def _attempts(quads: int, request: Request) -> list[tuple[str, int, tuple[float,
     engines = ["instant-meshes"] if request.engine == "auto" else [request.engine]
     for engine in engines:
         if engine == "instant-meshes" and quads >= 3000:
-            out.append((engine, 1, (0.995, 1.015, 1.035), request.crease_degrees))
+            out.append((engine, 1, (1.01, 1.02), request.crease_degrees))
         out.append((engine, 0, (1.0,), request.crease_degrees))
         # Where a seam of the engine's fields fails, it often holds at a slightly different density.
         out.append((engine, 0, (1.02,), request.crease_degrees))
@@ -310,12 +311,17 @@ def _finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, feature
     """The engine's quads drawn to creases, subdivided, evened out on the surface and unfolded."""
     area = polygon_normals(vertices, faces)[1].sum()
     vertices, constraints = trace(vertices, faces, features, (area / len(faces)) ** 0.5)
-    constraints = untied(vertices, faces, constraints)
+    free = untied(vertices, faces, constraints)
+    (across, curve), constraints = crossed(faces, constraints, free), free
     vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)
-    for _ in range(subdivisions):
+    for turn in range(subdivisions):
+        count = len(faces)
         vertices, faces, constraints = subdivide(vertices, faces, constraints)
+        if not turn:
+            constraints = held_at_centres(constraints, len(vertices) - count, across, curve)
         vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)
-    return _shaped(vertices, faces, surface, features, constraints, request, fine), faces
+    vertices = _shaped(vertices, faces, surface, features, constraints, request, fine)
+    return vertices, cut_along_features(vertices, faces, fine)
 
 
 def _shaped(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,

@@ -78,10 +78,25 @@ def _counting_order(keys: np.ndarray, width: int) -> np.ndarray:
 
 def is_watertight(faces: np.ndarray) -> bool:
     """Every edge has exactly two faces, which walk it in opposite directions."""
+    from scipy.sparse import csr_array
+
     if not len(faces):
         return False
-    edges = edges_of(faces)
-    return bool((edges.count == 2).all() and not edges.turned.any())
+    faces = np.asarray(faces)
+    if faces.shape[1] == 4 or faces.max() >= 2**31 - 1 or faces.min() < 0 or 3 * len(faces) > 2**31 - 1:
+        edges = edges_of(faces)
+        return bool((edges.count == 2).all() and not edges.turned.any())
+    # Of triangles in linear time: no directed edge occurs twice, and each occurs the other way round too.
+    start = faces.astype(np.int32).ravel()
+    end = np.ascontiguousarray(faces[:, [1, 2, 0]]).astype(np.int32).ravel()
+    n = int(start.max()) + 1
+    ones = np.ones(len(start), np.int8)
+    there, back = (csr_array((ones, pair), (n, n)) for pair in ((start, end), (end, start)))
+    if there.nnz != len(start) or (there.indptr != back.indptr).any():
+        return False
+    there.sort_indices()
+    back.sort_indices()
+    return bool((there.indices == back.indices).all())
 
 
 def is_manifold(faces: np.ndarray) -> bool:

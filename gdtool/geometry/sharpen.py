@@ -45,17 +45,19 @@ def restore_creases(vertices: np.ndarray, faces: np.ndarray,
     normals, area = face_normals(vertices, faces)
     bevel, rough = np.zeros(len(vertices), bool), np.zeros(len(faces), bool)
     # Only faces with both ends of a bent edge among their corners can have one: few of a fine mesh.
-    few = np.flatnonzero(_maybe_bent(normals, faces, len(vertices), crease_degrees / 2)[faces].sum(1) > 1)
+    columns = np.ascontiguousarray(faces.T)
+    maybe = _maybe_bent(normals, columns, len(vertices), crease_degrees / 2).astype(np.int8)
+    few = np.flatnonzero(maybe[columns[0]] + maybe[columns[1]] + maybe[columns[2]] > 1)
     ends, pairs, angle = dihedral_degrees(vertices, faces[few])
     bent = angle > crease_degrees / 2
     bevel[ends[bent].ravel()] = True
     rough[few[pairs[bent].ravel()]] = True
     used = np.zeros(len(vertices), bool)
-    used[faces.ravel()] = True
-    report["bevel_share"] = float(bevel[used].mean())
+    used[columns] = True
+    report["bevel_share"] = float(bevel.sum() / used.sum())
     near_bevel, marked = np.zeros(len(faces), bool), bevel.copy()
     for _ in range(_RINGS):
-        near_bevel = marked[faces].any(1)
+        near_bevel = marked[columns[0]] | marked[columns[1]] | marked[columns[2]]
         marked[faces[near_bevel].ravel()] = True
     side = np.flatnonzero(near_bevel & ~rough & (area > 0))
     if not bevel.any() or report["bevel_share"] > _LARGEST_SHARE or len(side) < _NEIGHBOURS:
@@ -82,20 +84,22 @@ def restore_creases(vertices: np.ndarray, faces: np.ndarray,
     return *collapse_bevels(out, faces, moved, _JOIN_EDGES * edge), report
 
 
-def _maybe_bent(normals: np.ndarray, faces: np.ndarray, count: int, degrees: float) -> np.ndarray:
+def _maybe_bent(normals: np.ndarray, columns: np.ndarray, count: int, degrees: float) -> np.ndarray:
     """(v,) bool: vertices that may have two faces whose normals differ by more than `degrees`; none that has is left out.
 
-    Of d unit normals two of which are a chord c apart the mean is no longer than sqrt(1 - c^2 / (2 d)): the variance is
-    the mean squared distance of the pairs, and each other normal is at least c / 2 from one of the two.
+    columns (3, f) are the faces' corners. Of d unit normals two of which are a chord c apart the mean is no longer than
+    sqrt(1 - c^2 / (2 d)): the variance is the mean squared distance of the pairs, and each other normal is at least c / 2
+    from one of the two.
     """
-    valid = (normals != 0).any(1).astype(np.float64)
-    total, number = np.zeros((count, 3)), np.zeros(count)
-    for i in range(3):
-        number += np.bincount(faces[:, i], valid, count)
-        for axis in range(3):
-            total[:, axis] += np.bincount(faces[:, i], normals[:, axis], count)
+    from scipy.sparse import csr_array
+
+    # Row v of this matrix adds up the faces of vertex v: a product is several times faster than a bincount per coordinate.
+    f = columns.shape[1]
+    adds = csr_array((np.ones(3 * f), columns.T.ravel(), np.arange(0, 3 * f + 1, 3)), (f, count)).T
+    total = adds @ np.column_stack([normals, (normals != 0).any(1)])
+    number = total[:, 3]
     chord = 2 * np.sin(np.radians(degrees) / 2)
-    return number**2 - (total * total).sum(1) > 0.99 * chord**2 / 2 * number - 1e-9
+    return number**2 - (total[:, :3] ** 2).sum(1) > 0.99 * chord**2 / 2 * number - 1e-9
 
 
 def _sides(normals: np.ndarray, valid: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

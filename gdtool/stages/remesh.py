@@ -170,4 +170,4 @@ def _quads(vertices, faces, options: Options, out: Output):
     return vertices, quads, record.engine, dict(record.figures)
 
 
-STAGE = Stage(name="remesh", version=4, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)
+STAGE = Stage(name="remesh", version=5, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)

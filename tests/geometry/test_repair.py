@@ -139,3 +139,12 @@ def test_edges_count_as_sorting_does():
     ends, inverse, count = np.unique(half, axis=0, return_inverse=True, return_counts=True)
     assert (edges.ends == ends).all() and (edges.count == count).all() and (edges.half_edge_idx == inverse.ravel()).all()
     assert (edges.order == np.argsort(inverse.ravel(), kind="stable")).all()
+
+
+@pytest.mark.parametrize("change", ["none", "turned", "opened", "doubled", "wedge"])
+def test_watertight_as_the_edges_say(change):
+    _, faces = torus(20)
+    faces = {"none": faces, "turned": np.concatenate([faces[:1, ::-1], faces[1:]]), "opened": faces[1:],
+             "doubled": np.concatenate([faces, faces[:1]]), "wedge": np.concatenate([faces, faces[:1], faces[:1, ::-1]])}[change]
+    edges = repair.edges_of(faces)
+    assert repair.is_watertight(faces) == bool((edges.count == 2).all() and not edges.turned.any()) == (change == "none")
