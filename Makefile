@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-materials bench-reconstruct bench-render bench-relight bench-sheets bench-throughput schemas docs-check model data clean
+.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-materials bench-reconstruct bench-render bench-relight bench-sheets bench-throughput bench-cutout bench-sample schemas docs-check model data clean
 
 venv: .venv/.done
 
@@ -22,10 +22,10 @@ test: venv
 stress: venv
 	$(BIN)/python -m pytest -m slow
 
-# What needs optional packages: Stable Diffusion's parts (diffusers, transformers; the tests make their own small weights), OpenUSD, Ray, meshopt (built: needs a C++ compiler).
+# What needs optional packages: Stable Diffusion's parts (diffusers, transformers; the tests make their own small weights), OpenUSD, Ray, OpenCV, meshopt (built: needs a C++ compiler).
 extras-test: venv
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[hub,usd,ray,meshopt]"
-	$(BIN)/python -m pytest tests/diffusion/test_pretrained.py tests/stages/test_bake_usd.py tests/stages/test_ray.py tests/assets/test_meshopt.py
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[hub,usd,ray,meshopt,cutout]"
+	$(BIN)/python -m pytest tests/diffusion/test_pretrained.py tests/stages/test_bake_usd.py tests/stages/test_ray.py tests/assets/test_meshopt.py tests/images/test_mask.py
 
 # Ten minutes of damaged files for every reader; what breaks one stays as a test.
 fuzz: venv
@@ -71,6 +71,10 @@ bench-relight: venv
 # MODELS (files) under LIGHTS (by commas) as gdtool and the peers render them, side by side, in out/sheets, to look at.
 bench-sheets: venv
 	$(BIN)/python benchmarks/contact_sheets.py $(or $(MODELS),procedural:1 procedural:2 procedural:3) --lights $(or $(LIGHTS),dark,mid,bright) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON)) -o out/sheets
+
+# GrabCut on pictures laid over photographed environments (needs ".[cutout]"): two minutes.
+bench-cutout: venv
+	$(BIN)/python benchmarks/cutout.py ../shared/assets/images ../shared/assets/hdr
 
 # Objects per core-minute of render-dataset, by cores and by objects; goes on where it was.
 bench-throughput: venv

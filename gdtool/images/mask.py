@@ -18,8 +18,8 @@ def foreground(image: np.ndarray, mask: np.ndarray | None = None, subject: objec
 
     image (h, w, c) as read_image gives it; mask (h, w[, c]) of the same size, brighter or more opaque is subject.
     In this order: the mask; the picture's own alpha, unless it is opaque everywhere; segmentation against a background
-    that is plain (a smooth gradient and soft shadows are). Raises InputError, naming `subject`, for a picture or mask
-    without a subject, or a background that is not plain.
+    that is plain (a smooth gradient and soft shadows are); with OpenCV (gdtool[cutout]) GrabCut against one that is not.
+    Raises InputError, naming `subject`, for a picture or mask without a subject, or a background that it blends into.
     """
     image = image.reshape(*image.shape[:2], -1)
     if mask is not None:
@@ -64,18 +64,7 @@ def _segmented(image: np.ndarray, subject: object) -> np.ndarray:
     if scale < 1:
         color = resize(color, small, order=1, anti_aliasing=True)
     lab = rgb2lab(color)
-    background, spread = _background(lab, subject)
-    difference = lab - background
-    # A soft shadow darkens without changing hue: lightness below the background's counts for less.
-    weight = np.where(difference[..., :1] < 0, 0.5, 1.0) * (1, 0, 0) + (0, 1, 1)
-    distance = np.sqrt(np.square(difference * weight).sum(-1))
-    sure = max(5.0, 5 * spread)
-    labels = _trimap(distance, sure, spread)
-    if not (labels == 1).any():
-        raise InputError(subject, "shows no subject that stands off its background", _CURE)
-    share = float((labels == 1).mean())
-    if share > 0.95:
-        raise InputError(subject, "is filled by its subject, or its background is not plain", _CURE)
+    labels = _labels(lab, color, subject)
     coverage = (labels == 1).astype(np.float64)
     if (labels == 0).any() and (labels == 2).any():
         with warnings.catch_warnings():
@@ -90,11 +79,43 @@ def _segmented(image: np.ndarray, subject: object) -> np.ndarray:
     return np.clip(coverage, 0, 1).astype(np.float32)
 
 
-def _background(lab: np.ndarray, subject: object) -> tuple[np.ndarray, float]:
+def _labels(lab: np.ndarray, color: np.ndarray, subject: object) -> np.ndarray:
+    """Labels (h, w) as of _trimap, by the difference from a plain background, else by GrabCut. lab and color (h, w, 3) are one picture."""
+    fitted = _background(lab)
+    if fitted is None:
+        return _labels_without_plain_background(color, subject)
+    background, spread = fitted
+    difference = lab - background
+    # A soft shadow darkens without changing hue: lightness below the background's counts for less.
+    weight = np.where(difference[..., :1] < 0, 0.5, 1.0) * (1, 0, 0) + (0, 1, 1)
+    distance = np.sqrt(np.square(difference * weight).sum(-1))
+    labels = _trimap(distance, max(5.0, 5 * spread), spread)
+    if not (labels == 1).any():
+        raise InputError(subject, "shows no subject that stands off its background", _CURE)
+    if float((labels == 1).mean()) > 0.95:
+        raise InputError(subject, "is filled by its subject, or its background is not plain", _CURE)
+    return labels
+
+
+def _labels_without_plain_background(color: np.ndarray, subject: object) -> np.ndarray:
+    from scipy import ndimage
+
+    from gdtool.images import cutout
+
+    if not cutout.available():
+        raise InputError(subject, "has a background that is not plain", f"{_CURE}, or pip install 'gdtool[cutout]'")
+    inside = cutout.cut_out(color, subject, _CURE)
+    labels = np.zeros(inside.shape, np.int32)
+    labels[ndimage.binary_erosion(inside, iterations=2, border_value=1)] = 1
+    labels[~ndimage.binary_dilation(inside, iterations=2)] = 2
+    return labels
+
+
+def _background(lab: np.ndarray) -> tuple[np.ndarray, float] | None:
     """Lab (h, w, 3) of the background everywhere, and its noise: a quadratic in x and y fitted to the border.
 
-    Pixels far from the fit are left out again and again, so a subject may touch some of the border. Raises InputError
-    where no such fit holds for more than half of it.
+    Pixels far from the fit are left out again and again, so a subject may touch some of the border. None where no
+    such fit holds for more than half of it.
     """
     height, width = lab.shape[:2]
     y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
@@ -118,7 +139,7 @@ def _background(lab: np.ndarray, subject: object) -> tuple[np.ndarray, float]:
         if keep.sum() < 50:
             break
     if keep.mean() < 0.5 or spread > 5:
-        raise InputError(subject, "has a background that is not plain", _CURE)
+        return None
     return basis @ fit, spread
 
 

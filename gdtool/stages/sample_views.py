@@ -1,9 +1,9 @@
 """Make six views of an object, in six domains, from one picture of it.
 
-Takes an image with alpha, or one on a plain background that is then cut out, or any image with --mask. The subject is
-cropped and centred as in training. Writes color, normal, depth, albedo, roughness, metallic and masks of the default
-rig for reconstruct, at the model's own resolution. Use --no-crop when the picture is framed like the rig's front view
-already (an orthographic render of a normalised object).
+Takes an image with alpha, or one on a plain background that is then cut out (on a busy one with gdtool[cutout]), or any
+image with --mask. The subject is cropped and centred as in training. Writes color, normal, depth, albedo, roughness,
+metallic and masks of the default rig for reconstruct, at the model's own resolution. Use --no-crop when the picture is
+framed like the rig's front view already (an orthographic render of a normalised object).
 
 Example:
   gdtool sample-views cat.png --seed 7

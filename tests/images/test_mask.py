@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from gdtool.core.errors import InputError
+from gdtool.images import cutout
 from gdtool.images.mask import foreground, touches_border
 
 
@@ -78,3 +79,32 @@ def test_what_has_no_subject_is_refused(image, mask, fact):
     with pytest.raises(InputError, match=fact) as caught:
         foreground(image, mask, "cat.png")
     assert str(caught.value).startswith("cat.png: ")
+
+
+def busy_scene(size: int = 320, contrast: float = 1.0):
+    """A reddish disc with stripes on leaves of greens and blues: (picture uint8, coverage)."""
+    y, x = np.meshgrid(np.linspace(-1, 1, size), np.linspace(-1, 1, size), indexing="ij")
+    coverage = np.clip((0.55 - np.hypot(x, y)) * size / 2 + 0.5, 0, 1)
+    leaves = np.repeat(np.repeat(np.random.default_rng(1).random((size // 8, size // 8, 1)), 8, 0), 8, 1)
+    ground = np.array([0.1, 0.6, 0.2]) * (1 - leaves) + np.array([0.2, 0.3, 0.8]) * leaves
+    stripes = 0.8 + 0.2 * np.sign(np.sin(14 * (x + y)))[..., None]
+    disc = contrast * np.array([0.85, 0.3, 0.15]) * stripes + (1 - contrast) * ground
+    image = disc * coverage[..., None] + ground * (1 - coverage[..., None])
+    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8), coverage
+
+
+def test_a_busy_background_is_cut_away_or_refused_but_never_guessed():
+    pytest.importorskip("cv2")
+    image, truth = busy_scene()
+    mask = foreground(image)
+    assert mask.dtype == np.float32 and overlap(mask, truth) > 0.95 and not touches_border(mask)
+    np.testing.assert_array_equal(mask, foreground(image))  # the same every time
+    hidden, _ = busy_scene(contrast=0.0)
+    with pytest.raises(InputError, match="do not tell the subject from it"):
+        foreground(hidden, subject="leaf.png")
+
+
+def test_without_opencv_a_busy_background_names_the_package(monkeypatch):
+    monkeypatch.setattr(cutout, "available", lambda: False)
+    with pytest.raises(InputError, match=r"not plain; .*gdtool\[cutout\]"):
+        foreground(busy_scene()[0], subject="leaf.png")

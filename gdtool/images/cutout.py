@@ -1,0 +1,60 @@
+"""A subject on a background that is not plain, by GrabCut (Rother et al. 2004, OpenCV), and whether that can be trusted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.core.errors import InputError
+
+INSETS = (0.02, 0.06)  # widths of the frame that is taken for background, as shares of the picture
+AGREEMENT = 0.85  # least overlap of what the two frames give; measured in docs/benchmarks/cutout.md
+
+
+def available() -> bool:
+    """Whether OpenCV is installed (gdtool[cutout])."""
+    import importlib.util
+
+    return importlib.util.find_spec("cv2") is not None
+
+
+def cut_out(color: np.ndarray, subject: object = "image", cure: str = "") -> np.ndarray:
+    """Boolean mask (h, w) of the one subject inside a picture, color (h, w, 3) sRGB in [0, 1].
+
+    The colors along the picture's frame are taken for background. Done with two widths of the frame: where the results
+    differ, the colors of subject and background do not tell them apart, and InputError is raised with `cure`.
+    """
+    _, wide, agreement = both_frames(color)
+    if agreement < AGREEMENT or not 0.005 < float(wide.mean()) < 0.8:
+        raise InputError(subject, "has a background that is not plain, and its colors do not tell the subject from it", cure)
+    return wide
+
+
+def both_frames(color: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """What the narrow and the wide frame give, (h, w) boolean each, and their overlap (intersection over union)."""
+    narrow, wide = (_grabcut(color, inset) for inset in INSETS)
+    either = (narrow | wide).sum()
+    return narrow, wide, float((narrow & wide).sum() / either) if either else 0.0
+
+
+def _grabcut(color: np.ndarray, inset: float) -> np.ndarray:
+    """The largest piece of what GrabCut finds, its holes kept."""
+    import cv2
+    from scipy import ndimage
+
+    height, width = color.shape[:2]
+    picture = np.ascontiguousarray(np.rint(np.clip(color[..., ::-1], 0, 1) * 255).astype(np.uint8))
+    margin_x, margin_y = (max(2, round(inset * side)) for side in (width, height))
+    labels = np.full((height, width), cv2.GC_BGD, np.uint8)
+    labels[margin_y:-margin_y, margin_x:-margin_x] = cv2.GC_PR_FGD
+    threads = cv2.getNumThreads()
+    cv2.setRNGSeed(0)  # the colors' first clustering is random
+    cv2.setNumThreads(1)
+    try:
+        cv2.grabCut(picture, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), 6, cv2.GC_INIT_WITH_MASK)
+    finally:
+        cv2.setNumThreads(threads)
+    found = ndimage.binary_opening((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD))
+    pieces, count = ndimage.label(found)
+    if not count:
+        return found
+    return pieces == 1 + int(np.argmax(ndimage.sum_labels(found, pieces, np.arange(1, count + 1))))
