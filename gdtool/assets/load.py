@@ -48,7 +48,9 @@ def _checked(scene: Scene, path: Path) -> Scene:
         raise InputError(path, "has no faces")
     if scene.faces.min() < 0 or scene.faces.max() >= len(scene.vertices):
         raise InputError(path, f"a face refers to a vertex out of range (there are {len(scene.vertices)})")
-    used = scene.vertices[np.unique(scene.faces)]
+    named = np.zeros(len(scene.vertices), bool)
+    named[scene.faces] = True
+    used = scene.vertices[named]
     if not np.isfinite(used).all():
         raise InputError(path, f"vertex {int(np.argwhere(~np.isfinite(scene.vertices))[0][0])} is not finite")
     low, high = used.min(0), used.max(0)
@@ -57,11 +59,13 @@ def _checked(scene: Scene, path: Path) -> Scene:
         raise InputError(path, f"is {extent:.3g} units large", "scale it down")
     if extent == 0:
         raise InputError(path, "has all its vertices in one point")
-    corners = (scene.vertices[scene.faces] - low) / extent
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    if not (area > 1e-16).any():
+    # Coordinates as rows: several times faster than corners of (f, 3, 3).
+    a, b, c = (np.ascontiguousarray(((scene.vertices[scene.faces[:, i]] - low) / extent).T) for i in range(3))
+    u, w = b - a, c - a
+    squared = (u[1] * w[2] - u[2] * w[1])**2 + (u[2] * w[0] - u[0] * w[2])**2 + (u[0] * w[1] - u[1] * w[0])**2
+    if not (squared > 1e-32).any():
         raise InputError(path, "has only faces without area")
-    empty = (corners == np.roll(corners, -1, axis=1)).all(2).any(1)
+    empty = (a == b).all(0) | (b == c).all(0) | (c == a).all(0)
     if empty.any():
         scene = replace(scene, faces=scene.faces[~empty], material_idx=scene.material_idx[~empty],
                         notes=(*scene.notes, f"{int(empty.sum())} faces with two corners in one place are left out"))

@@ -102,17 +102,20 @@ def shape_figures(vertices: np.ndarray, faces: np.ndarray) -> dict[str, float]:
 
 
 def distance_figures(vertices: np.ndarray, triangles: np.ndarray, source_vertices: np.ndarray, source_faces: np.ndarray,
-                     count: int, seed: int = 0) -> dict[str, float]:
-    """Sampled distances between two surfaces in their unit: mean of both directions, largest of both, mean normal angle."""
+                     count: int, seed: int = 0, source=None) -> dict[str, float]:
+    """Sampled distances between two surfaces in their unit: mean of both directions, largest of both, mean normal angle.
+
+    source: quad_shape.Surface of the source, where its search tree is there already.
+    """
     from gdtool.geometry.distance import closest_points, sample_surface
     from gdtool.geometry.normals import face_normals
 
     rng = np.random.default_rng(seed)
-    mine, source = (vertices, triangles), (source_vertices, source_faces)
+    mine, theirs = (vertices, triangles), (source_vertices, source_faces)
     distances, angles = [], []
-    for one, other in ((mine, source), (source, mine)):
+    for one, other in ((mine, theirs), (theirs, mine)):
         points, face_idx, _ = sample_surface(*one, count, rng)
-        distance, other_idx, _ = closest_points(points, *other)
+        distance, other_idx, _ = source.closest(points) if source is not None and other is theirs else closest_points(points, *other)
         distances.append(distance)
         cosine = (face_normals(*one)[0][face_idx] * face_normals(*other)[0][other_idx]).sum(1)
         angles.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

@@ -49,6 +49,7 @@ class Record:
     failed: list[str] = field(default_factory=list)
     figures: dict[str, float | int | bool | str] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
+    source: Surface | None = None  # the input with its search tree, built while a child worked
 
     def clock(self, name: str, start: float) -> None:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
@@ -70,10 +71,8 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
     record.clock("restore creases", start)
     # Where a child has one core, this process can use another: the search tree of the input, then the deviation from it.
     with ThreadPoolExecutor(1) as beside:
-        fine = beside.submit(Surface, fine_vertices, fine_faces)
+        fine = beside.submit(Surface, vertices, faces)
         coarse = _simplified(vertices, faces, fine_vertices, fine_faces, closed, request, record)
-        if record.figures.get("crease_vertices_restored") == 0 and fine_vertices is not vertices:
-            fine = beside.submit(Surface, vertices, faces)
         error = beside.submit(_deviation, fine, coarse) if coarse[1] is not faces else None
         done, names = [], []
         for part_vertices, part_faces, quads in _pieces(*coarse, request.quads):
@@ -87,6 +86,7 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
                 record.clock("fallback", start)
             done.append(found[:2])
             names.append(found[2])
+        record.source = fine.result()
         record.figures["simplify_error"] = error.result() if error is not None else 0.0
     record.engine = "; ".join(dict.fromkeys(names))
     offset = np.cumsum([0] + [len(v) for v, _ in done])

@@ -78,31 +78,44 @@ def _counting_order(keys: np.ndarray, width: int) -> np.ndarray:
 
 def is_watertight(faces: np.ndarray) -> bool:
     """Every edge has exactly two faces, which walk it in opposite directions."""
-    from scipy.sparse import csr_array
-
+    faces = np.asarray(faces)
     if not len(faces):
         return False
-    faces = np.asarray(faces)
-    if faces.shape[1] == 4 or faces.max() >= 2**31 - 1 or faces.min() < 0 or 3 * len(faces) > 2**31 - 1:
+    if faces.shape[1] == 4 or faces.min() < 0 or faces.max() >= 2**31 - 1 or 3 * len(faces) > 2**31 - 1:
         edges = edges_of(faces)
         return bool((edges.count == 2).all() and not edges.turned.any())
-    # Of triangles in linear time: no directed edge occurs twice, and each occurs the other way round too.
+    return _twins(faces) is not None
+
+
+def _twins(faces: np.ndarray) -> np.ndarray | None:
+    """(3 f,) the half edge the other way round for each half edge of triangles (f, 3); None where one has none or several.
+
+    In linear time: half edges are the entries of a sparse matrix, whose transpose has the same entries elsewhere.
+    """
+    from scipy.sparse import csr_array
+
     start = faces.astype(np.int32).ravel()
     end = np.ascontiguousarray(faces[:, [1, 2, 0]]).astype(np.int32).ravel()
     n = int(start.max()) + 1
-    ones = np.ones(len(start), np.int8)
-    there, back = (csr_array((ones, pair), (n, n)) for pair in ((start, end), (end, start)))
+    name = np.arange(1, len(start) + 1, dtype=np.int32)
+    there, back = (csr_array((name, pair), (n, n)) for pair in ((start, end), (end, start)))
     if there.nnz != len(start) or (there.indptr != back.indptr).any():
-        return False
+        return None
     there.sort_indices()
     back.sort_indices()
-    return bool((there.indices == back.indices).all())
+    if (there.indices != back.indices).any():
+        return None
+    out = np.empty(len(start), np.int32)
+    out[there.data - 1] = back.data - 1
+    return out
 
 
 def is_manifold(faces: np.ndarray) -> bool:
     """No edge has more than two faces, and the faces around each vertex form one fan."""
     if not len(faces):
         return False
+    if is_watertight(faces) and faces.shape[1] == 3:
+        return _vertices_manifold(faces)
     edges = edges_of(faces)
     return bool((edges.count <= 2).all()) and not len(split_vertices(faces))
 
@@ -150,69 +163,6 @@ def corner_fans(faces: np.ndarray, mates: np.ndarray | None = None) -> tuple[np.
     out = np.full(faces.shape, -1, np.int64)
     out[used] = label
     return out, fans
-
-
-def unpinched(vertices: np.ndarray, faces: np.ndarray, rounds: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """A closed triangle mesh two sheets of which share an edge, with a copy of the edge and its ends for each sheet.
-
-    faces (f, 3). Faces on both sides of one wedge of the inside stay together; crumbs that come off are dropped. Edges of
-    an odd number of faces, or of more one way than the other, are left.
-    """
-    edges = edges_of(faces)
-    pinched = np.flatnonzero((edges.count > 2) & (edges.count % 2 == 0))
-    if not len(pinched):
-        return one_vertex_per_fan(vertices, faces)
-    first = np.cumsum(edges.count) - edges.count
-    mates = []
-    for edge in pinched.tolist():
-        half = edges.order[first[edge]:first[edge] + edges.count[edge]]
-        a, b = vertices[edges.ends[edge]]
-        along = b - a
-        x = np.cross(along, [1.0, 0.0, 0.0] if abs(along[0]) < 0.9 * np.linalg.norm(along) else [0.0, 1.0, 0.0])
-        y = np.cross(along, x)
-        tip = vertices[faces[edges.half_face[half]].sum(1) - edges.ends[edge].sum()] - a
-        angle = np.arctan2(tip @ y / max(np.linalg.norm(y), 1e-300), tip @ x / max(np.linalg.norm(x), 1e-300))
-        half = half[np.argsort(angle, kind="stable")]
-        forward = edges.half_ends[half, 0] == edges.ends[edge, 0]
-        if 2 * int(forward.sum()) != len(half):
-            continue
-        # About the edge the inside begins at a backward face and ends at the next forward one.
-        depth = np.cumsum(np.where(forward, -1, 1))
-        half = np.roll(half, -(int(depth.argmin()) + 1))
-        forward = edges.half_ends[half, 0] == edges.ends[edge, 0]
-        opened: list[int] = []
-        for h, closes in zip(half.tolist(), forward.tolist(), strict=True):
-            if closes:
-                mates.append((opened.pop(), h))
-            else:
-                opened.append(h)
-    pairs = np.array(mates, np.int64).reshape(-1, 2)
-    pieces = components(faces)[0]
-    out, found = without_crumbs(*one_vertex_per_fan(vertices, faces, corner_fans(faces, pairs)[0]), pieces)
-    if rounds and (edges_of(found).count > 2).any():
-        # Two sheets with both ends in common besides: a vertex of its own in the middle of each tells them apart.
-        return unpinched(*_halved(vertices, faces, edges, pairs), rounds - 1)
-    return out, found
-
-
-def _halved(vertices: np.ndarray, faces: np.ndarray, edges: Edges, mates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each pair of half edges (k, 2) with a vertex of its own in the middle, its two triangles cut in two."""
-    touched, more, points = set(), [], []
-    faces = faces.copy()
-    for pair in mates.tolist():
-        own = edges.half_face[pair].tolist()
-        if touched & set(own) or own[0] == own[1]:
-            continue  # the next round
-        touched.update(own)
-        middle = len(vertices) + len(points)
-        points.append(vertices[edges.half_ends[pair[0]]].mean(0))
-        for h, f in zip(pair, own, strict=True):
-            a, b = edges.half_ends[h]
-            more.append(np.where(faces[f] == a, middle, faces[f]))
-            faces[f] = np.where(faces[f] == b, middle, faces[f])
-    if not points:
-        return vertices, faces
-    return np.concatenate([vertices, points]), np.concatenate([faces, more])
 
 
 def without_crumbs(vertices: np.ndarray, faces: np.ndarray, pieces: int) -> tuple[np.ndarray, np.ndarray]:
@@ -334,14 +284,24 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
 
 
 def _vertices_manifold(faces: np.ndarray) -> bool:
-    import igl
+    """Whether the faces around each vertex of a watertight mesh of triangles (f, 3) form one fan."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
 
-    return bool(np.all(igl.is_vertex_manifold(np.ascontiguousarray(faces, np.int64))))
+    twins = _twins(faces)
+    if twins is None:
+        return not len(split_vertices(faces))
+    # From an edge that leaves a vertex to the next one that does: its cycles are the fans.
+    n = len(twins)
+    before = np.arange(n).reshape(-1, 3)[:, [2, 0, 1]].ravel()
+    turn = csr_array((np.ones(n, np.int8), twins[before], np.arange(n + 1)), (n, n))
+    return connected_components(turn, True, "strong", return_labels=False) == int((np.bincount(faces.ravel()) > 0).sum())
 
 
 def _areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    from gdtool.geometry.normals import face_normals
+
+    return face_normals(vertices, faces)[1]
 
 
 def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:

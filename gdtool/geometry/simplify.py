@@ -7,6 +7,7 @@ import numpy as np
 from gdtool.core.child import ChildFailed, call
 from gdtool.core.errors import InputError
 from gdtool.geometry import repair
+from gdtool.geometry.unpinch import unpinched
 
 
 def collapse(vertices: np.ndarray, faces: np.ndarray, target_faces: int, aggressiveness: float) -> tuple[np.ndarray, np.ndarray]:
@@ -80,7 +81,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
             reasons.append(str(failure))
             continue
         if closed and _sound(*out, False, target_faces) and not _sound(*out, True, target_faces):
-            out = repair.unpinched(*out)  # what the quick collapse tears are mostly two sheets that meet in an edge
+            out = unpinched(*out)  # what the quick collapse tears are mostly two sheets that meet in an edge
         if _sound(*out, closed, target_faces):
             found, method = out, "quadric collapse" if name == "collapse" else "quadric collapse, topology kept"
             break

@@ -49,7 +49,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     options = _counted(vertices, faces, options, out)
     if quads is not None and options.keep and not options.triangles and not options.max_deviation and _meets(quads, options):
         out.skip("remeshing", f"the mesh already is {len(quads)} quads, closed and manifold")
-        found_vertices, found, engine, figures = vertices, quads, "passed through", {}
+        found_vertices, found, engine, figures, source = vertices, quads, "passed through", {}, None
     else:
         with out.step("clean"):
             vertices, faces, repairs = repair.clean(vertices, faces, _path(inputs))
@@ -58,11 +58,11 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
                                                              else name.replace("_", " ") for name, value in repairs.items()))
         if not repair.is_watertight(faces):
             out.warn(f"{inputs.name}: the surface is open; its boundaries are kept")
-        found_vertices, found, engine, figures = _decimated(vertices, faces, options, out) if options.triangles else _quads(vertices, faces, options, out)
+        found_vertices, found, engine, figures, source = (_decimated if options.triangles else _quads)(vertices, faces, options, out)
     with out.step("measure"):
         figures |= mesh_quality.topology_figures(found_vertices, found) | mesh_quality.shape_figures(found_vertices, found)
         if engine != "passed through":
-            figures |= mesh_quality.distance_figures(found_vertices, triangulated(found)[0], vertices, faces, 20000)
+            figures |= mesh_quality.distance_figures(found_vertices, triangulated(found)[0], vertices, faces, 20000, source=source)
     asked = options.triangles or (len(found) if options.max_deviation else options.faces)
     if engine != "passed through" and abs(len(found) / asked - 1) > 0.03 and (not options.triangles or len(found) > asked):
         out.warn(f"{inputs.name}: {len(found)} faces, not the {asked} asked for")
@@ -120,7 +120,8 @@ def _read(inputs: Inputs, out: Output):
             out.warn(f"{inputs.name}: {text}")
         vertices, faces = scene.vertices, scene.faces.astype(np.int64)
     check(vertices, faces, _path(inputs))
-    used = np.unique(faces)
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
     extent = float(np.ptp(vertices[used], 0).max())
     if not 1e-150 < extent < 1e150:
         raise InputError(_path(inputs), f"its longest side is {extent:g}, which cannot be computed with", "scale it")
@@ -148,7 +149,7 @@ def _decimated(vertices, faces, options: Options, out: Output):
     if "failed" in report:
         out.warn(f"simplify: {report['failed']}")
     figures = {"simplify_error": report["error"]}
-    return vertices, np.concatenate([faces, np.full((len(faces), 1), -1)], 1), report["method"], figures
+    return vertices, np.concatenate([faces, np.full((len(faces), 1), -1)], 1), report["method"], figures, None
 
 
 def _quads(vertices, faces, options: Options, out: Output):
@@ -167,7 +168,7 @@ def _quads(vertices, faces, options: Options, out: Output):
         out.skip("a way of remeshing", text)
     for name, seconds in record.seconds.items():
         out.seconds[name] = out.seconds.get(name, 0.0) + seconds
-    return vertices, quads, record.engine, dict(record.figures)
+    return vertices, quads, record.engine, dict(record.figures), record.source
 
 
 STAGE = Stage(name="remesh", version=5, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)

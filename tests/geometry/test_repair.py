@@ -5,6 +5,7 @@ import pytest
 
 from gdtool.core.errors import InputError
 from gdtool.geometry import repair
+from gdtool.geometry.unpinch import unpinched
 from tests.geometry.solids import cube, joined, plane, torus, volume
 
 
@@ -121,7 +122,7 @@ def test_sheets_that_meet_in_an_edge_are_parted():
     points = np.unique(both, axis=0)
     pinched = joined.ravel()[np.concatenate([faces, faces + 8])]
     assert len(points) == 14 and not repair.is_watertight(pinched)
-    out, parted = repair.unpinched(points, pinched)
+    out, parted = unpinched(points, pinched)
     assert repair.is_watertight(parted) and repair.is_manifold(parted)
     assert repair.components(parted)[0] == 2 and len(out) == 16
 
