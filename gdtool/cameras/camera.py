@@ -103,12 +103,17 @@ def rays(camera: Camera, pixels: np.ndarray | None = None) -> tuple[np.ndarray, 
     if camera.projection == "orthographic":
         step = camera.pixel_size
         local = np.stack([(x - camera.width / 2) * step, (camera.height / 2 - y) * step, np.zeros_like(x)], -1)
-        origins = local @ camera.world_from_camera[:3, :3].T + camera.position
+        origins = _turned(local, camera.world_from_camera[:3, :3]) + camera.position
         return origins, np.broadcast_to(-camera.backward, origins.shape).copy()
     local = np.stack([(x - camera.cx) / camera.fx, (camera.cy - y) / camera.fy, -np.ones_like(x)], -1)
-    directions = local @ camera.world_from_camera[:3, :3].T
+    directions = _turned(local, camera.world_from_camera[:3, :3])
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     return np.broadcast_to(camera.position, directions.shape).copy(), directions
+
+
+def _turned(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """rotation (3, 3) times vectors (..., 3). Not by BLAS: for products this small its threads, spinning, cost more than they do."""
+    return np.einsum("...j,kj->...k", vectors, rotation)
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 POOL = 1 << 16
 # Point-times-direction pairs shaded at once: many enough that calls cost little beside them.
 PAIRS = 1 << 17
+# Share of what a point's directions bring on average that one must bring for its shadow ray to be certain.
+RARE = 0.5
 # Sums of a point: of visible directions reflection, its part w, diffuse, its part w; of all directions the first three;
 # known without directions reflection, its part w, diffuse.
 SUMS = 10
@@ -63,6 +65,7 @@ class DirectLight:
             directions, radiance, density = environment.sample(sobol(POOL, 2, seed))
             self.pool = tuple(tensor_of(x) for x in (*directions.T, density, radiance))
             self.pattern = tuple(tensor_of(x) for x in sobol(POOL, 3, seed + 1).T)
+            self.dice = tensor_of(np.random.default_rng(seed).random(POOL))
         elif mode == "sampled":
             raise ValueError("sampled light needs samples")
         self.irradiance = IrradianceMap(environment)
@@ -76,7 +79,7 @@ class DirectLight:
     def radiance(self, points: Points) -> np.ndarray:
         """(n, 3) linear radiance toward the eye, emission included."""
         k = self.samples
-        step = max(1, PAIRS // max(k, 8))
+        step = max(1, PAIRS // max(2 * k, 8))
         sums = np.zeros((len(points), SUMS, 3), np.float32)
         runs = self._runs(points) if k else None
         if self.mode == "prefiltered" and len(points):
@@ -85,12 +88,12 @@ class DirectLight:
             n_v = np.einsum("ij,ij->i", points.values["normal"], points.view)
             self.prefiltered.prepare(lobe_roughness(tensor_of(points.values["roughness"]), tensor_of(n_v)))
 
-        at, counted = time.perf_counter(), np.zeros(3, np.int64)
+        at, counted = time.perf_counter(), np.zeros(4, np.int64)
         for start in range(0, len(points), step):
             part = slice(start, start + step)
             counted += self._chunk(points, part, None if runs is None else runs[:, part], sums[part])
-        cast, below, convex = counted.tolist()
-        self.renderer.counts.spend("directions", at, shadow_rays=cast, shadow_rays_below_horizon=below, shadow_rays_convex=convex)
+        cast, below, convex, rare = counted.tolist()
+        self.renderer.counts.spend("directions", at, shadow_rays=cast, shadow_rays_below_horizon=below, shadow_rays_convex=convex, shadow_rays_rare=rare)
         out = self._combined(points, sums)
         out += points.values["emissive"]
         unlit = points.values["unlit"]
@@ -111,8 +114,8 @@ class DirectLight:
             out[which] = (number // block) % (POOL // k // block) * block + ((points.sample % block) ^ (number % block))
         return out
 
-    def _chunk(self, points: Points, part: slice, runs: np.ndarray | None, sums: np.ndarray) -> tuple[int, int, int]:
-        """Fill sums; shadow rays cast, directions that needed none below the horizon, and on convex objects."""
+    def _chunk(self, points: Points, part: slice, runs: np.ndarray | None, sums: np.ndarray) -> tuple[int, int, int, int]:
+        """Fill sums; the counts of _hide."""
         import torch
 
         k = self.samples
@@ -123,22 +126,33 @@ class DirectLight:
             normal, view = (tensor_of(x[part]) for x in (points.values["normal"], points.view))
             result[:, 7], result[:, 8] = self.prefiltered.specular(normal, view, tensor_of(points.values["roughness"][part]))
         if not k:
-            return 0, 0, 0
+            return 0, 0, 0, 0
         light_run, pattern_run = torch.from_numpy(runs[0]), torch.from_numpy(runs[1])
 
         def run_of(pool, run):
             return pool.reshape(POOL // k, k, *pool.shape[1:]).index_select(0, run)
 
-        x, y, z, p_light, light = (run_of(part, light_run) for part in self.pool)
-        first = self._gather(points, part, surface, (x, y, z), light, p_light, k)
-        direction = surface.sample(*(run_of(u, pattern_run) for u in self.pattern))
-        pixel = self._pixel(*direction)
+        *toward, p_light, light = (run_of(pool, light_run) for pool in self.pool)
+        mirrored = surface.sample(*(run_of(u, pattern_run) for u in self.pattern))
+        pixel = self._pixel(*mirrored)
         flat = pixel.reshape(-1)
-        terms, p_reflect, above = evaluated = surface.evaluate(*direction)
-        second = self._gather(points, part, surface, direction, self.image.index_select(0, flat).view(*pixel.shape, 3),
-                              self.density.index_select(0, flat).view_as(pixel), k, evaluated)
-        result[:, :7] = first[0] + second[0]
-        return first[1] + second[1], first[2] + second[2], first[3] + second[3]
+        direction = [torch.cat(pair, 1) for pair in zip(toward, mirrored, strict=True)]
+        light = torch.cat([light, self.image.index_select(0, flat).view(*pixel.shape, 3)], 1)
+        p_light = torch.cat([p_light, self.density.index_select(0, flat).view_as(pixel)], 1)
+        terms, p_reflect, above = surface.evaluate(*direction)
+        everything = 1 / (k * (p_light + p_reflect)).clamp_min(1e-20)
+        weight, counted = above * everything, (0, 0, 0, 0)
+        if self.shadows:
+            brightness = surface.brightness(terms, light @ tensor_of(LUMINANCE)) * weight
+            dice = torch.cat([run_of(self.dice, light_run), run_of(self.dice, pattern_run)], 1)
+            counted = self._hide(points, part, surface, direction, (weight, everything), above, brightness, dice)
+        # Only prefiltered light asks what share of the reflection is visible.
+        split = self.mode == "prefiltered"
+        kept = terms[:3] if split else terms[2:3]
+        parts = torch.bmm(torch.stack([*(term * weight for term in terms), *(term * everything for term in kept)], 1), light)
+        result[:, :4] = parts[:, :4]
+        result[:, 4 if split else 6:7] = parts[:, 4:]
+        return counted
 
     def _pixel(self, x, y, z):
         """Environment.pixel_of in float32."""
@@ -149,32 +163,34 @@ class DirectLight:
         column = ((torch.atan2(z, x) * (0.5 / math.pi) + 0.5) * width).long().clamp(0, width - 1)
         return row * width + column
 
-    def _gather(self, points: Points, part: slice, surface: Surface, direction, light, p_light, k: int, evaluated=None):
-        """The first seven sums (n, 7, 3), shadow rays cast, directions that needed none below the horizon, and on convex
-        objects."""
+    def _hide(self, points: Points, part: slice, surface: Surface, direction, weights, above, brightness, dice) -> tuple[int, int, int, int]:
+        """Take the first of two weights (n, m) from directions that something hides; how many shadow rays that took, and how
+        many directions needed none: below the horizon, on convex objects, and for bringing too little light.
+
+        A direction that brings less than RARE of what its point's directions do on average is followed only with the
+        probability brightness / (RARE of that), and counts for as many more (Russian roulette): the mean stays what it is.
+        Both weights tell so, and where nothing is hidden they stay the same.
+        """
         import torch
 
-        terms, p_reflect, above = surface.evaluate(*direction) if evaluated is None else evaluated
-        everything = 1 / (k * (p_light + p_reflect)).clamp_min(1e-20)
-        weight = above * everything
+        columns = above.shape[1]
         flat = above.reshape(-1).nonzero()[:, 0]
         lit = len(flat)
-        if self.shadows and lit:
-            owner = (flat // k).numpy()
-            inner = self.renderer.may_be_hidden(points.position[part], surface.geometric_rows.numpy())
-            if inner is not None:
-                chosen = inner[owner]
-                flat, owner = flat[torch.from_numpy(chosen)], owner[chosen]
-            origins = surface.lifted(points.position[part], 2e-4 * self.renderer.extent)[owner]
-            rays = torch.stack([c.reshape(-1)[flat] for c in direction], 1).numpy()
-            weight.reshape(-1)[flat[torch.from_numpy(self.renderer.occluded(origins, rays))]] = 0.0
-        else:
-            flat = flat[:0]
-        # Only prefiltered light asks what share of the reflection is visible.
-        kept = slice(0, 3) if self.mode == "prefiltered" else slice(2, 3)
-        parts = torch.bmm(torch.stack([*(term * weight for term in terms), *(term * everything for term in terms[kept])], 1), light)
-        sums = parts if self.mode == "prefiltered" else torch.cat([parts[:, :4], torch.zeros(len(parts), 2, 3), parts[:, 4:]], 1)
-        return sums, len(flat), above.numel() - lit, lit - len(flat) if self.shadows else 0
+        inner = self.renderer.may_be_hidden(points.position[part], surface.geometric_rows.numpy())
+        if inner is not None:
+            flat = flat[torch.from_numpy(inner)[flat // columns]]
+        asked = len(flat)
+        chance = (brightness / (RARE * brightness.mean(1, keepdim=True)).clamp_min(1e-20)).reshape(-1)[flat].clamp_max_(1)
+        follow = dice.reshape(-1)[flat] < chance
+        visible, everything = (weight.reshape(-1) for weight in weights)
+        times = torch.where(follow, 1 / chance.clamp_min(1e-20), 0.0)
+        visible[flat] *= times
+        everything[flat] *= times
+        flat = flat[follow]
+        origins = surface.lifted(points.position[part], 2e-4 * self.renderer.extent)[(flat // columns).numpy()]
+        rays = torch.stack([c.reshape(-1)[flat] for c in direction], 1).numpy()
+        visible[flat[torch.from_numpy(self.renderer.occluded(origins, rays))]] = 0.0
+        return len(flat), above.numel() - lit, lit - asked, asked - len(flat)
 
     def _combined(self, points: Points, sums: np.ndarray) -> np.ndarray:
         """(n, 3) radiance without emission."""
@@ -213,7 +229,7 @@ class DirectLight:
 
 def _share(visible: np.ndarray, everything: np.ndarray, known: np.ndarray, starts: np.ndarray) -> np.ndarray:
     """(m, 1) visible share of light in each run of points (n, 3) that begins at starts (m,)."""
-    v, u, b = (np.add.reduceat(x @ LUMINANCE, starts) for x in (visible, everything, known))
+    v, u, b = (np.add.reduceat(np.einsum("ij,j->i", x, LUMINANCE), starts) for x in (visible, everything, known))
     return np.clip((v + PRIOR * b) / np.maximum(u + PRIOR * b, 1e-20), 0, 1).astype(np.float32)[:, None]
 
 

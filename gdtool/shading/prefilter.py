@@ -92,11 +92,11 @@ class IrradianceMap:
         phi = ((np.arange(2 * height) + 0.5) / (2 * height) - 0.5) * 2 * np.pi
         ring = np.sin(theta)[:, None]
         normals = np.stack([ring * np.cos(phi), np.broadcast_to(np.cos(theta)[:, None], (height, 2 * height)), ring * np.sin(phi)], -1)
-        weighted = (small.image * small.solid_angles[:, None, None]).reshape(-1, 3).astype(np.float32)
-        toward = small.directions.reshape(-1, 3).T.astype(np.float32)
+        weighted = torch.as_tensor((small.image * small.solid_angles[:, None, None]).reshape(-1, 3), dtype=torch.float32)
+        toward = torch.as_tensor(small.directions.reshape(-1, 3).T, dtype=torch.float32)
         # A few normals at a time: what lies between the two products stays in the cache.
-        parts = [np.maximum(part @ toward, 0) @ weighted for part in np.array_split(normals.reshape(-1, 3).astype(np.float32), height)]
-        self.values = np.concatenate(parts).reshape(height, 2 * height, 3)
+        parts = [(part @ toward).clamp_min_(0) @ weighted for part in torch.as_tensor(normals.reshape(-1, 3), dtype=torch.float32).chunk(height)]
+        self.values = torch.cat(parts).numpy().reshape(height, 2 * height, 3)
         # A column more on each side, from the other one.
         self.wrapped = torch.from_numpy(np.concatenate([self.values[:, -1:], self.values, self.values[:, :1]], 1))
 

@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 
+from gdtool.shading.environment import LUMINANCE
+
 MIN_SPECULAR_SHARE = 0.1
 # Normal maps may turn a normal away from the eye: such points are shaded as seen at grazing.
 MIN_VIEW_COSINE = 0.02
@@ -47,6 +49,14 @@ class Surface:
     def lifted(self, position: np.ndarray, offset: float) -> np.ndarray:
         """(n, 3) float32 positions (n, 3) moved a little off the surface, to the seen side."""
         return (position + offset * self.geometric_rows.numpy()).astype(np.float32)
+
+    def brightness(self, terms, luminance):
+        """(n, k) about how bright directions of a luminance (n, k) are reflected, from the terms of evaluate."""
+        import torch
+
+        weights = torch.from_numpy(LUMINANCE.astype(np.float32))
+        f0, diffuse = (self.f0 @ weights)[:, None], (self.albedo @ weights * (1 - self.metallic))[:, None]
+        return luminance * (f0 * terms[0] + (1 - f0) * terms[1] + diffuse * terms[2])
 
     def evaluate(self, x, y, z):
         """[D V c, D V c w, d c / π, d c w / π] with c = n·l and d the diffuse model's factor; density of sample(); and 1.0

@@ -40,13 +40,16 @@ def savings(renderer: Renderer, samples: int, light: DirectLight | None) -> list
         even = 1 - counts.pixels_refined / max(counts.pixels_in_bounds, 1)
         reason = f"{even:.0%} of the pixels in bounds are even and got {BASE} of {samples}; {counts.samples / max(counts.pixels_in_bounds, 1):.1f} on average"
         out.append(("samples", reason, fewer * counts.seconds.get("samples", 0.0) / taken))
-    directions = counts.shadow_rays + counts.shadow_rays_below_horizon + counts.shadow_rays_convex
+    directions = counts.shadow_rays + counts.shadow_rays_below_horizon + counts.shadow_rays_convex + counts.shadow_rays_rare
     each = counts.seconds.get("directions", 0.0) / max(directions, 1)
     if counts.shadow_rays_below_horizon:
         reason = f"{counts.shadow_rays_below_horizon / directions:.0%} of the directions are below the horizon"
         out.append(("shadow rays", reason, counts.shadow_rays_below_horizon * each))
     if counts.shadow_rays_convex:
         out.append(("shadow rays of convex objects", "nothing lies in front of a convex object's outside", counts.shadow_rays_convex * each))
+    if counts.shadow_rays_rare:
+        reason = f"{counts.shadow_rays_rare / directions:.0%} of the directions bring little light and were left out by chance, the others counting for more"
+        out.append(("shadow rays toward little light", reason, counts.shadow_rays_rare * each))
     if light is not None and light.prefiltered is not None and light.prefiltered.images:
         from gdtool.shading.prefilter import LADDER
 

@@ -56,7 +56,7 @@ class SurfaceLookup:
             texels = texture.image.reshape(-1, 1 if texture.image.ndim == 2 else texture.image.shape[2])
             scatter = texels[:: max(1, len(texels) // 64)]
             same = bool((scatter == texels[0]).all() and (texels == texels[0]).all())
-            self._constants[id(texture)] = TextureReader(texture).decode(texels[:1])[0] if same else None
+            self._constants[id(texture)] = TextureReader(texture).stored(np.zeros(1, np.int64))[0] if same else None
         return self._constants[id(texture)]
 
     def _uv(self, texture: Texture) -> np.ndarray | None:

@@ -44,95 +44,107 @@ def same_layout(texture: Texture) -> tuple:
 class TextureReader:
     """Texels of textures of one layout, side by side as linear float32: channels of the first, then of the next.
 
-    The finest level is as stored, coarser ones are box averages of about 2x2, made when asked. Threads may read at once.
+    The finest level stays as stored, image by image; coarser ones are box averages of about 2x2, made when asked. Threads
+    may read at once.
     """
 
     def __init__(self, *textures: Texture):
         self.texture = textures[0]
-        images = [t.image if t.image.ndim == 3 else t.image[..., None] for t in textures]
-        ends = np.cumsum([image.shape[2] for image in images])
-        self.parts = [slice(int(end) - image.shape[2], int(end)) for image, end in zip(images, ends, strict=True)]
+        self.images = [np.ascontiguousarray(t.image if t.image.ndim == 3 else t.image[..., None]) for t in textures]
+        ends = np.cumsum([image.shape[2] for image in self.images])
+        self.parts = [slice(int(end) - image.shape[2], int(end)) for image, end in zip(self.images, ends, strict=True)]
         self.colored = [t.encoding == "srgb" for t in textures]
-        self.levels: list[np.ndarray] = [np.ascontiguousarray(images[0] if len(images) == 1 else np.concatenate(images, 2))]
-        dtype = images[0].dtype
-        top = {"u1": 255, "u2": 65535}.get(dtype.str[1:])
+        # Coarser levels: of half the size, a quarter, …
+        self.levels: list[np.ndarray] = []
+        top = {"u1": 255, "u2": 65535}.get(self.images[0].dtype.str[1:])
         self._unit = np.float32(1.0 if top is None else 1.0 / top)
-        self._table = None if top is None else linear_from_srgb(np.arange(top + 1, dtype=dtype)).astype(np.float32)
+        self._table = None if top is None else linear_from_srgb(np.arange(top + 1, dtype=self.images[0].dtype)).astype(np.float32)
         self._lock = threading.Lock()
 
     @property
     def channels(self) -> int:
-        return self.levels[0].shape[-1]
+        return self.parts[-1].stop
 
     @property
     def depth(self) -> int:
         """How many levels there can be, down to one texel."""
-        return max(self.levels[0].shape[:2]).bit_length()
+        return max(self.images[0].shape[:2]).bit_length()
 
-    def decode(self, texels: np.ndarray) -> np.ndarray:
-        """Stored texels (..., c) of the finest level to linear float32; alpha is never sRGB."""
-        out = np.empty(texels.shape, np.float32)
-        for channels, colored in self._channels():
-            if colored:
-                values = texels[..., channels]
-                out[..., channels] = linear_from_srgb(values) if self._table is None else np.take(self._table, values)
-            else:
-                np.multiply(texels[..., channels], self._unit, out=out[..., channels], dtype=np.float32, casting="same_kind")
+    def stored(self, index: np.ndarray) -> np.ndarray:
+        """(n, c) linear float32 of texels (n,) of the finest level, row by row; alpha is never sRGB."""
+        out = np.empty((len(index), self.channels), np.float32)
+        for image, part, colored in zip(self.images, self.parts, self.colored, strict=True):
+            texels = np.take(image.reshape(-1, image.shape[2]), index, axis=0)
+            self._decode(texels, colored, out[:, part])
         return out
 
-    def _channels(self) -> list[tuple[slice, bool]]:
-        """Runs of channels that are all sRGB, or all not."""
-        runs: list[tuple[slice, bool]] = []
-        for part, colored in zip(self.parts, self.colored, strict=True):
-            last = part.stop if part.stop - part.start in (1, 3) else part.stop - 1
-            for run, srgb in ((slice(part.start, last), colored), (slice(last, part.stop), False)):
-                if run.start == run.stop:
-                    continue
-                if runs and runs[-1][1] == srgb:
-                    runs[-1] = (slice(runs[-1][0].start, run.stop), srgb)
-                else:
-                    runs.append((run, srgb))
-        return runs
+    def _decode(self, texels: np.ndarray, colored: bool, out: np.ndarray) -> None:
+        """Texels (..., c) as one image stores them into out, linear float32."""
+        for channels, srgb in _runs(texels.shape[-1], colored):
+            values = texels[..., channels]
+            if srgb:
+                out[..., channels] = self._linear(values)
+            else:
+                np.multiply(values, self._unit, out=out[..., channels], dtype=np.float32, casting="same_kind")
+
+    def _linear(self, values: np.ndarray) -> np.ndarray:
+        """float32 of stored sRGB values."""
+        return linear_from_srgb(values).astype(np.float32, copy=False) if self._table is None else np.take(self._table, values)
 
     def level(self, k: int) -> np.ndarray:
-        """(h // 2^k, w // 2^k, c), at least 1: level 0 as stored, the others linear float32."""
+        """(h // 2^k, w // 2^k, c) linear float32, at least 1 by 1."""
+        if k == 0:
+            height, width = self.images[0].shape[:2]
+            return self.stored(np.arange(height * width)).reshape(height, width, -1)
         with self._lock:
-            return self._made(k)
+            while len(self.levels) < k:
+                self._make_next()
+            return self.levels[k - 1]
 
-    def _made(self, k: int) -> np.ndarray:
-        while len(self.levels) <= k:
-            finer, first = self.levels[-1], len(self.levels) == 1
-            height, width, channels = finer.shape
-            coarse = np.empty((max(height // 2, 1), max(width // 2, 1), channels), np.float32)
-            halved = self._halved_even if height % 2 == width % 2 == 0 else self._halved_odd
-            bands = range(0, len(coarse), BAND // 2)
-            if len(bands) > 1:
-                with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-                    list(pool.map(lambda row: halved(finer, coarse[row:row + BAND // 2], row, first), bands))
-            else:
-                halved(finer, coarse, 0, first)
-            self.levels.append(coarse)
-        return self.levels[k]
+    def _make_next(self) -> None:
+        finer = self.levels[-1:] or self.images
+        parts = [slice(0, self.channels)] if self.levels else self.parts
+        height, width = finer[0].shape[:2]
+        coarse = np.empty((max(height // 2, 1), max(width // 2, 1), self.channels), np.float32)
+        halved = self._halved_even if height % 2 == width % 2 == 0 else self._halved_odd
+        # Coarser levels are linear already.
+        colored = None if self.levels else self.colored
 
-    def _halved_even(self, finer: np.ndarray, out: np.ndarray, row: int, first: bool) -> None:
-        """Means of 2x2 texels into out, rows of the coarser level from row on. first: finer is as stored."""
+        def make(row: int) -> None:
+            for i, (image, part) in enumerate(zip(finer, parts, strict=True)):
+                halved(image, coarse[row:row + BAND // 2, :, part], row, None if colored is None else colored[i])
+
+        bands = range(0, len(coarse), BAND // 2)
+        if len(bands) > 1:
+            with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+                list(pool.map(make, bands))
+        else:
+            make(0)
+        self.levels.append(coarse)
+
+    def _halved_even(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
+        """Means of 2x2 texels into out, rows of the coarser level from row on. colored: whether finer is stored in sRGB; None:
+        it is linear."""
         band = finer[2 * row:2 * (row + len(out))]
-        for channels, colored in self._channels() if first else [(slice(None), False)]:
+        for channels, srgb in [(slice(None), False)] if colored is None else _runs(finer.shape[2], colored):
             values = band[..., channels]
-            if colored:
-                values = linear_from_srgb(values).astype(np.float32) if self._table is None else np.take(self._table, values)
+            if srgb:
+                values = self._linear(values)
                 pairs, unit = values[0::2] + values[1::2], np.float32(0.25)
             else:
                 # Sums of four stay exact as they are stored: decoding is left for the quarter.
                 pairs = np.add(values[0::2], values[1::2], dtype=np.uint32 if values.dtype == np.uint16 else np.uint16 if values.dtype == np.uint8 else np.float32)
-                unit = np.float32(0.25) * (self._unit if first else np.float32(1))
+                unit = np.float32(0.25) * (np.float32(1) if colored is None else self._unit)
             np.multiply(pairs[:, 0::2] + pairs[:, 1::2], unit, out=out[..., channels], casting="same_kind", dtype=np.float32)
 
-    def _halved_odd(self, finer: np.ndarray, out: np.ndarray, row: int, first: bool) -> None:
+    def _halved_odd(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
         """The same where a side is odd: a coarser texel is wider than two, and takes its share of a third."""
         rows, columns = _shares(finer.shape[0])[:, row:row + len(out)], _shares(finer.shape[1])
         band = finer[2 * row:2 * (row + len(out)) + 1]
-        band = self.decode(band) if first else band
+        if colored is not None:
+            linear = np.empty(band.shape, np.float32)
+            self._decode(band, colored, linear)
+            band = linear
         across = sum(share[:, None] * band[:, tap::2][:, :len(share)] for tap, share in enumerate(columns))
         out[...] = sum(share[:, None, None] * across[tap::2][:len(share)] for tap, share in enumerate(rows))
 
@@ -158,9 +170,13 @@ class TextureReader:
         return out
 
     def _read_level(self, uv: np.ndarray, k: int) -> np.ndarray:
-        image = self.level(k)
-        height, width, channels = image.shape
-        flat = image.reshape(-1, channels)
+        image = self.level(k) if k else self.images[0]
+        height, width = image.shape[:2]
+        flat = image.reshape(-1, self.channels) if k else None
+
+        def texels(index: np.ndarray) -> np.ndarray:
+            return self.stored(index) if flat is None else np.take(flat, index, axis=0)
+
         # One period is enough for every wrap mode but clamp, and keeps huge coordinates exact enough.
         period = {"repeat": 1.0, "mirror": 2.0}
         u = uv[:, 0] % period[self.texture.wrap_u] if self.texture.wrap_u in period else np.clip(uv[:, 0], -1, 2)
@@ -169,19 +185,21 @@ class TextureReader:
         if self.texture.filter == "nearest":
             column = wrap_index(np.floor(x).astype(np.int64), width, self.texture.wrap_u)
             row = wrap_index(np.floor(y).astype(np.int64), height, self.texture.wrap_v)
-            return self._texels(flat, row * width + column, k)
+            return texels(row * width + column)
         x, y = x - 0.5, y - 0.5
         x0, y0 = np.floor(x), np.floor(y)
         fx, fy = (x - x0).astype(np.float32)[:, None], (y - y0).astype(np.float32)[:, None]
         x0, y0 = x0.astype(np.int64), y0.astype(np.int64)
         left, right = (wrap_index(x0 + i, width, self.texture.wrap_u) for i in (0, 1))
         top, bottom = (wrap_index(y0 + i, height, self.texture.wrap_v) * width for i in (0, 1))
-        upper = _between(self._texels(flat, top + left, k), self._texels(flat, top + right, k), fx)
-        return _between(upper, _between(self._texels(flat, bottom + left, k), self._texels(flat, bottom + right, k), fx), fy)
+        upper = _between(texels(top + left), texels(top + right), fx)
+        return _between(upper, _between(texels(bottom + left), texels(bottom + right), fx), fy)
 
-    def _texels(self, flat: np.ndarray, index: np.ndarray, k: int) -> np.ndarray:
-        texels = np.take(flat, index, axis=0)
-        return self.decode(texels) if k == 0 else texels
+
+def _runs(channels: int, colored: bool) -> list[tuple[slice, bool]]:
+    """Runs of the channels of one image, and whether they are sRGB: alpha never is."""
+    last = channels if channels in (1, 3) else channels - 1
+    return [(slice(0, channels), False)] if not colored else [(slice(0, last), True)] + [(slice(last, channels), False)] * (last < channels)
 
 
 def _shares(size: int) -> np.ndarray:

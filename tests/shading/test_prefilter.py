@@ -7,13 +7,11 @@ import pytest
 import torch
 
 from gdtool.cameras import rig
-from gdtool.geometry.rays import is_convex
 from gdtool.shading.direct import DirectLight
 from gdtool.shading.environment import Environment
 from gdtool.shading.prefilter import LightPyramid, Prefiltered, filtered_light, octahedral, octahedral_directions, read_octahedral
 from gdtool.shading.render import Goal, Renderer
 from gdtool.shading.studio import studio
-from tests.geometry.solids import cube
 from tests.shading.test_render import GREY, sphere, uniform
 
 
@@ -72,32 +70,6 @@ def test_prefiltered_is_near_the_converged_picture(light):
         pictures.append(np.clip(frame["color"][frame["mask"] == 1], 0, 1) ** (1 / 2.2))
     assert np.isfinite(pictures[1]).all()
     assert -10 * np.log10(((pictures[0] - pictures[1]) ** 2).mean()) > 30
-
-
-def test_convex_objects_need_no_shadow_rays():
-    vertices, faces = cube()
-    ball = sphere(rings=12)
-    assert is_convex(vertices, faces) and is_convex(ball.vertices, ball.faces)
-    dented = np.array(vertices, float)
-    dented[0] *= 0.2
-    assert not is_convex(dented, faces)
-    pictures = []
-    for skip in (True, False):
-        renderer = Renderer(ball)
-        renderer.convex = skip
-        light = DirectLight(renderer, studio("mid", fit=False)[0], 4)
-        pictures.append(renderer.buffers(rig("six", 32)[1], 4, light.color())["color"])
-        assert bool(renderer.counts.shadow_rays) is not skip
-    assert np.array_equal(*pictures)
-
-
-def test_pixels_outside_the_bounds_hold_nothing():
-    camera, renderer = rig("six", 48)[0], Renderer(sphere(0.2, 24))
-    few = renderer.buffers(camera, 8)
-    assert renderer.counts.pixels_in_bounds < 0.3 * renderer.counts.pixels
-    renderer.window = lambda camera: (0, 48, 0, 48)
-    everything = renderer.buffers(camera, 8)
-    assert all(np.array_equal(few[name], everything[name]) for name in few)
 
 
 def test_estimated_error_is_about_the_true_one():

@@ -214,39 +214,6 @@ def test_same_seed_same_pixels_and_noise_falls_with_samples():
     assert (one >= 0).all() and np.isfinite(one).all()
 
 
-def test_skipping_even_pixels_changes_nothing_that_counts():
-    """Adaptive sampling against all samples everywhere."""
-    material = dataclasses.replace(GREY, base_color=(1, 1, 1, 1), base_color_texture=four_colors())
-    scene, camera = quad(material), rig("six", 64)[1]
-    renderer = Renderer(scene)
-    adaptive = renderer.buffers(camera, 16)
-    few = renderer.counts.samples
-    import gdtool.shading.render as render
-
-    before, render.BASE = render.BASE, 16
-    try:
-        full = Renderer(scene).buffers(camera, 16)
-    finally:
-        render.BASE = before
-    assert few < 0.8 * 16 * 64 * 64
-    assert np.abs(adaptive["albedo"] - full["albedo"])[full["mask"] > 0].mean() < 2e-3
-    assert np.abs(adaptive["mask"] - full["mask"]).max() < 0.1
-
-
-def test_a_texture_of_one_value_is_a_factor():
-    """Not looked up, and the picture is the same to the bit; the manifest's skip names it."""
-    from gdtool.shading.savings import savings
-
-    flat = Texture(np.full((8, 8, 3), (200, 100, 50), np.uint8), "srgb")
-    scene = quad(dataclasses.replace(GREY, base_color_texture=flat, metallic_roughness_texture=Texture(four_colors().image)), uv_scale=1.7)
-    renderers = [Renderer(scene), Renderer(scene)]
-    renderers[1].lookup.skip_constant = False
-    few, all_ = (renderer.buffers(rig("six", 48)[1], 8) for renderer in renderers)
-    assert all(np.array_equal(few[name], all_[name]) for name in few)
-    told = {what: why for what, why, _ in savings(renderers[0], 8, None)}
-    assert "one value" in told["base color lookups"] and "metallic-roughness lookups" not in told
-
-
 def test_light_is_unbiased_at_few_directions():
     """The mean of many cheap renderings is the expensive one, in the open, in half shadow and on refined pixels."""
     light = Environment((np.random.default_rng(5).random((16, 32, 3)) ** 8).astype(np.float32) * 5)

@@ -1,0 +1,163 @@
+"""Every skip of the renderer on and off: what is left out changes nothing, or no more than the tolerance stated here."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+
+import gdtool.shading.direct as direct
+import gdtool.shading.render as render
+from gdtool.assets.scene import Material, Scene, Texture
+from gdtool.cameras import rig
+from gdtool.geometry.rays import is_convex
+from gdtool.shading.direct import DirectLight
+from gdtool.shading.prefilter import LADDER
+from gdtool.shading.reflection import Surface
+from gdtool.shading.render import Renderer
+from gdtool.shading.studio import studio
+from tests.geometry.solids import cube
+from tests.shading.test_render import GREY, four_colors, quad, sphere
+
+
+def test_convex_objects_need_no_shadow_rays(monkeypatch):
+    # Without chance, whose dice fall only where rays may be cast.
+    monkeypatch.setattr(direct, "RARE", 0.0)
+    vertices, faces = cube()
+    ball = sphere(rings=12)
+    assert is_convex(vertices, faces) and is_convex(ball.vertices, ball.faces)
+    dented = np.array(vertices, float)
+    dented[0] *= 0.2
+    assert not is_convex(dented, faces)
+    pictures = []
+    for skip in (True, False):
+        renderer = Renderer(ball)
+        renderer.convex = skip
+        light = DirectLight(renderer, studio("mid", fit=False)[0], 4)
+        pictures.append(renderer.buffers(rig("six", 32)[1], 4, light.color())["color"])
+        assert bool(renderer.counts.shadow_rays) is not skip
+    assert np.array_equal(*pictures)
+
+
+def test_pixels_outside_the_bounds_hold_nothing():
+    camera, renderer = rig("six", 48)[0], Renderer(sphere(0.2, 24))
+    few = renderer.buffers(camera, 8)
+    assert renderer.counts.pixels_in_bounds < 0.3 * renderer.counts.pixels
+    renderer.window = lambda camera: (0, 48, 0, 48)
+    everything = renderer.buffers(camera, 8)
+    assert all(np.array_equal(few[name], everything[name]) for name in few)
+
+
+def test_skipping_even_pixels_changes_nothing_that_counts(monkeypatch):
+    """Adaptive sampling against all samples everywhere."""
+    material = dataclasses.replace(GREY, base_color=(1, 1, 1, 1), base_color_texture=four_colors())
+    scene, camera = quad(material), rig("six", 64)[1]
+    renderer = Renderer(scene)
+    adaptive = renderer.buffers(camera, 16)
+    few = renderer.counts.samples
+    monkeypatch.setattr(render, "BASE", 16)
+    full = Renderer(scene).buffers(camera, 16)
+    assert few < 0.8 * 16 * 64 * 64
+    assert np.abs(adaptive["albedo"] - full["albedo"])[full["mask"] > 0].mean() < 2e-3
+    assert np.abs(adaptive["mask"] - full["mask"]).max() < 0.1
+
+
+def test_a_texture_of_one_value_is_a_factor():
+    """Not looked up, and the picture is the same to the bit; the manifest's skip names it."""
+    from gdtool.shading.savings import savings
+
+    flat = Texture(np.full((8, 8, 3), (200, 100, 50), np.uint8), "srgb")
+    scene = quad(dataclasses.replace(GREY, base_color_texture=flat, metallic_roughness_texture=Texture(four_colors().image)), uv_scale=1.7)
+    renderers = [Renderer(scene), Renderer(scene)]
+    renderers[1].lookup.skip_constant = False
+    few, all_ = (renderer.buffers(rig("six", 48)[1], 8) for renderer in renderers)
+    assert all(np.array_equal(few[name], all_[name]) for name in few)
+    told = {what: why for what, why, _ in savings(renderers[0], 8, None)}
+    assert "one value" in told["base color lookups"] and "metallic-roughness lookups" not in told
+
+
+def two_balls() -> Scene:
+    """A large ball that shades a small one, so that shadow rays have something to find."""
+    large, small = sphere(0.3, 24), sphere(0.15, 16)
+    vertices = np.concatenate([large.vertices, small.vertices + (0.28, 0.25, 0.2)])
+    faces = np.concatenate([large.faces, small.faces + len(large.vertices)])
+    return Scene(vertices=vertices, faces=faces, materials=(GREY,), normals=np.concatenate([large.normals, small.normals]))
+
+
+def test_leaving_out_rays_toward_little_light_keeps_the_mean(monkeypatch):
+    """Russian roulette: over many seeds the same picture (to 0.5 % in the mean, 3 % at a pixel), with fewer rays and hardly more noise."""
+    scene, camera, light = two_balls(), rig("six", 24)[1], studio("mid", fit=False)[0]
+    means, noises, rays = [], [], []
+    for share in (0.0, direct.RARE):
+        monkeypatch.setattr(direct, "RARE", share)
+        pictures = []
+        for seed in range(48):
+            renderer = Renderer(scene)
+            frame = renderer.buffers(camera, 4, DirectLight(renderer, light, 4, seed).color())
+            pictures.append(frame["color"][frame["mask"] == 1])
+        means.append(np.mean(pictures, 0))
+        noises.append(np.std(pictures, 0).mean())
+        rays.append(renderer.counts.shadow_rays)
+    assert renderer.counts.shadow_rays_rare > 0 and rays[1] < 0.9 * rays[0]
+    assert abs(means[1].mean() / means[0].mean() - 1) < 5e-3
+    assert np.abs(means[1] - means[0]).max() < 0.03 * means[0].max()
+    assert noises[1] < 1.1 * noises[0]
+
+
+def test_directions_below_the_horizon_bring_nothing(monkeypatch):
+    """Followed all the same, they meet the surface that they start from, but for a few that leave over an edge (1 in 1000)."""
+    monkeypatch.setattr(direct, "RARE", 0.0)
+    scene, camera, light = two_balls(), rig("six", 24)[1], studio("mid", fit=False)[0]
+    evaluate, frames, rays = Surface.evaluate, [], []
+
+    def all_above(self, *direction):
+        terms, density, above = evaluate(self, *direction)
+        return terms, density, torch.ones_like(above)
+
+    for followed in (evaluate, all_above):
+        monkeypatch.setattr(Surface, "evaluate", followed)
+        renderer = Renderer(scene)
+        frames.append(renderer.buffers(camera, 4, DirectLight(renderer, light, 4).color())["color"])
+        rays.append(renderer.counts.shadow_rays)
+    assert rays[1] > rays[0]
+    assert np.abs(frames[0] - frames[1]).mean() < 1e-3 * frames[0].mean()
+
+
+def test_absent_textures_are_as_white_ones():
+    white = Texture(np.full((4, 4, 3), 255, np.uint8), "linear")
+    flat = Texture(np.tile(np.array([128, 128, 255], np.uint8), (4, 4, 1)), "linear")
+    given = dataclasses.replace(GREY, base_color_texture=dataclasses.replace(white, encoding="srgb"), metallic_roughness_texture=white, normal_texture=flat,
+                                emissive_texture=dataclasses.replace(white, encoding="srgb"))
+    frames = []
+    for material in (GREY, given):
+        renderer = Renderer(quad(material))
+        renderer.lookup.skip_constant = False
+        frames.append(renderer.buffers(rig("six", 32)[1], 8))
+    # 128 of 255 is not quite a flat normal.
+    assert all(np.abs(frames[0][name] - frames[1][name]).max() < (5e-3 if name == "normal" else 1e-6) for name in frames[0])
+
+
+def test_opaque_materials_need_no_alpha_test():
+    """Alpha in the texture of an opaque material means nothing; tested at a cutoff of 0 it changes nothing."""
+    texels = np.full((8, 8, 4), 255, np.uint8)
+    texels[::2, :, 3] = 0
+    opaque = dataclasses.replace(GREY, base_color_texture=Texture(texels, "srgb"))
+    frames = []
+    for material in (opaque, dataclasses.replace(opaque, alpha_mode="MASK", alpha_cutoff=0.0)):
+        renderer = Renderer(quad(material))
+        assert (renderer.tested is None) == (material is opaque)
+        frames.append(renderer.buffers(rig("six", 32)[1], 8))
+    assert all(np.array_equal(frames[0][name], frames[1][name]) for name in frames[0])
+
+
+def test_prefiltered_levels_that_nothing_needs_are_not_missed():
+    camera, light, frames = rig("six", 32)[1], studio("mid", fit=False)[0], []
+    for everything in (False, True):
+        renderer = Renderer(sphere(rings=24))
+        shading = DirectLight(renderer, light, 0, mode="prefiltered")
+        if everything:
+            shading.prefiltered.prepare(np.array([r for r, _ in LADDER], np.float32))
+        frames.append(renderer.buffers(camera, 4, shading.color())["color"])
+        assert (len(shading.prefiltered.images) == len(LADDER)) == everything
+    assert np.array_equal(*frames)
