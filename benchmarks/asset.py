@@ -1,12 +1,14 @@
 """The finished asset against the model it was made from, and against itself in Blender.
 
-    python benchmarks/asset.py [MODEL_OR_FOLDER ...] [--peers-python PATH] [-o docs/benchmarks] [--minutes 10]
+    python benchmarks/asset.py [MODEL_OR_FOLDER ...] [--peers-python PATH] [-o docs/benchmarks] [--minutes 12]
 
 Each case of bake_cases.py (a model, and the quad mesh that gdtool's remesh and unwrap made of it) is baked by `gdtool bake`
 as a user runs it, 2048², with three coarser levels. Source and asset are then rendered alike from twelve azimuths under three
 lights, and compared: masked PSNR of the lit pictures (docs/metrics.md). With --peers-python (a Python that has bpy) Blender
 loads asset.glb and renders it from two sides, its base color without light and the whole lit; both are compared with gdtool's
-own pictures of the asset. Writes asset.md, asset.json and asset.png after every row.
+own pictures of the asset; so does three.js where tests/tools has its npm packages (tests/tools/compare_shown.py). shape: how
+far the quad mesh lies from the model, which no map can mend. Writes asset.md, asset.json and asset.png (the charts, and the
+pictures side by side) row by row: killed, or out of --minutes, it goes on where it was.
 """
 
 from __future__ import annotations
@@ -25,14 +27,18 @@ from bake import has_detail
 from bake_cases import Case, case_of, read_low
 from fine_meshes import models_in
 from measure import Failed, busy, gdtool, machine, number, say, table
+from rows import Rows
+from wireframe import file_name
 
 LIGHTS = ("dark", "mid", "bright")
 VIEWS = 12
 PEER_VIEWS = "front_right,back"
 PEER = Path(__file__).with_name("shading_blender.py")
 OWN = Path(__file__).with_name("shading_gdtool.py")
-COLUMNS = ("model", "seconds", "peak MB", *LIGHTS, "worst view", "base color dB", "roughness", "metallic", "normal deg", "lod3 drift",
-           "Blender base color dB", "Blender lit dB")
+TOOLS = Path(__file__).parents[1] / "tests/tools"
+LABELS = ["charts", *(f"{what}, {light}" for light in LIGHTS for what in ("source", "asset")), "asset", "in Blender"]
+COLUMNS = ("model", "seconds", "peak MB", *LIGHTS, "worst view", "base color dB", "roughness", "metallic", "normal deg", "shape",
+           "lod3 drift", "Blender base color dB", "Blender lit dB", "three.js base color dB", "three.js lit dB")
 BUFFERS = ("albedo", "roughness", "metallic", "normal")
 
 
@@ -92,6 +98,38 @@ def beside_blender(python: Path, asset: Path, folder: Path, size: int, samples: 
     return {"Blender base color dB": psnr(*stored["albedo"], where), "Blender lit dB": psnr(*stored["color"], where)}, pictures
 
 
+def shape(case: Case) -> float:
+    """Distance that 99 % of the model's surface keep to the quad mesh, share of the extent."""
+    from gdtool.assets.load import load_scene
+    from gdtool.folders.mesh import triangulated
+    from gdtool.geometry.distance import closest_points, sample_surface
+
+    scene, low = load_scene(case.glb), read_low(case)
+    points = sample_surface(scene.vertices, scene.faces, 20_000, np.random.default_rng(0))[0]
+    return float(np.quantile(closest_points(points, low.vertices, triangulated(low.faces)[0].astype(np.int64))[0], 0.99))
+
+
+def beside_three(asset: Path) -> dict[str, float]:
+    """How near gdtool's pictures of the asset are to three.js'. Raises Failed."""
+    done = subprocess.run([sys.executable, TOOLS / "compare_shown.py", asset / "asset.glb"], capture_output=True, text=True, timeout=200, check=False)
+    if done.returncode:
+        raise Failed((done.stderr.strip().splitlines() or ["no message"])[-1])
+    found = json.loads(done.stdout)
+    if failed := [value for value in found.values() if isinstance(value, str)]:
+        raise Failed(failed[0])
+    return {"three.js base color dB": found["three.js, base color"], "three.js lit dB": found["three.js, lit"]}
+
+
+def charts(case: Case, size: int) -> np.ndarray:
+    """(size, size, 3) of the texture coordinates."""
+    from gdtool.texture.unwrap import islands
+    from gdtool.texture.unwrap_preview import layout
+
+    low = read_low(case)
+    faces, face_uvs = low.faces.astype(np.int64), low.face_uvs.astype(np.int64)
+    return layout(faces, low.uv, face_uvs, islands(low.vertices, faces, face_uvs)[0], size)
+
+
 def baked(case: Case, folder: Path) -> tuple[Path, dict[str, float]]:
     """The asset folder, and what the command cost."""
     from gdtool.folders.mesh import write_obj
@@ -103,25 +141,62 @@ def baked(case: Case, folder: Path) -> tuple[Path, dict[str, float]]:
     return out, {"seconds": cost.seconds, "peak MB": cost.peak_mb, "lod3 drift": report.get("lod3_drift_mean")}
 
 
-def write(out: Path, rows: list[dict], sheet: list, note: str) -> None:
+def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
     """The reports of what there is so far."""
     from gdtool.images.contact import contact_sheet
-    from gdtool.images.io import write_png
+    from gdtool.images.io import read_image, write_png
 
-    out.mkdir(parents=True, exist_ok=True)
-    text = table(COLUMNS, ([number(row.get(name, "failed" if name == "seconds" and "failed" in row else None), 3) for name in COLUMNS] for row in rows))
-    failed = "\n".join(f"- {row['model']}: {row['failed']}" for row in rows if "failed" in row)
+    rows.write(complete)
+    text = table(COLUMNS, ([number(row.get(name, "failed" if name == "seconds" and "failed" in row else None), 3) for name in COLUMNS]
+                           for row in rows.rows))
+    failed = "\n".join(f"- {row['model']}: {row[what]}" for row in rows.rows for what in ("failed", "peer failed") if what in row)
     head = f"# Finished asset\n\n`python benchmarks/asset.py`, {machine()}. {note}\n\n`gdtool bake --size 2048 --lods 4` of the model's quad mesh: " \
         f"seconds and memory of the whole command; masked PSNR of lit pictures against the model's, mean of {VIEWS} views under " \
-        f"{', '.join(LIGHTS)}, and the worst; the buffers' errors; how far the coarsest level (an eighth) slid on its maps, share of the " \
-        "extent; gdtool's pictures of the asset against Blender's.\n\n"
+        f"{', '.join(LIGHTS)}, and the worst; the buffers' errors; shape: how far 99 % of the model's surface lie from the quad mesh, and " \
+        "how far the coarsest level (an eighth) slid on its maps, shares of the extent; gdtool's pictures of the asset against Blender's and " \
+        "three.js'.\n\n"
     (out / "asset.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![source and asset](asset.png)\n")
-    (out / "asset.json").write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")
+    sheet, names = [], []
+    for row in rows.rows:
+        at = [kept / "pictures" / file_name(row["model"], f"asset {label}") for label in LABELS]
+        if at[0].exists() and "mid" in row:
+            sheet.append([read_image(path)[..., :3].astype(np.float32) / 255 if path.exists() else None for path in at])
+            names.append(row["model"])
     if sheet:
-        wide = max(len(row) for row in sheet)
-        names = [f"{what}, {light}" for light in LIGHTS for what in ("source", "asset")] + ["asset", "in Blender"]
-        write_png(out / "asset.png", contact_sheet([row + [None] * (wide - len(row)) for row in sheet], labels_top=names[:wide],
-                                                   labels_left=[row["model"] for row in rows if "mid" in row]))
+        write_png(out / "asset.png", contact_sheet(sheet, labels_top=LABELS, labels_left=names))
+
+
+def measured(source: str | Path, asked: argparse.Namespace) -> dict:
+    """The row of one model."""
+    from gdtool.images.io import write_png
+
+    row: dict = {"model": source if source == "part" else source.stem, "way": "asset"}
+    pictures = asked.kept / "pictures"
+    pictures.mkdir(parents=True, exist_ok=True)
+    for label in LABELS:
+        (pictures / file_name(row["model"], f"asset {label}")).unlink(missing_ok=True)
+    shown = []
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            case = case_of(source, asked.kept)
+            asset, cost = baked(case, Path(folder))
+            errors, found = relit(case, asset, asked.size, asked.samples)
+            row |= cost | errors | {"shape": shape(case)}
+            shown = [charts(case, asked.size), *found]
+        except Exception as failure:  # a model that fails is a row of the table, not the end of it
+            return row | {"failed": f"{type(failure).__name__}: {failure}"}
+        try:
+            if asked.peers_python:
+                figures, found = beside_blender(asked.peers_python, asset, Path(folder, "peer"), 2 * asked.size, 4 * asked.samples)
+                row |= figures
+                shown += [image[::2, ::2] for image in found]
+            if (TOOLS / "node_modules/three").exists():
+                row |= beside_three(asset)
+        except (Failed, subprocess.TimeoutExpired) as failure:
+            row["peer failed"] = str(failure)
+    for label, image in zip(LABELS, shown, strict=False):
+        write_png(pictures / file_name(row["model"], f"asset {label}"), np.clip(image, 0, 1))
+    return row
 
 
 def main() -> None:
@@ -129,7 +204,7 @@ def main() -> None:
     parser.add_argument("models", nargs="*", type=Path)
     parser.add_argument("-o", "--out", type=Path, default=Path("docs/benchmarks"))
     parser.add_argument("--peers-python", type=Path)
-    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--minutes", type=float, default=12.0, help="a model that did not begin by then is left for the next time")
     parser.add_argument("--limit", type=int, default=12, help="models at most")
     parser.add_argument("--size", type=int, default=256, help="of the pictures")
     parser.add_argument("--samples", type=int, default=8)
@@ -138,31 +213,24 @@ def main() -> None:
     import torch
 
     torch.set_num_threads(1)  # shading runs in threads of its own
-    note, rows, sheet = busy(), [], []
-    end = time.monotonic() + 60 * asked.minutes
-    for source in ["part", *list(filter(has_detail, models_in(asked.models)))[:asked.limit]]:
-        row: dict = {"model": source if source == "part" else source.stem}
-        rows.append(row)
-        if time.monotonic() > end:
-            row["failed"] = f"not started within {asked.minutes:g} minutes"
+    end, note = time.monotonic() + 60 * asked.minutes, busy()
+    rows = Rows(asked.out / "asset.json", {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept", "minutes")})
+    sources = ["part", *list(filter(has_detail, models_in(asked.models)))[:asked.limit]]
+    left = []
+    for source in sources:
+        name = source if source == "part" else source.stem
+        if rows.has(name, "asset"):
             continue
-        say(row["model"])
-        with tempfile.TemporaryDirectory() as folder:
-            try:
-                case = case_of(source, asked.kept)
-                asset, cost = baked(case, Path(folder))
-                row |= cost
-                errors, pictures = relit(case, asset, asked.size, asked.samples)
-                row |= errors
-                sheet.append(pictures)
-                if asked.peers_python:
-                    found, more = beside_blender(asked.peers_python, asset, Path(folder, "peer"), 2 * asked.size, 4 * asked.samples)
-                    row |= found
-                    sheet[-1] = pictures + [image[::2, ::2] for image in more]
-            except Exception as failure:  # a model that fails is a row of the table, not the end of it
-                row["failed"] = f"{type(failure).__name__}: {failure}"
-        write(asked.out, rows, sheet, note)
+        if time.monotonic() > end:
+            left.append(name)
+            continue
+        say(name)
+        rows.add(measured(source, asked))
+        write(asked.out, rows, False, asked.kept, note)
+    write(asked.out, rows, not left, asked.kept, note)
     print((asked.out / "asset.md").read_text())
+    if left:
+        say(f"not begun within {asked.minutes:g} minutes: {', '.join(left)}; run it again and it goes on")
 
 
 if __name__ == "__main__":
