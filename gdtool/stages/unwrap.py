@@ -1,7 +1,8 @@
 """Mesh to atlas: few charts, cut along quad edges and creases, laid flat without mirroring and packed for mip-mapping.
 
 Use it after remesh, or on a mesh file of your own. Texture coordinates that a mesh already has are kept when they are
-valid, unless --redo. layout.png shows the charts, checkerboard.png the mesh under them.
+valid, unless --redo. With --symmetry the halves of a symmetric mesh share their texels. layout.png shows the charts,
+checkerboard.png the mesh under them.
 
 Example:
   gdtool unwrap cat.asset/mesh --size 2048
@@ -9,7 +10,7 @@ Example:
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
@@ -26,6 +27,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     mip_safe: Annotated[int, Meta(ge=1, le=65536, description="charts stay a texel apart down to the mip level of this size")] = 256
     padding: Annotated[int, Meta(ge=0, le=1024, description="texels between charts at --size; 0: what --mip-safe needs")] = 0
     max_stretch: Annotated[float, Meta(gt=1, le=100, description="a chart with more L2 stretch is cut")] = 1.1
+    symmetry: Annotated[Literal["none", "x", "y", "z"], Meta(description="faces that mirror others along this axis share their texels")] = "none"
     redo: Annotated[bool, Meta(description="make new texture coordinates even where the mesh has valid ones")] = False
     seconds: Annotated[float, Meta(gt=0, description="time limit of each native step, then a simpler way is taken")] = 120.0
 
@@ -39,6 +41,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.images.io import write_png
     from gdtool.texture import unwrap_preview
     from gdtool.texture.unwrap import Request, figures, islands, unwrap
+    from gdtool.texture.unwrap_mirror import with_twins
 
     with out.step("read"):
         mesh, matrix = _read(inputs, out)
@@ -54,13 +57,19 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     if not kept:
         request = Request(size=options.size, padding=padding, max_stretch=options.max_stretch, seconds=options.seconds)
         with out.step("unwrap"):
-            result = unwrap(mesh.vertices, mesh.faces.astype(np.int64), request)
+            twin, corner = _twins(mesh, options, inputs, out)
+            own = np.flatnonzero(twin < 0)
+            result = unwrap(mesh.vertices, mesh.faces[own].astype(np.int64), request)
         for text in result.failed:
             out.skip("a way of unwrapping", text)
-        mesh = QuadMesh(mesh.vertices, mesh.faces, result.uv, result.face_uvs)
+        mesh = QuadMesh(mesh.vertices, mesh.faces, result.uv, with_twins(result.face_uvs, own, twin, corner))
+    else:
+        twin = np.full(len(mesh.faces), -1)
     with out.step("measure"):
         faces, face_uvs = mesh.faces.astype(np.int64), mesh.face_uvs.astype(np.int64)
-        report = figures(mesh.vertices, faces, mesh.uv, face_uvs)
+        # Of those that share texels on purpose, the ones that were laid out.
+        report = figures(mesh.vertices, faces[twin < 0], mesh.uv, face_uvs[twin < 0])
+        report["shared"] = float((twin >= 0).mean())
         report["texels_per_unit"] = _density(mesh, options.size)
         if report["overlap"] > 0 and not kept:
             out.warn(f"{inputs.name}: charts overlap on {100 * report['overlap']:.2g} % of what they cover")
@@ -75,6 +84,21 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         vertices=len(mesh.vertices), quads=quads, triangles=len(mesh.faces) - quads, charts=report["charts"], size=options.size,
         padding=padding, coverage=report["coverage"], watertight=repair.is_watertight(mesh.faces), report=report | {"kept": kept},
         source_from_world=tuple(float(x) for x in matrix.ravel()))
+
+
+def _twins(mesh, options: Options, inputs: Inputs, out: Output):
+    """What mirror_twins says; nothing has a twin without --symmetry."""
+    import numpy as np
+
+    from gdtool.texture.unwrap_mirror import mirror_twins
+
+    if options.symmetry == "none":
+        return np.full(len(mesh.faces), -1), np.full(mesh.faces.shape, -1)
+    twin, corner = mirror_twins(mesh.vertices, mesh.faces.astype(np.int64), "xyz".index(options.symmetry))
+    if not (twin >= 0).any():
+        out.warn(f"{inputs.name}: no face mirrors another along {options.symmetry}, so that none share texels; "
+                 f"gdtool remesh --symmetry {options.symmetry} makes faces that do")
+    return twin, corner
 
 
 def _path(inputs: Inputs):

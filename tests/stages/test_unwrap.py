@@ -76,3 +76,25 @@ def test_wrong_kind_names_the_stage_that_makes_the_right_one(gdtool, tmp_path):
     assert gdtool("unwrap", "leaf.obj").returncode == 0
     run = gdtool("unwrap", "leaf.asset/atlas")
     assert run.returncode == 3 and "holds atlas" in run.stderr and "gdtool remesh" in run.stderr
+
+
+def test_symmetric_halves_share_their_texels(gdtool, tmp_path, ring):
+    run = gdtool("unwrap", "ring.obj", "--size", 512, "--symmetry", "x")
+    assert run.returncode == 0, run.stderr
+    folder = open_folder(tmp_path / "ring.asset/atlas")
+    report, mesh = folder.content.report, read_mesh(folder)
+    assert report["shared"] == 0.5 and report["overlap"] == 0 and report["mirrored"] == 0
+    # Each vertex' corners lie where those of its mirror image do.
+    def corners_of(vertices):
+        found = {}
+        for vertex, corner in zip(mesh.faces.ravel(), mesh.face_uvs.ravel(), strict=True):
+            found.setdefault(tuple(np.round(vertices[vertex], 6) + 0.0), set()).add(tuple(np.round(mesh.uv[corner], 6)))
+        return found
+
+    assert corners_of(mesh.vertices) == corners_of(mesh.vertices * (-1, 1, 1))
+    assert gdtool("validate", "ring.asset/atlas").returncode == 0
+    lopsided = ring[0] + (0.1 * ring[0][:, 1:2] ** 2 + 0.05 * ring[0][:, :1] ** 2) * (1, 0, 0)
+    write_obj(tmp_path / "bent.obj", QuadMesh(lopsided, ring[1].astype(np.int32)))
+    run = gdtool("unwrap", "bent.obj", "--size", 256, "--symmetry", "x")
+    assert run.returncode == 0 and "no face mirrors another along x" in run.stderr
+    assert content(tmp_path / "bent.asset/atlas")["report"]["shared"] == 0
