@@ -30,6 +30,7 @@ from gdtool.cameras import rig
 from gdtool.core.folder import open_folder
 from gdtool.core.manifest import MANIFEST, list_files
 from gdtool.core.manifest import encode as encode_manifest
+from gdtool.diffusion import familiarity
 from gdtool.diffusion.data import decode_object
 from gdtool.diffusion.encoding import BACKGROUND, encode
 from gdtool.diffusion.result import views_from_images
@@ -154,7 +155,7 @@ def install(source: Path, table: str, note: str) -> None:
     folder = open_folder(source, ("model",))
     if source.resolve() != DEFAULT_MODEL.resolve():
         DEFAULT_MODEL.mkdir(exist_ok=True)
-        for name in ("config.json", "model.safetensors", "loss.csv", "loss.png", "card.md"):
+        for name in ("config.json", "model.safetensors", "loss.csv", "loss.png", "card.md", familiarity.FILE):
             shutil.copyfile(source / name, DEFAULT_MODEL / name)
     card = (DEFAULT_MODEL / "card.md").read_text().split("## Measured quality")[0].rstrip()
     (DEFAULT_MODEL / "card.md").write_text(f"{card}\n\n## Measured quality\n\n{note}\n\n{table}")

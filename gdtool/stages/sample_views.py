@@ -41,6 +41,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.cameras import rig
     from gdtool.diffusion.data import to_tensor_condition
     from gdtool.diffusion.encoding import BACKGROUND
+    from gdtool.diffusion.familiarity import read_ranges, unfamiliar
     from gdtool.diffusion import wonder3d
     from gdtool.diffusion.result import views_from_images
     from gdtool.diffusion.sampling import sample_images
@@ -64,7 +65,11 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     with out.step("condition"):
         condition = _condition(inputs, options, config, out)
     with out.step("sample"):
-        rgba = to_tensor_condition(condition).to(out.device)
+        rgba = to_tensor_condition(condition)
+        strange = unfamiliar(rgba[0].numpy(), read_ranges(folder))
+        if strange:
+            out.warn(f"{inputs.name}: unlike the pictures this model was trained on, expect less of it: {'; '.join(strange)}")
+        rgba = rgba.to(out.device)
         images = sample_images(model, rgba, domains=domains, steps=options.steps or config.sampling_steps, guidance=options.guidance, seed=options.seed,
                                scheduler=options.scheduler, precision=options.precision, progress=out.progress)
     if config.convention == "wonder3d" and "normal" in images:

@@ -43,9 +43,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     import torch
 
-    from gdtool.diffusion import distributed
+    from gdtool.diffusion import distributed, familiarity
     from gdtool.diffusion.curve import draw_curve
-    from gdtool.diffusion.data import Objects, decode_dataset
+    from gdtool.diffusion.data import Objects, decode_dataset, from_bytes
     from gdtool.diffusion.model import parameter_count
     from gdtool.diffusion.report import card, validation_grid
     from gdtool.diffusion.weights import save_model
@@ -82,6 +82,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     write_png(out.path("loss.png"), draw_curve(out.workspace / "loss.csv"))
     for picture in sorted((out.workspace / "validation").glob("*.png")):
         shutil.copyfile(picture, out.path(f"validation/{picture.name}"))
+    every = range(0, used, max(used // 4000, 1))
+    pictures = (from_bytes(objects.conditions[i, k]).numpy() for i in every for k in range(min(2, objects.conditions.shape[1])))
+    familiarity.write_ranges(out.path(familiarity.FILE), familiarity.ranges(pictures))
     facts = {"objects": used, "steps": state.step, "training_minutes": round(state.seconds / 60, 1), "batch": train_config.batch,
              "parameters": parameter_count(state.model), "threads": out.threads, "device": out.device,
              "processes": distributed.size(), "ablation": options.ablation}

@@ -157,3 +157,14 @@ def test_a_cut_file_is_named_and_a_pickle_never_opened(gdtool, picture, damaged)
     result = sample(gdtool, "ball.png", "--model", damaged)
     assert result.returncode == 3 and "pickle" in result.stderr
     assert not (damaged.parent / "owned").exists()
+
+
+def test_a_picture_unlike_the_training_is_sampled_with_a_warning(gdtool, picture, tiny_model, tmp_path):
+    model = shutil.copytree(tiny_model, tmp_path / "model")
+    (model / "pictures.json").write_text(json.dumps({"width over height of the subject": {"low": 0.9, "high": 1.1}}))
+    write_manifest(model)
+    assert "unlike" not in sample(gdtool, "ball.png", "--model", model).stderr
+    (model / "pictures.json").write_text(json.dumps({"width over height of the subject": {"low": 2.0, "high": 3.0}}))
+    write_manifest(model)
+    result = sample(gdtool, "ball.png", "--model", model, "-o", "again")
+    assert result.returncode == 0 and "width over height of the subject is 1.09, in training 2 to 3" in result.stderr
