@@ -1,6 +1,6 @@
 """How good a model is on objects it was not trained on, beside two baselines; a Markdown table for its card.
 
-    gdtool render-dataset procedural:900000..900023 --size 64 --condition-views 3 -o held_out
+    gdtool render-dataset procedural:900000..900099 --size 128 --condition-views 3 -o held_out
     python benchmarks/model_quality.py held_out --model my-model --train objects -o docs/benchmarks --install
 
 --install puts the model, with the table in its card, where the package finds its bundled model.
