@@ -98,6 +98,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         _write(out, options, inputs, mesh, target, face_idx, maps, origin, matrix, report, levels)
 
 
+_MOST_DRIFT = 0.02  # share of the extent, mean: farther off a level shows the maps of other parts
+
+
 def _levels(target, count: int, out: Output, report: dict) -> list:
     """The coarser targets, finest first; what they cost in place goes to report."""
     from gdtool.texture.lods import coarser, drift
@@ -110,9 +113,13 @@ def _levels(target, count: int, out: Output, report: dict) -> list:
         if level is None:
             out.skip(f"level of {wanted} triangles", why)
             continue
+        slid = drift(level, target)
+        if slid["drift_mean"] > _MOST_DRIFT:
+            out.skip(f"level of {wanted} triangles", f"it would slide {100 * slid['drift_mean']:.1f} % of the extent on the maps")
+            continue
         levels.append(level)
         report[f"lod{len(levels)}_triangles"] = len(level.faces)
-        report |= {f"lod{len(levels)}_{name}": value for name, value in drift(level, target).items()}
+        report |= {f"lod{len(levels)}_{name}": value for name, value in slid.items()}
     return levels
 
 
@@ -267,6 +274,6 @@ def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx
 
 
 STAGE = Stage(
-    name="bake", version=3, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run,
+    name="bake", version=4, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run,
     second_inputs={"surface": SecondInput("surface", help="The surface to bake from; found along the provenance chain without it."),
                    "views": SecondInput("views", help="Views of it; found along the provenance chain without it.")})

@@ -42,3 +42,24 @@ def _span(full):
     from gdtool.texture.target import texel_width
 
     return texel_width(full, 1)
+
+
+def test_a_level_that_slides_on_its_maps_is_left_out_and_named(monkeypatch):
+    from dataclasses import replace
+
+    from gdtool.stages import bake
+    from gdtool.texture import lods
+
+    class Told:
+        threads, said = 1, []
+
+        def skip(self, what, reason, saved_seconds=None):
+            self.said.append((what, reason))
+
+    full, told, report = target(), Told(), {}
+    # A level whose texture corners are those of the opposite side.
+    wrong = replace(full, vertices=full.vertices * (-1, 1, 1))
+    monkeypatch.setattr(lods, "coarser", lambda target, n: (wrong, "") if n == len(full.faces) // 2 else (full, ""))
+    assert bake._levels(full, 3, told, report) == [full]
+    assert report["lod1_triangles"] == len(full.faces) and report["lod1_drift_mean"] < 1e-3
+    assert len(told.said) == 1 and "slide" in told.said[0][1]
