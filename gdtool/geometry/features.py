@@ -29,7 +29,7 @@ class Features:
         return len(self.segments) > 0
 
 
-_NOTHING = Features(np.zeros((0, 3)), np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
+NO_FEATURES = Features(np.zeros((0, 3)), np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
 def find_features(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float, shortest: float) -> Features:
@@ -53,7 +53,7 @@ def find_features(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float
         keep = (total >= shortest) & (sharp >= np.maximum(0.3 * total, shortest / 2))
         segments = segments[keep[label[segments[:, 0]]]]
     if not len(segments):
-        return _NOTHING
+        return NO_FEATURES
     used, segments = np.unique(segments, return_inverse=True)
     return _tidy(vertices[used], segments.reshape(-1, 2), 0.5 * shortest)
 
@@ -127,7 +127,7 @@ def _tidy(points: np.ndarray, segments: np.ndarray, short: float) -> Features:
         segments = onto_corner[segments[~drop[features.curve]]]
         segments = np.unique(np.sort(segments[segments[:, 0] != segments[:, 1]], 1), axis=0)
         if not len(segments):
-            return _NOTHING
+            return NO_FEATURES
     used, segments = np.unique(segments, return_inverse=True)
     return _arcs(points[used], segments.reshape(-1, 2))
 

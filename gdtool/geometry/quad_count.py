@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,16 +16,17 @@ _CLOSE_ENOUGH = 1.15  # counts nearer than this to each other are not told apart
 _MOST_RUNS = 6
 
 
-def coarsest(vertices: np.ndarray, faces: np.ndarray, request: Request, limit: float) -> tuple[np.ndarray, np.ndarray, Record, float]:
+def coarsest(vertices: np.ndarray, faces: np.ndarray, request: Request, limit: float,
+             way: Callable[..., tuple] | None = None) -> tuple[np.ndarray, np.ndarray, Record, float]:
     """The fewest quads, at most request.quads, that stay within `limit` of the surface, and the distance they reach.
 
     The distance is of vertices of both meshes to the other surface (simplify.deviation). It falls about as one over the
-    number of quads, which tells the next number to try; when even request.quads are too few they are returned.
+    number of quads, which tells the next number to try; when even request.quads are too few they are returned. way: what makes quads, called as remesh is.
     """
     too_few, enough = min(_FEWEST, request.quads) / _CLOSE_ENOUGH, None
     quads = request.quads
     for _ in range(_MOST_RUNS):
-        out, found, record = remesh(vertices, faces, replace(request, quads=quads))
+        out, found, record = (way or remesh)(vertices, faces, replace(request, quads=quads))
         reached = deviation(vertices, faces, out, triangulated(found)[0])
         if reached <= limit:
             enough = (quads, (out, found, record, reached))

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from gdtool.geometry.features import Constraints
+from gdtool.geometry.features import Constraints, closest_on_segments
 from gdtool.geometry.mesh_quality import columns_of
 from gdtool.geometry.quad_shape import Surface
+from gdtool.geometry.repair import edges_of
 
 _FLAT = 1e-3  # a quad whose diagonals pass within this share of its size needs no choice
 
@@ -56,4 +57,18 @@ def cut_along_features(vertices: np.ndarray, faces: np.ndarray, surface: Surface
     turned = bent[second < first]
     out = faces.copy()
     out[turned] = np.roll(faces[turned], -1, 1)
+    return out
+
+
+def to_rim(vertices: np.ndarray, faces: np.ndarray, surface: Surface, reach: float) -> np.ndarray:
+    """Vertices (v, 3) with those on the boundary of the quads drawn to the boundary of the surface where it is within `reach`."""
+    theirs = edges_of(surface.faces)
+    segments = theirs.ends[theirs.count == 1]
+    if not len(segments):
+        return vertices
+    mine = edges_of(faces)
+    rim = np.unique(mine.ends[mine.count == 1])
+    distance, _, point = closest_on_segments(vertices[rim], surface.vertices, segments)
+    out = vertices.copy()
+    out[rim[distance < reach]] = point[distance < reach]
     return out

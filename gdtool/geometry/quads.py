@@ -14,7 +14,7 @@ from gdtool.geometry.features import Constraints, Features, find_features, trace
 from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian, valences
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_engines import ENGINES, pair_and_split
-from gdtool.geometry.quad_paths import crossed, cut_along_features, held_at_centres
+from gdtool.geometry.quad_paths import crossed, cut_along_features, held_at_centres, to_rim
 from gdtool.geometry.quad_relax import balance, ease, square_up
 from gdtool.geometry.quad_shape import Surface, fill_holes, onto, relax, remove_doublets, subdivide, unfold
 from gdtool.geometry.quad_topology import cancel_irregular
@@ -25,6 +25,7 @@ COUNT_TOLERANCE = 0.03
 _SMALL_PIECE_QUADS = 48
 _TRIES = 3
 _CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a result is taken without a look at others
+_RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
 _HANDLES = "handles are lost or added"
 
 
@@ -39,6 +40,7 @@ class Request:
     restore_creases: bool = True
     seconds: float = 120.0
     memory_mb: int = 16000
+    least_jacobian: float = -1.0  # a coarser mesh subdivided is passed over where its worst quad is worse
 
 
 @dataclass
@@ -228,13 +230,15 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
                     least = float(scaled_jacobian(quad_vertices, quad_faces).min())
                     good = far < _CLOSE_EDGES and least > _LEAST_JACOBIAN
                     if best is None or good or far - 2 * least < best[0]:
-                        best = far - 2 * least, far, quad_vertices, quad_faces
+                        best = far - 2 * least, far, least, quad_vertices, quad_faces
                     if good or not subdivisions:
                         break
                 record.clock("fit", start)
-                _, far, quad_vertices, quad_faces = best
+                _, far, least, quad_vertices, quad_faces = best
                 limit = 1.0 if subdivisions else 2.0
                 fault = f"strays {far:.2g} edge lengths from the surface" if far > limit else None
+                if subdivisions and least < request.least_jacobian:
+                    fault = f"has a quad of scaled Jacobian {least:.2g}"
             elif fault == _HANDLES and not subdivisions and second_best is None and abs(off) <= COUNT_TOLERANCE:
                 second_best = quad_vertices, quad_faces, f"{label}, {fault}"
             if fault is None:
@@ -309,8 +313,8 @@ def _euler(faces: np.ndarray) -> int:
 def _finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, subdivisions: int,
               request: Request, fine: Surface) -> tuple[np.ndarray, np.ndarray]:
     """The engine's quads drawn to creases, subdivided, evened out on the surface and unfolded."""
-    area = polygon_normals(vertices, faces)[1].sum()
-    vertices, constraints = trace(vertices, faces, features, (area / len(faces)) ** 0.5)
+    edge = (polygon_normals(vertices, faces)[1].sum() / len(faces)) ** 0.5
+    vertices, constraints = trace(to_rim(vertices, faces, surface, _RIM_EDGES * edge), faces, features, edge)
     free = untied(vertices, faces, constraints)
     (across, curve), constraints = crossed(faces, constraints, free), free
     vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)

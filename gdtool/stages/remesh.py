@@ -2,7 +2,7 @@
 
 Use it after reconstruct, or on any mesh file (.obj, .ply, .stl, .glb) whose triangles you want to edit, subdivide or
 animate. Bevels that marching cubes left are drawn out to the creases they cut off. A mesh that already meets the
-request is passed through. --triangles N decimates instead.
+request is passed through. --triangles N decimates instead; --symmetry auto mirrors one half where the surface allows it.
 
 Example:
   gdtool remesh cat.asset/surface --faces 20000
@@ -30,6 +30,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     triangles: Annotated[int, Meta(ge=0, le=10_000_000, description="decimate to this many triangles instead of making quads; 0: quads")] = 0
     crease_angle: Annotated[float, Meta(ge=0, le=180, description="edges that turn by more degrees are kept sharp; 0: none")] = 30.0
     restore_creases: Annotated[bool, Meta(description="draw out the bevels of marching cubes to sharp creases")] = True
+    symmetry: Annotated[Literal["none", "auto", "x", "y", "z"], Meta(
+        description="make one half and mirror it where the surface is its own mirror image across the middle of this axis; auto: of the best of the three")] = "none"
     engine: Annotated[Literal["auto", "instant-meshes", "quadriflow", "split"], Meta(
         description="auto is instant-meshes with fallbacks; quadriflow needs pyQuadriFlow; split needs no engine")] = "auto"
     smooth_iterations: Annotated[int, Meta(ge=0, le=100, description="rounds of evening out the quads on the surface")] = 5
@@ -47,7 +49,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     with out.step("read"):
         vertices, faces, matrix, quads = _read(inputs, out)
     options = _counted(vertices, faces, options, out)
-    if quads is not None and options.keep and not options.triangles and not options.max_deviation and _meets(quads, options):
+    if quads is not None and options.keep and not options.triangles and not options.max_deviation and options.symmetry == "none" and _meets(quads, options):
         out.skip("remeshing", f"the mesh already is {len(quads)} quads, closed and manifold")
         found_vertices, found, engine, figures, source = vertices, quads, "passed through", {}, None
     else:
@@ -144,6 +146,8 @@ def _decimated(vertices, faces, options: Options, out: Output):
 
     from gdtool.geometry.simplify import simplify
 
+    if options.symmetry != "none":
+        out.skip("symmetry", "--triangles decimates the whole")
     with out.step("simplify"):
         vertices, faces, _, report = simplify(vertices, faces, options.triangles, seconds=options.seconds)
     if "failed" in report:
@@ -154,21 +158,42 @@ def _decimated(vertices, faces, options: Options, out: Output):
 
 def _quads(vertices, faces, options: Options, out: Output):
     from gdtool.geometry.quad_count import coarsest
-    from gdtool.geometry.quads import Request, remesh
+    from gdtool.geometry.quads import Request
 
     request = Request(quads=options.faces, crease_degrees=options.crease_angle, engine=options.engine, seconds=options.seconds,
                       smooth_iterations=options.smooth_iterations, restore_creases=options.restore_creases)
+    way, apart = _way(vertices, faces, options, out)
     if options.max_deviation:
-        vertices, quads, record, reached = coarsest(vertices, faces, request, options.max_deviation)
+        vertices, quads, record, reached = coarsest(vertices, faces, request, options.max_deviation, way)
         if reached > options.max_deviation:
             out.warn(f"{reached:.2g} from the surface with {len(quads)} quads, farther than --max-deviation; allow more --faces")
     else:
-        vertices, quads, record = remesh(vertices, faces, request)
+        vertices, quads, record = way(vertices, faces, request)
     for text in record.failed:
         out.skip("a way of remeshing", text)
     for name, seconds in record.seconds.items():
         out.seconds[name] = out.seconds.get(name, 0.0) + seconds
-    return vertices, quads, record.engine, dict(record.figures), record.source
+    return vertices, quads, record.engine, record.figures | apart, record.source
+
+
+def _way(vertices, faces, options: Options, out: Output):
+    """What makes the quads, and figures of the mirror plane that was looked for."""
+    from functools import partial
+
+    from gdtool.geometry.quad_mirror import AXES, mirror_plane, remesh_mirrored
+    from gdtool.geometry.quads import remesh
+
+    if options.symmetry == "none":
+        return remesh, {}
+    with out.step("find the mirror plane"):
+        axis, apart = mirror_plane(vertices, faces, options.faces, AXES if options.symmetry == "auto" else options.symmetry)
+    figures = {f"mirror_{name}_deviation": value for name, value in apart.items()}
+    if axis is None:
+        out.skip("symmetry", "no half is the other's mirror image: " + ", ".join(f"{value:.2g} apart across {name}" for name, value in apart.items()))
+        return remesh, figures | {"symmetry": "none"}
+    return partial(remesh_mirrored, axis=axis), figures
+
+
 
 
 STAGE = Stage(name="remesh", version=5, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)

@@ -9,7 +9,7 @@ import pytest
 from gdtool.core.folder import open_folder
 from gdtool.folders.mesh import read_mesh
 from gdtool.geometry import repair
-from tests.geometry.solids import cube, joined, sphere, write_obj
+from tests.geometry.solids import bored_box, cube, joined, sphere, write_obj
 
 
 def content(path):
@@ -100,3 +100,28 @@ def test_count_by_the_size_of_quads_or_by_their_distance(gdtool, tmp_path):
     assert near["quads"] < 1500 and near["watertight"] and near["report"]["hausdorff"] < 0.012
     run = gdtool("remesh", "ball.obj", "--faces", 100, "--max-deviation", 0.0001, "-o", "far")
     assert run.returncode == 0 and "farther than --max-deviation" in run.stderr
+
+
+def test_symmetry_is_kept_when_asked(gdtool, tmp_path):
+    vertices, faces = bored_box(48)
+    write_obj(tmp_path / "box.obj", vertices, faces)
+    assert gdtool("remesh", "box.obj", "--faces", 1500, "--symmetry", "z").returncode == 0
+    mesh, found = read_mesh(open_folder(tmp_path / "box.asset/mesh")), content(tmp_path / "box.asset/mesh")
+    assert found["report"]["symmetry"] == "z" and found["watertight"] and abs(len(mesh.faces) / 1500 - 1) <= 0.03
+    place = {tuple(point): i for i, point in enumerate(np.round(mesh.vertices, 6).tolist())}
+    other = np.array([place[x, y, -z if z else 0.0] for x, y, z in np.round(mesh.vertices, 6).tolist()])
+    corners = {frozenset(face) for face in mesh.faces.tolist()}
+    assert {frozenset(face) for face in other[mesh.faces].tolist()} == corners
+    assert 0 < (other == np.arange(len(other))).sum() < 200
+
+
+def test_symmetry_that_is_not_there_is_left_out_and_said(gdtool, tmp_path):
+    vertices, faces = sphere(24)
+    vertices[vertices[:, 0] > 0.3] *= [1.3, 1, 1]
+    write_obj(tmp_path / "egg.obj", vertices, faces)
+    assert gdtool("remesh", "egg.obj", "--faces", 400, "--symmetry", "x").returncode == 0
+    manifest = json.loads((tmp_path / "egg.asset/mesh/manifest.json").read_text())
+    assert any(skip["what"] == "symmetry" and "apart across x" in skip["reason"] for skip in manifest["skipped"])
+    assert manifest["content"]["report"]["symmetry"] == "none"
+    assert gdtool("remesh", "egg.obj", "--faces", 400, "--symmetry", "auto").returncode == 0
+    assert content(tmp_path / "egg.asset/mesh")["report"]["symmetry"] in ("y", "z")

@@ -61,6 +61,10 @@ def scaled(mesh, factor: float, far: float = 0.0):
     return mesh[0] * factor + far, mesh[1]
 
 
+def moved(mesh, x: float, y: float):
+    return mesh[0] + [x, y, 0], mesh[1]
+
+
 CASES = {
     "one face": lambda: (np.eye(3), np.array([[0, 1, 2]])), "slivers": slivers,
 }
@@ -69,7 +73,7 @@ SLOW_CASES = {
     "fan": lambda: fan(7), "size 1e-6": lambda: scaled(sphere(16), 1e-6), "size 1e6, far off": lambda: scaled(sphere(16), 1e6, 3e6),
     "crossing": crossing, "open": opened, "soup": soup, "wall of a hundred-thousandth": lambda: slab(1e-5), "fan of 200": lambda: fan(200),
     "size 1e-6 with creases": lambda: scaled(bored_box(40), 1e-6), "size 1e6 with creases": lambda: scaled(bored_box(40), 1e6),
-    "many pieces": lambda: joined(*(sphere(8, 0.05, (0.15 * i, 0.15 * j, 0)) for i in range(-5, 6) for j in range(-5, 6))),
+    "many pieces": lambda: joined(*(moved(scaled(sphere(8), 0.06), 0.15 * i, 0.15 * j) for i in range(-5, 6) for j in range(-5, 6))),
     "two faces": lambda: (cube()[0], cube()[1][:2]), "a thousand slabs thin": lambda: joined(*(scaled(slab(1e-3), 1.0, 0.01 * i) for i in range(20))),
 }
 
