@@ -7,7 +7,7 @@ import numpy as np
 from gdtool.core.errors import InputError
 
 INSETS = (0.02, 0.06)  # widths of the frame that is taken for background, as shares of the picture
-AGREEMENT = 0.85  # least overlap of what the two frames give; measured in docs/benchmarks/cutout.md
+AGREEMENT = 0.85  # least overlap of what the two frames give; docs/benchmarks/cutout.md says how well it tells
 
 
 def available() -> bool:

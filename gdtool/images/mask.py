@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 
@@ -13,12 +14,14 @@ WORKING_SIDE = 384  # pixels; larger pictures are segmented at this size
 _CURE = "give a mask with --mask, or cut the subject out (RGBA)"
 
 
-def foreground(image: np.ndarray, mask: np.ndarray | None = None, subject: object = "image") -> np.ndarray:
+def foreground(image: np.ndarray, mask: np.ndarray | None = None, subject: object = "image",
+               tell: Callable[[str], None] = lambda text: None) -> np.ndarray:
     """Coverage (h, w) float32 in [0, 1] of a picture's subject.
 
     image (h, w, c) as read_image gives it; mask (h, w[, c]) of the same size, brighter or more opaque is subject.
     In this order: the mask; the picture's own alpha, unless it is opaque everywhere; segmentation against a background
     that is plain (a smooth gradient and soft shadows are); with OpenCV (gdtool[cutout]) GrabCut against one that is not.
+    That is a guess (one in four that it does not refuse lacks or has too much: docs/benchmarks/cutout.md), and `tell` is told.
     Raises InputError, naming `subject`, for a picture or mask without a subject, or a background that it blends into.
     """
     image = image.reshape(*image.shape[:2], -1)
@@ -35,7 +38,7 @@ def foreground(image: np.ndarray, mask: np.ndarray | None = None, subject: objec
             raise InputError(subject, "is transparent everywhere", "save it with a visible subject")
         if (alpha < 0.5).any():
             return alpha
-    return _segmented(image, subject)
+    return _segmented(image, subject, tell)
 
 
 def touches_border(coverage: np.ndarray) -> bool:
@@ -50,7 +53,7 @@ def _mask_coverage(mask: np.ndarray) -> np.ndarray:
     return pixels[..., :1 if pixels.shape[2] < 3 else 3].mean(-1)
 
 
-def _segmented(image: np.ndarray, subject: object) -> np.ndarray:
+def _segmented(image: np.ndarray, subject: object, tell: Callable[[str], None]) -> np.ndarray:
     """Coverage by the difference from a background model fitted to the border, its edge by random walks (Grady 2006)."""
     from skimage.color import rgb2lab
     from skimage.segmentation import random_walker
@@ -64,7 +67,7 @@ def _segmented(image: np.ndarray, subject: object) -> np.ndarray:
     if scale < 1:
         color = resize(color, small, order=1, anti_aliasing=True)
     lab = rgb2lab(color)
-    labels = _labels(lab, color, subject)
+    labels = _labels(lab, color, subject, tell)
     coverage = (labels == 1).astype(np.float64)
     if (labels == 0).any() and (labels == 2).any():
         with warnings.catch_warnings():
@@ -79,11 +82,13 @@ def _segmented(image: np.ndarray, subject: object) -> np.ndarray:
     return np.clip(coverage, 0, 1).astype(np.float32)
 
 
-def _labels(lab: np.ndarray, color: np.ndarray, subject: object) -> np.ndarray:
+def _labels(lab: np.ndarray, color: np.ndarray, subject: object, tell: Callable[[str], None]) -> np.ndarray:
     """Labels (h, w) as of _trimap, by the difference from a plain background, else by GrabCut. lab and color (h, w, 3) are one picture."""
     fitted = _background(lab)
     if fitted is None:
-        return _labels_without_plain_background(color, subject)
+        labels = _labels_without_plain_background(color, subject)
+        tell(f"{subject}: the background is not plain; the subject was cut out by its colors and may lack parts: look at it, or give a mask")
+        return labels
     background, spread = fitted
     difference = lab - background
     # A soft shadow darkens without changing hue: lightness below the background's counts for less.

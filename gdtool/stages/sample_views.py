@@ -107,7 +107,7 @@ def _condition(inputs: Inputs, options: Options, config, out: Output):
     given = read_image(Path(options.mask)) if options.mask is not None else None
     if given is not None and given.shape[:2] != image.shape[:2]:
         raise InputError(options.mask, f"is {given.shape[1]}x{given.shape[0]}, the image {image.shape[1]}x{image.shape[0]}")
-    alpha = foreground(image, given, inputs.main)
+    alpha = foreground(image, given, inputs.main, out.warn)
     if not (alpha > 0.5).any():
         raise InputError(inputs.main, "shows no subject: its mask is empty", "give one with --mask")
     edge = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])

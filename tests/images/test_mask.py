@@ -93,11 +93,15 @@ def busy_scene(size: int = 320, contrast: float = 1.0):
     return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8), coverage
 
 
-def test_a_busy_background_is_cut_away_or_refused_but_never_guessed():
+def test_a_busy_background_is_cut_away_with_a_word_or_refused():
     pytest.importorskip("cv2")
     image, truth = busy_scene()
-    mask = foreground(image)
+    told = []
+    mask = foreground(image, None, "leaf.png", told.append)
     assert mask.dtype == np.float32 and overlap(mask, truth) > 0.95 and not touches_border(mask)
+    assert len(told) == 1 and told[0].startswith("leaf.png: the background is not plain")
+    foreground(scene()[0], None, "plain.png", told.append)
+    assert len(told) == 1
     np.testing.assert_array_equal(mask, foreground(image))  # the same every time
     hidden, _ = busy_scene(contrast=0.0)
     with pytest.raises(InputError, match="do not tell the subject from it"):
