@@ -105,6 +105,7 @@ model: data
 	$(BIN)/gdtool train $(DATA)/objects --minutes $(MINUTES) -o $(DATA)/small
 	$(BIN)/gdtool train $(DATA)/objects --start $(DATA)/small --size 128 --config benchmarks/model_training.json --steps $(STEPS) -o $(DATA)/model
 	$(BIN)/python benchmarks/model_quality.py $(DATA)/held_out --model $(DATA)/model --train $(DATA)/objects -o docs/benchmarks --install
+	$(BIN)/python benchmarks/model_sheets.py $(DATA)/held_out ../shared/assets/images
 
 # The JSON Schemas from the types that decode the manifests; a test compares.
 schemas: venv
