@@ -9,7 +9,7 @@ from gdtool.texture.raster import owner_count
 _FINE = 3  # cells of the supersampled mask in a cell of the square
 _MOST_BY_RASTER = 160
 _MANY = 48  # with more charts than these a coarser grid and fewer tries bound the time
-_GAIN = 0.02
+_GAIN, _GAIN_PER_CHART = 0.02, 0.002
 _TRIES = 1500  # charts placed in search of better orders
 
 
@@ -168,7 +168,7 @@ def _runs(mask: np.ndarray, stride: int) -> list[tuple[int, int, int]]:
 
 def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float) -> int:
     """Which of several ways to cut one surface into charts packs best, by a short search; each later one has to gain more
-    than the seams it adds are worth, _GAIN of the square."""
+    than the seams it adds are worth, _GAIN of the square and _GAIN_PER_CHART for each chart."""
     best, best_share = 0, 0.0
     for i, charts in enumerate(variants):
         if not 1 < len(charts) <= _MOST_BY_RASTER or any(charts is earlier for earlier in variants[:i]):
@@ -176,7 +176,8 @@ def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float)
         boxed, area = _boxed(charts)
         ranked = _search(boxed, area, gap, 160, 0, 0.3)
         share = ranked[0][0] if ranked else 0.0
-        if share > best_share + (_GAIN if best_share else 0.0):
+        more = len(charts) - len(variants[best])
+        if share > best_share + (_GAIN + _GAIN_PER_CHART * more if best_share else 0.0):
             best, best_share = i, share
     return best
 
