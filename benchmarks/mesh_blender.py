@@ -41,10 +41,27 @@ def corners(mesh) -> np.ndarray:
     return np.where(np.arange(4) < total[:, None], start[:, None] + np.arange(4), -1)
 
 
+def prepared(thing, vertices: np.ndarray) -> float:
+    """Enlarges the mesh and drops its tiniest edges; the factor. QuadriFlow calls a mesh with edges below 1e-4 not manifold."""
+    import bmesh
+
+    factor = 1000.0 / float(np.linalg.norm(np.ptp(vertices, 0)))
+    thing.data.vertices.foreach_set("co", (vertices * factor).astype(np.float32).ravel())
+    mesh = bmesh.new()
+    mesh.from_mesh(thing.data)
+    bmesh.ops.dissolve_degenerate(mesh, dist=5e-4, edges=mesh.edges)
+    bmesh.ops.triangulate(mesh, faces=mesh.faces)
+    mesh.to_mesh(thing.data)
+    mesh.free()
+    thing.data.update()
+    return factor
+
+
 def main() -> None:
     way, source, target, asked = sys.argv[1:5]
     with np.load(source) as given:
         thing = made(given["vertices"], given["faces"])
+        factor = prepared(thing, given["vertices"]) if way == "quadriflow" else 1.0
     start = time.perf_counter()
     if way == "quadriflow":
         state = bpy.ops.object.quadriflow_remesh(mode="FACES", target_faces=int(asked), use_preserve_sharp=True, use_mesh_symmetry=False, seed=0)
@@ -57,7 +74,7 @@ def main() -> None:
         mesh.loops.foreach_get("vertex_index", vertex)
         loops = corners(mesh)
         found = np.where(loops < 0, -1, vertex[loops]).astype(np.int64)
-        np.savez(target, vertices=points.reshape(-1, 3).astype(np.float64), faces=found, seconds=seconds)
+        np.savez(target, vertices=points.reshape(-1, 3).astype(np.float64) / factor, faces=found, seconds=seconds)
         return
     bpy.ops.object.mode_set(mode="EDIT")
     bpy.ops.mesh.select_all(action="SELECT")
