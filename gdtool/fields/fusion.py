@@ -12,12 +12,15 @@ from gdtool.fields.align import Corrections, corrections, disagreement, slope_ro
 from gdtool.fields.carve import carve, silhouettes_outvoted, smooth_unseen
 from gdtool.fields.clock import Clock
 from gdtool.fields.refine import drop_debris, measured_planes, refine
-from gdtool.fields.sights import Sight, pixel_footprint, prepare, with_edge
+from gdtool.fields.sights import WEAK, Sight, free_distance, hull_distance, pixel_footprint, prepare, with_edge
 from gdtool.fields.thin import near_points, restore_thin
 from gdtool.geometry.grids import edge_counts, extract
 from gdtool.geometry.normals import vertex_normals
+from gdtool.geometry.sharpen import dihedral_degrees, restore_creases
 
 LEAST_NOISE = 0.3  # grid steps: of views that had to be brought together
+OVER_EDGE = 0.25  # steps that a sharp edge may stand out of what the views leave, whose pixels round it off
+CREASE_ROUNDS, FOLD_DEGREES = 4, 150.0  # tries without what folded over; a fold's least angle between normals
 MAX_SAMPLES = 320  # along the longest side: 33 million samples, 0.6 GB at the peak
 # Rounds of bringing views together: how far apart two surfaces may lie to be taken for one (world units), and how stiff
 # the corrections are. The last is repeated while the disagreement falls by PLATEAU of itself.
@@ -138,7 +141,7 @@ def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: i
     if noise:
         from scipy.ndimage import gaussian_filter
 
-        values = gaussian_filter(values, min(1.0 + noise / step, 2.5), truncate=2.5)
+        values = gaussian_filter(values, min(0.6 + noise / step, 2.5), truncate=2.5)
     vertices, faces = extract(values, grid)
     if len(faces) == 0:
         raise ValueError("the silhouettes have no common volume")
@@ -149,9 +152,46 @@ def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: i
     if not noise and not outvoted:
         # A sheet's two sides would both be drawn onto its one measured surface.
         moved = refine(vertices, faces, sights, step, reach=reach)
-        vertices = np.where(near_points(vertices, thin, 2 * step)[:, None], vertices, moved)
+        thickened = near_points(vertices, thin, 2 * step)
+        vertices, faces = with_creases(np.where(thickened[:, None], vertices, moved), faces, sights, thickened, step)
     support = measured_planes(sights, vertices, vertex_normals(vertices, faces), reach)[2]
     return Shape(vertices, faces, support, step, dropped)
+
+
+def with_creases(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], fixed: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """The closed mesh with the bevels that marching cubes leaves along sharp edges drawn out; as given where that opens it.
+
+    fixed (v,) bool: vertices that stay. None moves out of the silhouettes, nor into what a view sees to be free.
+    """
+    def outside(points: np.ndarray) -> np.ndarray:
+        far = np.max([hull_distance(sight, points) for sight in sights], 0)
+        for sight in sights:
+            if sight.planes is not None:
+                distance, weight = free_distance(sight, points)
+                far = np.maximum(far, np.where(weight > WEAK, distance, -np.inf))
+        return far
+
+    def accept(idx: np.ndarray, points: np.ndarray) -> np.ndarray:
+        return ~fixed[idx] & (outside(points) < np.maximum(outside(vertices[idx]), OVER_EDGE * step))
+
+    fixed = fixed.copy()
+    for _ in range(CREASE_ROUNDS):
+        sharp, sharp_faces, _ = restore_creases(vertices, faces, accept=accept)
+        folded = folds(sharp, sharp_faces)
+        fresh = near_points(vertices, folded, 2 * step) & ~near_points(vertices, folds(vertices, faces), 2 * step) & ~fixed
+        if not fresh.any():
+            break
+        fixed |= fresh
+    else:
+        return vertices, faces
+    sharp_faces = np.ascontiguousarray(sharp_faces, np.int32)
+    return (sharp, sharp_faces) if is_closed_manifold(sharp_faces) else (vertices, faces)
+
+
+def folds(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Midpoints (n, 3) of the edges at which a mesh folds back onto itself."""
+    ends, _, angle = dihedral_degrees(vertices, faces)
+    return vertices[ends[angle > FOLD_DEGREES]].mean(1)
 
 
 def is_closed_manifold(faces: np.ndarray) -> bool:

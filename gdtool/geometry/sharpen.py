@@ -7,6 +7,8 @@ al. 2001 (Feature sensitive surface extraction), its rank cut to the number of s
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from gdtool.geometry.normals import face_normals, vertex_normals
@@ -32,12 +34,13 @@ def dihedral_degrees(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarra
     return edges.ends[edge_idx], pairs, angle
 
 
-def restore_creases(vertices: np.ndarray, faces: np.ndarray,
-                    crease_degrees: float = 30.0) -> tuple[np.ndarray, np.ndarray, dict[str, float | int]]:
+def restore_creases(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float = 30.0,
+                    accept: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray, dict[str, float | int]]:
     """Bevels drawn out to the creases they cut off: vertices, faces and a report (moved, largest_move, bevel_share).
 
     vertices (v, 3), faces (f, 3) fine enough for a bevel to be one cell wide. Creases that are sharp already, smooth
     parts and rough surfaces stay as they are. The rims of a bevel are joined where that keeps the mesh manifold.
+    accept: which of the vertices of indices (n,) may move to positions (n, 3), as bool (n,); all without it.
     """
     from scipy.spatial import cKDTree
 
@@ -74,6 +77,8 @@ def restore_creases(vertices: np.ndarray, faces: np.ndarray,
     point, residual = _meeting_point(vertices[at], n, c, cluster, sides)
     move = np.linalg.norm(point - vertices[at], axis=1)
     good = (sides >= 2) & (spread > crease_degrees * 0.8) & (move < _LARGEST_MOVE_EDGES * edge) & (residual < _LARGEST_RESIDUAL_EDGES * edge)
+    if accept is not None and good.any():
+        good[good] = accept(at[good], point[good])
     out = vertices.copy()
     out[at[good]] = point[good]
     if not good.any():
