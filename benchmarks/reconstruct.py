@@ -29,7 +29,7 @@ import numpy as np
 import peers
 from measure import Failed, busy, gdtool, machine, number, say
 from perturbation import Perturbation, perturbed
-from reconstruct_looks import MATERIALS, looks, sheet
+from reconstruct_looks import MATERIALS, keep_row, looks, sheet
 from reconstruct_report import COLUMNS, OURS, kind, markdown, plot
 
 FIRST_SEED = 3_000_000  # procedural objects that the bundled model has not seen
@@ -42,6 +42,7 @@ SUITE = (*(f"gso/vima/{n}.obj" for n in ("mario_figure", "porcelain_cup", "toy_t
          *(f"mesh/trimesh/{n}" for n in ("fandisk.obj", "plate_holes.STL", "cycloidal.ply", "featuretype.STL")))
 SEEDS, WAVELENGTHS = 5, (1 / 16, 1 / 8, 1 / 4)  # of --all; the default takes one pair a model, each in turn
 DEFAULT_DISTURBED, DEFAULT_BUDGETED, DEFAULT_COLOR = 10, 2, 4  # models
+PICTURED = 10  # models on the contact sheet
 ALWAYS = ("carved hull", "capped Poisson")  # peers run on every model; the others, which are worse, on the first of the default
 
 
@@ -180,8 +181,8 @@ def tasks(index: int, case: str, given: argparse.Namespace) -> dict:
     return found
 
 
-def measure(index: int, name: str, source: str, folder: Path, bench: Bench, pool) -> list[tuple[str, list]]:
-    """All runs on one model; rows for the contact sheet."""
+def measure(index: int, name: str, source: str, folder: Path, bench: Bench, pool) -> None:
+    """All runs on one model, and pictures of them for the contact sheet."""
     from gdtool.assets.load import load_scene
     from gdtool.core.folder import open_folder
     from gdtool.folders.surface import read_surface
@@ -192,7 +193,7 @@ def measure(index: int, name: str, source: str, folder: Path, bench: Bench, pool
     todo = {case: {m: t for m, t in tasks(index, case, given).items() if not bench.has(name, case, m)} for case in cases_of(index, given)}
     todo = {case: methods for case, methods in todo.items() if methods}
     if not todo:
-        return []
+        return
     say(name)
     clean = folder / "views"
     gdtool("render-dataset", source, "-o", clean, "--size", str(given.size), "--samples", "4", "--light-samples", "4", "--quiet")
@@ -202,7 +203,6 @@ def measure(index: int, name: str, source: str, folder: Path, bench: Bench, pool
     truth = replace(truth, vertices=transform_points(to_views, truth.vertices))  # a scale and a shift: its normals stay
     # How far the views' own normals are from the facets of the truth: nothing made from them can be much nearer.
     shown = normals_beside(truth.vertices, truth.faces, views)
-    rows = []
     for case, methods in todo.items():
         arrays, place = views, clean
         if kind({"case": case}) == "perturbed":
@@ -239,9 +239,8 @@ def measure(index: int, name: str, source: str, folder: Path, bench: Bench, pool
         bench.save()
         own = [m for r, m, _ in made if r["method"] == OURS]
         others = sorted((r.get("distance", np.inf), i) for i, (r, _, _) in enumerate(made) if not r["method"].startswith(OURS))
-        if given.sheet and own and kind({"case": case}) != "color":
-            rows.append((f"{name} {case}", [(truth.vertices, truth.faces), own[0], made[others[0][1]][1] if others else None]))
-    return rows
+        if given.sheet and own and index < PICTURED and kind({"case": case}) != "color":
+            keep_row(given.output, f"{name} {case}", [(truth.vertices, truth.faces), own[0], made[others[0][1]][1] if others else None])
 
 
 def arguments() -> argparse.Namespace:
@@ -258,17 +257,20 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--size", type=int, default=256, help="width and height of the views (default 256)")
     parser.add_argument("--seeds", type=int, default=0, help="disturbances of every model and wavelength (default: one of either a model, in turn)")
     parser.add_argument("--wavelengths", type=numbers, default=list(WAVELENGTHS), help="with --seeds: of the disturbance, shares of the picture")
-    parser.add_argument("--budgets", type=numbers, default=[5, 10, 20], help="also run ours with --budget of these seconds (default 5,10,20)")
+    parser.add_argument("--budgets", type=numbers, default=[5, 10, 20, 40, 120], help="also run ours with --budget of these seconds, on the first models (default 5,10,20,40,120)")
     parser.add_argument("--cases", type=lambda t: t.split(","), default=["clean", "perturbed", "color"], help="which views: clean,perturbed,color (default all)")
     parser.add_argument("--no-peers", dest="peers", action="store_false", help="leave the peers out")
     parser.add_argument("--fresh", action="store_true", help="measure every row anew")
-    parser.add_argument("--sheet", type=Path, metavar="PNG", help="write pictures of the truth, ours and the best peer of each model")
+    parser.add_argument("--sheet", type=Path, metavar="PNG", help="where the pictures of the truth, ours and the best peer go (default: beside the report)")
+    parser.add_argument("--minutes", type=float, default=16, help="begin no model after this long; the next run goes on (default 16; 0: no end)")
+    parser.add_argument("--no-sheet", action="store_true", help="no pictures")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep (and find again) the folders of every model here")
     parser.add_argument("--option", dest="options", action="append", default=[], help="further option of gdtool reconstruct, as --option=--method=paper")
     parser.add_argument("-o", "--output", type=Path, default=Path(__file__).parents[1] / "docs" / "benchmarks", help="folder of the report")
     given = parser.parse_args()
+    given.sheet = None if given.no_sheet else given.sheet or given.output / "reconstruct_sheet.png"
     if given.all:
-        given.seeds, given.budgets = given.seeds or SEEDS, [5, 10, 20, 40, 60, 120]
+        given.minutes, given.seeds, given.budgets = 0, given.seeds or SEEDS, [5, 10, 20, 40, 60, 120]
     return given
 
 
@@ -276,18 +278,23 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # Poisson's threads would burn a core waiting
     given = arguments()
     given.output.mkdir(parents=True, exist_ok=True)
-    bench, rows = Bench(given), []
+    bench, late, began = Bench(given), [], time.monotonic()
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:  # a fork of a process with OpenMP threads can hang
         for index, (name, source) in enumerate(models(given)):
+            if given.minutes and time.monotonic() - began > 60 * given.minutes:
+                late.append(name)
+                continue
             with tempfile.TemporaryDirectory() as folder:
                 try:
-                    rows += measure(index, name, source, given.keep / name.replace(":", "-") if given.keep else Path(folder), bench, pool)
+                    measure(index, name, source, given.keep / name.replace(":", "-") if given.keep else Path(folder), bench, pool)
                 except Failed as error:
                     say(f"{name}: left out: {error}")
-            if rows and given.sheet:
-                sheet(rows, ["truth", OURS, "best peer"], given.sheet)
     plot(bench.records, given.output / "reconstruct.png")
-    bench.save(complete=True)
+    if given.sheet:
+        sheet(given.output, ["truth", OURS, "best peer"], given.sheet, done=not late)
+    if late:
+        say(f"--minutes {given.minutes:g} are over; run again for {', '.join(late)}")
+    bench.save(complete=not late)
     print(markdown(bench.records, given, bench.head["remark"]))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -70,11 +71,26 @@ def picture(vertices: np.ndarray, faces: np.ndarray, size: int = EDGE) -> np.nda
     return image.reshape(size, 2, size, 2, 3).mean((1, 3))
 
 
-def sheet(rows: list[tuple[str, list]], heads: list[str], path: Path) -> None:
-    """Write the contact sheet: rows of (label, meshes (vertices, faces) or None)."""
+def keep_row(folder: Path, label: str, meshes: list) -> None:
+    """Keep pictures of meshes (vertices, faces), None for an empty place, until sheet() joins them: a stopped run loses none."""
+    place = folder / "reconstruct_pictures"
+    place.mkdir(parents=True, exist_ok=True)
+    name = f"{len(list(place.glob('*.npz'))):03d}.npz"
+    np.savez_compressed(place / name, label=label, **{str(i): picture(*mesh) for i, mesh in enumerate(meshes) if mesh is not None})
+
+
+def sheet(folder: Path, heads: list[str], path: Path, done: bool) -> None:
+    """Write the contact sheet of the rows kept in folder, of a case measured twice the later one; forget them when done."""
     from gdtool.images.contact import contact_sheet
     from gdtool.images.io import write_png
 
-    pictures = [[None if mesh is None else picture(*mesh) for mesh in meshes] for _, meshes in rows]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_png(path, contact_sheet(pictures, heads, [label for label, _ in rows]))
+    rows = {}
+    kept = sorted((folder / "reconstruct_pictures").glob("*.npz"))
+    for file in kept:
+        with np.load(file) as row:
+            rows[str(row["label"])] = [row[str(i)] if str(i) in row else None for i in range(len(heads))]
+    if rows:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_png(path, contact_sheet(list(rows.values()), heads, list(rows)))
+    if done:
+        shutil.rmtree(folder / "reconstruct_pictures", ignore_errors=True)
