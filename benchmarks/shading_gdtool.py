@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import os
 import time
@@ -32,9 +33,13 @@ def main() -> None:
     from gdtool.assets.load import load_scene
     from gdtool.cameras import rig
     from gdtool.shading import render
+    from gdtool.shading.closed_form import closed_form_image
     from gdtool.shading.direct import DirectLight
     from gdtool.shading.studio import studio
 
+    # What the renderer imports when it first needs it: no renderer's seconds have its imports in them.
+    for module in ("embreex.mesh_construction", "gdtool.shading.closed_form", "gdtool.shading.prefilter", "gdtool.texture.tangents", "torch.quasirandom"):
+        importlib.import_module(module)
     scene = normalised(load_scene(asked.model))
     if asked.converged:
         render.BASE = asked.samples
@@ -45,14 +50,16 @@ def main() -> None:
     if asked.light in ("sampled", "prefiltered"):
         color = DirectLight(renderer, environment, asked.light_samples, asked.seed, mode=asked.light).color()
     cameras = {camera.name: camera for camera in rig("six", asked.size)}
-    frames = []
-    for name in asked.views.split(","):
-        frame = renderer.buffers(cameras[name], asked.samples, color)
+
+    def view(camera):
+        frame = renderer.buffers(camera, asked.samples, color)
         if asked.light == "sg":
-            frame["color"] = render.closed_form_image(frame, cameras[name], lobes)
+            frame["color"] = closed_form_image(frame, camera, lobes)
         if "color" in frame:
             frame["color"] = frame["color"] * frame["mask"][..., None]
-        frames.append(frame)
+        return frame
+
+    frames = list(renderer.each(view, [cameras[name] for name in asked.views.split(",")]))
     seconds = {"wall s": time.perf_counter() - wall, "cpu s": time.process_time() - processor}
     np.savez(asked.out, names=np.array(asked.views.split(",")), **{key: np.stack([frame[key] for frame in frames]) for key in frames[0]})
     print(json.dumps({**seconds, "rays": renderer.counts.samples + renderer.counts.shadow_rays}))

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from gdtool.cameras import Camera, rays
 from gdtool.shading.brdf import (Brdf, alpha_of, clamp_cosine, f0_of, fresnel, ndf, visibility)
 from gdtool.shading.sg import MAX_SHARPNESS, SphericalGaussians, cosine_integral, dot, integral, normalize, product
 
@@ -95,3 +97,15 @@ def _specular(normal: Tensor, view: Tensor, n_v: Tensor, roughness: Tensor, f0: 
     lobes = (1 - weight)[..., None] * by_lobe[..., None] * fresnel(f0, n_v)[..., None, :]
     lobes = lobes + weight[..., None] * by_light[..., None] * fresnel(f0[..., None, :], v_h)
     return (lobes * lights.amplitudes).sum(-2)
+
+
+def closed_form_image(frame: dict[str, np.ndarray], camera: Camera, lobes: SphericalGaussians, brdf: str = "gltf") -> np.ndarray:
+    """(h, w, 3) unshadowed linear radiance of a view's own maps under spherical Gaussians; 0 where nothing is seen."""
+    inside = frame["mask"] > 0
+    view = -rays(camera)[1][inside]
+    maps = [torch.tensor(x, dtype=torch.float32) for x in (frame["normal"][inside], view, frame["albedo"][inside],
+                                                           frame["roughness"][inside], frame["metallic"][inside])]
+    out = np.zeros((*inside.shape, 3), np.float32)
+    with torch.no_grad():
+        out[inside] = shade(*maps, lobes.to(torch.float32), brdf).numpy()
+    return out

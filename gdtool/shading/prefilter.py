@@ -7,8 +7,10 @@ SIMD"), pole up: every texel has the same solid angle, so halving the image is e
 from __future__ import annotations
 
 import math
+import os
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -16,9 +18,11 @@ from gdtool.shading.environment import Environment
 
 # Roughness of the levels that may be made, each with its image's side: broad lobes vary slowly.
 LADDER = ((0.08, 256), (0.14, 128), (0.2, 128), (0.3, 64), (0.4, 32), (0.5, 32), (0.62, 32), (0.78, 32), (1.0, 32))
-LOBE_SAMPLES = 64
+LOBE_SAMPLES = 32
 # Side of the largest images that are summed over all of the light.
 DENSE = 64
+# Normals summed for at a time: what lies between the products stays in the cache.
+PART = 64
 TABLE = 32
 
 
@@ -94,9 +98,10 @@ class IrradianceMap:
         normals = np.stack([ring * np.cos(phi), np.broadcast_to(np.cos(theta)[:, None], (height, 2 * height)), ring * np.sin(phi)], -1)
         weighted = torch.as_tensor((small.image * small.solid_angles[:, None, None]).reshape(-1, 3), dtype=torch.float32)
         toward = torch.as_tensor(small.directions.reshape(-1, 3).T, dtype=torch.float32)
-        # A few normals at a time: what lies between the two products stays in the cache.
-        parts = [(part @ toward).clamp_min_(0) @ weighted for part in torch.as_tensor(normals.reshape(-1, 3), dtype=torch.float32).chunk(height)]
-        self.values = torch.cat(parts).numpy().reshape(height, 2 * height, 3)
+        parts = torch.as_tensor(normals.reshape(-1, 3), dtype=torch.float32).split(PART)
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            sums = list(pool.map(lambda part: (part @ toward).clamp_min_(0) @ weighted, parts))
+        self.values = torch.cat(sums).numpy().reshape(height, 2 * height, 3)
         # A column more on each side, from the other one.
         self.wrapped = torch.from_numpy(np.concatenate([self.values[:, -1:], self.values, self.values[:, :1]], 1))
 
@@ -209,10 +214,10 @@ def _sum_of_all(pyramid: LightPyramid, normal, a2: float):
     light = pyramid.texels[pyramid.offsets[level]:pyramid.offsets[level] + side * side]
     toward = torch.as_tensor(octahedral_directions(side), dtype=torch.float32)
     out = []
-    for part in normal.split(512):
-        cosine = (part @ toward.T).clamp_(-1, 1)
+    for part in normal.split(PART):
+        cosine = (part @ toward.T).clamp_(0, 1)
         # (n·h)² is (1 + n·l) / 2, so that D's bracket is (1 + a2)/2 − (1 − a2)/2 n·l.
-        weight = cosine.clamp_min(0) / (0.5 * (1 + a2) - 0.5 * (1 - a2) * cosine) ** 2
+        weight = torch.mul(cosine, -0.5 * (1 - a2)).add_(0.5 * (1 + a2)).square_().reciprocal_().mul_(cosine)
         out.append(weight @ light / weight.sum(1, keepdim=True))
     return torch.cat(out)
 

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -20,6 +22,7 @@ import numpy as np
 from gdtool.assets.scene import Scene
 from gdtool.cameras import Camera, project, rays
 from gdtool.geometry.rays import RayCaster, is_convex
+from gdtool.images.color import srgb_from_linear
 from gdtool.shading.environment import Environment
 from gdtool.shading.pattern import pixel_pattern
 from gdtool.shading.surface_points import SurfaceLookup
@@ -200,14 +203,18 @@ class Renderer:
         values = self.lookup.attributes(face_idx, barycentric, footprint, directions, emission)
         return Points(pixel[hit], sample[hit], origins[hit] + directions * distance[:, None], -directions, depth, values, together)
 
+    def each(self, work: Callable[[Camera], dict], cameras: Iterable[Camera]) -> Iterator[dict]:
+        """work(camera) of each, in order, two at once: while the sums of one are looked through, the other one's rays are traced."""
+        with ThreadPoolExecutor(min(2, self.caster.threads)) as pool:
+            yield from pool.map(work, cameras)
+
     def buffers(self, camera: Camera, samples: int = 16, shade=None, goal: Goal = Goal()) -> dict[str, np.ndarray]:
         """Domain images (h, w[, c]) float32 and "mask": see render_buffers. shade(points) -> {"color": (n, 3)} adds an
         image. samples: the most that a pixel gets."""
         begun = time.perf_counter()
         height, width = camera.height, camera.width
         top, bottom, left, right = self.window(camera)
-        self.counts.pixels += height * width
-        self.counts.pixels_in_bounds += max(bottom - top, 0) * max(right - left, 0)
+        self.counts.spend("bounds", begun, pixels=height * width, pixels_in_bounds=max(bottom - top, 0) * max(right - left, 0))
         total, pattern = _Sums(height * width), pixel_pattern(samples, BASE)
         pixel = (np.arange(top, bottom)[:, None] * width + np.arange(left, right)[None]).ravel()
         done, taken = 0, 0
@@ -216,18 +223,22 @@ class Renderer:
             count = min(max(2 * done, BASE), samples)
             more = count - done
             step = max(1, BAND_SAMPLES // more)
-            at = time.perf_counter()
 
             def look(part: np.ndarray, first: int = done, count: int = count) -> tuple[np.ndarray, Points, dict]:
+                at = time.perf_counter()
                 asked = np.repeat(part, count - first)
                 points = self.see(camera, asked, np.tile(np.arange(first, count), len(part)), pattern, count, shade is not None)
-                return asked, points, shade(points) if shade is not None and len(points) else {}
+                shaded = shade(points) if shade is not None and len(points) else {}
+                self.counts.spend("samples", at, pixels_refined=len(part) if first == BASE else 0)
+                return asked, points, shaded
 
-            for group in _batches([pixel[start:start + step] for start in range(0, len(pixel), step)], 4 * self.caster.threads):
-                for found in self.pool.map(look, group):
-                    total.add(*found)
-            self.counts.spend("samples", at)
-            self.counts.pixels_refined += len(pixel) if done == BASE else 0
+            waiting: deque = deque()
+            for start in range(0, len(pixel), step):
+                waiting.append(self.pool.submit(look, pixel[start:start + step]))
+                if len(waiting) > 4 * self.caster.threads:
+                    total.add(*waiting.popleft().result())
+            for found in waiting:
+                total.add(*found.result())
             taken += len(pixel) * more
             change = total.change()
             done = count
@@ -292,7 +303,7 @@ class _Sums:
         mean = np.clip(self.sums["color"] / np.maximum(self.seen, 1)[:, None], 0, 1)
         out = None
         if self.before is not None and len(covered):
-            moved = ((_srgb(mean[covered]) - _srgb(self.before[covered])) ** 2).mean(1)
+            moved = ((srgb_from_linear(mean[covered]) - srgb_from_linear(self.before[covered])) ** 2).mean(1)
             # A pixel that got nothing new is as good as its samples say.
             self.moved[covered] = np.where(self.asked[covered] > self.asked_before[covered], moved, self.moved[covered])
             out = float(-10 * np.log10(max(self.moved[covered].mean(), 1e-10)))
@@ -341,20 +352,11 @@ class _Sums:
         return out
 
 
-def _batches(parts: list, size: int) -> list[list]:
-    """The parts in runs of at most size."""
-    return [parts[i:i + size] for i in range(0, len(parts), size)]
-
-
 def _beside(inside: np.ndarray) -> np.ndarray:
     """(h * w,) bool: pixels that are inside (h, w), or have a neighbour of eight that is."""
     padded = np.pad(inside, 1)
     rows = padded[:-2] | padded[1:-1] | padded[2:]
     return (rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]).ravel()
-
-
-def _srgb(x: np.ndarray) -> np.ndarray:
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def _srgb_slope(x: np.ndarray) -> np.ndarray:
@@ -383,19 +385,3 @@ def render_color(scene: Scene, camera: Camera, environment: Environment, samples
     light = DirectLight(renderer, environment, light_samples, seed, brdf)
     images = renderer.buffers(camera, samples, light.color())
     return images["color"], images["mask"]
-
-
-def closed_form_image(frame: dict[str, np.ndarray], camera: Camera, lobes, brdf: str = "gltf") -> np.ndarray:
-    """(h, w, 3) unshadowed linear radiance of a view's own maps under spherical Gaussians; 0 where nothing is seen."""
-    import torch
-
-    from gdtool.shading.closed_form import shade
-
-    inside = frame["mask"] > 0
-    view = -rays(camera)[1][inside]
-    maps = [torch.tensor(x, dtype=torch.float32) for x in (frame["normal"][inside], view, frame["albedo"][inside],
-                                                           frame["roughness"][inside], frame["metallic"][inside])]
-    out = np.zeros((*inside.shape, 3), np.float32)
-    with torch.no_grad():
-        out[inside] = shade(*maps, lobes.to(torch.float32), brdf).numpy()
-    return out

@@ -63,8 +63,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.images.color import srgb_from_linear
     from gdtool.images.contact import contact_sheet
     from gdtool.images.io import write_png
+    from gdtool.shading.closed_form import closed_form_image
     from gdtool.shading.direct import DirectLight
-    from gdtool.shading.render import Goal, Renderer, closed_form_image
+    from gdtool.shading.render import Goal, Renderer
     from gdtool.shading.rigs import turntable
     from gdtool.shading.savings import savings
     from gdtool.shading.studio import studio

@@ -86,7 +86,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             lamps = _light(renderer, inputs, given, options)
             light = lamps.record
     with out.step("render"):
-        frames = [_view(renderer, camera, lamps, options) for camera in out.progress(cameras, len(cameras), "views")]
+        frames = list(out.progress(renderer.each(lambda camera: _view(renderer, camera, lamps, options), cameras), len(cameras), "views"))
     wanted = [d for d in ALL if d in options.domains]
     mask = np.stack([frame["mask"] for frame in frames])
     if not mask.any():
@@ -228,7 +228,7 @@ def _light(renderer: Renderer, inputs: Inputs, given: Folder | None, options: Op
 def _view(renderer: Renderer, camera: Camera, lamps: _Lamps | None, options: Options) -> dict[str, np.ndarray]:
     frame = renderer.buffers(camera, options.samples, lamps.direct.color(options.exposure) if "color" in options.domains else None)
     if "closed_form" in options.domains:
-        from gdtool.shading.render import closed_form_image
+        from gdtool.shading.closed_form import closed_form_image
 
         frame["closed_form"] = closed_form_image(frame, camera, lamps.lobes, options.brdf) * options.exposure
     return frame
@@ -243,8 +243,8 @@ def _write_conditions(out: Output, renderer: Renderer, direct: DirectLight, opti
     from gdtool.shading.rigs import condition_camera
 
     cameras = [condition_camera(rng, f"{i:03d}", options.size) for i in range(options.condition_views)]
-    for camera in out.progress(cameras, len(cameras), "conditions"):
-        frame = renderer.buffers(camera, options.samples, direct.color(options.exposure))
+    frames = renderer.each(lambda camera: renderer.buffers(camera, options.samples, direct.color(options.exposure)), cameras)
+    for camera, frame in zip(cameras, out.progress(frames, len(cameras), "conditions"), strict=True):
         color = srgb_from_linear(np.clip(frame["color"], 0, 1))
         write_png(out.path(f"condition/{camera.name}.png"), np.concatenate([color, frame["mask"][..., None]], -1))
     write_cameras(out.path("condition.json"), cameras)
