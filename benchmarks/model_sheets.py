@@ -73,6 +73,17 @@ def sheet(blocks: list[np.ndarray]) -> np.ndarray:
     return out
 
 
+def credit(path: Path) -> str:
+    """Where a picture comes from and under what licence, as a SOURCES.tsv (path, repository, path there, licence) above it says."""
+    for folder in path.resolve().parents:
+        if (folder / "SOURCES.tsv").is_file():
+            for line in (folder / "SOURCES.tsv").read_text().splitlines():
+                name, repository, _, licence = (line.split("\t") + 4 * [""])[:4]
+                if folder / name == path.resolve():
+                    return f" ({repository}, {licence})"
+    return ""
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("held_out", type=Path)
@@ -85,6 +96,11 @@ def main() -> None:
     pictures = [path for path in sorted(arguments.photographs.rglob("*.png")) if read_image(path).shape[-1] == 4]
     write_png(arguments.output / "model_photographs.png", sheet([block(model, photograph(path, size)) for path in pictures[:COUNT]]))
     folders = views_folders([arguments.held_out])[:COUNT]
+    lines = [f"{i + 1}. {path.stem}{credit(path)}" for i, path in enumerate(pictures[:COUNT])]
+    (arguments.output / "model_sheets.md").write_text("\n".join([
+        "# What the bundled model makes of twelve pictures and of twelve held-out objects", "",
+        "A block a picture: as the model is shown it, then its six views in color, normal, depth, albedo, roughness and metallic.", "",
+        "![twelve pictures](model_photographs.png)", "", "The pictures, row by row:", "", *lines, "", "![twelve held-out objects](model_held_out.png)", ""]))
     write_png(arguments.output / "model_held_out.png", sheet([block(model, decode_object(folder, model.config)[1][0]) for folder in folders]))
 
 
