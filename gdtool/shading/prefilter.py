@@ -18,7 +18,7 @@ from gdtool.shading.environment import Environment
 
 # Roughness of the levels that may be made, each with its image's side: broad lobes vary slowly.
 LADDER = ((0.08, 256), (0.14, 128), (0.2, 128), (0.3, 64), (0.4, 32), (0.5, 32), (0.62, 32), (0.78, 32), (1.0, 32))
-LOBE_SAMPLES = 32
+LOBE_SAMPLES = 64
 # Side of the largest images that are summed over all of the light.
 DENSE = 64
 # Normals summed for at a time: what lies between the products stays in the cache.
