@@ -14,9 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
-import subprocess
-import tempfile
 import time
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from fine_meshes import SOLIDS, Fine, models_in, of_model, of_solid
 from measure import busy, machine, number, say, table
+from mesh_runs import arguments, blender, cost_since, plot
 from rows import Rows
 from wireframe import file_name, sheet, wireframe
 
@@ -44,7 +42,7 @@ def ours(vertices: np.ndarray, faces: np.ndarray, quads: int, options: dict) -> 
 
     start = time.perf_counter()
     out, found, record = remesh(vertices, faces, Request(quads=quads, **options))
-    return out, found, _cost(start), record.engine
+    return out, found, cost_since(start), record.engine
 
 
 def peer(vertices: np.ndarray, faces: np.ndarray, quads: int, name: str) -> tuple:
@@ -54,13 +52,7 @@ def peer(vertices: np.ndarray, faces: np.ndarray, quads: int, name: str) -> tupl
     start = time.perf_counter()
     run = quad_engines.run_instant_meshes if name == "Instant Meshes" else quad_engines.run_quadriflow
     out, found = run(vertices.astype(np.float32), faces.astype(np.int32), quads, 30.0)
-    return out, found, _cost(start), name
-
-
-def _cost(start: float) -> dict[str, float]:
-    both = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return {"seconds": time.perf_counter() - start, "processor": sum(u.ru_utime + u.ru_stime for u in both),
-            "peak MB": max(u.ru_maxrss for u in both) / 1024}
+    return out, found, cost_since(start), name
 
 
 def float32_zero_area(vertices: np.ndarray, triangles: np.ndarray) -> int:
@@ -101,39 +93,20 @@ def score(fine: Fine, vertices: np.ndarray, quads: np.ndarray) -> dict:
     return out | ({} if fine.creases is None else crease_figures(fine.creases, vertices, triangles, diagonal))
 
 
-def blender(fine: Fine, quads: int, python: Path, limit: float) -> tuple:
-    """Blender's QuadriFlow through another Python. Raises ChildFailed."""
-    from gdtool.core.child import ChildFailed
-
-    with tempfile.TemporaryDirectory() as folder:
-        given, made = Path(folder) / "in.npz", Path(folder) / "out.npz"
-        np.savez(given, vertices=fine.vertices, faces=np.concatenate([fine.faces, np.full((len(fine.faces), 1), -1)], 1))
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        try:
-            done = subprocess.run([python, Path(__file__).with_name("mesh_blender.py"), "quadriflow", given, made, str(quads)],
-                                  capture_output=True, text=True, timeout=limit, check=False)
-        except subprocess.TimeoutExpired:
-            raise ChildFailed(f"took longer than {limit:g} s") from None
-        if not made.exists():
-            raise ChildFailed((done.stderr.strip() or done.stdout.strip() or "no result").splitlines()[-1][:120])
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        with np.load(made) as found:
-            cost = {"seconds": float(found["seconds"]), "processor": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime}
-            return found["vertices"], found["faces"], cost, BLENDER
-
-
 def measure(fine: Fine, ways: list[str], asked: argparse.Namespace, rows: Rows) -> None:
     """A row for each way that has none yet; one that fails says why. Keeps a wireframe, and our quads for unwrap.py."""
     from gdtool.core.child import ChildFailed, call
     from gdtool.images.io import write_png
 
     for way in ways:
-        if rows.has(fine.name, way):
+        if rows.has(fine.name, way) or time.monotonic() > asked.end:
             continue
         say(f"{fine.name}: {way}")
         try:
             if way == BLENDER:
-                found = blender(fine, asked.faces, asked.peers_python, asked.limit)
+                triangles = np.concatenate([fine.faces, np.full((len(fine.faces), 1), -1)], 1)
+                made, cost = blender("quadriflow", fine.vertices, triangles, asked.faces, asked.peers_python, asked.limit)
+                found = made["vertices"], made["faces"], cost, BLENDER
             elif way in PEERS:
                 found = call("remesh:peer", fine.vertices, fine.faces, asked.faces, way, seconds=asked.limit, memory_mb=16000)
             else:
@@ -149,44 +122,19 @@ def measure(fine: Fine, ways: list[str], asked: argparse.Namespace, rows: Rows) 
         rows.add(row)
 
 
-def plot(rows: list[dict], path: Path) -> None:
-    """Processor seconds against mean distance, a mark per model, a colour per way."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(7, 4.5), dpi=110)
-    for way in dict.fromkeys(row["way"] for row in rows):
-        mine = [row for row in rows if row["way"] == way and "mean" in row]
-        axes.scatter([row["processor"] for row in mine], [row["mean"] for row in mine], label=way, s=22)
-    axes.set(xscale="log", yscale="log", xlabel="seconds of the processor", ylabel="mean distance, share of the diagonal")
-    axes.legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("models", nargs="*", type=Path)
-    parser.add_argument("-o", "--out", type=Path, default=Path("docs/benchmarks"))
-    parser.add_argument("--solids", default=",".join(SOLIDS))
-    parser.add_argument("--faces", type=int, default=20_000)
+    parser = arguments(__doc__, "mesh files", "a Python that has bpy; without it Blender is left out")
     parser.add_argument("--input", type=int, default=1_000_000, help="triangles of each solid")
     parser.add_argument("--model-input", type=int, default=400_000, help="triangles of each model")
     parser.add_argument("--sweep", default="part,knobs", help="solids that the knobs are swept on")
     parser.add_argument("--slow-on", default="part,knobs", help="models that the slow peers run on")
-    parser.add_argument("--peers-python", type=Path, help="a Python that has bpy; without it Blender is left out")
-    parser.add_argument("--kept", type=Path, default=Path("out/bench_meshes"), help="folder for the inputs once made")
-    parser.add_argument("--limit", type=float, default=60.0, help="seconds for one run")
-    parser.add_argument("--only", default="", help="comma list of ways; all of them when empty")
     asked = parser.parse_args()
+    asked.end = time.monotonic() + 60 * asked.minutes
     os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # the children import this file
     if not asked.peers_python:
         say("Blender is left out: no --peers-python")
     note = busy()
-    rows = Rows(asked.out / "remesh.json", {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept")})
+    rows = Rows(asked.out / "remesh.json", {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept", "minutes", "end")})
 
     def ways(name: str) -> list[str]:
         out = [way for way in WAYS if way == "ours" or name in asked.sweep.split(",")]
@@ -203,7 +151,7 @@ def main() -> None:
                 f"`make bench-assets`, {machine()}. {note}\n\n")
         (asked.out / "remesh.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "")
                                              + "\n![time against error](remesh.png)\n\n![wireframes](remesh_sheet.png)\n")
-        plot(rows.rows, asked.out / "remesh.png")
+        plot(rows.rows, asked.out / "remesh.png", "mean", "mean distance, share of the diagonal", True)
         sheet(asked.kept / "pictures", list(dict.fromkeys(row["model"] for row in rows.rows)), ["ours", "Instant Meshes", BLENDER],
               asked.out / "remesh_sheet.png")
         return text
@@ -211,6 +159,8 @@ def main() -> None:
     sources = [*filter(None, asked.solids.split(",")), *models_in(asked.models)]
     text = ""
     for source in sources:
+        if time.monotonic() > asked.end:
+            break
         name = source if isinstance(source, str) else source.stem
         if not all(rows.has(name, way) for way in ways(name)) and not rows.has(name, "read"):
             try:
@@ -219,8 +169,10 @@ def main() -> None:
                 rows.add({"model": name, "way": "read", "failed": str(failure)})
             else:
                 measure(fine, ways(name), asked, rows)
-        text = report(source is sources[-1])
+        text = report(source is sources[-1] and time.monotonic() < asked.end)
     print(text)
+    if time.monotonic() > asked.end:
+        say(f"not all began within {asked.minutes:g} minutes: run it again and it goes on")
 
 
 if __name__ == "__main__":
