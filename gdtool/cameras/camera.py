@@ -94,26 +94,30 @@ def rays(camera: Camera, pixels: np.ndarray | None = None) -> tuple[np.ndarray, 
     """World-space rays through pixels: origins and unit directions, float64.
 
     pixels (..., 2) as (x, y) in pixel units, or None for all pixel centres, shape (h, w). Orthographic origins lie on
-    the camera plane, so the distance along an orthographic ray is the depth.
+    the camera plane, so the distance along an orthographic ray is the depth. In memory component by component.
     """
     if pixels is None:
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     else:
         x, y = pixels[..., 0], pixels[..., 1]
+    rotation = camera.world_from_camera[:3, :3]
     if camera.projection == "orthographic":
         step = camera.pixel_size
-        local = np.stack([(x - camera.width / 2) * step, (camera.height / 2 - y) * step, np.zeros_like(x)], -1)
-        origins = _turned(local, camera.world_from_camera[:3, :3]) + camera.position
-        return origins, np.broadcast_to(-camera.backward, origins.shape).copy()
-    local = np.stack([(x - camera.cx) / camera.fx, (camera.cy - y) / camera.fy, -np.ones_like(x)], -1)
-    directions = _turned(local, camera.world_from_camera[:3, :3])
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    return np.broadcast_to(camera.position, directions.shape).copy(), directions
-
-
-def _turned(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """rotation (3, 3) times vectors (..., 3). Not by BLAS: for products this small its threads, spinning, cost more than they do."""
-    return np.einsum("...j,kj->...k", vectors, rotation)
+        right, up = (x - camera.width / 2) * step, (camera.height / 2 - y) * step
+        origins = np.empty((3, *right.shape))
+        for out, (a, b, _), start in zip(origins, rotation, camera.position, strict=True):
+            np.multiply(right, a, out=out)
+            out += up * b
+            out += start
+        directions = np.empty_like(origins)
+        directions.T[...] = -camera.backward
+    else:
+        right, up = (x - camera.cx) / camera.fx, (camera.cy - y) / camera.fy
+        directions = np.stack([a * right + b * up - c for a, b, c in rotation])
+        directions /= np.sqrt((directions * directions).sum(0))
+        origins = np.empty_like(directions)
+        origins.T[...] = camera.position
+    return np.moveaxis(origins, 0, -1), np.moveaxis(directions, 0, -1)
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

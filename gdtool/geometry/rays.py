@@ -17,7 +17,8 @@ MAX_CONVEX = 20_000
 @dataclass(frozen=True)
 class Hits:
     """First hits of n rays. face_idx (n,) int32, -1 = miss; distance (n,) along the given direction, inf at a miss;
-    barycentric (n, 3) weights of the face's corners, zero at a miss."""
+    barycentric (n, 3) weights of the face's corners, zero at a miss,
+    component by component in memory."""
 
     face_idx: np.ndarray
     distance: np.ndarray
@@ -35,34 +36,50 @@ def intersect_planes(origins: np.ndarray, directions: np.ndarray, triangles: np.
     Möller & Trumbore 1997 in double precision; weights are clamped to the triangle, since Embree's watertight edges
     may give a face whose exact weights are a rounding below zero. A ray inside its plane gives the nearest corner's.
     """
-    return _meet(origins, directions, triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    a, b, c = triangles.transpose(1, 2, 0)
+    return _meet(origins, directions, np.concatenate([a, b - a, c - a]))
 
 
-def _meet(origins: np.ndarray, directions: np.ndarray, a: np.ndarray, e1: np.ndarray, e2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """intersect_planes for triangles given by a corner and two edges (n, 3)."""
-    p = _cross(directions, e2)
-    determinant = np.einsum("ij,ij->i", e1, p)
+def _meet(origins: np.ndarray, directions: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """intersect_planes for triangles (9, n): a corner and two edges. Component by component, so that every sum runs over
+    numbers that lie side by side."""
+    o, d, a, e1, e2 = origins.T, directions.T, triangles[:3], triangles[3:6], triangles[6:]
+    p = _cross(d, e2)
+    determinant = _dot(e1, p)
     flat = determinant == 0
-    inverse = 1.0 / np.where(flat, 1.0, determinant)
-    s = origins - a
-    u = np.einsum("ij,ij->i", s, p) * inverse
+    inverse = 1.0 / (np.where(flat, 1.0, determinant) if flat.any() else determinant)
+    s = [o[i] - a[i] for i in range(3)]
+    u = _dot(s, p)
+    u *= inverse
     q = _cross(s, e1)
-    v = np.einsum("ij,ij->i", directions, q) * inverse
-    distance = np.einsum("ij,ij->i", e2, q) * inverse
+    v = _dot(d, q)
+    v *= inverse
+    distance = _dot(e2, q)
+    distance *= inverse
     if flat.any():
-        distance[flat] = -np.einsum("ij,ij->i", s[flat], directions[flat]) / np.einsum("ij,ij->i", directions[flat], directions[flat])
+        distance[flat] = (-_dot(s, d) / _dot(d, d))[flat]
         u[flat] = v[flat] = 0.0
-    weights = np.stack([1.0 - u - v, u, v], 1)
+    weights = np.stack([1.0 - u - v, u, v])
     np.clip(weights, 0.0, 1.0, out=weights)
-    return distance, weights / (weights[:, :1] + weights[:, 1:2] + weights[:, 2:])
+    weights /= weights[0] + weights[1] + weights[2]
+    return distance, weights.T
 
 
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(n, 3) vector products; numpy's own takes twice as long."""
-    out = np.empty_like(a)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        np.multiply(a[:, j], b[:, k], out=out[:, i])
-        out[:, i] -= a[:, k] * b[:, j]
+def _cross(a, b) -> list[np.ndarray]:
+    """Vector products of vectors given as three arrays (n,)."""
+    out = []
+    for j, k in ((1, 2), (2, 0), (0, 1)):
+        product = a[j] * b[k]
+        product -= a[k] * b[j]
+        out.append(product)
+    return out
+
+
+def _dot(a, b) -> np.ndarray:
+    """(n,) scalar products of vectors given as three arrays (n,)."""
+    out = a[0] * b[0]
+    out += a[1] * b[1]
+    out += a[2] * b[2]
     return out
 
 
@@ -86,7 +103,7 @@ class RayCaster:
         extent = float((high - low).max())
         self.scale = 1.0 / extent if extent > 0 else 1.0
         a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
-        self._edges = np.concatenate([a, b - a, c - a], 1)
+        self._edges = np.concatenate([a.T, (b - a).T, (c - a).T])
         self._scene = EmbreeScene(robust=True)
         if len(self.faces):
             local = ((self.vertices - self.center) * self.scale).astype(np.float32)
@@ -104,8 +121,9 @@ class RayCaster:
 
         def chunk(start: int) -> None:
             part = slice(start, start + CHUNK)
-            center = self.center.astype(origins.dtype) if origins.dtype == np.float32 else self.center
-            local = np.ascontiguousarray((origins[part] - center) * origins.dtype.type(self.scale), np.float32)
+            local = np.empty((len(origins[part]), 3), np.float32)
+            for i in range(3):
+                np.multiply(origins[part, i] - origins.dtype.type(self.center[i]), origins.dtype.type(self.scale), out=local[:, i], casting="same_kind")
             along = np.ascontiguousarray(directions[part], np.float32)
             limit = None if limits is None else np.ascontiguousarray(limits[part] * self.scale, np.float32)
             out[part] = self._scene.run(local, along, query=query, dists=limit)
@@ -123,13 +141,13 @@ class RayCaster:
         """The nearest hit of each ray, from either side of a face. origins, directions (n, 3)."""
         origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
         face_idx = self._run(origins, directions, "INTERSECT", None)
-        distance = np.full(len(face_idx), np.inf)
-        barycentric = np.zeros((len(face_idx), 3))
+        distance, barycentric = np.full(len(face_idx), np.inf), np.zeros((3, len(face_idx))).T
         hit = np.flatnonzero(face_idx >= 0)
-        if len(hit):
-            # A corner and two edges of each face lie side by side: one read.
-            found = np.take(self._edges, face_idx[hit], axis=0)
-            distance[hit], barycentric[hit] = _meet(origins[hit], directions[hit], found[:, :3], found[:, 3:6], found[:, 6:])
+        if len(hit) == len(face_idx):
+            distance, barycentric = _meet(origins, directions, np.take(self._edges, face_idx, axis=1))
+        elif len(hit):
+            found = np.take(self._edges, face_idx[hit], axis=1)
+            distance[hit], barycentric[hit] = _meet(origins.T.take(hit, axis=1).T, directions.T.take(hit, axis=1).T, found)
         return Hits(face_idx, distance, barycentric)
 
     def occluded(self, origins: np.ndarray, directions: np.ndarray, max_distance: float | np.ndarray = np.inf) -> np.ndarray:

@@ -179,29 +179,33 @@ class Renderer:
         low, high = np.floor(pixels.min(0)).astype(int), np.ceil(pixels.max(0)).astype(int)
         return (max(low[1], 0), min(high[1], camera.height), max(low[0], 0), min(high[0], camera.width))
 
-    def see(self, camera: Camera, pixel: np.ndarray, sample: np.ndarray, pattern: np.ndarray, together: int,
-            emission: bool = True) -> Points:
-        """Points that samples at pixel (n,) + pattern[sample] see; together, how many a pixel has, sets the footprint."""
-        position = np.stack([pixel % camera.width, pixel // camera.width], 1) + pattern[sample]
-        origins, directions = rays(camera, position)
-        along = -np.einsum("ij,j->i", directions, camera.backward)
+    def see(self, camera: Camera, pixel: np.ndarray, pattern: np.ndarray, first: int, emission: bool = True) -> Points:
+        """Points that pixels (m,) see at the places pattern[first:], of which a pixel has as many as pattern (k, 2) has rows."""
+        sample = np.arange(first, len(pattern))
+        x, y = ((start[:, None] + offset).ravel() for start, offset in zip((pixel % camera.width, pixel // camera.width), pattern[first:].T, strict=True))
+        pixel, sample = np.repeat(pixel, len(sample)), np.tile(sample, len(pixel))
+        origins, directions = rays(camera, np.stack([x, y]).T)
+        along = -_dot(directions, camera.backward)
         if camera.projection == "orthographic":
             # Start in front of the object, not at a plane that may cut it.
             back = max(0.0, float((_corners(self.bounds) @ camera.backward).max()) - float(camera.position @ camera.backward)) + 1e-3 * self.extent
-            origins = origins + camera.backward * back
+            origins += camera.backward * back
         else:
             back = 0.0
         at = time.perf_counter()
         face_idx, distance, barycentric = self.trace(origins, directions)
         self.counts.spend("rays", at, samples=len(pixel))
         hit = np.flatnonzero(face_idx >= 0)
-        face_idx, barycentric, directions = face_idx[hit], barycentric[hit], directions[hit]
-        distance = distance[hit]
-        depth = distance * along[hit] - back
+        if len(hit) < len(pixel):
+            pixel, sample, face_idx, distance, along = (x.take(hit) for x in (pixel, sample, face_idx, distance, along))
+            origins, directions, barycentric = (x.T.take(hit, axis=1).T for x in (origins, directions, barycentric))
+        depth = distance * along
+        depth -= back
         width = camera.pixel_size if camera.projection == "orthographic" else depth / camera.fx
-        footprint = width / np.sqrt(together) * np.ones(len(hit))
-        values = self.lookup.attributes(face_idx, barycentric, footprint, directions, emission)
-        return Points(pixel[hit], sample[hit], origins[hit] + directions * distance[:, None], -directions, depth, values, together)
+        values = self.lookup.attributes(face_idx, barycentric, width / np.sqrt(len(pattern)), directions, emission)
+        position = directions * distance[:, None]
+        position += origins
+        return Points(pixel, sample, position, -directions, depth, values, len(pattern))
 
     def each(self, work: Callable[[Camera], dict], cameras: Iterable[Camera]) -> Iterator[dict]:
         """work(camera) of each, in order, two at once: while the sums of one are looked through, the other one's rays are traced."""
@@ -224,13 +228,12 @@ class Renderer:
             more = count - done
             step = max(1, BAND_SAMPLES // more)
 
-            def look(part: np.ndarray, first: int = done, count: int = count) -> tuple[np.ndarray, Points, dict]:
+            def look(part: np.ndarray, first: int = done, count: int = count) -> tuple[np.ndarray, int, Points, dict]:
                 at = time.perf_counter()
-                asked = np.repeat(part, count - first)
-                points = self.see(camera, asked, np.tile(np.arange(first, count), len(part)), pattern, count, shade is not None)
+                points = self.see(camera, part, pattern[:count], first, shade is not None)
                 shaded = shade(points) if shade is not None and len(points) else {}
                 self.counts.spend("samples", at, pixels_refined=len(part) if first == BASE else 0)
-                return asked, points, shaded
+                return part, count - first, points, shaded
 
             waiting: deque = deque()
             for start in range(0, len(pixel), step):
@@ -266,25 +269,26 @@ class _Sums:
         self.squares: dict[str, np.ndarray] = {}
         self.before: np.ndarray | None = None
 
-    def add(self, asked: np.ndarray, points: Points, shaded: dict[str, np.ndarray]) -> None:
-        self.asked += np.bincount(asked, minlength=self.pixels)
+    def add(self, asked: np.ndarray, times: int, points: Points, shaded: dict[str, np.ndarray]) -> None:
+        """What pixels (m,) saw with so many samples each."""
+        self.asked[asked] += times
         if not len(points):
             return
         values = {k: points.values[k] for k in ("normal", "albedo", "roughness", "metallic")}
         values["depth"] = points.depth
         values |= shaded
-        self.seen += np.bincount(points.pixel, minlength=self.pixels)
         # The samples of a pixel follow each other.
         starts = np.flatnonzero(np.diff(points.pixel, prepend=-1))
         owner = points.pixel[starts]
+        self.seen[owner] += np.diff(starts, append=len(points))
         for name, value in values.items():
-            value = value.reshape(len(points), -1).astype(np.float64)
+            value = np.ascontiguousarray(np.atleast_2d(value.T), np.float64 if name == "depth" else np.float32)
             if name not in self.sums:
-                self.sums[name] = np.zeros((self.pixels, value.shape[1]))
-                self.squares[name] = np.zeros((self.pixels, value.shape[1]))
-            self.sums[name][owner] += np.add.reduceat(value, starts)
+                self.sums[name] = np.zeros((self.pixels, len(value)))
+                self.squares[name] = np.zeros((self.pixels, len(value)))
+            self.sums[name][owner] += np.add.reduceat(value, starts, axis=1).T
             if name in STORED:
-                self.squares[name][owner] += np.add.reduceat(value * value, starts)
+                self.squares[name][owner] += np.add.reduceat(value * value, starts, axis=1).T
 
     def error(self, name: str, pixel: np.ndarray) -> np.ndarray:
         """Squared error (n,) to expect of the means of pixels (n,), as a picture stores them, mean over the channels."""
@@ -357,6 +361,11 @@ def _beside(inside: np.ndarray) -> np.ndarray:
     padded = np.pad(inside, 1)
     rows = padded[:-2] | padded[1:-1] | padded[2:]
     return (rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]).ravel()
+
+
+def _dot(vectors: np.ndarray, one: np.ndarray) -> np.ndarray:
+    """(n,) scalar products of vectors (n, 3) with one."""
+    return vectors[:, 0] * one[0] + vectors[:, 1] * one[1] + vectors[:, 2] * one[2]
 
 
 def _srgb_slope(x: np.ndarray) -> np.ndarray:

@@ -11,8 +11,13 @@ import numpy as np
 from gdtool.assets.scene import Texture
 from gdtool.images.color import linear_from_srgb
 
-# Rows decoded at a time when the first level is built: bounds the memory of a 4k texture.
-BAND = 256
+# Rows that a thread works on when a level is built: bounds the memory of a 4k texture; and those decoded at a time, few
+# enough that what lies between stays in the cache.
+BAND, CACHED = 256, 16
+# Lookups, as a share of the texels, after which decoding the finest level once costs less than going on texel by texel;
+# and the most numbers that it may then have (256 MB).
+WORTH = 0.15
+MAX_DECODED = 1 << 26
 
 
 def transform_uv(texture: Texture, uv: np.ndarray) -> np.ndarray:
@@ -60,6 +65,8 @@ class TextureReader:
         self._unit = np.float32(1.0 if top is None else 1.0 / top)
         self._table = None if top is None else linear_from_srgb(np.arange(top + 1, dtype=self.images[0].dtype)).astype(np.float32)
         self._lock = threading.Lock()
+        # How many lookups the finest level had, and all of it decoded once they were many.
+        self._asked, self._decoded = 0, None
 
     @property
     def channels(self) -> int:
@@ -94,12 +101,31 @@ class TextureReader:
     def level(self, k: int) -> np.ndarray:
         """(h // 2^k, w // 2^k, c) linear float32, at least 1 by 1."""
         if k == 0:
-            height, width = self.images[0].shape[:2]
-            return self.stored(np.arange(height * width)).reshape(height, width, -1)
+            out = np.empty((*self.images[0].shape[:2], self.channels), np.float32)
+
+            def decode(row: int) -> None:
+                for image, part, colored in zip(self.images, self.parts, self.colored, strict=True):
+                    for start in range(row, min(row + BAND, len(out)), CACHED):
+                        rows = slice(start, min(start + CACHED, row + BAND))
+                        self._decode(image[rows], colored, out[rows, :, part])
+
+            _each_band(decode, len(out), BAND)
+            return out
         with self._lock:
             while len(self.levels) < k:
                 self._make_next()
             return self.levels[k - 1]
+
+    def _levelled(self, k: int, count: int) -> np.ndarray | None:
+        """Level k where it is worth having as linear numbers for count lookups more; None: texels are decoded as they are read."""
+        if k:
+            return self.level(k)
+        with self._lock:
+            texels = self.images[0].shape[0] * self.images[0].shape[1]
+            self._asked += count
+            if self._decoded is None and self._asked > WORTH * texels and texels * self.channels <= MAX_DECODED:
+                self._decoded = self.level(0)
+            return self._decoded
 
     def _make_next(self) -> None:
         finer = self.levels[-1:] or self.images
@@ -114,12 +140,7 @@ class TextureReader:
             for i, (image, part) in enumerate(zip(finer, parts, strict=True)):
                 halved(image, coarse[row:row + BAND // 2, :, part], row, None if colored is None else colored[i])
 
-        bands = range(0, len(coarse), BAND // 2)
-        if len(bands) > 1:
-            with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-                list(pool.map(make, bands))
-        else:
-            make(0)
+        _each_band(make, len(coarse), BAND // 2)
         self.levels.append(coarse)
 
     def _halved_even(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
@@ -170,9 +191,9 @@ class TextureReader:
         return out
 
     def _read_level(self, uv: np.ndarray, k: int) -> np.ndarray:
-        image = self.level(k) if k else self.images[0]
-        height, width = image.shape[:2]
-        flat = image.reshape(-1, self.channels) if k else None
+        image = self._levelled(k, len(uv))
+        height, width = self.images[0].shape[:2] if image is None else image.shape[:2]
+        flat = None if image is None else image.reshape(-1, self.channels)
 
         def texels(index: np.ndarray) -> np.ndarray:
             return self.stored(index) if flat is None else np.take(flat, index, axis=0)
@@ -194,6 +215,16 @@ class TextureReader:
         top, bottom = (wrap_index(y0 + i, height, self.texture.wrap_v) * width for i in (0, 1))
         upper = _between(texels(top + left), texels(top + right), fx)
         return _between(upper, _between(texels(bottom + left), texels(bottom + right), fx), fy)
+
+
+def _each_band(work, rows: int, band: int) -> None:
+    """work(first row) of every band, on all cores."""
+    starts = range(0, rows, band)
+    if len(starts) > 1:
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            list(pool.map(work, starts))
+    else:
+        work(0)
 
 
 def _runs(channels: int, colored: bool) -> list[tuple[slice, bool]]:
