@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from gdtool.shading.environment import LUMINANCE, Environment
-from gdtool.shading.reflection import Surface, tensor_of
+from gdtool.shading.reflection import Surface, rows_of, tensor_of
 
 if TYPE_CHECKING:
     from gdtool.shading.render import Points, Renderer
@@ -63,14 +63,19 @@ class DirectLight:
         self.samples = 1 << round(math.log2(samples)) if samples else 0
         if self.samples:
             directions, radiance, density = environment.sample(sobol(POOL, 2, seed))
-            self.pool = tuple(tensor_of(x) for x in (*directions.T, density, radiance))
-            self.pattern = tuple(tensor_of(x) for x in sobol(POOL, 3, seed + 1).T)
-            self.dice = tensor_of(np.random.default_rng(seed).random(POOL))
+            dice = np.random.default_rng(seed).random(POOL)
+            # Runs of (x, y, z, density, red, green, blue, dice) for the light and of three numbers and dice for the reflection.
+            self.pool = self._runs_of(*directions.T, density, *radiance.T, dice)
+            self.pattern = self._runs_of(*sobol(POOL, 3, seed + 1).T, dice)
         elif mode == "sampled":
             raise ValueError("sampled light needs samples")
         self.irradiance = IrradianceMap(environment)
-        self.image, self.density = tensor_of(environment.image.reshape(-1, 3)), tensor_of(environment.pdf.reshape(-1))
+        self.pixels = tensor_of(np.concatenate([environment.image.reshape(-1, 3), environment.pdf.reshape(-1, 1)], 1))
         self.prefiltered = Prefiltered(LightPyramid(environment), brdf) if mode == "prefiltered" else None
+
+    def _runs_of(self, *values: np.ndarray):
+        """(k, c, POOL / k) of c arrays (POOL,)."""
+        return tensor_of(np.stack(values).reshape(len(values), -1, self.samples).transpose(2, 0, 1))
 
     def color(self, exposure: float = 1.0) -> Callable[[Points], dict[str, np.ndarray]]:
         """The shading that Renderer.buffers takes for a color image."""
@@ -80,25 +85,26 @@ class DirectLight:
         """(n, 3) linear radiance toward the eye, emission included."""
         k = self.samples
         step = max(1, PAIRS // max(2 * k, 8))
-        sums = np.zeros((len(points), SUMS, 3), np.float32)
+        sums = np.zeros((SUMS, 3, len(points)), np.float32)
         runs = self._runs(points) if k else None
         if self.mode == "prefiltered" and len(points):
             from gdtool.shading.prefilter import lobe_roughness
 
-            n_v = np.einsum("ij,ij->i", points.values["normal"], points.view)
-            self.prefiltered.prepare(lobe_roughness(tensor_of(points.values["roughness"]), tensor_of(n_v)))
+            n_v = (rows_of(points.values["normal"]) * rows_of(points.view)).sum(0)
+            self.prefiltered.prepare(lobe_roughness(tensor_of(points.values["roughness"]), n_v))
 
         at, counted = time.perf_counter(), np.zeros(4, np.int64)
         for start in range(0, len(points), step):
             part = slice(start, start + step)
-            counted += self._chunk(points, part, None if runs is None else runs[:, part], sums[part])
+            counted += self._chunk(points, part, None if runs is None else runs[:, part], sums[..., part])
         cast, below, convex, rare = counted.tolist()
         self.renderer.counts.spend("directions", at, shadow_rays=cast, shadow_rays_below_horizon=below, shadow_rays_convex=convex, shadow_rays_rare=rare)
         out = self._combined(points, sums)
-        out += points.values["emissive"]
+        out += points.values["emissive"].T
         unlit = points.values["unlit"]
-        out[unlit] = points.values["albedo"][unlit]
-        return out
+        if unlit.any():
+            out[:, unlit] = points.values["albedo"].T[:, unlit]
+        return out.T
 
     def _runs(self, points: Points) -> np.ndarray:
         """(2, n) which run of the pool and of the pattern each point takes.
@@ -115,43 +121,37 @@ class DirectLight:
         return out
 
     def _chunk(self, points: Points, part: slice, runs: np.ndarray | None, sums: np.ndarray) -> tuple[int, int, int, int]:
-        """Fill sums; the counts of _hide."""
+        """Fill sums (SUMS, 3, n); the counts of _hide."""
         import torch
 
         k = self.samples
         surface = Surface(points.view, points.values, part, self.brdf)
         result = torch.from_numpy(sums)
-        result[:, 9] = tensor_of(self.irradiance.lookup(points.values["normal"][part])) / math.pi
+        result[9] = self.irradiance.lookup(surface.normal) / math.pi
         if self.mode == "prefiltered":
-            normal, view = (tensor_of(x[part]) for x in (points.values["normal"], points.view))
-            result[:, 7], result[:, 8] = self.prefiltered.specular(normal, view, tensor_of(points.values["roughness"][part]))
+            result[7], result[8] = self.prefiltered.specular(surface.normal, surface.view, surface.roughness)
         if not k:
             return 0, 0, 0, 0
-        light_run, pattern_run = torch.from_numpy(runs[0]), torch.from_numpy(runs[1])
-
-        def run_of(pool, run):
-            return pool.reshape(POOL // k, k, *pool.shape[1:]).index_select(0, run)
-
-        *toward, p_light, light = (run_of(pool, light_run) for pool in self.pool)
-        mirrored = surface.sample(*(run_of(u, pattern_run) for u in self.pattern))
-        pixel = self._pixel(*mirrored)
-        flat = pixel.reshape(-1)
-        direction = [torch.cat(pair, 1) for pair in zip(toward, mirrored, strict=True)]
-        light = torch.cat([light, self.image.index_select(0, flat).view(*pixel.shape, 3)], 1)
-        p_light = torch.cat([p_light, self.density.index_select(0, flat).view_as(pixel)], 1)
+        drawn, numbers = (torch.stack([one.index_select(1, torch.from_numpy(run)) for one in pool]).unbind(1)
+                          for pool, run in zip((self.pool, self.pattern), runs, strict=True))
+        mirrored = surface.sample(*numbers[:3])
+        found = self.pixels.index_select(0, self._pixel(*mirrored).reshape(-1)).view(k, -1, 4)
+        direction = [torch.cat(pair) for pair in zip(drawn[:3], mirrored, strict=True)]
+        p_light, *light = (torch.cat([drawn[3 + (i + 1) % 4], found[..., i]]) for i in (3, 0, 1, 2))
         terms, p_reflect, above = surface.evaluate(*direction)
-        everything = 1 / (k * (p_light + p_reflect)).clamp_min(1e-20)
-        weight, counted = above * everything, (0, 0, 0, 0)
+        everything = 1 / (p_light + p_reflect).mul_(k).clamp_min_(1e-20)
+        visible, counted = everything * above, (0, 0, 0, 0)
         if self.shadows:
-            brightness = surface.brightness(terms, light @ tensor_of(LUMINANCE)) * weight
-            dice = torch.cat([run_of(self.dice, light_run), run_of(self.dice, pattern_run)], 1)
-            counted = self._hide(points, part, surface, direction, (weight, everything), above, brightness, dice)
+            luminance = sum(float(share) * c for share, c in zip(LUMINANCE, light, strict=True))
+            brightness = surface.brightness(terms, luminance).mul_(visible)
+            counted = self._hide(points, part, surface, direction, (visible, everything), above, brightness, torch.cat([drawn[7], numbers[3]]))
         # Only prefiltered light asks what share of the reflection is visible.
         split = self.mode == "prefiltered"
-        kept = terms[:3] if split else terms[2:3]
-        parts = torch.bmm(torch.stack([*(term * weight for term in terms), *(term * everything for term in kept)], 1), light)
-        result[:, :4] = parts[:, :4]
-        result[:, 4 if split else 6:7] = parts[:, 4:]
+        for which, weight, kept in ((0, visible, terms), (4 if split else 6, everything, terms[:3] if split else terms[2:3])):
+            for row, term in enumerate(kept, which):
+                weighted = term * weight
+                for channel, c in enumerate(light):
+                    torch.sum(weighted * c, 0, out=result[row, channel])
         return counted
 
     def _pixel(self, x, y, z):
@@ -164,7 +164,7 @@ class DirectLight:
         return row * width + column
 
     def _hide(self, points: Points, part: slice, surface: Surface, direction, weights, above, brightness, dice) -> tuple[int, int, int, int]:
-        """Take the first of two weights (n, m) from directions that something hides; how many shadow rays that took, and how
+        """Take the first of two weights (m, n) from directions that something hides; how many shadow rays that took, and how
         many directions needed none: below the horizon, on convex objects, and for bringing too little light.
 
         A direction that brings less than RARE of what its point's directions do on average is followed only with the
@@ -173,64 +173,62 @@ class DirectLight:
         """
         import torch
 
-        columns = above.shape[1]
-        flat = above.reshape(-1).nonzero()[:, 0]
-        lit = len(flat)
-        inner = self.renderer.may_be_hidden(points.position[part], surface.geometric_rows.numpy())
+        ask = above
+        inner = self.renderer.may_be_hidden(points.position[part], surface.geometric.T.numpy())
         if inner is not None:
-            flat = flat[torch.from_numpy(inner)[flat // columns]]
-        asked = len(flat)
-        chance = (brightness / (RARE * brightness.mean(1, keepdim=True)).clamp_min(1e-20)).reshape(-1)[flat].clamp_max_(1)
-        follow = dice.reshape(-1)[flat] < chance
-        visible, everything = (weight.reshape(-1) for weight in weights)
-        times = torch.where(follow, 1 / chance.clamp_min(1e-20), 0.0)
-        visible[flat] *= times
-        everything[flat] *= times
-        flat = flat[follow]
-        origins = surface.lifted(points.position[part], 2e-4 * self.renderer.extent)[(flat // columns).numpy()]
-        rays = torch.stack([c.reshape(-1)[flat] for c in direction], 1).numpy()
-        visible[flat[torch.from_numpy(self.renderer.occluded(origins, rays))]] = 0.0
+            ask = above & torch.from_numpy(inner)
+        chance = (brightness / (RARE * brightness.mean(0)).clamp_min(1e-20)).clamp_max_(1)
+        follow = ask & (dice < chance)
+        times = torch.where(ask, torch.where(follow, chance.clamp_min_(1e-20).reciprocal_(), 0.0), 1.0)
+        for weight in weights:
+            weight *= times
+        flat = follow.reshape(-1).nonzero()[:, 0]
+        n = above.shape[1]
+        origins = surface.lifted(points.position[part], 2e-4 * self.renderer.extent).index_select(1, flat % n)
+        rays = torch.stack([c.reshape(-1).index_select(0, flat) for c in direction])
+        weights[0].view(-1)[flat[torch.from_numpy(self.renderer.occluded(origins.numpy().T, rays.numpy().T))]] = 0.0
+        lit, asked = int(above.sum()), int(ask.sum())
         return len(flat), above.numel() - lit, lit - asked, asked - len(flat)
 
     def _combined(self, points: Points, sums: np.ndarray) -> np.ndarray:
-        """(n, 3) radiance without emission."""
+        """(3, n) radiance without emission."""
         if not len(points):
-            return np.empty((0, 3), np.float32)
-        values = points.values
-        albedo, metallic = values["albedo"], values["metallic"][:, None]
-        f0 = values["f0"][:, None] * (1 - metallic) + albedo * metallic
+            return np.empty((3, 0), np.float32)
+        import torch
+
+        from gdtool.shading.closed_form import disney_mean, fresnel_loss
+
+        values, sums = points.values, torch.from_numpy(sums)
+        albedo, metallic, f0, f90 = rows_of(values["albedo"]), *(tensor_of(values[name]) for name in ("metallic", "f0", "f90"))
+        f0 = f0 * (1 - metallic) + albedo * metallic
         # How much reflection grows toward grazing: to 1, or to what KHR_materials_specular leaves of a dielectric's.
-        growth = values["f90"][:, None] * (1 - metallic) + metallic - f0
-        n_v = np.einsum("ij,ij->i", values["normal"], points.view)
-        reflect = [f0 * sums[:, i] + growth * sums[:, i + 1] for i in (0, 4, 7)]
-        diffuse = [sums[:, i] for i in (2, 6, 9)]
+        growth = f90 * (1 - metallic) + metallic - f0
+        reflect = [f0 * sums[i] + growth * sums[i + 1] for i in (0, 4, 7)]
+        diffuse = [sums[i] for i in (2, 6, 9)]
         starts = np.flatnonzero(np.diff(points.pixel, prepend=-1))
-        owner = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(points)))
+
+        def share(known: list) -> torch.Tensor:
+            return torch.from_numpy(np.repeat(_share(*(x.numpy() for x in known), starts), np.diff(starts, append=len(points))))
+
         if self.mode == "prefiltered":
-            import torch
-
-            from gdtool.shading.closed_form import disney_mean, fresnel_loss
-
-            seen = [1.0, 1.0] if not self.samples else [_share(*x, starts)[owner] for x in (reflect, diffuse)]
-            cosine, roughness = tensor_of(n_v), tensor_of(values["roughness"])
-            if self.brdf == "gltf":
-                factor = 1 - f0 - growth * torch.as_tensor(fresnel_loss(cosine)).numpy()[:, None]
-            else:
-                factor = torch.as_tensor(disney_mean(roughness, cosine.clamp(0, 1))).numpy()[:, None]
+            seen = [1.0, 1.0] if not self.samples else [share(x) for x in (reflect, diffuse)]
+            n_v, roughness = (rows_of(values["normal"]) * rows_of(points.view)).sum(0), tensor_of(values["roughness"])
+            factor = 1 - f0 - growth * fresnel_loss(n_v) if self.brdf == "gltf" else disney_mean(roughness, n_v.clamp(0, 1))
             specular, received = reflect[2] * seen[0], diffuse[2] * seen[1] * factor
         else:
             specular, received = reflect[0], diffuse[0]
-            if self.known and self.brdf == "gltf":
-                received = received + _share(*diffuse, starts)[owner] * (diffuse[2] - diffuse[1])
             if self.brdf == "gltf":
-                received = (1 - f0) * received - growth * sums[:, 3]
-        return (specular + np.maximum(albedo * (1 - metallic) * received, 0)).astype(np.float32)
+                if self.known:
+                    received = received + share(diffuse) * (diffuse[2] - diffuse[1])
+                received = (1 - f0) * received - growth * sums[3]
+        return (specular + (albedo * (1 - metallic) * received).clamp_min_(0)).numpy()
 
 
 def _share(visible: np.ndarray, everything: np.ndarray, known: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """(m, 1) visible share of light in each run of points (n, 3) that begins at starts (m,)."""
-    v, u, b = (np.add.reduceat(np.einsum("ij,j->i", x, LUMINANCE), starts) for x in (visible, everything, known))
-    return np.clip((v + PRIOR * b) / np.maximum(u + PRIOR * b, 1e-20), 0, 1).astype(np.float32)[:, None]
+    """(m,) visible share of light in each run of points (3, n) that begins at starts (m,)."""
+    r, g, b = LUMINANCE.astype(np.float32)
+    v, u, k = (np.add.reduceat(r * x[0] + g * x[1] + b * x[2], starts) for x in (visible, everything, known))
+    return np.clip((v + PRIOR * k) / np.maximum(u + PRIOR * k, np.float32(1e-20)), 0, 1)
 
 
 def _scrambled(index: np.ndarray, seed: int) -> np.ndarray:

@@ -103,17 +103,17 @@ class IrradianceMap:
             sums = list(pool.map(lambda part: (part @ toward).clamp_min_(0) @ weighted, parts))
         self.values = torch.cat(sums).numpy().reshape(height, 2 * height, 3)
         # A column more on each side, from the other one.
-        self.wrapped = torch.from_numpy(np.concatenate([self.values[:, -1:], self.values, self.values[:, :1]], 1))
+        self.wrapped = torch.from_numpy(np.concatenate([self.values[:, -1:], self.values, self.values[:, :1]], 1).transpose(2, 0, 1).copy())
 
-    def lookup(self, normals: np.ndarray) -> np.ndarray:
-        """(n, 3) from unit normals (n, 3), arrays."""
+    def lookup(self, normals):
+        """(3, n) from unit normals (3, n), tensors."""
         import torch
 
         height, width = self.values.shape[:2]
-        nx, ny, nz = torch.as_tensor(np.ascontiguousarray(normals), dtype=torch.float32).unbind(1)
+        nx, ny, nz = normals
         y = torch.acos(ny.clamp(-1, 1)) * ((height - 1) / math.pi)
         x = (torch.atan2(nz, nx) * (0.5 / math.pi) + 0.5) * width + 0.5
-        return _bilinear(self.wrapped, y, x).numpy()
+        return _bilinear(self.wrapped, y, x)
 
 
 class Prefiltered:
@@ -132,24 +132,24 @@ class Prefiltered:
         self.table = lobe_table(brdf)
 
     def specular(self, normal, view, roughness):
-        """Two (n, 3) tensors a, b: reflected light is f0 a + (1 − f0) b. normal, view (n, 3) unit, roughness (n,)."""
+        """Two (3, n) tensors a, b: reflected light is f0 a + (1 − f0) b. normal, view (3, n) unit, roughness (n,)."""
         import torch
 
-        n_v = (normal * view).sum(1)
-        mirror = 2 * n_v[:, None] * normal - view
+        n_v = (normal * view).sum(0)
+        mirror = 2 * n_v * normal - view
         # Tried under two lights: nearer the integral than the mirror direction; Lagarde's (1 − r)(√(1 − r) + r) is better from
         # r = 0.3 (studio) or 0.5 (mid) on, and worse below.
-        toward = 1 - roughness**2
-        middle = torch.nn.functional.normalize(torch.lerp(normal, mirror, toward[:, None]), dim=1)
+        middle = torch.lerp(normal, mirror, 1 - roughness**2)
+        middle = middle / (middle * middle).sum(0).sqrt().clamp_min(1e-12)
         below, above, fraction = _levels(lobe_roughness(roughness, n_v))
-        light = torch.zeros(len(normal), 3)
+        light = torch.zeros(3, normal.shape[1])
         for level in torch.unique(torch.cat([below, above])).tolist():
             weight = torch.where(above == level, fraction, 0.0) + torch.where(below == level, 1 - fraction, 0.0)
             used = (weight > 0).nonzero()[:, 0]
             if len(used):
-                light[used] += weight[used, None] * read_octahedral(self._image(level), *middle[used].unbind(1))
+                light.index_add_(1, used, weight[used] * read_octahedral(self._image(level), *middle.index_select(1, used)))
         share = _bilinear(self.table, n_v.clamp(0, 1) * TABLE - 0.5, roughness.clamp(0, 1) * TABLE - 0.5)
-        return light * share[:, :1], light * share[:, 1:]
+        return light * share[0], light * share[1]
 
     def prepare(self, roughness: np.ndarray) -> None:
         """Make the images that roughness (n,) needs; those that nobody makes yet first."""
@@ -192,7 +192,7 @@ def _levels(roughness):
 
 
 def filtered_light(pyramid: LightPyramid, roughness: float, side: int):
-    """(side + 2, side + 2, 3) light averaged over the GGX lobe around each direction, weighted by its cosine, with a
+    """(3, side + 2, side + 2) light averaged over the GGX lobe around each direction, weighted by its cosine, with a
     border that wraps. The lobe is the one seen along its own normal."""
     import torch
 
@@ -202,7 +202,7 @@ def filtered_light(pyramid: LightPyramid, roughness: float, side: int):
     # Over an edge of the octahedron lies the same edge, turned around.
     rows = torch.cat([image[:1].flip(1), image, image[-1:].flip(1)])
     columns = torch.cat([rows[:, :1].flip(0), rows, rows[:, -1:].flip(0)], 1)
-    return columns.contiguous()
+    return columns.permute(2, 0, 1).contiguous()
 
 
 def _sum_of_all(pyramid: LightPyramid, normal, a2: float):
@@ -247,26 +247,26 @@ def _sum_of_samples(pyramid: LightPyramid, normal, a2: float):
 
 
 def read_octahedral(image, x, y, z):
-    """(n, 3) bilinear from an image of filtered_light."""
-    side = image.shape[0] - 2
+    """(3, n) bilinear from an image of filtered_light."""
+    side = image.shape[1] - 2
     s, t = octahedral(x, y, z)
     return _bilinear(image, t * side + 0.5, s * side + 0.5)
 
 
 def _bilinear(image, row, column):
-    """(n, c) from image (h, w, c) at rows and columns (n,) of texel centres, clamped."""
-    row, column = row.clamp(0, image.shape[0] - 1), column.clamp(0, image.shape[1] - 1)
-    r, c = row.long().clamp_max(image.shape[0] - 2), column.long().clamp_max(image.shape[1] - 2)
-    flat = image.reshape(-1, image.shape[2])
-    at = r * image.shape[1] + c
-    fr, fc = (row - r)[:, None], (column - c)[:, None]
-    upper = flat[at] * (1 - fc) + flat[at + 1] * fc
-    lower = flat[at + image.shape[1]] * (1 - fc) + flat[at + image.shape[1] + 1] * fc
-    return upper * (1 - fr) + lower * fr
+    """(c, n) from image (c, h, w) at rows and columns (n,) of texel centres, clamped."""
+    channels, height, width = image.shape
+    row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
+    r, c = row.long().clamp_max(height - 2), column.long().clamp_max(width - 2)
+    flat = image.reshape(channels, -1)
+    at = r * width + c
+    fr, fc = row - r, column - c
+    upper, lower = (flat.index_select(1, at + start).lerp(flat.index_select(1, at + start + 1), fc) for start in (0, width))
+    return upper.lerp(lower, fr)
 
 
 def lobe_table(brdf: str = "gltf", samples: int = 256):
-    """(TABLE, TABLE, 2) by n·v and roughness: ∫ D V c dl under Fresnel 1 and (1 − v·h)^5, visible normals sampled."""
+    """(2, TABLE, TABLE) by n·v and roughness: ∫ D V c dl under Fresnel 1 and (1 − v·h)^5, visible normals sampled."""
     import torch
 
     from gdtool.shading.direct import sobol
@@ -280,9 +280,9 @@ def lobe_table(brdf: str = "gltf", samples: int = 256):
     values = {"normal": normal, "geometric_normal": normal, "albedo": np.ones((count, 3)), "metallic": np.ones(count),
               "roughness": roughness, "f0": np.full(count, 0.04)}
     surface = Surface(view, values, slice(None), brdf)
-    uniform = [torch.as_tensor(u, dtype=torch.float32).expand(count, -1) for u in sobol(samples, 2, 7).T]
-    direction = surface.sample(*uniform, torch.zeros(count, samples))
+    uniform = [torch.as_tensor(u, dtype=torch.float32)[:, None].expand(-1, count) for u in sobol(samples, 2, 7).T]
+    direction = surface.sample(*uniform, torch.zeros(samples, count))
     terms, density, above = surface.evaluate(*direction)
     weight = above / density.clamp_min(1e-20)
     # The metal's density is all visible normals: share is 1.
-    return torch.stack([(terms[0] * weight).mean(1), (terms[1] * weight).mean(1)], -1).reshape(TABLE, TABLE, 2)
+    return torch.stack([(terms[0] * weight).mean(0), (terms[1] * weight).mean(0)]).reshape(2, TABLE, TABLE)

@@ -20,47 +20,50 @@ def tensor_of(x: np.ndarray):
     return torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)
 
 
+def rows_of(x: np.ndarray, part: slice = slice(None)):
+    """A (c, n) float32 tensor of vectors (n, c)."""
+    return tensor_of(x.T[:, part])
+
+
 class Surface:
-    """Reflection of n points toward the eye: evaluated and sampled for k directions each, vectors as three (n, k) tensors.
+    """Reflection of n points toward the eye: evaluated and sampled for k directions each, vectors as three (k, n) tensors.
 
     toward (n, 3) unit, values as of SurfaceLookup.attributes, part of both is taken.
     """
 
     def __init__(self, toward: np.ndarray, values: dict[str, np.ndarray], part: slice, brdf: str):
-        from gdtool.shading.brdf import alpha_of, f0_of
-
-        def tensor(x):
-            return tensor_of(x[part])
+        from gdtool.shading.brdf import alpha_of
 
         self.brdf = brdf
-        normal, view, self.geometric_rows = tensor(values["normal"]), tensor(toward), tensor(values["geometric_normal"])
-        self.albedo, self.metallic = tensor(values["albedo"]), tensor(values["metallic"])
-        roughness = tensor(values["roughness"])
-        self.f0 = f0_of(self.albedo, self.metallic, tensor(values["f0"])[:, None])
-        self.roughness, self.alpha = roughness[:, None], alpha_of(roughness)[:, None]
-        self.normal, self.view, self.geometric = ([c[:, None] for c in v.unbind(1)] for v in (normal, view, self.geometric_rows))
-        self.n_v_exact = (normal * view).sum(1)[:, None]
+        self.normal, self.view, self.geometric = (rows_of(x, part) for x in (values["normal"], toward, values["geometric_normal"]))
+        self.albedo, self.metallic, self.roughness = rows_of(values["albedo"], part), tensor_of(values["metallic"][part]), tensor_of(values["roughness"][part])
+        # As brdf.f0_of.
+        self.f0 = tensor_of(values["f0"][part]) * (1 - self.metallic) + self.albedo * self.metallic
+        self.alpha = alpha_of(self.roughness)
+        self.n_v_exact = (self.normal * self.view).sum(0)
         self.n_v = self.n_v_exact.clamp_min(MIN_VIEW_COSINE)
-        strongest = self.f0.amax(1)[:, None]
+        strongest = self.f0.amax(0)
         reflect = strongest + (1 - strongest) * (1 - self.n_v) ** 5
-        diffuse = (self.albedo.amax(1) * (1 - self.metallic))[:, None]
+        diffuse = self.albedo.amax(0) * (1 - self.metallic)
         self.share = (reflect / (reflect + diffuse).clamp_min(1e-6)).clamp(MIN_SPECULAR_SHARE, 1.0)
 
-    def lifted(self, position: np.ndarray, offset: float) -> np.ndarray:
-        """(n, 3) float32 positions (n, 3) moved a little off the surface, to the seen side."""
-        return (position + offset * self.geometric_rows.numpy()).astype(np.float32)
+    def lifted(self, position: np.ndarray, offset: float):
+        """(3, n) tensor of positions (n, 3) moved a little off the surface, to the seen side."""
+        import torch
+
+        return torch.from_numpy((position.T + np.float32(offset) * self.geometric.numpy()).astype(np.float32))
 
     def brightness(self, terms, luminance):
-        """(n, k) about how bright directions of a luminance (n, k) are reflected, from the terms of evaluate."""
+        """(k, n) about how bright directions of a luminance (k, n) are reflected, from the terms of evaluate."""
         import torch
 
         weights = torch.from_numpy(LUMINANCE.astype(np.float32))
-        f0, diffuse = (self.f0 @ weights)[:, None], (self.albedo @ weights * (1 - self.metallic))[:, None]
+        f0, diffuse = weights @ self.f0, weights @ self.albedo * (1 - self.metallic)
         return luminance * (f0 * terms[0] + (1 - f0) * terms[1] + diffuse * terms[2])
 
     def evaluate(self, x, y, z):
-        """[D V c, D V c w, d c / π, d c w / π] with c = n·l and d the diffuse model's factor; density of sample(); and 1.0
-        where the direction is above the horizon of both the shading and the true normal."""
+        """[D V c, D V c w, d c / π, d c w / π] with c = n·l and d the diffuse model's factor; density of sample(); and whether
+        the direction is above the horizon of both the shading and the true normal."""
         from gdtool.shading.brdf import disney_diffuse, ndf, visibility_gltf, visibility_paper
 
         nx, ny, nz = self.normal
@@ -68,7 +71,7 @@ class Surface:
         gx, gy, gz = self.geometric
         n_l = nx * x + ny * y + nz * z
         l_v = vx * x + vy * y + vz * z
-        above = ((n_l > 0) & (gx * x + gy * y + gz * z > 0)).to(n_l.dtype)
+        above = (n_l > 0) & (gx * x + gy * y + gz * z > 0)
         cosine = n_l.clamp(0, 1)
         # |l + v|² = 2 + 2 l·v, so the half vector itself is not needed.
         n_h = ((n_l + self.n_v_exact) * (2 + 2 * l_v).clamp_min(1e-12).rsqrt()).clamp(0, 1)
@@ -90,7 +93,7 @@ class Surface:
         return (specular, specular * w, diffuse, diffuse * w), density, above
 
     def sample(self, u, v, pick):
-        """Directions (three (n, k)) from uniform numbers: visible normals mirrored, or cosine-weighted."""
+        """Directions (three (k, n)) from uniform numbers (k, n): visible normals mirrored, or cosine-weighted."""
         import torch
 
         (tx, ty, tz), (bx, by, bz) = frame(*self.normal)

@@ -120,7 +120,7 @@ def _train(order: dict, objects, **how):
 
 
 def follow(threads: int) -> None:
-    """What a process of torchrun that is not the first does: wait for the first one's order, and train with it."""
+    """What a process of torchrun that is not the first does: wait for the first one's order, train with it, and end."""
     import torch
 
     from gdtool.diffusion import distributed
@@ -133,14 +133,14 @@ def follow(threads: int) -> None:
         every = decode_dataset((), 0, order["model"], order["workspace"])
         used = order["used"]
         _train(order, Objects(every.planes[:used], every.conditions[:used], every.lights[:used], every.names[:used]))
-    distributed.release()
+    distributed.leave()
 
 
 def dismiss() -> None:
-    """The first process lets the others go, also where it had nothing to do."""
+    """The first process of several, its work done, lets the others go, also where it had nothing to do, and ends."""
     from gdtool.diffusion import distributed
 
-    distributed.release()
+    distributed.leave()
 
 
 def plan(options: Options, as_json: bool) -> str:

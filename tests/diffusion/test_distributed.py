@@ -41,7 +41,7 @@ try:
     run_training(Model(MODEL), spheres(), train, workspace, seed=0, checkpoint_every=2, validate_every=100, progress=progress)
 except Stop:
     pass
-distributed.release()
+distributed.leave()
 """
 
 

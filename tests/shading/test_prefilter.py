@@ -46,7 +46,7 @@ def test_filtered_light_is_the_lobes_average(roughness, side, tolerance):
     cosine, a2 = normal @ toward.T, roughness**4
     lobe = np.maximum(cosine, 0) / (0.5 * (1 + a2) - 0.5 * (1 - a2) * cosine) ** 2
     truth = lobe @ light / (lobe @ weight)[:, None]
-    found = read_octahedral(filtered_light(LightPyramid(env), roughness, side), *(torch.tensor(c, dtype=torch.float32) for c in normal.T)).numpy()
+    found = read_octahedral(filtered_light(LightPyramid(env), roughness, side), *(torch.tensor(c, dtype=torch.float32) for c in normal.T)).numpy().T
     assert np.abs(found - truth).mean() < tolerance * truth.mean()
 
 
@@ -54,7 +54,7 @@ def test_only_needed_levels_are_made_and_white_stays_white():
     split = Prefiltered(LightPyramid(uniform()))
     split.prepare(np.array([0.45, 0.5], np.float32))
     assert set(split.images) == {4, 5}
-    normal = torch.tensor([[0.0, 0, 1]])
+    normal = torch.tensor([[0.0], [0], [1]])
     a, b = split.specular(normal, normal, torch.tensor([0.5]))
     assert 0.85 < float(a[0, 0]) < 0.95 and 0 < float(b[0, 0]) < 0.01
 
