@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -61,17 +62,20 @@ class DirectLight:
         self.mode, self.known = mode, known
         # Runs start at multiples of their length, a power of two, so that each is a stratified set of its own.
         self.samples = 1 << round(math.log2(samples)) if samples else 0
-        if self.samples:
-            directions, radiance, density = environment.sample(sobol(POOL, 2, seed))
-            dice = np.random.default_rng(seed).random(POOL)
-            # Runs of (x, y, z, density, red, green, blue, dice) for the light and of three numbers and dice for the reflection.
-            self.pool = self._runs_of(*directions.T, density, *radiance.T, dice)
-            self.pattern = self._runs_of(*sobol(POOL, 3, seed + 1).T, dice)
-        elif mode == "sampled":
+        if not self.samples and mode == "sampled":
             raise ValueError("sampled light needs samples")
-        self.irradiance = IrradianceMap(environment)
-        self.pixels = tensor_of(np.concatenate([environment.image.reshape(-1, 3), environment.pdf.reshape(-1, 1)], 1))
-        self.prefiltered = Prefiltered(LightPyramid(environment), brdf) if mode == "prefiltered" else None
+        with ThreadPoolExecutor(renderer.caster.threads) as pool:
+            known_light = pool.submit(IrradianceMap, environment)
+            prefiltered = pool.submit(lambda: Prefiltered(LightPyramid(environment), brdf)) if mode == "prefiltered" else None
+            if self.samples:
+                directions, radiance, density = environment.sample(sobol(POOL, 2, seed))
+                dice = np.random.default_rng(seed).random(POOL)
+                # Runs of (x, y, z, density, red, green, blue, dice) for the light and of three numbers and dice for the reflection.
+                self.pool = self._runs_of(*directions.T, density, *radiance.T, dice)
+                self.pattern = self._runs_of(*sobol(POOL, 3, seed + 1).T, dice)
+            self.pixels = tensor_of(np.concatenate([environment.image.reshape(-1, 3), environment.pdf.reshape(-1, 1)], 1))
+            self.irradiance = known_light.result()
+            self.prefiltered = None if prefiltered is None else prefiltered.result()
 
     def _runs_of(self, *values: np.ndarray):
         """(k, c, POOL / k) of c arrays (POOL,)."""

@@ -94,11 +94,11 @@ class Environment:
         """The same light at a lower resolution, energy kept: pixels are averaged by solid angle."""
         current = self
         while current.image.shape[0] >= 2 * height and not any(side % 2 for side in current.image.shape[:2]):
-            h, w = current.image.shape[:2]
-            weight = np.broadcast_to(current.solid_angles[:, None, None], (h, w, 1))
-            mass = (current.image * weight).reshape(h // 2, 2, w // 2, 2, 3).sum((1, 3))
-            total = weight.reshape(h // 2, 2, w // 2, 2, 1).sum((1, 3))
-            current = replace(self, image=mass / total)
+            weight = current.solid_angles
+            weight = (weight / np.repeat(2 * (weight[0::2] + weight[1::2]), 2))[:, None, None]
+            rows = current.image[0::2] * weight[0::2]
+            rows += current.image[1::2] * weight[1::2]
+            current = replace(self, image=rows[:, 0::2] + rows[:, 1::2])
         return current
 
     def cut(self, height: int) -> Environment:

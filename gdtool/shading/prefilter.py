@@ -7,10 +7,8 @@ SIMD"), pole up: every texel has the same solid angle, so halving the image is e
 from __future__ import annotations
 
 import math
-import os
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -71,17 +69,17 @@ class LightPyramid:
             levels.append(0.25 * (fine[0::2, 0::2] + fine[1::2, 0::2] + fine[0::2, 1::2] + fine[1::2, 1::2]))
         self.depth = len(levels)
         self.offsets = torch.tensor(np.concatenate([[0], np.cumsum([x.shape[0] ** 2 for x in levels])[:-1]]))
-        self.texels = torch.as_tensor(np.concatenate([x.reshape(-1, 3) for x in levels]), dtype=torch.float32)
+        self.texels = torch.as_tensor(np.concatenate([x.reshape(-1, 3) for x in levels]).T.copy(), dtype=torch.float32)
         self.texel_angle = 4 * math.pi / self.side**2
 
     def mean(self, x, y, z, solid_angle):
-        """Radiance (..., 3) averaged over a texel of the level whose solid angle is the next below solid_angle."""
+        """Radiance (3, k, n) toward (k, n), averaged over a texel of the level whose solid angle is the next below solid_angle (k, 1)."""
         level = (0.5 * (solid_angle * (1 / self.texel_angle)).log2()).long().clamp(0, self.depth - 1)
         side = self.side >> level
         s, t = octahedral(x, y, z)
         column = (s * side).long().minimum(side - 1)
         row = (t * side).long().minimum(side - 1)
-        return self.texels[self.offsets[level] + row * side + column]
+        return self.texels.index_select(1, (row.mul_(side).add_(column).add_(self.offsets[level])).reshape(-1)).view(3, *column.shape)
 
 
 class IrradianceMap:
@@ -99,9 +97,7 @@ class IrradianceMap:
         weighted = torch.as_tensor((small.image * small.solid_angles[:, None, None]).reshape(-1, 3), dtype=torch.float32)
         toward = torch.as_tensor(small.directions.reshape(-1, 3).T, dtype=torch.float32)
         parts = torch.as_tensor(normals.reshape(-1, 3), dtype=torch.float32).split(PART)
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-            sums = list(pool.map(lambda part: (part @ toward).clamp_min_(0) @ weighted, parts))
-        self.values = torch.cat(sums).numpy().reshape(height, 2 * height, 3)
+        self.values = torch.cat([(part @ toward).clamp_min_(0) @ weighted for part in parts]).numpy().reshape(height, 2 * height, 3)
         # A column more on each side, from the other one.
         self.wrapped = torch.from_numpy(np.concatenate([self.values[:, -1:], self.values, self.values[:, :1]], 1).transpose(2, 0, 1).copy())
 
@@ -211,7 +207,7 @@ def _sum_of_all(pyramid: LightPyramid, normal, a2: float):
 
     level = max(0, (pyramid.side // DENSE).bit_length() - 1)
     side = pyramid.side >> level
-    light = pyramid.texels[pyramid.offsets[level]:pyramid.offsets[level] + side * side]
+    light = pyramid.texels[:, pyramid.offsets[level]:pyramid.offsets[level] + side * side].T.contiguous()
     toward = torch.as_tensor(octahedral_directions(side), dtype=torch.float32)
     out = []
     for part in normal.split(PART):
@@ -236,13 +232,13 @@ def _sum_of_samples(pyramid: LightPyramid, normal, a2: float):
     density = a2 / (math.pi * ((1 - cosine**2) + a2 * cosine**2) ** 2) / 4
     # A half vector at angle θ reflects the normal to 2 θ.
     up, ring = 2 * cosine**2 - 1, 2 * cosine * (1 - cosine**2).clamp_min(0).sqrt()
-    weight, angle = up.clamp_min(0)[None], (2 / (LOBE_SAMPLES * density))[None]
+    weight, angle, ring, up, phi = up.clamp_min(0), (2 / (LOBE_SAMPLES * density))[:, None], ring[:, None], up[:, None], phi[:, None]
     out = []
     for part in normal.split(1024):
-        n = [c[:, None] for c in part.unbind(1)]
+        n = part.unbind(1)
         tangent, bitangent = frame(*n)
-        direction = [t * (ring * phi.cos())[None] + b * (ring * phi.sin())[None] + c * up[None] for t, b, c in zip(tangent, bitangent, n, strict=True)]
-        out.append((pyramid.mean(*direction, angle.expand(len(part), -1)) * weight[..., None]).sum(1))
+        direction = [t * (ring * phi.cos()) + b * (ring * phi.sin()) + c * up for t, b, c in zip(tangent, bitangent, n, strict=True)]
+        out.append((pyramid.mean(*direction, angle) * weight[:, None]).sum(1).T)
     return torch.cat(out) / weight.sum()
 
 

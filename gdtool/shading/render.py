@@ -226,7 +226,9 @@ class Renderer:
         while len(pixel) and done < samples:
             count = min(max(2 * done, BASE), samples)
             more = count - done
-            step = max(1, BAND_SAMPLES // more)
+            # As many bands for one thread as for the other, or one waits.
+            bands = self.caster.threads * -(-len(pixel) * more // (BAND_SAMPLES * self.caster.threads))
+            step = -(-len(pixel) // bands)
 
             def look(part: np.ndarray, first: int = done, count: int = count) -> tuple[np.ndarray, int, Points, dict]:
                 at = time.perf_counter()

@@ -86,13 +86,12 @@ class TextureReader:
         return out
 
     def _decode(self, texels: np.ndarray, colored: bool, out: np.ndarray) -> None:
-        """Texels (..., c) as one image stores them into out, linear float32."""
-        for channels, srgb in _runs(texels.shape[-1], colored):
-            values = texels[..., channels]
+        """Texels (..., c) as one image stores them into out, linear float32; channel by channel, as short rows are slow."""
+        for i, srgb in enumerate(_colored(texels.shape[-1], colored)):
             if srgb:
-                out[..., channels] = self._linear(values)
+                out[..., i] = self._linear(texels[..., i])
             else:
-                np.multiply(values, self._unit, out=out[..., channels], dtype=np.float32, casting="same_kind")
+                np.multiply(texels[..., i], self._unit, out=out[..., i], dtype=np.float32, casting="same_kind")
 
     def _linear(self, values: np.ndarray) -> np.ndarray:
         """float32 of stored sRGB values."""
@@ -147,16 +146,15 @@ class TextureReader:
         """Means of 2x2 texels into out, rows of the coarser level from row on. colored: whether finer is stored in sRGB; None:
         it is linear."""
         band = finer[2 * row:2 * (row + len(out))]
-        for channels, srgb in [(slice(None), False)] if colored is None else _runs(finer.shape[2], colored):
-            values = band[..., channels]
+        wide = {"u1": np.uint16, "u2": np.uint32}.get(band.dtype.str[1:], np.float32)
+        for i, srgb in enumerate([False] * band.shape[2] if colored is None else _colored(band.shape[2], colored)):
+            values = band[..., i]
             if srgb:
                 values = self._linear(values)
-                pairs, unit = values[0::2] + values[1::2], np.float32(0.25)
-            else:
-                # Sums of four stay exact as they are stored: decoding is left for the quarter.
-                pairs = np.add(values[0::2], values[1::2], dtype=np.uint32 if values.dtype == np.uint16 else np.uint16 if values.dtype == np.uint8 else np.float32)
-                unit = np.float32(0.25) * (np.float32(1) if colored is None else self._unit)
-            np.multiply(pairs[:, 0::2] + pairs[:, 1::2], unit, out=out[..., channels], casting="same_kind", dtype=np.float32)
+            # Sums of four stay exact as they are stored: decoding is left for the quarter.
+            pairs = np.add(values[0::2], values[1::2], dtype=np.float32 if srgb else wide)
+            unit = np.float32(0.25) * (np.float32(1) if srgb or colored is None else self._unit)
+            np.multiply(pairs[:, 0::2] + pairs[:, 1::2], unit, out=out[..., i], casting="same_kind", dtype=np.float32)
 
     def _halved_odd(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
         """The same where a side is odd: a coarser texel is wider than two, and takes its share of a third."""
@@ -227,10 +225,10 @@ def _each_band(work, rows: int, band: int) -> None:
         work(0)
 
 
-def _runs(channels: int, colored: bool) -> list[tuple[slice, bool]]:
-    """Runs of the channels of one image, and whether they are sRGB: alpha never is."""
+def _colored(channels: int, colored: bool) -> list[bool]:
+    """Which channels of one image are sRGB: alpha never is."""
     last = channels if channels in (1, 3) else channels - 1
-    return [(slice(0, channels), False)] if not colored else [(slice(0, last), True)] + [(slice(last, channels), False)] * (last < channels)
+    return [colored and i < last for i in range(channels)]
 
 
 def _shares(size: int) -> np.ndarray:
