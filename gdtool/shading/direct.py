@@ -88,7 +88,7 @@ class DirectLight:
     def radiance(self, points: Points) -> np.ndarray:
         """(n, 3) linear radiance toward the eye, emission included."""
         k = self.samples
-        step = max(1, PAIRS // max(2 * k, 8))
+        step = max(1, PAIRS // max(2 * k, 2))
         sums = np.zeros((SUMS, 3, len(points)), np.float32)
         runs = self._runs(points) if k else None
         if self.mode == "prefiltered" and len(points):

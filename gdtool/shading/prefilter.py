@@ -14,11 +14,10 @@ import numpy as np
 
 from gdtool.shading.environment import Environment
 
-# Roughness of the levels that may be made, each with its image's side: broad lobes vary slowly.
-LADDER = ((0.08, 256), (0.14, 128), (0.2, 128), (0.3, 64), (0.4, 32), (0.5, 32), (0.62, 32), (0.78, 32), (1.0, 32))
+# Roughness of the levels that may be made, each with its image's side, as broad lobes vary slowly, and the side of the light
+# of which it sums all texels; 0: it samples the lobe.
+LADDER = ((0.08, 256, 0), (0.14, 128, 0), (0.2, 128, 0), (0.3, 64, 64), (0.4, 32, 64), (0.5, 32, 32), (0.62, 32, 32), (0.78, 32, 32), (1.0, 32, 32))
 LOBE_SAMPLES = 64
-# Side of the largest images that are summed over all of the light.
-DENSE = 64
 # Normals summed for at a time: what lies between the products stays in the cache.
 PART = 64
 TABLE = 32
@@ -179,7 +178,7 @@ def _levels(roughness):
     """Steps of the ladder below and above (n,) roughness, and how far it is between them; one step where it is on one."""
     import torch
 
-    ladder = torch.tensor([r for r, _ in LADDER])
+    ladder = torch.tensor([r for r, *_ in LADDER])
     inside = roughness.clamp(LADDER[0][0], 1.0).contiguous()
     above = torch.searchsorted(ladder, inside)
     below = torch.where(ladder[above] == inside, above, above - 1)
@@ -187,25 +186,25 @@ def _levels(roughness):
     return below, above, fraction
 
 
-def filtered_light(pyramid: LightPyramid, roughness: float, side: int):
+def filtered_light(pyramid: LightPyramid, roughness: float, side: int, dense: int):
     """(3, side + 2, side + 2) light averaged over the GGX lobe around each direction, weighted by its cosine, with a
     border that wraps. The lobe is the one seen along its own normal."""
     import torch
 
     normal = torch.as_tensor(octahedral_directions(side), dtype=torch.float32)
     a2 = roughness**4
-    image = (_sum_of_all if side <= DENSE else _sum_of_samples)(pyramid, normal, a2).reshape(side, side, 3)
+    image = (_sum_of_all(pyramid, normal, a2, dense) if dense else _sum_of_samples(pyramid, normal, a2)).reshape(side, side, 3)
     # Over an edge of the octahedron lies the same edge, turned around.
     rows = torch.cat([image[:1].flip(1), image, image[-1:].flip(1)])
     columns = torch.cat([rows[:, :1].flip(0), rows, rows[:, -1:].flip(0)], 1)
     return columns.permute(2, 0, 1).contiguous()
 
 
-def _sum_of_all(pyramid: LightPyramid, normal, a2: float):
-    """(n, 3) by every texel of a level of the pyramid that is sharper than the lobe."""
+def _sum_of_all(pyramid: LightPyramid, normal, a2: float, dense: int):
+    """(n, 3) by every texel of the pyramid's level with so many a side, or of its finest."""
     import torch
 
-    level = max(0, (pyramid.side // DENSE).bit_length() - 1)
+    level = max(0, (pyramid.side // dense).bit_length() - 1)
     side = pyramid.side >> level
     light = pyramid.texels[:, pyramid.offsets[level]:pyramid.offsets[level] + side * side].T.contiguous()
     toward = torch.as_tensor(octahedral_directions(side), dtype=torch.float32)

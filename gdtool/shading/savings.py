@@ -55,7 +55,7 @@ def savings(renderer: Renderer, samples: int, light: DirectLight | None) -> list
 
         made = light.prefiltered.images
         if len(made) < len(LADDER):
-            texels = sum(side**2 for _, side in LADDER)
+            texels = sum(side**2 for _, side, _ in LADDER)
             here = sum(LADDER[level][1] ** 2 for level in made)
             reason = f"the scene's roughness needs {len(made)} of {len(LADDER)}"
             out.append(("prefiltered levels", reason, light.prefiltered.seconds * (texels - here) / here))

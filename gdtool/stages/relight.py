@@ -124,4 +124,4 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
                                  source_from_world=tuple(float(x) for x in matrix.ravel()), report=report)
 
 
-STAGE = Stage(name="relight", version=5, reads=("asset", "model-file"), writes="renders", Options=Options, run=run)
+STAGE = Stage(name="relight", version=6, reads=("asset", "model-file"), writes="renders", Options=Options, run=run)

@@ -157,7 +157,7 @@ def test_prefiltered_levels_that_nothing_needs_are_not_missed():
         renderer = Renderer(sphere(rings=24))
         shading = DirectLight(renderer, light, 0, mode="prefiltered")
         if everything:
-            shading.prefiltered.prepare(np.array([r for r, _ in LADDER], np.float32))
+            shading.prefiltered.prepare(np.array([r for r, *_ in LADDER], np.float32))
         frames.append(renderer.buffers(camera, 4, shading.color())["color"])
         assert (len(shading.prefiltered.images) == len(LADDER)) == everything
     assert np.array_equal(*frames)
