@@ -168,9 +168,12 @@ def write_png(path: str | Path, image: np.ndarray, bits: int = 8) -> None:
 def write_exr(path: str | Path, image: np.ndarray) -> None:
     """Write (h, w) or (h, w, 1, 3 or 4) as 32-bit float EXR, zip-compressed; alpha given straight, stored premultiplied.
 
-    Read again and compared; raises OutputError.
+    Read again and compared; raises OutputError, also for NaN and infinity, which readers take in many ways.
     """
-    _write(Path(path), np.asarray(image, np.float32), "float")
+    image = np.asarray(image, np.float32)
+    if not np.isfinite(image).all():
+        raise OutputError(path, f"would hold {int((~np.isfinite(image)).sum())} numbers that are not finite", "this is a fault of gdtool: please report it")
+    _write(Path(path), image, "float")
 
 
 def encode_png(image: np.ndarray, bits: int = 8) -> bytes:

@@ -62,6 +62,15 @@ def test_exr_is_exact_and_straight(tmp_path):
     np.testing.assert_allclose(read_image(tmp_path / "c.exr"), rgba, rtol=1e-6)
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_exr_holds_finite_numbers_only(tmp_path, bad):
+    image = np.ones((4, 5), np.float32)
+    image[1, 2] = bad
+    with pytest.raises(OutputError, match="1 numbers that are not finite"):
+        write_exr(tmp_path / "x.exr", image)
+    assert not (tmp_path / "x.exr").exists()
+
+
 def test_same_pixels_same_bytes():
     image = np.random.default_rng(4).random((16, 16, 3))
     assert encode_png(image) == encode_png(image)
