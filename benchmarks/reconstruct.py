@@ -126,10 +126,24 @@ def skips(views) -> list[dict]:
     limit = 3 * step
     points = np.stack(np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij"), -1).reshape(-1, 3)
     (dense, _), whole = timed(lambda: combined_distance(sights, grid.points(points), step, limit))
-    near = np.abs(dense.reshape(grid.shape)) < step
-    change = float(np.abs(dense.reshape(grid.shape) - values)[near].max())
-    found.append({"what": "samples away from the surface", "done": whole, "skipped": band, "change": change})
+    found.append({"what": "samples away from the surface", "done": whole, "skipped": band, "change": step * crossings_moved(dense.reshape(grid.shape), values)})
     return found
+
+
+def crossings_moved(one: np.ndarray, other: np.ndarray) -> float:
+    """How far two grids' surfaces lie apart along the grid's edges, at most, in steps; 1 where only one of them crosses an edge."""
+    farthest = 0.0
+    for axis in range(3):
+        place = []
+        for values in (np.moveaxis(one, axis, 0), np.moveaxis(other, axis, 0)):
+            a, b = values[:-1], values[1:]
+            place.append(np.where((a < 0) != (b < 0), a / np.where(a == b, 1, a - b), np.nan))
+        crossed = [np.isfinite(p) for p in place]
+        if (crossed[0] != crossed[1]).any():
+            return 1.0
+        if crossed[0].any():
+            farthest = max(farthest, float(np.abs(place[0] - place[1])[crossed[0]].max()))
+    return farthest
 
 
 def cases_of(index: int, given: argparse.Namespace) -> list[str]:

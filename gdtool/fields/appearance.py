@@ -13,12 +13,15 @@ MATERIALS = ("albedo", "roughness", "metallic")
 
 @dataclass
 class Appearance:
-    """albedo (v, 3), roughness, metallic, confidence (v,); light: record of light.json or None; figures; what was skipped."""
+    """albedo (v, 3), roughness, metallic, confidence (v,); views (v,) uint8 and residual (v,) as of a Surface; light: record
+    of light.json or None; figures; what was skipped."""
 
     albedo: np.ndarray
     roughness: np.ndarray
     metallic: np.ndarray
     confidence: np.ndarray
+    views: np.ndarray
+    residual: np.ndarray
     light: dict | None = None
     figures: dict[str, float | str] = field(default_factory=dict)
     skipped: list[tuple[str, str]] = field(default_factory=list)
@@ -37,7 +40,8 @@ def appearance(cameras, mask: np.ndarray, images: dict[str, np.ndarray], vertice
     seen = observe(cameras, mask, vertices, faces, normals, 0.5 * step)
     weight = seen.weight.sum(0)
     out = Appearance(np.full((len(vertices), 3), 0.5, np.float32), np.full(len(vertices), 0.5, np.float32),
-                     np.zeros(len(vertices), np.float32), (1 - np.exp(-4 * weight)).astype(np.float32))
+                     np.zeros(len(vertices), np.float32), (1 - np.exp(-4 * weight)).astype(np.float32),
+                     (seen.weight > 0).sum(0).astype(np.uint8), np.zeros(len(vertices), np.float32))
     fused = {}
     for name in (*MATERIALS, "color"):
         if name in images and (name != "color" or "albedo" not in images):
@@ -45,7 +49,7 @@ def appearance(cameras, mask: np.ndarray, images: dict[str, np.ndarray], vertice
             value, weight, residual = fuse(stack if stack.ndim == 4 else stack[..., None], mask, seen)
             fused[name] = np.clip(spread(value, weight, faces), 0, 1)
             if name in ("albedo", "color"):
-                out.confidence = confidence(weight, residual)
+                out.confidence, out.residual = confidence(weight, residual), residual.astype(np.float32)
                 out.figures[f"{name}_residual"] = float(np.average(residual, weights=weight + 1e-9))
     for name in MATERIALS:
         if name in fused:

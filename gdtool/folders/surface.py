@@ -17,6 +17,8 @@ from gdtool.folders.records import read_record, write_record
 # albedo is 8-bit sRGB under the names that viewers show.
 _VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"), ("red", "u1"),
                     ("green", "u1"), ("blue", "u1"), ("roughness", "<f4"), ("metallic", "<f4"), ("confidence", "<f4")])
+# What the confidence was made of, where it is known.
+_EVIDENCE = [("views", "u1"), ("residual", "<f4")]
 _FACE = np.dtype([("count", "u1"), ("idx", "<i4", 3)])
 _PLY_TYPES = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
               "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"}
@@ -27,7 +29,8 @@ class Surface:
     """A triangle mesh in the normalised frame with a material per vertex.
 
     vertices (v, 3) float, faces (f, 3) int32, normals (v, 3) unit or None, albedo (v, 3) linear in [0, 1],
-    roughness, metallic and confidence (v,) in [0, 1].
+    roughness, metallic and confidence (v,) in [0, 1]. views (v,) how many views see a vertex and residual (v,) the mean
+    distance of what they show there (linear albedo, else color) from what was made of it, both None where not known.
     """
 
     vertices: np.ndarray
@@ -38,6 +41,8 @@ class Surface:
     confidence: np.ndarray
     normals: np.ndarray | None = None
     light: dict[str, Any] | None = None
+    views: np.ndarray | None = None
+    residual: np.ndarray | None = None
 
 
 def write_surface(out: Output, surface: Surface, *, watertight: bool, method: str = "", source_from_world=None, **extra: Any) -> None:
@@ -55,7 +60,9 @@ def write_surface_ply(path: Path, surface: Surface) -> None:
     from gdtool.geometry.normals import vertex_normals
     from gdtool.images.color import srgb_from_linear
 
-    vertex = np.empty(len(surface.vertices), _VERTEX)
+    known = surface.views is not None and surface.residual is not None
+    layout = np.dtype(_VERTEX.descr + _EVIDENCE) if known else _VERTEX
+    vertex = np.empty(len(surface.vertices), layout)
     normals = surface.normals if surface.normals is not None else vertex_normals(surface.vertices, surface.faces)
     albedo = np.clip(surface.albedo, 0, 1)
     encoded = np.round(srgb_from_linear(albedo) * 255)
@@ -64,11 +71,13 @@ def write_surface_ply(path: Path, surface: Surface) -> None:
             vertex[name] = values[:, axis]
     for name in ("roughness", "metallic", "confidence"):
         vertex[name] = np.clip(getattr(surface, name), 0, 1)
+    if known:
+        vertex["views"], vertex["residual"] = np.minimum(surface.views, 255), surface.residual
     face = np.empty(len(surface.faces), _FACE)
     face["count"], face["idx"] = 3, surface.faces
     kinds = {"<f4": "float", "|u1": "uchar"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertex)}"]
-    lines += [f"property {kinds[_VERTEX[name].str]} {name}" for name in _VERTEX.names]
+    lines += [f"property {kinds[layout[name].str]} {name}" for name in layout.names]
     lines += [f"element face {len(face)}", "property list uchar int vertex_indices", "end_header", ""]
     with open(path, "wb") as file:
         file.write("\n".join(lines).encode())
@@ -146,4 +155,4 @@ def read_surface(folder: Folder) -> Surface:
     normals = np.stack([vertex[k] for k in ("nx", "ny", "nz")], -1).astype(np.float32) if {"nx", "ny", "nz"} <= set(names) else None
     light = read_record(folder.file("light.json")) if folder.content.light else None
     return Surface(vertices, faces, albedo.astype(np.float32), column("roughness", 0.5), column("metallic", 0.0),
-                   column("confidence", 0.0), normals, light)
+                   column("confidence", 0.0), normals, light, *(np.asarray(vertex[name]) if name in names else None for name, _ in _EVIDENCE))

@@ -93,7 +93,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             out.skip(what, reason)
     if fit is not None:
         _use_fit(fit, vertices, views, look, options, out)
-    surface = Surface(vertices, faces, look.albedo, look.roughness, look.metallic, look.confidence, normals, look.light)
+    surface = Surface(vertices, faces, look.albedo, look.roughness, look.metallic, look.confidence, normals, look.light, look.views, look.residual)
     report = {"seen_share": float((shape.support > 0.02).mean()), "pieces_dropped": shape.dropped, "grid_step": shape.step,
               "disagreement_before": before, "disagreement": noise, "agreement": agreed, "silhouettes_outvoted": outvoted,
               "mean_confidence": float(look.confidence.mean()), **look.figures, **figures}
@@ -192,4 +192,4 @@ def _check_masks(path, views, out: Output) -> None:
             out.warn(f"view {name}: its mask is empty; the view is left out")
 
 
-STAGE = Stage(name="reconstruct", version=8, reads=("views",), writes="surface", Options=Options, run=run)
+STAGE = Stage(name="reconstruct", version=9, reads=("views",), writes="surface", Options=Options, run=run)

@@ -1,5 +1,6 @@
 """Each kind's files say what was written, to the precision that its page promises."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from gdtool.core.manifest import Manifest
 from gdtool.core.stage import Output
 from gdtool.folders.mesh import QuadMesh, read_obj, triangulated, write_obj
 from gdtool.folders.records import read_cameras, read_record, write_cameras, write_record
-from gdtool.folders.surface import Surface, read_surface, write_surface
+from gdtool.folders.surface import Surface, read_surface, write_surface, write_surface_ply
 from gdtool.folders.views import Views, read_views, write_views
 
 CUBE = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float) - 0.5
@@ -90,6 +91,11 @@ def test_surface_comes_back_and_missing_properties_have_their_defaults():
     assert np.allclose(back.vertices, CUBE) and np.array_equal(back.faces, triangles)
     assert np.abs(back.albedo - surface.albedo).max() < 0.005 and np.allclose(back.roughness, surface.roughness)
     assert np.allclose(back.normals, CUBE / np.linalg.norm(CUBE, axis=1, keepdims=True), atol=1e-6)  # a cube's corners point outward
+    assert back.views is None and back.residual is None
+    seen = replace(surface, views=np.arange(n), residual=np.linspace(0, 0.7, n, dtype=np.float32))
+    write_surface_ply(folder.file("surface.ply"), seen)
+    back = read_surface(folder)
+    assert np.array_equal(back.views, seen.views) and np.array_equal(back.residual, seen.residual) and np.allclose(back.confidence, 0.5)
     bare = b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n" \
         b"element face 1\nproperty list uchar uint vertex_indices\nend_header\n" + CUBE[:3].astype("<f4").tobytes() + b"\x03" + np.arange(3, dtype="<u4").tobytes()
     folder.file("surface.ply").write_bytes(bare)

@@ -41,6 +41,9 @@ def test_writes_a_valid_surface_once(gdtool, folder, tmp_path):
     assert sure.mean() > 0.5
     assert np.abs(surface.albedo - albedo)[sure].mean() < 0.02
     assert np.abs(surface.roughness - roughness)[sure].mean() < 0.02
+    # Six views around: none sees what the ring hides, none all of it; exact views agree.
+    assert surface.views.min() == 0 and 2 <= surface.views.max() <= 5
+    assert (surface.views[sure] > 0).all() and surface.residual[surface.views == 0].max() == 0 and surface.residual.mean() < 0.02
     far = sure & (np.abs(surface.vertices[:, 0]) > 0.05)
     assert np.abs(surface.metallic - metallic)[far].mean() < 0.03
     assert gdtool("validate", out).returncode == 0
