@@ -6,6 +6,7 @@ result by pickle over pipes of our own; it dies with its parent, however the par
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import pickle
@@ -22,6 +23,32 @@ class ChildFailed(Exception):
     """The child crashed, ran out of time or memory, or ended without a result; str() says which."""
 
 
+# Children that have imported a module and wait for a call, by the module's name.
+_ready: dict[str, list[subprocess.Popen]] = {}
+
+
+def prepare(module: str, count: int = 1) -> None:
+    """Start children now that the next `count` calls into a module will use: their start-up then costs those no time.
+
+    For a main thread only: a child dies with the thread that starts it. What is never called ends with the process.
+    """
+    waiting = _ready.setdefault(module, [])
+    waiting.extend(_start(module) for _ in range(count - len(waiting)))
+
+
+def _start(module: str) -> subprocess.Popen:
+    return subprocess.Popen([sys.executable, "-m", "gdtool.core.child", module], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def _take(module: str) -> subprocess.Popen:
+    while _ready.get(module):
+        process = _ready[module].pop()
+        if process.poll() is None:
+            return process
+        process.communicate()
+    return _start(module)
+
+
 def call(function: str, *args: Any, seconds: float, memory_mb: int | None = None, **kwargs: Any) -> Any:
     """Result of "package.module:function"(*args, **kwargs), computed in a child process.
 
@@ -29,8 +56,7 @@ def call(function: str, *args: Any, seconds: float, memory_mb: int | None = None
     the child is raised here; everything else that goes wrong there raises ChildFailed.
     """
     request = pickle.dumps((function, args, kwargs, memory_mb), protocol=5)
-    process = subprocess.Popen([sys.executable, "-m", "gdtool.core.child"], stdin=subprocess.PIPE,
-                               stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process = _take(function.split(":")[0])
     timed_out = threading.Event()
 
     def stop() -> None:
@@ -83,7 +109,12 @@ def _main() -> None:
     # Native libraries print to stdout; the answer goes out through a descriptor they do not know.
     answer_to = os.dup(1)
     os.dup2(2, 1)
-    function, args, kwargs, memory_mb = pickle.loads(sys.stdin.buffer.read())
+    with contextlib.suppress(Exception):  # told when the function is asked for
+        importlib.import_module(sys.argv[1])
+    request = sys.stdin.buffer.read()
+    if not request:
+        return
+    function, args, kwargs, memory_mb = pickle.loads(request)
     module, name = function.split(":")
     try:
         target = getattr(importlib.import_module(module), name)

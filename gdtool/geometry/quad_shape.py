@@ -215,17 +215,25 @@ def normals_below(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> 
     return below / np.maximum(np.linalg.norm(below, axis=1), 1e-300)[:, None]
 
 
-def _incidence(faces: np.ndarray, count: int) -> list[np.ndarray]:
-    corner = faces.ravel()
-    order = np.argsort(corner, kind="stable")
-    bounds = np.searchsorted(corner[order], np.arange(1, count))
-    return np.split(order // faces.shape[1], bounds)
+class _Lists:
+    """Lists of values (n,), each under its key (n,) of 0…count − 1, in their order: lists[key] is an array."""
+
+    def __init__(self, key: np.ndarray, value: np.ndarray, count: int):
+        self.value = value[np.argsort(key, kind="stable")]
+        self.start = np.concatenate([[0], np.cumsum(np.bincount(key, minlength=count))])
+
+    def __getitem__(self, key: int) -> np.ndarray:
+        return self.value[self.start[key]:self.start[key + 1]]
 
 
-def _neighbours(ends: np.ndarray, count: int) -> list[np.ndarray]:
-    a, b = np.concatenate([ends[:, 0], ends[:, 1]]), np.concatenate([ends[:, 1], ends[:, 0]])
-    order = np.argsort(a, kind="stable")
-    return np.split(b[order], np.searchsorted(a[order], np.arange(1, count)))
+def _incidence(faces: np.ndarray, count: int) -> _Lists:
+    """The faces around each vertex."""
+    return _Lists(faces.ravel(), np.arange(faces.size) // faces.shape[1], count)
+
+
+def _neighbours(ends: np.ndarray, count: int) -> _Lists:
+    """The vertices that edges (e, 2) join to each."""
+    return _Lists(ends.T.ravel(), ends[:, ::-1].T.ravel(), count)
 
 
 def fill_holes(vertices: np.ndarray, faces: np.ndarray, longest: int = 64) -> tuple[np.ndarray, np.ndarray]:

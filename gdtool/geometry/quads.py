@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gdtool.core.child import ChildFailed, call
+from gdtool.core.child import ChildFailed, call, prepare
 from gdtool.geometry import repair
 from gdtool.geometry.features import Constraints, Features, find_features, trace, untied
 from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian, valences
@@ -65,6 +65,10 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
     record = Record()
     start = time.perf_counter()
     edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
+    if len(faces) > _needed(request):
+        prepare("gdtool.geometry.simplify")
+    if request.engine != "split":
+        prepare("gdtool.geometry.quad_engines", len(_attempts(request.quads, request)[0][2]))
     closed = repair.is_watertight(faces)
     fine_vertices, fine_faces = vertices, faces
     if request.restore_creases and request.crease_degrees > 0 and _median_edge(vertices, faces) < 0.75 * edge:
@@ -95,11 +99,16 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
     return np.concatenate([v for v, _ in done]), np.concatenate([f + o for (_, f), o in zip(done, offset, strict=False)]), record
 
 
+def _needed(request: Request) -> int:
+    """How many triangles show all that so many quads can."""
+    return max(3 * request.quads, 20000)
+
+
 def _simplified(vertices: np.ndarray, faces: np.ndarray, restored_vertices: np.ndarray, restored_faces: np.ndarray, closed: bool,
                 request: Request, record: Record) -> tuple[np.ndarray, np.ndarray]:
     """The mesh with its creases restored as coarse as the quads need, or the mesh as it was where that cannot be done."""
     start = time.perf_counter()
-    needed = max(3 * request.quads, 20000)
+    needed = _needed(request)
     restored = restored_vertices is not vertices
     found = simplify(restored_vertices, restored_faces, needed, seconds=request.seconds, closed=closed, thorough=not restored, measured=False)
     if restored and (found[3]["method"] == "none" and "failed" in found[3] or closed and not repair.is_watertight(found[1])):

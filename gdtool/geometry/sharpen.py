@@ -164,19 +164,23 @@ def collapse_bevels(vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, 
     """
     from gdtool.geometry.repair import compact
 
-    corners = moved[faces]
-    near = np.flatnonzero(corners.any(1))
-    ring: dict[int, set[int]] = {}
-    local = {int(i): list(map(int, faces[i])) for i in near}
-    for i, face in local.items():
-        for v in face:
-            ring.setdefault(v, set()).add(i)
-    half = np.concatenate([faces[near][:, [i, (i + 1) % 3]] for i in range(3)])
+    rims = faces[(moved[faces].sum(1) > 1)]
+    half = np.concatenate([rims[:, [i, (i + 1) % 3]] for i in range(3)])
     half = np.unique(np.sort(half[moved[half].all(1)], 1), axis=0)
     length = np.linalg.norm(vertices[half[:, 0]] - vertices[half[:, 1]], axis=1)
     order = np.argsort(length, kind="stable")
-    order = order[length[order] < longest]
-    position = {v: vertices[v].tolist() for v in ring}
+    half = half[order[length[order] < longest]]
+    # Only the faces around the ends of these edges are looked at.
+    ends = np.zeros(len(vertices), bool)
+    ends[half.ravel()] = True
+    near = np.flatnonzero(ends[faces].any(1))
+    local = dict(zip(near.tolist(), faces[near].tolist(), strict=True))
+    ring: dict[int, set[int]] = {}
+    for i, face in local.items():
+        for v in face:
+            ring.setdefault(v, set()).add(i)
+    places = np.fromiter(ring, np.int64, len(ring))
+    position = dict(zip(places.tolist(), vertices[places].tolist(), strict=True))
     became: dict[int, int] = {}
 
     def last(v: int) -> int:
@@ -186,7 +190,7 @@ def collapse_bevels(vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, 
 
     tiny = (1e-3 * longest) ** 2
     gone: set[int] = set()
-    for a, b in half[order].tolist():
+    for a, b in half.tolist():
         a, b = last(a), last(b)
         if a == b:
             continue
@@ -212,8 +216,7 @@ def collapse_bevels(vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, 
         became[a] = b
     out = faces.copy()
     keep = np.ones(len(faces), bool)
-    for i, face in local.items():
-        out[i] = face
+    out[near] = np.array(list(local.values()), faces.dtype).reshape(-1, 3)
     keep[list(gone)] = False
     return compact(vertices, out[keep])
 

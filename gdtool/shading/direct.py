@@ -70,8 +70,8 @@ class DirectLight:
             if self.samples:
                 directions, radiance, density = environment.sample(sobol(POOL, 2, seed))
                 dice = np.random.default_rng(seed).random(POOL)
-                # Runs of (x, y, z, density, red, green, blue, dice) for the light and of three numbers and dice for the reflection.
-                self.pool = self._runs_of(*directions.T, density, *radiance.T, dice)
+                # Runs of (x, y, z, red, green, blue, density, dice) for the light and of three numbers and dice for the reflection.
+                self.pool = self._runs_of(*directions.T, *radiance.T, density, dice)
                 self.pattern = self._runs_of(*sobol(POOL, 3, seed + 1).T, dice)
             self.pixels = tensor_of(np.concatenate([environment.image.reshape(-1, 3), environment.pdf.reshape(-1, 1)], 1))
             self.irradiance = known_light.result()
@@ -141,7 +141,7 @@ class DirectLight:
         mirrored = surface.sample(*numbers[:3])
         found = self.pixels.index_select(0, self._pixel(*mirrored).reshape(-1)).view(k, -1, 4)
         direction = [torch.cat(pair) for pair in zip(drawn[:3], mirrored, strict=True)]
-        p_light, *light = (torch.cat([drawn[3 + (i + 1) % 4], found[..., i]]) for i in (3, 0, 1, 2))
+        *light, p_light = (torch.cat([drawn[3 + i], found[..., i]]) for i in range(4))
         terms, p_reflect, above = surface.evaluate(*direction)
         everything = 1 / (p_light + p_reflect).mul_(k).clamp_min_(1e-20)
         visible, counted = everything * above, (0, 0, 0, 0)

@@ -1,6 +1,7 @@
 """Protected children: results, errors, crashes, time and memory limits."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -27,6 +28,10 @@ def refuse():
     raise InputError("mesh", "is a bow-tie", "cut it")
 
 
+def own_pid():
+    return os.getpid()
+
+
 def crash():
     os.abort()
 
@@ -45,6 +50,19 @@ def grow():
 
 def test_arrays_go_there_and_back_whatever_the_function_prints():
     assert (child.call("tests.core.test_child:double", np.arange(5), noise="text", seconds=30) == np.arange(5) * 2).all()
+
+
+def test_a_prepared_child_takes_the_next_call_and_a_dead_one_none():
+    child.prepare("tests.core.test_child", 2)
+    waiting = [process.pid for process in child._ready["tests.core.test_child"]]
+    assert len(set(waiting)) == 2
+    os.kill(waiting[1], signal.SIGKILL)
+    time.sleep(0.2)
+    assert child.call("tests.core.test_child:own_pid", seconds=30) == waiting[0]
+    assert child.call("tests.core.test_child:own_pid", seconds=30) not in waiting
+    child.prepare("no.such.module")
+    with pytest.raises(child.ChildFailed, match="ModuleNotFoundError"):
+        child.call("no.such.module:function", seconds=30)
 
 
 def test_our_errors_come_back_as_themselves():
