@@ -26,7 +26,8 @@ _SMALL_PIECE_QUADS = 48
 _TRIES = 3
 _CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a result is taken without a look at others
 _RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
-_HANDLES = "handles are lost or added"
+_HANDLES, _PIECES = "handles are lost or added", "pieces are lost or joined"
+_MOST_PIECES = 16  # that are remeshed one by one where together they fail
 
 
 @dataclass(frozen=True)
@@ -81,10 +82,16 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
         coarse = _simplified(vertices, faces, fine_vertices, fine_faces, closed, request, record)
         error = beside.submit(_deviation, fine, coarse) if coarse[1] is not faces else None
         done, names = [], []
-        for part_vertices, part_faces, quads in _pieces(*coarse, request.quads):
+        waiting = _pieces(*coarse, request.quads)
+        while waiting:
+            part_vertices, part_faces, quads = waiting.pop(0)
             found = None
             if quads >= _SMALL_PIECE_QUADS and request.engine != "split":
                 found = _by_engines(part_vertices, part_faces, quads, edge, request, record, fine)
+                if found is None and 1 < repair.components(part_faces)[0] <= _MOST_PIECES:
+                    # What lies close together an engine may join, and what is thin it may lose beside the rest.
+                    waiting = _one_by_one(part_vertices, part_faces, quads) + waiting
+                    continue
             if found is None:
                 start = time.perf_counter()
                 found = (*_fitted(*_by_splitting(part_vertices, part_faces, quads), part_vertices, part_faces, edge, request, fine.result()),
@@ -149,11 +156,25 @@ def _pieces(vertices: np.ndarray, faces: np.ndarray, quads: int) -> list[tuple[n
         if which.any():
             own = repair.compact(vertices, faces[which])
             budget = int(round(quads * area[which].sum() / area.sum()))
-            out.append((*own, budget if not small[which].all() else max(budget, 1)))
+            if small[which].all():
+                # Enough for their shape, out of at most a quarter of all.
+                of = np.unique(piece[which])
+                enough = np.maximum(quads * share[of], np.minimum(np.bincount(piece, minlength=count)[of] / 2, _SMALL_PIECE_QUADS)).sum()
+                budget = max(budget, int(min(enough, quads / 4)), 1)
+            out.append((*own, budget))
     if len(out) == 2:  # the asked count holds for the sum
         few = _by_splitting_count(out[1][1], out[1][2])
         out[0] = (*out[0][:2], max(quads - few, 4))
     return out
+
+
+def _one_by_one(vertices: np.ndarray, faces: np.ndarray, quads: int) -> list[tuple[np.ndarray, np.ndarray, int]]:
+    """Each piece as a mesh of its own, with its share of the quads by area, small ones with enough for their shape."""
+    count, piece = repair.components(faces)
+    area, triangles = np.bincount(piece, face_normals(vertices, faces)[1], count), np.bincount(piece, minlength=count)
+    share = np.maximum(quads * area / area.sum(), np.minimum(triangles / 2, 2 * _SMALL_PIECE_QUADS)).round().astype(int)
+    share[share.argmax()] -= share.sum() - quads
+    return [(*repair.compact(vertices, faces[piece == k]), max(int(share[k]), 6)) for k in range(count)]
 
 
 def _by_splitting_count(faces: np.ndarray, quads: int) -> int:
@@ -253,6 +274,8 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
             if fault is None:
                 return quad_vertices, quad_faces, label
             record.failed.append(f"{label}: {fault}")
+            if fault == _PIECES and repair.components(faces)[0] <= _MOST_PIECES:
+                return None  # they go one by one
             break
         else:
             record.failed.append(f"{label}: gave {count} faces for {quads}")
@@ -309,7 +332,7 @@ def _judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndar
     if not repair.is_manifold(quad_faces):
         return "not manifold", quad_vertices, quad_faces
     if repair.components(quad_faces)[0] != repair.components(faces)[0]:
-        return "pieces are lost or joined", quad_vertices, quad_faces
+        return _PIECES, quad_vertices, quad_faces
     if closed and _euler(quad_faces) != _euler(faces):
         return _HANDLES, quad_vertices, quad_faces
     return None, quad_vertices, quad_faces
