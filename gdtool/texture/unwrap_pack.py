@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gdtool.geometry.repair import edges_of
 from gdtool.texture.raster import owner_count
 
 _FINE = 3  # cells of the supersampled mask in a cell of the square
@@ -46,6 +47,9 @@ def _mask(uv: np.ndarray, triangles: np.ndarray, cells_per_unit: float, gap: flo
     size = int(span.max())
     width, height = span * _FINE
     covered = owner_count((uv * cells_per_unit + gap) / size, triangles, size * _FINE)[:height, :width] > 0
+    # Tips thinner than a fine cell lie between its centres: the rim, walked along in half cells, finds them.
+    column, row = np.minimum((_walked((uv * cells_per_unit + gap) * _FINE, triangles)).astype(int), (width - 1, height - 1)).T
+    covered[row, column] = True
     # Grown by a disk, row by row. Half a diagonal more: what is covered between the fine cells' centres.
     radius = gap * _FINE + 0.75
     reach = int(radius)
@@ -58,6 +62,15 @@ def _mask(uv: np.ndarray, triangles: np.ndarray, cells_per_unit: float, gap: flo
         row = before[:, reach + 1 + dx:reach + 1 + dx + width] > before[:, reach - dx:reach - dx + width]
         out[max(dy, 0):height + min(dy, 0)] |= row[max(-dy, 0):height - max(dy, 0)]
     return out.reshape(span[1], _FINE, span[0], _FINE).any((1, 3))
+
+
+def _walked(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Points (n, 2) along a chart's rim, at most half a unit apart."""
+    edges = edges_of(triangles)
+    one, two = uv[edges.ends[edges.count == 1].T]
+    steps = np.ceil(2 * np.abs(two - one).max(1)).astype(int) + 1
+    along = (np.arange(steps.sum()) - np.repeat(np.cumsum(steps) - steps, steps)) / np.repeat(steps, steps)
+    return np.repeat(one, steps, 0) + along[:, None] * np.repeat(two - one, steps, 0)
 
 
 class _Shapes:

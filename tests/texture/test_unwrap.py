@@ -134,6 +134,14 @@ def test_four_squares_pack_tight_and_turned_ones_are_set_upright():
     assert (owner_count(np.concatenate(places), np.concatenate([triangles + 4 * i for i in range(4)]), 512) <= 1).all()
 
 
+def test_the_tips_of_slivers_stay_clear_of_the_others():
+    """Where a triangle is narrower than the packer's cells it takes its place all the same."""
+    shapes = [np.array([[0, 0], [1, 0], [1, height]]) for height in (1.0, 0.055, 0.012)] + [np.array([[0, 0], [2.2, 0], [2.2, 0.055]])]
+    charts = [(shape, np.array([[0, 1, 2]])) for shape in shapes for _ in range(12)]
+    places, _ = pack(charts, 1 / 256)
+    assert (owner_count(np.concatenate(places), np.arange(3 * len(charts)).reshape(-1, 3), 4096) <= 1).all()
+
+
 def test_thousands_of_charts_go_on_shelves():
     triangle, faces = np.array([[0, 0], [1, 0], [0, 1.0]]), np.array([[0, 1, 2]])
     places, _ = pack([(triangle, faces)] * 1000, 0.004)
