@@ -226,9 +226,9 @@ class Renderer:
         while len(pixel) and done < samples:
             count = min(max(2 * done, BASE), samples)
             more = count - done
-            # As many bands for one thread as for the other, or one waits.
-            bands = self.caster.threads * -(-len(pixel) * more // (BAND_SAMPLES * self.caster.threads))
-            step = -(-len(pixel) // bands)
+            # Several bands are as many for one thread as for the other, or one waits; a small picture is one band.
+            bands = -(-len(pixel) * more // BAND_SAMPLES)
+            step = -(-len(pixel) // (bands if bands == 1 else -(-bands // self.caster.threads) * self.caster.threads))
 
             def look(part: np.ndarray, first: int = done, count: int = count) -> tuple[np.ndarray, int, Points, dict]:
                 at = time.perf_counter()
