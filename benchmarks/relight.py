@@ -8,12 +8,10 @@ goes on where it was.
 
 from __future__ import annotations
 
-import argparse
 import sys
-from pathlib import Path
 
 from measure import say
-from shading import HERE, Job, comparison, has, run, write
+from shading import HERE, Job, arguments, comparison, has, run, write
 from shading_scene import exported
 
 SETTINGS = [("sg", 4, 0), *(("prefiltered", s, k) for s, k in ((4, 0), (4, 1), (4, 2), (16, 4))),
@@ -21,15 +19,8 @@ SETTINGS = [("sg", 4, 0), *(("prefiltered", s, k) for s, k in ((4, 0), (4, 1), (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model")
-    parser.add_argument("env")
-    parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks"))
-    parser.add_argument("--size", type=int, default=512)
+    parser = arguments(__doc__)
     parser.add_argument("--view", default="front_right")
-    parser.add_argument("--peers-python", type=Path)
-    parser.add_argument("--reference", type=int, default=256, help="samples per pixel of gdtool's reference")
-    parser.add_argument("--repeats", type=int, default=3, help="of rows that take less than 5 s; the table has the median")
     asked = parser.parse_args()
     scene = exported(asked.model, asked.env, asked.output / ".relight")
     own = (sys.executable, str(HERE / "shading_gdtool.py"), asked.model, asked.env, "{out}", "--size", str(asked.size), "--views", asked.view)

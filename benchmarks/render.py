@@ -9,12 +9,10 @@ has its color too. About 15 minutes on two quiet cores. A killed run goes on whe
 
 from __future__ import annotations
 
-import argparse
 import sys
-from pathlib import Path
 
 from measure import say
-from shading import HERE, Job, comparison, has, run, write
+from shading import HERE, Job, arguments, comparison, has, run, write
 from shading_scene import exported
 
 VIEWS = "front,front_right,right,back,left,front_left"
@@ -22,16 +20,9 @@ BUFFERS = ("normal", "albedo", "roughness", "metallic")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model")
-    parser.add_argument("env")
-    parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks"))
-    parser.add_argument("--size", type=int, default=512)
+    parser = arguments(__doc__)
     parser.add_argument("--views", default=VIEWS)
     parser.add_argument("--scored", default="front_right", help="views that errors are taken of")
-    parser.add_argument("--peers-python", type=Path)
-    parser.add_argument("--reference", type=int, default=256, help="samples per pixel of gdtool's reference and of Cycles' buffers")
-    parser.add_argument("--repeats", type=int, default=3, help="of rows that take less than 5 s; the table has the median")
     asked = parser.parse_args()
     scene = exported(asked.model, asked.env, asked.output / ".render")
     own = (sys.executable, str(HERE / "shading_gdtool.py"), asked.model, asked.env, "{out}", "--size", str(asked.size))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
@@ -19,6 +20,19 @@ from measure import busy, machine, number, say, table
 HERE = Path(__file__).resolve().parent
 # Runs shorter than this, in seconds, are repeated if asked for: the table has the median.
 SHORT = 5.0
+
+
+def arguments(text: str) -> argparse.ArgumentParser:
+    """The options of both."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model")
+    parser.add_argument("env")
+    parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks"))
+    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--peers-python", type=Path)
+    parser.add_argument("--reference", type=int, default=256, help="samples per pixel of gdtool's reference and of Cycles' buffers")
+    parser.add_argument("--repeats", type=int, default=3, help="of rows that take less than 5 s; the table has the median")
+    return parser
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ TOLERANCE = {"normal": 0.009, "albedo": 0.009, "roughness": 0.009, "metallic": 0
 # What values are multiplied by for a picture; None: the sRGB curve.
 STORED = {"normal": 0.5, "albedo": None, "roughness": 1.0, "metallic": 1.0, "color": None}
 # Samples spread evenly know a mean better than random ones do, the more of them the better: measured, the error of n is
-# SPREAD n^SPREAD_POWER times the standard error (0.47 for 4, 0.25 for 64).
+# SPREAD n^SPREAD_POWER times the standard error (0.47 for 4, 0.25 for 64; tests/shading/test_pattern.py).
 SPREAD, SPREAD_POWER = 0.65, -0.2
 # Directions to the light are spread over a pixel's samples less evenly.
 COLOR_SPREAD = 0.8
