@@ -50,7 +50,7 @@ def textured_part():
     from gdtool.texture.raster import rasterize_uv
 
     vertices, faces = marched(part, PART_TRIANGLES)
-    vertices, faces = unit(vertices)[0], faces[:, ::-1]  # marching cubes winds its triangles toward the negative side
+    vertices = unit(vertices)[0]
     normals = vertex_normals(vertices, faces)
     own, corners, uv = xatlas.parametrize(vertices.astype(np.float32), faces.astype(np.uint32), normals.astype(np.float32))
     corners, uv = corners.astype(np.int32), np.asarray(uv, np.float64) * (1, -1) + (0, 1)

@@ -77,7 +77,7 @@ def part_creases(count: int = 800) -> np.ndarray:
 
 
 def marched(field: Callable, triangles: int, half: float = 1.06) -> tuple[np.ndarray, np.ndarray]:
-    """Zero set of field(x, y, z), negative inside, as about so many triangles."""
+    """Zero set of field(x, y, z), negative inside, as about so many triangles, counter-clockwise from outside."""
     from skimage.measure import marching_cubes
 
     def at(n: int) -> tuple[np.ndarray, np.ndarray]:
