@@ -45,19 +45,19 @@ def _meet(origins: np.ndarray, directions: np.ndarray, triangles: np.ndarray) ->
     numbers that lie side by side."""
     o, d, a, e1, e2 = origins.T, directions.T, triangles[:3], triangles[3:6], triangles[6:]
     p = _cross(d, e2)
-    determinant = _dot(e1, p)
+    determinant = dot(e1, p)
     flat = determinant == 0
     inverse = 1.0 / (np.where(flat, 1.0, determinant) if flat.any() else determinant)
     s = [o[i] - a[i] for i in range(3)]
-    u = _dot(s, p)
+    u = dot(s, p)
     u *= inverse
     q = _cross(s, e1)
-    v = _dot(d, q)
+    v = dot(d, q)
     v *= inverse
-    distance = _dot(e2, q)
+    distance = dot(e2, q)
     distance *= inverse
     if flat.any():
-        distance[flat] = (-_dot(s, d) / _dot(d, d))[flat]
+        distance[flat] = (-dot(s, d) / dot(d, d))[flat]
         u[flat] = v[flat] = 0.0
     weights = np.stack([1.0 - u - v, u, v])
     np.clip(weights, 0.0, 1.0, out=weights)
@@ -75,8 +75,8 @@ def _cross(a, b) -> list[np.ndarray]:
     return out
 
 
-def _dot(a, b) -> np.ndarray:
-    """(n,) scalar products of vectors given as three arrays (n,)."""
+def dot(a, b) -> np.ndarray:
+    """(n,) scalar products of vectors given as three arrays (n,), as (3, n) is."""
     out = a[0] * b[0]
     out += a[1] * b[1]
     out += a[2] * b[2]

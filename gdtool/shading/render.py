@@ -21,7 +21,7 @@ import numpy as np
 
 from gdtool.assets.scene import Scene
 from gdtool.cameras import Camera, project, rays
-from gdtool.geometry.rays import RayCaster, is_convex
+from gdtool.geometry.rays import RayCaster, dot, is_convex
 from gdtool.images.color import srgb_from_linear
 from gdtool.shading.environment import Environment
 from gdtool.shading.pattern import pixel_pattern
@@ -185,7 +185,7 @@ class Renderer:
         x, y = ((start[:, None] + offset).ravel() for start, offset in zip((pixel % camera.width, pixel // camera.width), pattern[first:].T, strict=True))
         pixel, sample = np.repeat(pixel, len(sample)), np.tile(sample, len(pixel))
         origins, directions = rays(camera, np.stack([x, y]).T)
-        along = -_dot(directions, camera.backward)
+        along = -dot(directions.T, camera.backward)
         if camera.projection == "orthographic":
             # Start in front of the object, not at a plane that may cut it.
             back = max(0.0, float((_corners(self.bounds) @ camera.backward).max()) - float(camera.position @ camera.backward)) + 1e-3 * self.extent
@@ -363,11 +363,6 @@ def _beside(inside: np.ndarray) -> np.ndarray:
     padded = np.pad(inside, 1)
     rows = padded[:-2] | padded[1:-1] | padded[2:]
     return (rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]).ravel()
-
-
-def _dot(vectors: np.ndarray, one: np.ndarray) -> np.ndarray:
-    """(n,) scalar products of vectors (n, 3) with one."""
-    return vectors[:, 0] * one[0] + vectors[:, 1] * one[1] + vectors[:, 2] * one[2]
 
 
 def _srgb_slope(x: np.ndarray) -> np.ndarray:

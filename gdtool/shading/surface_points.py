@@ -13,6 +13,7 @@ import numpy as np
 
 from gdtool.assets.scene import Scene, Texture
 from gdtool.geometry.normals import face_normals
+from gdtool.geometry.rays import dot
 from gdtool.shading.textures import TextureReader, same_layout
 
 ATTRIBUTES = ("albedo", "roughness", "metallic", "normal", "geometric_normal", "alpha", "emissive")
@@ -26,14 +27,6 @@ def _interpolated(values: np.ndarray, corners: np.ndarray, weights: np.ndarray) 
         more = np.take(values, corners[i], axis=1)
         more *= weights[i]
         out += more
-    return out
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(n,) scalar products of vectors (3, n)."""
-    out = a[0] * b[0]
-    out += a[1] * b[1]
-    out += a[2] * b[2]
     return out
 
 
@@ -150,7 +143,7 @@ class SurfaceLookup:
         if self._normals is None:
             return np.take(self._flat, at.face_idx, axis=1)
         smooth = _interpolated(self._normals, at.corners, at.weights)
-        length = np.sqrt(_dot(smooth, smooth))
+        length = np.sqrt(dot(smooth, smooth))
         none = np.flatnonzero(length <= 1e-6)
         if len(none):
             smooth[:, none], length[none] = self._flat[:, at.face_idx[none]], 1.0
@@ -204,7 +197,7 @@ class SurfaceLookup:
             bitangent += along * tangent[i]
             bitangent += up * normal[i]
             out[i] = bitangent
-        out /= np.maximum(np.sqrt(_dot(out, out)), np.float32(1e-30))
+        out /= np.maximum(np.sqrt(dot(out, out)), np.float32(1e-30))
         return out
 
     def alpha(self, face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -288,9 +281,9 @@ class SurfaceLookup:
                     normal[:, at] = mapped
         geometric = np.take(self._flat, points.face_idx, axis=1)
         if directions is not None:
-            side = _dot(geometric, directions.T)
+            side = dot(geometric, directions.T)
             geometric = geometric * np.where(side > 0, np.float32(-1), np.float32(1))
-            normal = normal * np.where(_dot(vertex_normal, geometric) < 0, np.float32(-1), np.float32(1))
+            normal = normal * np.where(dot(vertex_normal, geometric) < 0, np.float32(-1), np.float32(1))
         for values in (albedo, roughness, metallic, alpha):
             np.clip(values, 0, 1, out=values)
         return {"albedo": albedo.T, "roughness": roughness, "metallic": metallic, "alpha": alpha, "emissive": np.maximum(emissive, 0).T, "unlit": unlit,

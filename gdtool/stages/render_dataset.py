@@ -264,6 +264,6 @@ def _tell_skips(out: Output, renderer: Renderer, options: Options, lamps: _Lamps
 
 
 STAGE = Stage(
-    name="render-dataset", version=5, reads=("model-file", "asset"), writes="views", Options=Options, run=run, dataset=True,
+    name="render-dataset", version=6, reads=("model-file", "asset"), writes="views", Options=Options, run=run, dataset=True,
     second_inputs={"cameras": SecondInput("views", search=False, help="Views folder whose cameras, frame and light are used again.")},
 )

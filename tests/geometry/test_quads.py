@@ -18,6 +18,25 @@ def whole(faces):
     return faces.min() >= 0 and repair.is_watertight(faces) and repair.is_manifold(faces)
 
 
+def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
+    """Each has its share of the quads asked for, the small one enough for its shape, and none is lost."""
+    vertices, faces = joined(sphere(48, 0.4, (0, -0.2, 0)), sphere(48, 0.12, (0, 0.5, 0)))
+    parts = quads._one_by_one(vertices, faces, 2000)
+    assert len(parts) == 2
+    assert sum(count for *_, count in parts) == 2000 and min(count for *_, count in parts) >= 2000 * 0.02
+    tried = []
+    real = quads._by_engines
+
+    def fails_together(part, triangles, *rest):
+        tried.append(repair.components(triangles)[0])
+        return None if tried[-1] > 1 else real(part, triangles, *rest)
+
+    monkeypatch.setattr(quads, "_by_engines", fails_together)
+    out, found, _ = quads.remesh(vertices, faces, quads.Request(quads=2000))
+    assert tried == [2, 1, 1] and repair.components(found)[0] == 2 and whole(found)
+    assert abs(len(found) / 2000 - 1) <= 0.03
+
+
 def test_grid_figures():
     line = np.arange(5.0)
     x, y = np.meshgrid(line, line)
