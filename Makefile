@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-materials bench-reconstruct bench-render bench-relight bench-sheets bench-throughput bench-cutout bench-sample schemas docs-check model data clean
+.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-materials bench-reconstruct bench-render bench-relight bench-sheets bench-throughput bench-cutout bench-sample bench-model schemas docs-check model data clean
 
 venv: .venv/.done
 
@@ -107,6 +107,11 @@ model: data
 	$(BIN)/gdtool train $(DATA)/objects --start $(DATA)/small --size 128 --config benchmarks/model_training.json --steps $(STEPS) -o $(DATA)/model
 	$(BIN)/python benchmarks/model_quality.py $(DATA)/held_out --model $(DATA)/model --train $(DATA)/objects -o docs/benchmarks --install
 	$(BIN)/python benchmarks/model_sheets.py $(DATA)/held_out ../shared/assets/images
+
+# The bundled model's surfaces of held-out objects, and what the parts of the method are worth: nine small trainings, an hour or two.
+bench-model: data
+	$(BIN)/python benchmarks/image_to_surface.py $(DATA)/held_out --train $(DATA)/objects
+	$(BIN)/python benchmarks/ablations.py $(DATA)/objects --held-out $(DATA)/held_out
 
 # The JSON Schemas from the types that decode the manifests; a test compares.
 schemas: venv
