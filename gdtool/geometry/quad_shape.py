@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
 from gdtool.geometry.features import Constraints, Features, closest_on_segments
@@ -9,6 +11,7 @@ from gdtool.geometry.mesh_quality import polygon_normals, valences, worst_jacobi
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.repair import compact, edges_of
 
+_WORTH_THREADS, _ALONE = 1000, 10000  # libigl searches with all threads from more than so many points on
 _EXACT_EVERY = 3  # steps between two searches for the closest point; the others stay in its plane
 _LET_OFF_BELOW = 0.22  # a vertex leaves its feature for a quad with a smaller scaled Jacobian only
 _BENT_COSINE = 0.97  # between a quad's normal and that of the surface below its centre
@@ -29,8 +32,17 @@ class Surface:
         """Distance (n,), face_idx (n,) and closest point (n, 3) for points (n, 3)."""
         if not len(points):
             return np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 3))
-        squared, face_idx, point = self._tree.squared_distance(self.vertices, self.faces, np.ascontiguousarray(points, np.float64))
-        return np.sqrt(np.maximum(squared, 0)), np.asarray(face_idx), np.asarray(point)
+        points = np.ascontiguousarray(points, np.float64)
+        if _WORTH_THREADS < len(points) <= _ALONE:
+            with ThreadPoolExecutor(2) as pool:
+                parts = zip(*pool.map(self._search, np.array_split(points, 2)), strict=True)
+                squared, face_idx, point = (np.concatenate(part) for part in parts)
+        else:
+            squared, face_idx, point = self._search(points)
+        return np.sqrt(np.maximum(squared, 0)), face_idx, point
+
+    def _search(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return tuple(np.asarray(x) for x in self._tree.squared_distance(self.vertices, self.faces, points))
 
 
 def subdivide(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints | None = None):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 
-from gdtool.core.child import ChildFailed, call, prepare
+from gdtool.core.child import ChildFailed, begin, prepare
 from gdtool.geometry import repair
 from gdtool.geometry.features import Constraints, Features, find_features, trace, untied
 from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian, valences
@@ -70,17 +72,18 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
         prepare("gdtool.geometry.simplify")
     if request.engine != "split":
         prepare("gdtool.geometry.quad_engines", len(_attempts(request.quads, request)[0][2]))
-    closed = repair.is_watertight(faces)
+    closed = cache(lambda: repair.is_watertight(faces))
     fine_vertices, fine_faces = vertices, faces
     if request.restore_creases and request.crease_degrees > 0 and _median_edge(vertices, faces) < 0.75 * edge:
         fine_vertices, fine_faces, report = restore_creases(vertices, faces, request.crease_degrees)
         record.figures["crease_vertices_restored"] = report["moved"]
     record.clock("restore creases", start)
-    # Where a child has one core, this process can use another: the search tree of the input, then the deviation from it.
+    # While a child has one core, this process uses another: the search tree of the input, then the deviation from it. The
+    # tree is built only once the child has its mesh: building it holds the interpreter's lock.
+    fine = cache(lambda: Surface(vertices, faces))
+    coarse = _simplified(vertices, faces, fine_vertices, fine_faces, closed, request, record, fine)
     with ThreadPoolExecutor(1) as beside:
-        fine = beside.submit(Surface, vertices, faces)
-        coarse = _simplified(vertices, faces, fine_vertices, fine_faces, closed, request, record)
-        error = beside.submit(_deviation, fine, coarse) if coarse[1] is not faces else None
+        error = beside.submit(_deviation, fine(), coarse) if coarse[1] is not faces else None
         done, names = [], []
         waiting = _pieces(*coarse, request.quads)
         while waiting:
@@ -94,12 +97,12 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
                     continue
             if found is None:
                 start = time.perf_counter()
-                found = (*_fitted(*_by_splitting(part_vertices, part_faces, quads), part_vertices, part_faces, edge, request, fine.result()),
+                found = (*_fitted(*_by_splitting(part_vertices, part_faces, quads), part_vertices, part_faces, edge, request, fine()),
                          "pair and split")
                 record.clock("fallback", start)
             done.append(found[:2])
             names.append(found[2])
-        record.source = fine.result()
+        record.source = fine()
         record.figures["simplify_error"] = error.result() if error is not None else 0.0
     record.engine = "; ".join(dict.fromkeys(names))
     offset = np.cumsum([0] + [len(v) for v, _ in done])
@@ -111,18 +114,22 @@ def _needed(request: Request) -> int:
     return max(3 * request.quads, 20000)
 
 
-def _simplified(vertices: np.ndarray, faces: np.ndarray, restored_vertices: np.ndarray, restored_faces: np.ndarray, closed: bool,
-                request: Request, record: Record) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh with its creases restored as coarse as the quads need, or the mesh as it was where that cannot be done."""
+def _simplified(vertices: np.ndarray, faces: np.ndarray, restored_vertices: np.ndarray, restored_faces: np.ndarray, closed: Callable[[], bool],
+                request: Request, record: Record, meanwhile: Callable[[], object]) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with its creases restored as coarse as the quads need, or the mesh as it was where that cannot be done.
+
+    meanwhile: what to do while a child works; may be called more than once.
+    """
     start = time.perf_counter()
     needed = _needed(request)
     restored = restored_vertices is not vertices
-    found = simplify(restored_vertices, restored_faces, needed, seconds=request.seconds, closed=closed, thorough=not restored, measured=False)
-    if restored and (found[3]["method"] == "none" and "failed" in found[3] or closed and not repair.is_watertight(found[1])):
+    found = simplify(restored_vertices, restored_faces, needed, seconds=request.seconds, closed=closed, thorough=not restored, measured=False,
+                     meanwhile=meanwhile)
+    if restored and (found[3]["method"] == "none" and "failed" in found[3] or closed() and not repair.is_watertight(found[1])):
         # Bevels drawn out where there is no crease make folds that the collapse tears.
         record.failed.append("creases restored: the result cannot be simplified")
         record.figures["crease_vertices_restored"] = 0
-        found = simplify(vertices, faces, needed, seconds=request.seconds, closed=closed, measured=False)
+        found = simplify(vertices, faces, needed, seconds=request.seconds, closed=closed, measured=False, meanwhile=meanwhile)
     report = found[3]
     record.figures["simplified_to"] = report["faces"]
     if "failed" in report:
@@ -131,9 +138,9 @@ def _simplified(vertices: np.ndarray, faces: np.ndarray, restored_vertices: np.n
     return found[:2]
 
 
-def _deviation(fine: Future, coarse: tuple[np.ndarray, np.ndarray], limit: int = 20000) -> float:
+def _deviation(fine: Surface, coarse: tuple[np.ndarray, np.ndarray], limit: int = 20000) -> float:
     """Largest distance of the vertices of the input and of the simplified mesh to the other, at most `limit` of each."""
-    one, two = fine.result(), Surface(*coarse)
+    one, two = fine, Surface(*coarse)
     return float(max(b.closest(a.vertices[::max(len(a.vertices) // limit, 1)])[0].max() for a, b in ((one, two), (two, one))))
 
 
@@ -213,8 +220,8 @@ def _fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndar
 
 
 def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float, request: Request,
-                record: Record, fine: Future) -> tuple[np.ndarray, np.ndarray, str] | None:
-    """The first engine's result that stands up to judgement, finished; None when none does. fine: the input's Surface."""
+                record: Record, fine: Callable[[], Surface]) -> tuple[np.ndarray, np.ndarray, str] | None:
+    """The first engine's result that stands up to judgement, finished; None when none does. fine gives the input's Surface."""
     features = surface = None
     second_best = None
     for engine, subdivisions, factors, degrees in _attempts(quads, request):
@@ -222,19 +229,19 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
         asked = [quads * factor for factor in factors]
         for _ in range(_TRIES):
             start = time.perf_counter()
-            with ThreadPoolExecutor(len(asked)) as pool:
-                way = ENGINES["on few" if engine == "instant-meshes" and subdivisions else engine]
-                running = [pool.submit(call, way, vertices.astype(np.float32), faces.astype(np.int32), max(int(number / 4**subdivisions), 16),
-                                       degrees, seconds=request.seconds, memory_mb=request.memory_mb) for number in asked]
-                if features is None:
-                    features = find_features(vertices, faces, request.crease_degrees or 181.0, 3 * edge)
-                    surface = Surface(vertices, faces)
-                results = []
-                for number, future in zip(asked, running, strict=True):
-                    try:
-                        results.append((number, *_judged(*future.result(), vertices, faces)))
-                    except ChildFailed as failure:
-                        record.failed.append(f"{label}: {failure}")
+            way = ENGINES["on few" if engine == "instant-meshes" and subdivisions else engine]
+            running = [begin(way, vertices.astype(np.float32), faces.astype(np.int32), max(int(number / 4**subdivisions), 16),
+                             degrees, seconds=request.seconds, memory_mb=request.memory_mb) for number in asked]
+            if features is None:
+                features = find_features(vertices, faces, request.crease_degrees or 181.0, 3 * edge)
+                surface = Surface(vertices, faces)
+                fine()
+            results = []
+            for number, child in zip(asked, running, strict=True):
+                try:
+                    results.append((number, *_judged(*child.result(), vertices, faces)))
+                except ChildFailed as failure:
+                    record.failed.append(f"{label}: {failure}")
             record.clock("engine", start)
             if not results:
                 break
@@ -255,7 +262,7 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
                 # The others of the right count are finished too, until one has no thin quad and leaves no corner out.
                 best = None
                 for result in [r for r in results if rank(r)[:2] == (False, COUNT_TOLERANCE)]:
-                    quad_vertices, quad_faces = _finished(*result[2:], surface, features, subdivisions, request, fine.result())
+                    quad_vertices, quad_faces = _finished(*result[2:], surface, features, subdivisions, request, fine())
                     far = _farthest(quad_vertices, quad_faces, surface) / edge
                     least = float(scaled_jacobian(quad_vertices, quad_faces).min())
                     good = far < _CLOSE_EDGES and least > _LEAST_JACOBIAN
@@ -282,7 +289,7 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
     if second_best is not None:
         # Closed and manifold, but a gap or tunnel finer than the quads was bridged or filled: still better than no engine.
         start = time.perf_counter()
-        quad_vertices, quad_faces = _finished(*second_best[:2], surface, features, 0, request, fine.result())
+        quad_vertices, quad_faces = _finished(*second_best[:2], surface, features, 0, request, fine())
         record.clock("fit", start)
         if _farthest(quad_vertices, quad_faces, surface) < 2 * edge:
             return quad_vertices, quad_faces, second_best[2]

@@ -164,7 +164,9 @@ def collapse_bevels(vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, 
     """
     from gdtool.geometry.repair import compact
 
-    rims = faces[(moved[faces].sum(1) > 1)]
+    columns = np.ascontiguousarray(faces.T)
+    corners = moved.astype(np.int8)
+    rims = faces[corners[columns[0]] + corners[columns[1]] + corners[columns[2]] > 1]
     half = np.concatenate([rims[:, [i, (i + 1) % 3]] for i in range(3)])
     half = np.unique(np.sort(half[moved[half].all(1)], 1), axis=0)
     length = np.linalg.norm(vertices[half[:, 0]] - vertices[half[:, 1]], axis=1)
@@ -173,7 +175,7 @@ def collapse_bevels(vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, 
     # Only the faces around the ends of these edges are looked at.
     ends = np.zeros(len(vertices), bool)
     ends[half.ravel()] = True
-    near = np.flatnonzero(ends[faces].any(1))
+    near = np.flatnonzero(ends[columns[0]] | ends[columns[1]] | ends[columns[2]])
     local = dict(zip(near.tolist(), faces[near].tolist(), strict=True))
     ring: dict[int, set[int]] = {}
     for i, face in local.items():

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+
 import numpy as np
 
-from gdtool.core.child import ChildFailed, call
+from gdtool.core.child import ChildFailed, begin
 from gdtool.core.errors import InputError
 from gdtool.geometry import repair
 from gdtool.geometry.unpinch import unpinched
@@ -49,15 +52,16 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
 
 
 def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attributes: np.ndarray | None = None, *,
-             seconds: float = 120.0, closed: bool | None = None, thorough: bool = True,
-             measured: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, dict[str, float | int | str]]:
+             seconds: float = 120.0, closed: Callable[[], bool] | None = None, thorough: bool = True,
+             measured: bool = True, meanwhile: Callable[[], object] = lambda: None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, dict[str, float | int | str]]:
     """A mesh of about target_faces triangles of the same shape and topology.
 
     vertices (v, 3), faces (f, 3), attributes (v, a) or None. Returns vertices, faces, attributes (read at the closest
     point of the input) and a report: faces, method, and error, the largest distance of the result's vertices and of the
     input's vertices (at most 20,000 of them) to the other surface, in units of the input. A closed, manifold
-    input stays so (closed says whether it is, where that is known); without `thorough` it is given back as it is where
-    only the slow way would keep it closed; without `measured` the error is left out. Raises InputError as repair.check does.
+    input stays so (closed says whether it is; asked while the first child works); without `thorough` it is given back as it is where
+    only the slow way would keep it closed; without `measured` the error is left out. `meanwhile` is called while
+    each child works. Raises InputError as repair.check does.
     """
     repair.check(vertices, faces)
     target_faces = max(int(target_faces), 4)
@@ -67,7 +71,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     if not extent > 0:
         raise InputError("mesh", "all its faces lie in one point")
     unit = (vertices - centre) / extent
-    closed = repair.is_watertight(faces) if closed is None else closed
+    is_closed = cache(closed or (lambda: repair.is_watertight(faces)))
     reasons, found, method = [], None, ""
     # The quick collapse tears a closed mesh now and then (a handful of edges with four faces), at one pace and not at
     # another; MeshLab's takes ten times as long.
@@ -76,24 +80,27 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
         if name == "collapse_topology" and not thorough:
             break
         try:
-            out = call(f"gdtool.geometry.simplify:{name}", unit, faces.astype(np.int32), *arguments, seconds=seconds, memory_mb=16000)
+            running = begin(f"gdtool.geometry.simplify:{name}", unit, faces.astype(np.int32), *arguments, seconds=seconds, memory_mb=16000)
+            meanwhile()
+            is_closed()
+            out = running.result()
         except ChildFailed as failure:
             reasons.append(str(failure))
             continue
-        if closed and _sound(*out, False, target_faces) and not _sound(*out, True, target_faces):
+        if is_closed() and _sound(*out, False, target_faces) and not _sound(*out, True, target_faces):
             out = unpinched(*out)  # what the quick collapse tears are mostly two sheets that meet in an edge
-        if _sound(*out, closed, target_faces):
+        if _sound(*out, is_closed(), target_faces):
             found, method = out, "quadric collapse" if name == "collapse" else "quadric collapse, topology kept"
             break
         reasons.append("the result is not as closed as the input")
-    if found is None and not closed:
+    if found is None and not is_closed():
         found, method = cluster(unit, faces, target_faces), "vertex clustering"
         if not len(found[1]):
             found = None
     if found is None:
         return vertices, faces, attributes, {"faces": len(faces), "method": "none", "error": 0.0, "failed": "; ".join(reasons)}
     out_vertices, out_faces = repair.compact(*found)
-    if closed and repair.components(out_faces)[0] > 1:
+    if is_closed() and repair.components(out_faces)[0] > 1:
         out_vertices, out_faces = repair.without_crumbs(out_vertices, out_faces, repair.components(faces)[0])
     out_attributes = None
     if attributes is not None:

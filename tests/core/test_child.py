@@ -40,6 +40,10 @@ def leave():
     os._exit(0)
 
 
+def large():
+    return np.zeros(2**20)  # more than a pipe holds
+
+
 def hang():
     time.sleep(60)
 
@@ -63,6 +67,14 @@ def test_a_prepared_child_takes_the_next_call_and_a_dead_one_none():
     child.prepare("no.such.module")
     with pytest.raises(child.ChildFailed, match="ModuleNotFoundError"):
         child.call("no.such.module:function", seconds=30)
+
+
+def test_children_that_were_begun_work_at_once_and_keep_their_limits():
+    running = [child.begin("tests.core.test_child:large", seconds=2) for _ in range(2)] + [child.begin("tests.core.test_child:hang", seconds=2)]
+    time.sleep(2.5)  # the answers were given in time, though nobody asked for them
+    assert [len(one.result()) for one in running[:2]] == [2**20] * 2
+    with pytest.raises(child.ChildFailed, match="longer than 2 s"):
+        running[2].result()
 
 
 def test_our_errors_come_back_as_themselves():

@@ -137,12 +137,21 @@ def test_small_piece_is_not_lost():
     assert np.linalg.norm(out - 0.45, axis=1).min() < 0.05
 
 
+class Ended:
+    """A child that has ended, in the place of one that works."""
+
+    def __init__(self, outcome):
+        self.outcome = outcome
+
+    def result(self):
+        if isinstance(self.outcome, Exception):
+            raise self.outcome
+        return self.outcome
+
+
 @pytest.mark.parametrize("failure", ["died of SIGSEGV", "ended with exit code 0 and no result"])
 def test_dead_engine_is_replaced(monkeypatch, failure):
-    def dead(*_, **__):
-        raise ChildFailed(failure)
-
-    monkeypatch.setattr(quads, "call", dead)
+    monkeypatch.setattr(quads, "begin", lambda *_, **__: Ended(ChildFailed(failure)))
     vertices, faces = torus()
     _, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=900))
     assert record.engine == "pair and split" and any(failure in text for text in record.failed)
@@ -152,7 +161,7 @@ def test_dead_engine_is_replaced(monkeypatch, failure):
 def test_torn_output_is_not_believed(monkeypatch):
     # Three quads at one edge.
     book = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [1, 0, 6, 7]])
-    monkeypatch.setattr(quads, "call", lambda *_, **__: (np.random.default_rng(0).random((8, 3)), book))
+    monkeypatch.setattr(quads, "begin", lambda *_, **__: Ended((np.random.default_rng(0).random((8, 3)), book)))
     vertices, faces = sphere(24)
     _, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=300))
     assert whole(found) and any("not watertight" in text for text in record.failed)

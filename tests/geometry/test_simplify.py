@@ -49,7 +49,7 @@ def test_dead_child_of_open_mesh_falls_back(monkeypatch):
     def dead(*_, **__):
         raise ChildFailed("died of SIGSEGV")
 
-    monkeypatch.setattr(simplify, "call", dead)
+    monkeypatch.setattr(simplify, "begin", dead)
     vertices, faces = plane(40)
     out, out_faces, _, report = simplify.simplify(vertices, faces, 400)
     assert report["method"] == "vertex clustering" and "SIGSEGV" in report["failed"] and 0 < len(out_faces) < len(faces)
