@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gdtool.core.child import ChildFailed, call
+from gdtool.core.child import ChildFailed, call, prepare
 from gdtool.folders.mesh import triangulated
 from gdtool.geometry.repair import compact
 from gdtool.texture.raster import owner_count
@@ -48,6 +48,8 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
 
     vertices (v, 3) finite. Charts are never mirrored and do not overlap; all have one texel density.
     """
+    for module in ("gdtool.geometry.simplify", "gdtool.texture.unwrap_charts", "gdtool.texture.unwrap"):
+        prepare(module)
     extent = float(np.ptp(vertices[np.unique(faces[faces >= 0])], 0).max())
     unit = (vertices - vertices.mean(0)) / (extent if extent > 0 else 1.0)
     label, failed = find_charts(unit, faces, seconds=request.seconds, max_cost=request.max_cost)
@@ -109,10 +111,7 @@ def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good
             if half.all() or not half.any():
                 half = np.arange(len(faces_idx)) < len(faces_idx) // 2
             for part in (faces_idx[half], faces_idx[~half]):
-                own = np.full(len(faces), -1)
-                own[part] = 0
-                name = adjacency.connected(own)[part]
-                queue.extend(part[name == n] for n in np.unique(name))
+                queue.extend(adjacency.pieces(part))
             continue
         out.append((faces_idx, corners, uv, triangles))
     if not planes_only:

@@ -46,7 +46,28 @@ class Adjacency:
         self.normals, self.count = normals, len(faces)
         # Where the two faces walk the edge in one direction (a turned face) a chart cannot go on.
         turned = edges.turned[edge_idx]
-        self.pairs, self.cost, self.crease, self.ends = (x[~turned] for x in (self.pairs, self.cost, self.crease, self.ends))
+        order = np.argsort(self.pairs[~turned][:, 0], kind="stable")
+        self.pairs, self.cost, self.crease, self.ends = (x[~turned][order] for x in (self.pairs, self.cost, self.crease, self.ends))
+        self._begin = np.searchsorted(self.pairs[:, 0], np.arange(self.count + 1))
+
+    def within(self, faces_idx: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (r,) of the pairs whose two faces are both among faces_idx (k,), and their places (r, 2) there."""
+        first, number = self._begin[faces_idx], self._begin[faces_idx + 1] - self._begin[faces_idx]
+        rows = np.repeat(first - np.cumsum(number) + number, number) + np.arange(number.sum())
+        place = np.full(self.count, -1)
+        place[faces_idx] = np.arange(len(faces_idx))
+        pairs = place[self.pairs[rows]]
+        inside = (pairs >= 0).all(1)
+        return rows[inside], pairs[inside]
+
+    def pieces(self, faces_idx: np.ndarray) -> list[np.ndarray]:
+        """Faces (k,) parted into sets that are connected among themselves."""
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.csgraph import connected_components
+
+        _, pairs = self.within(faces_idx)
+        count, name = connected_components(coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(faces_idx),) * 2), False)
+        return [faces_idx[name == i] for i in range(count)]
 
     def connected(self, label: np.ndarray) -> np.ndarray:
         """Labels (f,) such that each is one connected set of faces: sets of one label that do not touch get their own."""
@@ -144,10 +165,7 @@ def bisect(adjacency: Adjacency, faces_idx: np.ndarray) -> np.ndarray:
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
 
-    number = np.full(adjacency.count, -1)
-    number[faces_idx] = np.arange(len(faces_idx))
-    inside = (number[adjacency.pairs] >= 0).all(1)
-    pairs = number[adjacency.pairs[inside]]
+    inside, pairs = adjacency.within(faces_idx)
     # Across a crease is far: halves part there when they can.
     size = np.sqrt(adjacency.area[faces_idx])
     length = (size[pairs[:, 0]] + size[pairs[:, 1]]) / 2 * np.where(adjacency.crease[inside], 5.0, 1.0) + 1e-12

@@ -9,6 +9,7 @@ from gdtool.geometry.repair import edges_of
 from gdtool.texture.raster import owner_count
 
 _SLIM_STEPS = (4, 4, 6, 8)
+_RELIED_GAIN = 1.0  # of a round of steps, in units of what the round before it gained
 
 
 def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, max_stretch: float) -> tuple[np.ndarray | None, str]:
@@ -32,7 +33,7 @@ def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, ma
         uv = _tutte(vertices, triangles)
         if uv is None or not _upright(uv, triangles):
             return None, "folds"
-    uv = _isometric(vertices, triangles, uv, good_stretch)
+    uv = _isometric(vertices, triangles, uv, good_stretch, max_stretch)
     if stretch(vertices, triangles, uv) > max_stretch:
         return None, "stretches"
     if overlaps(uv, triangles):
@@ -118,7 +119,8 @@ def _tutte(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
     return _scaled(vertices, triangles, uv)
 
 
-def _isometric(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray, good_stretch: float) -> np.ndarray:
+def _isometric(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray, good_stretch: float, max_stretch: float) -> np.ndarray:
+    """uv after SLIM: until good_stretch, until it gains little, or until it is clear that it will not come to max_stretch."""
     import igl
 
     best = uv
@@ -133,7 +135,7 @@ def _isometric(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray, good
         if not np.isfinite(found).all() or not _upright(found, triangles):
             break
         best, now = _scaled(vertices, triangles, found), stretch(vertices, triangles, found)
-        if now < good_stretch or before - now < 2e-4:
+        if now < good_stretch or before - now < 2e-4 or now - _RELIED_GAIN * (before - now) > max_stretch:
             break
         before = now
     return best
