@@ -111,7 +111,8 @@ def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good
             if half.all() or not half.any():
                 half = np.arange(len(faces_idx)) < len(faces_idx) // 2
             for part in (faces_idx[half], faces_idx[~half]):
-                queue.extend(adjacency.pieces(part))
+                name = adjacency.pieces(part)
+                queue.extend(part[name == n] for n in range(name.max() + 1))
             continue
         out.append((faces_idx, corners, uv, triangles))
     if not planes_only:

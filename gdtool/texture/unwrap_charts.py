@@ -60,14 +60,13 @@ class Adjacency:
         inside = (pairs >= 0).all(1)
         return rows[inside], pairs[inside]
 
-    def pieces(self, faces_idx: np.ndarray) -> list[np.ndarray]:
-        """Faces (k,) parted into sets that are connected among themselves."""
+    def pieces(self, faces_idx: np.ndarray) -> np.ndarray:
+        """(k,) number, from 0 on, of the set that each of faces_idx (k,) is connected in, through faces of faces_idx alone."""
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
 
         _, pairs = self.within(faces_idx)
-        count, name = connected_components(coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(faces_idx),) * 2), False)
-        return [faces_idx[name == i] for i in range(count)]
+        return connected_components(coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(faces_idx),) * 2), False)[1]
 
     def connected(self, label: np.ndarray) -> np.ndarray:
         """Labels (f,) such that each is one connected set of faces: sets of one label that do not touch get their own."""

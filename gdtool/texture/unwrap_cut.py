@@ -77,10 +77,9 @@ def _halves(adjacency: Adjacency, chart: tuple, smallest: float, rings: bool) ->
 
 def _pieces(adjacency: Adjacency, faces_idx: np.ndarray, side: np.ndarray) -> list[np.ndarray]:
     """The connected parts of a side (k,) of faces (k,), as masks (k,)."""
-    own = np.full(adjacency.count, -1)
-    own[faces_idx[side]] = 0
-    number = np.where(side, adjacency.connected(own)[faces_idx], -1)
-    return [number == n for n in np.unique(number[side])]
+    number = np.full(len(side), -1)
+    number[side] = adjacency.pieces(faces_idx[side])
+    return [number == n for n in range(number.max() + 1)]
 
 
 def _part(chart: tuple, half: np.ndarray) -> tuple:
