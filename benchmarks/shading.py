@@ -30,7 +30,7 @@ def arguments(text: str) -> argparse.ArgumentParser:
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks"))
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--peers-python", type=Path)
-    parser.add_argument("--reference", type=int, default=256, help="samples per pixel of gdtool's reference and of Cycles' buffers")
+    parser.add_argument("--reference", type=int, default=256, help="samples per pixel of gdtool's reference; in render.py of Cycles' buffers too")
     parser.add_argument("--repeats", type=int, default=3, help="of rows that take less than 5 s; the table has the median")
     return parser
 

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from gdtool.images.io import encode_png
+
 _COMPONENT = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
 _KIND = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 
@@ -80,4 +82,13 @@ def quad(**material: Any) -> Builder:
         builder.document["materials"] = [material]
         extra = {"material": 0}
     builder.primitive(attributes, builder.add(QUAD_FACES), **extra)
+    return builder
+
+
+def with_textures(**textures: np.ndarray) -> Builder:
+    """A quad with a material `m` whose images are embedded; texture i is named by keyword order."""
+    builder = quad(name="m")
+    views = [builder.view(encode_png(image)) for image in textures.values()]
+    builder.document["images"] = [{"bufferView": view, "mimeType": "image/png"} for view in views]
+    builder.document["textures"] = [{"source": i} for i in range(len(views))]
     return builder

@@ -8,23 +8,13 @@ from gdtool.assets.gltf_read import read_gltf
 from gdtool.assets.load import load_scene
 from gdtool.assets.scene import DEFAULT_MATERIAL
 from gdtool.core.errors import InputError, ResourceError
-from gdtool.images.io import encode_png
-from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, pack, quad
+from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad, with_textures
 
 
 def area_vector(scene) -> np.ndarray:
     """Sum of the faces' area vectors: which way, and how much, a flat shape faces."""
     a, b, c = (scene.vertices[scene.faces[:, i]] for i in range(3))
     return np.cross(b - a, c - a).sum(0) / 2
-
-
-def with_textures(**textures: np.ndarray) -> Builder:
-    """A quad with a material `m` whose images are embedded; texture i is named by keyword order."""
-    builder = quad(name="m")
-    views = [builder.view(encode_png(image)) for image in textures.values()]
-    builder.document["images"] = [{"bufferView": view, "mimeType": "image/png"} for view in views]
-    builder.document["textures"] = [{"source": i} for i in range(len(views))]
-    return builder
 
 
 def test_quad(tmp_path):
@@ -222,168 +212,6 @@ def test_shared_buffers_bring_only_their_vertices(tmp_path):
     for k in range(3):
         builder.primitive({"POSITION": positions}, builder.add(np.uint16([k, k + 10, k + 20])))
     assert len(read_gltf(builder.write(tmp_path / "a.glb")).vertices) == 9
-
-
-def test_material_with_everything(tmp_path):
-    pixels = np.random.default_rng(0).integers(0, 256, (4, 4, 4), np.uint8)
-    builder = with_textures(color=pixels, orm=pixels[..., :3], grey=pixels[..., :1])
-    builder.document["extensionsUsed"] = ["KHR_texture_transform", "KHR_materials_emissive_strength", "KHR_materials_ior", "KHR_materials_specular",
-                                          "KHR_materials_unlit", "KHR_materials_clearcoat"]
-    builder.document["samplers"] = [{"magFilter": 9728, "wrapS": 33071, "wrapT": 33648}]
-    builder.document["textures"][0]["sampler"] = 0
-    builder.document["materials"] = [{
-        "name": "all", "alphaMode": "MASK", "alphaCutoff": 0.25, "doubleSided": True, "emissiveFactor": [1, 0.5, 0],
-        "pbrMetallicRoughness": {
-            "baseColorFactor": [0.1, 0.2, 0.3, 0.4], "metallicFactor": 0.5, "roughnessFactor": 0.25,
-            "baseColorTexture": {"index": 0, "extensions": {"KHR_texture_transform": {"offset": [0.5, 0.25], "rotation": 1.5, "scale": [2, 3], "texCoord": 0}}},
-            "metallicRoughnessTexture": {"index": 1}},
-        "normalTexture": {"index": 2, "scale": 0.5}, "occlusionTexture": {"index": 1, "strength": 0.75}, "emissiveTexture": {"index": 2},
-        "extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": 4}, "KHR_materials_ior": {"ior": 1.3},
-                       "KHR_materials_specular": {"specularFactor": 0.5}, "KHR_materials_unlit": {}, "KHR_materials_clearcoat": {"clearcoatFactor": 1}}}]
-    scene = read_gltf(builder.write(tmp_path / "a.glb"))
-    m = scene.materials[0]
-    assert (m.name, m.base_color, m.metallic, m.roughness) == ("all", (0.1, 0.2, 0.3, 0.4), 0.5, 0.25)
-    assert (m.alpha_mode, m.alpha_cutoff, m.double_sided, m.unlit, m.ior, m.specular) == ("MASK", 0.25, True, True, 1.3, 0.5)
-    assert m.emissive == (4, 2, 0) and m.normal_scale == 0.5 and m.occlusion_strength == 0.75
-    t = m.base_color_texture
-    assert (t.encoding, t.offset, t.rotation, t.scale) == ("srgb", (0.5, 0.25), 1.5, (2, 3))
-    assert (t.wrap_u, t.wrap_v, t.filter) == ("clamp", "mirror", "nearest")
-    np.testing.assert_array_equal(t.image, pixels)
-    assert m.metallic_roughness_texture.encoding == "linear" and m.metallic_roughness_texture.wrap_u == "repeat"
-    assert m.occlusion_texture.image is m.metallic_roughness_texture.image
-    np.testing.assert_array_equal(m.normal_texture.image, np.repeat(pixels[..., :1], 3, -1))  # grey is grey in all colours
-    assert any("KHR_materials_clearcoat" in note for note in scene.notes)
-
-
-def test_defaults_of_a_bare_material(tmp_path):
-    m = read_gltf(quad(name="bare").write(tmp_path / "a.glb")).materials[0]
-    assert (m.base_color, m.metallic, m.roughness, m.alpha_mode, m.double_sided) == ((1, 1, 1, 1), 1, 1, "OPAQUE", False)
-
-
-def test_specular_glossiness_becomes_what_it_was(tmp_path):
-    builder = quad(extensions={"KHR_materials_pbrSpecularGlossiness": {
-        "diffuseFactor": [0.5, 0.25, 0.1, 1], "specularFactor": [0.04, 0.04, 0.04], "glossinessFactor": 0.7}})
-    dielectric = read_gltf(builder.write(tmp_path / "a.glb")).materials[0]
-    np.testing.assert_allclose(dielectric.base_color, [0.5, 0.25, 0.1, 1])
-    np.testing.assert_allclose([dielectric.metallic, dielectric.roughness], [0, 0.3])
-    builder.document["materials"][0]["extensions"]["KHR_materials_pbrSpecularGlossiness"] = {
-        "diffuseFactor": [0, 0, 0, 1], "specularFactor": [0.9, 0.6, 0.3], "glossinessFactor": 0.5}
-    metal = read_gltf(builder.write(tmp_path / "a.glb")).materials[0]
-    np.testing.assert_allclose(metal.base_color[:3], [0.9, 0.6, 0.3], atol=0.01)
-    np.testing.assert_allclose([metal.metallic, metal.roughness], [1, 0.5], atol=0.01)
-
-
-def test_specular_glossiness_maps(tmp_path):
-    diffuse = np.zeros((2, 2, 4), np.uint8)
-    diffuse[0] = (188, 120, 60, 255)
-    diffuse[1] = (0, 0, 0, 255)
-    gloss = np.zeros((4, 4, 4), np.uint8)
-    gloss[:2] = (57, 57, 57, 255)  # 0.04 in sRGB, full gloss
-    gloss[2:] = (230, 200, 150, 51)
-    builder = with_textures(diffuse=diffuse, gloss=gloss)
-    builder.document["materials"][0]["extensions"] = {"KHR_materials_pbrSpecularGlossiness": {
-        "diffuseTexture": {"index": 0}, "specularGlossinessTexture": {"index": 1}}}
-    m = read_gltf(builder.write(tmp_path / "a.glb")).materials[0]
-    color, surface = m.base_color_texture.image.astype(int), m.metallic_roughness_texture.image.astype(int)
-    assert color.shape == (4, 4, 4)
-    np.testing.assert_allclose(color[0, 0], [188, 120, 60, 255], atol=2)
-    np.testing.assert_allclose(color[3, 0], [230, 200, 150, 255], atol=3)
-    np.testing.assert_allclose(surface[0, 0, 1:], [0, 0], atol=3)
-    np.testing.assert_allclose(surface[3, 0, 1:], [204, 255], atol=3)
-
-
-def edited(change) -> bytes:
-    """A quad whose document `change` has edited."""
-    builder = quad(name="m")
-    change(builder)
-    return builder.glb()
-
-
-def set_in(*path, value):
-    def change(builder: Builder) -> None:
-        item = builder.document
-        for key in path[:-1]:
-            item = item[key]
-        item[path[-1]] = value
-    return change
-
-
-def nan_vertex(builder: Builder) -> None:
-    bad = QUAD.copy()
-    bad[2, 1] = np.nan
-    builder.document["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = builder.add(bad)
-
-
-def vertex_count(builder: Builder) -> None:
-    builder.document["meshes"][0]["primitives"][0]["attributes"]["NORMAL"] = builder.add(QUAD[:3])
-
-
-def index_out_of_range(builder: Builder) -> None:
-    builder.document["meshes"][0]["primitives"][0]["indices"] = builder.add(np.uint16([0, 1, 4]))
-
-
-@pytest.mark.parametrize(("content", "fact"), [
-    (edited(set_in("extensionsRequired", value=["KHR_texture_basisu"])), "KHR_texture_basisu"),
-    (edited(set_in("nodes", value=[{"mesh": 0, "children": [1]}, {"children": [0]}])), "cycle"),
-    (edited(set_in("nodes", value=[{"mesh": 0, "children": [0]}])), "tree"),
-    (edited(set_in("nodes", value=[{"children": [2]}, {"children": [2]}, {"mesh": 0}])), "two parents"),
-    (edited(set_in("nodes", 0, "children", value=[7])), "refers to node 7"),
-    (edited(set_in("nodes", 0, "rotation", value=[0, 0, 0, 0])), "quaternion"),
-    (edited(set_in("nodes", 0, "mesh", value=3)), "refers to mesh 3"),
-    (edited(set_in("asset", "version", value="1.0")), "glTF 1.0"),
-    (edited(set_in("asset", value={})), "version"),
-    (edited(set_in("accessors", 0, "count", value=5)), "past the end"),
-    (edited(set_in("accessors", 0, "byteOffset", value=8)), "past the end"),
-    (edited(set_in("accessors", 0, "count", value="four")), "accessors"),
-    (edited(set_in("accessors", 0, "componentType", value=5124)), "accessors"),
-    (edited(set_in("accessors", 0, "bufferView", value=99)), "buffer view 99"),
-    (edited(set_in("bufferViews", 0, "byteLength", value=10_000)), "past the end of its buffer"),
-    (edited(set_in("bufferViews", 0, "buffer", value=1)), "buffer 1"),
-    (edited(set_in("meshes", 0, "primitives", 0, "material", value=4)), "material 4"),
-    (edited(set_in("materials", 0, "normalTexture", value={"index": 0})), "texture 0"),
-    (edited(nan_vertex), "vertex 2 is not finite"),
-    (edited(vertex_count), "NORMAL has 3"),
-    (edited(index_out_of_range), "refers to vertex 4"),
-    (edited(set_in("nodes", value=[{}])), "has no faces"),
-    (quad().glb()[:-8], "says it has"),
-    (quad().glb() + b"\0\0\0\0", "says it has"),
-    (quad().glb()[:15], "cut short"),
-    (b"glTF" + b"\1\0\0\0" + quad().glb()[8:], "binary glTF 1"),
-    (pack(b"{]", b""), "is not glTF"),
-    (pack(b"[" * 100_000, b""), "is not"),
-    (b"", "is not glTF"),
-    (b"\xff\xfe{}", "is not glTF"),
-])
-def test_what_is_wrong_is_named(tmp_path, content, fact):
-    path = tmp_path / "x.glb"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=fact) as caught:
-        load_scene(path)
-    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_an_accessor_beyond_memory_is_a_resource_error(tmp_path):
-    builder = quad()
-    del builder.document["accessors"][0]["bufferView"]
-    builder.document["accessors"][0]["count"] = 2**31
-    builder.document["accessors"][0]["type"] = "MAT4"
-    with pytest.raises(ResourceError, match="GiB"):
-        load_scene(builder.write(tmp_path / "x.glb"))
-
-
-def test_texture_coordinates_that_no_mesh_has(tmp_path):
-    builder = with_textures(color=np.zeros((2, 2, 3), np.uint8))
-    builder.document["materials"][0]["pbrMetallicRoughness"] = {"baseColorTexture": {"index": 0, "texCoord": 3}}
-    with pytest.raises(InputError, match="texture coordinates 3"):
-        load_scene(builder.write(tmp_path / "x.glb"))
-
-
-def test_a_broken_texture_is_named(tmp_path):
-    builder = quad(pbrMetallicRoughness={"baseColorTexture": {"index": 0}})
-    builder.document["images"] = [{"bufferView": builder.view(b"no picture here, just words of text"), "mimeType": "image/png"}]
-    builder.document["textures"] = [{"source": 0}]
-    with pytest.raises(InputError, match="x.glb: image 0: is not an image"):
-        load_scene(builder.write(tmp_path / "x.glb"))
 
 
 def test_draco(tmp_path):
