@@ -8,7 +8,8 @@ from gdtool.assets.gltf_read import read_gltf
 from gdtool.assets.load import load_scene
 from gdtool.assets.scene import DEFAULT_MATERIAL
 from gdtool.core.errors import InputError, ResourceError
-from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad, with_textures
+from gdtool.images.io import encode_png
+from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad
 
 
 def area_vector(scene) -> np.ndarray:
