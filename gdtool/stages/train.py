@@ -47,7 +47,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.diffusion.curve import draw_curve
     from gdtool.diffusion.data import Objects, decode_dataset, from_bytes
     from gdtool.diffusion.model import parameter_count
-    from gdtool.diffusion.report import card, validation_grid
+    from gdtool.diffusion.report import append_validation, card, validation
     from gdtool.diffusion.weights import save_model
     from gdtool.core.kinds import ModelContent
     from gdtool.images.io import write_png
@@ -66,8 +66,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     def validate(state) -> None:
         if held:
-            grid = validation_grid(state, shown, train_config.precision)
+            grid, psnr = validation(state, shown, train_config.precision)
             write_png(out.workspace / "validation" / f"step_{state.step:06d}.png", grid)
+            append_validation(out.workspace / "validation.csv", state.step, state.seconds, psnr)
 
     distributed.start()
     order = {"model": model_config, "train": train_config, "start": start and start.path, "workspace": out.workspace.absolute(), "used": used,
@@ -80,6 +81,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     save_model(out.path, model_config, state.average)
     shutil.copyfile(out.workspace / "loss.csv", out.path("loss.csv"))
     write_png(out.path("loss.png"), draw_curve(out.workspace / "loss.csv"))
+    if held:
+        shutil.copyfile(out.workspace / "validation.csv", out.path("validation.csv"))
     for picture in sorted((out.workspace / "validation").glob("*.png")):
         shutil.copyfile(picture, out.path(f"validation/{picture.name}"))
     every = range(0, used, max(used // 4000, 1))

@@ -34,6 +34,8 @@ def test_train_writes_a_model_that_validates_and_then_skips(gdtool, spheres, tmp
     rows = list(csv.DictReader(open(model / "loss.csv")))
     assert [int(row["step"]) for row in rows] == [1, 2, 3, 4] and all(float(row["loss"]) > 0 for row in rows)
     assert (model / "validation" / "step_000004.png").stat().st_size > 1000
+    told = list(csv.DictReader(open(model / "validation.csv")))
+    assert [row["step"] for row in told] == ["4"] and 0 < float(told[0]["color"]) < 60 and float(told[0]["seconds"]) > 0
     assert (model / "loss.png").is_file() and "spheres" not in (model / "card.md").read_text()
     assert not list(model.glob("**/*.pt")) and load_file(model / "model.safetensors")
     assert gdtool("validate", model).returncode == 0
