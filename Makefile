@@ -106,6 +106,7 @@ model: data
 	$(BIN)/gdtool train $(DATA)/objects --minutes $(MINUTES) -o $(DATA)/small
 	$(BIN)/gdtool train $(DATA)/objects --start $(DATA)/small --size 128 --config benchmarks/model_training.json --steps $(STEPS) -o $(DATA)/model
 	$(BIN)/python benchmarks/model_quality.py $(DATA)/held_out --model $(DATA)/model --train $(DATA)/objects -o docs/benchmarks --install
+	$(BIN)/python benchmarks/model_curve.py $(DATA)/held_out --model $(DATA)/model
 	$(BIN)/python benchmarks/model_sheets.py $(DATA)/held_out ../shared/assets/images
 
 # The bundled model's surfaces of held-out objects, and what the parts of the method are worth: nine small trainings, an hour or two.

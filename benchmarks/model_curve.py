@@ -1,0 +1,102 @@
+"""Quality on held-out objects against the minutes of training that led to it: one point a model along its chain of starts.
+
+    python benchmarks/model_curve.py out/model/held_out --model out/model/model -o docs/benchmarks
+
+A model that was trained with --start goes back to the one it began with, and so on: the manifests say so, and for how long each
+was trained. Figures are those of model_quality.py (five unseen views), at each model's own size, in one step of sampling. The
+straight line through PSNR over the logarithm of the minutes is drawn on to ten times the longest training.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from measure import machine, number, say, table
+from model_quality import DEFAULT_MODEL, figures, views_folders
+
+from gdtool.cameras import rig
+from gdtool.core.folder import open_folder
+from gdtool.diffusion.data import decode_object
+from gdtool.diffusion.encoding import BACKGROUND
+from gdtool.diffusion.result import views_from_images
+from gdtool.diffusion.sampling import sample_images
+from gdtool.diffusion.weights import load_model
+from gdtool.folders.views import Views, read_views
+from gdtool.images.metrics import resized_views
+
+SHOWN = ("color_psnr_frame", "color_ssim_frame", "albedo_psnr_frame", "normal_degrees", "depth_error", "silhouette_overlap")
+
+
+def chain(path: Path) -> list[tuple[Path, float]]:
+    """Model folders from the first that was trained from nothing to this one, with the minutes of training up to each."""
+    folder = open_folder(path, ("model",), check=False)
+    start = next((Path(path, entry.path) for entry in folder.manifest.inputs if entry.role == "start"), None)
+    before = chain(start) if start is not None and start.exists() else []
+    return [*before, (path, (before[-1][1] if before else 0.0) + float(folder.content.report["training_minutes"]))]
+
+
+def quality(path: Path, folders: list) -> dict[str, float]:
+    """Mean figures of a model over held-out objects, and its size."""
+    model = load_model(path)
+    config, rows = model.config, []
+    cameras = {camera.name: camera for camera in rig("six", config.image_size)}
+    for seed, folder in enumerate(folders):
+        truth = read_views(folder)
+        truth = Views([cameras[name] for name in truth.names], *resized_views(truth.images, truth.mask, config.image_size, config.image_size))
+        rgba = torch.from_numpy(decode_object(folder, config)[1][0])[None]
+        images = sample_images(model, rgba, steps=1, seed=seed)
+        views = views_from_images({d: x[0] for d, x in images.items()}, [cameras[n] for n in config.views], BACKGROUND[config.backgrounds[0]],
+                                  config.domains, (0.5 + 0.5 * rgba[0, 3]).numpy())
+        rows.append(figures(views, truth))
+    return {"size": config.image_size, **{key: float(np.nanmean([row[key] for row in rows])) for key in SHOWN}}
+
+
+def draw(path: Path, points: list[dict]) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axis = pyplot.subplots(figsize=(6, 4))
+    minutes, psnr = (np.array([point[key] for point in points]) for key in ("minutes", "color_psnr_frame"))
+    axis.plot(minutes, psnr, "o")
+    for point in points:
+        axis.annotate(f"{point['size']} px", (point["minutes"], point["color_psnr_frame"]), textcoords="offset points", xytext=(6, -10), fontsize=8)
+    if len(points) > 1:
+        slope, offset = np.polyfit(np.log10(minutes), psnr, 1)
+        on = np.array([minutes.min(), 10 * minutes.max()])
+        axis.plot(on, slope * np.log10(on) + offset, "--", linewidth=0.8, label=f"{slope:.2f} dB for ten times the training")
+        axis.legend()
+    axis.set(xscale="log", xlabel="minutes of training", ylabel="color PSNR, five unseen views, dB")
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    pyplot.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("held_out", nargs="+", type=Path)
+    parser.add_argument("--model", type=Path, default=DEFAULT_MODEL)
+    parser.add_argument("--limit", type=int, default=100, help="held-out objects at most")
+    parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks"))
+    arguments = parser.parse_args()
+    folders, points = views_folders(arguments.held_out)[: arguments.limit], []
+    for path, minutes in chain(arguments.model):
+        points.append({"minutes": minutes, **quality(path, folders)})
+        say(f"  {path}: {minutes:.0f} minutes")
+    rows = [[number(point["minutes"]), *(number(point[key]) for key in ("size", *SHOWN))] for point in points]
+    text = "\n".join(["# Quality against minutes of training", "", f"{len(folders)} held-out objects, one step of sampling, trained and measured on {machine()}.", "",
+                      table(["minutes", "px", *(key.replace("_", " ") for key in SHOWN)], rows), "", "![PSNR against minutes](model_curve.png)", ""])
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    (arguments.output / "model_curve.json").write_text(json.dumps(points, indent=1) + "\n")
+    (arguments.output / "model_curve.md").write_text(text)
+    draw(arguments.output / "model_curve.png", points)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
