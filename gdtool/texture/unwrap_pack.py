@@ -8,8 +8,12 @@ from gdtool.geometry.repair import edges_of
 from gdtool.texture.raster import owner_count
 
 _FINE = 3  # cells of the supersampled mask in a cell of the square
+_COARSE, _COARSE_OF_MANY = 160, 90  # cells of the square's side in which orders are tried
+_FINER, _SETTLED, _ROUNDS = 4, 3, 12  # cells of the fine grid in one of the coarse; layouts that are tightened, by so many rounds
+_NEAR = sorted(((dx, dy) for dx in range(-3, 4) for dy in range(-3, 4)), key=lambda d: d[0] ** 2 + d[1] ** 2)
+_DENSITY = 0.66  # share of a square of so many cells that the charts would fill
 _MOST_BY_RASTER = 160
-_MANY = 48  # with more charts than these a coarser grid and fewer tries bound the time
+_MANY = 48  # with more charts than these a coarser grid bounds the time
 _GAIN, _GAIN_PER_CHART = 0.02, 0.002
 _TRIES = 1500  # charts placed in search of better orders
 
@@ -73,6 +77,17 @@ def _walked(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return np.repeat(one, steps, 0) + along[:, None] * np.repeat(two - one, steps, 0)
 
 
+def _turned(uv: np.ndarray, triangles: np.ndarray, cells_per_unit: float, gap: float) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """A chart's mask with half the gap around it at each quarter turn, and its uv (v, 2) in cells of that mask."""
+    mask = _mask(uv, triangles, cells_per_unit, gap / 2)
+    h, w = mask.shape
+    at = uv * cells_per_unit + gap / 2
+    # As np.rot90 turns the mask: its rows are v, its columns u.
+    u, v = at.T
+    return ([np.rot90(mask, quarter) for quarter in range(4)],
+            [at, np.stack([v, w - u], -1), np.stack([w - u, h - v], -1), np.stack([h - v, u], -1)])
+
+
 class _Shapes:
     """Charts as masks at one resolution, at each quarter turn, as sets of bits to test places with.
 
@@ -84,23 +99,17 @@ class _Shapes:
     def __init__(self, boxed: list, cells_per_unit: float, gap: float, side: int):
         self.stride, self.uv, self.shapes, self.runs, self.bits = side + 1, [], [], [], []
         for uv, triangles in boxed:
-            mask = _mask(uv, triangles, cells_per_unit, gap / 2)
-            h, w = mask.shape
-            at = uv * cells_per_unit + gap / 2
-            # As np.rot90 turns the mask: its rows are v, its columns u.
-            u, v = at.T
-            masks = [np.rot90(mask, quarter) for quarter in range(4)]
-            self.uv.append([at, np.stack([v, w - u], -1), np.stack([w - u, h - v], -1), np.stack([h - v, u], -1)])
+            masks, at = _turned(uv, triangles, cells_per_unit, gap)
+            self.uv.append(at)
             self.shapes.append([turned.shape for turned in masks])
-            small = max(h, w) <= side  # place() passes over the others
+            small = max(masks[0].shape) <= side  # place() passes over the others
             self.runs.append([_runs(turned, self.stride) if small else [] for turned in masks])
             self.bits.append([_bits(turned, self.stride) if small else 0 for turned in masks])
 
-    def place(self, order: list[int], side: int, contact: float, turns: list[int] | None = None) -> list[tuple[int, int, int]] | None:
+    def place(self, order: list[int], side: int, contact: float) -> list[tuple[int, int, int]] | None:
         """(turn, x, y) of each chart in a square of so many cells, or None when one finds no place.
 
-        Each goes where it stays low; contact weighs touching others and the walls against that. turns: the only one
-        to try for each chart.
+        Each goes where it stays low; contact weighs touching others and the walls against that.
         """
         stride, taken = self.stride, 0
         out: list[tuple[int, int, int] | None] = [None] * len(order)
@@ -110,7 +119,7 @@ class _Shapes:
             walls = taken << 1 | taken >> 1 | taken << stride | taken >> stride | border
             windows = [taken]  # of level k: from here on 2**k cells of the row, any taken
             best = None
-            for turn in range(4) if turns is None else [turns[i]]:
+            for turn in range(4):
                 h, w = self.shapes[i][turn]
                 if max(h, w) > side:
                     continue
@@ -187,8 +196,8 @@ def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float)
         if not 1 < len(charts) <= _MOST_BY_RASTER or any(charts is earlier for earlier in variants[:i]):
             continue
         boxed, area = _boxed(charts)
-        ranked = _search(boxed, area, gap, 160, 0, 0.3)
-        share = ranked[0][0] if ranked else 0.0
+        ranked = _search(boxed, area, gap, _COARSE, 0, 0.3)
+        share = _DENSITY * (_COARSE / ranked[0][0]) ** 2 if ranked else 0.0
         more = len(charts) - len(variants[best])
         if share > best_share + (_GAIN + _GAIN_PER_CHART * more if best_share else 0.0):
             best, best_share = i, share
@@ -202,11 +211,11 @@ def _boxed(charts: list) -> tuple[list, float]:
     return boxed, max(area, 1e-300)
 
 
-def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, cells: int = 512) -> tuple[list[np.ndarray], float]:
+def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float) -> tuple[list[np.ndarray], float]:
     """Places for charts: their uv (v, 2) in [0, 1], v up, all at one scale, and that scale (uv per unit of surface).
 
     charts: uv at the scale of the surface and triangles of each. gap: smallest distance between charts, and half of it
-    to the border, in uv. Several orders and weights are tried on a coarse grid, the best of them on a fine one; the
+    to the border, in uv. Several orders and weights are tried on a coarse grid, the best of them tightened on a fine one; the
     charts keep their resolution, what is sought is the smallest square that holds them.
     """
     boxed, area = _boxed(charts)
@@ -215,38 +224,66 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, cells: int = 5
         return [boxed[0][0] * scale + gap], scale
     if len(charts) > _MOST_BY_RASTER:
         return _shelves(boxed, gap)
-    many = len(charts) > _MANY
-    cells = min(cells, 288) if many else cells
+    coarse = _COARSE_OF_MANY if len(charts) > _MANY else _COARSE
     tries = max(_TRIES // len(charts), 8)
     for lowest, tried in ((0.45, tries), (0.3, tries), (0.12, 0)):
-        ranked = _search(boxed, area, gap, cells * 5 // 16, tried, lowest)
+        ranked = _search(boxed, area, gap, coarse, tried, lowest)
         if ranked:
             break
     else:
         return _shelves(boxed, gap)
-    share = ranked[0][0]
-    # At this resolution the square that the coarse grid found has `cells` cells a side.
-    side_most = int(cells * 1.06)
-    shapes = _Shapes(boxed, cells * (share / area) ** 0.5, gap * side_most, side_most)
-    best, best_side = None, side_most + 1
-    for _, order, contact, turns in ranked[:2 if many else 4]:
-        side = min(best_side - 1, side_most) if best is not None else int(cells * 0.98)
-        failed = 0
-        while side <= side_most and side < best_side:
-            found = shapes.place(order, side, contact, turns)
-            if found is not None:
-                best, best_side, side = found, side, side - max(cells // 128, 1)
-                if failed:
-                    break
-            elif best is not None:
+    best, best_scale = None, 0.0
+    for side, _, _, layout in ranked[:_SETTLED]:
+        places, scale = _settled(boxed, (_DENSITY / area) ** 0.5 * coarse, side, layout, gap)
+        if scale > best_scale:
+            best, best_scale = places, scale
+    return best, best_scale
+
+
+def _settled(boxed: list, cells_per_unit: float, side: int, layout: list[tuple[int, np.ndarray]], gap: float) -> tuple[list[np.ndarray], float]:
+    """A layout of a coarse grid (turn, and where its first vertex is, of each chart) tightened on a grid _FINER times as fine:
+    every chart goes up and to the left as far as the others let it, again and again, then the square is cut to what is
+    used. As pack() returns it."""
+    fine, most = cells_per_unit * _FINER, side * _FINER
+    stride = most + 1
+    bits, shapes, uvs, place = [], [], [], []
+    taken = 0
+    for (uv, triangles), (turn, first) in zip(boxed, layout, strict=True):
+        masks, at = _turned(uv, triangles, fine, gap * most)
+        own, (h, w) = _bits(masks[turn], stride), masks[turn].shape
+        x, y = np.rint(first * _FINER - at[turn][0]).astype(int).tolist()
+        # Rounded to cells it may touch another or the square's border: then it stands beside.
+        for dx, dy in _NEAR:
+            if 0 <= x + dx <= most - w and 0 <= y + dy <= most - h and not own << (y + dy) * stride + x + dx & taken:
                 break
-            else:
-                failed += 1
-                side += max(cells // 100, 1)
-    if best is None:
-        return _shelves(boxed, gap)
-    places = [(shapes.uv[i][turn] + [x, y]) / best_side for i, (turn, x, y) in enumerate(best)]
-    return places, (share / area) ** 0.5 * cells / best_side
+        else:
+            laid = [_turned(uv, triangles, cells_per_unit, 0)[1][turn] for (uv, triangles), (turn, _) in zip(boxed, layout, strict=True)]
+            return [(uv - uv[0] + first) / side for uv, (_, first) in zip(laid, layout, strict=True)], cells_per_unit / side
+        place.append([x + dx, y + dy])
+        taken |= own << (y + dy) * stride + x + dx
+        bits.append(own)
+        shapes.append((h, w))
+        uvs.append(at[turn])
+    for turn in range(_ROUNDS):
+        axis, still = 1 - turn % 2, True
+        for i in sorted(range(len(bits)), key=lambda k: place[k][axis]):
+            x, y = place[i]
+            others = taken ^ bits[i] << y * stride + x
+            step = 1 << 5
+            while step:
+                near = [x, y]
+                near[axis] -= step
+                if near[axis] >= 0 and not bits[i] << near[1] * stride + near[0] & others:
+                    x, y = near
+                    still = False
+                else:
+                    step //= 2
+            place[i] = [x, y]
+            taken = others | bits[i] << y * stride + x
+        if still and turn:
+            break
+    used = max(max(x + w, y + h) for (x, y), (h, w) in zip(place, shapes, strict=True))
+    return [(uv + at) / used for uv, at in zip(uvs, place, strict=True)], fine / used
 
 
 def _first_ways(boxed: list) -> list[tuple[list[int], float]]:
@@ -256,14 +293,15 @@ def _first_ways(boxed: list) -> list[tuple[list[int], float]]:
     return [(np.argsort(-np.array(rank), kind="stable").tolist(), contact) for contact in (0.5, 1.0, 0.3) for rank in (size, longest)]
 
 
-def _search(boxed: list, area: float, gap: float, cells: int, tries: int, lowest: float) -> list[tuple[float, list[int], float, list[int]]]:
-    """Ways to pack on a coarse grid, best first: share of the square, order, weight of contact, turn of each chart.
+def _search(boxed: list, area: float, gap: float, cells: int, tries: int, lowest: float) -> list[tuple[int, list[int], float, list]]:
+    """Ways to pack on a coarse grid, best first: side of the square, order, weight of contact, turn and place (x, y) of the first
+    vertex of each chart, in cells.
 
     None that stays below the share `lowest`. From the best of a few orders on, small changes of the best are tried.
     """
-    side_most = int(cells * (0.66 / lowest) ** 0.5)
-    shapes = _Shapes(boxed, cells * (0.66 / area) ** 0.5, gap * cells, side_most)
-    ranked: list[tuple[int, list[int], float, list[int]]] = []
+    side_most = int(cells * (_DENSITY / lowest) ** 0.5)
+    shapes = _Shapes(boxed, cells * (_DENSITY / area) ** 0.5, gap * side_most, side_most)
+    ranked: list[tuple[int, list[int], float, list]] = []
 
     def shrunk(order: list[int], contact: float, side: int, found: list) -> None:
         step = max(int(0.03 * cells), 2)
@@ -273,7 +311,7 @@ def _search(boxed: list, area: float, gap: float, cells: int, tries: int, lowest
                 step //= 2
             else:
                 side, found = side - step, smaller
-        ranked.append((side, order, contact, [placed[0] for placed in found]))
+        ranked.append((side, order, contact, found))
         ranked.sort(key=lambda way: way[0])
 
     for turn, (order, contact) in enumerate(_first_ways(boxed)):
@@ -296,7 +334,8 @@ def _search(boxed: list, area: float, gap: float, cells: int, tries: int, lowest
         found = shapes.place(order, side - 1, contact)
         if found is not None:
             shrunk(order, contact, side - 1, found)
-    return [(0.66 * (cells / side) ** 2, *way) for side, *way in ranked]
+    return [(side, order, contact, [(turn, shapes.uv[i][turn][0] + [x, y]) for i, (turn, x, y) in enumerate(found)])
+            for side, order, contact, found in ranked]
 
 
 def _shelves(boxed: list, gap: float) -> tuple[list[np.ndarray], float]:
