@@ -1,6 +1,6 @@
 """How near `gdtool reconstruct` comes to the truth, on exact and on disturbed views, beside what else a user could run.
 
-    python benchmarks/reconstruct.py                    public models in --assets and procedural ones: a quarter of an hour
+    python benchmarks/reconstruct.py                    public models in --assets and procedural ones: an hour
     python benchmarks/reconstruct.py --all              every model with five seeds at three wavelengths: hours
     python benchmarks/reconstruct.py --models DIR --limit 12 --procedural 0
     python benchmarks/reconstruct.py --sheet /tmp/objects.png --only bunny,spot --cases clean --budgets '' -o /tmp/report
