@@ -15,6 +15,12 @@ from torch import nn
 from gdtool.diffusion.config import DOMAINS
 
 
+def learned_position(count: int, width: int) -> nn.Parameter:
+    """(count, width), to begin with noise. Not drawn on the meta device: that alone would load PyTorch's compiler, a second."""
+    shape = torch.empty(count, width)
+    return nn.Parameter(shape if shape.is_meta else 0.1 * torch.randn(count, width))
+
+
 @dataclass(frozen=True)
 class Layout:
     """Which images a batch holds: b objects, each with the same domains (indices into DOMAINS) and k views."""
@@ -192,7 +198,7 @@ class Transformer(nn.Module):
         super().__init__()
         self.norm = nn.GroupNorm(groups, width, eps=1e-6)
         self.proj_in = nn.Conv2d(width, width, 1)
-        self.position = nn.Parameter(torch.randn(side * side, width) * 0.1) if side else None
+        self.position = learned_position(side * side, width) if side else None
         self.transformer_blocks = nn.ModuleList([
             TransformerBlock(width, heads, context_width, config.feed_forward, config.multi_view, config.cross_domain)])
         self.proj_out = nn.Conv2d(width, width, 1)
@@ -217,7 +223,7 @@ class RowAttention(nn.Module):
     def __init__(self, width: int, heads: int, side: int, groups: int):
         super().__init__()
         self.norm = nn.GroupNorm(groups, width, eps=1e-6)
-        self.position = nn.Parameter(torch.randn(side, width) * 0.1)
+        self.position = learned_position(side, width)
         self.attn = Attention(width, heads)
         nn.init.zeros_(self.attn.to_out[0].weight)
         nn.init.zeros_(self.attn.to_out[0].bias)

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from gdtool.core.errors import ResourceError
-from gdtool.diffusion.attention import Attention, FeedForward
+from gdtool.diffusion.attention import Attention, FeedForward, learned_position
 from gdtool.diffusion.config import ModelConfig
 
 
@@ -34,7 +34,7 @@ class PatchEncoder(nn.Module):
         width, p = config.encoder_width, config.encoder_patch
         self.patch = p
         self.embed = nn.Linear(4 * p * p, width)
-        self.position = nn.Parameter(torch.randn((config.image_size // p) ** 2, width) * 0.1)
+        self.position = learned_position((config.image_size // p) ** 2, width)
         self.layers = nn.ModuleList(EncoderLayer(width, max(width // 64, 1)) for _ in range(config.encoder_layers))
         self.norm = nn.LayerNorm(width)
 

@@ -26,7 +26,7 @@ def class_labels(config: ModelConfig) -> torch.Tensor:
     if config.convention == "wonder3d":
         return wonder3d.class_labels(config)
     azimuth = dict(SIX_VIEWS)
-    raw = torch.zeros(len(DOMAINS), len(config.views), 3 + len(DOMAINS))
+    raw = torch.zeros(len(DOMAINS), len(config.views), 3 + len(DOMAINS), device="cpu")
     for k, view in enumerate(config.views):
         raw[:, k, 2] = math.radians(azimuth[view])
     for i in range(len(DOMAINS)):

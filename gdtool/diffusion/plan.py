@@ -87,7 +87,7 @@ def structure(config: ModelConfig, device: str = "meta") -> Model:
         else:
             codec = PatchCodec(config)
         encoder = PatchEncoder(config) if config.encoder == "patch" else torch.nn.Identity()
-        return Model(config, codec, encoder)
+        return Model(config, codec, encoder).to(device)
 
 
 def step_cost(config: ModelConfig, domains: int, views: int, objects: int, *, fused: bool, dtype=torch.bfloat16, device: str = "meta") -> dict[str, float]:

@@ -11,13 +11,13 @@ from gdtool.diffusion.config import ModelConfig
 
 
 def signal_and_noise(config: ModelConfig) -> tuple[torch.Tensor, torch.Tensor]:
-    """a and s for every timestep, (timesteps,) float32 each."""
+    """a and s for every timestep, (timesteps,) float32 each; on the processor, also where a model is built on the meta device."""
     n = config.timesteps
     if config.noise_schedule == "scaled_linear":  # Stable Diffusion 1
-        beta = torch.linspace(0.00085**0.5, 0.012**0.5, n, dtype=torch.float64) ** 2
+        beta = torch.linspace(0.00085**0.5, 0.012**0.5, n, dtype=torch.float64, device="cpu") ** 2
         square = torch.cumprod(1 - beta, 0)
     else:  # Nichol & Dhariwal 2021, without their offset; ends in pure noise, so sampling starts where training was
-        square = torch.cos((torch.arange(n, dtype=torch.float64) + 1) / n * math.pi / 2) ** 2
+        square = torch.cos((torch.arange(n, dtype=torch.float64, device="cpu") + 1) / n * math.pi / 2) ** 2
     return square.sqrt().float(), (1 - square).sqrt().float()
 
 

@@ -33,7 +33,7 @@ def recognises(folder: Path) -> bool:
 
 def class_labels(config: ModelConfig) -> torch.Tensor:
     """(domains, views, 10): sines, then cosines. Domains that it has not get the switch (0, 0)."""
-    raw = torch.tensor([[[0.0, ELEVATION[view], AZIMUTH[view], *SWITCH.get(domain, (0.0, 0.0))] for view in config.views] for domain in DOMAINS])
+    raw = torch.tensor([[[0.0, ELEVATION[view], AZIMUTH[view], *SWITCH.get(domain, (0.0, 0.0))] for view in config.views] for domain in DOMAINS], device="cpu")
     return torch.cat([raw.sin(), raw.cos()], -1)
 
 

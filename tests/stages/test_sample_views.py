@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 
 import msgspec
 import numpy as np
@@ -168,3 +170,10 @@ def test_a_picture_unlike_the_training_is_sampled_with_a_warning(gdtool, picture
     write_manifest(model)
     result = sample(gdtool, "ball.png", "--model", model, "-o", "again")
     assert result.returncode == 0 and "width over height of the subject is 1.09, in training 2 to 3" in result.stderr
+
+
+def test_loading_a_model_leaves_pytorchs_compiler_out():
+    # It takes a second to import, and one operation on the meta device, where shapes are checked, can do that.
+    code = ("import sys; from pathlib import Path; import gdtool.models; from gdtool.diffusion.weights import load_model; "
+            "load_model(Path(gdtool.models.__file__).parent / 'default'); print([m for m in ('torch._dynamo', 'sympy') if m in sys.modules])")
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
