@@ -78,7 +78,7 @@ def by_model(records: list[dict], case: str) -> str:
 
 
 def by_budget(records: list[dict]) -> str:
-    """Every --budget beside the best peer that was done by then, medians over the cases that were run with budgets."""
+    """Every --budget beside the best peer that was done by then in all of the same cases; medians over them."""
     rows = []
     for case in ("clean", "perturbed"):
         budgets = sorted({limit for r in records if kind(r) == case and (limit := limit_of(r["method"])) is not None})
@@ -86,7 +86,8 @@ def by_budget(records: list[dict]) -> str:
             mine = [r for r in records if kind(r) == case and limit_of(r["method"]) == budget]
             cases = {(r["model"], r["case"]) for r in mine}
             ready = [r for r in records if (r["model"], r["case"]) in cases and limit_of(r["method"]) is None and r.get("seconds", 1e9) <= budget]
-            best, theirs = best_peer([r for r in ready if not r["method"].startswith(OURS)])
+            done = {m for m in {r["method"] for r in ready} if len({(r["model"], r["case"]) for r in ready if r["method"] == m}) == len(cases)}
+            best, theirs = best_peer([r for r in ready if r["method"] in done and not r["method"].startswith(OURS)])
             own, slowest = middle(mine, "distance"), max((r.get("seconds", 0.0) for r in mine), default=0.0)
             rows.append([f"{case}, {budget:g} s", figure(mine, "distance", 1e3), figure(mine, "iou", 1), number(slowest),
                          number(theirs * 1e3) if best else "–", best, "" if own is None or theirs is None else "yes" if own <= theirs else "NO"])
