@@ -54,7 +54,8 @@ bench-materials: venv
 	$(BIN)/python benchmarks/materials.py $(ARGS)
 
 # Reconstruction beside its peers, on public models in ../shared/assets (where there are any) and procedural objects: an hour
-# on two quiet cores, and it goes on where it was. ARGS=--all for every disturbance and budget of every model (hours), ARGS="--models DIR" for models of your own.
+# on two quiet cores, begun for a quarter of it each time: it goes on where it was. ARGS=--all for every disturbance and budget of
+# every model (hours), ARGS="--models DIR" for models of your own.
 bench-reconstruct: venv
 	$(BIN)/python benchmarks/reconstruct.py $(ARGS)
 

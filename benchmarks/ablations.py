@@ -3,9 +3,9 @@
     python benchmarks/ablations.py out/model/objects --held-out out/model/held_out -o docs/benchmarks
 
 Every variant is `gdtool train --ablation` at 64 px on the same objects in the same number of steps, for each seed, as
-benchmarks/model_training.json says but that all steps see all six domains, since supervision by rendering needs the maps together. Each model samples the held-out objects'
-pictures (front view) in one step and in eight; consistency (gdtool/diffusion/consistency.py: no truth needed) and the error over
-the five unseen views (model_quality.py) are means over the objects, then mean ± standard deviation over the seeds. The last
+benchmarks/model_training.json says but that all steps see all six domains, since supervision by rendering needs the maps
+together. Each model samples the held-out objects' pictures (front view) in one step and in eight; consistency
+(gdtool/diffusion/consistency.py: no truth needed) and the error over the five unseen views (model_quality.py) are means over the objects, then mean ± standard deviation over the seeds. The last
 columns are paired: the variant's figure less the whole method's of the same seed. Trainings are kept in --work and go on
 where they were; they may share the machine, only their seconds suffer. Some ten minutes a training on two cores.
 """
@@ -19,17 +19,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from measure import gdtool, machine, say, table
-from model_quality import figures, views_folders
+from model_quality import figures, sampled_views, true_views, views_folders
 
-from gdtool.cameras import rig
 from gdtool.diffusion.consistency import consistency
 from gdtool.diffusion.data import decode_object
-from gdtool.diffusion.encoding import BACKGROUND
-from gdtool.diffusion.result import views_from_images
-from gdtool.diffusion.sampling import sample_images
 from gdtool.diffusion.weights import load_model
-from gdtool.folders.views import Views, read_views
-from gdtool.images.metrics import resized_views
 
 VARIANTS = {"none": "the whole method", "no_cross_domain": "no attention across domains", "no_pbr": "no supervision by rendering"}
 SIZE = 64
@@ -55,16 +49,12 @@ def measured(path: Path, held_out: list) -> dict[str, dict[str, float]]:
     """Figures of one model by steps of sampling, means over the held-out objects."""
     model = load_model(path)
     config, found = model.config, {}
-    cameras = {camera.name: camera for camera in rig("six", SIZE)}
     for steps in STEPS:
         rows = []
         for number, folder in enumerate(held_out):
-            truth = read_views(folder)
-            truth = Views([cameras[name] for name in truth.names], *resized_views(truth.images, truth.mask, SIZE, SIZE))
+            truth = true_views(folder, SIZE)
             rgba = torch.from_numpy(decode_object(folder, config)[1][0])[None]
-            images = sample_images(model, rgba, steps=steps, seed=number)
-            views = views_from_images({d: x[0] for d, x in images.items()}, [cameras[n] for n in config.views], BACKGROUND[config.backgrounds[0]],
-                                      config.domains, (0.5 + 0.5 * rgba[0, 3]).numpy())
+            views = sampled_views(model, rgba, number, steps=steps)
             rows.append(consistency(views) | figures(views, truth))
         found[str(steps)] = {key: float(np.nanmean([row[key] for row in rows])) for key in rows[0]}
     return found

@@ -1,12 +1,13 @@
 """One picture to a surface, by the commands as they are: how near the surface comes to the object that was pictured.
 
-    python benchmarks/image_to_surface.py out/model/held_out --limit 40 -o docs/benchmarks
+    python benchmarks/image_to_surface.py out/model/held_out --train out/model/objects -o docs/benchmarks
 
 The picture is each object's front view; `sample-views --no-crop` makes the views of it, `reconstruct` the surface,
 `evaluate` measures it against the object, in the frame of the views, in both protocols of docs/metrics.md. Beside it
 the same object reconstructed from its true views, which is as good as the model could make it, and from the views of the
 training object (--train) whose picture is the nearest. Published for comparison, on other objects: GraphicsDreamer
-0.0231 and 0.5779 (syncdreamer protocol). Rows are kept: a run that was stopped goes on. Half a minute an object on two cores.
+0.0231 and 0.5779 (syncdreamer protocol). Rows are kept: a run that was stopped goes on. Half a minute
+an object on two cores.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from measure import Failed, evaluate, gdtool, machine, number, say, table
 from model_quality import DEFAULT_MODEL, nearest_to, views_folders
 from rows import Rows
 
-from gdtool.core.folder import Folder
+from gdtool.core.folder import Folder, open_folder
 from gdtool.diffusion.data import decode_object
 from gdtool.diffusion.weights import load_model
 
@@ -61,14 +62,14 @@ def main() -> None:
     parser.add_argument("held_out", nargs="+", type=Path)
     parser.add_argument("--model", type=Path, default=DEFAULT_MODEL)
     parser.add_argument("--train", nargs="*", type=Path, default=[], help="what it was trained on, for the nearest object's column")
-    parser.add_argument("--limit", type=int, default=40, help="objects at most")
+    parser.add_argument("--limit", type=int, default=25, help="objects at most")
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks"))
     arguments = parser.parse_args()
     config = load_model(arguments.model).config
     folders = views_folders(arguments.held_out)[: arguments.limit]
     trained = views_folders(arguments.train)
     pictures = [decode_object(folder, config)[1][0].astype(np.float16) for folder in trained]
-    kept = Rows(arguments.output / "image_to_surface.json", {"limit": arguments.limit, "model": str(arguments.model.resolve())})
+    kept = Rows(arguments.output / "image_to_surface.json", {"limit": arguments.limit, "model": open_folder(arguments.model, ("model",)).manifest.key})
     for folder in folders:
         name = folder.path.parent.name
         for way in WAYS:

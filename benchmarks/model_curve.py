@@ -16,17 +16,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from measure import machine, number, say, table
-from model_quality import DEFAULT_MODEL, figures, views_folders
+from model_quality import DEFAULT_MODEL, figures, sampled_views, true_views, views_folders
 
-from gdtool.cameras import rig
 from gdtool.core.folder import open_folder
 from gdtool.diffusion.data import decode_object
-from gdtool.diffusion.encoding import BACKGROUND
-from gdtool.diffusion.result import views_from_images
-from gdtool.diffusion.sampling import sample_images
 from gdtool.diffusion.weights import load_model
-from gdtool.folders.views import Views, read_views
-from gdtool.images.metrics import resized_views
 
 SHOWN = ("color_psnr_frame", "color_ssim_frame", "albedo_psnr_frame", "normal_degrees", "depth_error", "silhouette_overlap")
 
@@ -43,15 +37,10 @@ def quality(path: Path, folders: list) -> dict[str, float]:
     """Mean figures of a model over held-out objects, and its size."""
     model = load_model(path)
     config, rows = model.config, []
-    cameras = {camera.name: camera for camera in rig("six", config.image_size)}
     for seed, folder in enumerate(folders):
-        truth = read_views(folder)
-        truth = Views([cameras[name] for name in truth.names], *resized_views(truth.images, truth.mask, config.image_size, config.image_size))
+        truth = true_views(folder, config.image_size)
         rgba = torch.from_numpy(decode_object(folder, config)[1][0])[None]
-        images = sample_images(model, rgba, steps=1, seed=seed)
-        views = views_from_images({d: x[0] for d, x in images.items()}, [cameras[n] for n in config.views], BACKGROUND[config.backgrounds[0]],
-                                  config.domains, (0.5 + 0.5 * rgba[0, 3]).numpy())
-        rows.append(figures(views, truth))
+        rows.append(figures(sampled_views(model, rgba, seed, steps=1), truth))
     return {"size": config.image_size, **{key: float(np.nanmean([row[key] for row in rows])) for key in SHOWN}}
 
 

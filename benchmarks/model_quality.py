@@ -97,6 +97,21 @@ def decoded(planes: torch.Tensor, config) -> Views:
     return views_from_images({d: images[i] for i, d in enumerate(config.domains)}, [cameras[n] for n in config.views], 0.0, config.domains)
 
 
+def true_views(folder, size: int) -> Views:
+    """The views of a folder at another size, with the cameras of that size."""
+    truth, cameras = read_views(folder), {camera.name: camera for camera in rig("six", size)}
+    return Views([cameras[name] for name in truth.names], *resized_views(truth.images, truth.mask, size, size))
+
+
+def sampled_views(model, rgba: torch.Tensor, seed: int, **setting) -> Views:
+    """What a model makes of one condition (1, 4, h, w); setting: of sample_images."""
+    config = model.config
+    cameras = {camera.name: camera for camera in rig("six", config.image_size)}
+    images = sample_images(model, rgba, seed=seed, **setting)
+    return views_from_images({d: x[0].float() for d, x in images.items()}, [cameras[n] for n in config.views], BACKGROUND[config.backgrounds[0]],
+                             setting.get("domains", config.domains), (0.5 + 0.5 * rgba[0, 3]).numpy())
+
+
 def nearest_to(condition: torch.Tensor, pictures: list[np.ndarray]) -> int:
     """Which of the pictures (4, h, w) has the least squared error beside a condition of the same shape."""
     return int(np.argmin([float(np.square(p.astype(np.float32) - condition.numpy()).mean()) for p in pictures]))
@@ -107,7 +122,7 @@ def main() -> None:
     parser.add_argument("held_out", nargs="+", type=Path)
     parser.add_argument("--model", type=Path, default=DEFAULT_MODEL)
     parser.add_argument("--train", nargs="*", type=Path, default=[], help="what it was trained on, for the baselines")
-    parser.add_argument("--steps", default="1,4,8", help="denoising steps to measure")
+    parser.add_argument("--steps", default="1,4", help="denoising steps to measure")
     parser.add_argument("--scheduler", default="ddim", choices=["ddim", "dpm"])
     parser.add_argument("-o", "--output", type=Path, help="folder for NAME.json and NAME.md")
     parser.add_argument("--name", default="model_quality")
@@ -116,7 +131,6 @@ def main() -> None:
     arguments = parser.parse_args()
     model = load_model(arguments.model)
     config = model.config
-    cameras = {camera.name: camera for camera in rig("six", config.image_size)}
     table: dict[str, list[dict[str, float]]] = {}
     seconds: dict[str, float] = {}
     planes, pictures = [], []
@@ -126,15 +140,11 @@ def main() -> None:
         pictures.append(conditions[0].astype(np.float16))
     mean = torch.from_numpy(np.mean(planes, 0, dtype=np.float32)) if planes else None
     for number, folder in enumerate(views_folders(arguments.held_out)):
-        truth = read_views(folder)
-        images, mask = resized_views(truth.images, truth.mask, config.image_size, config.image_size)
-        truth = Views([cameras[name] for name in truth.names], images, mask)
+        truth = true_views(folder, config.image_size)
         rgba = torch.from_numpy(decode_object(folder, config)[1][0])[None]
         for steps in (int(s) for s in arguments.steps.split(",")):
             start = time.perf_counter()
-            sampled = sample_images(model, rgba, steps=steps, scheduler=arguments.scheduler, seed=number)
-            result = views_from_images({d: x[0] for d, x in sampled.items()}, [cameras[n] for n in config.views],
-                                       BACKGROUND[config.backgrounds[0]], config.domains, (0.5 + 0.5 * rgba[0, 3]).numpy())
+            result = sampled_views(model, rgba, number, steps=steps, scheduler=arguments.scheduler)
             name = f"model, {steps} step{'s' * (steps > 1)}"
             seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
             table.setdefault(name, []).append(figures(result, truth))

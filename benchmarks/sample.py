@@ -22,17 +22,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from measure import busy, gdtool, machine, number, say, seconds_axis, table
-from model_quality import DEFAULT_MODEL, figures, views_folders
+from model_quality import DEFAULT_MODEL, figures, sampled_views, true_views, views_folders
 
-from gdtool.cameras import rig
 from gdtool.diffusion.consistency import consistency
 from gdtool.diffusion.data import decode_object
-from gdtool.diffusion.encoding import BACKGROUND
-from gdtool.diffusion.result import views_from_images
-from gdtool.diffusion.sampling import sample_images
 from gdtool.diffusion.weights import load_model
-from gdtool.folders.views import Views, read_views
-from gdtool.images.metrics import over_white, psnr, resized_views
+from gdtool.folders.views import Views
+from gdtool.images.metrics import over_white, psnr
 
 REFERENCE = {"steps": 50}
 SETTINGS = [
@@ -61,14 +57,9 @@ def held_out_data(folder: Path, size: int, count: int) -> Path:
 
 def sampled(model, rgba: torch.Tensor, setting: dict, seed: int) -> tuple[Views, dict]:
     """The views of one object in one setting, and their seconds and processor seconds."""
-    config = model.config
     start, before = time.perf_counter(), sum(os.times()[:2])
-    images = sample_images(model, rgba, seed=seed, **setting)
-    cost = {"seconds": time.perf_counter() - start, "cpu_seconds": sum(os.times()[:2]) - before}
-    cameras = {camera.name: camera for camera in rig("six", config.image_size)}
-    views = views_from_images({d: x[0].float() for d, x in images.items()}, [cameras[n] for n in config.views], BACKGROUND[config.backgrounds[0]],
-                              setting.get("domains", config.domains), (0.5 + 0.5 * rgba[0, 3]).numpy())
-    return views, cost
+    views = sampled_views(model, rgba, seed, **setting)
+    return views, {"seconds": time.perf_counter() - start, "cpu_seconds": sum(os.times()[:2]) - before}
 
 
 def start_up(model: Path, picture: Path) -> dict[str, float]:
@@ -132,11 +123,8 @@ def main() -> None:
     record: dict = {"image_size": size, "remark": busy(), "start_up": start_up(arguments.model, folders[0].path / "condition" / "000.png"), "rows": {},
                     "consistency": {"sampled": [], "true": []}}
     arguments.output.mkdir(parents=True, exist_ok=True)
-    cameras = {camera.name: camera for camera in rig("six", size)}
     for seed, folder in enumerate(folders):
-        truth = read_views(folder)
-        images, mask = resized_views(truth.images, truth.mask, size, size)
-        truth = Views([cameras[name] for name in truth.names], images, mask)
+        truth = true_views(folder, size)
         rgba = torch.from_numpy(decode_object(folder, model.config)[1][0])[None]
         reference = None
         for setting in SETTINGS:
