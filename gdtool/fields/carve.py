@@ -49,7 +49,7 @@ def combined_distance(sights: list[Sight], points: np.ndarray, step: float, limi
             fused = _mean_surface(free, weight, limit) if noise else _nearest_surface(free, weight, step / 3, limit)
             # Noisy views have noisy masks, even after their edges were brought together.
             value = np.maximum(value - (SLACK * step if noise else 0.0), fused)
-            close = (np.abs(free - value) < step + noise) & (weight > WEAK)
+            close = (np.abs(free - value) < step + noise) & (weight > WEAK) & (free > -limit)
             seen = np.maximum(seen, np.where((close & smooth).any(0), SMOOTHLY, np.where(close.any(0), ROUGHLY, UNSEEN)))
         out[start:start + _CHUNK] = np.clip(value, -limit, limit)
         measured[start:start + _CHUNK] = seen
@@ -159,7 +159,8 @@ def carve(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 
 def smooth_unseen(values: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """Signed distances with the unseen part smoothed: fins and ridges left by the edges of what views see go.
 
-    What only edge pixels tell is smoothed by one step, since pixels decide it at random; smooth surfaces stay.
+    What only edge pixels tell is smoothed by one step, since pixels decide it at random; smooth surfaces stay, and
+    nothing is filled that a view saw to be free (slits that smoothing would close).
     """
     from scipy.ndimage import gaussian_filter
 
@@ -170,4 +171,4 @@ def smooth_unseen(values: np.ndarray, measured: np.ndarray) -> np.ndarray:
     unseen = loose(measured > UNSEEN)
     for _ in range(3):
         out = out + unseen * (gaussian_filter(out, 1.5, mode="nearest", truncate=2.5) - out)
-    return out
+    return np.maximum(out, values)

@@ -11,7 +11,7 @@ from gdtool.cameras import Camera
 from gdtool.fields.align import Corrections, corrections, disagreement, slope_rows
 from gdtool.fields.carve import carve, silhouettes_outvoted, smooth_unseen
 from gdtool.fields.clock import Clock
-from gdtool.fields.refine import drop_debris, measured_planes, refine
+from gdtool.fields.refine import FOLD_DEGREES, drop_debris, measured_planes, refine
 from gdtool.fields.sights import WEAK, Sight, free_distance, hull_distance, pixel_footprint, prepare, with_edge
 from gdtool.fields.thin import near_points, restore_thin
 from gdtool.geometry.grids import edge_counts, extract
@@ -20,7 +20,7 @@ from gdtool.geometry.sharpen import dihedral_degrees, restore_creases
 
 LEAST_NOISE = 0.3  # grid steps: of views that had to be brought together
 OVER_EDGE = 0.25  # steps that a sharp edge may stand out of what the views leave, whose pixels round it off
-CREASE_ROUNDS, FOLD_DEGREES = 4, 150.0  # tries without what folded over; a fold's least angle between normals
+CREASE_ROUNDS = 4  # tries without what folded over
 MAX_SAMPLES = 320  # along the longest side: 33 million samples, 0.6 GB at the peak
 # Rounds of bringing views together: how far apart two surfaces may lie to be taken for one (world units), and how stiff
 # the corrections are. The last is repeated while the disagreement falls by PLATEAU of itself.

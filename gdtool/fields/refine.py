@@ -8,8 +8,9 @@ from gdtool.fields.materials import neighbour_matrix
 from gdtool.fields.sights import WEAK, Sight, hull_distance, tangent_distance
 from gdtool.geometry.grids import components, keep_faces, signed_volume
 from gdtool.geometry.normals import face_normals, vertex_normals
+from gdtool.geometry.repair import edges_of
 
-
+FOLD_DEGREES = 150.0  # a fold's least angle between the normals of its sides
 _SEEN_FACES = 24  # faces that views measured, enough for a piece to be real
 
 
@@ -35,7 +36,7 @@ def measured_planes(sights: list[Sight], vertices: np.ndarray, normals: np.ndarr
 
 
 def refine(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: float, *, reach: float, rounds: int = 2,
-           smoothness: float = 0.05, iterations: int = 40) -> np.ndarray:
+           smoothness: float = 0.2, iterations: int = 40) -> np.ndarray:
     """New positions (v, 3): least squares of distances to the measured planes and of the umbrella Laplacian.
 
     Seen vertices follow the planes; unseen ones minimise bending, held loosely where the carving put them and inside
@@ -86,26 +87,42 @@ def conjugate_gradients(apply, right: np.ndarray, diagonal: np.ndarray, iteratio
 
 
 def _inside_silhouettes(vertices: np.ndarray, start: np.ndarray, sights: list[Sight], slack: float) -> np.ndarray:
-    """Vertices that left a silhouette by more than slack, and farther than they began, go back to where they began."""
-    out = np.full(len(vertices), -np.inf)
+    """Vertices that left a silhouette by more than slack, and farther than they began, go back along their way until they have not."""
+    share = np.ones(len(vertices))
     for sight in sights:
-        out = np.maximum(out, hull_distance(sight, vertices) - np.maximum(hull_distance(sight, start), 0))
-    return np.where((out > slack)[:, None], start, vertices)
+        before = hull_distance(sight, start)
+        limit, after = np.maximum(before, 0) + slack, hull_distance(sight, vertices)
+        share = np.where(after > limit, np.minimum(share, (limit - before) / np.maximum(after - before, slack)), share)
+    return start + share[:, None] * (vertices - start)
 
 
-def _unfold(vertices: np.ndarray, start: np.ndarray, faces: np.ndarray, rounds: int = 6) -> np.ndarray:
-    """Vertices of faces that turned over on the way from start go back, with their neighbours, until none has."""
+def _unfold(vertices: np.ndarray, start: np.ndarray, faces: np.ndarray, rounds: int = 8) -> np.ndarray:
+    """Vertices of faces that turned over on the way from start, or folded onto a neighbour, go back half of their way, and
+    those around them less of theirs, until none has."""
     before, _ = face_normals(start, faces)
+    beside = edges_of(faces).face_pairs()[1]
+    folded_before = _folded(before, beside)
+    share = np.ones(len(vertices))
+    moved = vertices
     for _ in range(rounds):
         after, _ = face_normals(vertices, faces)
         turned = (before * after).sum(1) < 0
+        turned[beside[_folded(after, beside) & ~folded_before]] = True
         if not turned.any():
             break
-        back = np.zeros(len(vertices), bool)
-        back[faces[turned]] = True
-        back[faces[back[faces].any(1)]] = True
-        vertices = np.where(back[:, None], start, vertices)
+        less = np.ones(len(vertices))
+        for factor in (0.5, 0.7, 0.85):  # ring by ring
+            around = faces[turned].ravel()
+            less[around] = np.minimum(less[around], factor)
+            turned = (less[faces] < 1).any(1)
+        share *= less
+        vertices = start + share[:, None] * (moved - start)
     return vertices
+
+
+def _folded(normals: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """Which of the pairs of neighbouring faces (k, 2) lie back to back."""
+    return np.einsum("ij,ij->i", normals[beside[:, 0]], normals[beside[:, 1]]) < np.cos(np.radians(FOLD_DEGREES))
 
 
 def drop_debris(vertices: np.ndarray, faces: np.ndarray, support: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, int]:

@@ -16,7 +16,7 @@ from gdtool.cameras import Camera, project, rays
 CURTAIN_REACH = 3  # pixels around an occluding contour in which free space is measured from the contour
 WEAK = 0.01  # weight of a distance that is only a bound
 _ROUGH = 0.3  # what a single pixel's plane counts beside one of four pixels that agree
-_NEIGHBOURS = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+_FAINT = 1e-4  # weight of a pixel whose depth fits no neighbour
 
 
 @dataclass(frozen=True)
@@ -130,66 +130,81 @@ def prepare(camera: Camera, mask: np.ndarray, depth: np.ndarray | None = None,
                       -rays(camera)[1]) if camera.projection != "orthographic" else camera.backward
     cosine = (normal * toward).sum(-1)
 
-    agree, smooth, broken = np.zeros(mask.shape, int), np.ones(mask.shape, bool), np.zeros(mask.shape, bool)
-    for shift in _NEIGHBOURS:
-        both, ahead, back = _plane_gaps(points, normal, valid, shift)
-        near = both & (np.maximum(np.abs(ahead), np.abs(back)) < foot)
-        agree += near
-        smooth &= near | ~both
-        broken |= both & (np.minimum(np.abs(ahead), np.abs(back)) > 1.5 * foot)
-    valid &= (agree >= 2) & ~_flying(points, normal, valid, foot)
+    shown = _Shown(points, normal, valid, foot)
+    firm, smooth, broken = shown.judged()
+    # What the others show is no plane, but before it the view is free.
+    normal = np.where(shown.image(~firm, False)[..., None], camera.backward, normal)
     planes = np.concatenate([normal, (normal * points).sum(-1, keepdims=True)], -1).astype(np.float32)
-    weight = np.where(valid, np.clip(cosine, 0.05, 1.0) ** 2 * mask ** 2, 0.0).astype(np.float32)
-    return Sight(camera, mask, silhouette, cropped, planes, weight, ~smooth | ~valid, broken,
-                 _curtain(points, normal, valid, foot), points.astype(np.float32))
+    curtain = shown.image(shown.curtain(normal[valid], firm), np.inf).astype(np.float32)
+    firm = shown.image(firm, False)
+    weight = np.where(firm, np.clip(cosine, 0.05, 1.0) ** 2 * mask ** 2, _FAINT * valid).astype(np.float32)
+    return Sight(camera, mask, silhouette, cropped, planes, weight, ~(firm & shown.image(smooth, False)), shown.image(broken, False),
+                 curtain, points.astype(np.float32))
+
+
+class _Shown:
+    """The n pixels of a view that show a surface, beside their neighbours: points and normals (h, w, 3), valid and foot (h, w)."""
+
+    def __init__(self, points: np.ndarray, normal: np.ndarray, valid: np.ndarray, foot: np.ndarray):
+        rim = [(CURTAIN_REACH,) * 2] * 2
+        self.valid, self.foot, self.inner, self.columns = valid, foot[valid], np.pad(valid, rim), valid.shape[1] + 2 * CURTAIN_REACH
+        self.points, self.normals = (np.pad(x, [*rim, (0, 0)]).reshape(-1, 3) for x in (points, normal))
+        self.at = np.flatnonzero(self.inner)
+        self.point, self.normal = self.points[self.at], self.normals[self.at]
+
+    def image(self, values: np.ndarray, fill) -> np.ndarray:
+        """values (n,) where they belong in (h, w)."""
+        out = np.full(self.valid.shape, fill, np.result_type(values, fill))
+        out[self.valid] = values
+        return out
+
+    def gaps(self, shift: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Whether the neighbour shows something too (n,), its height over this pixel's plane, and this one's over the neighbour's."""
+        beside = self.at + shift[0] * self.columns + shift[1]
+        delta = self.points[beside] - self.point
+        return self.inner.ravel()[beside], np.einsum("ij,ij->i", self.normal, delta), -np.einsum("ij,ij->i", self.normals[beside], delta)
+
+    def judged(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(n,) each: which pixels' depth fits two neighbours and does not float between a nearer surface on one side and a
+        farther one on the other (an average over an edge), which lie amid one smooth surface, and which beside a jump."""
+        count = len(self.at)
+        agree, smooth, broken, flying = np.zeros(count, int), np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
+        for shift in ((0, 1), (1, 0), (1, 1), (1, -1)):
+            heights = []
+            for i, j in (shift, (-shift[0], -shift[1])):
+                both, ahead, back = self.gaps((i, j))
+                nearer, farther = np.minimum(np.abs(ahead), np.abs(back)), np.maximum(np.abs(ahead), np.abs(back))
+                near = both & (farther < self.foot)
+                agree += near
+                smooth &= near | ~both
+                broken |= both & (nearer > 1.5 * self.foot)
+                heights.append(np.where(both & (nearer > self.foot), ahead, 0.0))
+            flying |= heights[0] * heights[1] < 0
+        return (agree >= 2) & ~flying, smooth, broken
+
+    def curtain(self, normal: np.ndarray, firm: np.ndarray) -> np.ndarray:
+        """Pixels (n,) from each pixel to the nearest one whose surface stands in front of its plane (an occluding contour).
+
+        normal (n, 3): of the planes. What is not firm (n,) hides nothing but what is not firm either.
+        """
+        hiding = self.inner.copy()
+        hiding.ravel()[self.at] = firm
+        out = np.full(len(self.at), np.inf)
+        for i in range(-CURTAIN_REACH, CURTAIN_REACH + 1):
+            for j in range(-CURTAIN_REACH, CURTAIN_REACH + 1):
+                distance = np.hypot(i, j)
+                if 0 < distance <= CURTAIN_REACH:
+                    beside = self.at + i * self.columns + j
+                    there = hiding.ravel()[beside] | (self.inner.ravel()[beside] & ~firm)
+                    height = np.einsum("ij,ij->i", normal, self.points[beside] - self.point)
+                    out = np.where(there & (height > (1.0 + distance) * self.foot), np.minimum(out, distance - 0.5), out)
+        return out
 
 
 def with_edge(sight: Sight, edge: float) -> Sight:
     """The view with its silhouette grown all around by edge (world units at the origin's distance; negative shrinks it)."""
     foot = float(pixel_footprint(sight.camera, float(np.linalg.norm(sight.camera.position))))
     return replace(sight, silhouette=(sight.silhouette - edge / foot).astype(np.float32))
-
-
-def _shifted(image: np.ndarray, shift: tuple[int, int], fill) -> np.ndarray:
-    """image[row + shift] with fill outside."""
-    out = np.full_like(image, fill)
-    h, w = image.shape[:2]
-    i, j = shift
-    out[max(0, -i):h - max(0, i), max(0, -j):w - max(0, j)] = image[max(0, i):h - max(0, -i), max(0, j):w - max(0, -j)]
-    return out
-
-
-def _plane_gaps(points, normal, valid, shift):
-    """Whether both pixels are valid, the neighbour's height over this pixel's plane, and this one's over the neighbour's."""
-    delta = _shifted(points, shift, 0.0) - points
-    both = valid & _shifted(valid, shift, False)
-    return both, (normal * delta).sum(-1), -(_shifted(normal, shift, 0.0) * delta).sum(-1)
-
-
-def _flying(points, normal, valid, foot) -> np.ndarray:
-    """Pixels that float between a nearer surface on one side and a farther one on the other: averages over an edge."""
-    out = np.zeros(valid.shape, bool)
-    for i, j in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        heights = []
-        for shift in ((i, j), (-i, -j)):
-            both, ahead, back = _plane_gaps(points, normal, valid, shift)
-            apart = both & (np.minimum(np.abs(ahead), np.abs(back)) > foot)
-            heights.append(np.where(apart, ahead, 0.0))
-        out |= heights[0] * heights[1] < 0
-    return out
-
-
-def _curtain(points, normal, valid, foot) -> np.ndarray:
-    """Pixels from each pixel to the nearest pixel whose surface stands in front of its plane (an occluding contour)."""
-    out = np.full(valid.shape, np.inf, np.float32)
-    for i in range(-CURTAIN_REACH, CURTAIN_REACH + 1):
-        for j in range(-CURTAIN_REACH, CURTAIN_REACH + 1):
-            distance = np.hypot(i, j)
-            if 0 < distance <= CURTAIN_REACH:
-                both, height, _ = _plane_gaps(points, normal, valid, (i, j))
-                hidden = both & (height > (1.0 + distance) * foot)
-                out = np.where(hidden, np.minimum(out, distance - 0.5), out)
-    return out
 
 
 def hull_distance(sight: Sight, points: np.ndarray) -> np.ndarray:

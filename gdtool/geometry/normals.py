@@ -13,7 +13,7 @@ def face_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, n
     ux, uy, uz, wx, wy, wz = x[b] - x[a], y[b] - y[a], z[b] - z[a], x[c] - x[a], y[c] - y[a], z[c] - z[a]
     nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
     length = np.sqrt(nx * nx + ny * ny + nz * nz)
-    over = 1 / np.maximum(length, 1e-300)
+    over = 1 / np.maximum(length, np.finfo(length.dtype).tiny)
     return np.stack([nx * over, ny * over, nz * over], -1), length / 2
 
 
@@ -25,7 +25,8 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     for i in range(3):
         u = corners[:, (i + 1) % 3] - corners[:, i]
         w = corners[:, (i + 2) % 3] - corners[:, i]
-        cosine = (u * w).sum(1) / np.maximum(np.linalg.norm(u, axis=1) * np.linalg.norm(w, axis=1), 1e-300)
+        length = np.linalg.norm(u, axis=1) * np.linalg.norm(w, axis=1)
+        cosine = (u * w).sum(1) / np.maximum(length, np.finfo(length.dtype).tiny)
         angle = np.arccos(np.clip(cosine, -1, 1))
         for axis in range(3):
             out[:, axis] += np.bincount(faces[:, i], normals[:, axis] * angle, len(vertices))

@@ -9,6 +9,7 @@ from gdtool.fields.fusion import align_depth, depth_for, folds, fuse_views, grid
 from gdtool.fields.sights import free_distance, hull_distance, silhouette_distance
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import components, signed_volume
+from gdtool.geometry.metrics import inside
 
 from .shapes import cube, sphere, torus, two_balls, views_of
 
@@ -63,6 +64,25 @@ def test_edges_are_drawn_out(monkeypatch):
     monkeypatch.setattr("gdtool.fields.fusion.with_creases", lambda vertices, faces, *_: (vertices, faces))
     blunt = missed()
     assert (sharp < blunt).all() and sharp.mean() < 0.85 * blunt.mean()
+
+
+def box(points, centre, half):
+    q = np.abs(points - centre) - half
+    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0)
+
+
+def test_a_narrow_gap_stays_open():
+    """Two handles before a head: only a pixel or two of one view shows, beside jumps in depth, that they do not touch."""
+    def opener(points):
+        handles = np.minimum(*(box(points, [0.12, 0, side * 0.125], [0.3, 0.12, 0.1]) for side in (1, -1)))
+        return np.minimum(handles, box(points, [-0.3, 0, 0], [0.12, 0.2, 0.2]))
+
+    shape = reconstruct(*views_of(opener, SIZE))
+    along, up = np.meshgrid(np.linspace(-0.1, 0.38, 25), np.linspace(-0.08, 0.08, 9))
+    between, within = (np.stack([along, up, np.full_like(along, z)], -1).reshape(-1, 3) for z in (0.0, 0.1))
+    assert is_closed_manifold(shape.faces)
+    assert inside(between, shape.vertices, shape.faces).mean() < 0.1
+    assert inside(within, shape.vertices, shape.faces).all()
 
 
 def test_two_pieces_stay_two(seen):
