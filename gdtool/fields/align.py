@@ -14,12 +14,12 @@ import numpy as np
 from gdtool.cameras import Camera, project, rays
 from gdtool.fields.sights import Sight, hull_distance, pixel_footprint, tangent_distance
 
-CONTROL = 11  # control points along a side of a view's correction
+CONTROL = 15  # control points along a side of a view's correction
 LARGEST = 0.06  # world units: no correction is larger
 PRIOR_SIZE = 0.01  # world units: how large a correction is expected to be
 PRIOR = 0.02  # what that expectation counts beside the matches
 SLOPE_LENGTH = 0.2  # world units over which normals go wrong by as much as depth does
-SLOPES, RIMS, EXTENTS = 1.0, 0.01, 0.3  # what the other evidence counts; rims lie beside curved outlines, so they only settle silhouettes
+SLOPES, RIMS, EXTENTS = 0.4, 0.01, 0.3  # what the other evidence counts; rims lie beside curved outlines, so they only settle silhouettes
 RIM_COSINE = 0.15  # normals this square to an axis belong to the outline
 
 
@@ -123,7 +123,7 @@ def _control_weights(pixels: np.ndarray, shape: tuple[int, int]) -> tuple[np.nda
 
 
 def _bending() -> np.ndarray:
-    """Second differences (r, CONTROL^2) of a control grid along both axes."""
+    """Second differences (r, CONTROL^2) of a control grid along both axes, over a tenth of its side squared."""
     rows = []
     for a in range(CONTROL):
         for b in range(1, CONTROL - 1):
@@ -132,7 +132,7 @@ def _bending() -> np.ndarray:
                 for (r, c), value in zip(place, (1, -2, 1), strict=True):
                     row[r, c] = value
                 rows.append(row.ravel())
-    return np.array(rows)
+    return np.array(rows) * ((CONTROL - 1) / 10) ** 2
 
 
 @dataclass(frozen=True)
