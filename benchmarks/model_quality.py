@@ -1,9 +1,10 @@
-"""How good a model is on objects it was not trained on, beside two baselines; a Markdown table for its card.
+r"""How good a model is on objects it was not trained on, beside two baselines; a Markdown table for its card.
 
     gdtool render-dataset procedural:900000..900099 --size 128 --condition-views 3 -o held_out
     python benchmarks/model_quality.py held_out --model my-model --train objects -o docs/benchmarks --install
-    gdtool render-dataset ../shared/assets/glb/*.glb ../shared/assets/gltf/*/*.gltf --size 128 -o real
-    python benchmarks/model_quality.py real --train objects --name model_quality_real -o docs/benchmarks
+    gdtool render-dataset ../shared/assets/glb/*.glb ../shared/assets/gltf/*/*.gltf $(find ../shared/assets/gso -name '*.obj' | grep -v _col) \
+        --size 128 --samples 8 --light-samples 4 --condition-views 3 -o real
+    python benchmarks/model_quality.py real --train objects --steps 1 --name model_quality_real -o docs/benchmarks
 
 --install puts the model, with the table in its card, where the package finds its bundled model.
 
