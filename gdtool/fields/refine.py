@@ -90,9 +90,13 @@ def _inside_silhouettes(vertices: np.ndarray, start: np.ndarray, sights: list[Si
     """Vertices that left a silhouette by more than slack, and farther than they began, go back along their way until they have not."""
     share = np.ones(len(vertices))
     for sight in sights:
-        before = hull_distance(sight, start)
-        limit, after = np.maximum(before, 0) + slack, hull_distance(sight, vertices)
-        share = np.where(after > limit, np.minimum(share, (limit - before) / np.maximum(after - before, slack)), share)
+        before, after = hull_distance(sight, start), hull_distance(sight, vertices)
+        limit = np.maximum(before, 0) + slack
+        left = np.flatnonzero(after > limit)
+        # Of one that began beyond the border of a picture that cuts the object no way is known: all of it.
+        known = np.isfinite(before[left])
+        begun = np.where(known, before[left], 0.0)
+        share[left] = np.minimum(share[left], known * (limit[left] - begun) / (after[left] - begun))
     return start + share[:, None] * (vertices - start)
 
 

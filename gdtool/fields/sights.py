@@ -110,8 +110,8 @@ def prepare(camera: Camera, mask: np.ndarray, depth: np.ndarray | None = None,
             normal: np.ndarray | None = None) -> Sight:
     """Prepare one view: mask (h, w) coverage, depth (h, w) along the axis and normal (h, w, 3) world, either optional.
 
-    Pixels whose depth fits no neighbour (an average over an edge) are dropped. Without normals they are taken from
-    the depth.
+    Pixels whose depth fits no neighbour (an average over an edge) tell only that the view before them is free. Without
+    normals they are taken from the depth.
     """
     silhouette = silhouette_distance(mask)
     border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from gdtool.cameras import rig
 from gdtool.fields.align import Corrections, agreement, corrections, disagreement, normals_fit_depth, slope_rows
 from gdtool.fields.carve import silhouettes_outvoted
 from gdtool.fields.fusion import align_depth, depth_for, folds, fuse_views, grid_step, is_closed_manifold, prepare_all
-from gdtool.fields.sights import free_distance, hull_distance, silhouette_distance
+from gdtool.fields.refine import _inside_silhouettes
+from gdtool.fields.sights import free_distance, hull_distance, prepare, silhouette_distance
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import components, signed_volume
 from gdtool.geometry.metrics import inside
@@ -83,6 +85,19 @@ def test_a_narrow_gap_stays_open():
     assert is_closed_manifold(shape.faces)
     assert inside(between, shape.vertices, shape.faces).mean() < 0.1
     assert inside(within, shape.vertices, shape.faces).all()
+
+
+def test_what_leaves_a_silhouette_goes_back_as_far_as_it_must():
+    """Also where it began beyond a picture that cuts the object, of which nothing is known."""
+    camera = rig("six", SIZE)[0]
+    mask = np.zeros((SIZE, SIZE), np.float32)
+    mask[:, :SIZE // 2] = 1
+    sight = prepare(camera, mask)
+    at = np.array([1.0, 0.0, 0.0])  # to the right of the front view
+    start, end = np.array([-0.2, 0.1, 3.0])[:, None] * at, np.array([0.3, 0.1, 0.3])[:, None] * at
+    found = _inside_silhouettes(end, start, [sight], 0.01)
+    assert sight.cropped and np.isfinite(found).all()
+    assert np.allclose(found @ at, [0.01, 0.1, 3.0], atol=2e-3)
 
 
 def test_two_pieces_stay_two(seen):
