@@ -10,7 +10,7 @@ from functools import cache
 
 import numpy as np
 
-from gdtool.core.child import ChildFailed, begin, prepare
+from gdtool.core.child import ChildFailed, begin, call, prepare
 from gdtool.geometry import repair
 from gdtool.geometry.features import Constraints, Features, find_features, trace, untied
 from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian, valences
@@ -27,8 +27,10 @@ COUNT_TOLERANCE = 0.03
 _SMALL_PIECE_QUADS = 48
 _TRIES = 3
 _CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a result is taken without a look at others
+_LOST_EDGES, _LOST_SHARE = 0.75, 0.01  # surface so far from the quads is lost on them, and how much of it may be
 _RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
 _HANDLES, _PIECES = "handles are lost or added", "pieces are lost or joined"
+_QUADS_PER_TRIANGLE = 2.25  # of pair_and_split, where most triangles find a partner
 _MOST_PIECES = 16  # that are remeshed one by one where together they fail
 
 
@@ -97,7 +99,7 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
                     continue
             if found is None:
                 start = time.perf_counter()
-                found = (*_fitted(*_by_splitting(part_vertices, part_faces, quads), part_vertices, part_faces, edge, request, fine()),
+                found = (*_fitted(*_by_splitting(part_vertices, part_faces, quads, request), part_vertices, part_faces, request, fine()),
                          "pair and split")
                 record.clock("fallback", start)
             done.append(found[:2])
@@ -188,12 +190,34 @@ def _by_splitting_count(faces: np.ndarray, quads: int) -> int:
     return max(quads, 12 * repair.components(faces)[0])
 
 
-def _by_splitting(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[np.ndarray, np.ndarray]:
+def _by_splitting(vertices: np.ndarray, faces: np.ndarray, quads: int, request: Request) -> tuple[np.ndarray, np.ndarray]:
     """pair_and_split of the mesh brought to the right number of triangles; no piece is lost."""
+    quads = _by_splitting_count(faces, quads)
+    even = _even(vertices, faces, quads, request)
+    return pair_and_split(*even, quads) if even is not None else _by_collapse(vertices, faces, quads)
+
+
+def _even(vertices: np.ndarray, faces: np.ndarray, quads: int, request: Request) -> tuple[np.ndarray, np.ndarray] | None:
+    """Even triangles of the same topology that split into so many quads; None where there are none, as on what is small and intricate."""
+    triangles = int(quads / _QUADS_PER_TRIANGLE)
+    few_vertices, few = simplify(vertices, faces, 2 * triangles, seconds=request.seconds, measured=False)[:2]
+    try:
+        out, found = call("gdtool.geometry.quad_engines:even_triangles", few_vertices, few, triangles, request.crease_degrees,
+                          seconds=request.seconds, memory_mb=request.memory_mb)
+    except ChildFailed:
+        return None
+    if not 2.1 * len(found) <= quads <= 3 * len(found):
+        return None
+    out, found = repair.compact(out, found)
+    same = all(of(found) == of(faces) for of in (repair.is_watertight, repair.is_manifold, _euler, lambda f: repair.components(f)[0]))
+    return (out, found) if same and np.isfinite(out).all() else None
+
+
+def _by_collapse(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[np.ndarray, np.ndarray]:
+    """pair_and_split of the mesh's own triangles, cut in four or collapsed to the right number."""
     import igl
 
-    quads = _by_splitting_count(faces, quads)
-    triangles = max(int(quads / 2.2), 4)
+    triangles = max(int(quads / _QUADS_PER_TRIANGLE), 4)
     while len(faces) < triangles:
         vertices, faces = (np.asarray(x) for x in igl.upsample(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64), 1))
     pieces = repair.components(faces)[0]
@@ -208,15 +232,19 @@ def _by_splitting(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[
     return pair_and_split(vertices, faces, quads)
 
 
-def _fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarray, faces: np.ndarray, edge: float,
+def _fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
             request: Request, fine: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """What pair_and_split made, evened out on the surface; only its vertices move."""
+    """What pair_and_split made, evened out on the surface where that makes better quads; only its vertices move."""
+    edge = (polygon_normals(quad_vertices, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
     features = find_features(vertices, faces, request.crease_degrees or 181.0, 3 * edge)
     surface = Surface(vertices, faces)
     traced, constraints = trace(quad_vertices, quad_faces, features, edge)
     constraints = untied(traced, quad_faces, constraints)
     traced = relax(onto(traced, surface, features, constraints), quad_faces, surface, features, constraints, request.smooth_iterations)
-    return _shaped(traced, quad_faces, surface, features, constraints, request, fine), quad_faces
+    traced = _shaped(traced, quad_faces, surface, features, constraints, request, fine)
+    before, after = (scaled_jacobian(v, quad_faces) for v in (quad_vertices, traced))
+    worse = (after < 0).sum() > (before < 0).sum() or after.mean() < before.mean()
+    return (quad_vertices if worse else traced), quad_faces
 
 
 def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float, request: Request,
@@ -274,6 +302,8 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
                 _, far, least, quad_vertices, quad_faces = best
                 limit = 1.0 if subdivisions else 2.0
                 fault = f"strays {far:.2g} edge lengths from the surface" if far > limit else None
+                if fault is None and (left := _left_out(quad_vertices, quad_faces, surface, _LOST_EDGES * edge)) > _LOST_SHARE:
+                    fault = f"leaves out {left:.1%} of the surface"
                 if subdivisions and least < request.least_jacobian:
                     fault = f"has a quad of scaled Jacobian {least:.2g}"
             elif fault == _HANDLES and not subdivisions and second_best is None and abs(off) <= COUNT_TOLERANCE:
@@ -385,3 +415,12 @@ def _farthest(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> floa
 
     step = max(len(surface.vertices) // 20000, 1)
     return float(closest_points(surface.vertices[::step], vertices, triangulated(faces)[0])[0].max())
+
+
+def _left_out(vertices: np.ndarray, faces: np.ndarray, surface: Surface, distance: float) -> float:
+    """Share of the surface's area that lies farther than `distance` from the quads: thin parts and rims that they do without."""
+    from gdtool.folders.mesh import triangulated
+    from gdtool.geometry.distance import closest_points, sample_surface
+
+    points = sample_surface(surface.vertices, surface.faces, 10000, np.random.default_rng(0))[0]
+    return float((closest_points(points, vertices, triangulated(faces)[0])[0] > distance).mean())

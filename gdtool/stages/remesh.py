@@ -196,4 +196,4 @@ def _way(vertices, faces, options: Options, out: Output):
 
 
 
-STAGE = Stage(name="remesh", version=6, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)
+STAGE = Stage(name="remesh", version=7, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)

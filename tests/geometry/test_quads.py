@@ -73,6 +73,35 @@ def test_pairing_gives_the_asked_count_exactly():
         assert abs(len(found) - count) <= 1 and whole(found) and volume(out, found) > 0
 
 
+@pytest.mark.parametrize("shape", ["slivers", "coincident"])
+def test_splitting_makes_square_quads_of_any_triangles(shape):
+    """What no engine manages is made even first: long slivers, and sheets that touch without being joined."""
+    if shape == "slivers":
+        vertices, faces = cube()
+        vertices = vertices * (1, 0.4, 0.15)  # twelve triangles
+    else:
+        vertices, faces = joined(cube(), cube())
+        vertices = vertices.copy()
+        vertices[8:, 0] += np.ptp(vertices[:8, 0])  # shares a side with the first
+    vertices = vertices / np.ptp(vertices, 0).max()
+    out, found, record = quads.remesh(vertices, faces, quads.Request(quads=3000, engine="split"))
+    assert record.engine == "pair and split" and whole(found) and abs(len(found) / 3000 - 1) <= 0.03
+    assert repair.components(found)[0] == repair.components(faces)[0]
+    figures = shape_figures(out, found)
+    assert figures["jacobian_mean"] > 0.85 and figures["folded_share"] == 0 and figures["angle_deviation_deg"] < 18
+    assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.01
+
+
+def test_surface_that_the_quads_do_without_is_measured():
+    vertices, faces = cube()
+    lid = faces[np.all(vertices[faces][:, :, 2] == vertices[:, 2].max(), 1)]
+    rest = np.array([f for f in faces.tolist() if f not in lid.tolist()])
+    surface = quads.Surface(vertices, faces)
+    closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, rest))
+    assert quads._left_out(vertices, closed, surface, 0.1) == 0
+    assert quads._left_out(vertices, opened, surface, 0.1) == pytest.approx(0.8**2 / 6, abs=0.02)  # the lid but its rim
+
+
 def test_bevels_of_marching_cubes_become_creases():
     vertices, faces = bored_box()
     sharp, sharp_faces, report = restore_creases(vertices, faces)
