@@ -83,7 +83,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         out.skip("occlusion", "left out by --no-ao")
     with out.step("maps"):
         maps = make_maps(texels, baked.values, occlusion=occlusion, bits=options.bits, padding=options.padding or None, normal_map=options.normal_map,
-                         threads=out.threads)
+                         threads=out.threads, **({"least_alpha": origin.alpha_cutoff} if origin.alpha_mode == "MASK" else {}))
     for what, reason in maps.skipped:
         out.skip(what, reason)
     if options.normal_map == "off":
@@ -274,6 +274,6 @@ def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx
 
 
 STAGE = Stage(
-    name="bake", version=5, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run,
+    name="bake", version=6, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run,
     second_inputs={"surface": SecondInput("surface", help="The surface to bake from; found along the provenance chain without it."),
                    "views": SecondInput("views", help="Views of it; found along the provenance chain without it.")})

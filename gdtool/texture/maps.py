@@ -68,12 +68,13 @@ def flat_angle(tangent_normals: np.ndarray) -> float:
 
 
 def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.ndarray | None = None, bits: int = 8,
-              padding: int | None = None, normal_map: str = "auto", threads: int = 1) -> Maps:
+              padding: int | None = None, normal_map: str = "auto", least_alpha: float = 0.5 / 255, threads: int = 1) -> Maps:
     """Maps of what texels read (bake.Baked.values): albedo, roughness, metallic, tangent_normal, perhaps alpha, emissive
     (n, 3) linear, height (n,) in the target's units, confidence (n,) in [0, 1].
 
     occlusion (n,) or None. normal_map "auto" leaves a flat map out. Gutters are filled over `padding` texels, everywhere
-    when None.
+    when None. Color of less alpha than least_alpha is never seen: it is filled like a gutter, or filtering would draw what
+    painters leave there, black mostly, around all that is seen.
     """
     from gdtool.images.color import linear_from_srgb, srgb_from_linear
 
@@ -132,8 +133,15 @@ def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.nd
     gutters = Gutters(texels.mask(), padding)
     # Alpha, the fourth channel, is never sRGB.
     encodings = {name: [srgb_from_linear] * 3 + [None] * (len(layers[name]) - 3) for name in ("base_color", "emissive") if name in layers}
-    stored = {name: _stored(texels, layers.pop(name), gutters, HEIGHT_BITS if name == "height" else bits, threads, name == "normal", encodings.get(name))
-              for name in list(layers)}
+    stored = {}
+    if alpha is not None and (hidden := alpha < least_alpha).any() and not hidden.all():
+        seen = Gutters(texels.image(~hidden), padding)
+        del layers["base_color"]
+        shown = [np.where(hidden, np.float32(0), channel) for channel in color]
+        stored["base_color"] = np.concatenate([_stored(texels, shown, seen, bits, threads, encodings=encodings["base_color"][:3]),
+                                               _stored(texels, [alpha], gutters, bits, threads)], 2)
+    stored |= {name: _stored(texels, layers.pop(name), gutters, HEIGHT_BITS if name == "height" else bits, threads, name == "normal", encodings.get(name))
+               for name in list(layers)}
     return Maps(texels.size, stored.get("base_color"), stored.get("orm"), stored.get("normal"), factors, has_occlusion, varies,
                 stored.get("emissive"), {name: stored[name] for name in ("height", "confidence") if name in stored}, skipped)
 

@@ -65,6 +65,23 @@ def test_alpha_is_kept_and_opaque_alpha_dropped(texels):
     assert set(np.unique(maps.base_color.reshape(-1, 4)[texels.texel][:, 3])) == {64, 255}
 
 
+@pytest.mark.parametrize("least", [0.5 / 255, 0.5])
+def test_color_that_is_never_seen_darkens_no_neighbour(texels, least):
+    """Leaves are cut out of black: under no alpha, or under less than the cutoff, the color around is stored."""
+    given, hidden = values(texels), np.arange(len(texels)) % 5 < 2
+    given["albedo"][:] = (0.2, 0.5, 0.3)
+    given["albedo"][hidden] = 0
+    given["alpha"] = np.where(hidden, 0.9 * least, 1).astype(np.float32)
+    stored = make_maps(texels, given, least_alpha=least).base_color
+    at = stored.reshape(-1, 4)[texels.texel]
+    np.testing.assert_array_equal(at[:, :3], np.tile(at[~hidden][0, :3], (len(at), 1)))
+    assert stored[..., :3].min() > 100
+    np.testing.assert_array_equal(at[:, 3], np.rint(given["alpha"] * 255))
+    given["alpha"][hidden] = 1.1 * least + 0.01  # is seen: stays as it is
+    at = make_maps(texels, given, least_alpha=least).base_color.reshape(-1, 4)[texels.texel]
+    assert at[hidden][:, :3].max() == 0
+
+
 def test_normal_map_only_where_it_says_something(texels):
     tilt = lambda degrees: (np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees)))  # noqa: E731
     assert make_maps(texels, values(texels, normal=tilt(0.8))).normal is None
