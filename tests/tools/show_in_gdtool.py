@@ -1,7 +1,7 @@
 """Renders a model from the front with gdtool: python show_in_gdtool.py MODEL OUT.png [unlit|ENV]
 
 The frame and the sun of show_in_three.mjs and show_in_blender.py, shaded from the exact buffers with Lambert's law; or
-lit by an environment as `gdtool relight` does.
+lit by an environment without shadows, of which three.js has none for such a light.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from gdtool.cameras import rig
 from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
 from gdtool.images.color import srgb_from_linear
 from gdtool.images.io import write_png
-from gdtool.shading.render import render_buffers, render_color
+from gdtool.shading.direct import DirectLight
+from gdtool.shading.render import Renderer, render_buffers
 from gdtool.shading.studio import studio
 
 
@@ -29,7 +30,9 @@ def main(model: str, out: str, mode: str = "lit") -> None:
         sun = np.maximum(images["normal"] @ (np.array([-1, 1, 1]) / np.sqrt(3)), 0)
         color, mask = images["albedo"] * (1.0 if mode == "unlit" else 0.3 + sun[..., None]), images["mask"]
     else:
-        color, mask = render_color(scene, front, studio(mode, 0, fit=False)[0])
+        renderer = Renderer(scene)
+        images = renderer.buffers(front, 16, DirectLight(renderer, studio(mode, 0, fit=False)[0], 16, shadows=False).color())
+        color, mask = images["color"], images["mask"]
     write_png(out, np.concatenate([srgb_from_linear(np.clip(color, 0, 1)), mask[..., None]], -1))
 
 
