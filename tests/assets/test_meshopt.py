@@ -1,4 +1,4 @@
-"""EXT_meshopt_compression by the package meshoptimizer, which also packs here (make extras-test)."""
+"""EXT_meshopt_compression by the package meshopt, which also packs here."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gdtool.assets.gltf_read import read_gltf
 from gdtool.core.errors import InputError
 from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder
 
-meshoptimizer = pytest.importorskip("meshoptimizer", reason="the extra meshopt is not installed")
+meshopt = pytest.importorskip("meshopt", reason="the extra codecs is not installed")
 
 
 def packed(builder: Builder, content: bytes, count: int, stride: int, mode: str, accessor: dict, **extra) -> int:
@@ -25,12 +25,11 @@ def packed(builder: Builder, content: bytes, count: int, stride: int, mode: str,
 def scene_of(tmp_path, index_type=np.uint32, mode="TRIANGLES", normals=None):
     builder = Builder()
     builder.document |= {"extensionsUsed": ["EXT_meshopt_compression"], "extensionsRequired": ["EXT_meshopt_compression"]}
-    attributes = {"POSITION": packed(builder, bytes(meshoptimizer.encode_vertex_buffer(QUAD, 4, 12)), 4, 12, "ATTRIBUTES", {"componentType": 5126, "type": "VEC3"})}
+    attributes = {"POSITION": packed(builder, meshopt.encode_vertex_buffer_level(QUAD, 2, 0), 4, 12, "ATTRIBUTES", {"componentType": 5126, "type": "VEC3"})}
     if normals is not None:
-        content = bytes(meshoptimizer.encode_vertex_buffer(normals.view(np.float32), 4, 4))
+        content = meshopt.encode_vertex_buffer_level(normals, 2, 0)
         attributes["NORMAL"] = packed(builder, content, 4, 4, "ATTRIBUTES", {"componentType": 5120, "type": "VEC3", "normalized": True}, filter="OCTAHEDRAL")
-    encode = meshoptimizer.encode_index_buffer if mode == "TRIANGLES" else meshoptimizer.encode_index_sequence
-    content = bytes(encode(QUAD_FACES.astype(np.uint32), len(QUAD_FACES), len(QUAD)))
+    content = meshopt.encode_gltf_buffer(QUAD_FACES.astype(np.uint32), mode)
     size = np.dtype(index_type).itemsize
     indices = packed(builder, content, len(QUAD_FACES), size, mode, {"componentType": {2: 5123, 4: 5125}[size], "type": "SCALAR"})
     builder.primitive(attributes, indices)
@@ -58,14 +57,14 @@ def test_exponents(tmp_path):
     """A float as a 24-bit whole number and an 8-bit exponent of two: 4 · 2⁻² is 1."""
     stored = ((QUAD * 4).astype(np.int64) | (0x100 - 2) << 24).astype(np.uint32)
     builder = Builder()
-    content = bytes(meshoptimizer.encode_vertex_buffer(stored.view(np.float32), 4, 12))
+    content = meshopt.encode_vertex_buffer_level(stored, 2, 0)
     builder.primitive({"POSITION": packed(builder, content, 4, 12, "ATTRIBUTES", {"componentType": 5126, "type": "VEC3"}, filter="EXPONENTIAL")},
                       builder.add(QUAD_FACES))
     np.testing.assert_array_equal(read_gltf(builder.write(tmp_path / "a.glb")).vertices, QUAD)
 
 
 def test_a_damaged_stream_is_named(tmp_path, monkeypatch):
-    good = meshoptimizer.encode_vertex_buffer
-    monkeypatch.setattr(meshoptimizer, "encode_vertex_buffer", lambda *a: bytes(good(*a))[:6])
+    good = meshopt.encode_vertex_buffer_level
+    monkeypatch.setattr(meshopt, "encode_vertex_buffer_level", lambda *a: good(*a)[:6])
     with pytest.raises(InputError, match="meshopt stream"):
         scene_of(tmp_path)
