@@ -27,7 +27,7 @@ COUNT_TOLERANCE = 0.03
 _SMALL_PIECE_QUADS = 48
 _TRIES = 3
 _CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a result is taken without a look at others
-_LOST_EDGES, _LOST_SHARE = 0.75, 0.01  # surface so far from the quads is lost on them, and how much of it may be
+_LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
 _RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
 _HANDLES, _PIECES = "handles are lost or added", "pieces are lost or joined"
 _QUADS_PER_TRIANGLE = 2.25  # of pair_and_split, where most triangles find a partner
@@ -181,7 +181,7 @@ def _one_by_one(vertices: np.ndarray, faces: np.ndarray, quads: int) -> list[tup
     """Each piece as a mesh of its own, with its share of the quads by area, small ones with enough for their shape."""
     count, piece = repair.components(faces)
     area, triangles = np.bincount(piece, face_normals(vertices, faces)[1], count), np.bincount(piece, minlength=count)
-    share = np.maximum(quads * area / area.sum(), np.minimum(triangles / 2, 2 * _SMALL_PIECE_QUADS)).round().astype(int)
+    share = np.maximum(quads * area / area.sum(), np.minimum(triangles / 2, quads / _MOST_PIECES)).round().astype(int)
     share[share.argmax()] -= share.sum() - quads
     return [(*repair.compact(vertices, faces[piece == k]), max(int(share[k]), 6)) for k in range(count)]
 
