@@ -23,7 +23,7 @@ from bake_cases import Case, case_of, read_low
 from bake_mips import rim_error
 from bake_score import Truth, scored
 from fine_meshes import models_in
-from measure import busy, machine, number, say, table
+from measure import busy, machine, number, peak_mb, say, table
 from rows import Rows
 from wireframe import file_name
 
@@ -45,11 +45,6 @@ def has_detail(path: Path) -> bool:
         say(f"{path.name}: left out: {error}")
         return False
     return scene.colors is not None or any(m.base_color_texture is not None for m in scene.materials)
-
-
-def peak_mb() -> float:
-    """The largest this process has been."""
-    return next(int(line.split()[1]) / 1024 for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
 
 
 class Clock:

@@ -38,12 +38,22 @@ def command() -> str:
     return found
 
 
+def peak_mb(process: int | str = "self") -> float:
+    """The largest that a process has been, 0 when it has ended."""
+    try:
+        lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    except OSError:
+        return 0.0
+    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")), 0.0)
+
+
 def gdtool(*arguments: str | Path, limit_seconds: float = 1800) -> Cost:
     """Run `gdtool arguments`. Raises Failed."""
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        start = time.perf_counter()
+        start, high = time.perf_counter(), 0.0
         process = subprocess.Popen([command(), *map(str, arguments)], stdout=out, stderr=err)
-        while True:  # wait4 is the only call that tells one child's memory
+        while True:  # wait4 is the only call that tells one child's memory, of its own children too
+            high = peak_mb(process.pid) or high
             pid, status, usage = os.wait4(process.pid, os.WNOHANG)
             seconds = time.perf_counter() - start
             if pid:
@@ -60,7 +70,9 @@ def gdtool(*arguments: str | Path, limit_seconds: float = 1800) -> Cost:
         last = texts[1].strip().splitlines()[-1:] or ["no message"]
         late = f" after {limit_seconds:.0f} s" if seconds > limit_seconds else ""
         raise Failed(f"{arguments[0]} exited with {process.returncode}{late}: {last[0]}")
-    return Cost(seconds, usage.ru_maxrss / 1024, texts[0], usage.ru_utime + usage.ru_stime)
+    # A child's account begins with what this process held when it started it; below that only the child itself can tell.
+    account = usage.ru_maxrss / 1024
+    return Cost(seconds, account if account > peak_mb() else high, texts[0], usage.ru_utime + usage.ru_stime)
 
 
 def evaluate(result: Path, *arguments: str | Path) -> dict:
