@@ -242,9 +242,8 @@ def _fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndar
     constraints = untied(traced, quad_faces, constraints)
     traced = relax(onto(traced, surface, features, constraints), quad_faces, surface, features, constraints, request.smooth_iterations)
     traced = _shaped(traced, quad_faces, surface, features, constraints, request, fine)
-    before, after = (scaled_jacobian(v, quad_faces) for v in (quad_vertices, traced))
-    worse = (after < 0).sum() > (before < 0).sum() or after.mean() < before.mean()
-    return (quad_vertices if worse else traced), quad_faces
+    before, after = (scaled_jacobian(v, quad_faces).mean() for v in (quad_vertices, traced))
+    return (traced if after >= before else quad_vertices), quad_faces
 
 
 def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float, request: Request,
