@@ -6,9 +6,10 @@ import numpy as np
 import torch
 
 from gdtool.cameras.camera import rig
-from gdtool.diffusion.config import DOMAINS, ModelConfig
+from gdtool.diffusion.config import DOMAINS, ModelConfig, TrainConfig
 from gdtool.diffusion.encoding import PLANES, SCALARS, decode
 
+SOFTNESS = 0.02  # of the absolute error: a gradient that is continuous at 0, without which sixteen-bit training rattles there
 LIT = ("normal", "albedo", "roughness", "metallic")  # what the closed form is made of
 
 
@@ -18,22 +19,26 @@ def linear(srgb: torch.Tensor) -> torch.Tensor:
     return torch.where(srgb <= 0.04045, srgb / 12.92, high)
 
 
-def squared_error(predicted: torch.Tensor, clean: torch.Tensor, objects: int, domains: tuple[int, ...], config: ModelConfig,
-                  weights: tuple[float, ...]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean squared error of latents (b d k, c, h, w) per object and domain, (b, d): with each domain's values weighted, and plain.
+def image_error(predicted: torch.Tensor, clean: torch.Tensor, objects: int, domains: tuple[int, ...], config: ModelConfig,
+                train: TrainConfig) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean error of latents (b d k, c, h, w) per object and domain, (b, d): as the training counts it, and plainly squared.
 
-    weights: one for each of DOMAINS; the coverage in a scalar domain's third channel weighs 1. The VAE's latents have no
-    such channels and are weighted as a whole.
+    train.domain_weights are of each domain's values; the coverage in a scalar domain's third channel weighs 1. In
+    train.absolute_domains the values count by their distance, of a normal in all three axes, rounded off below SOFTNESS
+    (Charbonnier's loss), all else by its square. The VAE's latents have no channel of coverage and are weighted as a whole.
     """
     square = (predicted - clean).float().square()
-    if config.codec == "patch":
-        per_channel = square.unflatten(1, (3, -1)).mean((2, 3, 4))  # (n, 3)
-        factor = torch.tensor([[weights[i], weights[i], 1.0 if DOMAINS[i] in SCALARS else weights[i]] for i in domains], device=square.device)
-    else:
-        per_channel = square.mean((1, 2, 3))[:, None]
-        factor = torch.tensor([[weights[i]] for i in domains], device=square.device)
-    per_channel = per_channel.unflatten(0, (objects, len(domains), -1))  # (b, d, k, channels)
-    return (per_channel * factor[:, None]).mean((2, 3)), per_channel.mean((2, 3))
+    if config.codec != "patch":
+        square = square.mean((1, 2, 3)).unflatten(0, (objects, len(domains), -1)).mean(2)
+        return square * square.new_tensor([train.domain_weights[i] for i in domains]), square
+    square = square.unflatten(1, (3, -1)).unflatten(0, (objects, len(domains), -1))  # (b, d, k, 3, patch², h, w)
+    counted = []
+    for j, i in enumerate(domains):
+        value, coverage = square[:, j].split((2, 1) if DOMAINS[i] in SCALARS else (3, 0), dim=2)
+        if DOMAINS[i] in train.absolute_domains:
+            value = ((value.mean(2, keepdim=True) + SOFTNESS**2).sqrt() - SOFTNESS).expand_as(value)
+        counted.append(torch.cat([train.domain_weights[i] * value, coverage], 2).flatten(1).mean(1))
+    return torch.stack(counted, 1), square.flatten(2).mean(2)
 
 
 def view_directions(config: ModelConfig) -> torch.Tensor:

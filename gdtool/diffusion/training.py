@@ -28,7 +28,7 @@ from gdtool.diffusion.attention import Layout
 from gdtool.diffusion.config import DOMAINS, ModelConfig, Phase, TrainConfig
 from gdtool.diffusion.data import Batch, Objects, draw, object_order
 from gdtool.diffusion.encoding import BACKGROUND, encode, encode_condition
-from gdtool.diffusion.losses import rendering_error, squared_error, view_directions
+from gdtool.diffusion.losses import image_error, rendering_error, view_directions
 from gdtool.diffusion.model import Model
 from gdtool.diffusion.optimizer import MOMENTS, make_optimizer, restore_moments
 from gdtool.diffusion.sampling import precision_context
@@ -145,9 +145,9 @@ def losses(model: Model, batch: Batch, step: Step, generators: list[torch.Genera
         condition = model.condition_latents(rgba, layout, step.views) * ~latent_off.repeat_interleave(n)[:, None, None, None]
         predicted = model.predict_clean(noisy, condition, t, context, layout, step.views)
 
-    weighted, square = squared_error(predicted, clean, b, step.domains, config, train.domain_weights)  # (b, d) each
+    counted, square = image_error(predicted, clean, b, step.domains, config, train)  # (b, d) each
     weight = loss_weight(model.signal[t], model.deviation[t], train.snr_gamma, train.snr_floor)
-    total = (weight[:, None] * weighted).mean()
+    total = (weight[:, None] * counted).mean()
     parts = {DOMAINS[i]: square[:, j].mean().detach() for j, i in enumerate(step.domains)}
 
     snr = (model.signal[t] / model.deviation[t]).square()

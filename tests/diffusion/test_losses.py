@@ -4,9 +4,9 @@ import numpy as np
 import torch
 
 from gdtool.diffusion.codec import make_codec
-from gdtool.diffusion.config import PRESETS
+from gdtool.diffusion.config import PRESETS, TrainConfig
 from gdtool.diffusion.encoding import encode, planes_from_images
-from gdtool.diffusion.losses import linear, rendering_error, squared_error, view_directions
+from gdtool.diffusion.losses import image_error, linear, rendering_error, view_directions
 from gdtool.images.color import linear_from_srgb
 from tests.diffusion.spheres import LIGHT, sphere_views
 
@@ -79,14 +79,44 @@ def test_a_weighted_domain_counts_more_and_its_coverage_does_not():
     codec = make_codec(CONFIG)
     _, truth, _ = setting()
     truth = torch.nn.functional.interpolate(truth.flatten(0, 1), size=CONFIG.image_size)
-    clean, weights = codec.encode(truth), (1.0, 2.0, 8.0, 1.0, 1.0, 0.5)
+    clean, train = codec.encode(truth), TrainConfig(domain_weights=(1.0, 2.0, 8.0, 1.0, 1.0, 0.5))
 
     def both(channel, domain):
         changed = truth.clone()
         changed[domain * 6: domain * 6 + 6, channel] += 0.3
-        return (x[0, domain] for x in squared_error(codec.encode(changed), clean, 1, tuple(range(6)), CONFIG, weights))
+        return (x[0, domain] for x in image_error(codec.encode(changed), clean, 1, tuple(range(6)), CONFIG, train))
 
     for domain, channel, factor in ((0, 0, 1), (1, 2, 2), (2, 0, 8), (2, 1, 8), (2, 2, 1), (5, 0, 0.5), (5, 2, 1)):
         weighted, plain = both(channel, domain)
         torch.testing.assert_close(plain, torch.tensor(0.03))
         torch.testing.assert_close(weighted, factor * plain)
+
+
+def test_in_a_domain_compared_by_distance_a_median_is_best_and_coverage_stays_squared():
+    """Of three truths 0, 0 and 0.9, one estimate: the squared error is least at their mean, the distance at their median."""
+    codec, base = make_codec(CONFIG), torch.zeros(36, 3, CONFIG.image_size, CONFIG.image_size)
+    train = TrainConfig(absolute_domains=("normal", "depth"))
+
+    def cost(domain, channels, estimate):
+        guess, total = base.clone(), 0.0
+        guess[domain * 6: domain * 6 + 6, channels] = estimate
+        for one in (0.0, 0.0, 0.9):
+            target = base.clone()
+            target[domain * 6: domain * 6 + 6, channels] = one
+            total += float(image_error(codec.encode(guess), codec.encode(target), 1, tuple(range(6)), CONFIG, train)[0][0, domain])
+        return total
+
+    for domain, channels in ((1, [0, 1, 2]), (2, [0, 1])):
+        assert cost(domain, channels, 0.0) < 0.8 * cost(domain, channels, 0.3)
+    for domain, channels in ((0, [0]), (2, [2]), (4, [0, 1])):
+        assert cost(domain, channels, 0.3) < cost(domain, channels, 0.0)
+
+
+def test_the_distance_of_a_normal_does_not_depend_on_the_axes():
+    codec, train = make_codec(CONFIG), TrainConfig(absolute_domains=("normal",))
+    zero = torch.zeros(6, 3, CONFIG.image_size, CONFIG.image_size)
+
+    def cost(vector):
+        return image_error(codec.encode(zero + torch.tensor(vector)[:, None, None]), codec.encode(zero), 1, (1,), CONFIG, train)[0]
+
+    torch.testing.assert_close(cost([0.3, 0.0, 0.0]), cost([0.3 / 3**0.5] * 3))
