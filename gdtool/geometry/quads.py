@@ -10,15 +10,16 @@ from functools import cache
 
 import numpy as np
 
-from gdtool.core.child import ChildFailed, begin, call, prepare
+from gdtool.core.child import ChildFailed, begin, prepare
 from gdtool.geometry import repair
 from gdtool.geometry.features import Constraints, Features, find_features, trace, untied
 from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian, valences
 from gdtool.geometry.normals import face_normals
-from gdtool.geometry.quad_engines import ENGINES, pair_and_split
+from gdtool.geometry.quad_engines import ENGINES
 from gdtool.geometry.quad_paths import crossed, cut_along_features, held_at_centres, to_rim
 from gdtool.geometry.quad_relax import balance, ease, square_up
 from gdtool.geometry.quad_shape import Surface, fill_holes, onto, relax, remove_doublets, subdivide, unfold
+from gdtool.geometry.quad_split import split_count, split_to_quads
 from gdtool.geometry.quad_topology import cancel_irregular
 from gdtool.geometry.sharpen import restore_creases
 from gdtool.geometry.simplify import simplify
@@ -30,7 +31,6 @@ _CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a res
 _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
 _RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
 _HANDLES, _PIECES = "handles are lost or added", "pieces are lost or joined"
-_QUADS_PER_TRIANGLE = 2.25  # of pair_and_split, where most triangles find a partner
 _MOST_PIECES = 16  # that are remeshed one by one where together they fail
 
 
@@ -99,8 +99,8 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
                     continue
             if found is None:
                 start = time.perf_counter()
-                found = (*_fitted(*_by_splitting(part_vertices, part_faces, quads, request), part_vertices, part_faces, request, fine()),
-                         "pair and split")
+                split = split_to_quads(part_vertices, part_faces, quads, request.crease_degrees, request.seconds, request.memory_mb)
+                found = *_fitted(*split, part_vertices, part_faces, request, fine()), "pair and split"
                 record.clock("fallback", start)
             done.append(found[:2])
             names.append(found[2])
@@ -172,7 +172,7 @@ def _pieces(vertices: np.ndarray, faces: np.ndarray, quads: int) -> list[tuple[n
                 budget = max(budget, int(min(enough, quads / 4)), 1)
             out.append((*own, budget))
     if len(out) == 2:  # the asked count holds for the sum
-        few = _by_splitting_count(out[1][1], out[1][2])
+        few = split_count(out[1][1], out[1][2])
         out[0] = (*out[0][:2], max(quads - few, 4))
     return out
 
@@ -186,55 +186,9 @@ def _one_by_one(vertices: np.ndarray, faces: np.ndarray, quads: int) -> list[tup
     return [(*repair.compact(vertices, faces[piece == k]), max(int(share[k]), 6)) for k in range(count)]
 
 
-def _by_splitting_count(faces: np.ndarray, quads: int) -> int:
-    return max(quads, 12 * repair.components(faces)[0])
-
-
-def _by_splitting(vertices: np.ndarray, faces: np.ndarray, quads: int, request: Request) -> tuple[np.ndarray, np.ndarray]:
-    """pair_and_split of the mesh brought to the right number of triangles; no piece is lost."""
-    quads = _by_splitting_count(faces, quads)
-    even = _even(vertices, faces, quads, request)
-    return pair_and_split(*even, quads) if even is not None else _by_collapse(vertices, faces, quads)
-
-
-def _even(vertices: np.ndarray, faces: np.ndarray, quads: int, request: Request) -> tuple[np.ndarray, np.ndarray] | None:
-    """Even triangles of the same topology that split into so many quads; None where there are none, as on what is small and intricate."""
-    triangles = int(quads / _QUADS_PER_TRIANGLE)
-    few_vertices, few = simplify(vertices, faces, 2 * triangles, seconds=request.seconds, measured=False)[:2]
-    try:
-        out, found = call("gdtool.geometry.quad_engines:even_triangles", few_vertices, few, triangles, request.crease_degrees,
-                          seconds=request.seconds, memory_mb=request.memory_mb)
-    except ChildFailed:
-        return None
-    if not 2.1 * len(found) <= quads <= 3 * len(found):
-        return None
-    out, found = repair.compact(out, found)
-    same = all(of(found) == of(faces) for of in (repair.is_watertight, repair.is_manifold, _euler, lambda f: repair.components(f)[0]))
-    return (out, found) if same and np.isfinite(out).all() else None
-
-
-def _by_collapse(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[np.ndarray, np.ndarray]:
-    """pair_and_split of the mesh's own triangles, cut in four or collapsed to the right number."""
-    import igl
-
-    triangles = max(int(quads / _QUADS_PER_TRIANGLE), 4)
-    while len(faces) < triangles:
-        vertices, faces = (np.asarray(x) for x in igl.upsample(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64), 1))
-    pieces = repair.components(faces)[0]
-    # A collapse that loses pieces is tried again more gently before the mesh is taken as it is.
-    for target in (triangles, 2 * triangles, 4 * triangles):
-        if target >= len(faces):
-            break
-        out, out_faces, _, _ = simplify(vertices, faces, target)
-        if repair.components(out_faces)[0] == pieces and repair.is_manifold(out_faces) >= repair.is_manifold(faces):
-            vertices, faces = out, out_faces
-            break
-    return pair_and_split(vertices, faces, quads)
-
-
 def _fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
             request: Request, fine: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """What pair_and_split made, evened out on the surface where that makes better quads; only its vertices move."""
+    """What split_to_quads made, evened out on the surface where that makes better quads; only its vertices move."""
     edge = (polygon_normals(quad_vertices, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
     features = find_features(vertices, faces, request.crease_degrees or 181.0, 3 * edge)
     surface = Surface(vertices, faces)
@@ -369,13 +323,9 @@ def _judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndar
         return "not manifold", quad_vertices, quad_faces
     if repair.components(quad_faces)[0] != repair.components(faces)[0]:
         return _PIECES, quad_vertices, quad_faces
-    if closed and _euler(quad_faces) != _euler(faces):
+    if closed and repair.euler_number(quad_faces) != repair.euler_number(faces):
         return _HANDLES, quad_vertices, quad_faces
     return None, quad_vertices, quad_faces
-
-
-def _euler(faces: np.ndarray) -> int:
-    return len(np.unique(faces[faces >= 0])) - len(repair.edges_of(faces).ends) + len(faces)
 
 
 def _finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, subdivisions: int,

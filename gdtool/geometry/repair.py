@@ -179,19 +179,27 @@ def without_crumbs(vertices: np.ndarray, faces: np.ndarray, pieces: int) -> tupl
 
 def components(faces: np.ndarray) -> tuple[int, np.ndarray]:
     """Number of pieces and the piece (f,) of each face; faces that share an edge are of one piece."""
-    from scipy.sparse import coo_matrix
+    from scipy.sparse import bmat, coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     edges = edges_of(faces)
     n = len(faces)
     graph = coo_matrix((np.ones(len(edges.half_face)), (edges.half_face, edges.half_edge_idx)), (n, len(edges.ends))).tocsr()
     # Faces and edges as one bipartite graph: linear in the number of corners, whatever the edges' valence.
-    from scipy.sparse import bmat
-
     count, label = connected_components(bmat([[None, graph], [graph.T, None]]), False)
     label = label[:n]
     names, label = np.unique(label, return_inverse=True)
     return len(names), label.ravel()
+
+
+def euler_number(faces: np.ndarray) -> int:
+    """Vertices that are used, less edges, plus faces."""
+    return len(np.unique(faces[faces >= 0])) - len(edges_of(faces).ends) + len(faces)
+
+
+def topology(faces: np.ndarray) -> tuple[bool, bool, int, int]:
+    """Watertight, manifold, pieces, Euler number: what a mesh must not change in when it is made coarser or even."""
+    return is_watertight(faces), is_manifold(faces), components(faces)[0], euler_number(faces)
 
 
 def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from gdtool.folders.mesh import triangulated
 from gdtool.geometry import quads, repair
 from gdtool.geometry.features import find_features
 from gdtool.geometry.mesh_quality import distance_figures, scaled_jacobian, shape_figures, topology_figures
-from gdtool.geometry.quad_engines import pair_and_split
+from gdtool.geometry.quad_split import pair_and_split
 from gdtool.geometry.quad_shape import remove_doublets, subdivide
 from gdtool.geometry.sharpen import restore_creases
 from tests.geometry.solids import bored_box, cube, joined, plane, sphere, torus, volume

@@ -1,0 +1,133 @@
+"""Quads without an engine, by a construction that cannot fail: even triangles, joined in pairs, every face cut in quads."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.core.child import ChildFailed, call
+from gdtool.geometry.normals import face_normals
+from gdtool.geometry.quad_shape import subdivide
+from gdtool.geometry.repair import compact, components, edges_of, is_manifold, topology
+from gdtool.geometry.simplify import simplify
+
+_QUADS_PER_TRIANGLE = 2.25  # of pair_and_split, where most triangles find a partner
+_EVEN_COUNT = 0.03  # even_triangles come so near to the number asked for
+_APART = 1e-6  # of the size, between vertices that coincide
+
+
+def split_count(faces: np.ndarray, quads: int) -> int:
+    """How many quads split_to_quads makes where so many are asked for: enough for every piece."""
+    return max(quads, 12 * components(faces)[0])
+
+
+def split_to_quads(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float, seconds: float,
+                   memory_mb: int) -> tuple[np.ndarray, np.ndarray]:
+    """Quads (split_count(faces, quads), 4) of any triangle mesh; no piece is lost, closed and manifold where the triangles are.
+
+    vertices (v, 3) in a unit box, faces (f, 3). Creases sharper than crease_degrees are kept; seconds and memory_mb: limits
+    of each run in a child, whose failure costs evenness alone.
+    """
+    quads = split_count(faces, quads)
+    even = _even(vertices, faces, quads, crease_degrees, seconds, memory_mb)
+    return pair_and_split(*even, quads) if even is not None else _by_collapse(vertices, faces, quads)
+
+
+def _even(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float, seconds: float,
+          memory_mb: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Even triangles of the same topology that split into so many quads; None where there are none, as on what is small and intricate."""
+    triangles = int(quads / _QUADS_PER_TRIANGLE)
+    few_vertices, few = simplify(vertices, faces, 2 * triangles, seconds=seconds, measured=False)[:2]
+    try:
+        out, found = call("gdtool.geometry.quad_split:even_triangles", few_vertices, few, triangles, crease_degrees, seconds=seconds,
+                          memory_mb=memory_mb)
+    except ChildFailed:
+        return None
+    if not 2.1 * len(found) <= quads <= 3 * len(found):
+        return None
+    out, found = compact(out, found)
+    return (out, found) if topology(found) == topology(faces) and np.isfinite(out).all() else None
+
+
+def even_triangles(vertices: np.ndarray, faces: np.ndarray, triangles: int, crease_degrees: float) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles of even size and shape, about as many as asked: MeshLab's isotropic remeshing (Botsch & Kobbelt 2004, "A
+    remeshing approach to multiresolution modeling"). Creases sharper than crease_degrees stay, a tenth of an edge is the
+    farthest that the surface moves. Unchecked."""
+    import pymeshlab
+
+    # MeshLab joins vertices that coincide, which closes slits and leaves edges of four faces.
+    apart = np.random.default_rng(0).uniform(-1, 1, vertices.shape) * _APART * np.ptp(vertices, 0).max()
+    own = np.ascontiguousarray(vertices + apart, np.float64), np.ascontiguousarray(faces, np.int32)
+    edge, found = (4 / 3**0.5 * face_normals(vertices, faces)[1].sum() / triangles) ** 0.5, faces
+    for _ in range(4):
+        meshes = pymeshlab.MeshSet()
+        meshes.add_mesh(pymeshlab.Mesh(*own))
+        meshes.meshing_isotropic_explicit_remeshing(
+            iterations=10, targetlen=pymeshlab.PureValue(edge), featuredeg=crease_degrees or 180.0, checksurfdist=True,
+            maxsurfdist=pymeshlab.PureValue(edge / 10))
+        mesh = meshes.current_mesh()
+        vertices, found = np.asarray(mesh.vertex_matrix()), np.asarray(mesh.face_matrix(), np.int64)
+        if abs(len(found) / triangles - 1) < _EVEN_COUNT or not len(found):
+            break
+        edge *= (len(found) / triangles) ** 0.7  # along creases they follow the edge itself
+    return vertices, found
+
+
+def _by_collapse(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[np.ndarray, np.ndarray]:
+    """pair_and_split of the mesh's own triangles, cut in four or collapsed to the right number."""
+    import igl
+
+    triangles = max(int(quads / _QUADS_PER_TRIANGLE), 4)
+    while len(faces) < triangles:
+        vertices, faces = (np.asarray(x) for x in igl.upsample(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64), 1))
+    pieces = components(faces)[0]
+    # A collapse that loses pieces is tried again more gently before the mesh is taken as it is.
+    for target in (triangles, 2 * triangles, 4 * triangles):
+        if target >= len(faces):
+            break
+        out, out_faces, _, _ = simplify(vertices, faces, target)
+        if components(out_faces)[0] == pieces and is_manifold(out_faces) >= is_manifold(faces):
+            vertices, faces = out, out_faces
+            break
+    return pair_and_split(vertices, faces, quads)
+
+
+def pair_and_split(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[np.ndarray, np.ndarray]:
+    """Quads without any engine: triangles joined in pairs, best first, then every face cut into one quad per corner.
+
+    About quads / 2.2 triangles give exactly `quads` quads. Closed and manifold exactly where the triangles are.
+    """
+    edges = edges_of(faces)
+    edge_idx, pairs = edges.face_pairs()
+    ends = edges.ends[edge_idx]
+    tips = faces[pairs].sum(2) - ends.sum(1)[:, None]
+    corners = np.stack([ends[:, 0], tips[:, 0], ends[:, 1], tips[:, 1]], -1)
+    p = vertices[corners]
+    after, before = np.roll(p, -1, 1) - p, np.roll(p, 1, 1) - p
+    length = np.maximum(np.linalg.norm(after, axis=-1) * np.linalg.norm(before, axis=-1), 1e-300)
+    cosine = np.abs((after * before).sum(-1) / length).max(1)
+    a, b = (np.cross(vertices[faces[pairs[:, i], 1]] - vertices[faces[pairs[:, i], 0]],
+                     vertices[faces[pairs[:, i], 2]] - vertices[faces[pairs[:, i], 0]]) for i in range(2))
+    bend = (a * b).sum(1) / np.maximum(np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1), 1e-300)
+    usable = (bend > 0.5) & ~edges.turned[edge_idx] & (tips[:, 0] != tips[:, 1])
+    # Each pair spares two quads: three a triangle apart, four together.
+    wanted = max((3 * len(faces) - quads + 1) // 2, 0)
+    single = np.ones(len(faces), bool)
+    chosen = []
+    for i in np.flatnonzero(usable)[np.argsort(cosine[usable] + (1 - bend[usable]), kind="stable")].tolist():
+        if len(chosen) >= wanted:
+            break
+        f, g = pairs[i]
+        if single[f] and single[g]:
+            single[f] = single[g] = False
+            chosen.append(i)
+    chosen = np.array(chosen, np.int64)
+    mixed = np.full((int(single.sum()) + len(chosen), 4), -1, np.int64)
+    mixed[:int(single.sum()), :3] = faces[single]
+    if len(chosen):
+        first = faces[pairs[chosen, 0]]
+        # The first triangle with its tip in front: tip, one end, the other triangle's tip, the other end.
+        turn = np.argmax(first == tips[chosen, 0][:, None], 1)
+        row = np.arange(len(chosen))
+        mixed[int(single.sum()):] = np.stack([tips[chosen, 0], first[row, (turn + 1) % 3], tips[chosen, 1], first[row, (turn + 2) % 3]], -1)
+    out, found, _ = subdivide(vertices, mixed)
+    return out, found
