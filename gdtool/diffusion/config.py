@@ -58,6 +58,8 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     timesteps: int = 1000
     noise_schedule: Literal["scaled_linear", "cosine"] = "cosine"
     sampling_steps: int = 50  # denoising steps of sample-views when none are asked for: what measured best for this model
+    # the mean of what is made of the picture and of its mirror image; twice the time. Patch codec and own convention only.
+    sampling_mirrored: bool = False
     # encoded background of color and albedo while training; sampling uses the first
     backgrounds: tuple[Literal["white", "grey", "black"], ...] = ("grey",)
     # where the pretrained parts of the paper's configuration live: a local folder or a hub id
@@ -122,7 +124,7 @@ PRESETS: dict[str, tuple[ModelConfig, TrainConfig]] = {
     ),
     # what a laptop trains over lunch, and what the bundled model is
     # While it is trained for minutes and not for days, its first prediction is its best (docs/benchmarks/model_quality.md).
-    "small": (ModelConfig(sampling_steps=1, row_attention=(True, False, False), noisy_input="shrunk"), TrainConfig()),
+    "small": (ModelConfig(sampling_steps=1, sampling_mirrored=True, row_attention=(True, False, False), noisy_input="shrunk"), TrainConfig()),
     # METHOD section 1: Stable Diffusion Image Variations grown to six domains; 30,000 multi-view steps, then 20,000
     # with attention across the domains, batch 512
     "paper": (

@@ -17,10 +17,9 @@ import torch.nn.functional as F
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
 from gdtool.diffusion.config import ModelConfig, TrainConfig
-from gdtool.diffusion.encoding import PLANE_COUNT, PLANES, planes_from_images
+from gdtool.diffusion.encoding import PLANE_COUNT, PLANES, mirrored_order, planes_from_images
 
 LIGHTS = 16
-MIRRORED_VIEW = {"front_right": "front_left", "front_left": "front_right", "right": "left", "left": "right"}
 
 
 @dataclass(frozen=True)
@@ -175,7 +174,7 @@ def draw(objects: Objects, idx: np.ndarray, config: ModelConfig, train: TrainCon
 
 def mirror(planes, rgba, light, views: tuple[str, ...]):
     """The mirror image of an object about its x = 0 plane: views swap sides, x of normals and lights turns round."""
-    order = [views.index(MIRRORED_VIEW.get(name, name)) for name in views]
+    order = mirrored_order(views)
     planes = planes[order].flip(-1)
     x = PLANES["normal"].start
     planes[:, x] = -planes[:, x]

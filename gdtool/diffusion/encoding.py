@@ -23,6 +23,7 @@ SCALARS = ("depth", "roughness", "metallic")
 PLANES = {"color": slice(0, 3), "normal": slice(3, 6), "depth": slice(6, 7), "albedo": slice(7, 10),
           "roughness": slice(10, 11), "metallic": slice(11, 12), "mask": slice(12, 13)}
 PLANE_COUNT = 13
+MIRRORED_VIEW = {"front_right": "front_left", "front_left": "front_right", "right": "left", "left": "right"}
 
 
 def planes_from_images(images: dict[str, np.ndarray], mask: np.ndarray) -> np.ndarray:
@@ -65,6 +66,20 @@ def encode(planes: torch.Tensor, domains: tuple[int, ...], background: torch.Ten
             value = torch.cat([value, value, mask], 2)
         out.append(value)
     return torch.stack(out, 1)
+
+
+def mirrored_order(views: tuple[str, ...]) -> list[int]:
+    """Where in views the one is that, flipped, shows the object's mirror image about x = 0 as each of them sees it."""
+    return [views.index(MIRRORED_VIEW.get(name, name)) for name in views]
+
+
+def mirrored(images: torch.Tensor, domains: tuple[int, ...], views: tuple[str, ...]) -> torch.Tensor:
+    """Encoded images (b, d, k, 3, h, w) of the objects' mirror images about x = 0; its own inverse."""
+    images = images[:, :, mirrored_order(views)].flip(-1)
+    for j, i in enumerate(domains):
+        if DOMAINS[i] == "normal":
+            images[:, j, :, 0] *= -1
+    return images
 
 
 def encode_condition(rgba: torch.Tensor, background: torch.Tensor) -> torch.Tensor:

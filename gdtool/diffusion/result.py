@@ -15,6 +15,18 @@ def sharpen(mask: torch.Tensor) -> torch.Tensor:
     return ((mask - 0.5) * 2 + 0.5).clamp(0, 1)
 
 
+def tied(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
+    """Coverage (k, h, w), where two orthographic cameras face one another the mean of both: they see one outline, mirrored."""
+    out = soft.clone()
+    for k, camera in enumerate(cameras):
+        facing = np.diag([-1.0, 1.0, -1.0])  # the other's axes, seen from this camera
+        for other, opposite in enumerate(cameras):
+            if camera.projection == opposite.projection == "orthographic" and np.allclose(
+                    camera.world_from_camera[:3, :3] @ facing, opposite.world_from_camera[:3, :3], atol=1e-6):
+                out[k] = (soft[k] + soft[other].flip(-1)) / 2
+    return out
+
+
 def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], background: float, domains: tuple[str, ...],
                       picture_alpha: np.ndarray | None = None) -> Views:
     """Encoded images (k, 3, h, w) of one object -> Views of the asked domains with one mask per view, shared by all.
@@ -25,7 +37,7 @@ def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], ba
     from gdtool.images.color import linear_from_srgb
 
     soft = coverage(images, background)
-    mask = sharpen(soft).numpy()
+    mask = sharpen(tied(soft, cameras)).numpy()
     values = decode(images, soft, background)
     if picture_alpha is not None:
         known = np.ascontiguousarray(picture_alpha, np.float32)

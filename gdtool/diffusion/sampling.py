@@ -7,9 +7,10 @@ from contextlib import nullcontext
 
 import torch
 
+from gdtool.core.errors import InputError
 from gdtool.diffusion.attention import Layout
 from gdtool.diffusion.config import DOMAINS
-from gdtool.diffusion.encoding import BACKGROUND, encode_condition
+from gdtool.diffusion.encoding import BACKGROUND, encode_condition, mirrored
 from gdtool.diffusion.model import Model
 from gdtool.diffusion.schedule import sample
 
@@ -22,15 +23,21 @@ def precision_context(device: torch.device | str, precision: str):
 
 @torch.no_grad()
 def sample_images(model: Model, rgba: torch.Tensor, *, domains: tuple[str, ...] = DOMAINS, steps: int = 8, guidance: float = 1.0,
-                  seed: int = 0, scheduler: str = "ddim", precision: str = "float32",
+                  seed: int = 0, scheduler: str = "ddim", precision: str = "float32", mirror: bool | None = None,
                   progress: Callable = lambda iterable, total, label: iterable) -> dict[str, torch.Tensor]:
     """Sample every view of the domains for a batch of objects.
 
     rgba (b, 4, h, w): framed condition, premultiplied and encoded (data.condition_plane). Returns domain to encoded
     images (b, k, 3, h, w) over the first of the configuration's backgrounds. Noise depends on seed alone: neither on the
     batch nor on which domains are asked for. Where color is primary it is sampled even when it is not asked for.
+    mirror: take at each step the mean of what the picture and its mirror image give; None: as the configuration says.
     """
-    config, device, b = model.config, rgba.device, len(rgba)
+    config, device = model.config, rgba.device
+    mirror = config.sampling_mirrored if mirror is None else mirror
+    if mirror and (config.codec != "patch" or config.convention != "gdtool"):
+        raise InputError("mirror", "only a model of the patch codec and of gdtool's convention is sampled with the mirrored picture")
+    rgba = torch.cat([rgba, rgba.flip(-1)]) if mirror else rgba
+    b = len(rgba)
     wanted = [d for d in config.domains if d in domains]
     if config.cross_domain != "none" and "color" not in wanted:
         wanted = ["color", *wanted]
@@ -39,6 +46,17 @@ def sample_images(model: Model, rgba: torch.Tensor, *, domains: tuple[str, ...] 
     every = Layout(1, tuple(range(len(DOMAINS))), len(views))
     noise = torch.randn(model.latent_shape(every), generator=torch.Generator().manual_seed(seed))
     noise = noise.unflatten(0, (len(DOMAINS), len(views)))[list(indices)].flatten(0, 1).repeat(b, 1, 1, 1).to(device)
+
+    def turned(latents):
+        """Latents of some of the objects as their mirror images'."""
+        images = model.codec.decode(latents).unflatten(0, (-1, len(indices), len(views)))
+        return model.codec.encode(mirrored(images, indices, config.views).flatten(0, 2))
+
+    def of_mirror(one):
+        return torch.cat([one, turned(one)])
+
+    if mirror:
+        noise = of_mirror(noise.chunk(2)[0])
 
     background = torch.full((b,), BACKGROUND[config.backgrounds[0]], device=device)
     rgba = encode_condition(rgba, background)
@@ -62,10 +80,15 @@ def sample_images(model: Model, rgba: torch.Tensor, *, domains: tuple[str, ...] 
         if guided:
             with_condition, without = clean.chunk(2)
             clean = without + guidance * (with_condition - without)
+        if mirror:
+            one, other = clean.chunk(2)
+            clean = of_mirror((one + turned(other)) / 2)
         return clean
 
     latents = sample(denoise, noise, config, steps, scheduler)
     for _ in bar:
         pass
+    if mirror:
+        latents, b = latents.chunk(2)[0], b // 2
     images = model.codec.decode(latents).unflatten(0, (b, len(indices), len(views)))
     return {d: images[:, j] for j, d in enumerate(wanted)}

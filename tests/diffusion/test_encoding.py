@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gdtool.diffusion.config import DOMAINS
-from gdtool.diffusion.encoding import coverage, decode, encode, planes_from_images
+from gdtool.diffusion.encoding import coverage, decode, encode, mirrored, planes_from_images
 from gdtool.diffusion.framing import FRONT_EXTENT, frame, whole_frame
 from tests.diffusion.spheres import sphere_views
 
@@ -97,3 +97,30 @@ def test_the_pictures_silhouette_is_the_front_views_and_mirrored_the_backs(spher
     np.testing.assert_allclose(out.mask[names.index("right")], views.mask[names.index("right")], atol=1e-6)
     assert all(np.isfinite(image).all() for image in out.images.values())
     assert (out.images["depth"][names.index("front")][alpha == 0] == 0).all()
+
+
+def test_mirrored_images_are_the_images_of_the_mirrored_object():
+    from gdtool.cameras import rig
+    from gdtool.diffusion.data import mirror
+
+    generator, names = torch.Generator().manual_seed(0), tuple(camera.name for camera in rig("six", 8))
+    planes = 2 * torch.rand(6, 13, 8, 8, generator=generator) - 1
+    turned = mirror(planes, torch.zeros(4, 8, 8), torch.zeros(16, 7), names)[0]
+    for domains in (tuple(range(6)), (0, 1), (2, 3)):
+        one, other = (encode(x[None], domains, torch.tensor([1.0])) for x in (planes, turned))
+        torch.testing.assert_close(mirrored(one, domains, names), other)
+        torch.testing.assert_close(mirrored(other, domains, names), one)
+
+
+def test_views_from_opposite_sides_get_one_outline():
+    """A model that guesses the outline from the right larger than from the left: both get the mean."""
+    from gdtool.cameras import rig
+    from gdtool.diffusion.result import tied
+
+    cameras = rig("six", 8)
+    names, soft = [camera.name for camera in cameras], torch.rand(6, 8, 8, generator=torch.Generator().manual_seed(1))
+    out = tied(soft, cameras)
+    right, left, slanted = (names.index(name) for name in ("right", "left", "front_right"))
+    torch.testing.assert_close(out[right], (soft[right] + soft[left].flip(-1)) / 2)
+    torch.testing.assert_close(out[left], out[right].flip(-1))
+    torch.testing.assert_close(out[slanted], soft[slanted])
