@@ -210,7 +210,7 @@ def measure(index: int, name: str, source: str, folder: Path, bench: Bench, pool
         return
     say(name)
     clean = folder / "views"
-    gdtool("render-dataset", source, "-o", clean, "--size", str(given.size), "--samples", "4", "--light-samples", "4", "--quiet")
+    gdtool("render-dataset", source, "-o", clean, "--size", str(given.size), "--light-samples", "4", "--quiet")
     opened = open_folder(clean)
     views, truth = read_views(opened), load_scene(source)
     to_views = invert_similarity(np.array(opened.content.source_from_world).reshape(4, 4))

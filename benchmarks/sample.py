@@ -1,4 +1,4 @@
-"""Sampling: time against error over scheduler, steps, guidance, precision and domains, on held-out objects.
+"""Sampling: time against error over scheduler, steps, the mirrored picture, guidance, precision and domains, on held-out objects.
 
     python benchmarks/sample.py --model my-model -o docs/benchmarks
 
@@ -30,14 +30,15 @@ from gdtool.diffusion.weights import load_model
 from gdtool.folders.views import Views
 from gdtool.images.metrics import over_white, psnr
 
-REFERENCE = {"steps": 50}
+REFERENCE = {"steps": 50, "mirror": False}
 SETTINGS = [
     REFERENCE,
-    *({"steps": steps} for steps in (1, 2, 4, 8, 20)),
-    *({"steps": steps, "scheduler": "dpm"} for steps in (4, 8, 20)),
-    *({"steps": steps, "precision": "bfloat16"} for steps in (1, 8)),
-    *({"steps": 8, "guidance": guidance} for guidance in (1.5, 3.0)),
-    *({"steps": 1, "domains": domains} for domains in (("color", "normal"), ("color",))),
+    *({"steps": steps, "mirror": False} for steps in (1, 2, 4, 8, 20)),
+    *({"steps": steps, "mirror": True} for steps in (1, 2, 4)),
+    *({"steps": steps, "scheduler": "dpm", "mirror": False} for steps in (4, 8, 20)),
+    *({"steps": steps, "precision": "bfloat16", "mirror": False} for steps in (1, 8)),
+    *({"steps": 8, "guidance": guidance, "mirror": False} for guidance in (1.5, 3.0)),
+    *({"steps": 1, "domains": domains, "mirror": False} for domains in (("color", "normal"), ("color",))),
 ]
 TRUE = ("color_psnr_frame", "color_ssim_frame", "albedo_psnr_frame", "normal_degrees", "depth_error", "silhouette_overlap")
 SHOWN = ("seconds", "cpu_seconds", "reference_psnr", *TRUE)
@@ -46,7 +47,8 @@ SHOWN = ("seconds", "cpu_seconds", "reference_psnr", *TRUE)
 def label(setting: dict) -> str:
     domains = setting.get("domains")
     return ", ".join([f"{setting.get('scheduler', 'ddim')} {setting['steps']}", *([f"guidance {setting['guidance']:g}"] if "guidance" in setting else []),
-                      *([setting["precision"]] if "precision" in setting else []), *(["+".join(domains)] if domains else [])])
+                      *([setting["precision"]] if "precision" in setting else []), *(["+".join(domains)] if domains else []),
+                      *(["and mirrored"] if setting["mirror"] else [])])
 
 
 def held_out_data(folder: Path, size: int, count: int) -> Path:
@@ -134,7 +136,7 @@ def main() -> None:
             row["reference_psnr"] = min(psnr(shown, wanted), 99.0)  # the reference itself is equal
             if set(views.images) == set(model.config.domains):
                 row |= {key: value for key, value in figures(views, truth).items() if key in TRUE}
-            if setting == {"steps": model.config.sampling_steps}:
+            if setting == {"steps": model.config.sampling_steps, "mirror": model.config.sampling_mirrored}:
                 record["consistency"]["sampled"].append(consistency(views))
                 record["consistency"]["true"].append(consistency(truth))
             record["rows"].setdefault(label(setting), []).append(row)
