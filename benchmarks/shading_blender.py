@@ -80,10 +80,14 @@ def add_buffers() -> None:
         for name, socket in INPUTS.items() if shader else ():
             out = tree.nodes.new("ShaderNodeOutputAOV")
             out.aov_name, source, target = name, shader.inputs[socket], out.inputs[0 if name == "albedo" else 1]
-            if source.links:
-                tree.links.new(source.links[0].from_socket, target)
-            else:
-                target.default_value = source.default_value
+            value = tree.nodes.new("ShaderNodeVectorMath")  # AOVs add up through cut-outs, so each surface gives its value times its alpha
+            value.operation = "MULTIPLY"
+            for given, factor in ((source, value.inputs[0]), (shader.inputs["Alpha"], value.inputs[1])):
+                if given.links:
+                    tree.links.new(given.links[0].from_socket, factor)
+                else:
+                    factor.default_value = given.default_value[:3] if given.type == "RGBA" else (given.default_value,) * 3
+            tree.links.new(value.outputs[0], target)
 
 
 def channels(path: str) -> dict[str, np.ndarray]:
