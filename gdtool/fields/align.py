@@ -7,7 +7,7 @@ enough to find, for every view, the smooth change of depth that brings its surfa
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import chain, combinations
 
 import numpy as np
 
@@ -20,6 +20,7 @@ PRIOR_SIZE = 0.01  # world units: how large a correction is expected to be
 PRIOR = 0.02  # what that expectation counts beside the matches
 SLOPE_LENGTH = 0.2  # world units over which normals go wrong by as much as depth does
 SLOPES, RIMS, EXTENTS = 0.4, 0.01, 0.3  # what the other evidence counts; rims lie beside curved outlines, so they only settle silhouettes
+WALL = 1.5  # pixels: what lies between surfaces that two views see from opposite sides is at least so thick
 RIM_COSINE = 0.15  # normals this square to an axis belong to the outline
 
 
@@ -90,8 +91,12 @@ class _Match:
         self.normal, self.here, self.there = normal, here, there
 
 
-def _matches(sights: list[Sight], reach: float, stride: int):
-    """Pairs of views that see the same surface: same direction of normal and within reach of each other's plane."""
+def _matches(sights: list[Sight], reach: float, stride: int, walls: float = 0.0):
+    """Pairs of views that see the same surface: same direction of normal and within reach of each other's plane.
+
+    With walls, pairs that see the two sides of one wall and leave it thinner than so many pixels, or less than nothing; the
+    distance is then how much it lacks.
+    """
     for i, first in enumerate(sights):
         if first.planes is None:
             continue
@@ -103,9 +108,12 @@ def _matches(sights: list[Sight], reach: float, stride: int):
             if i == j or second.planes is None:
                 continue
             distance, weight, normal, _ = tangent_distance(second, points)
-            same = (np.abs(distance) < reach) & (weight > 0.1) & ((normal * normals).sum(1) > 0.8)
+            cosine = (normal * normals).sum(1)
+            wall = walls * pixel_footprint(second.camera, float(np.linalg.norm(second.camera.position)))
+            same = cosine > 0.8 if walls == 0 else (cosine < -0.8) & (distance > -wall)
+            same &= (np.abs(distance) < reach) & (weight > 0.1)
             if same.any():
-                yield _Match(i, j, points[same], distance[same], np.minimum(weight, own)[same], normal[same],
+                yield _Match(i, j, points[same], distance[same] + wall, np.minimum(weight, own)[same], normal[same],
                              project(first.camera, points[same])[0], project(second.camera, points[same])[0])
 
 
@@ -192,14 +200,15 @@ def corrections(sights: list[Sight], slopes: list[tuple], before: Corrections, r
                 stride: int = 3) -> Corrections:
     """The whole correction of views that `before` has already been applied to, by one robust linear least squares.
 
-    A point of one view, moved along its ray, lies on another view's plane, moved along its own; the corrected depth
-    rises as the normals say (slopes: see slope_rows, of the views as they were given); what one view sees edge-on lies
-    on its silhouette; two silhouettes reach equally far along the direction that both show at full length. Priors keep
-    corrections small and smooth. What all views of a point get wrong in common is found by the last three alone.
+    A point of one view, moved along its ray, lies on another view's plane, moved along its own; what two views see from
+    opposite sides keeps a thickness; the corrected depth rises as the normals say (slopes: see slope_rows, of the views as
+    they were given); what one view sees edge-on lies on its silhouette; two silhouettes reach equally far along the
+    direction that both show at full length. Priors keep corrections small and smooth. What all views of a point get wrong
+    in common is found by the last three alone.
     """
     system, size = _System(len(sights)), CONTROL * CONTROL
     total = 0.0
-    for m in _matches(sights, reach, stride):
+    for m in chain(_matches(sights, reach, stride), _matches(sights, reach, stride, WALL)):
         weight = m.weight / (1 + (m.distance / (0.5 * reach)) ** 2) ** 2
         total += weight.sum()
         w_here, c_here = _control_weights(m.here, sights[m.i].mask.shape)

@@ -12,6 +12,7 @@ from gdtool.fields.sights import free_distance, hull_distance, prepare, silhouet
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import components, signed_volume
 from gdtool.geometry.metrics import inside
+from gdtool.geometry.repair import euler_number
 
 from .shapes import cube, sphere, torus, two_balls, views_of
 
@@ -142,6 +143,25 @@ def test_alignment_undoes_a_shift_of_depth(seen):
     assert found.depth(0, mask[0].shape)[mask[0] > 0.99].mean() < -0.008
     after = align_depth(cameras, mask, depth, images["normal"], grid_step(cameras, 0))
     assert after[2] < 0.4 * after[1]
+
+
+def test_a_thin_wall_that_two_views_turn_inside_out_has_no_hole():
+    """A dish that opens to the front; from the front its floor, 0.02 thick, lies 0.04 too deep in the middle, and so it does from the back."""
+    def dish(points):
+        return np.maximum(box(points, np.zeros(3), np.array([0.4, 0.4, 0.15])), -box(points, np.array([0, 0, 0.02]), np.array([0.34, 0.34, 0.15])))
+
+    cameras, images, mask = views_of(dish)
+    names, depth = [camera.name for camera in cameras], images["depth"].copy()
+    y, x = np.mgrid[:96, :96] + 0.5
+    bump = 0.04 * np.exp(-((x - 48) ** 2 + (y - 48) ** 2) / 20**2)
+    for name in ("front", "back"):
+        k = names.index(name)
+        depth[k] += np.where(mask[k] > 0, bump, 0).astype(np.float32)
+    step = grid_step(cameras, 0)
+    sights, _, noise = align_depth(cameras, mask, depth, images["normal"], step)
+    shape = fuse_views(sights, step, noise)
+    assert is_closed_manifold(shape.faces) and components(shape.faces, len(shape.vertices)).max() == 0
+    assert euler_number(shape.faces) == 2
 
 
 def test_silhouettes_that_were_grown_or_shrunk_are_found_out(seen):
