@@ -31,6 +31,7 @@ _CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a res
 _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
 _RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
 _HANDLES, _PIECES = "handles are lost or added", "pieces are lost or joined"
+_TOO_COARSE = _STRAYS, _LEAVES_OUT = "strays", "leaves out"
 _MOST_PIECES = 16  # that are remeshed one by one where together they fail
 
 
@@ -205,7 +206,11 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
     """The first engine's result that stands up to judgement, finished; None when none does. fine gives the input's Surface."""
     features = surface = None
     second_best = None
+    apart = 1 < repair.components(faces)[0] <= _MOST_PIECES  # what fails together can go one by one
+    given_up: set[str] = set()
     for engine, subdivisions, factors, degrees in _attempts(quads, request):
+        if engine in given_up:
+            continue
         label = engine + (f", {subdivisions} subdivision" if subdivisions else "") + ("" if degrees else ", creases left out")
         asked = [quads * factor for factor in factors]
         for _ in range(_TRIES):
@@ -254,9 +259,9 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
                 record.clock("fit", start)
                 _, far, least, quad_vertices, quad_faces = best
                 limit = 1.0 if subdivisions else 2.0
-                fault = f"strays {far:.2g} edge lengths from the surface" if far > limit else None
+                fault = f"{_STRAYS} {far:.2g} edge lengths from the surface" if far > limit else None
                 if fault is None and (left := _left_out(quad_vertices, quad_faces, surface, _LOST_EDGES * edge)) > _LOST_SHARE:
-                    fault = f"leaves out {left:.1%} of the surface"
+                    fault = f"{_LEAVES_OUT} {left:.1%} of the surface"
                 if subdivisions and least < request.least_jacobian:
                     fault = f"has a quad of scaled Jacobian {least:.2g}"
             elif fault == _HANDLES and not subdivisions and second_best is None and abs(off) <= COUNT_TOLERANCE:
@@ -264,11 +269,16 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
             if fault is None:
                 return quad_vertices, quad_faces, label
             record.failed.append(f"{label}: {fault}")
-            if fault == _PIECES and repair.components(faces)[0] <= _MOST_PIECES:
-                return None  # they go one by one
+            if apart and (fault == _PIECES or not subdivisions):
+                return None
+            # Another density mends a seam of the engine's fields, not a part that is too thin for so many quads.
+            if not subdivisions and fault.startswith(_TOO_COARSE):
+                given_up.add(engine)
             break
         else:
             record.failed.append(f"{label}: gave {count} faces for {quads}")
+            if not subdivisions:
+                given_up.add(engine)
     if second_best is not None:
         # Closed and manifold, but a gap or tunnel finer than the quads was bridged or filled: still better than no engine.
         start = time.perf_counter()
