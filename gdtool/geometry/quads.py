@@ -189,7 +189,7 @@ def _one_by_one(vertices: np.ndarray, faces: np.ndarray, quads: int) -> list[tup
 
 def _fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
             request: Request, fine: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """What split_to_quads made, evened out on the surface where that makes better quads; only its vertices move."""
+    """What split_to_quads made, each piece evened out on the surface where that makes better quads; only its vertices move."""
     edge = (polygon_normals(quad_vertices, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
     features = find_features(vertices, faces, request.crease_degrees or 181.0, 3 * edge)
     surface = Surface(vertices, faces)
@@ -197,8 +197,12 @@ def _fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndar
     constraints = untied(traced, quad_faces, constraints)
     traced = relax(onto(traced, surface, features, constraints), quad_faces, surface, features, constraints, request.smooth_iterations)
     traced = _shaped(traced, quad_faces, surface, features, constraints, request, fine)
-    before, after = (scaled_jacobian(v, quad_faces).mean() for v in (quad_vertices, traced))
-    return (traced if after >= before else quad_vertices), quad_faces
+    # Pieces that are a few quads wide fold and shrink when their vertices are evened out.
+    count, piece = repair.components(quad_faces)
+    before, after = (np.bincount(piece, scaled_jacobian(v, quad_faces), count) for v in (quad_vertices, traced))
+    stays = np.zeros(len(quad_vertices), bool)
+    stays[quad_faces[(after < before)[piece]]] = True
+    return np.where(stays[:, None], quad_vertices, traced), quad_faces
 
 
 def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float, request: Request,
