@@ -30,6 +30,7 @@ _TRIES = 3
 _CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a result is taken without a look at others
 _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
 _RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
+_FOLDED, _LET_GO = 0.05, 0.25  # scaled Jacobian; edge lengths
 _HANDLES, _PIECES = "handles are lost or added", "pieces are lost or joined"
 _TOO_COARSE = _STRAYS, _LEAVES_OUT = "strays", "leaves out"
 _MOST_PIECES = 16  # that are remeshed one by one where together they fail
@@ -197,12 +198,29 @@ def _fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndar
     constraints = untied(traced, quad_faces, constraints)
     traced = relax(onto(traced, surface, features, constraints), quad_faces, surface, features, constraints, request.smooth_iterations)
     traced = _shaped(traced, quad_faces, surface, features, constraints, request, fine)
-    # Pieces that are a few quads wide fold and shrink when their vertices are evened out.
+    # Pieces that are a few quads wide fold and shrink when their vertices are evened out: they stay as they were split, and
+    # elsewhere the vertices of quads that folded or let go of a corner.
     count, piece = repair.components(quad_faces)
-    before, after = (np.bincount(piece, scaled_jacobian(v, quad_faces), count) for v in (quad_vertices, traced))
+    split, evened = (scaled_jacobian(v, quad_faces) for v in (quad_vertices, traced))
+    worse = (np.bincount(piece, evened, count) < np.bincount(piece, split, count))[piece]
+    worse[_let_go(surface, quad_vertices, traced, quad_faces, _LET_GO * edge)] = True
     stays = np.zeros(len(quad_vertices), bool)
-    stays[quad_faces[(after < before)[piece]]] = True
+    while worse.any():
+        stays[quad_faces[worse]] = True
+        evened = scaled_jacobian(np.where(stays[:, None], quad_vertices, traced), quad_faces)
+        worse = (evened < _FOLDED) & (split > evened) & ~stays[quad_faces].all(1)
     return np.where(stays[:, None], quad_vertices, traced), quad_faces
+
+
+def _let_go(surface: Surface, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, distance: float) -> np.ndarray:
+    """Faces (k,) that stood for surface farther than `distance` from them, and twice as far as before, once their vertices moved."""
+    from gdtool.folders.mesh import triangulated
+    from gdtool.geometry.distance import closest_points, sample_surface
+
+    points = sample_surface(surface.vertices, surface.faces, 20000, np.random.default_rng(0))[0]
+    triangles, face_idx = triangulated(faces)
+    (before, nearest), after = closest_points(points, vertices, triangles)[:2], closest_points(points, moved, triangles)[0]
+    return np.unique(face_idx[nearest[(after > distance) & (after > 2 * before)]])
 
 
 def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float, request: Request,
