@@ -40,7 +40,7 @@ def quality(path: Path, folders: list) -> dict[str, float]:
     for seed, folder in enumerate(folders):
         truth = true_views(folder, config.image_size)
         rgba = torch.from_numpy(decode_object(folder, config)[1][0])[None]
-        rows.append(figures(sampled_views(model, rgba, seed, steps=1), truth))
+        rows.append(figures(sampled_views(model, rgba, seed, steps=1, mirror=False), truth))
     return {"size": config.image_size, **{key: float(np.nanmean([row[key] for row in rows])) for key in SHOWN}}
 
 
@@ -71,14 +71,20 @@ def main() -> None:
     parser.add_argument("held_out", nargs="+", type=Path)
     parser.add_argument("--model", type=Path, default=DEFAULT_MODEL)
     parser.add_argument("--limit", type=int, default=100, help="held-out objects at most")
+    parser.add_argument("--after", type=float, metavar="MINUTES", help="the model went on from one of so many minutes that is not here any more: its row, and those before, are kept")
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks"))
     arguments = parser.parse_args()
     folders, points = views_folders(arguments.held_out)[: arguments.limit], []
-    for path, minutes in chain(arguments.model):
+    models = chain(arguments.model)
+    if arguments.after is not None:
+        kept = json.loads((arguments.output / "model_curve.json").read_text())
+        points = [point for point in kept if point["minutes"] < arguments.after + 0.1]
+        models = [(arguments.model, arguments.after + models[-1][1] - (models[-2][1] if len(models) > 1 else 0.0))]
+    for path, minutes in models:
         points.append({"minutes": minutes, **quality(path, folders)})
         say(f"  {path}: {minutes:.0f} minutes")
     rows = [[number(point["minutes"]), *(number(point[key]) for key in ("size", *SHOWN))] for point in points]
-    text = "\n".join(["# Quality against minutes of training", "", f"{len(folders)} held-out objects, one step of sampling, trained and measured on {machine()}.", "",
+    text = "\n".join(["# Quality against minutes of training", "", f"{len(folders)} held-out objects, one step of sampling of the picture alone, trained and measured on {machine()}.", "",
                       table(["minutes", "px", *(key.replace("_", " ") for key in SHOWN)], rows), "", "![PSNR against minutes](model_curve.png)", ""])
     arguments.output.mkdir(parents=True, exist_ok=True)
     (arguments.output / "model_curve.json").write_text(json.dumps(points, indent=1) + "\n")

@@ -187,6 +187,26 @@ def test_dead_engine_is_replaced(monkeypatch, failure):
     assert whole(found) and abs(len(found) / 900 - 1) <= 0.03
 
 
+@pytest.mark.parametrize("outcome, runs", [("a smaller sphere", 1), ("a crash", 3)])
+def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypatch, outcome, runs):
+    """Another density or no creases mend a seam that tore; a part that is too fine for the quads stays so."""
+    asked = []
+    vertices, faces = sphere(24)
+    out, found, _ = quads.remesh(vertices / 2, faces, quads.Request(quads=1000, engine="split"))
+    small = out / 2, found
+
+    def begin(*arguments, **_):
+        asked.append(arguments)
+        return Ended(ChildFailed("died of SIGSEGV") if outcome == "a crash" else small)
+
+    monkeypatch.setattr(quads, "begin", begin)
+    for name in ("_finished", "_farthest"):  # where the small sphere would be drawn to the large one
+        monkeypatch.setattr(quads, name, {"_finished": lambda vertices, faces, *_: (vertices, faces), "_farthest": lambda *_: 0.3}[name])
+    _, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=1000))
+    assert len(asked) == runs and record.engine == "pair and split" and whole(found)
+    assert outcome == "a crash" or "strays" in record.failed[0]
+
+
 def test_torn_output_is_not_believed(monkeypatch):
     # Three quads at one edge.
     book = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [1, 0, 6, 7]])
