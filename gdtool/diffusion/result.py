@@ -17,9 +17,8 @@ def sharpen(mask: torch.Tensor) -> torch.Tensor:
 
 def tied(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
     """Coverage (k, h, w), where two orthographic cameras face one another the mean of both: they see one outline, mirrored."""
-    out = soft.clone()
+    out, facing = soft.clone(), np.diag([-1.0, 1.0, -1.0])  # the other's axes, as seen from a camera
     for k, camera in enumerate(cameras):
-        facing = np.diag([-1.0, 1.0, -1.0])  # the other's axes, seen from this camera
         for other, opposite in enumerate(cameras):
             if camera.projection == opposite.projection == "orthographic" and np.allclose(
                     camera.world_from_camera[:3, :3] @ facing, opposite.world_from_camera[:3, :3], atol=1e-6):

@@ -200,8 +200,9 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
         return Ended(ChildFailed("died of SIGSEGV") if outcome == "a crash" else small)
 
     monkeypatch.setattr(quads, "begin", begin)
-    for name in ("_finished", "_farthest"):  # where the small sphere would be drawn to the large one
-        monkeypatch.setattr(quads, name, {"_finished": lambda vertices, faces, *_: (vertices, faces), "_farthest": lambda *_: 0.3}[name])
+    # Fitting would draw the small sphere out to the large one.
+    monkeypatch.setattr(quads, "_finished", lambda vertices, faces, *_: (vertices, faces))
+    monkeypatch.setattr(quads, "_farthest", lambda *_: 0.3)
     _, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=1000))
     assert len(asked) == runs and record.engine == "pair and split" and whole(found)
     assert outcome == "a crash" or "strays" in record.failed[0]
