@@ -9,7 +9,7 @@ from gdtool.cameras.camera import rig
 from gdtool.diffusion.config import DOMAINS, ModelConfig, TrainConfig
 from gdtool.diffusion.encoding import PLANES, SCALARS, decode
 
-SOFTNESS = 0.02  # of the absolute error: a gradient that is continuous at 0, without which sixteen-bit training rattles there
+SOFTNESS = 0.02  # of the absolute error: its gradient is continuous at 0
 LIT = ("normal", "albedo", "roughness", "metallic")  # what the closed form is made of
 
 

@@ -10,7 +10,7 @@ import torch
 from gdtool.core.errors import InputError
 from gdtool.diffusion.attention import Layout
 from gdtool.diffusion.config import DOMAINS
-from gdtool.diffusion.encoding import BACKGROUND, encode_condition, mirrored
+from gdtool.diffusion.encoding import BACKGROUND, MIRRORED_VIEW, encode_condition, mirrored
 from gdtool.diffusion.model import Model
 from gdtool.diffusion.schedule import sample
 
@@ -30,12 +30,13 @@ def sample_images(model: Model, rgba: torch.Tensor, *, domains: tuple[str, ...] 
     rgba (b, 4, h, w): framed condition, premultiplied and encoded (data.condition_plane). Returns domain to encoded
     images (b, k, 3, h, w) over the first of the configuration's backgrounds. Noise depends on seed alone: neither on the
     batch nor on which domains are asked for. Where color is primary it is sampled even when it is not asked for.
-    mirror: take at each step the mean of what the picture and its mirror image give; None: as the configuration says.
+    mirror: take at each step the mean of what the picture and its mirror image give; None: as the configuration says, where it can.
     """
     config, device = model.config, rgba.device
-    mirror = config.sampling_mirrored if mirror is None else mirror
-    if mirror and (config.codec != "patch" or config.convention != "gdtool"):
-        raise InputError("mirror", "only a model of the patch codec and of gdtool's convention is sampled with the mirrored picture")
+    can = config.codec == "patch" and config.convention == "gdtool" and all(MIRRORED_VIEW.get(name, name) in config.views for name in config.views)
+    mirror = config.sampling_mirrored and can if mirror is None else mirror
+    if mirror and not can:
+        raise InputError("mirror", "only a model of the patch codec, in gdtool's convention, with views on both sides is sampled with the mirrored picture")
     rgba = torch.cat([rgba, rgba.flip(-1)]) if mirror else rgba
     b = len(rgba)
     wanted = [d for d in config.domains if d in domains]

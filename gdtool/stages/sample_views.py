@@ -71,7 +71,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         if strange:
             out.warn(f"{inputs.name}: unlike the pictures this model was trained on, expect less of it: {'; '.join(strange)}")
         rgba = rgba.to(out.device)
-        images = sample_images(model, rgba, domains=domains, steps=options.steps or config.sampling_steps, guidance=options.guidance, seed=options.seed, mirror=options.mirror and config.sampling_mirrored,
+        images = sample_images(model, rgba, domains=domains, steps=options.steps or config.sampling_steps, guidance=options.guidance, seed=options.seed, mirror=None if options.mirror else False,
                                scheduler=options.scheduler, precision=options.precision, progress=out.progress)
     if config.convention == "wonder3d" and "normal" in images:
         images["normal"] = wonder3d.premultiplied_normals(images["normal"])

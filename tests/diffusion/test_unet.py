@@ -150,6 +150,10 @@ def test_sampled_with_its_mirror_image_a_picture_gives_the_mirrored_views_of_the
 def test_only_a_model_of_pixels_is_sampled_with_the_mirror_image():
     with pytest.raises(InputError, match="mirror"):
         sample_images(tiny(convention="wonder3d"), torch.rand(1, 4, 16, 16), steps=1, mirror=True)
+    half = tiny(sampling_mirrored=True, views=("front", "right"))
+    with pytest.raises(InputError, match="both sides"):
+        sample_images(half, torch.rand(1, 4, 16, 16), steps=1, mirror=True)
+    assert sample_images(half, torch.rand(1, 4, 16, 16), steps=1)["color"].shape[1] == 2  # the preset asks, the model cannot
 
 
 def test_domains_that_are_not_asked_for_are_not_computed():
