@@ -8,16 +8,14 @@ import numpy as np
 
 from gdtool.core.child import ChildFailed, call, prepare
 from gdtool.folders.mesh import triangulated
-from gdtool.geometry.repair import compact
 from gdtool.texture.raster import owner_count
-from gdtool.texture.unwrap_charts import Adjacency, bisect, find_charts
+from gdtool.texture.unwrap_charts import Adjacency, bisect, find_charts, own_corners
 from gdtool.texture.unwrap_cut import cut_to_pack
 from gdtool.texture.unwrap_flatten import flatten, singular_values, stretch
+from gdtool.texture.unwrap_join import joined, joined_stretch
 from gdtool.texture.unwrap_pack import best_packed, pack
 
 _MORE_CHARTS, _MOST_CUT = 12, 40  # charts that cutting for packing adds, and ends with, at most
-_JOINS = 14  # attempts to join two charts
-_JOIN_SHARE = 0.02  # charts smaller than this share of the area are joined to others
 
 
 @dataclass(frozen=True)
@@ -52,12 +50,12 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
         prepare(module)
     extent = float(np.ptp(vertices[np.unique(faces[faces >= 0])], 0).max())
     unit = (vertices - vertices.mean(0)) / (extent if extent > 0 else 1.0)
-    label, failed = find_charts(unit, faces, seconds=request.seconds, max_cost=request.max_cost)
+    label, proxy, failed = find_charts(unit, faces, seconds=request.seconds, max_cost=request.max_cost)
     try:
-        flat, more = call("gdtool.texture.unwrap:flatten_all", unit, faces, label, request.good_stretch, request.max_stretch,
+        flat, more = call("gdtool.texture.unwrap:flatten_all", unit, faces, label, request.good_stretch, request.max_stretch, proxy,
                           seconds=request.seconds, memory_mb=8000)
     except ChildFailed as failure:
-        flat, more = flatten_all(unit, faces, label, request.good_stretch, request.max_stretch, planes_only=True)
+        flat, more = flatten_all(unit, faces, label, request.good_stretch, request.max_stretch)
         failed.append(f"flattening: {failure}; charts by the side they look at")
     failed += more
     flat = _cut_to_pack(Adjacency(unit, faces), flat, request.padding / request.size)
@@ -84,25 +82,29 @@ def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float) -> list:
 
 
 def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good_stretch: float, max_stretch: float,
-                planes_only: bool = False) -> tuple[list, list[str]]:
-    """Each chart flat, cut further where it has to be: list of (faces_idx, corners (k, 4), uv (c, 2) v up, triangles).
+                proxy: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[list, list[str]]:
+    """Each chart flat, small ones joined, cut further where it has to be: list of (faces_idx, corners (k, 4), uv (c, 2) v up, triangles).
 
-    corners are into uv. planes_only lays charts flat by projection alone, cutting until that works.
+    corners are into uv. proxy, vertices and triangles: a coarse mesh of the surface, on which joining is tried. Without one
+    nothing is joined and charts are laid flat by projection alone, cut until that works.
     """
     from gdtool.texture.unwrap_flatten import _plane
 
     adjacency = Adjacency(vertices, faces)
-    order = np.argsort(label, kind="stable")
-    queue = [part for part in np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(part)][::-1]
+    queue = _sets(label if proxy is None else joined(vertices, faces, label, *proxy, good_stretch))[::-1]
     out, cut = [], {}
     while queue:
         faces_idx = queue.pop()
-        points, corners = _own_corners(vertices, faces[faces_idx])
+        parts = _sets(label[faces_idx])
+        points, corners = own_corners(vertices, faces[faces_idx])
         triangles, _ = triangulated(corners)
-        if planes_only:
+        if proxy is None:
             uv, reason = _plane(points, triangles), "is not flat"
         else:
-            uv, reason = flatten(points, triangles.astype(np.int64), good_stretch, max_stretch)
+            uv, reason = flatten(points, triangles.astype(np.int64), good_stretch, max_stretch if len(parts) == 1 else joined_stretch(good_stretch))
+        if uv is None and len(parts) > 1:  # joined on the proxy, and do not lie flat together here
+            queue.extend(faces_idx[part] for part in parts)
+            continue
         if uv is None and len(faces_idx) == 1:
             uv = _alone(points, corners[0])
         if uv is None:
@@ -110,63 +112,17 @@ def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good
             half = bisect(adjacency, faces_idx)
             if half.all() or not half.any():
                 half = np.arange(len(faces_idx)) < len(faces_idx) // 2
-            for part in (faces_idx[half], faces_idx[~half]):
-                name = adjacency.pieces(part)
-                queue.extend(part[name == n] for n in range(name.max() + 1))
+            for side in (faces_idx[half], faces_idx[~half]):
+                queue.extend(side[part] for part in _sets(adjacency.pieces(side)))
             continue
         out.append((faces_idx, corners, uv, triangles))
-    if not planes_only:
-        out = _joined(vertices, faces, adjacency, out, good_stretch)
     return out, [f"{count} charts were cut: a chart {reason}" for reason, count in cut.items()]
 
 
-def _joined(vertices: np.ndarray, faces: np.ndarray, adjacency: Adjacency, charts: list, good_stretch: float) -> list:
-    """Small charts joined to the neighbour with the longest common seam, as long as the two lie flat together well."""
-    total = adjacency.area.sum()
-    label = np.full(len(faces), -1)
-    parts = {}
-    for i, chart in enumerate(charts):
-        label[chart[0]] = i
-        parts[i] = chart
-    limit = 1 + 2 * (good_stretch - 1)
-    tried: set[tuple[int, int]] = set()
-    for _ in range(_JOINS):
-        a, b = label[adjacency.pairs].T
-        apart = a != b
-        pair = np.sort(np.stack([a, b], -1)[apart], 1)
-        if not len(pair):
-            break
-        key, inverse = np.unique(pair[:, 0] * len(charts) + pair[:, 1], return_inverse=True)
-        # Seams in the open count ten times those on creases (Adjacency.cost).
-        seam = np.bincount(inverse.ravel(), adjacency.cost[apart])
-        area = np.bincount(label, adjacency.area, len(charts))
-        one, two = key // len(charts), key % len(charts)
-        smaller = np.minimum(area[one], area[two])
-        worth = np.where(smaller < _JOIN_SHARE * total, seam / np.sqrt(smaller + 1e-300), 0)
-        for k in np.argsort(-worth, kind="stable").tolist():
-            if worth[k] > 0 and (int(one[k]), int(two[k])) not in tried:
-                break
-        else:
-            break
-        i, j = int(one[k]), int(two[k])
-        tried.add((i, j))
-        faces_idx = np.concatenate([parts[i][0], parts[j][0]])
-        points, corners = _own_corners(vertices, faces[faces_idx])
-        triangles, _ = triangulated(corners)
-        uv, _ = flatten(points, triangles.astype(np.int64), good_stretch, limit)
-        if uv is not None:
-            parts[i] = (faces_idx, corners, uv, triangles)
-            del parts[j]
-            label[label == j] = i
-            tried = {pair for pair in tried if i not in pair and j not in pair}
-    return list(parts.values())
-
-
-def _own_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A chart's own vertices, those where it touches itself doubled, and its faces (k, 4) into them."""
-    from gdtool.geometry.repair import one_vertex_per_fan
-
-    return one_vertex_per_fan(*compact(vertices, faces))
+def _sets(label: np.ndarray) -> list[np.ndarray]:
+    """The places of each label, in the labels' order."""
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
 
 
 def _alone(points: np.ndarray, corners: np.ndarray) -> np.ndarray:

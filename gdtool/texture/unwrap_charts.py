@@ -7,7 +7,7 @@ import numpy as np
 from gdtool.core.child import ChildFailed, call
 from gdtool.folders.mesh import triangulated
 from gdtool.geometry.mesh_quality import polygon_normals
-from gdtool.geometry.repair import edges_of
+from gdtool.geometry.repair import compact, edges_of, one_vertex_per_fan
 
 _PROXY_TRIANGLES = 6000
 _CREASE_DEGREES = 30.0
@@ -91,8 +91,8 @@ class Adjacency:
         return key[order][last] % width
 
 
-def find_charts(vertices: np.ndarray, faces: np.ndarray, *, seconds: float, max_cost: float) -> tuple[np.ndarray, list[str]]:
-    """(f,) chart of each face, all connected, and what failed on the way.
+def find_charts(vertices: np.ndarray, faces: np.ndarray, *, seconds: float, max_cost: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], list[str]]:
+    """(f,) chart of each face, all connected, the coarse mesh (vertices, triangles) they were found on, and what failed on the way.
 
     vertices (v, 3) in a unit box, faces (f, 4). Without xatlas' help the faces go by the box side they look at.
     """
@@ -102,7 +102,7 @@ def find_charts(vertices: np.ndarray, faces: np.ndarray, *, seconds: float, max_
     failed: list[str] = []
     adjacency = Adjacency(vertices, faces)
     triangles, _ = triangulated(faces)
-    proxy_vertices, proxy, _, report = simplify(vertices, triangles.astype(np.int64), _PROXY_TRIANGLES)
+    proxy_vertices, proxy, _, report = simplify(vertices, triangles.astype(np.int64), _PROXY_TRIANGLES, measured=False)
     if report["method"] == "vertex clustering":
         proxy_vertices, proxy = vertices, triangles
     try:
@@ -117,7 +117,12 @@ def find_charts(vertices: np.ndarray, faces: np.ndarray, *, seconds: float, max_
         axis = np.abs(adjacency.normals).argmax(1)
         label = axis * 2 + (adjacency.normals[np.arange(len(faces)), axis] < 0)
     label = np.where(label < 0, label.max() + 1, label)
-    return tidy(adjacency, label), failed
+    return tidy(adjacency, label), (proxy_vertices, proxy.astype(np.int64)), failed
+
+
+def own_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A chart's own vertices, those where it touches itself doubled, and its faces (k, 3) or (k, 4) into them."""
+    return one_vertex_per_fan(*compact(vertices, faces))
 
 
 def tidy(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> np.ndarray:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import heapq
+import itertools
+
 import numpy as np
 
 from gdtool.folders.mesh import triangulated
 from gdtool.geometry.repair import edges_of
 from gdtool.texture.unwrap_charts import Adjacency
+from gdtool.texture.unwrap_pack import upright_box
 
 _ANGLES = np.radians(np.arange(0, 180, 15.0))
 _OFFSETS = np.linspace(0.06, 0.94, 23)
@@ -25,14 +29,26 @@ def cut_to_pack(adjacency: Adjacency, charts: list, most: int, rings: bool) -> l
     rings: cut those with a hole as well, which makes many charts of one.
     """
     smallest = _SMALLEST * adjacency.area.sum()
-    out, queue = [], list(charts)
+    out: list[tuple] = []
+    queue: list[tuple[float, int, tuple]] = []  # the one whose rectangle is emptiest first
+    number = itertools.count()  # and of equal ones the earlier
+
+    def add(chart: tuple) -> None:
+        uv, triangles = upright_box(chart[2]), chart[3]
+        a, b = uv[triangles[:, 1]] - uv[triangles[:, 0]], uv[triangles[:, 2]] - uv[triangles[:, 0]]
+        covered = float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()) / 2
+        heapq.heappush(queue, (covered - float(np.prod(np.ptp(uv, 0))), next(number), chart))
+
+    for chart in charts:
+        add(chart)
     while queue:
-        chart = queue.pop()
+        _, _, chart = heapq.heappop(queue)
         halves = _halves(adjacency, chart, smallest, rings) if len(out) + len(queue) + 2 <= most else None
         if halves is None:
             out.append(chart)
         else:
-            queue += [_part(chart, half) for half in halves]
+            for half in halves:
+                add(_part(chart, half))
     return out
 
 

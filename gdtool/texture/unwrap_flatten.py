@@ -8,7 +8,7 @@ from gdtool.geometry.normals import face_normals
 from gdtool.geometry.repair import edges_of
 from gdtool.texture.raster import owner_count
 
-_SLIM_STEPS = (4, 4, 6, 8)
+_SLIM_STEPS = (2, 2, 4, 6, 8)
 _RELIED_GAIN = 1.0  # of a round of steps, in units of what the round before it gained
 
 

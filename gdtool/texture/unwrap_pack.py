@@ -8,14 +8,14 @@ from gdtool.geometry.repair import edges_of
 from gdtool.texture.raster import owner_count
 
 _FINE = 3  # cells of the supersampled mask in a cell of the square
-_COARSE, _COARSE_OF_MANY = 160, 90  # cells of the square's side in which orders are tried
+_COARSE, _COARSE_OF_MANY = 200, 100  # cells of the square's side in which orders are tried
 _FINER, _SETTLED, _ROUNDS = 4, 3, 12  # cells of the fine grid in one of the coarse; layouts that are tightened, by so many rounds
 _NEAR = sorted(((dx, dy) for dx in range(-3, 4) for dy in range(-3, 4)), key=lambda d: d[0] ** 2 + d[1] ** 2)
 _DENSITY = 0.66  # share of a square of so many cells that the charts would fill
 _MOST_BY_RASTER = 160
 _MANY = 48  # with more charts than these a coarser grid bounds the time
 _GAIN, _GAIN_PER_CHART = 0.02, 0.002
-_TRIES = 1500  # charts placed in search of better orders
+_TRIES = 1000  # charts placed in search of better orders
 
 
 def upright_box(uv: np.ndarray) -> np.ndarray:
@@ -196,8 +196,8 @@ def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float)
         if not 1 < len(charts) <= _MOST_BY_RASTER or any(charts is earlier for earlier in variants[:i]):
             continue
         boxed, area = _boxed(charts)
-        ranked = _search(boxed, area, gap, _COARSE, 0, 0.3)
-        share = _DENSITY * (_COARSE / ranked[0][0]) ** 2 if ranked else 0.0
+        ranked = _search(boxed, area, gap, _COARSE_OF_MANY, 0, 0.3)
+        share = _DENSITY * (_COARSE_OF_MANY / ranked[0][0]) ** 2 if ranked else 0.0
         more = len(charts) - len(variants[best])
         if share > best_share + (_GAIN + _GAIN_PER_CHART * more if best_share else 0.0):
             best, best_share = i, share
