@@ -28,6 +28,7 @@ COUNT_TOLERANCE = 0.03
 _SMALL_PIECE_QUADS = 48
 _TRIES = 3
 _CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a result is taken without a look at others
+_HOPELESS_EDGES = 1.7  # farther than this before it is shaped, a subdivided result is given up
 _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
 _RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
 _FOLDED, _LET_GO = 0.05, 0.25  # scaled Jacobian; edge lengths
@@ -374,6 +375,8 @@ def _finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, feature
         if not turn:
             constraints = held_at_centres(constraints, len(vertices) - count, across, curve)
         vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)
+    if subdivisions and _farthest(vertices, faces, surface) > _HOPELESS_EDGES * edge / 2**subdivisions:
+        return vertices, faces  # shaping brings it a third nearer at most: it strays too far in any case
     vertices = _shaped(vertices, faces, surface, features, constraints, request, fine)
     return vertices, cut_along_features(vertices, faces, fine)
 
