@@ -109,7 +109,7 @@ def skips(views) -> list[dict]:
     from gdtool.fields.carve import carve, combined_distance
     from gdtool.fields.fusion import align_depth, bring_together, grid_step, prepare_all
 
-    depth, normal = views.images["depth"], views.images["normal"]
+    depth, normal, colors = views.images["depth"], views.images["normal"], [views.images[domain] for domain in ("albedo", "color")]
     step = grid_step(views.cameras, 0)
     sights = prepare_all(views.cameras, views.mask, depth, normal)
 
@@ -117,10 +117,10 @@ def skips(views) -> list[dict]:
         start = time.process_time()
         return function(), time.process_time() - start
 
-    (_, before, after), checked = timed(lambda: align_depth(views.cameras, views.mask, depth, normal, step))
+    (_, before, after), checked = timed(lambda: align_depth(views.cameras, views.mask, depth, normal, step, colors=colors))
     found = []
     if before == after:
-        (moved, _), forced = timed(lambda: bring_together(views.cameras, views.mask, depth, normal, sights))
+        (moved, _), forced = timed(lambda: bring_together(views.cameras, views.mask, depth, normal, sights, colors=colors))
         found.append({"what": "alignment of views that agree", "done": checked + forced, "skipped": checked, "change": abs(disagreement(moved) - before)})
     (grid, values, _), band = timed(lambda: carve(sights, step))
     limit = 3 * step

@@ -6,20 +6,23 @@ enough to find, for every view, the smooth change of depth that brings its surfa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain, combinations
 
 import numpy as np
 
 from gdtool.cameras import Camera, project, rays
+from gdtool.fields.photometric import Picture, color_rows
 from gdtool.fields.sights import Sight, hull_distance, pixel_footprint, tangent_distance
 
 CONTROL = 15  # control points along a side of a view's correction
 LARGEST = 0.06  # world units: no correction is larger
 PRIOR_SIZE = 0.01  # world units: how large a correction is expected to be
-PRIOR = 0.02  # what that expectation counts beside the matches
+PRIOR = 0.005  # what that expectation counts beside the matches
 SLOPE_LENGTH = 0.2  # world units over which normals go wrong by as much as depth does
 SLOPES, RIMS, EXTENTS = 0.4, 0.01, 0.3  # what the other evidence counts; rims lie beside curved outlines, so they only settle silhouettes
+COLORS = 0.002  # world units: a color as wrong as usual counts like a plane so far off
 WALL = 1.5  # pixels: what lies between surfaces that two views see from opposite sides is at least so thick
 RIM_COSINE = 0.15  # normals this square to an axis belong to the outline
 
@@ -183,32 +186,41 @@ class _System:
         return self.count * CONTROL * CONTROL + k
 
     def solve(self, prior: np.ndarray) -> Corrections:
-        from scipy.sparse import coo_matrix, diags
+        from scipy.sparse import csr_matrix
 
-        matrix, vector = prior.copy(), np.zeros(self.unknowns)
-        for coefficients, places, target, weight in self.rows:
-            row = np.repeat(np.arange(len(target)), places.shape[1])
-            part = coo_matrix((coefficients.ravel(), (row, places.ravel())), shape=(len(target), self.unknowns)).tocsr()
-            matrix += (part.T @ diags(weight) @ part).toarray()
-            vector += part.T @ (weight * target)
+        # All rows in one sparse matrix: its square is made dense but once.
+        place = np.concatenate([places.ravel() for _, places, _, _ in self.rows])
+        value = np.concatenate([(coefficients * np.sqrt(weight)[:, None]).ravel() for coefficients, _, _, weight in self.rows])
+        width = np.concatenate([np.full(len(target), places.shape[1]) for _, places, target, _ in self.rows])
+        rows = csr_matrix((value, place, np.concatenate([[0], np.cumsum(width)])), (len(width), self.unknowns))
+        vector = rows.T @ np.concatenate([np.sqrt(weight) * target for _, _, target, weight in self.rows])
+        matrix = prior + (rows.T @ rows).toarray()
         found = np.linalg.solve(matrix, vector)
         size = self.count * CONTROL * CONTROL
         return Corrections(found[:size].reshape(self.count, -1), found[size:])
 
 
 def corrections(sights: list[Sight], slopes: list[tuple], before: Corrections, reach: float, stiffness: float = 1.0,
-                stride: int = 3) -> Corrections:
+                stride: int = 3, pictures: Sequence[list[Picture]] = ()) -> Corrections:
     """The whole correction of views that `before` has already been applied to, by one robust linear least squares.
 
-    A point of one view, moved along its ray, lies on another view's plane, moved along its own; what two views see from
-    opposite sides keeps a thickness; the corrected depth rises as the normals say (slopes: see slope_rows, of the views as
-    they were given); what one view sees edge-on lies on its silhouette; two silhouettes reach equally far along the
-    direction that both show at full length. Priors keep corrections small and smooth. What all views of a point get wrong
-    in common is found by the last three alone.
+    A point of one view, moved along its ray, lies on another view's plane, moved along its own, and has the color that the
+    other shows there (pictures: of every view, once for each domain of colors); what two views see from opposite sides keeps
+    a thickness; the corrected depth rises as the normals say (slopes: see slope_rows, of the views as they were given);
+    what one view sees edge-on lies on its silhouette; two silhouettes reach equally far along the direction that both show
+    at full length. Priors keep corrections small and smooth. What all views of a point get wrong in common the planes
+    cannot tell, but all else can.
     """
     system, size = _System(len(sights)), CONTROL * CONTROL
     total = 0.0
-    for m in chain(_matches(sights, reach, stride), _matches(sights, reach, stride, WALL)):
+    matches = list(_matches(sights, reach, stride))
+    for m in matches:
+        for of_view in pictures:
+            slope, difference, weight = color_rows(m.points, m.here, m.there, of_view[m.i], of_view[m.j], m.weight)
+            weights, places = _control_weights(m.here, sights[m.i].mask.shape)
+            done = (before.control[m.i][places] * weights).sum(1)
+            system.add(weights * slope[:, None], system.of_view(m.i, places), slope * done - difference, COLORS**2 * weight)
+    for m in chain(matches, _matches(sights, reach, stride, WALL)):
         weight = m.weight / (1 + (m.distance / (0.5 * reach)) ** 2) ** 2
         total += weight.sum()
         w_here, c_here = _control_weights(m.here, sights[m.i].mask.shape)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from gdtool.cameras import Camera
 from gdtool.fields.align import Corrections, corrections, disagreement, slope_rows
 from gdtool.fields.carve import carve, silhouettes_outvoted, smooth_unseen
 from gdtool.fields.clock import Clock
+from gdtool.fields.photometric import Picture
 from gdtool.fields.refine import FOLD_DEGREES, drop_debris, measured_planes, refine
 from gdtool.fields.sights import WEAK, Sight, free_distance, hull_distance, pixel_footprint, prepare, with_edge
 from gdtool.fields.thin import near_points, restore_thin
@@ -70,22 +71,24 @@ def depth_for(cameras: list[Camera], mask: np.ndarray, normal: np.ndarray) -> np
 
 
 def align_depth(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray | None, normal: np.ndarray | None,
-                step: float, clock: Clock | None = None, tell: Callable[[str], None] = _silent) -> tuple[list[Sight], float, float]:
+                step: float, clock: Clock | None = None, tell: Callable[[str], None] = _silent,
+                colors: Sequence[np.ndarray] = ()) -> tuple[list[Sight], float, float]:
     """Prepared views whose surfaces were brought together where they disagree, the disagreement before and after.
 
-    Views that agree to a tenth of a step are left as they are.
+    colors: images (k, h, w, 3), linear, of what looks alike from all sides. Views that agree to a tenth of a step are left as they are.
     """
     sights = prepare_all(cameras, mask, depth, normal)
     before = disagreement(sights)
     if before < 0.1 * step:
         return sights, before, before
-    sights, after = bring_together(cameras, mask, depth, normal, sights, clock, tell)
+    sights, after = bring_together(cameras, mask, depth, normal, sights, clock, tell, colors)
     # What the views got wrong in common is not seen in their disagreement.
     return sights, before, max(after, LEAST_NOISE * step)
 
 
 def bring_together(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray, normal: np.ndarray | None, sights: list[Sight],
-                   clock: Clock | None = None, tell: Callable[[str], None] = _silent) -> tuple[list[Sight], float]:
+                   clock: Clock | None = None, tell: Callable[[str], None] = _silent,
+                   colors: Sequence[np.ndarray] = ()) -> tuple[list[Sight], float]:
     """Corrected views and their disagreement. sights: the views as they were given, prepared.
 
     Rounds go on until the disagreement falls no more, or until half of the clock's time is spent; each leaves whole
@@ -96,7 +99,8 @@ def bring_together(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray, n
     slopes = [slope_rows(sight) for sight in sights]
     found, after = Corrections.none(len(sights)), disagreement(sights)
     for count, (reach, stiffness) in enumerate((*ROUNDS, *[ROUNDS[-1]] * MORE_ROUNDS), 1):
-        found = corrections(sights, slopes, found, reach, stiffness)
+        pictures = [[Picture.of(cameras[k], stack[k], mask[k], reach) for k in kept] for stack in colors]
+        found = corrections(sights, slopes, found, reach, stiffness, pictures=pictures)
         changed = np.array(depth)
         for place, k in enumerate(kept):
             changed[k] = np.where(depth[k] > 0, depth[k] + found.depth(place, mask[k].shape), 0)

@@ -65,7 +65,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     with out.step("align"):
         normal = _normals(views, out)
         depth = _depth(views, out)
-        sights, before, noise = align_depth(views.cameras, views.mask, depth, normal, step, clock, log.status)
+        colors = [views.images[domain] for domain in ("albedo", "color") if domain in views.images]
+        sights, before, noise = align_depth(views.cameras, views.mask, depth, normal, step, clock, log.status, colors)
         agreed = agreement(sights)
         if agreed < LEAST_AGREEMENT:
             out.warn(f"depth and normals do not fit together (a view confirms {agreed:.0%} of another's points); the silhouettes alone give the shape")
@@ -192,4 +193,4 @@ def _check_masks(path, views, out: Output) -> None:
             out.warn(f"view {name}: its mask is empty; the view is left out")
 
 
-STAGE = Stage(name="reconstruct", version=12, reads=("views",), writes="surface", Options=Options, run=run)
+STAGE = Stage(name="reconstruct", version=13, reads=("views",), writes="surface", Options=Options, run=run)
