@@ -28,6 +28,7 @@ COUNT_TOLERANCE = 0.03
 _SMALL_PIECE_QUADS = 48
 _TRIES = 3
 _CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a result is taken without a look at others
+_NO_AREA = 1e-4  # squared edge lengths
 _HOPELESS_EDGES = 1.7  # farther than this before it is shaped, a subdivided result is given up
 _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
 _RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
@@ -210,6 +211,10 @@ def _fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndar
         stays[quad_faces[worse]] = True
         evened = scaled_jacobian(np.where(stays[:, None], quad_vertices, traced), quad_faces)
         worse = (evened < _FOLDED) & (split > evened) & ~stays[quad_faces].all(1)
+    # What has no area as it was split was better off evened out.
+    least = _NO_AREA * edge**2
+    flat = polygon_normals(np.where(stays[:, None], quad_vertices, traced), quad_faces)[1] < least
+    stays[quad_faces[flat & (polygon_normals(traced, quad_faces)[1] >= least)]] = False
     return np.where(stays[:, None], quad_vertices, traced), quad_faces
 
 
