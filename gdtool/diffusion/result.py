@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gdtool.cameras import Camera
+from gdtool.cameras import Camera, project
 from gdtool.diffusion.encoding import coverage, decode
+from gdtool.fields.sights import backproject
 from gdtool.folders.views import Views
 
 
@@ -24,6 +25,30 @@ def tied(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
                     camera.world_from_camera[:3, :3] @ facing, opposite.world_from_camera[:3, :3], atol=1e-6):
                 out[k] = (soft[k] + soft[other].flip(-1)) / 2
     return out
+
+
+def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera]) -> np.ndarray:
+    """Depth (k, h, w) with no point farther out than the outline of any other view, coverage (k, h, w), in that point's row.
+
+    A point is moved along its ray. Of orthographic cameras of one size that stand upright side by side, whose rows are at one
+    height: one view's rays run along another's rows.
+    """
+    out, (height, width) = depth.astype(np.float64), mask.shape[1:]
+    for k, camera in enumerate(cameras):
+        inside = mask[k] > 0.5
+        for j, other in enumerate(cameras):
+            right, up = other.world_from_camera[:3, :2].T
+            per_depth = -float(camera.backward @ right) / other.pixel_size if other.projection == "orthographic" else 0.0
+            upright = camera.projection == "orthographic" and np.allclose(camera.world_from_camera[:3, 1], up, atol=1e-6)
+            if abs(per_depth) * other.pixel_size < 0.3 or not upright or abs((camera.position - other.position) @ up) > 1e-6 \
+                    or camera.pixel_size != other.pixel_size:
+                continue
+            shown = mask[j] > 0.5
+            first, last = shown.argmax(1), width - shown[:, ::-1].argmax(1)
+            column = project(other, backproject(camera, out[k]).reshape(-1, 3))[0][:, 0].reshape(height, width)
+            lacking = np.clip(column, first[:, None], last[:, None]) - column
+            out[k] += np.where(inside & shown.any(1)[:, None], lacking / per_depth, 0.0)
+    return out.astype(np.float32)
 
 
 def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], background: float, domains: tuple[str, ...],
@@ -56,6 +81,8 @@ def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], ba
             value = linear_from_srgb(np.moveaxis(value, 1, -1))
         elif domain == "normal":
             value = np.moveaxis(value, 1, -1)
+        if domain == "depth":
+            value = within_silhouettes(value, mask, cameras)
         inside = mask > 0
         out[domain] = np.where(inside[..., None] if value.ndim == 4 else inside, value, 0).astype(np.float32)
     return Views(cameras, out, mask.astype(np.float32))

@@ -124,3 +124,31 @@ def test_views_from_opposite_sides_get_one_outline():
     torch.testing.assert_close(out[right], (soft[right] + soft[left].flip(-1)) / 2)
     torch.testing.assert_close(out[left], out[right].flip(-1))
     torch.testing.assert_close(out[slanted], soft[slanted])
+
+
+def test_depth_stays_within_the_outlines_that_other_views_show():
+    """Of a ball whose right side the model draws too far out and whose front too far in; what is right stays."""
+    from gdtool.diffusion.result import within_silhouettes
+    from gdtool.fields.sights import backproject
+    from tests.fields.shapes import sphere, views_of
+
+    cameras, images, mask = views_of(lambda points: sphere(points, 0.4), 64)
+    pixel = cameras[0].pixel_size
+    moved = np.abs(within_silhouettes(images["depth"], mask, cameras) - images["depth"])[mask > 0.99]
+    assert moved.max() < 3 * pixel and moved.mean() < 0.2 * pixel  # at the poles rows are as wide as the square root of their height
+    names = [camera.name for camera in cameras]
+    wrong = images["depth"].copy()
+    wrong[names.index("right")] -= 0.1 * (mask[names.index("right")] > 0.5)
+    wrong[names.index("front")] += 0.9 * (mask[names.index("front")] > 0.5)
+    found = within_silhouettes(wrong, mask, cameras)
+    for name in ("right", "front"):
+        k = names.index(name)
+        points = backproject(cameras[k], found[k].astype(float))[mask[k] > 0.99]
+        before = backproject(cameras[k], wrong[k].astype(float))[mask[k] > 0.99]
+        # Within the ball's width in every row that the others show, though the ray alone would allow more.
+        reach = np.hypot(points[:, 0], points[:, 2]) - np.sqrt(np.maximum(0.4**2 - points[:, 1] ** 2, 0))
+        assert reach.max() < 0.1 * 0.4 + 2 * pixel and (np.hypot(before[:, 0], before[:, 2]) > 0.45).any()
+    others = [k for k, name in enumerate(names) if name not in ("right", "front")]
+    np.testing.assert_allclose(found[others][mask[others] > 0.99], images["depth"][others][mask[others] > 0.99], atol=3 * pixel)
+    flat = mask * 0
+    assert (within_silhouettes(wrong, flat, cameras) == wrong).all()
