@@ -195,4 +195,4 @@ def test_training_lowers_the_error(tmp_path):
 def test_minutes_end_a_run(tmp_path):
     options = msgspec.structs.replace(TRAIN, steps=10**9, pbr_weight=0.0)
     state = run_training(Model(MODEL), spheres(), options, tmp_path, seed=0, minutes=0.01)
-    assert 0.6 <= state.seconds < 5 and state.step >= 1
+    assert 0.6 <= state.seconds < 60 and 1 <= state.step < 10**6  # on a busy machine one step may take seconds
