@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.cameras import project, rig
+from gdtool.cameras import project
 from gdtool.fields.fusion import align_depth, grid_step
 from gdtool.fields.photometric import Picture, color_rows
 
