@@ -63,11 +63,13 @@ def grid_step(cameras: list[Camera], resolution: int) -> float:
     return float(np.clip(0.8 * pixel, 1.0 / MAX_SAMPLES, 1.0 / 64))
 
 
-def depth_for(cameras: list[Camera], mask: np.ndarray, normal: np.ndarray) -> np.ndarray | None:
-    """Depth (k, h, w) from normals and silhouettes alone; None where that is not possible (perspective cameras)."""
+def depth_for(cameras: list[Camera], mask: np.ndarray, normal: np.ndarray, alike: dict[str, np.ndarray] | None = None) -> np.ndarray:
+    """Depth (k, h, w) from normals (k, h, w, 3) and silhouettes; alike: albedo, roughness and metallic views where there are any."""
+    from gdtool.fields.carve import hull_bounds, silhouettes_outvoted
     from gdtool.fields.integrate import depth_from_normals
 
-    return depth_from_normals(cameras, mask, normal, prepare_all(cameras, mask, None, None))
+    sights = prepare_all(cameras, mask, None, None)
+    return depth_from_normals(cameras, mask, normal, alike or {}, sights, hull_bounds(sights, silhouettes_outvoted(sights)))
 
 
 def align_depth(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray | None, normal: np.ndarray | None,

@@ -1,7 +1,7 @@
 """Depth from normals: what a view's normals say about shape where there is no depth view.
 
-Normals give the slope of the surface at every pixel; the silhouettes of all views bound how near it can be. One robust
-least squares joins both. Whatever stays open (steps inside a silhouette, an offset) the alignment of views settles.
+Normals give the slope of the surface at every pixel, matching the views (stereo.py) roughly where it lies and where it
+breaks off. One robust least squares joins both.
 """
 
 from __future__ import annotations
@@ -9,61 +9,34 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.cameras import Camera, rays
-from gdtool.fields.sights import Sight, hull_distance
+from gdtool.fields.sights import Sight
+from gdtool.fields.stereo import Matched, match_views, pixel_steps, slopes, stretched, unstretched
 
 MIN_FACING = 0.15  # normals turned farther away say little about depth
-_PULL = 2e-3  # weight of the hull's depth against one pixel's slope
+HOLD, LEAST_HOLD = 0.02, 1e-5  # weight of a matched depth against one pixel's slope, by its trust
+_STEP, _FIRST_STEP = 2.0, 6.0  # pixels: a step in depth that is so far off the slope counts a quarter; at first, and then
+_ASTRAY = 4.0  # pixels: likewise a matched depth
 
 
-def hull_depth(sights: list[Sight], camera: Camera, chosen: np.ndarray, samples: int = 160) -> np.ndarray:
-    """Depth (n,) along the viewing axis at which the rays of the chosen pixels (h, w) enter the silhouettes' common cone.
+def integrate_normals(camera: Camera, mask: np.ndarray, normal: np.ndarray, matched: Matched, rounds: int = 6) -> np.ndarray:
+    """Depth (h, w), 0 outside the mask (h, w), from world normals (h, w, 3) and the depth that matching found.
 
-    NaN where a ray never does. Marched in equal steps, the last refined linearly.
-    """
-    origins, directions = (x[chosen] for x in rays(camera))
-    t = np.linspace(camera.near, camera.far, samples)
-    depth = np.full(len(origins), np.nan)
-    before = np.full(len(origins), np.inf)
-    open_rays = np.arange(len(origins))
-    for k in range(samples):
-        value = np.max([hull_distance(s, origins[open_rays] + t[k] * directions[open_rays]) for s in sights], 0)
-        enters = value < 0
-        if k == 0:
-            hit = np.full(len(value), t[0])
-        else:
-            share = before[open_rays] / np.maximum(before[open_rays] - value, 1e-12)
-            hit = t[k - 1] + (t[k] - t[k - 1]) * np.clip(share, 0, 1)
-        depth[open_rays[enters]] = hit[enters]
-        before[open_rays] = value
-        open_rays = open_rays[~enters]
-        if len(open_rays) == 0:
-            break
-    return depth * -(directions @ camera.backward)
-
-
-def integrate_normals(camera: Camera, mask: np.ndarray, normal: np.ndarray, bound: np.ndarray, rounds: int = 6) -> np.ndarray:
-    """Depth (h, w), 0 outside the mask, from world normals (h, w, 3) and the hull's depth bound (h, w); orthographic only.
-
-    Minimises the differences of neighbouring depths against the slopes, each counted less the worse it fits (a step
-    between two surfaces fits badly), a weak pull to the bound, a firm one at the silhouette, where the surface touches
-    it, and a firm one back behind it.
+    Minimises the differences of neighbouring depths against the slopes and a pull to the matched depth, each counted
+    less the worse it fits: a step between two surfaces fits badly, and so does a mismatch.
     """
     from scipy.sparse import coo_matrix, diags
     from scipy.sparse.linalg import cg
 
-    inside = (mask > 0.5) & np.isfinite(bound) & (bound > 0)
+    inside = (mask > 0.5) & (matched.depth > 0)
     count = int(inside.sum())
     if count == 0:
         return np.zeros(mask.shape, np.float32)
     index = np.full(mask.shape, -1)
     index[inside] = np.arange(count)
-    local = normal @ camera.world_from_camera[:3, :3]
-    facing = np.maximum(local[..., 2], MIN_FACING)
-    # Depth grows away from the camera: over a pixel to the right by n_x / n_z pixels, over a pixel down by -n_y / n_z.
-    slopes = {1: local[..., 0] / facing * camera.pixel_size, 0: -local[..., 1] / facing * camera.pixel_size}
+    right, down, facing = slopes(camera, normal, MIN_FACING, rays(camera)[1])
     rows, columns, values, targets, trust = [], [], [], [], []
     size = 0
-    for axis, slope in slopes.items():
+    for axis, slope, pixel in zip((1, 0), (right, down), pixel_steps(camera), strict=True):
         ahead = np.roll(index, -1, axis)
         last = [slice(None), slice(None)]
         last[axis] = -1
@@ -75,36 +48,28 @@ def integrate_normals(camera: Camera, mask: np.ndarray, normal: np.ndarray, boun
         columns += [a, b]
         values += [-np.ones(len(a)), np.ones(len(a))]
         targets.append(((slope + np.roll(slope, -1, axis)) / 2)[pair])
-        least = np.minimum(local[..., 2], np.roll(local[..., 2], -1, axis))[pair]
-        trust.append(np.clip(least, 0.02, 1.0) ** 2)
+        trust.append(np.clip(np.minimum(facing, np.roll(facing, -1, axis))[pair], 0.02, 1.0) ** 2)
         size += len(a)
     differences = coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(size, count)).tocsr()
     target, trust = np.concatenate(targets), np.concatenate(trust)
-    start = bound[inside]
-    degree = np.asarray(abs(differences).sum(0)).ravel()
-    pull = np.where(degree < 4, 0.05, _PULL)
+    start, held = stretched(camera, matched.depth[inside]), HOLD * matched.trust[inside] + LEAST_HOLD
     depth = start.copy()
     for k in range(rounds):
-        gap = (differences @ depth - target) / (2.0 * camera.pixel_size)
-        weight = trust / (1 + gap ** 2) ** 2 if k else trust
-        hold = np.where(depth < start, 1.0, pull)
+        gap = (differences @ depth - target) / ((_STEP if k else _FIRST_STEP) * pixel)
+        weight = trust / (1 + gap**2) ** 2
+        hold = held / (1 + ((depth - start) / (_ASTRAY * pixel)) ** 2) ** 2
         system = differences.T @ diags(weight) @ differences + diags(hold)
-        right = differences.T @ (weight * target) + hold * start
-        depth = cg(system, right, x0=depth, rtol=1e-6, maxiter=300, M=diags(1 / system.diagonal()))[0]
+        depth = cg(system, differences.T @ (weight * target) + hold * start, x0=depth, rtol=1e-6, maxiter=300, M=diags(1 / system.diagonal()))[0]
     out = np.zeros(mask.shape, np.float32)
-    out[inside] = depth
+    out[inside] = unstretched(camera, depth)
     return out
 
 
-def depth_from_normals(cameras: list[Camera], mask: np.ndarray, normal: np.ndarray, sights: list[Sight]) -> np.ndarray | None:
-    """Depth (k, h, w) of all views from their normals and the silhouettes; None for perspective cameras."""
-    if any(camera.projection != "orthographic" for camera in cameras):
-        return None
-    out = np.zeros(mask.shape, np.float32)
-    for k, camera in enumerate(cameras):
-        chosen = mask[k] > 0.5
-        if chosen.any():
-            bound = np.full(mask[k].shape, np.nan)
-            bound[chosen] = hull_depth(sights, camera, chosen)
-            out[k] = integrate_normals(camera, mask[k], normal[k], bound)
-    return out
+def depth_from_normals(cameras: list[Camera], mask: np.ndarray, normal: np.ndarray, alike: dict[str, np.ndarray], sights: list[Sight],
+                       box: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Depth (k, h, w) of all views from normals and silhouettes, and from further images that look alike from all sides.
+
+    See match_views for the arguments.
+    """
+    matched = match_views(cameras, mask, normal, alike, sights, box)
+    return np.stack([integrate_normals(*view) for view in zip(cameras, mask, normal, matched, strict=True)])

@@ -12,7 +12,7 @@ from gdtool.cameras import Camera, rays
 from gdtool.geometry.grids import band_cells, extract, fine_points, grid_over
 
 # World units around the first geometry in which a ray looks for the surface, and its samples there: by whether depth
-# shaped it, or only normals and silhouettes did.
+# shaped it (the views' own, or what their normals gave), or only silhouettes did.
 _MEASURED, _BOUNDED = (0.03, 24), (0.08, 64)
 POOL = 150_000  # points whose distances are known
 START_SHARE = 0.33  # of the budget, at most: the views are what is to be fitted

@@ -65,7 +65,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     with out.step("align"):
         normal = _normals(views, out)
         depth = _depth(views, out)
-        colors = [views.images[domain] for domain in ("albedo", "color") if domain in views.images]
+        alike = ("albedo", "color") if "depth" in views.images else ("albedo", "color", "normal")
+        colors = [views.images[domain] for domain in alike if domain in views.images]
         sights, before, noise = align_depth(views.cameras, views.mask, depth, normal, step, clock, log.status, colors)
         agreed = agreement(sights)
         if agreed < LEAST_AGREEMENT:
@@ -86,7 +87,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     _check_cameras(folder, views.cameras, shape.vertices)
     vertices, faces, figures, fit = shape.vertices, shape.faces, {}, None
     if options.method == "paper":
-        vertices, faces, figures, fit = _fit(views, shape, options, out)
+        vertices, faces, figures, fit = _fit(views, sights, shape, options, out)
     with out.step("materials"):
         normals = vertex_normals(vertices, faces)
         look = appearance(views.cameras, views.mask, views.images, vertices, faces, normals, shape.step, views.light, options.seed)
@@ -110,19 +111,24 @@ def _clock(options: Options):
     return Clock(max(options.budget - AROUND, 1e-3) if options.budget and options.method == "grid" else 0.0)
 
 
-def _fit(views, shape, options: Options, out: Output):
-    """The paper's networks, started from the grid's shape, and the mesh of their surface."""
+def _fit(views, sights, shape, options: Options, out: Output):
+    """The paper's networks, started from the grid's shape, and the mesh of their surface.
+
+    sights: the aligned views. Where there are normals and no depth, theirs is what holds the surface in its place: normals
+    alone let it drift.
+    """
     from gdtool.fields.fusion import is_closed_manifold
     from gdtool.fields.paper import PaperOptions, extract_network, fit_networks
     from gdtool.fields.refine import keep_pieces
 
-    volume = 0 if "depth" in views.images else options.steps // 3
-    if not volume:
-        out.skip("volume start", "depth views say where the surface is")
+    told = next((domain for domain in ("depth", "normal") if domain in views.images), None)
+    volume = 0 if told else options.steps // 3
+    if told:
+        out.skip("volume start", f"{told} views say where the surface is")
     settings = PaperOptions(options.steps, volume, options.steps, rule=options.root, brdf=options.brdf, seed=options.seed,
                             budget=options.budget, device=out.device, precision=options.precision)
     with out.step("networks"):
-        fit, figures = fit_networks(views.cameras, views.mask, views.images, shape.vertices, shape.faces, settings,
+        fit, figures = fit_networks(views.cameras, views.mask, _with_depth(views, sights), shape.vertices, shape.faces, settings,
                                     lambda count, label: out.progress(range(count), count, label))
     with out.step("extract"):
         vertices, faces = extract_network(fit.sdf, shape.step, out.device)
@@ -132,6 +138,17 @@ def _fit(views, shape, options: Options, out: Output):
         out.warn("the networks' surface is not closed; the grid's is kept")
         return shape.vertices, shape.faces, figures, None
     return vertices, faces, figures, fit
+
+
+def _with_depth(views, sights) -> dict:
+    """The views' images, with the depth that the aligned views came to where there was none and normals gave it."""
+    import numpy as np
+
+    found = {id(sight.camera): (sight.points - sight.camera.position) @ -sight.camera.backward for sight in sights if sight.points is not None}
+    if "depth" in views.images or not found:
+        return views.images
+    return views.images | {"depth": np.stack([found.get(id(camera), np.zeros_like(mask)) for camera, mask in
+                                              zip(views.cameras, views.mask, strict=True)]).astype(np.float32)}
 
 
 def _use_fit(fit, vertices, views, look, options: Options, out: Output) -> None:
@@ -162,16 +179,14 @@ def _normals(views, out: Output):
 
 
 def _depth(views, out: Output):
-    """Depth views (k, h, w); without them, what the normals and silhouettes give; None without either."""
+    """Depth views (k, h, w); without them, what the normals give, matched from view to view; None without either."""
     from gdtool.fields.fusion import depth_for
 
     if "depth" in views.images or "normal" not in views.images:
         return views.images.get("depth")
-    with out.step("integrate normals"):
-        depth = depth_for(views.cameras, views.mask, views.images["normal"])
-    if depth is None:
-        out.skip("integration of normals", "cameras are perspective; the silhouettes alone give the shape")
-    return depth
+    alike = {domain: views.images[domain] for domain in ("albedo", "roughness", "metallic") if domain in views.images}
+    with out.step("match views"):
+        return depth_for(views.cameras, views.mask, views.images["normal"], alike)
 
 
 def _check_cameras(folder, cameras, vertices) -> None:
@@ -193,4 +208,4 @@ def _check_masks(path, views, out: Output) -> None:
             out.warn(f"view {name}: its mask is empty; the view is left out")
 
 
-STAGE = Stage(name="reconstruct", version=13, reads=("views",), writes="surface", Options=Options, run=run)
+STAGE = Stage(name="reconstruct", version=14, reads=("views",), writes="surface", Options=Options, run=run)
