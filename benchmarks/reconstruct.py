@@ -30,7 +30,7 @@ import peers
 from measure import Failed, busy, gdtool, machine, number, say
 from perturbation import Perturbation, perturbed
 from reconstruct_looks import MATERIALS, keep_row, looks, sheet
-from reconstruct_report import COLUMNS, OURS, kind, markdown, plot
+from reconstruct_report import COLUMNS, OURS, PAPER, kind, markdown, plot
 
 FIRST_SEED = 3_000_000  # procedural objects that the bundled model has not seen
 MODEL_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
@@ -41,7 +41,8 @@ SUITE = (*(f"gso/vima/{n}.obj" for n in ("mario_figure", "porcelain_cup", "toy_t
          *(f"mesh/odedstein/{n}/{n}.obj" for n in ("bunny", "spot", "penguin", "torus")),
          *(f"mesh/trimesh/{n}" for n in ("fandisk.obj", "plate_holes.STL", "cycloidal.ply", "featuretype.STL")))
 SEEDS, WAVELENGTHS = 5, (1 / 16, 1 / 8, 1 / 4)  # of --all; the default takes one pair a model, each in turn
-DEFAULT_DISTURBED, DEFAULT_BUDGETED, DEFAULT_COLOR = 10, 2, 4  # models
+DEFAULT_DISTURBED, DEFAULT_BUDGETED, DEFAULT_COLOR, DEFAULT_NORMALS = 10, 2, 4, 10  # models
+IGNORED = {"normals": "depth", "color": "normal,depth,albedo,roughness,metallic"}  # domains, of the exact views
 PICTURED = 10  # models on the contact sheet
 ALWAYS = ("carved hull", "capped Poisson")  # peers run on every model; the others, which are worse, on the first of the default
 
@@ -147,12 +148,13 @@ def crossings_moved(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def cases_of(index: int, given: argparse.Namespace) -> list[str]:
-    """Which views of the index-th model are reconstructed: clean, color, perturbed SEED WAVELENGTH."""
+    """Which views of the index-th model are reconstructed: clean, normals (exact, without depth), color, perturbed SEED WAVELENGTH."""
     if given.seeds:
         disturbed = [f"perturbed {seed} {wavelength:g}" for wavelength in given.wavelengths for seed in range(given.seeds)]
     else:
         disturbed = [f"perturbed {index % SEEDS} {WAVELENGTHS[index % len(WAVELENGTHS)]:g}"] if index < DEFAULT_DISTURBED else []
-    cases = ["clean", *disturbed, *(["color"] if given.all or index < DEFAULT_COLOR else [])]
+    fewer = [case for case, count in (("normals", DEFAULT_NORMALS), ("color", DEFAULT_COLOR)) if given.all or index < count]
+    cases = ["clean", *disturbed, *fewer]
     return [case for case in cases if kind({"case": case}) in given.cases]
 
 
@@ -185,13 +187,15 @@ class Bench:
 
 def tasks(index: int, case: str, given: argparse.Namespace) -> dict:
     """Method to the options of ours, or to the function of a peer."""
-    kept = ["--ignore", "normal,depth,albedo,roughness,metallic"] if case == "color" else []
+    left_out, every = IGNORED.get(case), given.all or index < DEFAULT_COLOR
+    kept = ["--ignore", left_out] if left_out else []
     found: dict = {OURS: [*kept, *given.options]}
-    if case != "color" and (given.all or index < DEFAULT_BUDGETED):
+    if case == "normals" and every:
+        found[PAPER] = [*kept, "--method", "paper"]
+    if not left_out and (given.all or index < DEFAULT_BUDGETED):
         found |= {f"{OURS} {budget:g} s": [*given.options, "--budget", f"{budget:g}"] for budget in given.budgets}
     if given.peers:
-        every = given.all or index < DEFAULT_COLOR
-        found |= {m: f for m, f in peers.available(deep=case != "color").items() if every or m in ALWAYS}
+        found |= {m: f for m, f in peers.available(deep=not left_out).items() if every or m in ALWAYS}
     return found
 
 
@@ -222,8 +226,8 @@ def measure(index: int, name: str, source: str, folder: Path, bench: Bench, pool
         if kind({"case": case}) == "perturbed":
             arrays = perturbed(views, Perturbation(int(case.split()[1]), float(case.split()[2])))
             place = publish(folder / case.replace(" ", "_"), arrays, clean)
-        elif case == "color":
-            arrays = replace(views, images={"color": views.images["color"]})
+        elif case in IGNORED:
+            arrays = replace(views, images={d: x for d, x in views.images.items() if d not in IGNORED[case].split(",")})
         made = []
         for method, how in methods.items():
             record, mesh, surface = {"model": name, "source": source, "method": method, "case": case, "views_normal_degrees": shown}, None, None
@@ -253,7 +257,7 @@ def measure(index: int, name: str, source: str, folder: Path, bench: Bench, pool
         bench.save()
         own = [m for r, m, _ in made if r["method"] == OURS]
         others = sorted((r.get("distance", np.inf), i) for i, (r, _, _) in enumerate(made) if not r["method"].startswith(OURS))
-        if given.sheet and own and index < PICTURED and kind({"case": case}) != "color":
+        if given.sheet and own and index < PICTURED and case not in IGNORED:
             keep_row(given.output, f"{name} {case}", [(truth.vertices, truth.faces), own[0], made[others[0][1]][1] if others else None])
 
 
@@ -272,7 +276,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=0, help="disturbances of every model and wavelength (default: one of either a model, in turn)")
     parser.add_argument("--wavelengths", type=numbers, default=list(WAVELENGTHS), help="with --seeds: of the disturbance, shares of the picture")
     parser.add_argument("--budgets", type=numbers, default=[5, 10, 20, 40, 120], help="also run ours with --budget of these seconds, on the first models (default 5,10,20,40,120)")
-    parser.add_argument("--cases", type=lambda t: t.split(","), default=["clean", "perturbed", "color"], help="which views: clean,perturbed,color (default all)")
+    parser.add_argument("--cases", type=lambda t: t.split(","), default=["clean", "perturbed", "normals", "color"], help="which views: clean,perturbed,normals,color (default all)")
     parser.add_argument("--no-peers", dest="peers", action="store_false", help="leave the peers out")
     parser.add_argument("--fresh", action="store_true", help="measure every row anew")
     parser.add_argument("--sheet", type=Path, metavar="PNG", help="where the pictures of the truth, ours and the best peer go (default: beside the report)")
