@@ -190,7 +190,7 @@ def tasks(index: int, case: str, given: argparse.Namespace) -> dict:
     left_out, every = IGNORED.get(case), given.all or index < DEFAULT_COLOR
     kept = ["--ignore", left_out] if left_out else []
     found: dict = {OURS: [*kept, *given.options]}
-    if case == "normals" and every:
+    if case == "normals":
         found[PAPER] = [*kept, "--method", "paper"]
     if not left_out and (given.all or index < DEFAULT_BUDGETED):
         found |= {f"{OURS} {budget:g} s": [*given.options, "--budget", f"{budget:g}"] for budget in given.budgets}

@@ -149,7 +149,7 @@ def plot(records: list[dict], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    cases = [case for case in ("clean", "perturbed") if any(kind(r) == case for r in records)]
+    cases = [case for case in TITLES if any(kind(r) == case for r in records)]
     picture, axes = plt.subplots(2, len(cases), figsize=(6 * len(cases), 7), layout="constrained", squeeze=False)
     for column, case in enumerate(cases):
         for row, (name, label) in enumerate((("distance", "Chamfer"), ("iou", "IoU"))):
@@ -165,7 +165,7 @@ def plot(records: list[dict], path: Path) -> None:
                     axis.plot(seconds, value, "o" if method == OURS else "s", label=method, markersize=9)
             if budgets:
                 axis.plot(*zip(*sorted(budgets), strict=True), ".-", color="grey", label=f"{OURS} --budget")
-            if name in LIMITS[case]:
+            if name in LIMITS.get(case, {}):
                 axis.axhline(LIMITS[case][name], color="grey", linestyle=":")
             axis.set(ylabel=label, title=TITLES[case], yscale="log" if name == "distance" else "linear")
             seconds_axis(axis)
