@@ -183,6 +183,7 @@ def _depth(views, out: Output):
     from gdtool.fields.fusion import depth_for
 
     if "depth" in views.images or "normal" not in views.images:
+        out.skip("matching of views", "depth views say where the surface is" if "depth" in views.images else "there are no normals to match")
         return views.images.get("depth")
     alike = {domain: views.images[domain] for domain in ("albedo", "roughness", "metallic") if domain in views.images}
     with out.step("match views"):

@@ -108,3 +108,14 @@ def test_views_that_show_nothing_have_no_depth():
     mask[2] = 0
     depth = depth_for(cameras, mask, images["normal"])
     assert (depth[2] == 0).all() and error(images, mask, depth).mean() < 0.008
+
+
+@pytest.mark.parametrize("lie", ["other sides", "noise", "nothing"])
+def test_normals_that_lie_still_leave_depths_within_the_silhouettes(lie):
+    cameras, images, mask = views_of(torus, SIZE)
+    normal = {"other sides": images["normal"][[0, 5, 4, 3, 2, 1]], "nothing": np.zeros_like(images["normal"]),
+              "noise": np.random.default_rng(0).standard_normal(images["normal"].shape).astype(np.float32)}[lie]
+    depth = depth_for(cameras, mask, normal)
+    inside = mask > 0.5
+    assert np.isfinite(depth).all() and (depth[~inside] == 0).all()
+    assert ((depth[inside] > 1) & (depth[inside] < 3)).all()
