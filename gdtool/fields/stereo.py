@@ -24,13 +24,13 @@ WORST = 3.0  # such differences: more says no more
 FACING = 0.12  # cosine: a point that is turned farther away is not seen well enough to compare
 SLACK = 1.5  # pixels that a silhouette may be off
 HIDDEN, HIDDEN_SHARE = 0.6, 0.15  # cost of what no other view shows, and what that counts beside a view that shows it
+FIT = 0.02  # misfit up to which views are taken to show one object
 NEARER = 0.05  # cost of a world unit behind the silhouettes' common volume: among depths that fit alike
 LITTLE, JUMP = 0.1, 0.6  # cost of a depth that leaves its neighbour's plane by one candidate, and by any number
 MET, AGREED = 2.0, 2.5  # pixels: so near is a point the one that another view shows (in the sweep; in the end)
 NEVER = 9.0  # cost of what is ruled out
 LEAST_COVER = 0.2  # of a block, for it to be matched
 MOST = 512  # depths that are tried
-SWEEPS = 2
 
 
 @dataclass(frozen=True)
@@ -125,14 +125,39 @@ def match_views(cameras: list[Camera], mask: np.ndarray, normal: np.ndarray, ali
     corners = np.stack(np.meshgrid(*zip(*box, strict=True), indexing="ij"), -1).reshape(-1, 3)
     looks = _looks({"normal": normal, **alike})
     views = [_View(*given, corners) for given in zip(cameras, mask, looks, normal, strict=True)]
-    found: list[np.ndarray] | None = None
-    for _ in range(SWEEPS):
-        known = None if found is None else _known(views, found)
-        found = []
+    found = _sweep(views, sights, None, NEARER)
+    # Views that do not fit one another say less of where a point is, and the silhouettes more.
+    doubt = max(1.0, _misfit(views, found) / FIT)
+    if doubt > 1:
         for view in views:
-            found.append(_least(_swept(view, [other for other in views if other is not view], sights, known), view))
+            view.looks, view.own = view.looks / doubt**0.5, view.own / doubt**0.5
+        found = _sweep(views, sights, None, NEARER * doubt)
+    found = _sweep(views, sights, _known(views, found), NEARER * doubt)
     return [_full_size(view, depth, trust, own) for view, depth, trust, own in
             zip(views, found, _confirmed(views, found), mask, strict=True)]
+
+
+def _sweep(views: list[_View], sights: list[Sight], known: dict[int, tuple[np.ndarray, np.ndarray]] | None, nearer: float) -> list[np.ndarray]:
+    """Stretched depth (n,) of every view's pixels; see _swept and _least."""
+    return [_least(_swept(view, [other for other in views if other is not view], sights, known, nearer), view) for view in views]
+
+
+def _misfit(views: list[_View], found: list[np.ndarray]) -> float:
+    """Median difference, in 0..1, to the view that fits best, of the pixels that another view can see.
+
+    True views come to .003 and less, views disturbed as benchmarks/perturbation.py does to .1, a model's to .7.
+    """
+    every = []
+    for view, depth in zip(views, found, strict=True):
+        chosen = np.flatnonzero(np.isfinite(depth))
+        points, best = view.points(np.nan_to_num(depth, nan=view.tried[0])), np.full(len(chosen), np.inf)
+        for other in views:
+            if other is not view:
+                difference = _compared(view, other, points, chosen)[0]
+                best = np.where(_facing(other, view)[chosen] > FACING, np.minimum(best, difference), best)
+        every.append(best[np.isfinite(best)])
+    joined = np.concatenate(every)
+    return float(np.median(joined)) if len(joined) else 0.0
 
 
 def _looks(images: dict[str, np.ndarray]) -> np.ndarray:
@@ -146,7 +171,8 @@ def _looks(images: dict[str, np.ndarray]) -> np.ndarray:
     return np.concatenate(parts, -1).astype(np.float32)
 
 
-def _swept(view: _View, others: list[_View], sights: list[Sight], known: dict[int, tuple[np.ndarray, np.ndarray]] | None) -> np.ndarray:
+def _swept(view: _View, others: list[_View], sights: list[Sight], known: dict[int, tuple[np.ndarray, np.ndarray]] | None,
+           nearer: float) -> np.ndarray:
     """Cost (n, candidates) of every depth that is tried, NEVER where a silhouette rules it out.
 
     known: depth and trust (h, w) of the others by id, from an earlier sweep.
@@ -164,7 +190,7 @@ def _swept(view: _View, others: list[_View], sights: list[Sight], known: dict[in
         behind = world - entered[allowed]
         hidden = np.full(len(allowed), HIDDEN)
         compared = [(*_compared(view, other, points, allowed), cosine[allowed], other) for other, cosine in zip(others, facing.T, strict=True)]
-        cost[allowed, k] = (_unordered(compared, hidden) if known is None else _ordered(compared, hidden, known)) + NEARER * behind
+        cost[allowed, k] = (_unordered(compared, hidden) if known is None else _ordered(compared, hidden, known)) + nearer * behind
     return cost
 
 

@@ -119,3 +119,14 @@ def test_normals_that_lie_still_leave_depths_within_the_silhouettes(lie):
     inside = mask > 0.5
     assert np.isfinite(depth).all() and (depth[~inside] == 0).all()
     assert ((depth[inside] > 1) & (depth[inside] < 3)).all()
+
+
+def test_views_that_do_not_fit_one_another_lean_on_the_silhouettes():
+    """Normals of each view turned by another 12 degrees: the ball and the wall fill their silhouettes, so these are right."""
+    cameras, images, mask = views_of(ball_before_a_wall, SIZE)
+    rng, normal = np.random.default_rng(0), images["normal"].copy()
+    for k in range(len(cameras)):
+        axis = rng.standard_normal(3)
+        turned = np.cross(axis / np.linalg.norm(axis), normal[k]) * np.tan(np.radians(12)) + normal[k]
+        normal[k] = turned / np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-9)
+    assert error(images, mask, depth_for(cameras, mask, normal)).mean() < 0.04
