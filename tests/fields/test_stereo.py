@@ -5,11 +5,12 @@ import pytest
 
 from gdtool.cameras import camera_at, rays, rig
 from gdtool.cameras.camera import SIX_VIEWS
+from gdtool.fields import stereo
 from gdtool.fields.carve import hull_bounds
 from gdtool.fields.fusion import depth_for, prepare_all
 from gdtool.fields.stereo import LITTLE, _passed, match_views, pixel_steps, slopes, stretched
 
-from .shapes import sphere, torus, views_of
+from .shapes import sphere, torus, two_balls, views_of
 
 SIZE = 96
 
@@ -121,12 +122,15 @@ def test_normals_that_lie_still_leave_depths_within_the_silhouettes(lie):
     assert ((depth[inside] > 1) & (depth[inside] < 3)).all()
 
 
-def test_views_that_do_not_fit_one_another_lean_on_the_silhouettes():
-    """Normals of each view turned by another 12 degrees: the ball and the wall fill their silhouettes, so these are right."""
-    cameras, images, mask = views_of(ball_before_a_wall, SIZE)
+def test_views_that_do_not_fit_one_another_lean_on_the_silhouettes(monkeypatch):
+    """Normals of each view turned by another 12 degrees; two balls fill their silhouettes, so these are right."""
+    cameras, images, mask = views_of(two_balls, SIZE)
     rng, normal = np.random.default_rng(0), images["normal"].copy()
     for k in range(len(cameras)):
         axis = rng.standard_normal(3)
         turned = np.cross(axis / np.linalg.norm(axis), normal[k]) * np.tan(np.radians(12)) + normal[k]
         normal[k] = turned / np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-9)
-    assert error(images, mask, depth_for(cameras, mask, normal)).mean() < 0.04
+    leaning = error(images, mask, depth_for(cameras, mask, normal)).mean()
+    monkeypatch.setattr(stereo, "FIT", 1e9)
+    trusting = error(images, mask, depth_for(cameras, mask, normal)).mean()
+    assert leaning < 0.8 * trusting
