@@ -190,7 +190,7 @@ def tasks(index: int, case: str, given: argparse.Namespace) -> dict:
     left_out, every = IGNORED.get(case), given.all or index < DEFAULT_COLOR
     kept = ["--ignore", left_out] if left_out else []
     found: dict = {OURS: [*kept, *given.options]}
-    if case == "normals":
+    if case == "normals" and (every or given.paper):
         found[PAPER] = [*kept, "--method", "paper"]
     if not left_out and (given.all or index < DEFAULT_BUDGETED):
         found |= {f"{OURS} {budget:g} s": [*given.options, "--budget", f"{budget:g}"] for budget in given.budgets}
@@ -277,6 +277,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--wavelengths", type=numbers, default=list(WAVELENGTHS), help="with --seeds: of the disturbance, shares of the picture")
     parser.add_argument("--budgets", type=numbers, default=[5, 10, 20, 40, 120], help="also run ours with --budget of these seconds, on the first models (default 5,10,20,40,120)")
     parser.add_argument("--cases", type=lambda t: t.split(","), default=["clean", "perturbed", "normals", "color"], help="which views: clean,perturbed,normals,color (default all)")
+    parser.add_argument("--paper", action="store_true", help="the paper's method on all models of the case normals, minutes each (default: the first four)")
     parser.add_argument("--no-peers", dest="peers", action="store_false", help="leave the peers out")
     parser.add_argument("--fresh", action="store_true", help="measure every row anew")
     parser.add_argument("--sheet", type=Path, metavar="PNG", help="where the pictures of the truth, ours and the best peer go (default: beside the report)")
