@@ -1,4 +1,4 @@
-"""Triangles to quads: an engine in a child, its result judged, repaired and fitted to the surface, and a chain of fallbacks."""
+"""Triangles to quads: an engine in a child, its result judged and repaired, fitted to the surface by quad_fit.py, and a chain of fallbacks."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ import numpy as np
 
 from gdtool.core.child import ChildFailed, begin, prepare
 from gdtool.geometry import repair
-from gdtool.geometry.features import Constraints, Features, find_features, trace, untied
-from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian, valences
+from gdtool.geometry.features import find_features
+from gdtool.geometry.mesh_quality import scaled_jacobian, valences
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_engines import ENGINES
-from gdtool.geometry.quad_paths import crossed, cut_along_features, held_at_centres, to_rim
-from gdtool.geometry.quad_relax import balance, ease, square_up
-from gdtool.geometry.quad_shape import Surface, fill_holes, onto, relax, remove_doublets, subdivide, unfold
+from gdtool.geometry.quad_fit import farthest, finished, fitted, left_out
+from gdtool.geometry.quad_shape import Surface, fill_holes, remove_doublets
 from gdtool.geometry.quad_split import split_count, split_to_quads
 from gdtool.geometry.quad_topology import cancel_irregular
 from gdtool.geometry.sharpen import restore_creases
@@ -28,11 +27,7 @@ COUNT_TOLERANCE = 0.03
 _SMALL_PIECE_QUADS = 48
 _TRIES = 3
 _CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a result is taken without a look at others
-_NO_AREA = 1e-4  # squared edge lengths
-_HOPELESS_EDGES = 1.7  # farther than this before it is shaped, a subdivided result is given up
 _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
-_RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
-_FOLDED, _LET_GO = 0.05, 0.25  # scaled Jacobian; edge lengths
 _HANDLES, _PIECES = "handles are lost or added", "pieces are lost or joined"
 _TOO_COARSE = _STRAYS, _LEAVES_OUT = "strays", "leaves out"
 _MOST_PIECES = 16  # that are remeshed one by one where together they fail
@@ -104,7 +99,7 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
             if found is None:
                 start = time.perf_counter()
                 split = split_to_quads(part_vertices, part_faces, quads, request.crease_degrees, request.seconds, request.memory_mb)
-                found = *_fitted(*split, part_vertices, part_faces, request, fine()), "pair and split"
+                found = *fitted(*split, part_vertices, part_faces, request, fine()), "pair and split"
                 record.clock("fallback", start)
             done.append(found[:2])
             names.append(found[2])
@@ -190,45 +185,6 @@ def _one_by_one(vertices: np.ndarray, faces: np.ndarray, quads: int) -> list[tup
     return [(*repair.compact(vertices, faces[piece == k]), max(int(share[k]), 6)) for k in range(count)]
 
 
-def _fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
-            request: Request, fine: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """What split_to_quads made, each piece evened out on the surface where that makes better quads; only its vertices move."""
-    edge = (polygon_normals(quad_vertices, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
-    features = find_features(vertices, faces, request.crease_degrees or 181.0, 3 * edge)
-    surface = Surface(vertices, faces)
-    traced, constraints = trace(quad_vertices, quad_faces, features, edge)
-    constraints = untied(traced, quad_faces, constraints)
-    traced = relax(onto(traced, surface, features, constraints), quad_faces, surface, features, constraints, request.smooth_iterations)
-    traced = _shaped(traced, quad_faces, surface, features, constraints, request, fine)
-    # Pieces that are a few quads wide fold and shrink when their vertices are evened out: they stay as they were split, and
-    # elsewhere the vertices of quads that folded or let go of a corner.
-    count, piece = repair.components(quad_faces)
-    split, evened = (scaled_jacobian(v, quad_faces) for v in (quad_vertices, traced))
-    worse = (np.bincount(piece, evened, count) < np.bincount(piece, split, count))[piece]
-    worse[_let_go(surface, quad_vertices, traced, quad_faces, _LET_GO * edge)] = True
-    stays = np.zeros(len(quad_vertices), bool)
-    while worse.any():
-        stays[quad_faces[worse]] = True
-        evened = scaled_jacobian(np.where(stays[:, None], quad_vertices, traced), quad_faces)
-        worse = (evened < _FOLDED) & (split > evened) & ~stays[quad_faces].all(1)
-    # What has no area as it was split was better off evened out.
-    least = _NO_AREA * edge**2
-    flat = polygon_normals(np.where(stays[:, None], quad_vertices, traced), quad_faces)[1] < least
-    stays[quad_faces[flat & (polygon_normals(traced, quad_faces)[1] >= least)]] = False
-    return np.where(stays[:, None], quad_vertices, traced), quad_faces
-
-
-def _let_go(surface: Surface, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, distance: float) -> np.ndarray:
-    """Faces (k,) that stood for surface farther than `distance` from them, and twice as far as before, once their vertices moved."""
-    from gdtool.folders.mesh import triangulated
-    from gdtool.geometry.distance import closest_points, sample_surface
-
-    points = sample_surface(surface.vertices, surface.faces, 20000, np.random.default_rng(0))[0]
-    triangles, face_idx = triangulated(faces)
-    (before, nearest), after = closest_points(points, vertices, triangles)[:2], closest_points(points, moved, triangles)[0]
-    return np.unique(face_idx[nearest[(after > distance) & (after > 2 * before)]])
-
-
 def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float, request: Request,
                 record: Record, fine: Callable[[], Surface]) -> tuple[np.ndarray, np.ndarray, str] | None:
     """The first engine's result that stands up to judgement, finished; None when none does. fine gives the input's Surface."""
@@ -276,8 +232,8 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
                 # The others of the right count are finished too, until one has no thin quad and leaves no corner out.
                 best = None
                 for result in [r for r in results if rank(r)[:2] == (False, COUNT_TOLERANCE)]:
-                    quad_vertices, quad_faces = _finished(*result[2:], surface, features, subdivisions, request, fine())
-                    far = _farthest(quad_vertices, quad_faces, surface) / edge
+                    quad_vertices, quad_faces = finished(*result[2:], surface, features, subdivisions, request, fine())
+                    far = farthest(quad_vertices, quad_faces, surface) / edge
                     least = float(scaled_jacobian(quad_vertices, quad_faces).min())
                     good = far < _CLOSE_EDGES and least > _LEAST_JACOBIAN
                     if best is None or good or far - 2 * least < best[0]:
@@ -288,7 +244,7 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
                 _, far, least, quad_vertices, quad_faces = best
                 limit = 1.0 if subdivisions else 2.0
                 fault = f"{_STRAYS} {far:.2g} edge lengths from the surface" if far > limit else None
-                if fault is None and (left := _left_out(quad_vertices, quad_faces, surface, _LOST_EDGES * edge)) > _LOST_SHARE:
+                if fault is None and (left := left_out(quad_vertices, quad_faces, surface, _LOST_EDGES * edge)) > _LOST_SHARE:
                     fault = f"{_LEAVES_OUT} {left:.1%} of the surface"
                 if subdivisions and least < request.least_jacobian:
                     fault = f"has a quad of scaled Jacobian {least:.2g}"
@@ -310,9 +266,9 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
     if second_best is not None:
         # Closed and manifold, but a gap or tunnel finer than the quads was bridged or filled: still better than no engine.
         start = time.perf_counter()
-        quad_vertices, quad_faces = _finished(*second_best[:2], surface, features, 0, request, fine())
+        quad_vertices, quad_faces = finished(*second_best[:2], surface, features, 0, request, fine())
         record.clock("fit", start)
-        if _farthest(quad_vertices, quad_faces, surface) < 2 * edge:
+        if farthest(quad_vertices, quad_faces, surface) < 2 * edge:
             return quad_vertices, quad_faces, second_best[2]
     return None
 
@@ -364,52 +320,3 @@ def _judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndar
     if closed and repair.euler_number(quad_faces) != repair.euler_number(faces):
         return _HANDLES, quad_vertices, quad_faces
     return None, quad_vertices, quad_faces
-
-
-def _finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, subdivisions: int,
-              request: Request, fine: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """The engine's quads drawn to creases, subdivided, evened out on the surface and unfolded."""
-    edge = (polygon_normals(vertices, faces)[1].sum() / len(faces)) ** 0.5
-    vertices, constraints = trace(to_rim(vertices, faces, surface, _RIM_EDGES * edge), faces, features, edge)
-    free = untied(vertices, faces, constraints)
-    (across, curve), constraints = crossed(faces, constraints, free), free
-    vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)
-    for turn in range(subdivisions):
-        count = len(faces)
-        vertices, faces, constraints = subdivide(vertices, faces, constraints)
-        if not turn:
-            constraints = held_at_centres(constraints, len(vertices) - count, across, curve)
-        vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)
-    if subdivisions and _farthest(vertices, faces, surface) > _HOPELESS_EDGES * edge / 2**subdivisions:
-        return vertices, faces  # shaping brings it a third nearer at most: it strays too far in any case
-    vertices = _shaped(vertices, faces, surface, features, constraints, request, fine)
-    return vertices, cut_along_features(vertices, faces, fine)
-
-
-def _shaped(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
-            request: Request, fine: Surface) -> np.ndarray:
-    """The quads squared up, then the few that stay folded or thin unfolded one vertex at a time; last, balanced about `fine`."""
-    vertices = square_up(vertices, faces, surface, features, constraints, request.smooth_iterations)
-    constraints = untied(vertices, faces, constraints)
-    vertices = square_up(vertices, faces, surface, features, constraints, 3 * request.smooth_iterations)
-    vertices = unfold(vertices, faces, surface, features, constraints)
-    vertices, constraints = ease(vertices, faces, surface, features, constraints)
-    return balance(vertices, faces, fine, constraints) if request.smooth_iterations else vertices
-
-
-def _farthest(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> float:
-    """How far the surface is from the quads at most: large where they are too coarse for a detail or leave out a corner."""
-    from gdtool.folders.mesh import triangulated
-    from gdtool.geometry.distance import closest_points
-
-    step = max(len(surface.vertices) // 20000, 1)
-    return float(closest_points(surface.vertices[::step], vertices, triangulated(faces)[0])[0].max())
-
-
-def _left_out(vertices: np.ndarray, faces: np.ndarray, surface: Surface, distance: float) -> float:
-    """Share of the surface's area that lies farther than `distance` from the quads: thin parts and rims that they do without."""
-    from gdtool.folders.mesh import triangulated
-    from gdtool.geometry.distance import closest_points, sample_surface
-
-    points = sample_surface(surface.vertices, surface.faces, 10000, np.random.default_rng(0))[0]
-    return float((closest_points(points, vertices, triangulated(faces)[0])[0] > distance).mean())

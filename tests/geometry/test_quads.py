@@ -5,9 +5,9 @@ import pytest
 
 from gdtool.core.child import ChildFailed
 from gdtool.folders.mesh import triangulated
-from gdtool.geometry import quads, repair
+from gdtool.geometry import quad_fit, quads, repair
 from gdtool.geometry.features import find_features
-from gdtool.geometry.mesh_quality import distance_figures, scaled_jacobian, shape_figures, topology_figures
+from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, scaled_jacobian, shape_figures, topology_figures
 from gdtool.geometry.quad_split import pair_and_split
 from gdtool.geometry.quad_shape import remove_doublets, subdivide
 from gdtool.geometry.sharpen import restore_creases
@@ -92,14 +92,30 @@ def test_splitting_makes_square_quads_of_any_triangles(shape):
     assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.01
 
 
+def test_quads_without_area_are_evened_out_where_their_neighbours_stay(monkeypatch):
+    """A mesh of the fallback whose every vertex is to stay, but one quad was split without area."""
+    vertices, faces = sphere(24, 0.5)
+    split, quad_faces = pair_and_split(vertices, faces, 600)
+    a, b, c, d = quad_faces[100]
+    split[b], split[d] = split[a], split[c]
+    assert polygon_normals(split, quad_faces)[1][100] < 1e-12
+    monkeypatch.setattr(quad_fit, "_let_go", lambda *given: np.arange(len(quad_faces)))
+    out, _ = quad_fit.fitted(split, quad_faces, vertices, faces, quads.Request(quads=600), quads.Surface(vertices, faces))
+    edge = (polygon_normals(out, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
+    assert polygon_normals(out, quad_faces)[1].min() > 1e-4 * edge**2
+    touched = np.isin(quad_faces, quad_faces[100]).any(1)
+    kept = np.setdiff1d(quad_faces[~touched], quad_faces[touched])
+    assert np.array_equal(out[kept], split[kept])
+
+
 def test_surface_that_the_quads_do_without_is_measured():
     vertices, faces = cube()
     lid = faces[np.all(vertices[faces][:, :, 2] == vertices[:, 2].max(), 1)]
     rest = np.array([f for f in faces.tolist() if f not in lid.tolist()])
     surface = quads.Surface(vertices, faces)
     closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, rest))
-    assert quads._left_out(vertices, closed, surface, 0.1) == 0
-    assert quads._left_out(vertices, opened, surface, 0.1) == pytest.approx(0.8**2 / 6, abs=0.02)  # the lid but its rim
+    assert quad_fit.left_out(vertices, closed, surface, 0.1) == 0
+    assert quad_fit.left_out(vertices, opened, surface, 0.1) == pytest.approx(0.8**2 / 6, abs=0.02)  # the lid but its rim
 
 
 def test_bevels_of_marching_cubes_become_creases():
@@ -201,8 +217,8 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
 
     monkeypatch.setattr(quads, "begin", begin)
     # Fitting would draw the small sphere out to the large one.
-    monkeypatch.setattr(quads, "_finished", lambda vertices, faces, *_: (vertices, faces))
-    monkeypatch.setattr(quads, "_farthest", lambda *_: 0.3)
+    monkeypatch.setattr(quads, "finished", lambda vertices, faces, *_: (vertices, faces))
+    monkeypatch.setattr(quads, "farthest", lambda *_: 0.3)
     _, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=1000))
     assert len(asked) == runs and record.engine == "pair and split" and whole(found)
     assert outcome == "a crash" or "strays" in record.failed[0]

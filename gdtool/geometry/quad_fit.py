@@ -1,0 +1,110 @@
+"""Quads drawn onto the surface that they stand for: to its creases and boundaries, evened out, unfolded; and how well they do."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gdtool.geometry import repair
+from gdtool.geometry.features import Constraints, Features, find_features, trace, untied
+from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian
+from gdtool.geometry.quad_paths import crossed, cut_along_features, held_at_centres, to_rim
+from gdtool.geometry.quad_relax import balance, ease, square_up
+from gdtool.geometry.quad_shape import Surface, onto, relax, subdivide, unfold
+
+if TYPE_CHECKING:
+    from gdtool.geometry.quads import Request
+
+_NO_AREA = 1e-4  # squared edge lengths
+_HOPELESS_EDGES = 1.7  # farther than this before it is shaped, a subdivided result is given up
+_RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
+_FOLDED, _LET_GO = 0.05, 0.25  # scaled Jacobian; edge lengths
+
+
+def finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, subdivisions: int,
+              request: Request, fine: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """The engine's quads drawn to creases, subdivided, evened out on the surface and unfolded."""
+    edge = (polygon_normals(vertices, faces)[1].sum() / len(faces)) ** 0.5
+    vertices, constraints = trace(to_rim(vertices, faces, surface, _RIM_EDGES * edge), faces, features, edge)
+    free = untied(vertices, faces, constraints)
+    (across, curve), constraints = crossed(faces, constraints, free), free
+    vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)
+    for turn in range(subdivisions):
+        count = len(faces)
+        vertices, faces, constraints = subdivide(vertices, faces, constraints)
+        if not turn:
+            constraints = held_at_centres(constraints, len(vertices) - count, across, curve)
+        vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)
+    if subdivisions and farthest(vertices, faces, surface) > _HOPELESS_EDGES * edge / 2**subdivisions:
+        return vertices, faces  # shaping brings it a third nearer at most: it strays too far in any case
+    vertices = _shaped(vertices, faces, surface, features, constraints, request, fine)
+    return vertices, cut_along_features(vertices, faces, fine)
+
+
+def _shaped(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
+            request: Request, fine: Surface) -> np.ndarray:
+    """The quads squared up, then the few that stay folded or thin unfolded one vertex at a time; last, balanced about `fine`."""
+    vertices = square_up(vertices, faces, surface, features, constraints, request.smooth_iterations)
+    constraints = untied(vertices, faces, constraints)
+    vertices = square_up(vertices, faces, surface, features, constraints, 3 * request.smooth_iterations)
+    vertices = unfold(vertices, faces, surface, features, constraints)
+    vertices, constraints = ease(vertices, faces, surface, features, constraints)
+    return balance(vertices, faces, fine, constraints) if request.smooth_iterations else vertices
+
+
+def fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
+            request: Request, fine: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """What split_to_quads made, each piece evened out on the surface where that makes better quads; only its vertices move."""
+    edge = (polygon_normals(quad_vertices, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
+    features = find_features(vertices, faces, request.crease_degrees or 181.0, 3 * edge)
+    surface = Surface(vertices, faces)
+    traced, constraints = trace(quad_vertices, quad_faces, features, edge)
+    constraints = untied(traced, quad_faces, constraints)
+    traced = relax(onto(traced, surface, features, constraints), quad_faces, surface, features, constraints, request.smooth_iterations)
+    traced = _shaped(traced, quad_faces, surface, features, constraints, request, fine)
+    # Pieces that are a few quads wide fold and shrink when their vertices are evened out: they stay as they were split, and
+    # elsewhere the vertices of quads that folded or let go of a corner.
+    count, piece = repair.components(quad_faces)
+    split, evened = (scaled_jacobian(v, quad_faces) for v in (quad_vertices, traced))
+    worse = (np.bincount(piece, evened, count) < np.bincount(piece, split, count))[piece]
+    worse[_let_go(surface, quad_vertices, traced, quad_faces, _LET_GO * edge)] = True
+    stays = np.zeros(len(quad_vertices), bool)
+    while worse.any():
+        stays[quad_faces[worse]] = True
+        evened = scaled_jacobian(np.where(stays[:, None], quad_vertices, traced), quad_faces)
+        worse = (evened < _FOLDED) & (split > evened) & ~stays[quad_faces].all(1)
+    # What has no area as it was split was better off evened out.
+    least = _NO_AREA * edge**2
+    flat = polygon_normals(np.where(stays[:, None], quad_vertices, traced), quad_faces)[1] < least
+    stays[quad_faces[flat & (polygon_normals(traced, quad_faces)[1] >= least)]] = False
+    return np.where(stays[:, None], quad_vertices, traced), quad_faces
+
+
+def _let_go(surface: Surface, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, distance: float) -> np.ndarray:
+    """Faces (k,) that stood for surface farther than `distance` from them, and twice as far as before, once their vertices moved."""
+    from gdtool.folders.mesh import triangulated
+    from gdtool.geometry.distance import closest_points, sample_surface
+
+    points = sample_surface(surface.vertices, surface.faces, 20000, np.random.default_rng(0))[0]
+    triangles, face_idx = triangulated(faces)
+    (before, nearest), after = closest_points(points, vertices, triangles)[:2], closest_points(points, moved, triangles)[0]
+    return np.unique(face_idx[nearest[(after > distance) & (after > 2 * before)]])
+
+
+def farthest(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> float:
+    """How far the surface is from the quads at most: large where they are too coarse for a detail or leave out a corner."""
+    from gdtool.folders.mesh import triangulated
+    from gdtool.geometry.distance import closest_points
+
+    step = max(len(surface.vertices) // 20000, 1)
+    return float(closest_points(surface.vertices[::step], vertices, triangulated(faces)[0])[0].max())
+
+
+def left_out(vertices: np.ndarray, faces: np.ndarray, surface: Surface, distance: float) -> float:
+    """Share of the surface's area that lies farther than `distance` from the quads: thin parts and rims that they do without."""
+    from gdtool.folders.mesh import triangulated
+    from gdtool.geometry.distance import closest_points, sample_surface
+
+    points = sample_surface(surface.vertices, surface.faces, 10000, np.random.default_rng(0))[0]
+    return float((closest_points(points, vertices, triangulated(faces)[0])[0] > distance).mean())
