@@ -134,12 +134,11 @@ def main() -> None:
     config = model.config
     table: dict[str, list[dict[str, float]]] = {}
     seconds: dict[str, float] = {}
-    planes, pictures = [], []
-    for folder in views_folders(arguments.train):
+    trained, pictures, mean = views_folders(arguments.train), [], 0.0  # all their views would not fit into memory
+    for folder in trained:
         one, conditions, _ = decode_object(folder, config)
-        planes.append(one.astype(np.float16))
+        mean = mean + torch.from_numpy(one) / len(trained)
         pictures.append(conditions[0].astype(np.float16))
-    mean = torch.from_numpy(np.mean(planes, 0, dtype=np.float32)) if planes else None
     for number, folder in enumerate(views_folders(arguments.held_out)):
         truth = true_views(folder, config.image_size)
         rgba = torch.from_numpy(decode_object(folder, config)[1][0])[None]
@@ -149,8 +148,8 @@ def main() -> None:
             name = f"model, {steps} step{'s' * (steps > 1)}"
             seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
             table.setdefault(name, []).append(figures(result, truth))
-        if planes:
-            nearest = torch.from_numpy(planes[nearest_to(rgba[0], pictures)].astype(np.float32))
+        if trained:
+            nearest = torch.from_numpy(decode_object(trained[nearest_to(rgba[0], pictures)], config)[0])
             table.setdefault("nearest training object", []).append(figures(decoded(nearest, config), truth))
             table.setdefault("mean training object", []).append(figures(decoded(mean, config), truth))
         print(f"{number + 1}: {folder.name}", flush=True)
