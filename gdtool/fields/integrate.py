@@ -14,7 +14,7 @@ from gdtool.fields.stereo import Matched, match_views, pixel_steps, slopes, stre
 
 MIN_FACING = 0.15  # normals turned farther away say little about depth
 HOLD, LEAST_HOLD = 0.02, 1e-5  # weight of a matched depth against one pixel's slope, by its trust
-_STEP, _FIRST_STEP = 2.0, 6.0  # pixels: a step in depth that is so far off the slope counts a quarter; at first, and then
+_FIRST_STEP, _STEP = 6.0, 2.0  # pixels: a step in depth that is so far off the slope counts a quarter; at first, and then
 _ASTRAY = 4.0  # pixels: likewise a matched depth
 
 

@@ -121,14 +121,14 @@ def _fit(views, sights, shape, options: Options, out: Output):
     from gdtool.fields.paper import PaperOptions, extract_network, fit_networks
     from gdtool.fields.refine import keep_pieces
 
-    told = next((domain for domain in ("depth", "normal") if domain in views.images), None)
-    volume = 0 if told else options.steps // 3
-    if told:
-        out.skip("volume start", f"{told} views say where the surface is")
+    images = _with_depth(views, sights)
+    volume = 0 if "depth" in images else options.steps // 3
+    if not volume:
+        out.skip("volume start", f"{'depth' if 'depth' in views.images else 'normal'} views say where the surface is")
     settings = PaperOptions(options.steps, volume, options.steps, rule=options.root, brdf=options.brdf, seed=options.seed,
                             budget=options.budget, device=out.device, precision=options.precision)
     with out.step("networks"):
-        fit, figures = fit_networks(views.cameras, views.mask, _with_depth(views, sights), shape.vertices, shape.faces, settings,
+        fit, figures = fit_networks(views.cameras, views.mask, images, shape.vertices, shape.faces, settings,
                                     lambda count, label: out.progress(range(count), count, label))
     with out.step("extract"):
         vertices, faces = extract_network(fit.sdf, shape.step, out.device)
