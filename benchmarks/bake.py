@@ -80,7 +80,6 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     reach = vertex_reach(target.vertices, target.faces, origin.source)
     baked = bake(target, texels, origin.source, origin.lookup, reach, threads=threads)
     wall, processor = clock()
-    kept = {name: texels.image(baked.values[name]) for name in ("albedo", "roughness", "metallic", "tangent_normal")} if out else {}
     traced, trace = None, None
     clock()
     if occlusion:
@@ -100,11 +99,19 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
         many = occlusion_tracer(target, origin.source, reach, origin.normals, 1024, 9, threads)(texels.face_idx[some], texels.barycentric[some])
         cost["occlusion rms"] = float(np.sqrt(np.mean((traced[some] - many) ** 2)))
     if out:
-        kept["normal"] = kept.pop("tangent_normal") * 0.5 + 0.5
-        if maps.base_color is not None:
-            kept["stored"] = maps.base_color  # with its gutters
-        np.savez(out, **kept)
+        np.savez(out, **with_gutters(texels, baked.values))
     return cost
+
+
+def with_gutters(texels, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What texels read as the floats of maps that are filled as ours are: albedo (s, s, 3) linear, roughness, metallic, normal as stored."""
+    from gdtool.images.color import linear_from_srgb, srgb_from_linear
+    from gdtool.texture.padding import fill_gutters
+
+    read = {name: values[name] for name in ("roughness", "metallic")} | {"albedo": srgb_from_linear(np.clip(values["albedo"], 0, 1)),
+                                                                        "normal": values["tangent_normal"] * 0.5 + 0.5}
+    maps = {name: fill_gutters(texels.image(value), texels.mask()) for name, value in read.items()}
+    return maps | {"albedo": linear_from_srgb(maps["albedo"])}
 
 
 def blender(python: Path, case: Case, size: int, samples: int, occlusion: int, out: Path, limit: float) -> dict[str, float]:
@@ -157,7 +164,7 @@ def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
     failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows.rows if "failed" in row)
     head = f"# Bake\n\n`python benchmarks/bake.py`, {machine()}. {note}\n\nbake: rasterising, reading, gutters and storing; seconds of the wall and of the " \
         "processor. Errors before storing, and after 8 bits. seam: how much more the two sides of seams " \
-        "differ than in the model, over the same at other edges. rim: the base color along the charts' rims in the mip level of " \
+        "differ than in the model, over the same at other edges, or over 1 where those differ less. rim: the base color along the charts' rims in the mip level of " \
         f"{MIP} texels, against each chart alone.\n\n"
     (out / "bake.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![maps](bake.png)\n")
     names = list(dict.fromkeys(row["model"] for row in rows.rows))
@@ -177,7 +184,6 @@ def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
 def run(case: Case, truth: Truth, way: str, size: int, samples: int, asked: argparse.Namespace) -> dict:
     """Cost and errors of one bake."""
     from gdtool.core.child import ChildFailed, call
-    from gdtool.images.color import linear_from_srgb
 
     with tempfile.TemporaryDirectory() as folder:
         at = Path(folder, "maps.npz")
@@ -192,10 +198,8 @@ def run(case: Case, truth: Truth, way: str, size: int, samples: int, asked: argp
             return {"failed": str(failure)}
         with np.load(at) as found:
             maps = dict(found)
-    stored = maps.pop("stored", None)
-    with_gutters = maps["albedo"] if stored is None else linear_from_srgb(stored[..., :3] / np.float32(255))
     corners = {name: maps.pop(name) for name in list(maps) if name.startswith("corner_")}
-    row |= scored(truth, maps, corners or None) | {f"rim at {MIP} dB": rim_error(truth.target, with_gutters, MIP)}
+    row |= scored(truth, maps, corners or None) | {f"rim at {MIP} dB": rim_error(truth.target, maps["albedo"], MIP)}
     if size == 2048 and samples <= 1:
         show(maps, asked.kept / "pictures" / picture(case.name, way))
     return row

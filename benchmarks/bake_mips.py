@@ -39,12 +39,12 @@ def rim_error(target, albedo: np.ndarray, level: int) -> float:
     with each chart alone in the map: means of its own texels only, the nearest of them carried on."""
     from gdtool.images.color import srgb_from_linear
     from gdtool.texture.padding import push_pull
-    from gdtool.texture.raster import owners_of
+    from gdtool.texture.target import texels_of
 
     size = albedo.shape[0]
     uv, chart, own = rim_points(target)
-    owner = owners_of(target.uv, target.face_uvs, size).reshape(size, size)
-    label = np.where(owner >= 0, chart[owner], -1)
+    texels = texels_of(target, size, rings=0)
+    label = texels.image(chart[texels.face_idx], -1)
     shown = bilinear(halved(albedo, level), uv)
     true = np.empty_like(shown)
     for k in np.unique(own):

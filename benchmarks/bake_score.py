@@ -116,6 +116,8 @@ class Seams:
     def ratio(self, name: str, image: np.ndarray) -> float | None:
         """How much more the two sides of seams differ in the map (s, s, c) than in the model, over the same for other edges.
 
+        Where other edges differ less than in the model (of surfaces that lie in one another its nearest is a matter of chance)
+        the seams are held against the model.
         The map is read bilinearly a texel to either side. Creases and parts' borders, where charts like to end, are steps of
         the model: its own difference at the same points is what is divided by. None where there are no seams.
         """
@@ -123,7 +125,7 @@ class Seams:
             return None
         step = 0.5 / 255
         more = [(np.abs(bilinear(image, uv[0]) - bilinear(image, uv[1])).mean() + step) / (true[name] + step) for uv, true in self.sides]
-        return float(more[0] / more[1])
+        return float(more[0] / max(more[1], 1.0))
 
 
 def _beside(target, half: np.ndarray, along: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:

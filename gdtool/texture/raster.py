@@ -162,6 +162,31 @@ def owner_count(uv: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
     return count.reshape(size, size)
 
 
+def between_centres(uv: np.ndarray, faces: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Texels that charts pass through too far from any texel they own: texel (n,) flat indices, and the triangle (n,) there.
+
+    owner (size, size) as from owners_of. Charts smaller than a texel, and slivers' ends, cover no texel's centre; lookups on
+    them would read what the charts around them are continued with. Texels beside owned ones are left to extend_owners.
+    """
+    from gdtool.geometry.repair import edges_of
+
+    size, wide = owner.shape[0], owner.shape[0] + 2
+    edges = edges_of(faces)
+    rim = np.flatnonzero(edges.count[edges.half_edge_idx] == 1)
+    start, end = (np.asarray(uv, np.float64)[edges.half_ends[rim, i]] * size for i in (0, 1))
+    # Every half texel along the charts' outlines.
+    counts = np.ceil(2 * np.linalg.norm(end - start, axis=1)).astype(np.int64) + 1
+    edge, step = _expand(counts)
+    at = start[edge] + (end - start)[edge] * (step / np.maximum(counts - 1, 1)[edge])[:, None]
+    inside = ((at >= 0) & (at < size)).all(1)
+    column, row = at[inside].astype(np.int64).T
+    covered = np.pad(owner >= 0, 1).ravel()
+    place = (row + 1) * wide + column + 1
+    lone = ~np.any([covered[place + down + along] for down in (-wide, 0, wide) for along in (-1, 0, 1)], 0)
+    texel, first = np.unique((row * size + column)[lone], return_index=True)
+    return texel, edges.half_face[rim[edge[inside][lone][first]]].astype(np.int32)
+
+
 def extend_owners(barycentrics: Barycentrics, face_idx: np.ndarray, rings: int,
                   farthest: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Texels just outside the charts and where they would lie if the triangle beside them went on.

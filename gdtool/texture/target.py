@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from gdtool.geometry.normals import face_normals
-from gdtool.texture.raster import Barycentrics, centres_in, extend_owners, owners_of
+from gdtool.texture.raster import Barycentrics, between_centres, centres_in, extend_owners, owners_of
 from gdtool.texture.tangents import corner_tangents, edge_pairs, frames_of
 
 CREASE_DEGREES = 45.0
@@ -111,9 +111,16 @@ class Texels:
 
 
 def texels_of(target: Target, size: int, rings: int = 2, threads: int = 1) -> Texels:
-    """Texels of a map of size x size that the target's charts cover, and `rings` of them around the charts."""
+    """Texels of a map of size x size that the target's charts cover, and `rings` of them around the charts.
+
+    Where charts pass between texel centres, too far from any, the texels that they pass through are theirs; where none covers a
+    centre there are no texels.
+    """
     barycentrics = Barycentrics(target.uv, target.face_uvs)
     owner = owners_of(target.uv, target.face_uvs, size)
+    if owner.max() >= 0:
+        texel, face = between_centres(target.uv, target.face_uvs, owner.reshape(size, size))
+        owner[texel] = face
     inside = np.flatnonzero(owner >= 0).astype(np.int32 if size <= 32768 else np.int64)
     ring, ring_owner, ring_at = extend_owners(barycentrics, owner.reshape(size, size), rings)
     face_idx = np.concatenate([owner[inside], ring_owner])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.texture.bake import bake, occlusion_tracer, vertex_lookup
+from gdtool.texture.maps import make_maps
 from gdtool.texture.occlusion import bake_occlusion, openness
 from gdtool.texture.raster import rasterize_uv
 from gdtool.texture.reproject import Source, vertex_reach
@@ -96,6 +97,22 @@ def test_thin_wall_does_not_bleed_through():
         baked = bake(target, texels, source, lookup, vertex_reach(low, faces, source))
         expected = np.where((texels.face_idx < 2)[:, None], [1.0, 0, 0], [0, 0, 1.0])
         np.testing.assert_allclose(baked.values["albedo"], expected, atol=1e-6)
+
+
+def test_a_chart_smaller_than_a_texel_has_its_own_color():
+    """A blue triangle that covers no texel's centre, beside the chart of a red square: its lookups are blue."""
+    vertices = np.array([[-0.5, 0, -0.5], [0.5, 0, -0.5], [0.5, 0, 0.5], [-0.5, 0, 0.5], [-0.01, 0.3, 0], [0, 0.3, 0.01], [0.01, 0.3, 0]])
+    faces = np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6]])
+    uv = np.array([[0.1, 0.1], [0.5, 0.1], [0.5, 0.5], [0.1, 0.5], *((np.array([[40.1, 20.7], [40.4, 20.7], [40.1, 20.9]])) / 64)])
+    target, source = Target.of(vertices, faces, uv, faces), Source(vertices, faces)
+    albedo = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], [4, 3], 0)
+    lookup = vertex_lookup(source, {"albedo": albedo, "roughness": np.ones(7), "metallic": np.zeros(7)}, np.repeat([[0, 1.0, 0]], 7, 0))
+    texels = texels_of(target, 64)
+    baked = bake(target, texels, source, lookup, vertex_reach(vertices, faces, source))
+    image = make_maps(texels, baked.values).base_color
+    assert rasterize_uv(uv, faces, 64)[0].max() == 1
+    np.testing.assert_array_equal(image[19:23, 39:43], np.broadcast_to([0, 0, 255], (4, 4, 3)))
+    np.testing.assert_array_equal(image[7:31, 7:31], np.broadcast_to([255, 0, 0], (24, 24, 3)))
 
 
 def test_every_covered_texel_is_read_and_ring_texels_continue_it(torus_bake):

@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from gdtool.texture.raster import SUBTEXEL_BITS, Barycentrics, extend_owners, owner_count, rasterize_uv
+from gdtool.texture.raster import SUBTEXEL_BITS, Barycentrics, between_centres, extend_owners, owner_count, owners_of, rasterize_uv
 
 
 def grid(n: int, low: float, high: float, jitter: float = 0.0, seed: int = 0):
@@ -121,3 +121,19 @@ def test_extended_owners_go_on_linearly():
     np.testing.assert_array_equal(ring.reshape(32, 32), wide & ~inside)
     back = (uv[faces[owner]] * barycentric[..., None]).sum(1)
     np.testing.assert_allclose(back, np.stack([texel % 32 + 0.5, texel // 32 + 0.5], 1) / 32, atol=1e-9)
+
+
+def test_charts_between_texel_centres_get_what_they_pass_through():
+    """A square, a triangle a third of a texel wide and a sliver of nine texels' length and a tenth's width, apart from one another."""
+    square = [[4, 4], [12, 4], [12, 12], [4, 12]]
+    tiny = [[20.6, 6.6], [20.9, 6.6], [20.6, 6.9]]
+    sliver = [[4.1, 20.05], [13.3, 20.05], [13.3, 20.15]]
+    uv = np.array([*square, *tiny, *sliver]) / 32
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [7, 8, 9]])
+    owner = owners_of(uv, faces, 32).reshape(32, 32)
+    assert set(np.unique(owner)) == {-1, 0, 1}
+    texel, face = between_centres(uv, faces, owner)
+    found = {(int(t) // 32, int(t) % 32): int(f) for t, f in zip(texel, face, strict=True)}
+    assert found == {(6, 20): 2} | {(20, column): 3 for column in range(4, 14)}
+    # A chart that is cut off by the map's border, and one beside texels it owns, add nothing.
+    assert len(between_centres(uv[:4] - 0.2, faces[:2], owners_of(uv[:4] - 0.2, faces[:2], 32).reshape(32, 32))[0]) == 0
