@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 HERE = Path(__file__).parent
+SIZE = 512
 
 
 def picture(command: list, out: Path, mode: str | Path) -> np.ndarray | str:
@@ -29,7 +30,19 @@ def picture(command: list, out: Path, mode: str | Path) -> np.ndarray | str:
         return str(error)
     if done.returncode or not out.exists():
         return (done.stderr.strip().splitlines() or ["no picture"])[-1]
-    return read_image(out).astype(np.float64) / 255
+    return averaged(read_image(out).astype(np.float64) / 255)
+
+
+def averaged(image: np.ndarray) -> np.ndarray:
+    """(SIZE, SIZE, 4) of image (s, s, 4), sRGB and straight alpha: means of squares in linear light."""
+    from gdtool.images.color import linear_from_srgb, srgb_from_linear
+
+    step = image.shape[0] // SIZE
+    if step == 1:
+        return image
+    alpha = image[..., 3:]
+    sums = np.concatenate([linear_from_srgb(image[..., :3]) * alpha, alpha], -1).reshape(SIZE, step, SIZE, step, 4).mean((1, 3))
+    return np.concatenate([srgb_from_linear(sums[..., :3] / np.maximum(sums[..., 3:], 1e-9)), sums[..., 3:]], -1)
 
 
 def inner(coverage: np.ndarray) -> np.ndarray:

@@ -1,4 +1,5 @@
 // Renders a .glb from the front with three.js in headless Chromium: node show_in_three.mjs MODEL.glb OUT.png [unlit|LIGHT.exr]
+// The picture is 2048 x 2048, to be averaged over 4 x 4 pixels in linear light: browsers average what is encoded.
 // Needs npm packages three and playwright-core (npm install in this folder, or NODE_PATH) and a Chromium: CHROMIUM, else
 // /usr/bin/chromium. Orthographic, half-width 0.72 of the longest side, sun from the upper left, like show_in_blender.py.
 import { createServer } from 'node:http';
@@ -31,7 +32,7 @@ const browser = await chromium.launch({
   args: ['--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader'],
 });
 try {
-  const page = await browser.newPage({ viewport: { width: 512, height: 512 } });
+  const page = await browser.newPage({ viewport: { width: 512, height: 512 }, deviceScaleFactor: 4 });
   page.on('console', (message) => console.error(message.text()));
   await page.goto(`http://127.0.0.1:${server.address().port}/${!mode ? '' : mode === 'unlit' ? '?unlit' : '?light'}`);
   await page.waitForFunction(() => window.done, null, { timeout: 60_000 });
