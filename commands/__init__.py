@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 
 import click
 
@@ -62,4 +63,6 @@ def main():
     """Run the command line and exit with one of its documented codes."""
     from ._common import guarded
 
+    # Threads that wait for one another by spinning take ten times as long where something else has one of the cores.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     guarded(cli)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line has it; before any test imports torch
 ROOT = Path(__file__).resolve().parents[1]
 
 

@@ -86,6 +86,33 @@ def test_paper_method_writes_its_networks(gdtool, folder, tmp_path):
     assert gdtool("validate", out).returncode == 0
 
 
+def test_paper_method_without_depth_goes_by_what_the_normals_gave(gdtool, folder, tmp_path):
+    out = tmp_path / "paper"
+    done = gdtool("reconstruct", folder, "--method", "paper", "--steps", 30, "--resolution", 32, "--ignore", "depth", "-o", out)
+    assert done.returncode == 0, done.stderr
+    skipped = {one["what"]: one["reason"] for one in manifest(out)["skipped"]}
+    assert skipped["volume start"] == "normal views say where the surface is" and "matching of views" not in skipped
+    assert manifest(out)["content"]["watertight"]
+    assert np.abs(torus(read_surface(open_folder(out)).vertices)).mean() < 0.06
+
+
+@pytest.mark.parametrize("method", ["grid", "paper"])
+def test_normals_that_contradict_one_another_leave_the_silhouettes(gdtool, tmp_path, torus_views, method):
+    """Each view's normals point anywhere: no matched depth is confirmed by another view."""
+    cameras, images, mask = torus_views
+    lies = np.random.default_rng(0).standard_normal(images["normal"].shape)
+    lies = np.where(mask[..., None] > 0, lies / np.linalg.norm(lies, axis=-1, keepdims=True), 0)
+    path = views_folder(tmp_path / "lies.asset" / "views", cameras, {"normal": lies.astype(np.float32)}, mask)
+    done = gdtool("reconstruct", path, "--method", method, "--steps", 20, "--resolution", 32)
+    assert done.returncode == 0, done.stderr
+    out = path.parent / "surface"
+    record = manifest(out)
+    assert record["content"]["watertight"]
+    assert any("do not fit together" in warning for warning in record["warnings"])
+    assert method == "grid" or "volume start" not in {one["what"] for one in record["skipped"]}
+    assert np.abs(read_surface(open_folder(out)).vertices).max() < 0.6
+
+
 def test_unknown_domain_is_a_usage_error(gdtool, folder):
     done = gdtool("reconstruct", folder, "--ignore", "dept")
     assert done.returncode == 2 and "dept" in done.stderr and done.stdout == ""
