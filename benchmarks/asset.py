@@ -32,6 +32,7 @@ from wireframe import file_name
 
 LIGHTS = ("dark", "mid", "bright")
 VIEWS = 12
+QUIET, MOST = 40.0, 16  # dB: pictures whose noise is more get four times the samples, and again, up to so many times
 PEER_VIEWS = "front_right,back"
 PEER = Path(__file__).with_name("shading_blender.py")
 OWN = Path(__file__).with_name("shading_gdtool.py")
@@ -56,6 +57,14 @@ def lit(scene, light: str, size: int, samples: int, threads: int, views: slice =
     return stacked, stacked.pop("mask")
 
 
+def noise(scene, light: str, size: int, samples: int, threads: int) -> float:
+    """PSNR in dB of one view with so many samples beside the same with four times as many."""
+    from gdtool.images.metrics import color_metrics
+
+    (one, covered), (finer, finely) = (lit(scene, light, size, times * samples, threads, slice(1, 2)) for times in (1, 4))
+    return color_metrics(one["color"], covered, finer["color"], finely)["psnr_masked"]
+
+
 def relit(case: Case, asset: Path, size: int, samples: int) -> tuple[dict[str, float], list[np.ndarray]]:
     """Errors of the asset's pictures, and one picture of each for the sheet."""
     from gdtool.assets.load import load_scene
@@ -64,11 +73,13 @@ def relit(case: Case, asset: Path, size: int, samples: int) -> tuple[dict[str, f
     threads, out, pictures, worst, floor = len(os.sched_getaffinity(0)), {}, [], 100.0, 100.0
     truth, result = load_scene(case.glb), load_scene(asset / "asset.glb")
     for light in LIGHTS:
-        (true, true_mask), (ours, mask) = lit(truth, light, size, samples, threads), lit(result, light, size, samples, threads)
+        count = samples
+        while (quiet := noise(truth, light, size, count, threads)) < QUIET and count < MOST * samples:
+            count *= 4
+        floor = min(floor, quiet)
+        (true, true_mask), (ours, mask) = lit(truth, light, size, count, threads), lit(result, light, size, count, threads)
         each = [color_metrics(ours["color"][k:k + 1], mask[k:k + 1], true["color"][k:k + 1], true_mask[k:k + 1])["psnr_masked"] for k in range(VIEWS)]
         out[light], worst = float(np.mean(each)), min(worst, *each)
-        finer, finer_mask = lit(truth, light, size, 4 * samples, threads, slice(1, 2))
-        floor = min(floor, color_metrics(true["color"][1:2], true_mask[1:2], finer["color"], finer_mask)["psnr_masked"])
         pictures += [over_white(true["color"][1], true_mask[1]), over_white(ours["color"][1], mask[1])]
     buffers = views_metrics({k: ours[k] for k in BUFFERS}, mask, {k: true[k] for k in BUFFERS}, true_mask)
     out |= {"worst view": worst, "floor": floor, "base color dB": buffers["albedo_psnr_masked"], "roughness": buffers["roughness_error"],
@@ -155,7 +166,7 @@ def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
     head = f"# Finished asset\n\n`python benchmarks/asset.py`, {machine()}. {note}\n\n`gdtool bake --size 2048 --lods 4` of the model's quad mesh: " \
         f"seconds and memory of the whole command; masked PSNR of lit pictures against the model's, mean of {VIEWS} views under " \
         f"{', '.join(LIGHTS)}, and the worst; floor: the model against itself " \
-        "with four times the samples, one view, under the light where they differ most; the buffers' errors; shape: how far 99 % " \
+        f"with four times the samples, one view, under the light where they differ most (below {QUIET:g} dB all get more); the buffers' errors; shape: how far 99 % " \
         "of the model's surface lie from the quad mesh, and " \
         "how far the coarsest level (an eighth) slid on its maps, shares of the extent; gdtool's pictures of the asset against Blender's and " \
         "three.js'.\n\n"
