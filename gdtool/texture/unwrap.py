@@ -15,7 +15,7 @@ from gdtool.texture.unwrap_flatten import flatten, singular_values, stretch
 from gdtool.texture.unwrap_join import joined, joined_stretch
 from gdtool.texture.unwrap_pack import best_packed, pack
 
-_MORE_CHARTS, _MOST_CUT = 12, 40  # charts that cutting for packing adds, and ends with, at most
+_MORE_CHARTS, _MORE_OF_RINGS, _MOST_CUT = 12, 23, 40  # charts that cutting for packing adds, where it cuts rings, and ends with, at most
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,8 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
 
 def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float) -> list:
     """The charts, cut further where that fills the square better."""
-    most = min(len(flat) + _MORE_CHARTS, _MOST_CUT)
-    variants = [flat, cut_to_pack(adjacency, flat, most, rings=False), cut_to_pack(adjacency, flat, most, rings=True)]
+    variants = [flat, *(cut_to_pack(adjacency, flat, min(len(flat) + more, _MOST_CUT), rings=more == _MORE_OF_RINGS)
+                        for more in (_MORE_CHARTS, _MORE_OF_RINGS))]
     variants = [one for i, one in enumerate(variants) if all(len(one) != len(before) for before in variants[:i])]
     if len(variants) > 1:
         flat = variants[best_packed([[(uv, triangles) for _, _, uv, triangles in one] for one in variants], gap)]

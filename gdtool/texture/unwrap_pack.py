@@ -16,6 +16,8 @@ _MOST_BY_RASTER = 160
 _MANY = 48  # with more charts than these a coarser grid bounds the time
 _GAIN, _GAIN_PER_CHART = 0.02, 0.002
 _TRIES = 1000  # charts placed in search of better orders
+_LEAST = 0.3  # share of the square that a way to cut has to fill
+_FINALISTS, _NEAR_BEST = 2, 1.06  # orders by which ways to cut are told apart, where the square's side comes so near to the best
 
 
 def upright_box(uv: np.ndarray) -> np.ndarray:
@@ -191,14 +193,22 @@ def _runs(mask: np.ndarray, stride: int) -> list[tuple[int, int, int]]:
 def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float) -> int:
     """Which of several ways to cut one surface into charts packs best, by a short search; each later one has to gain more
     than the seams it adds are worth, _GAIN of the square and _GAIN_PER_CHART for each chart."""
-    best, best_share = 0, 0.0
+    drafts = {}
     for i, charts in enumerate(variants):
-        if not 1 < len(charts) <= _MOST_BY_RASTER or any(charts is earlier for earlier in variants[:i]):
+        if 1 < len(charts) <= _MOST_BY_RASTER and not any(charts is earlier for earlier in variants[:i]):
+            boxed, area = _boxed(charts)
+            if ranked := _search(boxed, area, gap, _COARSE_OF_MANY, 0, _LEAST):
+                drafts[i] = boxed, area, ranked
+    # So coarse a grid takes more room the more charts there are: what comes near is told apart on the finer one.
+    smallest = min((ranked[0][0] for _, _, ranked in drafts.values()), default=0)
+    best, best_share = 0, 0.0
+    for i, (boxed, area, ranked) in drafts.items():
+        if ranked[0][0] > _NEAR_BEST * smallest:
             continue
-        boxed, area = _boxed(charts)
-        ranked = _search(boxed, area, gap, _COARSE_OF_MANY, 0, 0.3)
-        share = _DENSITY * (_COARSE_OF_MANY / ranked[0][0]) ** 2 if ranked else 0.0
-        more = len(charts) - len(variants[best])
+        ways = [(order, contact) for _, order, contact, _ in ranked[:_FINALISTS]]
+        ranked = _search(boxed, area, gap, _COARSE, 0, _LEAST, ways)
+        share = _DENSITY * (_COARSE / ranked[0][0]) ** 2 if ranked else 0.0
+        more = len(variants[i]) - len(variants[best])
         if share > best_share + (_GAIN + _GAIN_PER_CHART * more if best_share else 0.0):
             best, best_share = i, share
     return best
@@ -293,11 +303,13 @@ def _first_ways(boxed: list) -> list[tuple[list[int], float]]:
     return [(np.argsort(-np.array(rank), kind="stable").tolist(), contact) for contact in (0.5, 1.0, 0.3) for rank in (size, longest)]
 
 
-def _search(boxed: list, area: float, gap: float, cells: int, tries: int, lowest: float) -> list[tuple[int, list[int], float, list]]:
+def _search(boxed: list, area: float, gap: float, cells: int, tries: int, lowest: float,
+            ways: list[tuple[list[int], float]] | None = None) -> list[tuple[int, list[int], float, list]]:
     """Ways to pack on a coarse grid, best first: side of the square, order, weight of contact, turn and place (x, y) of the first
     vertex of each chart, in cells.
 
-    None that stays below the share `lowest`. From the best of a few orders on, small changes of the best are tried.
+    None that stays below the share `lowest`. From the best of a few orders on (ways, with their weights of contact), small
+    changes of the best are tried.
     """
     side_most = int(cells * (_DENSITY / lowest) ** 0.5)
     shapes = _Shapes(boxed, cells * (_DENSITY / area) ** 0.5, gap * side_most, side_most)
@@ -314,7 +326,7 @@ def _search(boxed: list, area: float, gap: float, cells: int, tries: int, lowest
         ranked.append((side, order, contact, found))
         ranked.sort(key=lambda way: way[0])
 
-    for turn, (order, contact) in enumerate(_first_ways(boxed)):
+    for turn, (order, contact) in enumerate(ways or _first_ways(boxed)):
         if turn == 2 and not ranked:
             return []  # ill-shaped charts: the others would not do either
         side, found = (int(0.9 * cells), None) if not ranked else (ranked[0][0] - 1, None)
