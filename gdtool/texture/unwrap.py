@@ -16,6 +16,7 @@ from gdtool.texture.unwrap_join import joined, joined_stretch
 from gdtool.texture.unwrap_pack import best_packed, pack
 
 _MORE_CHARTS, _MORE_OF_RINGS, _MOST_CUT = 12, 23, 40  # charts that cutting for packing adds, where it cuts rings, and ends with, at most
+_WELL_PACKED = 0.62  # of the square by a draft: rings stay whole
 
 
 @dataclass(frozen=True)
@@ -72,13 +73,17 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
 
 
 def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float) -> list:
-    """The charts, cut further where that fills the square better."""
-    variants = [flat, *(cut_to_pack(adjacency, flat, min(len(flat) + more, _MOST_CUT), rings=more == _MORE_OF_RINGS)
-                        for more in (_MORE_CHARTS, _MORE_OF_RINGS))]
-    variants = [one for i, one in enumerate(variants) if all(len(one) != len(before) for before in variants[:i])]
-    if len(variants) > 1:
-        flat = variants[best_packed([[(uv, triangles) for _, _, uv, triangles in one] for one in variants], gap)]
-    return flat
+    """The charts, cut further where that fills the square better; rings into arcs where it stays badly filled."""
+    best, share, seen = flat, 0.0, {len(flat)}
+    for more, rings in ((_MORE_CHARTS, False), (_MORE_OF_RINGS, True)):
+        if share > _WELL_PACKED:
+            break
+        other = cut_to_pack(adjacency, flat, min(len(flat) + more, _MOST_CUT), rings)
+        if len(other) not in seen:
+            seen.add(len(other))
+            chosen, share = best_packed([[(uv, triangles) for _, _, uv, triangles in one] for one in (best, other)], gap)
+            best = (best, other)[chosen]
+    return best
 
 
 def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good_stretch: float, max_stretch: float,

@@ -190,7 +190,7 @@ def _runs(mask: np.ndarray, stride: int) -> list[tuple[int, int, int]]:
     return list(zip(level.tolist(), one.tolist(), (one + length - (1 << level)).tolist(), strict=True))
 
 
-def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float) -> int:
+def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float) -> tuple[int, float]:
     """Which of several ways to cut one surface into charts packs best, by a short search; each later one has to gain more
     than the seams it adds are worth, _GAIN of the square and _GAIN_PER_CHART for each chart."""
     drafts = {}
@@ -211,7 +211,7 @@ def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float)
         more = len(variants[i]) - len(variants[best])
         if share > best_share + (_GAIN + _GAIN_PER_CHART * more if best_share else 0.0):
             best, best_share = i, share
-    return best
+    return best, best_share
 
 
 def _boxed(charts: list) -> tuple[list, float]:
