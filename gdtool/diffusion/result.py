@@ -30,8 +30,8 @@ def tied(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
 def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera]) -> np.ndarray:
     """Depth (k, h, w) with no point farther out than the outline of any other view, coverage (k, h, w), in that point's row.
 
-    A point is moved along its ray. Of orthographic cameras of one size that stand upright side by side, whose rows are at one
-    height: one view's rays run along another's rows.
+    A point is moved along its ray, within the camera's range. Of orthographic cameras of one size that stand upright side
+    by side, whose rows are at one height: one view's rays run along another's rows.
     """
     out, (height, width) = depth.astype(np.float64), mask.shape[1:]
     for k, camera in enumerate(cameras):
@@ -48,6 +48,8 @@ def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera
             column = project(other, backproject(camera, out[k]).reshape(-1, 3))[0][:, 0].reshape(height, width)
             lacking = np.clip(column, first[:, None], last[:, None]) - column
             out[k] += np.where(inside & shown.any(1)[:, None], lacking / per_depth, 0.0)
+        # Outlines that contradict one another would move points anywhere.
+        out[k] = np.where(inside, np.clip(out[k], camera.near, camera.far), out[k])
     return out.astype(np.float32)
 
 

@@ -123,6 +123,6 @@ def _condition(inputs: Inputs, options: Options, config, out: Output):
     return frame(rgba, config.image_size, extent) if options.crop else whole_frame(rgba, config.image_size)
 
 
-STAGE = Stage(name="sample-views", version=3, reads=("image-file",), writes="views", Options=Options, run=run,
+STAGE = Stage(name="sample-views", version=4, reads=("image-file",), writes="views", Options=Options, run=run,
               second_inputs={"model": SecondInput("model", search=False, default="models/default", foreign=True,
                                               help="Model folder of gdtool train, or Wonder3D v1 as a folder or hub id; the bundled model without it.")})

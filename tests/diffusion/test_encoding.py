@@ -152,3 +152,10 @@ def test_depth_stays_within_the_outlines_that_other_views_show():
     np.testing.assert_allclose(found[others][mask[others] > 0.99], images["depth"][others][mask[others] > 0.99], atol=3 * pixel)
     flat = mask * 0
     assert (within_silhouettes(wrong, flat, cameras) == wrong).all()
+    # Outlines of another object, at the very border of their pictures.
+    elsewhere = mask.copy()
+    elsewhere[1::2] = 0
+    elsewhere[1::2, :, :2] = 1
+    found = within_silhouettes(images["depth"], elsewhere, cameras)
+    inside = elsewhere > 0.5
+    assert found[inside].min() >= cameras[0].near and found[inside].max() <= cameras[0].far
