@@ -191,11 +191,12 @@ def _runs(mask: np.ndarray, stride: int) -> list[tuple[int, int, int]]:
 
 
 def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float) -> tuple[int, float]:
-    """Which of several ways to cut one surface into charts packs best, by a short search; each later one has to gain more
-    than the seams it adds are worth, _GAIN of the square and _GAIN_PER_CHART for each chart."""
+    """Which of several ways to cut one surface into charts packs best, by a short search, and the share of the square that it
+    fills (0, 0 where none can be told); each later one has to gain more than the seams it adds are worth, _GAIN of the
+    square and _GAIN_PER_CHART for each chart."""
     drafts = {}
     for i, charts in enumerate(variants):
-        if 1 < len(charts) <= _MOST_BY_RASTER and not any(charts is earlier for earlier in variants[:i]):
+        if 1 < len(charts) <= _MOST_BY_RASTER:
             boxed, area = _boxed(charts)
             if ranked := _search(boxed, area, gap, _COARSE_OF_MANY, 0, _LEAST):
                 drafts[i] = boxed, area, ranked
