@@ -12,7 +12,7 @@ from gdtool.fields.align import Corrections, corrections, disagreement, slope_ro
 from gdtool.fields.carve import carve, silhouettes_outvoted, smooth_unseen
 from gdtool.fields.clock import Clock
 from gdtool.fields.photometric import Picture
-from gdtool.fields.refine import FOLD_DEGREES, drop_debris, measured_planes, refine
+from gdtool.fields.refine import FOLD_DEGREES, bumpiness, drop_debris, follow_normals, measured_planes, refine
 from gdtool.fields.sights import WEAK, Sight, free_distance, hull_distance, pixel_footprint, prepare, with_edge
 from gdtool.fields.thin import near_points, restore_thin
 from gdtool.geometry.grids import edge_counts, extract
@@ -21,6 +21,7 @@ from gdtool.geometry.sharpen import dihedral_degrees, restore_creases
 
 LEAST_NOISE = 0.3  # grid steps: of views that had to be brought together
 OVER_EDGE = 0.25  # steps that a sharp edge may stand out of what the views leave, whose pixels round it off
+BUMPY = 6.5  # degrees between the surface of views that disagree and their normals: exact normals come to 3, a model's to 10
 CREASE_ROUNDS = 4  # tries without what folded over
 MAX_SAMPLES = 320  # along the longest side: 33 million samples, 0.6 GB at the peak
 # Rounds of bringing views together: how far apart two surfaces may lie to be taken for one (world units), and how stiff
@@ -40,13 +41,15 @@ def _silent(text: str) -> None:
 @dataclass(frozen=True)
 class Shape:
     """A closed mesh, outward: vertices (v, 3) float64, faces (f, 3) int32, support (v,): weight of the views that
-    measured each vertex; step: the grid's, world units; pieces dropped as debris."""
+    measured each vertex; step: the grid's, world units; pieces dropped as debris; bumps: degrees by which the normals of
+    views that disagree differed from the surface's, None where they did not matter."""
 
     vertices: np.ndarray
     faces: np.ndarray
     support: np.ndarray
     step: float
     dropped: int
+    bumps: float | None = None
 
 
 def prepare_all(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray | None, normal: np.ndarray | None) -> list[Sight]:
@@ -115,26 +118,27 @@ def bring_together(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray, n
     return sights, after
 
 
-def fuse_within(sights: list[Sight], step: float, noise: float, outvoted: int, clock: Clock) -> tuple[Shape, str]:
+def fuse_within(sights: list[Sight], step: float, noise: float, outvoted: int, clock: Clock, shaded: bool = True) -> tuple[Shape, str]:
     """fuse_views at the finest step that the clock has time for, and what was left out for it ("" for nothing).
 
     With an end in sight a draft is made first, which tells how quick the machine is and is the result when nothing finer
     can be done in time.
     """
     if not clock.limited:
-        return fuse_views(sights, step, noise, outvoted), ""
+        return fuse_views(sights, step, noise, outvoted, shaded), ""
     began = clock.spent()
-    draft = fuse_views(sights, DRAFT * step, noise, outvoted)
+    draft = fuse_views(sights, DRAFT * step, noise, outvoted, shaded)
     seconds = clock.spent() - began
     for coarser in (1.0, 1.4):
         finer = DRAFT / coarser
         if seconds * (finer**FUSING + AFTER * finer**SURFACE) <= clock.left():
-            return fuse_views(sights, coarser * step, noise, outvoted), "" if coarser == 1 else f"at {coarser} of its step"
+            return fuse_views(sights, coarser * step, noise, outvoted, shaded), "" if coarser == 1 else f"at {coarser} of its step"
     return draft, f"at {DRAFT:g} of its step"
 
 
-def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 0) -> Shape:
-    """Mesh of the prepared views. noise: world units by which they disagree; outvoted: see silhouettes_outvoted.
+def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 0, shaded: bool = True) -> Shape:
+    """Mesh of the prepared views. noise: world units by which they disagree; outvoted: see silhouettes_outvoted; shaded:
+    whether their normals are views' own, and not made of their depth.
 
     Raises ValueError when the silhouettes have no common volume.
     """
@@ -158,8 +162,11 @@ def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: i
         moved = refine(vertices, faces, sights, step, reach=reach)
         thickened = near_points(vertices, thin, 2 * step)
         vertices, faces = with_creases(np.where(thickened[:, None], vertices, moved), faces, sights, thickened, step)
+    bumps = bumpiness(vertices, faces, sights, reach + noise) if noise and shaded else None
+    if bumps is not None and bumps > BUMPY:
+        vertices = follow_normals(vertices, faces, sights, step, reach=reach + noise)
     support = measured_planes(sights, vertices, vertex_normals(vertices, faces), reach)[2]
-    return Shape(vertices, faces, support, step, dropped)
+    return Shape(vertices, faces, support, step, dropped, bumps)
 
 
 def _smoothed(values: np.ndarray, noise: float) -> np.ndarray:

@@ -10,6 +10,7 @@ from gdtool.geometry.grids import components, keep_faces, signed_volume
 from gdtool.geometry.normals import face_normals, vertex_normals
 from gdtool.geometry.repair import edges_of
 
+WAVELENGTH = 36.0  # steps: shorter bumps go where the normals show none
 FOLD_DEGREES = 150.0  # a fold's least angle between the normals of its sides
 _SEEN_FACES = 24  # faces that views measured, enough for a piece to be real
 
@@ -42,12 +43,9 @@ def refine(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: f
     Seen vertices follow the planes; unseen ones minimise bending, held loosely where the carving put them and inside
     the silhouettes.
     """
-    from scipy.sparse import diags, identity
+    from scipy.sparse import diags
 
-    graph = neighbour_matrix(faces, len(vertices))
-    degree = np.asarray(graph.sum(1)).ravel()
-    umbrella = (identity(len(vertices), format="csr", dtype=np.float32) - diags(1 / np.maximum(degree, 1)) @ graph).tocsr()
-    start = vertices
+    umbrella, start = _umbrella(faces, len(vertices)), vertices
     for _ in range(rounds):
         matrix, vector, total = measured_planes(sights, vertices, vertex_normals(vertices, faces), reach)
         unseen = np.exp(-10.0 * total)
@@ -64,6 +62,80 @@ def refine(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: f
         length = np.linalg.norm(move, axis=1, keepdims=True)
         vertices = vertices + move * np.minimum(1.0, step / np.maximum(length, 1e-12))
     return _unfold(_inside_silhouettes(vertices, start, sights, 0.25 * step), start, faces)
+
+
+def follow_normals(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: float, *, reach: float, rounds: int = 3,
+                   bending: float = 1.0, iterations: int = 300) -> np.ndarray:
+    """New positions (v, 3) of a surface fused from views that disagree: where it lies it says itself, what form it has their normals.
+
+    Depths that differ a little from view to view leave bumps, which are low and steep; the normals show none. Every
+    vertex moves along its own normal, so that edges come to lie across the normals shown there, and is held where it was
+    (Nehab et al., "Efficiently Combining Positions and Normals for Precise 3D Geometry", 2005): bumps shorter than about
+    WAVELENGTH go. What no view shows moves along with what is around it. reach: how far off a view's surface may be
+    (world units).
+    """
+    from scipy.sparse import csr_array, diags_array
+
+    start, ends = vertices, edges_of(faces).ends
+    a, b = ends.T
+    hold = 2 * (2 * np.pi / WAVELENGTH) ** 2
+    umbrella = _umbrella(faces, len(vertices))
+
+    def differences(at_a: np.ndarray, at_b: np.ndarray) -> csr_array:
+        """Matrix (e, v) of at_a (e,) times the value at an edge's one end less at_b (e,) times that at the other."""
+        return csr_array((np.stack([at_a, -at_b], 1).ravel(), ends.ravel(), np.arange(0, 2 * len(ends) + 1, 2)), (len(ends), len(vertices)))
+
+    for _ in range(rounds):
+        own = vertex_normals(vertices, faces)
+        shown, trust = shown_normals(sights, vertices, own, reach)
+        across = shown[a] + shown[b]
+        across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
+        along = vertices[a] - vertices[b]
+        stiff = 1 / np.maximum(np.linalg.norm(along, axis=1) / step, 0.1)
+        known = stiff * np.minimum(trust[a], trust[b])
+        slant = differences(np.einsum("ei,ei->e", across, own[a]), np.einsum("ei,ei->e", across, own[b]))
+        level = differences(np.ones(len(ends)), np.ones(len(ends)))
+        matrix = slant.T @ diags_array(known) @ slant + level.T @ diags_array(stiff - known) @ level + bending * umbrella.T @ umbrella
+        right = (-slant.T @ (known * np.einsum("ei,ei->e", across, along))
+                 - bending * umbrella.T @ np.einsum("vi,vi->v", own, umbrella @ vertices)
+                 - hold * np.einsum("vi,vi->v", own, vertices - start))
+        move = conjugate_gradients(lambda u, matrix=matrix: matrix @ u + hold * u, right[:, None], (matrix.diagonal() + hold)[:, None], iterations)
+        vertices = vertices + np.clip(move, -step, step) * own
+    return _unfold(_inside_silhouettes(vertices, start, sights, 0.25 * step), start, faces)
+
+
+def shown_normals(sights: list[Sight], vertices: np.ndarray, normals: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normal (v, 3) that the views show at the vertices of a surface, and the trust in it (v,) in 0..1, 0 where none does.
+
+    normals (v, 3): the surface's own; what a view shows farther than reach (world units) away, or turned away from them,
+    is another surface.
+    """
+    total = np.zeros((len(vertices), 3))
+    for sight in sights:
+        if sight.planes is None:
+            continue
+        distance, weight, normal, _ = tangent_distance(sight, vertices)
+        same = (np.abs(distance) < reach) & (weight > WEAK) & ((normal * normals).sum(1) > 0.3)
+        total += np.where(same, weight, 0.0)[:, None] * normal
+    length = np.linalg.norm(total, axis=1)
+    return total / np.maximum(length, 1e-12)[:, None], np.clip(length / 0.1, 0, 1)
+
+
+def bumpiness(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], reach: float) -> float:
+    """Median degrees between the normals of a surface and those that the views show there; 0 where they show none."""
+    own = vertex_normals(vertices, faces)
+    shown, trust = shown_normals(sights, vertices, own, reach)
+    cosine = np.einsum("vi,vi->v", shown, own)[trust > 0.5]
+    return float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1)))) if len(cosine) else 0.0
+
+
+def _umbrella(faces: np.ndarray, count: int):
+    """Sparse (count, count): a vertex less the mean of its neighbours."""
+    from scipy.sparse import diags, identity
+
+    graph = neighbour_matrix(faces, count)
+    degree = np.asarray(graph.sum(1)).ravel()
+    return (identity(count, format="csr", dtype=np.float32) - diags(1 / np.maximum(degree, 1)) @ graph).tocsr()
 
 
 def conjugate_gradients(apply, right: np.ndarray, diagonal: np.ndarray, iterations: int) -> np.ndarray:

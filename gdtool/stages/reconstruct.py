@@ -45,7 +45,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Reconstruct one views folder."""
     from gdtool.fields.appearance import appearance
     from gdtool.fields.align import agreement
-    from gdtool.fields.fusion import align_depth, fuse_within, grid_step, is_closed_manifold, prepare_all, silhouettes_outvoted
+    from gdtool.fields.fusion import BUMPY, align_depth, fuse_within, grid_step, is_closed_manifold, prepare_all, silhouettes_outvoted
     from gdtool.folders.surface import Surface, write_surface
     from gdtool.folders.views import read_views
     from gdtool.geometry.normals import vertex_normals
@@ -79,9 +79,12 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             out.warn(f"the silhouettes contradict one another: up to {outvoted} of {len(sights)} are outvoted at a point")
     with out.step("fuse"):
         try:
-            shape, coarser = fuse_within(sights, step, noise, outvoted, clock)
+            shape, coarser = fuse_within(sights, step, noise, outvoted, clock, normal is not None)
         except ValueError as error:
             raise InputError(folder.path, str(error), "check the masks and cameras") from None
+    if shape.bumps is None or shape.bumps <= BUMPY:
+        out.skip("surface by normals", f"it is within {shape.bumps:.1f} degrees of them" if shape.bumps is not None
+                 else "there are none" if normal is None else "the views agree")
     if coarser:
         out.skip("the whole grid", f"--budget has no time for it: the surface is taken {coarser}")
     _check_cameras(folder, views.cameras, shape.vertices)
@@ -209,4 +212,4 @@ def _check_masks(path, views, out: Output) -> None:
             out.warn(f"view {name}: its mask is empty; the view is left out")
 
 
-STAGE = Stage(name="reconstruct", version=14, reads=("views",), writes="surface", Options=Options, run=run)
+STAGE = Stage(name="reconstruct", version=15, reads=("views",), writes="surface", Options=Options, run=run)

@@ -6,15 +6,16 @@ import pytest
 from gdtool.cameras import rig
 from gdtool.fields.align import Corrections, agreement, corrections, disagreement, normals_fit_depth, slope_rows
 from gdtool.fields.carve import silhouettes_outvoted
-from gdtool.fields.fusion import align_depth, depth_for, folds, fuse_views, grid_step, is_closed_manifold, prepare_all
-from gdtool.fields.refine import _inside_silhouettes
+from gdtool.fields.fusion import BUMPY, align_depth, depth_for, folds, fuse_views, grid_step, is_closed_manifold, prepare_all
+from gdtool.fields.refine import _inside_silhouettes, bumpiness, follow_normals
 from gdtool.fields.sights import free_distance, hull_distance, prepare, silhouette_distance
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import components, signed_volume
 from gdtool.geometry.metrics import inside
+from gdtool.geometry.normals import vertex_normals
 from gdtool.geometry.repair import euler_number
 
-from .shapes import cube, sphere, torus, two_balls, views_of
+from .shapes import cube, gradient, sphere, torus, two_balls, views_of
 
 SIZE = 72
 
@@ -143,6 +144,44 @@ def test_alignment_undoes_a_shift_of_depth(seen):
     assert found.depth(0, mask[0].shape)[mask[0] > 0.99].mean() < -0.008
     after = align_depth(cameras, mask, depth, images["normal"], grid_step(cameras, 0))
     assert after[2] < 0.4 * after[1]
+
+
+def bumpy(seen, name):
+    """Sights of a solid whose depths are off by waves of a pixel, their grid step and noise."""
+    cameras, images, mask = seen[name]
+    y, x = np.mgrid[:SIZE, :SIZE]
+    waves = np.stack([0.02 * np.sin(0.6 * x + k) * np.sin(0.5 * y - 2 * k) for k in range(6)])
+    depth = np.where(images["depth"] > 0, images["depth"] + waves, 0).astype(np.float32)
+    step = grid_step(cameras, 0)
+    sights, _, noise = align_depth(cameras, mask, depth, images["normal"], step)
+    return sights, step, noise
+
+
+def degrees_off(solid, vertices, faces):
+    cosine = (vertex_normals(vertices, faces) * gradient(solid, vertices)).sum(1)
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+
+
+@pytest.mark.parametrize("solid", [sphere, torus])
+def test_bumps_that_the_normals_do_not_show_go(seen, solid):
+    sights, step, noise = bumpy(seen, solid.__name__)
+    rough, smooth = (fuse_views(sights, step, noise, shaded=shaded) for shaded in (False, True))
+    assert rough.bumps is None and smooth.bumps > BUMPY and is_closed_manifold(smooth.faces)
+    before, after = degrees_off(solid, rough.vertices, rough.faces), degrees_off(solid, smooth.vertices, smooth.faces)
+    assert np.median(after) < 0.6 * np.median(before)
+    assert np.abs(solid(smooth.vertices)).mean() < np.abs(solid(rough.vertices)).mean() + 1e-4
+
+
+@pytest.mark.parametrize("solid", [sphere, cube, torus])
+def test_a_surface_that_fits_its_normals_hardly_follows_them(seen, solid):
+    """What the skip leaves out: a tenth of a grid step at most places."""
+    cameras, images, mask = seen[solid.__name__]
+    step = grid_step(cameras, 0)
+    shape = reconstruct(cameras, images, mask)
+    sights = prepare_all(cameras, mask, images["depth"], images["normal"])
+    assert bumpiness(shape.vertices, shape.faces, sights, 2 * step) < BUMPY
+    moved = np.linalg.norm(follow_normals(shape.vertices, shape.faces, sights, step, reach=2 * step) - shape.vertices, axis=1) / step
+    assert moved.mean() < 0.05 and np.quantile(moved, 0.9) < 0.1
 
 
 def test_a_thin_wall_that_two_views_turn_inside_out_has_no_hole():
