@@ -27,14 +27,15 @@ WALL = 1.5  # pixels: what lies between surfaces that two views see from opposit
 RIM_COSINE = 0.15  # normals this square to an axis belong to the outline
 
 
-def disagreement(sights: list[Sight], reach: float = 0.06, stride: int = 3) -> float:
+def disagreement(sights: list[Sight], reach: float = 0.06, stride: int = 3, share: float = 0.5) -> float:
     """Median distance (world units) between one view's points and another's surface where both see the same part.
 
-    0 when no two views have depth in common.
+    share: of the points that lie nearer than what is returned, for another quantile. 0 when no two views have depth in
+    common.
     """
     gaps = [np.abs(m.distance) for m in _matches(sights, reach, stride)]
     gaps = np.concatenate(gaps) if gaps else np.zeros(0)
-    return float(np.median(gaps)) if len(gaps) else 0.0
+    return float(np.quantile(gaps, share)) if len(gaps) else 0.0
 
 
 def _sparse(sight: Sight, stride: int) -> np.ndarray:

@@ -80,11 +80,12 @@ def align_depth(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray | Non
                 colors: Sequence[np.ndarray] = ()) -> tuple[list[Sight], float, float]:
     """Prepared views whose surfaces were brought together where they disagree, the disagreement before and after.
 
-    colors: images (k, h, w, 3), linear, of what looks alike from all sides. Views that agree to a tenth of a step are left as they are.
+    colors: images (k, h, w, 3), linear, of what looks alike from all sides. Views that agree to a tenth of a step at three quarters of
+    their points are left as they are: of views that end at one another's silhouettes half may agree by that alone.
     """
     sights = prepare_all(cameras, mask, depth, normal)
     before = disagreement(sights)
-    if before < 0.1 * step:
+    if disagreement(sights, share=0.75) < 0.1 * step:
         return sights, before, before
     sights, after = bring_together(cameras, mask, depth, normal, sights, clock, tell, colors)
     # What the views got wrong in common is not seen in their disagreement.

@@ -146,6 +146,17 @@ def test_alignment_undoes_a_shift_of_depth(seen):
     assert after[2] < 0.4 * after[1]
 
 
+def test_views_of_which_only_some_agree_are_brought_together(seen):
+    """One lies a step too deep: most points are confirmed for all that."""
+    cameras, images, mask = seen["sphere"]
+    step, k, depth = grid_step(cameras, 0), [camera.name for camera in cameras].index("right"), images["depth"].copy()
+    depth[k] += np.where(mask[k] > 0, step, 0).astype(np.float32)
+    sights, before, noise = align_depth(cameras, mask, depth, images["normal"], step)
+    assert before < 0.1 * step < 0.2 * step < noise
+    exact = align_depth(cameras, mask, images["depth"], images["normal"], step)
+    assert exact[1] == exact[2] < 0.1 * step
+
+
 def bumpy(seen, name):
     """Sights of a solid whose depths are off by waves of a pixel, their grid step and noise."""
     cameras, images, mask = seen[name]
