@@ -62,33 +62,43 @@ def _halves(adjacency: Adjacency, chart: tuple, smallest: float, rings: bool) ->
     # Rectangles around the faces' centres: their rims lie half a face farther out.
     rim = float(np.sqrt(area.mean()))
     across = np.stack([centre @ (np.cos(a), np.sin(a)) for a in _ANGLES])
-    few = slice(None, None, -(-len(area) // _SEEN))
-    quarter = len(_ANGLES) // 2
-
-    def rectangle(of: np.ndarray) -> float:
-        span = np.ptp(across[:, few][:, of[few]], 1) + rim
-        return float((span[:quarter] * span[quarter:]).min())
-
-    whole = rectangle(np.ones(len(area), bool))
+    sample = across[:, :: -(-len(area) // _SEEN)]
+    whole = float(_rectangles(np.ptp(sample, 1) + rim))
     if area.sum() > _WELL_FILLED * whole:
         return None
     found = []
-    for row in across:
-        for share in _OFFSETS:
-            half = row < row.min() + share * np.ptp(row)
-            if half[few].any() and not half[few].all() and min(area[half].sum(), area[~half].sum()) >= smallest:
-                found.append((rectangle(half) + rectangle(~half), half))
+    for row, seen in zip(across, sample, strict=True):
+        line = row.min() + _OFFSETS * np.ptp(row)
+        covered = np.bincount(np.searchsorted(line, row, "right"), area, len(line) + 1).cumsum()[:-1]  # before each line
+        sorted_by = sample[:, np.argsort(seen, kind="stable")]
+        before, behind = _spans(sorted_by), _spans(sorted_by[:, ::-1])[:, ::-1]
+        count = np.searchsorted(np.sort(seen), line, "left")
+        good = (count > 0) & (count < len(seen)) & (np.minimum(covered, area.sum() - covered) >= smallest)
+        cost = _rectangles(before[:, count[good] - 1] + rim) + _rectangles(behind[:, count[good]] + rim)
+        found += [(float(c), row, place) for c, place in zip(cost, line[good], strict=True)]
     found.sort(key=lambda one: one[0])
     edges = edges_of(triangles)
     ring = rings and len(uv) - len(edges.ends) + len(triangles) < 1
-    for cost, half in found[:_TRIED]:
+    for cost, row, place in found[:_TRIED]:
         if cost > (1 - (_WORTH_OF_A_RING if ring else _WORTH)) * whole:
             return None
+        half = row < place
         parts = [part for side in (half, ~half) for part in _pieces(adjacency, faces_idx, side)]
         # A line across a ring leaves two arcs on one side: three parts are well, crumbs are not.
         if len(parts) <= 3 and min(area[part].sum() for part in parts) >= smallest:
             return parts
     return None
+
+
+def _spans(values: np.ndarray) -> np.ndarray:
+    """(a, n): how far values (a, n) up to each one spread."""
+    return np.maximum.accumulate(values, 1) - np.minimum.accumulate(values, 1)
+
+
+def _rectangles(spans: np.ndarray) -> np.ndarray:
+    """Area of the smallest of the rectangles that have spans (angles, …) along _ANGLES."""
+    quarter = len(_ANGLES) // 2
+    return (spans[:quarter] * spans[quarter:]).min(0)
 
 
 def _pieces(adjacency: Adjacency, faces_idx: np.ndarray, side: np.ndarray) -> list[np.ndarray]:
