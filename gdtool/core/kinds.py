@@ -44,6 +44,7 @@ class ViewsContent(Content, frozen=True, kw_only=True):
     environment: Annotated[str, Meta(description="name of the environment the color was lit by; empty: unknown")] = ""
     conditions: Annotated[int, Meta(ge=0, description="number of condition images, condition/000.png and on")] = 0
     model: Annotated[bool, Meta(description="source.glb holds the model the views show")] = False
+    picture: Annotated[str, Meta(description="name of the view that picture.png shows: what the views were made of; empty: none")] = ""
 
 
 class DatasetObject(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -10,6 +10,12 @@ from gdtool.cameras.camera import HALF_WIDTH
 FRONT_EXTENT = 0.5 / HALF_WIDTH
 
 
+def framed_side(image: np.ndarray, extent: float = FRONT_EXTENT) -> float:
+    """Side, in the picture's pixels, of the square that frame() takes of it."""
+    rows, columns = np.nonzero(image[..., 3] > 0.5)
+    return float(max(np.ptp(rows), np.ptp(columns)) + 1) / extent
+
+
 def frame(image: np.ndarray, size: int, extent: float = FRONT_EXTENT) -> np.ndarray:
     """Centre the subject's bounding box and scale its longest side to extent * size.
 
@@ -21,7 +27,7 @@ def frame(image: np.ndarray, size: int, extent: float = FRONT_EXTENT) -> np.ndar
 
     rows, columns = np.nonzero(image[..., 3] > 0.5)
     top, bottom, left, right = rows.min(), rows.max() + 1, columns.min(), columns.max() + 1
-    side = max(bottom - top, right - left) / extent
+    side = framed_side(image, extent)
     return _resample(image, (left + right - side) / 2, (top + bottom - side) / 2, side, size)
 
 

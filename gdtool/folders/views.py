@@ -80,6 +80,28 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
     return Views(cameras, images, mask, light)
 
 
+def read_picture(folder: Folder, cameras: list[Camera]) -> tuple[np.ndarray, Camera] | None:
+    """The picture (h, w, 4), linear color and straight alpha, that a views folder was made of, and the camera it looks through.
+
+    None where the folder holds none. Raises InputError for one that is not a whole number of times as fine as its view.
+    """
+    from gdtool.images.color import linear_from_srgb, unit_range
+    from gdtool.images.io import read_image
+
+    content: ViewsContent = folder.content
+    if not content.picture:
+        return None
+    camera = next((camera for camera in cameras if camera.name == content.picture), None)
+    if camera is None:
+        raise InputError(folder.path, f"the manifest says that picture.png shows the view {content.picture!r}, which it does not hold")
+    path = folder.file("picture.png")
+    image = unit_range(read_image(path))
+    h, w = image.shape[:2]
+    if image.ndim != 3 or image.shape[2] != 4 or h % camera.height or w % camera.width or h // camera.height != w // camera.width:
+        raise InputError(path, f"is {w}x{h}, not RGBA of a multiple of its view's {camera.width}x{camera.height}")
+    return np.concatenate([linear_from_srgb(image[..., :3]), image[..., 3:]], -1).astype(np.float32), camera
+
+
 def write_views(out: Output, views: Views, *, source_from_world: np.ndarray | None = None, **extra: Any) -> None:
     """Write a views folder and set out.content; extra goes to ViewsContent (exposure, environment, report, …)."""
     from gdtool.images.color import encode_normal, srgb_from_linear

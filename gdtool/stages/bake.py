@@ -207,7 +207,8 @@ def _read_origin(inputs: Inputs, options: Options, matrix, target, out: Output):
                     out.skip(f"{domain} views", "the views do not hold it: the surface's vertices serve")
         known = surface.content.field and not (read and {"albedo", "roughness", "metallic"} <= set(read.images))
         field = material_field(surface.file("field.safetensors"), out.device) if known else None
-        return from_surface(read_surface(surface), read if read is not None and read.images else None, field)
+        read = read if read is not None and read.images else None
+        return from_surface(read_surface(surface), read, field, None if read is None else _read_picture(views, read, out))
     named = options.model
     if named is None and hasattr(inputs.main, "content"):
         named = find_source(inputs.main)
@@ -219,6 +220,19 @@ def _read_origin(inputs: Inputs, options: Options, matrix, target, out: Output):
     from gdtool.texture.target import size_for, texel_width
 
     return from_scene(load_scene(named), matrix, lambda detail: texel_width(target, options.size or size_for(target, detail)))
+
+
+def _read_picture(folder, views, out: Output):
+    """The picture that the views were made of, where the folder holds it and they hold an albedo to put its detail on."""
+    from gdtool.folders.views import read_picture
+    from gdtool.texture.picture import picture_of
+
+    found = read_picture(folder, views.cameras)
+    if found is None or "albedo" not in views.images:
+        out.skip("picture", "the views' folder holds none" if found is None else "the views hold no albedo for its detail")
+        return None
+    image, camera = found
+    return picture_of(image, camera, views.images["albedo"][views.names.index(camera.name)])
 
 
 def target_of(mesh):
@@ -274,6 +288,6 @@ def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx
 
 
 STAGE = Stage(
-    name="bake", version=7, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run,
+    name="bake", version=8, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run,
     second_inputs={"surface": SecondInput("surface", help="The surface to bake from; found along the provenance chain without it."),
                    "views": SecondInput("views", help="Views of it; found along the provenance chain without it.")})

@@ -2,7 +2,8 @@
 
 Takes an image with alpha, or one on a plain background that is then cut out (on a busy one with gdtool[cutout]), or any
 image with --mask. The subject is cropped and centred as in training. Writes color, normal, depth, albedo, roughness,
-metallic and masks of the default rig for reconstruct, at the model's own resolution. Use --no-crop when the picture is
+metallic and masks of the default rig for reconstruct, at the model's own resolution, and the picture as it was framed at
+its own, for bake. Use --no-crop when the picture is
 framed like the rig's front view already (an orthographic render of a normalised object).
 
 Example:
@@ -19,8 +20,8 @@ from msgspec import Meta
 from gdtool.core.errors import InputError, UsageError
 from gdtool.core.stage import Inputs, Output, SecondInput, Stage, file_option
 
-
 EVERY = ("color", "normal", "depth", "albedo", "roughness", "metallic")
+FINEST = 8  # pixels of picture.png across one of a view
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -64,7 +65,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         raise UsageError("--domains", f"{unknown[0] if unknown else 'nothing'} is not a domain of this model",
                          f"it has {','.join(config.domains)}")
     with out.step("condition"):
-        condition = _condition(inputs, options, config, out)
+        condition, picture = _condition(inputs, options, config, out)
     with out.step("sample"):
         rgba = to_tensor_condition(condition)
         strange = unfamiliar(rgba[0].numpy(), read_ranges(folder))
@@ -81,7 +82,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     with out.step("write"):
         # what the model was shown, after cutting out and framing
         write_png(out.path("condition/000.png"), srgb_from_linear_rgba(condition, srgb_from_linear))
-        write_views(out, views, conditions=1)
+        write_png(out.path("picture.png"), srgb_from_linear_rgba(picture, srgb_from_linear))
+        write_views(out, views, conditions=1, picture="front")
 
 
 def srgb_from_linear_rgba(image, srgb_from_linear):
@@ -91,12 +93,14 @@ def srgb_from_linear_rgba(image, srgb_from_linear):
 
 
 def _condition(inputs: Inputs, options: Options, config, out: Output):
-    """The framed picture (size, size, 4), linear color and straight alpha. Raises InputError without a usable subject."""
+    """The framed picture (size, size, 4), linear color and straight alpha, and the same as many times finer as the picture is.
+    Raises InputError without a usable subject.
+    """
     from pathlib import Path
 
     import numpy as np
 
-    from gdtool.diffusion.framing import FRONT_EXTENT, frame, whole_frame
+    from gdtool.diffusion.framing import FRONT_EXTENT, frame, framed_side, whole_frame
     from gdtool.images.color import linear_from_srgb
     from gdtool.images.io import read_image
     from gdtool.diffusion import wonder3d
@@ -120,9 +124,13 @@ def _condition(inputs: Inputs, options: Options, config, out: Output):
         color = linear_from_srgb(color.astype(np.float32) / np.iinfo(image.dtype).max)
     rgba = np.concatenate([color, alpha[..., None]], -1).astype(np.float32)
     extent = wonder3d.EXTENT if config.convention == "wonder3d" else FRONT_EXTENT
-    return frame(rgba, config.image_size, extent) if options.crop else whole_frame(rgba, config.image_size)
+    size = config.image_size
+    finer = (framed_side(rgba, extent) if options.crop else max(rgba.shape[:2])) / size
+    condition, picture = (frame(rgba, side, extent) if options.crop else whole_frame(rgba, side)
+                          for side in (size, size * min(max(round(finer), 1), FINEST)))
+    return condition, picture
 
 
-STAGE = Stage(name="sample-views", version=4, reads=("image-file",), writes="views", Options=Options, run=run,
+STAGE = Stage(name="sample-views", version=5, reads=("image-file",), writes="views", Options=Options, run=run,
               second_inputs={"model": SecondInput("model", search=False, default="models/default", foreign=True,
                                               help="Model folder of gdtool train, or Wonder3D v1 as a folder or hub id; the bundled model without it.")})

@@ -69,9 +69,10 @@ def _needed(folder: Folder) -> set[str]:
 def _check_views(folder: Folder) -> Iterator[str]:
     import numpy as np
 
-    from gdtool.folders.views import read_views
+    from gdtool.folders.views import read_picture, read_views
 
     views = read_views(folder)
+    read_picture(folder, views.cameras)
     for k, camera in enumerate(views.cameras):
         inside = views.mask[k] > 0.5
         if not inside.any():

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gdtool.texture.occlusion import openness
-from gdtool.texture.project_views import Sight, observe
+from gdtool.texture.picture import Picture
+from gdtool.texture.project_views import Sight, observe, steadiness
 from gdtool.texture.raster import Barycentrics
 from gdtool.texture.reproject import Places, Source, reproject
 from gdtool.texture.target import TEXELS_AT_ONCE, Target, Texels, mapped, surface_at
@@ -23,12 +24,14 @@ Lookup = Callable[[Places], dict[str, np.ndarray]]
 class ViewsOfSource:
     """Views of the source and what their cameras see of it.
 
-    images: domain (albedo linear, roughness, metallic, normal) to (k, h, w[, c]); mask (k, h, w).
+    images: domain (albedo linear, roughness, metallic, normal) to (k, h, w[, c]); mask (k, h, w); picture: what one of them was
+    made of.
     """
 
     sights: list[Sight]
     images: dict[str, np.ndarray]
     mask: np.ndarray
+    picture: Picture | None = None
 
 
 @dataclass(frozen=True)
@@ -69,13 +72,16 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
         encoded[domain] = np.asarray(image if image.ndim == 4 else image[..., None], np.float32)
     stack = np.concatenate(list(encoded.values()), -1)
     channel = np.cumsum([0, *(image.shape[-1] for image in encoded.values())])
+    pictured = None
+    if views.picture is not None and "albedo" in domains:
+        pictured = next(k for k, sight in enumerate(views.sights) if sight.camera.name == views.picture.camera.name)
 
     def looked(places: Places) -> dict[str, np.ndarray]:
         out = dict(lookup(places))
         points = source.at(places.face_idx, places.barycentric, source.vertices)
         prior = [srgb_from_linear(out[d]) if d == "albedo" else out[d] for d in domains]
         prior = np.concatenate([p if p.ndim == 2 else p[:, None] for p in prior], 1)
-        value, seen = observe(points, out["normal"], views.sights, stack, views.mask, prior)
+        value, seen, shares = observe(points, out["normal"], views.sights, stack, views.mask, prior, known=pictured)
         for k, domain in enumerate(domains):
             own, read = prior[:, channel[k]:channel[k + 1]], value[:, channel[k]:channel[k + 1]]
             share = seen[:, None]
@@ -87,12 +93,25 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
             if domain == "normal":
                 mixed = unit(mixed)
             out[domain] = linear_from_srgb(mixed) if domain == "albedo" else mixed if out[domain].ndim == 2 else mixed[:, 0]
+        if pictured is not None:
+            _sharpen(out, points, views.picture, views.sights[pictured], seen * shares[pictured])
         out["seen"] = seen
         if "confidence" in out:
             out["confidence"] = seen + (1 - seen) * out["confidence"]
         return out
 
     return looked, domains
+
+
+def _sharpen(out: dict[str, np.ndarray], points: np.ndarray, picture: Picture, sight: Sight, share: np.ndarray) -> None:
+    """Multiply what the picture has in finer pixels into the albedo of points (n, 3), by the share (n,) that its view has in it.
+
+    What a metal shows is what it mirrors, and no detail of its own.
+    """
+    share = share * steadiness(sight, points) * (1 - out["metallic"])
+    seen = np.flatnonzero(share > 0.01)
+    out["albedo"] = np.array(out["albedo"], np.float32)
+    out["albedo"][seen] = np.clip(out["albedo"][seen] * (1 + share[seen, None] * (picture.at(points[seen]) - 1)), 0, 1)
 
 
 def _read(target: Target, source: Source, lookup: Lookup, reach: np.ndarray, face_idx: np.ndarray,

@@ -14,6 +14,7 @@ from gdtool.folders.views import Views
 from gdtool.geometry.frames import invert_similarity, transform_points
 from gdtool.geometry.normals import vertex_normals
 from gdtool.texture.bake import Lookup, ViewsOfSource, vertex_lookup, with_views
+from gdtool.texture.picture import Picture
 from gdtool.texture.project_views import pixel_footprint, sight_of
 from gdtool.texture.reproject import Places, Source
 from gdtool.texture.tangents import dot
@@ -24,7 +25,7 @@ class Origin:
     """A source in the normalised frame, its material lookup, its vertex normals (v, 3), and how its surface is drawn.
 
     label says where materials come from, for the report. detail is the width of the finest detail that the source holds,
-    in the normalised frame: a texel of its textures, half a pixel of its views or half an edge of its mesh.
+    in the normalised frame: a texel of its textures, half a pixel of its views, a pixel of the picture they were made of or half an edge of its mesh.
     """
 
     source: Source
@@ -64,10 +65,12 @@ def material_field(path: Path, device: str = "cpu") -> Callable[[np.ndarray], di
     return at
 
 
-def from_surface(surface: Surface, views: Views | None, field: Callable[[np.ndarray], dict[str, np.ndarray]] | None = None) -> Origin:
+def from_surface(surface: Surface, views: Views | None, field: Callable[[np.ndarray], dict[str, np.ndarray]] | None = None,
+                 picture: Picture | None = None) -> Origin:
     """A surface; views give material and normals where they see it well, its vertices elsewhere.
 
-    field (material_field) takes the vertices' place for the materials that no view shows.
+    field (material_field) takes the vertices' place for the materials that no view shows. picture: what one of the views
+    was made of, for its finer detail.
     """
     source = Source(surface.vertices, surface.faces)
     normals = surface.normals if surface.normals is not None else vertex_normals(surface.vertices, surface.faces)
@@ -85,9 +88,12 @@ def from_surface(surface: Surface, views: Views | None, field: Callable[[np.ndar
     if not images:
         return Origin(source, lookup, normals, label, detail=detail)
     sights = [sight_of(camera, source.caster, mask) for camera, mask in zip(views.cameras, views.mask, strict=True)]
-    lookup, domains = with_views(lookup, source, ViewsOfSource(sights, images, views.mask))
+    lookup, domains = with_views(lookup, source, ViewsOfSource(sights, images, views.mask, picture))
     label = ("" if label == "vertices" else label + ", ") + "views: " + " ".join(domains)
-    return Origin(source, lookup, normals, label, detail=min(detail, 0.5 * _view_pixel(views)))
+    detail = min(detail, 0.5 * _view_pixel(views))
+    if picture is not None and "albedo" in domains:
+        label, detail = label + ", picture: albedo", min(detail, _view_pixel(views) / picture.finer)
+    return Origin(source, lookup, normals, label, detail=detail)
 
 
 def _with_field(lookup: Lookup, source: Source, field: Callable[[np.ndarray], dict[str, np.ndarray]], names: list[str]) -> Lookup:

@@ -102,14 +102,22 @@ def _read(sight: Sight, stack: np.ndarray, mask: np.ndarray, points: np.ndarray,
     return facing, value, cosine * away * weight_sum
 
 
+def steadiness(sight: Sight, points: np.ndarray) -> np.ndarray:
+    """(n,) in [0, 1]: 0 where points (n, 3) lie within a pixel of a silhouette or a step in depth, 1 from two on."""
+    pixel = np.floor(project(sight.camera, points)[0]).astype(np.int64)
+    h, w = sight.clear.shape
+    return np.clip(sight.clear[np.clip(pixel[:, 1], 0, h - 1), np.clip(pixel[:, 0], 0, w - 1)] - 1, 0, 1)
+
+
 def observe(points: np.ndarray, normals: np.ndarray, sights: list[Sight], stack: np.ndarray, mask: np.ndarray,
-            prior: np.ndarray | None = None, sharpness: float = 6.0) -> tuple[np.ndarray, np.ndarray]:
+            prior: np.ndarray | None = None, sharpness: float = 6.0, known: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What the views say about points (n, 3) of the surface with unit normals (n, 3).
 
     stack (k, h, w, c) and mask (k, h, w) of the k sights. Views are weighted by facing, distance to silhouettes and
     coverage; the best one counts far more than the next (its power is sharpness), so detail is not averaged away, and
     the change from one view to another is smooth. A view that differs from all others and from prior (n, c) fades
-    out. Returns values (n, c) float32 and confidence (n,) float32 in [0, 1], 0 where no view sees the point.
+    out, but not the known one, which the others were made of. Returns values (n, c) float32, confidence (n,) float32 in [0, 1], 0 where no view sees the point, and each
+    view's share (k, n) of the values.
     """
     count, channels = len(points), stack.shape[-1]
     value = np.zeros((len(sights), count, channels), np.float32)
@@ -126,11 +134,15 @@ def observe(points: np.ndarray, normals: np.ndarray, sights: list[Sight], stack:
     share = quality / np.maximum(best, 1e-6)
     disputed = np.flatnonzero((high - low > TOLERANCE).any(1))
     if len(disputed):
-        share[:, disputed] = _fade_outliers(value[:, disputed], share[:, disputed], None if prior is None else prior[disputed])
+        faded = _fade_outliers(value[:, disputed], share[:, disputed], None if prior is None else prior[disputed])
+        if known is not None:
+            faded[known] = share[known, disputed]
+        share[:, disputed] = faded
     weight = share**sharpness
     total = weight.sum(0)
-    mean = np.einsum("kn,knc->nc", weight, value) / np.maximum(total, 1e-12)[:, None]
-    return mean.astype(np.float32), np.where(total > 0, confidence, 0).astype(np.float32)
+    weight /= np.maximum(total, 1e-12)
+    mean = np.einsum("kn,knc->nc", weight, value)
+    return mean.astype(np.float32), np.where(total > 0, confidence, 0).astype(np.float32), weight
 
 
 def _fade_outliers(value: np.ndarray, share: np.ndarray, prior: np.ndarray | None) -> np.ndarray:

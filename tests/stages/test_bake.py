@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gdtool.cameras import rig
 from gdtool.core.folder import open_folder
 from gdtool.folders.mesh import QuadMesh, write_obj
-from gdtool.images.io import read_image
-from tests.stages.bake_folders import make_chain, torus_atlas, write_atlas
+from gdtool.folders.views import Views, write_views
+from gdtool.images.io import read_image, write_png
+from tests.stages.bake_folders import finish, fresh, make_chain, torus_atlas, torus_views, write_atlas
 from tests.texture.shapes import albedo_of, psnr
 
 FAST = ("--size", 128, "--ao-rays", 16)
@@ -21,22 +23,21 @@ def chain(tmp_path_factory):
     return make_chain(tmp_path_factory.mktemp("chain") / "ring.asset")
 
 
-def rendered_albedo(asset: Path, chain: Path) -> float:
-    """PSNR in sRGB of the asset's base colour at the pixels of the chain's views, foreground only."""
+def rendered_albedo(asset: Path, views: Views | None = None, facing: float = 0.0) -> float:
+    """PSNR in sRGB of the asset's base colour at the pixels of views (the chain's), foreground that faces them only."""
     from gdtool.assets.load import load_scene
     from gdtool.cameras import rays
     from gdtool.geometry.rays import RayCaster
     from gdtool.images.color import srgb_from_linear
     from gdtool.shading.surface_points import SurfaceLookup
-    from tests.stages.bake_folders import torus_views
 
-    scene, views = load_scene(asset / "asset.glb"), torus_views()
+    scene, views = load_scene(asset / "asset.glb"), views or torus_views()
     lookup, caster = SurfaceLookup(scene), RayCaster(scene.vertices, scene.faces)
     ours, theirs = [], []
     for k, camera in enumerate(views.cameras):
         origins, directions = rays(camera)
         hits = caster.first_hit(origins.reshape(-1, 3), directions.reshape(-1, 3))
-        both = hits.found & (views.mask[k].ravel() > 0)
+        both = hits.found & (views.mask[k].ravel() > 0) & (views.images["normal"][k].reshape(-1, 3) @ camera.backward >= facing)
         ours.append(lookup.attributes(hits.face_idx[both], hits.barycentric[both])["albedo"])
         theirs.append(views.images["albedo"][k].reshape(-1, 3)[both])
     return psnr(srgb_from_linear(np.concatenate(ours)), srgb_from_linear(np.concatenate(theirs)))
@@ -57,16 +58,47 @@ def test_writes_a_folder_that_validates_and_skips_the_second_time(gdtool, chain,
     assert again.returncode == 0 and "up to date" in again.stderr
     other = gdtool("bake", chain, *FAST, "-o", "twin")
     assert other.returncode == 0 and (tmp_path / "twin" / "asset.glb").read_bytes() == before
-    assert rendered_albedo(tmp_path / "out", chain) > 28
+    assert rendered_albedo(tmp_path / "out") > 28
 
 
 def test_views_serve_where_vertices_know_nothing(gdtool, tmp_path):
     atlas = make_chain(tmp_path / "gray.asset", gray_vertices=True)
     assert gdtool("bake", atlas, *FAST, "--no-ao", "-o", "with").returncode == 0
     assert gdtool("bake", atlas, *FAST, "--no-ao", "--no-project-views", "-o", "without").returncode == 0
-    assert rendered_albedo(tmp_path / "with", atlas) > 26 > 20 > rendered_albedo(tmp_path / "without", atlas)
+    assert rendered_albedo(tmp_path / "with") > 26 > 20 > rendered_albedo(tmp_path / "without")
     skipped = {skip.what: skip.reason for skip in open_folder(tmp_path / "without").manifest.skipped}
     assert skipped["views"] == "left out by --no-project-views" and "occlusion" in skipped
+
+
+def test_a_picture_finer_than_its_view_is_baked(gdtool, tmp_path):
+    """Blurred views of the torus, and the picture that they were made of, sharp: the asset has it where the front sees it."""
+    from gdtool.images.color import srgb_from_linear
+    from gdtool.images.metrics import resized_views
+
+    atlas = make_chain(tmp_path / "gray.asset", gray_vertices=True)
+    fine = torus_views(384)
+    striped = np.where(np.arange(384) // 6 % 2, 0.9, 0.15).astype(np.float32)[None, None, :, None] * fine.mask[..., None] * np.float32([1, 0.8, 0.6])
+    images, mask = resized_views({**fine.images, "albedo": striped}, fine.mask, 96, 96)
+    for way in ("plain", "pictured"):
+        folder = tmp_path / way
+        out = fresh(folder)
+        if way == "pictured":
+            write_png(out.path("picture.png"), np.concatenate([srgb_from_linear(striped[0]), fine.mask[0][..., None]], -1))
+        write_views(out, Views(rig("six", 96), images, mask), picture="front" if way == "pictured" else "")
+        finish(folder, "views", out.content, {})
+        done = gdtool("bake", atlas, "--size", 512, "--no-ao", "--views", folder, "-o", f"from_{way}")
+        assert done.returncode == 0, done.stderr
+    assert gdtool("validate", tmp_path / "pictured").returncode == 0
+    front = Views(fine.cameras[:1], {"albedo": striped[:1], "normal": fine.images["normal"][:1]}, fine.mask[:1])
+    plain, pictured = (rendered_albedo(tmp_path / f"from_{way}", front, facing=0.8) for way in ("plain", "pictured"))
+    assert pictured > plain + 3
+    report = [open_folder(tmp_path / f"from_{way}").content.report["materials_from"] for way in ("plain", "pictured")]
+    assert ["picture" in text for text in report] == [False, True]
+    skipped = {skip.what: skip.reason for skip in open_folder(tmp_path / "from_plain").manifest.skipped}
+    assert skipped["picture"] == "the views' folder holds none"
+    write_png(tmp_path / "pictured" / "picture.png", np.ones((100, 100, 4)))
+    wrong = gdtool("bake", atlas, *FAST, "--views", tmp_path / "pictured", "-o", "never")
+    assert wrong.returncode == 3 and "picture.png" in wrong.stderr
 
 
 def test_without_views_the_vertices_serve_and_it_says_so(gdtool, tmp_path):
@@ -119,7 +151,7 @@ def test_bakes_a_textured_model_that_was_remeshed(gdtool, chain, tmp_path):
     write_atlas(tmp_path / "again", {})
     done = gdtool("bake", "again", *FAST, "--model", "first/asset.glb", "-o", "second")
     assert done.returncode == 0, done.stderr
-    assert rendered_albedo(tmp_path / "second", chain) > 26
+    assert rendered_albedo(tmp_path / "second") > 26
     assert open_folder(tmp_path / "second").content.report["materials_from"] == "model"
     # Remeshed from a model file, an atlas has that file at the start of its chain.
     write_atlas(tmp_path / "remeshed", {"source": tmp_path / "first" / "asset.glb"})
@@ -170,7 +202,7 @@ def test_broken_faces_do_not_stop_it(gdtool, chain, tmp_path):
     done = gdtool("bake", "atlas", *FAST, "-o", "out")
     assert done.returncode == 0, done.stderr
     assert gdtool("validate", "out").returncode == 0
-    assert rendered_albedo(tmp_path / "out", chain) > 25
+    assert rendered_albedo(tmp_path / "out") > 25
 
 
 @pytest.mark.parametrize("fault, code, message", [

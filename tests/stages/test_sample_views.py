@@ -63,6 +63,11 @@ def test_a_picture_becomes_six_views_in_six_domains(gdtool, picture, tiny_model,
         assert len(list((views / domain).glob("*"))) == 6, domain
     assert read_image(views / "normal/back.png").dtype == np.uint16
     assert (views / "contact_sheet.png").is_file()
+    # The ball is 39 pixels of the picture wide and 11 of the views: what they were made of is kept four times as fine.
+    assert json.loads((views / MANIFEST).read_text())["content"]["picture"] == "front"
+    kept, shown = read_image(views / "picture.png"), read_image(views / "condition/000.png")
+    assert kept.shape == (64, 64, 4)
+    assert np.abs(kept[..., 3].reshape(16, 4, 16, 4).mean((1, 3)) - shown[..., 3]).mean() < 8
     assert gdtool("validate", views).returncode == 0
     again = sample(gdtool, "ball.png", "--model", tiny_model)
     assert "up to date" in again.stderr and again.stdout == "ball.asset/views\n"
