@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-materials bench-reconstruct bench-render bench-relight bench-sheets bench-throughput bench-cutout bench-sample bench-model schemas docs-check model data clean
+.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-materials bench-reconstruct bench-render bench-relight bench-sheets bench-throughput bench-cutout bench-picture bench-sample bench-model schemas docs-check model data clean
 
 venv: .venv/.done
 
@@ -81,6 +81,11 @@ bench-sample: venv
 # GrabCut on pictures laid over photographed environments (needs ".[cutout]"): two minutes.
 bench-cutout: venv
 	$(BIN)/python benchmarks/cutout.py ../shared/assets/images ../shared/assets/hdr
+
+# What the picture adds to the albedo of the views: MODELS (textured files) in 512 px, half a minute each.
+bench-picture: venv
+	$(BIN)/gdtool render-dataset $(or $(MODELS),procedural:3000000..3000003) --size 512 --samples 4 --light-samples 4 --domains color,albedo -o out/fine
+	$(BIN)/python benchmarks/picture.py out/fine -o docs/benchmarks
 
 # Objects per core-minute of render-dataset, by cores and by objects; goes on where it was.
 bench-throughput: venv
