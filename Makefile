@@ -98,13 +98,13 @@ docs-check: venv
 # same grown to 128 px and trained on, the same with geometry and metal compared by distance (killed, each goes on where it was), and
 # its measurement, which puts it where the package finds it. Hours on two cores; set OBJECTS, MINUTES, STEPS and FINISH. So the bundled model was
 # made, its first step over 64 px views of 3341 objects with a start of 16 minutes over 586 of them, its second in two runs (3000 steps, and
-# 1400 at two thirds of the rate) over 1355 objects, its last in four runs (105 minutes, 112 with fewer conditions left out, both over 2397
-# objects, and twice 106 over 4338).
+# 1400 at two thirds of the rate) over 1355 objects, its last in five runs (105 minutes, 112 with fewer conditions left out, both over 2397
+# objects, and 106, 106 and 104 over 4338).
 DATA ?= out/model
 OBJECTS ?= 4341
 MINUTES ?= 100
 STEPS ?= 4400
-FINISH ?= 429
+FINISH ?= 533
 RENDER := $(BIN)/gdtool render-dataset --size 128 --light-samples 4 --domains color,normal,depth,albedo,roughness,metallic --condition-views 3
 
 data: venv
