@@ -2,8 +2,9 @@
 
 Use it after unwrap. Base color, occlusion-roughness-metallic and tangent-space normals are read texel by texel from the
 surface: from its confident views where there are any (found along the provenance chain), else from its vertices, or from
-the textures of the model that was remeshed. Maps that would be constant become factors, a flat normal map is left out.
-Without --size a texel is as fine as the source's detail: a texel of its textures, half a pixel of its views.
+the textures of the model that was remeshed. The picture that sample-views made the views of adds what it shows finer than
+they. Maps that would be constant become factors, a flat normal map is left out. Without --size a texel is as fine as the
+source's detail: a texel of its textures, half a pixel of its views, a pixel of the picture.
 
 Example:
   gdtool bake cat.asset/atlas --size 2048 --lods 4
