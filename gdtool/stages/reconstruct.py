@@ -84,7 +84,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             raise InputError(folder.path, str(error), "check the masks and cameras") from None
     if shape.bumps is None or shape.bumps <= BUMPY:
         out.skip("surface by normals", f"it is within {shape.bumps:.1f} degrees of them" if shape.bumps is not None
-                 else "there are none" if normal is None else "the views agree")
+                 else "there are none" if normal is None
+                 else "the silhouettes alone give the shape" if all(sight.planes is None for sight in sights) else "the views agree")
     if coarser:
         out.skip("the whole grid", f"--budget has no time for it: the surface is taken {coarser}")
     _check_cameras(folder, views.cameras, shape.vertices)

@@ -82,8 +82,10 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     with out.step("write"):
         # what the model was shown, after cutting out and framing
         write_png(out.path("condition/000.png"), srgb_from_linear_rgba(condition, srgb_from_linear))
-        write_png(out.path("picture.png"), srgb_from_linear_rgba(picture, srgb_from_linear))
-        write_views(out, views, conditions=1, picture="front")
+        shown = "front" if "front" in views.names else ""  # the view that is the picture's own
+        if shown:
+            write_png(out.path("picture.png"), srgb_from_linear_rgba(picture, srgb_from_linear))
+        write_views(out, views, conditions=1, picture=shown)
 
 
 def srgb_from_linear_rgba(image, srgb_from_linear):

@@ -35,6 +35,7 @@ def test_writes_a_valid_surface_once(gdtool, folder, tmp_path):
     surface = read_surface(open_folder(out))
     content = manifest(out)["content"]
     assert content["watertight"] and content["light"] and is_closed_manifold(surface.faces)
+    assert {s["what"]: s["reason"] for s in manifest(out)["skipped"]}["surface by normals"] == "the views agree"
     assert np.abs(torus(surface.vertices)).mean() < 0.002
     albedo, roughness, metallic = material(surface.vertices)
     sure = surface.confidence > 0.5
@@ -66,6 +67,7 @@ def test_color_alone_gives_an_honest_hull(gdtool, folder, tmp_path):
     surface = read_surface(open_folder(out))
     skipped = {s["what"]: s["reason"] for s in manifest(out)["skipped"]}
     assert "--ignore" in skipped["depth"] and "--ignore" in skipped["albedo"]
+    assert skipped["surface by normals"] == "there are none"
     assert manifest(out)["content"]["watertight"]
     # The hull holds the object, and is not much larger.
     assert np.abs(torus(surface.vertices)).mean() < 0.03
@@ -109,6 +111,7 @@ def test_normals_that_contradict_one_another_leave_the_silhouettes(gdtool, tmp_p
     record = manifest(out)
     assert record["content"]["watertight"]
     assert any("do not fit together" in warning for warning in record["warnings"])
+    assert {s["what"]: s["reason"] for s in record["skipped"]}["surface by normals"] == "the silhouettes alone give the shape"
     assert method == "grid" or "volume start" not in {one["what"] for one in record["skipped"]}
     assert np.abs(read_surface(open_folder(out)).vertices).max() < 0.6
 
