@@ -95,7 +95,7 @@ def decoded(planes: torch.Tensor, config) -> Views:
     indices = tuple(range(6))
     images = encode(planes[None], indices, torch.zeros(1))[0]
     cameras = {camera.name: camera for camera in rig("six", config.image_size)}
-    return views_from_images({d: images[i] for i, d in enumerate(config.domains)}, [cameras[n] for n in config.views], 0.0, config.domains)
+    return views_from_images({d: images[i] for i, d in enumerate(config.domains)}, [cameras[n] for n in config.views], 0.0, config.domains)[0]
 
 
 def true_views(folder, size: int) -> Views:
@@ -110,7 +110,7 @@ def sampled_views(model, rgba: torch.Tensor, seed: int, **setting) -> Views:
     cameras = {camera.name: camera for camera in rig("six", config.image_size)}
     images = sample_images(model, rgba, seed=seed, **setting)
     return views_from_images({d: x[0].float() for d, x in images.items()}, [cameras[n] for n in config.views], BACKGROUND[config.backgrounds[0]],
-                             setting.get("domains", config.domains), (0.5 + 0.5 * rgba[0, 3]).numpy())
+                             setting.get("domains", config.domains), (0.5 + 0.5 * rgba[0, 3]).numpy())[0]
 
 
 def nearest_to(condition: torch.Tensor, pictures: list[np.ndarray]) -> int:

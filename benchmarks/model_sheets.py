@@ -53,7 +53,7 @@ def block(model, condition: np.ndarray) -> np.ndarray:
     rgba = torch.from_numpy(np.ascontiguousarray(condition, np.float32))[None]
     sampled = sample_images(model, rgba, steps=config.sampling_steps)
     alpha = 0.5 + 0.5 * condition[3]
-    views = views_from_images({d: x[0] for d, x in sampled.items()}, [cameras[n] for n in config.views], BACKGROUND[config.backgrounds[0]],
+    views, _ = views_from_images({d: x[0] for d, x in sampled.items()}, [cameras[n] for n in config.views], BACKGROUND[config.backgrounds[0]],
                               config.domains, alpha)
     out = np.ones((len(config.domains) * h, (len(config.views) + 1) * h, 3), np.float32)
     out[:h, :h] = np.moveaxis(0.5 * (condition[:3] + alpha) + 1 - alpha, 0, -1)  # premultiplied, over white

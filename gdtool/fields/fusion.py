@@ -21,6 +21,8 @@ from gdtool.geometry.sharpen import dihedral_degrees, restore_creases
 
 LEAST_NOISE = 0.3  # grid steps: of views that had to be brought together
 OVER_EDGE = 0.25  # steps that a sharp edge may stand out of what the views leave, whose pixels round it off
+# Pixels by which the surface of views that a model made comes out too small: parts that they disagree about go, edges first.
+SMALL = 0.2
 BUMPY = 6.5  # degrees between the surface of views that disagree and their normals: exact normals come to 3, a model's to 10
 CREASE_ROUNDS = 4  # tries without what folded over
 MAX_SAMPLES = 320  # along the longest side: 33 million samples, 0.6 GB at the peak
@@ -58,12 +60,14 @@ def prepare_all(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray | Non
             for k, camera in enumerate(cameras) if (mask[k] > 0.5).any()]
 
 
+def finest_pixel(cameras: list[Camera]) -> float:
+    """World units across a pixel of the sharpest view, at the origin."""
+    return min(float(pixel_footprint(c, float(np.linalg.norm(c.position)))) for c in cameras)
+
+
 def grid_step(cameras: list[Camera], resolution: int) -> float:
     """World units between samples: resolution samples a unit, or (0) 0.8 of a pixel of the sharpest view."""
-    if resolution:
-        return 1.0 / resolution
-    pixel = min(float(pixel_footprint(c, float(np.linalg.norm(c.position)))) for c in cameras)
-    return float(np.clip(0.8 * pixel, 1.0 / MAX_SAMPLES, 1.0 / 64))
+    return 1.0 / resolution if resolution else float(np.clip(0.8 * finest_pixel(cameras), 1.0 / MAX_SAMPLES, 1.0 / 64))
 
 
 def depth_for(cameras: list[Camera], mask: np.ndarray, normal: np.ndarray, alike: dict[str, np.ndarray] | None = None) -> np.ndarray:
@@ -119,27 +123,28 @@ def bring_together(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray, n
     return sights, after
 
 
-def fuse_within(sights: list[Sight], step: float, noise: float, outvoted: int, clock: Clock, shaded: bool = True) -> tuple[Shape, str]:
+def fuse_within(sights: list[Sight], step: float, noise: float, outvoted: int, clock: Clock, shaded: bool = True,
+                grow: float = 0.0) -> tuple[Shape, str]:
     """fuse_views at the finest step that the clock has time for, and what was left out for it ("" for nothing).
 
     With an end in sight a draft is made first, which tells how quick the machine is and is the result when nothing finer
     can be done in time.
     """
     if not clock.limited:
-        return fuse_views(sights, step, noise, outvoted, shaded), ""
+        return fuse_views(sights, step, noise, outvoted, shaded, grow), ""
     began = clock.spent()
-    draft = fuse_views(sights, DRAFT * step, noise, outvoted, shaded)
+    draft = fuse_views(sights, DRAFT * step, noise, outvoted, shaded, grow)
     seconds = clock.spent() - began
     for coarser in (1.0, 1.4):
         finer = DRAFT / coarser
         if seconds * (finer**FUSING + AFTER * finer**SURFACE) <= clock.left():
-            return fuse_views(sights, coarser * step, noise, outvoted, shaded), "" if coarser == 1 else f"at {coarser} of its step"
+            return fuse_views(sights, coarser * step, noise, outvoted, shaded, grow), "" if coarser == 1 else f"at {coarser} of its step"
     return draft, f"at {DRAFT:g} of its step"
 
 
-def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 0, shaded: bool = True) -> Shape:
+def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 0, shaded: bool = True, grow: float = 0.0) -> Shape:
     """Mesh of the prepared views. noise: world units by which they disagree; outvoted: see silhouettes_outvoted; shaded:
-    whether their normals are views' own, and not made of their depth.
+    whether their normals are views' own, and not made of their depth; grow: world units by which the surface is moved out.
 
     Raises ValueError when the silhouettes have no common volume.
     """
@@ -151,7 +156,7 @@ def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: i
         values, thin = restore_thin(values, carved, grid, sights)
     if noise:
         values = _smoothed(values, noise / step)
-    vertices, faces = extract(values, grid)
+    vertices, faces = extract(values - np.float32(grow), grid)
     if len(faces) == 0:
         raise ValueError("the silhouettes have no common volume")
     reach = 1.5 * step + noise

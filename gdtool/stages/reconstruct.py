@@ -45,7 +45,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Reconstruct one views folder."""
     from gdtool.fields.appearance import appearance
     from gdtool.fields.align import agreement
-    from gdtool.fields.fusion import BUMPY, align_depth, fuse_within, grid_step, is_closed_manifold, prepare_all, silhouettes_outvoted
+    from gdtool.fields.fusion import BUMPY, SMALL, align_depth, finest_pixel, fuse_within, grid_step, is_closed_manifold, prepare_all, silhouettes_outvoted
     from gdtool.folders.surface import Surface, write_surface
     from gdtool.folders.views import read_views
     from gdtool.geometry.normals import vertex_normals
@@ -77,9 +77,12 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             out.skip("alignment of depth", f"the views agree to {noise / step:.3f} of a grid step")
         if outvoted:
             out.warn(f"the silhouettes contradict one another: up to {outvoted} of {len(sights)} are outvoted at a point")
+    grow = SMALL * finest_pixel(views.cameras) if folder.content.picture else 0.0
+    if not grow:
+        out.skip("growth of the surface", "no model made the views of a picture")
     with out.step("fuse"):
         try:
-            shape, coarser = fuse_within(sights, step, noise, outvoted, clock, normal is not None)
+            shape, coarser = fuse_within(sights, step, noise, outvoted, clock, normal is not None, grow)
         except ValueError as error:
             raise InputError(folder.path, str(error), "check the masks and cameras") from None
     if shape.bumps is None or shape.bumps <= BUMPY:
@@ -101,7 +104,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         _use_fit(fit, vertices, views, look, options, out)
     surface = Surface(vertices, faces, look.albedo, look.roughness, look.metallic, look.confidence, normals, look.light, look.views, look.residual)
     report = {"seen_share": float((shape.support > 0.02).mean()), "pieces_dropped": shape.dropped, "grid_step": shape.step,
-              "disagreement_before": before, "disagreement": noise, "agreement": agreed, "silhouettes_outvoted": outvoted,
+              "disagreement_before": before, "disagreement": noise, "grown": grow, "agreement": agreed, "silhouettes_outvoted": outvoted,
               "mean_confidence": float(look.confidence.mean()), **look.figures, **figures}
     with out.step("write"):
         write_surface(out, surface, watertight=is_closed_manifold(faces), method=options.method, field=fit is not None,
@@ -213,4 +216,4 @@ def _check_masks(path, views, out: Output) -> None:
             out.warn(f"view {name}: its mask is empty; the view is left out")
 
 
-STAGE = Stage(name="reconstruct", version=15, reads=("views",), writes="surface", Options=Options, run=run)
+STAGE = Stage(name="reconstruct", version=16, reads=("views",), writes="surface", Options=Options, run=run)

@@ -183,6 +183,14 @@ def test_bumps_that_the_normals_do_not_show_go(seen, solid):
     assert np.abs(solid(smooth.vertices)).mean() < np.abs(solid(rough.vertices)).mean() + 1e-4
 
 
+@pytest.mark.parametrize("solid", [sphere, torus])
+def test_a_surface_grows_by_as_much_as_it_is_asked_to(seen, solid):
+    sights, step, noise = bumpy(seen, solid.__name__)
+    plain, grown = (fuse_views(sights, step, noise, grow=grow) for grow in (0.0, step / 2))
+    assert np.mean(solid(grown.vertices)) - np.mean(solid(plain.vertices)) == pytest.approx(step / 2, rel=0.15)
+    assert is_closed_manifold(grown.faces)
+
+
 @pytest.mark.parametrize("solid", [sphere, cube, torus])
 def test_a_surface_that_fits_its_normals_hardly_follows_them(seen, solid):
     """What the skip leaves out: a tenth of a grid step at most places."""

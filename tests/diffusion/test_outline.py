@@ -1,0 +1,68 @@
+"""What the picture shows and the guessed outlines leave out: drawn where it is, and nothing where they have room."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_dilation
+
+from gdtool.diffusion.outline import draw_part, grown_masks, lost_part
+from tests.fields.shapes import cube, sphere, torus, views_of
+
+SIZE = 96
+FORWARD = 0.15  # the post stands this far in front of the ball's middle
+
+
+def ball_with_post(points):
+    post = np.maximum(np.hypot(points[..., 0] + 0.1, points[..., 2] - FORWARD) - 0.04, np.abs(points[..., 1] - 0.35) - 0.2)
+    return np.minimum(sphere(points, 0.3), post)
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """The views, and their masks with the post faded out of all but the front and the back one."""
+    cameras, images, mask = views_of(ball_with_post, SIZE)
+    ball = views_of(lambda points: sphere(points, 0.3), SIZE)[2]
+    guessed = np.array([own if camera.name in ("front", "back") else np.minimum(own, np.maximum(without, 0.2))
+                        for camera, own, without in zip(cameras, mask, ball, strict=True)])
+    return cameras, images, mask, guessed
+
+
+@pytest.mark.parametrize("deep", [True, False])
+def test_a_post_that_the_guessed_views_lost_is_put_where_it_stands(seen, deep):
+    cameras, images, mask, guessed = seen
+    front = [camera.name for camera in cameras].index("front")
+    pixel = cameras[0].pixel_size
+    known = np.where(guessed >= 0.5, guessed, 0)
+    part = lost_part(guessed, known, cameras, front, images["depth"][front] if deep else None)
+    assert np.abs(part.middle - (2 - FORWARD))[part.lost].mean() < pixel
+    grown = grown_masks(part, known, cameras, front)
+    for k in range(len(cameras)):
+        post = (mask[k] > 0.5) & (known[k] <= 0.5)
+        assert (grown[k] >= known[k]).all()
+        if k != front and post.any():
+            assert (grown[k] > 0.5)[post].mean() > 0.7  # but for a rim of half a pixel
+            beyond = (grown[k] > 0.5) & ~binary_dilation(mask[k] > 0.5, np.ones((3, 3)))
+            assert beyond.sum() < 8  # where it joins the ball
+
+
+def test_every_view_shows_the_part_as_the_known_one_has_it(seen):
+    cameras, images, mask, guessed = seen
+    names = [camera.name for camera in cameras]
+    front, right = names.index("front"), names.index("right")
+    known = np.where(guessed >= 0.5, guessed, 0)
+    wrong = {domain: np.where((known > 0.5).reshape(known.shape + (1,) * (x.ndim - 3)), x, 0) for domain, x in images.items()}
+    part = lost_part(guessed, known, cameras, front, images["depth"][front])
+    draw_part(part, wrong, known, cameras, front)
+    post = (mask[right] > 0.9) & (known[right] <= 0.5) & (grown_masks(part, known, cameras, front)[right] > 0.5)
+    off = wrong["depth"][right] - images["depth"][right]
+    assert post.sum() > 40 and np.abs(off[post]).mean() < 2 * cameras[0].pixel_size
+    cosine = (wrong["normal"][right] * images["normal"][right]).sum(-1)[post]
+    assert np.median(cosine) > 0.7 and (wrong["normal"][right] @ cameras[right].backward)[post].min() > 0
+    np.testing.assert_allclose(np.linalg.norm(wrong["normal"][right][post], axis=-1), 1, atol=1e-5)
+    assert np.abs(wrong["albedo"][right] - images["albedo"][right])[post].mean() < 0.1
+
+
+@pytest.mark.parametrize("solid", [sphere, cube, torus, ball_with_post])
+def test_views_that_have_room_for_all_of_the_picture_are_left_alone(solid):
+    cameras, images, mask = views_of(solid, 64)
+    front = [camera.name for camera in cameras].index("front")
+    assert lost_part(mask, mask, cameras, front, images["depth"][front]) is None
