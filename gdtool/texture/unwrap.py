@@ -59,8 +59,8 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
         flat, more = flatten_all(unit, faces, label, request.good_stretch, request.max_stretch)
         failed.append(f"flattening: {failure}; charts by the side they look at")
     failed += more
-    flat = _cut_to_pack(Adjacency(unit, faces), flat, request.padding / request.size)
-    places, _ = pack([(uv, triangles) for _, _, uv, triangles in flat], request.padding / request.size)
+    flat, ways = _cut_to_pack(Adjacency(unit, faces), flat, request.padding / request.size)
+    places, _ = pack([(uv, triangles) for _, _, uv, triangles in flat], request.padding / request.size, ways)
     face_uvs = np.full(faces.shape, -1, np.int64)
     chart = np.zeros(len(faces), np.int64)
     offset = 0
@@ -72,18 +72,19 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
     return Unwrapped(np.clip(np.stack([uv[:, 0], 1 - uv[:, 1]], -1), 0, 1), face_uvs.astype(np.int32), chart, failed)
 
 
-def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float) -> list:
-    """The charts, cut further where that fills the square better; rings into arcs where it stays badly filled."""
-    best, share, seen = flat, 0.0, {len(flat)}
+def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float) -> tuple[list, list]:
+    """The charts, cut further where that fills the square better, rings into arcs where it stays badly filled, and the ways
+    to pack them that were found on the way."""
+    best, share, seen, ways = flat, 0.0, {len(flat)}, []
     for more, rings in ((_MORE_CHARTS, False), (_MORE_OF_RINGS, True)):
         if share > _WELL_PACKED:
             break
         other = cut_to_pack(adjacency, flat, min(len(flat) + more, _MOST_CUT), rings)
         if len(other) not in seen:
             seen.add(len(other))
-            chosen, share = best_packed([[(uv, triangles) for _, _, uv, triangles in one] for one in (best, other)], gap)
+            chosen, share, ways = best_packed([[(uv, triangles) for _, _, uv, triangles in one] for one in (best, other)], gap)
             best = (best, other)[chosen]
-    return best
+    return best, ways
 
 
 def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good_stretch: float, max_stretch: float,

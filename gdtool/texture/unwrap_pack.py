@@ -190,10 +190,10 @@ def _runs(mask: np.ndarray, stride: int) -> list[tuple[int, int, int]]:
     return list(zip(level.tolist(), one.tolist(), (one + length - (1 << level)).tolist(), strict=True))
 
 
-def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float) -> tuple[int, float]:
-    """Which of several ways to cut one surface into charts packs best, by a short search, and the share of the square that it
-    fills (0, 0 where none can be told); each later one has to gain more than the seams it adds are worth, _GAIN of the
-    square and _GAIN_PER_CHART for each chart."""
+def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float) -> tuple[int, float, list[tuple[list[int], float]]]:
+    """Which of several ways to cut one surface into charts packs best, by a short search, the share of the square that it
+    fills (0, 0 where none can be told), and the orders and weights of contact to pack it in; each later one has to gain more
+    than the seams it adds are worth, _GAIN of the square and _GAIN_PER_CHART for each chart."""
     drafts = {}
     for i, charts in enumerate(variants):
         if 1 < len(charts) <= _MOST_BY_RASTER:
@@ -202,7 +202,7 @@ def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float)
                 drafts[i] = boxed, area, ranked
     # So coarse a grid takes more room the more charts there are: what comes near is told apart on the finer one.
     smallest = min((ranked[0][0] for _, _, ranked in drafts.values()), default=0)
-    best, best_share = 0, 0.0
+    best, best_share, best_ways = 0, 0.0, []
     for i, (boxed, area, ranked) in drafts.items():
         if ranked[0][0] > _NEAR_BEST * smallest:
             continue
@@ -211,8 +211,8 @@ def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float)
         share = _DENSITY * (_COARSE / ranked[0][0]) ** 2 if ranked else 0.0
         more = len(variants[i]) - len(variants[best])
         if share > best_share + (_GAIN + _GAIN_PER_CHART * more if best_share else 0.0):
-            best, best_share = i, share
-    return best, best_share
+            best, best_share, best_ways = i, share, ways
+    return best, best_share, best_ways
 
 
 def _boxed(charts: list) -> tuple[list, float]:
@@ -222,12 +222,12 @@ def _boxed(charts: list) -> tuple[list, float]:
     return boxed, max(area, 1e-300)
 
 
-def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float) -> tuple[list[np.ndarray], float]:
+def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, ways: list[tuple[list[int], float]] | None = None) -> tuple[list[np.ndarray], float]:
     """Places for charts: their uv (v, 2) in [0, 1], v up, all at one scale, and that scale (uv per unit of surface).
 
     charts: uv at the scale of the surface and triangles of each. gap: smallest distance between charts, and half of it
     to the border, in uv. Several orders and weights are tried on a coarse grid, the best of them tightened on a fine one; the
-    charts keep their resolution, what is sought is the smallest square that holds them.
+    charts keep their resolution, what is sought is the smallest square that holds them. ways: best_packed's, to start from.
     """
     boxed, area = _boxed(charts)
     if len(charts) == 1:
@@ -238,29 +238,30 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float) -> tuple[list[
     coarse = _COARSE_OF_MANY if len(charts) > _MANY else _COARSE
     tries = max(_TRIES // len(charts), 8)
     for lowest, tried in ((0.45, tries), (0.3, tries), (0.12, 0)):
-        ranked = _search(boxed, area, gap, coarse, tried, lowest)
+        ranked = _search(boxed, area, gap, coarse, tried, lowest, ways)
         if ranked:
             break
     else:
         return _shelves(boxed, gap)
-    best, best_scale = None, 0.0
+    best, best_scale, cells = None, 0.0, (_DENSITY / area) ** 0.5 * coarse
+    most = _FINER * max(side for side, *_ in ranked[:_SETTLED])
+    fine = [_turned(uv, triangles, _FINER * cells, gap * most) for uv, triangles in boxed]
     for side, _, _, layout in ranked[:_SETTLED]:
-        places, scale = _settled(boxed, (_DENSITY / area) ** 0.5 * coarse, side, layout, gap)
+        places, scale = _settled(boxed, cells, side, layout, fine, most)
         if scale > best_scale:
             best, best_scale = places, scale
     return best, best_scale
 
 
-def _settled(boxed: list, cells_per_unit: float, side: int, layout: list[tuple[int, np.ndarray]], gap: float) -> tuple[list[np.ndarray], float]:
+def _settled(boxed: list, cells_per_unit: float, side: int, layout: list[tuple[int, np.ndarray]], fine: list,
+             most: int) -> tuple[list[np.ndarray], float]:
     """A layout of a coarse grid (turn, and where its first vertex is, of each chart) tightened on a grid _FINER times as fine:
     every chart goes up and to the left as far as the others let it, again and again, then the square is cut to what is
-    used. As pack() returns it."""
-    fine, most = cells_per_unit * _FINER, side * _FINER
+    used. As pack() returns it. fine: the charts _turned() on that grid, for a square of at most so many of its cells."""
     stride = most + 1
     bits, shapes, uvs, place = [], [], [], []
     taken = 0
-    for (uv, triangles), (turn, first) in zip(boxed, layout, strict=True):
-        masks, at = _turned(uv, triangles, fine, gap * most)
+    for (masks, at), (turn, first) in zip(fine, layout, strict=True):
         own, (h, w) = _bits(masks[turn], stride), masks[turn].shape
         x, y = np.rint(first * _FINER - at[turn][0]).astype(int).tolist()
         # Rounded to cells it may touch another or the square's border: then it stands beside.
@@ -294,7 +295,7 @@ def _settled(boxed: list, cells_per_unit: float, side: int, layout: list[tuple[i
         if still and turn:
             break
     used = max(max(x + w, y + h) for (x, y), (h, w) in zip(place, shapes, strict=True))
-    return [(uv + at) / used for uv, at in zip(uvs, place, strict=True)], fine / used
+    return [(uv + at) / used for uv, at in zip(uvs, place, strict=True)], cells_per_unit * _FINER / used
 
 
 def _first_ways(boxed: list) -> list[tuple[list[int], float]]:
