@@ -12,7 +12,8 @@ _COARSE, _COARSE_OF_MANY = 200, 100  # cells of the square's side in which order
 _FINER, _SETTLED, _ROUNDS = 4, 3, 12  # cells of the fine grid in one of the coarse; layouts that are tightened, by so many rounds
 _NEAR = sorted(((dx, dy) for dx in range(-3, 4) for dy in range(-3, 4)), key=lambda d: d[0] ** 2 + d[1] ** 2)
 _DENSITY = 0.66  # share of a square of so many cells that the charts would fill
-_MOST_BY_RASTER = 160
+_MOST_BY_SEARCH, _MOST_BY_RASTER = 160, 1500  # charts for which orders are searched, and that go by raster at all
+_CLOSE = 0.01  # of the side, to which the square of so many is found
 _MANY = 48  # with more charts than these a coarser grid bounds the time
 _GAIN, _GAIN_PER_CHART = 0.02, 0.002
 _TRIES = 1000  # charts placed in search of better orders
@@ -196,7 +197,7 @@ def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float)
     than the seams it adds are worth, _GAIN of the square and _GAIN_PER_CHART for each chart."""
     drafts = {}
     for i, charts in enumerate(variants):
-        if 1 < len(charts) <= _MOST_BY_RASTER:
+        if 1 < len(charts) <= _MOST_BY_SEARCH:
             boxed, area = _boxed(charts)
             if ranked := _search(boxed, area, gap, _COARSE_OF_MANY, 0, _LEAST):
                 drafts[i] = boxed, area, ranked
@@ -237,11 +238,13 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, ways: list[tup
         return _shelves(boxed, gap)
     coarse = _COARSE_OF_MANY if len(charts) > _MANY else _COARSE
     tries = max(_TRIES // len(charts), 8)
-    for lowest, tried in ((0.45, tries), (0.3, tries), (0.12, 0)):
-        ranked = _search(boxed, area, gap, coarse, tried, lowest, ways)
-        if ranked:
-            break
+    if len(charts) > _MOST_BY_SEARCH:
+        coarse = _COARSE
+        ranked = _bisected(boxed, area, gap, coarse)
     else:
+        ranked = next(filter(None, (_search(boxed, area, gap, coarse, tried, lowest, ways)
+                                    for lowest, tried in ((0.45, tries), (0.3, tries), (0.12, 0)))), [])
+    if not ranked:
         return _shelves(boxed, gap)
     best, best_scale, cells = None, 0.0, (_DENSITY / area) ** 0.5 * coarse
     most = _FINER * max(side for side, *_ in ranked[:_SETTLED])
@@ -337,6 +340,8 @@ def _search(boxed: list, area: float, gap: float, cells: int, tries: int, lowest
             side += 0 if found is not None else max(int((0.04 if lowest > 0.2 else 0.12) * cells), 1)
         if found is not None:
             shrunk(order, contact, side, found)
+    if not ranked:
+        return []
     rng = np.random.default_rng(0)  # the same for each mesh: results do not depend on chance
     for _ in range(tries):
         side, order, contact, _ = ranked[0]
@@ -350,6 +355,23 @@ def _search(boxed: list, area: float, gap: float, cells: int, tries: int, lowest
             shrunk(order, contact, side - 1, found)
     return [(side, order, contact, [(turn, shapes.uv[i][turn][0] + [x, y]) for i, (turn, x, y) in enumerate(found)])
             for side, order, contact, found in ranked]
+
+
+def _bisected(boxed: list, area: float, gap: float, cells: int, lowest: float = 0.25, highest: float = 0.8) -> list[tuple[int, list[int], float, list]]:
+    """As _search(), of one order only, the largest first, in squares that are filled to a share between lowest and highest."""
+    least, most = (int(cells * (_DENSITY / share) ** 0.5) for share in (highest, lowest))
+    shapes = _Shapes(boxed, cells * (_DENSITY / area) ** 0.5, gap * most, most)
+    (order, contact), layout = _first_ways(boxed)[0], None
+    while layout is None or most - least > _CLOSE * cells:
+        side = (least + most) // 2
+        found = shapes.place(order, side, contact)
+        if found is not None:
+            most, layout = side, found
+        elif side < most:
+            least = side + 1
+        else:
+            return []
+    return [(most, order, contact, [(turn, shapes.uv[i][turn][0] + [x, y]) for i, (turn, x, y) in enumerate(layout)])]
 
 
 def _shelves(boxed: list, gap: float) -> tuple[list[np.ndarray], float]:

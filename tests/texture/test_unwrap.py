@@ -144,8 +144,21 @@ def test_the_tips_of_slivers_stay_clear_of_the_others():
 
 def test_thousands_of_charts_go_on_shelves():
     triangle, faces = np.array([[0, 0], [1, 0], [0, 1.0]]), np.array([[0, 1, 2]])
-    places, _ = pack([(triangle, faces)] * 1000, 0.004)
+    places, _ = pack([(triangle, faces)] * 2000, 0.002)
     assert min(uv.min() for uv in places) >= 0 and max(uv.max() for uv in places) <= 1
+
+
+def test_hundreds_of_charts_fill_the_square_better_than_shelves_do():
+    """Triangles of all sizes, whose bounding rectangles are half empty."""
+    from gdtool.texture.unwrap_pack import _shelves
+
+    rng = np.random.default_rng(0)
+    charts = [(corners * rng.uniform(0.2, 1), np.array([[0, 1, 2]])) for corners in rng.uniform(0, 1, (200, 1, 3, 2))[:, 0]]
+    charts = [(uv if np.cross(uv[1] - uv[0], uv[2] - uv[0]) > 0 else uv[::-1], t) for uv, t in charts]
+    places, scale = pack(charts, 1 / 512)
+    assert min(uv.min() for uv in places) >= 0 and max(uv.max() for uv in places) <= 1
+    assert (owner_count(np.concatenate(places), np.arange(3 * len(charts)).reshape(-1, 3), 2048) <= 1).all()
+    assert scale**2 > 1.2 * _shelves([(upright_box(uv), t) for uv, t in charts], 1 / 512)[1] ** 2
 
 
 def test_a_rim_that_crosses_by_a_hair_is_found():
