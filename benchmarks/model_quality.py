@@ -90,6 +90,20 @@ def figures(result: Views, truth: Views) -> dict[str, float]:
     return single
 
 
+def on_shared_pixels(results: list[Views], truth: Views) -> list[dict[str, float]]:
+    """Normals' and depth's errors of several results over the same pixels: those that lie on the object in all of them.
+
+    Each result's own figures are taken where it overlaps with the truth; one that leaves out what is hard fares better there.
+    """
+    unseen = [k for k, name in enumerate(truth.names) if name != "front"]
+    order = [[result.names.index(truth.names[k]) for k in unseen] for result in results]
+    mask = np.min([truth.mask[unseen], *(result.mask[places] for result, places in zip(results, order, strict=True))], 0)
+    both = (mask > 0.5) & (truth.mask[unseen] > 0.99)
+    return [{"normal_degrees_shared": normal_degrees(result.images["normal"][places], mask, truth.images["normal"][unseen], mask),
+             "depth_error_shared": float(np.abs(result.images["depth"][places] - truth.images["depth"][unseen])[both].mean()) if both.any() else float("nan")}
+            for result, places in zip(results, order, strict=True)]
+
+
 def decoded(planes: torch.Tensor, config) -> Views:
     """Views of one object from its encoded planes (k, 13, h, w)."""
     indices = tuple(range(6))
@@ -141,16 +155,20 @@ def main() -> None:
         pictures.append(conditions[0].astype(np.float16))
     for number, folder in enumerate(views_folders(arguments.held_out)):
         truth = true_views(folder, config.image_size)
-        rgba = torch.from_numpy(decode_object(folder, config)[1][0])[None]
+        rgba, sampled = torch.from_numpy(decode_object(folder, config)[1][0])[None], []
         for steps in (int(s) for s in arguments.steps.split(",")):
             start = time.perf_counter()
             result = sampled_views(model, rgba, number, steps=steps, scheduler=arguments.scheduler)
+            sampled.append(result)
             name = f"model, {steps} step{'s' * (steps > 1)}"
             seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
             table.setdefault(name, []).append(figures(result, truth))
         if trained:
             nearest = torch.from_numpy(decode_object(trained[nearest_to(rgba[0], pictures)], config)[0])
-            table.setdefault("nearest training object", []).append(figures(decoded(nearest, config), truth))
+            sampled.append(decoded(nearest, config))
+            table.setdefault("nearest training object", []).append(figures(sampled[-1], truth))
+            for rows, shared in zip(table.values(), on_shared_pixels(sampled, truth), strict=False):
+                rows[-1] |= shared
             table.setdefault("mean training object", []).append(figures(decoded(mean, config), truth))
         print(f"{number + 1}: {folder.name}", flush=True)
     count = len(next(iter(table.values())))
