@@ -236,10 +236,9 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, ways: list[tup
         return [boxed[0][0] * scale + gap], scale
     if len(charts) > _MOST_BY_RASTER:
         return _shelves(boxed, gap)
-    coarse = _COARSE_OF_MANY if len(charts) > _MANY else _COARSE
+    coarse = _COARSE_OF_MANY if _MANY < len(charts) <= _MOST_BY_SEARCH else _COARSE
     tries = max(_TRIES // len(charts), 8)
     if len(charts) > _MOST_BY_SEARCH:
-        coarse = _COARSE
         ranked = _bisected(boxed, area, gap, coarse)
     else:
         ranked = next(filter(None, (_search(boxed, area, gap, coarse, tried, lowest, ways)

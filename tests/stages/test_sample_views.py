@@ -64,7 +64,15 @@ def test_a_picture_becomes_six_views_in_six_domains(gdtool, picture, tiny_model,
     assert read_image(views / "normal/back.png").dtype == np.uint16
     assert (views / "contact_sheet.png").is_file()
     # The ball is 39 pixels of the picture wide and 11 of the views: what they were made of is kept four times as fine.
-    assert json.loads((views / MANIFEST).read_text())["content"]["picture"] == "front"
+    record = json.loads((views / MANIFEST).read_text())
+    assert record["content"]["picture"] == "front"
+    skipped = {one["what"] for one in record["skipped"]}
+    assert (record["content"]["report"]["drawn_share"] > 0) != ("parts of the picture in the other views" in skipped)
+    # Views that a model made of a picture: their surface is moved out by a fifth of a pixel.
+    made = gdtool("reconstruct", views)
+    assert made.returncode == 0, made.stderr
+    surface = json.loads((tmp_path / "ball.asset/surface" / MANIFEST).read_text())
+    assert surface["content"]["report"]["grown"] > 0 and "growth of the surface" not in {one["what"] for one in surface["skipped"]}
     kept, shown = read_image(views / "picture.png"), read_image(views / "condition/000.png")
     assert kept.shape == (64, 64, 4)
     assert np.abs(kept[..., 3].reshape(16, 4, 16, 4).mean((1, 3)) - shown[..., 3]).mean() < 8
