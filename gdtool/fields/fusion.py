@@ -162,7 +162,7 @@ def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: i
     reach = 1.5 * step + noise
     support = measured_planes(sights, vertices, vertex_normals(vertices, faces), reach)[2]
     deep = any(s.planes is not None for s in sights)
-    vertices, faces, dropped = drop_debris(vertices, faces, support if deep else np.ones(len(vertices)), step)
+    vertices, faces, dropped = drop_debris(vertices, faces, support if deep else np.ones(len(vertices)), step, hollows=deep and not noise)
     if not noise and not outvoted:
         # A sheet's two sides would both be drawn onto its one measured surface.
         moved = refine(vertices, faces, sights, step, reach=reach)

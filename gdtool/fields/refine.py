@@ -13,6 +13,7 @@ from gdtool.geometry.repair import edges_of
 WAVELENGTH = 36.0  # steps: shorter bumps go where the normals show none
 FOLD_DEGREES = 150.0  # a fold's least angle between the normals of its sides
 _SEEN_FACES = 24  # faces that views measured, enough for a piece to be real
+_HOLLOW_FACES = 12  # and for a hollow, of which they see little through a mouth that the grid closes
 
 
 def measured_planes(sights: list[Sight], vertices: np.ndarray, normals: np.ndarray, reach: float):
@@ -51,7 +52,7 @@ def refine(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: f
         unseen = np.exp(-10.0 * total)
         bending = diags((smoothness + unseen).astype(np.float32))
         energy = (umbrella.T @ bending @ umbrella).tocsr().astype(np.float32)
-        hold = (0.003 + 0.03 * unseen)[:, None].astype(np.float32)
+        hold = (0.003 + 0.2 * unseen)[:, None].astype(np.float32)
 
         def apply(u, matrix=matrix, energy=energy, hold=hold):
             return np.einsum("vij,vj->vi", matrix, u) + energy @ u + hold * u
@@ -201,15 +202,16 @@ def _folded(normals: np.ndarray, beside: np.ndarray) -> np.ndarray:
     return np.einsum("ij,ij->i", normals[beside[:, 0]], normals[beside[:, 1]]) < np.cos(np.radians(FOLD_DEGREES))
 
 
-def drop_debris(vertices: np.ndarray, faces: np.ndarray, support: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, int]:
+def drop_debris(vertices: np.ndarray, faces: np.ndarray, support: np.ndarray, step: float, hollows: bool = False) -> tuple[np.ndarray, np.ndarray, int]:
     """The mesh without inner bubbles and without pieces that are tiny or that no view supports (v,): and how many went.
 
-    The largest piece always stays.
+    The largest piece always stays. hollows: an inner wall that views saw stays too (of views that agree: others see through walls).
     """
     labels, volume = _pieces(vertices, faces)
     held = np.bincount(labels, support[faces].mean(1) > 0.02)
     # Of a plate seen edge-on only the rim has support: a few faces say that it is there.
-    keep = (volume > (2 * step) ** 3) & ((held > 0.2 * np.bincount(labels)) | (held >= _SEEN_FACES))
+    seen = np.where(volume > 0, (held > 0.2 * np.bincount(labels)) | (held >= _SEEN_FACES), hollows & (held >= _HOLLOW_FACES))
+    keep = (np.abs(volume) > (2 * step) ** 3) & seen
     keep[np.argmax(volume)] = True
     vertices, faces, _ = keep_faces(vertices, faces, keep[labels])
     return vertices, faces, int((~keep).sum())

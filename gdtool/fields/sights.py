@@ -202,9 +202,26 @@ class _Shown:
 
 
 def with_edge(sight: Sight, edge: float) -> Sight:
-    """The view with its silhouette grown all around by edge (world units at the origin's distance; negative shrinks it)."""
+    """The view with its silhouette grown all around by edge (world units at the origin's distance; negative shrinks it).
+
+    Pixels that it gains show nothing: that the view before them is free, as far as the nearest pixel's depth, is what they tell.
+    """
+    from scipy.ndimage import distance_transform_edt
+
     foot = float(pixel_footprint(sight.camera, float(np.linalg.norm(sight.camera.position))))
-    return replace(sight, silhouette=(sight.silhouette - edge / foot).astype(np.float32))
+    grown = replace(sight, silhouette=(sight.silhouette - edge / foot).astype(np.float32))
+    if sight.planes is None or edge <= 0 or not (sight.weight > 0).any():
+        return grown
+    gained = (grown.silhouette < 1) & (sight.weight == 0)  # and the pixels around them, between which points are looked up
+    row, column = distance_transform_edt(sight.weight == 0, return_distances=False, return_indices=True)[:, gained]
+    depth = np.zeros(sight.mask.shape)
+    depth[gained] = (sight.points[row, column] - sight.camera.position) @ -sight.camera.backward
+    points, planes, weight = backproject(sight.camera, depth)[gained], sight.planes.copy(), sight.weight.copy()
+    planes[gained] = np.concatenate([np.broadcast_to(sight.camera.backward, points.shape), points @ sight.camera.backward[:, None]], -1)
+    weight[gained] = _FAINT
+    places = sight.points.copy()
+    places[gained] = points
+    return replace(grown, planes=planes, weight=weight, points=places, rough=sight.rough | gained)
 
 
 def hull_distance(sight: Sight, points: np.ndarray) -> np.ndarray:

@@ -216,4 +216,4 @@ def _check_masks(path, views, out: Output) -> None:
             out.warn(f"view {name}: its mask is empty; the view is left out")
 
 
-STAGE = Stage(name="reconstruct", version=16, reads=("views",), writes="surface", Options=Options, run=run)
+STAGE = Stage(name="reconstruct", version=17, reads=("views",), writes="surface", Options=Options, run=run)

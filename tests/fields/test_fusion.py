@@ -7,8 +7,8 @@ from gdtool.cameras import rig
 from gdtool.fields.align import Corrections, agreement, corrections, disagreement, normals_fit_depth, slope_rows
 from gdtool.fields.carve import silhouettes_outvoted
 from gdtool.fields.fusion import BUMPY, align_depth, depth_for, folds, fuse_views, grid_step, is_closed_manifold, prepare_all
-from gdtool.fields.refine import _inside_silhouettes, bumpiness, follow_normals
-from gdtool.fields.sights import free_distance, hull_distance, prepare, silhouette_distance
+from gdtool.fields.refine import _inside_silhouettes, bumpiness, drop_debris, follow_normals
+from gdtool.fields.sights import free_distance, hull_distance, prepare, silhouette_distance, with_edge
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import components, signed_volume
 from gdtool.geometry.metrics import inside
@@ -220,6 +220,38 @@ def test_a_thin_wall_that_two_views_turn_inside_out_has_no_hole():
     shape = fuse_views(sights, step, noise)
     assert is_closed_manifold(shape.faces) and components(shape.faces, len(shape.vertices)).max() == 0
     assert euler_number(shape.faces) == 2
+
+
+def test_what_a_grown_silhouette_gains_is_free_as_far_as_beside_it(seen):
+    cameras, images, mask = seen["cube"]
+    pixel, edge = cameras[0].pixel_size, 2 * cameras[0].pixel_size
+    small = np.zeros_like(mask[0])
+    small[4:-4, 4:-4] = mask[0][4:-4, 4:-4] * (np.hypot(*(np.indices(small.shape[:2])[:, 4:-4, 4:-4] - SIZE / 2 + 0.5)) < 0.3 / pixel)
+    sight = prepare(cameras[0], small, np.where(small > 0, images["depth"][0], 0), images["normal"][0])
+    grown = with_edge(sight, edge)
+    rim, beyond = np.array([[0.3 + pixel, 0, 0.6]]), np.array([[0.3 + 6 * pixel, 0, 0.6]])
+    assert hull_distance(grown, rim) < 0 < hull_distance(sight, rim)
+    assert not np.isfinite(free_distance(sight, rim)[0]) and free_distance(grown, rim)[0] == pytest.approx([0.1], abs=2e-3)
+    assert free_distance(grown, rim)[1] < 1e-3  # a bound: no surface of its own
+    assert not np.isfinite(free_distance(grown, beyond)[0])
+    # Nothing is gained by one that shrinks, and what was seen is seen as before.
+    inner = np.array([[0.1, 0.05, 0.6]])
+    assert np.array_equal(with_edge(sight, -edge).weight, sight.weight)
+    assert free_distance(grown, inner)[0] == free_distance(sight, inner)[0]
+
+
+@pytest.mark.parametrize("seen_vertices, hollows, left", [(40, True, 2), (40, False, 1), (1, True, 1)])
+def test_a_hollow_stays_where_views_see_into_it(seen_vertices, hollows, left):
+    from skimage.measure import marching_cubes
+
+    axis = np.linspace(-0.6, 0.6, 61)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    vertices, faces, _, _ = marching_cubes(np.maximum(sphere(grid), -sphere(grid, 0.2)), 0.0, spacing=(0.02,) * 3)
+    vertices, inner = vertices - 0.6, np.linalg.norm(vertices - 0.6, axis=1) < 0.3
+    support = np.where(inner, 0.0, 1.0)
+    support[np.flatnonzero(inner)[:seen_vertices]] = 1.0
+    vertices, faces, dropped = drop_debris(vertices, faces, support, 0.02, hollows)
+    assert components(faces, len(vertices)).max() + 1 == left and dropped == 2 - left
 
 
 def test_silhouettes_that_were_grown_or_shrunk_are_found_out(seen):
