@@ -81,10 +81,10 @@ def _by_collapse(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[n
         vertices, faces = (np.asarray(x) for x in igl.upsample(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64), 1))
     pieces = components(faces)[0]
     # A collapse that loses pieces is tried again more gently before the mesh is taken as it is.
-    for target in (triangles, 2 * triangles, 4 * triangles):
-        if target >= len(faces):
+    for factor in (1.0, 1.15, 1.3, 1.6, 2.0, 4.0):
+        if factor * triangles >= len(faces):
             break
-        out, out_faces, _, _ = simplify(vertices, faces, target)
+        out, out_faces, _, _ = simplify(vertices, faces, int(factor * triangles), measured=False)
         if components(out_faces)[0] == pieces and is_manifold(out_faces) >= is_manifold(faces):
             vertices, faces = out, out_faces
             break
