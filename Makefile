@@ -99,13 +99,14 @@ docs-check: venv
 # (killed, each goes on where it was), and its measurement, which puts it where the package finds it. Hours on two cores; set OBJECTS,
 # MINUTES, STEPS, FINISH and GEOMETRY. So the bundled model was made, its first step over 64 px views of 3341 objects with a start of 16
 # minutes over 586 of them, its second in two runs (3000 steps, and 1400 at two thirds of the rate) over 1355 objects, its third in five
-# runs (105 minutes, 112 with fewer conditions left out, both over 2397 objects, and 106, 106 and 104 over 4338), its last over these.
+# runs (105 minutes, 112 with fewer conditions left out, both over 2397 objects, and 106, 106 and 104 over 4338), its last in two over
+# these (102 minutes with metal at 0.3, and 98).
 DATA ?= out/model
 OBJECTS ?= 4341
 MINUTES ?= 100
 STEPS ?= 4400
 FINISH ?= 533
-GEOMETRY ?= 102
+GEOMETRY ?= 200
 RENDER := $(BIN)/gdtool render-dataset --size 128 --light-samples 4 --domains color,normal,depth,albedo,roughness,metallic --condition-views 3
 
 data: venv

@@ -69,10 +69,14 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
     record = Record()
     start = time.perf_counter()
     edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
+    def prepare_engines() -> None:
+        if request.engine != "split":
+            prepare("gdtool.geometry.quad_engines", len(_attempts(request.quads, request)[0][2]))
+
     if len(faces) > _needed(request):
         prepare("gdtool.geometry.simplify")
-    if request.engine != "split":
-        prepare("gdtool.geometry.quad_engines", len(_attempts(request.quads, request)[0][2]))
+    else:
+        prepare_engines()
     closed = cache(lambda: repair.is_watertight(faces))
     fine_vertices, fine_faces = vertices, faces
     if request.restore_creases and request.crease_degrees > 0 and _median_edge(vertices, faces) < 0.75 * edge:
@@ -82,7 +86,12 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
     # While a child has one core, this process uses another: the search tree of the input, then the deviation from it. The
     # tree is built only once the child has its mesh: building it holds the interpreter's lock.
     fine = cache(lambda: Surface(vertices, faces))
-    coarse = _simplified(vertices, faces, fine_vertices, fine_faces, closed, request, record, fine)
+
+    def meanwhile() -> None:
+        prepare_engines()  # not before: their start would slow what this process does alone
+        fine()
+
+    coarse = _simplified(vertices, faces, fine_vertices, fine_faces, closed, request, record, meanwhile)
     with ThreadPoolExecutor(1) as beside:
         error = beside.submit(_deviation, fine(), coarse) if coarse[1] is not faces else None
         done, names = [], []
