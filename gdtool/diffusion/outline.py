@@ -105,11 +105,13 @@ def draw_part(part: Part, images: dict[str, np.ndarray], mask: np.ndarray, camer
         if k != known and "depth" in images:
             put |= images["depth"][k][row, column] > depth
         row, column, depth, normal, source = row[put], column[put], depth[put], normal[put], source[put]
+        fresh = mask[k][row, column] <= 0.5
         for domain, image in images.items():
             if domain == "depth":
                 image[k][row, column] = depth
             elif k != known:
-                image[k][row, column] = normal if domain == "normal" else own[domain][part.row[source], part.column[source]]
+                drawn = normal if domain == "normal" else own[domain][part.row[source], part.column[source]]
+                image[k][row[fresh], column[fresh]] = drawn[fresh]
 
 
 def _shown(part: Part, shape: tuple[int, int], cameras: list[Camera], known: int, k: int) -> tuple[np.ndarray, ...]:

@@ -51,7 +51,11 @@ def test_every_view_shows_the_part_as_the_known_one_has_it(seen):
     known = np.where(guessed >= 0.5, guessed, 0)
     wrong = {domain: np.where((known > 0.5).reshape(known.shape + (1,) * (x.ndim - 3)), x, 0) for domain, x in images.items()}
     part = lost_part(guessed, known, cameras, front, images["depth"][front])
+    before = {domain: x.copy() for domain, x in wrong.items()}
     draw_part(part, wrong, known, cameras, front)
+    for domain in set(wrong) - {"depth"}:
+        shown = known > 0.5
+        np.testing.assert_array_equal(wrong[domain][shown], before[domain][shown])
     post = (mask[right] > 0.9) & (known[right] <= 0.5) & (grown_masks(part, known, cameras, front)[right] > 0.5)
     off = wrong["depth"][right] - images["depth"][right]
     assert post.sum() > 40 and np.abs(off[post]).mean() < 2 * cameras[0].pixel_size
