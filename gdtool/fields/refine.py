@@ -41,7 +41,7 @@ def refine(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: f
            smoothness: float = 0.2, iterations: int = 40) -> np.ndarray:
     """New positions (v, 3): least squares of distances to the measured planes and of the umbrella Laplacian.
 
-    Seen vertices follow the planes; unseen ones minimise bending, held loosely where the carving put them and inside
+    Seen vertices follow the planes; unseen ones minimise bending, held where the carving put them and inside
     the silhouettes.
     """
     from scipy.sparse import diags

@@ -69,6 +69,7 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
     record = Record()
     start = time.perf_counter()
     edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
+
     def prepare_engines() -> None:
         if request.engine != "split":
             prepare("gdtool.geometry.quad_engines", len(_attempts(request.quads, request)[0][2]))
