@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,13 +11,13 @@ from gdtool.core.child import ChildFailed, call, prepare
 from gdtool.folders.mesh import triangulated
 from gdtool.texture.raster import owner_count
 from gdtool.texture.unwrap_charts import Adjacency, bisect, find_charts, own_corners
-from gdtool.texture.unwrap_cut import cut_to_pack
-from gdtool.texture.unwrap_flatten import flatten, singular_values, stretch
+from gdtool.texture.unwrap_cut import connected, cut_to_pack, part_of
+from gdtool.texture.unwrap_flatten import Flat, flatten, singular_values, stretch
 from gdtool.texture.unwrap_join import joined, joined_stretch
-from gdtool.texture.unwrap_pack import best_packed, pack
+from gdtool.texture.unwrap_pack import WELL_PACKED, best_packed, pack
+from gdtool.texture.unwrap_peel import onto_neighbours, peel
 
 _MORE_CHARTS, _MORE_OF_RINGS, _MOST_CUT = 12, 23, 40  # charts that cutting for packing adds, where it cuts rings, and ends with, at most
-_WELL_PACKED = 0.62  # of the square by a draft: rings stay whole
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float) -> tuple[list, li
     to pack them that were found on the way."""
     best, share, seen, ways = flat, 0.0, {len(flat)}, []
     for more, rings in ((_MORE_CHARTS, False), (_MORE_OF_RINGS, True)):
-        if share > _WELL_PACKED:
+        if share > WELL_PACKED:
             break
         other = cut_to_pack(adjacency, flat, min(len(flat) + more, _MOST_CUT), rings)
         if len(other) not in seen:
@@ -89,40 +90,55 @@ def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float) -> tuple[list, li
 
 def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good_stretch: float, max_stretch: float,
                 proxy: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[list, list[str]]:
-    """Each chart flat, small ones joined, cut further where it has to be: list of (faces_idx, corners (k, 4), uv (c, 2) v up, triangles).
+    """Each chart flat, small ones joined, those that overlap themselves peeled, cut further where it has to be.
 
-    corners are into uv. proxy, vertices and triangles: a coarse mesh of the surface, on which joining is tried. Without one
-    nothing is joined and charts are laid flat by projection alone, cut until that works.
+    List of (faces_idx, corners (k, 4), uv (c, 2) v up, triangles), corners into uv, and what was cut. proxy, vertices and
+    triangles: a coarse mesh of the surface, on which joining is tried. Without one nothing is joined and charts are laid flat by
+    projection alone, cut until that works.
     """
     from gdtool.texture.unwrap_flatten import _plane
 
     adjacency = Adjacency(vertices, faces)
-    queue = _sets(label if proxy is None else joined(vertices, faces, label, *proxy, good_stretch))[::-1]
-    out, cut = [], {}
-    while queue:
-        faces_idx = queue.pop()
-        parts = _sets(label[faces_idx])
-        points, corners = own_corners(vertices, faces[faces_idx])
-        triangles, _ = triangulated(corners)
-        if proxy is None:
-            uv, reason = _plane(points, triangles), "is not flat"
-        else:
-            uv, reason = flatten(points, triangles.astype(np.int64), good_stretch, max_stretch if len(parts) == 1 else joined_stretch(good_stretch))
-        if uv is None and len(parts) > 1:  # joined on the proxy, and do not lie flat together here
-            queue.extend(faces_idx[part] for part in parts)
-            continue
-        if uv is None and len(faces_idx) == 1:
-            uv = _alone(points, corners[0])
-        if uv is None:
-            cut[reason] = cut.get(reason, 0) + 1
+    charts: list[tuple] = []
+    cut: Counter[str] = Counter()
+
+    def lay(queue: list[np.ndarray], peeling: bool) -> list[np.ndarray]:
+        """Sets of faces laid flat, the last first; what was taken off those that overlapped themselves."""
+        off: list[np.ndarray] = []
+        while queue:
+            faces_idx = queue.pop()
+            parts = _sets(label[faces_idx])
+            points, corners = own_corners(vertices, faces[faces_idx])
+            triangles, face_idx = triangulated(corners)
+            if proxy is None:
+                flat = Flat(_plane(points, triangles), "is not flat")
+            else:
+                flat = flatten(points, triangles.astype(np.int64), good_stretch, max_stretch if len(parts) == 1 else joined_stretch(good_stretch))
+            uv = flat.uv
+            if uv is None and len(parts) > 1:  # joined on the proxy, and do not lie flat together here
+                queue.extend(faces_idx[part] for part in parts)
+                continue
+            if uv is None and len(faces_idx) == 1:
+                uv = _alone(points, corners[0])
+            if uv is not None:
+                charts.append((faces_idx, corners, uv, triangles))
+                continue
+            cut[flat.reason] += 1
+            keep = peel(adjacency, faces_idx, triangles, face_idx, flat) if peeling and flat.on_others is not None else None
+            if keep is not None:
+                largest, *others = sorted(connected(adjacency, faces_idx, keep), key=np.count_nonzero, reverse=True)
+                charts.append(part_of((faces_idx, corners, flat.overlapped, triangles), largest))
+                off += [faces_idx[part] for part in others + connected(adjacency, faces_idx, ~keep)]
+                continue
             half = bisect(adjacency, faces_idx)
             if half.all() or not half.any():
                 half = np.arange(len(faces_idx)) < len(faces_idx) // 2
-            for side in (faces_idx[half], faces_idx[~half]):
-                queue.extend(side[part] for part in _sets(adjacency.pieces(side)))
-            continue
-        out.append((faces_idx, corners, uv, triangles))
-    return out, [f"{count} charts were cut: a chart {reason}" for reason, count in cut.items()]
+            queue.extend(faces_idx[part] for side in (half, ~half) for part in connected(adjacency, faces_idx, side))
+        return off
+
+    off = lay(_sets(label if proxy is None else joined(vertices, faces, label, *proxy, good_stretch))[::-1], peeling=True)
+    lay(onto_neighbours(adjacency, vertices, faces, charts, off, good_stretch), peeling=False)
+    return charts, [f"{count} charts were cut: a chart {reason}" for reason, count in cut.items()]
 
 
 def _sets(label: np.ndarray) -> list[np.ndarray]:

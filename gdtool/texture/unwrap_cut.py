@@ -48,7 +48,7 @@ def cut_to_pack(adjacency: Adjacency, charts: list, most: int, rings: bool) -> l
             out.append(chart)
         else:
             for half in halves:
-                add(_part(chart, half))
+                add(part_of(chart, half))
     return out
 
 
@@ -83,7 +83,7 @@ def _halves(adjacency: Adjacency, chart: tuple, smallest: float, rings: bool) ->
         if cost > (1 - (_WORTH_OF_A_RING if ring else _WORTH)) * whole:
             return None
         half = row < place
-        parts = [part for side in (half, ~half) for part in _pieces(adjacency, faces_idx, side)]
+        parts = [part for side in (half, ~half) for part in connected(adjacency, faces_idx, side)]
         # A line across a ring leaves two arcs on one side: three parts are well, crumbs are not.
         if len(parts) <= 3 and min(area[part].sum() for part in parts) >= smallest:
             return parts
@@ -101,14 +101,15 @@ def _rectangles(spans: np.ndarray) -> np.ndarray:
     return (spans[:quarter] * spans[quarter:]).min(0)
 
 
-def _pieces(adjacency: Adjacency, faces_idx: np.ndarray, side: np.ndarray) -> list[np.ndarray]:
+def connected(adjacency: Adjacency, faces_idx: np.ndarray, side: np.ndarray) -> list[np.ndarray]:
     """The connected parts of a side (k,) of faces (k,), as masks (k,)."""
     number = np.full(len(side), -1)
     number[side] = adjacency.pieces(faces_idx[side])
     return [number == n for n in range(number.max() + 1)]
 
 
-def _part(chart: tuple, half: np.ndarray) -> tuple:
+def part_of(chart: tuple, half: np.ndarray) -> tuple:
+    """A chart (faces_idx, corners, uv, triangles) of some of its faces (k,) bool, which stay where they lie."""
     faces_idx, corners, uv, _ = chart
     used, local = np.unique(corners[half], return_inverse=True)
     local = local.reshape(-1, 4)

@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.repair import edges_of
-from gdtool.texture.raster import owner_count
+from gdtool.texture.raster import owned_texels, owner_count
 
 _SLIM_STEPS = (2, 2, 4, 6, 8)
 _RELIED_GAIN = 1.0  # of a round of steps, in units of what the round before it gained
 
 
-def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, max_stretch: float) -> tuple[np.ndarray | None, str]:
-    """uv (v, 2), v up, at the scale of the surface, of one connected chart; or None and why it has to be cut.
+class Flat(NamedTuple):
+    """uv (v, 2), or None and why the chart has to be cut; where it overlaps itself, `overlapped` (v, 2) shows how, and
+    on_others (t,) which of its triangles do."""
+
+    uv: np.ndarray | None
+    reason: str = ""
+    overlapped: np.ndarray | None = None
+    on_others: np.ndarray | None = None
+
+
+def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, max_stretch: float) -> Flat:
+    """One connected chart laid flat: uv (v, 2), v up, at the scale of the surface, or why it has to be cut.
 
     vertices (v, 3), triangles (t, 3), a manifold with boundary. Least-squares conformal map (Lévy et al. 2002), or Tutte's
     embedding where that folds, then SLIM (Rabinovich et al. 2017) on the symmetric Dirichlet energy until good_stretch.
@@ -21,24 +33,23 @@ def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, ma
     edges = edges_of(triangles)
     border = edges.count == 1
     if not border.any():
-        return None, "closed"
+        return Flat(None, "closed")
     uv = _plane(vertices, triangles)
     if uv is not None and stretch(vertices, triangles, uv) < good_stretch:
-        return uv, ""
+        return Flat(uv)
     uv = _conformal(vertices, triangles, edges.ends[border])
     if uv is None or not _upright(uv, triangles):
         euler = len(vertices) - len(edges.ends) + len(triangles)
         if euler != 1:
-            return None, "folds, and is no disk"
+            return Flat(None, "folds, and is no disk")
         uv = _tutte(vertices, triangles)
         if uv is None or not _upright(uv, triangles):
-            return None, "folds"
+            return Flat(None, "folds")
     uv = _isometric(vertices, triangles, uv, good_stretch, max_stretch)
     if stretch(vertices, triangles, uv) > max_stretch:
-        return None, "stretches"
-    if overlaps(uv, triangles):
-        return None, "overlaps itself"
-    return uv, ""
+        return Flat(None, "stretches")
+    on_others = overlapping(uv, triangles)
+    return Flat(None, "overlaps itself", uv, on_others) if on_others.any() else Flat(uv)
 
 
 def _areas(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -69,7 +80,7 @@ def _plane(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
     x = np.cross([0.0, 1.0, 0.0] if abs(mean[1]) < 0.9 else [1.0, 0.0, 0.0], mean)
     x /= np.linalg.norm(x)
     uv = np.stack([vertices @ x, vertices @ np.cross(mean, x)], -1)
-    if not _upright(uv, triangles) or overlaps(uv, triangles):
+    if not _upright(uv, triangles) or overlapping(uv, triangles).any():
         return None
     return _scaled(vertices, triangles, uv)
 
@@ -166,43 +177,52 @@ def stretch(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> floa
     return float(np.sqrt((weight * (values[use] ** 2).sum(1) / 2).sum() * flat[use].sum() / area[use].sum()))
 
 
-def overlaps(uv: np.ndarray, triangles: np.ndarray) -> bool:
-    """Whether a chart whose triangles are all upright covers a place twice.
+def overlapping(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """(t,) which triangles of a chart, all upright, lie on others of it: none, where it lies flat.
 
-    It does where its rim crosses itself, however little; a grid finer than its triangles finds what winds around twice.
+    Some do where its rim crosses itself, however little; a grid finer than its triangles finds what winds around twice.
     """
+    found = np.zeros(len(triangles), bool)
     extent = float(np.ptp(uv, 0).max())
     if not extent > 0:
-        return True
+        return ~found
     edges = edges_of(triangles)
-    if rim_crosses(uv, edges.ends[edges.count == 1]):
-        return True
+    rim = np.flatnonzero(edges.count[edges.half_edge_idx] == 1)
+    found[edges.half_face[rim[rim_crossings(uv, edges.half_ends[rim])]]] = True
     size = int(np.clip(10 * len(triangles) ** 0.5, 64, 512))
-    return bool((owner_count((uv - uv.min(0)) / extent, triangles, size) > 1).any())
+    at = (uv - uv.min(0)) / extent
+    twice = owner_count(at, triangles, size) > 1
+    if twice.any():
+        for face_idx, row, column in owned_texels(at, triangles, size):
+            found[face_idx[twice[row, column]]] = True
+    return found
 
 
-def rim_crosses(uv: np.ndarray, ends: np.ndarray, at_once: int = 2_000_000) -> bool:
-    """Whether two segments (s, 2) of points (v, 2) that share no end cross. Sweep over u, exact to rounding."""
+def rim_crossings(uv: np.ndarray, ends: np.ndarray, at_once: int = 2_000_000) -> np.ndarray:
+    """(n,) the segments of (s, 2), ends in points uv (v, 2), that cross another with which they share no end.
+
+    Sweep over u, exact to rounding.
+    """
     low, high = uv[ends].min(1), uv[ends].max(1)
     order = np.argsort(low[:, 0], kind="stable")
     ends, low, high = ends[order], low[order], high[order]
     # Each with those behind it in order that begin before it ends.
     number = np.searchsorted(low[:, 0], high[:, 0], "right") - np.arange(len(ends)) - 1
     total = np.cumsum(number)
-    start = 0
+    start, found = 0, []
     while start < len(ends):
         base = total[start - 1] if start else 0
         stop = max(start + 1, int(np.searchsorted(total, base + at_once, "right")))
         one = np.repeat(np.arange(start, stop), number[start:stop])
         two = one + 1 + np.arange(len(one)) - np.repeat(total[start:stop] - number[start:stop] - base, number[start:stop])
         near = (low[one, 1] <= high[two, 1]) & (low[two, 1] <= high[one, 1])
-        one, two = ends[one[near]], ends[two[near]]
-        apart = (one[:, 0] != two[:, 0]) & (one[:, 0] != two[:, 1]) & (one[:, 1] != two[:, 0]) & (one[:, 1] != two[:, 1])
-        a, b, c, d = uv[one[apart, 0]], uv[one[apart, 1]], uv[two[apart, 0]], uv[two[apart, 1]]
-        if ((_side(a, b, c) * _side(a, b, d) < 0) & (_side(c, d, a) * _side(c, d, b) < 0)).any():
-            return True
+        pair = np.stack([one[near], two[near]], -1)
+        at = ends[pair]
+        pair = pair[(at[:, 0, :, None] != at[:, 1, None, :]).all((1, 2))]
+        (a, b), (c, d) = uv[ends[pair[:, 0]]].swapaxes(0, 1), uv[ends[pair[:, 1]]].swapaxes(0, 1)
+        found.append(pair[(_side(a, b, c) * _side(a, b, d) < 0) & (_side(c, d, a) * _side(c, d, b) < 0)])
         start = stop
-    return False
+    return np.unique(order[np.concatenate(found).ravel()]) if found else np.zeros(0, np.int64)
 
 
 def _side(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:

@@ -46,7 +46,7 @@ def joined(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, proxy_ver
         i, j = int(one[k]), int(two[k])
         tried.add((i, j))
         points, triangles = own_corners(proxy_vertices, proxy[(place == i) | (place == j)])
-        if flatten(points, triangles, good_stretch, joined_stretch(good_stretch))[0] is not None:
+        if flatten(points, triangles, good_stretch, joined_stretch(good_stretch)).uv is not None:
             place[place == j] = i
             onto[onto == j] = i
             tried = {pair for pair in tried if i not in pair and j not in pair}

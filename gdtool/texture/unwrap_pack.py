@@ -16,6 +16,7 @@ _MOST_BY_SEARCH, _MOST_BY_RASTER = 160, 1500  # charts for which orders are sear
 _CLOSE = 0.01  # of the side, to which the square of so many is found
 _MANY = 48  # with more charts than these a coarser grid bounds the time
 _GAIN, _GAIN_PER_CHART = 0.02, 0.002
+WELL_PACKED = 0.62  # of the square, by a draft: charts that fill as much stay as they are
 _TRIES = 1000  # charts placed in search of better orders
 _LEAST = 0.3  # share of the square that a way to cut has to fill
 _FINALISTS, _NEAR_BEST = 2, 1.06  # orders by which ways to cut are told apart, where the square's side comes so near to the best
@@ -193,26 +194,28 @@ def _runs(mask: np.ndarray, stride: int) -> list[tuple[int, int, int]]:
 
 def best_packed(variants: list[list[tuple[np.ndarray, np.ndarray]]], gap: float) -> tuple[int, float, list[tuple[list[int], float]]]:
     """Which of several ways to cut one surface into charts packs best, by a short search, the share of the square that it
-    fills (0, 0 where none can be told), and the orders and weights of contact to pack it in; each later one has to gain more
-    than the seams it adds are worth, _GAIN of the square and _GAIN_PER_CHART for each chart."""
-    drafts = {}
+    fills (0, 0 where none can be told), and the orders and weights of contact to pack it in.
+
+    The first that fills WELL_PACKED of the square will do. Else each later one has to gain more than the seams it adds are
+    worth, _GAIN of the square and _GAIN_PER_CHART for each chart.
+    """
+    best, best_side, best_share, best_ways = 0, 0, 0.0, []
     for i, charts in enumerate(variants):
-        if 1 < len(charts) <= _MOST_BY_SEARCH:
-            boxed, area = _boxed(charts)
-            if ranked := _search(boxed, area, gap, _COARSE_OF_MANY, 0, _LEAST):
-                drafts[i] = boxed, area, ranked
-    # So coarse a grid takes more room the more charts there are: what comes near is told apart on the finer one.
-    smallest = min((ranked[0][0] for _, _, ranked in drafts.values()), default=0)
-    best, best_share, best_ways = 0, 0.0, []
-    for i, (boxed, area, ranked) in drafts.items():
-        if ranked[0][0] > _NEAR_BEST * smallest:
+        if not 1 < len(charts) <= _MOST_BY_SEARCH:
             continue
-        ways = [(order, contact) for _, order, contact, _ in ranked[:_FINALISTS]]
+        boxed, area = _boxed(charts)
+        ranked = _search(boxed, area, gap, _COARSE_OF_MANY, 0, _LEAST)
+        # So coarse a grid takes more room the more charts there are: what comes near is told apart on the finer one.
+        if not ranked or best_side and ranked[0][0] > _NEAR_BEST * best_side:
+            continue
+        side, ways = ranked[0][0], [(order, contact) for _, order, contact, _ in ranked[:_FINALISTS]]
         ranked = _search(boxed, area, gap, _COARSE, 0, _LEAST, ways)
         share = _DENSITY * (_COARSE / ranked[0][0]) ** 2 if ranked else 0.0
-        more = len(variants[i]) - len(variants[best])
+        more = len(charts) - len(variants[best])
         if share > best_share + (_GAIN + _GAIN_PER_CHART * more if best_share else 0.0):
-            best, best_share, best_ways = i, share, ways
+            best, best_side, best_share, best_ways = i, side, share, ways
+        if best_share > WELL_PACKED:
+            break
     return best, best_share, best_ways
 
 

@@ -1,0 +1,62 @@
+"""What lies on other parts of its own chart taken off it, and given to the charts around."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.folders.mesh import triangulated
+from gdtool.texture.unwrap_charts import Adjacency, own_corners
+from gdtool.texture.unwrap_flatten import Flat, flatten, overlapping
+from gdtool.texture.unwrap_join import joined_stretch
+
+_MOST = 0.2  # of a chart's area, that is taken off; where more lies on itself the chart is cut
+_NEIGHBOURS = 3  # charts that a piece is offered to
+
+
+def peel(adjacency: Adjacency, faces_idx: np.ndarray, triangles: np.ndarray, face_idx: np.ndarray, flat: Flat) -> np.ndarray | None:
+    """(k,) bool: faces of a chart that lie flat and apart from each other; None where too many would have to go.
+
+    faces_idx (k,); triangles (t, 3); face_idx (t,) the face of each, a place in faces_idx; flat: as flatten() gave it up.
+    Of the faces that lie on others connected sets go, the smallest first, until none does.
+    """
+    on_others = flat.on_others
+    keep, area = np.ones(len(faces_idx), bool), adjacency.area[faces_idx]
+    while on_others.any():
+        faces = np.unique(face_idx[keep[face_idx]][on_others])
+        piece = adjacency.pieces(faces_idx[faces])
+        keep[faces[piece == np.bincount(piece, area[faces]).argmin()]] = False
+        if area[~keep].sum() > _MOST * area.sum() or not keep.any():
+            return None
+        on_others = overlapping(flat.overlapped, triangles[keep[face_idx]])
+    return keep
+
+
+def onto_neighbours(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, charts: list, pieces: list[np.ndarray],
+                    good_stretch: float) -> list[np.ndarray]:
+    """Which of the pieces (lists of faces) lie flat with none of the charts beside them; the others join one, in place.
+
+    charts (faces_idx, corners, uv, triangles), as flatten_all() returns them.
+    """
+    owner = np.full(adjacency.count, -1)
+    for i, chart in enumerate(charts):
+        owner[chart[0]] = i
+    left = []
+    for piece in sorted(pieces, key=len, reverse=True):
+        inside = np.zeros(adjacency.count, bool)
+        inside[piece] = True
+        rows = np.flatnonzero(inside[adjacency.pairs].sum(1) == 1)
+        beside = owner[adjacency.pairs[rows]].max(1)  # the piece itself has no owner yet
+        seam = np.bincount(beside[beside >= 0], adjacency.cost[rows[beside >= 0]], len(charts))
+        for i in np.argsort(-seam, kind="stable")[:_NEIGHBOURS].tolist():
+            if not seam[i]:
+                continue
+            faces_idx = np.concatenate([charts[i][0], piece])
+            points, corners = own_corners(vertices, faces[faces_idx])
+            triangles, _ = triangulated(corners)
+            uv = flatten(points, triangles.astype(np.int64), good_stretch, joined_stretch(good_stretch)).uv
+            if uv is not None:
+                charts[i], owner[piece] = (faces_idx, corners, uv, triangles), i
+                break
+        else:
+            left.append(piece)
+    return left

@@ -1,0 +1,66 @@
+"""Charts that lie on themselves in places lose these places, and the charts around get them."""
+
+import numpy as np
+
+from gdtool.folders.mesh import triangulated
+from gdtool.texture import unwrap
+from gdtool.texture.unwrap_charts import Adjacency
+from gdtool.texture.unwrap_flatten import Flat, overlapping
+from gdtool.texture.unwrap_peel import onto_neighbours, peel
+from tests.texture.test_unwrap_join import GOOD, sheet
+
+
+def spiral(turns, around=120, across=6):
+    """A band of quads that winds around, each turn as high above the last as it is wide: flat, it lies on itself past one."""
+    angle, radius = np.meshgrid(np.linspace(0, 2 * np.pi * turns, around + 1), np.linspace(0.5, 0.6, across + 1))
+    uv = np.stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()], -1)
+    row, column = (x.ravel() for x in np.mgrid[:across, :around])
+    i = row * (around + 1) + column
+    faces = np.stack([i, i + around + 1, i + around + 2, i + 1], -1)
+    return np.concatenate([uv, 0.01 * angle.ravel()[:, None]], 1), faces, uv
+
+
+def test_the_end_that_lies_on_the_beginning_is_taken_off():
+    vertices, faces, uv = spiral(1.05)
+    triangles, face_idx = triangulated(faces)
+    flat = Flat(None, "overlaps itself", uv, overlapping(uv, triangles))
+    assert 0 < flat.on_others.mean() < 0.2
+    keep = peel(Adjacency(vertices, faces), np.arange(len(faces)), triangles, face_idx, flat)
+    # One of the two ends, not both; the rest lies apart.
+    assert 0.9 < keep.mean() < 0.97
+    assert not overlapping(uv, triangles[keep[face_idx]]).any()
+
+
+def test_what_lies_on_itself_by_half_is_not_peeled():
+    vertices, faces, uv = spiral(1.6)
+    triangles, face_idx = triangulated(faces)
+    flat = Flat(None, "overlaps itself", uv, overlapping(uv, triangles))
+    assert peel(Adjacency(vertices, faces), np.arange(len(faces)), triangles, face_idx, flat) is None
+
+
+def test_a_peeled_band_is_two_charts_and_not_many_halves():
+    vertices, faces, _ = spiral(1.05)
+    charts, cut = unwrap.flatten_all(vertices, faces, np.zeros(len(faces), int), GOOD, 1.5, (vertices, triangulated(faces)[0].astype(np.int64)))
+    assert len(charts) == 2 and cut == ["1 charts were cut: a chart overlaps itself"]
+    assert sorted(np.concatenate([chart[0] for chart in charts])) == list(range(len(faces)))
+    for _, _, uv, triangles in charts:
+        assert not overlapping(uv, triangles).any()
+
+
+def test_a_piece_goes_to_the_neighbour_that_it_lies_flat_with():
+    """Beside a dome, along a seam as long, lies the sheet that the piece continues."""
+    vertices, faces = sheet(12)
+    column = np.arange(144) % 12
+    bulge = np.clip(4 - (vertices[:, 0] * 12), 0, None)
+    vertices = vertices + np.stack([0 * bulge, 0 * bulge, 0.08 * bulge * np.sin(np.pi * vertices[:, 1])], -1)
+    piece, dome, flat = (np.flatnonzero(mask) for mask in ((column >= 4) & (column < 6), column < 4, column >= 6))
+
+    def chart(faces_idx):
+        return unwrap.flatten_all(vertices, faces[faces_idx], np.zeros(len(faces_idx), int), GOOD, 1.5,
+                                  (vertices, triangulated(faces[faces_idx])[0].astype(np.int64)))[0][0]
+
+    charts = [(own, *chart(own)[1:]) for own in (dome, flat)]
+    assert onto_neighbours(Adjacency(vertices, faces), vertices, faces, charts, [piece], GOOD) == []
+    assert len(charts[0][0]) == len(dome) and sorted(charts[1][0]) == sorted(np.concatenate([flat, piece]))
+    # With nothing flat beside it, it is left.
+    assert len(onto_neighbours(Adjacency(vertices, faces), vertices, faces, [charts[0]], [piece], 1 + 1e-9)) == 1
