@@ -134,7 +134,9 @@ def _limit_memory(megabytes: int) -> None:
 
     with open("/proc/self/statm") as file:
         now = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    limit = now + megabytes * 2**20
+    limit, most = now + megabytes * 2**20, resource.getrlimit(resource.RLIMIT_AS)[1]
+    if most != resource.RLIM_INFINITY:  # a child's child cannot have more than the child
+        limit = min(limit, most)
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 

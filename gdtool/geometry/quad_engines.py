@@ -6,6 +6,7 @@ Every engine takes vertices (v, 3) in a unit box and faces (f, 3) and returns ve
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse.csgraph  # noqa: F401 - what repair needs, read while a prepared child waits
 
 from gdtool.geometry.repair import compact, edges_of, topology
 

@@ -177,11 +177,12 @@ def collapse_bevels(vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, 
     ends[half.ravel()] = True
     near = np.flatnonzero(ends[columns[0]] | ends[columns[1]] | ends[columns[2]])
     local = dict(zip(near.tolist(), faces[near].tolist(), strict=True))
-    ring: dict[int, set[int]] = {}
+    ring: dict[int, set[int]] = {v: set() for v in np.flatnonzero(ends).tolist()}  # the faces around each end
     for i, face in local.items():
         for v in face:
-            ring.setdefault(v, set()).add(i)
-    places = np.fromiter(ring, np.int64, len(ring))
+            if v in ring:
+                ring[v].add(i)
+    places = np.unique(faces[near])
     position = dict(zip(places.tolist(), vertices[places].tolist(), strict=True))
     became: dict[int, int] = {}
 
@@ -199,9 +200,11 @@ def collapse_bevels(vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, 
         if _squared(position[a], position[b]) > longest * longest:
             continue
         shared = ring[a] & ring[b]
-        around_a = {v for i in ring[a] for v in local[i]}
-        around_b = {v for i in ring[b] for v in local[i]}
-        if len(shared) != 2 or len(around_a & around_b) != 4:
+        if len(shared) != 2:
+            continue
+        around_a = set().union(*map(local.__getitem__, ring[a]))
+        around_b = set().union(*map(local.__getitem__, ring[b]))
+        if len(around_a & around_b) != 4:
             continue
         if _turns(a, b, shared, ring, local, position, tiny):
             if _turns(b, a, shared, ring, local, position, tiny):
@@ -209,7 +212,8 @@ def collapse_bevels(vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, 
             a, b = b, a
         for i in shared:
             for v in local[i]:
-                ring[v].discard(i)
+                if v in ring:
+                    ring[v].discard(i)
             gone.add(i)
         for i in ring[a]:
             local[i] = [b if v == a else v for v in local[i]]
@@ -235,15 +239,15 @@ def _vector_area(p: list[float], q: list[float], r: list[float]) -> tuple[float,
 
 def _turns(a: int, b: int, shared: set[int], ring: dict, local: dict, position: dict, tiny: float) -> bool:
     """Whether moving vertex a to b turns a face over that has an area."""
-    for i in ring[a]:
-        if i in shared:
-            continue
-        face = local[i]
-        x, y, z = _vector_area(*(position[v] for v in face))
+    onto = position[b]
+    for i in ring[a] - shared:
+        one, two, three = local[i]
+        one_at, two_at, three_at = position[one], position[two], position[three]
+        x, y, z = _vector_area(one_at, two_at, three_at)
         before = x * x + y * y + z * z
         if before <= tiny * tiny:
             continue
-        p, q, r = _vector_area(*(position[b if v == a else v] for v in face))
+        p, q, r = _vector_area(onto if one == a else one_at, onto if two == a else two_at, onto if three == a else three_at)
         after = p * p + q * q + r * r
         if x * p + y * q + z * r <= 0.1 * (before * after) ** 0.5:
             return True

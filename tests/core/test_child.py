@@ -24,6 +24,10 @@ def double(array, noise=""):
     return array * 2
 
 
+def ask_for_more():
+    return child.call("tests.core.test_child:double", np.arange(3), seconds=20, memory_mb=10**6)
+
+
 def refuse():
     raise InputError("mesh", "is a bow-tie", "cut it")
 
@@ -95,6 +99,10 @@ def test_our_errors_come_back_as_themselves():
 def test_everything_else_is_a_failure_with_its_reason(name, words, limits):
     with pytest.raises(child.ChildFailed, match=words):
         child.call(f"tests.core.test_child:{name}", **limits)
+
+
+def test_a_childs_child_may_ask_for_more_than_the_child_has():
+    assert child.call("tests.core.test_child:ask_for_more", seconds=30, memory_mb=4000).tolist() == [0, 2, 4]
 
 
 def alive(pid):
