@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from gdtool.cameras import rig
 from gdtool.fields.align import Corrections, agreement, corrections, disagreement, normals_fit_depth, slope_rows
 from gdtool.fields.carve import silhouettes_outvoted
 from gdtool.fields.fusion import BUMPY, align_depth, depth_for, folds, fuse_views, grid_step, is_closed_manifold, prepare_all
-from gdtool.fields.refine import _inside_silhouettes, bumpiness, drop_debris, follow_normals
+from gdtool.fields.refine import _inside_silhouettes, bumpiness, drop_debris, follow_normals, refine
 from gdtool.fields.sights import free_distance, hull_distance, prepare, silhouette_distance, with_edge
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import components, signed_volume
@@ -320,3 +321,12 @@ def test_normals_of_another_surface_are_found_out(seen):
         assert normals_fit_depth(cameras, mask, images["depth"], images["normal"]) > 0.9
     assert normals_fit_depth(cameras, mask, images["depth"], np.roll(images["normal"], 1, -1)) < 0.5
     assert normals_fit_depth(cameras, mask, images["depth"], -images["normal"]) == 0.0
+
+
+def test_what_no_view_sees_stays_where_the_carving_put_it():
+    """A cube that nothing is known of: its corners give way to bending by less than a cell, the rest hardly at all."""
+    cube, cell = trimesh.creation.box((1, 1, 1)), 1 / 32
+    for _ in range(5):
+        cube = cube.subdivide()
+    move = np.linalg.norm(refine(np.asarray(cube.vertices), np.asarray(cube.faces), [], cell, reach=0.1) - cube.vertices, axis=1)
+    assert 0 < move.max() < 0.8 * cell and move.mean() < 0.08 * cell

@@ -5,7 +5,7 @@ import pytest
 
 from gdtool.core.child import ChildFailed
 from gdtool.folders.mesh import triangulated
-from gdtool.geometry import quad_fit, quads, repair
+from gdtool.geometry import quad_fit, quad_split, quads, repair, simplify
 from gdtool.geometry.features import find_features
 from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, scaled_jacobian, shape_figures, topology_figures
 from gdtool.geometry.quad_split import pair_and_split
@@ -71,6 +71,24 @@ def test_pairing_gives_the_asked_count_exactly():
     for count in (3 * len(faces) - 500, int(2.2 * len(faces))):
         out, found = pair_and_split(vertices, faces, count)
         assert abs(len(found) - count) <= 1 and whole(found) and volume(out, found) > 0
+
+
+def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypatch):
+    """One whose gentler steps keep the small piece: a third more quads than asked for, and not the whole mesh's."""
+    small, large = sphere(8), sphere(24)
+    vertices, faces = joined((small[0] * 0.1 + 3, small[1]), large)
+    tried = []
+
+    def losing(vertices, faces, target, measured):
+        tried.append(target)
+        own = simplify.simplify(*large, target - (len(small[1]) if target > 1000 else 0), measured=False)
+        return (*(joined(small, own[:2]) if target > 1000 else own[:2]), None, {})
+
+    monkeypatch.setattr(quad_split, "simplify", losing)
+    asked = 1800  # 800 triangles, of which 1.15 times as many lose the piece and 1.3 times keep it
+    out, found = quad_split._by_collapse(vertices, faces, asked)
+    assert len(tried) == 3 and repair.components(found)[0] == 2
+    assert asked < len(found) < 1.5 * asked < 1.8 * len(faces)
 
 
 @pytest.mark.parametrize("shape", ["slivers", "coincident"])
