@@ -1,6 +1,6 @@
 """Several processes, started by torchrun: who does which part of a batch, and what they agree on.
 
-    torchrun --nproc_per_node 8 -m gdtool train objects --preset paper --device cuda -o my-model
+    torchrun --nproc_per_node 8 -m -- gdtool train objects --preset paper --device cuda -o my-model
 
 PyTorch's own engine does the work: DistributedDataParallel, or with GDTOOL_SHARD=1 fully_shard (FSDP2), which splits
 weights, gradients and moments. With one process every function here is the identity. The first process alone runs the

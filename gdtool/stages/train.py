@@ -4,7 +4,7 @@ Takes a dataset folder (or any views folders with all six domains) of render-dat
 sample-views: weights, configuration, card, loss curve and validation images. Use it to train the small configuration
 on a processor, to go on from a model you have (--start; with --size, at a larger size), or, with --preset paper, to
 grow Stable Diffusion to six domains. Killed at any time, the same line goes on where it was. Sources may be .tar files of views folders, plain or in
-WebDataset's naming. `torchrun --nproc_per_node N -m gdtool train …` trains in N processes (GDTOOL_SHARD=1 splits the
+WebDataset's naming. `torchrun --nproc_per_node N -m -- gdtool train …` trains in N processes (GDTOOL_SHARD=1 splits the
 weights as well). --plan tells what a configuration costs, without data.
 
 Example:
