@@ -11,6 +11,7 @@ from gdtool.texture.unwrap_join import joined_stretch
 
 _MOST = 0.2  # of a chart's area, that is taken off; where more lies on itself the chart is cut
 _NEIGHBOURS = 3  # charts that a piece is offered to
+_WORK = 3  # faces that are laid flat again for that, in all, in units of the mesh's
 
 
 def peel(adjacency: Adjacency, faces_idx: np.ndarray, triangles: np.ndarray, face_idx: np.ndarray, flat: Flat) -> np.ndarray | None:
@@ -40,7 +41,7 @@ def onto_neighbours(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarra
     owner = np.full(adjacency.count, -1)
     for i, chart in enumerate(charts):
         owner[chart[0]] = i
-    left = []
+    left, work = [], 0
     for piece in sorted(pieces, key=len, reverse=True):
         inside = np.zeros(adjacency.count, bool)
         inside[piece] = True
@@ -48,9 +49,10 @@ def onto_neighbours(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarra
         beside = owner[adjacency.pairs[rows]].max(1)  # the piece itself has no owner yet
         seam = np.bincount(beside[beside >= 0], adjacency.cost[rows[beside >= 0]], len(charts))
         for i in np.argsort(-seam, kind="stable")[:_NEIGHBOURS].tolist():
-            if not seam[i]:
+            if not seam[i] or work > _WORK * adjacency.count:
                 continue
             faces_idx = np.concatenate([charts[i][0], piece])
+            work += len(faces_idx)
             points, corners = own_corners(vertices, faces[faces_idx])
             triangles, _ = triangulated(corners)
             uv = flatten(points, triangles.astype(np.int64), good_stretch, joined_stretch(good_stretch)).uv

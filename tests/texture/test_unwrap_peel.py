@@ -47,7 +47,7 @@ def test_a_peeled_band_is_two_charts_and_not_many_halves():
         assert not overlapping(uv, triangles).any()
 
 
-def test_a_piece_goes_to_the_neighbour_that_it_lies_flat_with():
+def test_a_piece_goes_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
     """Beside a dome, along a seam as long, lies the sheet that the piece continues."""
     vertices, faces = sheet(12)
     column = np.arange(144) % 12
@@ -62,5 +62,8 @@ def test_a_piece_goes_to_the_neighbour_that_it_lies_flat_with():
     charts = [(own, *chart(own)[1:]) for own in (dome, flat)]
     assert onto_neighbours(Adjacency(vertices, faces), vertices, faces, charts, [piece], GOOD) == []
     assert len(charts[0][0]) == len(dome) and sorted(charts[1][0]) == sorted(np.concatenate([flat, piece]))
-    # With nothing flat beside it, it is left.
+    # With nothing flat beside it, it is left; so are all once enough has been tried.
     assert len(onto_neighbours(Adjacency(vertices, faces), vertices, faces, [charts[0]], [piece], 1 + 1e-9)) == 1
+    charts = [(own, *chart(own)[1:]) for own in (dome, flat)]
+    monkeypatch.setattr("gdtool.texture.unwrap_peel._WORK", -1)
+    assert len(onto_neighbours(Adjacency(vertices, faces), vertices, faces, charts, [piece], GOOD)) == 1
