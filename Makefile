@@ -96,8 +96,8 @@ docs-check: venv
 
 # A model for the package: training objects, more that come last, and held-out ones at 128 px in $(DATA) (some 100 objects a core-minute), a
 # model of 64 px, the same grown to 128 px and trained on, the same with geometry and metal compared by distance, then twice with normals
-# and depth weighed more, the mean of these two over objects that it has not seen, and the mean of it before and after (killed, each goes on
-# where it was), and its measurement, which puts it where the package finds it. Hours on two cores; set OBJECTS, MINUTES, STEPS, FINISH,
+# and depth weighed more, the mean of these two trained on over objects that are new to it, and the mean of before and after (killed, each
+# goes on where it was), and its measurement, which puts it where the package finds it. Hours on two cores; set OBJECTS, MINUTES, STEPS, FINISH,
 # GEOMETRY, NEW and LAST. So the bundled model was made, its first step over 64 px views of 3341 objects with a start of 16 minutes over 586
 # of them, its second in two runs (3000 steps, and 1400 at two thirds of the rate) over 1355 objects, its third in five runs (105 minutes,
 # 112 with fewer conditions left out, both over 2397 objects, and 106, 106 and 104 over 4338), its fourth over these (102 minutes with metal
