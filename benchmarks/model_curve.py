@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from measure import machine, number, say, table
+from model_mean import STAGE as MEAN
 from model_quality import DEFAULT_MODEL, figures, sampled_views, true_views, views_folders
 
 from gdtool.core.folder import open_folder
@@ -26,8 +27,14 @@ SHOWN = ("color_psnr_frame", "color_ssim_frame", "albedo_psnr_frame", "normal_de
 
 
 def chain(path: Path) -> list[tuple[Path, float]]:
-    """Model folders from the first that was trained from nothing to this one, with the minutes of training up to each."""
+    """Model folders from the first that was trained from nothing to this one, with the minutes of training up to each.
+
+    A mean of models stands for the last of them, which went on from the others.
+    """
     folder = open_folder(path, ("model",), check=False)
+    if folder.manifest.stage == MEAN.name and folder.manifest.inputs:
+        last = chain(Path(path, folder.manifest.inputs[-1].path))
+        return [*last[:-1], (path, last[-1][1])]
     start = next((Path(path, entry.path) for entry in folder.manifest.inputs if entry.role == "start"), None)
     before = chain(start) if start is not None and start.exists() else []
     return [*before, (path, (before[-1][1] if before else 0.0) + float(folder.content.report["training_minutes"]))]

@@ -12,6 +12,9 @@ from gdtool.core.errors import InputError
 WELD_SHARE = 1e-7
 
 
+_FEW = 4000  # keys, below which sorting is quicker than building a sparse matrix
+
+
 @dataclass(frozen=True)
 class Edges:
     """Undirected edges of a mesh of triangles and quads.
@@ -70,7 +73,7 @@ def _counting_order(keys: np.ndarray, width: int) -> np.ndarray:
     """What np.argsort(keys, kind="stable") gives for keys (n,) below width, in linear time: as a sparse matrix' rows."""
     from scipy.sparse import csr_array
 
-    if width > 2**31 - 1 or len(keys) > 2**31 - 1:
+    if len(keys) < _FEW or width > 2**31 - 1 or len(keys) > 2**31 - 1:
         return np.argsort(keys, kind="stable")
     where = keys.astype(np.int32), np.arange(len(keys), dtype=np.int32)
     return csr_array((np.ones(len(keys), bool), where), (width, max(len(keys), 1))).indices

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,12 +9,11 @@ import numpy as np
 from gdtool.core.child import ChildFailed, call, prepare
 from gdtool.folders.mesh import triangulated
 from gdtool.texture.raster import owner_count
-from gdtool.texture.unwrap_charts import Adjacency, bisect, find_charts, own_corners
-from gdtool.texture.unwrap_cut import connected, cut_to_pack, part_of
-from gdtool.texture.unwrap_flatten import Flat, flatten, singular_values, stretch
-from gdtool.texture.unwrap_join import joined, joined_stretch
+from gdtool.texture.unwrap_charts import Adjacency, find_charts
+from gdtool.texture.unwrap_cut import cut_to_pack
+from gdtool.texture.unwrap_flatten import singular_values, stretch
+from gdtool.texture.unwrap_lay import flatten_all
 from gdtool.texture.unwrap_pack import WELL_PACKED, best_packed, pack
-from gdtool.texture.unwrap_peel import onto_neighbours, peel
 
 _MORE_CHARTS, _MORE_OF_RINGS, _MOST_CUT = 12, 23, 40  # charts that cutting for packing adds, where it cuts rings, and ends with, at most
 
@@ -48,13 +46,13 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
 
     vertices (v, 3) finite. Charts are never mirrored and do not overlap; all have one texel density.
     """
-    for module in ("gdtool.geometry.simplify", "gdtool.texture.unwrap_charts", "gdtool.texture.unwrap"):
+    for module in ("gdtool.geometry.simplify", "gdtool.texture.unwrap_charts", "gdtool.texture.unwrap_lay"):
         prepare(module)
     extent = float(np.ptp(vertices[np.unique(faces[faces >= 0])], 0).max())
     unit = (vertices - vertices.mean(0)) / (extent if extent > 0 else 1.0)
     label, proxy, failed = find_charts(unit, faces, seconds=request.seconds, max_cost=request.max_cost)
     try:
-        flat, more = call("gdtool.texture.unwrap:flatten_all", unit, faces, label, request.good_stretch, request.max_stretch, proxy,
+        flat, more = call("gdtool.texture.unwrap_lay:flatten_all", unit, faces, label, request.good_stretch, request.max_stretch, proxy,
                           seconds=request.seconds, memory_mb=8000)
     except ChildFailed as failure:
         flat, more = flatten_all(unit, faces, label, request.good_stretch, request.max_stretch)
@@ -86,74 +84,6 @@ def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float) -> tuple[list, li
             chosen, share, ways = best_packed([[(uv, triangles) for _, _, uv, triangles in one] for one in (best, other)], gap)
             best = (best, other)[chosen]
     return best, ways
-
-
-def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good_stretch: float, max_stretch: float,
-                proxy: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[list, list[str]]:
-    """Each chart flat, small ones joined, those that overlap themselves peeled, cut further where it has to be.
-
-    List of (faces_idx, corners (k, 4), uv (c, 2) v up, triangles), corners into uv, and what was cut. proxy, vertices and
-    triangles: a coarse mesh of the surface, on which joining is tried. Without one nothing is joined and charts are laid flat by
-    projection alone, cut until that works.
-    """
-    from gdtool.texture.unwrap_flatten import _plane
-
-    adjacency = Adjacency(vertices, faces)
-    charts: list[tuple] = []
-    cut: Counter[str] = Counter()
-
-    def lay(queue: list[np.ndarray], peeling: bool) -> list[np.ndarray]:
-        """Sets of faces laid flat, the last first; what was taken off those that overlapped themselves."""
-        off: list[np.ndarray] = []
-        while queue:
-            faces_idx = queue.pop()
-            parts = _sets(label[faces_idx])
-            points, corners = own_corners(vertices, faces[faces_idx])
-            triangles, face_idx = triangulated(corners)
-            if proxy is None:
-                flat = Flat(_plane(points, triangles), "is not flat")
-            else:
-                flat = flatten(points, triangles.astype(np.int64), good_stretch, max_stretch if len(parts) == 1 else joined_stretch(good_stretch))
-            uv = flat.uv
-            if uv is None and len(parts) > 1:  # joined on the proxy, and do not lie flat together here
-                queue.extend(faces_idx[part] for part in parts)
-                continue
-            if uv is None and len(faces_idx) == 1:
-                uv = _alone(points, corners[0])
-            if uv is not None:
-                charts.append((faces_idx, corners, uv, triangles))
-                continue
-            cut[flat.reason] += 1
-            keep = peel(adjacency, faces_idx, triangles, face_idx, flat) if peeling and flat.on_others is not None else None
-            if keep is not None:
-                largest, *others = sorted(connected(adjacency, faces_idx, keep), key=np.count_nonzero, reverse=True)
-                charts.append(part_of((faces_idx, corners, flat.overlapped, triangles), largest))
-                off += [faces_idx[part] for part in others + connected(adjacency, faces_idx, ~keep)]
-                continue
-            half = bisect(adjacency, faces_idx)
-            if half.all() or not half.any():
-                half = np.arange(len(faces_idx)) < len(faces_idx) // 2
-            queue.extend(faces_idx[part] for side in (half, ~half) for part in connected(adjacency, faces_idx, side))
-        return off
-
-    off = lay(_sets(label if proxy is None else joined(vertices, faces, label, *proxy, good_stretch))[::-1], peeling=True)
-    lay(onto_neighbours(adjacency, vertices, faces, charts, off, good_stretch), peeling=False)
-    return charts, [f"{count} charts were cut: a chart {reason}" for reason, count in cut.items()]
-
-
-def _sets(label: np.ndarray) -> list[np.ndarray]:
-    """The places of each label, in the labels' order."""
-    order = np.argsort(label, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
-
-
-def _alone(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """One face on its own that will not lie flat (no area, or folded): a square or right triangle of its size."""
-    used = corners[corners >= 0]
-    size = max(float(np.ptp(points, 0).max()), 1e-6)
-    uv = np.zeros((len(points), 2))
-    uv[used] = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)[:len(used)] * size
-    return uv
 
 
 def figures(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, size: int = 1024) -> dict[str, float | int]:

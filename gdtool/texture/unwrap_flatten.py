@@ -34,7 +34,7 @@ def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, ma
     border = edges.count == 1
     if not border.any():
         return Flat(None, "closed")
-    uv = _plane(vertices, triangles)
+    uv = onto_plane(vertices, triangles)
     if uv is not None and stretch(vertices, triangles, uv) < good_stretch:
         return Flat(uv)
     uv = _conformal(vertices, triangles, edges.ends[border])
@@ -67,7 +67,7 @@ def _scaled(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> np.n
     return (uv - uv.mean(0)) * (total / max(flat, 1e-300)) ** 0.5
 
 
-def _plane(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
+def onto_plane(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
     """The chart seen along its mean normal, when all of it faces that way: exact for flat charts."""
     normals, area = face_normals(vertices, triangles)
     mean = (normals * area[:, None]).sum(0)

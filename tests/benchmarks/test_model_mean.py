@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
+from gdtool.core.folder import open_folder
 from tests.stages.dataset import write_spheres
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "model_mean.py"
@@ -19,9 +20,10 @@ SMALLER = {"channels": [8, 16], "head_width": 8, "encoder_width": 16, "image_siz
 def trained(gdtool, tmp_path):
     spheres = write_spheres(tmp_path / "spheres", size=16)
 
-    def train(name, seed, **changes):
+    def train(name, seed, start=None, **changes):
         (tmp_path / f"{name}.json").write_text(json.dumps({"model": SMALLER | changes}))
-        result = gdtool("train", spheres, "--preset", "tiny", "--threads", 1, "--config", f"{name}.json", "--steps", 2, "--seed", seed, "-o", name)
+        begun = ["--start", start] if start else []
+        result = gdtool("train", spheres, "--preset", "tiny", "--threads", 1, "--config", f"{name}.json", *begun, "--steps", 2, "--seed", seed, "-o", name)
         assert result.returncode == 0, result.stderr
         return tmp_path / name
 
@@ -47,3 +49,18 @@ def test_the_mean_of_two_models_validates(gdtool, trained, tmp_path):
 def test_models_of_other_shapes_are_refused(trained, tmp_path):
     result = mean(trained("one", 1), trained("wide", 1, encoder_width=32), output=tmp_path / "both")
     assert result.returncode != 0 and "other weights" in result.stderr and not (tmp_path / "both").exists()
+
+
+def test_the_curve_of_a_mean_goes_back_over_its_last_model(gdtool, trained, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPT.parent)
+    from model_curve import chain
+
+    one = trained("one", 1)
+    other = trained("other", 2, start=one)
+    assert mean(one, other, output=tmp_path / "both").returncode == 0
+    last = trained("last", 3, start=tmp_path / "both")
+    assert mean(tmp_path / "both", last, output=tmp_path / "final").returncode == 0
+    found = chain(tmp_path / "final")
+    assert [path.resolve().name for path, _ in found] == ["one", "both", "final"]
+    minutes = [float(open_folder(path, ("model",)).content.report["training_minutes"]) for path in (one, other, last)]
+    np.testing.assert_allclose([total for _, total in found], np.cumsum(minutes))

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from gdtool.folders.mesh import triangulated
-from gdtool.texture import unwrap
+from gdtool.texture import unwrap_lay
 from gdtool.texture.unwrap_charts import Adjacency
 from gdtool.texture.unwrap_join import _brought_over, joined
 
@@ -63,8 +63,9 @@ def test_what_lay_flat_together_on_the_proxy_alone_comes_apart_again(monkeypatch
     ball.remove_unreferenced_vertices()
     faces = np.concatenate([ball.faces, np.full((len(ball.faces), 1), -1)], 1)
     label = (ball.triangles_center[:, 2] > 0.985).astype(int)
-    monkeypatch.setattr(unwrap, "joined", lambda *given: np.zeros(len(faces), int))
-    charts, _ = unwrap.flatten_all(ball.vertices, faces, label, GOOD, 1.5, (ball.vertices, ball.faces))
+    monkeypatch.setattr(unwrap_lay, "joined", lambda *given: np.zeros(len(faces), int))
+    monkeypatch.setattr(unwrap_lay, "_WHOLE", np.inf)
+    charts, _ = unwrap_lay.flatten_all(ball.vertices, faces, label, GOOD, 1.5, (ball.vertices, ball.faces))
     owner = np.full(len(faces), -1)
     for i, (faces_idx, _, uv, _) in enumerate(charts):
         owner[faces_idx] = i

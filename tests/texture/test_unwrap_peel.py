@@ -3,7 +3,7 @@
 import numpy as np
 
 from gdtool.folders.mesh import triangulated
-from gdtool.texture import unwrap
+from gdtool.texture import unwrap_lay
 from gdtool.texture.unwrap_charts import Adjacency
 from gdtool.texture.unwrap_flatten import Flat, overlapping
 from gdtool.texture.unwrap_peel import onto_neighbours, peel
@@ -40,7 +40,7 @@ def test_what_lies_on_itself_by_half_is_not_peeled():
 
 def test_a_peeled_band_is_two_charts_and_not_many_halves():
     vertices, faces, _ = spiral(1.05)
-    charts, cut = unwrap.flatten_all(vertices, faces, np.zeros(len(faces), int), GOOD, 1.5, (vertices, triangulated(faces)[0].astype(np.int64)))
+    charts, cut = unwrap_lay.flatten_all(vertices, faces, np.zeros(len(faces), int), GOOD, 1.5, (vertices, triangulated(faces)[0].astype(np.int64)))
     assert len(charts) == 2 and cut == ["1 charts were cut: a chart overlaps itself"]
     assert sorted(np.concatenate([chart[0] for chart in charts])) == list(range(len(faces)))
     for _, _, uv, triangles in charts:
@@ -56,7 +56,7 @@ def test_a_piece_goes_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
     piece, dome, flat = (np.flatnonzero(mask) for mask in ((column >= 4) & (column < 6), column < 4, column >= 6))
 
     def chart(faces_idx):
-        return unwrap.flatten_all(vertices, faces[faces_idx], np.zeros(len(faces_idx), int), GOOD, 1.5,
+        return unwrap_lay.flatten_all(vertices, faces[faces_idx], np.zeros(len(faces_idx), int), GOOD, 1.5,
                                   (vertices, triangulated(faces[faces_idx])[0].astype(np.int64)))[0][0]
 
     charts = [(own, *chart(own)[1:]) for own in (dome, flat)]

@@ -1,0 +1,154 @@
+"""All charts laid flat: small ones joined, those that lie on themselves peeled, cut where that does not help or all of them stretch too much."""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gdtool.folders.mesh import triangulated
+from gdtool.texture.unwrap_charts import Adjacency, bisect, own_corners
+from gdtool.texture.unwrap_cut import connected, part_of
+from gdtool.texture.unwrap_flatten import Flat, flatten, onto_plane, stretch
+from gdtool.texture.unwrap_join import joined, joined_stretch
+from gdtool.texture.unwrap_peel import onto_neighbours, peel
+
+_WHOLE = 1.4  # stretch of all charts together over 1, in units of what is good for one: with more the worst are cut
+_MOST_RELIEVED = 16, 0.5  # charts that are cut for that: so many, and this share of all
+
+
+@dataclass
+class Laid:
+    """charts (faces_idx, corners (k, 4), uv (c, 2) v up, triangles), corners into uv; `off`: sets of faces taken off them;
+    how many were cut for each reason."""
+
+    charts: list[tuple] = field(default_factory=list)
+    off: list[np.ndarray] = field(default_factory=list)
+    cut: Counter = field(default_factory=Counter)
+
+    def add(self, more: Laid) -> None:
+        self.charts += more.charts
+        self.off += more.off
+        self.cut += more.cut
+
+    def reasons(self) -> list[str]:
+        return [f"{count} charts were cut: a chart {reason}" for reason, count in self.cut.items()]
+
+
+def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good_stretch: float, max_stretch: float,
+                proxy: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[list, list[str]]:
+    """Each chart of faces (f, 4), label (f,), laid flat, and what was cut: Laid.charts and a line for each reason.
+
+    proxy, vertices and triangles: a coarse mesh of the surface, on which joining is tried. Without one nothing is joined and
+    charts are laid flat by projection alone, cut until that works.
+    """
+    adjacency = Adjacency(vertices, faces)
+
+    def further(sets: list[np.ndarray], **how: bool) -> Laid:
+        return lay(adjacency, vertices, faces, label, sets, good_stretch, max_stretch, **how)
+
+    if proxy is None:
+        laid = further(_sets(label), projected=True)
+        return laid.charts, laid.reasons()
+    laid = further(_sets(joined(vertices, faces, label, *proxy, good_stretch)), peeling=True)
+    laid.add(further(onto_neighbours(adjacency, vertices, faces, laid.charts, laid.off, good_stretch)))
+    _relieve(adjacency, vertices, faces, laid, further, good_stretch)
+    return laid.charts, laid.reasons()
+
+
+def lay(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, sets: list[np.ndarray], good_stretch: float,
+        max_stretch: float, *, peeling: bool = False, projected: bool = False) -> Laid:
+    """Sets of faces laid flat, cut where they do not lie so; a set of several labels (f,), joined, may stretch less and comes apart first.
+
+    peeling: take off what lies on other parts of a chart, where that is little. projected: by projection alone.
+    """
+    laid, queue = Laid(), sets[::-1]
+    while queue:
+        faces_idx = queue.pop()
+        parts = _sets(label[faces_idx])
+        points, corners = own_corners(vertices, faces[faces_idx])
+        triangles, face_idx = triangulated(corners)
+        if projected:
+            flat = Flat(onto_plane(points, triangles), "is not flat")
+        else:
+            flat = flatten(points, triangles.astype(np.int64), good_stretch, max_stretch if len(parts) == 1 else joined_stretch(good_stretch))
+        uv = flat.uv
+        if uv is None and len(parts) > 1:  # joined on the proxy, and do not lie flat together here
+            queue.extend(faces_idx[part] for part in parts)
+            continue
+        if uv is None and len(faces_idx) == 1:
+            uv = _alone(points, corners[0])
+        if uv is not None:
+            laid.charts.append((faces_idx, corners, uv, triangles))
+            continue
+        laid.cut[flat.reason] += 1
+        keep = peel(adjacency, faces_idx, triangles, face_idx, flat) if peeling and flat.on_others is not None else None
+        if keep is not None:
+            largest, *others = sorted(connected(adjacency, faces_idx, keep), key=np.count_nonzero, reverse=True)
+            laid.charts.append(part_of((faces_idx, corners, flat.overlapped, triangles), largest))
+            laid.off += [faces_idx[part] for part in others + connected(adjacency, faces_idx, ~keep)]
+            continue
+        queue.extend(_halves(adjacency, faces_idx))
+    return laid
+
+
+def _relieve(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, laid: Laid, further: Callable[[list[np.ndarray]], Laid],
+             good_stretch: float) -> None:
+    """The charts that make all of them together stretch too much cut, in place, those that weigh most first; further: lays the parts.
+
+    The square of the whole's stretch is the mean of the charts' squares by area: each is laid at the scale of the surface.
+    """
+    most = _MOST_RELIEVED[0] + int(_MOST_RELIEVED[1] * len(laid.charts))
+    allowed = ((1 + _WHOLE * (good_stretch - 1)) ** 2 - 1) * float(adjacency.area.sum())
+
+    def excess(chart: tuple) -> float:
+        faces_idx, corners, uv, triangles = chart
+        points = np.zeros((len(uv), 3))
+        used = corners >= 0
+        points[corners[used]] = vertices[faces[faces_idx][used]]
+        value = stretch(points, triangles.astype(np.int64), uv) ** 2 - 1
+        return float(adjacency.area[faces_idx].sum()) * value if np.isfinite(value) else 0.0
+
+    queue = [(-excess(chart), i) for i, chart in enumerate(laid.charts)]
+    heapq.heapify(queue)
+    total, gone = -sum(value for value, _ in queue), set()
+    while total > allowed and len(gone) < most and queue:
+        value, worst = heapq.heappop(queue)
+        faces_idx = laid.charts[worst][0]
+        if len(faces_idx) < 2:
+            continue
+        halves = further(_halves(adjacency, faces_idx))
+        added = [(-excess(chart), len(laid.charts) + i) for i, chart in enumerate(halves.charts)]
+        total += value - sum(more for more, _ in added)
+        laid.add(halves)
+        laid.cut["stretches more than most"] += 1
+        gone.add(worst)
+        for one in added:
+            heapq.heappush(queue, one)
+    laid.charts = [chart for i, chart in enumerate(laid.charts) if i not in gone]
+
+
+def _halves(adjacency: Adjacency, faces_idx: np.ndarray) -> list[np.ndarray]:
+    """Two or more connected sets of a chart's faces."""
+    half = bisect(adjacency, faces_idx)
+    if half.all() or not half.any():
+        half = np.arange(len(faces_idx)) < len(faces_idx) // 2
+    return [faces_idx[part] for side in (half, ~half) for part in connected(adjacency, faces_idx, side)]
+
+
+def _sets(label: np.ndarray) -> list[np.ndarray]:
+    """The places of each label, in the labels' order."""
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
+
+
+def _alone(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """One face on its own that will not lie flat (no area, or folded): a square or right triangle of its size."""
+    used = corners[corners >= 0]
+    size = max(float(np.ptp(points, 0).max()), 1e-6)
+    uv = np.zeros((len(points), 2))
+    uv[used] = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)[:len(used)] * size
+    return uv
