@@ -51,6 +51,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     domains: Annotated[tuple[str, ...], Meta(description="what to write")] = ALL
     brdf: Annotated[Literal["gltf", "paper"], Meta(description="reflection model of color and closed_form; gltf is what engines use")] = "gltf"
     normalize: Annotated[bool, Meta(description="centre the bounding box and scale its longest side to 1; see --cameras")] = True
+    turn: Annotated[float, Meta(ge=0, le=180, description="turn the object about the vertical, by its name and --seed, by up to so many degrees either way")] = 0.0
     condition_views: Annotated[int, Meta(ge=0, le=1000, description="pictures from the front at random elevation, projection and scale")] = 0
     filter: Annotated[Literal["all", "complete-pbr"], Meta(description="complete-pbr: refuse a model when more than 5 % of its area lacks a base color or metallic-roughness texture")] = "all"
     seed: Annotated[int, Meta(ge=0, description="seed of everything random, together with the object's name")] = 0
@@ -61,6 +62,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     unknown = sorted(set(options.domains) - set(ALL))
     if unknown:
         raise UsageError("--domains", f"{unknown[0]!r} is no domain", f"choose from {', '.join(ALL)}")
+    if options.turn and inputs.second.get("cameras") is not None:
+        raise UsageError("--turn", "does not go with --cameras, whose folder says how the object stands")
     import numpy as np
 
     from gdtool.assets.load import load_scene
@@ -138,8 +141,8 @@ def _filter(scene: Scene, name: str, options: Options) -> None:
 def _placed(scene: Scene, inputs: Inputs, given: Folder | None, options: Options) -> tuple[Scene, np.ndarray]:
     """The scene in the frame of the views, and source_from_world.
 
-    --no-normalize leaves it where it is. With --cameras it is put where that folder's object was when it comes from the
-    same source, is left when it is an asset or its box is about normalised, and is normalised otherwise.
+    --no-normalize leaves it where it is, --turn turns it first. With --cameras it is put where that folder's object was when
+    it comes from the same source, is left when it is an asset or its box is about normalised, and is normalised otherwise.
     """
     import dataclasses
 
@@ -151,6 +154,8 @@ def _placed(scene: Scene, inputs: Inputs, given: Folder | None, options: Options
     identity = np.eye(4)
     own = unit_box(scene.vertices[np.unique(scene.faces)])
     matrix = own if options.normalize else identity
+    if options.turn:
+        matrix = _turned(scene.vertices[np.unique(scene.faces)], inputs.name, options)
     if given is not None and options.normalize:
         theirs = np.array(given.content.source_from_world).reshape(4, 4)
         before = [entry.digest for entry in given.manifest.inputs if entry.role == "source"]
@@ -164,7 +169,23 @@ def _placed(scene: Scene, inputs: Inputs, given: Folder | None, options: Options
             matrix = identity
     if np.array_equal(matrix, identity):
         return scene, identity
-    return dataclasses.replace(scene, vertices=transform_points(invert_similarity(matrix), scene.vertices)), matrix
+    directions = {}
+    if matrix[:3, :3].astype(bool).sum() > 3:  # turned, and not only scaled
+        rotation = matrix[:3, :3] / (matrix[:3, 0] ** 2).sum() ** 0.5
+        directions = {name: np.concatenate([x[:, :3] @ rotation, x[:, 3:]], 1) for name in ("normals", "tangents") if (x := getattr(scene, name)) is not None}
+    return dataclasses.replace(scene, vertices=transform_points(invert_similarity(matrix), scene.vertices), **directions), matrix
+
+
+def _turned(vertices: np.ndarray, name: str, options: Options) -> np.ndarray:
+    """source_from_world (4, 4) of --turn: y stays where it is."""
+    import numpy as np
+
+    from gdtool.geometry.frames import unit_box
+
+    angle = np.radians(np.random.default_rng([options.seed, _number(name), 1]).uniform(-options.turn, options.turn))
+    source_from_turned = np.eye(4)
+    source_from_turned[[0, 0, 2, 2], [0, 2, 0, 2]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
+    return source_from_turned @ unit_box(vertices @ source_from_turned[:3, :3]) if options.normalize else source_from_turned
 
 
 def _asset_of(source: Any) -> Folder | None:
@@ -264,6 +285,6 @@ def _tell_skips(out: Output, renderer: Renderer, options: Options, lamps: _Lamps
 
 
 STAGE = Stage(
-    name="render-dataset", version=6, reads=("model-file", "asset"), writes="views", Options=Options, run=run, dataset=True,
+    name="render-dataset", version=7, reads=("model-file", "asset"), writes="views", Options=Options, run=run, dataset=True,
     second_inputs={"cameras": SecondInput("views", search=False, help="Views folder whose cameras, frame and light are used again.")},
 )

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from gdtool.core.folder import open_folder
 from gdtool.folders.records import read_cameras
@@ -81,6 +82,44 @@ def test_writes_a_folder_that_validates_with_all_it_should_hold(gdtool, box, tmp
     assert np.allclose(views.images["normal"][2, 16, 16], (1, 0, 0), atol=1e-4)
     assert views.images["depth"][0, 16, 16] == pytest.approx(2 - 1 / 3, abs=1e-5)
     assert (views.images["color"][views.mask > 0] > 0).any()
+
+
+def test_turned_objects_look_as_they_do_from_beside(gdtool, box, tmp_path):
+    """The frame says how far each was turned; their smooth normals turn with them."""
+    ball = trimesh.creation.icosphere(2)
+    ball.apply_scale((1.0, 1.5, 0.5))
+    ball.vertex_normals  # noqa: B018 - written with the file
+    ball.export("ball.glb")
+    for model in (box, "ball.glb"):
+        name = str(model).split("/")[-1].split(".")[0]
+        assert gdtool("render-dataset", model, *FAST, "--turn", "180", "-o", f"{name}-turned").returncode == 0
+        views = read_views(open_folder(tmp_path / f"{name}-turned"))
+        matrix = np.array(manifest(tmp_path / f"{name}-turned")["content"]["source_from_world"]).reshape(4, 4)
+        rotation = matrix[:3, :3] / np.linalg.norm(matrix[:3, 0])
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(rotation[1], (0, 1, 0), atol=1e-12)
+        assert abs(rotation[0, 2]) > 0.1
+        # The same object, turned by hand.
+        mesh = trimesh.load(str(model), force="mesh", process=False)
+        mesh.apply_transform(np.linalg.inv(matrix))
+        if name == "box":
+            mesh.unmerge_vertices()  # flat, as it is there
+        mesh.vertex_normals  # noqa: B018
+        mesh.export(f"{name}-by-hand.glb")
+        assert gdtool("render-dataset", f"{name}-by-hand.glb", *FAST, "--no-normalize", "--domains", "normal,depth", "-o", f"{name}-hand").returncode == 0
+        hand = read_views(open_folder(tmp_path / f"{name}-hand"))
+        both = (views.mask > 0.99) & (hand.mask > 0.99)
+        assert both.sum() > 0.9 * (views.mask > 0.99).sum() > 300
+        np.testing.assert_allclose(views.images["depth"][both], hand.images["depth"][both], atol=2e-3)
+        degrees = np.degrees(np.arccos(np.clip((views.images["normal"][both] * hand.images["normal"][both]).sum(-1), -1, 1)))
+        assert np.median(degrees) < 0.5
+    # Another seed, another angle; what is rendered through its cameras stands as it does.
+    assert gdtool("render-dataset", box, *FAST, "--turn", "180", "--seed", "1", "-o", "other").returncode == 0
+    assert manifest(tmp_path / "other")["content"]["source_from_world"] != manifest(tmp_path / "box-turned")["content"]["source_from_world"]
+    assert gdtool("render-dataset", "ball.glb", *FAST, "--cameras", "ball-turned", "-o", "again").returncode == 0
+    first, again = (read_views(open_folder(tmp_path / name)) for name in ("ball-turned", "again"))
+    np.testing.assert_array_equal(first.images["normal"], again.images["normal"])
+    assert gdtool("render-dataset", "ball.glb", *FAST, "--cameras", "ball-turned", "--turn", "5", "-o", "no").returncode == 2
 
 
 def test_second_run_is_up_to_date_and_same_seed_means_same_files(gdtool, box, tmp_path):
