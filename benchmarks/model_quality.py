@@ -5,6 +5,8 @@ r"""How good a model is on objects it was not trained on, beside two baselines; 
     gdtool render-dataset ../shared/assets/glb/*.glb ../shared/assets/gltf/*/*.gltf $(find ../shared/assets/gso -name '*.obj' | grep -v _col) \
         --size 128 --samples 8 --light-samples 4 --condition-views 3 -o real
     python benchmarks/model_quality.py real --train objects --steps 1 --name model_quality_real -o docs/benchmarks
+    gdtool render-dataset procedural:900000..900099 --turn 45 --size 128 --condition-views 3 -o turned
+    python benchmarks/model_quality.py turned --steps 1 --name model_quality_turned -o docs/benchmarks
 
 --install puts the model, with the table in its card, where the package finds its bundled model.
 
