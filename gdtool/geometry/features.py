@@ -185,6 +185,11 @@ def trace(vertices: np.ndarray, faces: np.ndarray, features: Features, edge: flo
     order = np.argsort(features.curve, kind="stable")
     bounds = np.searchsorted(features.curve[order], np.arange(features.curve.max() + 2))
     taken = fixed.copy()
+    # Curves are many and short: of each, only what is near is looked at.
+    by_x = np.argsort(vertices[:, 0], kind="stable")
+    sorted_x = vertices[by_x, 0]
+    begin = np.searchsorted(ends[:, 0], np.arange(count + 1))
+    allowed, number = np.full(count, np.inf), np.full(count, -1)
     for curve in range(len(bounds) - 1):
         segments = features.segments[order[bounds[curve]:bounds[curve + 1]]]
         stations = _stations(segments, features, at_corner, tree, taken, edge)
@@ -192,18 +197,22 @@ def trace(vertices: np.ndarray, faces: np.ndarray, features: Features, edge: flo
             continue
         local_points = features.points[segments]
         low, high = local_points.min((0, 1)) - 1.5 * edge, local_points.max((0, 1)) + 1.5 * edge
-        near = np.flatnonzero(((vertices >= low) & (vertices <= high)).all(1))
+        slab = np.sort(by_x[np.searchsorted(sorted_x, low[0]):np.searchsorted(sorted_x, high[0], "right")])
+        near = slab[((vertices[slab] >= low) & (vertices[slab] <= high)).all(1)]
         far, _, _ = closest_on_segments(vertices[near], features.points, segments)
         near, far = near[far < 1.5 * edge], far[far < 1.5 * edge]
-        allowed = np.full(count, np.inf)
+        allowed[:], number[:] = np.inf, -1
         allowed[near] = far
-        allowed[taken] = np.inf
+        allowed[near[taken[near]]] = np.inf
         for station in stations:
             allowed[station] = min(allowed[station] if np.isfinite(allowed[station]) else 0.0, 0.5 * edge)
-        usable = ends[np.isfinite(allowed[ends]).all(1)]
+        live = np.union1d(near, stations)
+        live = live[np.isfinite(allowed[live])]
+        many = begin[live + 1] - begin[live]
+        usable = ends[np.repeat(begin[live] - np.cumsum(many) + many, many) + np.arange(many.sum())]
+        usable = usable[np.isfinite(allowed[usable[:, 1]])]
         if not len(usable):
             continue
-        number = np.full(count, -1)
         here = np.unique(usable)
         number[here] = np.arange(len(here))
         mean = allowed[usable].mean(1) / edge

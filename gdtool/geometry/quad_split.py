@@ -12,6 +12,7 @@ from gdtool.geometry.simplify import simplify
 
 _QUADS_PER_TRIANGLE = 2.25  # of pair_and_split, where most triangles find a partner
 _EVEN_COUNT = 0.03  # even_triangles come so near to the number asked for
+_TRIES = 3
 _APART = 1e-6  # of the size, between vertices that coincide
 
 
@@ -36,7 +37,7 @@ def _even(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: f
           memory_mb: int) -> tuple[np.ndarray, np.ndarray] | None:
     """Even triangles of the same topology that split into so many quads; None where there are none, as on what is small and intricate."""
     triangles = int(quads / _QUADS_PER_TRIANGLE)
-    few_vertices, few = simplify(vertices, faces, 2 * triangles, seconds=seconds, measured=False)[:2]
+    few_vertices, few = simplify(vertices, faces, 2 * triangles, seconds=seconds, careful=True, measured=False)[:2]
     try:
         out, found = call("gdtool.geometry.quad_split:even_triangles", few_vertices, few, triangles, crease_degrees, seconds=seconds,
                           memory_mb=memory_mb)
@@ -66,8 +67,8 @@ def even_triangles(vertices: np.ndarray, faces: np.ndarray, triangles: int, crea
             maxsurfdist=pymeshlab.PureValue(edge / 10))
         mesh = meshes.current_mesh()
         vertices, found = np.asarray(mesh.vertex_matrix()), np.asarray(mesh.face_matrix(), np.int64)
-        if abs(len(found) / triangles - 1) < _EVEN_COUNT or not len(found):
-            break
+        if abs(len(found) / triangles - 1) < _EVEN_COUNT or not len(found) or topology(found) != topology(faces):
+            break  # what one length tears, another tears as well
         edge *= (len(found) / triangles) ** 0.7  # along creases they follow the edge itself
     return vertices, found
 
@@ -79,16 +80,27 @@ def _by_collapse(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[n
     triangles = max(int(quads / _QUADS_PER_TRIANGLE), 4)
     while len(faces) < triangles:
         vertices, faces = (np.asarray(x) for x in igl.upsample(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64), 1))
+    best = None
+    for _ in range(_TRIES):
+        found = pair_and_split(*_collapsed(vertices, faces, triangles), quads)
+        if best is None or abs(len(found[1]) - quads) < abs(len(best[1]) - quads):
+            best = found
+        if abs(len(found[1]) / quads - 1) < _EVEN_COUNT:
+            break
+        triangles = max(int(triangles * quads / len(found[1])), 4)  # where they bend too much for pairs there are more quads
+    return best
+
+
+def _collapsed(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple[np.ndarray, np.ndarray]:
+    """So many triangles, or a few more: a collapse that loses pieces is tried again more gently before the mesh is taken as it is."""
     pieces = components(faces)[0]
-    # A collapse that loses pieces is tried again more gently before the mesh is taken as it is.
     for factor in (1.0, 1.15, 1.3, 1.6, 2.0, 4.0):
         if factor * triangles >= len(faces):
             break
-        out, out_faces, _, _ = simplify(vertices, faces, int(factor * triangles), measured=False)
+        out, out_faces, _, _ = simplify(vertices, faces, int(factor * triangles), careful=True, measured=False)
         if components(out_faces)[0] == pieces and is_manifold(out_faces) >= is_manifold(faces):
-            vertices, faces = out, out_faces
-            break
-    return pair_and_split(vertices, faces, quads)
+            return out, out_faces
+    return vertices, faces
 
 
 def pair_and_split(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[np.ndarray, np.ndarray]:

@@ -66,6 +66,19 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
 
     vertices (v, 3) in a unit box, faces (f, 3). All faces are quads; closed and manifold where the input is.
     """
+    found = _remeshed(vertices, faces, request, careful=False)
+    edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
+    if (error := found[2].figures["simplify_error"]) <= edge:
+        return found
+    again = _remeshed(vertices, faces, request, careful=True)
+    again[2].failed = [*found[2].failed, f"simplify: {_STRAYS} {error / edge:.2g} edge lengths from the surface", *again[2].failed]
+    for step, seconds in found[2].seconds.items():
+        again[2].seconds[step] = again[2].seconds.get(step, 0.0) + seconds
+    return again
+
+
+def _remeshed(vertices: np.ndarray, faces: np.ndarray, request: Request, careful: bool) -> tuple[np.ndarray, np.ndarray, Record]:
+    """remesh() of what one way of simplifying leaves: the quick one, or the careful one (simplify.py)."""
     record = Record()
     start = time.perf_counter()
     edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
@@ -92,7 +105,7 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
         prepare_engines()  # not before: their start would slow what this process does alone
         fine()
 
-    coarse = _simplified(vertices, faces, fine_vertices, fine_faces, closed, request, record, meanwhile)
+    coarse = _simplified(vertices, faces, fine_vertices, fine_faces, closed, request, record, careful, meanwhile)
     with ThreadPoolExecutor(1) as beside:
         error = beside.submit(_deviation, fine(), coarse) if coarse[1] is not faces else None
         done, names = [], []
@@ -126,7 +139,7 @@ def _needed(request: Request) -> int:
 
 
 def _simplified(vertices: np.ndarray, faces: np.ndarray, restored_vertices: np.ndarray, restored_faces: np.ndarray, closed: Callable[[], bool],
-                request: Request, record: Record, meanwhile: Callable[[], object]) -> tuple[np.ndarray, np.ndarray]:
+                request: Request, record: Record, careful: bool, meanwhile: Callable[[], object]) -> tuple[np.ndarray, np.ndarray]:
     """The mesh with its creases restored as coarse as the quads need, or the mesh as it was where that cannot be done.
 
     meanwhile: what to do while a child works; may be called more than once.
@@ -134,13 +147,13 @@ def _simplified(vertices: np.ndarray, faces: np.ndarray, restored_vertices: np.n
     start = time.perf_counter()
     needed = _needed(request)
     restored = restored_vertices is not vertices
-    found = simplify(restored_vertices, restored_faces, needed, seconds=request.seconds, closed=closed, thorough=not restored, measured=False,
-                     meanwhile=meanwhile)
+    found = simplify(restored_vertices, restored_faces, needed, seconds=request.seconds, closed=closed, thorough=not restored, careful=careful,
+                     measured=False, meanwhile=meanwhile)
     if restored and (found[3]["method"] == "none" and "failed" in found[3] or closed() and not repair.is_watertight(found[1])):
         # Bevels drawn out where there is no crease make folds that the collapse tears.
         record.failed.append("creases restored: the result cannot be simplified")
         record.figures["crease_vertices_restored"] = 0
-        found = simplify(vertices, faces, needed, seconds=request.seconds, closed=closed, measured=False, meanwhile=meanwhile)
+        found = simplify(vertices, faces, needed, seconds=request.seconds, closed=closed, careful=careful, measured=False, meanwhile=meanwhile)
     report = found[3]
     record.figures["simplified_to"] = report["faces"]
     if "failed" in report:

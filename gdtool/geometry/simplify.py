@@ -10,7 +10,11 @@ import numpy as np
 from gdtool.core.child import ChildFailed, begin
 from gdtool.core.errors import InputError
 from gdtool.geometry import repair
+from gdtool.geometry.normals import face_normals
 from gdtool.geometry.unpinch import unpinched
+
+
+_STUCK, _FEW = 1.25, 32  # triangles in units of those asked for, and so many more, that a collapse may leave
 
 
 def collapse(vertices: np.ndarray, faces: np.ndarray, target_faces: int, aggressiveness: float) -> tuple[np.ndarray, np.ndarray]:
@@ -23,12 +27,16 @@ def collapse(vertices: np.ndarray, faces: np.ndarray, target_faces: int, aggress
 
 
 def collapse_topology(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """What the child runs where the quicker collapse tears the mesh: MeshLab's, which refuses what changes the topology."""
+    """What the child runs where the quicker collapse tears the mesh: MeshLab's, which refuses what changes the topology.
+
+    Without its cleaning afterwards, which joins what coincides.
+    """
     import pymeshlab
 
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int32)))
-    meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=target_faces, preservetopology=True, preservenormal=True)
+    meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=target_faces, preservetopology=True, preservenormal=True, planarquadric=True,
+                                                      autoclean=False)
     mesh = meshes.current_mesh()
     return np.asarray(mesh.vertex_matrix()), np.asarray(mesh.face_matrix(), np.int64)
 
@@ -52,7 +60,7 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
 
 
 def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attributes: np.ndarray | None = None, *,
-             seconds: float = 120.0, closed: Callable[[], bool] | None = None, thorough: bool = True,
+             seconds: float = 120.0, closed: Callable[[], bool] | None = None, thorough: bool = True, careful: bool = False,
              measured: bool = True, meanwhile: Callable[[], object] = lambda: None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, dict[str, float | int | str]]:
     """A mesh of about target_faces triangles of the same shape and topology.
 
@@ -60,8 +68,10 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     point of the input) and a report: faces, method, and error, the largest distance of the result's vertices and of the
     input's vertices (at most 20,000 of them) to the other surface, in units of the input. A closed, manifold
     input stays so (closed says whether it is; asked while the first child works); without `thorough` it is given back as it is where
-    only the slow way would keep it closed; without `measured` the error is left out. `meanwhile` is called while
-    each child works. Raises InputError as repair.check does.
+    only the slow way would keep it closed; `careful` takes the slow way first, for meshes with more small parts than triangles to
+    spare: the quick one reaches any number, even by tearing down what is large. Without `measured` the error is left out; with it, a quick
+    result that is as far off as its edges are long is compared with the slow one's. `meanwhile` is called while each child works.
+    Raises InputError as repair.check does.
     """
     repair.check(vertices, faces)
     target_faces = max(int(target_faces), 4)
@@ -74,11 +84,13 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     is_closed = cache(closed or (lambda: repair.is_watertight(faces)))
     reasons, found, method = [], None, ""
     # The quick collapse tears a closed mesh now and then (a handful of edges with four faces), at one pace and not at
-    # another; MeshLab's takes ten times as long.
-    for name, arguments in (("collapse", (target_faces, 5.0)), ("collapse", (target_faces, 3.0)), ("collapse", (target_faces, 8.0)),
-                            ("collapse_topology", (target_faces,))):
-        if name == "collapse_topology" and not thorough:
-            break
+    # another, and of parts made of slivers it collapses nothing, at any; MeshLab's takes ten times as long.
+    quick = [("collapse", (target_faces, pace)) for pace in (5.0, 3.0, 8.0)]
+    slow = [("collapse_topology", (target_faces,))] if thorough or careful else []
+    stuck = None
+    for name, arguments in slow + quick if careful else quick + slow:
+        if stuck is not None and name == "collapse":
+            continue
         try:
             running = begin(f"gdtool.geometry.simplify:{name}", unit, faces.astype(np.int32), *arguments, seconds=seconds, memory_mb=16000)
             meanwhile()
@@ -89,10 +101,16 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
             continue
         if is_closed() and _sound(*out, False, target_faces) and not _sound(*out, True, target_faces):
             out = unpinched(*out)  # what the quick collapse tears are mostly two sheets that meet in an edge
-        if _sound(*out, is_closed(), target_faces):
+        if not _sound(*out, is_closed(), target_faces):
+            reasons.append("the result is not as closed as the input")
+        elif name == "collapse" and slow and len(out[1]) > _STUCK * target_faces + _FEW:
+            stuck = out
+            reasons.append(f"the quick collapse stopped at {len(out[1])} triangles")
+        else:
             found, method = out, "quadric collapse" if name == "collapse" else "quadric collapse, topology kept"
             break
-        reasons.append("the result is not as closed as the input")
+    if found is None and stuck is not None:
+        found, method = stuck, "quadric collapse"
     if found is None and not is_closed():
         found, method = cluster(unit, faces, target_faces), "vertex clustering"
         if not len(found[1]):
@@ -114,7 +132,12 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
         report["error"] = deviation(unit, faces, out_vertices, out_faces) * extent
     if reasons:
         report["failed"] = "; ".join(reasons)
-    return out_vertices * extent + centre, out_faces, out_attributes, report
+    out = out_vertices * extent + centre, out_faces, out_attributes, report
+    edge = (4 / 3**0.5 * face_normals(unit, faces)[1].sum() / target_faces) ** 0.5
+    if measured and not careful and thorough and method == "quadric collapse" and report["error"] > edge * extent:
+        other = simplify(vertices, faces, target_faces, attributes, seconds=seconds, closed=is_closed, careful=True)
+        return min(out, other, key=lambda one: one[3]["error"] if one[3]["method"] != "none" else np.inf)
+    return out
 
 
 def _sound(vertices: np.ndarray, faces: np.ndarray, closed: bool, target_faces: int) -> bool:

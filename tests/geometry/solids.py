@@ -37,6 +37,26 @@ def bored_box(n: int = 56) -> tuple[np.ndarray, np.ndarray]:
     return marching(field, n, 1.03)
 
 
+def rod(sections: int, radius: float = 0.03, height: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
+    """A cylinder of slivers along z: two fans and a wall of two triangles a section."""
+    angle = 2 * np.pi * np.arange(sections) / sections
+    ring = radius * np.stack([np.cos(angle), np.sin(angle)], -1)
+    vertices = np.concatenate([np.c_[ring, np.full(sections, -height / 2)], np.c_[ring, np.full(sections, height / 2)], [[0, 0, -height / 2], [0, 0, height / 2]]])
+    one = np.arange(sections)
+    two = (one + 1) % sections
+    faces = [(one, two, two + sections), (one, two + sections, one + sections), (two, one, 0 * one + 2 * sections),
+             (one + sections, two + sections, 0 * one + 2 * sections + 1)]
+    return vertices, np.concatenate([np.stack(face, -1) for face in faces])
+
+
+def assembly(pins: int, sections: int) -> tuple[np.ndarray, np.ndarray]:
+    """A disk of radius 1 in a circle of so many pins, in a box of side 1."""
+    around = 2 * np.pi * np.arange(pins) / pins
+    pin = rod(sections)
+    vertices, faces = joined(rod(64, 1.0, 0.3), *((pin[0] + (1.3 * np.cos(a), 1.3 * np.sin(a), 0), pin[1]) for a in around))
+    return vertices / 2.66, faces
+
+
 def plane(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
     """Open square of side 1 in z = 0, facing +z."""
     line = np.linspace(-0.5, 0.5, n + 1)

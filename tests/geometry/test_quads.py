@@ -11,7 +11,7 @@ from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, scal
 from gdtool.geometry.quad_split import pair_and_split
 from gdtool.geometry.quad_shape import remove_doublets, subdivide
 from gdtool.geometry.sharpen import restore_creases
-from tests.geometry.solids import bored_box, cube, joined, plane, sphere, torus, volume
+from tests.geometry.solids import assembly, bored_box, cube, joined, plane, rod, sphere, torus, volume
 
 
 def whole(faces):
@@ -79,7 +79,7 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
     vertices, faces = joined((small[0] * 0.1 + 3, small[1]), large)
     tried = []
 
-    def losing(vertices, faces, target, measured):
+    def losing(vertices, faces, target, **how):
         tried.append(target)
         own = simplify.simplify(*large, target - (len(small[1]) if target > 1000 else 0), measured=False)
         return (*(joined(small, own[:2]) if target > 1000 else own[:2]), None, {})
@@ -87,8 +87,38 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
     monkeypatch.setattr(quad_split, "simplify", losing)
     asked = 1800  # 800 triangles, of which 1.15 times as many lose the piece and 1.3 times keep it
     out, found = quad_split._by_collapse(vertices, faces, asked)
-    assert len(tried) == 3 and repair.components(found)[0] == 2
+    assert tried[:3] == [800, 919, 1040] and repair.components(found)[0] == 2
     assert asked < len(found) < 1.5 * asked < 1.8 * len(faces)
+
+
+def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
+    """Pins with few triangles around: what bends too much stays single, and there are fewer triangles for it."""
+    vertices, faces = joined(*((pin[0] + (0.3 * k, 0, 0), pin[1]) for k, pin in enumerate([rod(24)] * 8)))
+    _, found = quad_split._by_collapse(vertices, faces, 400)
+    assert abs(len(found) / 400 - 1) < 0.1 and repair.components(found)[0] == 8 and repair.is_watertight(found)
+
+
+def test_large_parts_are_not_torn_down_for_small_ones():
+    """An assembly with more pins than the count has quads to spare, all of slivers, which the quick collapse does not touch."""
+    vertices, faces = assembly(60, 128)
+    out, found, record = quads.remesh(vertices, faces, quads.Request(quads=3000))
+    assert any("the quick collapse stopped" in line for line in record.failed) and record.figures["simplified_to"] == 20000
+    assert abs(len(found) / 3000 - 1) < 0.1 and whole(found) and repair.components(found)[0] == 61
+    assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.015
+
+
+def test_what_the_quick_collapse_ruins_is_made_again_with_care(monkeypatch):
+    vertices, faces = sphere(120, 0.5)
+    begun, begin = [], simplify.begin
+
+    def shrinking(function, vertices, *given, **limits):
+        begun.append(function.split(":")[1])
+        return begin(function, vertices * (0.5 if begun[-1] == "collapse" else 1), *given, **limits)
+
+    monkeypatch.setattr(simplify, "begin", shrinking)
+    out, _, record = quads.remesh(vertices, faces, quads.Request(quads=2000))
+    assert begun == ["collapse", "collapse_topology"] and abs(np.linalg.norm(out, axis=1) - 0.5).max() < 0.01
+    assert any(line.startswith("simplify: strays") for line in record.failed) and record.figures["simplify_error"] < 0.01
 
 
 @pytest.mark.parametrize("shape", ["slivers", "coincident"])

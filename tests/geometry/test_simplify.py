@@ -6,7 +6,7 @@ import pytest
 from gdtool.core.child import ChildFailed
 from gdtool.core.errors import InputError
 from gdtool.geometry import repair, simplify
-from tests.geometry.solids import cube, joined, plane, sphere, volume
+from tests.geometry.solids import assembly, cube, joined, plane, sphere, volume
 
 
 def test_sphere_keeps_shape_and_topology():
@@ -66,3 +66,37 @@ def test_index_out_of_range_never_reaches_the_library():
 def test_two_pieces_stay_two():
     vertices, faces = joined(sphere(24, 0.4, (-0.5, 0, 0)), sphere(24, 0.4, (0.5, 0, 0)))
     assert repair.components(simplify.simplify(vertices, faces, 400)[1])[0] == 2
+
+
+def test_slivers_that_the_quick_collapse_does_not_touch():
+    """Pins of slivers around a disk: the quick collapse leaves them as they are and tears down the disk."""
+    vertices, faces = assembly(60, 48)
+    out, found, _, report = simplify.simplify(vertices, faces, 900)
+    assert report["method"].endswith("topology kept") and "the quick collapse stopped" in report["failed"]
+    assert len(found) <= 900 and report["error"] < 0.02 and repair.topology(found) == repair.topology(faces)
+    # Without the slow way what there is is given back, and its error.
+    report = simplify.simplify(vertices, faces, 900, thorough=False)[3]
+    assert report["method"] == "quadric collapse" and report["faces"] > 5000 and report["error"] > 0.05
+
+
+def test_a_quick_result_that_is_far_off_is_compared_with_the_slow_one(monkeypatch):
+    vertices, faces = sphere(40)
+    begin = simplify.begin
+
+    def shrinking(function, vertices, *given, **limits):
+        return begin(function, vertices * (0.5 if function.endswith(":collapse") else 1), *given, **limits)
+
+    monkeypatch.setattr(simplify, "begin", shrinking)
+    out, _, _, report = simplify.simplify(vertices, faces, 800)
+    assert report["method"].endswith("topology kept") and report["error"] < 0.02
+    assert abs(np.linalg.norm(out, axis=1) - 0.8).max() < 0.02
+
+
+def test_the_collapse_that_keeps_the_topology_keeps_what_coincides():
+    """Two balls that touch in a vertex each: not joined, and nothing of them left out."""
+    one = sphere(24)
+    top = one[0][one[0][:, 0].argmax()]
+    two = one[0] * (-1, 1, 1) + (2 * top[0], 0, 0), one[1][:, ::-1]
+    vertices, faces = joined(one, two)
+    out, found = simplify.collapse_topology(vertices, faces, 600)
+    assert repair.topology(found) == repair.topology(faces) and len(found) <= 600
