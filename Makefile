@@ -101,15 +101,15 @@ docs-check: venv
 # GEOMETRY, NEW, LAST and HELD_OUT. So the bundled model was made, its first step over 64 px views of 3341 objects with a start of 16 minutes over 586
 # of them, its second in two runs (3000 steps, and 1400 at two thirds of the rate) over 1355 objects, its third in five runs (105 minutes,
 # 112 with fewer conditions left out, both over 2397 objects, and 106, 106 and 104 over 4338), its fourth over these (102 minutes with metal
-# at 0.3, and 98), its last in two processes (41 minutes).
+# at 0.3, and 98), its last in two runs of two processes (41 and 72 minutes, over 3000 objects and 4200 others), a mean after each.
 DATA ?= out/model
 OBJECTS ?= 4341
 MINUTES ?= 100
 STEPS ?= 4400
 FINISH ?= 533
 GEOMETRY ?= 100
-NEW ?= 8300
-LAST ?= 80
+NEW ?= 12500
+LAST ?= 210
 HELD_OUT ?= 900099
 RENDER := $(BIN)/gdtool render-dataset --size 128 --light-samples 4 --domains color,normal,depth,albedo,roughness,metallic --condition-views 3
 
