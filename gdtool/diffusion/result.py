@@ -14,11 +14,22 @@ from gdtool.folders.views import Views
 
 # The model's coverage at which outlines overlap the true ones most, at no cost in color; at one half they hold 4 % too little.
 OUTLINE = 0.45
+# Metal or not: the power by which a model's leaning is taken for its answer. From 3 on nothing is gained on held-out objects; edges stay soft.
+DECIDED = 4
 
 
 def sharpen(mask: torch.Tensor) -> torch.Tensor:
     """A model's coverage is soft where it is unsure of the outline; a real outline is a pixel wide: twice the slope there."""
     return ((mask - OUTLINE) * 2 + 0.5).clamp(0, 1)
+
+
+def decided(metallic: torch.Tensor) -> torch.Tensor:
+    """Metallic in [0, 1] nearer to 0 or 1, whichever it was nearer to: the odds to the power DECIDED.
+
+    A material is a metal or is none; what a model puts between says how sure it is, and is nearest on average at neither.
+    """
+    yes, no = metallic**DECIDED, (1 - metallic) ** DECIDED
+    return yes / (yes + no)
 
 
 def tied(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
@@ -95,6 +106,8 @@ def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], ba
             value = linear_from_srgb(np.moveaxis(value, 1, -1))
         elif domain == "normal":
             value = np.moveaxis(value, 1, -1)
+        elif domain == "metallic":
+            value = decided(values[domain]).numpy()
         if domain == "depth":
             value = within_silhouettes(value, mask, cameras)
         inside = mask > 0

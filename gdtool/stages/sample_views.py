@@ -3,8 +3,9 @@
 Takes an image with alpha, or one on a plain background that is then cut out (on a busy one with gdtool[cutout]), or any
 image with --mask. The subject is cropped and centred as in training. Writes color, normal, depth, albedo, roughness,
 metallic and masks of the default rig for reconstruct, at the model's own resolution, and the picture as it was framed at
-its own, for bake. What the picture shows and the outlines of the other views leave no room for is drawn into them. Use
---no-crop when the picture is framed like the rig's front view already (an orthographic render of a normalised object).
+its own, for bake. What the picture shows and the outlines of the other views leave no room for is drawn into them. What
+the model takes for rather metal than not is metal. Use --no-crop when the picture is framed like the rig's front view
+already (an orthographic render of a normalised object).
 
 Example:
   gdtool sample-views cat.png --seed 7
@@ -135,6 +136,6 @@ def _condition(inputs: Inputs, options: Options, config, out: Output):
     return condition, picture
 
 
-STAGE = Stage(name="sample-views", version=7, reads=("image-file",), writes="views", Options=Options, run=run,
+STAGE = Stage(name="sample-views", version=8, reads=("image-file",), writes="views", Options=Options, run=run,
               second_inputs={"model": SecondInput("model", search=False, default="models/default", foreign=True,
                                               help="Model folder of gdtool train, or Wonder3D v1 as a folder or hub id; the bundled model without it.")})

@@ -115,6 +115,31 @@ def test_mirrored_images_are_the_images_of_the_mirrored_object():
         torch.testing.assert_close(mirrored(other, domains, names), one)
 
 
+def test_what_is_nearly_metal_is_metal_and_edges_stay_soft():
+    from gdtool.diffusion.result import decided
+
+    given = torch.linspace(0, 1, 101, dtype=torch.float64)
+    out = decided(given)
+    assert out[0] == 0 and out[50] == 0.5 and out[100] == 1
+    assert (out.diff() > 0).all()
+    torch.testing.assert_close(out, 1 - out.flip(0))  # metal and no metal weigh the same
+    assert out[20] < 0.01 and out[80] > 0.99 and out[40] > 0.1
+
+
+def test_only_metallic_is_decided(sphere):
+    from gdtool.cameras import rig
+    from gdtool.diffusion.result import decided, views_from_images
+
+    views, _ = sphere
+    grey = np.full(views.mask.shape, 0.3, np.float32)
+    planes = planes_from_images(views.images | {"roughness": grey, "metallic": grey}, views.mask)
+    encoded = encode(torch.from_numpy(planes)[None], tuple(range(6)), torch.tensor([0.0]))[0]
+    out, _ = views_from_images({d: encoded[i] for i, d in enumerate(DOMAINS)}, rig("six", 32), 0.0, DOMAINS)
+    inside = out.mask > 0.99
+    np.testing.assert_allclose(out.images["roughness"][inside], 0.3, atol=1e-3)
+    np.testing.assert_allclose(out.images["metallic"][inside], float(decided(torch.tensor(0.3))), atol=1e-3)
+
+
 def test_views_from_opposite_sides_get_one_outline():
     """A model that guesses the outline from the right larger than from the left: both get the mean."""
     from gdtool.cameras import rig
