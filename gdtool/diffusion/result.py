@@ -8,6 +8,7 @@ import torch
 from gdtool.cameras import Camera, project
 from gdtool.diffusion.encoding import coverage, decode
 from gdtool.diffusion.outline import draw_part, grown_masks, lost_part
+from gdtool.diffusion.paint import repainted
 from gdtool.fields.sights import backproject
 from gdtool.folders.views import Views
 
@@ -70,9 +71,10 @@ def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera
 
 
 def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], background: float, domains: tuple[str, ...],
-                      picture_alpha: np.ndarray | None = None) -> tuple[Views, float]:
-    """Encoded images (k, 3, h, w) of one object -> Views of the asked domains with one mask per view, shared by all, and the
-    share of the picture that the other views left no room for (outline.py): they show it now.
+                      picture_alpha: np.ndarray | None = None) -> tuple[Views, dict[str, float]]:
+    """Encoded images (k, 3, h, w) of one object -> Views of the asked domains with one mask per view, shared by all, and a
+    report: drawn_share of the picture that the other views left no room for (outline.py), and they show now; and
+    painted_share of it whose albedo was given the picture's contrast (paint.py).
 
     picture_alpha (h, w): coverage of the framed picture. It is the front view's silhouette, and mirrored the back's
     (both orthographic), so neither is guessed; the front color, nearly the picture itself, is divided by it.
@@ -92,8 +94,8 @@ def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], ba
                 if "color" in images:
                     values["color"][k] = decode({"color": images["color"][k]}, torch.from_numpy(known), background)["color"]
     part, before, names = None, mask, [camera.name for camera in cameras]
-    if picture_alpha is not None and "front" in names:
-        front = names.index("front")
+    front = names.index("front") if picture_alpha is not None and "front" in names else None
+    if front is not None:
         part = lost_part(soft.numpy(), mask, cameras, front, values["depth"][front].numpy() if "depth" in images else None)
     if part is not None:
         mask = grown_masks(part, mask, cameras, front)
@@ -112,6 +114,13 @@ def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], ba
             value = within_silhouettes(value, mask, cameras)
         inside = mask > 0
         out[domain] = np.where(inside[..., None] if value.ndim == 4 else inside, value, 0).astype(np.float32)
+    report = {"drawn_share": 0.0, "painted_share": 0.0}
+    if front is not None and "albedo" in out and "color" in values:
+        color = linear_from_srgb(np.moveaxis(values["color"][front].numpy(), 0, -1))
+        normal, metallic = (out[domain][front] if domain in out else None for domain in ("normal", "metallic"))
+        out["albedo"][front], share = repainted(out["albedo"][front], color, mask[front], normal, metallic)
+        report["painted_share"] = float((share * mask[front]).sum() / max(mask[front].sum(), 1.0))
     if part is not None:
         draw_part(part, out, before, cameras, front)
-    return Views(cameras, out, mask.astype(np.float32)), 0.0 if part is None else float(part.lost.sum() / (mask[front] > 0.5).sum())
+        report["drawn_share"] = float(part.lost.sum() / (mask[front] > 0.5).sum())
+    return Views(cameras, out, mask.astype(np.float32)), report

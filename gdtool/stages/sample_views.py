@@ -3,8 +3,9 @@
 Takes an image with alpha, or one on a plain background that is then cut out (on a busy one with gdtool[cutout]), or any
 image with --mask. The subject is cropped and centred as in training. Writes color, normal, depth, albedo, roughness,
 metallic and masks of the default rig for reconstruct, at the model's own resolution, and the picture as it was framed at
-its own, for bake. What the picture shows and the outlines of the other views leave no room for is drawn into them. What
-the model takes for rather metal than not is metal. Use --no-crop when the picture is framed like the rig's front view
+its own, for bake. What the picture shows and the outlines of the other views leave no room for is drawn into them. The
+albedo of its own view gets the picture's contrast, as far as that is paint and not light. What the model takes for rather
+metal than not is metal. Use --no-crop when the picture is framed like the rig's front view
 already (an orthographic render of a normalised object).
 
 Example:
@@ -78,17 +79,19 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     if config.convention == "wonder3d" and "normal" in images:
         images["normal"] = wonder3d.premultiplied_normals(images["normal"])
     cameras = {camera.name: camera for camera in rig("wonder3d" if config.convention == "wonder3d" else "six", config.image_size)}
-    views, drawn = views_from_images({d: x[0].cpu() for d, x in images.items()}, [cameras[name] for name in config.views],
+    views, report = views_from_images({d: x[0].cpu() for d, x in images.items()}, [cameras[name] for name in config.views],
                               BACKGROUND[config.backgrounds[0]], domains, condition[..., 3])
     with out.step("write"):
         # what the model was shown, after cutting out and framing
         write_png(out.path("condition/000.png"), srgb_from_linear_rgba(condition, srgb_from_linear))
         shown = "front" if "front" in views.names else ""  # the view that is the picture's own
-        if not drawn:
+        if not report["drawn_share"]:
             out.skip("parts of the picture in the other views", "each has room for all of them" if shown else "no view is the picture's own")
+        if not report["painted_share"] and "albedo" in domains:
+            out.skip("paint of the picture", "its detail is light, or metal, by the model's albedo" if shown else "no view is the picture's own")
         if shown:
             write_png(out.path("picture.png"), srgb_from_linear_rgba(picture, srgb_from_linear))
-        write_views(out, views, conditions=1, picture=shown, report={"drawn_share": drawn})
+        write_views(out, views, conditions=1, picture=shown, report=report)
 
 
 def srgb_from_linear_rgba(image, srgb_from_linear):
@@ -136,6 +139,6 @@ def _condition(inputs: Inputs, options: Options, config, out: Output):
     return condition, picture
 
 
-STAGE = Stage(name="sample-views", version=8, reads=("image-file",), writes="views", Options=Options, run=run,
+STAGE = Stage(name="sample-views", version=9, reads=("image-file",), writes="views", Options=Options, run=run,
               second_inputs={"model": SecondInput("model", search=False, default="models/default", foreign=True,
                                               help="Model folder of gdtool train, or Wonder3D v1 as a folder or hub id; the bundled model without it.")})

@@ -81,7 +81,7 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
         points = source.at(places.face_idx, places.barycentric, source.vertices)
         prior = [srgb_from_linear(out[d]) if d == "albedo" else out[d] for d in domains]
         prior = np.concatenate([p if p.ndim == 2 else p[:, None] for p in prior], 1)
-        value, seen, shares = observe(points, out["normal"], views.sights, stack, views.mask, prior, known=pictured)
+        value, seen, shares = observe(points, out["normal"], views.sights, stack, views.mask, prior, known=pictured, colors=channel[1])
         for k, domain in enumerate(domains):
             own, read = prior[:, channel[k]:channel[k + 1]], value[:, channel[k]:channel[k + 1]]
             share = seen[:, None]

@@ -14,12 +14,10 @@ import numpy as np
 
 from gdtool.cameras import Camera, project
 from gdtool.fields.sights import bilinear
+from gdtool.images.detail import DARK, detail_gain
 from gdtool.images.metrics import resized
 
-DARK = 0.02  # linear: added above and below, so that noise in the dark is no detail
 MOST = 4.0  # as a factor, and one over it the least
-BAND, WINDOW = 3.0, 6.0  # view's pixels: wavelengths that the gain is told from, and the Gaussian window it is taken over
-FLOOR = 1e-3  # squared logarithms: less than this says nothing of the gain
 
 
 @dataclass(frozen=True)
@@ -45,22 +43,7 @@ def picture_of(image: np.ndarray, camera: Camera, albedo: np.ndarray) -> Picture
     view = resized(weighted, *small)
     fine, coarse = (np.log(x[..., :3] / np.maximum(x[..., 3:], 1e-3) + DARK) for x in (weighted, resized(view, *large)))
     shown = (image[..., 3:] > 0.5) & (resized(view[..., 3:], *large) > 0.25)
-    gain = resized(_gain(np.log(view[..., :3] / np.maximum(view[..., 3:], 1e-3) + DARK), np.log(albedo + DARK), view[..., 3]), *large)
+    gain = np.clip(detail_gain(np.log(view[..., :3] / np.maximum(view[..., 3:], 1e-3) + DARK), np.log(albedo + DARK), view[..., 3]), 0, 1)
+    gain = resized(gain, *large)
     factor = np.exp(np.clip(fine - coarse, -np.log(MOST), np.log(MOST)) * gain[..., None])
     return Picture(np.where(shown, factor, 1).astype(np.float32), camera, large[0] // small[0])
-
-
-def _gain(color: np.ndarray, albedo: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """How much of color's detail albedo has too (h, w), 0 to 1; both (h, w, 3) logarithms, mask (h, w)."""
-    from scipy.ndimage import gaussian_filter
-
-    mask = np.asarray(mask, np.float64)
-
-    def smooth(values: np.ndarray, width: float) -> np.ndarray:
-        wide = (width, width) + (0,) * (values.ndim - 2)
-        cover = gaussian_filter(mask, width)
-        held = mask if values.ndim == 2 else mask[..., None]
-        return gaussian_filter(values * held, wide) / np.maximum(cover if values.ndim == 2 else cover[..., None], 1e-6)
-
-    one, other = (x - smooth(x, BAND) for x in (color, albedo))
-    return np.clip(smooth((one * other).sum(-1), WINDOW) / (smooth((one * one).sum(-1), WINDOW) + FLOOR), 0, 1)

@@ -14,6 +14,8 @@ GRAZING = 0.12
 _SUPERSAMPLE = 2
 # Views that differ by less, in stored units, agree.
 TOLERANCE = 0.15
+# How much better a picture sees color than the views that were made of it, at the same angle; never more than one that faces the surface.
+KNOWN = 4.0
 
 
 @dataclass(frozen=True)
@@ -110,14 +112,15 @@ def steadiness(sight: Sight, points: np.ndarray) -> np.ndarray:
 
 
 def observe(points: np.ndarray, normals: np.ndarray, sights: list[Sight], stack: np.ndarray, mask: np.ndarray,
-            prior: np.ndarray | None = None, sharpness: float = 6.0, known: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            prior: np.ndarray | None = None, sharpness: float = 6.0, known: int | None = None, colors: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What the views say about points (n, 3) of the surface with unit normals (n, 3).
 
     stack (k, h, w, c) and mask (k, h, w) of the k sights. Views are weighted by facing, distance to silhouettes and
     coverage; the best one counts far more than the next (its power is sharpness), so detail is not averaged away, and
     the change from one view to another is smooth. A view that differs from all others and from prior (n, c) fades
-    out, but not the known one, which the others were made of. Returns values (n, c) float32, confidence (n,) float32 in [0, 1], 0 where no view sees the point, and each
-    view's share (k, n) of the values.
+    out, but not the known one, which the others were made of: of the first channels, its colors, it counts as if of KNOWN
+    times the quality, 1 at most. Returns values (n, c) float32, confidence (n,) float32 in [0, 1], 0 where no view sees the point, and each
+    view's share (k, n) of the values, of the colors where one is known.
     """
     count, channels = len(points), stack.shape[-1]
     value = np.zeros((len(sights), count, channels), np.float32)
@@ -140,8 +143,11 @@ def observe(points: np.ndarray, normals: np.ndarray, sights: list[Sight], stack:
         share[:, disputed] = faded
     weight = share**sharpness
     total = weight.sum(0)
-    weight /= np.maximum(total, 1e-12)
-    mean = np.einsum("kn,knc->nc", weight, value)
+    mean = np.einsum("kn,knc->nc", weight / np.maximum(total, 1e-12), value)
+    if known is not None:
+        weight[known] *= np.minimum(KNOWN, 1 / np.maximum(quality[known], 1e-6)) ** sharpness
+        mean[:, :colors] = np.einsum("kn,knc->nc", weight / np.maximum(weight.sum(0), 1e-12), value[..., :colors])
+    weight /= np.maximum(weight.sum(0), 1e-12)
     return mean.astype(np.float32), np.where(total > 0, confidence, 0).astype(np.float32), weight
 
 

@@ -90,14 +90,14 @@ def test_the_pictures_silhouette_is_the_front_views_and_mirrored_the_backs(spher
     views, planes = sphere
     encoded = encode(planes, tuple(range(6)), torch.tensor([0.0]))[0]
     alpha = np.tril(np.ones((32, 32), np.float32))
-    out, drawn = views_from_images({d: encoded[i] for i, d in enumerate(DOMAINS)}, rig("six", 32), 0.0, DOMAINS, alpha)
+    out, report = views_from_images({d: encoded[i] for i, d in enumerate(DOMAINS)}, rig("six", 32), 0.0, DOMAINS, alpha)
     names = list(out.names)
     np.testing.assert_array_equal(out.mask[names.index("front")], alpha)
     np.testing.assert_array_equal(out.mask[names.index("back")], alpha[:, ::-1])
     # The slanted shape is taller than the sphere: the others show what goes beyond it, and are as they were elsewhere.
     right, guessed = out.mask[names.index("right")], views.mask[names.index("right")]
     changed = np.abs(right - guessed) > 1e-6
-    assert drawn > 0.1 and (right[changed] == 1).all() and changed[guessed.max(1) == 0].any() and changed[guessed > 0.5].sum() == 0
+    assert report["drawn_share"] > 0.1 and (right[changed] == 1).all() and changed[guessed.max(1) == 0].any() and changed[guessed > 0.5].sum() == 0
     assert all(np.isfinite(image).all() for image in out.images.values())
     assert (out.images["depth"][names.index("front")][alpha == 0] == 0).all()
 

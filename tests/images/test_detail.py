@@ -1,0 +1,44 @@
+"""Means, gains and guided filtering over the covered part of a picture."""
+
+import numpy as np
+import pytest
+
+from gdtool.images.detail import detail_gain, guided, masked_mean
+
+SIZE = 48
+
+
+@pytest.fixture(scope="module")
+def disc():
+    y, x = np.mgrid[:SIZE, :SIZE] + 0.5
+    return (((x - SIZE / 2) ** 2 + (y - SIZE / 2) ** 2) < (0.4 * SIZE) ** 2).astype(float)
+
+
+def test_means_are_of_covered_pixels_only(disc):
+    values = np.where(disc[..., None] > 0, 0.7, 100.0) * np.ones(3)
+    np.testing.assert_allclose(masked_mean(values, disc, 4.0)[disc > 0], 0.7, rtol=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0, 1.5])
+def test_gain_is_how_much_of_the_detail_is_shared(disc, share):
+    rng = np.random.default_rng(0)
+    one = rng.normal(0, 1, (SIZE, SIZE, 3))
+    y, x = np.mgrid[:SIZE, :SIZE] / SIZE
+    other = share * one + (x + y)[..., None]  # a slope is no detail
+    np.testing.assert_allclose(detail_gain(one, other, disc)[disc > 0], share, atol=0.02)
+
+
+def test_what_is_linear_in_the_guide_comes_back_and_what_is_not_is_smoothed(disc):
+    rng = np.random.default_rng(1)
+    guide = rng.normal(0, 1, (SIZE, SIZE, 3))
+    linear = guide @ rng.normal(0, 1, (3, 3)) + 2.0
+    noise = rng.normal(0, 1, (SIZE, SIZE, 3))
+    inside = disc > 0
+    np.testing.assert_allclose(guided(linear, guide, disc, 6.0, 1e-6)[inside], linear[inside], atol=1e-3)
+    assert guided(noise, guide, disc, 6.0, 1e-6)[inside].std() < 0.3 * noise[inside].std()
+
+
+def test_a_flat_guide_leaves_the_mean(disc):
+    rng = np.random.default_rng(2)
+    values, guide = rng.normal(0, 1, (SIZE, SIZE, 2)), np.ones((SIZE, SIZE, 3))
+    np.testing.assert_allclose(guided(values, guide, disc, 4.0, 1e-3), masked_mean(masked_mean(values, disc, 4.0), disc, 4.0), atol=1e-6)
