@@ -9,7 +9,7 @@ import numpy as np
 from gdtool.geometry.features import Constraints, Features, closest_on_segments
 from gdtool.geometry.mesh_quality import polygon_normals, valences, worst_jacobian
 from gdtool.geometry.normals import face_normals
-from gdtool.geometry.repair import compact, edges_of
+from gdtool.geometry.repair import compact, corner_fans, edges_of
 
 _WORTH_THREADS, _ALONE = 1000, 10000  # libigl searches with all threads from more than so many points on
 _EXACT_EVERY = 3  # steps between two searches for the closest point; the others stay in its plane
@@ -249,25 +249,34 @@ def _neighbours(ends: np.ndarray, count: int) -> _Lists:
 
 
 def fill_holes(vertices: np.ndarray, faces: np.ndarray, longest: int = 64) -> tuple[np.ndarray, np.ndarray]:
-    """Quads (f, 4) with boundary loops of an even number of edges, at most `longest`, closed by quads around a new vertex."""
+    """Quads (f, 4) with boundary loops of an even number of edges, at most `longest`, closed by quads around a new vertex.
+
+    Where two holes meet at a vertex, each is closed by itself.
+    """
     edges = edges_of(faces)
-    half = edges.half_ends[edges.count[edges.half_edge_idx] == 1]
+    border = edges.count[edges.half_edge_idx] == 1
+    half = edges.half_ends[border]
     if not len(half):
         return vertices, faces
-    following = {}
-    for a, b in half.tolist():
-        if a in following:  # two holes meet here: which way on is not said
-            following[a] = None
-        else:
-            following[a] = b
+    fans = corner_fans(faces)[0]
+    leaving, arriving = fans.ravel()[border], np.roll(fans, -1, 1).ravel()[border]
+    starts: dict[int, list[int]] = {}
+    for k, vertex in enumerate(half[:, 0].tolist()):
+        starts.setdefault(vertex, []).append(k)
+    following = []
+    for k, vertex in enumerate(half[:, 1].tolist()):
+        ways = starts.get(vertex, [])
+        if len(ways) == 2:  # a hole's border comes by one of the two fans and leaves by the other
+            ways = [on for on in ways if leaving[on] != arriving[k]]
+        following.append(ways[0] if len(ways) == 1 else None)  # where more holes meet, which way on is not said
     new_points, new_faces, seen = [], [], set()
-    for start in following:
-        loop, v = [], start
-        while v is not None and v not in seen and len(loop) <= longest:
-            seen.add(v)
-            loop.append(v)
-            v = following.get(v)
-        if v != start or len(loop) % 2 or not 4 <= len(loop) <= longest:
+    for start in range(len(half)):
+        loop, k = [], start
+        while k is not None and k not in seen and len(loop) <= longest:
+            seen.add(k)
+            loop.append(int(half[k, 0]))
+            k = following[k]
+        if k != start or len(loop) % 2 or not 4 <= len(loop) <= longest or len(set(loop)) < len(loop):
             continue
         loop = loop[::-1]  # the hole's faces walk its edges the other way
         if len(loop) == 4:

@@ -30,6 +30,7 @@ _CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a res
 _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
 _HANDLES, _PIECES = "handles are lost or added", "pieces are lost or joined"
 _TOO_COARSE = _STRAYS, _LEAVES_OUT = "strays", "leaves out"
+_MENDINGS = 4  # rounds of filling holes and parting what meets at a vertex
 _MOST_PIECES = 16  # that are remeshed one by one where together they fail
 
 
@@ -327,18 +328,27 @@ def _judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndar
     if quad_faces.min() < 0 or quad_faces.max() >= len(quad_vertices) or not np.isfinite(quad_vertices).all():
         return "indices or coordinates out of range", quad_vertices, quad_faces
     whole = (np.sort(quad_faces, 1)[:, 1:] != np.sort(quad_faces, 1)[:, :-1]).all(1)
+    if not whole.any():
+        return "no quads", quad_vertices, quad_faces
     quad_vertices, quad_faces = repair.compact(quad_vertices, quad_faces[whole])
     closed = repair.is_watertight(faces)
-    if closed:
-        quad_vertices, quad_faces = fill_holes(quad_vertices, quad_faces)
-    quad_vertices, quad_faces = remove_doublets(*repair.one_vertex_per_fan(quad_vertices, quad_faces))
-    quad_vertices, quad_faces = cancel_irregular(quad_vertices, quad_faces)
-    quad_vertices, quad_faces = repair.without_crumbs(quad_vertices, quad_faces, repair.components(faces)[0])
+    pieces = repair.components(faces)[0]
+    for turn in range(_MENDINGS):
+        if turn and (not closed or repair.is_watertight(quad_faces)):
+            break
+        if closed:
+            quad_vertices, quad_faces = fill_holes(quad_vertices, quad_faces)
+        # What parts where fans met at a vertex, and what lay in a hole as a piece of its own, leave holes to fill.
+        quad_vertices, quad_faces = remove_doublets(*repair.one_vertex_per_fan(quad_vertices, quad_faces))
+        quad_vertices, quad_faces = cancel_irregular(quad_vertices, quad_faces)
+        quad_vertices, quad_faces = repair.without_crumbs(quad_vertices, quad_faces, pieces)
+        if not len(quad_faces):
+            return "no quads", quad_vertices, quad_faces
     if closed and not repair.is_watertight(quad_faces):
         return "not watertight, though the input is", quad_vertices, quad_faces
     if not repair.is_manifold(quad_faces):
         return "not manifold", quad_vertices, quad_faces
-    if repair.components(quad_faces)[0] != repair.components(faces)[0]:
+    if repair.components(quad_faces)[0] != pieces:
         return _PIECES, quad_vertices, quad_faces
     if closed and repair.euler_number(quad_faces) != repair.euler_number(faces):
         return _HANDLES, quad_vertices, quad_faces

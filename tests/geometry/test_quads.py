@@ -9,7 +9,7 @@ from gdtool.geometry import quad_fit, quad_split, quads, repair, simplify
 from gdtool.geometry.features import find_features
 from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, scaled_jacobian, shape_figures, topology_figures
 from gdtool.geometry.quad_split import pair_and_split
-from gdtool.geometry.quad_shape import remove_doublets, subdivide
+from gdtool.geometry.quad_shape import fill_holes, remove_doublets, subdivide
 from gdtool.geometry.sharpen import restore_creases
 from tests.geometry.solids import assembly, bored_box, cube, joined, plane, rod, sphere, torus, volume
 
@@ -272,13 +272,57 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
     assert outcome == "a crash" or "strays" in record.failed[0]
 
 
+def quad_cube(rounds):
+    vertices, faces = cube()[0], np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    for _ in range(rounds):
+        vertices, faces, _ = subdivide(vertices, faces)
+    return vertices, faces
+
+
+def around(faces, middle):
+    """The faces that touch face `middle` at one corner only, and those that share an edge with it."""
+    shared = np.isin(faces, faces[middle]).sum(1)
+    return np.flatnonzero(shared == 1), np.flatnonzero(shared == 2)
+
+
+def inner_face(vertices, faces):
+    """A face in the middle of a side of the cube."""
+    centre = vertices[faces].mean(1)
+    return int(np.linalg.norm(centre - [0.07, 0.07, centre[:, 2].max()], axis=1).argmin())
+
+
+def test_two_holes_that_meet_at_a_vertex_are_closed_each_by_itself():
+    vertices, faces = quad_cube(3)
+    middle = inner_face(vertices, faces)
+    open_faces = np.delete(faces, [middle, around(faces, middle)[0][0]], 0)
+    out, found = fill_holes(vertices, open_faces)
+    assert len(out) == len(vertices) and len(found) == len(faces) and whole(found)
+    assert volume(out, triangulated(found)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
+
+
+def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
+    vertices, faces = quad_cube(3)
+    middle = inner_face(vertices, faces)
+    corners, sides = around(faces, middle)
+    assert len(corners) == 4 and len(sides) == 4
+    torn = np.delete(faces, [*corners[1:], *sides], 0)
+    fault, out, found = quads._judged(vertices, torn, vertices, triangulated(faces)[0])
+    assert fault is None and whole(found) and repair.components(found)[0] == 1 and len(found) < len(faces)
+    assert volume(out, triangulated(found)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
+
+
+def test_output_without_area_is_no_quads():
+    vertices, faces = quad_cube(1)
+    assert quads._judged(vertices, faces[:, [0, 1, 1, 0]], vertices, triangulated(faces)[0])[0] == "no quads"
+
+
 def test_torn_output_is_not_believed(monkeypatch):
     # Three quads at one edge.
     book = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [1, 0, 6, 7]])
     monkeypatch.setattr(quads, "begin", lambda *_, **__: Ended((np.random.default_rng(0).random((8, 3)), book)))
     vertices, faces = sphere(24)
     _, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=300))
-    assert whole(found) and any("not watertight" in text for text in record.failed)
+    assert whole(found) and record.engine == "pair and split" and any("pieces are lost" in text for text in record.failed)
 
 
 def test_equal_input_gives_equal_quads():
