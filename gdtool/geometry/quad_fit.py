@@ -12,6 +12,7 @@ from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian
 from gdtool.geometry.quad_paths import crossed, cut_along_features, held_at_centres, to_rim
 from gdtool.geometry.quad_relax import balance, ease, square_up
 from gdtool.geometry.quad_shape import Surface, onto, relax, subdivide, unfold
+from gdtool.geometry.quad_tips import draw_out
 
 if TYPE_CHECKING:
     from gdtool.geometry.quads import Request
@@ -24,7 +25,7 @@ _FOLDED, _LET_GO = 0.05, 0.25  # scaled Jacobian; edge lengths
 
 def finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, subdivisions: int,
               request: Request, fine: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """The engine's quads drawn to creases, subdivided, evened out on the surface and unfolded."""
+    """The engine's quads drawn to creases, subdivided, drawn out over tips, evened out on the surface and unfolded."""
     edge = (polygon_normals(vertices, faces)[1].sum() / len(faces)) ** 0.5
     vertices, constraints = trace(to_rim(vertices, faces, surface, _RIM_EDGES * edge), faces, features, edge)
     free = untied(vertices, faces, constraints)
@@ -38,18 +39,21 @@ def finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features
         vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)
     if subdivisions and farthest(vertices, faces, surface) > _HOPELESS_EDGES * edge / 2**subdivisions:
         return vertices, faces  # shaping brings it a third nearer at most: it strays too far in any case
-    vertices = _shaped(vertices, faces, surface, features, constraints, request, fine)
+    tips = None
+    if not subdivisions:  # else an engine's quads of the full number come next, which leave less bare
+        vertices, faces, constraints, tips = draw_out(vertices, faces, constraints, surface, edge)
+    vertices = _shaped(vertices, faces, surface, features, constraints, request, fine, tips)
     return vertices, cut_along_features(vertices, faces, fine)
 
 
 def _shaped(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
-            request: Request, fine: Surface) -> np.ndarray:
+            request: Request, fine: Surface, tips: np.ndarray | None = None) -> np.ndarray:
     """The quads squared up, then the few that stay folded or thin unfolded one vertex at a time; last, balanced about `fine`."""
     vertices = square_up(vertices, faces, surface, features, constraints, request.smooth_iterations)
     constraints = untied(vertices, faces, constraints)
     vertices = square_up(vertices, faces, surface, features, constraints, 3 * request.smooth_iterations)
     vertices = unfold(vertices, faces, surface, features, constraints)
-    vertices, constraints = ease(vertices, faces, surface, features, constraints)
+    vertices, constraints = ease(vertices, faces, surface, features, constraints, tips=tips)
     return balance(vertices, faces, fine, constraints) if request.smooth_iterations else vertices
 
 
@@ -99,6 +103,11 @@ def farthest(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> float
 
     step = max(len(surface.vertices) // 20000, 1)
     return float(closest_points(surface.vertices[::step], vertices, triangulated(faces)[0])[0].max())
+
+
+def sticks_out(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> float:
+    """How far the middle of a quad is from the surface at most: large where quads bridge a gap or stand away from it."""
+    return float(surface.closest(vertices[faces].mean(1))[0].max())
 
 
 def left_out(vertices: np.ndarray, faces: np.ndarray, surface: Surface, distance: float) -> float:

@@ -104,10 +104,10 @@ def _rectangles(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def ease(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
-         least: float = 0.2, rounds: int = 6) -> tuple[np.ndarray, Constraints]:
+         least: float = 0.2, rounds: int = 6, tips: np.ndarray | None = None) -> tuple[np.ndarray, Constraints]:
     """Surroundings of quads that stay worse than `least` let off their feature curves and evened out; what got better is kept.
 
-    A path along a crease that winds cannot be straightened by moving vertices; here it is given up for a few quads.
+    tips: vertices that stay fixed, for evened out they would shrink back. A path along a crease that winds cannot be straightened by moving vertices; here it is given up for a few quads.
     """
     for turn in range(rounds):
         bad = scaled_jacobian(vertices, faces) < least
@@ -120,6 +120,8 @@ def ease(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Fe
         own = np.flatnonzero(near[faces].any(1))
         if len(own) > max(len(faces) // 5, 2000):
             break
+        if tips is not None:
+            near[tips] = False
         used, local = np.unique(faces[own], return_inverse=True)
         local = local.reshape(-1, 4)
         # Off their curves inside; where they were at the rim.

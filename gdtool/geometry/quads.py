@@ -16,7 +16,7 @@ from gdtool.geometry.features import find_features
 from gdtool.geometry.mesh_quality import scaled_jacobian, valences
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_engines import ENGINES
-from gdtool.geometry.quad_fit import farthest, finished, fitted, left_out
+from gdtool.geometry.quad_fit import farthest, finished, fitted, left_out, sticks_out
 from gdtool.geometry.quad_shape import Surface, fill_holes, remove_doublets
 from gdtool.geometry.quad_split import split_count, split_to_quads
 from gdtool.geometry.quad_topology import cancel_irregular
@@ -28,8 +28,9 @@ _SMALL_PIECE_QUADS = 48
 _TRIES = 3
 _CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a result is taken without a look at others
 _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
+_MOST_FOLDED = 0.01  # of the quads
 _HANDLES, _PIECES = "handles are lost or added", "pieces are lost or joined"
-_TOO_COARSE = _STRAYS, _LEAVES_OUT = "strays", "leaves out"
+_TOO_COARSE = _STRAYS, _LEAVES_OUT, _STICKS_OUT = "strays", "leaves out", "sticks out"
 _MENDINGS = 4  # rounds of filling holes and parting what meets at a vertex
 _MOST_PIECES = 16  # that are remeshed one by one where together they fail
 
@@ -221,6 +222,7 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
             continue
         label = engine + (f", {subdivisions} subdivision" if subdivisions else "") + ("" if degrees else ", creases left out")
         asked = [quads * factor for factor in factors]
+        extra = 0  # quads of the tips that are drawn out of the engine's
         for _ in range(_TRIES):
             start = time.perf_counter()
             way = ENGINES["on few" if engine == "instant-meshes" and subdivisions else engine]
@@ -239,18 +241,17 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
             record.clock("engine", start)
             if not results:
                 break
-            start = time.perf_counter()
+            start, wanted = time.perf_counter(), quads - extra
 
-            def rank(result: tuple) -> tuple:
-                off = abs(len(result[3]) * 4**subdivisions / quads - 1)
-                return result[1] is not None, max(off, COUNT_TOLERANCE), _irregular(result[3])
+            def rank(result: tuple, wanted: int = wanted) -> tuple:
+                return result[1] is not None, max(abs(len(result[3]) * 4**subdivisions / wanted - 1), COUNT_TOLERANCE), _irregular(result[3])
 
             results.sort(key=rank)
             number, fault, quad_vertices, quad_faces = results[0]
             count = len(quad_faces) * 4**subdivisions
-            off = count / quads - 1
+            off = count / wanted - 1
             if fault is None and abs(off) > COUNT_TOLERANCE:
-                asked = [number * quads / max(count, 1)]
+                asked = [number * wanted / max(count, 1)]
                 continue
             if fault is None:
                 # The others of the right count are finished too, until one has no thin quad and leaves no corner out.
@@ -261,15 +262,24 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
                     least = float(scaled_jacobian(quad_vertices, quad_faces).min())
                     good = far < _CLOSE_EDGES and least > _LEAST_JACOBIAN
                     if best is None or good or far - 2 * least < best[0]:
-                        best = far - 2 * least, far, least, quad_vertices, quad_faces
+                        best = far - 2 * least, far, least, quad_vertices, quad_faces, result
                     if good or not subdivisions:
                         break
                 record.clock("fit", start)
-                _, far, least, quad_vertices, quad_faces = best
+                _, far, least, quad_vertices, quad_faces, taken = best
+                if abs(len(quad_faces) / quads - 1) > COUNT_TOLERANCE:
+                    given = len(taken[3]) * 4**subdivisions
+                    extra, count = len(quad_faces) - given, len(quad_faces)
+                    asked = [taken[0] * (quads - extra) / given]
+                    continue
                 limit = 1.0 if subdivisions else 2.0
                 fault = f"{_STRAYS} {far:.2g} edge lengths from the surface" if far > limit else None
                 if fault is None and (left := left_out(quad_vertices, quad_faces, surface, _LOST_EDGES * edge)) > _LOST_SHARE:
                     fault = f"{_LEAVES_OUT} {left:.1%} of the surface"
+                if fault is None and (over := sticks_out(quad_vertices, quad_faces, surface) / edge) > limit:
+                    fault = f"{_STICKS_OUT} {over:.2g} edge lengths"
+                if fault is None and (folded := float((scaled_jacobian(quad_vertices, quad_faces) <= 0).mean())) > _MOST_FOLDED:
+                    fault = f"{folded:.1%} of the quads are folded"
                 if subdivisions and least < request.least_jacobian:
                     fault = f"has a quad of scaled Jacobian {least:.2g}"
             elif fault == _HANDLES and not subdivisions and second_best is None and abs(off) <= COUNT_TOLERANCE:

@@ -12,6 +12,16 @@ def cube(side: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     return (vertices - 0.5) * side, np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])
 
 
+def quad_cube(rounds: int) -> tuple[np.ndarray, np.ndarray]:
+    """A cube of 6 * 4**rounds quads."""
+    from gdtool.geometry.quad_shape import subdivide
+
+    vertices, faces = cube()[0], np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    for _ in range(rounds):
+        vertices, faces, _ = subdivide(vertices, faces)
+    return vertices, faces
+
+
 def marching(field, n: int, half: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Zero set of field(x, y, z), negative inside, on an n^3 grid over ±half; outward."""
     from skimage.measure import marching_cubes

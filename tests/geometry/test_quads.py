@@ -11,7 +11,7 @@ from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, scal
 from gdtool.geometry.quad_split import pair_and_split
 from gdtool.geometry.quad_shape import fill_holes, remove_doublets, subdivide
 from gdtool.geometry.sharpen import restore_creases
-from tests.geometry.solids import assembly, bored_box, cube, joined, plane, rod, sphere, torus, volume
+from tests.geometry.solids import assembly, bored_box, cube, joined, plane, quad_cube, rod, sphere, torus, volume
 
 
 def whole(faces):
@@ -270,13 +270,6 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
     _, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=1000))
     assert len(asked) == runs and record.engine == "pair and split" and whole(found)
     assert outcome == "a crash" or "strays" in record.failed[0]
-
-
-def quad_cube(rounds):
-    vertices, faces = cube()[0], np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
-    for _ in range(rounds):
-        vertices, faces, _ = subdivide(vertices, faces)
-    return vertices, faces
 
 
 def around(faces, middle):

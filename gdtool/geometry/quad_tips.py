@@ -1,0 +1,133 @@
+"""Tips and rims that quads leave bare, drawn out of them: what is thinner than a quad an engine cuts short."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.geometry.distance import closest_points, sample_surface
+from gdtool.geometry.features import Constraints
+from gdtool.geometry.quad_shape import Surface
+from gdtool.geometry.repair import components, edges_of, euler_number
+
+_BARE, _CLOSE, _STRAYS = 0.5, 0.75, 1.0  # edge lengths from the quads: what belongs to a tip, what is near enough, what makes one
+_STEP = 1.5  # edge lengths that a tip is drawn out at once
+_HELD = 0.75  # of the farthest that a vertex moves: those that move so far stay there
+_MOST_STEPS = 24
+_POINTS = 20000
+
+
+def draw_out(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, surface: Surface, edge: float,
+             most_added: float = 0.03) -> tuple[np.ndarray, np.ndarray, Constraints, np.ndarray]:
+    """Quads (f, 4) of mean edge length `edge` extruded over what of the surface strays from them, farthest first.
+
+    The vertices (v, 3) nearest to a tip move along it, an edge or two at a time, with the quads around them, and a ring of
+    new quads follows each step, as one would model a horn by hand, until most_added of the quads are new: what needs more is no matter of tips. Closed and
+    manifold as before, of as many pieces and handles. Returns vertices, faces, constraints, in which the tips are fixed, and the tips' vertices (t,).
+    """
+    from gdtool.folders.mesh import triangulated
+
+    step = max(len(surface.vertices) // _POINTS, 1)
+    points = np.concatenate([surface.vertices[::step], sample_surface(surface.vertices, surface.faces, _POINTS // 2, np.random.default_rng(0))[0]])
+    most, before = len(faces) * (1 + most_added), constraints.fixed.copy()
+    for turn in range(_MOST_STEPS):
+        triangles, face_idx = triangulated(faces)
+        away, nearest, _ = closest_points(points, vertices, triangles)
+        bare = away > _BARE * edge  # all others will stay near
+        points, away, nearest = points[bare], away[bare], nearest[bare]
+        if not len(points) or not turn and away.max() < _STRAYS * edge:
+            break
+        alive = np.ones(len(points), bool)
+        for tip in _apart(points, away, edge):
+            if away[tip].max() < _CLOSE * edge or len(faces) > most:
+                break
+            found = _extruded(vertices, faces, constraints, points[tip], face_idx[nearest[tip]], away[tip], surface, edge)
+            if found is None:
+                alive[tip] = False
+            else:
+                vertices, faces, constraints = found
+        points = points[alive]
+        if not len(points) or len(faces) > most or away[alive].max() < _CLOSE * edge:
+            break
+    before = np.concatenate([before, np.zeros(len(vertices) - len(before), bool)])
+    return vertices, faces, constraints, np.flatnonzero(constraints.fixed & ~before)
+
+
+def _apart(points: np.ndarray, away: np.ndarray, edge: float) -> list[np.ndarray]:
+    """Indices of the points of each tip, those that hang together; the tip that is farthest away first."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(points).query_pairs(edge, output_type="ndarray")
+    count, label = connected_components(coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(points),) * 2), False)
+    tips = [np.flatnonzero(label == k) for k in range(count)]
+    return sorted(tips, key=lambda tip: -away[tip].max())
+
+
+def _extruded(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, points: np.ndarray, quads: np.ndarray, away: np.ndarray,
+              surface: Surface, edge: float) -> tuple[np.ndarray, np.ndarray, Constraints] | None:
+    """One tip drawn out: points (n, 3) of it, the quad (n,) nearest to each, and how far away (n,); None where no disc of quads lies under it."""
+    corner = faces[quads, np.linalg.norm(vertices[faces[quads]] - points[:, None], axis=-1).argmin(1)]
+    # The farthest point within a step of each vertex, or the nearest where all are farther.
+    order = np.argsort(np.where(away <= _STEP * edge, -away, away), kind="stable")
+    moving, first = np.unique(corner[order], return_index=True)
+    target = points[order[first]]
+    farthest = np.array([corner[order[0]]])
+    for cap, aim in ((moving, target), (farthest, points[order[:1]])):
+        patch = np.isin(faces, cap).any(1)
+        loop = _border(faces, patch, cap)
+        if loop is not None:
+            break
+    else:
+        return None
+    shift = np.zeros_like(vertices)
+    shift[cap] = aim - vertices[cap]
+    length = np.linalg.norm(shift[cap], axis=1)
+    rings = max(round(length.max() / edge), 1)
+    base = loop[:, 0]
+    for vertex in base.tolist():
+        near = np.intersect1d(faces[patch & (faces == vertex).any(1)], cap)
+        shift[vertex] = shift[near].mean(0) if len(near) else 0
+    share = np.arange(1, rings + 1)[:, None, None] / (rings + 1)
+    new = surface.closest((vertices[base] + share * shift[base]).reshape(-1, 3))[2]
+    ring = np.concatenate([base, len(vertices) + np.arange(len(new))]).reshape(rings + 1, -1)
+    after = np.roll(ring, -1, 1)
+    sides = np.stack([ring[:-1], after[:-1], after[1:], ring[1:]], -1).reshape(-1, 4)
+    lifted = np.arange(len(vertices))
+    lifted[base] = ring[-1]
+    faces = np.concatenate([np.where(patch[:, None], lifted[faces], faces), sides])
+    vertices = np.concatenate([vertices, new])
+    vertices[cap] = aim
+    return vertices, faces, _extended(constraints, faces, len(vertices), cap, cap[length > _HELD * length.max()])
+
+
+def _border(faces: np.ndarray, patch: np.ndarray, cap: np.ndarray) -> np.ndarray | None:
+    """The directed edges (n, 2) around a patch of the faces, in a row; None unless it is a disc that the vertices `cap` alone lie inside."""
+    own = faces[patch]
+    edges = edges_of(own)
+    half = edges.half_ends[edges.count[edges.half_edge_idx] == 1]
+    # Inner edges of two quads, a rim that no vertex lies on twice, one piece without handles.
+    if (edges.count > 2).any() or edges.turned.any() or len(np.unique(half[:, 0])) < len(half) or np.isin(half, cap).any():
+        return None
+    if components(own)[0] != 1 or euler_number(own) != 1 or len(np.unique(own)) != len(half) + len(cap):
+        return None
+    following = dict(half.tolist())
+    loop = [int(half[0, 0])]
+    while (on := following[loop[-1]]) != loop[0]:
+        loop.append(on)
+        if len(loop) > len(half):
+            return None
+    return np.stack([loop, np.roll(loop, -1)], -1) if len(loop) == len(half) else None
+
+
+def _extended(constraints: Constraints, faces: np.ndarray, count: int, moved: np.ndarray, fixed: np.ndarray) -> Constraints:
+    """The constraints for so many vertices, without what held those that moved; `fixed` hold still."""
+    curve, still = np.full(count, -1), np.zeros(count, bool)
+    curve[:len(constraints.curve)], still[:len(constraints.fixed)] = constraints.curve, constraints.fixed
+    curve[moved], still[moved], still[fixed] = -1, False, True
+    ends = edges_of(faces).ends
+    path = np.sort(constraints.path, 1)
+    kept = np.isin(path[:, 0] * (count + 1) + path[:, 1], ends[:, 0] * (count + 1) + ends[:, 1]) & (curve[path] >= 0).all(1)
+    return Constraints(curve, still, constraints.path[kept], constraints.path_curve[kept])
+
+

@@ -1,0 +1,89 @@
+"""Tips: what sticks out of quads is drawn out of them, and nothing else changes."""
+
+import numpy as np
+import pytest
+
+from gdtool.geometry import quad_fit, quads, repair
+from gdtool.geometry.features import Constraints
+from gdtool.geometry.mesh_quality import distance_figures, scaled_jacobian
+from gdtool.folders.mesh import triangulated
+from gdtool.geometry.quad_fit import farthest
+from gdtool.geometry.quad_shape import Surface
+from gdtool.geometry.quad_tips import draw_out
+from tests.geometry.solids import quad_cube, sphere
+
+
+def horned(length, width=0.05, bend=0.0):
+    """A sphere of radius 0.4 with a horn at +x, whose middle line bends toward +y."""
+    vertices, faces = sphere(160, 0.4)
+    away = np.linalg.norm(vertices[:, 1:], axis=1)
+    horn = (vertices[:, 0] > 0) & (away < width)
+    share = 1 - away[horn] / width
+    vertices[horn, 0] += length * share
+    vertices[horn, 1] += bend * share**2
+    return vertices, faces
+
+
+def ball(rounds=4):
+    """Quads on the sphere of radius 0.4, and their edge length."""
+    vertices, faces = quad_cube(rounds)
+    vertices = vertices - vertices.mean(0)
+    vertices *= 0.4 / np.linalg.norm(vertices, axis=1, keepdims=True)
+    return vertices, faces, (4 * np.pi * 0.4**2 / len(faces)) ** 0.5
+
+
+@pytest.mark.parametrize("length, bend", [(0.08, 0.0), (0.25, 0.0), (0.25, 0.15)])
+def test_a_horn_is_drawn_out(length, bend):
+    vertices, faces, edge = ball()
+    surface = Surface(*horned(length, bend=bend))
+    assert farthest(vertices, faces, surface) > 1.4 * edge
+    out, found, constraints, tips = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge, most_added=0.3)
+    assert farthest(out, found, surface) < 0.8 * edge
+    assert repair.is_watertight(found) and repair.is_manifold(found) and repair.euler_number(found) == 2
+    assert len(faces) < len(found) < 1.2 * len(faces)
+    assert len(tips) and constraints.fixed[tips].all() and len(constraints.curve) == len(out)
+    apex = surface.vertices[surface.vertices[:, 0].argmax()]
+    assert np.linalg.norm(out[tips] - apex, axis=1).min() < 0.9 * edge
+    # The quads away from the horn are those that were there.
+    same = (vertices == out[:len(vertices)]).all(1)
+    assert same.sum() > 0.97 * len(vertices) and (vertices[~same, 0] > 0.3).all()
+
+
+def test_no_more_quads_than_allowed_are_spent():
+    vertices, faces, edge = ball()
+    found = draw_out(vertices, faces, Constraints.none(len(vertices)), Surface(*horned(0.25)), edge, most_added=0.01)[1]
+    assert 0 < len(found) - len(faces) < 0.01 * len(faces) + 40  # those of the step that went over it
+
+
+def test_what_is_near_enough_is_left_alone():
+    vertices, faces, edge = ball()
+    surface = Surface(*horned(0.8 * edge))
+    out, found, _, tips = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
+    assert out is vertices and found is faces and not len(tips)
+
+
+def test_paths_along_creases_end_where_a_tip_is_drawn_out():
+    """A path over the tip is no path of edges any more; the rest of it holds."""
+    vertices, faces, edge = ball()
+    around = np.flatnonzero((np.abs(vertices[:, 2]) < 1e-9))
+    around = around[np.argsort(np.arctan2(vertices[around, 1], vertices[around, 0]))]
+    path = np.stack([around, np.roll(around, -1)], -1)
+    curve = np.full(len(vertices), -1)
+    curve[around] = 0
+    held = Constraints(curve, np.zeros(len(vertices), bool), path, np.zeros(len(path), int))
+    _, found, constraints, tips = draw_out(vertices, faces, held, Surface(*horned(0.2)), edge)
+    edges = set(map(tuple, repair.edges_of(found).ends.tolist()))
+    assert 0.8 * len(path) < len(constraints.path) < len(path)
+    assert all(tuple(sorted(ends)) in edges for ends in constraints.path.tolist()) and (constraints.curve[tips] < 0).all()
+
+
+def test_an_engine_that_cuts_a_horn_short_is_still_taken(monkeypatch):
+    vertices, faces = horned(0.35, 0.04)
+    asked = quads.Request(quads=2000)
+    edge = (4 * np.pi * 0.4**2 / 2000) ** 0.5
+    out, found, record = quads.remesh(vertices, faces, asked)
+    figures = distance_figures(out, triangulated(found)[0], vertices, faces, 20000)
+    assert "instant-meshes" in record.engine and abs(len(found) / 2000 - 1) <= 0.03 and repair.is_watertight(found)
+    assert figures["hausdorff"] < 2 * edge and (scaled_jacobian(out, found) <= 0).mean() < 0.003
+    monkeypatch.setattr(quad_fit, "draw_out", lambda v, f, constraints, *_: (v, f, constraints, None))
+    assert quads.remesh(vertices, faces, asked)[2].engine == "pair and split"
