@@ -60,14 +60,21 @@ def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera
             if abs(per_depth) * other.pixel_size < 0.3 or not upright or abs((camera.position - other.position) @ up) > 1e-6 \
                     or camera.pixel_size != other.pixel_size:
                 continue
-            shown = mask[j] > 0.5
-            first, last = shown.argmax(1), width - shown[:, ::-1].argmax(1)
+            shown = (mask[j] > 0.5).any(1)
+            first, last = _begin(mask[j]), width - _begin(mask[j][:, ::-1])
             column = project(other, backproject(camera, out[k]).reshape(-1, 3))[0][:, 0].reshape(height, width)
             lacking = np.clip(column, first[:, None], last[:, None]) - column
-            out[k] += np.where(inside & shown.any(1)[:, None], lacking / per_depth, 0.0)
+            out[k] += np.where(inside & shown[:, None], lacking / per_depth, 0.0)
         # Outlines that contradict one another would move points anywhere.
         out[k] = np.where(inside, np.clip(out[k], camera.near, camera.far), out[k])
     return out.astype(np.float32)
+
+
+def _begin(mask: np.ndarray) -> np.ndarray:
+    """Column (h,) at which each row's coverage (h, w) first passes one half, between the centres of two pixels; 0 where it never does."""
+    row, first = np.arange(len(mask)), (mask > 0.5).argmax(1)
+    inner, outer = mask[row, first], np.where(first > 0, mask[row, first - 1], 0.0)
+    return np.where(inner > 0.5, first + 0.5 - (inner - 0.5) / np.maximum(inner - outer, 1e-6), 0.0)
 
 
 def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], background: float, domains: tuple[str, ...],

@@ -13,6 +13,7 @@ from gdtool.fields.carve import carve, silhouettes_outvoted, smooth_unseen
 from gdtool.fields.clock import Clock
 from gdtool.fields.photometric import Picture
 from gdtool.fields.refine import FOLD_DEGREES, bumpiness, drop_debris, follow_normals, measured_planes, refine
+from gdtool.fields.shown import restore_shown
 from gdtool.fields.sights import WEAK, Sight, free_distance, hull_distance, pixel_footprint, prepare, with_edge
 from gdtool.fields.thin import near_points, restore_thin
 from gdtool.geometry.grids import edge_counts, extract
@@ -23,7 +24,7 @@ LEAST_NOISE = 0.3  # grid steps: of views that had to be brought together
 OVER_EDGE = 0.25  # steps that a sharp edge may stand out of what the views leave, whose pixels round it off
 # Pixels by which the surface of views that a model made comes out too small: parts that they disagree about go, edges first.
 SMALL = 0.2
-BUMPY = 6.5  # degrees between the surface of views that disagree and their normals: exact normals come to 3, a model's to 10
+BUMPY = 3.5  # degrees between the surface of views that disagree and their normals: exact normals come to 3, a model's to 4 and more
 CREASE_ROUNDS = 4  # tries without what folded over
 MAX_SAMPLES = 320  # along the longest side: 33 million samples, 0.6 GB at the peak
 # Rounds of bringing views together: how far apart two surfaces may lie to be taken for one (world units), and how stiff
@@ -44,7 +45,8 @@ def _silent(text: str) -> None:
 class Shape:
     """A closed mesh, outward: vertices (v, 3) float64, faces (f, 3) int32, support (v,): weight of the views that
     measured each vertex; step: the grid's, world units; pieces dropped as debris; bumps: degrees by which the normals of
-    views that disagree differed from the surface's, None where they did not matter."""
+    views that disagree differed from the surface's, None where they did not matter; restored: share of the picture's mask behind
+    which the views together left nothing."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -52,6 +54,7 @@ class Shape:
     step: float
     dropped: int
     bumps: float | None = None
+    restored: float = 0.0
 
 
 def prepare_all(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray | None, normal: np.ndarray | None) -> list[Sight]:
@@ -124,27 +127,29 @@ def bring_together(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray, n
 
 
 def fuse_within(sights: list[Sight], step: float, noise: float, outvoted: int, clock: Clock, shaded: bool = True,
-                grow: float = 0.0) -> tuple[Shape, str]:
+                grow: float = 0.0, known: str = "") -> tuple[Shape, str]:
     """fuse_views at the finest step that the clock has time for, and what was left out for it ("" for nothing).
 
     With an end in sight a draft is made first, which tells how quick the machine is and is the result when nothing finer
     can be done in time.
     """
     if not clock.limited:
-        return fuse_views(sights, step, noise, outvoted, shaded, grow), ""
+        return fuse_views(sights, step, noise, outvoted, shaded, grow, known), ""
     began = clock.spent()
-    draft = fuse_views(sights, DRAFT * step, noise, outvoted, shaded, grow)
+    draft = fuse_views(sights, DRAFT * step, noise, outvoted, shaded, grow, known)
     seconds = clock.spent() - began
     for coarser in (1.0, 1.4):
         finer = DRAFT / coarser
         if seconds * (finer**FUSING + AFTER * finer**SURFACE) <= clock.left():
-            return fuse_views(sights, coarser * step, noise, outvoted, shaded, grow), "" if coarser == 1 else f"at {coarser} of its step"
+            return fuse_views(sights, coarser * step, noise, outvoted, shaded, grow, known), "" if coarser == 1 else f"at {coarser} of its step"
     return draft, f"at {DRAFT:g} of its step"
 
 
-def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 0, shaded: bool = True, grow: float = 0.0) -> Shape:
+def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 0, shaded: bool = True, grow: float = 0.0,
+               known: str = "") -> Shape:
     """Mesh of the prepared views. noise: world units by which they disagree; outvoted: see silhouettes_outvoted; shaded:
-    whether their normals are views' own, and not made of their depth; grow: world units by which the surface is moved out.
+    whether their normals are views' own, and not made of their depth; grow: world units by which the surface is moved out; known: name of the view whose
+    silhouette is no guess, all of which the mesh shows (shown.py), where views disagree; "" for none.
 
     Raises ValueError when the silhouettes have no common volume.
     """
@@ -156,7 +161,11 @@ def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: i
         values, thin = restore_thin(values, carved, grid, sights)
     if noise:
         values = _smoothed(values, noise / step)
-    vertices, faces = extract(values - np.float32(grow), grid)
+    values, restored = values - np.float32(grow), 0.0
+    for sight in sights:
+        if noise and sight.camera.name == known:
+            values, restored = restore_shown(values, grid, sights, sight)
+    vertices, faces = extract(values, grid)
     if len(faces) == 0:
         raise ValueError("the silhouettes have no common volume")
     reach = 1.5 * step + noise
@@ -172,7 +181,7 @@ def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: i
     if bumps is not None and bumps > BUMPY:
         vertices = follow_normals(vertices, faces, sights, step, reach=reach + noise)
     support = measured_planes(sights, vertices, vertex_normals(vertices, faces), reach)[2]
-    return Shape(vertices, faces, support, step, dropped, bumps)
+    return Shape(vertices, faces, support, step, dropped, bumps, restored)
 
 
 def _smoothed(values: np.ndarray, noise: float) -> np.ndarray:

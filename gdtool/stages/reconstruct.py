@@ -82,13 +82,16 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         out.skip("growth of the surface", "no model made the views of a picture")
     with out.step("fuse"):
         try:
-            shape, coarser = fuse_within(sights, step, noise, outvoted, clock, normal is not None, grow)
+            shape, coarser = fuse_within(sights, step, noise, outvoted, clock, normal is not None, grow, folder.content.picture)
         except ValueError as error:
             raise InputError(folder.path, str(error), "check the masks and cameras") from None
     if shape.bumps is None or shape.bumps <= BUMPY:
         out.skip("surface by normals", f"it is within {shape.bumps:.1f} degrees of them" if shape.bumps is not None
                  else "there are none" if normal is None
                  else "the silhouettes alone give the shape" if all(sight.planes is None for sight in sights) else "the views agree")
+    if not shape.restored:
+        out.skip("parts that the picture alone shows", "the views together have something behind each of its pixels" if grow and noise
+                 else "the views agree" if grow else "no model made the views of a picture")
     if coarser:
         out.skip("the whole grid", f"--budget has no time for it: the surface is taken {coarser}")
     _check_cameras(folder, views.cameras, shape.vertices)
@@ -104,7 +107,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         _use_fit(fit, vertices, views, look, options, out)
     surface = Surface(vertices, faces, look.albedo, look.roughness, look.metallic, look.confidence, normals, look.light, look.views, look.residual)
     report = {"seen_share": float((shape.support > 0.02).mean()), "pieces_dropped": shape.dropped, "grid_step": shape.step,
-              "disagreement_before": before, "disagreement": noise, "grown": grow, "agreement": agreed, "silhouettes_outvoted": outvoted,
+              "disagreement_before": before, "disagreement": noise, "grown": grow, "restored_share": shape.restored, "agreement": agreed, "silhouettes_outvoted": outvoted,
               "mean_confidence": float(look.confidence.mean()), **look.figures, **figures}
     with out.step("write"):
         write_surface(out, surface, watertight=is_closed_manifold(faces), method=options.method, field=fit is not None,
@@ -216,4 +219,4 @@ def _check_masks(path, views, out: Output) -> None:
             out.warn(f"view {name}: its mask is empty; the view is left out")
 
 
-STAGE = Stage(name="reconstruct", version=17, reads=("views",), writes="surface", Options=Options, run=run)
+STAGE = Stage(name="reconstruct", version=18, reads=("views",), writes="surface", Options=Options, run=run)

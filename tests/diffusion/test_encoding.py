@@ -187,3 +187,23 @@ def test_depth_stays_within_the_outlines_that_other_views_show():
     found = within_silhouettes(images["depth"], elsewhere, cameras)
     inside = elsewhere > 0.5
     assert found[inside].min() >= cameras[0].near and found[inside].max() <= cameras[0].far
+
+
+def test_an_outline_between_pixels_keeps_depth_to_a_fraction_of_one():
+    """Of a wall that leans by a fifth of a pixel a row: no steps of whole pixels in the depth of the view that faces it."""
+    from gdtool.cameras import rig
+    from gdtool.diffusion.result import within_silhouettes
+
+    size, lean = 64, 1 / 5
+    cameras = rig("six", size)
+    names, pixel = [camera.name for camera in cameras], cameras[0].pixel_size
+    front, right = names.index("front"), names.index("right")
+    row, column = np.mgrid[:size, :size]
+    edge = 8 + lean * row[:, 0]  # pixels from the middle
+    mask = np.zeros((6, size, size), np.float32)
+    mask[front, :, 20:-20] = 1
+    mask[right] = np.clip(edge[:, None] - np.abs(column + 0.5 - size / 2) + 0.5, 0, 1)
+    depth = np.where(mask > 0, np.linalg.norm(cameras[front].position) - 0.5, 0).astype(np.float32)
+    found = within_silhouettes(depth, mask, cameras)[front, :, size // 2]
+    wall = np.linalg.norm(cameras[front].position) - edge * pixel
+    np.testing.assert_allclose(found, wall, atol=0.1 * pixel)

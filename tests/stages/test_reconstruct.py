@@ -38,6 +38,7 @@ def test_writes_a_valid_surface_once(gdtool, folder, tmp_path):
     skipped = {s["what"]: s["reason"] for s in manifest(out)["skipped"]}
     assert skipped["surface by normals"] == "the views agree"
     assert skipped["growth of the surface"] == "no model made the views of a picture" and content["report"]["grown"] == 0
+    assert skipped["parts that the picture alone shows"] == "no model made the views of a picture" and content["report"]["restored_share"] == 0
     assert np.abs(torus(surface.vertices)).mean() < 0.002
     albedo, roughness, metallic = material(surface.vertices)
     sure = surface.confidence > 0.5

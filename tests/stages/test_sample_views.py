@@ -73,6 +73,7 @@ def test_a_picture_becomes_six_views_in_six_domains(gdtool, picture, tiny_model,
     assert made.returncode == 0, made.stderr
     surface = json.loads((tmp_path / "ball.asset/surface" / MANIFEST).read_text())
     assert surface["content"]["report"]["grown"] > 0 and "growth of the surface" not in {one["what"] for one in surface["skipped"]}
+    assert (surface["content"]["report"]["restored_share"] > 0) != ("parts that the picture alone shows" in {one["what"] for one in surface["skipped"]})
     kept, shown = read_image(views / "picture.png"), read_image(views / "condition/000.png")
     assert kept.shape == (64, 64, 4)
     assert np.abs(kept[..., 3].reshape(16, 4, 16, 4).mean((1, 3)) - shown[..., 3]).mean() < 8

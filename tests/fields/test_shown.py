@@ -1,0 +1,83 @@
+"""What the picture's own view shows and the fused views lost."""
+
+import numpy as np
+import pytest
+
+from gdtool.fields.fusion import fuse_views, grid_step, is_closed_manifold, prepare_all
+from gdtool.fields.shown import lost_pixels, opposite, restore_shown
+from gdtool.geometry.distance import closest_points
+from gdtool.geometry.grids import grid_over
+
+from .shapes import views_of
+
+SIZE, CHORD, HIGH = 96, 0.12, 0.03
+
+
+def box(points, half):
+    q = np.abs(points) - half
+    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0)
+
+
+def body(points):
+    return box(points, np.array([0.12, 0.12, 0.4]))
+
+
+def plane(points):
+    """A body along z with a wing along x, four pixels high and twelve deep."""
+    return np.minimum(body(points), box(points, np.array([0.4, HIGH, CHORD])))
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """The plane from the front and back, from elsewhere its body alone; depths as wavy as a model's."""
+    cameras, images, mask = views_of(plane, SIZE)
+    _, of_body, body_mask = views_of(body, SIZE)
+    y, x = np.mgrid[:SIZE, :SIZE]
+    for k, camera in enumerate(cameras):
+        if camera.name not in ("front", "back"):
+            mask[k] = body_mask[k]
+            for domain in images:
+                images[domain][k] = of_body[domain][k]
+        images["depth"][k] += np.where(images["depth"][k] > 0, 0.005 * np.sin(0.6 * x + k) * np.sin(0.5 * y - 2 * k), 0)
+    return prepare_all(cameras, mask, images["depth"], images["normal"])
+
+
+def test_a_wing_that_the_other_views_look_through_is_there(seen):
+    step = grid_step([sight.camera for sight in seen], 0)
+    without, found = (fuse_views(seen, step, 0.5 * step, known=known) for known in ("", "front"))
+    assert without.restored == 0 and np.abs(without.vertices[:, 0]).max() < 0.3
+    wing = found.vertices[np.abs(found.vertices[:, 0]) > 0.2]
+    assert is_closed_manifold(found.faces) and 0.2 < found.restored < 0.8
+    assert np.abs(wing[:, 0]).max() == pytest.approx(0.4, abs=0.02)
+    assert np.abs(wing[:, 1]).max() == pytest.approx(HIGH, abs=0.015)  # a pixel
+    assert np.abs(wing[:, 2]).max() == pytest.approx(CHORD, abs=0.02)
+    # The body is as it was.
+    tail = without.vertices[np.abs(without.vertices[:, 2]) > 0.25]
+    assert closest_points(tail, found.vertices, found.faces)[0].max() < 0.5 * step
+
+
+def test_views_that_agree_are_left_alone(seen):
+    step = grid_step([sight.camera for sight in seen], 0)
+    one, two = (fuse_views(seen, step, 0.0, known=known) for known in ("", "front"))
+    assert two.restored == 0 and np.array_equal(one.vertices, two.vertices)
+
+
+def test_without_a_view_from_behind_a_part_is_as_thick_as_wide(seen):
+    front = next(sight for sight in seen if sight.camera.name == "front")
+    assert opposite(seen, front).camera.name == "back" and opposite([front], front) is None
+    grid = grid_over(np.full(3, -0.45), np.full(3, 0.45), 0.01, margin=2)
+    index = np.argwhere(np.ones(grid.shape, bool))
+    values = body(grid.points(index)).reshape(grid.shape).astype(np.float32)
+    lost = lost_pixels(values, grid, front)
+    assert lost.sum() == pytest.approx(2 * 0.28 * 2 * HIGH / front.camera.pixel_size**2, rel=0.15)
+    alone, share = restore_shown(values, grid, [front], front)
+    assert share == pytest.approx(lost.sum() / (front.mask > 0.5).sum())
+    wing = grid.points(index[(alone < 0).ravel() & (np.abs(grid.points(index)[:, 0]) > 0.2)])
+    assert np.ptp(wing[:, 2]) < 0.08 and wing[:, 2].max() == pytest.approx(CHORD, abs=0.03)  # thin, where its front edge is seen
+    assert (alone <= values).all()
+    # What is there needs nothing, and a view without depth says nothing of where.
+    whole = plane(grid.points(index)).reshape(grid.shape).astype(np.float32)
+    same, share = restore_shown(whole, grid, seen, front)
+    assert share == 0 and same is whole
+    blind = prepare_all([front.camera], front.mask[None], None, None)[0]
+    assert restore_shown(values, grid, [blind], blind) == (values, 0.0)
