@@ -15,10 +15,10 @@ from gdtool.fields.sights import Sight, bilinear, pixel_footprint
 from gdtool.geometry.grids import Grid, dilate
 
 LEAST = 8  # pixels that hang together; fewer are the outline's own error
-ACROSS = 2  # pixels, both ways: what is narrower lies along an edge
+ACROSS, AWAY = 2, 2.5  # pixels, both ways and from what is there: what is narrower and nearer lies along an edge
 BESIDE = 2  # pixels of what is there anyhow that a part takes along, so that it is joined
-THINNEST = 1.0  # steps: half a part's thickness at least, or as much of its half width as ROUND, up to WIDEST pixels
-ROUND, WIDEST = 0.7, 3.0
+FLATTEST, THINNEST = 0.6, 1.0  # steps: half of what a part measures at least across the picture, and along the view
+ROUND, WIDEST = 0.7, 3.0  # of its half width, up to so many pixels, it is thick at least
 NEAR = 0.25  # steps outside the surface at which a sample still stands for it: half a cell is lost between samples
 SMOOTH = 1.0  # pixels: of the depths
 _CHUNK = 1 << 16
@@ -36,7 +36,7 @@ def opposite(sights: Sequence[Sight], known: Sight) -> Sight | None:
 
 def lost_pixels(values: np.ndarray, grid: Grid, sight: Sight) -> np.ndarray:
     """Pixels (h, w) bool of a view's mask behind which the grid of signed distances has no inside; without specks and edges."""
-    from scipy.ndimage import binary_opening, label
+    from scipy.ndimage import binary_opening, distance_transform_edt, label
 
     h, w = sight.mask.shape
     inside = np.argwhere(values < NEAR * grid.step)
@@ -45,7 +45,9 @@ def lost_pixels(values: np.ndarray, grid: Grid, sight: Sight) -> np.ndarray:
     lost = sight.mask > 0.5
     lost[pixels[:, 1], pixels[:, 0]] = False
     regions, count = label(lost, np.ones((3, 3)))
-    kept = np.bincount(regions.ravel(), binary_opening(lost, np.ones((ACROSS, ACROSS))).ravel(), count + 1) >= LEAST
+    away = distance_transform_edt(lost | (sight.mask <= 0.5)) > AWAY
+    telling = lost & (away | binary_opening(lost, np.ones((ACROSS, ACROSS))))
+    kept = np.bincount(regions.ravel(), telling.ravel(), count + 1) >= LEAST
     kept[0] = False
     return kept[regions]
 
@@ -56,7 +58,7 @@ def restore_shown(values: np.ndarray, grid: Grid, sights: Sequence[Sight], known
     values: negative inside, the distances from which the surface will be taken. Without a view from the other side a part is as thick as it
     is wide, up to WIDEST pixels.
     """
-    from scipy.ndimage import distance_transform_edt
+    from scipy.ndimage import distance_transform_edt, maximum_filter
 
     lost = lost_pixels(values, grid, known) if known.points is not None else np.zeros(known.mask.shape, bool)
     if not lost.any():
@@ -73,7 +75,8 @@ def restore_shown(values: np.ndarray, grid: Grid, sights: Sequence[Sight], known
         behind = _depth(other, zone[:, ::-1])[:, ::-1]
         last = np.where(behind > 0, between - behind, last)
     middle, half = (first + last) / 2, np.maximum((last - first) / 2, np.maximum(ROUND * wide, THINNEST * grid.step))
-    edge = np.maximum(np.where(zone, 0.5 - distance_transform_edt(zone), distance_transform_edt(~zone) - 0.5), known.silhouette)
+    edge = np.maximum(np.where(zone, 0.5 - distance_transform_edt(zone), distance_transform_edt(~zone) - 0.5), known.silhouette) * foot
+    edge -= np.maximum(FLATTEST * grid.step - maximum_filter(-edge, 3), 0.0)
     # Beyond the zone the nearest values within it.
     nearest = tuple(distance_transform_edt(~(zone & (first > 0)), return_distances=False, return_indices=True))
     slab = np.stack([middle[nearest], half[nearest], edge], -1).astype(np.float32)
@@ -83,7 +86,7 @@ def restore_shown(values: np.ndarray, grid: Grid, sights: Sequence[Sight], known
         index = np.stack(np.unravel_index(np.arange(start, min(start + _CHUNK, flat.size)), grid.shape), -1)
         pixels, depth = project(camera, grid.points(index))
         at = bilinear(slab, pixels)
-        distance = np.maximum(np.abs(depth - at[:, 0]) - at[:, 1], at[:, 2] * pixel_footprint(camera, depth))
+        distance = np.maximum(np.abs(depth - at[:, 0]) - at[:, 1], at[:, 2])
         flat[start:start + _CHUNK] = np.minimum(flat[start:start + _CHUNK], distance)
     return out, float(lost.sum() / mask.sum())
 
