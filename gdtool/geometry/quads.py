@@ -32,7 +32,8 @@ _MOST_FOLDED = 0.01  # of the quads
 _HANDLES, _PIECES = "handles are lost or added", "pieces are lost or joined"
 _TOO_COARSE = _STRAYS, _LEAVES_OUT, _STICKS_OUT = "strays", "leaves out", "sticks out"
 _MENDINGS = 4  # rounds of filling holes and parting what meets at a vertex
-_MOST_PIECES = 16  # that are remeshed one by one where together they fail
+_MOST_PIECES, _ALONE, _FEWEST = 16, 300, 6  # that are remeshed one by one where together they fail; quads of one that is, and of any
+_ON_ONE, _MOST_APART = 0.9, 1.5  # of a component's quads lie on the piece that they stand for; edge lengths that a piece strays
 
 
 @dataclass(frozen=True)
@@ -111,16 +112,17 @@ def _remeshed(vertices: np.ndarray, faces: np.ndarray, request: Request, careful
     with ThreadPoolExecutor(1) as beside:
         error = beside.submit(_deviation, fine(), coarse) if coarse[1] is not faces else None
         done, names = [], []
-        waiting = _pieces(*coarse, request.quads)
+        waiting = [(*part, False) for part in _pieces(*coarse, request.quads)]
         while waiting:
-            part_vertices, part_faces, quads = waiting.pop(0)
+            part_vertices, part_faces, quads, given_up = waiting.pop(0)
             found = None
-            if quads >= _SMALL_PIECE_QUADS and request.engine != "split":
-                found = _by_engines(part_vertices, part_faces, quads, edge, request, record, fine)
-                if found is None and 1 < repair.components(part_faces)[0] <= _MOST_PIECES:
-                    # What lies close together an engine may join, and what is thin it may lose beside the rest.
-                    waiting = _one_by_one(part_vertices, part_faces, quads) + waiting
-                    continue
+            if not given_up and quads >= _SMALL_PIECE_QUADS and request.engine != "split":
+                found, whole = _by_engines(part_vertices, part_faces, quads, edge, request, record, fine)
+                if found is None and repair.components(part_faces)[0] > 1:
+                    found, left = _by_pieces(part_vertices, part_faces, quads, whole, edge, request, record, fine)
+                    waiting = left + waiting
+                    if found is None:
+                        continue
             if found is None:
                 start = time.perf_counter()
                 split = split_to_quads(part_vertices, part_faces, quads, request.crease_degrees, request.seconds, request.memory_mb)
@@ -131,8 +133,7 @@ def _remeshed(vertices: np.ndarray, faces: np.ndarray, request: Request, careful
         record.source = fine()
         record.figures["simplify_error"] = error.result() if error is not None else 0.0
     record.engine = "; ".join(dict.fromkeys(names))
-    offset = np.cumsum([0] + [len(v) for v, _ in done])
-    return np.concatenate([v for v, _ in done]), np.concatenate([f + o for (_, f), o in zip(done, offset, strict=False)]), record
+    return *_joined(done), record
 
 
 def _needed(request: Request) -> int:
@@ -201,21 +202,91 @@ def _pieces(vertices: np.ndarray, faces: np.ndarray, quads: int) -> list[tuple[n
     return out
 
 
-def _one_by_one(vertices: np.ndarray, faces: np.ndarray, quads: int) -> list[tuple[np.ndarray, np.ndarray, int]]:
-    """Each piece as a mesh of its own, with its share of the quads by area, small ones with enough for their shape."""
+def _by_pieces(vertices: np.ndarray, faces: np.ndarray, quads: int, whole: tuple[str, np.ndarray, np.ndarray] | None, edge: float,
+               request: Request, record: Record, fine: Callable[[], Surface]) -> tuple[tuple[np.ndarray, np.ndarray, str] | None, list[tuple]]:
+    """Of several pieces, those whose quads in an engine's result `whole` stand up to judgement, finished; and what is left to do.
+
+    What is left: (vertices, faces, quads, whether it is given up) of each large piece and, given up, of all others together. What lies close
+    together an engine may join, and what is thin it may lose beside the rest, so that it may do better on one piece alone.
+    """
+    start = time.perf_counter()
     count, piece = repair.components(faces)
-    area, triangles = np.bincount(piece, face_normals(vertices, faces)[1], count), np.bincount(piece, minlength=count)
-    share = np.maximum(quads * area / area.sum(), np.minimum(triangles / 2, quads / _MOST_PIECES)).round().astype(int)
-    share[share.argmax()] -= share.sum() - quads
-    return [(*repair.compact(vertices, faces[piece == k]), max(int(share[k]), 6)) for k in range(count)]
+    area = np.bincount(piece, face_normals(vertices, faces)[1], count)
+    found, good = None, np.zeros(count, bool)
+    if whole is not None and count <= quads / _SMALL_PIECE_QUADS:
+        parts = [repair.compact(vertices, faces[piece == k]) for k in range(count)]
+        judged = [_judged(*part, *parts[k]) if len(part[1]) else ("lost", *part) for k, part in enumerate(_quads_of_pieces(*whole[1:], vertices, faces, piece))]
+        good = np.array([fault is None for fault, _, _ in judged])
+        if good.any():
+            surface = Surface(*repair.compact(vertices, faces[good[piece]]))
+            features = find_features(surface.vertices, surface.faces, request.crease_degrees or 181.0, 3 * edge)
+            done = finished(*_joined([quads_of[1:] for quads_of, fits in zip(judged, good, strict=True) if fits]), surface, features, 0, request, fine())
+            of_piece = _quads_of_pieces(*done, vertices, faces, piece)
+            for k in np.flatnonzero(good):
+                good[k] = len(of_piece[k][1]) and _fault(*of_piece[k], Surface(*parts[k]), edge, _MOST_APART) is None
+            if good.any():
+                found = *_joined([of_piece[k] for k in np.flatnonzero(good)]), whole[0]
+    left = quads - (len(found[1]) if found is not None else 0)
+    waiting = []
+    if not good.all():
+        share = np.where(good, 0.0, area / area[~good].sum())
+        alone = np.argsort(-share, kind="stable")[:_MOST_PIECES]
+        least = np.minimum(np.bincount(piece, minlength=count) / 2, quads / _MOST_PIECES)  # enough for its shape
+        own = np.maximum(left * share, least)[alone]
+        alone, own = alone[(share[alone] > 0) & (own >= _ALONE)], own[(share[alone] > 0) & (own >= _ALONE)]
+        rest = ~good
+        rest[alone] = False
+        if rest.any():
+            few = max(int(left * share[rest].sum()), 1)
+            waiting.append((*repair.compact(vertices, faces[rest[piece]]), few, True))
+            left -= split_count(waiting[0][1], few)
+        own = np.maximum((own * (left / max(own.sum(), 1))).round().astype(int), _FEWEST)
+        waiting += [(*repair.compact(vertices, faces[piece == k]), int(number), False) for k, number in zip(alone, own, strict=True)]
+    record.clock("pieces", start)
+    return found, waiting
+
+
+def _quads_of_pieces(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
+                     piece: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Vertices and quads of each piece (f,) of the triangles: of the components of a quad mesh those that lie on it; on two, on none."""
+    from gdtool.geometry.distance import closest_points
+
+    count, label = repair.components(quad_faces)
+    on = piece[closest_points(quad_vertices[quad_faces].mean(1), vertices, faces)[1]]
+    share = np.zeros((count, piece.max() + 1))
+    np.add.at(share, (label, on), 1)
+    owner = np.where(share.max(1) >= _ON_ONE * share.sum(1), share.argmax(1), -1)
+    return [repair.compact(quad_vertices, quad_faces[owner[label] == k]) for k in range(piece.max() + 1)]
+
+
+def _joined(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Meshes as one."""
+    offset = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
+    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate([faces + o for (_, faces), o in zip(parts, offset, strict=False)])
+
+
+def _fault(quad_vertices: np.ndarray, quad_faces: np.ndarray, surface: Surface, edge: float, limit: float) -> str | None:
+    """What of finished quads does not do on the surface, or None. limit: edge lengths that they may stray."""
+    if (far := farthest(quad_vertices, quad_faces, surface) / edge) > limit:
+        return f"{_STRAYS} {far:.2g} edge lengths from the surface"
+    if (left := left_out(quad_vertices, quad_faces, surface, _LOST_EDGES * edge)) > _LOST_SHARE:
+        return f"{_LEAVES_OUT} {left:.1%} of the surface"
+    if (over := sticks_out(quad_vertices, quad_faces, surface) / edge) > limit:
+        return f"{_STICKS_OUT} {over:.2g} edge lengths"
+    if (folded := float((scaled_jacobian(quad_vertices, quad_faces) <= 0).mean())) > _MOST_FOLDED:
+        return f"{folded:.1%} of the quads are folded"
+    return None
 
 
 def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float, request: Request,
-                record: Record, fine: Callable[[], Surface]) -> tuple[np.ndarray, np.ndarray, str] | None:
-    """The first engine's result that stands up to judgement, finished; None when none does. fine gives the input's Surface."""
+                record: Record, fine: Callable[[], Surface]) -> tuple[tuple[np.ndarray, np.ndarray, str] | None, tuple[str, np.ndarray, np.ndarray] | None]:
+    """The first engine's result that stands up to judgement, finished; None when none does. fine gives the input's Surface.
+
+    Of several pieces, too, what an engine made of all of them that does not stand up: the way, its vertices and quads, mended where they could be.
+    """
     features = surface = None
-    second_best = None
-    apart = 1 < repair.components(faces)[0] <= _MOST_PIECES  # what fails together can go one by one
+    second_best = whole = None
+    apart = repair.components(faces)[0] > 1  # what fails together can go piece by piece
     given_up: set[str] = set()
     for engine, subdivisions, factors, degrees in _attempts(quads, request):
         if engine in given_up:
@@ -250,7 +321,9 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
             number, fault, quad_vertices, quad_faces = results[0]
             count = len(quad_faces) * 4**subdivisions
             off = count / wanted - 1
-            if fault is None and abs(off) > COUNT_TOLERANCE:
+            if apart and not subdivisions and len(quad_faces):
+                whole = label, quad_vertices, quad_faces
+            if (fault is None or apart and not subdivisions) and abs(off) > COUNT_TOLERANCE:
                 asked = [number * wanted / max(count, 1)]
                 continue
             if fault is None:
@@ -272,23 +345,16 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
                     extra, count = len(quad_faces) - given, len(quad_faces)
                     asked = [taken[0] * (quads - extra) / given]
                     continue
-                limit = 1.0 if subdivisions else 2.0
-                fault = f"{_STRAYS} {far:.2g} edge lengths from the surface" if far > limit else None
-                if fault is None and (left := left_out(quad_vertices, quad_faces, surface, _LOST_EDGES * edge)) > _LOST_SHARE:
-                    fault = f"{_LEAVES_OUT} {left:.1%} of the surface"
-                if fault is None and (over := sticks_out(quad_vertices, quad_faces, surface) / edge) > limit:
-                    fault = f"{_STICKS_OUT} {over:.2g} edge lengths"
-                if fault is None and (folded := float((scaled_jacobian(quad_vertices, quad_faces) <= 0).mean())) > _MOST_FOLDED:
-                    fault = f"{folded:.1%} of the quads are folded"
+                fault = _fault(quad_vertices, quad_faces, surface, edge, 1.0 if subdivisions else 2.0)
                 if subdivisions and least < request.least_jacobian:
                     fault = f"has a quad of scaled Jacobian {least:.2g}"
             elif fault == _HANDLES and not subdivisions and second_best is None and abs(off) <= COUNT_TOLERANCE:
                 second_best = quad_vertices, quad_faces, f"{label}, {fault}"
             if fault is None:
-                return quad_vertices, quad_faces, label
+                return (quad_vertices, quad_faces, label), None
             record.failed.append(f"{label}: {fault}")
-            if apart and (fault == _PIECES or not subdivisions):
-                return None
+            if apart and not subdivisions:
+                return None, whole
             # Another density mends a seam of the engine's fields, not a part that is too thin for so many quads.
             if not subdivisions and fault.startswith(_TOO_COARSE):
                 given_up.add(engine)
@@ -303,8 +369,8 @@ def _by_engines(vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float
         quad_vertices, quad_faces = finished(*second_best[:2], surface, features, 0, request, fine())
         record.clock("fit", start)
         if farthest(quad_vertices, quad_faces, surface) < 2 * edge:
-            return quad_vertices, quad_faces, second_best[2]
-    return None
+            return (quad_vertices, quad_faces, second_best[2]), None
+    return None, whole
 
 
 def _irregular(faces: np.ndarray) -> int:

@@ -21,20 +21,42 @@ def whole(faces):
 def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
     """Each has its share of the quads asked for, the small one enough for its shape, and none is lost."""
     vertices, faces = joined(sphere(48, 0.4, (0, -0.2, 0)), sphere(48, 0.12, (0, 0.5, 0)))
-    parts = quads._one_by_one(vertices, faces, 2000)
-    assert len(parts) == 2
-    assert sum(count for *_, count in parts) == 2000 and min(count for *_, count in parts) >= 2000 * 0.02
+    found, parts = quads._by_pieces(vertices, faces, 4000, None, 0.03, quads.Request(), quads.Record(), None)
+    assert found is None and len(parts) == 2 and not any(given_up for *_, given_up in parts)
+    assert sum(count for _, _, count, _ in parts) == 4000 and min(count for _, _, count, _ in parts) >= 4000 * 0.02
     tried = []
     real = quads._by_engines
 
     def fails_together(part, triangles, *rest):
         tried.append(repair.components(triangles)[0])
-        return None if tried[-1] > 1 else real(part, triangles, *rest)
+        return (None, None) if tried[-1] > 1 else real(part, triangles, *rest)
 
     monkeypatch.setattr(quads, "_by_engines", fails_together)
-    out, found, _ = quads.remesh(vertices, faces, quads.Request(quads=2000))
+    out, found, _ = quads.remesh(vertices, faces, quads.Request(quads=4000))
     assert tried == [2, 1, 1] and repair.components(found)[0] == 2 and whole(found)
-    assert abs(len(found) / 2000 - 1) <= 0.03
+    assert abs(len(found) / 4000 - 1) <= 0.03
+
+
+@pytest.mark.parametrize("hopeless", [False, True])
+def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless):
+    """Of more than go one by one; where one of them fails, too, whatever is tried, it alone is paired triangles."""
+    ball, large = sphere(64, 0.09), sphere(48, 0.3)
+    balls = [(ball[0] + (0.22 * i, 0.22 * j, 0), ball[1]) for i in range(5) for j in range(4)]
+    vertices, faces = joined(*balls, (large[0] + (0.4, 0.3, 0.5), large[1]))
+    real = quads._judged
+
+    def fails(quad_vertices, quad_faces, of_vertices, of_faces):
+        fault, *mended = real(quad_vertices, quad_faces, of_vertices, of_faces)
+        bad = repair.components(of_faces)[0] > 1 or hopeless and np.ptp(of_vertices, 0).max() > 0.5
+        return "not watertight, though the input is" if bad else fault, *mended
+
+    monkeypatch.setattr(quads, "_judged", fails)
+    out, found, record = quads.remesh(vertices, faces, quads.Request(quads=4000))
+    assert record.engine == ("instant-meshes; pair and split" if hopeless else "instant-meshes")
+    assert repair.components(found)[0] == 21 and whole(found) and abs(len(found) / 4000 - 1) <= 0.03
+    small = found[(out[found][..., 2] < 0.15).all(1)]
+    assert topology_figures(*repair.compact(out, small))["irregular_share"] < 0.1  # eight of a ball's hundred; of paired triangles a fifth and more
+    assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.02
 
 
 def test_grid_figures():
