@@ -176,8 +176,11 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
     vertices = vertices.copy()
     normals = normals_below(vertices, faces, surface)
     angles = np.arange(8) * (np.pi / 4)
+    settled = np.zeros(len(vertices), bool)  # found no better place, and nothing beside them moved since
     for turn in range(rounds):
         loose = turn >= rounds - 4
+        if turn == rounds - 4:
+            settled &= (constraints.curve < 0) & ~constraints.fixed
         bad = np.flatnonzero(worst_jacobian(vertices, faces, normals) < (_LET_OFF_BELOW if loose else least))
         if not len(bad):
             break
@@ -187,7 +190,7 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
             break
         for v in touched.tolist():
             held = constraints.curve[v] >= 0
-            if (constraints.fixed[v] and not loose) or (boundary[v] and not held):
+            if settled[v] or (constraints.fixed[v] and not loose) or (boundary[v] and not held):
                 continue
             mine, here = ring[v], vertices[v].copy()
             near = vertices[neighbours[v]]
@@ -211,8 +214,10 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
             flat = flat.reshape(-1, 3)
             got = worst_jacobian(flat, own, np.tile(normals[mine], (len(places), 1))).reshape(len(places), -1).min(1)
             best = int(got.argmax())
-            if got[best] > got[0] + 1e-3:
+            settled[v] = got[best] <= got[0] + 1e-3
+            if not settled[v]:
                 vertices[v] = places[best]
+                settled[faces[mine]] = False
     return vertices
 
 

@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 
 from gdtool.core.child import ChildFailed, begin, prepare
+from gdtool.core.threads import mapped
 from gdtool.geometry import repair
 from gdtool.geometry.features import find_features
 from gdtool.geometry.mesh_quality import scaled_jacobian, valences
@@ -47,6 +48,7 @@ class Request:
     restore_creases: bool = True
     seconds: float = 120.0
     memory_mb: int = 16000
+    threads: int = 1  # pieces that go one by one are done side by side
     least_jacobian: float = -1.0  # a coarser mesh subdivided is passed over where its worst quad is worse
 
 
@@ -63,6 +65,12 @@ class Record:
     def clock(self, name: str, start: float) -> None:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
+    def add(self, other: Record) -> None:
+        """What was tried, and the seconds, of a part."""
+        self.failed += other.failed
+        for name, seconds in other.seconds.items():
+            self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+
 
 def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[np.ndarray, np.ndarray, Record]:
     """Quads (q, 4) on the surface of a clean triangle mesh (repair.clean), and the record of how.
@@ -74,9 +82,10 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
     if (error := found[2].figures["simplify_error"]) <= edge:
         return found
     again = _remeshed(vertices, faces, request, careful=True)
-    again[2].failed = [*found[2].failed, f"simplify: {_STRAYS} {error / edge:.2g} edge lengths from the surface", *again[2].failed]
-    for step, seconds in found[2].seconds.items():
-        again[2].seconds[step] = again[2].seconds.get(step, 0.0) + seconds
+    first, record = found[2], again[2]
+    first.failed.append(f"simplify: {_STRAYS} {error / edge:.2g} edge lengths from the surface")
+    first.add(record)
+    record.failed, record.seconds = first.failed, first.seconds
     return again
 
 
@@ -111,29 +120,37 @@ def _remeshed(vertices: np.ndarray, faces: np.ndarray, request: Request, careful
     coarse = _simplified(vertices, faces, fine_vertices, fine_faces, closed, request, record, careful, meanwhile)
     with ThreadPoolExecutor(1) as beside:
         error = beside.submit(_deviation, fine(), coarse) if coarse[1] is not faces else None
-        done, names = [], []
-        waiting = [(*part, False) for part in _pieces(*coarse, request.quads)]
-        while waiting:
-            part_vertices, part_faces, quads, given_up = waiting.pop(0)
-            found = None
-            if not given_up and quads >= _SMALL_PIECE_QUADS and request.engine != "split":
-                found, whole = _by_engines(part_vertices, part_faces, quads, edge, request, record, fine)
-                if found is None and repair.components(part_faces)[0] > 1:
-                    found, left = _by_pieces(part_vertices, part_faces, quads, whole, edge, request, record, fine)
-                    waiting = left + waiting
-                    if found is None:
-                        continue
-            if found is None:
-                start = time.perf_counter()
-                split = split_to_quads(part_vertices, part_faces, quads, request.crease_degrees, request.seconds, request.memory_mb)
-                found = *fitted(*split, part_vertices, part_faces, request, fine()), "pair and split"
-                record.clock("fallback", start)
-            done.append(found[:2])
-            names.append(found[2])
+        done = [found for part in _pieces(*coarse, request.quads) for found in _quads_of(*part, False, edge, request, record, fine)]
         record.source = fine()
         record.figures["simplify_error"] = error.result() if error is not None else 0.0
-    record.engine = "; ".join(dict.fromkeys(names))
-    return *_joined(done), record
+    record.engine = "; ".join(dict.fromkeys(way for _, _, way in done))
+    return *_joined([found[:2] for found in done]), record
+
+
+def _quads_of(vertices: np.ndarray, faces: np.ndarray, quads: int, given_up: bool, edge: float, request: Request, record: Record,
+              fine: Callable[[], Surface]) -> list[tuple[np.ndarray, np.ndarray, str]]:
+    """Vertices, quads and the way that they were made of a mesh, or of parts of it that were made in different ways.
+
+    given_up: no engine is tried. edge: of a quad; fine: gives the input's Surface.
+    """
+    if not given_up and quads >= _SMALL_PIECE_QUADS and request.engine != "split":
+        found, whole = _by_engines(vertices, faces, quads, edge, request, record, fine)
+        if found is not None:
+            return [found]
+        if repair.components(faces)[0] > 1:
+            found, left = _by_pieces(vertices, faces, quads, whole, edge, request, record, fine)
+            records = [Record() for _ in left]
+            rest = mapped(lambda k: _quads_of(*left[k], edge, request, records[k], fine), range(len(left)), min(request.threads, len(left)))
+            out = [] if found is None else [found]
+            for own, made in zip(records, rest, strict=True):
+                out += made
+                record.add(own)
+            return out
+    start = time.perf_counter()
+    split = split_to_quads(vertices, faces, quads, request.crease_degrees, request.seconds, request.memory_mb)
+    found = *fitted(*split, vertices, faces, request, fine()), "pair and split"
+    record.clock("fallback", start)
+    return [found]
 
 
 def _needed(request: Request) -> int:

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from gdtool.core.errors import InputError, OutputError, ResourceError, from_os_error
+from gdtool.core.threads import mapped
 from gdtool.images.containers import MAX_SIDE, check_container, suffix_of
 
 MAX_BYTES = 1 << 30  # of decoded pixels
@@ -186,12 +187,7 @@ def encode_png(image: np.ndarray, bits: int = 8) -> bytes:
 
 def encode_pngs(images: list[np.ndarray], bits: int = 8, threads: int = 1) -> list[bytes]:
     """encode_png of each image, several at a time: OpenImageIO leaves the interpreter's lock while it compresses."""
-    from concurrent.futures import ThreadPoolExecutor
-
-    if threads <= 1 or len(images) <= 1:
-        return [encode_png(image, bits) for image in images]
-    with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(lambda image: encode_png(image, bits), images))
+    return list(mapped(lambda image: encode_png(image, bits), images, min(threads, len(images))))
 
 
 def _write(path: Path, image: np.ndarray, kind: str) -> None:

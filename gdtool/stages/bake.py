@@ -104,8 +104,8 @@ _MOST_DRIFT = 0.02  # share of the extent, mean: farther off a level shows the m
 
 def _levels(target, count: int, out: Output, report: dict) -> list:
     """The coarser targets, finest first; what they cost in place goes to report."""
+    from gdtool.core.threads import mapped
     from gdtool.texture.lods import coarser, drift
-    from gdtool.texture.target import mapped
 
     counts = [max(len(target.faces) >> k, 4) for k in range(1, count)]
     levels = []

@@ -161,7 +161,7 @@ def _quads(vertices, faces, options: Options, out: Output):
     from gdtool.geometry.quads import Request
 
     request = Request(quads=options.faces, crease_degrees=options.crease_angle, engine=options.engine, seconds=options.seconds,
-                      smooth_iterations=options.smooth_iterations, restore_creases=options.restore_creases)
+                      smooth_iterations=options.smooth_iterations, restore_creases=options.restore_creases, threads=out.threads)
     way, apart = _way(vertices, faces, options, out)
     if options.max_deviation:
         vertices, quads, record, reached = coarsest(vertices, faces, request, options.max_deviation, way)

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from gdtool.core.threads import mapped
 from gdtool.texture.padding import Gutters
 from gdtool.texture.tangents import unit
-from gdtool.texture.target import Texels, mapped
+from gdtool.texture.target import Texels
 
 # Smaller differences than this, in stored units, are no detail: one step of 8 bits and rounding.
 CONSTANT_RANGE = 1.5 / 255

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gdtool.core.threads import mapped
 from gdtool.texture.tangents import dot, unit
-from gdtool.texture.target import TEXELS_AT_ONCE, Target, Texels, mapped, surface_at, texels_of
+from gdtool.texture.target import TEXELS_AT_ONCE, Target, Texels, surface_at, texels_of
 
 
 def cosine_directions(count: int) -> np.ndarray:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from gdtool.core.threads import mapped
 from gdtool.geometry.normals import face_normals
 from gdtool.texture.raster import Barycentrics, between_centres, centres_in, extend_owners, owners_of
 from gdtool.texture.tangents import corner_tangents, edge_pairs, frames_of
@@ -133,15 +132,6 @@ def texels_of(target: Target, size: int, rings: int = 2, threads: int = 1) -> Te
         pass
     at[len(inside):] = ring_at
     return Texels(size, np.concatenate([inside, ring.astype(inside.dtype)]), face_idx, at, len(inside))
-
-
-def mapped(run: Callable, parts: list, threads: int) -> Iterator:
-    """run(part) of each part, in order, on several threads."""
-    if threads <= 1:
-        yield from map(run, parts)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        yield from pool.map(run, parts)
 
 
 def surface_at(target: Target, face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -37,6 +37,16 @@ def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
     assert abs(len(found) / 4000 - 1) <= 0.03
 
 
+def test_pieces_side_by_side_come_out_as_one_after_the_other(monkeypatch):
+    vertices, faces = joined(*(sphere(32, 0.2, (0.5 * k, 0, 0)) for k in range(3)))
+    real = quads._judged
+    monkeypatch.setattr(quads, "_judged", lambda *mesh: ("together", *mesh[:2]) if repair.components(mesh[3])[0] > 1 else real(*mesh))
+    monkeypatch.setattr(quads, "_quads_of_pieces", lambda *given: [(np.zeros((0, 3)), np.zeros((0, 4), np.int64))] * 3)
+    (one, one_faces, one_record), (two, two_faces, two_record) = (quads.remesh(vertices, faces, quads.Request(quads=1500, threads=n)) for n in (1, 3))
+    assert np.array_equal(one, two) and np.array_equal(one_faces, two_faces) and repair.components(two_faces)[0] == 3
+    assert two_record.failed == one_record.failed and set(two_record.seconds) == set(one_record.seconds)
+
+
 @pytest.mark.parametrize("hopeless", [False, True])
 def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless):
     """Of more than go one by one; where one of them fails, too, whatever is tried, it alone is paired triangles."""
