@@ -7,6 +7,8 @@ r"""How good a model is on objects it was not trained on, beside two baselines; 
     python benchmarks/model_quality.py real --train objects --steps 1 --name model_quality_real -o docs/benchmarks
     gdtool render-dataset procedural:900000..900099 --turn 45 --size 128 --condition-views 3 -o turned
     python benchmarks/model_quality.py turned --steps 1 --name model_quality_turned -o docs/benchmarks
+    gdtool render-dataset procedural:900100..900399 --size 128 --condition-views 3 -o more
+    python benchmarks/model_quality.py held_out more --train objects --steps 1 --name model_quality_400 -o docs/benchmarks
 
 --install puts the model, with the table in its card, where the package finds its bundled model.
 
