@@ -69,7 +69,8 @@ def textured_part():
 def quads_for(scene, quads: int = QUADS) -> dict[str, np.ndarray]:
     """A quad mesh of a scene's shape with texture coordinates, by gdtool's own remesh and unwrap."""
     from gdtool.geometry import repair
-    from gdtool.geometry.quads import Request, remesh
+    from gdtool.geometry.quad_task import Request
+    from gdtool.geometry.quads import remesh
     from gdtool.texture.unwrap import Request as Charts
     from gdtool.texture.unwrap import unwrap
 

@@ -38,7 +38,8 @@ COLUMNS = ("model", "way", "seconds", "processor", "peak MB", "quads", "watertig
 
 def ours(vertices: np.ndarray, faces: np.ndarray, quads: int, options: dict) -> tuple:
     """In a child: vertices, quads, cost, the engine taken."""
-    from gdtool.geometry.quads import Request, remesh
+    from gdtool.geometry.quad_task import Request
+    from gdtool.geometry.quads import remesh
 
     start = time.perf_counter()
     out, found, record = remesh(vertices, faces, Request(quads=quads, **options))

@@ -111,7 +111,8 @@ def measure(name: str, vertices: np.ndarray, faces: np.ndarray, ways: list[str],
 
 def quads_of(source: str | Path, faces: int, triangles: int, kept: Path) -> tuple[str, np.ndarray, np.ndarray]:
     """Name, vertices and quads (f, 4) of a solid or a model file, remeshed unless it is quads."""
-    from gdtool.geometry.quads import Request, remesh
+    from gdtool.geometry.quad_task import Request
+    from gdtool.geometry.quads import remesh
 
     if isinstance(source, Path) and source.suffix.lower() == ".obj":
         from gdtool.folders.mesh import read_obj

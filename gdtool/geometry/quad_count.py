@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from gdtool.folders.mesh import triangulated
-from gdtool.geometry.quads import Record, Request, remesh
+from gdtool.geometry.quad_task import Record, Request
+from gdtool.geometry.quads import remesh
 from gdtool.geometry.simplify import deviation
 
 _FEWEST = 64

@@ -15,7 +15,7 @@ from gdtool.geometry.quad_shape import Surface, onto, relax, subdivide, unfold
 from gdtool.geometry.quad_tips import draw_out
 
 if TYPE_CHECKING:
-    from gdtool.geometry.quads import Request
+    from gdtool.geometry.quad_task import Request
 
 _NO_AREA = 1e-4  # squared edge lengths
 _HOPELESS_EDGES = 1.7  # farther than this before it is shaped, a subdivided result is given up

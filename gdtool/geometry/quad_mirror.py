@@ -11,7 +11,8 @@ from gdtool.geometry.features import Constraints, Features
 from gdtool.geometry.mesh_quality import scaled_jacobian
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_shape import Surface, fill_holes, remove_doublets, unfold
-from gdtool.geometry.quads import Record, Request, remesh
+from gdtool.geometry.quad_task import Record, Request
+from gdtool.geometry.quads import remesh
 from gdtool.geometry.sharpen import restore_creases
 
 _TOLERANCE_EDGES, _TOLERANCE_SIDE = 0.25, 0.004  # of the quads' side, of the longest side: halves farther apart differ

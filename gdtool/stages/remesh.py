@@ -158,7 +158,7 @@ def _decimated(vertices, faces, options: Options, out: Output):
 
 def _quads(vertices, faces, options: Options, out: Output):
     from gdtool.geometry.quad_count import coarsest
-    from gdtool.geometry.quads import Request
+    from gdtool.geometry.quad_task import Request
 
     request = Request(quads=options.faces, crease_degrees=options.crease_angle, engine=options.engine, seconds=options.seconds,
                       smooth_iterations=options.smooth_iterations, restore_creases=options.restore_creases, threads=out.threads)

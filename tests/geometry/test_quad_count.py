@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.geometry import quad_count
-from gdtool.geometry.quads import Record, Request
+from gdtool.geometry.quad_task import Record, Request
 
 
 @pytest.fixture

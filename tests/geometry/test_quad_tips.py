@@ -9,6 +9,7 @@ from gdtool.geometry.mesh_quality import distance_figures, scaled_jacobian
 from gdtool.folders.mesh import triangulated
 from gdtool.geometry.quad_fit import farthest
 from gdtool.geometry.quad_shape import Surface
+from gdtool.geometry.quad_task import Request
 from gdtool.geometry.quad_tips import draw_out
 from tests.geometry.solids import quad_cube, sphere
 
@@ -79,7 +80,7 @@ def test_paths_along_creases_end_where_a_tip_is_drawn_out():
 
 def test_an_engine_that_cuts_a_horn_short_is_still_taken(monkeypatch):
     vertices, faces = horned(0.35, 0.04)
-    asked = quads.Request(quads=2000)
+    asked = Request(quads=2000)
     edge = (4 * np.pi * 0.4**2 / 2000) ** 0.5
     out, found, record = quads.remesh(vertices, faces, asked)
     figures = distance_figures(out, triangulated(found)[0], vertices, faces, 20000)

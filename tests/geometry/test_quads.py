@@ -5,11 +5,12 @@ import pytest
 
 from gdtool.core.child import ChildFailed
 from gdtool.folders.mesh import triangulated
-from gdtool.geometry import quad_fit, quad_split, quads, repair, simplify
+from gdtool.geometry import quad_fit, quad_pieces, quad_split, quad_ways, quads, repair, simplify
 from gdtool.geometry.features import find_features
 from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, scaled_jacobian, shape_figures, topology_figures
 from gdtool.geometry.quad_split import pair_and_split
-from gdtool.geometry.quad_shape import fill_holes, remove_doublets, subdivide
+from gdtool.geometry.quad_shape import Surface, fill_holes, remove_doublets, subdivide
+from gdtool.geometry.quad_task import Part, Request
 from gdtool.geometry.sharpen import restore_creases
 from tests.geometry.solids import assembly, bored_box, cube, joined, plane, quad_cube, rod, sphere, torus, volume
 
@@ -21,28 +22,30 @@ def whole(faces):
 def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
     """Each has its share of the quads asked for, the small one enough for its shape, and none is lost."""
     vertices, faces = joined(sphere(48, 0.4, (0, -0.2, 0)), sphere(48, 0.12, (0, 0.5, 0)))
-    found, parts = quads._by_pieces(vertices, faces, 4000, None, 0.03, quads.Request(), quads.Record(), None)
-    assert found is None and len(parts) == 2 and not any(given_up for *_, given_up in parts)
-    assert sum(count for _, _, count, _ in parts) == 4000 and min(count for _, _, count, _ in parts) >= 4000 * 0.02
+    both = Part(vertices, faces, 4000, 0.03, Request(), None)
+    assert quad_pieces.well_made(both, None)[0] is None
+    parts = quad_pieces.apart(both, np.zeros(2, bool), 4000)
+    assert len(parts) == 2 and not any(part.given_up for part in parts)
+    assert sum(part.quads for part in parts) == 4000 and min(part.quads for part in parts) >= 4000 * 0.02
     tried = []
-    real = quads._by_engines
+    real = quad_ways.Trial.run
 
-    def fails_together(part, triangles, *rest):
-        tried.append(repair.components(triangles)[0])
-        return (None, None) if tried[-1] > 1 else real(part, triangles, *rest)
+    def fails_together(trial):
+        tried.append(trial.part.pieces[0])
+        return None if tried[-1] > 1 else real(trial)
 
-    monkeypatch.setattr(quads, "_by_engines", fails_together)
-    out, found, _ = quads.remesh(vertices, faces, quads.Request(quads=4000))
+    monkeypatch.setattr(quad_ways.Trial, "run", fails_together)
+    out, found, _ = quads.remesh(vertices, faces, Request(quads=4000))
     assert tried == [2, 1, 1] and repair.components(found)[0] == 2 and whole(found)
     assert abs(len(found) / 4000 - 1) <= 0.03
 
 
 def test_pieces_side_by_side_come_out_as_one_after_the_other(monkeypatch):
     vertices, faces = joined(*(sphere(32, 0.2, (0.5 * k, 0, 0)) for k in range(3)))
-    real = quads._judged
-    monkeypatch.setattr(quads, "_judged", lambda *mesh: ("together", *mesh[:2]) if repair.components(mesh[3])[0] > 1 else real(*mesh))
-    monkeypatch.setattr(quads, "_quads_of_pieces", lambda *given: [(np.zeros((0, 3)), np.zeros((0, 4), np.int64))] * 3)
-    (one, one_faces, one_record), (two, two_faces, two_record) = (quads.remesh(vertices, faces, quads.Request(quads=1500, threads=n)) for n in (1, 3))
+    real = quad_ways.judged
+    monkeypatch.setattr(quad_ways, "judged", lambda *mesh: ("together", *mesh[:2]) if repair.components(mesh[3])[0] > 1 else real(*mesh))
+    monkeypatch.setattr(quad_pieces, "quads_by_piece", lambda *given: [(np.zeros((0, 3)), np.zeros((0, 4), np.int64))] * 3)
+    (one, one_faces, one_record), (two, two_faces, two_record) = (quads.remesh(vertices, faces, Request(quads=1500, threads=n)) for n in (1, 3))
     assert np.array_equal(one, two) and np.array_equal(one_faces, two_faces) and repair.components(two_faces)[0] == 3
     assert two_record.failed == one_record.failed and set(two_record.seconds) == set(one_record.seconds)
 
@@ -53,15 +56,16 @@ def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless)
     ball, large = sphere(64, 0.09), sphere(48, 0.3)
     balls = [(ball[0] + (0.22 * i, 0.22 * j, 0), ball[1]) for i in range(5) for j in range(4)]
     vertices, faces = joined(*balls, (large[0] + (0.4, 0.3, 0.5), large[1]))
-    real = quads._judged
+    real = quad_ways.judged
 
     def fails(quad_vertices, quad_faces, of_vertices, of_faces):
         fault, *mended = real(quad_vertices, quad_faces, of_vertices, of_faces)
         bad = repair.components(of_faces)[0] > 1 or hopeless and np.ptp(of_vertices, 0).max() > 0.5
         return "not watertight, though the input is" if bad else fault, *mended
 
-    monkeypatch.setattr(quads, "_judged", fails)
-    out, found, record = quads.remesh(vertices, faces, quads.Request(quads=4000))
+    monkeypatch.setattr(quad_ways, "judged", fails)
+    monkeypatch.setattr(quad_pieces, "judged", fails)
+    out, found, record = quads.remesh(vertices, faces, Request(quads=4000))
     assert record.engine == ("instant-meshes; pair and split" if hopeless else "instant-meshes")
     assert repair.components(found)[0] == 21 and whole(found) and abs(len(found) / 4000 - 1) <= 0.03
     small = found[(out[found][..., 2] < 0.15).all(1)]
@@ -133,7 +137,7 @@ def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
 def test_large_parts_are_not_torn_down_for_small_ones():
     """An assembly with more pins than the count has quads to spare, all of slivers, which the quick collapse does not touch."""
     vertices, faces = assembly(60, 128)
-    out, found, record = quads.remesh(vertices, faces, quads.Request(quads=3000))
+    out, found, record = quads.remesh(vertices, faces, Request(quads=3000))
     assert any("the quick collapse stopped" in line for line in record.failed) and record.figures["simplified_to"] == 20000
     assert abs(len(found) / 3000 - 1) < 0.1 and whole(found) and repair.components(found)[0] == 61
     assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.015
@@ -148,7 +152,7 @@ def test_what_the_quick_collapse_ruins_is_made_again_with_care(monkeypatch):
         return begin(function, vertices * (0.5 if begun[-1] == "collapse" else 1), *given, **limits)
 
     monkeypatch.setattr(simplify, "begin", shrinking)
-    out, _, record = quads.remesh(vertices, faces, quads.Request(quads=2000))
+    out, _, record = quads.remesh(vertices, faces, Request(quads=2000))
     assert begun == ["collapse", "collapse_topology"] and abs(np.linalg.norm(out, axis=1) - 0.5).max() < 0.01
     assert any(line.startswith("simplify: strays") for line in record.failed) and record.figures["simplify_error"] < 0.01
 
@@ -164,7 +168,7 @@ def test_splitting_makes_square_quads_of_any_triangles(shape):
         vertices = vertices.copy()
         vertices[8:, 0] += np.ptp(vertices[:8, 0])  # shares a side with the first
     vertices = vertices / np.ptp(vertices, 0).max()
-    out, found, record = quads.remesh(vertices, faces, quads.Request(quads=3000, engine="split"))
+    out, found, record = quads.remesh(vertices, faces, Request(quads=3000, engine="split"))
     assert record.engine == "pair and split" and whole(found) and abs(len(found) / 3000 - 1) <= 0.03
     assert repair.components(found)[0] == repair.components(faces)[0]
     figures = shape_figures(out, found)
@@ -180,7 +184,7 @@ def test_quads_without_area_are_evened_out_where_their_neighbours_stay(monkeypat
     split[b], split[d] = split[a], split[c]
     assert polygon_normals(split, quad_faces)[1][100] < 1e-12
     monkeypatch.setattr(quad_fit, "_let_go", lambda *given: np.arange(len(quad_faces)))
-    out, _ = quad_fit.fitted(split, quad_faces, vertices, faces, quads.Request(quads=600), quads.Surface(vertices, faces))
+    out, _ = quad_fit.fitted(split, quad_faces, vertices, faces, Request(quads=600), Surface(vertices, faces))
     edge = (polygon_normals(out, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
     assert polygon_normals(out, quad_faces)[1].min() > 1e-4 * edge**2
     touched = np.isin(quad_faces, quad_faces[100]).any(1)
@@ -192,7 +196,7 @@ def test_surface_that_the_quads_do_without_is_measured():
     vertices, faces = cube()
     lid = faces[np.all(vertices[faces][:, :, 2] == vertices[:, 2].max(), 1)]
     rest = np.array([f for f in faces.tolist() if f not in lid.tolist()])
-    surface = quads.Surface(vertices, faces)
+    surface = Surface(vertices, faces)
     closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, rest))
     assert quad_fit.left_out(vertices, closed, surface, 0.1) == 0
     assert quad_fit.left_out(vertices, opened, surface, 0.1) == pytest.approx(0.8**2 / 6, abs=0.02)  # the lid but its rim
@@ -217,7 +221,7 @@ def test_smooth_and_sharp_meshes_are_left_alone():
 
 def test_sphere():
     vertices, faces = sphere(48)
-    out, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=1000))
+    out, found, record = quads.remesh(vertices / 2, faces, Request(quads=1000))
     assert record.engine.startswith("instant-meshes") and whole(found)
     assert abs(len(found) / 1000 - 1) <= 0.03
     assert np.abs(np.linalg.norm(out, axis=1) - 0.4).max() < 2e-3
@@ -226,14 +230,14 @@ def test_sphere():
 
 def test_torus_keeps_its_hole():
     vertices, faces = torus()
-    out, found, _ = quads.remesh(vertices / 2, faces, quads.Request(quads=1500))
+    out, found, _ = quads.remesh(vertices / 2, faces, Request(quads=1500))
     assert whole(found) and len(out) == len(found)  # Euler characteristic 0: E = 2F, V = F
     assert volume(out, found) == pytest.approx(2 * np.pi**2 * 0.65 * 0.28**2 / 8, rel=0.02)
 
 
 def test_creases_lie_on_quad_edges():
     vertices, faces = bored_box()
-    out, found, _ = quads.remesh(vertices / 2, faces, quads.Request(quads=2500))
+    out, found, _ = quads.remesh(vertices / 2, faces, Request(quads=2500))
     assert whole(found) and abs(len(found) / 2500 - 1) <= 0.03
     triangles, _ = triangulated(found)
     line = np.linspace(-0.37, 0.37, 50)
@@ -244,12 +248,12 @@ def test_creases_lie_on_quad_edges():
 
 
 def test_coarse_cube_is_filled_with_quads():
-    out, found, _ = quads.remesh(*cube(), quads.Request(quads=600))
+    out, found, _ = quads.remesh(*cube(), Request(quads=600))
     assert whole(found) and abs(len(found) / 600 - 1) <= 0.03 and volume(out, found) == pytest.approx(1, rel=0.02)
 
 
 def test_open_plane_stays_open_and_flat():
-    out, found, _ = quads.remesh(*plane(), quads.Request(quads=400))
+    out, found, _ = quads.remesh(*plane(), Request(quads=400))
     assert repair.is_manifold(found) and np.abs(out[:, 2]).max() < 1e-9
     area = distance_figures(out, triangulated(found)[0], *plane(), 2000)
     assert area["hausdorff"] < 0.03  # less than an edge length: the boundary is where it was
@@ -257,7 +261,7 @@ def test_open_plane_stays_open_and_flat():
 
 def test_small_piece_is_not_lost():
     vertices, faces = joined(sphere(40, 0.7), sphere(40, 0.05, (0.9, 0.9, 0.9)))
-    out, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=1000))
+    out, found, record = quads.remesh(vertices / 2, faces, Request(quads=1000))
     assert repair.components(found)[0] == 2 and whole(found) and "pair and split" in record.engine
     assert np.linalg.norm(out - 0.45, axis=1).min() < 0.05
 
@@ -276,9 +280,9 @@ class Ended:
 
 @pytest.mark.parametrize("failure", ["died of SIGSEGV", "ended with exit code 0 and no result"])
 def test_dead_engine_is_replaced(monkeypatch, failure):
-    monkeypatch.setattr(quads, "begin", lambda *_, **__: Ended(ChildFailed(failure)))
+    monkeypatch.setattr(quad_ways, "begin", lambda *_, **__: Ended(ChildFailed(failure)))
     vertices, faces = torus()
-    _, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=900))
+    _, found, record = quads.remesh(vertices / 2, faces, Request(quads=900))
     assert record.engine == "pair and split" and any(failure in text for text in record.failed)
     assert whole(found) and abs(len(found) / 900 - 1) <= 0.03
 
@@ -288,18 +292,18 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
     """Another density or no creases mend a seam that tore; a part that is too fine for the quads stays so."""
     asked = []
     vertices, faces = sphere(24)
-    out, found, _ = quads.remesh(vertices / 2, faces, quads.Request(quads=1000, engine="split"))
+    out, found, _ = quads.remesh(vertices / 2, faces, Request(quads=1000, engine="split"))
     small = out / 2, found
 
     def begin(*arguments, **_):
         asked.append(arguments)
         return Ended(ChildFailed("died of SIGSEGV") if outcome == "a crash" else small)
 
-    monkeypatch.setattr(quads, "begin", begin)
+    monkeypatch.setattr(quad_ways, "begin", begin)
     # Fitting would draw the small sphere out to the large one.
-    monkeypatch.setattr(quads, "finished", lambda vertices, faces, *_: (vertices, faces))
-    monkeypatch.setattr(quads, "farthest", lambda *_: 0.3)
-    _, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=1000))
+    monkeypatch.setattr(quad_ways, "finished", lambda vertices, faces, *_: (vertices, faces))
+    monkeypatch.setattr(quad_ways, "farthest", lambda *_: 0.3)
+    _, found, record = quads.remesh(vertices / 2, faces, Request(quads=1000))
     assert len(asked) == runs and record.engine == "pair and split" and whole(found)
     assert outcome == "a crash" or "strays" in record.failed[0]
 
@@ -331,26 +335,26 @@ def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
     corners, sides = around(faces, middle)
     assert len(corners) == 4 and len(sides) == 4
     torn = np.delete(faces, [*corners[1:], *sides], 0)
-    fault, out, found = quads._judged(vertices, torn, vertices, triangulated(faces)[0])
+    fault, out, found = quad_ways.judged(vertices, torn, vertices, triangulated(faces)[0])
     assert fault is None and whole(found) and repair.components(found)[0] == 1 and len(found) < len(faces)
     assert volume(out, triangulated(found)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
 
 
 def test_output_without_area_is_no_quads():
     vertices, faces = quad_cube(1)
-    assert quads._judged(vertices, faces[:, [0, 1, 1, 0]], vertices, triangulated(faces)[0])[0] == "no quads"
+    assert quad_ways.judged(vertices, faces[:, [0, 1, 1, 0]], vertices, triangulated(faces)[0])[0] == "no quads"
 
 
 def test_torn_output_is_not_believed(monkeypatch):
     # Three quads at one edge.
     book = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [1, 0, 6, 7]])
-    monkeypatch.setattr(quads, "begin", lambda *_, **__: Ended((np.random.default_rng(0).random((8, 3)), book)))
+    monkeypatch.setattr(quad_ways, "begin", lambda *_, **__: Ended((np.random.default_rng(0).random((8, 3)), book)))
     vertices, faces = sphere(24)
-    _, found, record = quads.remesh(vertices / 2, faces, quads.Request(quads=300))
+    _, found, record = quads.remesh(vertices / 2, faces, Request(quads=300))
     assert whole(found) and record.engine == "pair and split" and any("pieces are lost" in text for text in record.failed)
 
 
 def test_equal_input_gives_equal_quads():
     vertices, faces = sphere(24)
-    one, two = (quads.remesh(vertices / 2, faces, quads.Request(quads=500)) for _ in range(2))
+    one, two = (quads.remesh(vertices / 2, faces, Request(quads=500)) for _ in range(2))
     assert (one[0] == two[0]).all() and (one[1] == two[1]).all()

@@ -1,0 +1,87 @@
+"""A mesh of several pieces: the small ones apart from the large, and where all fail together, those that fail one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.geometry import repair
+from gdtool.geometry.distance import closest_points
+from gdtool.geometry.quad_fit import finished
+from gdtool.geometry.quad_split import split_count
+from gdtool.geometry.quad_task import Part
+from gdtool.geometry.quad_ways import Found, fault_of, judged
+
+SMALL_PIECE_QUADS = 48
+_MOST_ALONE, _ALONE, _FEWEST = 16, 300, 6  # pieces that are remeshed one by one; quads of one that is, and of any
+_ON_ONE, _MOST_APART = 0.9, 1.5  # of a component's quads lie on the piece that they stand for; edge lengths that a piece strays
+
+
+def by_size(part: Part) -> list[Part]:
+    """The large pieces as one mesh and the small ones as another, each with its share of the quads by area."""
+    (count, piece), quads = part.pieces, part.quads
+    share = part.piece_areas / part.piece_areas.sum()
+    small = share * quads < SMALL_PIECE_QUADS
+    if small.all() or not small.any():  # many like pieces: the engine may still do; the fallback takes what it loses
+        return [part.of(np.ones(len(piece), bool), quads)]
+    # Enough for their shape, out of at most a quarter of all.
+    own = quads * share[small]
+    enough = np.maximum(own, np.minimum(np.bincount(piece, minlength=count)[small] / 2, SMALL_PIECE_QUADS)).sum()
+    few = part.of(small[piece], max(round(own.sum()), int(min(enough, quads / 4)), 1))
+    return [part.of(~small[piece], max(quads - split_count(few.faces, few.quads), 4)), few]  # the asked count holds for the sum
+
+
+def well_made(part: Part, whole: Found | None) -> tuple[Found | None, np.ndarray]:
+    """Of an engine's quads of all pieces those of the pieces on which they stand up to judgement, finished; which these are (pieces,) bool."""
+    (count, piece), good = part.pieces, np.zeros(part.pieces[0], bool)
+    if whole is None or count > part.quads / SMALL_PIECE_QUADS:
+        return None, good
+    parts = [part.of(piece == k, 0) for k in range(count)]
+    quads = [judged(*quads, own.vertices, own.faces) for own, quads in zip(parts, quads_by_piece(*whole[:2], part), strict=True)]
+    good[:] = [fault is None for fault, _, _ in quads]
+    if not good.any():
+        return None, good
+    these = part.of(good[piece], part.quads)
+    done = finished(*joined([own[1:] for own, fits in zip(quads, good, strict=True) if fits]), these.surface, these.features, 0, part.request, part.fine())
+    made = quads_by_piece(*done, part)
+    for k in np.flatnonzero(good):
+        good[k] = len(made[k][1]) > 0 and fault_of(*made[k], parts[k].surface, part.edge, _MOST_APART) is None
+    return ((*joined([made[k] for k in np.flatnonzero(good)]), whole[2]) if good.any() else None), good
+
+
+def apart(part: Part, done: np.ndarray, quads: int) -> list[Part]:
+    """What is left to do of the pieces that are not done (pieces,) bool, in so many quads: each large one, and, given up, all others together.
+
+    What lies close together an engine may join, and what is thin it may lose beside the rest, so that it may do better on one piece alone.
+    """
+    if done.all():
+        return []
+    count, piece = part.pieces
+    share = np.where(done, 0.0, part.piece_areas / part.piece_areas[~done].sum())
+    least = np.minimum(np.bincount(piece, minlength=count) / 2, part.quads / _MOST_ALONE)  # enough for its shape
+    alone = np.argsort(-share, kind="stable")[:_MOST_ALONE]
+    own = np.maximum(quads * share, least)[alone]
+    large = (share[alone] > 0) & (own >= _ALONE)
+    alone, own, rest = alone[large], own[large], ~done
+    rest[alone] = False
+    out = []
+    if rest.any():
+        out.append(part.of(rest[piece], max(int(quads * share[rest].sum()), 1), given_up=True))
+        quads -= split_count(out[0].faces, out[0].quads)
+    own = np.maximum((own * (quads / max(own.sum(), 1))).round().astype(int), _FEWEST)
+    return out + [part.of(piece == k, int(number)) for k, number in zip(alone, own, strict=True)]
+
+
+def quads_by_piece(vertices: np.ndarray, quads: np.ndarray, part: Part) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Vertices and quads of each piece: of the components of a quad mesh those that lie on it; what lies on two is nobody's."""
+    (count, piece), (components, label) = part.pieces, repair.components(quads)
+    on = piece[closest_points(vertices[quads].mean(1), part.vertices, part.faces)[1]]
+    share = np.zeros((components, count))
+    np.add.at(share, (label, on), 1)
+    owner = np.where(share.max(1) >= _ON_ONE * share.sum(1), share.argmax(1), -1)
+    return [repair.compact(vertices, quads[owner[label] == k]) for k in range(count)]
+
+
+def joined(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Meshes as one."""
+    offset = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
+    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate([faces + o for (_, faces), o in zip(parts, offset, strict=False)])

@@ -1,0 +1,87 @@
+"""What remeshing is asked for, what it works on, and the record of what it did."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from gdtool.geometry import repair
+from gdtool.geometry.features import Features, find_features
+from gdtool.geometry.normals import face_normals
+from gdtool.geometry.quad_shape import Surface
+
+_FEATURE_EDGES = 3  # quads long: shorter creases are noise
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked for: about `quads` faces; creases sharper than crease_degrees followed; limits of one engine run."""
+
+    quads: int = 20000
+    crease_degrees: float = 30.0
+    engine: str = "auto"
+    smooth_iterations: int = 5
+    restore_creases: bool = True
+    seconds: float = 120.0
+    memory_mb: int = 16000
+    threads: int = 1  # pieces that go one by one are done side by side
+    least_jacobian: float = -1.0  # a coarser mesh subdivided is passed over where its worst quad is worse
+
+
+@dataclass
+class Record:
+    """What was done: the engine whose result was taken, what was tried before and why not, figures, seconds by step."""
+
+    engine: str = ""
+    failed: list[str] = field(default_factory=list)
+    figures: dict[str, float | int | bool | str] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    source: Surface | None = None  # the input with its search tree, built while a child worked
+
+    def clock(self, name: str, start: float) -> None:
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+    def add(self, other: Record) -> None:
+        """What was tried, and the seconds, of a part."""
+        self.failed += other.failed
+        for name, seconds in other.seconds.items():
+            self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+
+
+@dataclass
+class Part:
+    """Triangles that are to be made into `quads` quads, `edge` long each; what is known of them is found out once."""
+
+    vertices: np.ndarray  # (v, 3)
+    faces: np.ndarray  # (f, 3)
+    quads: int
+    edge: float
+    request: Request
+    fine: Callable[[], Surface]  # the whole input as it was before it was simplified
+    given_up: bool = False  # no engine is tried
+
+    def of(self, faces: np.ndarray, quads: int, given_up: bool = False) -> Part:
+        """Some of the triangles: faces (f,) bool."""
+        return Part(*repair.compact(self.vertices, self.faces[faces]), quads, self.edge, self.request, self.fine, given_up)
+
+    @cached_property
+    def pieces(self) -> tuple[int, np.ndarray]:
+        """How many, and which each triangle belongs to."""
+        return repair.components(self.faces)
+
+    @cached_property
+    def piece_areas(self) -> np.ndarray:
+        """Area of each piece."""
+        return np.bincount(self.pieces[1], face_normals(self.vertices, self.faces)[1], self.pieces[0])
+
+    @cached_property
+    def surface(self) -> Surface:
+        return Surface(self.vertices, self.faces)
+
+    @cached_property
+    def features(self) -> Features:
+        return find_features(self.vertices, self.faces, self.request.crease_degrees or 181.0, _FEATURE_EDGES * self.edge)
