@@ -11,8 +11,9 @@ from gdtool.geometry.features import Constraints, Features, find_features, trace
 from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian
 from gdtool.geometry.quad_paths import crossed, cut_along_features, held_at_centres, to_rim
 from gdtool.geometry.quad_relax import balance, ease, square_up
-from gdtool.geometry.quad_shape import Surface, onto, relax, subdivide, unfold
+from gdtool.geometry.quad_shape import Surface, onto, relax, subdivide
 from gdtool.geometry.quad_tips import draw_out
+from gdtool.geometry.quad_unfold import unfold
 
 if TYPE_CHECKING:
     from gdtool.geometry.quad_task import Request

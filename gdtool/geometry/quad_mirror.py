@@ -10,8 +10,9 @@ from gdtool.geometry import repair
 from gdtool.geometry.features import Constraints, Features
 from gdtool.geometry.mesh_quality import scaled_jacobian
 from gdtool.geometry.normals import face_normals
-from gdtool.geometry.quad_shape import Surface, fill_holes, remove_doublets, unfold
+from gdtool.geometry.quad_shape import Surface, fill_holes, remove_doublets
 from gdtool.geometry.quad_task import Record, Request
+from gdtool.geometry.quad_unfold import unfold
 from gdtool.geometry.quads import remesh
 from gdtool.geometry.sharpen import restore_creases
 

@@ -1,4 +1,4 @@
-"""Shaping of a quad mesh: regular subdivision, relaxing on the surface it stands for, and repair of folded quads."""
+"""Shaping of a quad mesh: regular subdivision, relaxing on the surface it stands for, holes and doublets."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from gdtool.geometry.features import Constraints, Features, closest_on_segments
-from gdtool.geometry.mesh_quality import polygon_normals, valences, worst_jacobian
+from gdtool.geometry.mesh_quality import polygon_normals, valences
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.repair import compact, corner_fans, edges_of
 
 _WORTH_THREADS, _ALONE = 1000, 10000  # libigl searches with all threads from more than so many points on
 _EXACT_EVERY = 3  # steps between two searches for the closest point; the others stay in its plane
-_LET_OFF_BELOW = 0.22  # a vertex leaves its feature for a quad with a smaller scaled Jacobian only
 _BENT_COSINE = 0.97  # between a quad's normal and that of the surface below its centre
 
 
@@ -161,66 +160,6 @@ def still_vertices(faces: np.ndarray, count: int, constraints: Constraints) -> n
     return constraints.fixed | (boundary & (constraints.curve < 0))
 
 
-def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
-           least: float = 0.3, rounds: int = 12, most_visits: int = 6000) -> np.ndarray:
-    """Vertices of folded and needle-like quads moved to the best of a few places near them.
-
-    A vertex moves only where the worst scaled Jacobian of its quads, against the surface's normals, gets better. Free
-    vertices stay on the surface, held ones slide along their curve; in the last rounds they may leave it. most_visits
-    bounds the work (a count, not a time: equal input gives equal output).
-    """
-    edges = edges_of(faces)
-    ring, neighbours = _incidence(faces, len(vertices)), _neighbours(edges.ends, len(vertices))
-    boundary = np.zeros(len(vertices), bool)
-    boundary[edges.ends[edges.count != 2].ravel()] = True
-    vertices = vertices.copy()
-    normals = normals_below(vertices, faces, surface)
-    angles = np.arange(8) * (np.pi / 4)
-    settled = np.zeros(len(vertices), bool)  # found no better place, and nothing beside them moved since
-    for turn in range(rounds):
-        loose = turn >= rounds - 4
-        if turn == rounds - 4:
-            settled &= (constraints.curve < 0) & ~constraints.fixed
-        bad = np.flatnonzero(worst_jacobian(vertices, faces, normals) < (_LET_OFF_BELOW if loose else least))
-        if not len(bad):
-            break
-        touched = np.unique(faces[bad])
-        most_visits -= len(touched)
-        if most_visits < 0:
-            break
-        for v in touched.tolist():
-            held = constraints.curve[v] >= 0
-            if settled[v] or (constraints.fixed[v] and not loose) or (boundary[v] and not held):
-                continue
-            mine, here = ring[v], vertices[v].copy()
-            near = vertices[neighbours[v]]
-            mean = near.mean(0)
-            spread = np.linalg.norm(near - mean, axis=1).mean()
-            axes = np.linalg.svd(near - mean, full_matrices=False)[2]
-            # A ring of places in the plane of the neighbours finds a way out of most folds.
-            circle = np.cos(angles)[:, None] * axes[0] + np.sin(angles)[:, None] * axes[min(1, len(axes) - 1)]
-            places = np.concatenate([[mean, vertices[faces[mine]].mean((0, 1)), (mean + here) / 2],
-                                     here + 0.12 * spread * circle, here + 0.35 * spread * circle])
-            if held and not loose:
-                places = closest_on_segments(places, features.points, features.segments[features.curve == constraints.curve[v]])[2]
-            else:
-                places = surface.closest(places)[2]
-            places = np.concatenate([[here], places])
-            corners = np.tile(vertices[faces[mine]], (len(places), 1, 1, 1))
-            corners[:, faces[mine] == v] = places[:, None]
-            flat = corners.reshape(-1, 4, 3)
-            own = np.arange(len(flat) * 4).reshape(-1, 4)
-            # Against the surface's normal and the quad's own: a quad may be folded in one and not in the other.
-            flat = flat.reshape(-1, 3)
-            got = worst_jacobian(flat, own, np.tile(normals[mine], (len(places), 1))).reshape(len(places), -1).min(1)
-            best = int(got.argmax())
-            settled[v] = got[best] <= got[0] + 1e-3
-            if not settled[v]:
-                vertices[v] = places[best]
-                settled[faces[mine]] = False
-    return vertices
-
-
 def normals_below(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> np.ndarray:
     """(f, 3) unit normal of the surface under each quad: at its centre, of one beside which it is bent also half-way to its corners."""
     corners = vertices[faces]
@@ -232,7 +171,7 @@ def normals_below(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> 
     return below / np.maximum(np.linalg.norm(below, axis=1), 1e-300)[:, None]
 
 
-class _Lists:
+class Lists:
     """Lists of values (n,), each under its key (n,) of 0…count − 1, in their order: lists[key] is an array."""
 
     def __init__(self, key: np.ndarray, value: np.ndarray, count: int):
@@ -243,14 +182,14 @@ class _Lists:
         return self.value[self.start[key]:self.start[key + 1]]
 
 
-def _incidence(faces: np.ndarray, count: int) -> _Lists:
+def incidence(faces: np.ndarray, count: int) -> Lists:
     """The faces around each vertex."""
-    return _Lists(faces.ravel(), np.arange(faces.size) // faces.shape[1], count)
+    return Lists(faces.ravel(), np.arange(faces.size) // faces.shape[1], count)
 
 
-def _neighbours(ends: np.ndarray, count: int) -> _Lists:
+def neighbours(ends: np.ndarray, count: int) -> Lists:
     """The vertices that edges (e, 2) join to each."""
-    return _Lists(ends.T.ravel(), ends[:, ::-1].T.ravel(), count)
+    return Lists(ends.T.ravel(), ends[:, ::-1].T.ravel(), count)
 
 
 def fill_holes(vertices: np.ndarray, faces: np.ndarray, longest: int = 64) -> tuple[np.ndarray, np.ndarray]:
@@ -302,7 +241,7 @@ def remove_doublets(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
         doublets = np.flatnonzero(inner & (valence == 2))
         if not len(doublets):
             break
-        ring = _incidence(faces, len(vertices))
+        ring = incidence(faces, len(vertices))
         dead = np.zeros(len(faces), bool)
         faces = faces.copy()
         touched: set[int] = set()
