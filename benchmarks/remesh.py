@@ -42,7 +42,8 @@ def ours(vertices: np.ndarray, faces: np.ndarray, quads: int, options: dict) -> 
     from gdtool.geometry.quads import remesh
 
     start = time.perf_counter()
-    out, found, record = remesh(vertices, faces, Request(quads=quads, **options))
+    threads = len(os.sched_getaffinity(0))  # as the command has
+    out, found, record = remesh(vertices, faces, Request(quads=quads, threads=threads, **options))
     return out, found, cost_since(start), record.engine
 
 
