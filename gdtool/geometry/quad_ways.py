@@ -22,6 +22,7 @@ _CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a res
 _FAR_EDGES, _FAR_SUBDIVIDED = 2.0, 1.0  # edge lengths that a result may stray; of a subdivided one, after which others come
 _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
 _MOST_FOLDED = 0.01  # of the quads
+_CUT_EDGES, _CUT_SHARE = 0.25, 0.01  # surface so far from the quads lies beyond an edge that they cut off; how much of a piece may
 _HANDLES, _PIECES = "handles are lost or added", "pieces are lost or joined"
 _TOO_COARSE = _STRAYS, _LEAVES_OUT, _STICKS_OUT = "strays", "leaves out", "sticks out"
 _MENDINGS = 4  # rounds of filling holes and parting what meets at a vertex
@@ -129,7 +130,7 @@ class Trial:
                 count, extra = len(found), len(found) - taken.count
                 asked = [taken.asked * (quads - extra) / taken.count]
                 continue
-            fault = fault_of(vertices, found, part.surface, part.edge, _FAR_SUBDIVIDED if way.subdivisions else _FAR_EDGES)
+            fault = fault_of(vertices, found, part.surface, part.edge, _FAR_SUBDIVIDED if way.subdivisions else _FAR_EDGES, part.piece)
             if way.subdivisions and (least := scaled_jacobian(vertices, found).min()) < part.request.least_jacobian:
                 fault = f"has a quad of scaled Jacobian {least:.2g}"
             return self._failed(way, fault) if fault is not None else (vertices, found, way.label)
@@ -192,8 +193,12 @@ def _irregular(faces: np.ndarray) -> int:
     return int((valence[inner] != 4).sum())
 
 
-def fault_of(vertices: np.ndarray, quads: np.ndarray, surface: Surface, edge: float, limit: float) -> str | None:
-    """What of finished quads does not do on the surface, or None. limit: edge lengths that they may stray."""
+def fault_of(vertices: np.ndarray, quads: np.ndarray, surface: Surface, edge: float, limit: float, piece: bool) -> str | None:
+    """What of finished quads does not do on the surface, or None.
+
+    limit: edge lengths that they may stray. piece: it is one of several, and not most of them, so that paired triangles that keep its
+    edges do better than quads that cut them off.
+    """
     if (far := farthest(vertices, quads, surface) / edge) > limit:
         return f"{_STRAYS} {far:.2g} edge lengths from the surface"
     if (left := left_out(vertices, quads, surface, _LOST_EDGES * edge)) > _LOST_SHARE:
@@ -202,6 +207,8 @@ def fault_of(vertices: np.ndarray, quads: np.ndarray, surface: Surface, edge: fl
         return f"{_STICKS_OUT} {over:.2g} edge lengths"
     if (folded := float((scaled_jacobian(vertices, quads) <= 0).mean())) > _MOST_FOLDED:
         return f"{folded:.1%} of the quads are folded"
+    if piece and (cut := left_out(vertices, quads, surface, _CUT_EDGES * edge)) > _CUT_SHARE:
+        return f"cuts off {cut:.1%} of the surface"
     return None
 
 
