@@ -40,6 +40,17 @@ def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
     assert abs(len(found) / 4000 - 1) <= 0.03
 
 
+def test_quads_that_cut_edges_off_do_not_do_for_one_piece_of_several():
+    vertices, faces = quad_cube(3)
+    surface, edge = Surface(vertices, triangulated(faces)[0]), 0.125 * np.ptp(vertices[:, 0])
+    assert quad_ways.fault_of(vertices, faces, surface, edge, 1.0, piece=True) is None
+    cut = vertices.copy()
+    on_two = np.isclose(np.abs(vertices), np.abs(vertices).max()).sum(1) >= 2  # the cube's twelve edges
+    cut[on_two] *= 1 - 0.5 * edge / np.ptp(vertices[:, 0])
+    assert quad_ways.fault_of(cut, faces, surface, edge, 1.0, piece=False) is None
+    assert quad_ways.fault_of(cut, faces, surface, edge, 1.0, piece=True).startswith("cuts off")
+
+
 def test_pieces_side_by_side_come_out_as_one_after_the_other(monkeypatch):
     vertices, faces = joined(*(sphere(32, 0.2, (0.5 * k, 0, 0)) for k in range(3)))
     real = quad_ways.judged
