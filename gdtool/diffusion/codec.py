@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
+from torch.utils.checkpoint import checkpoint
 
 from gdtool.core.errors import ResourceError
 from gdtool.diffusion.config import ModelConfig
+
+
+CHUNK = 4  # images that go through the VAE at once: its memory does not grow with the batch
 
 
 class PatchCodec:
@@ -32,7 +38,11 @@ class PatchCodec:
 
 
 class VaeCodec:
-    """Stable Diffusion's autoencoder (diffusers), frozen: factor 8, 4 channels, the mode times the scaling factor."""
+    """Stable Diffusion's autoencoder (diffusers), frozen: factor 8, 4 channels, the mode times the scaling factor.
+
+    It follows its input's device and takes CHUNK images at a time; where a gradient goes through decode(), each chunk is
+    computed again for it, so that only one chunk's activations are held.
+    """
 
     latent_channels = condition_channels = 4
 
@@ -47,14 +57,25 @@ class VaeCodec:
         self.vae = vae.requires_grad_(False).eval()
 
     def encode(self, images: torch.Tensor) -> torch.Tensor:
+        """(n, 3, h, w) in [-1, 1] -> (n, 4, h / 8, w / 8)"""
+        vae = self.vae.to(images.device)
         with torch.no_grad():
-            return self.vae.encode(images).latent_dist.mode() * self.vae.config.scaling_factor
+            return in_chunks(lambda x: vae.encode(x).latent_dist.mode() * vae.config.scaling_factor, images)
 
     def encode_condition(self, rgba: torch.Tensor) -> torch.Tensor:
         return self.encode(rgba[:, :3])
 
     def decode(self, latents: torch.Tensor) -> torch.Tensor:
-        return self.vae.decode(latents / self.vae.config.scaling_factor).sample
+        """(n, 4, h / 8, w / 8) -> (n, 3, h, w); differentiable."""
+        vae = self.vae.to(latents.device)
+        return in_chunks(lambda x: vae.decode(x / vae.config.scaling_factor).sample, latents)
+
+
+def in_chunks(function: Callable[[torch.Tensor], torch.Tensor], x: torch.Tensor) -> torch.Tensor:
+    """function of x, CHUNK of its first axis at a time; with a gradient, computed again chunk by chunk."""
+    if torch.is_grad_enabled() and x.requires_grad:
+        return torch.cat([checkpoint(function, part, use_reentrant=False) for part in x.split(CHUNK)])
+    return torch.cat([function(part) for part in x.split(CHUNK)])
 
 
 def make_codec(config: ModelConfig) -> PatchCodec | VaeCodec:

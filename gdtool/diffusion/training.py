@@ -28,7 +28,7 @@ from gdtool.diffusion.attention import Layout
 from gdtool.diffusion.config import DOMAINS, ModelConfig, Phase, TrainConfig
 from gdtool.diffusion.data import Batch, Objects, draw, object_order
 from gdtool.diffusion.encoding import BACKGROUND, encode, encode_condition
-from gdtool.diffusion.losses import image_error, rendering_error, view_directions
+from gdtool.diffusion.losses import LIT, image_error, rendering_error, view_directions
 from gdtool.diffusion.model import Model
 from gdtool.diffusion.optimizer import MOMENTS, make_optimizer, restore_moments
 from gdtool.diffusion.sampling import precision_context
@@ -153,14 +153,17 @@ def losses(model: Model, batch: Batch, step: Step, generators: list[torch.Genera
     snr = (model.signal[t] / model.deviation[t]).square()
     near = torch.nonzero(snr > train.pbr_snr).flatten()
     if train.pbr_weight > 0 and len(near) and {1, 3, 4, 5} <= set(step.domains):
-        images = model.codec.decode(predicted).unflatten(0, (b, len(step.domains), len(step.views)))
+        # decoded and shaded: what light is computed from, of the objects that it is computed for
+        lit = [j for j, i in enumerate(step.domains) if DOMAINS[i] in LIT]
+        latents = predicted.unflatten(0, (b, len(step.domains), -1))[:, lit]
         directions = view_directions(config)[step.views].to(device)
-        order = {i: j for j, i in enumerate(step.domains)}
-        rendered = [
-            snr[i].clamp(max=train.snr_gamma)
-            * rendering_error(images[i], truth[i], order, planes[i], batch.lights[i], directions, train.pbr_pixels,
-                              float(background[i]), generators[i])
-            for i in near.tolist()]
+        order = {step.domains[j]: place for place, j in enumerate(lit)}
+        rendered = []
+        for i in near.tolist():
+            images = model.codec.decode(latents[i].flatten(0, 1)).unflatten(0, latents.shape[1:3])
+            error = rendering_error(images, truth[i][lit], order, planes[i], batch.lights[i], directions, train.pbr_pixels,
+                                    float(background[i]), generators[i])
+            rendered.append(snr[i].clamp(max=train.snr_gamma) * error)
         parts["rendering"] = (torch.stack(rendered).sum() / b).detach()
         total = total + train.pbr_weight * torch.stack(rendered).sum() / b
     return {"loss": total, **parts}

@@ -1,0 +1,99 @@
+"""The codecs: what the VAE is asked for, in pieces of bounded size, and on which device."""
+
+from types import SimpleNamespace
+
+import msgspec
+import numpy as np
+import pytest
+import torch
+
+from gdtool.diffusion import codec as codecs
+from gdtool.diffusion.codec import CHUNK, PatchCodec, VaeCodec
+from gdtool.diffusion.config import PRESETS
+from gdtool.diffusion.data import draw
+from gdtool.diffusion.model import Model
+from gdtool.diffusion.training import choose, losses, phase_at
+from tests.diffusion.test_training import MODEL, TRAIN, spheres
+
+
+class StandInVae(torch.nn.Module):
+    """diffusers' interface: means of 8 x 8 pixels, and back. Writes down how many images it was given."""
+
+    config = SimpleNamespace(scaling_factor=0.5)
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.ones(1))
+        self.given = []
+
+    def encode(self, images):
+        self.given.append(len(images))
+        latent = torch.nn.functional.avg_pool2d(torch.cat([images, images[:, :1]], 1), 8) * self.weight
+        return SimpleNamespace(latent_dist=SimpleNamespace(mode=lambda: latent))
+
+    def decode(self, latents):
+        self.given.append(len(latents))
+        return SimpleNamespace(sample=torch.tanh(torch.nn.functional.interpolate(latents[:, :3], scale_factor=8) * self.weight))
+
+
+def vae_codec():
+    vae = StandInVae()
+    return VaeCodec(msgspec.structs.replace(PRESETS["tiny"][0], codec="vae"), vae), vae
+
+
+def test_the_vae_is_given_few_images_at_a_time_and_the_result_is_that_of_all():
+    codec, vae = vae_codec()
+    images = torch.rand(2 * CHUNK + 1, 3, 16, 16)
+    latents = codec.encode(images)
+    assert vae.given == [CHUNK, CHUNK, 1]
+    torch.testing.assert_close(latents, torch.cat([codec.encode(one[None]) for one in images]))
+    torch.testing.assert_close(codec.decode(latents), vae.decode(latents / 0.5).sample)
+
+
+def test_a_gradient_through_decode_is_exact_and_takes_the_activations_of_one_chunk():
+    codec, vae = vae_codec()
+    start = torch.randn(2 * CHUNK, 4, 2, 2)
+    saved = []
+    given = []
+    for decode in (codec.decode, lambda x: vae.decode(x / 0.5).sample):
+        latents = start.clone().requires_grad_()
+        with torch.autograd.graph.saved_tensors_hooks(lambda x: saved.append(x.numel()) or x, lambda x: x):
+            out = decode(latents)
+        given.append(sum(saved))
+        saved.clear()
+        out.square().sum().backward()
+        if decode == codec.decode:
+            expected = latents.grad
+    torch.testing.assert_close(latents.grad, expected)
+    assert given[0] < given[1] / 4
+
+
+def test_the_vae_follows_its_input(monkeypatch):
+    codec, vae = vae_codec()
+    moved = []
+    monkeypatch.setattr(vae, "to", lambda device: moved.append(torch.device(device).type) or StandInVae().to(device))
+    out = codec.encode(torch.zeros(1, 3, 16, 16, device="meta"))
+    assert moved == ["meta"] and out.device.type == "meta"
+
+
+@pytest.mark.parametrize("near", [0, 1, 2])
+def test_only_what_the_rendering_loss_looks_at_is_decoded(monkeypatch, near):
+    """The four domains that light is computed from, of the objects with little noise."""
+    counts, plain = [], PatchCodec.decode
+    monkeypatch.setattr(codecs.PatchCodec, "decode", lambda self, x: counts.append(len(x)) or plain(self, x))
+    model, objects = Model(MODEL), spheres(2)
+    train = msgspec.structs.replace(TRAIN, pure_noise=0.0)
+    step = choose(MODEL, phase_at(1.0, train), 0, 0)
+    model.signal = torch.full_like(model.signal, 1e-3)
+    model.deviation = torch.ones_like(model.deviation)
+    choices, generators = zip(*(step.choices(place) for place in range(2)), strict=True)
+    model.signal[_timesteps(step)[:near]] = 3.0
+    losses(model, draw(objects, np.arange(2), MODEL, train, choices), step, list(generators), train)
+    assert sum(counts) == near * 4 * len(step.views)
+
+
+def _timesteps(step):
+    """The timesteps that losses() draws for two objects."""
+    choices = [step.choices(place) for place in range(2)]
+    draw(spheres(2), np.arange(2), MODEL, TRAIN, [one[0] for one in choices])
+    return [int(torch.rand(4, generator=generator)[0] * MODEL.timesteps) for _, generator in choices]
