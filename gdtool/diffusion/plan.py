@@ -1,13 +1,15 @@
 """What a training will cost before it is run: memory and FLOPs of a step, and the time on one and on eight GPUs.
 
 Nothing is tabled but the GPUs: the network is built on PyTorch's meta device (shapes without numbers), a step is run
-there forward and backward, FLOPs are counted by torch.utils.flop_counter and memory by following every storage.
+there forward and backward, FLOPs are counted by torch.utils.flop_counter and memory by following every storage. So are
+the VAE's encoding, its decoding for the loss by rendering, and CLIP; the shading itself is run on a few numbers.
 """
 
 from __future__ import annotations
 
 import contextlib
 import weakref
+from pathlib import Path
 from types import SimpleNamespace
 
 import torch
@@ -16,10 +18,13 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from gdtool.diffusion import attention
 from gdtool.diffusion.attention import Layout
-from gdtool.diffusion.codec import PatchCodec
+from gdtool.diffusion.codec import CHUNK, PatchCodec, VaeCodec
 from gdtool.diffusion.config import DOMAINS, ModelConfig, Phase, TrainConfig
 from gdtool.diffusion.encoder import PatchEncoder
+from gdtool.diffusion.encoding import PLANES
+from gdtool.diffusion.losses import LIT, rendering_error, view_directions
 from gdtool.diffusion.model import Model, parameter_count
+from gdtool.diffusion.schedule import signal_and_noise
 
 # Dense bfloat16 peak in FLOP/s, memory in bytes, NVLink in bytes/s in one direction (NVIDIA's data sheets, SXM parts).
 GPUS = {"A100 80 GB": (312e12, 80e9, 300e9), "H100 80 GB": (989e12, 80e9, 450e9), "H200 141 GB": (989e12, 141e9, 450e9)}
@@ -128,24 +133,87 @@ def _one_step(config: ModelConfig, domains: int, views: int, objects: int, fused
 
 
 def frozen_cost(config: ModelConfig) -> dict[str, float] | None:
-    """FLOPs per encoded image of Stable Diffusion's VAE, and per object of CLIP ViT-L/14; None without diffusers."""
-    if config.codec != "vae":
-        return {"image": 0.0, "object": 0.0}
+    """What the frozen VAE and CLIP cost; None without diffusers.
+
+    FLOPs: encode and decode per image (decode with what a gradient through it takes), object for CLIP. Bytes:
+    encode_bytes and decode_bytes at once (they do not grow with the batch), weights_bytes in float32.
+    """
+    cost = dict.fromkeys(("encode", "decode", "object", "encode_bytes", "decode_bytes", "weights_bytes"), 0.0)
     try:
-        from diffusers import AutoencoderKL
-        from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
+        if config.codec == "vae":
+            codec = VaeCodec(config, frozen_part(config, "vae"))
+            shape = (CHUNK, 4, codec.side, codec.side)
+            images = torch.zeros(CHUNK, 3, config.image_size, config.image_size, device="meta")
+            cost["encode"], cost["encode_bytes"] = _counted(lambda: codec.encode(images))
+            cost["decode"], cost["decode_bytes"] = _counted(
+                lambda: codec.decode(torch.zeros(shape, device="meta", requires_grad=True)).sum().backward())
+            cost["encode"], cost["decode"] = cost["encode"] / CHUNK, cost["decode"] / CHUNK
+            cost["weights_bytes"] += 4.0 * parameter_count(codec.vae)
+        if config.encoder == "clip":
+            clip = frozen_part(config, "image_encoder").requires_grad_(False)
+            cost["object"], _ = _counted(lambda: clip(torch.zeros(1, 3, 224, 224, device="meta")))
+            cost["weights_bytes"] += 4.0 * parameter_count(clip)
     except ImportError:
         return None
-    with torch.device("meta"), torch.no_grad():
-        vae = AutoencoderKL(down_block_types=("DownEncoderBlock2D",) * 4, up_block_types=("UpDecoderBlock2D",) * 4,
-                            block_out_channels=(128, 256, 512, 512), layers_per_block=2, latent_channels=4)
-        clip = CLIPVisionModelWithProjection(CLIPVisionConfig(
-            hidden_size=1024, intermediate_size=4096, projection_dim=768, num_hidden_layers=24, num_attention_heads=16, image_size=224, patch_size=14))
-        with FlopCounterMode(display=False) as image:
-            vae.encode(torch.zeros(1, 3, config.image_size, config.image_size))
-        with FlopCounterMode(display=False) as one:
-            clip(torch.zeros(1, 3, 224, 224))
-    return {"image": float(image.get_total_flops()), "object": float(one.get_total_flops())}
+    return cost
+
+
+def frozen_part(config: ModelConfig, part: str) -> torch.nn.Module:
+    """The vae or image_encoder that a local config.pretrained describes, else Stable Diffusion Image Variations', without numbers."""
+    from diffusers import AutoencoderKL
+    from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
+
+    described = Path(config.pretrained) / part / "config.json" if config.pretrained else Path()
+    with torch.device("meta"):
+        if part == "image_encoder":
+            return CLIPVisionModelWithProjection(CLIPVisionConfig.from_json_file(described) if described.is_file() else CLIPVisionConfig(
+                hidden_size=1024, intermediate_size=4096, projection_dim=768, num_hidden_layers=24, num_attention_heads=16, image_size=224, patch_size=14))
+        if described.is_file():
+            return AutoencoderKL.from_config(AutoencoderKL.load_config(described.parent))
+        return AutoencoderKL(down_block_types=("DownEncoderBlock2D",) * 4, up_block_types=("UpDecoderBlock2D",) * 4,
+                             block_out_channels=(128, 256, 512, 512), layers_per_block=2, latent_channels=4)
+
+
+def _counted(call) -> tuple[float, float]:
+    """FLOPs and peak bytes of a call."""
+    counter, memory = FlopCounterMode(display=False), LiveBytes()
+    with counter:
+        call()
+    with memory:
+        call()
+    return float(counter.get_total_flops()), float(memory.peak)
+
+
+def rendering_share(config: ModelConfig, train: TrainConfig, domains: int) -> float:
+    """Of the objects of a step, how many the loss by rendering sees on average."""
+    lit = {DOMAINS.index(d) for d in LIT} <= {DOMAINS.index(d) for d in config.domains} and domains == len(config.domains)
+    if not lit or train.pbr_weight == 0:
+        return 0.0
+    signal, deviation = signal_and_noise(config)
+    near = (signal / deviation).square() > train.pbr_snr
+    return float(near.float().mean()) * (1 - train.pure_noise) + train.pure_noise * float(near[-1])
+
+
+def shading_bytes(config: ModelConfig, train: TrainConfig, views: int) -> float:
+    """The most that the loss by rendering of one object holds, its decoded images among it."""
+    shape = (len(LIT), views, 3, config.image_size, config.image_size)
+    planes = torch.ones(views, PLANES["mask"].stop, *shape[-2:])
+    lights = torch.tensor([[0.0, 0, 1, 1, 1, 1, 1]]).repeat(16, 1)
+    order = {DOMAINS.index(d): j for j, d in enumerate(LIT)}
+    memory, start = LiveBytes(), torch.rand(shape)
+    with memory:
+        predicted = start.clone().requires_grad_()
+        rendering_error(predicted, start, order, planes, lights, view_directions(config)[:views], train.pbr_pixels, 0.0, torch.Generator()).backward()
+    return float(memory.peak)
+
+
+def data_bytes(config: ModelConfig, domains: int, views: int) -> float:
+    """What one object of a step takes as data: its planes, their encoding, and clean, noise, noisy and condition latents."""
+    codec = structure(config).codec
+    pixels, latent = config.image_size**2, codec.side**2
+    images = domains * views
+    return 4.0 * (PLANES["mask"].stop * pixels * (len(config.views) + views) + images * 3 * pixels
+                  + images * latent * (3 * codec.latent_channels + codec.condition_channels))
 
 
 def plan_of(config: ModelConfig, train: TrainConfig) -> dict:
@@ -157,7 +225,7 @@ def plan_of(config: ModelConfig, train: TrainConfig) -> dict:
     done, hours = 0.0, {(gpu, n): 0.0 for gpu in GPUS for n in (1, 8)}
     for phase in train.phases:
         steps, done = round((phase.share - done) * train.steps), phase.share
-        own = _phase(config, train, phase, frozen, weights)
+        own = phase_cost(config, train, phase, frozen, weights)
         report["phases"].append({"steps": steps, **own})
         for gpu, (peak, _, link) in GPUS.items():
             for n in (1, 8):
@@ -165,25 +233,38 @@ def plan_of(config: ModelConfig, train: TrainConfig) -> dict:
                 hours[gpu, n] += steps * (own["flops_per_step"] / (n * peak * UTILISATION) + exchange) / 3600
     for gpu, (_, capacity, _) in GPUS.items():
         # each part of a batch is split over the GPUs
-        fits = {str(n): max(p["bytes"] - p["activation_bytes"] * (1 - -(-p["objects_at_once"] // n) / p["objects_at_once"])
+        fits = {str(n): max(p["bytes"] - p["growing_bytes"] * (1 - -(-p["objects_at_once"] // n) / p["objects_at_once"])
                             for p in report["phases"]) < 0.9 * capacity for n in (1, 8)}
         report["hours"][gpu] = {"1": hours[gpu, 1], "8": hours[gpu, 8], "fits": fits}
     return report
 
 
-def _phase(config: ModelConfig, train: TrainConfig, phase: Phase, frozen: dict | None, weights: int) -> dict:
+def phase_cost(config: ModelConfig, train: TrainConfig, phase: Phase, frozen: dict | None, weights: int, *, fused: bool = True) -> dict:
+    """FLOPs of a step of a phase, averaged over the timesteps, and the most bytes that one holds.
+
+    The loss by rendering is decoded and held for as many objects as have little noise: on average in FLOPs, all in bytes.
+    """
     domains, views = min(phase.domains, len(config.domains)), min(phase.views, len(config.views))
     batch = phase.batch or train.batch
     part = -(-batch // train.accumulate)
     dtype = torch.bfloat16 if train.precision == "bfloat16" else torch.float32
-    one, two = (step_cost(config, domains, views, n, fused=True, dtype=dtype) for n in (1, 2))
+    one, two = (step_cost(config, domains, views, n, fused=fused, dtype=dtype) for n in (1, 2))
     # both are affine in the number of objects: measured at one and two, not assumed
-    flops, memory = (one[key] + (two[key] - one[key]) * (part - 1) for key in ("flops", "bytes"))
-    images = batch * (domains * views + 1)
-    flops_step = flops * batch / part + (frozen["image"] * images + frozen["object"] * batch if frozen else 0.0)
+    flops, network = (one[key] + (two[key] - one[key]) * (part - 1) for key in ("flops", "bytes"))
+    share = rendering_share(config, train, domains)
+    data = part * data_bytes(config, domains, views)
+    rendering = part * shading_bytes(config, train, views) if share else 0.0
+    conditions = 1 + (config.mirror_back and "back" in config.views)
+    own = frozen or dict.fromkeys(("encode", "decode", "object", "encode_bytes", "decode_bytes", "weights_bytes"), 0.0)
+    encoding = own["encode"] * (domains * views + conditions)
+    decoding = own["decode"] * share * len(LIT) * views
+    growing = data + network + rendering
+    held = max(data + own["encode_bytes"], growing + (own["decode_bytes"] if share else 0.0))
     copies = weights * 2 if dtype == torch.bfloat16 else 0
-    return {"domains": domains, "views": views, "batch": batch, "objects_at_once": part, "flops_per_step": flops_step,
-            "activation_bytes": memory, "bytes": weights * BYTES_PER_WEIGHT + copies + memory}
+    return {"domains": domains, "views": views, "batch": batch, "objects_at_once": part,
+            "flops_per_step": flops * batch / part + batch * (encoding + decoding + own["object"]),
+            "vae_flops_per_step": batch * (encoding + decoding), "rendering_share": share, "rendering_bytes": rendering,
+            "growing_bytes": growing, "activation_bytes": held, "bytes": weights * BYTES_PER_WEIGHT + copies + own["weights_bytes"] + held}
 
 
 def text_of(report: dict) -> str:

@@ -9,7 +9,9 @@ from torch.utils.flop_counter import FlopCounterMode
 from gdtool.diffusion.attention import Layout
 from gdtool.diffusion.config import PRESETS, Phase
 from gdtool.diffusion.model import Model, parameter_count
-from gdtool.diffusion.plan import plan_of, step_cost
+from gdtool.diffusion.plan import frozen_cost, phase_cost, plan_of, rendering_share, step_cost
+from gdtool.diffusion.training import new_state, train_step
+from tests.diffusion.test_training import spheres
 
 CONFIG = msgspec.structs.replace(PRESETS["tiny"][0], image_size=32, channels=(32, 64), encoder_width=32)
 
@@ -42,13 +44,65 @@ def test_memory_is_what_the_profiler_sees(checkpointing):
     config = msgspec.structs.replace(CONFIG, gradient_checkpointing=checkpointing)
     profiler = profile(activities=[ProfilerActivity.CPU], profile_memory=True)
     model = measured_step(config, 2, profiler)
+    gradients = sum(p.numel() * 4 for p in model.parameters() if p.grad is not None)
+    planned = step_cost(config, 3, 2, 2, fused=False, dtype=torch.float32)["bytes"]
+    assert planned == pytest.approx(peak_of(profiler) - gradients, rel=0.2)
+
+
+def peak_of(profiler) -> int:
     live = peak = 0
     for event in sorted((e for e in profiler.profiler.kineto_results.events() if e.name() == "[memory]"), key=lambda e: e.start_ns()):
         live += event.nbytes()
         peak = max(peak, live)
-    gradients = sum(p.numel() * 4 for p in model.parameters() if p.grad is not None)
-    planned = step_cost(config, 3, 2, 2, fused=False, dtype=torch.float32)["bytes"]
-    assert planned == pytest.approx(peak - gradients, rel=0.2)
+    return peak
+
+
+@pytest.fixture
+def with_vae(tmp_path):
+    """A configuration with a VAE of Stable Diffusion's structure and a few thousand weights."""
+    diffusers = pytest.importorskip("diffusers", reason="needs pip install 'gdtool[hub]'")
+    blocks = {"block_out_channels": (8, 8, 8, 8), "norm_num_groups": 4, "latent_channels": 4}
+    diffusers.AutoencoderKL(down_block_types=("DownEncoderBlock2D",) * 4, up_block_types=("UpDecoderBlock2D",) * 4, **blocks).save_pretrained(tmp_path / "vae")
+    return msgspec.structs.replace(CONFIG, codec="vae", condition_alpha=False, condition_skip=False, image_size=64, pretrained=str(tmp_path))
+
+
+def real_and_planned(config, rendering):
+    """(FLOPs, peak bytes less gradients) of a train_step of two objects, all six domains, and what is planned for it."""
+    phase = Phase(domains=6, views=2)
+    train = msgspec.structs.replace(PRESETS["tiny"][1], batch=2, precision="float32", pure_noise=0.0, phases=(phase,), tilted=0.0, hue=False, mirror=False,
+                                    pbr_weight=0.1 if rendering else 0.0, pbr_snr=-1.0)  # every object has less noise than that
+    torch.manual_seed(0)
+    state, objects = new_state(Model(config).train(), train), spheres(2, config.image_size)
+    train_step(state, objects, train, 0, None, "cpu")  # the optimiser's moments are there from now on
+    with FlopCounterMode(display=False) as counter:
+        train_step(state, objects, train, 0, None, "cpu")
+    profiler = profile(activities=[ProfilerActivity.CPU], profile_memory=True)
+    with profiler:
+        train_step(state, objects, train, 0, None, "cpu")
+    weights = parameter_count(state.model)
+    planned = phase_cost(config, train, phase, frozen_cost(config), weights, fused=False)
+    return (counter.get_total_flops(), peak_of(profiler) - 4 * weights), (planned["flops_per_step"], planned["activation_bytes"])
+
+
+@pytest.mark.parametrize("rendering", [False, True])
+def test_a_real_training_step_costs_what_is_planned(rendering):
+    real, planned = real_and_planned(CONFIG, rendering)
+    assert planned[0] == real[0]
+    assert planned[1] == pytest.approx(real[1], rel=0.15)
+
+
+@pytest.mark.parametrize("rendering", [False, True])
+def test_a_real_training_step_with_a_vae_costs_what_is_planned(with_vae, rendering):
+    real, planned = real_and_planned(with_vae, rendering)
+    assert planned[0] == pytest.approx(real[0], rel=0.01)
+    assert planned[1] == pytest.approx(real[1], rel=0.15)
+
+
+def test_objects_with_much_noise_are_not_rendered():
+    train = PRESETS["tiny"][1]
+    assert rendering_share(CONFIG, train, 3) == 0.0 == rendering_share(CONFIG, msgspec.structs.replace(train, pbr_weight=0.0), 6)
+    # the cosine schedule's SNR is 1 half-way
+    assert rendering_share(CONFIG, msgspec.structs.replace(train, pbr_snr=1.0, pure_noise=0.6), 6) == pytest.approx(0.2, abs=0.01)
 
 
 def test_a_plan_adds_up():
