@@ -93,8 +93,10 @@ def _words(kinds: tuple[str, ...]) -> str:
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+$")
 
 
-def hub_folder(text: str) -> str:
+def hub_folder(text: str, revision: str = "") -> str:
     """The folder that a Hugging Face hub id names, downloaded once; any other text, and what exists here, is itself.
+
+    revision: a branch, tag or commit there; "": its main branch.
 
     Raises ResourceError without huggingface_hub, InputError for what the hub does not give.
     """
@@ -106,7 +108,7 @@ def hub_folder(text: str) -> str:
         raise ResourceError(text, "does not exist here, and huggingface_hub is not installed to ask the hub for it",
                             "pip install 'gdtool[hub]', or give a local folder") from None
     try:
-        return snapshot_download(text, allow_patterns=["*.json", "*.safetensors"])
+        return snapshot_download(text, revision=revision or None, allow_patterns=["*.json", "*.safetensors"])
     except Exception as error:  # of several libraries: no network, no such id, no permission
         raise InputError(text, f"is no folder here, and the hub does not give it ({type(error).__name__})") from None
 

@@ -10,6 +10,7 @@ from torch.utils.checkpoint import checkpoint
 
 from gdtool.core.errors import ResourceError
 from gdtool.diffusion.config import ModelConfig
+from gdtool.diffusion.weights import pretrained_part
 
 
 CHUNK = 4  # images that go through the VAE at once: its memory does not grow with the batch
@@ -53,7 +54,7 @@ class VaeCodec:
                 from diffusers import AutoencoderKL
             except ImportError:
                 raise ResourceError("diffusers", "is not installed, and the vae codec needs it", "pip install 'gdtool[hub]'") from None
-            vae = AutoencoderKL.from_pretrained(config.pretrained, subfolder="vae", use_safetensors=True)
+            vae = AutoencoderKL.from_pretrained(pretrained_part(config, "vae"), use_safetensors=True)
         self.vae = vae.requires_grad_(False).eval()
 
     def encode(self, images: torch.Tensor) -> torch.Tensor:

@@ -64,6 +64,7 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     backgrounds: tuple[Literal["white", "grey", "black"], ...] = ("grey",)
     # where the pretrained parts of the paper's configuration live: a local folder or a hub id
     pretrained: str = ""
+    revision: str = ""  # branch, tag or commit of a hub id; "": its main branch
 
 
 class Phase(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -133,7 +134,7 @@ PRESETS: dict[str, tuple[ModelConfig, TrainConfig]] = {
                     heads=8, norm_groups=32, feed_forward=4, time_scale_shift=False, position_embedding=False,
                     condition_skip=False, gradient_checkpointing=True, encoder="clip", encoder_width=768,
                     prediction="epsilon", noise_schedule="scaled_linear", backgrounds=("white", "black", "grey"),
-                    pretrained="lambdalabs/sd-image-variations-diffusers"),
+                    pretrained="lambdalabs/sd-image-variations-diffusers", revision="v2.0"),
         TrainConfig(batch=512, accumulate=64, steps=50_000, warmup=100, decay=False, class_rate=10.0, ema=0.9999, snr_floor=0.0,
                     pure_noise=0.0, hue=False, mirror=False,
                     phases=(Phase(share=0.6, domains=1, views=6, learning_rate=1e-4),

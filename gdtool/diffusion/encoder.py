@@ -9,6 +9,7 @@ from torch import nn
 from gdtool.core.errors import ResourceError
 from gdtool.diffusion.attention import Attention, FeedForward, learned_position
 from gdtool.diffusion.config import ModelConfig
+from gdtool.diffusion.weights import pretrained_part
 
 
 class EncoderLayer(nn.Module):
@@ -46,7 +47,10 @@ class PatchEncoder(nn.Module):
 
 
 class ClipEncoder(nn.Module):
-    """CLIP ViT-L/14's projected embedding as one 768-wide token, frozen, as Stable Diffusion Image Variations has it."""
+    """CLIP ViT-L/14's projected embedding as one 768-wide token, frozen, as Stable Diffusion Image Variations has it.
+
+    Its model card resizes tensors, bicubic without antialiasing; Wonder3D has CLIP's own processor do it, with.
+    """
 
     # mean and deviation of CLIP's training images (openai/clip-vit-large-patch14, preprocessor_config.json)
     MEAN, DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
@@ -58,13 +62,15 @@ class ClipEncoder(nn.Module):
                 from transformers import CLIPVisionModelWithProjection
             except ImportError:
                 raise ResourceError("transformers", "is not installed, and the clip encoder needs it", "pip install 'gdtool[hub]'") from None
-            clip = CLIPVisionModelWithProjection.from_pretrained(config.pretrained, subfolder="image_encoder", use_safetensors=True)
+            clip = CLIPVisionModelWithProjection.from_pretrained(pretrained_part(config, "image_encoder"), use_safetensors=True)
+        self.antialias = config.convention == "wonder3d"
         # in a list, so that its weights are neither trained nor saved with ours
         self.frozen = [clip.requires_grad_(False).eval()]
 
     def forward(self, rgba):
         clip = self.frozen[0].to(rgba.device)
-        image = F.interpolate(0.5 + 0.5 * rgba[:, :3], size=(224, 224), mode="bicubic", antialias=True).clamp(0, 1)
+        image = F.interpolate(0.5 + 0.5 * rgba[:, :3], size=(224, 224), mode="bicubic", antialias=self.antialias)
+        image = image.clamp(0, 1) if self.antialias else image  # as pictures of 8 bits are
         mean, deviation = (torch.tensor(x, device=rgba.device)[:, None, None] for x in (self.MEAN, self.DEVIATION))
         with torch.no_grad():
             return clip((image - mean) / deviation).image_embeds.unsqueeze(1)

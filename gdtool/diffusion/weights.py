@@ -9,6 +9,7 @@ import msgspec
 import torch
 
 from gdtool.core.errors import InputError
+from gdtool.core.sources import hub_folder
 from gdtool.diffusion.config import DOMAINS, ModelConfig
 
 WEIGHTS = "model.safetensors"
@@ -35,6 +36,20 @@ def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise InputError(path, f"tensor {name} holds NaN or infinite weights")
     return tensors, metadata
+
+
+def pretrained_part(config: ModelConfig, part: str) -> Path:
+    """The folder unet, vae or image_encoder of config.pretrained, a local folder or a hub id. Raises ResourceError without
+    huggingface_hub for a hub id, InputError where it has no safetensors."""
+    folder = Path(hub_folder(config.pretrained, config.revision))
+    if not list((folder / part).glob("*.safetensors")):
+        if folder == Path(config.pretrained):
+            read_tensors(folder / part / "diffusion_pytorch_model.safetensors")  # names the pickle, or what is missing
+        revision = f" --revision {config.revision}" if config.revision else ""
+        raise InputError(config.pretrained, f"has no safetensors in {part}/ on the hub, and a pickle can run code and is never opened",
+                         f"hf download {config.pretrained}{revision} --local-dir DIR && python -m gdtool.diffusion.convert DIR, "
+                         'then --config with {"model": {"pretrained": "DIR"}}')
+    return folder / part
 
 
 def check_shapes(path: Path, tensors: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> None:

@@ -73,6 +73,9 @@ def load(folder: Path):
     from gdtool.diffusion.model import Model
     from gdtool.diffusion.weights import check_shapes, read_tensors
 
+    if _json(folder / "unet" / "config.json").get("in_channels") == 4:
+        raise InputError(folder, "is a Stable Diffusion that makes single pictures, such as Image Variations: a training starts from it, it has no views",
+                         "give a model folder of gdtool train, or Wonder3D's; gdtool train --preset paper trains one from it")
     if not (folder / UNET).is_file() and not list((folder / "unet").glob("*.bin")):
         raise InputError(folder / UNET, "does not exist", "where the hub has pickles alone: hf download ID --local-dir DIR && "
                          "python -m gdtool.diffusion.convert DIR, then --model DIR")

@@ -139,6 +139,6 @@ def _condition(inputs: Inputs, options: Options, config, out: Output):
     return condition, picture
 
 
-STAGE = Stage(name="sample-views", version=10, reads=("image-file",), writes="views", Options=Options, run=run,
+STAGE = Stage(name="sample-views", version=11, reads=("image-file",), writes="views", Options=Options, run=run,
               second_inputs={"model": SecondInput("model", search=False, default="models/default", foreign=True,
                                               help="Model folder of gdtool train, or Wonder3D v1 as a folder or hub id; the bundled model without it.")})

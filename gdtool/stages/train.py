@@ -214,5 +214,5 @@ def _objects(inputs: Inputs, workspace):
     return itertools.chain.from_iterable(parts), total
 
 
-STAGE = Stage(name="train", version=2, reads=("dataset", "views", "archive-file"), writes="model", Options=Options, run=run, gathers=True,
+STAGE = Stage(name="train", version=3, reads=("dataset", "views", "archive-file"), writes="model", Options=Options, run=run, gathers=True,
               second_inputs={"start": SecondInput("model", search=False, help="Model folder whose weights to start from.")})
