@@ -12,12 +12,19 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+from dataclasses import replace
+from datetime import timedelta
 from typing import Any
 
 import numpy as np
 import torch
 import torch.distributed as dist
 from torch import nn
+
+
+# The first process decodes the data and makes validation pictures while the others wait for it, which PyTorch allows for
+# 10 or 30 minutes. torchrun ends all when one dies, so a long wait hides nothing.
+PATIENCE = timedelta(days=2)
 
 
 def size() -> int:
@@ -31,7 +38,7 @@ def rank() -> int:
 def start() -> None:
     """Join the other processes, when torchrun started several and they have not met."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1 and not dist.is_initialized():
-        dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
+        dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo", timeout=PATIENCE)
         if torch.cuda.is_available():
             torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
 
@@ -138,13 +145,16 @@ def sharded(x: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
 
 
 def gathered(state):
-    """state with whole weights and averages, for writing."""
-    if is_sharded(state.model):
-        from gdtool.diffusion.model import Model
+    """state with whole weights and averages, for writing and for validation; every process takes part. state stays as it is."""
+    if not is_sharded(state.model):
+        return state
+    from gdtool.diffusion.model import Model
 
-        own = dict(state.model.named_parameters())
-        state.average = {name: whole(x, own[name]) for name, x in state.average.items()}
-        weights = {name: whole(p.detach()) for name, p in own.items()}
-        state.model = Model(state.model.config, state.model.codec).to(next(iter(weights.values())).device).train()
-        state.model.load_state_dict(weights, strict=False)
-    return state
+    own = dict(state.model.named_parameters())
+    average = {name: whole(x, own[name]) for name, x in state.average.items()}
+    weights = {name: whole(p.detach()) for name, p in own.items()}
+    config = state.model.config
+    encoder = state.model.encoder if config.encoder == "clip" else None  # frozen, and so not split
+    model = Model(config, state.model.codec, encoder).to(next(iter(weights.values())).device).train()
+    model.load_state_dict(weights, strict=False)
+    return replace(state, model=model, average=average)

@@ -14,7 +14,7 @@ import math
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ from gdtool.diffusion.schedule import loss_weight
 from gdtool.diffusion.weights import read_tensors
 
 CHECKPOINT = "checkpoint.safetensors"
+MOST_SKIPPED = 10  # steps in a row with a gradient that is not finite: the run is lost
 
 
 @dataclass
@@ -48,7 +49,7 @@ class State:
     objective: torch.nn.Module
     step: int = 0
     seconds: float = 0.0
-    history: list[dict[str, float]] = field(default_factory=list)
+    skipped: int = 0  # steps in a row
 
 
 @dataclass(frozen=True)
@@ -196,15 +197,17 @@ def train_step(state: State, objects: Objects, train: TrainConfig, seed: int, mi
             sums[name] = sums.get(name, 0.0) + float(value.detach()) * share
     sums = distributed.total(sums)
     norm = distributed.local(torch.nn.utils.clip_grad_norm_(state.model.parameters(), train.clip), whole=True)
-    if bool(torch.isfinite(norm)):  # a step that is not finite is left out rather than the whole run lost
+    finite = bool(torch.isfinite(norm))
+    if finite:  # a step that is not finite is left out rather than the whole run lost
         state.optimizer.step()
+    state.skipped = 0 if finite else state.skipped + 1
     state.optimizer.zero_grad(set_to_none=True)
     state.step += 1
     keep = min(train.ema, (1 + state.step) / (10 + state.step))
     names = list(state.average)
     own = {name: distributed.local(p) for name, p in state.model.named_parameters()}
     torch._foreach_lerp_([state.average[n] for n in names], [own[n] for n in names], 1 - keep)
-    return {"step": state.step, "rate": rate, "norm": float(norm), **sums}
+    return {"step": state.step, "rate": rate, "norm": float(norm), "skipped": int(not finite), **sums}
 
 
 def save_checkpoint(state: State, workspace: Path, identity: str) -> None:
@@ -249,8 +252,12 @@ def load_checkpoint(state: State, workspace: Path, identity: str) -> bool:
 
 def run_training(model: Model, objects: Objects, train: TrainConfig, workspace: Path, *, seed: int, minutes: float | None = None,
                  checkpoint_every: int = 200, validate_every: int = 1000, validate: Callable[[State], None] = lambda state: None,
-                 device: str = "cpu", progress=lambda iterable, total, label: iterable) -> State:
-    """Train until the steps or the minutes are spent; resumes from workspace. The first process writes workspace/loss.csv."""
+                 device: str = "cpu", warn: Callable[[str], None] = lambda message: None,
+                 progress=lambda iterable, total, label: iterable) -> State:
+    """Train until the steps or the minutes are spent; resumes from workspace. The first process writes workspace/loss.csv.
+
+    Raises InputError when MOST_SKIPPED steps in a row had a gradient that is not finite; before that warns of each.
+    """
     identity = msgspec.json.encode([model.config, train, seed, len(objects)]).decode()
     torch.manual_seed(seed)
     state = new_state(model.to(device).train(), train)
@@ -266,20 +273,31 @@ def run_training(model: Model, objects: Objects, train: TrainConfig, workspace: 
             state.seconds += distributed.total({"s": time.perf_counter() - start})["s"] / distributed.size()
             writer.writerow({k: (f"{v:.6g}" if isinstance(v, float) else v) for k, v in record.items()} | {"seconds": f"{state.seconds:.1f}"})
             file.flush()
+            _tell_skipped(state, warn)
             next(bar, None)
             if state.step % checkpoint_every == 0:
                 save_checkpoint(state, workspace, identity)
-            if state.step % validate_every == 0 and not distributed.is_sharded(state.model) and distributed.rank() == 0:
-                validate(state)
+            if state.step % validate_every == 0:
+                whole = distributed.gathered(state)
+                if distributed.rank() == 0:
+                    validate(whole)
         for _ in bar:
             break
     save_checkpoint(state, workspace, identity)
     return distributed.gathered(state)
 
 
+def _tell_skipped(state: State, warn: Callable[[str], None]) -> None:
+    if state.skipped >= MOST_SKIPPED:
+        raise InputError("training", f"has a gradient that is not finite in {MOST_SKIPPED} steps up to {state.step}",
+                         "lower the learning rate, train in float32, or look at the data; the checkpoint has finite weights")
+    if state.skipped:
+        warn(f"step {state.step} is left out: its gradient is not finite ({state.skipped} in a row)")
+
+
 def _continued(file, step: int, domains: tuple[str, ...]) -> csv.DictWriter:
     """A writer of the log that keeps the rows up to step; rows after a checkpoint will be written again."""
-    columns = ["step", "seconds", "loss", "rate", "norm", *domains, "rendering"]
+    columns = ["step", "seconds", "loss", "rate", "norm", "skipped", *domains, "rendering"]
     kept = [row for row in csv.DictReader(file) if int(row["step"]) <= step] if step else []
     file.seek(0)
     file.truncate() if file.name != os.devnull else None

@@ -75,7 +75,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
              "seed": options.seed, "minutes": options.minutes, "checkpoint_every": options.checkpoint_every, "device": out.device}
     distributed.send(order)
     with out.step("train"):
-        state = _train(order, objects, validate_every=options.validate_every, validate=validate, progress=out.progress)
+        state = _train(order, objects, validate_every=options.validate_every, validate=validate, warn=out.warn, progress=out.progress)
     with out.step("validate"):
         validate(state)
     save_model(out.path, model_config, state.average)

@@ -16,6 +16,7 @@ import msgspec, torch
 from gdtool.diffusion import distributed
 from gdtool.diffusion.config import Phase
 from gdtool.diffusion.model import Model
+from gdtool.diffusion.report import append_validation, validation
 from gdtool.diffusion.training import run_training
 from tests.diffusion.test_training import MODEL, TRAIN, spheres
 
@@ -37,8 +38,12 @@ def progress(iterable, total, label):
             raise Stop  # as a kill between two checkpoints would
         yield i
 
+def validate(state):
+    assert distributed.rank() == 0
+    append_validation(workspace / "validation.csv", state.step, 0.0, validation(state, spheres(1), "float32")[1])
+
 try:
-    run_training(Model(MODEL), spheres(), train, workspace, seed=0, checkpoint_every=2, validate_every=100, progress=progress)
+    run_training(Model(MODEL), spheres(), train, workspace, seed=0, checkpoint_every=2, validate_every=3, validate=validate, progress=progress)
 except Stop:
     pass
 distributed.leave()
@@ -60,13 +65,16 @@ def run(tmp_path, name, processes, accumulate=1, shard=False, steps=99):
 @pytest.fixture(scope="module")
 def single(tmp_path_factory):
     folder = tmp_path_factory.mktemp("single")
-    return run(folder, "one", 1)
+    return *run(folder, "one", 1), folder / "one" / "validation.csv"
 
 
 @pytest.mark.parametrize("processes, accumulate, shard", [(1, 2, False), (2, 1, False), (2, 2, True)], ids=["accumulated", "ddp", "fsdp"])
 def test_the_curve_is_that_of_one_process(single, tmp_path, processes, accumulate, shard):
     """Same global batch of four: in two parts one after the other, in two processes, and with the weights split too."""
     curve, tensors = run(tmp_path, "many", processes, accumulate, shard)
+    one, many = (np.genfromtxt(path, delimiter=",", skip_header=1) for path in (single[2], tmp_path / "many" / "validation.csv"))
+    assert many[:, 0].tolist() == [3, 6]
+    np.testing.assert_allclose(many, one, atol=0.05)
     assert len(curve) == 6
     np.testing.assert_allclose(curve, single[0], rtol=2e-4, atol=1e-6)
     assert tensors.keys() == single[1].keys()

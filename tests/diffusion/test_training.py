@@ -192,6 +192,33 @@ def test_training_lowers_the_error(tmp_path):
     assert all(float(rows[-1][d]) > 0 for d in DOMAINS)
 
 
+def poisoned(monkeypatch, bad):
+    """losses() whose gradient is not finite in the steps of which bad(number) holds."""
+    plain = training.losses
+
+    def losses(model, batch, step, *rest):
+        out = plain(model, batch, step, *rest)
+        return out | {"loss": out["loss"] * float("nan")} if bad(step.number) else out
+
+    monkeypatch.setattr(training, "losses", losses)
+
+
+def test_steps_that_are_not_finite_are_left_out_counted_and_told(tmp_path, monkeypatch):
+    poisoned(monkeypatch, lambda number: number in (1, 2, 5))
+    said = []
+    state = run_training(Model(MODEL), spheres(), msgspec.structs.replace(TRAIN, steps=7), tmp_path, seed=0, warn=said.append)
+    assert [line.split(" is left out")[0] for line in said] == ["step 2", "step 3", "step 6"] and "2 in a row" in said[1]
+    assert [row["skipped"] for row in csv.DictReader(open(tmp_path / "loss.csv"))] == list("0110010")
+    assert all(torch.isfinite(p).all() for p in state.model.parameters())
+
+
+def test_a_lost_run_ends_with_finite_weights_in_its_checkpoint(tmp_path, monkeypatch):
+    poisoned(monkeypatch, lambda number: number >= 4)
+    with pytest.raises(InputError, match="not finite in 10 steps up to 14"):
+        run_training(Model(MODEL), spheres(), msgspec.structs.replace(TRAIN, steps=40), tmp_path, seed=0, checkpoint_every=4)
+    assert all(torch.isfinite(x).all() for x in training.read_tensors(tmp_path / CHECKPOINT)[0].values())
+
+
 def test_minutes_end_a_run(tmp_path):
     options = msgspec.structs.replace(TRAIN, steps=10**9, pbr_weight=0.0)
     state = run_training(Model(MODEL), spheres(), options, tmp_path, seed=0, minutes=0.01)
