@@ -10,6 +10,7 @@ from gdtool.geometry.repair import edges_of
 from gdtool.geometry.sharpen import dihedral_degrees
 
 _CORNER_TURN_DEGREES = 50.0
+_THINNEST = 0.05  # height over longest side of a triangle that has no direction of its own: simplifying folds some over
 _STRAIGHT = 0.35  # the sine of a quad's corner below which features may not hold both its sides
 
 
@@ -38,7 +39,7 @@ def find_features(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    ends, _, angle = dihedral_degrees(vertices, faces)
+    ends, _, angle = dihedral_degrees(vertices, faces, _THINNEST)
     edges = edges_of(faces)
     strong = np.concatenate([angle > crease_degrees, np.ones(int((edges.count != 2).sum()), bool)])
     segments = np.concatenate([ends, edges.ends[edges.count != 2]])

@@ -20,18 +20,43 @@ _FARTHEST_EDGES = 4.0  # sides are looked for within this many edge lengths
 _LARGEST_MOVE_EDGES = 1.75
 _LARGEST_RESIDUAL_EDGES = 0.12
 _JOIN_EDGES = 0.6  # rims of one bevel end up nearer to each other than this
+_SLIVERS_IN_A_ROW = 2
 _LARGEST_SHARE = 0.25  # more bevel vertices than this: a rough surface, not a mechanical part
 
 
-def dihedral_degrees(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges (k, 2) with two faces, those faces (k, 2), and the angle (k,) between their normals; 0 beside zero-area faces."""
+def dihedral_degrees(vertices: np.ndarray, faces: np.ndarray, thinnest: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Edges (k, 2) with two faces, those faces (k, 2), and the angle (k,) between their normals in degrees; 0 beside zero-area faces.
+
+    thinnest: a triangle whose height is a smaller share of its longest side has no direction of its own: it counts with
+    the face across that side.
+    """
     edges = edges_of(faces)
     edge_idx, pairs = edges.face_pairs()
+    ends = edges.ends[edge_idx]
     normals, area = face_normals(vertices, faces)
+    if thinnest:
+        across = _across_slivers(np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1), pairs, area, thinnest)
+        normals, area = normals[across], area[across]
     cosine = np.einsum("ki,ki->k", normals[pairs[:, 0]], normals[pairs[:, 1]])
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     angle[(area[pairs] <= 0).any(1)] = 0
-    return edges.ends[edge_idx], pairs, angle
+    return ends, pairs, angle
+
+
+def _across_slivers(length: np.ndarray, pairs: np.ndarray, area: np.ndarray, thinnest: float) -> np.ndarray:
+    """For faces of areas (f,) with edges of `length` (k,) between pairs (k, 2) of them: the face (f,) across the longest of a
+    sliver's edges, and across that one's where it is a sliver too; all others themselves."""
+    longest = np.zeros(len(area))
+    for one in pairs.T:
+        np.maximum.at(longest, one, length)
+    sliver = 2 * area < thinnest * longest**2
+    across = np.arange(len(area))
+    for one, other in (pairs.T, pairs.T[::-1]):
+        theirs = sliver[one] & (length == longest[one])
+        across[one[theirs]] = other[theirs]
+    for _ in range(_SLIVERS_IN_A_ROW):
+        across = np.where(sliver[across], across[across], across)
+    return across
 
 
 def restore_creases(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float = 30.0,

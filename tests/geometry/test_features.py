@@ -1,0 +1,33 @@
+"""Creases are where the surface turns, not where simplifying has folded a sliver over."""
+
+import numpy as np
+import pytest
+
+from gdtool.geometry.features import find_features
+from gdtool.geometry.sharpen import dihedral_degrees
+
+FACES = np.array([(0, 1, 4), (1, 2, 4), (0, 4, 2), (0, 2, 3)])
+
+
+def square(turned_degrees: float) -> np.ndarray:
+    """A square of two halves that turn about the diagonal 0-2, and vertex 4 past the diagonal, so that (0, 4, 2) is a folded sliver."""
+    angle = np.radians(turned_degrees)
+    along, side = np.array([1, 1, 0]) / 2**0.5, np.array([-1, 1, 0]) / 2**0.5
+    tip = along / 2**0.5 + (side * np.cos(angle) + np.array([0, 0, 1]) * np.sin(angle)) / 2**0.5
+    middle = along / 2**0.5 + 0.01 * side
+    return np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), tip, middle])
+
+
+def test_a_folded_sliver_is_no_crease():
+    vertices = square(0.0)
+    assert dihedral_degrees(vertices, FACES)[2].max() > 170
+    assert dihedral_degrees(vertices, FACES, 0.05)[2].max() < 1e-5
+    boundary = find_features(vertices, FACES, 30.0, 0.1)
+    on_rim = [tuple(sorted(np.round(boundary.points[s].sum(1), 6))) for s in boundary.segments]
+    assert sorted(on_rim) == [(0, 1), (0, 1), (1, 2), (1, 2)]
+
+
+def test_a_crease_beside_a_sliver_is_kept():
+    ends, _, angle = dihedral_degrees(square(60.0), FACES, 0.05)
+    at = {tuple(sorted(pair)): degrees for pair, degrees in zip(ends.tolist(), angle, strict=True)}
+    assert at[0, 2] < 1e-5 and at[0, 4] == pytest.approx(60) and at[2, 4] == pytest.approx(60) and at[1, 4] < 1e-5
