@@ -35,7 +35,7 @@ def ours(path: Path, faces: int) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         cost = gdtool("remesh", "--quiet", "--faces", str(faces), path, "-o", Path(folder) / "mesh")
         made = json.loads((Path(folder) / "mesh/manifest.json").read_text())
-    content, passed = made["content"], sum(skip["what"] == "a way of remeshing" for skip in made["skipped"])
+    content, passed = made["content"], len(content["tried"])
     return {"seconds": cost.seconds, "quads": content["quads"], "as": f"{content['engine']} ({passed})"} | figures_of(content["report"])
 
 

@@ -89,6 +89,7 @@ class MeshContent(Content, frozen=True, kw_only=True):
     triangles: Count
     watertight: bool
     engine: str = ""
+    tried: Annotated[tuple[str, ...], Meta(description="ways that were tried before, and why each was not taken")] = ()
 
 
 class AtlasContent(Content, frozen=True, kw_only=True):

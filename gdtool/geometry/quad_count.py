@@ -35,7 +35,7 @@ def coarsest(vertices: np.ndarray, faces: np.ndarray, request: Request, limit: f
             if enough is None:
                 return out, found, record, reached
             too_few = quads
-        if enough[0] <= _CLOSE_ENOUGH * too_few:
+        if enough[0] <= _CLOSE_ENOUGH * too_few or request.for_engines <= 0:
             break
         guess = quads * 1.05 * reached / limit
         middle = (too_few * enough[0]) ** 0.5

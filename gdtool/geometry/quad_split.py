@@ -30,7 +30,7 @@ def split_to_quads(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_d
     """
     quads = split_count(faces, quads)
     even = _even(vertices, faces, quads, crease_degrees, seconds, memory_mb)
-    return pair_and_split(*even, quads) if even is not None else _by_collapse(vertices, faces, quads)
+    return pair_and_split(*even, quads) if even is not None else _by_collapse(vertices, faces, quads, seconds)
 
 
 def _even(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float, seconds: float,
@@ -73,7 +73,7 @@ def even_triangles(vertices: np.ndarray, faces: np.ndarray, triangles: int, crea
     return vertices, found
 
 
-def _by_collapse(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[np.ndarray, np.ndarray]:
+def _by_collapse(vertices: np.ndarray, faces: np.ndarray, quads: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """pair_and_split of the mesh's own triangles, cut in four or collapsed to the right number."""
     import igl
 
@@ -82,7 +82,7 @@ def _by_collapse(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[n
         vertices, faces = (np.asarray(x) for x in igl.upsample(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64), 1))
     best = None
     for _ in range(_TRIES):
-        found = pair_and_split(*_collapsed(vertices, faces, triangles), quads)
+        found = pair_and_split(*_collapsed(vertices, faces, triangles, seconds), quads)
         if best is None or abs(len(found[1]) - quads) < abs(len(best[1]) - quads):
             best = found
         if abs(len(found[1]) / quads - 1) < _EVEN_COUNT:
@@ -91,13 +91,13 @@ def _by_collapse(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[n
     return best
 
 
-def _collapsed(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple[np.ndarray, np.ndarray]:
+def _collapsed(vertices: np.ndarray, faces: np.ndarray, triangles: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """So many triangles, or a few more: a collapse that loses pieces is tried again more gently before the mesh is taken as it is."""
     pieces = components(faces)[0]
     for factor in (1.0, 1.15, 1.3, 1.6, 2.0, 4.0):
         if factor * triangles >= len(faces):
             break
-        out, out_faces, _, _ = simplify(vertices, faces, int(factor * triangles), careful=True, measured=False)
+        out, out_faces, _, _ = simplify(vertices, faces, int(factor * triangles), seconds=seconds, careful=True, measured=False)
         if components(out_faces)[0] == pieces and is_manifold(out_faces) >= is_manifold(faces):
             return out, out_faces
     return vertices, faces

@@ -14,22 +14,34 @@ from gdtool.geometry.features import Features, find_features
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_shape import Surface
 
+_ENGINES_SHARE, _LEAST_SECONDS = 0.7, 20.0
 _FEATURE_EDGES = 3  # quads long: shorter creases are noise
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for: about `quads` faces; creases sharper than crease_degrees followed; limits of one engine run."""
+    """What is asked for: about `quads` faces; creases sharper than crease_degrees followed; time limit of the whole, memory limit of a child."""
 
     quads: int = 20000
     crease_degrees: float = 30.0
     engine: str = "auto"
     smooth_iterations: int = 5
     restore_creases: bool = True
-    seconds: float = 120.0
+    seconds: float = 120.0  # from when the request is made; engines have a share of them, the rest is for what needs none
     memory_mb: int = 16000
     threads: int = 1  # pieces that go one by one are done side by side
     least_jacobian: float = -1.0  # a coarser mesh subdivided is passed over where its worst quad is worse
+    begun: float = field(default_factory=time.monotonic)
+
+    @property
+    def for_engines(self) -> float:
+        """Seconds in which engines may still be tried; below zero when what is not done by then goes without one."""
+        return self.begun + _ENGINES_SHARE * self.seconds - time.monotonic()
+
+    @property
+    def for_the_rest(self) -> float:
+        """Seconds for what a result cannot do without: those left, and some however late it is."""
+        return max(self.begun + self.seconds - time.monotonic(), _LEAST_SECONDS)
 
 
 @dataclass

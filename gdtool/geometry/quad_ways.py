@@ -26,6 +26,7 @@ _CUT_EDGES, _CUT_SHARE = 0.25, 0.01  # surface so far from the quads lies beyond
 _HANDLES, _PIECES = "handles are lost or added", "pieces are lost or joined"
 _TOO_COARSE = _STRAYS, _LEAVES_OUT, _STICKS_OUT = "strays", "leaves out", "sticks out"
 _MENDINGS = 4  # rounds of filling holes and parting what meets at a vertex
+_SHORTEST_RUN = 0.05  # seconds
 _MANY = 3000  # quads of a mesh that is tried coarser and subdivided
 
 Found = tuple[np.ndarray, np.ndarray, str]  # vertices (v, 3), quads (q, 4), the way that they were made
@@ -43,6 +44,11 @@ class _Way:
     @property
     def label(self) -> str:
         return self.engine + (f", {self.subdivisions} subdivision" if self.subdivisions else "") + ("" if self.degrees else ", creases left out")
+
+    def near(self, count: float) -> list[float]:
+        """Numbers to ask for side by side, as far from one another as the first, `count` in their middle."""
+        middle = sum(self.factors) / len(self.factors)
+        return [count * factor / middle for factor in self.factors]
 
     @property
     def children(self) -> int:
@@ -99,6 +105,10 @@ class Trial:
     def run(self) -> Found | None:
         """The first way's quads that stand up to judgement, finished; None when none does."""
         for way in _ways(self.part.quads, self.part.request):
+            if self.part.request.for_engines <= 0:
+                self.record.failed.append(f"{way.label}: not tried, the time is over")
+                self._over = True
+                return self._bridged()
             if way.engine not in self._given_up and (found := self._by(way)) is not None:
                 return found
             if self._over:
@@ -119,7 +129,7 @@ class Trial:
             if together and len(best.quads):
                 self.whole = best.vertices, best.quads, way.label
             if not counted and (best.fault is None or together):
-                asked = [best.asked * wanted / max(count, 1)]
+                asked = way.near(best.asked * wanted / max(count, 1))
                 continue
             if best.fault is not None:
                 if best.fault == _HANDLES and not way.subdivisions and self._second_best is None and counted:
@@ -128,7 +138,7 @@ class Trial:
             vertices, found, taken = self._finished(way, [r for r in results if r.fault is None and abs(r.off(wanted)) <= COUNT_TOLERANCE])
             if abs(len(found) / quads - 1) > COUNT_TOLERANCE:
                 count, extra = len(found), len(found) - taken.count
-                asked = [taken.asked * (quads - extra) / taken.count]
+                asked = way.near(taken.asked * (quads - extra) / taken.count)
                 continue
             fault = fault_of(vertices, found, part.surface, part.edge, _FAR_SUBDIVIDED if way.subdivisions else _FAR_EDGES, part.piece)
             if way.subdivisions and (least := scaled_jacobian(vertices, found).min()) < part.request.least_jacobian:
@@ -144,7 +154,7 @@ class Trial:
         part, request, start = self.part, self.part.request, time.perf_counter()
         name = ENGINES["on few" if way.engine == "instant-meshes" and way.subdivisions else way.engine]
         running = [begin(name, part.vertices.astype(np.float32), part.faces.astype(np.int32), max(int(number / way.children), 16),
-                         way.degrees, seconds=request.seconds, memory_mb=request.memory_mb) for number in asked]
+                         way.degrees, seconds=max(request.for_engines, _SHORTEST_RUN), memory_mb=request.memory_mb) for number in asked]
         _ = part.features, part.surface, part.fine()  # found out while the children work
         out = []
         for number, child in zip(asked, running, strict=True):

@@ -30,7 +30,7 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
     """
     found = _remeshed(vertices, faces, request, careful=False)
     edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
-    if (error := found[2].figures["simplify_error"]) <= edge:
+    if (error := found[2].figures["simplify_error"]) <= edge or request.for_engines <= 0:
         return found
     again = _remeshed(vertices, faces, request, careful=True)
     first, record = found[2], again[2]
@@ -93,7 +93,7 @@ def _quads_of(part: Part, record: Record) -> list[Found]:
                 record.add(own)
             return out
     start = time.perf_counter()
-    split = split_to_quads(part.vertices, part.faces, part.quads, part.request.crease_degrees, part.request.seconds, part.request.memory_mb)
+    split = split_to_quads(part.vertices, part.faces, part.quads, part.request.crease_degrees, part.request.for_the_rest, part.request.memory_mb)
     found = *fitted(*split, part.vertices, part.faces, part.request, part.fine()), "pair and split"
     record.clock("fallback", start)
     return [found]
@@ -113,13 +113,13 @@ def _simplified(vertices: np.ndarray, faces: np.ndarray, restored_vertices: np.n
     start = time.perf_counter()
     needed = _needed(request)
     restored = restored_vertices is not vertices
-    found = simplify(restored_vertices, restored_faces, needed, seconds=request.seconds, closed=closed, thorough=not restored, careful=careful,
+    found = simplify(restored_vertices, restored_faces, needed, seconds=request.for_the_rest, closed=closed, thorough=not restored, careful=careful,
                      measured=False, meanwhile=meanwhile)
     if restored and (found[3]["method"] == "none" and "failed" in found[3] or closed() and not repair.is_watertight(found[1])):
         # Bevels drawn out where there is no crease make folds that the collapse tears.
         record.failed.append("creases restored: the result cannot be simplified")
         record.figures["crease_vertices_restored"] = 0
-        found = simplify(vertices, faces, needed, seconds=request.seconds, closed=closed, careful=careful, measured=False, meanwhile=meanwhile)
+        found = simplify(vertices, faces, needed, seconds=request.for_the_rest, closed=closed, careful=careful, measured=False, meanwhile=meanwhile)
     report = found[3]
     record.figures["simplified_to"] = report["faces"]
     if "failed" in report:

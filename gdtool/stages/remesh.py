@@ -35,7 +35,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     engine: Annotated[Literal["auto", "instant-meshes", "quadriflow", "split"], Meta(
         description="auto is instant-meshes with fallbacks; quadriflow needs pyQuadriFlow; split needs no engine")] = "auto"
     smooth_iterations: Annotated[int, Meta(ge=0, le=100, description="rounds of evening out the quads on the surface")] = 5
-    seconds: Annotated[float, Meta(gt=0, description="time limit of one engine run, then the next is tried")] = 120.0
+    seconds: Annotated[float, Meta(gt=0, description="time limit; engines are tried in the first 70 % of it, what is not done by then is paired triangles")] = 120.0
     keep: Annotated[bool, Meta(description="pass a mesh through that already meets the request")] = True
 
 
@@ -45,13 +45,14 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     from gdtool.folders.mesh import QuadMesh, triangulated, write_mesh
     from gdtool.geometry import mesh_quality, repair
+    from gdtool.geometry.quad_task import Record
 
     with out.step("read"):
         vertices, faces, matrix, quads = _read(inputs, out)
     options = _counted(vertices, faces, options, out)
     if quads is not None and options.keep and not options.triangles and not options.max_deviation and options.symmetry == "none" and _meets(quads, options):
         out.skip("remeshing", f"the mesh already is {len(quads)} quads, closed and manifold")
-        found_vertices, found, engine, figures, source = vertices, quads, "passed through", {}, None
+        found_vertices, found, record = vertices, quads, Record(engine="passed through")
     else:
         with out.step("clean"):
             vertices, faces, repairs = repair.clean(vertices, faces, _path(inputs))
@@ -60,19 +61,20 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
                                                              else name.replace("_", " ") for name, value in repairs.items()))
         if not repair.is_watertight(faces):
             out.warn(f"{inputs.name}: the surface is open; its boundaries are kept")
-        found_vertices, found, engine, figures, source = (_decimated if options.triangles else _quads)(vertices, faces, options, out)
+        found_vertices, found, record = (_decimated if options.triangles else _quads)(vertices, faces, options, out)
     with out.step("measure"):
-        figures |= mesh_quality.topology_figures(found_vertices, found) | mesh_quality.shape_figures(found_vertices, found)
-        if engine != "passed through":
-            figures |= mesh_quality.distance_figures(found_vertices, triangulated(found)[0], vertices, faces, 20000, source=source)
+        figures = record.figures | mesh_quality.topology_figures(found_vertices, found) | mesh_quality.shape_figures(found_vertices, found)
+        if record.engine != "passed through":
+            figures |= mesh_quality.distance_figures(found_vertices, triangulated(found)[0], vertices, faces, 20000, source=record.source)
     asked = options.triangles or (len(found) if options.max_deviation else options.faces)
-    if engine != "passed through" and abs(len(found) / asked - 1) > 0.03 and (not options.triangles or len(found) > asked):
+    if record.engine != "passed through" and abs(len(found) / asked - 1) > 0.03 and (not options.triangles or len(found) > asked):
         out.warn(f"{inputs.name}: {len(found)} faces, not the {asked} asked for")
     with out.step("write"):
         write_mesh(out, QuadMesh(found_vertices, found.astype(np.int32)))
     is_quad = found[:, 3] >= 0
     out.content = MeshContent(vertices=len(found_vertices), quads=int(is_quad.sum()), triangles=int((~is_quad).sum()),
-                              watertight=bool(figures["watertight"]), engine=engine, report=figures,
+                              watertight=bool(figures["watertight"]), engine=record.engine, tried=tuple(record.failed),
+                              report=figures,
                               source_from_world=tuple(float(x) for x in matrix.ravel()))
 
 
@@ -144,6 +146,7 @@ def _meets(quads, options: Options) -> bool:
 def _decimated(vertices, faces, options: Options, out: Output):
     import numpy as np
 
+    from gdtool.geometry.quad_task import Record
     from gdtool.geometry.simplify import simplify
 
     if options.symmetry != "none":
@@ -152,8 +155,8 @@ def _decimated(vertices, faces, options: Options, out: Output):
         vertices, faces, _, report = simplify(vertices, faces, options.triangles, seconds=options.seconds)
     if "failed" in report:
         out.warn(f"simplify: {report['failed']}")
-    figures = {"simplify_error": report["error"]}
-    return vertices, np.concatenate([faces, np.full((len(faces), 1), -1)], 1), report["method"], figures, None
+    record = Record(engine=report["method"], figures={"simplify_error": report["error"]})
+    return vertices, np.concatenate([faces, np.full((len(faces), 1), -1)], 1), record
 
 
 def _quads(vertices, faces, options: Options, out: Output):
@@ -169,11 +172,10 @@ def _quads(vertices, faces, options: Options, out: Output):
             out.warn(f"{reached:.2g} from the surface with {len(quads)} quads, farther than --max-deviation; allow more --faces")
     else:
         vertices, quads, record = way(vertices, faces, request)
-    for text in record.failed:
-        out.skip("a way of remeshing", text)
     for name, seconds in record.seconds.items():
         out.seconds[name] = out.seconds.get(name, 0.0) + seconds
-    return vertices, quads, record.engine, record.figures | apart, record.source
+    record.figures |= apart
+    return vertices, quads, record
 
 
 def _way(vertices, faces, options: Options, out: Output):
@@ -194,4 +196,4 @@ def _way(vertices, faces, options: Options, out: Output):
     return partial(remesh_mirrored, axis=axis), figures
 
 
-STAGE = Stage(name="remesh", version=14, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)
+STAGE = Stage(name="remesh", version=15, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)

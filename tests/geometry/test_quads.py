@@ -1,5 +1,7 @@
 """Quads: count, topology, creases, and that a way through is found whatever the engine does."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -133,7 +135,7 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
 
     monkeypatch.setattr(quad_split, "simplify", losing)
     asked = 1800  # 800 triangles, of which 1.15 times as many lose the piece and 1.3 times keep it
-    out, found = quad_split._by_collapse(vertices, faces, asked)
+    out, found = quad_split._by_collapse(vertices, faces, asked, 60.0)
     assert tried[:3] == [800, 919, 1040] and repair.components(found)[0] == 2
     assert asked < len(found) < 1.5 * asked < 1.8 * len(faces)
 
@@ -141,7 +143,7 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
 def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
     """Pins with few triangles around: what bends too much stays single, and there are fewer triangles for it."""
     vertices, faces = joined(*((pin[0] + (0.3 * k, 0, 0), pin[1]) for k, pin in enumerate([rod(24)] * 8)))
-    _, found = quad_split._by_collapse(vertices, faces, 400)
+    _, found = quad_split._by_collapse(vertices, faces, 400, 60.0)
     assert abs(len(found) / 400 - 1) < 0.1 and repair.components(found)[0] == 8 and repair.is_watertight(found)
 
 
@@ -369,3 +371,18 @@ def test_equal_input_gives_equal_quads():
     vertices, faces = sphere(24)
     one, two = (quads.remesh(vertices / 2, faces, Request(quads=500)) for _ in range(2))
     assert (one[0] == two[0]).all() and (one[1] == two[1]).all()
+
+
+def test_when_the_time_is_over_no_engine_is_begun():
+    """What was asked for comes all the same, as paired triangles, and the record says why."""
+    vertices, faces = sphere(96, 0.45)
+    start = time.monotonic()
+    out, found, record = quads.remesh(vertices, faces, Request(quads=4000, seconds=0.01))
+    assert record.engine == "pair and split" and record.failed == ["instant-meshes, 1 subdivision: not tried, the time is over"]
+    assert whole(found) and abs(len(found) / 4000 - 1) <= 0.03 and time.monotonic() - start < 30
+
+
+def test_every_round_asks_for_two_densities():
+    way = quad_ways._ways(20000, Request())[0]
+    assert len(way.near(20000)) == 2 and np.mean(way.near(20000)) == pytest.approx(20000)
+    assert way.near(20000)[1] / way.near(20000)[0] == pytest.approx(way.factors[1] / way.factors[0])
