@@ -69,16 +69,17 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     from gdtool.texture.occlusion import bake_occlusion
     from gdtool.texture.origin import from_scene
     from gdtool.texture.reproject import vertex_reach
-    from gdtool.texture.target import texel_width, texels_of
+    from gdtool.texture.target import samples_for, texel_width, texels_of
 
     threads = len(os.sched_getaffinity(0))
     scene, mesh = load_scene(case.glb), read_low(case)
     target = target_of(mesh)[0]
-    origin = from_scene(scene, np.eye(4), lambda detail: texel_width(target, size))
+    width = texel_width(target, size)
+    origin = from_scene(scene, np.eye(4), lambda detail: 0.5 * width / samples_for(width, detail) ** 0.5)
     cost, clock = {}, Clock()
     texels = texels_of(target, size, threads=threads)
     reach = vertex_reach(target.vertices, target.faces, origin.source)
-    baked = bake(target, texels, origin.source, origin.lookup, reach, threads=threads)
+    baked = bake(target, texels, origin.source, origin.lookup, reach, samples=samples_for(width, origin.detail), threads=threads)
     wall, processor = clock()
     traced, trace = None, None
     clock()

@@ -26,7 +26,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Options of bake."""
 
     size: Annotated[int, Meta(ge=16, le=16384, description="width and height of the maps in texels; without it what the source's detail needs, 256 to 4096")] | None = None
-    samples: Annotated[int, Meta(ge=1, le=64, description="samples per texel where neighbouring texels differ: 1, 4, 9, …")] = 1
+    samples: Annotated[int, Meta(ge=1, le=64, description="samples per texel where neighbouring texels differ: 1, 4, 9, …; without it 4 where a texel is much wider than the source's detail, else 1")] | None = None
     ao: Annotated[bool, Meta(description="trace ambient occlusion")] = True
     ao_rays: Annotated[int, Meta(ge=1, le=65536, description="rays per traced point of ambient occlusion")] = 64
     padding: Annotated[int, Meta(ge=0, description="texels of gutter around charts; 0: all that is free")] = 0
@@ -49,7 +49,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.texture.maps import make_maps
     from gdtool.texture.occlusion import bake_occlusion
     from gdtool.texture.reproject import vertex_reach
-    from gdtool.texture.target import size_for, texels_of
+    from gdtool.texture.target import texel_width, texels_of
 
     if options.usd != "none":
         from gdtool.texture.usd import require
@@ -65,7 +65,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         few = slice(None, None, max(1, len(target.faces) // 5000))
         if origin.source.turn_to(target.vertices[target.faces[few]].mean(1), target.normals[few].mean(1)):
             out.warn(f"{inputs.name}: what it is baked from is inside out beside it; the faces are taken the other way round")
-    size = options.size or size_for(target, origin.detail)
+    size, samples = _fineness(options, target, origin.detail)
+    if options.samples is None and samples == 1:
+        out.skip("more samples", f"a texel is {texel_width(target, size) / max(origin.detail, 1e-12):.2g} times as wide as the source's detail: one stands for it")
     _check_memory(inputs, size)
     with out.step("rasterise"):
         texels = texels_of(target, size, threads=out.threads)
@@ -73,7 +75,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             raise InputError(_path(inputs), "its texture coordinates cover no texel", "run gdtool unwrap")
     with out.step("bake"):
         reach = vertex_reach(target.vertices, target.faces, origin.source)
-        baked = bake(target, texels, origin.source, origin.lookup, reach, samples=options.samples, threads=out.threads, progress=out.progress,
+        baked = bake(target, texels, origin.source, origin.lookup, reach, samples=samples, threads=out.threads, progress=out.progress,
                      height=options.height, confidence=options.confidence)
     occlusion = None
     if options.ao:
@@ -90,7 +92,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     if options.normal_map == "off":
         out.skip("normal map", "left out by --normal-map off")
     report = {**baked.report, "seen_share": 0.0 if baked.seen is None else float((baked.seen[:texels.inside] > 0.5).mean()),
-              "materials_from": origin.label, "detail": origin.detail}
+              "materials_from": origin.label, "detail": origin.detail, "samples": samples}
     levels = []
     if options.lods > 1:
         with out.step("levels of detail"):
@@ -218,9 +220,22 @@ def _read_origin(inputs: Inputs, options: Options, matrix, target, out: Output):
     if named is None:
         raise InputError(_path(inputs), "has no surface to bake from along its provenance chain", "name one with --surface or --model")
     from gdtool.assets.load import load_scene
-    from gdtool.texture.target import size_for, texel_width
+    from gdtool.texture.target import texel_width
 
-    return from_scene(load_scene(named), matrix, lambda detail: texel_width(target, options.size or size_for(target, detail)))
+    def footprint(detail: float) -> float:
+        size, samples = _fineness(options, target, detail)
+        # Between texels a lookup is a mean of its own: of a level as coarse as the sample is wide it blurs twice.
+        return 0.5 * texel_width(target, size) / samples**0.5
+
+    return from_scene(load_scene(named), matrix, footprint)
+
+
+def _fineness(options: Options, target, detail: float) -> tuple[int, int]:
+    """Size of the maps, and samples of a texel where the source varies, for a source whose detail is so wide."""
+    from gdtool.texture.target import samples_for, size_for, texel_width
+
+    size = options.size or size_for(target, detail)
+    return size, samples_for(texel_width(target, size), detail) if options.samples is None else round(options.samples**0.5) ** 2
 
 
 def _read_picture(folder, views, out: Output):
@@ -289,6 +304,6 @@ def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx
 
 
 STAGE = Stage(
-    name="bake", version=9, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run,
+    name="bake", version=10, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run,
     second_inputs={"surface": SecondInput("surface", help="The surface to bake from; found along the provenance chain without it."),
                    "views": SecondInput("views", help="Views of it; found along the provenance chain without it.")})

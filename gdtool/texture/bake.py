@@ -11,9 +11,9 @@ from gdtool.core.threads import mapped
 from gdtool.texture.occlusion import openness
 from gdtool.texture.picture import Picture
 from gdtool.texture.project_views import Sight, observe, steadiness
-from gdtool.texture.raster import Barycentrics
 from gdtool.texture.reproject import Places, Source, reproject
 from gdtool.texture.target import TEXELS_AT_ONCE, Target, Texels, surface_at
+from gdtool.texture.supersample import supersample
 from gdtool.texture.tangents import dot, encode_tangent_space, unit
 
 # Looks the material of places up: dict of albedo (n, 3) linear, roughness (n,), metallic (n,), normal (n, 3) unit in
@@ -128,7 +128,7 @@ def bake(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: 
     """Bake what lookup says of the source into the texels.
 
     reach (t,) from reproject.vertex_reach. samples per texel (a square number) are taken where neighbouring texels
-    differ, one elsewhere. values has albedo, roughness, metallic, tangent_normal (n, 3) and whatever else lookup gives besides
+    differ, one elsewhere (supersample.supersample). values has albedo, roughness, metallic, tangent_normal (n, 3) and whatever else lookup gives besides
     normal; where they are asked for height (n,), how far above the target, along its normal, the source lies, and the
     lookup's confidence (n,), 0 where the normal leads to nothing and the nearest point serves.
     """
@@ -136,15 +136,19 @@ def bake(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: 
     values: dict[str, np.ndarray] = {}
     by_ray = np.empty(len(texels), bool)
 
-    def run(part: slice) -> None:
-        read, frame, places = _read(target, source, lookup, reach, texels.face_idx[part], texels.barycentric[part])
-        read["tangent_normal"] = encode_tangent_space(*frame[1:], read.pop("normal"))
+    def read(face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[dict[str, np.ndarray], Places]:
+        out, frame, places = _read(target, source, lookup, reach, face_idx, barycentric)
+        out["tangent_normal"] = encode_tangent_space(*frame[1:], out.pop("normal"))
         if height:
-            read["height"] = dot(source.at(places.face_idx, places.barycentric, source.vertices) - frame[0], unit(frame[1]))
-        certain = read.pop("confidence", None)
+            out["height"] = dot(source.at(places.face_idx, places.barycentric, source.vertices) - frame[0], unit(frame[1]))
+        certain = out.pop("confidence", None)
         if confidence:
-            read["confidence"] = np.where(places.by_ray, certain, 0)
-        for name, value in read.items():
+            out["confidence"] = np.where(places.by_ray, certain, 0)
+        return out, places
+
+    def run(part: slice) -> None:
+        found, places = read(texels.face_idx[part], texels.barycentric[part])
+        for name, value in found.items():
             # setdefault is atomic: threads that come first at the same time agree on one array.
             if name not in values:
                 values.setdefault(name, np.empty((len(texels), *value.shape[1:]), np.float32))
@@ -156,50 +160,9 @@ def bake(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: 
         pass
     report = {"texels": texels.inside, "nearest_point_share": float(1 - by_ray[:texels.inside].mean())}
     if samples > 1:
-        report["supersampled_share"] = _supersample(target, texels, source, lookup, reach, samples, values)
+        report["supersampled_share"] = supersample(target, texels, values, lambda *at: read(*at)[0], samples, threads)
     seen = values.pop("seen", None)
     return Baked(values, seen, report)
-
-
-def varying(texels: Texels, values: dict[str, np.ndarray], tolerance: float = 0.03) -> np.ndarray:
-    """(m,) indices of the inside texels that differ from a neighbour by more than tolerance in anything."""
-    from scipy.ndimage import maximum_filter, minimum_filter
-
-    mask = texels.mask()
-    out = np.zeros_like(mask)
-    for name in ("albedo", "roughness", "metallic", "tangent_normal", "alpha"):
-        if name not in values:
-            continue
-        image = texels.image(values[name])
-        for channel in np.moveaxis(np.atleast_3d(image), -1, 0):
-            low = minimum_filter(np.where(mask, channel, np.inf), 3)
-            high = maximum_filter(np.where(mask, channel, -np.inf), 3)
-            out |= high - low > tolerance
-    return np.flatnonzero(out.ravel()[texels.texel[:texels.inside]])
-
-
-def _supersample(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: np.ndarray, samples: int,
-                 values: dict[str, np.ndarray]) -> float:
-    """Replace values of varying texels by means over a grid of samples within each; the share of texels that were."""
-    chosen = varying(texels, values)
-    side, barycentrics = int(round(samples**0.5)), Barycentrics(target.uv, target.face_uvs)
-    texel = texels.texel[chosen]
-    for start in range(0, len(chosen), TEXELS_AT_ONCE):
-        mine, at = chosen[start:start + TEXELS_AT_ONCE], texel[start:start + TEXELS_AT_ONCE]
-        face_idx = texels.face_idx[mine]
-        total: dict[str, np.ndarray] = {}
-        for k in range(side * side):
-            offset = (np.array([k % side, k // side]) + 0.5) / side
-            barycentric = barycentrics.at(face_idx, (at % texels.size + offset[0]) / texels.size, (at // texels.size + offset[1]) / texels.size)
-            read, _, _ = _read(target, source, lookup, reach, face_idx, np.clip(barycentric, -1, 2).astype(np.float32))
-            read.pop("confidence", None)
-            for name, value in read.items():
-                total[name] = total.get(name, 0) + value / (side * side)
-        frame = surface_at(target, face_idx, texels.barycentric[mine])
-        total["tangent_normal"] = encode_tangent_space(*frame[1:], unit(total.pop("normal")))
-        for name, value in total.items():
-            values[name][mine] = value
-    return len(chosen) / max(texels.inside, 1)
 
 
 def occlusion_tracer(target: Target, source: Source, reach: np.ndarray, normals: np.ndarray, rays: int, seed: int,

@@ -150,11 +150,11 @@ def texture_detail(scene: Scene) -> float | None:
     return float(spans[order][np.searchsorted(np.cumsum(weight[order]), weight.sum() / 2)])
 
 
-def from_scene(scene: Scene, source_from_world: np.ndarray, texel_width: Callable[[float], float] = lambda detail: 0.0) -> Origin:
+def from_scene(scene: Scene, source_from_world: np.ndarray, footprint: Callable[[float], float] = lambda detail: 0.0) -> Origin:
     """A model with its own textures, in its own frame; source_from_world (4, 4) takes the normalised frame there.
 
-    texel_width(detail) is what a texel of the baked maps spans, in the normalised frame, when the model's detail (see
-    Origin) is known: finer textures are averaged over it.
+    footprint(detail) is the width, in the normalised frame, that the model's textures are averaged over where they are read, when
+    the model's detail (see Origin) is known.
     """
     from gdtool.shading.surface_points import SurfaceLookup
 
@@ -170,7 +170,7 @@ def from_scene(scene: Scene, source_from_world: np.ndarray, texel_width: Callabl
     own = texture_detail(scene)
     # Vertex colors, or nothing but factors: the mesh says how fine it is.
     detail = 0.5 * _edge(source) if own is None else own / float(np.sqrt((source_from_world[:3, 0] ** 2).sum()))
-    width = texel_width(detail) * np.sqrt((source_from_world[:3, 0] ** 2).sum())
+    width = footprint(detail) * np.sqrt((source_from_world[:3, 0] ** 2).sum())
 
     def lookup(places: Places) -> dict[str, np.ndarray]:
         read = points.attributes(places.face_idx, places.barycentric, np.full(len(places.face_idx), width, np.float32))

@@ -15,6 +15,8 @@ from gdtool.texture.tangents import corner_tangents, edge_pairs, frames_of
 CREASE_DEGREES = 45.0
 # Texels at a time: few enough that what is computed of them stays in the cache.
 TEXELS_AT_ONCE = 32_768
+# A texel this many times as wide as the source's detail has too much in it for one sample (docs/numerics.md).
+COARSE_TEXEL = 3.0
 
 
 def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float = CREASE_DEGREES) -> np.ndarray:
@@ -164,3 +166,8 @@ def size_for(target: Target, detail: float, least: int = 256, most: int = 4096) 
     """The power of two at which a texel of the map spans about detail, in the target's units: up to a tenth more."""
     wanted = texel_width(target, 1) / max(detail, 1e-9) / 1.1
     return int(np.clip(2 ** np.ceil(np.log2(max(wanted, 1))), least, most))
+
+
+def samples_for(width: float, detail: float) -> int:
+    """How many samples a texel that spans width needs where the source varies, whose detail is so wide (both in one unit)."""
+    return 4 if width > COARSE_TEXEL * detail else 1

@@ -281,6 +281,13 @@ def test_size_follows_the_detail_of_the_source(gdtool, chain, tmp_path):
     # Views of 96 pixels over 1.44, but vertices 0.013 apart: half of that on an atlas of this torus.
     content = open_folder(tmp_path / "views").content
     assert content.size == 512 and 0.005 < content.report["detail"] < 0.0075
+    # A texel that is as wide as the detail needs one sample, one of eight times that width several.
+    skipped = {skip.what: skip.reason for skip in open_folder(tmp_path / "views").manifest.skipped}
+    assert content.report["samples"] == 1 and "times as wide as the source's detail" in skipped["more samples"]
+    assert gdtool("bake", chain, "--size", 64, "--no-ao", "-o", "small").returncode == 0
+    small = open_folder(tmp_path / "small")
+    assert small.content.report["samples"] == 4 and small.content.report["supersampled_share"] > 0.2
+    assert "more samples" not in {skip.what for skip in small.manifest.skipped}
     assert gdtool("bake", chain, "--size", 1024, "--no-ao", "-o", "large").returncode == 0
     write_atlas(tmp_path / "again", {})
     done = gdtool("bake", "again", "--model", "large/asset.glb", "--no-ao", "-o", "second")
