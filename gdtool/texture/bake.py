@@ -120,7 +120,10 @@ def _read(target: Target, source: Source, lookup: Lookup, reach: np.ndarray, fac
     """What lookup says of the places that stand for places on the target; what surface_at says; and the places."""
     frame = surface_at(target, face_idx, barycentric)
     places = reproject(frame[0], unit(frame[1]), reach[face_idx], source)
-    return lookup(places), frame, places
+    read = lookup(places)
+    if places.from_behind.any():
+        read["normal"] = np.where(places.from_behind[:, None], -read["normal"], read["normal"])
+    return read, frame, places
 
 
 def bake(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: np.ndarray, samples: int = 1,
@@ -175,7 +178,7 @@ def occlusion_tracer(target: Target, source: Source, reach: np.ndarray, normals:
             points, facing, _, _ = surface_at(target, face_idx[part], barycentric[part])
             places = reproject(points, unit(facing), reach[face_idx[part]], source)
             at = source.at(places.face_idx, places.barycentric, source.vertices)
-            geometric = source.face_normals[places.face_idx]
+            geometric = source.face_normals[places.face_idx] * np.where(places.from_behind, -1, 1)[:, None]
             smooth = source.at(places.face_idx, places.barycentric, normals)
             side = dot(smooth, geometric)[:, None]
             smooth = unit(np.where(np.abs(side) > 0.2, smooth * np.sign(side), geometric))

@@ -78,11 +78,13 @@ class Source:
 
 @dataclass(frozen=True)
 class Places:
-    """Places on a source: face_idx (n,), barycentric (n, 3) float32, and by_ray (n,) bool, False where by nearest point."""
+    """Places on a source: face_idx (n,), barycentric (n, 3) float32, by_ray (n,) bool, False where by nearest point, and from_behind
+    (n,) bool, where the back of the face is meant."""
 
     face_idx: np.ndarray
     barycentric: np.ndarray
     by_ray: np.ndarray
+    from_behind: np.ndarray
 
 
 def vertex_reach(vertices: np.ndarray, faces: np.ndarray, source: Source) -> np.ndarray:
@@ -127,8 +129,12 @@ def _march(points: np.ndarray, directions: np.ndarray, normals: np.ndarray, reac
     return face, distance, barycentric
 
 
-def _nearest_agreeing(points: np.ndarray, normals: np.ndarray, source: Source) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest place whose face looks the same way as the normal: face_idx (n,), point (n, 3). Plain nearest if none does."""
+def _nearest_agreeing(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source) -> tuple[np.ndarray, np.ndarray]:
+    """Nearest place whose face looks the same way as the normal: face_idx (n,), point (n, 3).
+
+    Plain nearest if none does; and where that lies within reach (n,) but none that looks the same way: the back of a sheet that has
+    but one side.
+    """
     face, point = source.nearest.closest(points)
     wrong = np.flatnonzero(dot(source.face_normals[face], normals) <= AGREEMENT)
     if not len(wrong):
@@ -143,7 +149,9 @@ def _nearest_agreeing(points: np.ndarray, normals: np.ndarray, source: Source) -
             if among is None:
                 continue
             other_face, other_point = among.closest(points[mine])
-            better = dot(source.face_normals[other_face], normals[mine]) > AGREEMENT
+            apart, other_apart = (np.linalg.norm(at - points[mine], axis=1) for at in (point[mine], other_point))
+            sheet = (apart <= reach[mine]) & (other_apart > reach[mine])
+            better = (dot(source.face_normals[other_face], normals[mine]) > AGREEMENT) & ~sheet
             face[mine[better]], point[mine[better]] = other_face[better], other_point[better]
     return face, point
 
@@ -174,7 +182,8 @@ def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source
     """Where points (n, 3) with unit normals (n, 3) of the baked mesh lie on the source.
 
     The nearest face along the normal, outward or inward within reach (n,), that looks the same way; the nearest such
-    place in any direction where the normal meets none. So nothing is read from the other side of a thin wall.
+    place in any direction where the normal meets none. So nothing is read from the other side of a thin wall. A sheet without
+    another side is read from behind.
     """
     from gdtool.geometry.distance import barycentric_of
 
@@ -187,9 +196,9 @@ def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source
     face[rest[outward]], barycentric[rest[outward]] = out_face[outward], out_at[outward]
     lost = np.flatnonzero(face < 0)
     if len(lost):
-        face[lost], nearest = _nearest_agreeing(points[lost], normals[lost], source)
+        face[lost], nearest = _nearest_agreeing(points[lost], normals[lost], reach[lost], source)
         barycentric[lost] = barycentric_of(nearest, source.vertices[source.faces[face[lost]]])
     _slide_off_edges(points, normals, source, face, barycentric)
     by_ray = np.ones(len(points), bool)
     by_ray[lost] = False
-    return Places(face, barycentric, by_ray)
+    return Places(face, barycentric, by_ray, dot(source.face_normals_32[face], normals) <= 0)

@@ -21,7 +21,7 @@ def surface():
 
 def places_on(surface, count=4000):
     rng = np.random.default_rng(0)
-    return Places(rng.integers(0, len(surface.faces), count).astype(np.int32), rng.dirichlet((1, 1, 1), count).astype(np.float32), np.ones(count, bool))
+    return Places(rng.integers(0, len(surface.faces), count).astype(np.int32), rng.dirichlet((1, 1, 1), count).astype(np.float32), np.ones(count, bool), np.zeros(count, bool))
 
 
 def at(origin, places):
@@ -60,7 +60,7 @@ def test_a_part_in_front_does_not_colour_what_it_hides(surface):
     origin = from_surface(whole, Views(views.cameras[:1], {"albedo": albedo[:1]}, mask[:1]))
     read = origin.lookup(places_on(surface))
     assert read["albedo"][:, 1].min() > 0.04  # the plate's green is 0; the ring's is above 0.1
-    on_plate = Places(np.array([len(faces) - 2], np.int32), np.full((1, 3), 1 / 3, np.float32), np.ones(1, bool))
+    on_plate = Places(np.array([len(faces) - 2], np.int32), np.full((1, 3), 1 / 3, np.float32), np.ones(1, bool), np.zeros(1, bool))
     np.testing.assert_allclose(origin.lookup(on_plate)["albedo"], [[1, 0, 0]], atol=1e-3)
 
 

@@ -85,7 +85,7 @@ def _front_places(vertices, faces, normals):
 
     facing = np.flatnonzero(normals[faces].mean(1)[:, 2] > 0.95)
     facing = facing[vertices[faces[facing]].mean(1)[:, 2] > 0.3]
-    return Places(facing.astype(np.int32), np.full((len(facing), 3), 1 / 3, np.float32), np.ones(len(facing), bool))
+    return Places(facing.astype(np.int32), np.full((len(facing), 3), 1 / 3, np.float32), np.ones(len(facing), bool), np.zeros(len(facing), bool))
 
 
 def test_a_picture_tells_color_where_other_views_face_the_surface_better_and_nothing_else():

@@ -62,3 +62,19 @@ def test_reach_covers_the_distance_but_not_the_object():
     faces = triangles_of(coarse_quads)
     reach = vertex_reach(coarse, faces, Source(vertices, triangles_of(quads)))
     assert reach.min() > 0.005 and reach.max() < 0.08
+
+
+def test_a_sheet_without_another_side_is_read_from_behind():
+    # A square at z = 0 that looks along +z, and a floor far below its middle that looks the way its back does not.
+    square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    source = Source(np.concatenate([square, square + (0, 0, -0.3)]), np.concatenate([faces, faces[:, ::-1] + 4]))
+    rng = np.random.default_rng(2)
+    points = np.column_stack([rng.uniform(-0.45, 0.45, (500, 2)), rng.uniform(-0.002, 0.002, 500)])
+    for side in (1.0, -1.0):
+        places = reproject(points, np.tile([0.0, 0.0, side], (500, 1)), np.full(500, 0.01), source)
+        np.testing.assert_allclose(at(source, places), points * (1, 1, 0), atol=1e-6)
+        assert (places.from_behind == (side < 0)).all() and (places.by_ray == (side > 0)).all()
+    # Within reach what looks the same way comes first, however near the sheet.
+    places = reproject(points, np.tile([0.0, 0.0, -1.0], (500, 1)), np.full(500, 0.35), source)
+    np.testing.assert_allclose(at(source, places)[:, 2], -0.3, atol=1e-6)
