@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
@@ -197,8 +196,3 @@ def permute_colors(planes, rgba, light, order):
 def to_tensor_condition(image: np.ndarray) -> torch.Tensor:
     """condition_plane of one framed image (h, w, 4) linear, as a batch of one."""
     return torch.from_numpy(condition_plane(image)).unsqueeze(0)
-
-
-def resize_planes(planes: torch.Tensor, size: int) -> torch.Tensor:
-    """Antialiased resize of premultiplied (n, c, h, w)."""
-    return F.interpolate(planes, size=(size, size), mode="bilinear", antialias=True, align_corners=False)

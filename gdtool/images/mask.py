@@ -41,11 +41,6 @@ def foreground(image: np.ndarray, mask: np.ndarray | None = None, subject: objec
     return _segmented(image, subject, tell)
 
 
-def touches_border(coverage: np.ndarray) -> bool:
-    """Whether the subject reaches the picture's edge, and so may be cut off."""
-    return bool(max(coverage[0].max(), coverage[-1].max(), coverage[:, 0].max(), coverage[:, -1].max()) > 0.5)
-
-
 def _mask_coverage(mask: np.ndarray) -> np.ndarray:
     pixels = np.clip(unit_range(mask), 0, 1).astype(np.float32).reshape(*mask.shape[:2], -1)
     if pixels.shape[2] in (2, 4) and pixels[..., -1].min() < 0.5:
