@@ -17,18 +17,18 @@ _MOST = 0.75  # of the mesh: a piece that is more is judged as one that is alone
 _ON_ONE, _MOST_APART = 0.9, 1.5  # of a component's quads lie on the piece that they stand for; edge lengths that a piece strays
 
 
-def by_size(part: Part) -> list[Part]:
-    """The large pieces as one mesh and the small ones as another, each with its share of the quads by area."""
+def by_size(part: Part) -> tuple[Part | None, Part]:
+    """The small pieces as one mesh, None where there are none, and the large ones as another, each with its share of the quads by area."""
     (count, piece), quads = part.pieces, part.quads
     share = part.piece_areas / part.piece_areas.sum()
     small = share * quads < SMALL_PIECE_QUADS
     if small.all() or not small.any():  # many like pieces: the engine may still do; the fallback takes what it loses
-        return [part.of(np.ones(len(piece), bool), quads)]
+        return None, part
     # Enough for their shape, out of at most a quarter of all.
     own = quads * share[small]
     enough = np.maximum(own, np.minimum(np.bincount(piece, minlength=count)[small] / 2, SMALL_PIECE_QUADS)).sum()
     few = part.of(small[piece], max(round(own.sum()), int(min(enough, quads / 4)), 1))
-    return [part.of(~small[piece], max(quads - split_count(few.faces, few.quads), 4)), few]  # the asked count holds for the sum
+    return few, part.of(~small[piece], max(quads - few.quads, 4))
 
 
 def well_made(part: Part, whole: Found | None) -> tuple[Found | None, np.ndarray]:

@@ -67,7 +67,11 @@ def _remeshed(vertices: np.ndarray, faces: np.ndarray, request: Request, careful
     with ThreadPoolExecutor(1) as beside:
         error = beside.submit(_deviation, fine(), coarse) if coarse[1] is not faces else None
         whole = Part(*coarse, request.quads, edge, request, fine)
-        done = [found for part in by_size(whole) for found in _quads_of(part, record)]
+        few, large = by_size(whole)
+        done = _quads_of(few, record) if few is not None else []
+        # Small pieces cannot always be made of as few quads as asked for; the count holds for the sum.
+        large.quads = max(request.quads - sum(len(found) for _, found, _ in done), 4)
+        done = _quads_of(large, record) + done
         record.source = fine()
         record.figures["simplify_error"] = error.result() if error is not None else 0.0
     record.engine = "; ".join(dict.fromkeys(way for _, _, way in done))

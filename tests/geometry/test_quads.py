@@ -279,6 +279,17 @@ def test_small_piece_is_not_lost():
     assert np.linalg.norm(out - 0.45, axis=1).min() < 0.05
 
 
+def test_the_count_holds_where_small_pieces_take_more_than_their_share():
+    """A tray of ten triangles comes out of the fallback as two dozen quads however few are asked for."""
+    corners = np.stack(np.meshgrid(*[np.arange(5)] * 3, indexing="ij"), -1).reshape(-1, 3)[:100]
+    vertices, faces = cube(0.01)
+    trays = [(vertices + 0.05 * corner + 0.3, faces[:-2]) for corner in corners]
+    vertices, faces = joined(sphere(60, 0.25), *trays)
+    out, found, _ = quads.remesh(vertices, faces, Request(quads=4000, engine="split"))
+    assert abs(len(found) / 4000 - 1) < 0.03 and repair.components(found)[0] == 101
+    assert 1000 < (np.linalg.norm(out, axis=1)[found].max(1) < 0.27).sum() < 2700
+
+
 class Ended:
     """A child that has ended, in the place of one that works."""
 
