@@ -134,7 +134,7 @@ def quads_of(source: str | Path, faces: int, triangles: int, kept: Path) -> tupl
 
 def main() -> None:
     parser = arguments(__doc__, "what is unwrapped besides the solids", "a Python that has bpy; without it Blender is left out")
-    parser.add_argument("--input", type=int, default=400_000, help="triangles that remesh gets")
+    parser.add_argument("--input", type=int, default=1_000_000, help="triangles that remesh gets")
     parser.add_argument("--sweep", default="part,spot", help="models that the knobs are swept on")
     asked = parser.parse_args()
     settings = {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept", "minutes")}
