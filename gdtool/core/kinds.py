@@ -103,6 +103,7 @@ class AtlasContent(Content, frozen=True, kw_only=True):
     padding: Annotated[int, Meta(ge=0, description="texels between charts at that size")]
     coverage: Share
     watertight: bool = False
+    tried: Annotated[tuple[str, ...], Meta(description="ways that were tried before, and why each was not taken")] = ()
 
 
 class AssetContent(Content, frozen=True, kw_only=True):

@@ -29,7 +29,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     max_stretch: Annotated[float, Meta(gt=1, le=100, description="a chart with more L2 stretch is cut")] = 1.1
     symmetry: Annotated[Literal["none", "x", "y", "z"], Meta(description="faces that mirror others along this axis share their texels")] = "none"
     redo: Annotated[bool, Meta(description="make new texture coordinates even where the mesh has valid ones")] = False
-    seconds: Annotated[float, Meta(gt=0, description="time limit of each native step, then a simpler way is taken")] = 120.0
+    seconds: Annotated[float, Meta(gt=0, description="time limit; charts are shaped in the first 60 % of it, what is left then goes in simpler ways")] = 120.0
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
@@ -46,7 +46,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     with out.step("read"):
         mesh, matrix = _read(inputs, out)
     padding = options.padding or max(-(-options.size // min(options.mip_safe, options.size)), 1)
-    kept = False
+    kept, tried = False, []
     if mesh.uv is not None and not options.redo:
         reason = _invalid(mesh)
         kept = reason is None
@@ -60,8 +60,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             twin, corner = _twins(mesh, options, inputs, out)
             own = np.flatnonzero(twin < 0)
             result = unwrap(mesh.vertices, mesh.faces[own].astype(np.int64), request)
-        for text in result.failed:
-            out.skip("a way of unwrapping", text)
+        tried = result.failed
+        for what, why, seconds in result.skipped:
+            out.skip(what, why, seconds)
         mesh = QuadMesh(mesh.vertices, mesh.faces, result.uv, with_twins(result.face_uvs, own, twin, corner))
     else:
         twin = np.full(len(mesh.faces), -1)
@@ -71,6 +72,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         report = figures(mesh.vertices, faces[twin < 0], mesh.uv, face_uvs[twin < 0])
         report["shared"] = float((twin >= 0).mean())
         report["texels_per_unit"] = _density(mesh, options.size)
+        if kept and report["mirrored"] > 0:
+            out.warn(f"{inputs.name}: {report['mirrored']:.0%} of the surface is mirrored in its texture coordinates; tangent-space "
+                     "normal maps hold there in MikkTSpace alone, and --redo makes coordinates without mirrored charts")
         if report["overlap"] > 0 and not kept:
             out.warn(f"{inputs.name}: charts overlap on {100 * report['overlap']:.2g} % of what they cover")
     with out.step("preview"):
@@ -83,6 +87,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     out.content = AtlasContent(
         vertices=len(mesh.vertices), quads=quads, triangles=len(mesh.faces) - quads, charts=report["charts"], size=options.size,
         padding=padding, coverage=report["coverage"], watertight=repair.is_watertight(mesh.faces), report=report | {"kept": kept},
+        tried=tuple(tried),
         source_from_world=tuple(float(x) for x in matrix.ravel()))
 
 
@@ -197,4 +202,4 @@ def _density(mesh, size: int) -> float:
     return float(size * (polygon_normals(flat, mesh.face_uvs)[1].sum() / area) ** 0.5)
 
 
-STAGE = Stage(name="unwrap", version=11, reads=("mesh", "mesh-file"), writes="atlas", Options=Options, run=run)
+STAGE = Stage(name="unwrap", version=12, reads=("mesh", "mesh-file"), writes="atlas", Options=Options, run=run)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,11 +17,13 @@ from gdtool.texture.unwrap_lay import flatten_all
 from gdtool.texture.unwrap_pack import WELL_PACKED, best_packed, pack
 
 _MORE_CHARTS, _MORE_OF_RINGS, _MOST_CUT = 12, 23, 40  # charts that cutting for packing adds, where it cuts rings, and ends with, at most
+_FOUND, _SHAPED, _PROJECTED, _PACKED = 0.2, 0.6, 0.8, 0.9  # shares of the time by which charts are found, shaped, projected, packed
+_SHORTEST = 0.05  # seconds of a child
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for. padding: texels between charts at `size`; seconds: limit of each native run."""
+    """What is asked for. padding: texels between charts at `size`; seconds: time limit of the whole, from when the request is made."""
 
     size: int = 2048
     padding: int = 8
@@ -28,38 +31,47 @@ class Request:
     good_stretch: float = 1.002
     max_cost: float = 2.0
     seconds: float = 120.0
+    begun: float = field(default_factory=time.monotonic)
+
+    def by(self, share: float) -> float:
+        """When that share of the time is over, on the clock time.monotonic."""
+        return self.begun + share * self.seconds
 
 
 @dataclass
 class Unwrapped:
     """uv (c, 2) in [0, 1], (0, 0) at the image's top left; face_uvs (f, 4) into it, -1 with a triangle's fourth corner;
-    chart (f,); what failed on the way."""
+    chart (f,); what was tried and failed on the way; what was skipped, why, and the seconds that it would have taken."""
 
     uv: np.ndarray
     face_uvs: np.ndarray
     chart: np.ndarray
     failed: list[str] = field(default_factory=list)
+    skipped: list[tuple[str, str, float]] = field(default_factory=list)
 
 
 def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapped:
     """Texture coordinates of quads and triangles faces (f, 4); a quad lies in one chart, its corners flat together.
 
-    vertices (v, 3) finite. Charts are never mirrored and do not overlap; all have one texel density.
+    vertices (v, 3) finite. Charts are never mirrored and do not overlap; all have one texel density. As the time runs out the
+    rest goes in simpler ways: charts by the side of a box that they look at, laid flat by projection, at last face by face, in rows.
     """
     for module in ("gdtool.geometry.simplify", "gdtool.texture.unwrap_charts", "gdtool.texture.unwrap_lay"):
         prepare(module)
     extent = float(np.ptp(vertices[np.unique(faces[faces >= 0])], 0).max())
     unit = (vertices - vertices.mean(0)) / (extent if extent > 0 else 1.0)
-    label, proxy, failed = find_charts(unit, faces, seconds=request.seconds, max_cost=request.max_cost)
+    label, proxy, failed = find_charts(unit, faces, until=request.by(_FOUND), max_cost=request.max_cost)
+    by = request.by(_SHAPED), request.by(_PROJECTED)
     try:
-        flat, more = call("gdtool.texture.unwrap_lay:flatten_all", unit, faces, label, request.good_stretch, request.max_stretch, proxy,
-                          seconds=request.seconds, memory_mb=8000)
+        flat, more = call("gdtool.texture.unwrap_lay:flatten_all", unit, faces, label, request.good_stretch, request.max_stretch, proxy, by,
+                          seconds=max(by[1] - time.monotonic(), _SHORTEST), memory_mb=8000)
     except ChildFailed as failure:
-        flat, more = flatten_all(unit, faces, label, request.good_stretch, request.max_stretch)
+        late = max(by[1], time.monotonic() + (_PROJECTED - _SHAPED) * request.seconds)
+        flat, more = flatten_all(unit, faces, label, request.good_stretch, request.max_stretch, by=(by[0], late))
         failed.append(f"flattening: {failure}; charts by the side they look at")
     failed += more
-    flat, ways = _cut_to_pack(Adjacency(unit, faces), flat, request.padding / request.size)
-    places, _ = pack([(uv, triangles) for _, _, uv, triangles in flat], request.padding / request.size, ways)
+    flat, ways, skipped = _cut_to_pack(Adjacency(unit, faces), flat, request.padding / request.size, request.by(_PACKED))
+    places, _ = pack([(uv, triangles) for _, _, uv, triangles in flat], request.padding / request.size, ways, request.by(_PACKED))
     face_uvs = np.full(faces.shape, -1, np.int64)
     chart = np.zeros(len(faces), np.int64)
     offset = 0
@@ -68,22 +80,24 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
         chart[faces_idx] = i
         offset += len(uv)
     uv = np.concatenate(places)
-    return Unwrapped(np.clip(np.stack([uv[:, 0], 1 - uv[:, 1]], -1), 0, 1), face_uvs.astype(np.int32), chart, failed)
+    return Unwrapped(np.clip(np.stack([uv[:, 0], 1 - uv[:, 1]], -1), 0, 1), face_uvs.astype(np.int32), chart, failed, skipped)
 
 
-def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float) -> tuple[list, list]:
-    """The charts, cut further where that fills the square better, rings into arcs where it stays badly filled, and the ways
-    to pack them that were found on the way."""
-    best, share, seen, ways = flat, 0.0, {len(flat)}, []
+def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float, until: float) -> tuple[list, list, list[tuple[str, str, float]]]:
+    """The charts, cut further where that fills the square better, rings into arcs where it stays badly filled; the ways to pack them
+    that were found on the way; and what was skipped."""
+    best, share, seen, ways, start = flat, 0.0, {len(flat)}, [], time.monotonic()
     for more, rings in ((_MORE_CHARTS, False), (_MORE_OF_RINGS, True)):
         if share > WELL_PACKED:
+            return best, ways, [("cutting rings for packing", f"the charts fill {share:.0%} of the square as they are", time.monotonic() - start)]
+        if time.monotonic() > until:
             break
         other = cut_to_pack(adjacency, flat, min(len(flat) + more, _MOST_CUT), rings)
         if len(other) not in seen:
             seen.add(len(other))
             chosen, share, ways = best_packed([[(uv, triangles) for _, _, uv, triangles in one] for one in (best, other)], gap)
             best = (best, other)[chosen]
-    return best, ways
+    return best, ways, []
 
 
 def figures(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, size: int = 1024) -> dict[str, float | int]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 
 from gdtool.core.child import ChildFailed, call
@@ -11,6 +13,7 @@ from gdtool.geometry.repair import compact, edges_of, one_vertex_per_fan
 
 _PROXY_TRIANGLES = 6000
 _CREASE_DEGREES = 30.0
+_SHORTEST = 0.05  # seconds of a child
 _SMALLEST_SHARE = 0.003  # of the area; a smaller chart joins a neighbour if it has one
 
 
@@ -91,10 +94,11 @@ class Adjacency:
         return key[order][last] % width
 
 
-def find_charts(vertices: np.ndarray, faces: np.ndarray, *, seconds: float, max_cost: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], list[str]]:
+def find_charts(vertices: np.ndarray, faces: np.ndarray, *, until: float, max_cost: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], list[str]]:
     """(f,) chart of each face, all connected, the coarse mesh (vertices, triangles) they were found on, and what failed on the way.
 
-    vertices (v, 3) in a unit box, faces (f, 4). Without xatlas' help the faces go by the box side they look at.
+    vertices (v, 3) in a unit box, faces (f, 4); until: when to have given up, on the clock time.monotonic. Without xatlas' help
+    the faces go by the box side they look at.
     """
     from gdtool.geometry.distance import closest_points
     from gdtool.geometry.simplify import simplify
@@ -102,12 +106,13 @@ def find_charts(vertices: np.ndarray, faces: np.ndarray, *, seconds: float, max_
     failed: list[str] = []
     adjacency = Adjacency(vertices, faces)
     triangles, _ = triangulated(faces)
-    proxy_vertices, proxy, _, report = simplify(vertices, triangles.astype(np.int64), _PROXY_TRIANGLES, measured=False)
+    proxy_vertices, proxy, _, report = simplify(vertices, triangles.astype(np.int64), _PROXY_TRIANGLES, measured=False,
+                                                   seconds=max(until - time.monotonic(), _SHORTEST))
     if report["method"] == "vertex clustering":
         proxy_vertices, proxy = vertices, triangles
     try:
         chart = call("gdtool.texture.unwrap_charts:run_xatlas", proxy_vertices.astype(np.float32), proxy.astype(np.int32), max_cost,
-                     seconds=seconds, memory_mb=8000)
+                     seconds=max(until - time.monotonic(), _SHORTEST), memory_mb=8000)
         centre = vertices[np.where(faces < 0, faces[:, :1], faces)].mean(1)
         label = chart[closest_points(centre, proxy_vertices, proxy)[1]]
         if (label < 0).all():

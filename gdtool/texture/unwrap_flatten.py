@@ -94,8 +94,11 @@ def _conformal(vertices: np.ndarray, triangles: np.ndarray, border: np.ndarray) 
     if one == two:
         return None
     length = float(np.linalg.norm(vertices[two] - vertices[one]))
-    uv = np.asarray(igl.lscm(np.ascontiguousarray(vertices), np.ascontiguousarray(triangles, np.int64), np.array([one, two], np.int64),
-                             np.array([[0.0, 0.0], [length, 0.0]]))[0])
+    try:
+        uv = np.asarray(igl.lscm(np.ascontiguousarray(vertices), np.ascontiguousarray(triangles, np.int64), np.array([one, two], np.int64),
+                                 np.array([[0.0, 0.0], [length, 0.0]]))[0])
+    except RuntimeError:  # triangles without an area make its matrix singular
+        return None
     if not np.isfinite(uv).all():
         return None
     if _areas(uv, triangles).sum() < 0:

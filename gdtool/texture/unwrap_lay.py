@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,6 +19,7 @@ from gdtool.texture.unwrap_peel import onto_neighbours, peel
 
 _WHOLE = 1.4  # stretch of all charts together over 1, in units of what is good for one: with more the worst are cut
 _MOST_RELIEVED = 16, 0.5  # charts that are cut for that: so many, and this share of all
+_LATE = "was left when the time was over"
 
 
 @dataclass
@@ -39,35 +41,45 @@ class Laid:
 
 
 def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good_stretch: float, max_stretch: float,
-                proxy: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[list, list[str]]:
+                proxy: tuple[np.ndarray, np.ndarray] | None = None, by: tuple[float, float] = (np.inf, np.inf)) -> tuple[list, list[str]]:
     """Each chart of faces (f, 4), label (f,), laid flat, and what was cut: Laid.charts and a line for each reason.
 
     proxy, vertices and triangles: a coarse mesh of the surface, on which joining is tried. Without one nothing is joined and
-    charts are laid flat by projection alone, cut until that works.
+    charts are laid flat by projection alone, cut until that works. by: when, on the clock time.monotonic, projection alone goes on
+    with what is left, and when each face of that becomes a chart.
     """
     adjacency = Adjacency(vertices, faces)
 
     def further(sets: list[np.ndarray], **how: bool) -> Laid:
-        return lay(adjacency, vertices, faces, label, sets, good_stretch, max_stretch, **how)
+        return lay(adjacency, vertices, faces, label, sets, good_stretch, max_stretch, by, **how)
 
     if proxy is None:
         laid = further(_sets(label), projected=True)
         return laid.charts, laid.reasons()
-    laid = further(_sets(joined(vertices, faces, label, *proxy, good_stretch)), peeling=True)
-    laid.add(further(onto_neighbours(adjacency, vertices, faces, laid.charts, laid.off, good_stretch)))
-    _relieve(adjacency, vertices, faces, laid, further, good_stretch)
+    joined_label = joined(vertices, faces, label, *proxy, good_stretch) if time.monotonic() < by[0] else label
+    laid = further(_sets(joined_label), peeling=True)
+    off = onto_neighbours(adjacency, vertices, faces, laid.charts, laid.off, good_stretch) if time.monotonic() < by[0] else laid.off
+    laid.add(further(off))
+    if time.monotonic() < by[0]:
+        _relieve(adjacency, vertices, faces, laid, further, good_stretch)
     return laid.charts, laid.reasons()
 
 
 def lay(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, sets: list[np.ndarray], good_stretch: float,
-        max_stretch: float, *, peeling: bool = False, projected: bool = False) -> Laid:
+        max_stretch: float, by: tuple[float, float] = (np.inf, np.inf), *, peeling: bool = False, projected: bool = False) -> Laid:
     """Sets of faces laid flat, cut where they do not lie so; a set of several labels (f,), joined, may stretch less and comes apart first.
 
-    peeling: take off what lies on other parts of a chart, where that is little. projected: by projection alone.
+    by: as flatten_all()'s. peeling: take off what lies on other parts of a chart, where that is little. projected: by projection alone.
     """
     laid, queue = Laid(), sets[::-1]
     while queue:
-        faces_idx = queue.pop()
+        faces_idx, now = queue.pop(), time.monotonic()
+        if now > by[1] and len(faces_idx) > 1:
+            laid.cut[_LATE] += 1
+            queue.extend(faces_idx[:, None])
+            continue
+        if now > by[0]:
+            peeling, projected = False, True
         parts = _sets(label[faces_idx])
         points, corners = own_corners(vertices, faces[faces_idx])
         triangles, face_idx = triangulated(corners)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 
 from gdtool.geometry.repair import edges_of
@@ -12,11 +14,11 @@ _COARSE, _COARSE_OF_MANY = 200, 100  # cells of the square's side in which order
 _FINER, _SETTLED, _ROUNDS = 4, 3, 12  # cells of the fine grid in one of the coarse; layouts that are tightened, by so many rounds
 _NEAR = sorted(((dx, dy) for dx in range(-3, 4) for dy in range(-3, 4)), key=lambda d: d[0] ** 2 + d[1] ** 2)
 _DENSITY = 0.66  # share of a square of so many cells that the charts would fill
-_MOST_BY_SEARCH, _MOST_BY_RASTER = 160, 1500  # charts for which orders are searched, and that go by raster at all
+_MOST_BY_SEARCH, _MOST_BY_RASTER = 160, 4000  # charts for which orders are searched, and that go by raster at all
 _CLOSE = 0.01  # of the side, to which the square of so many is found
 _MANY = 48  # with more charts than these a coarser grid bounds the time
-_GAIN, _GAIN_PER_CHART = 0.02, 0.002
-WELL_PACKED = 0.62  # of the square, by a draft: charts that fill as much stay as they are
+_GAIN, _GAIN_PER_CHART = 0.015, 0.001
+WELL_PACKED = 0.64  # of the square, by a draft: charts that fill as much stay as they are
 _TRIES = 1000  # charts placed in search of better orders
 _LEAST = 0.3  # share of the square that a way to cut has to fill
 _FINALISTS, _NEAR_BEST = 2, 1.06  # orders by which ways to cut are told apart, where the square's side comes so near to the best
@@ -95,12 +97,14 @@ def _turned(uv: np.ndarray, triangles: np.ndarray, cells_per_unit: float, gap: f
 class _Shapes:
     """Charts as masks at one resolution, at each quarter turn, as sets of bits to test places with.
 
-    cells_per_unit: cells per unit of surface; gap: cells between charts; side: the largest square they are packed in.
+    cells_per_unit: cells per unit of surface; gap: cells between charts; side: the largest square they are packed in; until: when, on the
+    clock time.monotonic, no place is found any more.
     A set of cells is one integer, the cell (x, y) its bit y * (side + 1) + x: shifting moves it, and all places of a
     chart are tested by one shift per run of its cells.
     """
 
-    def __init__(self, boxed: list, cells_per_unit: float, gap: float, side: int):
+    def __init__(self, boxed: list, cells_per_unit: float, gap: float, side: int, until: float = np.inf):
+        self.until = until
         self.stride, self.uv, self.shapes, self.runs, self.bits = side + 1, [], [], [], []
         for uv, triangles in boxed:
             masks, at = _turned(uv, triangles, cells_per_unit, gap)
@@ -120,6 +124,8 @@ class _Shapes:
         line = (1 << side) - 1
         border = line | line << (side - 1) * stride | _every(1 | 1 << side - 1, side, stride)
         for i in order:
+            if time.monotonic() > self.until:
+                return None
             walls = taken << 1 | taken >> 1 | taken << stride | taken >> stride | border
             windows = [taken]  # of level k: from here on 2**k cells of the row, any taken
             best = None
@@ -226,25 +232,27 @@ def _boxed(charts: list) -> tuple[list, float]:
     return boxed, max(area, 1e-300)
 
 
-def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, ways: list[tuple[list[int], float]] | None = None) -> tuple[list[np.ndarray], float]:
+def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, ways: list[tuple[list[int], float]] | None = None,
+         until: float = np.inf) -> tuple[list[np.ndarray], float]:
     """Places for charts: their uv (v, 2) in [0, 1], v up, all at one scale, and that scale (uv per unit of surface).
 
     charts: uv at the scale of the surface and triangles of each. gap: smallest distance between charts, and half of it
     to the border, in uv. Several orders and weights are tried on a coarse grid, the best of them tightened on a fine one; the
-    charts keep their resolution, what is sought is the smallest square that holds them. ways: best_packed's, to start from.
+    charts keep their resolution, what is sought is the smallest square that holds them. ways: best_packed's, to start from. until: when to seek no longer, on the clock
+    time.monotonic; where nothing is found by then the charts stand in rows.
     """
     boxed, area = _boxed(charts)
     if len(charts) == 1:
         scale = (1 - 2 * gap) / max(float(np.ptp(boxed[0][0], 0).max()), 1e-300)
         return [boxed[0][0] * scale + gap], scale
-    if len(charts) > _MOST_BY_RASTER:
+    if len(charts) > _MOST_BY_RASTER or time.monotonic() > until:
         return _shelves(boxed, gap)
     coarse = _COARSE_OF_MANY if _MANY < len(charts) <= _MOST_BY_SEARCH else _COARSE
     tries = max(_TRIES // len(charts), 8)
     if len(charts) > _MOST_BY_SEARCH:
-        ranked = _bisected(boxed, area, gap, coarse)
+        ranked = _bisected(boxed, area, gap, coarse, until=until)
     else:
-        ranked = next(filter(None, (_search(boxed, area, gap, coarse, tried, lowest, ways)
+        ranked = next(filter(None, (_search(boxed, area, gap, coarse, tried, lowest, ways, until)
                                     for lowest, tried in ((0.45, tries), (0.3, tries), (0.12, 0)))), [])
     if not ranked:
         return _shelves(boxed, gap)
@@ -311,7 +319,7 @@ def _first_ways(boxed: list) -> list[tuple[list[int], float]]:
 
 
 def _search(boxed: list, area: float, gap: float, cells: int, tries: int, lowest: float,
-            ways: list[tuple[list[int], float]] | None = None) -> list[tuple[int, list[int], float, list]]:
+            ways: list[tuple[list[int], float]] | None = None, until: float = np.inf) -> list[tuple[int, list[int], float, list]]:
     """Ways to pack on a coarse grid, best first: side of the square, order, weight of contact, turn and place (x, y) of the first
     vertex of each chart, in cells.
 
@@ -319,7 +327,7 @@ def _search(boxed: list, area: float, gap: float, cells: int, tries: int, lowest
     changes of the best are tried.
     """
     side_most = int(cells * (_DENSITY / lowest) ** 0.5)
-    shapes = _Shapes(boxed, cells * (_DENSITY / area) ** 0.5, gap * side_most, side_most)
+    shapes = _Shapes(boxed, cells * (_DENSITY / area) ** 0.5, gap * side_most, side_most, until)
     ranked: list[tuple[int, list[int], float, list]] = []
 
     def shrunk(order: list[int], contact: float, side: int, found: list) -> None:
@@ -346,6 +354,8 @@ def _search(boxed: list, area: float, gap: float, cells: int, tries: int, lowest
         return []
     rng = np.random.default_rng(0)  # the same for each mesh: results do not depend on chance
     for _ in range(tries):
+        if time.monotonic() > until:
+            break
         side, order, contact, _ = ranked[0]
         order = list(order)
         for _ in range(int(rng.integers(1, 4))):
@@ -359,10 +369,11 @@ def _search(boxed: list, area: float, gap: float, cells: int, tries: int, lowest
             for side, order, contact, found in ranked]
 
 
-def _bisected(boxed: list, area: float, gap: float, cells: int, lowest: float = 0.25, highest: float = 0.8) -> list[tuple[int, list[int], float, list]]:
+def _bisected(boxed: list, area: float, gap: float, cells: int, lowest: float = 0.25, highest: float = 0.8,
+              until: float = np.inf) -> list[tuple[int, list[int], float, list]]:
     """As _search(), of one order only, the largest first, in squares that are filled to a share between lowest and highest."""
     least, most = (int(cells * (_DENSITY / share) ** 0.5) for share in (highest, lowest))
-    shapes = _Shapes(boxed, cells * (_DENSITY / area) ** 0.5, gap * most, most)
+    shapes = _Shapes(boxed, cells * (_DENSITY / area) ** 0.5, gap * most, most, until)
     (order, contact), layout = _first_ways(boxed)[0], None
     while layout is None or most - least > _CLOSE * cells:
         side = (least + most) // 2

@@ -50,6 +50,24 @@ def test_own_coordinates_are_kept_unless_redo(gdtool, tmp_path):
     assert content(tmp_path / "leaf.asset/atlas")["coverage"] > 0.9
 
 
+def test_mirrored_coordinates_are_kept_and_told(gdtool, tmp_path):
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
+    uv = np.array([[0.4, 0.9], [0.1, 0.9], [0.1, 0.6], [0.4, 0.6]])
+    quad = np.array([[0, 1, 2, 3]], np.int32)
+    write_obj(tmp_path / "leaf.obj", QuadMesh(vertices, quad, uv, quad))
+    run = gdtool("unwrap", "leaf.obj")
+    assert run.returncode == 0 and "100% of the surface is mirrored" in run.stderr
+    assert content(tmp_path / "leaf.asset/atlas")["report"]["mirrored"] == 1
+    assert "mirrored" not in gdtool("unwrap", "leaf.obj", "--redo").stderr
+
+
+def test_a_short_time_is_kept_and_told(gdtool, tmp_path, ring):
+    run = gdtool("unwrap", "ring.obj", "--size", 512, "--seconds", 0.01)
+    assert run.returncode == 0, run.stderr
+    found = content(tmp_path / "ring.asset/atlas")
+    assert found["tried"] and found["report"]["overlap"] == 0 and found["report"]["mirrored"] == 0
+
+
 def test_overlapping_coordinates_are_replaced(gdtool, tmp_path):
     vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0], [2, 1, 0.0]])
     faces = np.array([[0, 1, 2, 3], [1, 4, 5, 2]], np.int32)

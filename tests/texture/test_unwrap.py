@@ -1,12 +1,15 @@
 """Unwrap: quads stay whole, nothing overlaps, nothing is mirrored, and a dead child is survived."""
 
+import time
+
 import numpy as np
 import pytest
 
 from gdtool.core.child import ChildFailed
-from gdtool.texture import unwrap, unwrap_charts
+from gdtool.texture import unwrap, unwrap_charts, unwrap_pack
 from gdtool.texture.raster import owner_count
 from gdtool.texture.unwrap_flatten import Flat, flatten, stretch
+from gdtool.texture.unwrap_lay import flatten_all
 from gdtool.texture.unwrap_pack import pack, upright_box
 from tests.geometry.solids import cube
 from tests.texture.shapes import torus
@@ -96,6 +99,57 @@ def test_dead_xatlas_leaves_box_projection(monkeypatch):
     result = unwrap.unwrap(vertices, faces, SMALL)
     checked(vertices, faces, result)
     assert len(result.failed) >= 2 and "took longer" in result.failed[0]
+
+
+@pytest.mark.parametrize("seconds", [1e-3, 0.3])
+def test_with_hardly_any_time_the_atlas_is_plain_and_valid(seconds):
+    vertices, faces, _ = torus(96, 48)
+    start = time.monotonic()
+    result = unwrap.unwrap(vertices, faces, unwrap.Request(size=512, padding=4, seconds=seconds))
+    assert time.monotonic() - start < 20 and result.failed
+    checked(vertices, faces, result)
+
+
+def test_what_is_left_when_the_time_is_over_goes_face_by_face():
+    vertices, faces, _ = torus(24, 12)
+    charts, why = flatten_all(vertices, faces, np.zeros(len(faces), int), 1.002, 1.1, by=(0.0, 0.0))
+    assert len(charts) == len(faces) and why == ["1 charts were cut: a chart was left when the time was over"]
+    result = unwrap.unwrap(vertices, faces, unwrap.Request(size=512, padding=4, seconds=1e-9))
+    assert checked(vertices, faces, result)["charts"] == len(faces)
+
+
+def test_what_the_conformal_map_refuses_starts_from_a_circle(monkeypatch):
+    def refuses(*_):
+        raise RuntimeError("igl::lscm failed")
+
+    monkeypatch.setattr("igl.lscm", refuses)
+    points = np.random.default_rng(0).random((30, 2))
+    import scipy.spatial
+
+    triangles = scipy.spatial.Delaunay(points).simplices.astype(np.int64)
+    bowl = np.concatenate([points, ((points - 0.5) ** 2).sum(1, keepdims=True) * 2], 1)
+    flat = flatten(bowl, triangles, 1.0001, 1.5)
+    assert flat.uv is not None and stretch(bowl, triangles, flat.uv) < 1.2
+
+
+def test_rings_stay_whole_where_the_charts_fill_the_square(monkeypatch):
+    """Skipped, and nothing worth its seams is lost: with every cut tried the square is filled no better by a tenth."""
+    side = np.arange(9)
+    x, y = np.meshgrid(side, side)
+    plate = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1) / 8.0
+    i = (side[:-1, None] * 9 + side[:-1]).ravel()
+    quads = np.stack([i, i + 1, i + 10, i + 9], -1)
+    ell = quads[(plate[quads].mean(1)[:, :2] < 0.25).any(1)]
+    meshes = [(plate, quads)] * 8 + [(plate, ell)]
+    vertices = np.concatenate([points + [0, 0, height] for height, (points, _) in enumerate(meshes)])
+    faces = np.concatenate([own + 81 * k for k, (_, own) in enumerate(meshes)])
+    found = unwrap.unwrap(vertices, faces, SMALL)
+    assert [what for what, _, _ in found.skipped] == ["cutting rings for packing"] and found.skipped[0][2] > 0
+    monkeypatch.setattr(unwrap, "WELL_PACKED", np.inf)
+    monkeypatch.setattr(unwrap_pack, "WELL_PACKED", np.inf)
+    other = unwrap.unwrap(vertices, faces, SMALL)
+    few, many = checked(vertices, faces, found), checked(vertices, faces, other)
+    assert not other.skipped and many["coverage"] < 1.1 * few["coverage"] and many["stretch"] == pytest.approx(few["stretch"], abs=1e-3)
 
 
 def test_cylinder_side_is_developable():
