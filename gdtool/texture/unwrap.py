@@ -17,7 +17,8 @@ from gdtool.texture.unwrap_lay import flatten_all
 from gdtool.texture.unwrap_pack import WELL_PACKED, best_packed, pack
 
 _MORE_CHARTS, _MORE_OF_RINGS, _MOST_CUT = 12, 23, 40  # charts that cutting for packing adds, where it cuts rings, and ends with, at most
-_FOUND, _SHAPED, _PROJECTED, _PACKED = 0.2, 0.6, 0.8, 0.9  # shares of the time by which charts are found, shaped, projected, packed
+# Shares of the time by which charts are found, shaped, projected, a child that has not ended is given up, and charts are packed.
+_FOUND, _SHAPED, _PROJECTED, _HUNG, _PACKED = 0.2, 0.6, 0.7, 0.8, 0.9
 _SHORTEST = 0.05  # seconds of a child
 
 
@@ -64,9 +65,9 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
     by = request.by(_SHAPED), request.by(_PROJECTED)
     try:
         flat, more = call("gdtool.texture.unwrap_lay:flatten_all", unit, faces, label, request.good_stretch, request.max_stretch, proxy, by,
-                          seconds=max(by[1] - time.monotonic(), _SHORTEST), memory_mb=8000)
+                          seconds=max(request.by(_HUNG) - time.monotonic(), _SHORTEST), memory_mb=8000)
     except ChildFailed as failure:
-        late = max(by[1], time.monotonic() + (_PROJECTED - _SHAPED) * request.seconds)
+        late = time.monotonic() + (_PROJECTED - _SHAPED) * request.seconds
         flat, more = flatten_all(unit, faces, label, request.good_stretch, request.max_stretch, by=(by[0], late))
         failed.append(f"flattening: {failure}; charts by the side they look at")
     failed += more

@@ -38,12 +38,12 @@ def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, ma
     if uv is not None and stretch(vertices, triangles, uv) < good_stretch:
         return Flat(uv)
     uv = _conformal(vertices, triangles, edges.ends[border])
-    if uv is None or not _upright(uv, triangles):
+    if uv is None or not upright(uv, triangles):
         euler = len(vertices) - len(edges.ends) + len(triangles)
         if euler != 1:
             return Flat(None, "folds, and is no disk")
         uv = _tutte(vertices, triangles)
-        if uv is None or not _upright(uv, triangles):
+        if uv is None or not upright(uv, triangles):
             return Flat(None, "folds")
     uv = _isometric(vertices, triangles, uv, good_stretch, max_stretch)
     if stretch(vertices, triangles, uv) > max_stretch:
@@ -57,7 +57,8 @@ def _areas(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
 
 
-def _upright(uv: np.ndarray, triangles: np.ndarray) -> bool:
+def upright(uv: np.ndarray, triangles: np.ndarray) -> bool:
+    """Whether all triangles (t, 3) in uv (v, 2) have an area and are counter-clockwise."""
     area = _areas(uv, triangles)
     return bool(np.isfinite(area).all() and (area > 1e-10 * max(area.max(initial=0), 1e-300)).all())
 
@@ -80,7 +81,7 @@ def onto_plane(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None
     x = np.cross([0.0, 1.0, 0.0] if abs(mean[1]) < 0.9 else [1.0, 0.0, 0.0], mean)
     x /= np.linalg.norm(x)
     uv = np.stack([vertices @ x, vertices @ np.cross(mean, x)], -1)
-    if not _upright(uv, triangles) or overlapping(uv, triangles).any():
+    if not upright(uv, triangles) or overlapping(uv, triangles).any():
         return None
     return _scaled(vertices, triangles, uv)
 
@@ -146,7 +147,7 @@ def _isometric(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray, good
     before = stretch(vertices, triangles, best)
     for steps in _SLIM_STEPS:
         found = np.asarray(igl.slim_solve(state, steps))[:, :2]
-        if not np.isfinite(found).all() or not _upright(found, triangles):
+        if not np.isfinite(found).all() or not upright(found, triangles):
             break
         best, now = _scaled(vertices, triangles, found), stretch(vertices, triangles, found)
         if now < good_stretch or before - now < 2e-4 or now - _RELIED_GAIN * (before - now) > max_stretch:

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gdtool.folders.mesh import triangulated
+from gdtool.geometry.mesh_quality import polygon_normals
 from gdtool.texture.unwrap_charts import Adjacency, bisect, own_corners
 from gdtool.texture.unwrap_cut import connected, part_of
-from gdtool.texture.unwrap_flatten import Flat, flatten, onto_plane, stretch
+from gdtool.texture.unwrap_flatten import Flat, flatten, onto_plane, stretch, upright
 from gdtool.texture.unwrap_join import joined, joined_stretch
 from gdtool.texture.unwrap_peel import onto_neighbours, peel
 
@@ -74,9 +75,9 @@ def lay(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, label: np
     laid, queue = Laid(), sets[::-1]
     while queue:
         faces_idx, now = queue.pop(), time.monotonic()
-        if now > by[1] and len(faces_idx) > 1:
-            laid.cut[_LATE] += 1
-            queue.extend(faces_idx[:, None])
+        if now > by[1]:
+            laid.cut[_LATE] += len(faces_idx) > 1
+            laid.charts += _face_by_face(vertices, faces, faces_idx)
             continue
         if now > by[0]:
             peeling, projected = False, True
@@ -155,6 +156,22 @@ def _sets(label: np.ndarray) -> list[np.ndarray]:
     """The places of each label, in the labels' order."""
     order = np.argsort(label, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
+
+
+def _face_by_face(vertices: np.ndarray, faces: np.ndarray, faces_idx: np.ndarray) -> list[tuple]:
+    """A chart of each of some faces (k,), seen along its normal; where it folds so, a square or right triangle of its size."""
+    own = faces[faces_idx]
+    corner = vertices[np.where(own < 0, own[:, :1], own)]
+    x = corner[:, 1] - corner[:, 0]
+    x /= np.maximum(np.linalg.norm(x, axis=1), 1e-300)[:, None]
+    y = np.cross(polygon_normals(vertices, own)[0], x)
+    uv = np.stack([np.einsum("kcd,kd->kc", corner, x), np.einsum("kcd,kd->kc", corner, y)], -1)
+    charts = []
+    for face, used, flat, points in zip(faces_idx.tolist(), own >= 0, uv, corner, strict=True):
+        corners = np.where(used, np.arange(4), -1)[None]
+        flat, triangles = flat[used], triangulated(corners)[0]
+        charts.append((np.array([face]), corners, flat if upright(flat, triangles) else _alone(points[used], corners[0]), triangles))
+    return charts
 
 
 def _alone(points: np.ndarray, corners: np.ndarray) -> np.ndarray:

@@ -241,11 +241,13 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, ways: list[tup
     charts keep their resolution, what is sought is the smallest square that holds them. ways: best_packed's, to start from. until: when to seek no longer, on the clock
     time.monotonic; where nothing is found by then the charts stand in rows.
     """
+    if time.monotonic() > until:
+        return _shelves([(uv - uv.min(0), triangles) for uv, triangles in charts], gap)
     boxed, area = _boxed(charts)
     if len(charts) == 1:
         scale = (1 - 2 * gap) / max(float(np.ptp(boxed[0][0], 0).max()), 1e-300)
         return [boxed[0][0] * scale + gap], scale
-    if len(charts) > _MOST_BY_RASTER or time.monotonic() > until:
+    if len(charts) > _MOST_BY_RASTER:
         return _shelves(boxed, gap)
     coarse = _COARSE_OF_MANY if _MANY < len(charts) <= _MOST_BY_SEARCH else _COARSE
     tries = max(_TRIES // len(charts), 8)
