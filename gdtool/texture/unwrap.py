@@ -18,13 +18,13 @@ from gdtool.texture.unwrap_pack import WELL_PACKED, best_packed, pack
 
 _MORE_CHARTS, _MORE_OF_RINGS, _MOST_CUT = 12, 23, 40  # charts that cutting for packing adds, where it cuts rings, and ends with, at most
 # Shares of the time by which charts are found, shaped, projected, a child that has not ended is given up, and charts are packed.
-_FOUND, _SHAPED, _PROJECTED, _HUNG, _PACKED = 0.2, 0.6, 0.7, 0.8, 0.9
+_SHARES = 0.2, 0.6, 0.7, 0.8, 0.9
 _SHORTEST = 0.05  # seconds of a child
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for. padding: texels between charts at `size`; seconds: time limit of the whole, from when the request is made."""
+    """What is asked for. padding: texels between charts at `size`; seconds: time limit of the whole."""
 
     size: int = 2048
     padding: int = 8
@@ -32,11 +32,6 @@ class Request:
     good_stretch: float = 1.002
     max_cost: float = 2.0
     seconds: float = 120.0
-    begun: float = field(default_factory=time.monotonic)
-
-    def by(self, share: float) -> float:
-        """When that share of the time is over, on the clock time.monotonic."""
-        return self.begun + share * self.seconds
 
 
 @dataclass
@@ -57,22 +52,23 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
     vertices (v, 3) finite. Charts are never mirrored and do not overlap; all have one texel density. As the time runs out the
     rest goes in simpler ways: charts by the side of a box that they look at, laid flat by projection, at last face by face, in rows.
     """
+    begun = time.monotonic()
+    found_by, shaped_by, projected_by, hung_by, packed_by = (begun + share * request.seconds for share in _SHARES)
     for module in ("gdtool.geometry.simplify", "gdtool.texture.unwrap_charts", "gdtool.texture.unwrap_lay"):
         prepare(module)
     extent = float(np.ptp(vertices[np.unique(faces[faces >= 0])], 0).max())
     unit = (vertices - vertices.mean(0)) / (extent if extent > 0 else 1.0)
-    label, proxy, failed = find_charts(unit, faces, until=request.by(_FOUND), max_cost=request.max_cost)
-    by = request.by(_SHAPED), request.by(_PROJECTED)
+    label, proxy, failed = find_charts(unit, faces, until=found_by, max_cost=request.max_cost)
     try:
-        flat, more = call("gdtool.texture.unwrap_lay:flatten_all", unit, faces, label, request.good_stretch, request.max_stretch, proxy, by,
-                          seconds=max(request.by(_HUNG) - time.monotonic(), _SHORTEST), memory_mb=8000)
+        flat, more = call("gdtool.texture.unwrap_lay:flatten_all", unit, faces, label, request.good_stretch, request.max_stretch, proxy,
+                          (shaped_by, projected_by), seconds=max(hung_by - time.monotonic(), _SHORTEST), memory_mb=8000)
     except ChildFailed as failure:
-        late = time.monotonic() + (_PROJECTED - _SHAPED) * request.seconds
-        flat, more = flatten_all(unit, faces, label, request.good_stretch, request.max_stretch, by=(by[0], late))
+        late = time.monotonic() + projected_by - shaped_by
+        flat, more = flatten_all(unit, faces, label, request.good_stretch, request.max_stretch, by=(shaped_by, late))
         failed.append(f"flattening: {failure}; charts by the side they look at")
     failed += more
-    flat, ways, skipped = _cut_to_pack(Adjacency(unit, faces), flat, request.padding / request.size, request.by(_PACKED))
-    places, _ = pack([(uv, triangles) for _, _, uv, triangles in flat], request.padding / request.size, ways, request.by(_PACKED))
+    flat, ways, skipped = _cut_to_pack(Adjacency(unit, faces), flat, request.padding / request.size, packed_by)
+    places, _ = pack([(uv, triangles) for _, _, uv, triangles in flat], request.padding / request.size, ways, packed_by)
     face_uvs = np.full(faces.shape, -1, np.int64)
     chart = np.zeros(len(faces), np.int64)
     offset = 0
