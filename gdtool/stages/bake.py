@@ -87,8 +87,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     with out.step("maps"):
         maps = make_maps(texels, baked.values, occlusion=occlusion, bits=options.bits, padding=options.padding or None, normal_map=options.normal_map,
                          threads=out.threads, **({"least_alpha": origin.alpha_cutoff} if origin.alpha_mode == "MASK" else {}))
-    for what, reason in maps.skipped:
-        out.skip(what, reason)
+    for what, reason, seconds in maps.skipped:
+        out.skip(what, reason, seconds)
     if options.normal_map == "off":
         out.skip("normal map", "left out by --normal-map off")
     report = {**baked.report, "seen_share": 0.0 if baked.seen is None else float((baked.seen[:texels.inside] > 0.5).mean()),
@@ -102,6 +102,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
 
 _MOST_DRIFT = 0.02  # share of the extent, mean: farther off a level shows the maps of other parts
+_FEWER = 0.9  # of the level before: what cannot come down to what is asked is worth having with fewer than that
 
 
 def _levels(target, count: int, out: Output, report: dict) -> list:
@@ -110,9 +111,11 @@ def _levels(target, count: int, out: Output, report: dict) -> list:
     from gdtool.texture.lods import coarser, drift
 
     counts = [max(len(target.faces) >> k, 4) for k in range(1, count)]
-    levels = []
+    levels, most = [], len(target.faces)
     # Each is a child process of its own: threads only wait for them.
     for wanted, (level, why) in zip(counts, mapped(lambda n: coarser(target, n), counts, out.threads), strict=True):
+        if level is not None and len(level.faces) > max(_FEWER * most, 1.5 * wanted):
+            level, why = None, f"it cannot have fewer than {len(level.faces)} triangles without tearing a seam"
         if level is None:
             out.skip(f"level of {wanted} triangles", why)
             continue
@@ -120,6 +123,9 @@ def _levels(target, count: int, out: Output, report: dict) -> list:
         if slid["drift_mean"] > _MOST_DRIFT:
             out.skip(f"level of {wanted} triangles", f"it would slide {100 * slid['drift_mean']:.1f} % of the extent on the maps")
             continue
+        most = len(level.faces)
+        if most > 1.5 * wanted:
+            out.warn(f"the level of {wanted} triangles has {most}: fewer would tear a seam")
         levels.append(level)
         report[f"lod{len(levels)}_triangles"] = len(level.faces)
         report |= {f"lod{len(levels)}_{name}": value for name, value in slid.items()}
@@ -304,6 +310,6 @@ def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx
 
 
 STAGE = Stage(
-    name="bake", version=10, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run,
+    name="bake", version=11, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run,
     second_inputs={"surface": SecondInput("surface", help="The surface to bake from; found along the provenance chain without it."),
                    "views": SecondInput("views", help="Views of it; found along the provenance chain without it.")})

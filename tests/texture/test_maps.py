@@ -28,7 +28,7 @@ def test_constants_become_factors(texels):
     assert maps.base_color is None and maps.orm is None and maps.normal is None
     np.testing.assert_allclose(maps.factors["base_color"], (0.5, 0.2, 0.1, 1.0), atol=1e-5)
     assert maps.factors["roughness"] == (pytest.approx(0.4),) and maps.factors["metallic"] == (0.0,)
-    assert {what for what, _ in maps.skipped} == {"base_color map", "roughness and metallic map", "occlusion map", "normal map"}
+    assert {what for what, _, _ in maps.skipped} == {"base_color map", "roughness and metallic map", "occlusion map", "normal map"}
     assert contact_sheet_of(maps).dtype == np.uint8
 
 
