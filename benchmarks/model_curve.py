@@ -23,6 +23,9 @@ from gdtool.core.folder import open_folder
 from gdtool.diffusion.data import decode_object
 from gdtool.diffusion.weights import load_model
 
+NOTE = ("Minutes are of the clock, of runs on one core or two, alone or beside other work, as the card says; the first rows are at 64 px, where views are "
+        "easier to match. The line in the picture goes through all of them and is drawn on to ten times the training: what a faster machine would add "
+        "is an estimate by it, not a measurement.")
 SHOWN = ("color_psnr_frame", "color_ssim_frame", "albedo_psnr_frame", "normal_degrees", "depth_error", "silhouette_overlap")
 
 
@@ -92,7 +95,7 @@ def main() -> None:
         say(f"  {path}: {minutes:.0f} minutes")
     rows = [[number(point["minutes"]), *(number(point[key]) for key in ("size", *SHOWN))] for point in points]
     text = "\n".join(["# Quality against minutes of training", "", f"{len(folders)} held-out objects, one step of sampling of the picture alone, trained and measured on {machine()}.", "",
-                      table(["minutes", "px", *(key.replace("_", " ") for key in SHOWN)], rows), "", "![PSNR against minutes](model_curve.png)", ""])
+                      table(["minutes", "px", *(key.replace("_", " ") for key in SHOWN)], rows), "", NOTE, "", "![PSNR against minutes](model_curve.png)", ""])
     arguments.output.mkdir(parents=True, exist_ok=True)
     (arguments.output / "model_curve.json").write_text(json.dumps(points, indent=1) + "\n")
     (arguments.output / "model_curve.md").write_text(text)

@@ -23,14 +23,15 @@ def precision_context(device: torch.device | str, precision: str):
 
 @torch.no_grad()
 def sample_images(model: Model, rgba: torch.Tensor, *, domains: tuple[str, ...] = DOMAINS, steps: int = 8, guidance: float = 1.0,
-                  seed: int = 0, scheduler: str = "ddim", precision: str = "float32", mirror: bool | None = None,
+                  guided_from: float = 0.0, guided_to: float = 1.0, seed: int = 0, scheduler: str = "ddim", precision: str = "float32", mirror: bool | None = None,
                   progress: Callable = lambda iterable, total, label: iterable) -> dict[str, torch.Tensor]:
     """Sample every view of the domains for a batch of objects.
 
     rgba (b, 4, h, w): framed condition, premultiplied and encoded (data.condition_plane). Returns domain to encoded
     images (b, k, 3, h, w) over the first of the configuration's backgrounds. Noise depends on seed alone: neither on the
     batch nor on which domains are asked for. Where color is primary it is sampled even when it is not asked for.
-    mirror: take at each step the mean of what the picture and its mirror image give; None: as the configuration says, where it can.
+    guided_from, guided_to: timesteps, as shares of all, between which guidance acts; elsewhere there is none and half the work
+    (Kynkäänniemi et al. 2024). mirror: take at each step the mean of what the picture and its mirror image give; None: as the configuration says, where it can.
     """
     config, device = model.config, rgba.device
     can = config.codec == "patch" and config.convention == "gdtool" and all(MIRRORED_VIEW.get(name, name) in config.views for name in config.views)
@@ -62,23 +63,22 @@ def sample_images(model: Model, rgba: torch.Tensor, *, domains: tuple[str, ...] 
     background = torch.full((b,), BACKGROUND[config.backgrounds[0]], device=device)
     rgba = encode_condition(rgba, background)
     guided = guidance != 1.0
-    layout = Layout(2 * b if guided else b, indices, len(views))
     with precision_context(device, precision):
         context = model.encoder(rgba)
     single = Layout(b, indices, len(views))
     condition = model.condition_latents(rgba, single, views)
     if guided:  # second half of the batch: no embedding, no latent
-        context = torch.cat([context, torch.zeros_like(context)])
-        condition = torch.cat([condition, torch.zeros_like(condition)])
+        double = torch.cat([condition, torch.zeros_like(condition)]), torch.cat([context, torch.zeros_like(context)]), Layout(2 * b, indices, len(views))
     bar = iter(progress(range(steps), steps, "sampling"))
 
     def denoise(x, t, i):
         next(bar, None)
-        x = x.repeat(2, 1, 1, 1) if guided else x
+        both = guided and guided_from <= t / (config.timesteps - 1) <= guided_to
+        seen, told, layout = double if both else (condition, context, single)
         times = torch.full((layout.objects,), t, device=device)
         with precision_context(device, precision):
-            clean = model.predict_clean(x, condition, times, context, layout, views)
-        if guided:
+            clean = model.predict_clean(x.repeat(2, 1, 1, 1) if both else x, seen, times, told, layout, views)
+        if both:
             with_condition, without = clean.chunk(2)
             clean = without + guidance * (with_condition - without)
         if mirror:

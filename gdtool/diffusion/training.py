@@ -252,9 +252,10 @@ def load_checkpoint(state: State, workspace: Path, identity: str) -> bool:
 
 def run_training(model: Model, objects: Objects, train: TrainConfig, workspace: Path, *, seed: int, minutes: float | None = None,
                  checkpoint_every: int = 200, validate_every: int = 1000, validate: Callable[[State], None] = lambda state: None,
-                 device: str = "cpu", warn: Callable[[str], None] = lambda message: None,
+                 device: str = "cpu", warn: Callable[[str], None] = lambda message: None, log: Callable[[dict], None] = lambda record: None,
                  progress=lambda iterable, total, label: iterable) -> State:
-    """Train until the steps or the minutes are spent; resumes from workspace. The first process writes workspace/loss.csv.
+    """Train until the steps or the minutes are spent; resumes from workspace. The first process writes workspace/loss.csv, and gives
+    each of its rows to log.
 
     Raises InputError when MOST_SKIPPED steps in a row had a gradient that is not finite; before that warns of each.
     """
@@ -273,6 +274,7 @@ def run_training(model: Model, objects: Objects, train: TrainConfig, workspace: 
             state.seconds += distributed.total({"s": time.perf_counter() - start})["s"] / distributed.size()
             writer.writerow({k: (f"{v:.6g}" if isinstance(v, float) else v) for k, v in record.items()} | {"seconds": f"{state.seconds:.1f}"})
             file.flush()
+            log(record)
             _tell_skipped(state, warn)
             next(bar, None)
             if state.step % checkpoint_every == 0:

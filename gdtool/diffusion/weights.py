@@ -16,8 +16,9 @@ WEIGHTS = "model.safetensors"
 PICKLES = ("*.bin", "*.pt", "*.pth", "*.ckpt", "*.pkl")
 
 
-def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    """Tensors and metadata of a safetensors file. Raises InputError when it is damaged or holds NaN or infinity."""
+def read_tensors(path: Path, cure: str = "gdtool train writes it") -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+    """Tensors and metadata of a safetensors file. Raises InputError, with the cure where it is not there, and when it is damaged or
+    holds NaN or infinity."""
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
@@ -25,7 +26,7 @@ def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
         if pickles:
             raise InputError(pickles[0], "is a pickle, which can run code and is never opened",
                              f"convert it to safetensors: python -m gdtool.diffusion.convert {shlex.quote(str(pickles[0]))}")
-        raise InputError(path, "does not exist", "gdtool train writes it")
+        raise InputError(path, "does not exist", cure)
     try:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
@@ -44,7 +45,8 @@ def pretrained_part(config: ModelConfig, part: str) -> Path:
     folder = Path(hub_folder(config.pretrained, config.revision))
     if not list((folder / part).glob("*.safetensors")):
         if folder == Path(config.pretrained):
-            read_tensors(folder / part / "diffusion_pytorch_model.safetensors")  # names the pickle, or what is missing
+            read_tensors(folder / part / "diffusion_pytorch_model.safetensors",  # names the pickle, or what is missing
+                         f"{config.pretrained} is to hold a pipeline as diffusers saves it, with {part}/")
         revision = f" --revision {config.revision}" if config.revision else ""
         raise InputError(config.pretrained, f"has no safetensors in {part}/ on the hub, and a pickle can run code and is never opened",
                          f"hf download {config.pretrained}{revision} --local-dir DIR && python -m gdtool.diffusion.convert DIR, "

@@ -14,6 +14,7 @@ from gdtool.geometry.normals import face_normals
 from gdtool.geometry.unpinch import unpinched
 
 
+_BY_WAY = 6  # times the triangles asked for, to which the quicker collapse still goes well
 _STUCK, _FEW = 1.25, 32  # triangles in units of those asked for, and so many more, that a collapse may leave
 
 
@@ -39,6 +40,17 @@ def collapse_topology(vertices: np.ndarray, faces: np.ndarray, target_faces: int
                                                       autoclean=False)
     mesh = meshes.current_mesh()
     return np.asarray(mesh.vertex_matrix()), np.asarray(mesh.face_matrix(), np.int64)
+
+
+def collapse_by_way(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
+    """What the child runs where the quicker collapse does not come to its end: that one as far as it goes well, MeshLab's from there.
+
+    A third of the time of MeshLab's alone. No triangles at all where the quicker one does not come so far either.
+    """
+    vertices, faces = collapse(vertices, faces, _BY_WAY * target_faces, 5.0)
+    if len(faces) > _STUCK * _BY_WAY * target_faces:
+        return vertices, faces[:0]
+    return collapse_topology(vertices, faces, target_faces)
 
 
 def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
@@ -87,9 +99,11 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     # another, and of parts made of slivers it collapses nothing, at any; MeshLab's takes ten times as long.
     quick = [("collapse", (target_faces, pace)) for pace in (5.0, 3.0, 8.0)]
     slow = [("collapse_topology", (target_faces,))] if thorough or careful else []
+    if slow and len(faces) > 2 * _BY_WAY * target_faces:
+        slow.insert(0, ("collapse_by_way", (target_faces,)))
     stuck = None
     for name, arguments in slow + quick if careful else quick + slow:
-        if stuck is not None and name == "collapse":
+        if stuck is not None and name == "collapse" or name == "collapse_by_way" and stuck is None and not careful:
             continue
         try:
             running = begin(f"gdtool.geometry.simplify:{name}", unit, faces.astype(np.int32), *arguments, seconds=seconds, memory_mb=16000)

@@ -19,7 +19,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from gdtool.core.errors import InputError, UsageError
+from gdtool.core.errors import InputError, ResourceError, UsageError
 from gdtool.core.stage import Inputs, Output, SecondInput, Stage, file_option
 
 EVERY = ("color", "normal", "depth", "albedo", "roughness", "metallic")
@@ -29,6 +29,8 @@ FINEST = 8  # pixels of picture.png across one of a view
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     steps: Annotated[int, Meta(ge=1, le=1000, description="Denoising steps; without it what measured best for the model.")] | None = None
     guidance: Annotated[float, Meta(ge=0, le=30, description="Classifier-free guidance; 1: none, and half the time.")] = 1.0
+    guided_from: Annotated[float, Meta(ge=0, le=1, description="Least noise that guidance acts at, as a share of the timesteps.")] = 0.0
+    guided_to: Annotated[float, Meta(ge=0, le=1, description="Most noise that guidance acts at; outside there is none, and half the time.")] = 1.0
     scheduler: Annotated[Literal["ddim", "dpm"], Meta(description="Sampler: DDIM or DPM-Solver++.")] = "ddim"
     mirror: Annotated[bool, Meta(description="Take the mean with what the picture's mirror image gives, where the model is one that gains from it; twice the time.")] = True
     seed: Annotated[int, Meta(ge=0, description="Seed of the noise, the same for every object whatever the order.")] = 0
@@ -36,6 +38,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     mask: file_option("Image that is bright where the subject is.") = None
     crop: Annotated[bool, Meta(description="Centre the subject and scale it as in training.")] = True
     precision: Annotated[Literal["float32", "bfloat16"], Meta(description="Arithmetic of the networks.")] = "float32"
+    compile: Annotated[bool, Meta(description="Compile the network first (torch.compile, needs a C++ compiler): two minutes the first time, ten seconds afterwards, then a third less time a step.")] = False
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
@@ -48,7 +51,6 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.diffusion.familiarity import read_ranges, unfamiliar
     from gdtool.diffusion import wonder3d
     from gdtool.diffusion.result import views_from_images
-    from gdtool.diffusion.sampling import sample_images
     from gdtool.diffusion.weights import load_model
     from gdtool.folders.views import write_views
     from gdtool.images.color import srgb_from_linear
@@ -74,8 +76,13 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         if strange:
             out.warn(f"{inputs.name}: unlike the pictures this model was trained on, expect less of it: {'; '.join(strange)}")
         rgba = rgba.to(out.device)
-        images = sample_images(model, rgba, domains=domains, steps=options.steps or config.sampling_steps, guidance=options.guidance, seed=options.seed, mirror=None if options.mirror else False,
-                               scheduler=options.scheduler, precision=options.precision, progress=out.progress)
+        # The order that convolutions work in; a twentieth quicker, the same to rounding.
+        model.unet.to(memory_format=torch.channels_last)
+        images = _sampled(model, options.compile, rgba, domains=domains, steps=options.steps or config.sampling_steps, guidance=options.guidance,
+                          guided_from=options.guided_from, guided_to=options.guided_to, seed=options.seed, mirror=None if options.mirror else False,
+                          scheduler=options.scheduler, precision=options.precision, progress=out.progress)
+        if options.guidance != 1 and (options.guided_from > 0 or options.guided_to < 1):
+            out.skip("guidance of some steps", "they are outside --guided-from and --guided-to")
     if config.convention == "wonder3d" and "normal" in images:
         images["normal"] = wonder3d.premultiplied_normals(images["normal"])
     cameras = {camera.name: camera for camera in rig("wonder3d" if config.convention == "wonder3d" else "six", config.image_size)}
@@ -92,6 +99,22 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         if shown:
             write_png(out.path("picture.png"), srgb_from_linear_rgba(picture, srgb_from_linear))
         write_views(out, views, conditions=1, picture=shown, report=report)
+
+
+def _sampled(model, compiled: bool, rgba, **setting):
+    """sample_images(), of the compiled network where that is asked for. Raises ResourceError where it cannot be compiled."""
+    from gdtool.diffusion.sampling import sample_images
+
+    if not compiled:
+        return sample_images(model, rgba, **setting)
+    from torch._dynamo.exc import TorchDynamoException
+
+    model.unet.compile()
+    try:
+        return sample_images(model, rgba, **setting)
+    except TorchDynamoException as failure:
+        raise ResourceError("--compile", f"PyTorch cannot compile the network here: {str(failure).strip().splitlines()[0]}",
+                            "leave it out, or install a C++ compiler") from None
 
 
 def srgb_from_linear_rgba(image, srgb_from_linear):

@@ -35,6 +35,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     held_out: Annotated[int, Meta(ge=0, description="Last objects of the data that are not trained on but shown in validation images.")] = 4
     checkpoint_every: Annotated[int, Meta(ge=1, description="Steps between checkpoints.")] = 100
     validate_every: Annotated[int, Meta(ge=1, description="Steps between validation images.")] = 500
+    tensorboard: Annotated[bool, Meta(description="Write TensorBoard's event files as well, into the run's workspace and the model (needs tensorboard).")] = False
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
@@ -48,6 +49,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.diffusion.data import Objects, decode_dataset, from_bytes
     from gdtool.diffusion.model import parameter_count
     from gdtool.diffusion.report import append_validation, card, validation
+    from gdtool.diffusion.tensorboard import Events
     from gdtool.diffusion.weights import save_model
     from gdtool.core.kinds import ModelContent
     from gdtool.images.io import write_png
@@ -63,21 +65,29 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     shown = Objects(objects.planes[used:], objects.conditions[used:], objects.lights[used:], objects.names[used:])
     objects = Objects(objects.planes[:used], objects.conditions[:used], objects.lights[:used], objects.names[:used])
     (out.workspace / "validation").mkdir(exist_ok=True)
+    events = Events(out.workspace / "tensorboard") if options.tensorboard else None
 
     def validate(state) -> None:
         if held:
             grid, psnr = validation(state, shown, train_config.precision)
             write_png(out.workspace / "validation" / f"step_{state.step:06d}.png", grid)
             append_validation(out.workspace / "validation.csv", state.step, state.seconds, psnr)
+            if events is not None:
+                events.picture(state.step, grid)
 
     distributed.start()
     order = {"model": model_config, "train": train_config, "start": start and start.path, "workspace": out.workspace.absolute(), "used": used,
              "seed": options.seed, "minutes": options.minutes, "checkpoint_every": options.checkpoint_every, "device": out.device}
     distributed.send(order)
     with out.step("train"):
-        state = _train(order, objects, validate_every=options.validate_every, validate=validate, warn=out.warn, progress=out.progress)
+        how = {} if events is None else {"log": events.scalars}
+        state = _train(order, objects, validate_every=options.validate_every, validate=validate, warn=out.warn, progress=out.progress, **how)
     with out.step("validate"):
         validate(state)
+    if events is not None:
+        events.close()
+        for file in sorted((out.workspace / "tensorboard").iterdir()):
+            shutil.copyfile(file, out.path(f"tensorboard/{file.name}"))
     save_model(out.path, model_config, state.average)
     shutil.copyfile(out.workspace / "loss.csv", out.path("loss.csv"))
     write_png(out.path("loss.png"), draw_curve(out.workspace / "loss.csv"))

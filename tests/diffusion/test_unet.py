@@ -131,6 +131,23 @@ def test_objects_of_a_batch_do_not_meet(guidance):
         torch.testing.assert_close(both[domain][1], alone[domain][0], rtol=1e-4, atol=1e-5)
 
 
+def test_guidance_costs_and_acts_between_its_timesteps_alone(monkeypatch):
+    model, seen = tiny(), []
+    rgba = torch.rand(1, 4, 16, 16) * 2 - 1
+    whole = model.predict_clean
+    monkeypatch.setattr(model, "predict_clean", lambda x, *rest: seen.append(len(x)) or whole(x, *rest))
+    plain, all_over = (sample_images(model, rgba, steps=4, seed=4, guidance=guidance) for guidance in (1.0, 2.5))
+    one = seen[0]
+    assert seen == [one] * 4 + [2 * one] * 4
+    seen.clear()
+    early = sample_images(model, rgba, steps=4, seed=4, guidance=2.5, guided_from=0.6)
+    assert seen == [2 * one] * 2 + [one] * 2
+    never = sample_images(model, rgba, steps=4, seed=4, guidance=2.5, guided_to=0.0, guided_from=1.0)
+    for domain in plain:
+        assert torch.equal(never[domain], plain[domain])
+    assert not torch.allclose(early["color"][0, 1:], plain["color"][0, 1:]) and not torch.allclose(early["color"][0, 1:], all_over["color"][0, 1:])
+
+
 @pytest.mark.parametrize("guidance", [1.0, 2.5])
 def test_sampled_with_its_mirror_image_a_picture_gives_the_mirrored_views_of_the_turned_picture(guidance):
     """At one step, where noise of no weight says nothing; at two both sides of the mean have mirrored noise, so each object is whole."""

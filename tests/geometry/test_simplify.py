@@ -100,3 +100,18 @@ def test_the_collapse_that_keeps_the_topology_keeps_what_coincides():
     vertices, faces = joined(one, two)
     out, found = simplify.collapse_topology(vertices, faces, 600)
     assert repair.topology(found) == repair.topology(faces) and len(found) <= 600
+
+
+def test_where_the_quick_collapse_gives_up_it_still_goes_most_of_the_way(monkeypatch):
+    """MeshLab's goes on from six times the triangles asked for: as near to the surface as from all of them."""
+    vertices, faces = sphere(64)
+    assert len(faces) > 20_000
+    whole, by_way = simplify.collapse_topology(vertices, faces, 1000), simplify.collapse_by_way(vertices, faces, 1000)
+    assert len(by_way[1]) == 1000 and repair.is_watertight(by_way[1])
+    assert simplify.deviation(vertices, faces, *by_way) < 1.5 * simplify.deviation(vertices, faces, *whole)
+    called, begin = [], simplify.begin
+    monkeypatch.setattr(simplify, "begin", lambda name, *rest, **how: called.append(name.split(":")[1]) or begin(name, *rest, **how))
+    found = simplify.simplify(vertices, faces, 1000, careful=True)
+    assert called == ["collapse_by_way"] and found[3]["faces"] == 1000
+    monkeypatch.setattr(simplify, "collapse", lambda vertices, faces, target, pace: (vertices, faces))
+    assert not len(simplify.collapse_by_way(vertices, faces, 1000)[1])

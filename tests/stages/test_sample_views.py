@@ -105,6 +105,23 @@ def test_a_subset_of_the_domains(gdtool, picture, tiny_model, tmp_path):
     assert wrong.returncode == 2 and "normals" in wrong.stderr
 
 
+@pytest.mark.slow
+def test_a_compiled_network_gives_the_same(gdtool, picture, tiny_model, tmp_path):
+    for name, more in (("plain", ()), ("compiled", ("--compile",))):
+        result = sample(gdtool, "ball.png", "--model", tiny_model, *more, "-o", name)
+        assert result.returncode == 0, result.stderr
+    for path in sorted((tmp_path / "plain/color").glob("*.png")):
+        np.testing.assert_allclose(read_image(path), read_image(tmp_path / "compiled/color" / path.name), atol=1)
+
+
+@pytest.mark.slow
+def test_without_a_compiler_that_is_said(gdtool, picture, tiny_model, monkeypatch, tmp_path):
+    monkeypatch.setenv("CXX", "/bin/false")
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
+    result = sample(gdtool, "ball.png", "--model", tiny_model, "--compile", "-o", "out")
+    assert result.returncode == 5 and "--compile: PyTorch cannot compile" in result.stderr and not (tmp_path / "out").exists()
+
+
 def test_a_mask_file_says_what_the_subject_is(gdtool, tiny_model, tmp_path):
     rng = np.random.default_rng(0)
     write_png(tmp_path / "busy.png", rng.random((64, 64, 3)))

@@ -43,6 +43,25 @@ def test_train_writes_a_model_that_validates_and_then_skips(gdtool, spheres, tmp
     assert second.stdout == "model\n" and "up to date" in second.stderr
 
 
+def test_tensorboard_has_every_row_of_the_log(gdtool, spheres, tmp_path):
+    loader = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    run = gdtool("train", spheres, *TINY, "--steps", 4, "--held-out", 1, "--tensorboard", "-o", "model")
+    assert run.returncode == 0, run.stderr
+    found = loader.EventAccumulator(str(tmp_path / "model/tensorboard"))
+    found.Reload()
+    rows = list(csv.DictReader(open(tmp_path / "model/loss.csv")))
+    assert [(event.step, pytest.approx(event.value, rel=1e-4)) for event in found.Scalars("loss")] == [(int(row["step"]), float(row["loss"])) for row in rows]
+    assert [event.step for event in found.Images("validation")] == [4]
+
+
+def test_without_the_package_tensorboard_is_refused(gdtool, spheres, tmp_path, monkeypatch):
+    (tmp_path / "hidden/tensorboard").mkdir(parents=True)
+    (tmp_path / "hidden/tensorboard/__init__.py").write_text("raise ImportError('hidden')\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "hidden"))
+    run = gdtool("train", spheres, *TINY, "--steps", 2, "--tensorboard", "-o", "model")
+    assert run.returncode == 5 and "pip install 'gdtool[tensorboard]'" in run.stderr and not (tmp_path / "model").exists()
+
+
 def test_same_seed_same_weights(gdtool, spheres, tmp_path):
     for name in ("a", "b"):
         assert gdtool("train", spheres, *TINY, "--steps", 2, "--held-out", 0, "-o", name).returncode == 0

@@ -1,0 +1,42 @@
+"""A training's figures and validation pictures as TensorBoard's event files, for those who watch several runs at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gdtool.core.errors import ResourceError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+class Events:
+    """Event files in a folder, written from the first record on. Raises ResourceError without the package tensorboard."""
+
+    def __init__(self, folder: Path):
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            raise ResourceError("--tensorboard", "needs the package tensorboard", "pip install 'gdtool[tensorboard]', or leave it out") from None
+        self._open, self._folder, self._writer = SummaryWriter, folder, None
+
+    def _at(self, step: int):
+        if self._writer is None:  # a resumed run goes over the steps since its checkpoint again: those of before are purged
+            self._writer = self._open(str(self._folder), purge_step=step, flush_secs=10)
+        return self._writer
+
+    def scalars(self, record: dict[str, float | int]) -> None:
+        """The numbers of a step's record, under their names in loss.csv."""
+        step = int(record["step"])
+        for name, value in record.items():
+            if name != "step":
+                self._at(step).add_scalar(name, value, step)
+
+    def picture(self, step: int, grid: np.ndarray) -> None:
+        """A validation picture (h, w, 3) uint8."""
+        self._at(step).add_image("validation", grid, step, dataformats="HWC")
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
