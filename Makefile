@@ -22,10 +22,10 @@ test: venv
 stress: venv
 	$(BIN)/python -m pytest -m slow
 
-# What needs optional packages: Stable Diffusion's parts (diffusers, transformers; the tests make their own small weights), OpenUSD, Ray, OpenCV, TensorBoard.
+# What needs optional packages: Stable Diffusion's parts (diffusers, transformers; the tests make their own small weights), OpenUSD, Ray, onnxruntime, TensorBoard.
 extras-test: venv
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[hub,usd,ray,cutout,tensorboard]"
-	$(BIN)/python -m pytest tests/diffusion/test_pretrained.py tests/diffusion/test_wonder3d.py tests/diffusion/test_plan.py tests/stages/test_bake_usd.py tests/stages/test_ray.py tests/images/test_mask.py tests/stages/test_train.py
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[hub,usd,ray,matting,tensorboard]" onnx
+	$(BIN)/python -m pytest tests/diffusion/test_pretrained.py tests/diffusion/test_wonder3d.py tests/diffusion/test_plan.py tests/stages/test_bake_usd.py tests/stages/test_ray.py tests/images/test_matting.py tests/stages/test_train.py
 
 # Ten minutes of damaged files for every reader; what breaks one stays as a test.
 fuzz: venv
@@ -79,7 +79,7 @@ bench-sheets: venv
 bench-sample: venv
 	OMP_WAIT_POLICY=PASSIVE $(BIN)/python benchmarks/sample.py $(if $(SAMPLED),--model $(SAMPLED))
 
-# GrabCut on pictures laid over photographed environments (needs ".[cutout]"): two minutes.
+# GrabCut on pictures laid over photographed environments: two minutes.
 bench-cutout: venv
 	$(BIN)/python benchmarks/cutout.py ../shared/assets/images ../shared/assets/hdr
 

@@ -3,7 +3,7 @@
     python benchmarks/cutout.py ../shared/assets/images ../shared/assets/hdr -o docs/benchmarks
 
 Pictures with alpha (first folder) are laid over crops of photographed environments (second folder, three each), so the
-truth is known. Needs gdtool[cutout]; two minutes on two quiet cores. Written as it goes.
+truth is known. Two minutes on two quiet cores. Written as it goes.
 """
 
 from __future__ import annotations

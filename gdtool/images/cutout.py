@@ -10,13 +10,6 @@ INSETS = (0.02, 0.06)  # widths of the frame that is taken for background, as sh
 AGREEMENT = 0.85  # least overlap of what the two frames give; docs/benchmarks/cutout.md says how well it tells
 
 
-def available() -> bool:
-    """Whether OpenCV is installed (gdtool[cutout])."""
-    import importlib.util
-
-    return importlib.util.find_spec("cv2") is not None
-
-
 def cut_out(color: np.ndarray, subject: object = "image", cure: str = "") -> np.ndarray:
     """Boolean mask (h, w) of the one subject inside a picture, color (h, w, 3) sRGB in [0, 1].
 

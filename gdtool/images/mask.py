@@ -1,9 +1,10 @@
-"""Where the subject of a picture is: its alpha, a mask given with it, or its difference from a plain background."""
+"""Where the subject of a picture is: its alpha, a mask given with it, what a network says, or its difference from the background."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -11,17 +12,17 @@ from gdtool.core.errors import InputError
 from gdtool.images.color import rgba, srgb_from_linear, unit_range
 
 WORKING_SIDE = 384  # pixels; larger pictures are segmented at this size
-_CURE = "give a mask with --mask, or cut the subject out (RGBA)"
+_CURE = "give a mask with --mask, a network with --matting, or cut the subject out (RGBA)"
 
 
 def foreground(image: np.ndarray, mask: np.ndarray | None = None, subject: object = "image",
-               tell: Callable[[str], None] = lambda text: None) -> np.ndarray:
+               tell: Callable[[str], None] = lambda text: None, network: str | Path | None = None) -> np.ndarray:
     """Coverage (h, w) float32 in [0, 1] of a picture's subject.
 
     image (h, w, c) as read_image gives it; mask (h, w[, c]) of the same size, brighter or more opaque is subject.
-    In this order: the mask; the picture's own alpha, unless it is opaque everywhere; segmentation against a background
-    that is plain (a smooth gradient and soft shadows are); with OpenCV (gdtool[cutout]) GrabCut against one that is not.
-    That is a guess (one in four that it does not refuse lacks or has too much: docs/benchmarks/cutout.md), and `tell` is told.
+    In this order: the mask; the picture's own alpha, unless it is opaque everywhere; the network (matting.py), where one is
+    given; segmentation against a background that is plain (a smooth gradient and soft shadows are); GrabCut against one that
+    is not. That is a guess (one in four that it does not refuse lacks or has too much: docs/benchmarks/cutout.md), and `tell` is told.
     Raises InputError, naming `subject`, for a picture or mask without a subject, or a background that it blends into.
     """
     image = image.reshape(*image.shape[:2], -1)
@@ -38,6 +39,8 @@ def foreground(image: np.ndarray, mask: np.ndarray | None = None, subject: objec
             raise InputError(subject, "is transparent everywhere", "save it with a visible subject")
         if (alpha < 0.5).any():
             return alpha
+    if network is not None:
+        return _salient(image, subject, network)
     return _segmented(image, subject, tell)
 
 
@@ -48,14 +51,29 @@ def _mask_coverage(mask: np.ndarray) -> np.ndarray:
     return pixels[..., :1 if pixels.shape[2] < 3 else 3].mean(-1)
 
 
+def _encoded(image: np.ndarray) -> np.ndarray:
+    """sRGB (h, w, 3) in [0, 1] of a picture as read_image gives it."""
+    color = rgba(image)[..., :3]
+    return srgb_from_linear(np.clip(color, 0, 1)) if image.dtype.kind == "f" else color
+
+
+def _salient(image: np.ndarray, subject: object, network: str | Path) -> np.ndarray:
+    """Coverage by a trained network."""
+    from gdtool.images.matting import saliency
+
+    coverage = _without_specks(saliency(_encoded(image), network)).astype(np.float32)
+    if not 0.002 < (coverage > 0.5).mean() < 0.95:
+        raise InputError(subject, f"shows {network} no subject that stands off its background", _CURE)
+    return coverage
+
+
 def _segmented(image: np.ndarray, subject: object, tell: Callable[[str], None]) -> np.ndarray:
     """Coverage by the difference from a background model fitted to the border, its edge by random walks (Grady 2006)."""
     from skimage.color import rgb2lab
     from skimage.segmentation import random_walker
     from skimage.transform import resize
 
-    color = rgba(image)[..., :3]
-    color = srgb_from_linear(np.clip(color, 0, 1)) if image.dtype.kind == "f" else color
+    color = _encoded(image)
     height, width = color.shape[:2]
     scale = min(1.0, WORKING_SIDE / max(height, width))
     small = (max(8, round(height * scale)), max(8, round(width * scale)))
@@ -100,11 +118,9 @@ def _labels(lab: np.ndarray, color: np.ndarray, subject: object, tell: Callable[
 def _labels_without_plain_background(color: np.ndarray, subject: object) -> np.ndarray:
     from scipy import ndimage
 
-    from gdtool.images import cutout
+    from gdtool.images.cutout import cut_out
 
-    if not cutout.available():
-        raise InputError(subject, "has a background that is not plain", f"{_CURE}, or pip install 'gdtool[cutout]'")
-    inside = cutout.cut_out(color, subject, _CURE)
+    inside = cut_out(color, subject, _CURE)
     labels = np.zeros(inside.shape, np.int32)
     labels[ndimage.binary_erosion(inside, iterations=2, border_value=1)] = 1
     labels[~ndimage.binary_dilation(inside, iterations=2)] = 2

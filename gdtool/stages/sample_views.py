@@ -1,7 +1,7 @@
 """Make six views of an object, in six domains, from one picture of it.
 
-Takes an image with alpha, or one on a plain background that is then cut out (on a busy one with gdtool[cutout]), or any
-image with --mask. The subject is cropped and centred as in training. Writes color, normal, depth, albedo, roughness,
+Takes an image with alpha, or one that is then cut out of its background, for sure where that is plain and as a guess where it
+is busy, or any image with --mask or --matting. The subject is cropped and centred as in training. Writes color, normal, depth, albedo, roughness,
 metallic and masks of the default rig for reconstruct, at the model's own resolution, and the picture as it was framed at
 its own, for bake. What the picture shows and the outlines of the other views leave no room for is drawn into them. The
 albedo of its own view gets the picture's contrast, as far as that is paint and not light. What the model takes for rather
@@ -36,6 +36,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     seed: Annotated[int, Meta(ge=0, description="Seed of the noise, the same for every object whatever the order.")] = 0
     domains: Annotated[tuple[str, ...], Meta(description="Domains to write; color is made in any case, being the primary.")] = EVERY
     mask: file_option("Image that is bright where the subject is.") = None
+    matting: file_option("ONNX file of a network that cuts the subject out of any background: u2net.onnx, u2netp.onnx or silueta.onnx (needs gdtool[matting]).") = None
     crop: Annotated[bool, Meta(description="Centre the subject and scale it as in training.")] = True
     precision: Annotated[Literal["float32", "bfloat16"], Meta(description="Arithmetic of the networks.")] = "float32"
     compile: Annotated[bool, Meta(description="Compile the network first (torch.compile, needs a C++ compiler): two minutes the first time, ten seconds afterwards, then a third less time a step.")] = False
@@ -143,7 +144,7 @@ def _condition(inputs: Inputs, options: Options, config, out: Output):
     given = read_image(Path(options.mask)) if options.mask is not None else None
     if given is not None and given.shape[:2] != image.shape[:2]:
         raise InputError(options.mask, f"is {given.shape[1]}x{given.shape[0]}, the image {image.shape[1]}x{image.shape[0]}")
-    alpha = foreground(image, given, inputs.main, out.warn)
+    alpha = foreground(image, given, inputs.main, out.warn, options.matting)
     if not (alpha > 0.5).any():
         raise InputError(inputs.main, "shows no subject: its mask is empty", "give one with --mask")
     edge = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from gdtool.core.errors import InputError
-from gdtool.images import cutout
 from gdtool.images.mask import foreground
 
 
@@ -94,7 +93,6 @@ def busy_scene(size: int = 320, contrast: float = 1.0):
 
 
 def test_a_busy_background_is_cut_away_with_a_word_or_refused():
-    pytest.importorskip("cv2")
     image, truth = busy_scene()
     told = []
     mask = foreground(image, None, "leaf.png", told.append)
@@ -106,9 +104,3 @@ def test_a_busy_background_is_cut_away_with_a_word_or_refused():
     hidden, _ = busy_scene(contrast=0.0)
     with pytest.raises(InputError, match="do not tell the subject from it"):
         foreground(hidden, subject="leaf.png")
-
-
-def test_without_opencv_a_busy_background_names_the_package(monkeypatch):
-    monkeypatch.setattr(cutout, "available", lambda: False)
-    with pytest.raises(InputError, match=r"not plain; .*gdtool\[cutout\]"):
-        foreground(busy_scene()[0], subject="leaf.png")
