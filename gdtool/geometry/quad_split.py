@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 
 from gdtool.core.child import ChildFailed, call
-from gdtool.geometry.distance import closest_points, sample_surface
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_shape import subdivide
 from gdtool.geometry.repair import compact, components, edges_of, is_manifold, topology
@@ -16,8 +13,6 @@ from gdtool.geometry.simplify import simplify
 _QUADS_PER_TRIANGLE = 2.25  # of pair_and_split, where most triangles find a partner
 _EVEN_COUNT = 0.03  # even_triangles come so near to the number asked for
 _TRIES = 3
-_SHAPELESS, _SAMPLES = 0.1, 5000  # edge lengths that the surface is from the quads on average where they do not stand for it; points of it
-_MORE, _MOST_MORE = 1.25, 2.5  # quads in units of those before, and of those asked for
 _APART = 1e-6  # of the size, between vertices that coincide
 
 
@@ -28,15 +23,14 @@ def split_count(faces: np.ndarray, quads: int) -> int:
 
 def split_to_quads(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float, seconds: float,
                    memory_mb: int) -> tuple[np.ndarray, np.ndarray]:
-    """Quads (split_count(faces, quads), 4) of any triangle mesh; no piece is lost, closed and manifold where the triangles are. More, up
-    to _MOST_MORE times as many, where so few cannot stand for it: a surface of hundreds of handles has no shape without them.
+    """Quads (split_count(faces, quads), 4) of any triangle mesh; no piece is lost, closed and manifold where the triangles are.
 
     vertices (v, 3) in a unit box, faces (f, 3). Creases sharper than crease_degrees are kept; seconds and memory_mb: limits
     of each run in a child, whose failure costs evenness alone.
     """
     quads = split_count(faces, quads)
     even = _even(vertices, faces, quads, crease_degrees, seconds, memory_mb)
-    return pair_and_split(*even, quads) if even is not None else _by_collapse_enough(vertices, faces, quads, seconds)
+    return pair_and_split(*even, quads) if even is not None else _by_collapse(vertices, faces, quads, seconds)
 
 
 def _even(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float, seconds: float,
@@ -77,19 +71,6 @@ def even_triangles(vertices: np.ndarray, faces: np.ndarray, triangles: int, crea
             break  # what one length tears, another tears as well
         edge *= (len(found) / triangles) ** 0.7  # along creases they follow the edge itself
     return vertices, found
-
-
-def _by_collapse_enough(vertices: np.ndarray, faces: np.ndarray, quads: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """_by_collapse() of as few more quads as leave the surface where it is."""
-    points = sample_surface(vertices, faces, _SAMPLES, np.random.default_rng(0))[0]
-    near = _SHAPELESS * (face_normals(vertices, faces)[1].sum() / quads) ** 0.5
-    wanted, until = quads, time.monotonic() + seconds
-    while True:
-        out, found = _by_collapse(vertices, faces, wanted, seconds)
-        apart = closest_points(points, out, np.concatenate([found[:, :3], found[:, [0, 2, 3]]]))[0].mean()
-        if apart <= near or wanted * _MORE > _MOST_MORE * quads or time.monotonic() > until:
-            return out, found
-        wanted = int(wanted * _MORE)
 
 
 def _by_collapse(vertices: np.ndarray, faces: np.ndarray, quads: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:

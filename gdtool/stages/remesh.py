@@ -152,7 +152,7 @@ def _decimated(vertices, faces, options: Options, out: Output):
     if options.symmetry != "none":
         out.skip("symmetry", "--triangles decimates the whole")
     with out.step("simplify"):
-        vertices, faces, _, report = simplify(vertices, faces, options.triangles, seconds=options.seconds)
+        vertices, faces, _, report = simplify(vertices, faces, options.triangles, seconds=options.seconds, near=True)
     if "failed" in report:
         out.warn(f"simplify: {report['failed']}")
     record = Record(engine=report["method"], figures={"simplify_error": report["error"]})
@@ -196,4 +196,4 @@ def _way(vertices, faces, options: Options, out: Output):
     return partial(remesh_mirrored, axis=axis), figures
 
 
-STAGE = Stage(name="remesh", version=17, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)
+STAGE = Stage(name="remesh", version=18, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)

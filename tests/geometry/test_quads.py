@@ -140,27 +140,6 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
     assert asked < len(found) < 1.5 * asked < 1.8 * len(faces)
 
 
-def test_the_fallback_takes_more_quads_where_so_few_stand_for_nothing(monkeypatch):
-    """A collapse to the last triangles that the handles of a surface leave draws them across it."""
-    vertices, faces = sphere(40)
-    asked, collapse = [], quad_split._by_collapse
-
-    def shapeless(vertices, faces, wanted, seconds):
-        asked.append(wanted)
-        out, found = collapse(vertices, faces, wanted, seconds)
-        return (0.3 * out if wanted < 900 else out), found
-
-    monkeypatch.setattr(quad_split, "_by_collapse", shapeless)
-    monkeypatch.setattr(quad_split, "_even", lambda *_: None)
-    out, found = quad_split.split_to_quads(vertices, faces, 600, 30.0, 60.0, 8000)
-    assert asked == [600, 750, 937] and abs(len(found) / 937 - 1) < 0.05
-    assert distance_figures(out, triangulated(found)[0], vertices, faces, 2000)["hausdorff"] < 0.03
-    asked.clear()
-    monkeypatch.setattr(quad_split, "_SHAPELESS", -1.0)
-    quad_split.split_to_quads(vertices, faces, 600, 30.0, 60.0, 8000)
-    assert asked[-1] <= 2.5 * 600 < 1.25 * asked[-1]  # and no end of them
-
-
 def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
     """Pins with few triangles around: what bends too much stays single, and there are fewer triangles for it."""
     vertices, faces = joined(*((pin[0] + (0.3 * k, 0, 0), pin[1]) for k, pin in enumerate([rod(24)] * 8)))

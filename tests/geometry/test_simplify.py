@@ -6,7 +6,7 @@ import pytest
 from gdtool.core.child import ChildFailed
 from gdtool.core.errors import InputError
 from gdtool.geometry import repair, simplify
-from tests.geometry.solids import assembly, cube, joined, plane, sphere, volume
+from tests.geometry.solids import assembly, bored_box, cube, joined, plane, quad_cube, sphere, volume
 
 
 def test_sphere_keeps_shape_and_topology():
@@ -77,6 +77,26 @@ def test_slivers_that_the_quick_collapse_does_not_touch():
     # Without the slow way what there is is given back, and its error.
     report = simplify.simplify(vertices, faces, 900, thorough=False)[3]
     assert report["method"] == "quadric collapse" and report["faces"] > 5000 and report["error"] > 0.05
+
+
+def test_flat_parts_go_first_however_they_lie():
+    """Sides cut finely, turned so that rounding bends them: the quick collapse comes to its end, and the cube stays one."""
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    vertices, quads = quad_cube(6)
+    vertices, faces = vertices @ (turn * np.linalg.det(turn)), np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])
+    out, found = repair.compact(*simplify.collapse(simplify.uneven(vertices, faces), faces, 200, 5.0))
+    assert len(found) == 200 and repair.is_watertight(found) and repair.is_manifold(found)
+    assert simplify.deviation(vertices, faces, out, found) < 1e-3 and volume(out, found) == pytest.approx(1, abs=1e-4)
+    assert len(simplify.collapse(vertices, faces, 200, 5.0)[1]) > 5000
+    # What is not flat stays where it is, and what is flat along an axis, which rounding does not bend.
+    for vertices, faces in (sphere(40), bored_box(40)):
+        assert simplify.uneven(vertices, faces) is vertices
+
+
+def test_near_keeps_nearer_with_as_many_triangles():
+    vertices, faces = bored_box(64)
+    even, near = (simplify.simplify(vertices, faces, 1000, near=near)[3] for near in (False, True))
+    assert even["faces"] == near["faces"] == 1000 and near["error"] < 0.5 * even["error"]
 
 
 def test_a_quick_result_that_is_far_off_is_compared_with_the_slow_one(monkeypatch):
