@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,7 +17,7 @@ from gdtool.texture.unwrap_flatten import singular_values, stretch
 from gdtool.texture.unwrap_lay import flatten_all
 from gdtool.texture.unwrap_pack import WELL_PACKED, best_packed, pack
 
-_MORE_CHARTS, _MORE_OF_RINGS, _MOST_CUT = 12, 23, 40  # charts that cutting for packing adds, where it cuts rings, and ends with, at most
+_MORE_CHARTS, _MOST_CUT = (5, 9, 13, 18, 23), 40  # charts that cutting for packing adds, about, and ends with, at most
 # Shares of the time by which charts are found, shaped, projected, a child that has not ended is given up, and charts are packed.
 _SHARES = 0.2, 0.6, 0.7, 0.8, 0.9
 _SHORTEST = 0.05  # seconds of a child
@@ -67,7 +68,9 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
         flat, more = flatten_all(unit, faces, label, request.good_stretch, request.max_stretch, by=(shaped_by, late))
         failed.append(f"flattening: {failure}; charts by the side they look at")
     failed += more
-    flat, ways, skipped = _cut_to_pack(Adjacency(unit, faces), flat, request.padding / request.size, packed_by)
+    ways, skipped = [], []
+    if time.monotonic() < packed_by:
+        flat, ways, skipped = _cut_to_pack(Adjacency(unit, faces), flat, request.padding / request.size, packed_by)
     places, _ = pack([(uv, triangles) for _, _, uv, triangles in flat], request.padding / request.size, ways, packed_by)
     face_uvs = np.full(faces.shape, -1, np.int64)
     chart = np.zeros(len(faces), np.int64)
@@ -81,20 +84,23 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
 
 
 def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float, until: float) -> tuple[list, list, list[tuple[str, str, float]]]:
-    """The charts, cut further where that fills the square better, rings into arcs where it stays badly filled; the ways to pack them
-    that were found on the way; and what was skipped."""
-    best, share, seen, ways, start = flat, 0.0, {len(flat)}, [], time.monotonic()
-    for more, rings in ((_MORE_CHARTS, False), (_MORE_OF_RINGS, True)):
-        if share > WELL_PACKED:
-            return best, ways, [("cutting rings for packing", f"the charts fill {share:.0%} of the square as they are", time.monotonic() - start)]
-        if time.monotonic() > until:
-            break
-        other = cut_to_pack(adjacency, flat, min(len(flat) + more, _MOST_CUT), rings)
-        if len(other) not in seen:
-            seen.add(len(other))
-            chosen, share, ways = best_packed([[(uv, triangles) for _, _, uv, triangles in one] for one in (best, other)], gap)
-            best = (best, other)[chosen]
-    return best, ways, []
+    """The charts, cut further where that fills the square better; orders to pack them in that were found on the way; what was skipped."""
+    counts = [len(flat) + more for more in _MORE_CHARTS if len(flat) + more <= _MOST_CUT]
+    tried, start = [flat], time.monotonic()
+
+    def variants() -> Iterator[list]:
+        yield [(uv, triangles) for _, _, uv, triangles in flat]
+        for charts in cut_to_pack(adjacency, flat, counts):
+            if time.monotonic() > until:
+                return
+            tried.append(charts)
+            yield [(uv, triangles) for _, _, uv, triangles in charts]
+
+    chosen, share, ways = best_packed(variants(), gap)
+    skipped = []
+    if share > WELL_PACKED and len(tried) <= len(counts):
+        skipped = [("cutting further for packing", f"the charts fill {share:.0%} of the square", time.monotonic() - start)]
+    return tried[chosen], ways, skipped
 
 
 def figures(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, size: int = 1024) -> dict[str, float | int]:

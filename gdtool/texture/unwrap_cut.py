@@ -4,57 +4,78 @@ from __future__ import annotations
 
 import heapq
 import itertools
+from collections.abc import Iterator
+from functools import cached_property
 
 import numpy as np
 
 from gdtool.folders.mesh import triangulated
-from gdtool.geometry.repair import edges_of
 from gdtool.texture.unwrap_charts import Adjacency
-from gdtool.texture.unwrap_pack import upright_box
 
 _ANGLES = np.radians(np.arange(0, 180, 15.0))
 _OFFSETS = np.linspace(0.06, 0.94, 23)
-_WELL_FILLED = 0.62  # of its smallest upright rectangle: such a chart stays whole
-_WORTH = 0.15  # of the rectangle, that a cut has to save
-_WORTH_OF_A_RING = -0.05  # halves of a ring save nothing, their halves do
+_WORTH = 0.003  # of all area, that rectangles around the charts have to lose for each chart that a cut adds
 _TRIED = 16  # lines, best first
 _SEEN = 1000  # faces of a chart that its rectangles are taken around
 _SMALLEST = 0.004  # of all area, that a part has to have
 
 
-def cut_to_pack(adjacency: Adjacency, charts: list, most: int, rings: bool) -> list:
-    """Charts (faces_idx, corners, uv, triangles) with the ill-shaped ones cut along straight lines of their plane, as far
-    as the quads allow; at most `most` in all. Texture coordinates stay: parts of what is flat are flat.
+def cut_to_pack(adjacency: Adjacency, charts: list, counts: list[int]) -> Iterator[list]:
+    """Charts (faces_idx, corners, uv, triangles) with the ill-shaped ones cut along straight lines of their plane, as far as the
+    quads allow: for each of the rising counts a list of about so many charts, until no cut is worth it.
 
-    rings: cut those with a hole as well, which makes many charts of one.
+    First come the cuts for which the smallest rectangles around the charts lose most, for each chart added. Texture coordinates
+    stay: parts of what is flat are flat.
     """
-    smallest = _SMALLEST * adjacency.area.sum()
-    out: list[tuple] = []
-    queue: list[tuple[float, int, tuple]] = []  # the one whose rectangle is emptiest first
-    number = itertools.count()  # and of equal ones the earlier
+    total = float(adjacency.area.sum())
+    number = itertools.count()  # of equal ones the earlier
+    whole, queue = [], []
 
-    def add(chart: tuple) -> None:
-        uv, triangles = upright_box(chart[2]), chart[3]
-        a, b = uv[triangles[:, 1]] - uv[triangles[:, 0]], uv[triangles[:, 2]] - uv[triangles[:, 0]]
-        covered = float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()) / 2
-        heapq.heappush(queue, (covered - float(np.prod(np.ptp(uv, 0))), next(number), chart))
+    def add(piece: _Piece) -> None:
+        if piece.rate < _WORTH * total:
+            whole.append(piece.chart)
+        else:
+            heapq.heappush(queue, (-piece.rate, next(number), piece))
 
     for chart in charts:
-        add(chart)
-    while queue:
-        _, _, chart = heapq.heappop(queue)
-        halves = _halves(adjacency, chart, smallest, rings) if len(out) + len(queue) + 2 <= most else None
-        if halves is None:
-            out.append(chart)
-        else:
-            for half in halves:
-                add(part_of(chart, half))
-    return out
+        add(_Piece(adjacency, chart, _SMALLEST * total))
+    for count in counts:
+        changed = False
+        while queue and len(whole) + len(queue) < count:
+            for part in heapq.heappop(queue)[2].cut[1]:
+                add(part)
+            changed = True
+        if changed:
+            yield whole + [piece.chart for _, _, piece in sorted(queue, key=lambda one: one[1])]
 
 
-def _halves(adjacency: Adjacency, chart: tuple, smallest: float, rings: bool) -> list[np.ndarray] | None:
-    """Two masks (k,) of the chart's faces, each connected, whose rectangles are smallest together; None to leave it whole."""
-    faces_idx, corners, uv, triangles = chart
+class _Piece:
+    """A chart, and how it would be cut."""
+
+    def __init__(self, adjacency: Adjacency, chart: tuple, smallest: float):
+        self._adjacency, self.chart, self._smallest = adjacency, chart, smallest
+
+    @cached_property
+    def cut(self) -> tuple[float, list[_Piece]] | None:
+        """What the rectangles around its parts have less than its own, and these, two or three; None where no cut will do."""
+        found = _halves(self._adjacency, self.chart, self._smallest)
+        return found and (found[0], [_Piece(self._adjacency, part_of(self.chart, half), self._smallest) for half in found[1]])
+
+    @cached_property
+    def rate(self) -> float:
+        """The area that rectangles lose for each chart that is added, by this cut or by it and those of its parts: a ring's halves
+        save nothing, their halves do."""
+        if self.cut is None:
+            return -np.inf
+        saved, added = self.cut[0], len(self.cut[1]) - 1
+        more = [part.cut for part in self.cut[1] if part.cut is not None and part.cut[0] > 0]
+        return max(saved / added, (saved + sum(one for one, _ in more)) / (added + sum(len(parts) - 1 for _, parts in more)))
+
+
+def _halves(adjacency: Adjacency, chart: tuple, smallest: float) -> tuple[float, list[np.ndarray]] | None:
+    """The area that rectangles lose by a cut of the chart, and masks (k,) of its faces, two or three, each connected; None where
+    none will do. Of straight lines the one is taken for which the rectangles are smallest."""
+    faces_idx, corners, uv, _ = chart
     area = adjacency.area[faces_idx]
     if area.sum() < 2 * smallest:
         return None
@@ -64,8 +85,6 @@ def _halves(adjacency: Adjacency, chart: tuple, smallest: float, rings: bool) ->
     across = np.stack([centre @ (np.cos(a), np.sin(a)) for a in _ANGLES])
     sample = across[:, :: -(-len(area) // _SEEN)]
     whole = float(_rectangles(np.ptp(sample, 1) + rim))
-    if area.sum() > _WELL_FILLED * whole:
-        return None
     found = []
     for row, seen in zip(across, sample, strict=True):
         line = row.min() + _OFFSETS * np.ptp(row)
@@ -77,17 +96,29 @@ def _halves(adjacency: Adjacency, chart: tuple, smallest: float, rings: bool) ->
         cost = _rectangles(before[:, count[good] - 1] + rim) + _rectangles(behind[:, count[good]] + rim)
         found += [(float(c), row, place) for c, place in zip(cost, line[good], strict=True)]
     found.sort(key=lambda one: one[0])
-    edges = edges_of(triangles)
-    ring = rings and len(uv) - len(edges.ends) + len(triangles) < 1
+    _, pairs = adjacency.within(faces_idx)
     for cost, row, place in found[:_TRIED]:
-        if cost > (1 - (_WORTH_OF_A_RING if ring else _WORTH)) * whole:
-            return None
-        half = row < place
-        parts = [part for side in (half, ~half) for part in connected(adjacency, faces_idx, side)]
+        number = _pieces(pairs, row < place, area, smallest)
         # A line across a ring leaves two arcs on one side: three parts are well, crumbs are not.
-        if len(parts) <= 3 and min(area[part].sum() for part in parts) >= smallest:
-            return parts
+        if 1 < number.max() + 1 <= 3 and np.bincount(number, area).min() >= smallest:
+            return whole - cost, [number == n for n in range(number.max() + 1)]
     return None
+
+
+def _pieces(pairs: np.ndarray, half: np.ndarray, area: np.ndarray, smallest: float) -> np.ndarray:
+    """(k,) number, from 0 on, of the connected part of its side, half (k,) bool, that each face is in; pairs (r, 2) of faces share
+    an edge. Parts below `smallest`, which a line leaves along a rim that is not straight, change sides."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    for crumbs_may_change in (True, False):
+        together = pairs[half[pairs[:, 0]] == half[pairs[:, 1]]]
+        number = connected_components(coo_matrix((np.ones(len(together)), (together[:, 0], together[:, 1])), (len(half),) * 2), False)[1]
+        crumb = np.bincount(number, area) < smallest
+        if not crumbs_may_change or not crumb.any():
+            break
+        half = half ^ crumb[number]
+    return number
 
 
 def _spans(values: np.ndarray) -> np.ndarray:
