@@ -1,7 +1,10 @@
-"""Whether a framed picture is like those a model was trained on: a few plain figures of it against their range there.
+"""Whether a model knows what a framed picture shows: plain figures of the picture against their range over the training
+pictures, and figures of what the model made of it against what is usual.
 
 The image encoder's own features do not tell (photographs of anything lie among the training objects, whose own tail reaches
-far further), so the figures are ones that a user can read and act upon.
+far further), so the picture's figures are ones that a user can read and act upon. They seldom tell either: how unsure a model
+is shows in its result (docs/benchmarks/model_doubt.md). One step of sampling answers with the middle of all outlines it holds
+possible, and that is a blur; and it may lose parts, whose rows the picture fills and the other views do not.
 """
 
 from __future__ import annotations
@@ -14,6 +17,9 @@ import numpy as np
 FILE = "pictures.json"  # in a model folder
 TAIL = 0.005  # share of the training pictures left out at each end
 MARGIN = 0.1  # of the range, added at each end
+# Figures of a result (result_figures) and what one of them, and the usual most of it, says to the user.
+DOUBTS = {"outline_blur": "their outlines are blurred over {:.1f} pixels, {:.1f} at most is usual",
+          "row_mismatch": "they begin or end at another height than the picture, in {:.1%} of the frame, {:.1%} at most is usual"}
 
 
 class PictureRange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -62,6 +68,41 @@ def unfamiliar(rgba: np.ndarray, known: dict[str, PictureRange]) -> list[str]:
         if not low - margin <= value <= high + margin:
             found.append(f"{name} is {value:.3g}, in training {low:.3g} to {high:.3g}")
     return found
+
+
+def result_figures(coverage: np.ndarray, front: int | None = None, alpha: np.ndarray | None = None) -> dict[str, float]:
+    """How unsure a model was of the views that the picture does not show: the figures in DOUBTS.
+
+    coverage (k, h, w) in [0, 1], as the model made it; front: the view whose silhouette the picture's coverage alpha (h, w) is,
+    without it all views count, and only outline_blur is told. outline_blur: width in pixels of the ramp from 0 to 1 across the
+    outlines, over which m (1 - m) adds up to a sixth of the width; their length is counted along rows and columns.
+    row_mismatch: views side by side, upright and orthographic, fill the same rows; how far each row's greatest coverage is
+    from that of the picture's row, mean over all rows of the frame.
+    """
+    unseen = np.asarray([view for k, view in enumerate(coverage) if k != front], np.float64)
+    inside = unseen > 0.5
+    length = sum(int(np.diff(inside, axis=a).sum()) for a in (1, 2))
+    out = {"outline_blur": float(6 * (unseen * (1 - unseen)).sum() / max(length, 1))}
+    if front is not None and alpha is not None:
+        out["row_mismatch"] = float(np.abs(unseen.max(2) - alpha.max(1)).mean())
+    return out
+
+
+def limits(results: list[dict[str, float]], alarms: float) -> dict[str, PictureRange]:
+    """Ranges of a result's figures, all up to one quantile: the lowest at which at most the share `alarms` of these results
+    leaves one of them."""
+    columns = np.array([[one[name] for name in DOUBTS] for one in results])  # (n, figures)
+    for quantile in np.linspace(1 - alarms, 1, 101):
+        high = np.quantile(columns, quantile, axis=0)
+        if (columns > high).any(1).mean() <= alarms:
+            break
+    return {name: PictureRange(0.0, float(value)) for name, value in zip(DOUBTS, high, strict=True)}
+
+
+def doubts(result: dict[str, float], known: dict[str, PictureRange]) -> list[str]:
+    """What of a result's figures lies above the usual, in words; empty where nothing does."""
+    return [words.format(result[name], known[name].high) for name, words in DOUBTS.items()
+            if name in result and name in known and result[name] > known[name].high]
 
 
 def write_ranges(path: Path, known: dict[str, PictureRange]) -> None:

@@ -7,6 +7,7 @@ import torch
 
 from gdtool.cameras import Camera, project
 from gdtool.diffusion.encoding import coverage, decode
+from gdtool.diffusion.familiarity import result_figures
 from gdtool.diffusion.outline import draw_part, grown_masks, lost_part
 from gdtool.diffusion.paint import repainted
 from gdtool.fields.sights import backproject
@@ -80,8 +81,9 @@ def _begin(mask: np.ndarray) -> np.ndarray:
 def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], background: float, domains: tuple[str, ...],
                       picture_alpha: np.ndarray | None = None) -> tuple[Views, dict[str, float]]:
     """Encoded images (k, 3, h, w) of one object -> Views of the asked domains with one mask per view, shared by all, and a
-    report: drawn_share of the picture that the other views left no room for (outline.py), and they show now; and
-    painted_share of it whose albedo was given the picture's contrast (paint.py).
+    report: drawn_share of the picture that the other views left no room for (outline.py), and they show now;
+    painted_share of it whose albedo was given the picture's contrast (paint.py); and how unsure the model was of the other
+    views, outline_blur in pixels and row_mismatch (familiarity.result_figures).
 
     picture_alpha (h, w): coverage of the framed picture. It is the front view's silhouette, and mirrored the back's
     (both orthographic), so neither is guessed; the front color, nearly the picture itself, is divided by it.
@@ -121,7 +123,7 @@ def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], ba
             value = within_silhouettes(value, mask, cameras)
         inside = mask > 0
         out[domain] = np.where(inside[..., None] if value.ndim == 4 else inside, value, 0).astype(np.float32)
-    report = {"drawn_share": 0.0, "painted_share": 0.0}
+    report = {"drawn_share": 0.0, "painted_share": 0.0} | result_figures(soft.numpy(), front, picture_alpha)
     if front is not None and "albedo" in out and "color" in values:
         color = linear_from_srgb(np.moveaxis(values["color"][front].numpy(), 0, -1))
         normal, metallic = (out[domain][front] if domain in out else None for domain in ("normal", "metallic"))

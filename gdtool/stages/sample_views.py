@@ -5,8 +5,9 @@ is busy, or any image with --mask or --matting. The subject is cropped and centr
 metallic and masks of the default rig for reconstruct, at the model's own resolution, and the picture as it was framed at
 its own, for bake. What the picture shows and the outlines of the other views leave no room for is drawn into them. The
 albedo of its own view gets the picture's contrast, as far as that is paint and not light. What the model takes for rather
-metal than not is metal. Use --no-crop when the picture is framed like the rig's front view
-already (an orthographic render of a normalised object).
+metal than not is metal. It warns of pictures unlike the model's training, and where the result shows that the model is
+unsure of it. Use --no-crop when the picture is framed like the rig's front view already (an orthographic render of a
+normalised object).
 
 Example:
   gdtool sample-views cat.png --seed 7
@@ -49,7 +50,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.cameras import rig
     from gdtool.diffusion.data import to_tensor_condition
     from gdtool.diffusion.encoding import BACKGROUND
-    from gdtool.diffusion.familiarity import read_ranges, unfamiliar
+    from gdtool.diffusion.familiarity import doubts, read_ranges, unfamiliar
     from gdtool.diffusion import wonder3d
     from gdtool.diffusion.result import views_from_images
     from gdtool.diffusion.weights import load_model
@@ -73,7 +74,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         condition, picture = _condition(inputs, options, config, out)
     with out.step("sample"):
         rgba = to_tensor_condition(condition)
-        strange = unfamiliar(rgba[0].numpy(), read_ranges(folder))
+        known = read_ranges(folder)
+        strange = unfamiliar(rgba[0].numpy(), known)
         if strange:
             out.warn(f"{inputs.name}: unlike the pictures this model was trained on, expect less of it: {'; '.join(strange)}")
         rgba = rgba.to(out.device)
@@ -89,6 +91,14 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     cameras = {camera.name: camera for camera in rig("wonder3d" if config.convention == "wonder3d" else "six", config.image_size)}
     views, report = views_from_images({d: x[0].cpu() for d, x in images.items()}, [cameras[name] for name in config.views],
                               BACKGROUND[config.backgrounds[0]], domains, condition[..., 3])
+    # What is usual was measured as the model is sampled when nothing is asked for.
+    if options.steps in (None, config.sampling_steps) and options.guidance == 1 and options.mirror and domains == config.domains:
+        unsure = doubts(report, known)
+        if unsure:
+            out.warn(f"{inputs.name}: the model is unsure of the views that the picture does not show ({'; '.join(unsure)}): look at contact_sheet.png "
+                     "before going on, and try a picture straight from the front, or another --model")
+    else:
+        out.skip("the model's doubt of its result", "what is usual is known of the model's own steps, without guidance, in all domains")
     with out.step("write"):
         # what the model was shown, after cutting out and framing
         write_png(out.path("condition/000.png"), srgb_from_linear_rgba(condition, srgb_from_linear))
@@ -163,6 +173,6 @@ def _condition(inputs: Inputs, options: Options, config, out: Output):
     return condition, picture
 
 
-STAGE = Stage(name="sample-views", version=11, reads=("image-file",), writes="views", Options=Options, run=run,
+STAGE = Stage(name="sample-views", version=12, reads=("image-file",), writes="views", Options=Options, run=run,
               second_inputs={"model": SecondInput("model", search=False, default="models/default", foreign=True,
                                               help="Model folder of gdtool train, or Wonder3D v1 as a folder or hub id; the bundled model without it.")})

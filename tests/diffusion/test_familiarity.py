@@ -1,10 +1,11 @@
-"""Pictures unlike the training's are told, with the figure that is outside; training's own are not."""
+"""Pictures unlike the training's are told, and results that a model was unsure of, with the figure that is outside; training's own are not."""
 
 import numpy as np
 import pytest
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.familiarity import FILE, picture_figures, ranges, read_ranges, unfamiliar, write_ranges
+from gdtool.diffusion.familiarity import (DOUBTS, FILE, PictureRange, doubts, limits, picture_figures, ranges, read_ranges,
+                                          result_figures, unfamiliar, write_ranges)
 
 
 def box(width, height, brightness, noise=0.02, size=32, seed=0):
@@ -41,3 +42,47 @@ def test_ranges_are_kept_in_the_model_folder_and_may_be_absent(known, tmp_path):
     (tmp_path / FILE).write_text('{"mean brightness": {"low": "a"}}')
     with pytest.raises(InputError, match=FILE):
         read_ranges(tmp_path)
+
+
+def ramped(width, size=64, top=0):
+    """Coverage (size, size) of a bar from column 16 to 48, from the row top on, its sides ramps so many pixels wide."""
+    column = np.arange(size) + 0.5
+    row = np.clip(0.5 + (16 - np.abs(column - size / 2)) / width, 0, 1)
+    return np.where(np.arange(size)[:, None] >= top, row, 0.0).astype(np.float32)
+
+
+@pytest.mark.parametrize("width", [2, 6, 12])
+def test_the_blur_of_outlines_is_the_width_of_their_ramps(width):
+    assert result_figures(ramped(width)[None].repeat(3, 0))["outline_blur"] == pytest.approx(width, rel=0.15)
+
+
+def test_the_picture_s_own_view_is_no_doubt():
+    views = np.stack([ramped(12), ramped(2), ramped(2)])
+    shown = result_figures(views, 0, ramped(1))
+    assert shown["outline_blur"] == pytest.approx(result_figures(views[1:])["outline_blur"]) and shown["row_mismatch"] == pytest.approx(0, abs=1e-6)
+
+
+def test_rows_that_the_other_views_leave_empty_are_counted():
+    views = np.stack([ramped(1), ramped(1), ramped(1, top=16)])  # a quarter of the rows, in one of two views
+    assert result_figures(views, 0, ramped(1))["row_mismatch"] == pytest.approx(0.125, abs=1e-6)
+    assert "row_mismatch" not in result_figures(views)  # no picture, no rows
+
+
+def test_an_empty_result_has_figures():
+    assert result_figures(np.zeros((6, 8, 8), np.float32), 0, ramped(1, 8)) == {"outline_blur": 0.0, "row_mismatch": 1.0}
+
+
+def test_limits_let_the_asked_share_through():
+    rng = np.random.default_rng(0)
+    results = [dict(zip(DOUBTS, rng.exponential(size=len(DOUBTS)), strict=True)) for _ in range(400)]
+    known = limits(results, 0.05)
+    told = [doubts(one, known) for one in results]
+    assert 0.045 < np.mean([bool(words) for words in told]) <= 0.05
+    assert min(np.mean([one[name] > known[name].high for one in results]) for name in DOUBTS) > 0.02  # each has its part
+
+
+def test_a_doubt_is_told_with_its_figure_and_the_usual():
+    known = {"outline_blur": PictureRange(0.0, 9.0), "row_mismatch": PictureRange(0.0, 0.05)}
+    assert doubts({"outline_blur": 9.0, "row_mismatch": 0.05}, known) == []
+    assert doubts({"outline_blur": 12.34, "row_mismatch": 0.01}, known) == ["their outlines are blurred over 12.3 pixels, 9.0 at most is usual"]
+    assert doubts({"outline_blur": 12.34, "row_mismatch": 0.5}, {}) == []  # a model that does not say what is usual

@@ -203,6 +203,23 @@ def test_a_picture_unlike_the_training_is_sampled_with_a_warning(gdtool, picture
     assert result.returncode == 0 and "width over height of the subject is 1.09, in training 2 to 3" in result.stderr
 
 
+def test_a_result_that_the_model_is_unsure_of_is_told(gdtool, picture, tiny_model, tmp_path):
+    model = shutil.copytree(tiny_model, tmp_path / "model")
+    for name, high in (("sure", 1e6), ("unsure", 0.0)):
+        (model / "pictures.json").write_text(json.dumps({"outline_blur": {"low": 0.0, "high": high}}))
+        write_manifest(model)
+        result = sample(gdtool, "ball.png", "--model", model, "-o", name)
+        record = json.loads((tmp_path / name / MANIFEST).read_text())
+        width = record["content"]["report"]["outline_blur"]
+        told = [text for text in record["warnings"] if "unsure" in text]
+        assert result.returncode == 0 and width > 0 and len(told) == (name == "unsure")
+    assert f"blurred over {width:.1f} pixels, 0.0 at most is usual" in told[0] and told[0] in result.stderr
+    # What is usual is known of one way of sampling.
+    result = sample(gdtool, "ball.png", "--model", model, "--domains", "normal,depth", "-o", "other")
+    record = json.loads((tmp_path / "other" / MANIFEST).read_text())
+    assert not any("unsure" in text for text in record["warnings"]) and "the model's doubt of its result" in {one["what"] for one in record["skipped"]}
+
+
 def test_loading_a_model_leaves_pytorchs_compiler_out():
     # It takes a second to import, and one operation on the meta device, where shapes are checked, can do that.
     code = ("import sys; from pathlib import Path; import gdtool.models; from gdtool.diffusion.weights import load_model; "
