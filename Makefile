@@ -123,6 +123,7 @@ data: venv
 	$(RENDER) --samples 4 --turn 45 procedural:$$(($(NEW) + 1))..$(TURNED) -o $(DATA)/new_turned
 	$(RENDER) --samples 8 procedural:900000..$(HELD_OUT) -o $(DATA)/held_out
 	$(RENDER) --samples 8 --turn 45 procedural:900000..$(HELD_OUT) -o $(DATA)/turned
+	$(RENDER) --samples 4 procedural:950000..950299 -o $(DATA)/validation
 
 model: data
 	$(BIN)/gdtool train $(DATA)/objects --minutes $(MINUTES) -o $(DATA)/small
@@ -133,6 +134,7 @@ model: data
 	$(BIN)/python benchmarks/model_mean.py $(DATA)/one $(DATA)/other -o $(DATA)/mean
 	$(BIN)/gdtool train $(DATA)/new $(DATA)/new_turned --start $(DATA)/mean --size 128 --config benchmarks/model_geometry.json --minutes $(LAST) --seed 2 -o $(DATA)/last
 	$(BIN)/python benchmarks/model_mean.py $(DATA)/mean $(DATA)/last -o $(DATA)/model
+	$(BIN)/python benchmarks/model_doubt.py $(DATA)/held_out --model $(DATA)/model --calibrate $(DATA)/validation --photographs ../shared/assets/images -o docs/benchmarks
 	$(BIN)/python benchmarks/model_quality.py $(DATA)/held_out --model $(DATA)/model --train $(DATA)/objects $(DATA)/new $(DATA)/new_turned -o docs/benchmarks --install
 	$(BIN)/python benchmarks/model_quality.py $(DATA)/turned --steps 1 --name model_quality_turned -o docs/benchmarks
 	$(BIN)/python benchmarks/model_curve.py $(DATA)/held_out --model $(DATA)/model
@@ -144,7 +146,8 @@ bench-model: data
 	$(RENDER) --samples 8 procedural:900100..$(MORE) -o $(DATA)/more
 	$(BIN)/python benchmarks/model_quality.py $(DATA)/held_out $(DATA)/more --train $(DATA)/objects $(DATA)/new --steps 1 --name model_quality_400 -o docs/benchmarks
 	$(BIN)/python benchmarks/image_to_surface.py $(DATA)/held_out --train $(DATA)/objects $(DATA)/new
-	$(BIN)/python benchmarks/ablations.py $(DATA)/objects --held-out $(DATA)/held_out
+	$(RENDER) --size 64 --samples 4 procedural:0..799 -o $(DATA)/small_objects
+	$(BIN)/python benchmarks/ablations.py $(DATA)/small_objects --held-out $(DATA)/held_out
 
 # The JSON Schemas from the types that decode the manifests; a test compares.
 schemas: venv
