@@ -55,7 +55,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
     """
     begun = time.monotonic()
     found_by, shaped_by, projected_by, hung_by, packed_by = (begun + share * request.seconds for share in _SHARES)
-    for module in ("gdtool.geometry.simplify", "gdtool.texture.unwrap_charts", "gdtool.texture.unwrap_lay"):
+    for module in ("gdtool.geometry.simplify", "gdtool.texture.unwrap_charts", "gdtool.texture.unwrap_lay", "gdtool.texture.unwrap_pack"):
         prepare(module)
     extent = float(np.ptp(vertices[np.unique(faces[faces >= 0])], 0).max())
     unit = (vertices - vertices.mean(0)) / (extent if extent > 0 else 1.0)

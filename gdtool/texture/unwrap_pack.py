@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gdtool.core.child import ChildFailed, begin
 from gdtool.texture.unwrap_settle import settled
 from gdtool.texture.unwrap_shapes import Shapes, rim_of, upright_box
 
@@ -20,7 +21,8 @@ _SETTLED = 4  # layouts that are tightened
 _GAIN, _GAIN_PER_CHART = 0.006, 0.0012
 WELL_PACKED = 0.67  # of the square, by a draft: charts that fill as much stay as they are
 _TRIES, _TRIES_OF_DRAFT = 3600, 150  # charts placed in search of better orders, at last and to tell ways to cut apart
-_CHAINS = 3  # of changes of orders
+_CHAINS = 4  # of changes of orders
+_SLACK = 5.0  # seconds that the child has to start and to stop
 _MOVES = 0.25  # by which some charts change their place in the order, typically, in units of its length
 _MOST_BY_SEARCH = 160  # charts for which orders are searched
 
@@ -73,7 +75,7 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, ways: list[tup
     if len(charts) > _COARSE[-1][0]:
         return _shelves([uv for uv, _ in boxed], gap)
     for share in (_OWN, 0.0) if len(charts) <= _MOST_BY_SEARCH else (0.0,):
-        cells, shapes, found = _drafted(boxed, area, gap, share, _TRIES, ways or [], until)
+        cells, shapes, found = _drafted(boxed, area, gap, share, _TRIES, ways or [], until, beside=True)
         cells_per_unit = cells * (_DENSITY / area) ** 0.5
         if found and len(charts) <= _MOST_BY_SEARCH:
             packed = settled(boxed, shapes, cells_per_unit, [(one.side, one.at) for one in found[:_SETTLED]], gap)
@@ -92,22 +94,22 @@ def _boxed(charts: list) -> tuple[list, float]:
 
 
 def _drafted(boxed: list, area: float, gap: float, share: float, tries: int, ways: list[tuple[list[int], float]],
-             until: float = np.inf) -> tuple[int, Shapes | None, list[Layout]]:
+             until: float = np.inf, beside: bool = False) -> tuple[int, Shapes | None, list[Layout]]:
     """Cells of the side of a square that the charts fill to _DENSITY, the charts on that grid, and layouts of them, best first."""
     cells = next(cells for most, cells in _COARSE if len(boxed) <= most)
     shapes = None
     for least in _LEAST:
         most = int(cells * (_DENSITY / least) ** 0.5)
         shapes = Shapes(boxed, cells * (_DENSITY / area) ** 0.5, gap * (cells if share else most), most, share)
-        found = _search(shapes, cells, most, tries // len(boxed) if len(boxed) <= _MOST_BY_SEARCH else 0, ways, until)
+        found = _search(shapes, cells, most, tries // len(boxed) if len(boxed) <= _MOST_BY_SEARCH else 0, ways, until, beside)
         if found:
             return cells, shapes, found
     return cells, shapes, []
 
 
-def _search(shapes: Shapes, cells: int, most: int, tries: int, ways: list[tuple[list[int], float]], until: float) -> list[Layout]:
+def _search(shapes: Shapes, cells: int, most: int, tries: int, ways: list[tuple[list[int], float]], until: float, beside: bool) -> list[Layout]:
     """Layouts in squares of at most so many cells, best first: of a few orders (ways, with their weights of contact), then of small
-    changes of the best, in several chains: each soon ends where no small change helps."""
+    changes of the best, in several chains: each soon ends where no small change helps. beside: half of them in a child."""
     found: list[Layout] = []
     ways = ways or _first_ways(shapes)[:6 if len(shapes.bits) <= _MOST_BY_SEARCH else 1]
     for order, contact in ways:
@@ -116,22 +118,41 @@ def _search(shapes: Shapes, cells: int, most: int, tries: int, ways: list[tuple[
         layout = _placed(shapes, order, side, largest, contact, until)
         if layout is not None:
             found.insert(0, layout)
-    begun_with = found[0] if found else None
-    for chain in range(_CHAINS if found else 0):
-        rng = np.random.default_rng(chain)  # the same for each mesh: results do not depend on chance
-        best = begun_with
-        for _ in range(tries // _CHAINS):
-            if time.monotonic() > until:
-                break
-            place = np.argsort(best.order).astype(float)
-            moved = rng.integers(len(place), size=int(rng.integers(1, 4)))
-            place[moved] += rng.normal(0, _MOVES * len(place), len(moved))
-            contact = float(np.clip(best.contact * rng.choice([0.6, 1.0, 1.0, 1.6]), 0.15, 2.0))
-            layout = _placed(shapes, np.argsort(place, kind="stable").tolist(), best.side - 1, best.side - 1, contact, until)
-            if layout is not None:
-                best = layout
-                found.append(layout)
+    if not found or tries < _CHAINS:
+        return found
+    here, there = ([(shapes, found[0], tries // _CHAINS, chain, until) for chain in range(first, _CHAINS, 2)] for first in (0, 1))
+    if beside:
+        child = begin("gdtool.texture.unwrap_pack:chains", there, seconds=min(max(until - time.monotonic(), 0.0), 3600.0) + _SLACK)
+        found += chains(here)
+        try:
+            found += child.result()
+        except ChildFailed:
+            found += chains(there)
+    else:
+        found += chains(here + there)
     return sorted(found, key=lambda layout: layout.side)
+
+
+def chains(several: list[tuple]) -> list[Layout]:
+    """The layouts of several chains, _chain()'s arguments each."""
+    return [layout for one in several for layout in _chain(*one)]
+
+
+def _chain(shapes: Shapes, best: Layout, tries: int, number: int, until: float) -> list[Layout]:
+    """Ever smaller layouts, found by changing the place of a few charts in the order of the best so far, again and again."""
+    rng, found = np.random.default_rng(number), []  # the same for each mesh: results do not depend on chance
+    for _ in range(tries):
+        if time.monotonic() > until:
+            break
+        place = np.argsort(best.order).astype(float)
+        moved = rng.integers(len(place), size=int(rng.integers(1, 4)))
+        place[moved] += rng.normal(0, _MOVES * len(place), len(moved))
+        contact = float(np.clip(best.contact * rng.choice([0.6, 1.0, 1.0, 1.6]), 0.15, 2.0))
+        layout = _placed(shapes, np.argsort(place, kind="stable").tolist(), best.side - 1, best.side - 1, contact, until)
+        if layout is not None:
+            best = layout
+            found.append(layout)
+    return found
 
 
 def _placed(shapes: Shapes, order: list[int], side: int, most: int, contact: float, until: float) -> Layout | None:
