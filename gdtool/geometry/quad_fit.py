@@ -38,11 +38,10 @@ def finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features
         if not turn:
             constraints = held_at_centres(constraints, len(vertices) - count, across, curve)
         vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)
-    if subdivisions and farthest(vertices, faces, surface) > _HOPELESS_EDGES * edge / 2**subdivisions:
+    edge /= 2**subdivisions
+    vertices, faces, constraints, tips = draw_out(vertices, faces, constraints, surface, edge)
+    if subdivisions and farthest(vertices, faces, surface) > _HOPELESS_EDGES * edge:
         return vertices, faces  # shaping brings it a third nearer at most: it strays too far in any case
-    tips = None
-    if not subdivisions:  # else an engine's quads of the full number come next, which leave less bare
-        vertices, faces, constraints, tips = draw_out(vertices, faces, constraints, surface, edge)
     vertices = _shaped(vertices, faces, surface, features, constraints, request, fine, tips)
     return vertices, cut_along_features(vertices, faces, fine)
 

@@ -12,6 +12,7 @@ from gdtool.geometry.quad_unfold import unfold
 _SQUARE_SHARE = 0.4  # of the way from the nearest rectangle to the nearest square
 _POOR = 0.6  # quads with a smaller scaled Jacobian pull harder
 _NORMALS_EVERY = 6
+_THIN = 0.3  # quads of a smaller scaled Jacobian stay where they are balanced
 
 
 def square_up(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
@@ -52,7 +53,7 @@ def balance(vertices: np.ndarray, faces: np.ndarray, surface: Surface, constrain
     """Vertices moved off the surface by the mean height of it above their quads, so that as much of it lies above as below.
 
     A quad whose corners lie on a curved surface lies beneath it everywhere: half of its error is that it does. Features
-    and boundaries stay where they are, and so do quads that do not run along the surface.
+    and boundaries stay where they are, and so do quads that do not run along the surface and thin ones that it would make thinner.
     """
     free = (constraints.curve < 0) & ~still_vertices(faces, len(vertices), constraints)
     normals, area = polygon_normals(vertices, faces)
@@ -68,7 +69,11 @@ def balance(vertices: np.ndarray, faces: np.ndarray, surface: Surface, constrain
     flat, shares = faces.ravel(), np.repeat(area, 4)
     total = np.maximum(np.bincount(flat, shares, len(vertices)), 1e-300)
     move = np.stack([np.bincount(flat, shares * np.repeat(mean * normals[:, i], 4), len(vertices)) for i in range(3)], -1) / total[:, None]
-    return np.where(free[:, None], vertices + move, vertices)
+    out = np.where(free[:, None], vertices + move, vertices)
+    before, after = scaled_jacobian(vertices, faces), scaled_jacobian(out, faces)
+    thin = faces[(after < _THIN) & (after < before)]
+    out[thin] = vertices[thin]
+    return out
 
 
 def _rectangles(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -133,9 +138,14 @@ def ease(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Fe
         trial = square_up(trial, local, surface, features, mine, 10)
         trial = unfold(trial, local, surface, features, mine, most_visits=1500)
         before, after = scaled_jacobian(vertices[used], local), scaled_jacobian(trial, local)
-        if (int((after < least).sum()), -float(after.min())) < (int((before < least).sum()), -float(before.min())):
+        if _faults(after, least) < _faults(before, least):
             vertices = vertices.copy()
             vertices[used] = trial
             kept = ~near[constraints.path].any(1)
             constraints = Constraints(curve, fixed, constraints.path[kept], constraints.path_curve[kept])
     return vertices, constraints
+
+
+def _faults(jacobian: np.ndarray, least: float) -> tuple[int, int, float]:
+    """How bad quads of these scaled Jacobians are: those folded, those below `least`, the worst."""
+    return int((jacobian <= 0).sum()), int((jacobian < least).sum()), -float(jacobian.min())

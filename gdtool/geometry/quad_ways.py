@@ -23,7 +23,7 @@ _FAR_EDGES, _FAR_SUBDIVIDED = 2.0, 1.0  # edge lengths that a result may stray; 
 _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
 _MOST_FOLDED = 0.01  # of the quads
 _CUT_EDGES, _CUT_SHARE = 0.25, 0.01  # surface so far from the quads lies beyond an edge that they cut off; how much of a piece may
-_HANDLES, _PIECES = "handles are lost or added", "pieces are lost or joined"
+_LOST, _ADDED, _PIECES = "handles are lost", "handles are added", "pieces are lost or joined"
 _TOO_COARSE = _STRAYS, _LEAVES_OUT, _STICKS_OUT = "strays", "leaves out", "sticks out"
 _MENDINGS = 4  # rounds of filling holes and parting what meets at a vertex
 _SHORTEST_RUN = 0.05  # seconds
@@ -62,7 +62,7 @@ def _ways(quads: int, request: Request) -> list[_Way]:
     A coarser mesh subdivided has a quarter of the irregular vertices; it fails where features are finer than its quads.
     """
     engine = "instant-meshes" if request.engine == "auto" else request.engine
-    out = [_Way(engine, 1, (1.01, 1.02), request.crease_degrees)] if engine == "instant-meshes" and quads >= _MANY else []
+    out = [_Way(engine, 1, (0.985, 1.01), request.crease_degrees)] if engine == "instant-meshes" and quads >= _MANY else []
     # Where a seam of the engine's fields fails, it often holds at a slightly different density.
     out += [_Way(engine, 0, (1.0,), request.crease_degrees), _Way(engine, 0, (1.02,), request.crease_degrees), _Way(engine, 0, (0.98,), 0.0)]
     return out + [_Way("instant-meshes", 0, (1.0,), request.crease_degrees)] * (request.engine == "quadriflow")
@@ -113,6 +113,8 @@ class Trial:
                 return found
             if self._over:
                 return None
+            if self._second_best is not None:
+                break  # what one density bridges, another does too
         return self._bridged()
 
     def _by(self, way: _Way) -> Found | None:
@@ -128,22 +130,27 @@ class Trial:
             together = self._several and not way.subdivisions
             if together and len(best.quads):
                 self.whole = best.vertices, best.quads, way.label
-            if not counted and (best.fault is None or together):
+            fine = best.fault is None or best.fault == _LOST and sticks_out(best.vertices, best.quads, part.surface) < 2 * _CLOSE_EDGES * part.edge
+            if not counted and (fine or together):
                 asked = way.near(best.asked * wanted / max(count, 1))
                 continue
-            if best.fault is not None:
-                if best.fault == _HANDLES and not way.subdivisions and self._second_best is None and counted:
-                    self._second_best = best.vertices, best.quads, f"{way.label}, {best.fault}"
+            if counted and best.fault in (_LOST, _ADDED) and not way.subdivisions:
+                self._second_best = best.vertices, best.quads, f"{way.label}, {best.fault}"
+            if not fine:
                 return self._failed(way, best.fault)
-            vertices, found, taken = self._finished(way, [r for r in results if r.fault is None and abs(r.off(wanted)) <= COUNT_TOLERANCE])
+            vertices, found, taken = self._finished(way, [r for r in results if r.fault == best.fault and abs(r.off(wanted)) <= COUNT_TOLERANCE])
             if abs(len(found) / quads - 1) > COUNT_TOLERANCE:
                 count, extra = len(found), len(found) - taken.count
                 asked = way.near(taken.asked * (quads - extra) / taken.count)
                 continue
             fault = fault_of(vertices, found, part.surface, part.edge, _FAR_SUBDIVIDED if way.subdivisions else _FAR_EDGES, part.piece)
+            if taken.fault and (over := sticks_out(vertices, found, part.surface) / part.edge) > _CLOSE_EDGES:
+                fault = f"{_STICKS_OUT} {over:.2g} edge lengths"  # else what is lost was finer than a quad
             if way.subdivisions and (least := scaled_jacobian(vertices, found).min()) < part.request.least_jacobian:
                 fault = f"has a quad of scaled Jacobian {least:.2g}"
-            return self._failed(way, fault) if fault is not None else (vertices, found, way.label)
+            if fault is not None:
+                return self._failed(way, f"{taken.fault}; {fault}" if taken.fault else fault)
+            return vertices, found, f"{way.label}, {taken.fault}" if taken.fault else way.label
         self.record.failed.append(f"{way.label}: gave {count} faces for {quads}")
         if not way.subdivisions:
             self._given_up.add(way.engine)
@@ -251,6 +258,6 @@ def judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarr
         return "not manifold", quad_vertices, quad_faces
     if repair.components(quad_faces)[0] != pieces:
         return _PIECES, quad_vertices, quad_faces
-    if closed and repair.euler_number(quad_faces) != repair.euler_number(faces):
-        return _HANDLES, quad_vertices, quad_faces
+    if closed and (more := repair.euler_number(quad_faces) - repair.euler_number(faces)):
+        return _LOST if more > 0 else _ADDED, quad_vertices, quad_faces
     return None, quad_vertices, quad_faces

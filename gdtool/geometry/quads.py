@@ -11,7 +11,6 @@ import numpy as np
 
 from gdtool.core.child import prepare
 from gdtool.core.threads import mapped
-from gdtool.geometry import repair
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_fit import fitted
 from gdtool.geometry.quad_pieces import SMALL_PIECE_QUADS, apart, by_size, joined, well_made
@@ -19,7 +18,6 @@ from gdtool.geometry.quad_shape import Surface
 from gdtool.geometry.quad_split import split_to_quads
 from gdtool.geometry.quad_task import Part, Record, Request
 from gdtool.geometry.quad_ways import Found, Trial, prepare_engines
-from gdtool.geometry.sharpen import restore_creases
 from gdtool.geometry.simplify import simplify
 
 
@@ -28,11 +26,11 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
 
     vertices (v, 3) in a unit box, faces (f, 3). All faces are quads; closed and manifold where the input is.
     """
-    found = _remeshed(vertices, faces, request, careful=False)
     edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
+    found = _remeshed(vertices, faces, request, edge, careful=False)
     if (error := found[2].figures["simplify_error"]) <= edge or request.for_engines <= 0:
         return found
-    again = _remeshed(vertices, faces, request, careful=True)
+    again = _remeshed(vertices, faces, request, edge, careful=True)
     first, record = found[2], again[2]
     first.failed.append(f"simplify: strays {error / edge:.2g} edge lengths from the surface")
     first.add(record)
@@ -40,21 +38,9 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
     return again
 
 
-def _remeshed(vertices: np.ndarray, faces: np.ndarray, request: Request, careful: bool) -> tuple[np.ndarray, np.ndarray, Record]:
-    """remesh() of what one way of simplifying leaves: the quick one, or the careful one (simplify.py)."""
+def _remeshed(vertices: np.ndarray, faces: np.ndarray, request: Request, edge: float, careful: bool) -> tuple[np.ndarray, np.ndarray, Record]:
+    """remesh() of what one way of simplifying leaves: the quick one, or the careful one (simplify.py). edge: of the quads."""
     record = Record()
-    start = time.perf_counter()
-    edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
-    if len(faces) > _needed(request):
-        prepare("gdtool.geometry.simplify")
-    else:
-        prepare_engines(request.quads, request)
-    closed = cache(lambda: repair.is_watertight(faces))
-    fine_vertices, fine_faces = vertices, faces
-    if request.restore_creases and request.crease_degrees > 0 and _median_edge(vertices, faces) < 0.75 * edge:
-        fine_vertices, fine_faces, report = restore_creases(vertices, faces, request.crease_degrees)
-        record.figures["crease_vertices_restored"] = report["moved"]
-    record.clock("restore creases", start)
     # While a child has one core, this process uses another: the search tree of the input, then the deviation from it. The
     # tree is built only once the child has its mesh: building it holds the interpreter's lock.
     fine = cache(lambda: Surface(vertices, faces))
@@ -63,7 +49,7 @@ def _remeshed(vertices: np.ndarray, faces: np.ndarray, request: Request, careful
         prepare_engines(request.quads, request)  # not before: their start would slow what this process does alone
         fine()
 
-    coarse = _simplified(vertices, faces, fine_vertices, fine_faces, closed, request, record, careful, meanwhile)
+    coarse = _simplified(vertices, faces, edge, request, record, careful, meanwhile)
     with ThreadPoolExecutor(1) as beside:
         error = beside.submit(_deviation, fine(), coarse) if coarse[1] is not faces else None
         whole = Part(*coarse, request.quads, edge, request, fine)
@@ -108,24 +94,24 @@ def _needed(request: Request) -> int:
     return max(3 * request.quads, 20000)
 
 
-def _simplified(vertices: np.ndarray, faces: np.ndarray, restored_vertices: np.ndarray, restored_faces: np.ndarray, closed: Callable[[], bool],
-                request: Request, record: Record, careful: bool, meanwhile: Callable[[], object]) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh with its creases restored as coarse as the quads need, or the mesh as it was where that cannot be done.
+def _simplified(vertices: np.ndarray, faces: np.ndarray, edge: float, request: Request, record: Record, careful: bool,
+                meanwhile: Callable[[], object]) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with its creases restored as coarse as quads of that edge need, or the mesh as it was where that cannot be done.
 
     meanwhile: what to do while a child works; may be called more than once.
     """
     start = time.perf_counter()
-    needed = _needed(request)
-    restored = restored_vertices is not vertices
-    found = simplify(restored_vertices, restored_faces, needed, seconds=request.for_the_rest, closed=closed, thorough=not restored, careful=careful,
-                     measured=False, meanwhile=meanwhile)
-    if restored and (found[3]["method"] == "none" and "failed" in found[3] or closed() and not repair.is_watertight(found[1])):
-        # Bevels drawn out where there is no crease make folds that the collapse tears.
-        record.failed.append("creases restored: the result cannot be simplified")
-        record.figures["crease_vertices_restored"] = 0
-        found = simplify(vertices, faces, needed, seconds=request.for_the_rest, closed=closed, careful=careful, measured=False, meanwhile=meanwhile)
+    needed = max(3 * request.quads, 20000)  # triangles that show all that so many quads can
+    if len(faces) > needed:
+        prepare("gdtool.geometry.simplify")
+    else:
+        prepare_engines(request.quads, request)
+    # Bevels so wide as the quads are drawn as they are.
+    restored = request.restore_creases and _median_edge(vertices, faces) < 0.75 * edge
+    found = simplify(vertices, faces, needed, seconds=request.for_the_rest, crease_degrees=request.crease_degrees if restored else 0.0,
+                     careful=careful, measured=False, meanwhile=meanwhile)
     report = found[3]
-    record.figures["simplified_to"] = report["faces"]
+    record.figures |= {"simplified_to": report["faces"]} | ({"crease_vertices_restored": report["creases"]} if restored else {})
     if "failed" in report:
         record.failed.append(f"simplify: {report['failed']}")
     record.clock("simplify", start)

@@ -11,6 +11,7 @@ from gdtool.core.child import ChildFailed, begin
 from gdtool.core.errors import InputError
 from gdtool.geometry import repair
 from gdtool.geometry.normals import face_normals
+from gdtool.geometry.sharpen import restore_creases
 from gdtool.geometry.unpinch import unpinched
 
 
@@ -108,8 +109,20 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
         cells *= 2
 
 
+def reduced(vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple, crease_degrees: float) -> tuple[np.ndarray, np.ndarray, int]:
+    """What the child runs: one of the collapses above, bevels first drawn out to creases (sharpen.py) unless crease_degrees is 0.
+
+    Returns vertices, faces, and how many vertices were drawn out.
+    """
+    moved = 0
+    if crease_degrees:
+        vertices, faces, drawn = restore_creases(vertices, faces, crease_degrees)
+        moved = drawn["moved"]
+    return *globals()[way](uneven(vertices, faces), faces, *arguments), moved
+
+
 def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attributes: np.ndarray | None = None, *,
-             seconds: float = 120.0, closed: Callable[[], bool] | None = None, thorough: bool = True, careful: bool = False,
+             seconds: float = 120.0, closed: Callable[[], bool] | None = None, crease_degrees: float = 0.0, careful: bool = False,
              near: bool = False, measured: bool = True,
              meanwhile: Callable[[], object] = lambda: None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, dict[str, float | int | str]]:
     """A mesh of about target_faces triangles of the same shape and topology.
@@ -117,8 +130,9 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     vertices (v, 3), faces (f, 3), attributes (v, a) or None. Returns vertices, faces, attributes (read at the closest
     point of the input) and a report: faces, method, and error, the largest distance of the result's vertices and of the
     input's vertices (at most 20,000 of them) to the other surface, in units of the input. A closed, manifold
-    input stays so (closed says whether it is; asked while the first child works); without `thorough` it is given back as it is where
-    only the slow way would keep it closed; `careful` takes the slow way first, for meshes with more small parts than triangles to
+    input stays so (closed says whether it is; asked while the first child works). With crease_degrees, bevels are drawn out first to
+    creases that turn by more, unless what comes of it cannot be collapsed; the report says how many vertices moved (creases).
+    `careful` takes the slow way first, for meshes with more small parts than triangles to
     spare: the quick one reaches any number, even by tearing down what is large. With `near` the quick one keeps nearer to the surface, its
     triangles less even. Without `measured` the error is left out; with it, a quick result that is as far off as its edges are long is
     compared with the slow one's. `meanwhile` is called while each child works.
@@ -127,50 +141,24 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     repair.check(vertices, faces)
     target_faces = max(int(target_faces), 4)
     if len(faces) <= target_faces:
-        return vertices, faces, attributes, {"faces": len(faces), "method": "none", "error": 0.0}
+        report = {"faces": len(faces), "method": "none", "error": 0.0, "creases": 0}
+        if crease_degrees:
+            vertices, faces, drawn = restore_creases(vertices, faces, crease_degrees)
+            report |= {"faces": len(faces), "creases": drawn["moved"]}
+        return vertices, faces, attributes, report
     centre, extent = (vertices.min(0) + vertices.max(0)) / 2, float(np.ptp(vertices, 0).max())
     if not extent > 0:
         raise InputError("mesh", "all its faces lie in one point")
     unit = (vertices - centre) / extent
-    edge, given = _edge(unit, faces, target_faces), uneven(unit, faces)
+    edge = _edge(unit, faces, target_faces)
     is_closed = cache(closed or (lambda: repair.is_watertight(faces)))
-    reasons, found, method = [], None, ""
-    # The quick collapse tears a closed mesh now and then (a handful of edges with four faces), at one pace and not at
-    # another, and of parts made of slivers it collapses nothing, at any; MeshLab's takes ten times as long.
-    quick = [("collapse", (target_faces, pace, near and edge or 1.0)) for pace in (5.0, 3.0, 8.0)]
-    slow = [("collapse_topology", (target_faces,))] if thorough or careful else []
-    if slow and len(faces) > 2 * _BY_WAY * target_faces:
-        slow.insert(0, ("collapse_by_way", (target_faces,)))
-    stuck = None
-    for name, arguments in slow + quick if careful else quick + slow:
-        if stuck is not None and name == "collapse" or name == "collapse_by_way" and stuck is None and not careful:
-            continue
-        try:
-            running = begin(f"gdtool.geometry.simplify:{name}", given, faces.astype(np.int32), *arguments, seconds=seconds, memory_mb=16000)
-            meanwhile()
-            is_closed()
-            out = running.result()
-        except ChildFailed as failure:
-            reasons.append(str(failure))
-            continue
-        if is_closed() and _sound(*out, False, target_faces) and not _sound(*out, True, target_faces):
-            out = unpinched(*out)  # what the quick collapse tears are mostly two sheets that meet in an edge
-        if not _sound(*out, is_closed(), target_faces):
-            reasons.append("the result is not as closed as the input")
-        elif name == "collapse" and slow and len(out[1]) > _STUCK * target_faces + _FEW:
-            stuck = out
-            reasons.append(f"the quick collapse stopped at {len(out[1])} triangles")
-        else:
-            found, method = out, "quadric collapse" if name == "collapse" else "quadric collapse, topology kept"
-            break
-    if found is None and stuck is not None:
-        found, method = stuck, "quadric collapse"
+    found, method, moved, reasons = _collapsed(unit, faces, target_faces, near and edge or 1.0, crease_degrees, careful, seconds, is_closed, meanwhile)
     if found is None and not is_closed():
         found, method = cluster(unit, faces, target_faces), "vertex clustering"
         if not len(found[1]):
             found = None
     if found is None:
-        return vertices, faces, attributes, {"faces": len(faces), "method": "none", "error": 0.0, "failed": "; ".join(reasons)}
+        return vertices, faces, attributes, {"faces": len(faces), "method": "none", "error": 0.0, "creases": 0, "failed": "; ".join(reasons)}
     out_vertices, out_faces = repair.compact(*found)
     if is_closed() and repair.components(out_faces)[0] > 1:
         out_vertices, out_faces = repair.without_crumbs(out_vertices, out_faces, repair.components(faces)[0])
@@ -181,16 +169,55 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
         _, face_idx, point = closest_points(out_vertices, unit, faces)
         weights = barycentric_of(point, unit[faces[face_idx]])
         out_attributes = np.einsum("nc,nc...->n...", weights, attributes[faces[face_idx]])
-    report = {"faces": len(out_faces), "method": method}
+    report = {"faces": len(out_faces), "method": method, "creases": moved}
     if measured:
         report["error"] = deviation(unit, faces, out_vertices, out_faces) * extent
     if reasons:
         report["failed"] = "; ".join(reasons)
     out = out_vertices * extent + centre, out_faces, out_attributes, report
-    if measured and not careful and thorough and method == "quadric collapse" and report["error"] > edge * extent:
+    if measured and not careful and method == "quadric collapse" and report["error"] > edge * extent:
         other = simplify(vertices, faces, target_faces, attributes, seconds=seconds, closed=is_closed, careful=True, near=near)
         return min(out, other, key=lambda one: one[3]["error"] if one[3]["method"] != "none" else np.inf)
     return out
+
+
+def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit: float, crease_degrees: float, careful: bool, seconds: float,
+               is_closed: Callable[[], bool], meanwhile: Callable[[], object]) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, int, list[str]]:
+    """What the first way leaves that keeps the mesh as closed as it is, or None; its name, how many vertices went to creases, what failed."""
+    # The quick collapse tears a closed mesh now and then (a handful of edges with four faces), at one pace and not at
+    # another, and of parts made of slivers it collapses nothing, at any; MeshLab's takes ten times as long.
+    quick = [("collapse", (target_faces, pace, unit)) for pace in (5.0, 3.0, 8.0)]
+    slow = [("collapse_topology", (target_faces,))]
+    if len(faces) > 2 * _BY_WAY * target_faces:
+        slow.insert(0, ("collapse_by_way", (target_faces,)))
+    reasons, stuck, moved = [], None, 0
+    for way, arguments in slow + quick if careful else quick + slow:
+        if stuck is not None and way == "collapse" or way == "collapse_by_way" and stuck is None and not careful:
+            continue
+        if moved and way != "collapse" and not careful:
+            break  # what cannot be collapsed are folds, of bevels that were drawn out where there is no crease
+        try:
+            running = begin("gdtool.geometry.simplify:reduced", vertices, faces.astype(np.int32), way, arguments, crease_degrees,
+                            seconds=seconds, memory_mb=16000)
+            meanwhile()
+            is_closed()
+            *out, moved = running.result()
+        except ChildFailed as failure:
+            reasons.append(str(failure))
+            continue
+        if is_closed() and _sound(*out, False, target_faces) and not _sound(*out, True, target_faces):
+            out = unpinched(*out)  # what the quick collapse tears are mostly two sheets that meet in an edge
+        if not _sound(*out, is_closed(), target_faces):
+            reasons.append("the result is not as closed as the input")
+        elif way == "collapse" and not moved and len(out[1]) > _STUCK * target_faces + _FEW:
+            stuck = out
+            reasons.append(f"the quick collapse stopped at {len(out[1])} triangles")
+        else:
+            return out, "quadric collapse" if way == "collapse" else "quadric collapse, topology kept", moved, reasons
+    if moved:
+        found = _collapsed(vertices, faces, target_faces, unit, 0.0, careful, seconds, is_closed, meanwhile)
+        return *found[:3], [*reasons, "creases restored: the result cannot be simplified", *found[3]]
+    return stuck, "quadric collapse", 0, reasons
 
 
 def _sound(vertices: np.ndarray, faces: np.ndarray, closed: bool, target_faces: int) -> bool:

@@ -4,9 +4,9 @@ import numpy as np
 
 from gdtool.geometry.features import Constraints, Features, untied
 from gdtool.geometry.mesh_quality import scaled_jacobian
-from gdtool.geometry.quad_relax import ease, square_up
+from gdtool.geometry.quad_relax import balance, ease, square_up
 from gdtool.geometry.quad_shape import Surface
-from tests.geometry.solids import plane
+from tests.geometry.solids import plane, sphere
 
 NO_FEATURES = Features(np.zeros((0, 3)), np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
 
@@ -52,3 +52,32 @@ def test_a_corner_pinned_in_the_wrong_place_is_eased():
     pinned = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
     out, left = ease(bent, quads, Surface(*plane()), NO_FEATURES, pinned)
     assert scaled_jacobian(out, quads).min() >= 0.2 and not left.fixed[40]
+
+
+def test_easing_folds_nothing_that_was_not_folded():
+    vertices, quads = grid()
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        fixed = rng.random(len(vertices)) < 0.2
+        pinned = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
+        bent = vertices + rng.normal(0, 0.06, vertices.shape) * (1, 1, 0)
+        before = scaled_jacobian(bent, quads)
+        after = scaled_jacobian(ease(bent, quads, Surface(*plane()), NO_FEATURES, pinned)[0], quads)
+        assert (after <= 0).sum() <= (before <= 0).sum()
+
+
+def test_balancing_lifts_quads_to_the_surface_but_leaves_thin_ones():
+    """A grid below the top of a ball, with a few corners nearly on the opposite diagonal."""
+    vertices, quads = grid()
+    vertices = vertices * 0.3
+    thin = quads[[10, 30, 50]]
+    vertices[thin[:, 0]] = 0.55 * vertices[thin[:, 1]] + 0.45 * vertices[thin[:, 3]]
+    ball = Surface(*sphere(48, 0.8))
+    vertices[:, 2] = np.sqrt(0.8**2 - (vertices[:, :2] ** 2).sum(1))
+    vertices = ball.closest(vertices)[2]
+    before = scaled_jacobian(vertices, quads)
+    out = balance(vertices, quads, ball, Constraints.none(len(vertices)))
+    after = scaled_jacobian(out, quads)
+    assert (before < 0.3).any() and (after[before < 0.3] >= before[before < 0.3] - 1e-12).all()
+    centre = np.abs(ball.closest(out[quads].mean(1))[0]).mean(), np.abs(ball.closest(vertices[quads].mean(1))[0]).mean()
+    assert centre[0] < 0.8 * centre[1]

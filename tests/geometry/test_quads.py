@@ -14,7 +14,7 @@ from gdtool.geometry.quad_split import pair_and_split
 from gdtool.geometry.quad_shape import Surface, fill_holes, remove_doublets, subdivide
 from gdtool.geometry.quad_task import Part, Request
 from gdtool.geometry.sharpen import restore_creases
-from tests.geometry.solids import assembly, bored_box, cube, joined, plane, quad_cube, rod, sphere, torus, volume
+from tests.geometry.solids import assembly, bored_box, cube, joined, marching, plane, quad_cube, rod, sphere, torus, volume
 
 
 def whole(faces):
@@ -160,9 +160,9 @@ def test_what_the_quick_collapse_ruins_is_made_again_with_care(monkeypatch):
     vertices, faces = sphere(120, 0.5)
     begun, begin = [], simplify.begin
 
-    def shrinking(function, vertices, *given, **limits):
-        begun.append(function.split(":")[1])
-        return begin(function, vertices * (0.5 if begun[-1] == "collapse" else 1), *given, **limits)
+    def shrinking(function, vertices, faces, way, *given, **limits):
+        begun.append(way)
+        return begin(function, vertices * (0.5 if way == "collapse" else 1), faces, way, *given, **limits)
 
     monkeypatch.setattr(simplify, "begin", shrinking)
     out, _, record = quads.remesh(vertices, faces, Request(quads=2000))
@@ -330,6 +330,33 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
     _, found, record = quads.remesh(vertices / 2, faces, Request(quads=1000))
     assert len(asked) == runs and record.engine == "pair and split" and whole(found)
     assert outcome == "a crash" or "strays" in record.failed[0]
+
+
+def with_tunnel(vertices, faces, length):
+    """A ball with a tunnel, a triangle wide, from its top to a triangle about so far away."""
+    centre = vertices[faces].mean(1)
+    top = centre[:, 2].argmax()
+    other = np.abs(np.linalg.norm(centre - centre[top], axis=1) - length).argmin()
+    a, b = faces[top], faces[other][::-1]
+    b = min((np.roll(b, k) for k in range(3)), key=lambda b: np.linalg.norm(vertices[a] - vertices[b], axis=1).sum())
+    tube = [[a[k], a[(k + 1) % 3], b[k]] for k in range(3)] + [[a[(k + 1) % 3], b[(k + 1) % 3], b[k]] for k in range(3)]
+    return vertices, np.concatenate([np.delete(faces, [top, other], 0), tube])
+
+
+def bored_ball():
+    return marching(lambda x, y, z: np.maximum(np.sqrt(x * x + y * y + z * z) - 0.4, 0.06 - np.hypot(x, y)), 64, 0.5)
+
+
+@pytest.mark.parametrize("shape, given_up", [("a skin-deep tunnel", True), ("a bore", False)])
+def test_a_handle_is_given_up_only_where_it_is_finer_than_a_quad(monkeypatch, shape, given_up):
+    vertices, faces = sphere(96, 0.4)
+    out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
+    vertices, faces = with_tunnel(vertices, faces, 0.07) if given_up else bored_ball()
+    assert repair.is_watertight(faces) and repair.is_manifold(faces) and repair.euler_number(faces) == 0
+    monkeypatch.setattr(quad_ways, "begin", lambda *_, **__: Ended((out, found)))  # an engine that makes a ball of it
+    _, found, record = quads.remesh(vertices, faces, Request(quads=1000))
+    assert whole(found) and (record.engine == "instant-meshes, handles are lost") == given_up
+    assert repair.euler_number(found) == (2 if given_up else 0)
 
 
 def around(faces, middle):
