@@ -25,6 +25,7 @@ _MOST_FOLDED = 0.01  # of the quads
 _CUT_EDGES, _CUT_SHARE = 0.25, 0.01  # surface so far from the quads lies beyond an edge that they cut off; how much of a piece may
 _LOST, _ADDED, _PIECES = "handles are lost", "handles are added", "pieces are lost or joined"
 _TOO_COARSE = _STRAYS, _LEAVES_OUT, _STICKS_OUT = "strays", "leaves out", "sticks out"
+_MOST_TORN = 0.1  # of the quads may be missing from a result that another density may mend
 _MENDINGS = 4  # rounds of filling holes and parting what meets at a vertex
 _SHORTEST_RUN = 0.05  # seconds
 _MANY = 3000  # quads of a mesh that is tried coarser and subdivided
@@ -137,7 +138,7 @@ class Trial:
             if counted and best.fault in (_LOST, _ADDED) and not way.subdivisions:
                 self._second_best = best.vertices, best.quads, f"{way.label}, {best.fault}"
             if not fine:
-                return self._failed(way, best.fault)
+                return self._failed(way, best.fault, torn=best.off(wanted) < -_MOST_TORN)
             vertices, found, taken = self._finished(way, [r for r in results if r.fault == best.fault and abs(r.off(wanted)) <= COUNT_TOLERANCE])
             if abs(len(found) / quads - 1) > COUNT_TOLERANCE:
                 count, extra = len(found), len(found) - taken.count
@@ -187,12 +188,12 @@ class Trial:
         self.record.clock("fit", start)
         return best[1]
 
-    def _failed(self, way: _Way, fault: str) -> None:
+    def _failed(self, way: _Way, fault: str, torn: bool = False) -> None:
         self.record.failed.append(f"{way.label}: {fault}")
         if not way.subdivisions:
             self._over = self._several
             # Another density mends a seam of the engine's fields, not a part that is too thin for so many quads.
-            if fault.startswith(_TOO_COARSE):
+            if torn or fault.startswith(_TOO_COARSE):
                 self._given_up.add(way.engine)
 
     def _bridged(self) -> Found | None:

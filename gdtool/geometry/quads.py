@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import numpy as np
@@ -26,42 +25,32 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
 
     vertices (v, 3) in a unit box, faces (f, 3). All faces are quads; closed and manifold where the input is.
     """
+    if len(faces) > _needed(request):
+        prepare("gdtool.geometry.simplify")
+    record, fine = Record(), cache(lambda: Surface(vertices, faces))
     edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
-    found = _remeshed(vertices, faces, request, edge, careful=False)
-    if (error := found[2].figures["simplify_error"]) <= edge or request.for_engines <= 0:
-        return found
-    again = _remeshed(vertices, faces, request, edge, careful=True)
-    first, record = found[2], again[2]
-    first.failed.append(f"simplify: strays {error / edge:.2g} edge lengths from the surface")
-    first.add(record)
-    record.failed, record.seconds = first.failed, first.seconds
-    return again
-
-
-def _remeshed(vertices: np.ndarray, faces: np.ndarray, request: Request, edge: float, careful: bool) -> tuple[np.ndarray, np.ndarray, Record]:
-    """remesh() of what one way of simplifying leaves: the quick one, or the careful one (simplify.py). edge: of the quads."""
-    record = Record()
-    # While a child has one core, this process uses another: the search tree of the input, then the deviation from it. The
-    # tree is built only once the child has its mesh: building it holds the interpreter's lock.
-    fine = cache(lambda: Surface(vertices, faces))
-
-    def meanwhile() -> None:
-        prepare_engines(request.quads, request)  # not before: their start would slow what this process does alone
-        fine()
-
-    coarse = _simplified(vertices, faces, edge, request, record, careful, meanwhile)
-    with ThreadPoolExecutor(1) as beside:
-        error = beside.submit(_deviation, fine(), coarse) if coarse[1] is not faces else None
-        whole = Part(*coarse, request.quads, edge, request, fine)
-        few, large = by_size(whole)
-        done = _quads_of(few, record) if few is not None else []
-        # Small pieces cannot always be made of as few quads as asked for; the count holds for the sum.
-        large.quads = max(request.quads - sum(len(found) for _, found, _ in done), 4)
-        done = _quads_of(large, record) + done
-        record.source = fine()
-        record.figures["simplify_error"] = error.result() if error is not None else 0.0
+    whole = _coarse(vertices, faces, edge, request, record, fine)
+    few, large = by_size(whole)
+    done = _quads_of(few, record) if few is not None else []
+    # Small pieces cannot always be made of as few quads as asked for; the count holds for the sum.
+    large.quads = max(request.quads - sum(len(found) for _, found, _ in done), 4)
+    done = _quads_of(large, record) + done
+    record.source = fine()
     record.engine = "; ".join(dict.fromkeys(way for _, _, way in done))
     return *joined([found[:2] for found in done]), record
+
+
+def _coarse(vertices: np.ndarray, faces: np.ndarray, edge: float, request: Request, record: Record, fine: Callable[[], Surface]) -> Part:
+    """What quads of that edge need of the mesh, its creases restored: collapsed quickly, with care where that strays by more than an edge."""
+    for careful in (False, True):
+        start = time.perf_counter()
+        part = Part(*_simplified(vertices, faces, edge, request, record, careful, fine), request.quads, edge, request, fine)
+        record.figures["simplify_error"] = error = _deviation(fine(), part.surface) if part.faces is not faces else 0.0
+        record.clock("simplify", start)
+        if error <= edge or request.for_engines <= 0:
+            break
+        record.failed.append(f"simplify: strays {error / edge:.2g} edge lengths from the surface")
+    return part
 
 
 def _quads_of(part: Part, record: Record) -> list[Found]:
@@ -95,33 +84,31 @@ def _needed(request: Request) -> int:
 
 
 def _simplified(vertices: np.ndarray, faces: np.ndarray, edge: float, request: Request, record: Record, careful: bool,
-                meanwhile: Callable[[], object]) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh with its creases restored as coarse as quads of that edge need, or the mesh as it was where that cannot be done.
+                fine: Callable[[], Surface]) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with its creases restored as coarse as quads of that edge need, or the mesh as it was where that cannot be done."""
 
-    meanwhile: what to do while a child works; may be called more than once.
-    """
-    start = time.perf_counter()
-    needed = max(3 * request.quads, 20000)  # triangles that show all that so many quads can
-    if len(faces) > needed:
-        prepare("gdtool.geometry.simplify")
-    else:
+    def meanwhile() -> None:
+        # Not before: the engines' start would slow what this process does alone, the tree's building holds the interpreter's lock.
         prepare_engines(request.quads, request)
-    # Bevels so wide as the quads are drawn as they are.
+        fine()
+
+    if len(faces) <= _needed(request):
+        prepare_engines(request.quads, request)
+    # Bevels as wide as the quads are drawn as they are.
     restored = request.restore_creases and _median_edge(vertices, faces) < 0.75 * edge
-    found = simplify(vertices, faces, needed, seconds=request.for_the_rest, crease_degrees=request.crease_degrees if restored else 0.0,
+    found = simplify(vertices, faces, _needed(request), seconds=request.for_the_rest, crease_degrees=request.crease_degrees if restored else 0.0,
                      careful=careful, measured=False, meanwhile=meanwhile)
     report = found[3]
     record.figures |= {"simplified_to": report["faces"]} | ({"crease_vertices_restored": report["creases"]} if restored else {})
     if "failed" in report:
         record.failed.append(f"simplify: {report['failed']}")
-    record.clock("simplify", start)
     return found[:2]
 
 
-def _deviation(fine: Surface, coarse: tuple[np.ndarray, np.ndarray], limit: int = 20000) -> float:
+def _deviation(fine: Surface, coarse: Surface, limit: int = 20000) -> float:
     """Largest distance of the vertices of the input and of the simplified mesh to the other, at most `limit` of each."""
-    one, two = fine, Surface(*coarse)
-    return float(max(b.closest(a.vertices[::max(len(a.vertices) // limit, 1)])[0].max() for a, b in ((one, two), (two, one))))
+    pairs = (fine, coarse), (coarse, fine)
+    return float(max(b.closest(a.vertices[::max(len(a.vertices) // limit, 1)])[0].max() for a, b in pairs))
 
 
 def _median_edge(vertices: np.ndarray, faces: np.ndarray) -> float:

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
 
 from gdtool.geometry.normals import face_normals, vertex_normals
 from gdtool.geometry.repair import edges_of
@@ -67,8 +69,6 @@ def restore_creases(vertices: np.ndarray, faces: np.ndarray, crease_degrees: flo
     parts and rough surfaces stay as they are. The rims of a bevel are joined where that keeps the mesh manifold.
     accept: which of the vertices of indices (n,) may move to positions (n, 3), as bool (n,); all without it.
     """
-    from scipy.spatial import cKDTree
-
     report: dict[str, float | int] = {"moved": 0, "largest_move": 0.0, "bevel_share": 0.0}
     normals, area = face_normals(vertices, faces)
     bevel, rough = np.zeros(len(vertices), bool), np.zeros(len(faces), bool)
@@ -121,8 +121,6 @@ def _maybe_bent(normals: np.ndarray, columns: np.ndarray, count: int, degrees: f
     sqrt(1 - c^2 / (2 d)): the variance is the mean squared distance of the pairs, and each other normal is at least c / 2
     from one of the two.
     """
-    from scipy.sparse import csr_array
-
     # Row v of this matrix adds up the faces of vertex v: a product is several times faster than a bincount per coordinate.
     f = columns.shape[1]
     adds = csr_array((np.ones(3 * f), columns.T.ravel(), np.arange(0, 3 * f + 1, 3)), (f, count)).T
