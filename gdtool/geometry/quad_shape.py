@@ -12,7 +12,7 @@ from gdtool.geometry.normals import face_normals
 from gdtool.geometry.repair import compact, corner_fans, edges_of
 
 _WORTH_THREADS, _ALONE = 1000, 10000  # libigl searches with all threads from more than so many points on
-_EXACT_EVERY = 3  # steps between two searches for the closest point; the others stay in its plane
+_EXACT_EVERY = 5  # steps between two searches for the closest point; the others stay in its plane
 _BENT_COSINE = 0.97  # between a quad's normal and that of the surface below its centre
 
 

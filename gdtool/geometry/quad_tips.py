@@ -10,6 +10,7 @@ from gdtool.geometry.quad_shape import Surface
 from gdtool.geometry.repair import components, edges_of, euler_number
 
 _BARE, _CLOSE, _STRAYS = 0.5, 0.75, 1.0  # edge lengths from the quads: what belongs to a tip, what is near enough, what makes one
+_TIP = 1.5  # edge lengths that a tip measures at most which one vertex reaches
 _STEP = 1.5  # edge lengths that a tip is drawn out at once
 _HELD = 0.75  # of the farthest that a vertex moves: those that move so far stay there
 _MOST_STEPS = 24
@@ -21,13 +22,14 @@ def draw_out(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, 
     """Quads (f, 4) of mean edge length `edge` extruded over what of the surface strays from them, farthest first.
 
     The vertices (v, 3) nearest to a tip move along it, an edge or two at a time, with the quads around them, and a ring of
-    new quads follows each step, as one would model a horn by hand, until most_added of the quads are new: what needs more is no matter of tips. Closed and
-    manifold as before, of as many pieces and handles. Returns vertices, faces, constraints, in which the tips are fixed, and the tips' vertices (t,).
+    new quads follows each step, as one would model a horn by hand, until most_added of the quads are new: what needs more is no matter of tips.
+    A tip that is nearer than an edge takes one vertex and no ring. Closed and manifold as before, of as many pieces and handles. Returns vertices, faces,
+    constraints, in which the tips are fixed, and the tips' vertices (t,).
     """
     from gdtool.folders.mesh import triangulated
 
     step = max(len(surface.vertices) // _POINTS, 1)
-    points = np.concatenate([surface.vertices[::step], sample_surface(surface.vertices, surface.faces, _POINTS // 2, np.random.default_rng(0))[0]])
+    points = samples = np.concatenate([surface.vertices[::step], sample_surface(surface.vertices, surface.faces, _POINTS // 2, np.random.default_rng(0))[0]])
     most, before = len(faces) * (1 + most_added), constraints.fixed.copy()
     for turn in range(_MOST_STEPS):
         triangles, face_idx = triangulated(faces)
@@ -48,8 +50,27 @@ def draw_out(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, 
         points = points[alive]
         if not len(points) or len(faces) > most or away[alive].max() < _CLOSE * edge:
             break
+    vertices, constraints = _reached(vertices, faces, constraints, samples, edge)
     before = np.concatenate([before, np.zeros(len(vertices) - len(before), bool)])
     return vertices, faces, constraints, np.flatnonzero(constraints.fixed & ~before)
+
+
+def _reached(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, points: np.ndarray, edge: float) -> tuple[np.ndarray, Constraints]:
+    """Tips that end less than an edge from the quads: the nearest vertex moves there and stays."""
+    from gdtool.folders.mesh import triangulated
+
+    triangles, face_idx = triangulated(faces)
+    away, nearest, _ = closest_points(points, vertices, triangles)
+    bare = (away > _BARE * edge) & (away < _STRAYS * edge)
+    points, quads, away = points[bare], face_idx[nearest[bare]], away[bare]
+    if not len(points):
+        return vertices, constraints
+    ends = [tip[away[tip].argmax()] for tip in _apart(points, away, edge) if np.ptp(points[tip], 0).max() < _TIP * edge]
+    corner = faces[quads[ends], np.linalg.norm(vertices[faces[quads[ends]]] - points[ends][:, None], axis=-1).argmin(1)]
+    moved, first = np.unique(corner, return_index=True)  # the farthest comes first
+    out = vertices.copy()
+    out[moved] = points[ends][first]
+    return out, _extended(constraints, faces, len(vertices), moved, moved)
 
 
 def _apart(points: np.ndarray, away: np.ndarray, edge: float) -> list[np.ndarray]:

@@ -58,9 +58,18 @@ def test_no_more_quads_than_allowed_are_spent():
 
 def test_what_is_near_enough_is_left_alone():
     vertices, faces, edge = ball()
-    surface = Surface(*horned(0.8 * edge))
+    surface = Surface(*horned(0.4 * edge))
     out, found, _, tips = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
     assert out is vertices and found is faces and not len(tips)
+
+
+def test_one_vertex_reaches_a_tip_that_is_less_than_an_edge_away():
+    vertices, faces, edge = ball()
+    surface = Surface(*horned(0.9 * edge))
+    assert 0.6 * edge < farthest(vertices, faces, surface) < edge
+    out, found, constraints, tips = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
+    assert found is faces and farthest(out, faces, surface) < 0.4 * edge
+    assert len(tips) == 1 and constraints.fixed[tips].all() and (out == vertices).all(1).sum() == len(vertices) - 1
 
 
 def test_paths_along_creases_end_where_a_tip_is_drawn_out():
