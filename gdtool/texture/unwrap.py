@@ -5,10 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
 
 import numpy as np
 
-from gdtool.core.child import ChildFailed, call, prepare
+from gdtool.core.child import ChildFailed, begin, prepare
 from gdtool.folders.mesh import triangulated
 from gdtool.texture.raster import owner_count
 from gdtool.texture.unwrap_charts import Adjacency, find_charts
@@ -55,14 +57,23 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
     """
     begun = time.monotonic()
     found_by, shaped_by, projected_by, hung_by, packed_by = (begun + share * request.seconds for share in _SHARES)
-    for module in ("gdtool.geometry.simplify", "gdtool.texture.unwrap_charts", "gdtool.texture.unwrap_lay", "gdtool.texture.unwrap_pack"):
+    for module in ("gdtool.geometry.simplify", "gdtool.texture.unwrap_charts"):
         prepare(module)
     extent = float(np.ptp(vertices[np.unique(faces[faces >= 0])], 0).max())
     unit = (vertices - vertices.mean(0)) / (extent if extent > 0 else 1.0)
-    label, proxy, failed = find_charts(unit, faces, until=found_by, max_cost=request.max_cost)
+
+    @cache
+    def adjacency() -> Adjacency:  # asked for first while a child simplifies the mesh
+        prepare("gdtool.texture.unwrap_child")
+        return Adjacency(unit, faces)
+
+    label, part, proxy, failed = find_charts(adjacency, unit, faces, until=found_by, max_cost=request.max_cost)
     try:
-        flat, more = call("gdtool.texture.unwrap_lay:flatten_all", unit, faces, label, request.good_stretch, request.max_stretch, proxy,
-                          (shaped_by, projected_by), seconds=max(hung_by - time.monotonic(), _SHORTEST), memory_mb=8000)
+        child = begin("gdtool.texture.unwrap_child:flatten_all", unit, faces, label, request.good_stretch, request.max_stretch, proxy,
+                      (shaped_by, projected_by), part, seconds=max(hung_by - time.monotonic(), _SHORTEST), memory_mb=8000)
+        prepare("gdtool.texture.unwrap_pack")
+        import_module("scipy.spatial")  # packing would wait for it
+        flat, more = child.result()
     except ChildFailed as failure:
         late = time.monotonic() + projected_by - shaped_by
         flat, more = flatten_all(unit, faces, label, request.good_stretch, request.max_stretch, by=(shaped_by, late))
@@ -70,7 +81,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
     failed += more
     ways, skipped = [], []
     if time.monotonic() < packed_by:
-        flat, ways, skipped = _cut_to_pack(Adjacency(unit, faces), flat, request.padding / request.size, packed_by)
+        flat, ways, skipped = _cut_to_pack(adjacency(), flat, request.padding / request.size, packed_by)
     places, _ = pack([(uv, triangles) for _, _, uv, triangles in flat], request.padding / request.size, ways, packed_by)
     face_uvs = np.full(faces.shape, -1, np.int64)
     chart = np.zeros(len(faces), np.int64)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 
 from gdtool.core.child import ChildFailed, call
 from gdtool.folders.mesh import triangulated
 from gdtool.geometry.mesh_quality import polygon_normals
-from gdtool.geometry.repair import compact, edges_of, one_vertex_per_fan
+from gdtool.geometry.repair import edges_of, one_vertex_per_fan
 
 _PROXY_TRIANGLES = 6000
 _CREASE_DEGREES = 30.0
@@ -63,12 +64,15 @@ class Adjacency:
         inside = (pairs >= 0).all(1)
         return rows[inside], pairs[inside]
 
-    def pieces(self, faces_idx: np.ndarray) -> np.ndarray:
-        """(k,) number, from 0 on, of the set that each of faces_idx (k,) is connected in, through faces of faces_idx alone."""
+    def pieces(self, faces_idx: np.ndarray, side: np.ndarray | None = None) -> np.ndarray:
+        """(k,) number, from 0 on, of the set that each of faces_idx (k,) is connected in, through faces of faces_idx alone, and where there
+        are sides (k,), of its own."""
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
 
         _, pairs = self.within(faces_idx)
+        if side is not None:
+            pairs = pairs[side[pairs[:, 0]] == side[pairs[:, 1]]]
         return connected_components(coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(faces_idx),) * 2), False)[1]
 
     def connected(self, label: np.ndarray) -> np.ndarray:
@@ -94,19 +98,20 @@ class Adjacency:
         return key[order][last] % width
 
 
-def find_charts(vertices: np.ndarray, faces: np.ndarray, *, until: float, max_cost: float) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], list[str]]:
-    """(f,) chart of each face, all connected, the coarse mesh (vertices, triangles) they were found on, and what failed on the way.
+def find_charts(adjacency: Callable[[], Adjacency], vertices: np.ndarray, faces: np.ndarray, *, until: float,
+                max_cost: float) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray], list[str]]:
+    """(f,) chart of each face, all connected, (f,) its part of that, the coarse mesh (vertices, triangles) they were found on, and what
+    failed on the way.
 
-    vertices (v, 3) in a unit box, faces (f, 4); until: when to have given up, on the clock time.monotonic. Without xatlas' help
-    the faces go by the box side they look at.
+    vertices (v, 3) in a unit box, faces (f, 4), adjacency gives theirs; until: when to have given up, on the clock time.monotonic.
+    Without xatlas' help the faces go by the box side they look at.
     """
     from gdtool.geometry.distance import closest_points
     from gdtool.geometry.simplify import simplify
 
     failed: list[str] = []
-    adjacency = Adjacency(vertices, faces)
     triangles, _ = triangulated(faces)
-    proxy_vertices, proxy, _, report = simplify(vertices, triangles.astype(np.int64), _PROXY_TRIANGLES, measured=False,
+    proxy_vertices, proxy, _, report = simplify(vertices, triangles.astype(np.int64), _PROXY_TRIANGLES, measured=False, meanwhile=adjacency,
                                                    seconds=max(until - time.monotonic(), _SHORTEST))
     if report["method"] == "vertex clustering":
         proxy_vertices, proxy = vertices, triangles
@@ -119,19 +124,30 @@ def find_charts(vertices: np.ndarray, faces: np.ndarray, *, until: float, max_co
             raise ChildFailed("xatlas made no charts")
     except ChildFailed as failure:
         failed.append(f"xatlas: {failure}")
-        axis = np.abs(adjacency.normals).argmax(1)
-        label = axis * 2 + (adjacency.normals[np.arange(len(faces)), axis] < 0)
+        normals = adjacency().normals
+        axis = np.abs(normals).argmax(1)
+        label = axis * 2 + (normals[np.arange(len(faces)), axis] < 0)
     label = np.where(label < 0, label.max() + 1, label)
-    return tidy(adjacency, label), (proxy_vertices, proxy.astype(np.int64)), failed
+    return *tidy(adjacency(), label), (proxy_vertices, proxy.astype(np.int64)), failed
 
 
 def own_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A chart's own vertices, those where it touches itself doubled, and its faces (k, 3) or (k, 4) into them."""
-    return one_vertex_per_fan(*compact(vertices, faces))
+    """A chart's own vertices, those where it touches itself doubled, and its faces (k, 3) or (k, 4) into them.
+
+    In the whole mesh each vertex has one fan of faces: a chart has parts of it that do not touch, or all of it.
+    """
+    used, corners = faces >= 0, np.full(faces.shape, -1, np.int64)
+    vertex, first, place = np.unique(faces[used], return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    corners[used] = np.argsort(order)[place]
+    points, edges = vertices[vertex[order]], edges_of(corners)
+    fans = np.bincount(corners[used], minlength=len(points)) - np.bincount(edges.ends[edges.count == 2].ravel(), minlength=len(points))
+    return one_vertex_per_fan(points, corners) if fans.max(initial=0) > 1 else (points, corners)
 
 
-def tidy(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> np.ndarray:
-    """Labels with short, straight seams that prefer creases, without islands too small to be a chart."""
+def tidy(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> tuple[np.ndarray, np.ndarray]:
+    """Labels with short, straight seams that prefer creases, without islands too small to be a chart; and what these charts were made
+    of: labels from when each island had joined one neighbour."""
     first = label
     typical = np.median(adjacency.cost) if len(adjacency.cost) else 0.0
     parity = (np.arange(adjacency.count) * 2654435761 >> 7) % 2
@@ -143,8 +159,8 @@ def tidy(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> np.ndarra
             break
         label = np.where(changing, voted, label)
     label = adjacency.connected(label)
-    smallest = _SMALLEST_SHARE * adjacency.area.sum()
-    for _ in range(20):
+    part, smallest = label, _SMALLEST_SHARE * adjacency.area.sum()
+    for turn in range(20):
         area = np.bincount(label, adjacency.area)
         faces = np.bincount(label)
         small = (area < smallest) | (faces < min(8, adjacency.count // 64))
@@ -166,7 +182,8 @@ def tidy(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> np.ndarra
         swap = (target[target] == np.arange(len(area))) & (target > np.arange(len(area)))
         onto = np.where(swap, np.arange(len(area)), target)
         label = adjacency.connected(onto[label])
-    return label
+        part = label if turn == 0 else part
+    return label, part
 
 
 def bisect(adjacency: Adjacency, faces_idx: np.ndarray) -> np.ndarray:
@@ -178,10 +195,11 @@ def bisect(adjacency: Adjacency, faces_idx: np.ndarray) -> np.ndarray:
     # Across a crease is far: halves part there when they can.
     size = np.sqrt(adjacency.area[faces_idx])
     length = (size[pairs[:, 0]] + size[pairs[:, 1]]) / 2 * np.where(adjacency.crease[inside], 5.0, 1.0) + 1e-12
-    graph = coo_matrix((length, (pairs[:, 0], pairs[:, 1])), (len(faces_idx),) * 2).tocsr()
+    a, b = pairs.T
+    graph = coo_matrix((np.concatenate([length, length]), (np.concatenate([a, b]), np.concatenate([b, a]))), (len(faces_idx),) * 2).tocsr()
 
     def far_from(start: int) -> tuple[int, np.ndarray]:
-        distance = dijkstra(graph, directed=False, indices=start)
+        distance = dijkstra(graph, indices=start)
         return int(np.where(np.isfinite(distance), distance, -1).argmax()), distance
 
     one, _ = far_from(0)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gdtool.geometry.normals import face_normals
-from gdtool.geometry.repair import edges_of
+from gdtool.geometry.repair import Edges, edges_of
 from gdtool.texture.raster import owned_texels, owner_count
 
 _SLIM_STEPS = (2, 2, 4, 6, 8)
@@ -34,8 +34,8 @@ def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, ma
     border = edges.count == 1
     if not border.any():
         return Flat(None, "closed")
-    uv = onto_plane(vertices, triangles)
-    if uv is not None and stretch(vertices, triangles, uv) < good_stretch:
+    surface, uv = Surface(vertices, triangles), _seen(vertices, triangles)
+    if uv is not None and surface.stretch(uv) < good_stretch and not overlapping(uv, triangles, edges).any():
         return Flat(uv)
     uv = _conformal(vertices, triangles, edges.ends[border])
     if uv is None or not upright(uv, triangles):
@@ -45,10 +45,10 @@ def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, ma
         uv = _tutte(vertices, triangles)
         if uv is None or not upright(uv, triangles):
             return Flat(None, "folds")
-    uv = _isometric(vertices, triangles, uv, good_stretch, max_stretch)
-    if stretch(vertices, triangles, uv) > max_stretch:
+    uv, reached = _isometric(vertices, triangles, uv, surface, good_stretch, max_stretch)
+    if reached > max_stretch:
         return Flat(None, "stretches")
-    on_others = overlapping(uv, triangles)
+    on_others = overlapping(uv, triangles, edges)
     return Flat(None, "overlaps itself", uv, on_others) if on_others.any() else Flat(uv)
 
 
@@ -69,7 +69,12 @@ def _scaled(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> np.n
 
 
 def onto_plane(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
-    """The chart seen along its mean normal, when all of it faces that way: exact for flat charts."""
+    """The chart seen along its mean normal, when all of it faces that way and none lies on another: exact for flat charts."""
+    uv = _seen(vertices, triangles)
+    return None if uv is None or overlapping(uv, triangles).any() else uv
+
+
+def _seen(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
     normals, area = face_normals(vertices, triangles)
     mean = (normals * area[:, None]).sum(0)
     length = np.linalg.norm(mean)
@@ -81,9 +86,7 @@ def onto_plane(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None
     x = np.cross([0.0, 1.0, 0.0] if abs(mean[1]) < 0.9 else [1.0, 0.0, 0.0], mean)
     x /= np.linalg.norm(x)
     uv = np.stack([vertices @ x, vertices @ np.cross(mean, x)], -1)
-    if not upright(uv, triangles) or overlapping(uv, triangles).any():
-        return None
-    return _scaled(vertices, triangles, uv)
+    return _scaled(vertices, triangles, uv) if upright(uv, triangles) else None
 
 
 def _conformal(vertices: np.ndarray, triangles: np.ndarray, border: np.ndarray) -> np.ndarray | None:
@@ -134,26 +137,25 @@ def _tutte(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
     return _scaled(vertices, triangles, uv)
 
 
-def _isometric(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray, good_stretch: float, max_stretch: float) -> np.ndarray:
-    """uv after SLIM: until good_stretch, until it gains little, or until it is clear that it will not come to max_stretch."""
+def _isometric(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray, surface: Surface, good_stretch: float,
+               max_stretch: float) -> tuple[np.ndarray, float]:
+    """uv after SLIM, and its stretch: until good_stretch, until it gains little, or until it is clear that it will not come to max_stretch."""
     import igl
 
-    best = uv
-    if stretch(vertices, triangles, best) < good_stretch:
-        return best
-    start = np.concatenate([uv, np.zeros((len(uv), 1))], 1)
-    state = igl.slim_precompute(np.asfortranarray(vertices, np.float64), np.asfortranarray(triangles, np.int32), np.asfortranarray(start[:, :2]),
+    best, before = uv, surface.stretch(uv)
+    if before < good_stretch:
+        return best, before
+    state = igl.slim_precompute(np.asfortranarray(vertices, np.float64), np.asfortranarray(triangles, np.int32), np.asfortranarray(uv),
                                 igl.MappingEnergyType.SYMMETRIC_DIRICHLET, np.zeros(0, np.int32), np.zeros((0, 2), order="F"), 0.0)
-    before = stretch(vertices, triangles, best)
     for steps in _SLIM_STEPS:
         found = np.asarray(igl.slim_solve(state, steps))[:, :2]
         if not np.isfinite(found).all() or not upright(found, triangles):
             break
-        best, now = _scaled(vertices, triangles, found), stretch(vertices, triangles, found)
-        if now < good_stretch or before - now < 2e-4 or now - _RELIED_GAIN * (before - now) > max_stretch:
+        best, last, before = _scaled(vertices, triangles, found), before, surface.stretch(found)
+        gained = last - before
+        if before < good_stretch or gained < 2e-4 or before - _RELIED_GAIN * gained > max_stretch:
             break
-        before = now
-    return best
+    return best, before
 
 
 def singular_values(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -172,16 +174,38 @@ def singular_values(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray)
 
 def stretch(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> float:
     """L2 stretch (Sander et al. 2001), 1 for an isometry, at the scale where the areas agree."""
-    values, area = singular_values(vertices, triangles, uv)
-    flat = np.abs(_areas(uv, triangles))
-    use = (area > 1e-12 * area.sum()) & (flat > 1e-14 * max(flat.sum(), 1e-300))
-    if not use.any():
-        return float("inf")
-    weight = area[use] / area[use].sum()
-    return float(np.sqrt((weight * (values[use] ** 2).sum(1) / 2).sum() * flat[use].sum() / area[use].sum()))
+    return Surface(vertices, triangles).stretch(uv)
 
 
-def overlapping(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+class Surface:
+    """Triangles (t, 3) of vertices (v, 3), whose maps to the plane are measured: what they all share is computed once."""
+
+    def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
+        self._abc = tuple(triangles.T)
+        a, b, c = self._abc
+        one, two = (vertices[b] - vertices[a]).T, (vertices[c] - vertices[a]).T
+        self._metric = (one * one).sum(0), (one * two).sum(0), (two * two).sum(0)
+        normal = one[[1, 2, 0]] * two[[2, 0, 1]] - one[[2, 0, 1]] * two[[1, 2, 0]]
+        self.area = np.sqrt((normal * normal).sum(0)) / 2
+
+    def squared(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(t,) mean square of the two singular values of the map from uv (v, 2) to each triangle, and its area in uv, not negative."""
+        a, b, c = self._abc
+        (u, v), (s, t), (e, f, g) = (uv[b] - uv[a]).T, (uv[c] - uv[a]).T, self._metric
+        flat = np.abs(u * t - v * s)
+        return (e * (s * s + t * t) - 2 * f * (u * s + v * t) + g * (u * u + v * v)) / (2 * np.maximum(flat, 1e-150) ** 2), flat / 2
+
+    def stretch(self, uv: np.ndarray) -> float:
+        """As stretch()."""
+        square, flat = self.squared(uv)
+        area, total = self.area, self.area.sum()
+        use = (area > 1e-12 * total) & (flat > 1e-14 * max(flat.sum(), 1e-300))
+        if not use.any():
+            return float("inf")
+        return float(np.sqrt((area * square)[use].sum() * flat[use].sum()) / area[use].sum())
+
+
+def overlapping(uv: np.ndarray, triangles: np.ndarray, edges: Edges | None = None) -> np.ndarray:
     """(t,) which triangles of a chart, all upright, lie on others of it: none, where it lies flat.
 
     Some do where its rim crosses itself, however little; a grid finer than its triangles finds what winds around twice.
@@ -190,7 +214,7 @@ def overlapping(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     extent = float(np.ptp(uv, 0).max())
     if not extent > 0:
         return ~found
-    edges = edges_of(triangles)
+    edges = edges or edges_of(triangles)
     rim = np.flatnonzero(edges.count[edges.half_edge_idx] == 1)
     found[edges.half_face[rim[rim_crossings(uv, edges.half_ends[rim])]]] = True
     size = int(np.clip(10 * len(triangles) ** 0.5, 64, 512))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.geometry.mesh_quality import polygon_normals
+from gdtool.geometry.repair import one_vertex_per_fan
 from gdtool.texture.unwrap_charts import Adjacency, own_corners
 from gdtool.texture.unwrap_flatten import flatten
 
@@ -20,9 +21,10 @@ def joined_stretch(good_stretch: float) -> float:
 def joined(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, proxy_vertices: np.ndarray, proxy: np.ndarray, good_stretch: float) -> np.ndarray:
     """Labels (f,) of faces (f, 4) with small charts joined to the neighbour with the longest common seam, where the two lie
     flat together on the proxy, triangles (t, 3) of the same surface."""
+    proxy_vertices, proxy = one_vertex_per_fan(proxy_vertices, proxy)
     adjacency = Adjacency(proxy_vertices, np.concatenate([proxy, np.full((len(proxy), 1), -1)], 1))
     place = _brought_over(vertices, faces, label, proxy_vertices, proxy, adjacency)
-    total, count = adjacency.area.sum(), int(label.max()) + 1
+    total, count, most = adjacency.area.sum(), int(label.max()) + 1, joined_stretch(good_stretch)
     onto = np.arange(count)
     tried: set[tuple[int, int]] = set()
     for _ in range(_JOINS):
@@ -46,7 +48,7 @@ def joined(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, proxy_ver
         i, j = int(one[k]), int(two[k])
         tried.add((i, j))
         points, triangles = own_corners(proxy_vertices, proxy[(place == i) | (place == j)])
-        if flatten(points, triangles, good_stretch, joined_stretch(good_stretch)).uv is not None:
+        if flatten(points, triangles, good_stretch, most).uv is not None:
             place[place == j] = i
             onto[onto == j] = i
             tried = {pair for pair in tried if i not in pair and j not in pair}

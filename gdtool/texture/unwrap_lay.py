@@ -10,8 +10,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from gdtool.core.child import ChildFailed, begin, prepare
 from gdtool.folders.mesh import triangulated
 from gdtool.geometry.mesh_quality import polygon_normals
+from gdtool.geometry.repair import one_vertex_per_fan
 from gdtool.texture.unwrap_charts import Adjacency, bisect, own_corners
 from gdtool.texture.unwrap_cut import connected, part_of
 from gdtool.texture.unwrap_flatten import Flat, flatten, onto_plane, stretch, upright
@@ -20,16 +22,18 @@ from gdtool.texture.unwrap_peel import onto_neighbours, peel
 
 _WHOLE = 1.4  # stretch of all charts together over 1, in units of what is good for one: with more the worst are cut
 _MOST_RELIEVED = 16, 0.5  # charts that are cut for that: so many, and this share of all
+_BESIDE = 4000  # faces of several charts, from which on half of them are laid flat in a child
+_SLACK = 5.0  # seconds that it has to start and to stop
 _LATE = "was left when the time was over"
 
 
 @dataclass
 class Laid:
-    """charts (faces_idx, corners (k, 4), uv (c, 2) v up, triangles), corners into uv; `off`: sets of faces taken off them;
-    how many were cut for each reason."""
+    """charts (faces_idx, corners (k, 4), uv (c, 2) v up, triangles), corners into uv; `off`: sets of faces taken off
+    them, each with a face of the chart that it came off; how many were cut for each reason."""
 
     charts: list[tuple] = field(default_factory=list)
-    off: list[np.ndarray] = field(default_factory=list)
+    off: list[tuple[int, np.ndarray]] = field(default_factory=list)
     cut: Counter = field(default_factory=Counter)
 
     def add(self, more: Laid) -> None:
@@ -42,35 +46,64 @@ class Laid:
 
 
 def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good_stretch: float, max_stretch: float,
-                proxy: tuple[np.ndarray, np.ndarray] | None = None, by: tuple[float, float] = (np.inf, np.inf)) -> tuple[list, list[str]]:
+                proxy: tuple[np.ndarray, np.ndarray] | None = None, by: tuple[float, float] = (np.inf, np.inf),
+                part: np.ndarray | None = None) -> tuple[list, list[str]]:
     """Each chart of faces (f, 4), label (f,), laid flat, and what was cut: Laid.charts and a line for each reason.
 
     proxy, vertices and triangles: a coarse mesh of the surface, on which joining is tried. Without one nothing is joined and
     charts are laid flat by projection alone, cut until that works. by: when, on the clock time.monotonic, projection alone goes on
-    with what is left, and when each face of that becomes a chart.
+    with what is left, and when each face of that becomes a chart. part (f,): what stays together where a chart is cut, if it can.
     """
-    adjacency = Adjacency(vertices, faces)
+    if proxy is not None and len(faces) >= _BESIDE:
+        prepare("gdtool.texture.unwrap_child")
+    adjacency, part = Adjacency(vertices, faces), label if part is None else part
+    vertices, faces = one_vertex_per_fan(vertices, faces)
 
     def further(sets: list[np.ndarray], **how: bool) -> Laid:
-        return lay(adjacency, vertices, faces, label, sets, good_stretch, max_stretch, by, **how)
+        return _lay_beside(adjacency, vertices, faces, label, part, sets, good_stretch, max_stretch, by, **how)
 
     if proxy is None:
         laid = further(_sets(label), projected=True)
         return laid.charts, laid.reasons()
     joined_label = joined(vertices, faces, label, *proxy, good_stretch) if time.monotonic() < by[0] else label
     laid = further(_sets(joined_label), peeling=True)
-    off = onto_neighbours(adjacency, vertices, faces, laid.charts, laid.off, good_stretch) if time.monotonic() < by[0] else laid.off
-    laid.add(further(off))
     if time.monotonic() < by[0]:
-        _relieve(adjacency, vertices, faces, laid, further, good_stretch)
+        laid.off = onto_neighbours(adjacency, vertices, faces, laid.charts, laid.off, good_stretch)
+    laid.add(further([faces_idx for _, faces_idx in laid.off]))
+    if time.monotonic() < by[0]:
+        _relieve(adjacency, vertices, faces, part, laid, further, good_stretch)
     return laid.charts, laid.reasons()
 
 
-def lay(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, sets: list[np.ndarray], good_stretch: float,
-        max_stretch: float, by: tuple[float, float] = (np.inf, np.inf), *, peeling: bool = False, projected: bool = False) -> Laid:
+def _lay_beside(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, part: np.ndarray, sets: list[np.ndarray], *how,
+                **more: bool) -> Laid:
+    """lay(), half of it in a child where many faces are to be laid."""
+    if sum(map(len, sets)) < _BESIDE or len(sets) < 2:
+        return lay(adjacency, vertices, faces, label, part, sets, *how, **more)
+    halves, load, place = ([], []), [0, 0], np.zeros(len(faces), int)
+    for number in sorted(range(len(sets)), key=lambda i: -len(sets[i])):
+        lighter = int(load[1] < load[0])
+        halves[lighter].append(sets[number])
+        load[lighter] += len(sets[number])
+        place[sets[number]] = number
+    here, there = ((adjacency, vertices, faces, label, part, half, *how) for half in halves)
+    child = begin("gdtool.texture.unwrap_child:lay", *there, **more, seconds=min(max(how[-1][1] - time.monotonic(), 0.0), 3600.0) + _SLACK)
+    laid = lay(*here, **more)
+    try:
+        laid.add(child.result())
+    except ChildFailed:
+        laid.add(lay(*there, **more))
+    laid.charts.sort(key=lambda chart: place[chart[0][0]])  # as if laid one after the other
+    laid.off.sort(key=lambda one: place[one[0]])
+    return laid
+
+
+def lay(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, part: np.ndarray, sets: list[np.ndarray],
+        good_stretch: float, max_stretch: float, by: tuple[float, float] = (np.inf, np.inf), *, peeling: bool = False,
+        projected: bool = False) -> Laid:
     """Sets of faces laid flat, cut where they do not lie so; a set of several labels (f,), joined, may stretch less and comes apart first.
 
-    by: as flatten_all()'s. peeling: take off what lies on other parts of a chart, where that is little. projected: by projection alone.
+    part, by: as flatten_all()'s. peeling: take off what lies on other parts of a chart, where that is little. projected: by projection alone.
     """
     laid, queue = Laid(), sets[::-1]
     while queue:
@@ -102,13 +135,14 @@ def lay(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, label: np
         if keep is not None:
             largest, *others = sorted(connected(adjacency, faces_idx, keep), key=np.count_nonzero, reverse=True)
             laid.charts.append(part_of((faces_idx, corners, flat.overlapped, triangles), largest))
-            laid.off += [faces_idx[part] for part in others + connected(adjacency, faces_idx, ~keep)]
+            home = int(laid.charts[-1][0][0])
+            laid.off += [(home, faces_idx[part]) for part in others + connected(adjacency, faces_idx, ~keep)]
             continue
-        queue.extend(_halves(adjacency, faces_idx))
+        queue.extend(_halves(adjacency, part, faces_idx))
     return laid
 
 
-def _relieve(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, laid: Laid, further: Callable[[list[np.ndarray]], Laid],
+def _relieve(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, laid: Laid, further: Callable[[list[np.ndarray]], Laid],
              good_stretch: float) -> None:
     """The charts that make all of them together stretch too much cut, in place, those that weigh most first; further: lays the parts.
 
@@ -133,7 +167,7 @@ def _relieve(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, laid
         faces_idx = laid.charts[worst][0]
         if len(faces_idx) < 2:
             continue
-        halves = further(_halves(adjacency, faces_idx))
+        halves = further(_halves(adjacency, part, faces_idx))
         added = [(-excess(chart), len(laid.charts) + i) for i, chart in enumerate(halves.charts)]
         total += value - sum(more for more, _ in added)
         laid.add(halves)
@@ -144,12 +178,17 @@ def _relieve(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, laid
     laid.charts = [chart for i, chart in enumerate(laid.charts) if i not in gone]
 
 
-def _halves(adjacency: Adjacency, faces_idx: np.ndarray) -> list[np.ndarray]:
-    """Two or more connected sets of a chart's faces."""
-    half = bisect(adjacency, faces_idx)
+def _halves(adjacency: Adjacency, part: np.ndarray, faces_idx: np.ndarray) -> list[np.ndarray]:
+    """Two or more connected sets of a chart's faces, cut between its parts, part (f,), where it has several: they begin and end at creases."""
+    half, area = bisect(adjacency, faces_idx), adjacency.area[faces_idx]
     if half.all() or not half.any():
         half = np.arange(len(faces_idx)) < len(faces_idx) // 2
-    return [faces_idx[part] for side in (half, ~half) for part in connected(adjacency, faces_idx, side)]
+    place = np.unique(part[faces_idx], return_inverse=True)[1]
+    share = np.bincount(place, area * half) / np.maximum(np.bincount(place, area), 1e-300)
+    whole = (share > np.clip(0.5, share.min(), np.nextafter(share.max(), 0)))[place]  # some on each side, unless their shares are equal
+    half = half if whole.all() else whole
+    number = adjacency.pieces(faces_idx, half)
+    return [faces_idx[number == n] for n in range(number.max() + 1)]
 
 
 def _sets(label: np.ndarray) -> list[np.ndarray]:

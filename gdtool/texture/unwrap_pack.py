@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gdtool.core.child import ChildFailed, begin
-from gdtool.texture.unwrap_settle import settled
+from gdtool.texture.unwrap_settle import ROUGH, Fine
 from gdtool.texture.unwrap_shapes import Shapes, rim_of, upright_box
 
 _COARSE = ((48, 144), (160, 160), (4000, 320))  # for up to so many charts: cells of the square's side in which orders are tried
@@ -48,7 +48,8 @@ def best_packed(variants: Iterable[list[tuple[np.ndarray, np.ndarray]]], gap: fl
         if not 1 < len(charts) <= _MOST_BY_SEARCH:
             continue
         boxed, area = _boxed(charts)
-        cells, _, found = _drafted(boxed, area, gap, _OWN, _TRIES_OF_DRAFT, [])
+        cells, shapes, found = _drafted(boxed, area, gap, _OWN, [])
+        found = _improved(shapes, found, _TRIES_OF_DRAFT, np.inf)
         share = _DENSITY * (cells / found[0].side) ** 2 if found else 0.0
         if share > best_share + (_GAIN + _GAIN_PER_CHART * (len(charts) - best_count) if best_share else 0.0):
             best, best_share, best_count, best_ways = i, share, len(charts), [(layout.order, layout.contact) for layout in found[:2]]
@@ -74,11 +75,16 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, ways: list[tup
         return [boxed[0][0] * scale + gap], scale
     if len(charts) > _COARSE[-1][0]:
         return _shelves([uv for uv, _ in boxed], gap)
-    for share in (_OWN, 0.0) if len(charts) <= _MOST_BY_SEARCH else (0.0,):
-        cells, shapes, found = _drafted(boxed, area, gap, share, _TRIES, ways or [], until, beside=True)
+    searched = len(charts) <= _MOST_BY_SEARCH
+    for share in (_OWN, 0.0) if searched else (0.0,):
+        cells, shapes, found = _drafted(boxed, area, gap, share, ways or [], until)
         cells_per_unit = cells * (_DENSITY / area) ** 0.5
-        if found and len(charts) <= _MOST_BY_SEARCH:
-            packed = settled(boxed, shapes, cells_per_unit, [(one.side, one.at) for one in found[:_SETTLED]], gap)
+        if found and searched:
+            if share and Fine(boxed, shapes, cells_per_unit, [found[0].side], gap, ROUGH).apart(found[0].at) is None:
+                continue  # one in the other, as arcs of rings are: orders of these are sought where a cell has one owner
+            found = _improved(shapes, found, _TRIES, until, beside=True)
+            best = found[:_SETTLED]
+            packed = Fine(boxed, shapes, cells_per_unit, [one.side for one in best], gap).settled([one.at for one in best])
             if packed:
                 return packed
         if found and not share:  # nowhere too near another as it is
@@ -93,44 +99,44 @@ def _boxed(charts: list) -> tuple[list, float]:
     return [(uv, rim_of(uv, triangles)) for uv, triangles in upright], max(area, 1e-300)
 
 
-def _drafted(boxed: list, area: float, gap: float, share: float, tries: int, ways: list[tuple[list[int], float]],
-             until: float = np.inf, beside: bool = False) -> tuple[int, Shapes | None, list[Layout]]:
-    """Cells of the side of a square that the charts fill to _DENSITY, the charts on that grid, and layouts of them, best first."""
+def _drafted(boxed: list, area: float, gap: float, share: float, ways: list[tuple[list[int], float]],
+             until: float = np.inf) -> tuple[int, Shapes | None, list[Layout]]:
+    """Cells of the side of a square that the charts fill to _DENSITY, the charts on that grid, and layouts of them, best first: of a few
+    orders, or of ways, orders with their weights of contact."""
     cells = next(cells for most, cells in _COARSE if len(boxed) <= most)
     shapes = None
     for least in _LEAST:
         most = int(cells * (_DENSITY / least) ** 0.5)
         shapes = Shapes(boxed, cells * (_DENSITY / area) ** 0.5, gap * (cells if share else most), most, share)
-        found = _search(shapes, cells, most, tries // len(boxed) if len(boxed) <= _MOST_BY_SEARCH else 0, ways, until, beside)
+        found: list[Layout] = []
+        for order, contact in ways or _first_ways(shapes)[:6 if len(boxed) <= _MOST_BY_SEARCH else 1]:
+            # Later ones have to do better, and the first has no room to grow beyond what it is asked for.
+            side, largest = (found[0].side - 1,) * 2 if found else (int(0.9 * cells), most)
+            layout = _placed(shapes, order, side, largest, contact, until)
+            if layout is not None:
+                found.insert(0, layout)
         if found:
             return cells, shapes, found
     return cells, shapes, []
 
 
-def _search(shapes: Shapes, cells: int, most: int, tries: int, ways: list[tuple[list[int], float]], until: float, beside: bool) -> list[Layout]:
-    """Layouts in squares of at most so many cells, best first: of a few orders (ways, with their weights of contact), then of small
-    changes of the best, in several chains: each soon ends where no small change helps. beside: half of them in a child."""
-    found: list[Layout] = []
-    ways = ways or _first_ways(shapes)[:6 if len(shapes.bits) <= _MOST_BY_SEARCH else 1]
-    for order, contact in ways:
-        # Later ones have to do better, and the first has no room to grow beyond what it is asked for.
-        side, largest = (found[0].side - 1,) * 2 if found else (int(0.9 * cells), most)
-        layout = _placed(shapes, order, side, largest, contact, until)
-        if layout is not None:
-            found.insert(0, layout)
-    if not found or tries < _CHAINS:
+def _improved(shapes: Shapes, found: list[Layout], tries: int, until: float, beside: bool = False) -> list[Layout]:
+    """The layouts, and better ones, best first: of small changes of the best order, in several chains: each soon ends where no small
+    change helps. tries: charts placed; beside: half of the chains in a child."""
+    if not found or tries < _CHAINS * len(found[0].order):
         return found
-    here, there = ([(shapes, found[0], tries // _CHAINS, chain, until) for chain in range(first, _CHAINS, 2)] for first in (0, 1))
+    each = tries // len(found[0].order) // _CHAINS
+    here, there = ([(shapes, found[0], each, chain, until) for chain in range(first, _CHAINS, 2)] for first in (0, 1))
     if beside:
         child = begin("gdtool.texture.unwrap_pack:chains", there, seconds=min(max(until - time.monotonic(), 0.0), 3600.0) + _SLACK)
-        found += chains(here)
+        more = chains(here)
         try:
-            found += child.result()
+            more += child.result()
         except ChildFailed:
-            found += chains(there)
+            more += chains(there)
     else:
-        found += chains(here + there)
-    return sorted(found, key=lambda layout: layout.side)
+        more = chains(here + there)
+    return sorted(found + more, key=lambda layout: layout.side)
 
 
 def chains(several: list[tuple]) -> list[Layout]:

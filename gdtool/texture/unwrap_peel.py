@@ -32,21 +32,23 @@ def peel(adjacency: Adjacency, faces_idx: np.ndarray, triangles: np.ndarray, fac
     return keep
 
 
-def onto_neighbours(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, charts: list, pieces: list[np.ndarray],
-                    good_stretch: float) -> list[np.ndarray]:
-    """Which of the pieces (lists of faces) lie flat with none of the charts beside them; the others join one, in place.
+def onto_neighbours(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, charts: list, pieces: list[tuple[int, np.ndarray]],
+                    good_stretch: float) -> list[tuple[int, np.ndarray]]:
+    """Which of the pieces lie flat with none of the charts beside them; the others join one, in place.
 
-    charts (faces_idx, corners, uv, triangles), as flatten_all() returns them.
+    charts (faces_idx, corners, uv, triangles), as flatten_all() returns them; pieces: a face of the chart that it lay on, and is not
+    offered to again, and its faces.
     """
     owner = np.full(adjacency.count, -1)
     for i, chart in enumerate(charts):
         owner[chart[0]] = i
     left, work = [], 0
-    for piece in sorted(pieces, key=len, reverse=True):
+    for home, piece in sorted(pieces, key=lambda one: len(one[1]), reverse=True):
         inside = np.zeros(adjacency.count, bool)
         inside[piece] = True
         rows = np.flatnonzero(inside[adjacency.pairs].sum(1) == 1)
         beside = owner[adjacency.pairs[rows]].max(1)  # the piece itself has no owner yet
+        beside = np.where(beside == owner[home], -1, beside)
         seam = np.bincount(beside[beside >= 0], adjacency.cost[rows[beside >= 0]], len(charts))
         for i in np.argsort(-seam, kind="stable")[:_NEIGHBOURS].tolist():
             if not seam[i] or work > _WORK * adjacency.count:
@@ -60,5 +62,5 @@ def onto_neighbours(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarra
                 charts[i], owner[piece] = (faces_idx, corners, uv, triangles), i
                 break
         else:
-            left.append(piece)
+            left.append((home, piece))
     return left

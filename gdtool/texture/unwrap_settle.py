@@ -6,39 +6,55 @@ import numpy as np
 
 from gdtool.texture.unwrap_shapes import Shapes, bits_of, turned
 
-_FINE = 768  # cells of the side of the fine grid, about
+FINE, ROUGH = 768, 300  # cells of the side of the fine grid, about, and of one that tells whether charts come apart
 _SPREADS = (1.0, 1.01, 1.02, 1.03, 1.04, 1.05, 1.07, 1.1)  # by which charts are moved apart until each finds room
 _NEAR = sorted(((dx, dy) for dx in range(-16, 17) for dy in range(-16, 17)), key=lambda d: d[0] ** 2 + d[1] ** 2)  # places tried, in cells
 _ROUNDS = 12  # of moving all of them up, or all of them to the left
 
 
-def settled(boxed: list, shapes: Shapes, cells_per_unit: float, layouts: list[tuple[int, list]], gap: float) -> tuple[list[np.ndarray], float] | None:
-    """The best of the layouts (side, (turn, x, y) of each chart in cells of the shapes), as pack() returns it: on a grid several times
-    as fine each chart goes to the nearest place where it is clear of the others, then up and to the left as far as they let it,
-    again and again; then the square is cut to what is used. None where in none of them all find a place."""
-    finer = max(round(_FINE / layouts[0][0]), 1)
-    most = int(finer * max(side for side, _ in layouts) * _SPREADS[-1])
-    fine = [turned(rim, uv, finer * cells_per_unit, gap * most) for uv, rim in boxed]
-    bits: dict[tuple[int, int], int] = {}
-    best, best_used = None, most + 1
-    for _, layout in layouts:
+class Fine:
+    """Charts on a finer grid than their shapes', of about so many cells a side, the gap around them; sides: of the layouts that are to be
+    moved there, the best first, in cells of the shapes."""
+
+    def __init__(self, boxed: list, shapes: Shapes, cells_per_unit: float, sides: list[int], gap: float, cells: int = FINE):
+        self._finer = max(round(cells / sides[0]), 1)
+        self._most = int(self._finer * max(sides) * _SPREADS[-1])
+        self._shapes, self._cells = shapes, cells_per_unit * self._finer
+        self._turned = [turned(rim, uv, self._cells, gap * self._most) for uv, rim in boxed]
+        self._bits: dict[tuple[int, int], int] = {}
+
+    def apart(self, layout: list) -> tuple[list[list[int]], int] | None:
+        """Places [x, y] of the charts of a layout, (turn, x, y) of each in cells of the shapes, and what they take: each at the nearest
+        place where it is clear of the others. None where one finds none."""
         for i, (turn, _, _) in enumerate(layout):
-            if (i, turn) not in bits:
-                bits[i, turn] = bits_of(fine[i][0][turn], most + 1)
-        own, size = [bits[i, at[0]] for i, at in enumerate(layout)], [fine[i][0][at[0]].shape for i, at in enumerate(layout)]
+            if (i, turn) not in self._bits:
+                self._bits[i, turn] = bits_of(self._turned[i][0][turn], self._most + 1)
         for spread in _SPREADS:
             wanted = []
             for i, (turn, x, y) in enumerate(layout):
-                h, w = shapes.shapes[i][turn]
-                first = shapes.uv[i][turn][0] + [x, y] + (spread - 1) * np.array([x + w / 2, y + h / 2])
-                wanted.append(np.rint(first * finer - fine[i][1][turn][0]).astype(int))
-            found = _apart(own, size, wanted, most)
+                h, w = self._shapes.shapes[i][turn]
+                first = self._shapes.uv[i][turn][0] + [x, y] + (spread - 1) * np.array([x + w / 2, y + h / 2])
+                wanted.append(np.rint(first * self._finer - self._turned[i][1][turn][0]).astype(int))
+            found = _apart(*self._masks(layout), wanted, self._most)
             if found is not None:
-                place, used = _tightened(own, size, *found, most + 1)
+                return found
+        return None
+
+    def settled(self, layouts: list[list]) -> tuple[list[np.ndarray], float] | None:
+        """The best of the layouts, as pack() returns it: the charts apart, then up and to the left as far as they let each other, again
+        and again; then the square is cut to what is used. None where in none of them all find a place."""
+        best, best_used = None, self._most + 1
+        for layout in layouts:
+            found = self.apart(layout)
+            if found is not None:
+                place, used = _tightened(*self._masks(layout), *found, self._most + 1)
                 if used < best_used:
-                    best_used, best = used, [fine[i][1][at[0]] + xy for i, (at, xy) in enumerate(zip(layout, place, strict=True))]
-                break
-    return best and ([uv / best_used for uv in best], cells_per_unit * finer / best_used)
+                    best_used, best = used, [self._turned[i][1][at[0]] + xy for i, (at, xy) in enumerate(zip(layout, place, strict=True))]
+        return best and ([uv / best_used for uv in best], self._cells / best_used)
+
+    def _masks(self, layout: list) -> tuple[list[int], list[tuple[int, int]]]:
+        """Cells of the charts as they are turned, and their sizes (h, w)."""
+        return [self._bits[i, at[0]] for i, at in enumerate(layout)], [self._turned[i][0][at[0]].shape for i, at in enumerate(layout)]
 
 
 def _apart(own: list[int], size: list[tuple[int, int]], wanted: list[np.ndarray], most: int) -> tuple[list[list[int]], int] | None:

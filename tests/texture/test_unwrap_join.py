@@ -71,3 +71,13 @@ def test_what_lay_flat_together_on_the_proxy_alone_comes_apart_again(monkeypatch
         owner[faces_idx] = i
         assert np.isfinite(uv).all()
     assert len(charts) == 2 and ((owner == owner[label.argmax()]) == (label == 1)).all()
+
+
+def test_a_chart_that_touches_itself_in_a_vertex_has_it_twice():
+    from gdtool.texture.unwrap_charts import own_corners
+
+    vertices, faces = sheet(2)
+    for own, count in (([0, 1], 6), ([0, 3], 8), ([0, 1, 3], 8), ([0, 1, 2, 3], 9)):
+        points, corners = own_corners(vertices, faces[own])
+        assert len(points) == count
+        np.testing.assert_array_equal(points[corners], vertices[faces[own]])

@@ -1,6 +1,7 @@
 """Charts are cut where all of them together stretch too much."""
 
 import numpy as np
+import pytest
 import trimesh
 
 from gdtool.texture import unwrap_lay
@@ -60,3 +61,40 @@ def test_what_cannot_be_relieved_ends(monkeypatch):
     cuts = [int(line.split()[0]) for line in why if "more than most" in line]
     assert cuts and cuts[0] >= 16
     assert sorted(np.concatenate([chart[0] for chart in charts])) == list(range(len(faces)))
+
+
+@pytest.mark.parametrize("child", ["none", "works", "is gone"])
+def test_half_laid_in_a_child_is_what_is_laid_in_turn(monkeypatch, child):
+    vertices, faces, centre = ball()
+    label = (centre > 0) @ [1, 2, 4]
+    how = vertices, faces, label, 1.002, 1.1, (vertices, faces[:, :3])
+    monkeypatch.setattr(unwrap_lay, "joined", lambda *given: label)
+    monkeypatch.setattr(unwrap_lay, "_BESIDE", np.inf)
+    in_turn = unwrap_lay.flatten_all(*how)
+    assert len(in_turn[0]) >= 8
+    begun, begin = [], unwrap_lay.begin
+    monkeypatch.setattr(unwrap_lay, "begin", lambda *args, **more: begun.append(args) or begin(*args, **more))
+    monkeypatch.setattr(unwrap_lay, "_BESIDE", np.inf if child == "none" else 4000)
+    if child == "is gone":
+        def fails(*_):
+            raise unwrap_lay.ChildFailed("is gone")
+
+        monkeypatch.setattr("gdtool.core.child.Running.result", fails)
+    charts, why = unwrap_lay.flatten_all(*how)
+    assert len(begun) == (child != "none") and sorted(why) == sorted(in_turn[1])
+    for one, other in zip(charts, in_turn[0], strict=True):
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_a_chart_is_cut_between_its_parts_and_without_any_through_the_middle():
+    from gdtool.texture.unwrap_charts import Adjacency
+    from tests.texture.test_unwrap_join import sheet
+
+    vertices, faces = sheet(20)
+    vertices = vertices * [2, 1, 1]
+    adjacency, column = Adjacency(vertices, faces), np.arange(400) % 20
+    for part, first in ((column >= 6, 6), (np.where(column < 12, 7, np.where(column < 15, 3, 5)), 12)):
+        one, other = unwrap_lay._halves(adjacency, part, np.arange(400))
+        assert {len(one), len(other)} == {20 * first, 400 - 20 * first} and (column[one] < first).all() != (column[other] < first).all()
+    assert min(map(len, unwrap_lay._halves(adjacency, np.zeros(400, int), np.arange(400)))) > 150

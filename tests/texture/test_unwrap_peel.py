@@ -59,11 +59,14 @@ def test_a_piece_goes_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
         return unwrap_lay.flatten_all(vertices, faces[faces_idx], np.zeros(len(faces_idx), int), GOOD, 1.5,
                                   (vertices, triangulated(faces[faces_idx])[0].astype(np.int64)))[0][0]
 
-    charts = [(own, *chart(own)[1:]) for own in (dome, flat)]
-    assert onto_neighbours(Adjacency(vertices, faces), vertices, faces, charts, [piece], GOOD) == []
-    assert len(charts[0][0]) == len(dome) and sorted(charts[1][0]) == sorted(np.concatenate([flat, piece]))
-    # With nothing flat beside it, it is left; so are all once enough has been tried.
-    assert len(onto_neighbours(Adjacency(vertices, faces), vertices, faces, [charts[0]], [piece], 1 + 1e-9)) == 1
-    charts = [(own, *chart(own)[1:]) for own in (dome, flat)]
+    def left(home, beside=(dome, flat), good=GOOD):
+        charts = [(own, *chart(own)[1:]) for own in beside]
+        return len(onto_neighbours(Adjacency(vertices, faces), vertices, faces, charts, [(int(home[0]), piece)], good)), charts
+
+    count, charts = left(piece)
+    assert not count and len(charts[0][0]) == len(dome) and sorted(charts[1][0]) == sorted(np.concatenate([flat, piece]))
+    # What it came off does not get it back; with nothing flat beside it, it is left; so are all once enough has been tried.
+    assert left(flat, [flat])[0] == 1 and left(dome, [flat])[0] == 0
+    assert left(piece, [dome], 1 + 1e-9)[0] == 1
     monkeypatch.setattr("gdtool.texture.unwrap_peel._WORK", -1)
-    assert len(onto_neighbours(Adjacency(vertices, faces), vertices, faces, charts, [piece], GOOD)) == 1
+    assert left(piece)[0] == 1

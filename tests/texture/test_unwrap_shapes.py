@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.texture.raster import owner_count
-from gdtool.texture.unwrap_settle import settled
+from gdtool.texture.unwrap_settle import Fine
 from gdtool.texture.unwrap_shapes import Shapes, rim_of, turned, upright_box
 
 RING = np.array([[0, 0], [9, 0], [9, 7], [0, 7], [2, 2], [7, 2], [7, 5], [2, 5.0]])
@@ -46,7 +46,7 @@ def test_a_layout_whose_charts_touch_is_moved_apart():
     boxed = [(square, rim_of(square, triangles))] * 4
     gap, cells = 1 / 50, 10.4  # squares of 10.4 cells, at places 10 cells apart
     shapes = Shapes(boxed, cells, 0.0, 40, 0.5)
-    places, scale = settled(boxed, shapes, cells, [(22, [(0, 0, 0), (0, 10, 0), (0, 0, 10), (0, 10, 10)])], gap)
+    places, scale = Fine(boxed, shapes, cells, [22], gap).settled([[(0, 0, 0), (0, 10, 0), (0, 0, 10), (0, 10, 10)]])
     low, high = np.array([uv.min(0) for uv in places]), np.array([uv.max(0) for uv in places])
     assert low.min() >= 0.4 * gap and high.max() <= 1 - 0.4 * gap and high - low == pytest.approx(np.full((4, 2), scale))
     apart = np.maximum(low[:, None] - high[None], low[None] - high[:, None]).max(-1)
@@ -68,7 +68,8 @@ def test_chains_beside_each_other_find_what_they_find_in_turn(monkeypatch):
     boxed, area = unwrap_pack._boxed(charts)
 
     def search(beside):
-        return unwrap_pack._drafted(boxed, area, 0.002, unwrap_pack._OWN, 800, [], beside=beside)[2]
+        _, shapes, found = unwrap_pack._drafted(boxed, area, 0.002, unwrap_pack._OWN, [])
+        return unwrap_pack._improved(shapes, found, 800, np.inf, beside)
 
     in_turn = search(False)
     assert len(in_turn) > 1 and search(True) == in_turn
@@ -78,3 +79,17 @@ def test_chains_beside_each_other_find_what_they_find_in_turn(monkeypatch):
 
     monkeypatch.setattr("gdtool.core.child.Running.result", fails)
     assert search(True) == in_turn
+
+
+def test_orders_are_sought_once_where_charts_do_not_come_apart(monkeypatch):
+    from gdtool.texture import unwrap_pack
+
+    sides = np.random.default_rng(3).uniform(1, 5, (14, 2))
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    charts = [(np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]) * side, triangles) for side in sides]
+    sought, improved = [], unwrap_pack._improved
+    monkeypatch.setattr(unwrap_pack, "_improved", lambda *given, **more: sought.append(given) or improved(*given, **more))
+    monkeypatch.setattr(Fine, "apart", lambda *given: None)
+    places, _ = unwrap_pack.pack(charts, 0.002)
+    assert len(sought) == 1
+    assert (owner_count(np.concatenate(places), np.concatenate([triangles + 4 * i for i in range(14)]), 2048) <= 1).all()
