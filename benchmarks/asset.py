@@ -149,7 +149,7 @@ def baked(case: Case, folder: Path) -> tuple[Path, dict[str, float]]:
 
     low, out = folder / f"{case.name}.obj", folder / "asset"
     write_obj(low, read_low(case))
-    cost = gdtool("bake", low, "--model", case.glb, "--size", 2048, "--lods", 4, "-o", out, "--quiet")
+    cost = gdtool("bake", low, "--model", case.glb, "--size", 2048, "--lods", 4, "--source-frame", "-o", out, "--quiet")
     report = json.loads((out / "manifest.json").read_text())["content"]["report"]
     return out, {"seconds": cost.seconds, "peak MB": cost.peak_mb, "lod3 drift": report.get("lod3_drift_mean")}
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from gdtool.core.threads import mapped
 from gdtool.texture.padding import Gutters
-from gdtool.texture.tangents import unit
 from gdtool.texture.target import Texels
 
 # Smaller differences than this, in stored units, are no detail: one step of 8 bits and rounding.
 CONSTANT_RANGE = 1.5 / 255
 # 99.5 % of a normal map within this angle of straight up is flat: 8 bits store normals to 0.4 degrees.
 FLAT_DEGREES = 1.0
+_ROWS_AT_ONCE = 64
 HEIGHT_BITS = 16  # a step of 8 bits is a visible terrace
 
 
@@ -83,7 +83,7 @@ def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.nd
 
     inside = slice(0, texels.inside)
     skipped: list[tuple[str, str]] = []
-    layers: dict[str, list[np.ndarray]] = {}
+    layers: dict[str, list[np.ndarray | None]] = {}
     color = [values["albedo"][:, k] for k in range(3)]
     alpha = np.clip(values["alpha"], 0, 1) if "alpha" in values else None
     if alpha is not None and alpha[inside].min() >= 1 - CONSTANT_RANGE:
@@ -96,7 +96,7 @@ def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.nd
     else:
         factors = {"base_color": (*(round(float(x), 6) for x in linear_from_srgb(np.array(constants))), 1.0)}
         skipped.append(("base_color map", "base color is constant: a factor says it"))
-    packed = [None, None, None]
+    packed: list[np.ndarray | None] = [None, None, None]
     for channel, name in ((1, "roughness"), (2, "metallic")):
         constant = constant_of(values[name][inside])
         if constant is None:
@@ -114,8 +114,7 @@ def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.nd
     if has_occlusion:
         packed[0] = occlusion
     if varies or has_occlusion:
-        ones = np.ones(len(texels), np.float32)
-        layers["orm"] = [ones if channel is None else channel for channel in packed]
+        layers["orm"] = packed
     angle = flat_angle(values["tangent_normal"][inside])
     if normal_map == "on" or (normal_map == "auto" and angle > FLAT_DEGREES):
         layers["normal"] = list(np.moveaxis(values["tangent_normal"], -1, 0))
@@ -135,42 +134,56 @@ def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.nd
     if "confidence" in values:
         layers["confidence"] = [values["confidence"]]
     gutters = Gutters(texels.mask(), padding)
-    # Alpha, the fourth channel, is never sRGB.
-    encodings = {name: [srgb_from_linear] * 3 + [None] * (len(layers[name]) - 3) for name in ("base_color", "emissive") if name in layers}
-    stored, start = {}, time.perf_counter()
+    planes = {name: [_Plane(channel, gutters, srgb_from_linear if name in ("base_color", "emissive") and k < 3 else None)
+                     for k, channel in enumerate(layer)] for name, layer in layers.items()}  # alpha, the fourth channel, is never sRGB
     if alpha is not None and (hidden := alpha < least_alpha).any() and not hidden.all():
         seen = Gutters(texels.image(~hidden), padding)
-        del layers["base_color"]
-        shown = [np.where(hidden, np.float32(0), channel) for channel in color]
-        stored["base_color"] = np.concatenate([_stored(texels, shown, seen, bits, threads, encodings=encodings["base_color"][:3]),
-                                               _stored(texels, [alpha], gutters, bits, threads)], 2)
-    stored |= {name: _stored(texels, layers.pop(name), gutters, HEIGHT_BITS if name == "height" else bits, threads, name == "normal", encodings.get(name))
-               for name in list(layers)}
+        planes["base_color"][:3] = [_Plane(np.where(hidden, np.float32(0), channel), seen, srgb_from_linear) for channel in color]
+    start = time.perf_counter()
+    stored = _stored(texels, planes, {name: HEIGHT_BITS if name == "height" else bits for name in planes}, threads)
     one = (time.perf_counter() - start) / len(stored) if stored else None
     return Maps(texels.size, stored.get("base_color"), stored.get("orm"), stored.get("normal"), factors, has_occlusion, varies,
                 stored.get("emissive"), {name: stored[name] for name in ("height", "confidence") if name in stored},
                 [(what, why, one if what.endswith("map") else None) for what, why in skipped])
 
 
-def _stored(texels: Texels, layer: list[np.ndarray], gutters: Gutters, bits: int, threads: int, direction: bool = False,
-            encodings: list[Callable | None] | None = None) -> np.ndarray:
-    """(s, s, c) uint8 or uint16 of channels (n,) in [0, 1], gutters filled; direction: of a unit vector, stored as 0.5 n + 0.5.
+@dataclass(frozen=True)
+class _Plane:
+    """One channel of a map: values (n,) in [0, 1], or of a unit vector; None for 1 everywhere. encoding: what they are put through first."""
 
-    encodings: what each channel is put through first, nothing for None."""
-    def plane(layered: tuple[np.ndarray, Callable | None]) -> np.ndarray:
-        channel, encoding = layered
-        return gutters.fill(texels.image(channel if encoding is None else encoding(np.clip(channel, 0, 1))))
+    values: np.ndarray | None
+    gutters: Gutters
+    encoding: Callable | None
 
-    out = np.empty((texels.size, texels.size, len(layer)), np.uint8 if bits == 8 else np.uint16)
-    layered = list(zip(layer, encodings or [None] * len(layer), strict=True))
-    if not direction:
-        for k, image in enumerate(mapped(plane, layered, threads)):
-            out[..., k] = quantise(image, bits)
-        return out
-    planes = list(mapped(plane, layered, threads))
-    for row in range(0, texels.size, 64):
-        normal = unit(np.stack([image[row:row + 64] for image in planes], -1))
-        out[row:row + 64] = quantise(normal * np.float32(0.5) + np.float32(0.5), bits)
+
+def _stored(texels: Texels, layers: dict[str, list[_Plane]], bits: dict[str, int], threads: int) -> dict[str, np.ndarray]:
+    """(s, s, c) uint8 or uint16 of each layer's channels, gutters filled; "normal" is stored as 0.5 n + 0.5 of unit vectors."""
+    out = {name: np.empty((texels.size, texels.size, len(layer)), np.uint8 if bits[name] == 8 else np.uint16) for name, layer in layers.items()}
+    normal: dict[int, np.ndarray] = {}
+
+    def store(at: tuple[str, int]) -> None:
+        name, k = at
+        plane = layers[name][k]
+        if plane.values is None:
+            out[name][..., k] = np.iinfo(out[name].dtype).max
+            return
+        image = plane.gutters.fill(texels.image(plane.values if plane.encoding is None else plane.encoding(np.clip(plane.values, 0, 1))))
+        if name == "normal":
+            normal[k] = image
+        else:
+            out[name][..., k] = quantise(image, bits[name])
+
+    def turn(row: int) -> None:
+        rows = [normal[k][row:row + _ROWS_AT_ONCE] for k in range(3)]
+        length = np.sqrt(sum(component * component for component in rows))
+        scale = np.float32(0.5) / np.where(length > 0, length, np.float32(1))
+        for k, component in enumerate(rows):
+            out["normal"][row:row + _ROWS_AT_ONCE, :, k] = quantise(component * scale + np.float32(0.5), bits["normal"])
+
+    for _ in mapped(store, [(name, k) for name, layer in layers.items() for k in range(len(layer))], threads):
+        pass
+    for _ in mapped(turn, list(range(0, texels.size, _ROWS_AT_ONCE)) if normal else [], threads):
+        pass
     return out
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from threading import Lock
 
 import numpy as np
 
 from gdtool.geometry.normals import face_normals
-from gdtool.texture.tangents import dot
+from gdtool.texture.tangents import dot, weld
 
 # A place on the source is on the right side when its face's normal agrees with the mesh's normal: dot product above this.
 AGREEMENT = 0.1
@@ -51,6 +52,18 @@ class Source:
         self.nearest = Nearest(self.vertices, faces)
         self._facing: dict[tuple[int, float], Nearest | None] = {}
         self._lock = Lock()
+
+    @cached_property
+    def twins(self) -> np.ndarray:
+        """(f,) int32: the face that has the same corners and looks the other way, -1 where there is none."""
+        corners = np.sort(weld(self.vertices)[self.faces], axis=1)
+        order = np.lexsort(corners.T)
+        one, two = order[:-1], order[1:]
+        paired = (corners[one] == corners[two]).all(1) & (dot(self.face_normals[one], self.face_normals[two]) < 0)
+        one, two = one[paired], two[paired]
+        out = np.full(len(self.faces), -1, np.int32)
+        out[one], out[two] = two, one
+        return out
 
     def facing(self, axis: int, sign: float) -> Nearest | None:
         """Nearest among the faces within 75 degrees of a coordinate axis; None when there are none."""
@@ -101,18 +114,22 @@ def vertex_reach(vertices: np.ndarray, faces: np.ndarray, source: Source) -> np.
     return 2 * distance[faces].max(1) + 0.3 * np.minimum(longest, np.percentile(longest, 99)) + 1e-4 * extent
 
 
-def _march(points: np.ndarray, directions: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source,
-           start: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First face on the right side along each ray within reach: face_idx (n,) or -1, distance (n,), barycentric (n, 3)."""
+def _march(points: np.ndarray, directions: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source, start: float,
+           through: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """First face on the right side along each ray within reach: face_idx (n,), -1 for none, distance (n,), barycentric (n, 3).
+
+    Faces on the wrong side are stepped through, unless a ray that may not go through meets the first of them from behind: these rays
+    (k,) come last, with the place of that face and a distance of infinity.
+    """
     face, t, barycentric = source.caster.quick_hits(points - directions * points.dtype.type(start), directions)
     t -= np.float32(start)
     near = (face >= 0) & (t <= reach)
-    agrees = dot(source.face_normals_32[face], normals) > AGREEMENT
+    cosine = dot(source.face_normals_32[face], normals)
+    good = near & (cosine > AGREEMENT)
+    back = near & (cosine < -AGREEMENT) & (not through)
     # The other side of a wall: step through it and look on.
-    active = np.flatnonzero(near & ~agrees)
-    good = near & agrees
-    if not good.all():
-        face[~good] = -1
+    active = np.flatnonzero(near & ~good & ~back)
+    face[~(good | back)] = -1
     distance = np.where(good, np.abs(t), np.float32(np.inf))
     travelled = t[active] + start
     for _ in range(_RETRIES - 1):
@@ -126,7 +143,7 @@ def _march(points: np.ndarray, directions: np.ndarray, normals: np.ndarray, reac
         found = active[agrees]
         face[found], distance[found], barycentric[found] = hit_face[agrees], np.abs(t[agrees]), hit_at[agrees]
         active, travelled = active[~agrees], t[~agrees] + start
-    return face, distance, barycentric
+    return face, distance, barycentric, np.flatnonzero(back)
 
 
 def _nearest_agreeing(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source) -> tuple[np.ndarray, np.ndarray]:
@@ -156,15 +173,15 @@ def _nearest_agreeing(points: np.ndarray, normals: np.ndarray, reach: np.ndarray
     return face, point
 
 
-def _slide_off_edges(points: np.ndarray, normals: np.ndarray, source: Source, face: np.ndarray, barycentric: np.ndarray) -> None:
-    """Where a ray met a slanted face from afar, take the nearest place instead if it agrees; changes face, barycentric.
+def _slide_off_edges(points: np.ndarray, normals: np.ndarray, source: Source, met: np.ndarray, face: np.ndarray, barycentric: np.ndarray) -> None:
+    """Where a ray met (n,) bool a slanted face from afar, take the nearest place instead if it agrees; changes face, barycentric.
 
     At a crease that remeshing cut off, the normal leads past the edge to a place well away from the nearest one.
     """
     from gdtool.geometry.distance import barycentric_of
 
     cosine = dot(source.face_normals_32[face], normals)
-    slanted = np.flatnonzero(cosine < 0.99)
+    slanted = np.flatnonzero(met & (cosine > AGREEMENT) & (cosine < 0.99))
     away = source.at(face[slanted], barycentric[slanted], source.vertices) - points[slanted]
     # How far beside the nearest place the ray went, were the face a plane.
     beside = np.sqrt(dot(away, away) * np.maximum(1 - cosine[slanted] ** 2, 0))
@@ -178,27 +195,44 @@ def _slide_off_edges(points: np.ndarray, normals: np.ndarray, source: Source, fa
     barycentric[slanted] = barycentric_of(nearest, source.vertices[source.faces[nearest_face]])
 
 
+def _turn_over(source: Source, places: np.ndarray, face: np.ndarray, barycentric: np.ndarray) -> None:
+    """Move those of the places (k,) that lie on a face with a twin to the twin; changes face, barycentric."""
+    from gdtool.geometry.distance import barycentric_of
+
+    if not len(places):
+        return
+    twin = source.twins[face[places]]
+    places, twin = places[twin >= 0], twin[twin >= 0]
+    at = source.at(face[places], barycentric[places], source.vertices)
+    face[places], barycentric[places] = twin, barycentric_of(at, source.vertices[source.faces[twin]])
+
+
 def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source) -> Places:
     """Where points (n, 3) with unit normals (n, 3) of the baked mesh lie on the source.
 
     The nearest face along the normal, outward or inward within reach (n,), that looks the same way; the nearest such
     place in any direction where the normal meets none. So nothing is read from the other side of a thin wall. A sheet without
-    another side is read from behind.
+    another side is read from behind, and nothing through it.
     """
     from gdtool.geometry.distance import barycentric_of
 
     start = 2e-5 * source.extent
-    face, distance, barycentric = _march(points, -normals, normals, reach, source, start)
+    face, distance, barycentric, behind = _march(points, -normals, normals, reach, source, start, through=False)
     # Two sheets that look the same way have a third between them: outward cannot be nearer than what is this near.
     rest = np.flatnonzero(distance > 5e-4 * source.extent)
-    out_face, out_distance, out_at = _march(points[rest], normals[rest], normals[rest], np.minimum(reach, distance)[rest], source, start)
+    out_face, out_distance, out_at, _ = _march(points[rest], normals[rest], normals[rest], np.minimum(reach, distance)[rest], source, start)
     outward = (out_face >= 0) & (out_distance < distance[rest])
-    face[rest[outward]], barycentric[rest[outward]] = out_face[outward], out_at[outward]
+    face[rest[outward]], distance[rest[outward]], barycentric[rest[outward]] = out_face[outward], out_distance[outward], out_at[outward]
+    # Inside something whose front is not there: a sheet with one side, unless its other side lies on it.
+    behind = behind[np.isinf(distance[behind])]
+    _turn_over(source, behind, face, barycentric)
     lost = np.flatnonzero(face < 0)
     if len(lost):
         face[lost], nearest = _nearest_agreeing(points[lost], normals[lost], reach[lost], source)
         barycentric[lost] = barycentric_of(nearest, source.vertices[source.faces[face[lost]]])
-    _slide_off_edges(points, normals, source, face, barycentric)
-    by_ray = np.ones(len(points), bool)
+    by_ray, from_behind = np.ones(len(points), bool), np.zeros(len(points), bool)
     by_ray[lost] = False
-    return Places(face, barycentric, by_ray, dot(source.face_normals_32[face], normals) <= 0)
+    _slide_off_edges(points, normals, source, by_ray, face, barycentric)
+    for some in (behind, lost):
+        from_behind[some] = dot(source.face_normals_32[face[some]], normals[some]) <= 0
+    return Places(face, barycentric, by_ray, from_behind)

@@ -13,8 +13,9 @@ from gdtool.texture.raster import Barycentrics, between_centres, centres_in, ext
 from gdtool.texture.tangents import corner_tangents, edge_pairs, frames_of
 
 CREASE_DEGREES = 45.0
-# Texels at a time: few enough that what is computed of them stays in the cache.
-TEXELS_AT_ONCE = 32_768
+# Texels at a time: few enough that what is computed of them stays near the cache, enough that libigl, which looks for nearest points
+# while no other thread may run, does so on all cores: it begins at 10,000 points.
+TEXELS_AT_ONCE = 65_536
 # A texel this many times as wide as the source's detail has too much in it for one sample (docs/numerics.md).
 COARSE_TEXEL = 3.0
 
@@ -106,7 +107,9 @@ class Texels:
 
     def image(self, values: np.ndarray, fill: float = 0.0) -> np.ndarray:
         """(size, size, …) image of values (n, …) of these texels."""
-        out = np.full((self.size * self.size, *values.shape[1:]), fill, values.dtype)
+        out = np.zeros((self.size * self.size, *values.shape[1:]), values.dtype)
+        if fill:
+            out[:] = fill
         out[self.texel] = values
         return out.reshape(self.size, self.size, *values.shape[1:])
 
@@ -130,7 +133,7 @@ def texels_of(target: Target, size: int, rings: int = 2, threads: int = 1) -> Te
     def place(part: slice) -> None:
         at[part] = centres_in(barycentrics, face_idx[part], inside[part], size)
 
-    for _ in mapped(place, [slice(s, min(s + 4 * TEXELS_AT_ONCE, len(inside))) for s in range(0, len(inside), 4 * TEXELS_AT_ONCE)], threads):
+    for _ in mapped(place, [slice(s, min(s + 2 * TEXELS_AT_ONCE, len(inside))) for s in range(0, len(inside), 2 * TEXELS_AT_ONCE)], threads):
         pass
     at[len(inside):] = ring_at
     return Texels(size, np.concatenate([inside, ring.astype(inside.dtype)]), face_idx, at, len(inside))

@@ -74,7 +74,36 @@ def test_a_sheet_without_another_side_is_read_from_behind():
     for side in (1.0, -1.0):
         places = reproject(points, np.tile([0.0, 0.0, side], (500, 1)), np.full(500, 0.01), source)
         np.testing.assert_allclose(at(source, places), points * (1, 1, 0), atol=1e-6)
-        assert (places.from_behind == (side < 0)).all() and (places.by_ray == (side > 0)).all()
+        assert (places.from_behind == (side < 0)).all()
     # Within reach what looks the same way comes first, however near the sheet.
     places = reproject(points, np.tile([0.0, 0.0, -1.0], (500, 1)), np.full(500, 0.35), source)
     np.testing.assert_allclose(at(source, places)[:, 2], -0.3, atol=1e-6)
+
+
+def test_a_sheet_is_not_looked_through():
+    # What lies behind a sheet without another side, and looks the same way as the mesh, is not what the mesh stands for.
+    square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
+    faces = np.array([[0, 2, 1], [0, 3, 2]])
+    source = Source(np.concatenate([square, square * 0.9 - (0, 0, 0.01)]), np.concatenate([faces, faces[:, ::-1] + 4]))
+    rng = np.random.default_rng(3)
+    for height in (0.0, 0.002):  # the mesh lies on the sheet, or a little above it
+        points = np.column_stack([rng.uniform(-0.4, 0.4, (500, 2)), np.full(500, height)])
+        places = reproject(points, np.tile([0.0, 0.0, 1.0], (500, 1)), np.full(500, 0.05), source)
+        np.testing.assert_allclose(at(source, places), points * (1, 1, 0), atol=1e-6)
+        assert places.from_behind.all() and places.by_ray.all()
+
+
+def test_of_two_faces_back_to_back_the_one_that_looks_the_same_way_is_read():
+    square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
+    front = np.array([[0, 1, 2], [0, 2, 3]])
+    rng = np.random.default_rng(4)
+    points = np.column_stack([rng.uniform(-0.45, 0.45, (500, 2)), rng.uniform(-0.002, 0.002, 500)])
+    for order in (1, -1):  # whichever of the two the ray meets
+        source = Source(np.concatenate([square, square]), np.concatenate([front, front[:, ::-1] + 4])[::order])
+        np.testing.assert_array_equal(source.twins, [2, 3, 0, 1])
+        for side in (1.0, -1.0):
+            normals = np.tile([0.0, 0.0, side], (500, 1))
+            places = reproject(points, normals, np.full(500, 0.01), source)
+            np.testing.assert_allclose(source.face_normals[places.face_idx], normals, atol=1e-9)
+            assert not places.from_behind.any()
+            np.testing.assert_allclose(at(source, places), points * (1, 1, 0), atol=1e-6)
