@@ -17,7 +17,7 @@ from gdtool.geometry.quad_task import Part, Record, Request
 from gdtool.geometry.quad_topology import cancel_irregular
 
 COUNT_TOLERANCE = 0.03
-_TRIES = 3  # of one way, to come near enough to the count
+_TRIES, _MOST_MORE = 3, 2.0  # of one way, to come near enough to the count; times what was asked for before
 _CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a result is taken without a look at others
 _FAR_EDGES, _FAR_SUBDIVIDED = 2.0, 1.0  # edge lengths that a result may stray; of a subdivided one, after which others come
 _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
@@ -121,7 +121,7 @@ class Trial:
     def _by(self, way: _Way) -> Found | None:
         part, quads = self.part, self.part.quads
         asked, extra = [quads * factor for factor in way.factors], 0  # extra: quads of the tips that are drawn out of the engine's
-        for _ in range(_TRIES):
+        for turn in range(_TRIES):
             wanted = quads - extra
             results = sorted(self._results(way, asked), key=lambda result, wanted=wanted: result.rank(wanted))
             if not results:
@@ -133,7 +133,9 @@ class Trial:
                 self.whole = best.vertices, best.quads, way.label
             fine = best.fault is None or best.fault == _LOST and sticks_out(best.vertices, best.quads, part.surface) < 2 * _CLOSE_EDGES * part.edge
             if not counted and (fine or together):
-                asked = way.near(best.asked * wanted / max(count, 1))
+                if turn and count * _MOST_MORE < wanted:
+                    break  # small pieces are lost however many are asked for
+                asked = way.near(best.asked * min(wanted / max(count, 1), _MOST_MORE))
                 continue
             if counted and best.fault in (_LOST, _ADDED) and not way.subdivisions:
                 self._second_best = best.vertices, best.quads, f"{way.label}, {best.fault}"
