@@ -39,6 +39,8 @@ def finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features
             constraints = held_at_centres(constraints, len(vertices) - count, across, curve)
         vertices = relax(onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations)
     edge /= 2**subdivisions
+    if subdivisions:  # what ran across a quad has vertices nearer to it now
+        vertices, constraints = trace(vertices, faces, features, edge)
     vertices, faces, constraints, tips = draw_out(vertices, faces, constraints, surface, edge)
     if subdivisions and farthest(vertices, faces, surface) > _HOPELESS_EDGES * edge:
         return vertices, faces  # shaping brings it a third nearer at most: it strays too far in any case

@@ -63,7 +63,7 @@ def _ways(quads: int, request: Request) -> list[_Way]:
     A coarser mesh subdivided has a quarter of the irregular vertices; it fails where features are finer than its quads.
     """
     engine = "instant-meshes" if request.engine == "auto" else request.engine
-    out = [_Way(engine, 1, (0.985, 1.01), request.crease_degrees)] if engine == "instant-meshes" and quads >= _MANY else []
+    out = [_Way(engine, 1, (0.99, 1.005), request.crease_degrees)] if engine == "instant-meshes" and quads >= _MANY else []
     # Where a seam of the engine's fields fails, it often holds at a slightly different density.
     out += [_Way(engine, 0, (1.0,), request.crease_degrees), _Way(engine, 0, (1.02,), request.crease_degrees), _Way(engine, 0, (0.98,), 0.0)]
     return out + [_Way("instant-meshes", 0, (1.0,), request.crease_degrees)] * (request.engine == "quadriflow")
