@@ -48,7 +48,7 @@ def joined(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, proxy_ver
         i, j = int(one[k]), int(two[k])
         tried.add((i, j))
         points, triangles = own_corners(proxy_vertices, proxy[(place == i) | (place == j)])
-        if flatten(points, triangles, good_stretch, most).uv is not None:
+        if flatten(points, triangles, most, most).uv is not None:  # better than good enough is not asked
             place[place == j] = i
             onto[onto == j] = i
             tried = {pair for pair in tried if i not in pair and j not in pair}
