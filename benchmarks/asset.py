@@ -163,7 +163,7 @@ def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
     text = table(COLUMNS, ([number(row.get(name, "failed" if name == "seconds" and "failed" in row else None), 3) for name in COLUMNS]
                            for row in rows.rows))
     failed = "\n".join(f"- {row['model']}: {row[what]}" for row in rows.rows for what in ("failed", "peer failed") if what in row)
-    head = f"# Finished asset\n\n`python benchmarks/asset.py`, {machine()}. {note}\n\n`gdtool bake --size 2048 --lods 4` of the model's quad mesh: " \
+    head = f"# Finished asset\n\n`python benchmarks/asset.py`, {machine()}. {note}\n\n`gdtool bake --size 2048 --lods 4 --source-frame` of the model's quad mesh: " \
         f"seconds and memory of the whole command; masked PSNR of lit pictures against the model's, mean of {VIEWS} views under " \
         f"{', '.join(LIGHTS)}, and the worst; floor: the model against itself " \
         f"with four times the samples, one view, under the light where they differ most (below {QUIET:g} dB all get more); the buffers' errors; shape: how far 99 % " \
