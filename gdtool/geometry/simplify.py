@@ -220,7 +220,7 @@ def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit:
             reasons.append(f"the quick collapse stopped at {len(out[1])} triangles")
         else:
             return out, "quadric collapse" if way == "collapse" else "quadric collapse, topology kept", moved, reasons
-    if moved:
+    if moved or crease_degrees and stuck is None:
         found = _collapsed(vertices, faces, target_faces, unit, 0.0, careful, seconds, is_closed, meanwhile)
         return *found[:3], [*reasons, "creases restored: the result cannot be simplified", *found[3]]
     return stuck, "quadric collapse", 0, reasons
