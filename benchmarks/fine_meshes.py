@@ -184,9 +184,9 @@ def _kept(path: Path, make: Callable) -> tuple[np.ndarray, np.ndarray]:
         with np.load(path) as found:
             return found["vertices"], _outward(found["vertices"], found["faces"])
     vertices, faces = make()
-    faces = _outward(vertices, faces)
+    vertices, faces = vertices.astype(np.float64), _outward(vertices, faces).astype(np.int64)
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(path, vertices=vertices.astype(np.float64), faces=faces.astype(np.int64))
+    np.savez(path, vertices=vertices, faces=faces)
     return vertices, faces
 
 

@@ -7,6 +7,7 @@ result by pickle over pipes of our own; it dies with its parent, however the par
 from __future__ import annotations
 
 import contextlib
+import gc
 import importlib
 import os
 import pickle
@@ -150,6 +151,7 @@ def _main() -> None:
     request = sys.stdin.buffer.read()
     if not request:
         return
+    gc.disable()  # it looks at a hundred thousand small objects again and again as they become more; a child ends soon
     function, args, kwargs, memory_mb = pickle.loads(request)
     module, name = function.split(":")
     try:

@@ -6,7 +6,6 @@ Every engine takes vertices (v, 3) in a unit box and faces (f, 3) and returns ve
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse.csgraph  # noqa: F401 - what repair needs, read while a prepared child waits
 
 from gdtool.geometry.repair import compact, edges_of, topology
 
@@ -51,5 +50,4 @@ def run_quadriflow(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_d
     return np.asarray(found["vertices"], np.float64), np.asarray(found["faces"], np.int64)
 
 
-ENGINES = {"instant-meshes": "gdtool.geometry.quad_engines:run_instant_meshes", "on few": "gdtool.geometry.quad_engines:run_on_few",
-           "quadriflow": "gdtool.geometry.quad_engines:run_quadriflow"}
+ENGINES = {"instant-meshes": run_instant_meshes, "on few": run_on_few, "quadriflow": run_quadriflow}

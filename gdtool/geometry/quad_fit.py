@@ -24,9 +24,9 @@ _RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surfa
 _FOLDED, _LET_GO = 0.05, 0.25  # scaled Jacobian; edge lengths
 
 
-def finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, subdivisions: int,
-              request: Request, fine: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """The engine's quads drawn to creases, subdivided, drawn out over tips, evened out on the surface and unfolded."""
+def drawn(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, subdivisions: int,
+          request: Request) -> tuple[np.ndarray, np.ndarray, Constraints]:
+    """The engine's quads drawn to creases, subdivided, drawn out over tips, evened out on the surface and unfolded; what they are held to."""
     edge = (polygon_normals(vertices, faces)[1].sum() / len(faces)) ** 0.5
     vertices, constraints = trace(to_rim(vertices, faces, surface, _RIM_EDGES * edge), faces, features, edge)
     free = untied(vertices, faces, constraints)
@@ -43,20 +43,26 @@ def finished(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features
         vertices, constraints = trace(vertices, faces, features, edge)
     vertices, faces, constraints, tips = draw_out(vertices, faces, constraints, surface, edge)
     if subdivisions and farthest(vertices, faces, surface) > _HOPELESS_EDGES * edge:
-        return vertices, faces  # shaping brings it a third nearer at most: it strays too far in any case
-    vertices = _shaped(vertices, faces, surface, features, constraints, request, fine, tips)
+        return vertices, faces, constraints  # shaping brings it a third nearer at most: it strays too far in any case
+    vertices, constraints = _shaped(vertices, faces, surface, features, constraints, request, tips)
+    return vertices, faces, constraints
+
+
+def settled(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, fine: Surface, request: Request) -> tuple[np.ndarray, np.ndarray]:
+    """Quads balanced about the input as it was before it was simplified, and cut in two where they bend along it."""
+    if request.smooth_iterations:
+        vertices = balance(vertices, faces, fine, constraints)
     return vertices, cut_along_features(vertices, faces, fine)
 
 
 def _shaped(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
-            request: Request, fine: Surface, tips: np.ndarray | None = None) -> np.ndarray:
-    """The quads squared up, then the few that stay folded or thin unfolded one vertex at a time; last, balanced about `fine`."""
+            request: Request, tips: np.ndarray | None = None) -> tuple[np.ndarray, Constraints]:
+    """The quads squared up, then the few that stay folded or thin unfolded one vertex at a time; what they are held to from then on."""
     vertices = square_up(vertices, faces, surface, features, constraints, request.smooth_iterations)
     constraints = untied(vertices, faces, constraints)
     vertices = square_up(vertices, faces, surface, features, constraints, 3 * request.smooth_iterations)
     vertices = unfold(vertices, faces, surface, features, constraints)
-    vertices, constraints = ease(vertices, faces, surface, features, constraints, tips=tips)
-    return balance(vertices, faces, fine, constraints) if request.smooth_iterations else vertices
+    return ease(vertices, faces, surface, features, constraints, tips=tips)
 
 
 def fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
@@ -68,7 +74,9 @@ def fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarr
     traced, constraints = trace(quad_vertices, quad_faces, features, edge)
     constraints = untied(traced, quad_faces, constraints)
     traced = relax(onto(traced, surface, features, constraints), quad_faces, surface, features, constraints, request.smooth_iterations)
-    traced = _shaped(traced, quad_faces, surface, features, constraints, request, fine)
+    traced, constraints = _shaped(traced, quad_faces, surface, features, constraints, request)
+    if request.smooth_iterations:
+        traced = balance(traced, quad_faces, fine, constraints)
     # Pieces that are a few quads wide fold and shrink when their vertices are evened out: they stay as they were split, and
     # elsewhere the vertices of quads that folded or let go of a corner.
     count, piece = repair.components(quad_faces)

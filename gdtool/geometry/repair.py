@@ -205,13 +205,22 @@ def topology(faces: np.ndarray) -> tuple[bool, bool, int, int]:
 
 def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Without the vertices that no face uses."""
-    used = np.zeros(len(vertices) + 1, bool)
-    used[faces.ravel()] = True
+    used, faces = renumbered(faces, len(vertices))
+    return vertices if len(used) == len(vertices) else vertices.take(used, 0), faces
+
+
+def renumbered(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Which of `count` vertices faces use (u,), in order, and the faces by their place among these, int64; -1 stays."""
+    out = np.array(faces, np.int64)
+    used = np.zeros(count + 1, bool)
+    used[out] = True
     used[-1] = False  # where -1, a triangle's fourth corner, points
-    if used[:-1].all():
-        return vertices, np.array(faces, np.int64)
-    number = np.where(used, np.cumsum(used) - 1, -1)
-    return vertices[used[:-1]], number[faces]
+    places = np.flatnonzero(used)
+    if len(places) < count:
+        number = np.full(count + 1, -1)
+        number[places] = np.arange(len(places))
+        out = number.take(out)
+    return places, out
 
 
 def check(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> None:

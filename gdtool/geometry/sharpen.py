@@ -7,14 +7,15 @@ al. 2001 (Feature sensitive surface extraction), its rank cut to the number of s
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from gdtool.geometry.normals import face_normals, vertex_normals
-from gdtool.geometry.repair import edges_of
+from gdtool.geometry.rays import dot
+from gdtool.geometry.repair import compact, edges_of, renumbered
 
 _NEIGHBOURS = 24
 _RINGS = 5  # of faces around a bevel, among which the sides are
@@ -69,113 +70,124 @@ def restore_creases(vertices: np.ndarray, faces: np.ndarray, crease_degrees: flo
     parts and rough surfaces stay as they are. The rims of a bevel are joined where that keeps the mesh manifold.
     accept: which of the vertices of indices (n,) may move to positions (n, 3), as bool (n,); all without it.
     """
-    report: dict[str, float | int] = {"moved": 0, "largest_move": 0.0, "bevel_share": 0.0}
+    at, point, edge, bevel_share = _drawn_out(vertices, faces, crease_degrees, accept)
+    largest = np.linalg.norm(point - vertices[at], axis=1).max(initial=0)
+    report = {"moved": len(at), "largest_move": float(largest), "bevel_share": bevel_share}
+    if not len(at):
+        return vertices, faces, report
+    out, moved = vertices.copy(), np.zeros(len(vertices), bool)
+    out[at], moved[at] = point, True
+    return *collapse_bevels(out, faces, moved, _JOIN_EDGES * edge), report
+
+
+def _drawn_out(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float,
+               accept: Callable[[np.ndarray, np.ndarray], np.ndarray] | None) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Which vertices (n,) of restore_creases move, where to (n, 3), about how long edges are, and the share of bevel vertices."""
     normals, area = face_normals(vertices, faces)
     bevel, rough = np.zeros(len(vertices), bool), np.zeros(len(faces), bool)
+    corners = corners_of(faces, len(vertices))
+    faces_at = corners.T.tocsr()
     # Only faces with both ends of a bent edge among their corners can have one: few of a fine mesh.
-    columns = np.ascontiguousarray(faces.T)
-    maybe = _maybe_bent(normals, columns, len(vertices), crease_degrees / 2).astype(np.int8)
-    few = np.flatnonzero(maybe[columns[0]] + maybe[columns[1]] + maybe[columns[2]] > 1)
+    maybe = _maybe_bent(normals, faces_at, crease_degrees / 2)
+    few = np.flatnonzero(corners @ maybe.astype(np.int8) > 1)
     ends, pairs, angle = dihedral_degrees(vertices, faces[few])
     bent = angle > crease_degrees / 2
     bevel[ends[bent].ravel()] = True
     rough[few[pairs[bent].ravel()]] = True
-    used = np.zeros(len(vertices), bool)
-    used[columns] = True
-    report["bevel_share"] = float(bevel.sum() / used.sum())
-    near_bevel, marked = np.zeros(len(faces), bool), bevel.copy()
+    at, bevel_share = np.flatnonzero(bevel), float(bevel.sum() / (np.diff(faces_at.indptr) > 0).sum())
+    near_bevel, marked, ring = np.zeros(len(faces), bool), bevel.copy(), at
     for _ in range(_RINGS):
-        near_bevel = marked[columns[0]] | marked[columns[1]] | marked[columns[2]]
-        marked[faces[near_bevel].ravel()] = True
+        before = near_bevel.copy()
+        near_bevel[faces_at[ring].indices] = True
+        found = faces.take(np.flatnonzero(near_bevel > before), 0)
+        before = marked.copy()
+        marked[found] = True
+        ring = np.flatnonzero(marked > before)
     side = np.flatnonzero(near_bevel & ~rough & (area > 0))
-    if not bevel.any() or report["bevel_share"] > _LARGEST_SHARE or len(side) < _NEIGHBOURS:
-        return vertices, faces, report
+    if not len(at) or bevel_share > _LARGEST_SHARE or len(side) < _NEIGHBOURS:
+        return at[:0], vertices[:0], 0.0, bevel_share
     sampled = vertices[faces[::max(len(faces) // 20000, 1)]]
     edge = np.median(np.linalg.norm(sampled - np.roll(sampled, 1, 1), axis=-1))  # of a grid's mesh all edges are about a cell
-    at = np.flatnonzero(bevel)
-    centroid = vertices[faces[side]].mean(1)
+    centroid = sum(vertices.take(corner, 0) for corner in faces[side].T) / 3
     distance, near = cKDTree(centroid).query(vertices[at], k=_NEIGHBOURS, workers=2)
-    own = vertex_normals(vertices, faces[near_bevel])[at]
-    n, c = normals[side][near], centroid[near]
-    valid = (distance < _FARTHEST_EDGES * edge) & ((n * own[:, None]).sum(-1) > 0.1)
+    around, its_faces = renumbered(faces[np.unique(faces_at[at].indices)], len(vertices))
+    own = vertex_normals(vertices[around], its_faces)[bevel[around]]
+    # A row per coordinate (3, k, p) from here on.
+    n, c = (np.ascontiguousarray(rows.T).take(np.ascontiguousarray(near.T), 1) for rows in (normals.take(side, 0), centroid))
+    valid = (distance.T < _FARTHEST_EDGES * edge) & (dot(n, own.T) > 0.1)
     cluster, sides, spread = _sides(n, valid, crease_degrees * 0.8)
     point, residual = _meeting_point(vertices[at], n, c, cluster, sides)
     move = np.linalg.norm(point - vertices[at], axis=1)
     good = (sides >= 2) & (spread > crease_degrees * 0.8) & (move < _LARGEST_MOVE_EDGES * edge) & (residual < _LARGEST_RESIDUAL_EDGES * edge)
     if accept is not None and good.any():
         good[good] = accept(at[good], point[good])
-    out = vertices.copy()
-    out[at[good]] = point[good]
-    if not good.any():
-        return vertices, faces, report
-    report["moved"], report["largest_move"] = int(good.sum()), float(move[good].max())
-    moved = np.zeros(len(vertices), bool)
-    moved[at[good]] = True
-    return *collapse_bevels(out, faces, moved, _JOIN_EDGES * edge), report
+    return at[good], point[good], edge, bevel_share
 
 
-def _maybe_bent(normals: np.ndarray, columns: np.ndarray, count: int, degrees: float) -> np.ndarray:
+def corners_of(faces: np.ndarray, count: int) -> csr_array:
+    """(f, count) bool: which vertices are corners of each of faces (f, 3). Products with it are several times faster than indexing."""
+    return csr_array((np.ones(faces.size, bool), faces.ravel(), np.arange(0, faces.size + 1, 3)), (len(faces), count))
+
+
+def _maybe_bent(normals: np.ndarray, faces_at: csr_array, degrees: float) -> np.ndarray:
     """(v,) bool: vertices that may have two faces whose normals differ by more than `degrees`; none that has is left out.
 
-    columns (3, f) are the faces' corners. Of d unit normals two of which are a chord c apart the mean is no longer than
+    faces_at (v, f) are the faces of each. Of d unit normals two of which are a chord c apart the mean is no longer than
     sqrt(1 - c^2 / (2 d)): the variance is the mean squared distance of the pairs, and each other normal is at least c / 2
     from one of the two.
     """
-    # Row v of this matrix adds up the faces of vertex v: a product is several times faster than a bincount per coordinate.
-    f = columns.shape[1]
-    adds = csr_array((np.ones(3 * f), columns.T.ravel(), np.arange(0, 3 * f + 1, 3)), (f, count)).T
-    total = adds @ np.column_stack([normals, (normals != 0).any(1)])
-    number = total[:, 3]
+    total = faces_at @ normals.astype(float, copy=False)
+    number = np.diff(faces_at.indptr).astype(float)
     chord = 2 * np.sin(np.radians(degrees) / 2)
-    return number**2 - (total[:, :3] ** 2).sum(1) > 0.99 * chord**2 / 2 * number - 1e-9
+    return number**2 - np.einsum("vi,vi->v", total, total) > 0.99 * chord**2 / 2 * number - 1e-9
 
 
 def _sides(normals: np.ndarray, valid: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Group k normals (p, k, 3) at each point into up to three sides.
+    """Group k normals (3, k, p) at each of p points into up to three sides.
 
-    Returns the side (p, k) of each, -1 where not valid; the number of sides (p,); the largest angle (p,) between two.
+    Returns the side (k, p) of each, -1 where not valid (k, p); the number of sides (p,); the largest angle (p,) between two.
     """
-    p, k = valid.shape
-    row = np.arange(p)
+    point = np.arange(valid.shape[1])
     cosine_limit = np.cos(np.radians(degrees))
 
-    def masked(cosine: np.ndarray) -> np.ndarray:
-        return np.where(valid, cosine, 2.0)
+    def cosine_to(direction: np.ndarray) -> np.ndarray:
+        return np.where(valid, dot(normals, direction), 2.0)
 
-    mean = (normals * valid[..., None]).sum(1)
-    first = masked((normals * mean[:, None]).sum(-1)).argmin(1)
-    to_first = masked((normals * normals[row, first][:, None]).sum(-1))
-    second = to_first.argmin(1)
-    spread = np.degrees(np.arccos(np.clip(to_first[row, second], -1, 1)))
-    to_second = masked((normals * normals[row, second][:, None]).sum(-1))
-    nearest = np.where(valid, np.maximum(to_first, to_second), 2.0)
-    third = nearest.argmin(1)
-    has_second = to_first[row, second] < cosine_limit
-    has_third = has_second & (nearest[row, third] < cosine_limit)
-    to_third = np.where(has_third[:, None], (normals * normals[row, third][:, None]).sum(-1), -2.0)
-    to_second = np.where(has_second[:, None], to_second, -2.0)
-    cluster = np.stack([to_first, to_second, to_third], -1).argmax(-1)
+    first = cosine_to((normals * valid).sum(1)).argmin(0)
+    to_first = cosine_to(normals[:, first, point])
+    second = to_first.argmin(0)
+    spread = np.degrees(np.arccos(np.clip(to_first[second, point], -1, 1)))
+    to_second = cosine_to(normals[:, second, point])
+    nearest = np.maximum(to_first, to_second)
+    third = nearest.argmin(0)
+    has_second = to_first[second, point] < cosine_limit
+    has_third = has_second & (nearest[third, point] < cosine_limit)
+    to_third = np.where(has_third, dot(normals, normals[:, third, point]), -2.0)
+    to_second = np.where(has_second, to_second, -2.0)
+    cluster = np.where(to_third > np.maximum(to_first, to_second), 2, to_second > to_first)
     cluster = np.where(valid, cluster, -1)
-    enough = valid.any(1)
+    enough = valid.any(0)
     return cluster, np.where(enough, 1 + has_second + has_third, 0), np.where(enough, spread, 0.0)
 
 
 def _meeting_point(points: np.ndarray, normals: np.ndarray, centroids: np.ndarray, cluster: np.ndarray,
                    sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The point nearest to points (p, 3) where the sides' planes meet, and the rms distance (p,) to those planes."""
+    """The point nearest to points (p, 3) where the planes of their k faces' normals and centroids (3, k, p), grouped by
+    cluster (k, p) into sides (p,), meet, and the rms distance (p,) to those planes."""
     weight = np.zeros(cluster.shape)
     for i in range(3):  # each side counts the same, however many of its faces are near
         mine = cluster == i
-        weight += mine / np.maximum(mine.sum(1, keepdims=True), 1)
-    offset = (normals * (centroids - points[:, None])).sum(-1)
-    matrix = np.einsum("pk,pki,pkj->pij", weight, normals, normals)
+        weight += mine / np.maximum(mine.sum(0), 1)
+    offset = dot(normals, centroids - points.T[:, None])
+    weighted = weight * normals
+    matrix = np.stack([(one * normals).sum(1) for one in weighted]).transpose(2, 0, 1)
     value, vector = np.linalg.eigh(matrix)
     # Rank = number of sides, unless three planes share a line.
     rank_ok = np.stack([(sides == 3) & (value[:, 0] > 0.03 * value[:, 2]), (sides >= 2) & (value[:, 1] > 0.02 * value[:, 2]), sides >= 1], -1)
     inverse = np.where(rank_ok, 1 / np.where(rank_ok, value, 1), 0)
-    right = np.einsum("pk,pki,pk->pi", weight, normals, offset)
+    right = np.einsum("ikp,kp->pi", weighted, offset)
     move = np.einsum("pij,pj,pkj,pk->pi", vector, inverse, vector, right)
-    residual = np.sqrt((weight * (offset - (normals * move[:, None]).sum(-1)) ** 2).sum(1) / np.maximum(weight.sum(1), 1e-12))
+    residual = np.sqrt((weight * (offset - dot(normals, move.T)) ** 2).sum(0) / np.maximum(weight.sum(0), 1e-12))
     return points + move, residual
 
 
@@ -185,93 +197,92 @@ def collapse_bevels(vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, 
     vertices (v, 3), faces (f, 3), moved (v,) bool. An edge collapses only where the mesh stays manifold (link condition,
     Dey et al. 1999) and no face with an area turns over. Returns compact vertices and faces.
     """
-    from gdtool.geometry.repair import compact
-
-    columns = np.ascontiguousarray(faces.T)
-    corners = moved.astype(np.int8)
-    rims = faces[corners[columns[0]] + corners[columns[1]] + corners[columns[2]] > 1]
+    touches = corners_of(faces, len(vertices)) @ moved.astype(np.int8)
+    rims = faces[np.flatnonzero(touches > 1)].astype(np.int64)
     half = np.concatenate([rims[:, [i, (i + 1) % 3]] for i in range(3)])
-    half = np.unique(np.sort(half[moved[half].all(1)], 1), axis=0)
+    half = np.sort(half[moved[half].all(1)], 1)
+    half = np.stack(np.divmod(np.unique(half[:, 0] * len(vertices) + half[:, 1]), len(vertices)), -1)
     length = np.linalg.norm(vertices[half[:, 0]] - vertices[half[:, 1]], axis=1)
     order = np.argsort(length, kind="stable")
     half = half[order[length[order] < longest]]
     # Only the faces around the ends of these edges are looked at.
     ends = np.zeros(len(vertices), bool)
     ends[half.ravel()] = True
-    near = np.flatnonzero(ends[columns[0]] | ends[columns[1]] | ends[columns[2]])
-    local = dict(zip(near.tolist(), faces[near].tolist(), strict=True))
-    ring: dict[int, set[int]] = {v: set() for v in np.flatnonzero(ends).tolist()}  # the faces around each end
-    for i, face in local.items():
-        for v in face:
-            if v in ring:
-                ring[v].add(i)
-    places = np.unique(faces[near])
-    position = dict(zip(places.tolist(), vertices[places].tolist(), strict=True))
-    became: dict[int, int] = {}
+    near = np.flatnonzero(touches)
+    near = near[ends[faces[near]].any(1)]
+    places, local = renumbered(faces[near], len(vertices))
+    faces_at = corners_of(local, len(places)).T.tocsr()
+    first, around = faces_at.indptr.tolist(), faces_at.indices.tolist()
+    ring = {v: set(around[first[v]:first[v + 1]]) for v in np.flatnonzero(ends[places]).tolist()}  # the faces around each end
+    position = vertices[places]
+    area = list(zip(*(one.tolist() for one in _vector_area(*(position[corner].T for corner in local.T)))))
+    position, corners = position.tolist(), list(zip(*local.T.tolist()))
+    became = list(range(len(places)))
 
     def last(v: int) -> int:
-        while v in became:
+        while became[v] != v:
             v = became[v]
         return v
 
     tiny = (1e-3 * longest) ** 2
-    gone: set[int] = set()
-    for a, b in half.tolist():
+    gone: list[int] = []
+    for a, b in np.searchsorted(places, half).tolist():
         a, b = last(a), last(b)
-        if a == b:
-            continue
-        if _squared(position[a], position[b]) > longest * longest:
+        if a == b or _squared(position[a], position[b]) > longest * longest:
             continue
         shared = ring[a] & ring[b]
         if len(shared) != 2:
             continue
-        around_a = set().union(*map(local.__getitem__, ring[a]))
-        around_b = set().union(*map(local.__getitem__, ring[b]))
+        around_a = set().union(*map(corners.__getitem__, ring[a]))
+        around_b = set().union(*map(corners.__getitem__, ring[b]))
         if len(around_a & around_b) != 4:
             continue
-        if _turns(a, b, shared, ring, local, position, tiny):
-            if _turns(b, a, shared, ring, local, position, tiny):
-                continue
+        after = _after(a, b, ring[a] - shared, corners, position, area, tiny)
+        if after is None:
             a, b = b, a
+            after = _after(a, b, ring[a] - shared, corners, position, area, tiny)
+            if after is None:
+                continue
         for i in shared:
-            for v in local[i]:
+            for v in corners[i]:
                 if v in ring:
                     ring[v].discard(i)
-            gone.add(i)
-        for i in ring[a]:
-            local[i] = [b if v == a else v for v in local[i]]
-            ring[b].add(i)
+        gone += shared
+        for i, its_corners, its_area in after:
+            corners[i], area[i] = its_corners, its_area
+        ring[b] |= ring[a]
         ring[a] = set()
         became[a] = b
-    out = faces.copy()
     keep = np.ones(len(faces), bool)
-    out[near] = np.array(list(local.values()), faces.dtype).reshape(-1, 3)
-    keep[list(gone)] = False
-    return compact(vertices, out[keep])
+    keep[near[gone]] = False
+    kept = np.flatnonzero(keep)
+    out = faces.take(kept, 0)
+    stays = keep[near]
+    out[np.searchsorted(kept, near[stays])] = places[[last(v) for v in range(len(places))]][local[stays]]
+    return compact(vertices, out)
 
 
 def _squared(a: list[float], b: list[float]) -> float:
     return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
 
 
-def _vector_area(p: list[float], q: list[float], r: list[float]) -> tuple[float, float, float]:
+def _vector_area(p: Sequence, q: Sequence, r: Sequence) -> tuple:
+    """Twice the area of triangles as a vector, and its square; of coordinates that are numbers or arrays (n,)."""
     ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
     vx, vy, vz = r[0] - p[0], r[1] - p[1], r[2] - p[2]
-    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    return x, y, z, x * x + y * y + z * z
 
 
-def _turns(a: int, b: int, shared: set[int], ring: dict, local: dict, position: dict, tiny: float) -> bool:
-    """Whether moving vertex a to b turns a face over that has an area."""
-    onto = position[b]
-    for i in ring[a] - shared:
-        one, two, three = local[i]
-        one_at, two_at, three_at = position[one], position[two], position[three]
-        x, y, z = _vector_area(one_at, two_at, three_at)
-        before = x * x + y * y + z * z
-        if before <= tiny * tiny:
-            continue
-        p, q, r = _vector_area(onto if one == a else one_at, onto if two == a else two_at, onto if three == a else three_at)
-        after = p * p + q * q + r * r
-        if x * p + y * q + z * r <= 0.1 * (before * after) ** 0.5:
-            return True
-    return False
+def _after(a: int, b: int, faces: set[int], corners: list, position: list, area: list, tiny: float) -> list[tuple] | None:
+    """Faces with their corners and vector areas when vertex a has moved to b; None where one turns over that has an area."""
+    out = []
+    for i in faces:
+        one, two, three = corners[i]
+        moved = b if one == a else one, b if two == a else two, b if three == a else three
+        after = p, q, r, area_after = _vector_area(position[moved[0]], position[moved[1]], position[moved[2]])
+        x, y, z, before = area[i]
+        if before > tiny * tiny and x * p + y * q + z * r <= 0.1 * (before * area_after) ** 0.5:
+            return None
+        out.append((i, moved, after))
+    return out

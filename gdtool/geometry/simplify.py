@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from itertools import combinations_with_replacement
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from gdtool.core.child import ChildFailed, begin
 from gdtool.core.errors import InputError
 from gdtool.geometry import repair
 from gdtool.geometry.normals import face_normals
-from gdtool.geometry.sharpen import restore_creases
+from gdtool.geometry.sharpen import corners_of, restore_creases
 from gdtool.geometry.unpinch import unpinched
 
 
@@ -29,20 +30,27 @@ def uneven(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     taken down to its last triangles instead.
     """
     some = np.arange(len(vertices)) % max(len(vertices) // _SAMPLE, 1) == 0
-    around = some[faces[:, 0]] | some[faces[:, 1]] | some[faces[:, 2]]
-    if _flat(vertices, faces[around])[some].mean() < _FEW_FLAT:
+    around, few = repair.renumbered(faces[np.flatnonzero(corners_of(faces, len(vertices)) @ some)], len(vertices))
+    if _flat(vertices[around], few)[some[around]].sum() / some.sum() < _FEW_FLAT:
         return vertices
-    few = _few(faces)
-    far = _UNEVEN * np.median(np.linalg.norm(vertices[few] - vertices[np.roll(few, 1, 1)], axis=-1))
-    return vertices + np.where(_flat(vertices, faces)[:, None], far * np.random.default_rng(0).uniform(-1, 1, vertices.shape), 0)
+    corners = vertices[_few(faces)]
+    far = _UNEVEN * np.median(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1))
+    flat = np.flatnonzero(_flat(vertices, faces))
+    out = vertices.astype(np.float64)
+    out[flat] += far * np.random.default_rng(0).uniform(-1, 1, vertices.shape)[flat]
+    return out
 
 
 def _flat(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(v,) bool: vertices all of whose faces lie in a plane that rounding bends."""
-    nx, ny, nz = face_normals(vertices.astype(np.float32).astype(np.float64), faces)[0].T
-    corners, count = faces.T.ravel(), np.maximum(np.bincount(faces.ravel(), minlength=len(vertices)), 1)
-    xx, xy, xz, yy, yz, zz = (np.bincount(corners, np.tile(product, 3), len(vertices)) / count
-                              for product in (nx * nx, nx * ny, nx * nz, ny * ny, ny * nz, nz * nz))
+    normals, corners = face_normals(vertices.astype(np.float32).astype(np.float64), faces)[0].T, np.ascontiguousarray(faces.T, np.intp)
+    sums = np.zeros((6, len(vertices)))
+    for total, (one, other) in zip(sums, combinations_with_replacement(normals, 2), strict=True):
+        product = one * other
+        for corner in corners:
+            np.add.at(total, corner, product)
+    sums /= np.maximum(np.bincount(corners.ravel(), minlength=len(vertices)), 1)
+    xx, xy, xz, yy, yz, zz = sums
     determinant = abs(xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz))
     return (0 < determinant) & (determinant < _FLAT)
 

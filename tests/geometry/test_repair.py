@@ -149,3 +149,10 @@ def test_watertight_as_the_edges_say(change):
              "doubled": np.concatenate([faces, faces[:1]]), "wedge": np.concatenate([faces, faces[:1], faces[:1, ::-1]])}[change]
     edges = repair.edges_of(faces)
     assert repair.is_watertight(faces) == bool((edges.count == 2).all() and not edges.turned.any()) == (change == "none")
+
+
+def test_unused_vertices_go_and_triangles_among_quads_stay():
+    vertices = np.arange(21.0).reshape(7, 3)
+    out, faces = repair.compact(vertices, np.array([[1, 2, 4, 5], [1, 5, 6, -1]], np.int32))
+    assert (out == vertices[[1, 2, 4, 5, 6]]).all() and (faces == [[0, 1, 2, 3], [0, 3, 4, -1]]).all() and faces.dtype == np.int64
+    assert repair.compact(out, faces)[0] is out

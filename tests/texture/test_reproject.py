@@ -41,8 +41,8 @@ def test_thin_wall_is_never_crossed():
         for offset in (-0.004, -0.0005, 0.0, 0.0005, 0.004):
             points = np.column_stack([xy, np.full(3000, side * (0.0005 + offset))])
             places = reproject(points, normals, np.full(3000, 0.01), source)
-            np.testing.assert_allclose(at(source, places)[:, 2], side * 0.0005, atol=1e-7)
-            np.testing.assert_allclose(at(source, places)[:, :2], xy, atol=1e-7)
+            np.testing.assert_allclose(at(source, places)[:, 2], side * 0.0005, atol=3e-7)  # weights of the corners are float32
+            np.testing.assert_allclose(at(source, places)[:, :2], xy, atol=3e-7)  # weights of the corners are float32
 
 
 def test_nearest_point_serves_where_the_normal_misses_and_stays_on_its_side():

@@ -1,0 +1,85 @@
+"""Meshes of several pieces: none is lost, each has its share."""
+
+import numpy as np
+import pytest
+
+from gdtool.folders.mesh import triangulated
+from gdtool.geometry import quad_candidate, quad_pieces, quad_ways, quads, repair
+from gdtool.geometry.mesh_quality import distance_figures, topology_figures
+from gdtool.geometry.quad_task import Part, Request
+from tests.geometry.engines import in_this_process, whole
+from tests.geometry.solids import cube, joined, sphere
+
+
+def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
+    """Each has its share of the quads asked for, the small one enough for its shape, and none is lost."""
+    vertices, faces = joined(sphere(48, 0.4, (0, -0.2, 0)), sphere(48, 0.12, (0, 0.5, 0)))
+    both = Part(vertices, faces, 4000, 0.03, Request(), None)
+    assert quad_pieces.well_made(both, None)[0] is None
+    parts = quad_pieces.apart(both, np.zeros(2, bool), 4000)
+    assert len(parts) == 2 and not any(part.given_up for part in parts)
+    assert sum(part.quads for part in parts) == 4000 and min(part.quads for part in parts) >= 4000 * 0.02
+    tried = []
+    real = quad_ways.Trial.run
+
+    def fails_together(trial):
+        tried.append(trial.part.pieces[0])
+        return None if tried[-1] > 1 else real(trial)
+
+    monkeypatch.setattr(quad_ways.Trial, "run", fails_together)
+    out, found, _ = quads.remesh(vertices, faces, Request(quads=4000))
+    assert tried == [2, 1, 1] and repair.components(found)[0] == 2 and whole(found)
+    assert abs(len(found) / 4000 - 1) <= 0.03
+
+
+def test_pieces_side_by_side_come_out_as_one_after_the_other(monkeypatch):
+    vertices, faces = joined(*(sphere(32, 0.2, (0.5 * k, 0, 0)) for k in range(3)))
+    real = quad_candidate.judged
+    in_this_process(monkeypatch)
+    monkeypatch.setattr(quad_candidate, "judged", lambda *mesh: ("together", *mesh[:2]) if repair.components(mesh[3])[0] > 1 else real(*mesh))
+    monkeypatch.setattr(quad_pieces, "quads_by_piece", lambda *given: [(np.zeros((0, 3)), np.zeros((0, 4), np.int64))] * 3)
+    (one, one_faces, one_record), (two, two_faces, two_record) = (quads.remesh(vertices, faces, Request(quads=1500, threads=n)) for n in (1, 3))
+    assert np.array_equal(one, two) and np.array_equal(one_faces, two_faces) and repair.components(two_faces)[0] == 3
+    assert two_record.failed == one_record.failed and set(two_record.seconds) == set(one_record.seconds)
+
+
+@pytest.mark.parametrize("hopeless", [False, True])
+def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless):
+    """Of more than go one by one; where one of them fails, too, whatever is tried, it alone is paired triangles."""
+    ball, large = sphere(64, 0.09), sphere(48, 0.3)
+    balls = [(ball[0] + (0.22 * i, 0.22 * j, 0), ball[1]) for i in range(5) for j in range(4)]
+    vertices, faces = joined(*balls, (large[0] + (0.4, 0.3, 0.5), large[1]))
+    real = quad_candidate.judged
+
+    def fails(quad_vertices, quad_faces, of_vertices, of_faces):
+        fault, *mended = real(quad_vertices, quad_faces, of_vertices, of_faces)
+        bad = repair.components(of_faces)[0] > 1 or hopeless and np.ptp(of_vertices, 0).max() > 0.5
+        return "not watertight, though the input is" if bad else fault, *mended
+
+    in_this_process(monkeypatch)
+    monkeypatch.setattr(quad_candidate, "judged", fails)
+    monkeypatch.setattr(quad_pieces, "judged", fails)
+    out, found, record = quads.remesh(vertices, faces, Request(quads=4000))
+    assert record.engine == ("instant-meshes; pair and split" if hopeless else "instant-meshes")
+    assert repair.components(found)[0] == 21 and whole(found) and abs(len(found) / 4000 - 1) <= 0.03
+    small = found[(out[found][..., 2] < 0.15).all(1)]
+    assert topology_figures(*repair.compact(out, small))["irregular_share"] < 0.1  # eight of a ball's hundred; of paired triangles a fifth and more
+    assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.02
+
+
+def test_small_piece_is_not_lost():
+    vertices, faces = joined(sphere(40, 0.7), sphere(40, 0.05, (0.9, 0.9, 0.9)))
+    out, found, record = quads.remesh(vertices / 2, faces, Request(quads=1000))
+    assert repair.components(found)[0] == 2 and whole(found) and "pair and split" in record.engine
+    assert np.linalg.norm(out - 0.45, axis=1).min() < 0.05
+
+
+def test_the_count_holds_where_small_pieces_take_more_than_their_share():
+    """A tray of ten triangles comes out of the fallback as two dozen quads however few are asked for."""
+    corners = np.stack(np.meshgrid(*[np.arange(5)] * 3, indexing="ij"), -1).reshape(-1, 3)[:100]
+    vertices, faces = cube(0.01)
+    trays = [(vertices + 0.05 * corner + 0.3, faces[:-2]) for corner in corners]
+    vertices, faces = joined(sphere(60, 0.25), *trays)
+    out, found, _ = quads.remesh(vertices, faces, Request(quads=4000, engine="split"))
+    assert abs(len(found) / 4000 - 1) < 0.03 and repair.components(found)[0] == 101
+    assert 1000 < (np.linalg.norm(out, axis=1)[found].max(1) < 0.27).sum() < 2700

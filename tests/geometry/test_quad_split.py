@@ -1,0 +1,80 @@
+"""The fallback without an engine: triangles paired and split."""
+
+import numpy as np
+import pytest
+
+from gdtool.folders.mesh import triangulated
+from gdtool.geometry import quad_fit, quad_split, quads, repair, simplify
+from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, shape_figures
+from gdtool.geometry.quad_shape import Surface
+from gdtool.geometry.quad_split import pair_and_split
+from gdtool.geometry.quad_task import Request
+from tests.geometry.engines import whole
+from tests.geometry.solids import cube, joined, rod, sphere, volume
+
+
+def test_pairing_gives_the_asked_count_exactly():
+    vertices, faces = sphere(24)
+    for count in (3 * len(faces) - 500, int(2.2 * len(faces))):
+        out, found = pair_and_split(vertices, faces, count)
+        assert abs(len(found) - count) <= 1 and whole(found) and volume(out, found) > 0
+
+
+def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypatch):
+    """One whose gentler steps keep the small piece: a third more quads than asked for, and not the whole mesh's."""
+    small, large = sphere(8), sphere(24)
+    vertices, faces = joined((small[0] * 0.1 + 3, small[1]), large)
+    tried = []
+
+    def losing(vertices, faces, target, **how):
+        tried.append(target)
+        own = simplify.simplify(*large, target - (len(small[1]) if target > 1000 else 0), measured=False)
+        return (*(joined(small, own[:2]) if target > 1000 else own[:2]), None, {})
+
+    monkeypatch.setattr(quad_split, "simplify", losing)
+    asked = 1800  # 800 triangles, of which 1.15 times as many lose the piece and 1.3 times keep it
+    out, found = quad_split._by_collapse(vertices, faces, asked, 60.0)
+    assert tried[:3] == [800, 919, 1040] and repair.components(found)[0] == 2
+    assert asked < len(found) < 1.5 * asked < 1.8 * len(faces)
+
+
+def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
+    """Pins with few triangles around: what bends too much stays single, and there are fewer triangles for it."""
+    vertices, faces = joined(*((pin[0] + (0.3 * k, 0, 0), pin[1]) for k, pin in enumerate([rod(24)] * 8)))
+    _, found = quad_split._by_collapse(vertices, faces, 400, 60.0)
+    assert abs(len(found) / 400 - 1) < 0.1 and repair.components(found)[0] == 8 and repair.is_watertight(found)
+
+
+@pytest.mark.parametrize("shape", ["slivers", "coincident"])
+def test_splitting_makes_square_quads_of_any_triangles(shape):
+    """What no engine manages is made even first: long slivers, and sheets that touch without being joined."""
+    if shape == "slivers":
+        vertices, faces = cube()
+        vertices = vertices * (1, 0.4, 0.15)  # twelve triangles
+    else:
+        vertices, faces = joined(cube(), cube())
+        vertices = vertices.copy()
+        vertices[8:, 0] += np.ptp(vertices[:8, 0])  # shares a side with the first
+    vertices = vertices / np.ptp(vertices, 0).max()
+    out, found, record = quads.remesh(vertices, faces, Request(quads=3000, engine="split"))
+    assert record.engine == "pair and split" and whole(found) and abs(len(found) / 3000 - 1) <= 0.03
+    assert repair.components(found)[0] == repair.components(faces)[0]
+    figures = shape_figures(out, found)
+    assert figures["jacobian_mean"] > 0.85 and figures["folded_share"] == 0 and figures["angle_deviation_deg"] < 18
+    assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.01
+
+
+def test_quads_without_area_are_evened_out_where_their_neighbours_stay(monkeypatch):
+    """A mesh of the fallback whose every vertex is to stay, but one quad was split without area."""
+    vertices, faces = sphere(24, 0.5)
+    split, quad_faces = pair_and_split(vertices, faces, 600)
+    a, b, c, d = quad_faces[100]
+    split[b], split[d] = split[a], split[c]
+    assert polygon_normals(split, quad_faces)[1][100] < 1e-12
+    monkeypatch.setattr(quad_fit, "_let_go", lambda *given: np.arange(len(quad_faces)))
+    out, _ = quad_fit.fitted(split, quad_faces, vertices, faces, Request(quads=600), Surface(vertices, faces))
+    edge = (polygon_normals(out, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
+    assert polygon_normals(out, quad_faces)[1].min() > 1e-4 * edge**2
+    touched = np.isin(quad_faces, quad_faces[100]).any(1)
+    kept = np.setdiff1d(quad_faces[~touched], quad_faces[touched])
+    assert np.array_equal(out[kept], split[kept])

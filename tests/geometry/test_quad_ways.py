@@ -1,0 +1,144 @@
+"""What an engine makes is mended, judged and not believed; whatever it does, a way through is found."""
+
+import time
+
+import numpy as np
+import pytest
+
+from gdtool.core.child import ChildFailed
+from gdtool.folders.mesh import triangulated
+from gdtool.geometry import quad_candidate, quad_ways, quads, repair
+from gdtool.geometry.features import Constraints
+from gdtool.geometry.quad_candidate import Candidate
+from gdtool.geometry.quad_fit import left_out
+from gdtool.geometry.quad_shape import Surface
+from gdtool.geometry.quad_task import Request
+from tests.geometry.engines import Ended, around, in_this_process, inner_face, whole
+from tests.geometry.solids import cube, marching, quad_cube, sphere, torus, volume
+
+
+@pytest.mark.parametrize("failure", ["died of SIGSEGV", "ended with exit code 0 and no result"])
+def test_dead_engine_is_replaced(monkeypatch, failure):
+    monkeypatch.setattr(quad_ways, "begin", lambda *_, **__: Ended(ChildFailed(failure)))
+    vertices, faces = torus()
+    _, found, record = quads.remesh(vertices / 2, faces, Request(quads=900))
+    assert record.engine == "pair and split" and any(failure in text for text in record.failed)
+    assert whole(found) and abs(len(found) / 900 - 1) <= 0.03
+
+
+@pytest.mark.parametrize("outcome, runs", [("a smaller sphere", 1), ("a crash", 3)])
+def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypatch, outcome, runs):
+    """Another density or no creases mend a seam that tore; a part that is too fine for the quads stays so."""
+    vertices, faces = sphere(24)
+    out, found, _ = quads.remesh(vertices / 2, faces, Request(quads=1000, engine="split"))
+
+    def engine(*_):
+        if outcome == "a crash":
+            raise ChildFailed("died of SIGSEGV")
+        return out / 2, found
+
+    calls = in_this_process(monkeypatch, engine)
+    # Drawn onto the large sphere the small one would become it.
+    monkeypatch.setattr(quad_candidate, "drawn", lambda vertices, faces, *_: (vertices, faces, Constraints.none(len(vertices))))
+    monkeypatch.setattr(quad_ways, "farthest", lambda *_: 0.3)
+    _, found, record = quads.remesh(vertices / 2, faces, Request(quads=1000))
+    assert len(calls) == runs and record.engine == "pair and split" and whole(found)
+    assert outcome == "a crash" or "strays" in record.failed[0]
+
+
+def with_tunnel(vertices, faces, length):
+    """A ball with a tunnel, a triangle wide, from its top to a triangle about so far away."""
+    centre = vertices[faces].mean(1)
+    top = centre[:, 2].argmax()
+    other = np.abs(np.linalg.norm(centre - centre[top], axis=1) - length).argmin()
+    a, b = faces[top], faces[other][::-1]
+    b = min((np.roll(b, k) for k in range(3)), key=lambda b: np.linalg.norm(vertices[a] - vertices[b], axis=1).sum())
+    tube = [[a[k], a[(k + 1) % 3], b[k]] for k in range(3)] + [[a[(k + 1) % 3], b[(k + 1) % 3], b[k]] for k in range(3)]
+    return vertices, np.concatenate([np.delete(faces, [top, other], 0), tube])
+
+
+def bored_ball():
+    return marching(lambda x, y, z: np.maximum(np.sqrt(x * x + y * y + z * z) - 0.4, 0.06 - np.hypot(x, y)), 64, 0.5)
+
+
+@pytest.mark.parametrize("shape, given_up", [("a skin-deep tunnel", True), ("a bore", False)])
+def test_a_handle_is_given_up_only_where_it_is_finer_than_a_quad(monkeypatch, shape, given_up):
+    vertices, faces = sphere(96, 0.4)
+    out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
+    vertices, faces = with_tunnel(vertices, faces, 0.07) if given_up else bored_ball()
+    assert repair.is_watertight(faces) and repair.is_manifold(faces) and repair.euler_number(faces) == 0
+    in_this_process(monkeypatch, lambda *_: (out, found))  # an engine that makes a ball of it
+    _, found, record = quads.remesh(vertices, faces, Request(quads=1000))
+    assert whole(found) and (record.engine == "instant-meshes, handles are lost") == given_up
+    assert repair.euler_number(found) == (2 if given_up else 0)
+
+
+def test_torn_output_is_not_believed(monkeypatch):
+    # Three quads at one edge.
+    book = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [1, 0, 6, 7]])
+    in_this_process(monkeypatch, lambda *_: (np.random.default_rng(0).random((8, 3)), book))
+    vertices, faces = sphere(24)
+    _, found, record = quads.remesh(vertices / 2, faces, Request(quads=300))
+    assert whole(found) and record.engine == "pair and split" and any("pieces are lost" in text for text in record.failed)
+
+
+def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
+    vertices, faces = quad_cube(3)
+    middle = inner_face(vertices, faces)
+    corners, sides = around(faces, middle)
+    assert len(corners) == 4 and len(sides) == 4
+    torn = np.delete(faces, [*corners[1:], *sides], 0)
+    fault, out, found = quad_candidate.judged(vertices, torn, vertices, triangulated(faces)[0])
+    assert fault is None and whole(found) and repair.components(found)[0] == 1 and len(found) < len(faces)
+    assert volume(out, triangulated(found)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
+
+
+def test_output_without_area_is_no_quads():
+    vertices, faces = quad_cube(1)
+    assert quad_candidate.judged(vertices, faces[:, [0, 1, 1, 0]], vertices, triangulated(faces)[0])[0] == "no quads"
+
+
+def test_quads_that_cut_edges_off_do_not_do_for_one_piece_of_several():
+    vertices, faces = quad_cube(3)
+    surface, edge = Surface(vertices, triangulated(faces)[0]), 0.125 * np.ptp(vertices[:, 0])
+    assert quad_ways.fault_of(vertices, faces, surface, edge, 1.0, piece=True) is None
+    cut = vertices.copy()
+    on_two = np.isclose(np.abs(vertices), np.abs(vertices).max()).sum(1) >= 2  # the cube's twelve edges
+    cut[on_two] *= 1 - 0.5 * edge / np.ptp(vertices[:, 0])
+    assert quad_ways.fault_of(cut, faces, surface, edge, 1.0, piece=False) is None
+    assert quad_ways.fault_of(cut, faces, surface, edge, 1.0, piece=True).startswith("cuts off")
+
+
+def test_surface_that_the_quads_do_without_is_measured():
+    vertices, faces = cube()
+    lid = faces[np.all(vertices[faces][:, :, 2] == vertices[:, 2].max(), 1)]
+    rest = np.array([f for f in faces.tolist() if f not in lid.tolist()])
+    surface = Surface(vertices, faces)
+    closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, rest))
+    assert left_out(vertices, closed, surface, 0.1) == 0
+    assert left_out(vertices, opened, surface, 0.1) == pytest.approx(0.8**2 / 6, abs=0.02)  # the lid but its rim
+
+
+def test_when_the_time_is_over_no_engine_is_begun():
+    """What was asked for comes all the same, as paired triangles, and the record says why."""
+    vertices, faces = sphere(96, 0.45)
+    start = time.monotonic()
+    out, found, record = quads.remesh(vertices, faces, Request(quads=4000, seconds=0.01))
+    assert record.engine == "pair and split" and record.failed == ["instant-meshes, 1 subdivision: not tried, the time is over"]
+    assert whole(found) and abs(len(found) / 4000 - 1) <= 0.03 and time.monotonic() - start < 30
+
+
+def test_every_round_asks_for_two_densities():
+    way = quad_ways._ways(20000, Request())[0]
+    assert len(way.near(20000)) == 2 and np.mean(way.near(20000)) == pytest.approx(20000)
+    assert way.near(20000)[1] / way.near(20000)[0] == pytest.approx(way.factors[1] / way.factors[0])
+
+
+def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out():
+    """The first in rank where it will do; where none does, what comes nearest to it."""
+    def candidate(far, least):
+        return Candidate(1000, None, np.zeros((0, 3)), np.zeros((0, 4), int), 1000, True, far=far, least=least)
+
+    good, better, bare, thin = candidate(0.5, 0.3), candidate(0.1, 0.9), candidate(0.9, 0.5), candidate(0.3, 0.1)
+    assert quad_ways._chosen([good, better]) is good and quad_ways._chosen([bare, good]) is good
+    assert quad_ways._chosen([bare, thin]) is bare and quad_ways._chosen([candidate(2.0, 0.5), thin]) is thin

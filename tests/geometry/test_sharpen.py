@@ -1,0 +1,59 @@
+"""Bevels: what is found where the surface turns, and what their collapse may change."""
+
+import numpy as np
+import pytest
+
+from gdtool.geometry import repair, sharpen
+from gdtool.geometry.features import find_features
+from gdtool.geometry.normals import face_normals
+from tests.geometry.solids import bored_box, cube, sphere, torus, volume
+
+
+@pytest.mark.parametrize("solid", [sphere, torus, bored_box])
+def test_no_bent_edge_is_left_out(solid):
+    vertices, faces = solid(40)
+    maybe = sharpen._maybe_bent(face_normals(vertices, faces)[0], sharpen.corners_of(faces, len(vertices)).T.tocsr(), 15.0)
+    ends, _, angle = sharpen.dihedral_degrees(vertices, faces)
+    assert maybe[ends[angle > 15]].all()
+
+
+@pytest.mark.parametrize("kind", [np.int32, np.int64])
+def test_creases_restored_keep_the_mesh_closed_and_their_input(kind):
+    vertices, faces = bored_box(48)
+    before, faces = vertices.copy(), faces.astype(kind)
+    before_faces = faces.copy()
+    out, found, report = sharpen.restore_creases(vertices, faces)
+    assert (vertices == before).all() and (faces == before_faces).all()
+    assert report["moved"] > 300 and 0 < report["largest_move"] < 0.1 and 0 < report["bevel_share"] < 0.25
+    assert len(found) < len(faces) - 200 and repair.topology(found) == repair.topology(faces)
+    assert len(np.unique(found)) == len(out) and np.linalg.norm(out - [0.8, 0.6, 0.5], axis=1).min() < 0.02
+    true = 1.6 * 1.2 * 1.0 - np.pi * 0.3**2
+    assert abs(volume(out, found) - true) < 0.3 * abs(volume(vertices, faces) - true)
+
+
+def test_bevels_collapse_onto_vertices_they_had():
+    vertices, faces = bored_box(32)
+    longest = 0.6 * np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1).max()
+    out, found = sharpen.collapse_bevels(vertices, faces, np.ones(len(vertices), bool), longest)
+    assert len(found) < 0.9 * len(faces) and repair.topology(found) == repair.topology(faces)
+    assert {tuple(place) for place in out.tolist()} < {tuple(place) for place in vertices.tolist()}
+    for moved, longest in ((np.zeros(len(vertices), bool), longest), (np.ones(len(vertices), bool), 0.0)):
+        same, same_faces = sharpen.collapse_bevels(vertices, faces, moved, longest)
+        assert (same == vertices).all() and (same_faces == faces).all()
+
+
+def test_bevels_of_marching_cubes_become_creases():
+    vertices, faces = bored_box()
+    sharp, sharp_faces, report = sharpen.restore_creases(vertices, faces)
+    assert report["moved"] > 300 and repair.is_watertight(sharp_faces) and repair.is_manifold(sharp_faces)
+    corner = np.array([0.8, 0.6, 0.5])
+    before, after = (np.linalg.norm(v - corner, axis=1).min() for v in (vertices, sharp))
+    assert after < 0.2 * before
+    features = find_features(sharp, sharp_faces, 30.0, 0.15)
+    length = np.linalg.norm(features.points[features.segments[:, 0]] - features.points[features.segments[:, 1]], axis=1).sum()
+    assert length == pytest.approx(4 * (1.6 + 1.2 + 1.0) + 2 * 2 * np.pi * 0.3, rel=0.05)
+
+
+def test_smooth_and_sharp_meshes_are_left_alone():
+    for vertices, faces in (sphere(32), cube()):
+        assert sharpen.restore_creases(vertices, faces)[2]["moved"] == 0
