@@ -1,26 +1,24 @@
-"""One candidate: what an engine makes of a surface, mended, judged and drawn onto it. Runs in a child, beside others."""
+"""One candidate: what an engine makes of a surface, mended and judged in a child, then drawn onto the surface."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import igl  # noqa: F401 - read while a prepared child waits, as scipy's graphs are
 import numpy as np
-import scipy.sparse.csgraph  # noqa: F401
+import scipy.sparse.csgraph  # noqa: F401 - what repair needs, read while a prepared child waits
 
 from gdtool.geometry import repair
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import scaled_jacobian, valences
 from gdtool.geometry.quad_engines import ENGINES
-from gdtool.geometry.quad_fit import drawn, farthest, sticks_out
+from gdtool.geometry.quad_fit import FAR_EDGES, FAR_SUBDIVIDED, STICKS_OUT, drawn, fault_of, sticks_out
 from gdtool.geometry.quad_shape import fill_holes, remove_doublets
 from gdtool.geometry.quad_task import Part
 from gdtool.geometry.quad_topology import cancel_irregular
 
 COUNT_TOLERANCE = 0.03
 LOST, ADDED, PIECES = "handles are lost", "handles are added", "pieces are lost or joined"
-CLOSE_EDGES = 0.55  # nearer than this, a result is taken without a look at others
-_LEAST_JACOBIAN = 0.2  # and squarer than this
+_CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a result is taken without a look at others
 _MENDINGS = 4  # rounds of filling holes and parting what meets at a vertex
 
 
@@ -50,17 +48,22 @@ class Way:
 
 @dataclass
 class Candidate:
-    """What an engine made of `asked`, mended, what is wrong with it, and, where it is worth the while, drawn onto the surface."""
+    """What an engine made of `asked`, mended, what is wrong with it, and, once it was tried, drawn onto the surface."""
 
+    way: Way
     asked: float
     fault: str | None
     vertices: np.ndarray
     quads: np.ndarray
-    count: int  # of the quads that it will have when it is subdivided
-    usable: bool = False  # without a fault, or with one finer than its quads
     drawn: tuple[np.ndarray, np.ndarray, Constraints] | None = None  # quad_fit.drawn
     far: float = np.inf  # of the surface from the quads drawn, in edge lengths
     least: float = -1.0  # their worst scaled Jacobian
+    wrong: str | None = None  # what of them does not do on the surface
+
+    @property
+    def count(self) -> int:
+        """Of the quads that it will have when it is subdivided."""
+        return len(self.quads) * self.way.children
 
     def off(self, wanted: float) -> float:
         return self.count / wanted - 1
@@ -80,24 +83,35 @@ class Candidate:
 
     @property
     def good(self) -> bool:
-        return self.far < CLOSE_EDGES and self.least > _LEAST_JACOBIAN
+        """Whether it is taken without a look at others."""
+        return self.wrong is None and self.far < _CLOSE_EDGES and self.least > _LEAST_JACOBIAN
+
+    def usable(self, part: Part) -> bool:
+        """Without a fault, or with one that is finer than its quads."""
+        return self.fault is None or self.fault == LOST and sticks_out(self.vertices, self.quads, part.surface) < 2 * _CLOSE_EDGES * part.edge
+
+    def draw(self, part: Part) -> None:
+        """Drawn onto the surface, and judged there."""
+        subdivisions, surface = self.way.subdivisions, part.surface
+        self.drawn = drawn(self.vertices, self.quads, surface, part.features, subdivisions, part.request)
+        vertices, quads, _ = self.drawn
+        self.least = float(scaled_jacobian(vertices, quads).min())
+        self.wrong, self.far = fault_of(vertices, quads, surface, part.edge, FAR_SUBDIVIDED if subdivisions else FAR_EDGES, part.piece)
+        if self.fault and (over := sticks_out(vertices, quads, surface) / part.edge) > _CLOSE_EDGES:
+            self.wrong = f"{STICKS_OUT} {over:.2g} edge lengths"  # else what is lost was finer than a quad
+        if subdivisions and self.least < part.request.least_jacobian:
+            self.wrong = f"has a quad of scaled Jacobian {self.least:.2g}"
 
     def _irregular(self) -> int:
         valence, inner = valences(self.quads, int(self.quads.max(initial=0)) + 1)
         return int((valence[inner] != 4).sum())
 
 
-def candidate(part: Part, way: Way, asked: float, wanted: float) -> Candidate:
-    """What the child runs. Drawn onto the surface is what comes near to the number wanted, if it can be used or is the last resort."""
+def candidate(vertices: np.ndarray, faces: np.ndarray, way: Way, asked: float) -> Candidate:
+    """What the child runs."""
     engine = ENGINES["on few" if way.engine == "instant-meshes" and way.subdivisions else way.engine]
-    found = engine(part.vertices.astype(np.float32), part.faces.astype(np.int32), max(int(asked / way.children), 16), way.degrees)
-    fault, vertices, quads = judged(*found, part.vertices, part.faces)
-    out = Candidate(asked, fault, vertices, quads, len(quads) * way.children)
-    out.usable = fault is None or fault == LOST and sticks_out(vertices, quads, part.surface) < 2 * CLOSE_EDGES * part.edge
-    if out.counted(wanted) and (out.usable or out.bridged and not way.subdivisions):
-        out.drawn = drawn(vertices, quads, part.surface, part.features, way.subdivisions, part.request)
-        out.far, out.least = farthest(*out.drawn[:2], part.surface) / part.edge, float(scaled_jacobian(*out.drawn[:2]).min())
-    return out
+    found = engine(vertices.astype(np.float32), faces.astype(np.int32), max(int(asked / way.children), 16), way.degrees)
+    return Candidate(way, asked, *judged(*found, vertices, faces))
 
 
 def judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> tuple[str | None, np.ndarray, np.ndarray]:

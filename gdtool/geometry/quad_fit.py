@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 _NO_AREA = 1e-4  # squared edge lengths
 _HOPELESS_EDGES = 1.7  # farther than this before it is shaped, a subdivided result is given up
 _RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
+FAR_EDGES, FAR_SUBDIVIDED = 2.0, 1.0  # edge lengths that a result may stray; of a subdivided one, after which others come
+_LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
+_MOST_FOLDED = 0.01  # of the quads
+_CUT_EDGES, _CUT_SHARE = 0.25, 0.01  # surface so far from the quads lies beyond an edge that they cut off; how much of a piece may
+TOO_COARSE = _STRAYS, _LEAVES_OUT, STICKS_OUT = "strays", "leaves out", "sticks out"
 _FOLDED, _LET_GO = 0.05, 0.25  # scaled Jacobian; edge lengths
 
 
@@ -41,8 +46,8 @@ def drawn(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: F
     edge /= 2**subdivisions
     if subdivisions:  # what ran across a quad has vertices nearer to it now
         vertices, constraints = trace(vertices, faces, features, edge)
-    vertices, faces, constraints, tips = draw_out(vertices, faces, constraints, surface, edge)
-    if subdivisions and farthest(vertices, faces, surface) > _HOPELESS_EDGES * edge:
+    vertices, faces, constraints, tips, far = draw_out(vertices, faces, constraints, surface, edge)
+    if subdivisions and far > _HOPELESS_EDGES * edge:
         return vertices, faces, constraints  # shaping brings it a third nearer at most: it strays too far in any case
     vertices, constraints = _shaped(vertices, faces, surface, features, constraints, request, tips)
     return vertices, faces, constraints
@@ -60,7 +65,7 @@ def _shaped(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features:
     """The quads squared up, then the few that stay folded or thin unfolded one vertex at a time; what they are held to from then on."""
     vertices = square_up(vertices, faces, surface, features, constraints, request.smooth_iterations)
     constraints = untied(vertices, faces, constraints)
-    vertices = square_up(vertices, faces, surface, features, constraints, 3 * request.smooth_iterations)
+    vertices = square_up(vertices, faces, surface, features, constraints, 2 * request.smooth_iterations)
     vertices = unfold(vertices, faces, surface, features, constraints)
     return ease(vertices, faces, surface, features, constraints, tips=tips)
 
@@ -106,13 +111,37 @@ def _let_go(surface: Surface, vertices: np.ndarray, moved: np.ndarray, faces: np
     return np.unique(face_idx[nearest[(after > distance) & (after > 2 * before)]])
 
 
-def farthest(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> float:
-    """How far the surface is from the quads at most: large where they are too coarse for a detail or leave out a corner."""
-    from gdtool.folders.mesh import triangulated
-    from gdtool.geometry.distance import closest_points
+def fault_of(vertices: np.ndarray, quads: np.ndarray, surface: Surface, edge: float, limit: float, piece: bool) -> tuple[str | None, float]:
+    """What of finished quads does not do on the surface, or None, and how far they are from it, in edge lengths.
 
+    limit: edge lengths that they may stray. piece: it is one of several, and not most of them, so that paired triangles that keep its
+    edges do better than quads that cut them off.
+    """
+    mine = surface_of(vertices, quads)
+    if (far := farthest(mine, surface) / edge) > limit:
+        return f"{_STRAYS} {far:.2g} edge lengths from the surface", far
+    if (left := left_out(mine, surface, _LOST_EDGES * edge)) > _LOST_SHARE:
+        return f"{_LEAVES_OUT} {left:.1%} of the surface", far
+    if (over := sticks_out(vertices, quads, surface) / edge) > limit:
+        return f"{STICKS_OUT} {over:.2g} edge lengths", far
+    if (folded := float((scaled_jacobian(vertices, quads) <= 0).mean())) > _MOST_FOLDED:
+        return f"{folded:.1%} of the quads are folded", far
+    if piece and (cut := left_out(mine, surface, _CUT_EDGES * edge)) > _CUT_SHARE:
+        return f"cuts off {cut:.1%} of the surface", far
+    return None, far
+
+
+def surface_of(vertices: np.ndarray, quads: np.ndarray) -> Surface:
+    """The surface of the triangles that quads are cut into."""
+    from gdtool.folders.mesh import triangulated
+
+    return Surface(vertices, triangulated(quads)[0])
+
+
+def farthest(quads: Surface, surface: Surface) -> float:
+    """How far the surface is from the quads at most: large where they are too coarse for a detail or leave out a corner."""
     step = max(len(surface.vertices) // 20000, 1)
-    return float(closest_points(surface.vertices[::step], vertices, triangulated(faces)[0])[0].max())
+    return float(quads.closest(surface.vertices[::step])[0].max())
 
 
 def sticks_out(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> float:
@@ -120,10 +149,9 @@ def sticks_out(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> flo
     return float(surface.closest(vertices[faces].mean(1))[0].max())
 
 
-def left_out(vertices: np.ndarray, faces: np.ndarray, surface: Surface, distance: float) -> float:
+def left_out(quads: Surface, surface: Surface, distance: float) -> float:
     """Share of the surface's area that lies farther than `distance` from the quads: thin parts and rims that they do without."""
-    from gdtool.folders.mesh import triangulated
-    from gdtool.geometry.distance import closest_points, sample_surface
+    from gdtool.geometry.distance import sample_surface
 
     points = sample_surface(surface.vertices, surface.faces, 10000, np.random.default_rng(0))[0]
-    return float((closest_points(points, vertices, triangulated(faces)[0])[0] > distance).mean())
+    return float((quads.closest(points)[0] > distance).mean())

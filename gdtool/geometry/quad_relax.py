@@ -16,12 +16,13 @@ _THIN = 0.3  # quads of a smaller scaled Jacobian stay where they are balanced
 
 
 def square_up(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
-              iterations: int, strength: float = 0.8) -> np.ndarray:
+              iterations: int, strength: float = 1.2) -> np.ndarray:
     """Vertices (v, 3) such that the quads (f, 4) have right angles, on the surface and on the feature curves.
 
     Shape projection (Bouaziz et al. 2012) onto rectangles in the plane of the surface below each quad. That plane says
     which way round a quad goes, so folded quads are asked to turn over. The best vertices met are returned: fewest
-    folded quads first, then the largest mean Jacobian.
+    folded quads first, then the largest mean Jacobian. strength: of the way that vertices go at once; beyond 1 ten rounds do what
+    takes fifteen at 0.8.
     """
     if not len(faces) or not iterations:
         return vertices

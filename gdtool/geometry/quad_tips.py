@@ -18,22 +18,26 @@ _POINTS = 20000
 
 
 def draw_out(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, surface: Surface, edge: float,
-             most_added: float = 0.03) -> tuple[np.ndarray, np.ndarray, Constraints, np.ndarray]:
+             most_added: float = 0.03) -> tuple[np.ndarray, np.ndarray, Constraints, np.ndarray, float]:
     """Quads (f, 4) of mean edge length `edge` extruded over what of the surface strays from them, farthest first.
 
     The vertices (v, 3) nearest to a tip move along it, an edge or two at a time, with the quads around them, and a ring of
     new quads follows each step, as one would model a horn by hand, until most_added of the quads are new: what needs more is no matter of tips.
     A tip that is nearer than an edge takes one vertex and no ring. Closed and manifold as before, of as many pieces and handles. Returns vertices, faces,
-    constraints, in which the tips are fixed, and the tips' vertices (t,).
+    constraints, in which the tips are fixed, the tips' vertices (t,), and how far the surface was from the quads at most before the last vertices moved.
     """
     from gdtool.folders.mesh import triangulated
 
     step = max(len(surface.vertices) // _POINTS, 1)
     points = samples = np.concatenate([surface.vertices[::step], sample_surface(surface.vertices, surface.faces, _POINTS // 2, np.random.default_rng(0))[0]])
     most, before = len(faces) * (1 + most_added), constraints.fixed.copy()
+    triangles, face_idx = triangulated(faces)
+    away, nearest, _ = closest_points(points, vertices, triangles)
+    of_samples = away, face_idx[nearest]
     for turn in range(_MOST_STEPS):
-        triangles, face_idx = triangulated(faces)
-        away, nearest, _ = closest_points(points, vertices, triangles)
+        if turn:
+            triangles, face_idx = triangulated(faces)
+            away, nearest, _ = closest_points(points, vertices, triangles)
         bare = away > _BARE * edge  # all others will stay near
         points, away, nearest = points[bare], away[bare], nearest[bare]
         if not len(points) or not turn and away.max() < _STRAYS * edge:
@@ -47,22 +51,27 @@ def draw_out(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, 
                 alive[tip] = False
             else:
                 vertices, faces, constraints = found
+                of_samples = None
         points = points[alive]
         if not len(points) or len(faces) > most or away[alive].max() < _CLOSE * edge:
             break
-    vertices, constraints = _reached(vertices, faces, constraints, samples, edge)
+    if of_samples is None:
+        triangles, face_idx = triangulated(faces)
+        away, nearest, _ = closest_points(samples, vertices, triangles)
+        of_samples = away, face_idx[nearest]
+    vertices, constraints = _reached(vertices, faces, constraints, samples, *of_samples, edge)
     before = np.concatenate([before, np.zeros(len(vertices) - len(before), bool)])
-    return vertices, faces, constraints, np.flatnonzero(constraints.fixed & ~before)
+    return vertices, faces, constraints, np.flatnonzero(constraints.fixed & ~before), float(of_samples[0].max())
 
 
-def _reached(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, points: np.ndarray, edge: float) -> tuple[np.ndarray, Constraints]:
-    """Tips that end less than an edge from the quads: the nearest vertex moves there and stays."""
-    from gdtool.folders.mesh import triangulated
+def _reached(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, points: np.ndarray, away: np.ndarray,
+             nearest: np.ndarray, edge: float) -> tuple[np.ndarray, Constraints]:
+    """Tips that end less than an edge from the quads: the nearest vertex moves there and stays.
 
-    triangles, face_idx = triangulated(faces)
-    away, nearest, _ = closest_points(points, vertices, triangles)
+    points (n, 3) of the surface, how far each is `away` (n,), and the quad `nearest` (n,) to it.
+    """
     bare = (away > _BARE * edge) & (away < _STRAYS * edge)
-    points, quads, away = points[bare], face_idx[nearest[bare]], away[bare]
+    points, quads, away = points[bare], nearest[bare], away[bare]
     if not len(points):
         return vertices, constraints
     ends = [tip[away[tip].argmax()] for tip in _apart(points, away, edge) if np.ptp(points[tip], 0).max() < _TIP * edge]

@@ -84,10 +84,15 @@ def is_watertight(faces: np.ndarray) -> bool:
     faces = np.asarray(faces)
     if not len(faces):
         return False
-    if faces.shape[1] == 4 or faces.min() < 0 or faces.max() >= 2**31 - 1 or 3 * len(faces) > 2**31 - 1:
+    if not _plain(faces):
         edges = edges_of(faces)
         return bool((edges.count == 2).all() and not edges.turned.any())
     return _twins(faces) is not None
+
+
+def _plain(faces: np.ndarray) -> bool:
+    """Whether these are triangles (f, 3) that _twins can take."""
+    return len(faces) > 0 and faces.shape[1] == 3 and faces.min() >= 0 and max(faces.max(), 3 * len(faces)) < 2**31 - 1
 
 
 def _twins(faces: np.ndarray) -> np.ndarray | None:
@@ -185,12 +190,23 @@ def components(faces: np.ndarray) -> tuple[int, np.ndarray]:
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
+    if _plain(faces) and (twins := _twins(faces)) is not None:
+        return _pieces(twins)
     edges = edges_of(faces)
     # The faces of an edge in a row, each tied to the next: linear in the number of corners, whatever the edges' valence.
     edge, face = edges.half_edge_idx[edges.order], edges.half_face[edges.order]
     tied = edge[1:] == edge[:-1]
     rows, columns = face[:-1][tied], face[1:][tied]
     return connected_components(coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), (len(faces),) * 2), False)
+
+
+def _pieces(twins: np.ndarray) -> tuple[int, np.ndarray]:
+    """components() of triangles that have twins."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    f = len(twins) // 3
+    return connected_components(csr_array((np.ones(3 * f, np.int8), twins // 3, np.arange(0, 3 * f + 1, 3)), (f, f)), True, "weak")
 
 
 def euler_number(faces: np.ndarray) -> int:
@@ -200,6 +216,9 @@ def euler_number(faces: np.ndarray) -> int:
 
 def topology(faces: np.ndarray) -> tuple[bool, bool, int, int]:
     """Watertight, manifold, pieces, Euler number: what a mesh must not change in when it is made coarser or even."""
+    if _plain(faces) and (twins := _twins(faces)) is not None:
+        corners = len(np.unique(faces))
+        return True, _one_fan_each(faces, twins), _pieces(twins)[0], corners - len(faces) // 2
     return is_watertight(faces), is_manifold(faces), components(faces)[0], euler_number(faces)
 
 
@@ -303,12 +322,14 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
 
 def _vertices_manifold(faces: np.ndarray) -> bool:
     """Whether the faces around each vertex of a watertight mesh of triangles (f, 3) form one fan."""
+    twins = _twins(faces)
+    return not len(split_vertices(faces)) if twins is None else _one_fan_each(faces, twins)
+
+
+def _one_fan_each(faces: np.ndarray, twins: np.ndarray) -> bool:
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
-    twins = _twins(faces)
-    if twins is None:
-        return not len(split_vertices(faces))
     # From an edge that leaves a vertex to the next one that does: its cycles are the fans.
     n = len(twins)
     before = np.arange(n).reshape(-1, 3)[:, [2, 0, 1]].ravel()

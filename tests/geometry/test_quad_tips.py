@@ -7,7 +7,7 @@ from gdtool.geometry import quad_fit, quads, repair
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import distance_figures, scaled_jacobian
 from gdtool.folders.mesh import triangulated
-from gdtool.geometry.quad_fit import farthest
+from gdtool.geometry.quad_fit import farthest, surface_of
 from gdtool.geometry.quad_shape import Surface
 from gdtool.geometry.quad_task import Request
 from gdtool.geometry.quad_tips import draw_out
@@ -38,9 +38,9 @@ def ball(rounds=4):
 def test_a_horn_is_drawn_out(length, bend):
     vertices, faces, edge = ball()
     surface = Surface(*horned(length, bend=bend))
-    assert farthest(vertices, faces, surface) > 1.4 * edge
-    out, found, constraints, tips = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge, most_added=0.3)
-    assert farthest(out, found, surface) < 0.8 * edge
+    assert farthest(surface_of(vertices, faces), surface) > 1.4 * edge
+    out, found, constraints, tips, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge, most_added=0.3)
+    assert farthest(surface_of(out, found), surface) < 0.8 * edge
     assert repair.is_watertight(found) and repair.is_manifold(found) and repair.euler_number(found) == 2
     assert len(faces) < len(found) < 1.2 * len(faces)
     assert len(tips) and constraints.fixed[tips].all() and len(constraints.curve) == len(out)
@@ -60,16 +60,16 @@ def test_no_more_quads_than_allowed_are_spent():
 def test_what_is_near_enough_is_left_alone():
     vertices, faces, edge = ball()
     surface = Surface(*horned(0.4 * edge))
-    out, found, _, tips = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
+    out, found, _, tips, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
     assert out is vertices and found is faces and not len(tips)
 
 
 def test_one_vertex_reaches_a_tip_that_is_less_than_an_edge_away():
     vertices, faces, edge = ball()
     surface = Surface(*horned(0.9 * edge))
-    assert 0.6 * edge < farthest(vertices, faces, surface) < edge
-    out, found, constraints, tips = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
-    assert found is faces and farthest(out, faces, surface) < 0.4 * edge
+    assert 0.6 * edge < farthest(surface_of(vertices, faces), surface) < edge
+    out, found, constraints, tips, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
+    assert found is faces and farthest(surface_of(out, faces), surface) < 0.4 * edge
     assert len(tips) == 1 and constraints.fixed[tips].all() and (out == vertices).all(1).sum() == len(vertices) - 1
 
 
@@ -82,7 +82,7 @@ def test_paths_along_creases_end_where_a_tip_is_drawn_out():
     curve = np.full(len(vertices), -1)
     curve[around] = 0
     held = Constraints(curve, np.zeros(len(vertices), bool), path, np.zeros(len(path), int))
-    _, found, constraints, tips = draw_out(vertices, faces, held, Surface(*horned(0.2)), edge)
+    _, found, constraints, tips, _ = draw_out(vertices, faces, held, Surface(*horned(0.2)), edge)
     edges = set(map(tuple, repair.edges_of(found).ends.tolist()))
     assert 0.8 * len(path) < len(constraints.path) < len(path)
     assert all(tuple(sorted(ends)) in edges for ends in constraints.path.tolist()) and (constraints.curve[tips] < 0).all()
@@ -97,5 +97,5 @@ def test_an_engine_that_cuts_a_horn_short_is_still_taken(monkeypatch):
     assert "instant-meshes" in record.engine and abs(len(found) / 2000 - 1) <= 0.03 and repair.is_watertight(found)
     assert figures["hausdorff"] < 2 * edge and (scaled_jacobian(out, found) <= 0).mean() < 0.003
     in_this_process(monkeypatch)
-    monkeypatch.setattr(quad_fit, "draw_out", lambda v, f, constraints, *_: (v, f, constraints, None))
+    monkeypatch.setattr(quad_fit, "draw_out", lambda v, f, constraints, *_: (v, f, constraints, None, 0.0))
     assert quads.remesh(vertices, faces, asked)[2].engine == "pair and split"

@@ -10,9 +10,9 @@ from gdtool.folders.mesh import triangulated
 from gdtool.geometry import quad_candidate, quad_ways, quads, repair
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.quad_candidate import Candidate
-from gdtool.geometry.quad_fit import left_out
+from gdtool.geometry.quad_fit import fault_of, left_out, surface_of
 from gdtool.geometry.quad_shape import Surface
-from gdtool.geometry.quad_task import Request
+from gdtool.geometry.quad_task import Part, Record, Request
 from tests.geometry.engines import Ended, around, in_this_process, inner_face, whole
 from tests.geometry.solids import cube, marching, quad_cube, sphere, torus, volume
 
@@ -40,7 +40,6 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
     calls = in_this_process(monkeypatch, engine)
     # Drawn onto the large sphere the small one would become it.
     monkeypatch.setattr(quad_candidate, "drawn", lambda vertices, faces, *_: (vertices, faces, Constraints.none(len(vertices))))
-    monkeypatch.setattr(quad_ways, "farthest", lambda *_: 0.3)
     _, found, record = quads.remesh(vertices / 2, faces, Request(quads=1000))
     assert len(calls) == runs and record.engine == "pair and split" and whole(found)
     assert outcome == "a crash" or "strays" in record.failed[0]
@@ -101,12 +100,12 @@ def test_output_without_area_is_no_quads():
 def test_quads_that_cut_edges_off_do_not_do_for_one_piece_of_several():
     vertices, faces = quad_cube(3)
     surface, edge = Surface(vertices, triangulated(faces)[0]), 0.125 * np.ptp(vertices[:, 0])
-    assert quad_ways.fault_of(vertices, faces, surface, edge, 1.0, piece=True) is None
+    assert fault_of(vertices, faces, surface, edge, 1.0, piece=True)[0] is None
     cut = vertices.copy()
     on_two = np.isclose(np.abs(vertices), np.abs(vertices).max()).sum(1) >= 2  # the cube's twelve edges
     cut[on_two] *= 1 - 0.5 * edge / np.ptp(vertices[:, 0])
-    assert quad_ways.fault_of(cut, faces, surface, edge, 1.0, piece=False) is None
-    assert quad_ways.fault_of(cut, faces, surface, edge, 1.0, piece=True).startswith("cuts off")
+    assert fault_of(cut, faces, surface, edge, 1.0, piece=False)[0] is None
+    assert fault_of(cut, faces, surface, edge, 1.0, piece=True)[0].startswith("cuts off")
 
 
 def test_surface_that_the_quads_do_without_is_measured():
@@ -115,8 +114,8 @@ def test_surface_that_the_quads_do_without_is_measured():
     rest = np.array([f for f in faces.tolist() if f not in lid.tolist()])
     surface = Surface(vertices, faces)
     closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, rest))
-    assert left_out(vertices, closed, surface, 0.1) == 0
-    assert left_out(vertices, opened, surface, 0.1) == pytest.approx(0.8**2 / 6, abs=0.02)  # the lid but its rim
+    assert left_out(surface_of(vertices, closed), surface, 0.1) == 0
+    assert left_out(surface_of(vertices, opened), surface, 0.1) == pytest.approx(0.8**2 / 6, abs=0.02)  # the lid but its rim
 
 
 def test_when_the_time_is_over_no_engine_is_begun():
@@ -134,11 +133,17 @@ def test_every_round_asks_for_two_densities():
     assert way.near(20000)[1] / way.near(20000)[0] == pytest.approx(way.factors[1] / way.factors[0])
 
 
-def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out():
-    """The first in rank where it will do; where none does, what comes nearest to it."""
-    def candidate(far, least):
-        return Candidate(1000, None, np.zeros((0, 3)), np.zeros((0, 4), int), 1000, True, far=far, least=least)
+def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypatch):
+    """The first in rank where it will do, without a look at the other; where none does, what comes nearest to it."""
+    way = quad_ways._ways(20000, Request())[0]
+    drawn = []
 
+    def candidate(far, least, wrong=None):
+        return Candidate(way, 1000, None, np.zeros((0, 3)), np.zeros((0, 4), int), far=far, least=least, wrong=wrong)
+
+    monkeypatch.setattr(Candidate, "draw", lambda one, part: drawn.append(one))
+    choose = quad_ways.Trial(Part(*cube(), 1000, 0.1, Request(), None), Record())._drawn
     good, better, bare, thin = candidate(0.5, 0.3), candidate(0.1, 0.9), candidate(0.9, 0.5), candidate(0.3, 0.1)
-    assert quad_ways._chosen([good, better]) is good and quad_ways._chosen([bare, good]) is good
-    assert quad_ways._chosen([bare, thin]) is bare and quad_ways._chosen([candidate(2.0, 0.5), thin]) is thin
+    assert choose([good, better]) is good and drawn == [good] and choose([bare, good]) is good
+    assert choose([candidate(0.1, 0.9, "leaves out 1 % of the surface"), thin]) is thin
+    assert choose([bare, thin]) is bare and choose([candidate(2.0, 0.5), thin]) is thin
