@@ -24,7 +24,9 @@ _RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surfa
 FAR_EDGES, FAR_SUBDIVIDED = 2.0, 1.0  # edge lengths that a result may stray; of a subdivided one, after which others come
 _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
 _MOST_FOLDED = 0.01  # of the quads
-_CUT_EDGES, _CUT_SHARE = 0.25, 0.01  # surface so far from the quads lies beyond an edge that they cut off; how much of a piece may
+_CUT_EDGES = 0.25  # surface so far from the quads lies beyond an edge that they cut off
+# How much of it may: of a piece, for paired triangles keep its edges; of a subdivided result, after which finer ones come.
+CUT_WHOLE, CUT_PIECE, CUT_SUBDIVIDED = 0.02, 0.01, 0.005
 TOO_COARSE = _STRAYS, _LEAVES_OUT, STICKS_OUT = "strays", "leaves out", "sticks out"
 _FOLDED, _LET_GO = 0.05, 0.25  # scaled Jacobian; edge lengths
 
@@ -111,11 +113,10 @@ def _let_go(surface: Surface, vertices: np.ndarray, moved: np.ndarray, faces: np
     return np.unique(face_idx[nearest[(after > distance) & (after > 2 * before)]])
 
 
-def fault_of(vertices: np.ndarray, quads: np.ndarray, surface: Surface, edge: float, limit: float, piece: bool) -> tuple[str | None, float]:
+def fault_of(vertices: np.ndarray, quads: np.ndarray, surface: Surface, edge: float, limit: float, most_cut: float) -> tuple[str | None, float]:
     """What of finished quads does not do on the surface, or None, and how far they are from it, in edge lengths.
 
-    limit: edge lengths that they may stray. piece: it is one of several, and not most of them, so that paired triangles that keep its
-    edges do better than quads that cut them off.
+    limit: edge lengths that they may stray. most_cut: share of the surface that may lie beyond an edge that they cut off.
     """
     mine = surface_of(vertices, quads)
     if (far := farthest(mine, surface) / edge) > limit:
@@ -126,7 +127,7 @@ def fault_of(vertices: np.ndarray, quads: np.ndarray, surface: Surface, edge: fl
         return f"{STICKS_OUT} {over:.2g} edge lengths", far
     if (folded := float((scaled_jacobian(vertices, quads) <= 0).mean())) > _MOST_FOLDED:
         return f"{folded:.1%} of the quads are folded", far
-    if piece and (cut := left_out(mine, surface, _CUT_EDGES * edge)) > _CUT_SHARE:
+    if (cut := left_out(mine, surface, _CUT_EDGES * edge)) > most_cut:
         return f"cuts off {cut:.1%} of the surface", far
     return None, far
 

@@ -7,7 +7,7 @@ import numpy as np
 from gdtool.geometry import repair
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.quad_candidate import judged
-from gdtool.geometry.quad_fit import drawn, fault_of, settled
+from gdtool.geometry.quad_fit import CUT_PIECE, CUT_WHOLE, drawn, fault_of, settled
 from gdtool.geometry.quad_split import split_count
 from gdtool.geometry.quad_task import Part
 from gdtool.geometry.quad_ways import Found
@@ -47,7 +47,7 @@ def well_made(part: Part, whole: Found | None) -> tuple[Found | None, np.ndarray
     done = settled(*drawn(*these_quads, these.surface, these.features, 0, part.request), part.fine(), part.request)
     made, small = quads_by_piece(*done, part), part.piece_areas < _MOST * part.piece_areas.sum()
     for k in np.flatnonzero(good):
-        good[k] = len(made[k][1]) > 0 and fault_of(*made[k], parts[k].surface, part.edge, _MOST_APART, small[k])[0] is None
+        good[k] = len(made[k][1]) > 0 and fault_of(*made[k], parts[k].surface, part.edge, _MOST_APART, CUT_PIECE if small[k] else CUT_WHOLE)[0] is None
     return ((*joined([made[k] for k in np.flatnonzero(good)]), whole[2]) if good.any() else None), good
 
 

@@ -97,15 +97,15 @@ def test_output_without_area_is_no_quads():
     assert quad_candidate.judged(vertices, faces[:, [0, 1, 1, 0]], vertices, triangulated(faces)[0])[0] == "no quads"
 
 
-def test_quads_that_cut_edges_off_do_not_do_for_one_piece_of_several():
+def test_quads_that_cut_edges_off_do_not_do():
     vertices, faces = quad_cube(3)
     surface, edge = Surface(vertices, triangulated(faces)[0]), 0.125 * np.ptp(vertices[:, 0])
-    assert fault_of(vertices, faces, surface, edge, 1.0, piece=True)[0] is None
+    assert fault_of(vertices, faces, surface, edge, 1.0, 0.005)[0] is None
     cut = vertices.copy()
     on_two = np.isclose(np.abs(vertices), np.abs(vertices).max()).sum(1) >= 2  # the cube's twelve edges
     cut[on_two] *= 1 - 0.5 * edge / np.ptp(vertices[:, 0])
-    assert fault_of(cut, faces, surface, edge, 1.0, piece=False)[0] is None
-    assert fault_of(cut, faces, surface, edge, 1.0, piece=True)[0].startswith("cuts off")
+    assert fault_of(cut, faces, surface, edge, 1.0, 0.5)[0] is None
+    assert fault_of(cut, faces, surface, edge, 1.0, 0.005)[0].startswith("cuts off")
 
 
 def test_surface_that_the_quads_do_without_is_measured():
