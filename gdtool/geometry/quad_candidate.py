@@ -100,7 +100,7 @@ class Candidate:
         self.wrong, self.far = fault_of(vertices, quads, surface, part.edge, *limits)
         if self.fault and (over := sticks_out(vertices, quads, surface) / part.edge) > _CLOSE_EDGES:
             self.wrong = f"{STICKS_OUT} {over:.2g} edge lengths"  # else what is lost was finer than a quad
-        if subdivisions and self.least < part.request.least_jacobian:
+        if self.wrong is None and subdivisions and self.least < part.request.least_jacobian:
             self.wrong = f"has a quad of scaled Jacobian {self.least:.2g}"
 
     def _irregular(self) -> int:

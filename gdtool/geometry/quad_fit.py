@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from gdtool.geometry.quad_task import Request
 
 _NO_AREA = 1e-4  # squared edge lengths
-_HOPELESS_EDGES = 1.7  # farther than this before it is shaped, a subdivided result is given up
+_HOPELESS_EDGES, _HOPELESS_SHARE = 1.7, 0.03  # farther than this before it is shaped, or so much of it cut off, a subdivided result is given up
 _RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
 FAR_EDGES, FAR_SUBDIVIDED = 2.0, 1.0  # edge lengths that a result may stray; of a subdivided one, after which others come
 _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
@@ -27,7 +27,7 @@ _MOST_FOLDED = 0.01  # of the quads
 _CUT_EDGES = 0.25  # surface so far from the quads lies beyond an edge that they cut off
 # How much of it may: of a piece, for paired triangles keep its edges; of a subdivided result, after which finer ones come.
 CUT_WHOLE, CUT_PIECE, CUT_SUBDIVIDED = 0.02, 0.01, 0.005
-TOO_COARSE = _STRAYS, _LEAVES_OUT, STICKS_OUT = "strays", "leaves out", "sticks out"
+TOO_COARSE = _STRAYS, _LEAVES_OUT, STICKS_OUT, _CUTS_OFF = "strays", "leaves out", "sticks out", "cuts off"
 _FOLDED, _LET_GO = 0.05, 0.25  # scaled Jacobian; edge lengths
 
 
@@ -48,9 +48,9 @@ def drawn(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: F
     edge /= 2**subdivisions
     if subdivisions:  # what ran across a quad has vertices nearer to it now
         vertices, constraints = trace(vertices, faces, features, edge)
-    vertices, faces, constraints, tips, far = draw_out(vertices, faces, constraints, surface, edge)
-    if subdivisions and far > _HOPELESS_EDGES * edge:
-        return vertices, faces, constraints  # shaping brings it a third nearer at most: it strays too far in any case
+    vertices, faces, constraints, tips, away = draw_out(vertices, faces, constraints, surface, edge)
+    if subdivisions and (away.max() > _HOPELESS_EDGES * edge or (away > _CUT_EDGES * edge).mean() > _HOPELESS_SHARE):
+        return vertices, faces, constraints  # shaping brings it a third nearer at most: it does not do in any case
     vertices, constraints = _shaped(vertices, faces, surface, features, constraints, request, tips)
     return vertices, faces, constraints
 
@@ -128,7 +128,7 @@ def fault_of(vertices: np.ndarray, quads: np.ndarray, surface: Surface, edge: fl
     if (folded := float((scaled_jacobian(vertices, quads) <= 0).mean())) > _MOST_FOLDED:
         return f"{folded:.1%} of the quads are folded", far
     if (cut := left_out(mine, surface, _CUT_EDGES * edge)) > most_cut:
-        return f"cuts off {cut:.1%} of the surface", far
+        return f"{_CUTS_OFF} {cut:.1%} of the surface", far
     return None, far
 
 

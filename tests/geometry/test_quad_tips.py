@@ -60,8 +60,8 @@ def test_no_more_quads_than_allowed_are_spent():
 def test_what_is_near_enough_is_left_alone():
     vertices, faces, edge = ball()
     surface = Surface(*horned(0.4 * edge))
-    out, found, _, tips, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
-    assert out is vertices and found is faces and not len(tips)
+    out, found, _, tips, away = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
+    assert out is vertices and found is faces and not len(tips) and away.max() == pytest.approx(0.4 * edge, rel=0.2)
 
 
 def test_one_vertex_reaches_a_tip_that_is_less_than_an_edge_away():
@@ -97,5 +97,5 @@ def test_an_engine_that_cuts_a_horn_short_is_still_taken(monkeypatch):
     assert "instant-meshes" in record.engine and abs(len(found) / 2000 - 1) <= 0.03 and repair.is_watertight(found)
     assert figures["hausdorff"] < 2 * edge and (scaled_jacobian(out, found) <= 0).mean() < 0.003
     in_this_process(monkeypatch)
-    monkeypatch.setattr(quad_fit, "draw_out", lambda v, f, constraints, *_: (v, f, constraints, None, 0.0))
+    monkeypatch.setattr(quad_fit, "draw_out", lambda v, f, constraints, *_: (v, f, constraints, None, np.zeros(1)))
     assert quads.remesh(vertices, faces, asked)[2].engine == "pair and split"
