@@ -101,7 +101,7 @@ def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float, until: float) -> 
 
     def variants() -> Iterator[list]:
         yield [(uv, triangles) for _, _, uv, triangles in flat]
-        for charts in cut_to_pack(adjacency, flat, counts):
+        for charts in counts and cut_to_pack(adjacency, flat, counts):
             if time.monotonic() > until:
                 return
             tried.append(charts)

@@ -137,12 +137,22 @@ def own_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np
     In the whole mesh each vertex has one fan of faces: a chart has parts of it that do not touch, or all of it.
     """
     used, corners = faces >= 0, np.full(faces.shape, -1, np.int64)
-    vertex, first, place = np.unique(faces[used], return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    corners[used] = np.argsort(order)[place]
-    points, edges = vertices[vertex[order]], edges_of(corners)
-    fans = np.bincount(corners[used], minlength=len(points)) - np.bincount(edges.ends[edges.count == 2].ravel(), minlength=len(points))
-    return one_vertex_per_fan(points, corners) if fans.max(initial=0) > 1 else (points, corners)
+    vertex = faces[used]
+    first = np.empty(len(vertices), np.int64)
+    first[vertex[::-1]] = np.arange(len(vertex))[::-1]  # of several assignments to one element the last one stays
+    new = first[vertex] == np.arange(len(vertex))
+    corners[used] = (np.cumsum(new) - 1)[first[vertex]]
+    points = vertices[vertex[new]]
+    # An open fan has a corner more than edges between them; sorted, such an edge comes twice.
+    following = np.roll(corners, -1, 1)
+    if faces.shape[1] == 4:
+        following[:, 2] = np.where(used[:, 3], following[:, 2], corners[:, 0])
+    low, high = np.minimum(corners, following)[used], np.maximum(corners, following)[used]
+    key = np.sort(low * len(points) + high)
+    low, high = np.divmod(key[1:][key[1:] == key[:-1]], len(points))
+    fans = np.bincount(corners[used], minlength=len(points)) - np.bincount(low, minlength=len(points)) - np.bincount(high, minlength=len(points))
+    several = fans.max(initial=0) > 1 or (key[2:] == key[:-2]).any()
+    return one_vertex_per_fan(points, corners) if several else (points, corners)
 
 
 def tidy(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> tuple[np.ndarray, np.ndarray]:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read as NumPy is imported: several children share the cores
+
 import igl
 import scipy.sparse.csgraph
 import scipy.spatial
 
-from gdtool.texture.unwrap_lay import flatten_all, lay
+from gdtool.texture.unwrap_lay import flatten_all, lay_next
 
-__all__ = ["flatten_all", "igl", "lay", "scipy"]
+__all__ = ["flatten_all", "igl", "lay_next", "scipy"]

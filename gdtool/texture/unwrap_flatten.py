@@ -15,13 +15,11 @@ _RELIED_GAIN = 1.0  # of a round of steps, in units of what the round before it 
 
 
 class Flat(NamedTuple):
-    """uv (v, 2), or None and why the chart has to be cut; where it overlaps itself, `overlapped` (v, 2) shows how, and
-    on_others (t,) which of its triangles do."""
+    """uv (v, 2), or None and why the chart has to be cut; where it overlaps itself, `overlapped` (v, 2) shows how."""
 
     uv: np.ndarray | None
     reason: str = ""
     overlapped: np.ndarray | None = None
-    on_others: np.ndarray | None = None
 
 
 def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, max_stretch: float) -> Flat:
@@ -34,13 +32,13 @@ def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, ma
     border = edges.count == 1
     if not border.any():
         return Flat(None, "closed")
-    surface, uv = Surface(vertices, triangles), _seen(vertices, triangles)
-    if uv is not None and surface.stretch(uv) < good_stretch and not overlapping(uv, triangles, edges).any():
+    surface, uv = Isometry(vertices, triangles), _seen(vertices, triangles)
+    disk = len(vertices) - len(edges.ends) + len(triangles) == 1 and edges.count.max() == 2
+    if uv is not None and surface.stretch(uv) < good_stretch and not lies_on_itself(uv, triangles, edges, disk):
         return Flat(uv)
     uv = _conformal(vertices, triangles, edges.ends[border])
     if uv is None or not upright(uv, triangles):
-        euler = len(vertices) - len(edges.ends) + len(triangles)
-        if euler != 1:
+        if not disk:
             return Flat(None, "folds, and is no disk")
         uv = _tutte(vertices, triangles)
         if uv is None or not upright(uv, triangles):
@@ -48,8 +46,7 @@ def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, ma
     uv, reached = _isometric(vertices, triangles, uv, surface, good_stretch, max_stretch)
     if reached > max_stretch:
         return Flat(None, "stretches")
-    on_others = overlapping(uv, triangles, edges)
-    return Flat(None, "overlaps itself", uv, on_others) if on_others.any() else Flat(uv)
+    return Flat(None, "overlaps itself", uv) if lies_on_itself(uv, triangles, edges, disk) else Flat(uv)
 
 
 def _areas(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -137,7 +134,7 @@ def _tutte(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
     return _scaled(vertices, triangles, uv)
 
 
-def _isometric(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray, surface: Surface, good_stretch: float,
+def _isometric(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray, surface: Isometry, good_stretch: float,
                max_stretch: float) -> tuple[np.ndarray, float]:
     """uv after SLIM, and its stretch: until good_stretch, until it gains little, or until it is clear that it will not come to max_stretch."""
     import igl
@@ -174,11 +171,11 @@ def singular_values(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray)
 
 def stretch(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> float:
     """L2 stretch (Sander et al. 2001), 1 for an isometry, at the scale where the areas agree."""
-    return Surface(vertices, triangles).stretch(uv)
+    return Isometry(vertices, triangles).stretch(uv)
 
 
-class Surface:
-    """Triangles (t, 3) of vertices (v, 3), whose maps to the plane are measured: what they all share is computed once."""
+class Isometry:
+    """How far maps of triangles (t, 3) of vertices (v, 3) to the plane are from one: what they all share is computed once."""
 
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
         self._abc = tuple(triangles.T)
@@ -205,21 +202,34 @@ class Surface:
         return float(np.sqrt((area * square)[use].sum() * flat[use].sum()) / area[use].sum())
 
 
-def overlapping(uv: np.ndarray, triangles: np.ndarray, edges: Edges | None = None) -> np.ndarray:
+def lies_on_itself(uv: np.ndarray, triangles: np.ndarray, edges: Edges, disk: bool) -> bool:
+    """overlapping().any(). What a rim winds around once lies on nothing: of a disk whose rim does not cross itself that is all."""
+    if not np.ptp(uv, 0).max() > 0:
+        return True
+    rim = np.flatnonzero(edges.count[edges.half_edge_idx] == 1)
+    return len(rim_crossings(uv, edges.half_ends[rim])) > 0 or not disk and bool((_covered(uv, triangles)[2] > 1).any())
+
+
+def _covered(uv: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
+    """A chart in the unit square, (v, 2), and how many of its triangles own each texel of a grid finer than they are, size and (size, size)."""
+    size = int(np.clip(10 * len(triangles) ** 0.5, 64, 512))
+    at = (uv - uv.min(0)) / np.ptp(uv, 0).max()
+    return at, size, owner_count(at, triangles, size)
+
+
+def overlapping(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """(t,) which triangles of a chart, all upright, lie on others of it: none, where it lies flat.
 
     Some do where its rim crosses itself, however little; a grid finer than its triangles finds what winds around twice.
     """
     found = np.zeros(len(triangles), bool)
-    extent = float(np.ptp(uv, 0).max())
-    if not extent > 0:
+    if not np.ptp(uv, 0).max() > 0:
         return ~found
-    edges = edges or edges_of(triangles)
+    edges = edges_of(triangles)
     rim = np.flatnonzero(edges.count[edges.half_edge_idx] == 1)
     found[edges.half_face[rim[rim_crossings(uv, edges.half_ends[rim])]]] = True
-    size = int(np.clip(10 * len(triangles) ** 0.5, 64, 512))
-    at = (uv - uv.min(0)) / extent
-    twice = owner_count(at, triangles, size) > 1
+    at, size, count = _covered(uv, triangles)
+    twice = count > 1
     if twice.any():
         for face_idx, row, column in owned_texels(at, triangles, size):
             found[face_idx[twice[row, column]]] = True

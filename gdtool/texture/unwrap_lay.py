@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import heapq
+import os
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -22,7 +25,8 @@ from gdtool.texture.unwrap_peel import onto_neighbours, peel
 
 _WHOLE = 1.4  # stretch of all charts together over 1, in units of what is good for one: with more the worst are cut
 _MOST_RELIEVED = 16, 0.5  # charts that are cut for that: so many, and this share of all
-_BESIDE = 4000  # faces of several charts, from which on half of them are laid flat in a child
+_BESIDE = 4000  # faces of several charts, from which on some of them are laid flat in a child
+_MOST_BESIDE, _BYTES = 10_000, 4  # charts whose numbers, of so many bytes each, a pipe holds
 _SLACK = 5.0  # seconds that it has to start and to stop
 _LATE = "was left when the time was over"
 
@@ -75,26 +79,48 @@ def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good
     return laid.charts, laid.reasons()
 
 
-def _lay_beside(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, part: np.ndarray, sets: list[np.ndarray], *how,
-                **more: bool) -> Laid:
-    """lay(), half of it in a child where many faces are to be laid."""
-    if sum(map(len, sets)) < _BESIDE or len(sets) < 2:
-        return lay(adjacency, vertices, faces, label, part, sets, *how, **more)
-    halves, load, place = ([], []), [0, 0], np.zeros(len(faces), int)
+def _lay_beside(*given, **more: bool) -> Laid:
+    """lay(), in a child too where many faces are to be laid: each takes the next largest set until none is left."""
+    sets, by = given[5], given[8]
+    if sum(map(len, sets)) < _BESIDE or not 1 < len(sets) <= _MOST_BESIDE:
+        return lay(*given, **more)
+    queue, end = os.pipe()
     for number in sorted(range(len(sets)), key=lambda i: -len(sets[i])):
-        lighter = int(load[1] < load[0])
-        halves[lighter].append(sets[number])
-        load[lighter] += len(sets[number])
-        place[sets[number]] = number
-    here, there = ((adjacency, vertices, faces, label, part, half, *how) for half in halves)
-    child = begin("gdtool.texture.unwrap_child:lay", *there, **more, seconds=min(max(how[-1][1] - time.monotonic(), 0.0), 3600.0) + _SLACK)
-    laid = lay(*here, **more)
+        os.write(end, number.to_bytes(_BYTES, "little"))
+    os.close(end)
+    shared, there = os.dup(queue), {}
+
+    def beside() -> None:  # it may not have begun yet: nothing waits for that
+        with contextlib.suppress(ChildFailed):
+            there.update(begin("gdtool.texture.unwrap_child:lay_next", f"/proc/{os.getpid()}/fd/{shared}", *given, **more,
+                               seconds=min(max(by[1] - time.monotonic(), 0.0), 3600.0) + _SLACK).result())
+        os.close(shared)
+
+    thread = threading.Thread(target=beside, daemon=True)
+    thread.start()
     try:
-        laid.add(child.result())
-    except ChildFailed:
-        laid.add(lay(*there, **more))
-    laid.charts.sort(key=lambda chart: place[chart[0][0]])  # as if laid one after the other
-    laid.off.sort(key=lambda one: place[one[0]])
+        own = _next(queue, given, more)
+    finally:
+        os.close(queue)
+    if len(own) < len(sets):
+        thread.join()
+    laid = Laid()
+    for i, faces_idx in enumerate(sets):
+        laid.add(own.get(i) or there.get(i) or lay(*given[:5], [faces_idx], *given[6:], **more))
+    return laid
+
+
+def lay_next(path: str, *given, **more: bool) -> dict[int, Laid]:
+    """What the child runs: lay() of each of the sets that it comes to take from the queue, a pipe of their numbers."""
+    queue = os.open(path, os.O_RDONLY)
+    return _next(queue, given, more)
+
+
+def _next(queue: int, given: tuple, more: dict[str, bool]) -> dict[int, Laid]:
+    laid = {}
+    while number := os.read(queue, _BYTES):
+        i = int.from_bytes(number, "little")
+        laid[i] = lay(*given[:5], [given[5][i]], *given[6:], **more)
     return laid
 
 
@@ -131,7 +157,7 @@ def lay(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, label: np
             laid.charts.append((faces_idx, corners, uv, triangles))
             continue
         laid.cut[flat.reason] += 1
-        keep = peel(adjacency, faces_idx, triangles, face_idx, flat) if peeling and flat.on_others is not None else None
+        keep = peel(adjacency, faces_idx, triangles, face_idx, flat.overlapped) if peeling and flat.overlapped is not None else None
         if keep is not None:
             largest, *others = sorted(connected(adjacency, faces_idx, keep), key=np.count_nonzero, reverse=True)
             laid.charts.append(part_of((faces_idx, corners, flat.overlapped, triangles), largest))

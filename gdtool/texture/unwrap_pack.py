@@ -24,6 +24,7 @@ _TRIES, _TRIES_OF_DRAFT = 3600, 150  # charts placed in search of better orders,
 _CHAINS = 4  # of changes of orders
 _SLACK = 5.0  # seconds that the child has to start and to stop
 _MOVES = 0.25  # by which some charts change their place in the order, typically, in units of its length
+_OFTEN = 20  # tries of a chain, from which on it is kept where two charts meet
 _MOST_BY_SEARCH = 160  # charts for which orders are searched
 
 
@@ -44,10 +45,11 @@ def best_packed(variants: Iterable[list[tuple[np.ndarray, np.ndarray]]], gap: fl
     worth, _GAIN of the square and _GAIN_PER_CHART for each chart.
     """
     best, best_share, best_count, best_ways = 0, 0.0, 0, []
+    known: dict[tuple[int, int], list] = {}
     for i, charts in enumerate(variants):
         if not 1 < len(charts) <= _MOST_BY_SEARCH:
             continue
-        boxed, area = _boxed(charts)
+        boxed, area = _boxed(charts, known)
         cells, shapes, found = _drafted(boxed, area, gap, _OWN, [])
         found = _improved(shapes, found, _TRIES_OF_DRAFT, np.inf)
         share = _DENSITY * (cells / found[0].side) ** 2 if found else 0.0
@@ -92,11 +94,22 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, ways: list[tup
     return _shelves([uv for uv, _ in boxed], gap)
 
 
-def _boxed(charts: list) -> tuple[list, float]:
-    """Charts set upright, with their outlines, and their area."""
-    upright = [(upright_box(uv), triangles) for uv, triangles in charts]
-    area = sum(float(np.abs(np.cross(uv[t[:, 1]] - uv[t[:, 0]], uv[t[:, 2]] - uv[t[:, 0]])).sum()) / 2 for uv, t in upright)
-    return [(uv, rim_of(uv, triangles)) for uv, triangles in upright], max(area, 1e-300)
+def _boxed(charts: list, known: dict[tuple[int, int], list] | None = None) -> tuple[list, float]:
+    """Charts set upright, with their outlines, and their area. known: of charts that come again, by the ids of their arrays."""
+    known, found = {} if known is None else known, []
+    for chart in charts:
+        one = known.setdefault((id(chart[0]), id(chart[1])), [chart])
+        if len(one) == 1:
+            one += _upright(*chart)
+        found.append(one)
+    return [(uv, rim) for _, uv, rim, _ in found], max(sum(area for *_, area in found), 1e-300)
+
+
+def _upright(uv: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """A chart, triangles (t, 3), set upright, its outline and its area."""
+    uv = upright_box(uv)
+    (a, b), (c, d) = (uv[t[:, 1]] - uv[t[:, 0]]).T, (uv[t[:, 2]] - uv[t[:, 0]]).T
+    return uv, rim_of(uv, t), float(np.abs(a * d - b * c).sum()) / 2
 
 
 def _drafted(boxed: list, area: float, gap: float, share: float, ways: list[tuple[list[int], float]],
@@ -147,6 +160,7 @@ def chains(several: list[tuple]) -> list[Layout]:
 def _chain(shapes: Shapes, best: Layout, tries: int, number: int, until: float) -> list[Layout]:
     """Ever smaller layouts, found by changing the place of a few charts in the order of the best so far, again and again."""
     rng, found = np.random.default_rng(number), []  # the same for each mesh: results do not depend on chance
+    known: dict[tuple[int, float], dict] = {}
     for _ in range(tries):
         if time.monotonic() > until:
             break
@@ -154,29 +168,36 @@ def _chain(shapes: Shapes, best: Layout, tries: int, number: int, until: float) 
         moved = rng.integers(len(place), size=int(rng.integers(1, 4)))
         place[moved] += rng.normal(0, _MOVES * len(place), len(moved))
         contact = float(np.clip(best.contact * rng.choice([0.6, 1.0, 1.0, 1.6]), 0.15, 2.0))
-        layout = _placed(shapes, np.argsort(place, kind="stable").tolist(), best.side - 1, best.side - 1, contact, until)
+        layout = _placed(shapes, np.argsort(place, kind="stable").tolist(), best.side - 1, best.side - 1, contact, until,
+                         known.setdefault((best.side, contact), {}), tries >= _OFTEN)
         if layout is not None:
             best = layout
             found.append(layout)
     return found
 
 
-def _placed(shapes: Shapes, order: list[int], side: int, most: int, contact: float, until: float) -> Layout | None:
+def _placed(shapes: Shapes, order: list[int], side: int, most: int, contact: float, until: float, known: dict | None = None,
+            often: bool = False) -> Layout | None:
     """Charts placed one by one in a square of `side` cells, which grows up to `most` where one finds no room; None where that is not
-    enough, or the time is over."""
-    taken, at = 0, [(0, 0, 0)] * len(order)
-    border = shapes.border(side)
+    enough, or the time is over. known: {chart: (its place, known of those placed behind it)}, kept between orders for one side and contact;
+    often: these charts are placed so often that it is worth keeping where two of them meet.
+    """
+    taken, at, others = 0, [(0, 0, 0)] * len(order), []
+    border, after = shapes.border(side), {} if known is None else known
     for i in order:
-        place = shapes.placed(i, taken, border, side, contact)
+        if i not in after:
+            after[i] = shapes.placed(i, taken, border, side, contact, others if often else None), {}
+        place, after = after[i]
         while place is None:
             side += max(int(_GROWS * side), 1)
             if side > most:
                 return None
             border = shapes.border(side)
-            place = shapes.placed(i, taken, border, side, contact)
+            place = shapes.placed(i, taken, border, side, contact, others if often else None)
         if time.monotonic() > until:
             return None
         at[i] = place
+        others.append((i, place))
         taken |= shapes.cells(i, place)
     return Layout(max(shapes.reach(i, place) for i, place in enumerate(at)), at, order, contact)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from gdtool.folders.mesh import triangulated
 from gdtool.texture.unwrap_charts import Adjacency, own_corners
-from gdtool.texture.unwrap_flatten import Flat, flatten, overlapping
+from gdtool.texture.unwrap_flatten import flatten, overlapping
 from gdtool.texture.unwrap_join import joined_stretch
 
 _MOST = 0.2  # of a chart's area, that is taken off; where more lies on itself the chart is cut
@@ -14,13 +14,13 @@ _NEIGHBOURS = 3  # charts that a piece is offered to
 _WORK = 3  # faces that are laid flat again for that, in all, in units of the mesh's
 
 
-def peel(adjacency: Adjacency, faces_idx: np.ndarray, triangles: np.ndarray, face_idx: np.ndarray, flat: Flat) -> np.ndarray | None:
+def peel(adjacency: Adjacency, faces_idx: np.ndarray, triangles: np.ndarray, face_idx: np.ndarray, overlapped: np.ndarray) -> np.ndarray | None:
     """(k,) bool: faces of a chart that lie flat and apart from each other; None where too many would have to go.
 
-    faces_idx (k,); triangles (t, 3); face_idx (t,) the face of each, a place in faces_idx; flat: as flatten() gave it up.
+    faces_idx (k,); triangles (t, 3); face_idx (t,) the face of each, a place in faces_idx; overlapped (v, 2): as flatten() gave it up.
     Of the faces that lie on others connected sets go, the smallest first, until none does.
     """
-    on_others = flat.on_others
+    on_others = overlapping(overlapped, triangles)
     keep, area = np.ones(len(faces_idx), bool), adjacency.area[faces_idx]
     while on_others.any():
         faces = np.unique(face_idx[keep[face_idx]][on_others])
@@ -28,7 +28,7 @@ def peel(adjacency: Adjacency, faces_idx: np.ndarray, triangles: np.ndarray, fac
         keep[faces[piece == np.bincount(piece, area[faces]).argmin()]] = False
         if area[~keep].sum() > _MOST * area.sum() or not keep.any():
             return None
-        on_others = overlapping(flat.overlapped, triangles[keep[face_idx]])
+        on_others = overlapping(overlapped, triangles[keep[face_idx]])
     return keep
 
 
@@ -39,14 +39,16 @@ def onto_neighbours(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarra
     charts (faces_idx, corners, uv, triangles), as flatten_all() returns them; pieces: a face of the chart that it lay on, and is not
     offered to again, and its faces.
     """
-    owner = np.full(adjacency.count, -1)
+    owner, number = np.full((2, adjacency.count), -1)
     for i, chart in enumerate(charts):
         owner[chart[0]] = i
+    for i, (_, piece) in enumerate(pieces):
+        number[piece] = i
+    sides = number[adjacency.pairs]
+    rim = np.flatnonzero(sides[:, 0] != sides[:, 1])
+    rows_of = _rows_of(sides[rim].T.ravel(), np.tile(rim, 2), len(pieces))
     left, work = [], 0
-    for home, piece in sorted(pieces, key=lambda one: len(one[1]), reverse=True):
-        inside = np.zeros(adjacency.count, bool)
-        inside[piece] = True
-        rows = np.flatnonzero(inside[adjacency.pairs].sum(1) == 1)
+    for rows, (home, piece) in sorted(zip(rows_of, pieces, strict=True), key=lambda one: len(one[1][1]), reverse=True):
         beside = owner[adjacency.pairs[rows]].max(1)  # the piece itself has no owner yet
         beside = np.where(beside == owner[home], -1, beside)
         seam = np.bincount(beside[beside >= 0], adjacency.cost[rows[beside >= 0]], len(charts))
@@ -64,3 +66,9 @@ def onto_neighbours(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarra
         else:
             left.append((home, piece))
     return left
+
+
+def _rows_of(number: np.ndarray, rows: np.ndarray, count: int) -> list[np.ndarray]:
+    """The rows (r,) of each number (r,) below count, in rising order; -1 is none."""
+    order = np.lexsort((rows, number))
+    return np.split(rows[order], np.searchsorted(number[order], np.arange(count + 1)))[1:-1]

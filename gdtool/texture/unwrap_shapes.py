@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.geometry.repair import edges_of
-
 _FINE = 3  # cells of the supersampled mask in a cell of the square
 _LOOK = 12  # runs of a chart between two looks whether any place is left
 
@@ -77,8 +75,11 @@ def _walked(outline: np.ndarray) -> np.ndarray:
 
 def rim_of(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """(s, 2, 2) the segments of a chart's outline: uv of the edges that one triangle has."""
-    edges = edges_of(triangles)
-    return uv[edges.ends[edges.count == 1]]
+    following = triangles[:, [1, 2, 0]]
+    key = np.sort((np.minimum(triangles, following).astype(np.int64) * len(uv) + np.maximum(triangles, following)).ravel())
+    once = np.ones(len(key) + 1, bool)
+    once[1:-1] = key[1:] != key[:-1]
+    return uv[np.stack(np.divmod(key[once[1:] & once[:-1]], len(uv)), -1)]
 
 
 def turned(rim: np.ndarray, uv: np.ndarray, cells_per_unit: float, gap: float, share: float = 0.0) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -97,37 +98,50 @@ class Shapes:
 
     cells_per_unit: cells per unit of surface; gap: cells between charts; side: the largest square they are packed in.
     A set of cells is one integer, the cell (x, y) its bit y * (side + 1) + x: shifting moves it, and all places of a
-    chart are tested by one shift per run of its cells.
+    chart are tested by one shift per run of its cells, or per chart that is placed.
     """
 
     def __init__(self, boxed: list, cells_per_unit: float, gap: float, side: int, share: float = 0.0):
-        self.stride, self.uv, self.shapes, self.runs, self.bits = side + 1, [], [], [], []
+        self.stride, self.uv, self.shapes, self.runs, self.bits, self._rim = side + 1, [], [], [], [], []
+        self._windows: dict[int, tuple[dict, dict]] = {}
+        self._meetings: dict[int, int] = {}
         for uv, rim in boxed:
             masks, at = turned(rim, uv, cells_per_unit, gap, share)
             self.uv.append(at)
             self.shapes.append([mask.shape for mask in masks])
             small = max(masks[0].shape) <= side  # placed() passes over the others
-            self.runs.append([_runs(mask, self.stride) if small else [] for mask in masks])
+            # Of turns 0 and 2 and of 1 and 3 one is the other half a turn on.
+            pairs = [_runs(mask, self.stride) if small else ([], []) for mask in masks[:2]]
+            self.runs.append([pairs[turn % 2][turn // 2] for turn in range(4)])
             self.bits.append([bits_of(mask, self.stride) if small else 0 for mask in masks])
+            own = self.bits[-1][0]
+            within = own & own << 1 & own >> 1 & own << self.stride & own >> self.stride
+            self._rim.append(own.bit_count() - within.bit_count())  # cells that can touch others
 
     def border(self, side: int) -> int:
         """The cells along the border of a square of `side` cells."""
         return (1 << side) - 1 | ((1 << side) - 1) << (side - 1) * self.stride | _every(1 | 1 << side - 1, side, self.stride)
 
-    def placed(self, i: int, taken: int, border: int, side: int, contact: float) -> tuple[int, int, int] | None:
+    def placed(self, i: int, taken: int, border: int, side: int, contact: float,
+               others: list[tuple[int, tuple[int, int, int]]] | None = None) -> tuple[int, int, int] | None:
         """(turn, x, y) of chart i in a square of `side` cells beside the cells taken, or None where there is no room.
 
-        It goes where it stays low; contact weighs touching others and the walls, border(side), against that.
+        It goes where it stays low; contact weighs touching others and the walls, border(side), against that. others: the charts that take
+        these cells, and where: quicker where the same few charts are placed over and over, as what they leave free of each other is kept.
         """
         stride = self.stride
         walls = taken << 1 | taken >> 1 | taken << stride | taken >> stride | border
-        windows = [taken]  # of level k: from here on 2**k cells of the row, any taken
+        windows = {}, {}
         best = None
         for turn in range(4):
             h, w = self.shapes[i][turn]
             if max(h, w) > side:
                 continue
-            free = _free(self.runs[i][turn], (h, w), windows, side, stride)
+            if others is None:
+                free = _free(self.runs[i][turn], (h, w), taken, windows, side, stride)
+            else:
+                free = _every((1 << side - w + 1) - 1, side - h + 1, stride)
+                free = (free | (hit := self._hit(i, turn, others))) ^ hit
             # Only where it is stopped above and to the left, or above and to the right.
             blocked = free << stride | free << 1 & free >> 1
             corners = (free | blocked) ^ blocked
@@ -137,14 +151,45 @@ class Shapes:
             y, x = np.divmod(places, stride)
             far = (y + h + 0.25 * (x + w)) / side
             own = self.bits[i][turn]
-            most = contact * own.bit_count() / (2 * (h + w))
+            most = min(contact, contact * self._rim[i] / (2 * (h + w)))
             for k in np.argsort(far, kind="stable").tolist():
-                if best is not None and far[k] - min(contact, most) >= best[0] - 1e-9:
+                if best is not None and far[k] - most >= best[0] - 1e-9:
                     break
                 cost = float(far[k]) - contact * (own << int(places[k]) & walls).bit_count() / (2 * (h + w))
                 if best is None or cost < best[0] - 1e-9:
                     best = cost, turn, int(x[k]), int(y[k])
         return best and best[1:]
+
+    def _hit(self, i: int, turn: int, others: list[tuple[int, tuple[int, int, int]]]) -> int:
+        """The places where chart i at this turn meets one of the others, each at (turn, x, y)."""
+        h, w = self.shapes[i][turn]
+        hit, last, stride, meetings = 0, (h - 1) * self.stride + w - 1, self.stride, self._meetings
+        # Where it meets a cell are its own cells mirrored there: as it is half a turn on, its last cell where its first was.
+        own = 4 * i + (turn ^ 2)
+        first = 4 * len(self.bits) * own
+        for j, (other_turn, x, y) in others:
+            key = first + 4 * j + other_turn
+            meeting = meetings.get(key)
+            if meeting is None:
+                meeting = meetings[key] = self._sum(own, 4 * j + other_turn)
+            shift = y * stride + x - last
+            hit |= meeting << shift if shift >= 0 else meeting >> -shift
+        return hit
+
+    def _sum(self, one: int, two: int) -> int:
+        """The Minkowski sum of two charts' cells, each given as 4 i + turn. Rows longer than the stride go on in the next: what comes
+        there does so from left of the square, and no chart whose first cell is there would end within it."""
+        if len(self.runs[one // 4][one % 4]) > len(self.runs[two // 4][two % 4]):
+            one, two = two, one
+        windows, cells, out = self._windows.setdefault(two, ({}, {})), self.bits[two // 4][two % 4], 0
+        for axis, level, a, b in self.runs[one // 4][one % 4]:
+            window = windows[axis].get(level)
+            if window is None:
+                window = _window(cells, windows[axis], level, self.stride if axis else 1)
+            out |= window << a
+            if b > a:
+                out |= window << b
+        return out
 
     def cells(self, i: int, at: tuple[int, int, int]) -> int:
         """What chart i takes at (turn, x, y)."""
@@ -157,21 +202,33 @@ class Shapes:
         return max(x + w, y + h)
 
 
-def _free(runs: list[tuple[int, int, int]], size: tuple[int, int], windows: list[int], side: int, stride: int) -> int:
+def _free(runs: list[tuple[int, int, int, int]], size: tuple[int, int], taken: int, windows: tuple[dict, dict], side: int, stride: int) -> int:
     """The places in a square of `side` cells where a chart of size (h, w) that has these runs is clear of what is taken.
 
-    windows: of level k the cells from which on 2**k cells of the row have any taken; those that are missing are added.
+    windows: by level k the cells from which on 2**k cells of the row, and of the column, have any taken; those that are missing are added.
     """
     free, hit = _every((1 << side - size[1] + 1) - 1, side - size[0] + 1, stride), 0
-    for number, (level, one, two) in enumerate(runs, 1):
-        while len(windows) <= level:
-            windows.append(windows[-1] | windows[-1] >> (1 << len(windows) - 1))
-        hit |= windows[level] >> one
+    for number, (axis, level, one, two) in enumerate(runs, 1):
+        window = windows[axis].get(level)
+        if window is None:
+            window = _window(taken, windows[axis], level, -stride if axis else -1)
+        hit |= window >> one
         if two > one:
-            hit |= windows[level] >> two
+            hit |= window >> two
         if number % _LOOK == 0 and not (free | hit) ^ hit:
             break
     return (free | hit) ^ hit
+
+
+def _window(cells: int, known: dict[int, int], level: int, step: int) -> int:
+    """Cells spread over 2**level places, `step` bits apart; known: those of lower levels, to which it is added."""
+    if level not in known:
+        if not level:
+            known[level] = cells
+        else:
+            less, far = _window(cells, known, level - 1, step), step << level - 1
+            known[level] = less | (less << far if far > 0 else less >> -far)
+    return known[level]
 
 
 def _every(row: int, count: int, stride: int) -> int:
@@ -196,14 +253,20 @@ def _places(bits: int) -> np.ndarray:
     return np.flatnonzero(np.unpackbits(np.frombuffer(bits.to_bytes(bits.bit_length() // 8 + 1, "little"), np.uint8), bitorder="little").view(bool))
 
 
-def _runs(mask: np.ndarray, stride: int) -> list[tuple[int, int, int]]:
-    """(level, one, two) of each run of cells in the rows of mask (h, w), the longest first: 2**level cells from one and from two cover it."""
-    padded = np.zeros((mask.shape[0], mask.shape[1] + 2), np.int8)
-    padded[:, 1:-1] = mask
+def _runs(mask: np.ndarray, stride: int) -> tuple[list, list]:
+    """Runs of cells in the rows of mask (h, w), or the columns where these are fewer, the longest first, as it is and half a turn on:
+    (axis, level, one, two) of each, 2**level cells from one and from two cover it, axis 1 is down a column."""
+    axis = int(mask.shape[0] > mask.shape[1])
+    lines = mask.T if axis else mask
+    along, across = (stride, 1) if axis else (1, stride)
+    padded = np.zeros((lines.shape[0], lines.shape[1] + 2), np.int8)
+    padded[:, 1:-1] = lines
     step = np.diff(padded, axis=1)
-    row, start = np.nonzero(step > 0)
+    line, start = np.nonzero(step > 0)
     length = np.nonzero(step < 0)[1] - start
     order = np.argsort(-length, kind="stable")
-    length, one = length[order], (row * stride + start)[order]
+    length, one = length[order], (line * across + start * along)[order]
     level = np.frexp(length)[1] - 1
-    return list(zip(level.tolist(), one.tolist(), (one + length - (1 << level)).tolist(), strict=True))
+    rest, last = (length - (1 << level)) * along, (mask.shape[0] - 1) * stride + mask.shape[1] - 1
+    levels, axes = level.tolist(), [axis] * len(level)
+    return tuple(list(zip(axes, levels, first.tolist(), (first + rest).tolist(), strict=True)) for first in (one, last - one - (length - 1) * along))

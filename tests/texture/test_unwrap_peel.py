@@ -3,9 +3,10 @@
 import numpy as np
 
 from gdtool.folders.mesh import triangulated
+from gdtool.geometry.repair import edges_of
 from gdtool.texture import unwrap_lay
 from gdtool.texture.unwrap_charts import Adjacency
-from gdtool.texture.unwrap_flatten import Flat, overlapping
+from gdtool.texture.unwrap_flatten import lies_on_itself, overlapping
 from gdtool.texture.unwrap_peel import onto_neighbours, peel
 from tests.texture.test_unwrap_join import GOOD, sheet
 
@@ -23,19 +24,24 @@ def spiral(turns, around=120, across=6):
 def test_the_end_that_lies_on_the_beginning_is_taken_off():
     vertices, faces, uv = spiral(1.05)
     triangles, face_idx = triangulated(faces)
-    flat = Flat(None, "overlaps itself", uv, overlapping(uv, triangles))
-    assert 0 < flat.on_others.mean() < 0.2
-    keep = peel(Adjacency(vertices, faces), np.arange(len(faces)), triangles, face_idx, flat)
+    assert 0 < overlapping(uv, triangles).mean() < 0.2
+    keep = peel(Adjacency(vertices, faces), np.arange(len(faces)), triangles, face_idx, uv)
     # One of the two ends, not both; the rest lies apart.
     assert 0.9 < keep.mean() < 0.97
     assert not overlapping(uv, triangles[keep[face_idx]]).any()
 
 
+def test_a_disk_whose_rim_does_not_cross_itself_lies_on_nothing():
+    for turns in (0.9, 1.05, 1.6):
+        _, faces, uv = spiral(turns)
+        triangles = triangulated(faces)[0].astype(np.int64)
+        assert lies_on_itself(uv, triangles, edges_of(triangles), True) == overlapping(uv, triangles).any() == (turns > 1)
+
+
 def test_what_lies_on_itself_by_half_is_not_peeled():
     vertices, faces, uv = spiral(1.6)
     triangles, face_idx = triangulated(faces)
-    flat = Flat(None, "overlaps itself", uv, overlapping(uv, triangles))
-    assert peel(Adjacency(vertices, faces), np.arange(len(faces)), triangles, face_idx, flat) is None
+    assert peel(Adjacency(vertices, faces), np.arange(len(faces)), triangles, face_idx, uv) is None
 
 
 def test_a_peeled_band_is_two_charts_and_not_many_halves():

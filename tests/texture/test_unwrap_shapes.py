@@ -40,6 +40,24 @@ def test_places_are_free_and_none_is_found_in_a_full_square():
     assert shapes.placed(0, (1 << 41 * 40) - 1, border, 40, 0.5) is None
 
 
+def test_what_charts_leave_free_of_each_other_is_what_is_not_taken():
+    ring, sides = rim_of(RING, RING_TRIANGLES), np.random.default_rng(5).uniform(1, 9, (6, 2))
+    square, triangles = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    boxed = [(RING, ring)] * 2 + [(square * side, rim_of(square * side, triangles)) for side in sides]
+    shapes = Shapes(boxed, 2.0, 1.5, 44)
+    border, taken, others = shapes.border(40), 0, []  # a smaller square than they are made for
+    for i in range(8):
+        place = shapes.placed(i, taken, border, 40, 0.5)
+        assert shapes.placed(i, taken, border, 40, 0.5, others) == place is not None
+        free = [not shapes.cells(i, (turn, x, y)) & taken for turn in range(4) for x in range(41 - shapes.shapes[i][turn][1])
+                for y in range(41 - shapes.shapes[i][turn][0])]
+        hit = [not shapes._hit(i, turn, others) >> y * shapes.stride + x & 1 for turn in range(4) for x in range(41 - shapes.shapes[i][turn][1])
+               for y in range(41 - shapes.shapes[i][turn][0])]
+        assert hit == free
+        others.append((i, place))
+        taken |= shapes.cells(i, place)
+
+
 def test_a_layout_whose_charts_touch_is_moved_apart():
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
