@@ -26,7 +26,8 @@ class ChildFailed(Exception):
 
 # glibc gives large blocks back at once, and native vectors that grow fault their pages in again and again: a sixth of the
 # time of a quadric collapse. A child ends soon; it keeps what it has.
-_ALLOCATOR = {"MALLOC_MMAP_THRESHOLD_": str(2**30), "MALLOC_TRIM_THRESHOLD_": str(2**32), "MALLOC_TOP_PAD_": str(2**26)}
+# OpenBLAS starts a thread for each core as numpy is imported, which takes a third of a child's start-up; none multiplies dense matrices.
+_SETTINGS = {"OPENBLAS_NUM_THREADS": "1", "MALLOC_MMAP_THRESHOLD_": str(2**30), "MALLOC_TRIM_THRESHOLD_": str(2**32), "MALLOC_TOP_PAD_": str(2**26)}
 # Children that have imported a module and wait for a call, by the module's name.
 _ready: dict[str, list[subprocess.Popen]] = {}
 
@@ -42,7 +43,7 @@ def prepare(module: str, count: int = 1) -> None:
 
 def _start(module: str) -> subprocess.Popen:
     return subprocess.Popen([sys.executable, "-m", "gdtool.core.child", module], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                            env=_ALLOCATOR | os.environ)
+                            env=_SETTINGS | os.environ)
 
 
 def _take(module: str) -> subprocess.Popen:

@@ -12,13 +12,15 @@ from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import scaled_jacobian, valences
 from gdtool.geometry.quad_engines import ENGINES
 from gdtool.geometry.quad_fit import CUT_PIECE, CUT_SUBDIVIDED, CUT_WHOLE, FAR_EDGES, FAR_SUBDIVIDED, STICKS_OUT, drawn, fault_of, sticks_out
+from gdtool.geometry.quad_glide import cancel_pairs
 from gdtool.geometry.quad_shape import fill_holes, remove_doublets
 from gdtool.geometry.quad_task import Part
 from gdtool.geometry.quad_topology import cancel_irregular
 
 COUNT_TOLERANCE = 0.03
 LOST, ADDED, PIECES = "handles are lost", "handles are added", "pieces are lost or joined"
-_CLOSE_EDGES, _LEAST_JACOBIAN = 0.55, 0.2  # nearer and squarer than this, a result is taken without a look at others
+_NEAR_EDGES, _LEAST_JACOBIAN = 0.75, 0.2  # nearer and squarer than this, a result is taken without a look at others
+_OUT_EDGES = 0.55  # what sticks out less is finer than a quad
 _MENDINGS = 4  # rounds of filling holes and parting what meets at a vertex
 
 
@@ -84,11 +86,11 @@ class Candidate:
     @property
     def good(self) -> bool:
         """Whether it is taken without a look at others."""
-        return self.wrong is None and self.far < _CLOSE_EDGES and self.least > _LEAST_JACOBIAN
+        return self.wrong is None and self.far < _NEAR_EDGES and self.least > _LEAST_JACOBIAN
 
     def usable(self, part: Part) -> bool:
         """Without a fault, or with one that is finer than its quads."""
-        return self.fault is None or self.fault == LOST and sticks_out(self.vertices, self.quads, part.surface) < 2 * _CLOSE_EDGES * part.edge
+        return self.fault is None or self.fault == LOST and sticks_out(self.vertices, self.quads, part.surface) < 2 * _OUT_EDGES * part.edge
 
     def draw(self, part: Part) -> None:
         """Drawn onto the surface, and judged there."""
@@ -98,7 +100,7 @@ class Candidate:
         self.least = float(scaled_jacobian(vertices, quads).min())
         limits = (FAR_SUBDIVIDED, CUT_SUBDIVIDED) if subdivisions else (FAR_EDGES, CUT_PIECE if part.piece else CUT_WHOLE)
         self.wrong, self.far = fault_of(vertices, quads, surface, part.edge, *limits)
-        if self.fault and (over := sticks_out(vertices, quads, surface) / part.edge) > _CLOSE_EDGES:
+        if self.fault and (over := sticks_out(vertices, quads, surface) / part.edge) > _OUT_EDGES:
             self.wrong = f"{STICKS_OUT} {over:.2g} edge lengths"  # else what is lost was finer than a quad
         if self.wrong is None and subdivisions and self.least < part.request.least_jacobian:
             self.wrong = f"has a quad of scaled Jacobian {self.least:.2g}"
@@ -142,6 +144,7 @@ def judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarr
         return "not watertight, though the input is", quad_vertices, quad_faces
     if not repair.is_manifold(quad_faces):
         return "not manifold", quad_vertices, quad_faces
+    quad_faces = cancel_pairs(quad_vertices, quad_faces)
     if repair.components(quad_faces)[0] != pieces:
         return PIECES, quad_vertices, quad_faces
     if closed and (more := repair.euler_number(quad_faces) - repair.euler_number(faces)):

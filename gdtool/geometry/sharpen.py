@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
 
 from gdtool.geometry.normals import face_normals, vertex_normals
 from gdtool.geometry.rays import dot
@@ -83,6 +82,8 @@ def restore_creases(vertices: np.ndarray, faces: np.ndarray, crease_degrees: flo
 def _drawn_out(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float,
                accept: Callable[[np.ndarray, np.ndarray], np.ndarray] | None) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Which vertices (n,) of restore_creases move, where to (n, 3), about how long edges are, and the share of bevel vertices."""
+    from scipy.spatial import cKDTree
+
     normals, area = face_normals(vertices, faces)
     bevel, rough = np.zeros(len(vertices), bool), np.zeros(len(faces), bool)
     corners = corners_of(faces, len(vertices))

@@ -7,6 +7,7 @@ from functools import cache
 from itertools import combinations_with_replacement
 
 import numpy as np
+import scipy.spatial  # noqa: F401 - what sharpen needs, read while a prepared child waits
 
 from gdtool.core.child import ChildFailed, begin
 from gdtool.core.errors import InputError
@@ -16,6 +17,7 @@ from gdtool.geometry.sharpen import corners_of, restore_creases
 from gdtool.geometry.unpinch import unpinched
 
 
+_PACES, _UNIT = (4.0, 3.0, 8.0), 0.5  # how steeply the collapse's bound rises, tried in turn; the unit of lengths, in sizes of the mesh
 _BY_WAY = 6  # times the triangles asked for, to which the quicker collapse still goes well
 _UNEVEN, _FLAT = 1e-3, 1e-14  # edge lengths that what is flat is moved by; determinant of the mean of its normals' squares
 _FEW_FLAT, _SAMPLE = 0.01, 20000  # of the vertices: so few stop no collapse; how many of them tell
@@ -166,7 +168,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     unit = (vertices - centre) / extent
     edge = _edge(unit, faces, target_faces)
     is_closed = cache(closed or (lambda: repair.is_watertight(faces)))
-    found, method, moved, reasons = _collapsed(unit, faces, target_faces, near and edge or 1.0, crease_degrees, careful, seconds, is_closed, meanwhile)
+    found, method, moved, reasons = _collapsed(unit, faces, target_faces, edge if near else _UNIT, crease_degrees, careful, seconds, is_closed, meanwhile)
     if found is None and not is_closed():
         found, method = cluster(unit, faces, target_faces), "vertex clustering"
         if not len(found[1]):
@@ -200,7 +202,7 @@ def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit:
     """What the first way leaves that keeps the mesh as closed as it is, or None; its name, how many vertices went to creases, what failed."""
     # The quick collapse tears a closed mesh now and then (a handful of edges with four faces), at one pace and not at
     # another, and of parts made of slivers it collapses nothing, at any; MeshLab's takes ten times as long.
-    quick = [("collapse", (target_faces, pace, unit)) for pace in (5.0, 3.0, 8.0)]
+    quick = [("collapse", (target_faces, pace, unit)) for pace in _PACES]
     slow = [("collapse_topology", (target_faces,))]
     if len(faces) > 2 * _BY_WAY * target_faces:
         slow.insert(0, ("collapse_by_way", (target_faces,)))

@@ -22,6 +22,16 @@ def quad_cube(rounds: int) -> tuple[np.ndarray, np.ndarray]:
     return vertices, faces
 
 
+def quad_torus(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
+    """A torus of n x n quads, all vertices regular."""
+    u, v = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    a, b = 2 * np.pi * u / n, 2 * np.pi * v / n
+    points = np.stack([(2 + np.cos(b)) * np.cos(a), (2 + np.cos(b)) * np.sin(a), np.sin(b)], -1).reshape(-1, 3)
+    at = lambda i, j: (i % n) * n + j % n  # noqa: E731
+    quads = np.stack([at(u, v), at(u + 1, v), at(u + 1, v + 1), at(u, v + 1)], -1).reshape(-1, 4)
+    return points, quads
+
+
 def marching(field, n: int, half: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Zero set of field(x, y, z), negative inside, on an n^3 grid over ±half; outward."""
     from skimage.measure import marching_cubes

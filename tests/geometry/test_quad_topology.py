@@ -5,16 +5,7 @@ import numpy as np
 from gdtool.geometry import repair
 from gdtool.geometry.mesh_quality import valences
 from gdtool.geometry.quad_topology import cancel_irregular
-
-
-def torus_quads(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """A torus of n x n quads, all vertices regular."""
-    u, v = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
-    a, b = 2 * np.pi * u / n, 2 * np.pi * v / n
-    points = np.stack([(2 + np.cos(b)) * np.cos(a), (2 + np.cos(b)) * np.sin(a), np.sin(b)], -1).reshape(-1, 3)
-    at = lambda i, j: (i % n) * n + j % n  # noqa: E731
-    quads = np.stack([at(u, v), at(u + 1, v), at(u + 1, v + 1), at(u, v + 1)], -1).reshape(-1, 4)
-    return points, quads
+from tests.geometry.solids import quad_torus
 
 
 def opened(points: np.ndarray, quads: np.ndarray, v: int) -> tuple[np.ndarray, np.ndarray]:
@@ -34,7 +25,7 @@ def opened(points: np.ndarray, quads: np.ndarray, v: int) -> tuple[np.ndarray, n
 
 
 def test_an_opened_vertex_closes_again():
-    points, quads = torus_quads()
+    points, quads = quad_torus()
     more_points, more = opened(points, quads, 40)
     assert repair.is_watertight(more) and (valences(more, len(more_points))[0] != 4).sum() == 4
     out, found = cancel_irregular(more_points, more)
@@ -43,6 +34,6 @@ def test_an_opened_vertex_closes_again():
 
 
 def test_a_regular_mesh_stays():
-    points, quads = torus_quads()
+    points, quads = quad_torus()
     out, found = cancel_irregular(points, quads)
     assert (found == quads).all() and (out == points).all()
