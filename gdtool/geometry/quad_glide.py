@@ -18,10 +18,12 @@ def cancel_pairs(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
     Such a pair moves on by the rotation of an edge, one way or the other, and leaves regular quads behind (Peng et al. 2011,
     Connectivity editing for quadrilateral meshes). Each is led both ways until a rotation beside it leaves less that is irregular,
-    or put back.
+    or put back. Faces that do not all look the same way out are left as they are.
     """
     valence, inner = valences(faces, len(vertices))
     net = _Net(vertices, faces, valence, inner)
+    if not net.oriented():
+        return faces
     for steps in _STEPS:
         for vertex in np.flatnonzero(inner & (np.array(net.valence) > 4)).tolist():
             net.gain_beside(vertex)
@@ -55,6 +57,10 @@ class _Net:
         self._face_at = [0] * len(valence)  # one of those around each vertex
         for k in range(len(self.faces)):
             self._enter(k)
+
+    def oriented(self) -> bool:
+        """Whether no two faces walk an edge in the same direction."""
+        return len(self._face_of) == 4 * len(self.faces)
 
     def gain_beside(self, *vertices: int) -> bool:
         """Whether there were rotations of edges at vertices that leave less that is irregular; they are done."""

@@ -62,6 +62,16 @@ def test_a_regular_mesh_and_an_open_one_stay():
     assert (cancel_pairs(points, quads) == quads).all()
 
 
+def test_a_band_with_one_side_stays():
+    """A Moebius band has no two sides: edges that two faces walk the same way cannot be turned."""
+    n = 20
+    at = np.arange(n * 5).reshape(n, 5)
+    following = np.concatenate([at[1:], at[:1, ::-1]])
+    quads = np.stack([at[:, :-1], following[:, :-1], following[:, 1:], at[:, 1:]], -1).reshape(-1, 4)
+    points = np.random.default_rng(0).standard_normal((n * 5, 3))
+    assert (cancel_pairs(points, quads) == quads).all()
+
+
 def test_creases_stay():
     """Edges of a cube turn no more, whatever would cancel across them."""
     points, quads = quad_cube(3)
