@@ -19,7 +19,7 @@ from gdtool.texture.unwrap_flatten import singular_values, stretch
 from gdtool.texture.unwrap_lay import flatten_all
 from gdtool.texture.unwrap_pack import WELL_PACKED, best_packed, pack
 
-_MORE_CHARTS, _MOST_CUT = (5, 9, 13, 18, 23), 40  # charts that cutting for packing adds, about, and ends with, at most
+_MORE_CHARTS, _MOST_CUT = (5, 9, 13, 18, 23, 27), 43  # charts that cutting for packing adds, about, and ends with, at most
 # Shares of the time by which charts are found, shaped, projected, a child that has not ended is given up, and charts are packed.
 _SHARES = 0.2, 0.6, 0.7, 0.8, 0.9
 _SHORTEST = 0.05  # seconds of a child
