@@ -11,7 +11,7 @@ from gdtool.geometry import repair
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import scaled_jacobian, valences
 from gdtool.geometry.quad_engines import ENGINES
-from gdtool.geometry.quad_fit import CUT_PIECE, CUT_SUBDIVIDED, CUT_WHOLE, FAR_EDGES, FAR_SUBDIVIDED, STICKS_OUT, drawn, fault_of, sticks_out
+from gdtool.geometry.quad_fit import CUT_OFF, CUT_SUBDIVIDED, FAR_EDGES, FAR_SUBDIVIDED, STICKS_OUT, drawn, fault_of, sticks_out
 from gdtool.geometry.quad_glide import cancel_pairs
 from gdtool.geometry.quad_shape import fill_holes, remove_doublets
 from gdtool.geometry.quad_task import Part
@@ -98,7 +98,7 @@ class Candidate:
         self.drawn = drawn(self.vertices, self.quads, surface, part.features, subdivisions, part.request)
         vertices, quads, _ = self.drawn
         self.least = float(scaled_jacobian(vertices, quads).min())
-        limits = (FAR_SUBDIVIDED, CUT_SUBDIVIDED) if subdivisions else (FAR_EDGES, CUT_PIECE if part.piece else CUT_WHOLE)
+        limits = (FAR_SUBDIVIDED, CUT_SUBDIVIDED) if subdivisions else (FAR_EDGES, CUT_OFF)
         self.wrong, self.far = fault_of(vertices, quads, surface, part.edge, *limits)
         if self.fault and (over := sticks_out(vertices, quads, surface) / part.edge) > _OUT_EDGES:
             self.wrong = f"{STICKS_OUT} {over:.2g} edge lengths"  # else what is lost was finer than a quad

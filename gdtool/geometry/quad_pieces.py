@@ -7,14 +7,13 @@ import numpy as np
 from gdtool.geometry import repair
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.quad_candidate import judged
-from gdtool.geometry.quad_fit import CUT_PIECE, CUT_WHOLE, drawn, fault_of, settled
+from gdtool.geometry.quad_fit import CUT_OFF, drawn, fault_of, settled
 from gdtool.geometry.quad_split import split_count
 from gdtool.geometry.quad_task import Part
 from gdtool.geometry.quad_ways import Found
 
 SMALL_PIECE_QUADS = 48
 _MOST_ALONE, _ALONE, _FEWEST = 16, 300, 6  # pieces that are remeshed one by one; quads of one that is, and of any
-_MOST = 0.75  # of the mesh: a piece that is more is judged as one that is alone
 _ON_ONE, _MOST_APART = 0.9, 1.5  # of a component's quads lie on the piece that they stand for; edge lengths that a piece strays
 
 
@@ -45,9 +44,9 @@ def well_made(part: Part, whole: Found | None) -> tuple[Found | None, np.ndarray
     these = part.of(good[piece], part.quads)
     these_quads = joined([own[1:] for own, fits in zip(quads, good, strict=True) if fits])
     done = settled(*drawn(*these_quads, these.surface, these.features, 0, part.request), part.fine(), part.request)
-    made, small = quads_by_piece(*done, part), part.piece_areas < _MOST * part.piece_areas.sum()
+    made = quads_by_piece(*done, part)
     for k in np.flatnonzero(good):
-        good[k] = len(made[k][1]) > 0 and fault_of(*made[k], parts[k].surface, part.edge, _MOST_APART, CUT_PIECE if small[k] else CUT_WHOLE)[0] is None
+        good[k] = len(made[k][1]) > 0 and fault_of(*made[k], parts[k].surface, part.edge, _MOST_APART, CUT_OFF)[0] is None
     return ((*joined([made[k] for k in np.flatnonzero(good)]), whole[2]) if good.any() else None), good
 
 
@@ -71,7 +70,7 @@ def apart(part: Part, done: np.ndarray, quads: int) -> list[Part]:
         out.append(part.of(rest[piece], max(int(quads * share[rest].sum()), 1), given_up=True))
         quads -= split_count(out[0].faces, out[0].quads)
     own = np.maximum((own * (quads / max(own.sum(), 1))).round().astype(int), _FEWEST)
-    return out + [part.of(piece == k, int(number), piece=number < _MOST * part.quads) for k, number in zip(alone, own, strict=True)]
+    return out + [part.of(piece == k, int(number)) for k, number in zip(alone, own, strict=True)]
 
 
 def quads_by_piece(vertices: np.ndarray, quads: np.ndarray, part: Part) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -75,11 +75,10 @@ class Part:
     request: Request
     fine: Callable[[], Surface]  # the whole input as it was before it was simplified
     given_up: bool = False  # no engine is tried
-    piece: bool = False  # one of several, and not most of them
 
-    def of(self, faces: np.ndarray, quads: int, given_up: bool = False, piece: bool = False) -> Part:
+    def of(self, faces: np.ndarray, quads: int, given_up: bool = False) -> Part:
         """Some of the triangles: faces (f,) bool."""
-        return Part(*repair.compact(self.vertices, self.faces[faces]), quads, self.edge, self.request, self.fine, given_up, piece)
+        return Part(*repair.compact(self.vertices, self.faces[faces]), quads, self.edge, self.request, self.fine, given_up)
 
     @cached_property
     def pieces(self) -> tuple[int, np.ndarray]:
