@@ -203,11 +203,12 @@ class Isometry:
 
 
 def lies_on_itself(uv: np.ndarray, triangles: np.ndarray, edges: Edges, disk: bool) -> bool:
-    """overlapping().any(). What a rim winds around once lies on nothing: of a disk whose rim does not cross itself that is all."""
+    """overlapping().any(). What a rim winds around once lies on nothing: of a disk whose rim does not come to itself that is all."""
     if not np.ptp(uv, 0).max() > 0:
         return True
     rim = np.flatnonzero(edges.count[edges.half_edge_idx] == 1)
-    return len(rim_crossings(uv, edges.half_ends[rim])) > 0 or not disk and bool((_covered(uv, triangles)[2] > 1).any())
+    crossing, touches = rim_crossings(uv, edges.half_ends[rim])
+    return len(crossing) > 0 or (touches or not disk) and bool((_covered(uv, triangles)[2] > 1).any())
 
 
 def _covered(uv: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
@@ -227,7 +228,7 @@ def overlapping(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
         return ~found
     edges = edges_of(triangles)
     rim = np.flatnonzero(edges.count[edges.half_edge_idx] == 1)
-    found[edges.half_face[rim[rim_crossings(uv, edges.half_ends[rim])]]] = True
+    found[edges.half_face[rim[rim_crossings(uv, edges.half_ends[rim])[0]]]] = True
     at, size, count = _covered(uv, triangles)
     twice = count > 1
     if twice.any():
@@ -236,10 +237,10 @@ def overlapping(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return found
 
 
-def rim_crossings(uv: np.ndarray, ends: np.ndarray, at_once: int = 2_000_000) -> np.ndarray:
-    """(n,) the segments of (s, 2), ends in points uv (v, 2), that cross another with which they share no end.
+def rim_crossings(uv: np.ndarray, ends: np.ndarray, at_once: int = 2_000_000) -> tuple[np.ndarray, bool]:
+    """(n,) the segments of (s, 2), ends in points uv (v, 2), that cross another with which they share no end; whether any touch.
 
-    Sweep over u, exact to rounding.
+    Sweep over u, exact to rounding. Where the ends of two lie in one place, as those of a cut do, they may cross there or only touch.
     """
     low, high = uv[ends].min(1), uv[ends].max(1)
     order = np.argsort(low[:, 0], kind="stable")
@@ -247,7 +248,7 @@ def rim_crossings(uv: np.ndarray, ends: np.ndarray, at_once: int = 2_000_000) ->
     # Each with those behind it in order that begin before it ends.
     number = np.searchsorted(low[:, 0], high[:, 0], "right") - np.arange(len(ends)) - 1
     total = np.cumsum(number)
-    start, found = 0, []
+    start, found, touches = 0, [], False
     while start < len(ends):
         base = total[start - 1] if start else 0
         stop = max(start + 1, int(np.searchsorted(total, base + at_once, "right")))
@@ -258,9 +259,11 @@ def rim_crossings(uv: np.ndarray, ends: np.ndarray, at_once: int = 2_000_000) ->
         at = ends[pair]
         pair = pair[(at[:, 0, :, None] != at[:, 1, None, :]).all((1, 2))]
         (a, b), (c, d) = uv[ends[pair[:, 0]]].swapaxes(0, 1), uv[ends[pair[:, 1]]].swapaxes(0, 1)
-        found.append(pair[(_side(a, b, c) * _side(a, b, d) < 0) & (_side(c, d, a) * _side(c, d, b) < 0)])
+        one, other = _side(a, b, c) * _side(a, b, d), _side(c, d, a) * _side(c, d, b)
+        found.append(pair[(one < 0) & (other < 0)])
+        touches = touches or bool(((one <= 0) & (other <= 0) & (one * other == 0)).any())
         start = stop
-    return np.unique(order[np.concatenate(found).ravel()]) if found else np.zeros(0, np.int64)
+    return np.unique(order[np.concatenate(found).ravel()]) if found else np.zeros(0, np.int64), touches
 
 
 def _side(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:

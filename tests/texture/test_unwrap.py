@@ -221,7 +221,7 @@ def test_a_rim_that_crosses_by_a_hair_is_found():
 
     square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     ends = np.array([[0, 1], [1, 2], [2, 3], [3, 0]])
-    assert not len(rim_crossings(square, ends)) and rim_crossings(square[[0, 2, 1, 3]], ends).tolist() == [0, 2]
+    assert not len(rim_crossings(square, ends)[0]) and rim_crossings(square[[0, 2, 1, 3]], ends)[0].tolist() == [0, 2]
     # A strip of upright triangles bent almost into a ring: its ends pass each other by a millionth.
     for turn, crosses in ((2 * np.pi - 1e-6, False), (2 * np.pi + 1e-6, True)):
         angle = np.repeat(np.linspace(0, turn, 65), 2)

@@ -1,6 +1,7 @@
 """Charts that lie on themselves in places lose these places, and the charts around get them."""
 
 import numpy as np
+import pytest
 
 from gdtool.folders.mesh import triangulated
 from gdtool.geometry.repair import edges_of
@@ -36,6 +37,19 @@ def test_a_disk_whose_rim_does_not_cross_itself_lies_on_nothing():
         _, faces, uv = spiral(turns)
         triangles = triangulated(faces)[0].astype(np.int64)
         assert lies_on_itself(uv, triangles, edges_of(triangles), True) == overlapping(uv, triangles).any() == (turns > 1)
+
+
+@pytest.mark.parametrize("past", [0.0, 20.0])
+def test_a_rim_that_crosses_itself_where_two_of_its_corners_coincide(past):
+    """A fan around a corner of the rim, once around; and with an end past either side of where it meets itself, all in one place."""
+    degrees, length = np.array([-past, *range(0, 361, 30), 360 + past]), np.array([0.6, *[1.0] * 13, 0.6])
+    uv = np.concatenate([[[0, 0]], length[:, None] * np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))], -1)])
+    uv[14] = uv[2]
+    if not past:
+        uv = np.delete(uv, [1, 15], 0)
+    i = np.arange(1, len(uv) - 1)
+    triangles = np.stack([np.zeros_like(i), i, i + 1], -1)
+    assert lies_on_itself(uv, triangles, edges_of(triangles), True) == bool(past)
 
 
 def test_what_lies_on_itself_by_half_is_not_peeled():
