@@ -20,7 +20,8 @@ from remesh import score
 from rows import Rows
 
 _NOISE = 1e-7  # of the size
-COLUMNS = ("model", "draw", "seconds", "processor", "quads", "watertight", "irregular", "jacobian", "least", "mean", "hausdorff", "crease mean", "crease recall")
+COLUMNS = ("model", "draw", "seconds", "processor", "quads", "watertight", "irregular", "jacobian", "least", "mean", "hausdorff", "crease mean",
+           "crease recall")
 SUMMED = {"irregular": max, "jacobian": min, "least": min, "mean": max, "hausdorff": max, "crease mean": max, "crease recall": min}
 
 
@@ -50,9 +51,7 @@ def main() -> None:
             f"`python benchmarks/remesh_draws.py`, {machine()}. {note}\n\n{text}\n")
         return text
 
-    text = ""
-    sources = [*filter(None, asked.solids.split(",")), *models_in(asked.models)]
-    for source in sources:
+    for source in [*filter(None, asked.solids.split(",")), *models_in(asked.models)]:
         name = source if isinstance(source, str) else source.stem
         wanted = [draw for draw in range(asked.draws) if not rows.has(name, str(draw))]
         if not wanted or time.monotonic() > end:
@@ -70,8 +69,10 @@ def main() -> None:
             except ChildFailed as failure:
                 row = {"failed": str(failure)}
             rows.add({"model": name, "way": str(draw), "draw": draw, **row})
-        text = report(source is sources[-1] and time.monotonic() < end)
-    print(text)
+        report(False)
+    print(report(time.monotonic() < end))
+    if time.monotonic() > end:
+        say(f"not all began within {asked.minutes:g} minutes: run it again and it goes on")
 
 
 if __name__ == "__main__":

@@ -11,20 +11,20 @@ from gdtool.geometry.sharpen import dihedral_degrees
 from tests.geometry.solids import marching, plane, quad_cube, quad_torus
 
 
-def rotated(quads: np.ndarray, p: int, q: int) -> tuple[np.ndarray, int]:
-    """The edge from p to q turned within the hexagon around it, and the corner before p in its first face, where it ends now."""
+def rotated(quads: np.ndarray, p: int, q: int) -> np.ndarray:
+    """The edge from p to q turned within the hexagon around it: it ends now at the corner before p in its first face."""
     one = next(f for f in quads.tolist() if p in f and f[(f.index(p) + 1) % 4] == q)
     two = next(f for f in quads.tolist() if q in f and f[(f.index(q) + 1) % 4] == p)
     r, s = (one[(one.index(q) + i) % 4] for i in (1, 2))
     t, u = (two[(two.index(p) + i) % 4] for i in (1, 2))
     left = [f for f in quads.tolist() if f not in (one, two)]
-    return np.array([*left, [s, p, t, u], [u, q, r, s]]), s
+    return np.array([*left, [s, p, t, u], [u, q, r, s]])
 
 
 def sheared(quads: np.ndarray, columns: list[tuple[int, int]]) -> np.ndarray:
     """The rungs of a row of quads turned one after the other: two pairs of irregular vertices, as far apart."""
     for rung in columns:
-        quads = rotated(quads, *rung)[0]
+        quads = rotated(quads, *rung)
     return quads
 
 
@@ -81,7 +81,7 @@ def test_creases_stay():
     rng, torn = np.random.default_rng(0), quads
     for edge in rng.permutation(flat)[:40].tolist():
         try:
-            turned = rotated(torn, *edge)[0]
+            turned = rotated(torn, *edge)
         except StopIteration:  # turned away before
             continue
         valence = valences(turned, len(points))[0]
