@@ -11,7 +11,7 @@ from gdtool.geometry import repair
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import scaled_jacobian, valences
 from gdtool.geometry.quad_engines import ENGINES
-from gdtool.geometry.quad_fit import CUT_OFF, CUT_SUBDIVIDED, FAR_EDGES, FAR_SUBDIVIDED, STICKS_OUT, drawn, fault_of, sticks_out
+from gdtool.geometry.quad_fit import CUT_OFF, CUT_SUBDIVIDED, FAR_EDGES, FAR_SUBDIVIDED, STICKS_OUT, Outline, drawn, fault_of, outlined, sticks_out
 from gdtool.geometry.quad_glide import cancel_pairs
 from gdtool.geometry.quad_shape import fill_holes, remove_doublets
 from gdtool.geometry.quad_task import Part
@@ -20,6 +20,7 @@ from gdtool.geometry.quad_topology import cancel_irregular
 COUNT_TOLERANCE = 0.03
 LOST, ADDED, PIECES = "handles are lost", "handles are added", "pieces are lost or joined"
 _NEAR_EDGES, _LEAST_JACOBIAN = 0.75, 0.2  # nearer and squarer than this, a result is taken without a look at others
+_NEAR_OUTLINE = 1.0  # edge lengths: shaping hardly brings what is farther within _NEAR_EDGES
 _OUT_EDGES = 0.55  # what sticks out less is finer than a quad
 _MENDINGS = 4  # rounds of filling holes and parting what meets at a vertex
 
@@ -57,7 +58,8 @@ class Candidate:
     fault: str | None
     vertices: np.ndarray
     quads: np.ndarray
-    drawn: tuple[np.ndarray, np.ndarray, Constraints] | None = None  # quad_fit.drawn
+    outline: Outline | None = None
+    drawn: tuple[np.ndarray, np.ndarray, Constraints] | None = None
     far: float = np.inf  # of the surface from the quads drawn, in edge lengths
     least: float = -1.0  # their worst scaled Jacobian
     wrong: str | None = None  # what of them does not do on the surface
@@ -92,10 +94,15 @@ class Candidate:
         """Without a fault, or with one that is finer than its quads."""
         return self.fault is None or self.fault == LOST and sticks_out(self.vertices, self.quads, part.surface) < 2 * _OUT_EDGES * part.edge
 
+    def promising(self, part: Part) -> bool:
+        """Whether its outline is so near to the surface that it can come out good."""
+        self.outline = outlined(self.vertices, self.quads, part.surface, part.features, self.way.subdivisions, part.request)
+        return self.outline.far < _NEAR_OUTLINE
+
     def draw(self, part: Part) -> None:
         """Drawn onto the surface, and judged there."""
         subdivisions, surface = self.way.subdivisions, part.surface
-        self.drawn = drawn(self.vertices, self.quads, surface, part.features, subdivisions, part.request)
+        self.drawn = drawn(self.outline, surface, part.features, part.request)
         vertices, quads, _ = self.drawn
         self.least = float(scaled_jacobian(vertices, quads).min())
         limits = (FAR_SUBDIVIDED, CUT_SUBDIVIDED) if subdivisions else (FAR_EDGES, CUT_OFF)

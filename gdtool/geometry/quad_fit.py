@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,9 +31,20 @@ TOO_COARSE = _STRAYS, _LEAVES_OUT, STICKS_OUT, _CUTS_OFF = "strays", "leaves out
 _FOLDED, _LET_GO = 0.05, 0.25  # scaled Jacobian; edge lengths
 
 
-def drawn(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, subdivisions: int,
-          request: Request) -> tuple[np.ndarray, np.ndarray, Constraints]:
-    """The engine's quads drawn to creases, subdivided, drawn out over tips, evened out on the surface and unfolded; what they are held to."""
+@dataclass(frozen=True)
+class Outline:
+    """An engine's quads drawn to the creases, subdivided and drawn out over tips, not evened out yet."""
+
+    vertices: np.ndarray  # (v, 3)
+    faces: np.ndarray  # (f, 4)
+    constraints: Constraints
+    tips: np.ndarray  # vertices (t,) that are to stay
+    far: float  # edge lengths that samples of the surface are from it at most
+    hopeless: bool  # shaping brings it a third nearer at most, which does not do
+
+
+def outlined(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, subdivisions: int, request: Request) -> Outline:
+    """The engine's quads drawn to creases, subdivided, and drawn out over tips."""
     edge = (polygon_normals(vertices, faces)[1].sum() / len(faces)) ** 0.5
     vertices, constraints = trace(to_rim(vertices, faces, surface, _RIM_EDGES * edge), faces, features, edge)
     free = untied(vertices, faces, constraints)
@@ -48,10 +60,17 @@ def drawn(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: F
     if subdivisions:  # what ran across a quad has vertices nearer to it now
         vertices, constraints = trace(vertices, faces, features, edge)
     vertices, faces, constraints, tips, away = draw_out(vertices, faces, constraints, surface, edge)
-    if subdivisions and (away.max() > _HOPELESS_EDGES * edge or (away > _CUT_EDGES * edge).mean() > _HOPELESS_SHARE):
-        return vertices, faces, constraints  # shaping brings it a third nearer at most: it does not do in any case
-    vertices, constraints = _shaped(vertices, faces, surface, features, constraints, request, tips)
-    return vertices, faces, constraints
+    far = float(away.max()) / edge
+    hopeless = subdivisions > 0 and (far > _HOPELESS_EDGES or (away > _CUT_EDGES * edge).mean() > _HOPELESS_SHARE)
+    return Outline(vertices, faces, constraints, tips, far, hopeless)
+
+
+def drawn(outline: Outline, surface: Surface, features: Features, request: Request) -> tuple[np.ndarray, np.ndarray, Constraints]:
+    """An outline evened out on the surface and unfolded, unless that is hopeless; what it is held to."""
+    if outline.hopeless:
+        return outline.vertices, outline.faces, outline.constraints
+    vertices, constraints = _shaped(outline.vertices, outline.faces, surface, features, outline.constraints, request, outline.tips)
+    return vertices, outline.faces, constraints
 
 
 def settled(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, fine: Surface, request: Request) -> tuple[np.ndarray, np.ndarray]:
@@ -120,13 +139,14 @@ def fault_of(vertices: np.ndarray, quads: np.ndarray, surface: Surface, edge: fl
     mine = surface_of(vertices, quads)
     if (far := farthest(mine, surface) / edge) > limit:
         return f"{_STRAYS} {far:.2g} edge lengths from the surface", far
-    if (left := left_out(mine, surface, _LOST_EDGES * edge)) > _LOST_SHARE:
+    left, cut = left_out(mine, surface, (_LOST_EDGES * edge, _CUT_EDGES * edge))
+    if left > _LOST_SHARE:
         return f"{_LEAVES_OUT} {left:.1%} of the surface", far
     if (over := sticks_out(vertices, quads, surface) / edge) > limit:
         return f"{STICKS_OUT} {over:.2g} edge lengths", far
     if (folded := float((scaled_jacobian(vertices, quads) <= 0).mean())) > _MOST_FOLDED:
         return f"{folded:.1%} of the quads are folded", far
-    if (cut := left_out(mine, surface, _CUT_EDGES * edge)) > most_cut:
+    if cut > most_cut:
         return f"{_CUTS_OFF} {cut:.1%} of the surface", far
     return None, far
 
@@ -149,9 +169,10 @@ def sticks_out(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> flo
     return float(surface.closest(vertices[faces].mean(1))[0].max())
 
 
-def left_out(quads: Surface, surface: Surface, distance: float) -> float:
-    """Share of the surface's area that lies farther than `distance` from the quads: thin parts and rims that they do without."""
+def left_out(quads: Surface, surface: Surface, distances: tuple[float, ...]) -> list[float]:
+    """Shares of the surface's area that lie farther than each of `distances` from the quads: thin parts and rims that they do without."""
     from gdtool.geometry.distance import sample_surface
 
     points = sample_surface(surface.vertices, surface.faces, 10000, np.random.default_rng(0))[0]
-    return float((quads.closest(points)[0] > distance).mean())
+    away = quads.closest(points)[0]
+    return [float((away > distance).mean()) for distance in distances]

@@ -7,7 +7,7 @@ import numpy as np
 from gdtool.geometry import repair
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.quad_candidate import judged
-from gdtool.geometry.quad_fit import CUT_OFF, drawn, fault_of, settled
+from gdtool.geometry.quad_fit import CUT_OFF, drawn, fault_of, outlined, settled
 from gdtool.geometry.quad_split import split_count
 from gdtool.geometry.quad_task import Part
 from gdtool.geometry.quad_ways import Found
@@ -43,7 +43,8 @@ def well_made(part: Part, whole: Found | None) -> tuple[Found | None, np.ndarray
         return None, good
     these = part.of(good[piece], part.quads)
     these_quads = joined([own[1:] for own, fits in zip(quads, good, strict=True) if fits])
-    done = settled(*drawn(*these_quads, these.surface, these.features, 0, part.request), part.fine(), part.request)
+    outline = outlined(*these_quads, these.surface, these.features, 0, part.request)
+    done = settled(*drawn(outline, these.surface, these.features, part.request), part.fine(), part.request)
     made = quads_by_piece(*done, part)
     for k in np.flatnonzero(good):
         good[k] = len(made[k][1]) > 0 and fault_of(*made[k], parts[k].surface, part.edge, _MOST_APART, CUT_OFF)[0] is None

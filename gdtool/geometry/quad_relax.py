@@ -8,6 +8,7 @@ from gdtool.geometry.features import Constraints, Features
 from gdtool.geometry.mesh_quality import columns_of, cross, polygon_normals, scaled_jacobian, worst_jacobian
 from gdtool.geometry.quad_shape import Slide, Surface, normals_below, relax, still_vertices
 from gdtool.geometry.quad_unfold import unfold
+from gdtool.geometry.repair import edges_of
 
 _SQUARE_SHARE = 0.4  # of the way from the nearest rectangle to the nearest square
 _POOR = 0.6  # quads with a smaller scaled Jacobian pull harder
@@ -59,13 +60,15 @@ def balance(vertices: np.ndarray, faces: np.ndarray, surface: Surface, constrain
     free = (constraints.curve < 0) & ~still_vertices(faces, len(vertices), constraints)
     normals, area = polygon_normals(vertices, faces)
     corners = vertices[faces]
-    # Of the two triangles that the quad is cut into: centroids and middles of the inner edges.
+    # Of the two triangles that the quad is cut into: centroids, and middles of the edges, which are those of the quads beside them too.
     a, b, c, d = (corners[:, i] for i in range(4))
-    samples = np.stack([(a + b + c) / 3, (a + c + d) / 3, (a + c) / 2, (a + b) / 2, (b + c) / 2, (c + d) / 2, (d + a) / 2], 1)
+    inner, edges = np.concatenate([(a + b + c) / 3, (a + c + d) / 3, (a + c) / 2]), edges_of(faces)
+    samples = np.concatenate([inner, vertices[edges.ends].mean(1)])
     weight = np.array([3, 3, 2, 1, 1, 1, 1]) / 12
-    _, face_idx, point = surface.closest(samples.reshape(-1, 3))
-    height = np.einsum("qki,qi->qk", point.reshape(samples.shape) - samples, normals)
-    along = np.einsum("qki,qi->qk", surface.normals[face_idx].reshape(samples.shape), normals) > 0.9
+    _, face_idx, point = surface.closest(samples)
+    own = np.concatenate([np.arange(len(inner)).reshape(3, -1).T, len(inner) + edges.half_edge_idx.reshape(-1, 4)], 1)  # (q, 7)
+    height = np.einsum("qki,qi->qk", (point - samples).take(own, 0), normals)
+    along = np.einsum("qki,qi->qk", surface.normals[face_idx].take(own, 0), normals) > 0.9
     mean = np.where(along.all(1) & (np.abs(height).max(1) < 0.1 * np.sqrt(area)), height @ weight, 0.0)
     flat, shares = faces.ravel(), np.repeat(area, 4)
     total = np.maximum(np.bincount(flat, shares, len(vertices)), 1e-300)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from itertools import chain
 
 import numpy as np
 
@@ -114,14 +115,18 @@ class Trial:
         return sorted(out, key=lambda one: one.rank(wanted))
 
     def _drawn(self, candidates: list[Candidate]) -> Candidate:
-        """The first drawn onto the surface, and while none has come out good the others; the one that comes nearest to it."""
-        start = time.perf_counter()
-        for k, one in enumerate(candidates):
+        """The first that comes out good, those that do not promise to last; where none does the one that comes nearest to the surface."""
+        start, late, done = time.perf_counter(), [], []
+        for one in chain(candidates, late):
+            if one.outline is None and not one.promising(self.part):
+                late.append(one)
+                continue
             one.draw(self.part)
+            done.append(one)
             if one.good or not one.way.subdivisions:
                 break
         self.record.clock("fit", start)
-        return one if one.good else min(candidates[:k + 1], key=lambda one: (one.wrong is not None, one.far - 2 * one.least))
+        return one if one.good else min(done, key=lambda one: (one.wrong is not None, one.far - 2 * one.least))
 
     def _settled(self, taken: Candidate) -> Found:
         start = time.perf_counter()

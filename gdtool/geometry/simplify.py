@@ -7,7 +7,7 @@ from functools import cache
 from itertools import combinations_with_replacement
 
 import numpy as np
-import scipy.spatial  # noqa: F401 - what sharpen needs, read while a prepared child waits
+import scipy.sparse  # noqa: F401 - what repair needs, read while a prepared child waits
 
 from gdtool.core.child import ChildFailed, begin
 from gdtool.core.errors import InputError
@@ -125,16 +125,9 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
         cells *= 2
 
 
-def reduced(vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple, crease_degrees: float) -> tuple[np.ndarray, np.ndarray, int]:
-    """What the child runs: one of the collapses above, bevels first drawn out to creases (sharpen.py) unless crease_degrees is 0.
-
-    Returns vertices, faces, and how many vertices were drawn out.
-    """
-    moved = 0
-    if crease_degrees:
-        vertices, faces, drawn = restore_creases(vertices, faces, crease_degrees)
-        moved = drawn["moved"]
-    return *globals()[way](uneven(vertices, faces), faces, *arguments), moved
+def reduced(vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """What the child runs: one of the collapses above, what is flat made uneven first."""
+    return globals()[way](uneven(vertices, faces), faces, *arguments)
 
 
 def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attributes: np.ndarray | None = None, *,
@@ -167,8 +160,26 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
         raise InputError("mesh", "all its faces lie in one point")
     unit = (vertices - centre) / extent
     edge = _edge(unit, faces, target_faces)
-    is_closed = cache(closed or (lambda: repair.is_watertight(faces)))
-    found, method, moved, reasons = _collapsed(unit, faces, target_faces, edge if near else _UNIT, crease_degrees, careful, seconds, is_closed, meanwhile)
+    is_closed, pieces = cache(closed or (lambda: repair.is_watertight(faces))), cache(lambda: repair.components(faces)[0])
+
+    def while_it_runs() -> None:
+        meanwhile()
+        if is_closed():
+            pieces()
+
+    def collapsed(vertices: np.ndarray, faces: np.ndarray, moved: int):
+        return _collapsed(vertices, faces, target_faces, edge if near else _UNIT, moved, careful, seconds, is_closed, while_it_runs)
+
+    moved = 0
+    if crease_degrees:
+        # By this process, while the child starts: the search tree, which meanwhile() builds, then takes as long as the collapse does.
+        *drawn, creases = restore_creases(unit, faces.astype(np.int32), crease_degrees)
+        moved = creases["moved"]
+    found, method, reasons = collapsed(*(drawn if moved else (unit, faces)), moved)
+    if found is None and moved:
+        moved, reasons = 0, [*reasons, "creases restored: the result cannot be simplified"]
+        found, method, more = collapsed(unit, faces, 0)
+        reasons += more
     if found is None and not is_closed():
         found, method = cluster(unit, faces, target_faces), "vertex clustering"
         if not len(found[1]):
@@ -177,7 +188,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
         return vertices, faces, attributes, {"faces": len(faces), "method": "none", "error": 0.0, "creases": 0, "failed": "; ".join(reasons)}
     out_vertices, out_faces = repair.compact(*found)
     if is_closed() and repair.components(out_faces)[0] > 1:
-        out_vertices, out_faces = repair.without_crumbs(out_vertices, out_faces, repair.components(faces)[0])
+        out_vertices, out_faces = repair.without_crumbs(out_vertices, out_faces, pieces())
     out_attributes = None
     if attributes is not None:
         from gdtool.geometry.distance import barycentric_of, closest_points
@@ -197,27 +208,26 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     return out
 
 
-def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit: float, crease_degrees: float, careful: bool, seconds: float,
-               is_closed: Callable[[], bool], meanwhile: Callable[[], object]) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, int, list[str]]:
-    """What the first way leaves that keeps the mesh as closed as it is, or None; its name, how many vertices went to creases, what failed."""
+def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit: float, moved: int, careful: bool, seconds: float,
+               is_closed: Callable[[], bool], while_it_runs: Callable[[], object]) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str]]:
+    """What the first way leaves that keeps the mesh as closed as it is, or None; its name, what failed. moved: vertices that were drawn out to creases."""
     # The quick collapse tears a closed mesh now and then (a handful of edges with four faces), at one pace and not at
     # another, and of parts made of slivers it collapses nothing, at any; MeshLab's takes ten times as long.
     quick = [("collapse", (target_faces, pace, unit)) for pace in _PACES]
     slow = [("collapse_topology", (target_faces,))]
     if len(faces) > 2 * _BY_WAY * target_faces:
         slow.insert(0, ("collapse_by_way", (target_faces,)))
-    reasons, stuck, moved = [], None, 0
+    reasons, stuck = [], None
     for way, arguments in slow + quick if careful else quick + slow:
         if stuck is not None and way == "collapse" or way == "collapse_by_way" and stuck is None and not careful:
             continue
         if moved and way != "collapse" and not careful:
             break  # what cannot be collapsed are folds, of bevels that were drawn out where there is no crease
         try:
-            running = begin("gdtool.geometry.simplify:reduced", vertices, faces.astype(np.int32), way, arguments, crease_degrees,
+            running = begin("gdtool.geometry.simplify:reduced", vertices, faces.astype(np.int32), way, arguments,
                             seconds=seconds, memory_mb=16000)
-            meanwhile()
-            is_closed()
-            *out, moved = running.result()
+            while_it_runs()
+            out = running.result()
         except ChildFailed as failure:
             reasons.append(str(failure))
             continue
@@ -229,11 +239,8 @@ def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit:
             stuck = out
             reasons.append(f"the quick collapse stopped at {len(out[1])} triangles")
         else:
-            return out, "quadric collapse" if way == "collapse" else "quadric collapse, topology kept", moved, reasons
-    if moved or crease_degrees and stuck is None:
-        found = _collapsed(vertices, faces, target_faces, unit, 0.0, careful, seconds, is_closed, meanwhile)
-        return *found[:3], [*reasons, "creases restored: the result cannot be simplified", *found[3]]
-    return stuck, "quadric collapse", 0, reasons
+            return out, "quadric collapse" if way == "collapse" else "quadric collapse, topology kept", reasons
+    return stuck, "quadric collapse", reasons
 
 
 def _sound(vertices: np.ndarray, faces: np.ndarray, closed: bool, target_faces: int) -> bool:

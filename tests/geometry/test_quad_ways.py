@@ -10,7 +10,7 @@ from gdtool.folders.mesh import triangulated
 from gdtool.geometry import quad_candidate, quad_ways, quads, repair
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.quad_candidate import Candidate
-from gdtool.geometry.quad_fit import fault_of, left_out, surface_of
+from gdtool.geometry.quad_fit import Outline, fault_of, left_out, surface_of
 from gdtool.geometry.quad_shape import Surface
 from gdtool.geometry.quad_task import Part, Record, Request
 from tests.geometry.engines import Ended, around, in_this_process, inner_face, whole
@@ -39,7 +39,8 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
 
     calls = in_this_process(monkeypatch, engine)
     # Drawn onto the large sphere the small one would become it.
-    monkeypatch.setattr(quad_candidate, "drawn", lambda vertices, faces, *_: (vertices, faces, Constraints.none(len(vertices))))
+    monkeypatch.setattr(quad_candidate, "outlined", lambda vertices, faces, *_: Outline(
+        vertices, faces, Constraints.none(len(vertices)), tips=np.zeros(0, int), far=0.0, hopeless=True))
     _, found, record = quads.remesh(vertices / 2, faces, Request(quads=1000))
     assert len(calls) == runs and record.engine == "pair and split" and whole(found)
     assert outcome == "a crash" or "strays" in record.failed[0]
@@ -114,8 +115,8 @@ def test_surface_that_the_quads_do_without_is_measured():
     rest = np.array([f for f in faces.tolist() if f not in lid.tolist()])
     surface = Surface(vertices, faces)
     closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, rest))
-    assert left_out(surface_of(vertices, closed), surface, 0.1) == 0
-    assert left_out(surface_of(vertices, opened), surface, 0.1) == pytest.approx(0.8**2 / 6, abs=0.02)  # the lid but its rim
+    assert left_out(surface_of(vertices, closed), surface, (0.1,)) == [0]
+    assert left_out(surface_of(vertices, opened), surface, (0.1, 2.0)) == pytest.approx([0.8**2 / 6, 0], abs=0.02)  # the lid but its rim
 
 
 def test_when_the_time_is_over_no_engine_is_begun():
@@ -134,16 +135,30 @@ def test_every_round_asks_for_two_densities():
 
 
 def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypatch):
-    """The first in rank where it will do, without a look at the other; where none does, what comes nearest to it."""
+    """The first in rank where it will do, without a look at the other, and the other first where the first's outline leaves out more;
+    where none does, what comes nearest to it."""
     way = quad_ways._ways(20000, Request())[0]
     drawn = []
 
-    def candidate(far, least, wrong=None):
-        return Candidate(way, 1000, None, np.zeros((0, 3)), np.zeros((0, 4), int), far=far, least=least, wrong=wrong)
+    def candidate(far, least, wrong=None, outline=0.5):
+        found = Candidate(way, 1000, None, np.zeros((0, 3)), np.zeros((0, 4), int), far=far, least=least, wrong=wrong)
+        found.asked_of_outline = outline
+        return found
 
+    def outlined(one, part):
+        one.outline = one.asked_of_outline
+        return one.outline < 1
+
+    monkeypatch.setattr(Candidate, "promising", outlined)
     monkeypatch.setattr(Candidate, "draw", lambda one, part: drawn.append(one))
     choose = quad_ways.Trial(Part(*cube(), 1000, 0.1, Request(), None), Record())._drawn
     good, better, bare, thin = candidate(0.5, 0.3), candidate(0.1, 0.9), candidate(0.9, 0.5), candidate(0.3, 0.1)
     assert choose([good, better]) is good and drawn == [good] and choose([bare, good]) is good
     assert choose([candidate(0.1, 0.9, "leaves out 1 % of the surface"), thin]) is thin
     assert choose([bare, thin]) is bare and choose([candidate(2.0, 0.5), thin]) is thin
+    drawn.clear()
+    late = candidate(0.9, 0.3, outline=1.1)
+    assert choose([late, good]) is good and drawn == [good]
+    late.outline = None
+    drawn.clear()
+    assert choose([late, candidate(2.0, 0.5)]) is late and drawn[1] is late and len(drawn) == 2
