@@ -155,7 +155,9 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
             vertices, faces, drawn = restore_creases(vertices, faces, crease_degrees)
             report |= {"faces": len(faces), "creases": drawn["moved"]}
         return vertices, faces, attributes, report
-    centre, extent = (vertices.min(0) + vertices.max(0)) / 2, float(np.ptp(vertices, 0).max())
+    rows = np.ascontiguousarray(vertices.T)  # several times faster than along the columns
+    low, high = rows.min(1), rows.max(1)
+    centre, extent = (low + high) / 2, float((high - low).max())
     if not extent > 0:
         raise InputError("mesh", "all its faces lie in one point")
     unit = (vertices - centre) / extent

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.geometry.repair import Edges, components, corner_fans, edges_of, one_vertex_per_fan, without_crumbs
+from gdtool.geometry.repair import Edges, corner_fans, edges_of, one_vertex_per_fan
 
 
 def unpinched(vertices: np.ndarray, faces: np.ndarray, rounds: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """A closed triangle mesh two sheets of which share an edge, with a copy of the edge and its ends for each sheet.
 
-    faces (f, 3). Faces on both sides of one wedge of the inside stay together; crumbs that come off are dropped. Edges of
+    faces (f, 3). Faces on both sides of one wedge of the inside stay together; what comes off is a piece of its own. Edges of
     an odd number of faces, or of more one way than the other, are left.
     """
     edges = edges_of(faces)
     pinched = np.flatnonzero((edges.count > 2) & (edges.count % 2 == 0))
     if not len(pinched):
         return one_vertex_per_fan(vertices, faces)
+    # Only the faces around the ends of these edges are looked at.
+    end = np.zeros(len(vertices), bool)
+    end[edges.ends[pinched]] = True
+    near = np.flatnonzero(end[faces].any(1))
+    own = faces[near]
+    edges = edges_of(own)
+    pinched = np.flatnonzero((edges.count > 2) & (edges.count % 2 == 0))
     first = np.cumsum(edges.count) - edges.count
     mates = []
     for edge in pinched.tolist():
@@ -25,7 +32,7 @@ def unpinched(vertices: np.ndarray, faces: np.ndarray, rounds: int = 3) -> tuple
         along = b - a
         x = np.cross(along, [1.0, 0.0, 0.0] if abs(along[0]) < 0.9 * np.linalg.norm(along) else [0.0, 1.0, 0.0])
         y = np.cross(along, x)
-        tip = vertices[faces[edges.half_face[half]].sum(1) - edges.ends[edge].sum()] - a
+        tip = vertices[own[edges.half_face[half]].sum(1) - edges.ends[edge].sum()] - a
         angle = np.arctan2(tip @ y / max(np.linalg.norm(y), 1e-300), tip @ x / max(np.linalg.norm(x), 1e-300))
         half = half[np.argsort(angle, kind="stable")]
         forward = edges.half_ends[half, 0] == edges.ends[edge, 0]
@@ -42,20 +49,23 @@ def unpinched(vertices: np.ndarray, faces: np.ndarray, rounds: int = 3) -> tuple
             else:
                 opened.append(h)
     pairs = np.array(mates, np.int64).reshape(-1, 2)
-    pieces = components(faces)[0]
-    out, found = without_crumbs(*one_vertex_per_fan(vertices, faces, corner_fans(faces, pairs)[0]), pieces)
-    if rounds and (edges_of(found).count > 2).any():
+    fans = faces.astype(np.int64)
+    fans[near] = np.where(end[own], len(vertices) + corner_fans(own, pairs)[0], own)
+    out, found = one_vertex_per_fan(vertices, faces, fans)
+    if not rounds:
+        return out, found
+    if (edges_of(found).count > 2).any():
         # Two sheets with both ends in common besides: a vertex of its own in the middle of each tells them apart.
-        return unpinched(*_halved(vertices, faces, edges, pairs), rounds - 1)
-    return out, found
+        out, found = _halved(vertices, faces, near, edges, pairs)
+    return unpinched(out, found, rounds - 1)
 
 
-def _halved(vertices: np.ndarray, faces: np.ndarray, edges: Edges, mates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each pair of half edges (k, 2) with a vertex of its own in the middle, its two triangles cut in two."""
+def _halved(vertices: np.ndarray, faces: np.ndarray, near: np.ndarray, edges: Edges, mates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each pair of half edges (k, 2) of the faces `near` with a vertex of its own in the middle, its two triangles cut in two."""
     touched, more, points = set(), [], []
     faces = faces.copy()
     for pair in mates.tolist():
-        own = edges.half_face[pair].tolist()
+        own = near[edges.half_face[pair]].tolist()
         if touched & set(own) or own[0] == own[1]:
             continue  # the next round
         touched.update(own)
