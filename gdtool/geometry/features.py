@@ -163,7 +163,7 @@ def trace(vertices: np.ndarray, faces: np.ndarray, features: Features, edge: flo
     faces (f, 4); edge is the mean edge length. For each curve the shortest path of edges that stays near it is taken;
     paths may not cross one another nor touch a face with three corners in a row.
     """
-    from scipy.sparse import coo_matrix
+    from scipy.sparse import csr_array
     from scipy.sparse.csgraph import dijkstra
     from scipy.spatial import cKDTree
 
@@ -190,7 +190,7 @@ def trace(vertices: np.ndarray, faces: np.ndarray, features: Features, edge: flo
     by_x = np.argsort(vertices[:, 0], kind="stable")
     sorted_x = vertices[by_x, 0]
     begin = np.searchsorted(ends[:, 0], np.arange(count + 1))
-    allowed, number = np.full(count, np.inf), np.full(count, -1)
+    allowed, number, live = np.full(count, np.inf), np.full(count, -1), np.zeros(0, np.int64)
     for curve in range(len(bounds) - 1):
         segments = features.segments[order[bounds[curve]:bounds[curve + 1]]]
         stations = _stations(segments, features, at_corner, tree, taken, edge)
@@ -202,15 +202,15 @@ def trace(vertices: np.ndarray, faces: np.ndarray, features: Features, edge: flo
         near = slab[((vertices[slab] >= low) & (vertices[slab] <= high)).all(1)]
         far, _, _ = closest_on_segments(vertices[near], features.points, segments)
         near, far = near[far < 1.5 * edge], far[far < 1.5 * edge]
-        allowed[:], number[:] = np.inf, -1
+        allowed[live], number[live] = np.inf, -1  # of the curve before
         allowed[near] = far
         allowed[near[taken[near]]] = np.inf
         for station in stations:
             allowed[station] = min(allowed[station] if np.isfinite(allowed[station]) else 0.0, 0.5 * edge)
         live = np.union1d(near, stations)
-        live = live[np.isfinite(allowed[live])]
-        many = begin[live + 1] - begin[live]
-        usable = ends[np.repeat(begin[live] - np.cumsum(many) + many, many) + np.arange(many.sum())]
+        low_ends = live[np.isfinite(allowed[live])]
+        many = begin[low_ends + 1] - begin[low_ends]
+        usable = ends[np.repeat(begin[low_ends] - np.cumsum(many) + many, many) + np.arange(many.sum())]
         usable = usable[np.isfinite(allowed[usable[:, 1]])]
         if not len(usable):
             continue
@@ -218,7 +218,8 @@ def trace(vertices: np.ndarray, faces: np.ndarray, features: Features, edge: flo
         number[here] = np.arange(len(here))
         mean = allowed[usable].mean(1) / edge
         cost = np.linalg.norm(vertices[usable[:, 0]] - vertices[usable[:, 1]], axis=1) * (1 + 8 * mean**2)
-        graph = coo_matrix((cost, (number[usable[:, 0]], number[usable[:, 1]])), (len(here), len(here))).tocsr()
+        # Edges come in the order of their ends, as the rows of a sparse matrix do.
+        graph = csr_array((cost, number[usable[:, 1]], np.searchsorted(number[usable[:, 0]], np.arange(len(here) + 1))), (len(here), len(here)))
         found: list[int] = []
         for a, b in zip(stations[:-1], stations[1:], strict=True):
             if number[a] < 0 or number[b] < 0:
