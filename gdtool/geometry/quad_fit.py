@@ -10,6 +10,7 @@ import numpy as np
 from gdtool.geometry import repair
 from gdtool.geometry.features import Constraints, Features, find_features, trace, untied
 from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian
+from gdtool.geometry.quad_collapse import without_folded
 from gdtool.geometry.quad_paths import crossed, cut_along_features, held_at_centres, to_rim
 from gdtool.geometry.quad_relax import balance, ease, square_up
 from gdtool.geometry.quad_shape import Surface, onto, relax, subdivide
@@ -66,11 +67,14 @@ def outlined(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features
 
 
 def drawn(outline: Outline, surface: Surface, features: Features, request: Request) -> tuple[np.ndarray, np.ndarray, Constraints]:
-    """An outline evened out on the surface and unfolded, unless that is hopeless; what it is held to."""
+    """An outline evened out on the surface, unfolded and without what stays folded, unless that is hopeless; what it is held to."""
     if outline.hopeless:
         return outline.vertices, outline.faces, outline.constraints
     vertices, constraints = _shaped(outline.vertices, outline.faces, surface, features, outline.constraints, request, outline.tips)
-    return vertices, outline.faces, constraints
+    vertices, faces, constraints = without_folded(vertices, outline.faces, surface, constraints)
+    if len(faces) < len(outline.faces):
+        vertices = unfold(vertices, faces, surface, features, constraints)
+    return vertices, faces, constraints
 
 
 def settled(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, fine: Surface, request: Request) -> tuple[np.ndarray, np.ndarray]:
