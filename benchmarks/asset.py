@@ -7,7 +7,7 @@ as a user runs it, 2048², with three coarser levels. Source and asset are then 
 lights, and compared: masked PSNR of the lit pictures (docs/metrics.md). With --peers-python (a Python that has bpy) Blender
 loads asset.glb and renders it from two sides, its base color without light and the whole lit; both are compared with gdtool's
 own pictures of the asset; so does three.js where tests/tools has its npm packages (tests/tools/compare_shown.py). shape: how
-far the quad mesh lies from the model, which no map can mend. Writes asset.md, asset.json and asset.png (the charts, and the
+far the quad mesh lies from the model, which no map can mend. Writes asset.md, asset.json and asset.jpg (the charts, and the
 pictures side by side) row by row: killed, or out of --minutes, it goes on where it was.
 """
 
@@ -156,8 +156,10 @@ def baked(case: Case, folder: Path) -> tuple[Path, dict[str, float]]:
 
 def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
     """The reports of what there is so far."""
+    from PIL import Image
+
     from gdtool.images.contact import contact_sheet
-    from gdtool.images.io import read_image, write_png
+    from gdtool.images.io import read_image
 
     rows.write(complete)
     text = table(COLUMNS, ([number(row.get(name, "failed" if name == "seconds" and "failed" in row else None), 3) for name in COLUMNS]
@@ -170,7 +172,7 @@ def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
         "of the model's surface lie from the quad mesh, and " \
         "how far the coarsest level (an eighth) slid on its maps, shares of the extent; gdtool's pictures of the asset against Blender's and " \
         "three.js'.\n\n"
-    (out / "asset.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![source and asset](asset.png)\n")
+    (out / "asset.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![source and asset](asset.jpg)\n")
     sheet, names = [], []
     for row in rows.rows:
         at = [kept / "pictures" / file_name(row["model"], f"asset {label}") for label in LABELS]
@@ -178,7 +180,7 @@ def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
             sheet.append([read_image(path)[..., :3].astype(np.float32) / 255 if path.exists() else None for path in at])
             names.append(row["model"])
     if sheet:
-        write_png(out / "asset.png", contact_sheet(sheet, labels_top=LABELS, labels_left=names))
+        Image.fromarray(contact_sheet(sheet, labels_top=LABELS, labels_left=names)).save(out / "asset.jpg", quality=85)
 
 
 def measured(source: str | Path, asked: argparse.Namespace) -> dict:

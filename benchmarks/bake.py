@@ -2,7 +2,7 @@
 
     python benchmarks/bake.py [MODEL_OR_FOLDER ...] [--peers-python PATH] [-o docs/benchmarks] [--minutes 12] [--sizes 1024,2048,4096]
 
-Writes bake.md, bake.json and bake.png (the maps side by side) row by row: killed, or out of --minutes, it goes on where it
+Writes bake.md, bake.json and bake.jpg (the maps side by side) row by row: killed, or out of --minutes, it goes on where it
 was. Models that have neither a texture nor colors are left out; those that cannot be remeshed are named. The sizes are swept
 on the peers' case, the others have 2048². Errors: benchmarks/bake_score.py; along the charts' rims at the mip level of 256
 texels, which is what unwrap leaves room for: bake_mips.py. --peers-python is a Python that has bpy; without it Blender is left out.
@@ -157,8 +157,10 @@ def picture(name: str, way: str) -> str:
 
 def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
     """The reports of what there is so far."""
+    from PIL import Image
+
     from gdtool.images.contact import contact_sheet
-    from gdtool.images.io import read_image, write_png
+    from gdtool.images.io import read_image
 
     rows.write(complete)
     text = table(COLUMNS, ([number(row.get(name, "failed" if name == "size" and "failed" in row else None), 4) for name in COLUMNS] for row in rows.rows))
@@ -167,7 +169,7 @@ def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
         "processor. Errors before storing, and after 8 bits. seam: how much more the two sides of seams " \
         "differ than in the model, over the same at other edges, or over 1 where those differ less. rim: the base color along the charts' rims in the mip level of " \
         f"{MIP} texels, against each chart alone.\n\n"
-    (out / "bake.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![maps](bake.png)\n")
+    (out / "bake.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![maps](bake.jpg)\n")
     names = list(dict.fromkeys(row["model"] for row in rows.rows))
     sheet = []
     for name in names:
@@ -178,8 +180,9 @@ def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
         sheet.append(line)
     whole = [i for i, line in enumerate(sheet) if line[0] is not None]
     if whole:
-        write_png(out / "bake.png", contact_sheet([sheet[i] for i in whole], labels_top=[*KINDS, *(f"{kind}, Blender" for kind in KINDS)],
-                                                  labels_left=[names[i] for i in whole]))
+        table_of_maps = contact_sheet([sheet[i] for i in whole], labels_top=[*KINDS, *(f"{kind}, Blender" for kind in KINDS)],
+                                      labels_left=[names[i] for i in whole])
+        Image.fromarray(table_of_maps).save(out / "bake.jpg", quality=85)
 
 
 def run(case: Case, truth: Truth, way: str, size: int, samples: int, asked: argparse.Namespace) -> dict:
