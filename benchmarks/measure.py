@@ -88,8 +88,22 @@ def machine() -> str:
 
 def busy() -> str:
     """A sentence for the report when the machine had other work as the benchmark began, else nothing."""
-    load, cores = os.getloadavg()[0], len(os.sched_getaffinity(0))
-    return f"Other work ran meanwhile (load {load:.1f} on {cores} cores as it began): the times are upper bounds." if load > 0.6 * cores else ""
+    working, cores = _cores_at_work(), len(os.sched_getaffinity(0))
+    return f"Other work ran meanwhile ({working:.1f} of {cores} cores as it began): the times are upper bounds." if working > 0.3 * cores else ""
+
+
+def _cores_at_work(seconds: float = 1.0) -> float:
+    """How many cores work right now; the load of the last minute, which counts what ended since, where the kernel does not say."""
+    if not Path("/proc/stat").exists():
+        return os.getloadavg()[0]
+
+    def used() -> float:
+        ticks = [int(text) for text in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]]
+        return (sum(ticks) - sum(ticks[3:5])) / os.sysconf("SC_CLK_TCK")  # without idle and waiting
+
+    before = used()
+    time.sleep(seconds)
+    return (used() - before) / seconds
 
 
 def say(text: str) -> None:
