@@ -35,8 +35,8 @@ def ours(path: Path, faces: int) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         cost = gdtool("remesh", "--quiet", "--faces", str(faces), path, "-o", Path(folder) / "mesh")
         made = json.loads((Path(folder) / "mesh/manifest.json").read_text())
-    content, passed = made["content"], len(content["tried"])
-    return {"seconds": cost.seconds, "quads": content["quads"], "as": f"{content['engine']} ({passed})"} | figures_of(content["report"])
+    content = made["content"]
+    return {"seconds": cost.seconds, "quads": content["quads"], "as": f"{content['engine']} ({len(content['tried'])})"} | figures_of(content["report"])
 
 
 def peer(path: Path, faces: int) -> dict:
