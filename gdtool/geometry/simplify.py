@@ -169,7 +169,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
         if is_closed():
             pieces()
 
-    def collapsed(vertices: np.ndarray, faces: np.ndarray, moved: int):
+    def collapsed(vertices: np.ndarray, faces: np.ndarray, moved: int) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str]]:
         return _collapsed(vertices, faces, target_faces, edge if near else _UNIT, moved, careful, seconds, is_closed, while_it_runs)
 
     moved = 0

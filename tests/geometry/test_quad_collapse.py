@@ -50,7 +50,7 @@ def test_what_is_held_stays():
     torn, quads, new = opened(vertices, faces, 17, 0.1)
     constraints = Constraints.none(len(torn))
     constraints.curve[[new[0], new[2]]] = 0
-    out, found, same = without_folded(torn, quads, surface_of(vertices, faces), replace(constraints, fixed=np.ones(len(torn), bool)))
+    out, found, _ = without_folded(torn, quads, surface_of(vertices, faces), replace(constraints, fixed=np.ones(len(torn), bool)))
     assert out is torn and found is quads
     # One of the two is held: it is the one that stays, where it was.
     constraints.curve[new[2]] = -1
