@@ -90,8 +90,10 @@ def _tidy(points: np.ndarray, segments: np.ndarray, short: float) -> Features:
     """Arcs between corners, after those that are too short to follow are gone.
 
     Slivers along a crease make spurs, bubbles and doubled corners: arcs that end freely or return to their corner are
-    dropped when short, short arcs between two corners drawn together into one corner.
+    dropped when short, short arcs between two corners drawn together into one corner. No corner comes farther than
+    `short` that way, for what hangs on it would leave the surface: an arc that asks for more is a gap from then on.
     """
+    came = np.zeros(len(points))  # how far what was drawn into a corner came
     for _ in range(12):
         features = _arcs(points, segments)
         count = int(features.curve.max()) + 1
@@ -119,9 +121,10 @@ def _tidy(points: np.ndarray, segments: np.ndarray, short: float) -> Features:
                 a = onto_corner[a]
             while onto_corner[b] != b:
                 b = onto_corner[b]
-            if a != b:
-                keep, lose = (a, b) if degree[a] >= degree[b] else (b, a)
-                onto_corner[lose] = keep
+            keep, lose = (a, b) if degree[a] >= degree[b] else (b, a)
+            farthest = came[lose] + np.linalg.norm(points[keep] - points[lose])
+            if a != b and farthest <= short:
+                onto_corner[lose], came[keep] = keep, max(came[keep], farthest)
             drop[i] = True
         while (onto_corner[onto_corner] != onto_corner).any():
             onto_corner = onto_corner[onto_corner]

@@ -24,6 +24,7 @@ _NO_AREA = 1e-4  # squared edge lengths
 _HOPELESS_EDGES, _HOPELESS_SHARE = 1.7, 0.03  # farther than this before it is shaped, or so much of it cut off, a subdivided result is given up
 _RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
 FAR_EDGES, FAR_SUBDIVIDED = 2.0, 1.0  # edge lengths that a result may stray; of a subdivided one, after which others come
+_LIKELY = 0.75  # of them: what strays less before it is shaped is not likely to stray more than it may afterwards
 _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
 _MOST_FOLDED = 0.01  # of the quads
 _CUT_EDGES = 0.25  # surface so far from the quads lies beyond an edge that they cut off
@@ -40,7 +41,9 @@ class Outline:
     faces: np.ndarray  # (f, 4)
     constraints: Constraints
     tips: np.ndarray  # vertices (t,) that are to stay
+    edge: float  # about its quads' edge length
     far: float  # edge lengths that samples of the surface are from it at most
+    limit: float  # edge lengths that quads made of it may stray
     hopeless: bool  # shaping brings it a third nearer at most, which does not do
 
 
@@ -63,15 +66,19 @@ def outlined(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features
     vertices, faces, constraints, tips, away = draw_out(vertices, faces, constraints, surface, edge)
     far = float(away.max()) / edge
     hopeless = subdivisions > 0 and (far > _HOPELESS_EDGES or (away > _CUT_EDGES * edge).mean() > _HOPELESS_SHARE)
-    return Outline(vertices, faces, constraints, tips, far, hopeless)
+    return Outline(vertices, faces, constraints, tips, edge, far, FAR_SUBDIVIDED if subdivisions else FAR_EDGES, hopeless)
 
 
 def drawn(outline: Outline, surface: Surface, features: Features, request: Request) -> tuple[np.ndarray, np.ndarray, Constraints]:
     """An outline evened out on the surface, unfolded and without what stays folded, unless that is hopeless; what it is held to."""
     if outline.hopeless:
         return outline.vertices, outline.faces, outline.constraints
-    vertices, constraints = _shaped(outline.vertices, outline.faces, surface, features, outline.constraints, request, outline.tips)
-    vertices, faces, constraints = without_folded(vertices, outline.faces, surface, constraints)
+    faces = outline.faces
+    vertices, constraints = _squared(outline.vertices, faces, surface, features, outline.constraints, request)
+    if outline.far > _LIKELY * outline.limit and farthest(surface_of(vertices, faces), surface) > outline.limit * outline.edge:
+        return vertices, faces, constraints  # what unfolds quads brings them no nearer
+    vertices, constraints = _unfolded(vertices, faces, surface, features, constraints, outline.tips)
+    vertices, faces, constraints = without_folded(vertices, faces, surface, constraints)
     if len(faces) < len(outline.faces):
         vertices = unfold(vertices, faces, surface, features, constraints)
     return vertices, faces, constraints
@@ -84,12 +91,17 @@ def settled(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, f
     return vertices, cut_along_features(vertices, faces, fine)
 
 
-def _shaped(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
-            request: Request, tips: np.ndarray | None = None) -> tuple[np.ndarray, Constraints]:
-    """The quads squared up, then the few that stay folded or thin unfolded one vertex at a time; what they are held to from then on."""
+def _squared(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
+             request: Request) -> tuple[np.ndarray, Constraints]:
+    """The quads squared up; what they are held to from then on."""
     vertices = square_up(vertices, faces, surface, features, constraints, request.smooth_iterations)
     constraints = untied(vertices, faces, constraints)
-    vertices = square_up(vertices, faces, surface, features, constraints, 2 * request.smooth_iterations)
+    return square_up(vertices, faces, surface, features, constraints, 2 * request.smooth_iterations), constraints
+
+
+def _unfolded(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
+              tips: np.ndarray | None = None) -> tuple[np.ndarray, Constraints]:
+    """The few quads that stay folded or thin unfolded one vertex at a time; what they are held to from then on."""
     vertices = unfold(vertices, faces, surface, features, constraints)
     return ease(vertices, faces, surface, features, constraints, tips=tips)
 
@@ -103,7 +115,8 @@ def fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarr
     traced, constraints = trace(quad_vertices, quad_faces, features, edge)
     constraints = untied(traced, quad_faces, constraints)
     traced = relax(onto(traced, surface, features, constraints), quad_faces, surface, features, constraints, request.smooth_iterations)
-    traced, constraints = _shaped(traced, quad_faces, surface, features, constraints, request)
+    traced, constraints = _squared(traced, quad_faces, surface, features, constraints, request)
+    traced, constraints = _unfolded(traced, quad_faces, surface, features, constraints)
     if request.smooth_iterations:
         traced = balance(traced, quad_faces, fine, constraints)
     # Pieces that are a few quads wide fold and shrink when their vertices are evened out: they stay as they were split, and

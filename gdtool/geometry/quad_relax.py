@@ -14,6 +14,8 @@ _SQUARE_SHARE = 0.4  # of the way from the nearest rectangle to the nearest squa
 _POOR = 0.6  # quads with a smaller scaled Jacobian pull harder
 _NORMALS_EVERY = 6
 _THIN = 0.3  # quads of a smaller scaled Jacobian stay where they are balanced
+_FEW_BAD, _MOST_IN_VAIN = 8, 2  # more bad quads than these are given up after so many rounds in a row that leave most of them
+_MOST_LEFT = 0.75
 
 
 def square_up(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
@@ -119,9 +121,11 @@ def ease(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Fe
 
     tips: vertices that stay fixed, for evened out they would shrink back. A path along a crease that winds cannot be straightened by moving vertices; here it is given up for a few quads.
     """
+    in_vain, left = 0, np.inf
     for turn in range(rounds):
         bad = scaled_jacobian(vertices, faces) < least
-        if not bad.any():
+        in_vain, left = in_vain + 1 if bad.sum() > _MOST_LEFT * left else 0, bad.sum()
+        if not left or in_vain == _MOST_IN_VAIN and left > _FEW_BAD:
             break
         near = np.zeros(len(vertices), bool)
         near[faces[bad]] = True

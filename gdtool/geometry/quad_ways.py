@@ -87,12 +87,12 @@ class Trial:
             if not usable:
                 return self._failed(way, best.fault, torn=best.off(wanted) < -_MOST_TORN)
             taken = self._drawn([one for one in candidates if one.fault == best.fault and one.counted(wanted)])
+            if taken.wrong is not None:
+                return self._failed(way, f"{taken.fault}; {taken.wrong}" if taken.fault else taken.wrong)
             if abs((count := len(taken.drawn[1])) / quads - 1) > COUNT_TOLERANCE:
                 extra = count - taken.count
                 asked = way.near(taken.asked * (quads - extra) / taken.count)
                 continue
-            if taken.wrong is not None:
-                return self._failed(way, f"{taken.fault}; {taken.wrong}" if taken.fault else taken.wrong)
             return self._settled(taken)
         self.record.failed.append(f"{way.label}: gave {count} faces for {quads}")
         if not way.subdivisions:

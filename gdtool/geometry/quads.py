@@ -11,13 +11,15 @@ import numpy as np
 from gdtool.core.child import prepare
 from gdtool.core.threads import mapped
 from gdtool.geometry.normals import face_normals
-from gdtool.geometry.quad_fit import fitted
+from gdtool.geometry.quad_fit import farthest, fitted
 from gdtool.geometry.quad_pieces import SMALL_PIECE_QUADS, apart, by_size, joined, well_made
 from gdtool.geometry.quad_shape import Surface
 from gdtool.geometry.quad_split import split_to_quads
 from gdtool.geometry.quad_task import Part, Record, Request
 from gdtool.geometry.quad_ways import Found, Trial, prepare_engines
-from gdtool.geometry.simplify import simplify
+from gdtool.geometry.simplify import SHAKEN, median_edge, simplify
+
+_SHAKEN_OFF = 3.0  # of the noise that keeps triangles even, which moves few of their corners farther off the surface
 
 
 def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[np.ndarray, np.ndarray, Record]:
@@ -41,11 +43,23 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
 
 
 def _coarse(vertices: np.ndarray, faces: np.ndarray, edge: float, request: Request, record: Record, fine: Callable[[], Surface]) -> Part:
-    """What quads of that edge need of the mesh, its creases restored: collapsed quickly, with care where that strays by more than an edge."""
+    """What quads of that edge need of the mesh, its creases restored: collapsed quickly, with care where that strays by more than an edge.
+
+    What the noise that keeps its triangles even moved is on the surface again.
+    """
     for careful in (False, True):
         start = time.perf_counter()
-        part = Part(*_simplified(vertices, faces, edge, request, record, careful, fine), request.quads, edge, request, fine)
-        record.figures["simplify_error"] = error = _deviation(fine(), part.surface) if part.faces is not faces else 0.0
+        out, found = _simplified(vertices, faces, edge, request, record, careful, fine)
+        error = 0.0
+        if len(found) < len(faces):
+            away, _, point = fine().closest(out)
+            near = away < _SHAKEN_OFF * SHAKEN * median_edge(vertices, faces)  # what is farther was drawn out to a crease
+            out[near] = point[near]
+            error = float(away.max())
+        part = Part(out, found, request.quads, edge, request, fine)
+        if error:
+            error = max(error, farthest(part.surface, fine()))
+        record.figures["simplify_error"] = error
         record.clock("simplify", start)
         if error <= edge or request.for_engines <= 0:
             break
@@ -95,23 +109,11 @@ def _simplified(vertices: np.ndarray, faces: np.ndarray, edge: float, request: R
     if len(faces) <= _needed(request):
         prepare_engines(request.quads, request)
     # Bevels as wide as the quads are drawn as they are.
-    restored = request.restore_creases and _median_edge(vertices, faces) < 0.75 * edge
+    restored = request.restore_creases and median_edge(vertices, faces) < 0.75 * edge
     found = simplify(vertices, faces, _needed(request), seconds=request.for_the_rest, crease_degrees=request.crease_degrees if restored else 0.0,
-                     careful=careful, measured=False, meanwhile=meanwhile)
+                     careful=careful, even=True, measured=False, meanwhile=meanwhile)
     report = found[3]
     record.figures |= {"simplified_to": report["faces"]} | ({"crease_vertices_restored": report["creases"]} if restored else {})
     if "failed" in report:
         record.failed.append(f"simplify: {report['failed']}")
     return found[:2]
-
-
-def _deviation(fine: Surface, coarse: Surface, limit: int = 20000) -> float:
-    """Largest distance of the vertices of the input and of the simplified mesh to the other, at most `limit` of each."""
-    pairs = (fine, coarse), (coarse, fine)
-    return float(max(b.closest(a.vertices[::max(len(a.vertices) // limit, 1)])[0].max() for a, b in pairs))
-
-
-def _median_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
-    step = max(len(faces) // 20000, 1)
-    few = faces[::step]
-    return float(np.median(np.linalg.norm(vertices[few] - vertices[np.roll(few, 1, 1)], axis=-1)))

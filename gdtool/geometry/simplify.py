@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from itertools import combinations_with_replacement
+from itertools import combinations, combinations_with_replacement
 
 import numpy as np
 import scipy.sparse  # noqa: F401 - what repair needs, read while a prepared child waits
@@ -20,8 +20,26 @@ from gdtool.geometry.unpinch import unpinched
 _PACES, _UNIT = (4.0, 3.0, 8.0), 0.5  # how steeply the collapse's bound rises, tried in turn; the unit of lengths, in sizes of the mesh
 _BY_WAY = 6  # times the triangles asked for, to which the quicker collapse still goes well
 _UNEVEN, _FLAT = 1e-3, 1e-14  # edge lengths that what is flat is moved by; determinant of the mean of its normals' squares
+SHAKEN = 0.03  # edge lengths that all is moved by where the triangles are to be even
 _FEW_FLAT, _SAMPLE = 0.01, 20000  # of the vertices: so few stop no collapse; how many of them tell
 _STUCK, _FEW = 1.25, 32  # triangles in units of those asked for, and so many more, that a collapse may leave
+
+
+def shaken(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Vertices (v, 3) moved by noise of SHAKEN times the shortest edge of their faces (f, 3), for a collapse that leaves triangles of one size.
+
+    With it every vertex that is taken in adds about the same to an edge's error, where the surface is flat as where it is
+    curved less than the noise; without it what is flat comes out in a few large triangles, and slivers around it.
+    """
+    corners = [np.ascontiguousarray(vertices, np.float32).take(corner, 0) for corner in faces.T]
+    shortest = np.full(len(faces), np.inf, np.float32)
+    for one, other in combinations(corners, 2):
+        side = one - other
+        np.minimum(shortest, np.einsum("fi,fi->f", side, side), out=shortest)
+    far = np.full(len(vertices), median_edge(vertices, faces) ** 2, np.float32)
+    for corner in faces.T:
+        np.minimum.at(far, corner, shortest)
+    return vertices + SHAKEN * np.sqrt(far)[:, None] * np.random.default_rng(0).standard_normal(vertices.shape, np.float32)
 
 
 def uneven(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -35,11 +53,9 @@ def uneven(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     around, few = repair.renumbered(faces[np.flatnonzero(corners_of(faces, len(vertices)) @ some)], len(vertices))
     if _flat(vertices[around], few)[some[around]].sum() / some.sum() < _FEW_FLAT:
         return vertices
-    corners = vertices[_few(faces)]
-    far = _UNEVEN * np.median(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1))
     flat = np.flatnonzero(_flat(vertices, faces))
     out = vertices.astype(np.float64)
-    out[flat] += far * np.random.default_rng(0).uniform(-1, 1, vertices.shape)[flat]
+    out[flat] += _UNEVEN * median_edge(vertices, faces) * np.random.default_rng(0).uniform(-1, 1, vertices.shape)[flat]
     return out
 
 
@@ -74,6 +90,12 @@ def collapse(vertices: np.ndarray, faces: np.ndarray, target_faces: int, aggress
 def _edge(vertices: np.ndarray, faces: np.ndarray, count: int) -> float:
     """About how long the edges are of so many even triangles in its place."""
     return float((4 / 3**0.5 * face_normals(vertices, _few(faces))[1].mean() * len(faces) / count) ** 0.5)
+
+
+def median_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """The median length of the edges, of some of them."""
+    corners = vertices[_few(faces)]
+    return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1)))
 
 
 def _few(faces: np.ndarray) -> np.ndarray:
@@ -125,14 +147,14 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
         cells *= 2
 
 
-def reduced(vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """What the child runs: one of the collapses above, what is flat made uneven first."""
-    return globals()[way](uneven(vertices, faces), faces, *arguments)
+def reduced(vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple, even: bool) -> tuple[np.ndarray, np.ndarray]:
+    """What the child runs: one of the collapses above of what is shaken, or uneven, first."""
+    return globals()[way]((shaken if even else uneven)(vertices, faces), faces, *arguments)
 
 
 def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attributes: np.ndarray | None = None, *,
              seconds: float = 120.0, closed: Callable[[], bool] | None = None, crease_degrees: float = 0.0, careful: bool = False,
-             near: bool = False, measured: bool = True,
+             near: bool = False, even: bool = False, measured: bool = True,
              meanwhile: Callable[[], object] = lambda: None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, dict[str, float | int | str]]:
     """A mesh of about target_faces triangles of the same shape and topology.
 
@@ -143,7 +165,8 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     creases that turn by more, unless what comes of it cannot be collapsed; the report says how many vertices moved (creases).
     `careful` takes the slow way first, for meshes with more small parts than triangles to
     spare: the quick one reaches any number, even by tearing down what is large. With `near` the quick one keeps nearer to the surface, its
-    triangles less even. Without `measured` the error is left out; with it, a quick result that is as far off as its edges are long is
+    triangles less even; with `even` the triangles are of one size, and off the surface by some hundredths of the input's edges (SHAKEN).
+    Without `measured` the error is left out; with it, a quick result that is as far off as its edges are long is
     compared with the slow one's. `meanwhile` is called while each child works.
     Raises InputError as repair.check does.
     """
@@ -170,7 +193,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
             pieces()
 
     def collapsed(vertices: np.ndarray, faces: np.ndarray, moved: int) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str]]:
-        return _collapsed(vertices, faces, target_faces, edge if near else _UNIT, moved, careful, seconds, is_closed, while_it_runs)
+        return _collapsed(vertices, faces, target_faces, edge if near else _UNIT, even, moved, careful, seconds, is_closed, while_it_runs)
 
     moved = 0
     if crease_degrees:
@@ -205,12 +228,12 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
         report["failed"] = "; ".join(reasons)
     out = out_vertices * extent + centre, out_faces, out_attributes, report
     if measured and not careful and method == "quadric collapse" and report["error"] > edge * extent:
-        other = simplify(vertices, faces, target_faces, attributes, seconds=seconds, closed=is_closed, careful=True, near=near)
+        other = simplify(vertices, faces, target_faces, attributes, seconds=seconds, closed=is_closed, careful=True, near=near, even=even)
         return min(out, other, key=lambda one: one[3]["error"] if one[3]["method"] != "none" else np.inf)
     return out
 
 
-def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit: float, moved: int, careful: bool, seconds: float,
+def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit: float, even: bool, moved: int, careful: bool, seconds: float,
                is_closed: Callable[[], bool], while_it_runs: Callable[[], object]) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str]]:
     """What the first way leaves that keeps the mesh as closed as it is, or None; its name, what failed. moved: vertices that were drawn out to creases."""
     # The quick collapse tears a closed mesh now and then (a handful of edges with four faces), at one pace and not at
@@ -226,7 +249,7 @@ def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit:
         if moved and way != "collapse" and not careful:
             break  # what cannot be collapsed are folds, of bevels that were drawn out where there is no crease
         try:
-            running = begin("gdtool.geometry.simplify:reduced", vertices, faces.astype(np.int32), way, arguments,
+            running = begin("gdtool.geometry.simplify:reduced", vertices, faces.astype(np.int32), way, arguments, even,
                             seconds=seconds, memory_mb=16000)
             while_it_runs()
             out = running.result()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.geometry.features import find_features
+from gdtool.geometry.features import _tidy, find_features
 from gdtool.geometry.sharpen import dihedral_degrees
 
 FACES = np.array([(0, 1, 4), (1, 2, 4), (0, 4, 2), (0, 2, 3)])
@@ -31,3 +31,16 @@ def test_a_crease_beside_a_sliver_is_kept():
     ends, _, angle = dihedral_degrees(square(60.0), FACES, 0.05)
     at = {tuple(sorted(pair)): degrees for pair, degrees in zip(ends.tolist(), angle, strict=True)}
     assert at[0, 2] < 1e-5 and at[0, 4] == pytest.approx(60) and at[2, 4] == pytest.approx(60) and at[1, 4] < 1e-5
+
+
+def test_corners_in_a_row_are_not_all_drawn_into_one():
+    """A comb: teeth an edge apart stand on a spine of arcs that are all too short to follow."""
+    teeth, length, short = 21, 10, 1.5
+    points = np.array([(x, y, 0.0) for x in range(teeth) for y in range(length)])
+    root = length * np.arange(teeth)
+    segments = np.concatenate([np.stack([root[:-1], root[1:]], -1)] + [np.stack([root + y, root + y + 1], -1) for y in range(length - 1)])
+    found = _tidy(points, segments, short)
+    ends = found.points[found.segments]
+    assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() <= 1 + short
+    # No tooth is lost, and the corners that are left stand on the spine.
+    assert (found.points[:, 1] == length - 1).sum() == teeth and 1 < len(np.unique(ends[ends[..., 1] == 0], axis=0)) < teeth

@@ -40,7 +40,7 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
     calls = in_this_process(monkeypatch, engine)
     # Drawn onto the large sphere the small one would become it.
     monkeypatch.setattr(quad_candidate, "outlined", lambda vertices, faces, *_: Outline(
-        vertices, faces, Constraints.none(len(vertices)), tips=np.zeros(0, int), far=0.0, hopeless=True))
+        vertices, faces, Constraints.none(len(vertices)), tips=np.zeros(0, int), edge=1.0, far=0.0, limit=1.0, hopeless=True))
     _, found, record = quads.remesh(vertices / 2, faces, Request(quads=1000))
     assert len(calls) == runs and record.engine == "pair and split" and whole(found)
     assert outcome == "a crash" or "strays" in record.failed[0]

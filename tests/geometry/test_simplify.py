@@ -128,6 +128,31 @@ def test_creases_are_drawn_out_unless_that_cannot_be_collapsed(monkeypatch):
     assert off(out) > 0.5 * off(vertices)
 
 
+def test_even_leaves_triangles_of_one_size():
+    vertices, faces = bored_box(64)
+
+    def spread(even):
+        out, found = simplify.simplify(vertices, faces, 1500, even=even, measured=False)[:2]
+        edges = repair.edges_of(found)
+        assert repair.is_watertight(found) and abs(len(found) / 1500 - 1) < 0.02
+        tenth, most = np.quantile(np.linalg.norm(out[edges.ends[:, 0]] - out[edges.ends[:, 1]], axis=1), (0.1, 0.9))
+        return most / tenth
+
+    assert spread(even=True) < 4 < 10 < spread(even=False)
+
+
+def test_the_noise_of_even_is_as_fine_as_the_detail():
+    """A ball a thousandth of the size of what lies beside it keeps its shape."""
+    cube_vertices, quads = quad_cube(6)
+    ball_vertices, ball_faces = sphere(24)
+    ball = ball_vertices * 1e-3 + (2.0, 0.0, 0.0), ball_faces
+    vertices, faces = joined((cube_vertices, np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])), ball)
+    out = simplify.shaken(vertices, faces)
+    assert np.abs(out - vertices)[:len(cube_vertices)].max() > 0.01 * np.linalg.norm(cube_vertices[quads[0, 0]] - cube_vertices[quads[0, 1]])
+    radius = np.linalg.norm(out[len(cube_vertices):] - (2.0, 0.0, 0.0), axis=1)
+    assert 1e-6 < np.abs(radius - 0.8e-3).max() < 1e-5
+
+
 def test_near_keeps_nearer_with_as_many_triangles():
     vertices, faces = bored_box(64)
     even, near = (simplify.simplify(vertices, faces, 1000, near=near)[3] for near in (False, True))

@@ -1,0 +1,33 @@
+"""The engine on few: what it is given is as closed as the input, also where the collapse tears it."""
+
+import numpy as np
+
+from gdtool.geometry import quad_engines, repair, simplify
+from tests.geometry.solids import sphere
+
+
+def given(monkeypatch, vertices, faces, quads):
+    """The faces that the engine is given."""
+    seen = []
+    monkeypatch.setattr(quad_engines, "run_instant_meshes", lambda vertices, faces, *_: seen.append(faces) or (vertices, faces))
+    quad_engines.run_on_few(vertices, faces, quads, 30.0)
+    return seen[0]
+
+
+def test_what_is_collapsed_is_given_where_its_tears_can_be_mended(monkeypatch):
+    vertices, faces = sphere(40)
+    few_vertices, few = simplify.collapse(vertices, faces, 1200, 5.0)
+
+    def tearing(*_):
+        """A flap of two triangles stands on an edge, which has four faces then."""
+        a, b, _ = few[0]
+        tip = len(few_vertices)
+        return np.concatenate([few_vertices, [[0.0, 0.0, 2.0]]]), np.concatenate([few, [[a, b, tip], [b, a, tip]]])
+
+    monkeypatch.setattr(simplify, "collapse", tearing)
+    assert not repair.is_watertight(tearing()[1])
+    found = given(monkeypatch, vertices, faces, 300)
+    assert len(few) <= len(found) < len(few) + 12 and repair.topology(found) == repair.topology(faces)
+    # What loses half of it is not: the engine has the mesh as it was.
+    monkeypatch.setattr(simplify, "collapse", lambda *_: (few_vertices, few[: len(few) // 2]))
+    assert given(monkeypatch, vertices, faces, 300) is faces
