@@ -2,7 +2,7 @@
 
 The first is the bake case of ../shared/peers: a marching-cubes solid of 166,000 triangles with 1024² textures that were
 rasterised from a closed-form material. The others are public models with their own textures. All are in a unit box, and
-kept in a folder as NAME.glb and NAME.npz (vertices, faces (f, 4), uv with (0, 0) at the top left, face_uvs), for remeshing
+kept in a folder as NAME.glb and NAME_VERSIONS.npz (vertices, faces (f, 4), uv with (0, 0) at the top left, face_uvs), for remeshing
 takes longer than baking.
 """
 
@@ -84,11 +84,13 @@ def case_of(source: str | Path, kept: Path) -> Case:
     """The part, or a model file in a unit box; made where it is not kept yet."""
     from gdtool.assets.gltf_write import write_glb
     from gdtool.assets.load import load_scene
+    from gdtool.stages import remesh, unwrap
 
     part_asked = source == "part"
     name = "part" if part_asked else Path(source).stem
     stem = kept / (f"bake_{name}" if part_asked else f"bake_{name}_{hashlib.sha256(Path(source).read_bytes()).hexdigest()[:8]}")
-    case = Case(name, stem.with_suffix(".glb"), stem.with_suffix(".npz"))
+    made_by = "_".join(f"{stage.name}{stage.version}" for stage in (remesh.STAGE, unwrap.STAGE))  # another version makes other quads
+    case = Case(name, stem.with_suffix(".glb"), stem.with_name(f"{stem.name}_{made_by}.npz"))
     if not (case.glb.exists() and case.low.exists()):
         kept.mkdir(parents=True, exist_ok=True)
         scene = textured_part() if part_asked else load_scene(source)
