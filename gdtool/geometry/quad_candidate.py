@@ -63,6 +63,7 @@ class Candidate:
     far: float = np.inf  # of the surface from the quads drawn, in edge lengths
     least: float = -1.0  # their worst scaled Jacobian
     wrong: str | None = None  # what of them does not do on the surface
+    passable: bool = False  # a subdivided one that is wrong: whether it would do without the subdivision
 
     @property
     def count(self) -> int:
@@ -111,6 +112,8 @@ class Candidate:
             self.wrong = f"{STICKS_OUT} {over:.2g} edge lengths"  # else what is lost was finer than a quad
         if self.wrong is None and subdivisions and self.least < part.request.least_jacobian:
             self.wrong = f"has a quad of scaled Jacobian {self.least:.2g}"
+        if self.wrong and subdivisions and not self.fault:
+            self.passable = fault_of(vertices, quads, surface, part.edge, FAR_EDGES, CUT_OFF)[0] is None
 
     def _irregular(self) -> int:
         valence, inner = valences(self.quads, int(self.quads.max(initial=0)) + 1)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from gdtool.geometry.quad_task import Request
 
 _NO_AREA = 1e-4  # squared edge lengths
-_HOPELESS_EDGES, _HOPELESS_SHARE = 1.7, 0.03  # farther than this before it is shaped, or so much of it cut off, a subdivided result is given up
+_HOPELESS_EDGES, _HOPELESS_SHARE = 1.7, 0.02  # farther than this before it is shaped, or so much of its area cut off, a subdivided result is given up
 _RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
 FAR_EDGES, FAR_SUBDIVIDED = 2.0, 1.0  # edge lengths that a result may stray; of a subdivided one, after which others come
 _LIKELY = 0.75  # of them: what strays less before it is shaped is not likely to stray more than it may afterwards
@@ -63,10 +63,9 @@ def outlined(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features
     edge /= 2**subdivisions
     if subdivisions:  # what ran across a quad has vertices nearer to it now
         vertices, constraints = trace(vertices, faces, features, edge)
-    vertices, faces, constraints, tips, away = draw_out(vertices, faces, constraints, surface, edge)
-    far = float(away.max()) / edge
-    hopeless = subdivisions > 0 and (far > _HOPELESS_EDGES or (away > _CUT_EDGES * edge).mean() > _HOPELESS_SHARE)
-    return Outline(vertices, faces, constraints, tips, edge, far, FAR_SUBDIVIDED if subdivisions else FAR_EDGES, hopeless)
+    vertices, faces, constraints, tips, far, away = draw_out(vertices, faces, constraints, surface, edge)
+    hopeless = subdivisions > 0 and (far > _HOPELESS_EDGES * edge or (away > _CUT_EDGES * edge).mean() > _HOPELESS_SHARE)
+    return Outline(vertices, faces, constraints, tips, edge, far / edge, FAR_SUBDIVIDED if subdivisions else FAR_EDGES, hopeless)
 
 
 def drawn(outline: Outline, surface: Surface, features: Features, request: Request) -> tuple[np.ndarray, np.ndarray, Constraints]:

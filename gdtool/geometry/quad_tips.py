@@ -18,14 +18,14 @@ _POINTS = 20000
 
 
 def draw_out(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, surface: Surface, edge: float,
-             most_added: float = 0.03) -> tuple[np.ndarray, np.ndarray, Constraints, np.ndarray, np.ndarray]:
+             most_added: float = 0.03) -> tuple[np.ndarray, np.ndarray, Constraints, np.ndarray, float, np.ndarray]:
     """Quads (f, 4) of mean edge length `edge` extruded over what of the surface strays from them, farthest first.
 
     The vertices (v, 3) nearest to a tip move along it, an edge or two at a time, with the quads around them, and a ring of
     new quads follows each step, as one would model a horn by hand, until most_added of the quads are new: what needs more is no matter of tips.
     A tip that is nearer than an edge takes one vertex and no ring. Closed and manifold as before, of as many pieces and handles. Returns vertices, faces,
-    constraints, in which the tips are fixed, the tips' vertices (t,), and how far samples (n,) of the surface were from the quads
-    before the last vertices moved.
+    constraints, in which the tips are fixed, the tips' vertices (t,), how far the surface was from the quads at most before the last
+    vertices moved, and how far samples (n,) spread over its area were.
     """
     from gdtool.folders.mesh import triangulated
 
@@ -62,7 +62,7 @@ def draw_out(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, 
         of_samples = away, face_idx[nearest]
     vertices, constraints = _reached(vertices, faces, constraints, samples, *of_samples, edge)
     before = np.concatenate([before, np.zeros(len(vertices) - len(before), bool)])
-    return vertices, faces, constraints, np.flatnonzero(constraints.fixed & ~before), of_samples[0]
+    return vertices, faces, constraints, np.flatnonzero(constraints.fixed & ~before), float(of_samples[0].max()), of_samples[0][-(_POINTS // 2):]
 
 
 def _reached(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, points: np.ndarray, away: np.ndarray,

@@ -26,7 +26,7 @@ def _ways(quads: int, request: Request) -> list[Way]:
     A coarser mesh subdivided has a quarter of the irregular vertices; it fails where features are finer than its quads.
     """
     engine = "instant-meshes" if request.engine == "auto" else request.engine
-    out = [Way(engine, 1, (0.99, 1.005), request.crease_degrees)] if engine == "instant-meshes" and quads >= _MANY else []
+    out = [Way(engine, 1, (0.985, 1.005), request.crease_degrees)] if engine == "instant-meshes" and quads >= _MANY else []
     # Where a seam of the engine's fields fails, it often holds at a slightly different density.
     out += [Way(engine, 0, (1.0,), request.crease_degrees), Way(engine, 0, (1.02,), request.crease_degrees), Way(engine, 0, (0.98,), 0.0)]
     return out + [Way("instant-meshes", 0, (1.0,), request.crease_degrees)] * (request.engine == "quadriflow")
@@ -46,6 +46,7 @@ class Trial:
         self.whole: Found | None = None  # of several pieces what an engine made of all of them, mended where it could be
         self._several = part.pieces[0] > 1  # what fails together can go piece by piece
         self._over = False
+        self._passable: Candidate | None = None
         self._second_best: Candidate | None = None
         self._given_up: set[str] = set()
 
@@ -55,14 +56,15 @@ class Trial:
             if self.part.request.for_engines <= 0:
                 self.record.failed.append(f"{way.label}: not tried, the time is over")
                 self._over = True
-                return self._bridged()
+                return self._passed() or self._bridged()
+            tried = not way.subdivisions and self._passable is not None
             if way.engine not in self._given_up and (found := self._by(way)) is not None:
                 return found
             if self._over:
-                return None
-            if self._second_best is not None:
+                return self._passed()
+            if tried or self._second_best is not None:
                 break  # what one density bridges, another does too
-        return self._bridged()
+        return self._passed() or self._bridged()
 
     def _by(self, way: Way) -> Found | None:
         quads = self.part.quads
@@ -88,6 +90,8 @@ class Trial:
                 return self._failed(way, best.fault, torn=best.off(wanted) < -_MOST_TORN)
             taken = self._drawn([one for one in candidates if one.fault == best.fault and one.counted(wanted)])
             if taken.wrong is not None:
+                if taken.passable and abs(len(taken.drawn[1]) / quads - 1) <= COUNT_TOLERANCE:
+                    self._passable = taken
                 return self._failed(way, f"{taken.fault}; {taken.wrong}" if taken.fault else taken.wrong)
             if abs((count := len(taken.drawn[1])) / quads - 1) > COUNT_TOLERANCE:
                 extra = count - taken.count
@@ -141,6 +145,10 @@ class Trial:
             # Another density mends a seam of the engine's fields, not a part that is too thin for so many quads.
             if torn or fault.startswith(TOO_COARSE):
                 self._given_up.add(way.engine)
+
+    def _passed(self) -> Found | None:
+        """A subdivided result that is no worse than what is taken of a finer one: better than none."""
+        return None if self._passable is None else self._settled(self._passable)
 
     def _bridged(self) -> Found | None:
         """A gap or tunnel finer than the quads was bridged or filled: still better than no engine."""

@@ -189,8 +189,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
 
     def while_it_runs() -> None:
         meanwhile()
-        if is_closed():
-            pieces()
+        is_closed()
 
     def collapsed(vertices: np.ndarray, faces: np.ndarray, moved: int) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str]]:
         return _collapsed(vertices, faces, target_faces, edge if near else _UNIT, even, moved, careful, seconds, is_closed, while_it_runs)

@@ -6,6 +6,7 @@ import pytest
 from gdtool.geometry import quad_fit, quads, repair
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import distance_figures, scaled_jacobian
+from gdtool.geometry.normals import face_normals
 from gdtool.folders.mesh import triangulated
 from gdtool.geometry.quad_fit import farthest, surface_of
 from gdtool.geometry.quad_shape import Surface
@@ -39,7 +40,7 @@ def test_a_horn_is_drawn_out(length, bend):
     vertices, faces, edge = ball()
     surface = Surface(*horned(length, bend=bend))
     assert farthest(surface_of(vertices, faces), surface) > 1.4 * edge
-    out, found, constraints, tips, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge, most_added=0.3)
+    out, found, constraints, tips, _, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge, most_added=0.3)
     assert farthest(surface_of(out, found), surface) < 0.8 * edge
     assert repair.is_watertight(found) and repair.is_manifold(found) and repair.euler_number(found) == 2
     assert len(faces) < len(found) < 1.2 * len(faces)
@@ -60,15 +61,41 @@ def test_no_more_quads_than_allowed_are_spent():
 def test_what_is_near_enough_is_left_alone():
     vertices, faces, edge = ball()
     surface = Surface(*horned(0.4 * edge))
-    out, found, _, tips, away = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
-    assert out is vertices and found is faces and not len(tips) and away.max() == pytest.approx(0.4 * edge, rel=0.2)
+    out, found, _, tips, far, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
+    assert out is vertices and found is faces and not len(tips) and far == pytest.approx(0.4 * edge, rel=0.2)
+
+
+def test_what_is_bare_is_told_by_area_and_not_by_how_many_vertices_are_there():
+    """Creases have most of a simplified mesh's vertices: what is cut off along them is little of the surface all the same."""
+    vertices, faces, edge = ball()
+    fine, triangles = sphere(160, 0.4)
+    narrow = fine[:, 0] > 0.39
+    fine = np.where(narrow[:, None], fine * (1 + 0.4 * edge / 0.4), fine)  # lifted by less than what makes a tip
+    many = Surface(*_cut_in_four(fine, triangles, narrow[triangles].all(1), 3))
+    assert (many.vertices[:, 0] > 0.39).mean() > 0.5
+    far, away = draw_out(vertices, faces, Constraints.none(len(vertices)), many, edge)[4:]
+    share = face_normals(many.vertices, many.faces)[1] * (many.vertices[many.faces].mean(1)[:, 0] > 0.39)
+    assert far == pytest.approx(0.4 * edge, rel=0.2)
+    assert (away > 0.25 * edge).mean() == pytest.approx(share.sum() / face_normals(many.vertices, many.faces)[1].sum(), abs=0.01)
+
+
+def _cut_in_four(vertices, faces, which, rounds):
+    """Some of the faces cut at the middles of their edges, without those beside them."""
+    own, rest = faces[which], faces[~which]
+    for _ in range(rounds):
+        a, b, c = (vertices[own[:, i]] for i in range(3))
+        n, k = len(vertices), np.arange(len(own))
+        ab, bc, ca = n + k, n + len(own) + k, n + 2 * len(own) + k
+        vertices = np.concatenate([vertices, (a + b) / 2, (b + c) / 2, (c + a) / 2])
+        own = np.concatenate([np.stack(x, -1) for x in ((own[:, 0], ab, ca), (ab, own[:, 1], bc), (ca, bc, own[:, 2]), (ab, bc, ca))])
+    return vertices, np.concatenate([own, rest])
 
 
 def test_one_vertex_reaches_a_tip_that_is_less_than_an_edge_away():
     vertices, faces, edge = ball()
     surface = Surface(*horned(0.9 * edge))
     assert 0.6 * edge < farthest(surface_of(vertices, faces), surface) < edge
-    out, found, constraints, tips, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
+    out, found, constraints, tips, _, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
     assert found is faces and farthest(surface_of(out, faces), surface) < 0.4 * edge
     assert len(tips) == 1 and constraints.fixed[tips].all() and (out == vertices).all(1).sum() == len(vertices) - 1
 
@@ -82,7 +109,7 @@ def test_paths_along_creases_end_where_a_tip_is_drawn_out():
     curve = np.full(len(vertices), -1)
     curve[around] = 0
     held = Constraints(curve, np.zeros(len(vertices), bool), path, np.zeros(len(path), int))
-    _, found, constraints, tips, _ = draw_out(vertices, faces, held, Surface(*horned(0.2)), edge)
+    _, found, constraints, tips, _, _ = draw_out(vertices, faces, held, Surface(*horned(0.2)), edge)
     edges = set(map(tuple, repair.edges_of(found).ends.tolist()))
     assert 0.8 * len(path) < len(constraints.path) < len(path)
     assert all(tuple(sorted(ends)) in edges for ends in constraints.path.tolist()) and (constraints.curve[tips] < 0).all()
@@ -97,5 +124,5 @@ def test_an_engine_that_cuts_a_horn_short_is_still_taken(monkeypatch):
     assert "instant-meshes" in record.engine and abs(len(found) / 2000 - 1) <= 0.03 and repair.is_watertight(found)
     assert figures["hausdorff"] < 2 * edge and (scaled_jacobian(out, found) <= 0).mean() < 0.003
     in_this_process(monkeypatch)
-    monkeypatch.setattr(quad_fit, "draw_out", lambda v, f, constraints, *_: (v, f, constraints, None, np.zeros(1)))
+    monkeypatch.setattr(quad_fit, "draw_out", lambda v, f, constraints, *_: (v, f, constraints, None, 0.0, np.zeros(1)))
     assert quads.remesh(vertices, faces, asked)[2].engine == "pair and split"

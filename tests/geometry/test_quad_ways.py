@@ -119,6 +119,25 @@ def test_surface_that_the_quads_do_without_is_measured():
     assert left_out(surface_of(vertices, opened), surface, (0.1, 2.0)) == pytest.approx([0.8**2 / 6, 0], abs=0.02)  # the lid but its rim
 
 
+def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_finer_one_comes(monkeypatch):
+    """Of a coarser mesh subdivided less is put up with than of a finer one, for the finer one comes after it; where it does not, it is better than none."""
+
+    def torn(*_):
+        raise ChildFailed("died of SIGSEGV")
+
+    calls = in_this_process(monkeypatch)
+    monkeypatch.setitem(quad_candidate.ENGINES, "instant-meshes", torn)
+    least = [0.008]
+    monkeypatch.setattr(quad_candidate, "fault_of", lambda *given: ("cuts off 0.7% of the surface" if given[-1] < least[0] else None, 0.5))
+    vertices, faces = sphere(96, 0.45)
+    _, found, record = quads.remesh(vertices, faces, Request(quads=4000))
+    assert record.engine == "instant-meshes, 1 subdivision" and whole(found) and abs(len(found) / 4000 - 1) <= 0.03
+    assert "cuts off" in record.failed[0] and "SIGSEGV" in record.failed[1]
+    assert sum(not way.subdivisions for _, _, way, _ in calls) == 1
+    least[0] = 0.02
+    assert quads.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
+
+
 def test_when_the_time_is_over_no_engine_is_begun():
     """What was asked for comes all the same, as paired triangles, and the record says why."""
     vertices, faces = sphere(96, 0.45)
