@@ -112,7 +112,7 @@ class Candidate:
             self.wrong = f"{STICKS_OUT} {over:.2g} edge lengths"  # else what is lost was finer than a quad
         if self.wrong is None and subdivisions and self.least < part.request.least_jacobian:
             self.wrong = f"has a quad of scaled Jacobian {self.least:.2g}"
-        if self.wrong and subdivisions and not self.fault:
+        if self.wrong and subdivisions and not self.fault and self.far <= FAR_SUBDIVIDED and not self.outline.hopeless:  # else it is not shaped to its end
             self.passable = fault_of(vertices, quads, surface, part.edge, FAR_EDGES, CUT_OFF)[0] is None
 
     def _irregular(self) -> int:

@@ -127,14 +127,18 @@ def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_fine
 
     calls = in_this_process(monkeypatch)
     monkeypatch.setitem(quad_candidate.ENGINES, "instant-meshes", torn)
-    least = [0.008]
-    monkeypatch.setattr(quad_candidate, "fault_of", lambda *given: ("cuts off 0.7% of the surface" if given[-1] < least[0] else None, 0.5))
+    monkeypatch.setattr(quad_candidate, "fault_of", lambda *given: ("cuts off 0.7% of the surface" if given[-1] < 0.007 else None, 0.5))
     vertices, faces = sphere(96, 0.45)
     _, found, record = quads.remesh(vertices, faces, Request(quads=4000))
     assert record.engine == "instant-meshes, 1 subdivision" and whole(found) and abs(len(found) / 4000 - 1) <= 0.03
     assert "cuts off" in record.failed[0] and "SIGSEGV" in record.failed[1]
     assert sum(not way.subdivisions for _, _, way, _ in calls) == 1
-    least[0] = 0.02
+    monkeypatch.setattr(quad_candidate, "FAR_SUBDIVIDED", 0.4)  # farther than that it is not unfolded
+    assert quads.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
+    monkeypatch.undo()
+    in_this_process(monkeypatch)
+    monkeypatch.setitem(quad_candidate.ENGINES, "instant-meshes", torn)
+    monkeypatch.setattr(quad_candidate, "fault_of", lambda *given: ("cuts off 2% of the surface", 0.5))
     assert quads.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
 
 
