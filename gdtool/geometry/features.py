@@ -11,6 +11,7 @@ from gdtool.geometry.sharpen import dihedral_degrees
 
 _CORNER_TURN_DEGREES = 50.0
 _THINNEST = 0.05  # height over longest side of a triangle that has no direction of its own: simplifying folds some over
+_HANGING = 2.0  # times what is short: a corner from which longer segments go is drawn less far, for each would leave the surface all along
 _STRAIGHT = 0.35  # the sine of a quad's corner below which features may not hold both its sides
 
 
@@ -91,13 +92,17 @@ def _tidy(points: np.ndarray, segments: np.ndarray, short: float) -> Features:
 
     Slivers along a crease make spurs, bubbles and doubled corners: arcs that end freely or return to their corner are
     dropped when short, short arcs between two corners drawn together into one corner. No corner comes farther than
-    `short` that way, for what hangs on it would leave the surface: an arc that asks for more is a gap from then on.
+    `short` that way, for what hangs on it would leave the surface: an arc that asks for more is a gap from then on. Where long
+    segments hang on both corners, as on the short edges of a thin plate, the arc stays.
     """
     came = np.zeros(len(points))  # how far what was drawn into a corner came
     for _ in range(12):
         features = _arcs(points, segments)
         count = int(features.curve.max()) + 1
-        length = np.bincount(features.curve, np.linalg.norm(points[segments[:, 0]] - points[segments[:, 1]], axis=1), count)
+        piece = np.linalg.norm(points[segments[:, 0]] - points[segments[:, 1]], axis=1)
+        length, hanging = np.bincount(features.curve, piece, count), np.full(len(points), _HANGING * short)
+        np.maximum.at(hanging, segments, piece[:, None])
+        reach = _HANGING * short**2 / hanging  # that each corner may be drawn
         degree = np.bincount(segments.ravel(), minlength=len(points))
         is_corner = np.zeros(len(points), bool)
         is_corner[features.corners] = True
@@ -111,7 +116,7 @@ def _tidy(points: np.ndarray, segments: np.ndarray, short: float) -> Features:
         loop = (high < 0) | (low == high)
         free = ~loop & ((degree[np.clip(low, 0, len(points) - 1)] == 1) | (degree[high] == 1))
         drop = (loop & (length < 4 * short)) | (free & (length < 2 * short))
-        draw = np.flatnonzero(~loop & ~free & (length < short))
+        draw = np.flatnonzero(~loop & ~free & (length < np.maximum(reach[np.clip(low, 0, len(points) - 1)], reach[high])))
         if not drop.any() and not len(draw):
             break
         onto_corner = np.arange(len(points))
@@ -121,10 +126,10 @@ def _tidy(points: np.ndarray, segments: np.ndarray, short: float) -> Features:
                 a = onto_corner[a]
             while onto_corner[b] != b:
                 b = onto_corner[b]
-            keep, lose = (a, b) if degree[a] >= degree[b] else (b, a)
+            keep, lose = (a, b) if (-reach[a], degree[a]) >= (-reach[b], degree[b]) else (b, a)
             farthest = came[lose] + np.linalg.norm(points[keep] - points[lose])
-            if a != b and farthest <= short:
-                onto_corner[lose], came[keep] = keep, max(came[keep], farthest)
+            if a != b and farthest <= reach[lose]:
+                onto_corner[lose], came[keep], reach[keep] = keep, max(came[keep], farthest), min(reach[keep], reach[lose])
             drop[i] = True
         while (onto_corner[onto_corner] != onto_corner).any():
             onto_corner = onto_corner[onto_corner]

@@ -20,7 +20,7 @@ from gdtool.geometry.quad_topology import cancel_irregular
 COUNT_TOLERANCE = 0.03
 LOST, ADDED, PIECES = "handles are lost", "handles are added", "pieces are lost or joined"
 _NEAR_EDGES, _LEAST_JACOBIAN = 0.75, 0.2  # nearer and squarer than this, a result is taken without a look at others
-_NEAR_OUTLINE = 1.0  # edge lengths: shaping hardly brings what is farther within _NEAR_EDGES
+_NEAR_OUTLINE = 0.9  # edge lengths: shaping hardly brings what is farther within _NEAR_EDGES
 _OUT_EDGES = 0.55  # what sticks out less is finer than a quad
 _MENDINGS = 4  # rounds of filling holes and parting what meets at a vertex
 

@@ -14,7 +14,8 @@ from gdtool.texture.unwrap_shapes import Shapes, rim_of, upright_box
 
 _COARSE = ((48, 144), (160, 160), (4000, 320))  # for up to so many charts: cells of the square's side in which orders are tried
 _DENSITY = 0.66  # share of a square of so many cells that the charts would fill
-_OWN = 0.2  # of a cell, that a chart has to take of it for the cell to count as its own: on the fine grid the rest finds room
+# Of a cell, that a chart has to take of it for the cell to count as its own: on the fine grid the rest finds room, mostly; else the next.
+_OWN = 0.2, 0.1
 _LEAST = (0.45, 0.12)  # shares of the square that charts have to fill, first and at the very least
 _GROWS = 0.02  # of its side, that a square grows by where a chart finds no room
 _SETTLED = 4  # layouts that are tightened
@@ -50,7 +51,7 @@ def best_packed(variants: Iterable[list[tuple[np.ndarray, np.ndarray]]], gap: fl
         if not 1 < len(charts) <= _MOST_BY_SEARCH:
             continue
         boxed, area = _boxed(charts, known)
-        cells, shapes, found = _drafted(boxed, area, gap, _OWN, [])
+        cells, shapes, found = _drafted(boxed, area, gap, _OWN[0], [])
         found = _improved(shapes, found, _TRIES_OF_DRAFT, np.inf)
         share = _DENSITY * (cells / found[0].side) ** 2 if found else 0.0
         if share > best_share + (_GAIN + _GAIN_PER_CHART * (len(charts) - best_count) if best_share else 0.0):
@@ -78,12 +79,12 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, ways: list[tup
     if len(charts) > _COARSE[-1][0]:
         return _shelves([uv for uv, _ in boxed], gap)
     searched = len(charts) <= _MOST_BY_SEARCH
-    for share in (_OWN, 0.0) if searched else (0.0,):
-        cells, shapes, found = _drafted(boxed, area, gap, share, ways or [], until)
+    for share in (*_OWN, 0.0) if searched else (0.0,):
+        cells, shapes, found = _drafted(boxed, area, gap, share, (ways or []) if share == _OWN[0] else [], until)
         cells_per_unit = cells * (_DENSITY / area) ** 0.5
         if found and searched:
-            if share and Fine(boxed, shapes, cells_per_unit, [found[0].side], gap, ROUGH).apart(found[0].at) is None:
-                continue  # one in the other, as arcs of rings are: orders of these are sought where a cell has one owner
+            if share == _OWN[0] and Fine(boxed, shapes, cells_per_unit, [found[0].side], gap, ROUGH).apart(found[0].at) is None:
+                continue  # one in the other, as arcs of rings are
             found = _improved(shapes, found, _TRIES, until, beside=True)
             best = found[:_SETTLED]
             packed = Fine(boxed, shapes, cells_per_unit, [one.side for one in best], gap).settled([one.at for one in best])

@@ -86,7 +86,7 @@ def test_chains_beside_each_other_find_what_they_find_in_turn(monkeypatch):
     boxed, area = unwrap_pack._boxed(charts)
 
     def search(beside):
-        _, shapes, found = unwrap_pack._drafted(boxed, area, 0.002, unwrap_pack._OWN, [])
+        _, shapes, found = unwrap_pack._drafted(boxed, area, 0.002, unwrap_pack._OWN[0], [])
         return unwrap_pack._improved(shapes, found, 800, np.inf, beside)
 
     in_turn = search(False)
