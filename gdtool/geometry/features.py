@@ -11,6 +11,7 @@ from gdtool.geometry.sharpen import dihedral_degrees
 
 _CORNER_TURN_DEGREES = 50.0
 _THINNEST = 0.05  # height over longest side of a triangle that has no direction of its own: simplifying folds some over
+_CHOICES = 4  # vertices that a curve may be drawn from where it has no corner of its own: the nearest may be another's
 _HANGING = 2.0  # times what is short: a corner from which longer segments go is drawn less far, for each would leave the surface all along
 _STRAIGHT = 0.35  # the sine of a quad's corner below which features may not hold both its sides
 
@@ -263,8 +264,8 @@ def _stations(segments: np.ndarray, features: Features, at_corner: dict[int, int
 
     def vertex_at(share: float, reach: float) -> int | None:
         place = np.array([np.interp(share * walked[-1], walked, points[:, i]) for i in range(3)])
-        distance, vertex = tree.query(place)
-        return int(vertex) if distance < reach * edge and not taken[vertex] else None
+        near = tree.query(place, np.arange(1, min(_CHOICES, tree.n) + 1), distance_upper_bound=reach * edge)[1]
+        return next((int(vertex) for vertex in near if vertex < tree.n and not taken[vertex]), None)
 
     if closed and ordered[0] not in at_corner:
         found = [vertex_at(share, 0.8) for share in (0, 1 / 4, 1 / 2, 3 / 4)]

@@ -17,7 +17,6 @@ from gdtool.geometry.quad_shape import fill_holes, remove_doublets
 from gdtool.geometry.quad_task import Part
 from gdtool.geometry.quad_topology import cancel_irregular
 
-COUNT_TOLERANCE = 0.03
 LOST, ADDED, PIECES = "handles are lost", "handles are added", "pieces are lost or joined"
 _NEAR_EDGES, _LEAST_JACOBIAN = 0.75, 0.2  # nearer and squarer than this, a result is taken without a look at others
 _NEAR_OUTLINE = 0.9  # edge lengths: shaping hardly brings what is farther within _NEAR_EDGES
@@ -73,13 +72,9 @@ class Candidate:
     def off(self, wanted: float) -> float:
         return self.count / wanted - 1
 
-    def counted(self, wanted: float) -> bool:
-        """Whether there are about as many quads as wanted."""
-        return abs(self.off(wanted)) <= COUNT_TOLERANCE
-
-    def rank(self, wanted: float) -> tuple:
-        """Smaller is better."""
-        return self.fault is not None, max(abs(self.off(wanted)), COUNT_TOLERANCE), self._irregular()
+    def rank(self, wanted: float, tolerance: float) -> tuple:
+        """Smaller is better. tolerance: share of the quads wanted that there may be more or fewer."""
+        return self.fault is not None, max(abs(self.off(wanted)), tolerance), self._irregular()
 
     @property
     def bridged(self) -> bool:

@@ -9,11 +9,12 @@ from gdtool.geometry.distance import closest_points
 from gdtool.geometry.quad_candidate import judged
 from gdtool.geometry.quad_fit import CUT_OFF, drawn, fault_of, outlined, settled
 from gdtool.geometry.quad_split import split_count
-from gdtool.geometry.quad_task import Part
+from gdtool.geometry.quad_task import COUNT_TOLERANCE, Part
 from gdtool.geometry.quad_ways import Found
 
 SMALL_PIECE_QUADS = 48
 _MOST_ALONE, _ALONE, _FEWEST = 16, 300, 6  # pieces that are remeshed one by one; quads of one that is, and of any
+_SURELY = 0.02  # of the quads of a piece, that there may be more or fewer in any case; the rest of the tolerance goes by the root of their number
 _ON_ONE, _MOST_APART = 0.9, 1.5  # of a component's quads lie on the piece that they stand for; edge lengths that a piece strays
 
 
@@ -55,6 +56,7 @@ def apart(part: Part, done: np.ndarray, quads: int) -> list[Part]:
     """What is left to do of the pieces that are not done (pieces,) bool, in so many quads: each large one, and, given up, all others together.
 
     What lies close together an engine may join, and what is thin it may lose beside the rest, so that it may do better on one piece alone.
+    It comes less near to a count of few; what their counts may be off is shared such that the sum of all pieces still holds.
     """
     if done.all():
         return []
@@ -71,7 +73,9 @@ def apart(part: Part, done: np.ndarray, quads: int) -> list[Part]:
         out.append(part.of(rest[piece], max(int(quads * share[rest].sum()), 1), given_up=True))
         quads -= split_count(out[0].faces, out[0].quads)
     own = np.maximum((own * (quads / max(own.sum(), 1))).round().astype(int), _FEWEST)
-    return out + [part.of(piece == k, int(number)) for k, number in zip(alone, own, strict=True)]
+    spare = max(COUNT_TOLERANCE * part.quads - _SURELY * own.sum(), 0)
+    tolerance = _SURELY + spare * np.sqrt(own) / np.sqrt(own).sum() / own
+    return out + [part.of(piece == k, int(number), tolerance=float(off)) for k, number, off in zip(alone, own, tolerance, strict=True)]
 
 
 def quads_by_piece(vertices: np.ndarray, quads: np.ndarray, part: Part) -> list[tuple[np.ndarray, np.ndarray]]:

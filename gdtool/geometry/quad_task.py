@@ -14,6 +14,7 @@ from gdtool.geometry.features import Features, find_features
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_shape import Surface
 
+COUNT_TOLERANCE = 0.03
 _ENGINES_SHARE, _LEAST_SECONDS = 0.7, 20.0
 _FEATURE_EDGES = 3  # quads long: shorter creases are noise
 
@@ -75,10 +76,15 @@ class Part:
     request: Request
     fine: Callable[[], Surface]  # the whole input as it was before it was simplified
     given_up: bool = False  # no engine is tried
+    tolerance: float = COUNT_TOLERANCE  # share of the quads that there may be more or fewer
 
-    def of(self, faces: np.ndarray, quads: int, given_up: bool = False) -> Part:
+    def of(self, faces: np.ndarray, quads: int, given_up: bool = False, tolerance: float = COUNT_TOLERANCE) -> Part:
         """Some of the triangles: faces (f,) bool."""
-        return Part(*repair.compact(self.vertices, self.faces[faces]), quads, self.edge, self.request, self.fine, given_up)
+        return Part(*repair.compact(self.vertices, self.faces[faces]), quads, self.edge, self.request, self.fine, given_up, tolerance)
+
+    def counted(self, count: int, wanted: float) -> bool:
+        """Whether so many quads are about as many as wanted."""
+        return abs(count / wanted - 1) <= self.tolerance
 
     @cached_property
     def pieces(self) -> tuple[int, np.ndarray]:

@@ -8,7 +8,7 @@ from itertools import chain
 import numpy as np
 
 from gdtool.core.child import ChildFailed, begin, prepare
-from gdtool.geometry.quad_candidate import COUNT_TOLERANCE, Candidate, Way
+from gdtool.geometry.quad_candidate import Candidate, Way
 from gdtool.geometry.quad_fit import FAR_EDGES, TOO_COARSE, settled
 from gdtool.geometry.quad_task import Part, Record, Request
 
@@ -75,7 +75,7 @@ class Trial:
             if not candidates:
                 return None
             best = candidates[0]
-            count, counted, usable = best.count, best.counted(wanted), best.usable(self.part)
+            count, counted, usable = best.count, self.part.counted(best.count, wanted), best.usable(self.part)
             together = self._several and not way.subdivisions
             if together and len(best.quads):
                 self.whole = best.vertices, best.quads, way.label
@@ -88,12 +88,12 @@ class Trial:
                 self._second_best = best
             if not usable:
                 return self._failed(way, best.fault, torn=best.off(wanted) < -_MOST_TORN)
-            taken = self._drawn([one for one in candidates if one.fault == best.fault and one.counted(wanted)])
+            taken = self._drawn([one for one in candidates if one.fault == best.fault and self.part.counted(one.count, wanted)])
             if taken.wrong is not None:
-                if taken.passable and abs(len(taken.drawn[1]) / quads - 1) <= COUNT_TOLERANCE:
+                if taken.passable and self.part.counted(len(taken.drawn[1]), quads):
                     self._passable = taken
                 return self._failed(way, f"{taken.fault}; {taken.wrong}" if taken.fault else taken.wrong)
-            if abs((count := len(taken.drawn[1])) / quads - 1) > COUNT_TOLERANCE:
+            if not self.part.counted(count := len(taken.drawn[1]), quads):
                 extra = count - taken.count
                 asked = way.near(taken.asked * (quads - extra) / taken.count)
                 continue
@@ -116,7 +116,7 @@ class Trial:
             except ChildFailed as failure:
                 self.record.failed.append(f"{way.label}: {failure}")
         self.record.clock("engine", start)
-        return sorted(out, key=lambda one: one.rank(wanted))
+        return sorted(out, key=lambda one: one.rank(wanted, part.tolerance))
 
     def _drawn(self, candidates: list[Candidate]) -> Candidate:
         """The first that comes out good, those that do not promise to last; where none does the one that comes nearest to the surface."""
