@@ -28,6 +28,13 @@ class Features:
     curve: np.ndarray
     corners: np.ndarray
 
+    def shortest(self) -> float:
+        """The length of the shortest curve, infinite where there is none."""
+        if not self:
+            return np.inf
+        length = np.linalg.norm(self.points[self.segments[:, 0]] - self.points[self.segments[:, 1]], axis=1)
+        return float(np.bincount(self.curve, length).min())
+
     def __bool__(self) -> bool:
         return len(self.segments) > 0
 

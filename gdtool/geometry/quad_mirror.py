@@ -109,7 +109,7 @@ def remesh_mirrored(vertices: np.ndarray, faces: np.ndarray, request: Request, a
         moved = report["moved"]
     half = half_of(fine_vertices, fine_faces, axis)
     out, quads, record = remesh(*half, replace(request, quads=max(request.quads // 2, 8), restore_creases=False, least_jacobian=_LEAST_JACOBIAN / 2))
-    out, quads = joined_with_mirror(out, quads, axis, edge, record.source)
+    out, quads = joined_with_mirror(out, quads, axis, edge, record.source or Surface(*half))
     if moved is not None:
         record.figures["crease_vertices_restored"] = moved
     fault = None

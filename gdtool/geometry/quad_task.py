@@ -16,6 +16,7 @@ from gdtool.geometry.quad_shape import Surface
 
 COUNT_TOLERANCE = 0.03
 _ENGINES_SHARE, _LEAST_SECONDS = 0.7, 20.0
+_NARROW_EDGES = 1.5
 _FEATURE_EDGES = 3  # quads long: shorter creases are noise
 
 
@@ -99,6 +100,11 @@ class Part:
     @cached_property
     def surface(self) -> Surface:
         return Surface(self.vertices, self.faces)
+
+    @cached_property
+    def narrow(self) -> bool:
+        """Whether creases lie closer together than _NARROW_EDGES, as on thin plates and small bevels; not asked of what has more triangles than quads."""
+        return len(self.faces) < self.quads and self.features.shortest() < _NARROW_EDGES * self.edge
 
     @cached_property
     def features(self) -> Features:

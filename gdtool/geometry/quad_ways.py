@@ -57,6 +57,9 @@ class Trial:
                 self.record.failed.append(f"{way.label}: not tried, the time is over")
                 self._over = True
                 return self._passed() or self._bridged()
+            if way.subdivisions and self.part.narrow:
+                self.record.failed.append(f"{way.label}: not tried, its quads are wider than the strips between creases")
+                continue
             tried = not way.subdivisions and self._passable is not None
             if way.engine not in self._given_up and (found := self._by(way)) is not None:
                 return found

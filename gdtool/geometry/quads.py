@@ -15,22 +15,34 @@ from gdtool.geometry.quad_fit import farthest, fitted
 from gdtool.geometry.quad_pieces import SMALL_PIECE_QUADS, apart, by_size, joined, well_made
 from gdtool.geometry.quad_shape import Surface
 from gdtool.geometry.quad_split import split_to_quads
+from gdtool.geometry.quad_spread import spread
 from gdtool.geometry.quad_task import Part, Record, Request
 from gdtool.geometry.quad_ways import Found, Trial, prepare_engines
 from gdtool.geometry.simplify import SHAKEN, median_edge, simplify
 
+_GAP = 8.0  # edge lengths between pieces: none of what is asked of a surface reaches so far
 _SHAKEN_OFF = 3.0  # of the noise that keeps triangles even, which moves few of their corners farther off the surface
 
 
 def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[np.ndarray, np.ndarray, Record]:
     """Quads (q, 4) on the surface of a clean triangle mesh (repair.clean), and the record of how.
 
-    vertices (v, 3) in a unit box, faces (f, 3). All faces are quads; closed and manifold where the input is.
+    vertices (v, 3) in a unit box, faces (f, 3). All faces are quads; closed and manifold where the input is. Pieces that nearly touch
+    are laid apart meanwhile, so that none is drawn onto another.
     """
     if len(faces) > _needed(request):
         prepare("gdtool.geometry.simplify")
-    record, fine = Record(), cache(lambda: Surface(vertices, faces))
     edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
+    if (pieces := spread(vertices, faces, _GAP * edge)) is not None:
+        out, quads, record = _remeshed(pieces.vertices, faces, edge, request)
+        record.source = None
+        return pieces.back(out), quads, record
+    return _remeshed(vertices, faces, edge, request)
+
+
+def _remeshed(vertices: np.ndarray, faces: np.ndarray, edge: float, request: Request) -> tuple[np.ndarray, np.ndarray, Record]:
+    """remesh() of what is one piece, or of pieces none of which is near another, or that are too many to lay apart."""
+    record, fine = Record(), cache(lambda: Surface(vertices, faces))
     whole = _coarse(vertices, faces, edge, request, record, fine)
     few, large = by_size(whole)
     done = _quads_of(few, record) if few is not None else []

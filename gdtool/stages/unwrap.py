@@ -202,4 +202,4 @@ def _density(mesh, size: int) -> float:
     return float(size * (polygon_normals(flat, mesh.face_uvs)[1].sum() / area) ** 0.5)
 
 
-STAGE = Stage(name="unwrap", version=17, reads=("mesh", "mesh-file"), writes="atlas", Options=Options, run=run)
+STAGE = Stage(name="unwrap", version=18, reads=("mesh", "mesh-file"), writes="atlas", Options=Options, run=run)

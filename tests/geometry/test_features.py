@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from gdtool.geometry.features import _tidy, find_features
+from gdtool.geometry.features import Features, _tidy, find_features, trace
 from gdtool.geometry.sharpen import dihedral_degrees
+from tests.geometry.solids import cube
 
 FACES = np.array([(0, 1, 4), (1, 2, 4), (0, 4, 2), (0, 2, 3)])
 
@@ -44,3 +45,33 @@ def test_corners_in_a_row_are_not_all_drawn_into_one():
     assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() <= 1 + short
     # No tooth is lost, and the corners that are left stand on the spine.
     assert (found.points[:, 1] == length - 1).sum() == teeth and 1 < len(np.unique(ends[ends[..., 1] == 0], axis=0)) < teeth
+
+
+def plate(thickness: float) -> tuple[np.ndarray, np.ndarray]:
+    vertices, faces = cube()
+    return vertices * (1, 1, thickness), faces
+
+
+@pytest.mark.parametrize("thickness", [0.005, 0.014])
+def test_both_rims_of_a_thin_plate_are_kept(thickness):
+    """Its short edges are half a quad or more than one long; drawn together they would bend the rims by their whole length."""
+    vertices, faces = plate(thickness)
+    found = find_features(vertices, faces, 30.0, 0.03)
+    length = np.linalg.norm(found.points[found.segments[:, 0]] - found.points[found.segments[:, 1]], axis=1)
+    assert len(found.corners) == 8 and length.sum() == pytest.approx(8 + 4 * thickness)
+    assert found.shortest() == pytest.approx(thickness)
+
+
+def test_a_curve_whose_corner_has_no_vertex_of_its_own_is_followed_all_the_same():
+    """Two corners nearer to each other than to any other vertex of the grid: both curves are held, one from the vertex beside."""
+    side = 21
+    x, y = np.meshgrid(np.arange(side), np.arange(side), indexing="ij")
+    vertices = np.stack([x, y, 0 * x], -1).reshape(-1, 3).astype(float)
+    at = np.arange(side**2).reshape(side, side)
+    faces = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]], -1).reshape(-1, 4)
+    points = np.array([(3.0, 10.1, 0), (17.0, 10.0, 0), (3.0, 10.3, 0), (17.0, 11.0, 0)])
+    features = Features(points, np.array([(0, 1), (2, 3)]), np.array([0, 1]), np.arange(4))
+    _, held = trace(vertices, faces, features, 1.0)
+    for curve in (0, 1):
+        path = vertices[held.path[held.path_curve == curve]].reshape(-1, 3)
+        assert len(path) and path[:, 0].min() <= 4 and path[:, 0].max() == 17

@@ -185,3 +185,16 @@ def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypa
     late.outline = None
     drawn.clear()
     assert choose([late, candidate(2.0, 0.5)]) is late and drawn[1] is late and len(drawn) == 2
+
+
+def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypatch):
+    """A plate hardly thicker than a quad: the engine is asked at full density alone, both rims are met, and the record says so."""
+    calls = in_this_process(monkeypatch)
+    vertices, faces = cube()
+    vertices = vertices * (1, 0.8, 0.02)
+    out, found, record = quads.remesh(vertices, faces, Request(quads=8000))
+    assert all(not way.subdivisions for _, _, way, _ in calls) and "not tried, its quads are wider" in record.failed[0]
+    assert record.engine == "instant-meshes" and whole(found)
+    corners = vertices[np.abs(vertices[:, None] - out[None]).max(-1).min(1) < 1e-9]
+    assert len(corners) == 8
+    assert left_out(surface_of(out, found), Surface(vertices, faces), (0.005,)) == [0.0]

@@ -1,0 +1,47 @@
+"""Pieces that nearly touch are remeshed as if they were alone."""
+
+import numpy as np
+
+from gdtool.folders.mesh import triangulated
+from gdtool.geometry import quads, repair
+from gdtool.geometry.mesh_quality import scaled_jacobian
+from gdtool.geometry.quad_spread import spread
+from gdtool.geometry.quad_task import Request
+from tests.geometry.solids import cube, joined
+
+
+def boxes(*sizes_and_centres):
+    box, faces = cube()
+    return joined(*((box * size + centre, faces) for size, centre in sizes_and_centres))
+
+
+def test_pieces_are_laid_apart_and_brought_back():
+    """Side by side, one inside the other, and of unlike size."""
+    vertices, faces = boxes(((0.4, 0.3, 0.5), (0, 0, 0)), ((0.4, 0.3, 0.5), (0, 0.301, 0)), ((0.1, 0.1, 0.1), (0, 0, 0)), ((0.9, 0.05, 0.05), (0, 0, 0.4)))
+    found = spread(vertices, faces, 0.1)
+    _, piece = repair.components(faces)
+    boxes_of = [(found.vertices[faces[piece == k]].min((0, 1)), found.vertices[faces[piece == k]].max((0, 1))) for k in range(4)]
+    for i, (low, high) in enumerate(boxes_of):
+        for other_low, other_high in boxes_of[:i]:
+            assert (np.maximum(low - other_high, other_low - high)).max() >= 0.1 - 1e-9
+    assert np.abs(found.back(found.vertices) - vertices).max() < 1e-12
+    middle = found.vertices[faces].mean(1)
+    assert np.abs(found.back(middle) - vertices[faces].mean(1)).max() < 1e-12
+
+
+def test_what_is_one_piece_or_apart_as_it_is_stays():
+    assert spread(*cube(), 0.1) is None
+    assert spread(*boxes((0.3, (0, 0, 0)), (0.3, (0, 0.5, 0))), 0.1) is None
+    assert spread(*boxes((0.3, (0, 0, 0)), (0.3, (0, 0.5, 0))), 0.25) is not None
+
+
+def test_quads_of_one_piece_are_not_drawn_onto_another():
+    """Two blocks a twentieth of a quad apart: no quad folds, none goes from one to the other, each is met all over."""
+    vertices, faces = boxes((0.4, (0, 0, 0)), (0.4, (0, 0.401, 0)))
+    out, found, record = quads.remesh(vertices, faces, Request(quads=4000))
+    assert "instant-meshes" in record.engine and scaled_jacobian(out, found).min() > 0.2
+    count, piece = repair.components(found)
+    assert count == 2
+    spans = sorted(np.round(np.stack([out[found[piece == k]].min((0, 1)), out[found[piece == k]].max((0, 1))]), 6).tolist() for k in range(2))
+    assert spans == [[[-0.2] * 3, [0.2] * 3], [[-0.2, 0.201, -0.2], [0.2, 0.601, 0.2]]]
+    assert repair.is_watertight(triangulated(found)[0])
