@@ -14,7 +14,8 @@ from gdtool.geometry.quad_ways import Found
 
 SMALL_PIECE_QUADS = 48
 _MOST_ALONE, _ALONE, _FEWEST = 16, 300, 6  # pieces that are remeshed one by one; quads of one that is, and of any
-_SURELY = 0.02  # of the quads of a piece, that there may be more or fewer in any case; the rest of the tolerance goes by the root of their number
+# Of the quads of a piece, that there may be more or fewer in any case, and at most; the rest of the tolerance goes by the root of their number.
+_SURELY, _MOST_OFF = 0.02, 0.15
 _ON_ONE, _MOST_APART = 0.9, 1.5  # of a component's quads lie on the piece that they stand for; edge lengths that a piece strays
 
 
@@ -74,7 +75,7 @@ def apart(part: Part, done: np.ndarray, quads: int) -> list[Part]:
         quads -= split_count(out[0].faces, out[0].quads)
     own = np.maximum((own * (quads / max(own.sum(), 1))).round().astype(int), _FEWEST)
     spare = max(COUNT_TOLERANCE * part.quads - _SURELY * own.sum(), 0)
-    tolerance = _SURELY + spare * np.sqrt(own) / np.sqrt(own).sum() / own
+    tolerance = np.minimum(_SURELY + spare * np.sqrt(own) / np.sqrt(own).sum() / own, _MOST_OFF)
     return out + [part.of(piece == k, int(number), tolerance=float(off)) for k, number, off in zip(alone, own, tolerance, strict=True)]
 
 
