@@ -28,7 +28,7 @@ _LIKELY = 0.75  # of them: what strays less before it is shaped is not likely to
 _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
 _MOST_FOLDED = 0.01  # of the quads
 _CUT_EDGES = 0.25  # surface so far from the quads lies beyond an edge that they cut off
-CUT_OFF, CUT_SUBDIVIDED = 0.02, 0.005  # how much of it may, as paired triangles keep its edges; of a subdivided result, after which finer ones come
+CUT_OFF, CUT_SUBDIVIDED = 0.0125, 0.005  # how much of it may, as paired triangles keep its edges; of a subdivided result, after which finer ones come
 TOO_COARSE = _STRAYS, _LEAVES_OUT, STICKS_OUT, _CUTS_OFF = "strays", "leaves out", "sticks out", "cuts off"
 _FOLDED, _LET_GO = 0.05, 0.25  # scaled Jacobian; edge lengths
 
