@@ -28,12 +28,16 @@ class Features:
     curve: np.ndarray
     corners: np.ndarray
 
-    def shortest(self) -> float:
-        """The length of the shortest curve, infinite where there is none."""
+    def in_strips(self, width: float) -> float:
+        """Share of the curves' length that edges strips no wider than that, as the rims of thin plates do: curves that shorter ones
+        meet at both ends."""
         if not self:
-            return np.inf
-        length = np.linalg.norm(self.points[self.segments[:, 0]] - self.points[self.segments[:, 1]], axis=1)
-        return float(np.bincount(self.curve, length).min())
+            return 0.0
+        length = np.bincount(self.curve, np.linalg.norm(self.points[self.segments[:, 0]] - self.points[self.segments[:, 1]], axis=1))
+        met = np.zeros(len(self.points), bool)
+        met[self.segments[(length < width)[self.curve]]] = True
+        edging = (length >= width) & (np.bincount(self.curve, met[self.segments].sum(1)) >= 2)
+        return float(length[edging].sum() / length.sum())
 
     def __bool__(self) -> bool:
         return len(self.segments) > 0

@@ -16,7 +16,7 @@ from gdtool.geometry.quad_shape import Surface
 
 COUNT_TOLERANCE = 0.03
 _ENGINES_SHARE, _LEAST_SECONDS = 0.7, 20.0
-_NARROW_EDGES = 1.5
+_NARROW_EDGES, _FEW_NARROW = 1.5, 0.05  # share of the creases' length
 _FEATURE_EDGES = 3  # quads long: shorter creases are noise
 
 
@@ -103,8 +103,9 @@ class Part:
 
     @cached_property
     def narrow(self) -> bool:
-        """Whether creases lie closer together than _NARROW_EDGES, as on thin plates and small bevels; not asked of what has more triangles than quads."""
-        return len(self.faces) < self.quads and self.features.shortest() < _NARROW_EDGES * self.edge
+        """Whether more than a few creases lie in pairs closer together than _NARROW_EDGES, as on thin plates and small bevels; not asked of
+        what has more triangles than quads."""
+        return len(self.faces) < self.quads and self.features.in_strips(_NARROW_EDGES * self.edge) > _FEW_NARROW
 
     @cached_property
     def features(self) -> Features:
