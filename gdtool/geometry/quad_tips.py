@@ -13,6 +13,7 @@ _BARE, _CLOSE, _STRAYS = 0.5, 0.75, 1.0  # edge lengths from the quads: what bel
 _TIP = 1.5  # edge lengths that a tip measures at most which one vertex reaches
 _STEP = 1.5  # edge lengths that a tip is drawn out at once
 _HELD = 0.75  # of the farthest that a vertex moves: those that move so far stay there
+_CROWDED = 0.75  # edge lengths from one that stays: others do not, for what lies between them would have no room
 _MOST_STEPS = 24
 _POINTS = 20000
 
@@ -129,7 +130,17 @@ def _extruded(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints,
     faces = np.concatenate([np.where(patch[:, None], lifted[faces], faces), sides])
     vertices = np.concatenate([vertices, new])
     vertices[cap] = aim
-    return vertices, faces, _extended(constraints, faces, len(vertices), cap, cap[length > _HELD * length.max()])
+    held = [k for k in np.argsort(-length, kind="stable") if length[k] > _HELD * length.max()]
+    return vertices, faces, _extended(constraints, faces, len(vertices), cap, cap[_sparse(aim, held, _CROWDED * edge)])
+
+
+def _sparse(points: np.ndarray, order: list[int], distance: float) -> list[int]:
+    """Of the points (n, 3) in that order those that are farther than `distance` from all before them that are taken."""
+    out: list[int] = []
+    for k in order:
+        if (np.linalg.norm(points[out] - points[k], axis=1) > distance).all():
+            out.append(k)
+    return out
 
 
 def _border(faces: np.ndarray, patch: np.ndarray, cap: np.ndarray) -> np.ndarray | None:

@@ -126,3 +126,15 @@ def test_an_engine_that_cuts_a_horn_short_is_still_taken(monkeypatch):
     in_this_process(monkeypatch)
     monkeypatch.setattr(quad_fit, "draw_out", lambda v, f, constraints, *_: (v, f, constraints, None, 0.0, np.zeros(1)))
     assert quads.remesh(vertices, faces, asked)[2].engine == "pair and split"
+
+
+def test_what_is_held_on_a_blunt_tip_leaves_room_for_quads():
+    """Held as near to each other as the points that they were drawn to, they leave quads between them without area."""
+    vertices, faces, edge = ball()
+    fine, triangles = sphere(160, 0.4)
+    # A ridge some edges wide and a tenth of that thick: all vertices of its cap are drawn about as far.
+    blunt = (fine[:, 0] > 0) & (abs(fine[:, 1]) < 2.2 * edge) & (abs(fine[:, 2]) < 0.4 * edge)
+    fine[blunt, 0] += 1.4 * edge
+    out, _, _, tips, _, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), Surface(fine, triangles), edge, most_added=0.3)
+    apart = np.linalg.norm(out[tips][:, None] - out[tips], axis=-1)[np.triu_indices(len(tips), 1)]
+    assert len(tips) > 2 and apart.min() > 0.7 * edge
