@@ -2,46 +2,24 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 
+from gdtool.geometry.distance import SearchTree
 from gdtool.geometry.features import Constraints, Features, closest_on_segments
 from gdtool.geometry.mesh_quality import polygon_normals, valences
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.repair import compact, corner_fans, edges_of
 
-_WORTH_THREADS, _ALONE = 1000, 10000  # libigl searches with all threads from more than so many points on
 _EXACT_EVERY = 5  # steps between two searches for the closest point; the others stay in its plane
 _BENT_COSINE = 0.97  # between a quad's normal and that of the surface below its centre
 
 
-class Surface:
-    """A triangle mesh that points are projected to; its search tree is built once."""
+class Surface(SearchTree):
+    """A triangle mesh that points are projected to, with the normals (f, 3) of its faces."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
-        import igl
-
-        self.vertices, self.faces = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
-        self._tree = igl.AABB()
-        self._tree.init(self.vertices, self.faces)
+        super().__init__(vertices, faces)
         self.normals = face_normals(self.vertices, self.faces)[0]
-
-    def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distance (n,), face_idx (n,) and closest point (n, 3) for points (n, 3)."""
-        if not len(points):
-            return np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 3))
-        points = np.ascontiguousarray(points, np.float64)
-        if _WORTH_THREADS < len(points) <= _ALONE:
-            with ThreadPoolExecutor(2) as pool:
-                parts = zip(*pool.map(self._search, np.array_split(points, 2)), strict=True)
-                squared, face_idx, point = (np.concatenate(part) for part in parts)
-        else:
-            squared, face_idx, point = self._search(points)
-        return np.sqrt(np.maximum(squared, 0)), face_idx, point
-
-    def _search(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return tuple(np.asarray(x) for x in self._tree.squared_distance(self.vertices, self.faces, points))
 
 
 def subdivide(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints | None = None):

@@ -12,6 +12,7 @@ import scipy.sparse  # noqa: F401 - what repair needs, read while a prepared chi
 from gdtool.core.child import ChildFailed, begin
 from gdtool.core.errors import InputError
 from gdtool.geometry import repair
+from gdtool.geometry.halves import in_halves, worth_halving
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.sharpen import corners_of, restore_creases
 from gdtool.geometry.unpinch import unpinched
@@ -73,7 +74,8 @@ def _flat(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return (0 < determinant) & (determinant < _FLAT)
 
 
-def collapse(vertices: np.ndarray, faces: np.ndarray, target_faces: int, aggressiveness: float, unit: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def collapse(vertices: np.ndarray, faces: np.ndarray, target_faces: int, aggressiveness: float, unit: float = 1.0,
+             keep_border: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """What the child runs: fast-simplification's quadric collapse (Garland & Heckbert 1997), with lengths in units of `unit`.
 
     It takes all edges whose error is below a bound that rises from round to round, from the same number whatever the size of the
@@ -83,7 +85,8 @@ def collapse(vertices: np.ndarray, faces: np.ndarray, target_faces: int, aggress
     import fast_simplification
 
     out_vertices, out_faces = fast_simplification.simplify(
-        np.ascontiguousarray(vertices / unit, np.float32), np.ascontiguousarray(faces, np.int32), target_count=target_faces, agg=aggressiveness)
+        np.ascontiguousarray(vertices / unit, np.float32), np.ascontiguousarray(faces, np.int32), target_count=target_faces, agg=aggressiveness,
+        preserve_border=keep_border)
     return np.asarray(out_vertices, np.float64) * unit, np.asarray(out_faces, np.int64)
 
 
@@ -149,7 +152,17 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
 
 def reduced(vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple, even: bool) -> tuple[np.ndarray, np.ndarray]:
     """What the child runs: one of the collapses above of what is shaken, or uneven, first."""
-    return globals()[way]((shaken if even else uneven)(vertices, faces), faces, *arguments)
+    vertices = (shaken if even else uneven)(vertices, faces)
+    if even and way == "collapse" and worth_halving(faces, arguments[0]):
+        # Only of even triangles it is known how many of them each half is to have.
+        target_faces, pace, unit = arguments
+
+        def at_pace(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit: float, keep_border: bool) -> tuple[np.ndarray, np.ndarray]:
+            return collapse(vertices, faces, target_faces, pace, unit, keep_border)
+
+        if (found := in_halves(at_pace, vertices, faces, target_faces, unit)) is not None:
+            return found
+    return globals()[way](vertices, faces, *arguments)
 
 
 def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attributes: np.ndarray | None = None, *,
@@ -161,7 +174,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     vertices (v, 3), faces (f, 3), attributes (v, a) or None. Returns vertices, faces, attributes (read at the closest
     point of the input) and a report: faces, method, and error, the largest distance of the result's vertices and of the
     input's vertices (at most 20,000 of them) to the other surface, in units of the input. A closed, manifold
-    input stays so (closed says whether it is; asked while the first child works). With crease_degrees, bevels are drawn out first to
+    input stays so (closed says whether it is; asked only of what does not come out closed). With crease_degrees, bevels are drawn out first to
     creases that turn by more, unless what comes of it cannot be collapsed; the report says how many vertices moved (creases).
     `careful` takes the slow way first, for meshes with more small parts than triangles to
     spare: the quick one reaches any number, even by tearing down what is large. With `near` the quick one keeps nearer to the surface, its
@@ -187,12 +200,8 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     edge = _edge(unit, faces, target_faces)
     is_closed, pieces = cache(closed or (lambda: repair.is_watertight(faces))), cache(lambda: repair.components(faces)[0])
 
-    def while_it_runs() -> None:
-        meanwhile()
-        is_closed()
-
     def collapsed(vertices: np.ndarray, faces: np.ndarray, moved: int) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str]]:
-        return _collapsed(vertices, faces, target_faces, edge if near else _UNIT, even, moved, careful, seconds, is_closed, while_it_runs)
+        return _collapsed(vertices, faces, target_faces, edge if near else _UNIT, even, moved, careful, seconds, is_closed, meanwhile)
 
     moved = 0
     if crease_degrees:
@@ -211,7 +220,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     if found is None:
         return vertices, faces, attributes, {"faces": len(faces), "method": "none", "error": 0.0, "creases": 0, "failed": "; ".join(reasons)}
     out_vertices, out_faces = repair.compact(*found)
-    if is_closed() and repair.components(out_faces)[0] > 1:
+    if repair.components(out_faces)[0] > 1 and is_closed():
         out_vertices, out_faces = repair.without_crumbs(out_vertices, out_faces, pieces())
     out_attributes = None
     if attributes is not None:
@@ -233,7 +242,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
 
 
 def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit: float, even: bool, moved: int, careful: bool, seconds: float,
-               is_closed: Callable[[], bool], while_it_runs: Callable[[], object]) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str]]:
+               is_closed: Callable[[], bool], meanwhile: Callable[[], object]) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str]]:
     """What the first way leaves that keeps the mesh as closed as it is, or None; its name, what failed. moved: vertices that were drawn out to creases."""
     # The quick collapse tears a closed mesh now and then (a handful of edges with four faces), at one pace and not at
     # another, and of parts made of slivers it collapses nothing, at any; MeshLab's takes ten times as long.
@@ -250,14 +259,17 @@ def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit:
         try:
             running = begin("gdtool.geometry.simplify:reduced", vertices, faces.astype(np.int32), way, arguments, even,
                             seconds=seconds, memory_mb=16000)
-            while_it_runs()
+            meanwhile()
             out = running.result()
         except ChildFailed as failure:
             reasons.append(str(failure))
             continue
-        if is_closed() and _sound(*out, False, target_faces) and not _sound(*out, True, target_faces):
+        # What comes out closed does for any input: whether that is closed is asked of no other.
+        sound = _sound(*out, True, target_faces)
+        if not sound and is_closed() and _sound(*out, False, target_faces):
             out = unpinched(*out)  # what the quick collapse tears are mostly two sheets that meet in an edge
-        if not _sound(*out, is_closed(), target_faces):
+            sound = _sound(*out, True, target_faces)
+        if not sound and (is_closed() or not _sound(*out, False, target_faces)):
             reasons.append("the result is not as closed as the input")
         elif way == "collapse" and not moved and len(out[1]) > _STUCK * target_faces + _FEW:
             stuck = out

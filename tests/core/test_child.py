@@ -56,6 +56,12 @@ def grow():
     return np.ones(2**28)  # 2 GB
 
 
+def by_two(name):
+    """Its own and its copy's process, and what the copy answers."""
+    answer = child.beside(globals()[name])
+    return os.getpid(), answer()
+
+
 def test_arrays_go_there_and_back_whatever_the_function_prints():
     assert (child.call("tests.core.test_child:double", np.arange(5), noise="text", seconds=30) == np.arange(5) * 2).all()
 
@@ -103,6 +109,27 @@ def test_everything_else_is_a_failure_with_its_reason(name, words, limits):
 
 def test_a_childs_child_may_ask_for_more_than_the_child_has():
     assert child.call("tests.core.test_child:ask_for_more", seconds=30, memory_mb=4000).tolist() == [0, 2, 4]
+
+
+def test_a_copy_of_a_child_works_beside_it():
+    own, other = child.call("tests.core.test_child:by_two", "own_pid", seconds=30)
+    assert own != other and not alive(other)
+    assert len(child.call("tests.core.test_child:by_two", "large", seconds=30)[1]) == 2**20
+    for death in ("crash", "leave", "refuse"):
+        with pytest.raises(child.ChildFailed, match=f"{death} died in a copy"):
+            child.call("tests.core.test_child:by_two", death, seconds=30)
+
+
+def test_a_copy_dies_with_the_child():
+    running = child.begin("tests.core.test_child:by_two", "hang", seconds=5)
+    copies = []
+    while not copies and not running._timed_out:
+        time.sleep(0.05)
+        copies = subprocess.run(["pgrep", "-P", str(running._process.pid)], capture_output=True, text=True).stdout.split()
+    with pytest.raises(child.ChildFailed, match="longer than 5 s"):
+        running.result()
+    time.sleep(0.3)
+    assert copies and not any(alive(pid) for pid in copies)
 
 
 def alive(pid):

@@ -1,7 +1,11 @@
+import sys
+
 import numpy as np
 import pytest
 
-from gdtool.geometry.distance import barycentric_of, closest_points, sample_surface, winding_number
+from gdtool.geometry import distance
+from gdtool.geometry.distance import SearchTree, barycentric_of, closest_on_triangles, closest_points, sample_surface, winding_number
+from tests.geometry.solids import sphere
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
 HALVES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -40,6 +44,41 @@ def test_zero_area_faces_are_segments_and_are_never_sampled():
     assert set(sample_surface(SQUARE, faces, 2000, np.random.default_rng(0))[1]) == {1}
     with pytest.raises(ValueError, match="without area"):
         sample_surface(SQUARE, faces[:1], 10, np.random.default_rng(0))
+
+
+def test_the_closest_point_of_a_triangle_by_its_own_side_or_corner():
+    rng = np.random.default_rng(4)
+    triangles = rng.normal(size=(400, 3, 3))
+    triangles[100:200, 2] = triangles[100:200, 1]  # segments
+    triangles[200:250] = triangles[200:250, :1]  # points
+    points = rng.normal(size=(400, 3)) * 2
+    found = closest_on_triangles(points, triangles)
+    for point, triangle, closest in zip(points, triangles, found, strict=True):
+        np.testing.assert_allclose(closest, closest_points(point[None], triangle, np.array([[0, 1, 2]]))[2][0], atol=1e-9)
+
+
+@pytest.mark.parametrize("place", [(0, 0, 0), (1e6, -3e5, 20)], ids=["at the origin", "far from it"])
+@pytest.mark.parametrize("large", [0, 10**9], ids=["fcpw", "libigl"])
+def test_a_search_tree_finds_what_a_single_search_does(monkeypatch, large, place):
+    pytest.importorskip("fcpw")
+    monkeypatch.setattr(distance, "_LARGE", large)
+    vertices, faces = sphere(40)
+    vertices, faces = vertices + place, np.concatenate([faces, np.repeat(faces[:9, :1], 3, 1)])  # and some of no area
+    rng = np.random.default_rng(5)
+    tree = SearchTree(vertices, faces)
+    for count in (0, 30, 3000):  # alone and by two threads
+        points = rng.normal(size=(count, 3)) + place
+        away, face_idx, point = tree.closest(points)
+        want = closest_points(points, vertices, faces)
+        np.testing.assert_allclose(away, want[0], rtol=0, atol=5e-7 if large == 0 else 2e-9)
+        np.testing.assert_allclose(np.linalg.norm(points - point, axis=1), away, atol=1e-9)
+        np.testing.assert_allclose(closest_on_triangles(points, vertices[faces[face_idx]]), point, atol=1e-9)
+
+
+def test_without_fcpw_a_large_mesh_is_searched_by_libigl(monkeypatch):
+    monkeypatch.setattr(distance, "_LARGE", 0)
+    monkeypatch.setitem(sys.modules, "fcpw", None)
+    assert SearchTree(SQUARE, HALVES).closest(np.array([[0.5, 0.25, 2.0]]))[0].tolist() == [2]
 
 
 def test_winding_number_of_a_cube():
