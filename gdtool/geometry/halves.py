@@ -16,7 +16,7 @@ LARGE = 200_000  # triangles from which a second process pays
 _MOST_LEFT = 0.15  # of the triangles: where more are left, the rim, which stays as fine as it was, is too much of a half
 _RIM_FACES = 2.25  # triangles that a half is left with for each vertex of its rim
 _MOST_ON_RIM = 0.25  # of the triangles asked for
-_RINGS, _SEAM_UNIT = 2, 0.1  # of triangles about the rim that are collapsed once the halves are one; the unit that this is done in, in that of the halves
+_RINGS, _SEAM_UNIT = 3, 0.1  # of triangles about the rim that are collapsed once the halves are one; the unit that this is done in, in that of the halves
 
 
 def worth_halving(faces: np.ndarray, target_faces: int) -> bool:

@@ -90,9 +90,14 @@ class Candidate:
         """Without a fault, or with one that is finer than its quads."""
         return self.fault is None or self.fault == LOST and sticks_out(self.vertices, self.quads, part.surface) < 2 * _OUT_EDGES * part.edge
 
+    def trace(self, part: Part) -> None:
+        """Find its outline, once."""
+        if self.outline is None:
+            self.outline = outlined(self.vertices, self.quads, part.surface, part.features, self.way.subdivisions, part.request)
+
     def promising(self, part: Part) -> bool:
         """Whether its outline is so near to the surface that it can come out good."""
-        self.outline = outlined(self.vertices, self.quads, part.surface, part.features, self.way.subdivisions, part.request)
+        self.trace(part)
         return self.outline.far < _NEAR_OUTLINE
 
     def draw(self, part: Part) -> None:

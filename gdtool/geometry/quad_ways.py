@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from itertools import chain
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -91,12 +91,13 @@ class Trial:
                 self._second_best = best
             if not usable:
                 return self._failed(way, best.fault, torn=best.off(wanted) < -_MOST_TORN)
-            taken = self._drawn([one for one in candidates if one.fault == best.fault and self.part.counted(one.count, wanted)])
-            if taken.wrong is not None:
+            taken = self._drawn(self._of_count([one for one in candidates if one.fault == best.fault], extra))
+            if taken is not None and taken.wrong is not None:
                 if taken.passable and self.part.counted(len(taken.drawn[1]), quads):
                     self._passable = taken
                 return self._failed(way, f"{taken.fault}; {taken.wrong}" if taken.fault else taken.wrong)
-            if not self.part.counted(count := len(taken.drawn[1]), quads):
+            taken, count = (best, len(best.outline.faces)) if taken is None else (taken, len(taken.drawn[1]))
+            if not self.part.counted(count, quads):
                 extra = count - taken.count
                 asked = way.near(taken.asked * (quads - extra) / taken.count)
                 continue
@@ -121,19 +122,38 @@ class Trial:
         self.record.clock("engine", start)
         return sorted(out, key=lambda one: one.rank(wanted, part.tolerance))
 
-    def _drawn(self, candidates: list[Candidate]) -> Candidate:
-        """The first that comes out good, those that do not promise to last; where none does the one that comes nearest to the surface."""
-        start, late, done = time.perf_counter(), [], []
-        for one in chain(candidates, late):
-            if one.outline is None and not one.promising(self.part):
-                late.append(one)
+    def _of_count(self, candidates: list[Candidate], extra: int) -> Iterator[Candidate]:
+        """Those that have about as many quads as asked for once tips are drawn out of theirs, at the first `extra` more, and those that are hopeless."""
+        quads = self.part.quads
+        for one in candidates:
+            if one is not candidates[0] and not self.part.counted(one.count + extra, quads):
                 continue
+            one.trace(self.part)
+            extra = len(one.outline.faces) - one.count
+            if one.outline.hopeless or self.part.counted(one.count + extra, quads):
+                yield one
+
+    def _drawn(self, candidates: Iterable[Candidate]) -> Candidate | None:
+        """The first that comes out good, those that do not promise to last; where none does the one that comes nearest to the surface."""
+        start, done = time.perf_counter(), []
+        for one in self._promising_first(candidates):
             one.draw(self.part)
             done.append(one)
             if one.good or not one.way.subdivisions:
                 break
         self.record.clock("fit", start)
-        return one if one.good else min(done, key=lambda one: (one.wrong is not None, one.far - 2 * one.least))
+        if not done or done[-1].good:
+            return done[-1] if done else None
+        return min(done, key=lambda one: (one.wrong is not None, one.far - 2 * one.least))
+
+    def _promising_first(self, candidates: Iterable[Candidate]) -> Iterator[Candidate]:
+        late = []
+        for one in candidates:
+            if one.promising(self.part):
+                yield one
+            else:
+                late.append(one)
+        yield from late
 
     def _settled(self, taken: Candidate) -> Found:
         start = time.perf_counter()

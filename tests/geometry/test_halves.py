@@ -56,7 +56,7 @@ def test_the_halves_are_one_mesh_again_as_good_as_collapsed_whole(shapes, name):
     ends = out[repair.edges_of(found).ends]
     length, near = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1), abs(ends[..., across] - seam).min(1) < 0.05
     assert near.sum() > 200 and 0.8 < np.median(length[near]) / np.median(length[~near]) < 1.25
-    assert np.quantile(length[near], 0.02) > 0.9 * np.quantile(length[~near], 0.02)
+    assert np.quantile(length[near], 0.02) > 0.7 * np.quantile(length[~near], 0.02)
 
 
 def test_it_comes_out_the_same_each_time(shapes):

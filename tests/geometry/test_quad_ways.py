@@ -187,6 +187,24 @@ def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypa
     assert choose([late, candidate(2.0, 0.5)]) is late and drawn[1] is late and len(drawn) == 2
 
 
+def test_the_quads_of_tips_count_before_any_are_drawn(monkeypatch):
+    """What has too many quads with those of its tips is not drawn; another that has as many tips but fewer quads is, and only then a new one asked for."""
+    way = quad_ways._ways(20000, Request())[0]
+    trial = quad_ways.Trial(Part(*cube(), 4000, 0.1, Request(), None), Record())
+
+    def candidate(count, tips, hopeless=False):
+        found = Candidate(way, count, None, np.zeros((0, 3)), np.zeros((count // 4, 4), int))
+        found.traced = Outline(np.zeros((0, 3)), np.zeros((count + tips, 4), int), None, np.zeros(0, int), 0.1, 0.0, 1.0, hopeless)
+        return found
+
+    monkeypatch.setattr(Candidate, "trace", lambda one, part: setattr(one, "outline", one.traced))
+    plain, far, fewer = candidate(4000, 0), candidate(4100, 100), candidate(3900, 100)
+    assert next(trial._of_count([plain, far], 0)) is plain and far.outline is None
+    assert list(trial._of_count([far, fewer, candidate(4080, 100)], 0)) == [fewer]
+    assert trial._drawn(trial._of_count([far, plain := candidate(4060, 0)], 0)) is None and plain.outline is None
+    assert list(trial._of_count([hopeless := candidate(4100, 100, hopeless=True)], 0)) == [hopeless]
+
+
 def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypatch):
     """A plate hardly thicker than a quad: the engine is asked at full density alone, both rims are met, and the record says so."""
     calls = in_this_process(monkeypatch)
