@@ -69,8 +69,8 @@ def _first(rim: np.ndarray, used: np.ndarray, faces: np.ndarray) -> tuple[np.nda
     return order, number.take(faces)
 
 
-def _seam_collapsed(collapse: Collapse, vertices: np.ndarray, faces: np.ndarray, rim: int, target_faces: int, unit: float) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh whose first `rim` vertices are a seam, without the small triangles about it."""
+def _seam_collapsed(collapse: Collapse, vertices: np.ndarray, faces: np.ndarray, rim: int, target_faces: int, unit: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """A mesh whose first `rim` vertices are a seam, without the small triangles about it; None where these lost their border."""
     near = np.arange(len(vertices)) < rim
     for _ in range(_RINGS):
         about = near[faces].any(1)
@@ -80,6 +80,8 @@ def _seam_collapsed(collapse: Collapse, vertices: np.ndarray, faces: np.ndarray,
     border, rest = np.flatnonzero(used.all(0)), np.flatnonzero(used[1])
     order, few = _first(border, used[0], faces[about])
     made_vertices, made = collapse(vertices[order], few, target_faces - int((~about).sum()), unit, True)
+    if len(made_vertices) < len(border) or not np.allclose(made_vertices[:len(border)], vertices[border], rtol=0, atol=1e-6 * np.ptp(vertices, 0).max()):
+        return None
     number = np.empty(len(vertices), np.int64)
     number[rest] = np.arange(len(rest))
     place = np.concatenate([number[border], len(rest) + np.arange(len(made_vertices) - len(border))])

@@ -74,6 +74,17 @@ def test_where_it_cannot_be_there_is_nothing(shapes, how, target_faces):
         assert halved(*shapes["torus"], target_faces, how) is None
 
 
+@pytest.mark.parametrize("spoil", [lambda vertices: vertices[:3], lambda vertices: vertices + 0.01], ids=["fewer", "moved"])
+def test_a_seam_that_lost_its_border_is_not_put_in(shapes, spoil):
+    def spoiling(*given):
+        out, found = at_pace(*given)
+        return spoil(out), found
+
+    vertices, faces = shapes["torus"]
+    assert halves._seam_collapsed(at_pace, vertices, faces, 300, len(faces) - 200, UNIT) is not None
+    assert halves._seam_collapsed(spoiling, vertices, faces, 300, len(faces) - 200, UNIT) is None
+
+
 @pytest.mark.parametrize("failure", [OSError("cannot allocate memory"), child.ChildFailed("died")])
 def test_without_a_second_process_there_is_nothing(monkeypatch, shapes, failure):
     def beside(*_):
