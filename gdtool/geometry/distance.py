@@ -82,7 +82,7 @@ def _fcpw_search(vertices: np.ndarray, faces: np.ndarray) -> _Search | None:
 def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """(n, 3): the point of each of triangles (n, 3, 3) that is closest to the one of points (n, 3) in its place.
 
-    As trimesh.triangles.closest_point, whose import takes .3 s, as long as all searches of a remesh.
+    As trimesh.triangles.closest_point, whose import takes .3 s.
     """
     weights = barycentric_of(points, triangles)
     out = np.einsum("nc,ncd->nd", weights, triangles)
