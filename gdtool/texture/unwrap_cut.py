@@ -89,12 +89,13 @@ def _halves(adjacency: Adjacency, chart: tuple, smallest: float) -> tuple[float,
     for row, seen in zip(across, sample, strict=True):
         line = row.min() + _OFFSETS * np.ptp(row)
         covered = np.bincount(np.searchsorted(line, row, "right"), area, len(line) + 1).cumsum()[:-1]  # before each line
-        sorted_by = sample[:, np.argsort(seen, kind="stable")]
-        before, behind = _spans(sorted_by), _spans(sorted_by[:, ::-1])[:, ::-1]
-        count = np.searchsorted(np.sort(seen), line, "left")
+        order = np.argsort(seen, kind="stable")
+        count = np.searchsorted(seen[order], line, "left")
         good = (count > 0) & (count < len(seen)) & (np.minimum(covered, area.sum() - covered) >= smallest)
-        cost = _rectangles(before[:, count[good] - 1] + rim) + _rectangles(behind[:, count[good]] + rim)
-        found += [(float(c), row, place) for c, place in zip(cost, line[good], strict=True)]
+        if good.any():
+            before, behind = _spans(sample.take(order, 1), count[good])
+            cost = _rectangles(before + rim) + _rectangles(behind + rim)
+            found += [(float(c), row, place) for c, place in zip(cost, line[good], strict=True)]
     found.sort(key=lambda one: one[0])
     _, pairs = adjacency.within(faces_idx)
     for cost, row, place in found[:_TRIED]:
@@ -121,9 +122,13 @@ def _pieces(pairs: np.ndarray, half: np.ndarray, area: np.ndarray, smallest: flo
     return number
 
 
-def _spans(values: np.ndarray) -> np.ndarray:
-    """(a, n): how far values (a, n) up to each one spread."""
-    return np.maximum.accumulate(values, 1) - np.minimum.accumulate(values, 1)
+def _spans(values: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far values (a, n) spread before each of the rising counts (c,), 0 < count < n, and from it on: (a, c) both."""
+    first, at = np.unique(np.append(0, counts), return_inverse=True)
+    high, low = np.maximum.reduceat(values, first, 1), np.minimum.reduceat(values, first, 1)
+    before = np.maximum.accumulate(high, 1) - np.minimum.accumulate(low, 1)
+    behind = np.maximum.accumulate(high[:, ::-1], 1) - np.minimum.accumulate(low[:, ::-1], 1)
+    return before[:, at[1:] - 1], behind[:, ::-1][:, at[1:]]
 
 
 def _rectangles(spans: np.ndarray) -> np.ndarray:

@@ -145,17 +145,19 @@ class Shapes:
             # Only where it is stopped above and to the left, or above and to the right.
             blocked = free << stride | free << 1 & free >> 1
             corners = (free | blocked) ^ blocked
+            most = min(contact, contact * self._rim[i] / (2 * (h + w)))
+            if best is not None:  # no farther down than it could still be better
+                corners &= (1 << max(int((best[0] + most) * side - h - 0.25 * w) + 1, 0) * stride) - 1
             if not corners:
                 continue
             places = _places(corners)
             y, x = np.divmod(places, stride)
             far = (y + h + 0.25 * (x + w)) / side
             own = self.bits[i][turn]
-            most = min(contact, contact * self._rim[i] / (2 * (h + w)))
             for k in np.argsort(far, kind="stable").tolist():
                 if best is not None and far[k] - most >= best[0] - 1e-9:
                     break
-                cost = float(far[k]) - contact * (own << int(places[k]) & walls).bit_count() / (2 * (h + w))
+                cost = float(far[k]) - contact * (walls >> int(places[k]) & own).bit_count() / (2 * (h + w))
                 if best is None or cost < best[0] - 1e-9:
                     best = cost, turn, int(x[k]), int(y[k])
         return best and best[1:]
