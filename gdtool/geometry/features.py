@@ -52,10 +52,11 @@ def find_features(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    ends, _, angle = dihedral_degrees(vertices, faces, _THINNEST)
     edges = edges_of(faces)
-    strong = np.concatenate([angle > crease_degrees, np.ones(int((edges.count != 2).sum()), bool)])
-    segments = np.concatenate([ends, edges.ends[edges.count != 2]])
+    ends, _, angle = dihedral_degrees(vertices, faces, _THINNEST, edges)
+    border = edges.ends[edges.count != 2]
+    strong = np.concatenate([angle > crease_degrees, np.ones(len(border), bool)])
+    segments = np.concatenate([ends, border])
     weak = np.concatenate([angle > 0.6 * crease_degrees, strong[len(ends):]])
     segments, strong = segments[weak], strong[weak]
     length = np.linalg.norm(vertices[segments[:, 0]] - vertices[segments[:, 1]], axis=1)

@@ -29,7 +29,7 @@ def square_up(vertices: np.ndarray, faces: np.ndarray, surface: Surface, feature
     """
     if not len(faces) or not iterations:
         return vertices
-    still = still_vertices(faces, len(vertices), constraints)
+    still = still_vertices(edges_of(faces), len(vertices), constraints)
     flat = faces.T.ravel()
     best, best_rank = vertices, None
     slide = Slide(surface, features, constraints)
@@ -59,12 +59,13 @@ def balance(vertices: np.ndarray, faces: np.ndarray, surface: Surface, constrain
     A quad whose corners lie on a curved surface lies beneath it everywhere: half of its error is that it does. Features
     and boundaries stay where they are, and so do quads that do not run along the surface and thin ones that it would make thinner.
     """
-    free = (constraints.curve < 0) & ~still_vertices(faces, len(vertices), constraints)
+    edges = edges_of(faces)
+    free = (constraints.curve < 0) & ~still_vertices(edges, len(vertices), constraints)
     normals, area = polygon_normals(vertices, faces)
     corners = vertices[faces]
     # Of the two triangles that the quad is cut into: centroids, and middles of the edges, which are those of the quads beside them too.
     a, b, c, d = (corners[:, i] for i in range(4))
-    inner, edges = np.concatenate([(a + b + c) / 3, (a + c + d) / 3, (a + c) / 2]), edges_of(faces)
+    inner = np.concatenate([(a + b + c) / 3, (a + c + d) / 3, (a + c) / 2])
     samples = np.concatenate([inner, vertices[edges.ends].mean(1)])
     weight = np.array([3, 3, 2, 1, 1, 1, 1]) / 12
     _, face_idx, point = surface.closest(samples)
@@ -140,7 +141,7 @@ def ease(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Fe
         local = local.reshape(-1, 4)
         # Off their curves inside; where they were at the rim.
         curve, fixed = np.where(near, -1, constraints.curve), constraints.fixed & ~near
-        mesh_rim = still_vertices(faces, len(vertices), constraints) & ~constraints.fixed
+        mesh_rim = still_vertices(edges_of(faces), len(vertices), constraints) & ~constraints.fixed
         mine = Constraints(np.full(len(used), -1), (~near | mesh_rim)[used], constraints.path[:0], constraints.path_curve[:0])
         trial = relax(vertices[used], local, surface, features, mine, 10 + 10 * turn)
         trial = square_up(trial, local, surface, features, mine, 10)

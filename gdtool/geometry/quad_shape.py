@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from gdtool.geometry.distance import SearchTree
 from gdtool.geometry.features import Constraints, Features, closest_on_segments
 from gdtool.geometry.mesh_quality import polygon_normals, valences
 from gdtool.geometry.normals import face_normals
-from gdtool.geometry.repair import compact, corner_fans, edges_of
+from gdtool.geometry.repair import Edges, compact, corner_fans, edges_of
 
 _EXACT_EVERY = 5  # steps between two searches for the closest point; the others stay in its plane
 _BENT_COSINE = 0.97  # between a quad's normal and that of the surface below its centre
@@ -72,13 +74,13 @@ class Slide:
     """Brings vertices that move in small steps back: exactly, or to the plane or line that they were on last."""
 
     def __init__(self, surface: Surface, features: Features, constraints: Constraints):
-        self._surface, self._features = surface, features
+        self._surface, self._points = surface, features.points
         self._free = np.flatnonzero((constraints.curve < 0) & ~constraints.fixed)
         held = np.flatnonzero(constraints.curve >= 0)
-        order = held[np.argsort(constraints.curve[held], kind="stable")]
-        self._held = np.split(order, np.flatnonzero(np.diff(constraints.curve[order])) + 1) if len(order) else []
-        self._curves = [features.segments[features.curve == constraints.curve[mine[0]]] for mine in self._held]
-        self._lines: list[np.ndarray] = []
+        self._held = held[np.argsort(constraints.curve[held], kind="stable")]  # curve by curve
+        curve = constraints.curve[self._held]
+        first = np.flatnonzero(np.diff(curve, prepend=-1)).tolist()
+        self._curves = [(slice(start, end), features.segments[features.curve == curve[start]]) for start, end in pairwise([*first, len(curve)])]
         self._normals: np.ndarray | None = None
         self._steps = 0
 
@@ -88,12 +90,13 @@ class Slide:
         _, face_idx, point = self._surface.closest(vertices[self._free])
         out[self._free] = point
         self._normals = self._surface.normals[face_idx]
-        self._lines = []
-        for mine, segments in zip(self._held, self._curves, strict=True):
-            _, segment, point = closest_on_segments(vertices[mine], self._features.points, segments)
-            out[mine] = point
-            line = np.diff(self._features.points[segments[segment]], axis=1)[:, 0]
-            self._lines.append(line / np.maximum(np.linalg.norm(line, axis=1), 1e-300)[:, None])
+        held, ends = vertices[self._held], np.zeros((len(self._held), 2), np.int64)
+        for own, segments in self._curves:
+            _, segment, held[own] = closest_on_segments(held[own], self._points, segments)
+            ends[own] = segments[segment]
+        out[self._held] = held
+        line = self._points[ends[:, 1]] - self._points[ends[:, 0]]
+        self._lines = line / np.maximum(np.linalg.norm(line, axis=1), 1e-300)[:, None]
         return out
 
     def step(self, moved: np.ndarray, vertices: np.ndarray, last: bool) -> np.ndarray:
@@ -101,11 +104,9 @@ class Slide:
         self._steps += 1
         if last or self._normals is None or self._steps % _EXACT_EVERY == 0:
             return self.exact(moved)
-        out = moved.copy()
-        way = moved[self._free] - vertices[self._free]
-        out[self._free] -= np.einsum("ni,ni->n", way, self._normals)[:, None] * self._normals
-        for mine, line in zip(self._held, self._lines, strict=True):
-            out[mine] = vertices[mine] + np.einsum("ni,ni->n", moved[mine] - vertices[mine], line)[:, None] * line
+        out, way = moved.copy(), moved - vertices
+        for own, direction, start, sign in ((self._free, self._normals, moved, -1), (self._held, self._lines, vertices, 1)):
+            out[own] = start[own] + sign * np.einsum("ni,ni->n", way[own], direction)[:, None] * direction
         return out
 
 
@@ -118,7 +119,7 @@ def relax(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: F
     held = (constraints.curve >= 0) & ~constraints.fixed
     if along is not None:
         held &= np.diff(along.indptr) == 2  # where a path breaks off its end would draw back, and leave the feature bare
-    still = still_vertices(faces, len(vertices), constraints)
+    still = still_vertices(edges, len(vertices), constraints)
     slide = Slide(surface, features, constraints)
     for turn in range(iterations):
         target = average @ vertices
@@ -130,9 +131,8 @@ def relax(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: F
     return vertices
 
 
-def still_vertices(faces: np.ndarray, count: int, constraints: Constraints) -> np.ndarray:
-    """(v,) bool: vertices that may not move: corners of features, and boundaries that no curve leads."""
-    edges = edges_of(faces)
+def still_vertices(edges: Edges, count: int, constraints: Constraints) -> np.ndarray:
+    """(v,) bool: of `count` vertices those that may not move: corners of features, and boundaries that no curve leads."""
     boundary = np.zeros(count, bool)
     boundary[edges.ends[edges.count != 2].ravel()] = True
     return constraints.fixed | (boundary & (constraints.curve < 0))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gdtool.geometry.distance import closest_points, sample_surface
@@ -32,14 +34,14 @@ def draw_out(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, 
 
     step = max(len(surface.vertices) // _POINTS, 1)
     points = samples = np.concatenate([surface.vertices[::step], sample_surface(surface.vertices, surface.faces, _POINTS // 2, np.random.default_rng(0))[0]])
-    most, before = len(faces) * (1 + most_added), constraints.fixed.copy()
+    most, given = len(faces) * (1 + most_added), constraints
     triangles, face_idx = triangulated(faces)
     away, nearest, _ = closest_points(points, vertices, triangles)
     of_samples = away, face_idx[nearest]
     for turn in range(_MOST_STEPS):
         if turn:
             triangles, face_idx = triangulated(faces)
-            away, nearest, _ = closest_points(points, vertices, triangles)
+            away, nearest = _nearest(points, away, vertices, triangles)
         bare = away > _BARE * edge  # all others will stay near
         points, away, nearest = points[bare], away[bare], nearest[bare]
         if not len(points) or not turn and away.max() < _STRAYS * edge:
@@ -54,15 +56,17 @@ def draw_out(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, 
             else:
                 vertices, faces, constraints = found
                 of_samples = None
-        points = points[alive]
-        if not len(points) or len(faces) > most or away[alive].max() < _CLOSE * edge:
+        points, away = points[alive], away[alive]
+        if not len(points) or len(faces) > most or away.max() < _CLOSE * edge:
             break
     if of_samples is None:
         triangles, face_idx = triangulated(faces)
         away, nearest, _ = closest_points(samples, vertices, triangles)
         of_samples = away, face_idx[nearest]
     vertices, constraints = _reached(vertices, faces, constraints, samples, *of_samples, edge)
-    before = np.concatenate([before, np.zeros(len(vertices) - len(before), bool)])
+    if constraints is not given:
+        constraints = _still_paths(constraints, faces)
+    before = np.concatenate([given.fixed, np.zeros(len(vertices) - len(given.fixed), bool)])
     return vertices, faces, constraints, np.flatnonzero(constraints.fixed & ~before), float(of_samples[0].max()), of_samples[0][-(_POINTS // 2):]
 
 
@@ -81,7 +85,24 @@ def _reached(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, 
     moved, first = np.unique(corner, return_index=True)  # the farthest comes first
     out = vertices.copy()
     out[moved] = points[ends][first]
-    return out, _extended(constraints, faces, len(vertices), moved, moved)
+    return out, _extended(constraints, len(vertices), moved, moved)
+
+
+def _nearest(points: np.ndarray, away: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far points (n, 3) are from the triangles (t, 3), and the nearest of these, where most are about `away` (n,): of few points
+    only what is as near is searched."""
+    from scipy.spatial import cKDTree
+
+    corners = vertices[triangles]
+    reach = away.max()
+    longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1).max()
+    near = np.isfinite(cKDTree(points).query(vertices, distance_upper_bound=reach + longest)[0])
+    few = np.flatnonzero(near[triangles].any(1))
+    if len(few):
+        found, nearest, _ = closest_points(points, vertices, triangles[few])
+        if found.max() <= reach:
+            return found, few[nearest]
+    return closest_points(points, vertices, triangles)[:2]
 
 
 def _apart(points: np.ndarray, away: np.ndarray, edge: float) -> list[np.ndarray]:
@@ -131,7 +152,7 @@ def _extruded(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints,
     vertices = np.concatenate([vertices, new])
     vertices[cap] = aim
     held = [k for k in np.argsort(-length, kind="stable") if length[k] > _HELD * length.max()]
-    return vertices, faces, _extended(constraints, faces, len(vertices), cap, cap[_sparse(aim, held, _CROWDED * edge)])
+    return vertices, faces, _extended(constraints, len(vertices), cap, cap[_sparse(aim, held, _CROWDED * edge)])
 
 
 def _sparse(points: np.ndarray, order: list[int], distance: float) -> list[int]:
@@ -162,14 +183,16 @@ def _border(faces: np.ndarray, patch: np.ndarray, cap: np.ndarray) -> np.ndarray
     return np.stack([loop, np.roll(loop, -1)], -1) if len(loop) == len(half) else None
 
 
-def _extended(constraints: Constraints, faces: np.ndarray, count: int, moved: np.ndarray, fixed: np.ndarray) -> Constraints:
-    """The constraints for so many vertices, without what held those that moved; `fixed` hold still."""
+def _extended(constraints: Constraints, count: int, moved: np.ndarray, fixed: np.ndarray) -> Constraints:
+    """The constraints for so many vertices, without what held those that moved, their paths as they were; `fixed` hold still."""
     curve, still = np.full(count, -1), np.zeros(count, bool)
     curve[:len(constraints.curve)], still[:len(constraints.fixed)] = constraints.curve, constraints.fixed
     curve[moved], still[moved], still[fixed] = -1, False, True
-    ends = edges_of(faces).ends
-    path = np.sort(constraints.path, 1)
-    kept = np.isin(path[:, 0] * (count + 1) + path[:, 1], ends[:, 0] * (count + 1) + ends[:, 1]) & (curve[path] >= 0).all(1)
-    return Constraints(curve, still, constraints.path[kept], constraints.path_curve[kept])
+    return replace(constraints, curve=curve, fixed=still)
 
 
+def _still_paths(constraints: Constraints, faces: np.ndarray) -> Constraints:
+    """Of the paths those edges that are still there, and still held at both ends."""
+    ends, path, width = edges_of(faces).ends, np.sort(constraints.path, 1), len(constraints.curve) + 1
+    kept = np.isin(path[:, 0] * width + path[:, 1], ends[:, 0] * width + ends[:, 1]) & (constraints.curve[path] >= 0).all(1)
+    return replace(constraints, path=constraints.path[kept], path_curve=constraints.path_curve[kept])

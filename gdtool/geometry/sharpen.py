@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 
 from gdtool.geometry.normals import face_normals, vertex_normals
 from gdtool.geometry.rays import dot
-from gdtool.geometry.repair import compact, edges_of, renumbered
+from gdtool.geometry.repair import Edges, compact, edges_of, renumbered
 
 _NEIGHBOURS = 24
 _RINGS = 5  # of faces around a bevel, among which the sides are
@@ -26,13 +26,14 @@ _SLIVERS_IN_A_ROW = 2
 _LARGEST_SHARE = 0.25  # more bevel vertices than this: a rough surface, not a mechanical part
 
 
-def dihedral_degrees(vertices: np.ndarray, faces: np.ndarray, thinnest: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def dihedral_degrees(vertices: np.ndarray, faces: np.ndarray, thinnest: float = 0.0,
+                     edges: Edges | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Edges (k, 2) with two faces, those faces (k, 2), and the angle (k,) between their normals in degrees; 0 beside zero-area faces.
 
     thinnest: a triangle whose height is a smaller share of its longest side has no direction of its own: it counts with
-    the face across that side.
+    the face across that side. edges: those of the faces, where they are known.
     """
-    edges = edges_of(faces)
+    edges = edges or edges_of(faces)
     edge_idx, pairs = edges.face_pairs()
     ends = edges.ends[edge_idx]
     normals, area = face_normals(vertices, faces)
