@@ -16,6 +16,7 @@ LARGE = 200_000  # triangles from which a second process pays
 _MOST_LEFT = 0.15  # of the triangles: where more are left, the rim, which stays as fine as it was, is too much of a half
 _RIM_FACES = 2.25  # triangles that a half is left with for each vertex of its rim
 _MOST_ON_RIM = 0.25  # of the triangles asked for
+_CHUNK = 2**14  # triangles at a time: what they need in between stays in the cache
 _RINGS, _SEAM_UNIT = 3, 0.1  # of triangles about the rim that are collapsed once the halves are one; the unit that this is done in, in that of the halves
 
 
@@ -32,10 +33,10 @@ def in_halves(collapse: Collapse, vertices: np.ndarray, faces: np.ndarray, targe
     vertices (v, 3), faces (f, 3). The halves keep their rims, by whose vertices, their first ones, they are joined; then
     what is about the seam is collapsed once more.
     """
-    across = np.ptp(vertices, 0).argmax()
-    place = vertices[:, across].take(faces[:, 0])
+    rows = np.ascontiguousarray(vertices.T)
+    place = rows[np.ptp(rows, 1).argmax()].take(faces[:, 0])
     low = place < np.median(place)
-    halves = faces[low], faces[~low]
+    halves = [faces.take(np.flatnonzero(side), 0) for side in (low, ~low)]
     used = np.zeros((2, len(vertices)), bool)
     for own, half in zip(used, halves, strict=True):
         own[half] = True
@@ -90,9 +91,12 @@ def _seam_collapsed(collapse: Collapse, vertices: np.ndarray, faces: np.ndarray,
 
 def _even(faces: np.ndarray) -> bool:
     """Whether each edge of faces (f, 3) is one of an even number of them, by the exclusive or of hashes (splitmix64's): wrong once in 2^64."""
-    start = faces.astype(np.uint64)
-    end = start[:, [1, 2, 0]]
-    key = np.minimum(start, end) << np.uint64(32) | np.maximum(start, end)
-    key = (key ^ key >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
-    key = (key ^ key >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
-    return not np.bitwise_xor.reduce(key ^ key >> np.uint64(31), axis=None)
+    together = np.uint64(0)
+    for i in range(0, len(faces), _CHUNK):
+        start = np.ascontiguousarray(faces[i:i + _CHUNK].T, np.uint64)
+        end = start[[1, 2, 0]]
+        key = np.minimum(start, end) << np.uint64(32) | np.maximum(start, end)
+        key = (key ^ key >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
+        key = (key ^ key >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
+        together ^= np.bitwise_xor.reduce(key ^ key >> np.uint64(31), axis=None)
+    return not together

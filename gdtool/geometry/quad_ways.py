@@ -38,6 +38,15 @@ def prepare_engines(quads: int, request: Request) -> None:
         prepare("gdtool.geometry.quad_candidate", len(_ways(quads, request)[0].factors))
 
 
+def _between(gave: list[tuple[float, int]], wanted: float) -> float | None:
+    """What to ask for where one number gave fewer quads than wanted and another more: a number between them. gave: (asked, count) of each."""
+    fewer, more = [one for one in gave if one[1] < wanted], [one for one in gave if one[1] > wanted]
+    if not fewer or not more:
+        return None
+    (low, below), (high, above) = max(fewer, key=lambda one: one[1]), min(more, key=lambda one: one[1])
+    return low + (high - low) * (wanted - below) / (above - below)
+
+
 class Trial:
     """The ways tried on one part."""
 
@@ -72,6 +81,7 @@ class Trial:
     def _by(self, way: Way) -> Found | None:
         quads = self.part.quads
         asked, extra = [quads * factor for factor in way.factors], 0  # extra: quads of the tips that are drawn out of the engine's
+        gave: list[tuple[float, int]] = []
         for turn in range(_TRIES):
             wanted = quads - extra
             candidates = self._candidates(way, asked, wanted)
@@ -85,7 +95,8 @@ class Trial:
             if not counted and (usable or together):
                 if turn and count * _MOST_MORE < wanted:
                     break  # small pieces are lost however many are asked for
-                asked = way.near(best.asked * min(wanted / max(count, 1), _MOST_MORE))
+                gave += [(one.asked, one.count) for one in candidates if one.fault == best.fault]
+                asked = way.near(_between(gave, wanted) or best.asked * min(wanted / max(count, 1), _MOST_MORE))
                 continue
             if counted and best.bridged and not way.subdivisions:
                 self._second_best = best

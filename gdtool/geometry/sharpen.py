@@ -7,7 +7,7 @@ al. 2001 (Feature sensitive surface extraction), its rank cut to the number of s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -22,6 +22,7 @@ _FARTHEST_EDGES = 4.0  # sides are looked for within this many edge lengths
 _LARGEST_MOVE_EDGES = 1.75
 _LARGEST_RESIDUAL_EDGES = 0.12
 _JOIN_EDGES = 0.6  # rims of one bevel end up nearer to each other than this
+_LENGTHS = 64  # steps in which the lengths of edges between rims are told apart
 _SLIVERS_IN_A_ROW = 2
 _LARGEST_SHARE = 0.25  # more bevel vertices than this: a rough surface, not a mechanical part
 
@@ -197,7 +198,7 @@ def collapse_bevels(vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, 
     """Collapse edges shorter than `longest` between moved vertices: both rims of a bevel that became one crease.
 
     vertices (v, 3), faces (f, 3), moved (v,) bool. An edge collapses only where the mesh stays manifold (link condition,
-    Dey et al. 1999) and no face with an area turns over. Returns compact vertices and faces.
+    Dey et al. 1999) and no face with an area turns over; shorter ones first. Returns compact vertices and faces.
     """
     touches = corners_of(faces, len(vertices)) @ moved.astype(np.int8)
     rims = faces[np.flatnonzero(touches > 1)].astype(np.int64)
@@ -205,86 +206,92 @@ def collapse_bevels(vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, 
     half = np.sort(half[moved[half].all(1)], 1)
     half = np.stack(np.divmod(np.unique(half[:, 0] * len(vertices) + half[:, 1]), len(vertices)), -1)
     length = np.linalg.norm(vertices[half[:, 0]] - vertices[half[:, 1]], axis=1)
-    order = np.argsort(length, kind="stable")
-    half = half[order[length[order] < longest]]
+    half, length = half[length < longest], length[length < longest]
+    # By chance among those of about one length: along a crease each would wait for the next.
+    half = half[np.lexsort((np.random.default_rng(0).permutation(len(half)), length // (longest / _LENGTHS)))]
     # Only the faces around the ends of these edges are looked at.
     ends = np.zeros(len(vertices), bool)
     ends[half.ravel()] = True
     near = np.flatnonzero(touches)
     near = near[ends[faces[near]].any(1)]
     places, local = renumbered(faces[near], len(vertices))
-    faces_at = corners_of(local, len(places)).T.tocsr()
-    first, around = faces_at.indptr.tolist(), faces_at.indices.tolist()
-    ring = {v: set(around[first[v]:first[v + 1]]) for v in np.flatnonzero(ends[places]).tolist()}  # the faces around each end
-    position = vertices[places]
-    area = list(zip(*(one.tolist() for one in _vector_area(*(position[corner].T for corner in local.T)))))
-    position, corners = position.tolist(), list(zip(*local.T.tolist()))
-    became = list(range(len(places)))
-
-    def last(v: int) -> int:
-        while became[v] != v:
-            v = became[v]
-        return v
-
-    tiny = (1e-3 * longest) ** 2
-    gone: list[int] = []
-    for a, b in np.searchsorted(places, half).tolist():
-        a, b = last(a), last(b)
-        if a == b or _squared(position[a], position[b]) > longest * longest:
-            continue
-        shared = ring[a] & ring[b]
-        if len(shared) != 2:
-            continue
-        around_a = set().union(*map(corners.__getitem__, ring[a]))
-        around_b = set().union(*map(corners.__getitem__, ring[b]))
-        if len(around_a & around_b) != 4:
-            continue
-        after = _after(a, b, ring[a] - shared, corners, position, area, tiny)
-        if after is None:
-            a, b = b, a
-            after = _after(a, b, ring[a] - shared, corners, position, area, tiny)
-            if after is None:
-                continue
-        for i in shared:
-            for v in corners[i]:
-                if v in ring:
-                    ring[v].discard(i)
-        gone += shared
-        for i, its_corners, its_area in after:
-            corners[i], area[i] = its_corners, its_area
-        ring[b] |= ring[a]
-        ring[a] = set()
-        became[a] = b
+    rims = _Rims(vertices[places], local, longest)
+    rims.collapse(np.searchsorted(places, half))
     keep = np.ones(len(faces), bool)
-    keep[near[gone]] = False
+    keep[near[~rims.stays]] = False
     kept = np.flatnonzero(keep)
     out = faces.take(kept, 0)
-    stays = keep[near]
-    out[np.searchsorted(kept, near[stays])] = places[[last(v) for v in range(len(places))]][local[stays]]
+    out[np.searchsorted(kept, near[rims.stays])] = places[rims.became[local[rims.stays]]]
     return compact(vertices, out)
 
 
-def _squared(a: list[float], b: list[float]) -> float:
-    return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
+class _Rims:
+    """Vertices (v, 3) and faces (f, 3) about bevels whose short edges are collapsed; which faces stay (f,) bool, what each vertex became (v,)."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, longest: float):
+        self._position, self._corners = np.ascontiguousarray(vertices.T), np.ascontiguousarray(faces.T)
+        self._area, self._longest = _vector_area(self._position, self._corners), longest
+        self._tiny = (1e-3 * longest) ** 4
+        self.stays, self.became = np.ones(len(faces), bool), np.arange(len(vertices))
+
+    def collapse(self, edges: np.ndarray) -> None:
+        """The edges (e, 2) taken in their order, each where it can be by then.
+
+        All at once that have no face around them in common with an earlier one: what comes of it is the same.
+        """
+        a, b = edges.T
+        turn, near = np.arange(len(a)), np.flatnonzero(self.stays)
+        while len(turn):
+            marked = np.zeros(len(self.became), bool)
+            marked[a] = marked[b] = True
+            near = near[marked[self._corners[:, near]].any(0)]
+            corners = self._corners[:, near]
+            first = np.full(len(marked), turn[-1])
+            np.minimum.at(first, a, turn)
+            np.minimum.at(first, b, turn)
+            around, of_face = np.full(len(marked), turn[-1]), first[corners].min(0)
+            for corner in corners:
+                np.minimum.at(around, corner, of_face)
+            now = np.minimum(around[a], around[b]) >= turn
+            self._joined(a[now], b[now], near, corners)
+            near = near[self.stays[near]]
+            a, b, turn = self.became[a[~now]], self.became[b[~now]], turn[~now]
+        while (self.became[self.became] != self.became).any():
+            self.became = self.became[self.became]
+
+    def _joined(self, a: np.ndarray, b: np.ndarray, near: np.ndarray, corners: np.ndarray) -> None:
+        """Edges from a (n,) to b (n,) collapsed where they can be, no two of which have a face around them in common; near (m,): all faces
+        around them, with their corners (3, m)."""
+        way = self._position[:, a] - self._position[:, b]
+        few = (a != b) & (dot(way, way) <= self._longest**2)
+        a, b = a[few], b[few]
+        if not len(a):
+            return
+        of = np.full((2, len(self.became)), -1)
+        of[0, a] = of[1, b] = np.arange(len(a))
+        with_a, with_b = of[0][corners].max(0), of[1][corners].max(0)
+        shared = (with_a >= 0) & (with_a == with_b)
+        about = [np.unique((edge * of.shape[1] + corners)[:, edge >= 0]) for edge in (with_a, with_b)]
+        common = np.intersect1d(*about, assume_unique=True) // of.shape[1]
+        can = (np.bincount(with_a[shared], minlength=len(a)) == 2) & (np.bincount(common, minlength=len(a)) == 4)
+        done = np.zeros(len(a), bool)
+        for edge, one, other in ((with_a, a, b), (with_b, b, a)):
+            moves = np.flatnonzero((edge >= 0) & ~shared & (can & ~done)[edge])
+            edge, face = edge[moves], near[moves]
+            after = np.where(corners[:, moves] == one[edge], other[edge], corners[:, moves])
+            area, was = _vector_area(self._position, after), self._area[:, face]
+            good = can & ~done
+            good[edge[(was[3] > self._tiny) & (dot(was, area) <= 0.1 * np.sqrt(was[3] * area[3]))]] = False
+            taken = good[edge]
+            self._corners[:, face[taken]], self._area[:, face[taken]] = after[:, taken], area[:, taken]
+            self.became[one[good]] = other[good]
+            done |= good
+        self.stays[near[shared][done[with_a[shared]]]] = False
 
 
-def _vector_area(p: Sequence, q: Sequence, r: Sequence) -> tuple:
-    """Twice the area of triangles as a vector, and its square; of coordinates that are numbers or arrays (n,)."""
-    ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
-    vx, vy, vz = r[0] - p[0], r[1] - p[1], r[2] - p[2]
-    x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    return x, y, z, x * x + y * y + z * z
-
-
-def _after(a: int, b: int, faces: set[int], corners: list, position: list, area: list, tiny: float) -> list[tuple] | None:
-    """Faces with their corners and vector areas when vertex a has moved to b; None where one turns over that has an area."""
-    out = []
-    for i in faces:
-        one, two, three = corners[i]
-        moved = b if one == a else one, b if two == a else two, b if three == a else three
-        after = p, q, r, area_after = _vector_area(position[moved[0]], position[moved[1]], position[moved[2]])
-        x, y, z, before = area[i]
-        if before > tiny * tiny and x * p + y * q + z * r <= 0.1 * (before * area_after) ** 0.5:
-            return None
-        out.append((i, moved, after))
-    return out
+def _vector_area(position: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Twice the area of triangles as a vector, and its square (4, n); position (3, v), corners (3, n)."""
+    p, q, r = (position[:, corner] for corner in corners)
+    u, v = q - p, r - p
+    area = np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+    return np.concatenate([area, dot(area, area)[None]])

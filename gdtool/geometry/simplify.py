@@ -22,6 +22,7 @@ _PACES, _UNIT = (4.0, 3.0, 8.0), 0.5  # how steeply the collapse's bound rises, 
 _BY_WAY = 6  # times the triangles asked for, to which the quicker collapse still goes well
 _UNEVEN, _FLAT = 1e-3, 1e-14  # edge lengths that what is flat is moved by; determinant of the mean of its normals' squares
 SHAKEN = 0.03  # edge lengths that all is moved by where the triangles are to be even
+_CHUNK = 2**14  # faces at a time: what they need in between stays in the cache
 _FEW_FLAT, _SAMPLE = 0.01, 20000  # of the vertices: so few stop no collapse; how many of them tell
 _STUCK, _FEW = 1.25, 32  # triangles in units of those asked for, and so many more, that a collapse may leave
 
@@ -32,14 +33,16 @@ def shaken(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     With it every vertex that is taken in adds about the same to an edge's error, where the surface is flat as where it is
     curved less than the noise; without it what is flat comes out in a few large triangles, and slivers around it.
     """
-    corners = [np.ascontiguousarray(vertices, np.float32).take(corner, 0) for corner in faces.T]
-    shortest = np.full(len(faces), np.inf, np.float32)
-    for one, other in combinations(corners, 2):
-        side = one - other
-        np.minimum(shortest, np.einsum("fi,fi->f", side, side), out=shortest)
+    position = np.ascontiguousarray(vertices, np.float32)
     far = np.full(len(vertices), median_edge(vertices, faces) ** 2, np.float32)
-    for corner in faces.T:
-        np.minimum.at(far, corner, shortest)
+    for i in range(0, len(faces), _CHUNK):
+        corners = np.ascontiguousarray(faces[i:i + _CHUNK].T, np.intp)
+        shortest = np.full(corners.shape[1], np.inf, np.float32)
+        for one, other in combinations(corners, 2):
+            side = position.take(one, 0) - position.take(other, 0)
+            np.minimum(shortest, np.einsum("fi,fi->f", side, side), out=shortest)
+        for corner in corners:
+            np.minimum.at(far, corner, shortest)
     return vertices + SHAKEN * np.sqrt(far)[:, None] * np.random.default_rng(0).standard_normal(vertices.shape, np.float32)
 
 

@@ -157,6 +157,14 @@ def test_every_round_asks_for_two_densities():
     assert way.near(20000)[1] / way.near(20000)[0] == pytest.approx(way.factors[1] / way.factors[0])
 
 
+def test_what_is_asked_next_lies_between_what_gave_too_few_and_what_gave_too_many():
+    """An engine's count may jump by a twentieth: in proportion to the last answer what gave too many would be asked for again."""
+    gave = [(19700.0, 20868), (20100.0, 21164)]
+    assert quad_ways._between(gave, 20000) is None and quad_ways._between(gave, 22000) is None
+    gave += [(18691.0, 19164), (19070.0, 18844)]
+    assert quad_ways._between(gave, 20000) == pytest.approx(19186, abs=1)
+
+
 def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypatch):
     """The first in rank where it will do, without a look at the other, and the other first where the first's outline leaves out more;
     where none does, what comes nearest to it."""

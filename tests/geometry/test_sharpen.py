@@ -42,6 +42,18 @@ def test_bevels_collapse_onto_vertices_they_had():
         assert (same == vertices).all() and (same_faces == faces).all()
 
 
+def test_edges_collapsed_at_once_are_those_collapsed_one_by_one():
+    vertices, faces = bored_box(24)
+    edges = repair.edges_of(faces).ends
+    edges = edges[np.random.default_rng(0).permutation(len(edges))]
+    longest = 0.9 * np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).max()
+    together, alone = (sharpen._Rims(vertices, faces.astype(np.int64), longest) for _ in range(2))
+    together.collapse(edges)
+    for edge in edges:
+        alone.collapse(alone.became[edge][None])
+    assert (together.became == alone.became).all() and (together.stays == alone.stays).all() and together.stays.mean() < 0.8
+
+
 def test_bevels_of_marching_cubes_become_creases():
     vertices, faces = bored_box()
     sharp, sharp_faces, report = sharpen.restore_creases(vertices, faces)
