@@ -12,6 +12,7 @@ from gdtool.geometry.simplify import simplify
 
 _QUADS_PER_TRIANGLE = 2.25  # of pair_and_split, where most triangles find a partner
 _EVEN_COUNT = 0.03  # even_triangles come so near to the number asked for
+_NEARER = 0.5  # each length tried brings the logarithm of their number so much nearer, where it can be had
 _TRIES = 3
 _APART = 1e-6  # of the size, between vertices that coincide
 
@@ -58,7 +59,7 @@ def even_triangles(vertices: np.ndarray, faces: np.ndarray, triangles: int, crea
     # MeshLab joins vertices that coincide, which closes slits and leaves edges of four faces.
     apart = np.random.default_rng(0).uniform(-1, 1, vertices.shape) * _APART * np.ptp(vertices, 0).max()
     own = np.ascontiguousarray(vertices + apart, np.float64), np.ascontiguousarray(faces, np.int32)
-    edge, found = (4 / 3**0.5 * face_normals(vertices, faces)[1].sum() / triangles) ** 0.5, faces
+    edge, found, off = (4 / 3**0.5 * face_normals(vertices, faces)[1].sum() / triangles) ** 0.5, faces, np.inf
     for _ in range(4):
         meshes = pymeshlab.MeshSet()
         meshes.add_mesh(pymeshlab.Mesh(*own))
@@ -69,6 +70,9 @@ def even_triangles(vertices: np.ndarray, faces: np.ndarray, triangles: int, crea
         vertices, found = np.asarray(mesh.vertex_matrix()), np.asarray(mesh.face_matrix(), np.int64)
         if abs(len(found) / triangles - 1) < _EVEN_COUNT or not len(found) or topology(found) != topology(faces):
             break  # what one length tears, another tears as well
+        before, off = off, abs(np.log(len(found) / triangles))
+        if off > _NEARER * before:
+            break  # so few are not to be had: its creases take more
         edge *= (len(found) / triangles) ** 0.7  # along creases they follow the edge itself
     return vertices, found
 

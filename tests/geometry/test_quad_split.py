@@ -38,6 +38,18 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
     assert asked < len(found) < 1.5 * asked < 1.8 * len(faces)
 
 
+def test_even_triangles_are_sought_no_longer_than_they_come_nearer_to_their_number(monkeypatch):
+    """A cube has twelve triangles whatever their edge; on a sphere any number is found."""
+    import pymeshlab
+
+    runs, mesh_set = [], pymeshlab.MeshSet
+    monkeypatch.setattr(pymeshlab, "MeshSet", lambda: runs.append(1) or mesh_set())
+    cubes = joined(*((cube()[0] + (3 * i, 0, 0), cube()[1]) for i in range(20)))
+    assert len(quad_split.even_triangles(*cubes, 100, 30.0)[1]) == 240 and len(runs) == 2
+    runs.clear()
+    assert abs(len(quad_split.even_triangles(*sphere(24), 500, 30.0)[1]) / 500 - 1) < 0.05 and 1 <= len(runs) <= 4
+
+
 def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
     """Pins with few triangles around: what bends too much stays single, and there are fewer triangles for it."""
     vertices, faces = joined(*((pin[0] + (0.3 * k, 0, 0), pin[1]) for k, pin in enumerate([rod(24)] * 8)))
