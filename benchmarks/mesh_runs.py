@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from fine_meshes import SOLIDS
+from measure import number, table
 
 
 def cost_since(start: float) -> dict[str, float]:
@@ -57,6 +58,16 @@ def arguments(text: str, models: str, peers: str) -> argparse.ArgumentParser:
     parser.add_argument("--minutes", type=float, default=12.0, help="a run that did not begin by then is left for the next time")
     parser.add_argument("--only", default="", help="comma list of ways; all of them when empty")
     return parser
+
+
+def beside(rows: list[dict], peers: list[str]) -> str:
+    """A table: our seconds on each model, and their ratio to those of each peer that ran in the same hour; machines differ, ratios less."""
+    took = {(row["model"], row["way"]): row["seconds"] for row in rows if "seconds" in row}
+    peers = [peer for peer in peers if any(way == peer for _, way in took)]
+    ours = {model: seconds for (model, way), seconds in took.items() if way == "ours"}
+    lines = [[model, number(seconds), *(number(seconds / took[model, peer] if (model, peer) in took else None, 2) for peer in peers)]
+             for model, seconds in ours.items()]
+    return table(["model", "our seconds", *(f"ratio to {peer}" for peer in peers)], lines)
 
 
 def plot(rows: list[dict], path: Path, error: str, label: str, logarithmic: bool) -> None:

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from fine_meshes import SOLIDS, Fine, models_in, of_model, of_solid
 from measure import busy, machine, number, say, table
-from mesh_runs import arguments, blender, cost_since, plot
+from mesh_runs import arguments, beside, blender, cost_since, plot
 from rows import Rows
 from wireframe import file_name, sheet, wireframe
 
@@ -150,7 +150,7 @@ def main() -> None:
         failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows.rows if "failed" in row)
         head = (f"# Remesh: {asked.faces} quads from {asked.input} triangles\n\n"
                 f"`make bench-assets`, {machine()}. {note}\n\n")
-        (asked.out / "remesh.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "")
+        (asked.out / "remesh.md").write_text(head + beside(rows.rows, [*PEERS, BLENDER]) + "\n\n" + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "")
                                              + "\n![time against error](remesh.png)\n\n![wireframes](remesh_sheet.png)\n")
         plot(rows.rows, asked.out / "remesh.png", "mean", "mean distance, share of the diagonal", True)
         sheet(asked.kept / "pictures", list(dict.fromkeys(row["model"] for row in rows.rows)), ["ours", "Instant Meshes", BLENDER],

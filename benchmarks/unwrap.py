@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from fine_meshes import models_in, of_model, of_solid
 from measure import busy, machine, number, say, table
-from mesh_runs import arguments, blender, cost_since, plot
+from mesh_runs import arguments, beside, blender, cost_since, plot
 from rows import Rows
 from wireframe import file_name, sheet
 
@@ -157,7 +157,7 @@ def main() -> None:
                                for row in rows.rows))
         failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows.rows if "failed" in row)
         head = f"# Unwrap: about {asked.faces} quads\n\n`make bench-assets`, {machine()}. {note}\n\n"
-        (asked.out / "unwrap.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "")
+        (asked.out / "unwrap.md").write_text(head + beside(rows.rows, [*PEERS, BLENDER]) + "\n\n" + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "")
                                              + "\n![time against coverage](unwrap.png)\n\n![layouts](unwrap_sheet.png)\n")
         shares = [row | {"uncovered": 1 - row["coverage"]} for row in rows.rows if "coverage" in row]
         plot(shares, asked.out / "unwrap.png", "uncovered", "share of the texture that no chart covers", False)
