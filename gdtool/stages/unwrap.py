@@ -15,6 +15,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from gdtool.core.child import prepare
 from gdtool.core.errors import InputError
 from gdtool.core.kinds import AtlasContent
 from gdtool.core.stage import Inputs, Output, Stage
@@ -34,6 +35,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Unwrap one mesh."""
+    prepare("gdtool.geometry.simplify")  # for unwrap()'s first child, while the mesh is read
+
     import numpy as np
 
     from gdtool.folders.mesh import QuadMesh, write_mesh
@@ -202,4 +205,4 @@ def _density(mesh, size: int) -> float:
     return float(size * (polygon_normals(flat, mesh.face_uvs)[1].sum() / area) ** 0.5)
 
 
-STAGE = Stage(name="unwrap", version=18, reads=("mesh", "mesh-file"), writes="atlas", Options=Options, run=run)
+STAGE = Stage(name="unwrap", version=19, reads=("mesh", "mesh-file"), writes="atlas", Options=Options, run=run)

@@ -57,14 +57,14 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
     """
     begun = time.monotonic()
     found_by, shaped_by, projected_by, hung_by, packed_by = (begun + share * request.seconds for share in _SHARES)
-    for module in ("gdtool.geometry.simplify", "gdtool.texture.unwrap_charts"):
-        prepare(module)
+    prepare("gdtool.geometry.simplify")
     extent = float(np.ptp(vertices[np.unique(faces[faces >= 0])], 0).max())
     unit = (vertices - vertices.mean(0)) / (extent if extent > 0 else 1.0)
 
     @cache
     def adjacency() -> Adjacency:  # asked for first while a child simplifies the mesh
-        prepare("gdtool.texture.unwrap_child")
+        for module in ("gdtool.texture.unwrap_charts", "gdtool.texture.unwrap_child"):
+            prepare(module)
         return Adjacency(unit, faces)
 
     label, part, proxy, failed = find_charts(adjacency, unit, faces, until=found_by, max_cost=request.max_cost)
@@ -107,10 +107,12 @@ def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float, until: float) -> 
             tried.append(charts)
             yield [(uv, triangles) for _, _, uv, triangles in charts]
 
-    chosen, share, ways = best_packed(variants(), gap)
-    skipped = []
+    chosen, share, ways, leapt = best_packed(variants(), gap)
+    skipped, took = [], time.monotonic() - start
+    if leapt:
+        skipped.append((f"packing {leapt} ways to cut", "the charts before filled too little of the square", leapt * took / (len(tried) - leapt)))
     if share > WELL_PACKED and len(tried) <= len(counts):
-        skipped = [("cutting further for packing", f"the charts fill {share:.0%} of the square", time.monotonic() - start)]
+        skipped.append(("cutting further for packing", f"the charts fill {share:.0%} of the square", took))
     return tried[chosen], ways, skipped
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ _GROWS = 0.02  # of its side, that a square grows by where a chart finds no room
 _SETTLED = 4  # layouts that are tightened
 _GAIN, _GAIN_PER_CHART = 0.006, 0.0012
 WELL_PACKED = 0.67  # of the square, by a draft: charts that fill as much stay as they are
+_NEXT_GAINS = 0.09  # of the square, that cutting one step further gains at most, mostly
 _TRIES, _TRIES_OF_DRAFT = 3600, 150  # charts placed in search of better orders, at last and to tell ways to cut apart
 _CHAINS = 4  # of changes of orders
 _SLACK = 5.0  # seconds that the child has to start and to stop
@@ -38,27 +40,33 @@ class Layout(NamedTuple):
     contact: float
 
 
-def best_packed(variants: Iterable[list[tuple[np.ndarray, np.ndarray]]], gap: float) -> tuple[int, float, list[tuple[list[int], float]]]:
+def best_packed(variants: Iterable[list[tuple[np.ndarray, np.ndarray]]], gap: float
+                ) -> tuple[int, float, list[tuple[list[int], float]], int]:
     """Which of several ways to cut one surface into charts packs best, by a short search, the share of the square that it
-    fills (0, 0 where none can be told), and the orders and weights of contact to pack it in.
+    fills (0, 0 where none can be told), the orders and weights of contact to pack it in, and how many ways it leapt over.
 
-    The first that fills WELL_PACKED of the square will do. Else each later one has to gain more than the seams it adds are
-    worth, _GAIN of the square and _GAIN_PER_CHART for each chart.
+    variants: each cut a step further than the one before. The first that fills WELL_PACKED of the square will do, and where
+    one lacks several times _NEXT_GAINS of that, the next ones are leapt over. Else each later one has to gain more than the
+    seams it adds are worth, _GAIN of the square and _GAIN_PER_CHART for each chart.
     """
-    best, best_share, best_count, best_ways = 0, 0.0, 0, []
+    best, best_share, best_count, best_ways, leapt, leap = 0, 0.0, 0, [], 0, 0
     known: dict[tuple[int, int], list] = {}
-    for i, charts in enumerate(variants):
+    numbered = enumerate(variants)
+    while ahead := list(islice(numbered, 1 + leap)):
+        i, charts = ahead[-1]
+        leapt, leap = leapt + len(ahead) - 1, 0
         if not 1 < len(charts) <= _MOST_BY_SEARCH:
             continue
         boxed, area = _boxed(charts, known)
         cells, shapes, found = _drafted(boxed, area, gap, _OWN[0], [])
         found = _improved(shapes, found, _TRIES_OF_DRAFT, np.inf)
         share = _DENSITY * (cells / found[0].side) ** 2 if found else 0.0
+        leap = int((WELL_PACKED - share) / _NEXT_GAINS) if WELL_PACKED > share > 0 else 0
         if share > best_share + (_GAIN + _GAIN_PER_CHART * (len(charts) - best_count) if best_share else 0.0):
             best, best_share, best_count, best_ways = i, share, len(charts), [(layout.order, layout.contact) for layout in found[:2]]
         if best_share > WELL_PACKED:
             break
-    return best, best_share, best_ways
+    return best, best_share, best_ways, leapt
 
 
 def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, ways: list[tuple[list[int], float]] | None = None,

@@ -146,8 +146,9 @@ def test_charts_stay_whole_where_they_fill_the_square(monkeypatch):
     faces = np.concatenate([own + 81 * k for k, (_, own) in enumerate(meshes)])
     found = unwrap.unwrap(vertices, faces, SMALL)
     assert [what for what, _, _ in found.skipped] == ["cutting further for packing"] and found.skipped[0][2] > 0
-    monkeypatch.setattr(unwrap, "WELL_PACKED", np.inf)
-    monkeypatch.setattr(unwrap_pack, "WELL_PACKED", np.inf)
+    monkeypatch.setattr(unwrap, "WELL_PACKED", 1.0)
+    monkeypatch.setattr(unwrap_pack, "WELL_PACKED", 1.0)
+    monkeypatch.setattr(unwrap_pack, "_NEXT_GAINS", 1.0)
     other = unwrap.unwrap(vertices, faces, SMALL)
     few, many = checked(vertices, faces, found), checked(vertices, faces, other)
     assert not other.skipped and many["coverage"] < 1.1 * few["coverage"] and many["stretch"] == pytest.approx(few["stretch"], abs=1e-3)
@@ -281,7 +282,10 @@ def test_orders_are_not_searched_for_more_charts_where_few_fill_the_square():
         return [(corners, np.array([[0, 1, 2], [0, 2, 3]]))] * n
 
     few, many, narrow = grid(4, (1, 1)), grid(16, (0.5, 0.5)), grid(2, (3.0, 0.1))
-    chosen, share, _ = best_packed([few, many], 1 / 512)
+    chosen, share, *_ = best_packed([few, many], 1 / 512)
     assert chosen == 0 and share > WELL_PACKED
     # Where the first fills it badly, those that fill it are taken.
     assert best_packed([narrow, many], 1 / 512)[0] == 1
+    # Where it fills much less, the next ones are leapt over, though never the last.
+    strips = grid(2, (3.0, 0.3))
+    assert best_packed([strips, few, many], 1 / 512)[::3] == (2, 1) and best_packed([strips, many], 1 / 512)[::3] == (1, 0)
