@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from fine_meshes import SOLIDS, Fine, models_in, of_model, of_solid
 from measure import busy, machine, number, say, table
-from mesh_runs import arguments, beside, blender, cost_since, plot
+from mesh_runs import arguments, as_commanded, beside, blender, cost_since, plot
 from rows import Rows
 from wireframe import file_name, sheet, wireframe
 
@@ -38,6 +38,7 @@ COLUMNS = ("model", "way", "seconds", "processor", "peak MB", "quads", "watertig
 
 def ours(vertices: np.ndarray, faces: np.ndarray, quads: int, options: dict) -> tuple:
     """In a child: vertices, quads, cost, the engine taken."""
+    as_commanded()
     from gdtool.geometry.quad_task import Request
     from gdtool.geometry.quads import remesh
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from fine_meshes import models_in, of_model, of_solid
 from measure import busy, machine, number, say, table
-from mesh_runs import arguments, beside, blender, cost_since, plot
+from mesh_runs import arguments, as_commanded, beside, blender, cost_since, plot
 from rows import Rows
 from wireframe import file_name, sheet
 
@@ -37,6 +37,7 @@ COLUMNS = ("model", "way", "seconds", "processor", "charts", "coverage", "overla
 
 def ours(vertices: np.ndarray, faces: np.ndarray, options: dict) -> tuple:
     """In a child: texture coordinates, faces into them, cost."""
+    as_commanded()
     from gdtool.texture.unwrap import Request, unwrap
 
     start = time.perf_counter()

@@ -1,7 +1,8 @@
 """Run one function in a killable child process with a time and a memory limit.
 
 Native mesh code hangs, crashes or calls exit() on hard input (FAULTS.md). The child gets its arguments and gives its
-result by pickle over pipes of our own; it dies with its parent, however the parent dies.
+result by pickle over pipes of our own; it dies with its parent, however the parent dies. On Linux it is forked by a process
+that has read numpy and what else children need (nursery.py), elsewhere started anew.
 """
 
 from __future__ import annotations
@@ -16,9 +17,11 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from gdtool.core import errors
+from gdtool.core.nursery import Forked, Nursery, die_with_parent
 
 
 class ChildFailed(Exception):
@@ -29,71 +32,100 @@ class ChildFailed(Exception):
 # time of a quadric collapse. A child ends soon; it keeps what it has.
 # OpenBLAS starts a thread for each core as numpy is imported, which takes a third of a child's start-up; none multiplies dense matrices.
 _SETTINGS = {"OPENBLAS_NUM_THREADS": "1", "MALLOC_MMAP_THRESHOLD_": str(2**30), "MALLOC_TRIM_THRESHOLD_": str(2**32), "MALLOC_TOP_PAD_": str(2**26)}
-# Children that have imported a module and wait for a call, by the module's name.
-_ready: dict[str, list[subprocess.Popen]] = {}
+_FORKS = sys.platform == "linux"
+_nursery: Nursery | None = None
+_asking = threading.Lock()
 
 
-def prepare(module: str, count: int = 1) -> None:
-    """Start children now that the next `count` calls into a module will use: their start-up then costs those no time.
+@dataclass
+class Spent:
+    """By what forks children and those that have ended: they are no children of this process to the system (RUSAGE_CHILDREN)."""
 
-    For a main thread only: a child dies with the thread that starts it. What is never called ends with the process.
-    """
-    waiting = _ready.setdefault(module, [])
-    waiting.extend(_start(module) for _ in range(count - len(waiting)))
+    seconds: float = 0.0  # of the processor
+    peak_mb: float = 0.0  # resident in one of them
+    _nursery: float = 0.0
+
+    def add(self, child: Forked) -> None:
+        self.seconds += child.seconds + max(child.nursery_seconds - self._nursery, 0)
+        self._nursery = max(child.nursery_seconds, self._nursery)
+        self.peak_mb = max(self.peak_mb, child.peak_mb)
 
 
-def _start(module: str) -> subprocess.Popen:
-    return subprocess.Popen([sys.executable, "-m", "gdtool.core.child", module], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                            env=_SETTINGS | os.environ)
+spent = Spent()
 
 
-def _take(module: str) -> subprocess.Popen:
-    while _ready.get(module):
-        process = _ready[module].pop()
-        if process.poll() is None:
-            return process
-        process.communicate()
-    return _start(module)
+def prepare(module: str) -> None:
+    """Have a module that the next children will ask for read now, by the process that forks them: that then costs those no time."""
+    if _FORKS:
+        _tell_nursery(lambda nursery: nursery.read(module))
+
+
+def _tell_nursery(tell: Callable[[Nursery], Any]) -> Any:
+    """What comes of telling the nursery, a new one where there is none or it is no more."""
+    global _nursery
+    with _asking:
+        if _nursery is not None:
+            with contextlib.suppress(OSError):
+                return tell(_nursery)
+        _nursery = Nursery.start(_SETTINGS | os.environ)
+        return tell(_nursery)
+
+
+def forget_nursery() -> None:
+    """Have the next children forked by a process that reads what they need anew, as in a command that has just been started."""
+    global _nursery, _asking, spent
+    _asking, spent = threading.Lock(), Spent()
+    if _nursery is not None:
+        _nursery.leave()
+        _nursery = None
+
+
+if _FORKS:
+    os.register_at_fork(after_in_child=forget_nursery)  # a copy of this process has children of its own
+
+
+def _started() -> Forked | subprocess.Popen:
+    if _FORKS:
+        return _tell_nursery(Nursery.fork)
+    code = f"from {__name__} import serve; serve()"
+    return subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=_SETTINGS | os.environ)
 
 
 class Running:
     """A call under way in a child: result() waits for it."""
 
-    def __init__(self, function: str, process: subprocess.Popen, request: bytes, seconds: float):
+    def __init__(self, function: str, process: Forked | subprocess.Popen, request: bytes, seconds: float):
         self._function, self._process, self._timed_out = function, process, False
         self._answer, self._noise = b"", b""
         self._timer = threading.Timer(seconds, self._stop)
         self._timer.daemon = True
         self._timer.start()
-        try:
-            with contextlib.suppress(BrokenPipeError):  # it is dead already: result() says of what
-                process.stdin.write(request)
-            with contextlib.suppress(BrokenPipeError):
-                process.stdin.close()
-        except BaseException:
-            process.kill()
-            process.wait()
-            raise
-        process.stdin = None  # communicate() would flush it
-        # Read from now on: a child that is done ends, whenever result() is asked for.
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
+        # A child that still starts takes in what it is asked when it can, and one that is done ends, whenever result() is asked for.
+        self._talk = threading.Thread(target=self._converse, args=(request,), daemon=True)
+        self._talk.start()
 
     def _stop(self) -> None:
         self._timed_out = True
         self._process.kill()
 
-    def _read(self) -> None:
+    def _converse(self, request: bytes) -> None:
+        for told in (lambda: self._process.stdin.write(request), self._process.stdin.close):
+            with contextlib.suppress(BrokenPipeError):  # it is dead already: result() says of what
+                told()
+        self._process.stdin = None  # communicate() would flush it
         self._answer, self._noise = self._process.communicate()
         self._timer.cancel()
+        if isinstance(self._process, Forked):
+            with _asking:
+                spent.add(self._process)
 
     def result(self) -> Any:
         """What the function returned. A GdtoolError raised in the child is raised here; ChildFailed for all else."""
         try:
-            self._reader.join()
+            self._talk.join()
         except BaseException:
             self._process.kill()
-            self._reader.join()
+            self._talk.join()
             raise
         process, function = self._process, self._function
         if self._timed_out:
@@ -112,12 +144,15 @@ class Running:
 
 
 def begin(function: str, *args: Any, seconds: float, memory_mb: int | None = None, **kwargs: Any) -> Running:
-    """Start "package.module:function"(*args, **kwargs) in a child process; the child has all of it when this returns.
+    """Start "package.module:function"(*args, **kwargs) in a child process, which gets the arguments as they are now.
 
     memory_mb limits the growth of the child's address space over what it has after importing.
     """
-    request = pickle.dumps((function, args, kwargs, memory_mb), protocol=5)
-    return Running(function, _take(function.split(":")[0]), request, seconds)
+    place = None
+    with contextlib.suppress(OSError):  # it may have been deleted
+        place = os.getcwd()
+    request = pickle.dumps((place, sys.path, _SETTINGS | os.environ)) + pickle.dumps((function, args, kwargs, memory_mb), protocol=5)
+    return Running(function, _started(), request, seconds)
 
 
 def call(function: str, *args: Any, seconds: float, memory_mb: int | None = None, **kwargs: Any) -> Any:
@@ -135,7 +170,7 @@ def beside(function: Callable[..., Any], *args: Any) -> Callable[[], Any]:
     pid = os.fork()
     if not pid:
         try:
-            _die_with_parent()
+            die_with_parent()
             os.close(receive)
             answer = function(*args)
             with os.fdopen(send, "wb") as file:
@@ -155,13 +190,6 @@ def beside(function: Callable[..., Any], *args: Any) -> Callable[[], Any]:
     return result
 
 
-def _die_with_parent() -> None:
-    if sys.platform == "linux":
-        import ctypes
-
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
-
-
 def _limit_memory(megabytes: int) -> None:
     import resource
 
@@ -173,18 +201,26 @@ def _limit_memory(megabytes: int) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 
-def _main() -> None:
-    _die_with_parent()
+def serve(nursery: Nursery | None = None) -> None:
+    """What a child runs: what it is asked comes from stdin, the answer goes to stdout, all else that is printed to stderr.
+
+    nursery: where it was forked, and where children of its own come from; None for one that was started.
+    """
+    global _nursery
+    if nursery is None:
+        die_with_parent()
+    _nursery = nursery
     # Native libraries print to stdout; the answer goes out through a descriptor they do not know.
     answer_to = os.dup(1)
     os.dup2(2, 1)
-    with contextlib.suppress(Exception):  # told when the function is asked for
-        importlib.import_module(sys.argv[1])
-    request = sys.stdin.buffer.read()
-    if not request:
-        return
     gc.disable()  # it looks at a hundred thousand small objects again and again as they become more; a child ends soon
-    function, args, kwargs, memory_mb = pickle.loads(request)
+    with os.fdopen(0, "rb", closefd=False) as asked:
+        place, sys.path[:], environment = pickle.load(asked)
+        os.environ.clear()
+        os.environ.update(environment)
+        with contextlib.suppress(OSError, TypeError):
+            os.chdir(place)
+        function, args, kwargs, memory_mb = pickle.load(asked)
     module, name = function.split(":")
     try:
         target = getattr(importlib.import_module(module), name)
@@ -200,7 +236,3 @@ def _main() -> None:
     with os.fdopen(answer_to, "wb") as file:
         pickle.dump(answer, file, protocol=5)
     os._exit(0)  # a native library may hang or crash in its own teardown; the answer is out
-
-
-if __name__ == "__main__":
-    _main()

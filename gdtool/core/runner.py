@@ -20,7 +20,7 @@ import msgspec
 
 import gdtool
 from gdtool import __version__
-from gdtool.core import log, sources
+from gdtool.core import child, log, sources
 from gdtool.core.errors import GdtoolError, InputError, ResourceError, UsageError, from_os_error
 from gdtool.core.folder import Folder, find_ancestor, is_folder, open_folder
 from gdtool.core.manifest import (MANIFEST, InputEntry, Manifest, RunRecord, check_files, digest_of, encode, list_files,
@@ -228,7 +228,7 @@ def _peak_memory_mb() -> float:
         own = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 1024
     except (OSError, StopIteration):
         own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return max(own, children)
+    return max(own, children, child.spent.peak_mb)
 
 
 def write_dataset_index(root: Path, results: list[Result]) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse.csgraph  # noqa: F401 - what repair needs, read while a prepared child waits
+import scipy.sparse.csgraph  # noqa: F401 - what repair needs, read before a child is forked
 
 from gdtool.geometry import repair
 from gdtool.geometry.features import Constraints

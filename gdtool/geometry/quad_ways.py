@@ -35,7 +35,7 @@ def _ways(quads: int, request: Request) -> list[Way]:
 def prepare_engines(quads: int, request: Request) -> None:
     """Start the children of the first way now (core.child.prepare)."""
     if request.engine != "split":
-        prepare("gdtool.geometry.quad_candidate", len(_ways(quads, request)[0].factors))
+        prepare("gdtool.geometry.quad_candidate")
 
 
 def _between(gave: list[tuple[float, int]], wanted: float) -> float | None:

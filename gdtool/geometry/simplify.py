@@ -7,7 +7,8 @@ from functools import cache
 from itertools import combinations, combinations_with_replacement
 
 import numpy as np
-import scipy.sparse  # noqa: F401 - what repair needs, read while a prepared child waits
+import scipy.sparse  # noqa: F401 - what repair and sharpen need, read before a child is forked
+import scipy.spatial  # noqa: F401
 
 from gdtool.core.child import ChildFailed, begin
 from gdtool.core.errors import InputError
@@ -153,9 +154,18 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
         cells *= 2
 
 
-def reduced(vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple, even: bool) -> tuple[np.ndarray, np.ndarray]:
-    """What the child runs: one of the collapses above of what is shaken, or uneven, first."""
-    vertices = (shaken if even else uneven)(vertices, faces)
+def reduced(vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple, even: bool,
+            crease_degrees: float = 0.0) -> tuple[np.ndarray, np.ndarray, int]:
+    """What the child runs: one of the collapses above of what is shaken, or uneven, first, and before that drawn out to creases that turn
+    by more than crease_degrees, if any; and how many vertices were."""
+    moved = 0
+    if crease_degrees:
+        vertices, faces, creases = restore_creases(vertices, faces, crease_degrees)
+        moved = int(creases["moved"])
+    return *_reduced((shaken if even else uneven)(vertices, faces), faces.astype(np.int32, copy=False), way, arguments, even), moved
+
+
+def _reduced(vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple, even: bool) -> tuple[np.ndarray, np.ndarray]:
     if even and way == "collapse" and worth_halving(faces, arguments[0]):
         # Only of even triangles it is known how many of them each half is to have.
         target_faces, pace, unit = arguments
@@ -203,18 +213,13 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     edge = _edge(unit, faces, target_faces)
     is_closed, pieces = cache(closed or (lambda: repair.is_watertight(faces))), cache(lambda: repair.components(faces)[0])
 
-    def collapsed(vertices: np.ndarray, faces: np.ndarray, moved: int) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str]]:
-        return _collapsed(vertices, faces, target_faces, edge if near else _UNIT, even, moved, careful, seconds, is_closed, meanwhile)
+    def collapsed(crease_degrees: float) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str], int | None]:
+        return _collapsed(unit, faces, target_faces, edge if near else _UNIT, even, crease_degrees, careful, seconds, is_closed, meanwhile)
 
-    moved = 0
-    if crease_degrees:
-        # By this process, while the child starts: the search tree, which meanwhile() builds, then takes as long as the collapse does.
-        *drawn, creases = restore_creases(unit, faces.astype(np.int32), crease_degrees)
-        moved = creases["moved"]
-    found, method, reasons = collapsed(*(drawn if moved else (unit, faces)), moved)
-    if found is None and moved:
-        moved, reasons = 0, [*reasons, "creases restored: the result cannot be simplified"]
-        found, method, more = collapsed(unit, faces, 0)
+    found, method, reasons, moved = collapsed(crease_degrees)
+    if found is None and moved != 0:
+        reasons.append("creases restored: the result cannot be simplified")
+        found, method, more, moved = collapsed(0.0)
         reasons += more
     if found is None and not is_closed():
         found, method = cluster(unit, faces, target_faces), "vertex clustering"
@@ -244,26 +249,28 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     return out
 
 
-def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit: float, even: bool, moved: int, careful: bool, seconds: float,
-               is_closed: Callable[[], bool], meanwhile: Callable[[], object]) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str]]:
-    """What the first way leaves that keeps the mesh as closed as it is, or None; its name, what failed. moved: vertices that were drawn out to creases."""
+def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit: float, even: bool, crease_degrees: float, careful: bool,
+               seconds: float, is_closed: Callable[[], bool], meanwhile: Callable[[], object]
+               ) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str], int | None]:
+    """What the first way leaves that keeps the mesh as closed as it is, or None; its name, what failed, and how many vertices were drawn
+    out to creases, None where no child came to tell."""
     # The quick collapse tears a closed mesh now and then (a handful of edges with four faces), at one pace and not at
     # another, and of parts made of slivers it collapses nothing, at any; MeshLab's takes ten times as long.
     quick = [("collapse", (target_faces, pace, unit)) for pace in _PACES]
     slow = [("collapse_topology", (target_faces,))]
     if len(faces) > 2 * _BY_WAY * target_faces:
         slow.insert(0, ("collapse_by_way", (target_faces,)))
-    reasons, stuck = [], None
+    reasons, stuck, moved = [], None, None if crease_degrees else 0
     for way, arguments in slow + quick if careful else quick + slow:
         if stuck is not None and way == "collapse" or way == "collapse_by_way" and stuck is None and not careful:
             continue
-        if moved and way != "collapse" and not careful:
+        if moved != 0 and way != "collapse" and not careful:
             break  # what cannot be collapsed are folds, of bevels that were drawn out where there is no crease
         try:
-            running = begin("gdtool.geometry.simplify:reduced", vertices, faces.astype(np.int32), way, arguments, even,
+            running = begin("gdtool.geometry.simplify:reduced", vertices, faces.astype(np.int32), way, arguments, even, crease_degrees,
                             seconds=seconds, memory_mb=16000)
             meanwhile()
-            out = running.result()
+            *out, moved = running.result()
         except ChildFailed as failure:
             reasons.append(str(failure))
             continue
@@ -278,8 +285,8 @@ def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit:
             stuck = out
             reasons.append(f"the quick collapse stopped at {len(out[1])} triangles")
         else:
-            return out, "quadric collapse" if way == "collapse" else "quadric collapse, topology kept", reasons
-    return stuck, "quadric collapse", reasons
+            return out, "quadric collapse" if way == "collapse" else "quadric collapse, topology kept", reasons, moved
+    return stuck, "quadric collapse", reasons, moved
 
 
 def _sound(vertices: np.ndarray, faces: np.ndarray, closed: bool, target_faces: int) -> bool:

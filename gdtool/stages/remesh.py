@@ -15,6 +15,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from gdtool.core.child import prepare
 from gdtool.core.errors import InputError
 from gdtool.core.kinds import MeshContent
 from gdtool.core.stage import Inputs, Output, Stage
@@ -41,6 +42,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Remesh one surface or mesh file."""
+    prepare("gdtool.geometry.simplify")  # for remesh()'s first child, while the mesh is read
+
     import numpy as np
 
     from gdtool.folders.mesh import QuadMesh, triangulated, write_mesh

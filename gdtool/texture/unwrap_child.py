@@ -1,4 +1,4 @@
-"""What unwrap's children run: they import all that it needs before they are called, while others work."""
+"""What unwrap's children run, with all that it needs, which is read before they are forked, while others work."""
 
 from __future__ import annotations
 

@@ -14,9 +14,11 @@ from gdtool.core.errors import InputError
 from tests.conftest import ROOT
 
 
-@pytest.fixture(autouse=True)
-def importable(monkeypatch):
+@pytest.fixture(autouse=True, params=[True, False] if sys.platform == "linux" else [False], ids=lambda forks: "forked" if forks else "started")
+def forks(request, monkeypatch):
+    monkeypatch.setattr(child, "_FORKS", request.param)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    return request.param
 
 
 def double(array, noise=""):
@@ -26,6 +28,29 @@ def double(array, noise=""):
 
 def ask_for_more():
     return child.call("tests.core.test_child:double", np.arange(3), seconds=20, memory_mb=10**6)
+
+
+def parents():
+    """Own parent, and that of a child."""
+    return os.getppid(), child.call("os:getppid", seconds=20)
+
+
+def leave_one_behind(pid_file):
+    child.begin("tests.core.test_child:hang_as", pid_file, seconds=30)
+    while not pid_file.exists():
+        time.sleep(0.02)
+
+
+def hang_as(pid_file):
+    pid_file.with_suffix(".new").write_text(str(os.getpid()))
+    pid_file.with_suffix(".new").rename(pid_file)
+    hang()
+
+
+def work(seconds):
+    kept = np.ones(2**23)  # 64 MB
+    while time.process_time() < seconds:
+        kept.sum()
 
 
 def refuse():
@@ -66,17 +91,60 @@ def test_arrays_go_there_and_back_whatever_the_function_prints():
     assert (child.call("tests.core.test_child:double", np.arange(5), noise="text", seconds=30) == np.arange(5) * 2).all()
 
 
-def test_a_prepared_child_takes_the_next_call_and_a_dead_one_none():
-    child.prepare("tests.core.test_child", 2)
-    waiting = [process.pid for process in child._ready["tests.core.test_child"]]
-    assert len(set(waiting)) == 2
-    os.kill(waiting[1], signal.SIGKILL)
-    time.sleep(0.2)
-    assert child.call("tests.core.test_child:own_pid", seconds=30) == waiting[0]
-    assert child.call("tests.core.test_child:own_pid", seconds=30) not in waiting
+def test_what_is_prepared_is_read_already_and_what_cannot_be_is_told_when_it_is_asked_for(tmp_path, forks):
+    (tmp_path / "marked_module.py").write_text("import os\nread_by = os.getpid()\ndef asked():\n    return os.getpid(), read_by\n")
+    sys.path.append(str(tmp_path))
+    try:
+        child.prepare("marked_module")
+        own, read_by = child.call("marked_module:asked", seconds=30)
+    finally:
+        sys.path.remove(str(tmp_path))
+    assert own != os.getpid() and (own != read_by) == forks
     child.prepare("no.such.module")
     with pytest.raises(child.ChildFailed, match="ModuleNotFoundError"):
         child.call("no.such.module:function", seconds=30)
+
+
+def test_a_child_has_the_place_and_the_environment_of_the_call(tmp_path, monkeypatch):
+    child.prepare("tests.core.test_child")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("GDTOOL_MARK", "1")
+    assert child.call("os:getcwd", seconds=30) == str(tmp_path.resolve())
+    assert child.call("os:getenv", "GDTOOL_MARK", seconds=30) == "1"
+    monkeypatch.delenv("GDTOOL_MARK")
+    assert child.call("os:getenv", "GDTOOL_MARK", seconds=30) is None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="children are forked on Linux only")
+def test_what_forks_children_is_started_again_where_it_died_and_has_one_thread(forks):
+    if not forks:
+        pytest.skip("children are started anew")
+    for module in ("gdtool.geometry.simplify", "gdtool.geometry.quad_candidate", "gdtool.texture.unwrap_charts", "gdtool.texture.unwrap_child",
+                   "gdtool.texture.unwrap_pack"):
+        child.prepare(module)
+    assert child.call("os:getppid", seconds=30) == child._nursery.process.pid
+    assert len(os.listdir(f"/proc/{child._nursery.process.pid}/task")) == 1  # what has more cannot be copied
+    running = child.begin("tests.core.test_child:hang", seconds=30)
+    child._nursery.process.kill()
+    with pytest.raises(child.ChildFailed, match="SIGKILL"):
+        running.result()
+    assert child.call("tests.core.test_child:double", 1, seconds=30) == 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="children are forked on Linux only")
+def test_a_copy_of_this_process_has_children_of_its_own(forks):
+    first = child.call("os:getppid", seconds=30)
+    receive, send = os.pipe()
+    if not os.fork():
+        try:
+            os.write(send, b"%d" % child.call("os:getppid", seconds=30))
+        finally:
+            os._exit(0)
+    os.close(send)
+    with os.fdopen(receive, "rb") as file:
+        assert int(file.read()) != first
+    os.wait()
+    assert child.call("os:getppid", seconds=30) == first
 
 
 def test_children_that_were_begun_work_at_once_and_keep_their_limits():
@@ -111,6 +179,25 @@ def test_a_childs_child_may_ask_for_more_than_the_child_has():
     assert child.call("tests.core.test_child:ask_for_more", seconds=30, memory_mb=4000).tolist() == [0, 2, 4]
 
 
+def test_a_childs_child_comes_from_where_the_child_came_from_and_dies_with_it(tmp_path, forks):
+    own, other = child.call("tests.core.test_child:parents", seconds=30)
+    assert (own == other) == forks
+    child.call("tests.core.test_child:leave_one_behind", tmp_path / "pid", seconds=30)
+    pid = int((tmp_path / "pid").read_text())
+    deadline = time.monotonic() + 5
+    while alive(pid) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not alive(pid)
+
+
+def test_what_children_spent_is_known(monkeypatch, forks):
+    if not forks:
+        pytest.skip("the system counts what was started")
+    monkeypatch.setattr(child, "spent", child.Spent())
+    child.call("tests.core.test_child:work", 0.3, seconds=30)
+    assert 0.25 < child.spent.seconds < 5 and 64 < child.spent.peak_mb < 2000
+
+
 def test_a_copy_of_a_child_works_beside_it():
     own, other = child.call("tests.core.test_child:by_two", "own_pid", seconds=30)
     assert own != other and not alive(other)
@@ -120,16 +207,30 @@ def test_a_copy_of_a_child_works_beside_it():
             child.call("tests.core.test_child:by_two", death, seconds=30)
 
 
-def test_a_copy_dies_with_the_child():
+def test_a_copy_dies_with_the_child(forks):
     running = child.begin("tests.core.test_child:by_two", "hang", seconds=5)
-    copies = []
+    copies, nursery = [], child._nursery.process.pid if forks else None
     while not copies and not running._timed_out:
         time.sleep(0.05)
-        copies = subprocess.run(["pgrep", "-P", str(running._process.pid)], capture_output=True, text=True).stdout.split()
+        copies = [pid for pid in below(os.getpid()) if parent_of(pid) not in (os.getpid(), nursery)]
     with pytest.raises(child.ChildFailed, match="longer than 5 s"):
         running.result()
     time.sleep(0.3)
     assert copies and not any(alive(pid) for pid in copies)
+
+
+def parent_of(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return int(file.read().rsplit(")", 1)[1].split()[1])
+    except FileNotFoundError:
+        return None
+
+
+def below(pid):
+    """Processes that it started, and that these started."""
+    own = [int(one) for one in subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True).stdout.split()]
+    return own + [other for one in own for other in below(one)]
 
 
 def alive(pid):
@@ -141,14 +242,14 @@ def alive(pid):
         return False
 
 
-def test_the_child_dies_with_its_parent():
-    code = "from gdtool.core import child; child.call('tests.core.test_child:hang', seconds=50)"
+def test_the_child_dies_with_its_parent(forks):
+    code = f"from gdtool.core import child; child._FORKS = {forks}; child.call('tests.core.test_child:hang', seconds=50)"
     parent = subprocess.Popen([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(ROOT), "GDTOOL_MARK": "1"})
     children = []
     for _ in range(100):
         time.sleep(0.05)
-        children = subprocess.run(["pgrep", "-P", str(parent.pid)], capture_output=True, text=True).stdout.split()
-        if children:
+        children = below(parent.pid)
+        if len(children) > forks:  # what forks it is one
             break
     time.sleep(0.5)  # let it set its death signal
     parent.kill()

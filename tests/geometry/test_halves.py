@@ -111,10 +111,10 @@ def test_even_triangles_are_collapsed_in_halves_and_whole_where_these_fail(monke
     asked = []
     monkeypatch.setattr(simplify, "worth_halving", lambda faces, target_faces: True)
     monkeypatch.setattr(simplify, "in_halves", lambda *given: asked.append(given[3:]))
-    out, found = simplify.reduced(vertices, faces, "collapse", (600, 4.0, UNIT), True)
-    assert asked == [(600, UNIT)] and len(found) == 600 and repair.is_watertight(found)
+    out, found, moved = simplify.reduced(vertices, faces, "collapse", (600, 4.0, UNIT), True)
+    assert asked == [(600, UNIT)] and len(found) == 600 and repair.is_watertight(found) and moved == 0
     simplify.reduced(vertices, faces, "collapse", (600, 4.0, UNIT), False)
     simplify.reduced(*plane(20), "collapse_topology", (600,), True)
     assert len(asked) == 1
-    monkeypatch.setattr(simplify, "in_halves", lambda *given: "halves")
-    assert simplify.reduced(vertices, faces, "collapse", (600, 4.0, UNIT), True) == "halves"
+    monkeypatch.setattr(simplify, "in_halves", lambda *given: ("halves", "joined"))
+    assert simplify.reduced(vertices, faces, "collapse", (600, 4.0, UNIT), True) == ("halves", "joined", 0)
