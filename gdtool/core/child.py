@@ -57,7 +57,8 @@ spent = Spent()
 def prepare(module: str) -> None:
     """Have a module that the next children will ask for read now, by the process that forks them: that then costs those no time."""
     if _FORKS:
-        _tell_nursery(lambda nursery: nursery.read(module))
+        with contextlib.suppress(OSError):
+            _tell_nursery(lambda nursery: nursery.read(module))
 
 
 def _tell_nursery(tell: Callable[[Nursery], Any]) -> Any:
@@ -86,7 +87,8 @@ if _FORKS:
 
 def _started() -> Forked | subprocess.Popen:
     if _FORKS:
-        return _tell_nursery(Nursery.fork)
+        with contextlib.suppress(OSError):  # no such sockets to be had
+            return _tell_nursery(Nursery.fork)
     code = f"from {__name__} import serve; serve()"
     return subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=_SETTINGS | os.environ)
 

@@ -131,6 +131,16 @@ def test_what_forks_children_is_started_again_where_it_died_and_has_one_thread(f
     assert child.call("tests.core.test_child:double", 1, seconds=30) == 2
 
 
+def test_children_are_started_where_none_can_be_forked(monkeypatch):
+    def refused(environment):
+        raise PermissionError
+
+    monkeypatch.setattr(child, "_nursery", None)
+    monkeypatch.setattr(child.Nursery, "start", refused)
+    child.prepare("tests.core.test_child")
+    assert child.call("os:getppid", seconds=30) == os.getpid()
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="children are forked on Linux only")
 def test_a_copy_of_this_process_has_children_of_its_own(forks):
     first = child.call("os:getppid", seconds=30)
