@@ -74,7 +74,7 @@ def quads_for(scene, quads: int = QUADS) -> dict[str, np.ndarray]:
     from gdtool.texture.unwrap import Request as Charts
     from gdtool.texture.unwrap import unwrap
 
-    vertices, faces, _ = repair.clean(scene.vertices, scene.faces)
+    vertices, faces, *_ = repair.clean(scene.vertices, scene.faces)
     low, low_faces, _ = remesh(vertices, faces.astype(np.int64), Request(quads=quads))
     flat = unwrap(low, low_faces, Charts(size=2048))
     return {"vertices": low, "faces": low_faces, "uv": flat.uv, "face_uvs": flat.face_uvs}

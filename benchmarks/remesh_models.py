@@ -48,7 +48,7 @@ def peer(path: Path, faces: int) -> dict:
 
     scene = load_scene(path)
     vertices, triangles = repair.compact(scene.vertices, scene.faces.astype(np.int64))
-    vertices, triangles, _ = repair.clean(transform_points(invert_similarity(unit_box(vertices)), vertices), triangles, path)
+    vertices, triangles, *_ = repair.clean(transform_points(invert_similarity(unit_box(vertices)), vertices), triangles, path)
     start = time.perf_counter()
     out, found = call("gdtool.geometry.quad_engines:run_instant_meshes", vertices.astype(np.float32), triangles.astype(np.int32), faces, 30.0,
                       seconds=120, memory_mb=16000)

@@ -55,45 +55,20 @@ def write_obj(path: Path, mesh: QuadMesh, header: tuple[str, ...] = ()) -> None:
 
 
 def read_obj(path: Path) -> QuadMesh:
-    """Read the v, vt and f lines of an OBJ of triangles and quads; other lines are passed over.
+    """Read the v, vt and f lines of an OBJ of triangles and quads.
 
     Polygons of more corners are cut into quads and a triangle. Raises InputError for what is not so.
     """
-    vertices, uvs, faces, face_uvs = [], [], [], []
-    with open(path, encoding="utf-8", errors="replace") as file:
-        for number, line in enumerate(file, 1):
-            words = line.split()
-            if not words:
-                continue
-            try:
-                if words[0] == "v":
-                    vertices.append((float(words[1]), float(words[2]), float(words[3])))
-                elif words[0] == "vt":
-                    uvs.append((float(words[1]), 1 - float(words[2])))
-                elif words[0] == "f":
-                    corners = []
-                    for word in words[1:]:
-                        parts = word.split("/")
-                        v = int(parts[0])
-                        t = int(parts[1]) if len(parts) > 1 and parts[1] else 0
-                        corners.append((v - 1 if v > 0 else len(vertices) + v, t - 1 if t > 0 else len(uvs) + t if t else -1))
-                    if len(corners) < 3:
-                        raise ValueError("a face has fewer than three corners")
-                    for i in range(1, len(corners) - 1, 2):
-                        ring = [corners[0], *corners[i:i + 3]]
-                        ring += [(-1, -1)] * (4 - len(ring))
-                        faces.append([v for v, _ in ring])
-                        face_uvs.append([t for _, t in ring])
-            except (ValueError, IndexError) as error:
-                raise InputError(path, f"line {number} is not what OBJ says ({error})") from None
-    if not faces:
-        raise InputError(path, "has no faces")
-    points, quads = np.array(vertices, np.float64).reshape(-1, 3), np.array(faces, np.int32)
-    if quads.max() >= len(points) or quads[:, :3].min() < 0:
+    from gdtool.assets.obj_lines import read_lines
+
+    lines = read_lines(path)
+    points, coordinates = lines.vertices, lines.uvs * (1, -1) + (0, 1)
+    place = _cut(lines.sizes)
+    quads, corners = (np.where(place >= 0, lines.corners[:, column].astype(np.int32)[place], -1) for column in (0, 1))
+    if quads.max() >= len(points):
         raise InputError(path, f"a face refers to a vertex out of range (there are {len(points)})")
     if not np.isfinite(points).all():
         raise InputError(path, f"vertex {int(np.argwhere(~np.isfinite(points))[0][0]) + 1} is not finite")
-    corners, coordinates = np.array(face_uvs, np.int32), np.array(uvs, np.float64).reshape(-1, 2)
     if (corners[quads >= 0] < 0).any():
         return QuadMesh(points, quads)
     if corners.max() >= len(coordinates):
@@ -101,6 +76,16 @@ def read_obj(path: Path) -> QuadMesh:
     if not np.isfinite(coordinates).all():
         raise InputError(path, "has a texture coordinate that is not finite")
     return QuadMesh(points, quads, coordinates, corners)
+
+
+def _cut(sizes: np.ndarray) -> np.ndarray:
+    """Quads (q, 4), and triangles with a fourth of -1, that polygons of sizes (p,) corners are cut into, as places among all corners."""
+    first = np.cumsum(sizes) - sizes
+    pieces = (sizes - 1) // 2
+    polygon = np.repeat(np.arange(len(sizes)), pieces)
+    step = 2 * (np.arange(len(polygon)) - np.repeat(np.cumsum(pieces) - pieces, pieces))[:, None] + np.array([0, 1, 2, 3])
+    step[:, 0] = 0
+    return np.where(step < sizes[polygon, None], first[polygon, None] + step, -1)
 
 
 def write_mesh(out: Output, mesh: QuadMesh) -> None:

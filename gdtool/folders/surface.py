@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gdtool.assets.ply import binary_ply, columns
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
 from gdtool.core.kinds import IDENTITY, SurfaceContent
@@ -20,8 +21,6 @@ _VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("nx", "<f4"), ("n
 # What the confidence was made of, where it is known.
 _EVIDENCE = [("views", "u1"), ("residual", "<f4")]
 _FACE = np.dtype([("count", "u1"), ("idx", "<i4", 3)])
-_PLY_TYPES = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
-              "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8"}
 
 
 @dataclass(frozen=True)
@@ -85,46 +84,6 @@ def write_surface_ply(path: Path, surface: Surface) -> None:
         file.write(face.tobytes())
 
 
-def _layout(header: list[str]) -> tuple[dict[str, int], np.dtype, np.dtype]:
-    """Counts by element, and the records of vertices and faces. Raises ValueError, IndexError or KeyError."""
-    counts: dict[str, int] = {}
-    fields, element, list_types = [], "", ("", "")
-    for line in header:
-        words = line.split()
-        if words[:1] == ["element"]:
-            element, counts[words[1]] = words[1], int(words[2])
-        elif words[:2] == ["property", "list"] and element == "face":
-            list_types = (words[2], words[3])
-        elif words[:1] == ["property"] and element == "vertex":
-            fields.append((words[2], _PLY_TYPES[words[1]]))
-    if list(counts) != ["vertex", "face"] or min(counts.values()) < 0 or not fields:
-        raise ValueError(counts)
-    face = [("count", _PLY_TYPES[list_types[0]]), ("idx", _PLY_TYPES[list_types[1]], 3)]
-    return counts, np.dtype(fields), np.dtype(face)
-
-
-def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertex records and faces of a binary little-endian PLY of triangles. Raises InputError."""
-    content = path.read_bytes()
-    end = content.find(b"end_header\n")
-    header = content[:end].decode("ascii", "replace").split("\n") if end >= 0 else []
-    if not header or header[0].strip() != "ply" or "format binary_little_endian 1.0" not in header:
-        raise InputError(path, "is not a binary little-endian PLY")
-    try:
-        counts, vertex_type, face_type = _layout(header)
-    except (ValueError, IndexError, KeyError):  # a word missing, no number, a type or a property twice
-        raise InputError(path, "needs one vertex element of numbers and then one face element with one list") from None
-    body = content[end + len(b"end_header\n"):]
-    size = counts["vertex"] * vertex_type.itemsize
-    if len(body) != size + counts["face"] * face_type.itemsize:
-        raise InputError(path, "has not the length that its header says (faces must be triangles)")
-    vertex = np.frombuffer(body, vertex_type, counts["vertex"])
-    face = np.frombuffer(body, face_type, counts["face"], size)
-    if len(face) and (face["count"] != 3).any():
-        raise InputError(path, "has faces that are not triangles")
-    return vertex, face["idx"].astype(np.int32)
-
-
 def read_surface(folder: Folder) -> Surface:
     """Read a surface folder. Materials that surface.ply does not hold get albedo 0.8, roughness 0.5, metallic 0.
 
@@ -133,7 +92,10 @@ def read_surface(folder: Folder) -> Surface:
     from gdtool.images.color import linear_from_srgb
 
     path = folder.file("surface.ply")
-    vertex, faces = _read_ply(path)
+    try:
+        vertex, faces = binary_ply(path.read_bytes())
+    except ValueError as error:
+        raise InputError(path, str(error)) from None
     names = vertex.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise InputError(path, "has no x, y, z")
@@ -141,7 +103,7 @@ def read_surface(folder: Folder) -> Surface:
         raise InputError(path, "has no faces")
     if faces.min() < 0 or faces.max() >= len(vertex):
         raise InputError(path, f"a face refers to vertex {int(faces.max())} of {len(vertex)}")
-    vertices = np.stack([vertex[k] for k in "xyz"], -1).astype(np.float64)
+    vertices = columns(vertex, "x y z")
     if not np.isfinite(vertices).all():
         raise InputError(path, f"vertex {int(np.argwhere(~np.isfinite(vertices))[0][0])} is not finite")
 
@@ -152,7 +114,7 @@ def read_surface(folder: Folder) -> Surface:
         albedo = linear_from_srgb(np.stack([vertex[k] for k in ("red", "green", "blue")], -1).astype(np.float32) / 255)
     else:
         albedo = np.full((len(vertex), 3), 0.8, np.float32)
-    normals = np.stack([vertex[k] for k in ("nx", "ny", "nz")], -1).astype(np.float32) if {"nx", "ny", "nz"} <= set(names) else None
+    normals = columns(vertex, "nx ny nz").astype(np.float32) if {"nx", "ny", "nz"} <= set(names) else None
     light = read_record(folder.file("light.json")) if folder.content.light else None
-    return Surface(vertices, faces, albedo.astype(np.float32), column("roughness", 0.5), column("metallic", 0.0),
+    return Surface(vertices, faces.astype(np.int32), albedo.astype(np.float32), column("roughness", 0.5), column("metallic", 0.0),
                    column("confidence", 0.0), normals, light, *(np.asarray(vertex[name]) if name in names else None for name, _ in _EVIDENCE))

@@ -14,6 +14,7 @@ from gdtool.cameras import rays as camera_rays
 from gdtool.geometry.distance import closest_points, sample_surface, winding_number
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.rays import RayCaster
+from gdtool.geometry.rows import unique_rows
 
 # What lies within this of the first hit counts as seen: half a pixel of 256 across 1.44, in units of the truth's size.
 SEEN_TOLERANCE = 2e-3
@@ -26,8 +27,7 @@ SYNC_FOV = float(np.degrees(2 * np.arctan(32 / 35 / 2)))
 
 def weld(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """faces (f, 3) with vertices of equal position named by one index: glTF splits them at seams."""
-    _, index = np.unique(np.asarray(vertices) + 0.0, axis=0, return_inverse=True)  # + 0.0: -0 equals 0
-    return index.reshape(-1)[faces]
+    return unique_rows(vertices)[2][faces]
 
 
 def is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:

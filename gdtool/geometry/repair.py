@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.core.errors import InputError
+from gdtool.geometry.rows import unique_rows
 
 # Welding joins vertices closer than this share of the longest side: far below any detail, far above rounding.
 WELD_SHARE = 1e-7
@@ -253,8 +254,8 @@ def check(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
         raise InputError(subject, f"vertex {int(np.argmax(bad))} is not finite ({int(bad.sum())} such)")
 
 
-def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> tuple[np.ndarray, np.ndarray, dict[str, int | bool]]:
-    """A manifold, consistently oriented mesh of the same shape, and what had to be done to it.
+def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> tuple[np.ndarray, np.ndarray, dict[str, int | bool], bool]:
+    """A manifold, consistently oriented mesh of the same shape, what had to be done to it, and whether it is watertight.
 
     vertices (v, 3) float, faces (f, 3). A closed, manifold mesh passes unchanged except for unused vertices. Raises
     InputError (see check), also when all faces have no area.
@@ -278,14 +279,15 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
     faces = faces[~repeated]
     if not len(faces):
         raise InputError(subject, "no face has an area")
-    closed = is_watertight(faces)
+    twins = _twins(faces) if _plain(faces) else None
+    closed = is_watertight(faces) if twins is None else True
     if closed:
         vertices, faces = compact(vertices, faces)
-    if closed and _vertices_manifold(faces):
-        if _volume(vertices, faces) < 0:
+    if closed and (_vertices_manifold(faces) if twins is None else _one_fan_each(faces, twins)):
+        if _volume(vertices / extent, faces) < 0:
             report["turned_inside_out"] = True
             faces = faces[:, ::-1].copy()
-        return vertices, faces, report
+        return vertices, faces, report, True
     if not closed:
         # A closed mesh is left as its indices say: welding could join sheets that only touch.
         welded = _weld(vertices, faces, extent * WELD_SHARE)
@@ -293,7 +295,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
         repeated = (welded == np.roll(welded, 1, 1)).any(1)
         note("degenerate_faces", repeated.sum() + report.get("degenerate_faces", 0))
         faces = welded[~repeated]
-    _, first = np.unique(np.sort(faces, 1), axis=0, return_index=True)
+    _, first, _ = unique_rows(np.sort(faces, 1))
     note("duplicate_faces", len(faces) - len(first))
     faces = faces[np.sort(first)]
     if not len(faces):
@@ -314,10 +316,11 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
     if (number > 1).any():
         note("nonmanifold_vertices", (number > 1).sum())
         vertices, faces = one_vertex_per_fan(vertices, faces, fans)
-    if is_watertight(faces) and _volume(vertices, faces) < 0:
+    closed = is_watertight(faces)
+    if closed and _volume(vertices / extent, faces) < 0:
         report["turned_inside_out"] = True
         faces = faces[:, ::-1].copy()
-    return vertices, faces, report
+    return vertices, faces, report, closed
 
 
 def _vertices_manifold(faces: np.ndarray) -> bool:
@@ -344,15 +347,19 @@ def _areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    a, b, c = (vertices[faces[:, i]] - vertices[faces[0, 0]] for i in range(3))
-    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
+    """Signed volume within a closed mesh of triangles (f, 3)."""
+    from gdtool.geometry.normals import face_normals
+
+    normals, areas = face_normals(vertices, faces)
+    corners = (vertices - vertices[faces[0, 0]]).take(faces[:, 0], 0)
+    return float(np.einsum("ij,ij,i", corners, normals, areas, optimize=False) / 3)
 
 
 def _weld(vertices: np.ndarray, faces: np.ndarray, distance: float) -> np.ndarray:
     """Faces with one index for vertices that round to the same place."""
     grid = np.rint((vertices - vertices.min(0)) / distance)
-    _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-    return first[inverse.ravel()][faces]
+    _, first, inverse = unique_rows(grid)
+    return first[inverse][faces]
 
 
 def _split(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

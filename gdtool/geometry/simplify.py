@@ -15,6 +15,7 @@ from gdtool.core.errors import InputError
 from gdtool.geometry import repair
 from gdtool.geometry.halves import in_halves, worth_halving
 from gdtool.geometry.normals import face_normals
+from gdtool.geometry.rows import unique_rows
 from gdtool.geometry.sharpen import corners_of, restore_creases
 from gdtool.geometry.unpinch import unpinched
 
@@ -142,12 +143,11 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
     cells = int(np.clip((target_faces / 2) ** 0.5 / 2, 4, 2000))
     while True:
         grid = np.floor((vertices - low) / extent * cells)
-        _, inverse, count = np.unique(grid, axis=0, return_inverse=True, return_counts=True)
-        inverse = inverse.ravel()
-        out = np.stack([np.bincount(inverse, vertices[:, i]) for i in range(3)], -1) / count[:, None]
+        _, _, inverse = unique_rows(grid)
+        out = np.stack([np.bincount(inverse, vertices[:, i]) for i in range(3)], -1) / np.bincount(inverse)[:, None]
         merged = inverse[faces]
         merged = merged[(merged != np.roll(merged, 1, 1)).all(1)]
-        _, first = np.unique(np.sort(merged, 1), axis=0, return_index=True)
+        _, first, _ = unique_rows(np.sort(merged, 1))
         merged = merged[np.sort(first)]
         if len(merged) or cells > 4000:
             return repair.compact(out, merged)

@@ -58,11 +58,11 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         found_vertices, found, record = vertices, quads, Record(engine="passed through")
     else:
         with out.step("clean"):
-            vertices, faces, repairs = repair.clean(vertices, faces, _path(inputs))
+            vertices, faces, repairs, closed = repair.clean(vertices, faces, _path(inputs))
         if repairs:
             out.warn(f"{inputs.name}: repaired " + ", ".join(f"{value} {name.replace('_', ' ')}" if not isinstance(value, bool)
                                                              else name.replace("_", " ") for name, value in repairs.items()))
-        if not repair.is_watertight(faces):
+        if not closed:
             out.warn(f"{inputs.name}: the surface is open; its boundaries are kept")
         found_vertices, found, record = (_decimated if options.triangles else _quads)(vertices, faces, options, out)
     with out.step("measure"):

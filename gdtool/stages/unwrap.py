@@ -147,17 +147,18 @@ def _from_scene(main, inputs: Inputs, out: Output):
 
     from gdtool.assets.load import load_scene
     from gdtool.folders.mesh import QuadMesh
+    from gdtool.geometry.rows import unique_rows
 
     scene = load_scene(main)
     for text in scene.notes:
         out.warn(f"{inputs.name}: {text}")
     if not len(scene.faces):
         raise InputError(_path(inputs), "has no faces")
-    vertices, joined = np.unique(scene.vertices, axis=0, return_inverse=True)
+    vertices, _, joined = unique_rows(scene.vertices)
     filler = np.full((len(scene.faces), 1), -1, np.int32)
     corners = np.concatenate([scene.faces, filler], 1).astype(np.int32)
     uv = scene.uvs[0] if scene.uvs else None
-    return QuadMesh(vertices, np.concatenate([joined.ravel()[scene.faces], filler], 1).astype(np.int32), uv, None if uv is None else corners)
+    return QuadMesh(vertices, np.concatenate([joined[scene.faces], filler], 1).astype(np.int32), uv, None if uv is None else corners)
 
 
 def _without_degenerate(mesh, inputs: Inputs, out: Output):

@@ -3,6 +3,7 @@ import struct
 import numpy as np
 import pytest
 
+from gdtool.assets import scan_read
 from gdtool.assets.load import load_scene
 from gdtool.core.errors import InputError
 
@@ -49,6 +50,47 @@ def test_plain_ply(tmp_path):
     (tmp_path / "x.ply").write_text(ply())
     scene = load_scene(tmp_path / "x.ply")
     assert scene.colors is None and scene.normals is None and any("roughness 0.5" in note for note in scene.notes)
+
+
+def binary(order: str = "<", colors: bool = False, wide: bool = False, faces: np.ndarray = FACES) -> bytes:
+    """A binary PLY; normals of no unit length."""
+    kind, place = ("double", order + "f8") if wide else ("float", order + "f4")
+    names = ["x", "y", "z", "nx", "ny", "nz"]
+    vertex = np.empty(len(CORNERS), [(name, place) for name in names] + [(name, "u1") for name in ("red", "green", "blue") if colors])
+    for i, name in enumerate(names):
+        vertex[name] = np.concatenate([CORNERS / 3, CORNERS + 0.5], 1)[:, i]
+    for name in vertex.dtype.names[6:]:
+        vertex[name] = np.arange(len(CORNERS)) * 60
+    face = np.empty(len(faces), [("count", "u1"), ("idx", order + "i4", 3)])
+    face["count"], face["idx"] = 3, faces
+    lines = ["ply", f"format binary_{'little' if order == '<' else 'big'}_endian 1.0", "comment made here", f"element vertex {len(vertex)}"]
+    lines += [f"property {kind} {name}" for name in names] + [f"property uchar {name}" for name in vertex.dtype.names[6:]]
+    lines += [f"element face {len(face)}", "property list uchar int vertex_index", "end_header", ""]
+    return "\n".join(lines).encode() + vertex.tobytes() + face.tobytes()
+
+
+@pytest.mark.parametrize(("name", "content"), [("x.ply", binary()), ("x.ply", binary(">")), ("x.ply", binary(colors=True)), ("x.ply", binary(wide=True)),
+                                               ("x.stl", stl(FACES))], ids=["little", "big", "colors", "double", "stl"])
+def test_plain_binary_files_are_read_as_trimesh_reads_them(tmp_path, monkeypatch, name, content):
+    (tmp_path / name).write_bytes(content)
+    with monkeypatch.context() as patch:
+        patch.setattr(scan_read, "_by_trimesh", None)  # not needed
+        ours = load_scene(tmp_path / name)
+    for plain in ("_plain_ply", "_plain_stl"):
+        monkeypatch.setattr(scan_read, plain, lambda data: None)
+    true = load_scene(tmp_path / name)
+    assert ours.notes == true.notes and ours.materials == true.materials and (name == "x.stl" or true.normals is not None)
+    for key in ("vertices", "faces", "normals", "colors"):
+        one, two = getattr(ours, key), getattr(true, key)
+        assert one is two is None or one.dtype == two.dtype and np.array_equal(one, two)
+
+
+@pytest.mark.parametrize(("content", "fact"), [(binary()[:-1], "PLY"), (binary() + b"x", "PLY"), (binary(faces=FACES + 1), "out of range")],
+                         ids=["cut", "more", "index"])
+def test_binary_files_that_are_not_what_they_say_are_refused(tmp_path, content, fact):
+    (tmp_path / "x.ply").write_bytes(content)
+    with pytest.raises(InputError, match=fact):
+        load_scene(tmp_path / "x.ply")
 
 
 @pytest.mark.parametrize(("name", "content", "fact"), [

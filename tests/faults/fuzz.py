@@ -65,9 +65,13 @@ def read_quads(path: Path) -> None:
 
 
 def read_points(path: Path) -> None:
-    from gdtool.folders.surface import _read_ply
+    from gdtool.assets.ply import binary_ply
+    from gdtool.core.errors import InputError
 
-    _read_ply(path)
+    try:
+        binary_ply(path.read_bytes())
+    except ValueError as error:
+        raise InputError(path, str(error)) from None
 
 
 def read_record(path: Path) -> None:

@@ -12,8 +12,8 @@ from tests.geometry.solids import cube, joined, plane, torus, volume
 def test_cube_is_watertight_and_passes_unchanged():
     vertices, faces = cube(2.0)
     assert repair.is_watertight(faces) and repair.is_manifold(faces)
-    out_vertices, out_faces, report = repair.clean(vertices, faces)
-    assert report == {} and (out_vertices == vertices).all() and (out_faces == faces).all()
+    out_vertices, out_faces, report, closed = repair.clean(vertices, faces)
+    assert closed and report == {} and (out_vertices == vertices).all() and (out_faces == faces).all()
     assert volume(out_vertices, out_faces) == pytest.approx(8)
 
 
@@ -39,8 +39,8 @@ def test_quads_and_triangles_share_edges():
 def test_soup_is_welded():
     vertices, faces = cube()
     soup, soup_faces = vertices[faces].reshape(-1, 3), np.arange(36).reshape(-1, 3)
-    out_vertices, out_faces, report = repair.clean(soup, soup_faces)
-    assert len(out_vertices) == 8 and repair.is_watertight(out_faces) and report == {"welded_vertices": 28}
+    out_vertices, out_faces, report, closed = repair.clean(soup, soup_faces)
+    assert len(out_vertices) == 8 and closed and repair.is_watertight(out_faces) and report == {"welded_vertices": 28}
 
 
 def test_two_cubes_at_one_edge_become_two_manifolds():
@@ -49,8 +49,8 @@ def test_two_cubes_at_one_edge_become_two_manifolds():
     _, first, inverse = np.unique(vertices.round(6), axis=0, return_index=True, return_inverse=True)
     shared = first[inverse.ravel()][faces]
     assert not repair.is_manifold(shared)
-    out_vertices, out_faces, report = repair.clean(vertices, shared)
-    assert report["nonmanifold_edges"] == 1
+    out_vertices, out_faces, report, closed = repair.clean(vertices, shared)
+    assert closed and report["nonmanifold_edges"] == 1
     assert repair.is_watertight(out_faces) and repair.is_manifold(out_faces) and repair.components(out_faces)[0] == 2
     assert volume(out_vertices, out_faces) == pytest.approx(2)
 
@@ -61,21 +61,21 @@ def test_bow_tie_is_parted():
     _, first, inverse = np.unique(vertices.round(6), axis=0, return_index=True, return_inverse=True)
     shared = first[inverse.ravel()][faces]
     assert repair.is_watertight(shared) and not repair.is_manifold(shared) and len(repair.split_vertices(shared)) == 1
-    out_vertices, out_faces, report = repair.clean(vertices, shared)
-    assert report == {"nonmanifold_vertices": 1} and repair.is_manifold(out_faces) and len(out_vertices) == 16
+    out_vertices, out_faces, report, closed = repair.clean(vertices, shared)
+    assert closed and report == {"nonmanifold_vertices": 1} and repair.is_manifold(out_faces) and len(out_vertices) == 16
 
 
 def test_turned_faces_are_turned_back():
     vertices, faces = cube()
     faces[3] = faces[3][::-1]
-    out_vertices, out_faces, report = repair.clean(vertices, faces)
-    assert report["turned_edges"] == 3 and repair.is_watertight(out_faces) and volume(out_vertices, out_faces) == pytest.approx(1)
+    out_vertices, out_faces, report, closed = repair.clean(vertices, faces)
+    assert closed and report["turned_edges"] == 3 and repair.is_watertight(out_faces) and volume(out_vertices, out_faces) == pytest.approx(1)
 
 
 def test_inside_out_is_turned():
     vertices, faces = cube()
-    out_vertices, out_faces, report = repair.clean(vertices, faces[:, ::-1])
-    assert report == {"turned_inside_out": True} and volume(out_vertices, out_faces) == pytest.approx(1)
+    out_vertices, out_faces, report, closed = repair.clean(vertices, faces[:, ::-1])
+    assert closed and report == {"turned_inside_out": True} and volume(out_vertices, out_faces) == pytest.approx(1)
 
 
 def test_duplicate_and_flat_faces_go():
@@ -83,8 +83,8 @@ def test_duplicate_and_flat_faces_go():
     vertices = np.concatenate([vertices, [[0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0]]])
     n = len(vertices)
     more = np.concatenate([faces, faces[:2], [[n - 3, n - 2, n - 1], [0, 0, 1]]])
-    _, out, report = repair.clean(vertices, more)
-    assert len(out) == 8 and report["duplicate_faces"] == 2 and report["zero_area_faces"] == 1 and report["degenerate_faces"] == 1
+    _, out, report, closed = repair.clean(vertices, more)
+    assert not closed and len(out) == 8 and report["duplicate_faces"] == 2 and report["zero_area_faces"] == 1 and report["degenerate_faces"] == 1
 
 
 @pytest.mark.parametrize("vertices, faces, fact", [
