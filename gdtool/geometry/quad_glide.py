@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,7 +66,7 @@ class _Net:
         """Whether there were rotations of edges at vertices that leave less that is irregular; they are done."""
         found = False
         while better := next((one for vertex in vertices for other in self._neighbours(vertex)
-                              for one in self._turns(vertex, other, lambda gain, x, y: gain > 0)), None):
+                              for one in self._turns(vertex, other)), None):
             self._apply(better)
             found = True
         return found
@@ -93,22 +93,22 @@ class _Net:
     def _neutral(self, vertex: int) -> Iterator[_Turn]:
         """Rotations of its edges that take one from it and give one to a vertex of three, and leave as much that is irregular."""
         for other in self._neighbours(vertex):
-            yield from self._turns(vertex, other, lambda gain, x, y: gain == 0 and (x == 3 or y == 3))
+            yield from self._turns(vertex, other, neutral=True)
 
-    def _turns(self, p: int, q: int, wanted: Callable[[int, int, int], bool]) -> Iterator[_Turn]:
-        """The two rotations of an edge, those of them that leave quads of a manifold, no vertex of two edges, and what is wanted.
-
-        wanted: told how much less the edges at the corners will be off four, and how many there are now at the two that gain one.
-        """
+    def _turns(self, p: int, q: int, neutral: bool = False) -> Iterator[_Turn]:
+        """The two rotations of an edge, those of them that leave quads of a manifold, no vertex of two edges, and less that is irregular;
+        or if neutral as much, and one edge more at a vertex of three."""
         valence, inner = self.valence, self._inner
         if valence[p] < 4 or valence[q] < 4 or not (inner[p] and inner[q]):
             return
+        fewer = (valence[p] > 4) + (valence[q] > 4)  # ends that will be less off four, and not more
+        if not fewer and not neutral:
+            return  # the others gain no more than these lose
         one, two = self._face_of[p, q], self._face_of[q, p]
         r, s, t, u = *self._after(one, q), *self._after(two, p)
-        fewer = sum(1 if valence[vertex] > 4 else -1 for vertex in (p, q))
         for x, y in ((r, t), (s, u)):
-            gain = fewer + sum(1 if valence[vertex] < 4 else -1 for vertex in (x, y))
-            if not (wanted(gain, valence[x], valence[y]) and inner[x] and inner[y]):
+            threes = (valence[x] < 4) + (valence[y] < 4)
+            if not ((fewer + threes == 2 and 3 in (valence[x], valence[y]) if neutral else fewer + threes > 2) and inner[x] and inner[y]):
                 continue
             if (x, y) in self._face_of or (y, x) in self._face_of or len({p, q, r, s, t, u}) < 6 or not self._flat(one, two):
                 continue

@@ -10,6 +10,7 @@ import numpy as np
 
 from gdtool.core.child import prepare
 from gdtool.core.threads import mapped
+from gdtool.geometry.halves import even
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_fit import farthest, fitted
 from gdtool.geometry.quad_pieces import SMALL_PIECE_QUADS, apart, by_size, joined, well_made
@@ -123,7 +124,7 @@ def _simplified(vertices: np.ndarray, faces: np.ndarray, edge: float, request: R
     # Bevels as wide as the quads are drawn as they are.
     restored = request.restore_creases and median_edge(vertices, faces) < 0.75 * edge
     found = simplify(vertices, faces, _needed(request), seconds=request.for_the_rest, crease_degrees=request.crease_degrees if restored else 0.0,
-                     careful=careful, even=True, measured=False, meanwhile=meanwhile)
+                     closed=lambda: even(faces), careful=careful, even=True, measured=False, meanwhile=meanwhile)
     report = found[3]
     record.figures |= {"simplified_to": report["faces"]} | ({"crease_vertices_restored": report["creases"]} if restored else {})
     if "failed" in report:
