@@ -10,8 +10,9 @@ import numpy as np
 
 # Rays handed to Embree at a time: few enough that a chunk stays in the cache, enough that threads are busy.
 CHUNK = 1 << 16
-# Corners above which a mesh is not tested for being convex: the test's time is their number squared.
-MAX_CONVEX = 20_000
+# Corners above which a mesh is not tested for being convex: a second of work.
+MAX_CONVEX = 200_000
+_MOST_BY_PAIRS = 20_000_000  # faces times corners; of more the hull is quicker
 
 
 @dataclass(frozen=True)
@@ -162,7 +163,7 @@ def is_convex(vertices: np.ndarray, faces: np.ndarray, tolerance: float = 1e-6) 
     """Whether all faces lie on the hull of their corners, so that none hides another from outside.
 
     Each face's plane must have everything on one side (to tolerance, of the longest side). A scatter of faces is
-    tested first: nearly every mesh that is not convex fails there.
+    tested first: nearly every mesh that is not convex fails there. Those of many faces are held against the hull (Qhull).
     """
     from gdtool.geometry.normals import face_normals
 
@@ -173,10 +174,36 @@ def is_convex(vertices: np.ndarray, faces: np.ndarray, tolerance: float = 1e-6) 
     extent = float((points.max(0) - points.min(0)).max())
     normals, areas = face_normals(vertices, faces)
     solid = np.flatnonzero(areas > 1e-12 * extent**2)
-    for chosen in (solid[:: max(1, len(solid) // 64)], solid):
-        for start in range(0, len(chosen), 512):
-            part = chosen[start:start + 512]
-            height = normals[part] @ points.T - np.einsum("ij,ij->i", normals[part], vertices[faces[part, 0]])[:, None]
-            if (np.minimum(height.max(1), -height.min(1)) > tolerance * extent).any():
-                return False
+    few = solid[:: max(1, len(solid) // 64)]
+    if not _all_before(vertices, faces, normals, few, points, tolerance * extent):
+        return False
+    if len(solid) * len(points) > _MOST_BY_PAIRS and (away := _off_hull(vertices, faces[solid], points)) is not None:
+        return away <= tolerance * extent
+    return _all_before(vertices, faces, normals, solid, points, tolerance * extent)
+
+
+def _all_before(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, chosen: np.ndarray, points: np.ndarray, height: float) -> bool:
+    """Whether the planes of the chosen faces have all points on one side, but for that height."""
+    for start in range(0, len(chosen), 512):
+        part = chosen[start:start + 512]
+        over = normals[part] @ points.T - np.einsum("ij,ij->i", normals[part], vertices[faces[part, 0]])[:, None]
+        if (np.minimum(over.max(1), -over.min(1)) > height).any():
+            return False
     return True
+
+
+def _off_hull(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> float | None:
+    """How far the middle of a face is within the hull of points (n, 3) at most; None where they lie in a plane.
+
+    What has its middle on the hull lies on it: the plane that touches the hull there has none of the face before it.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    from gdtool.geometry.distance import closest_points
+
+    try:
+        hull = ConvexHull(points)
+    except QhullError:
+        return None
+    middle = (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3
+    return float(closest_points(middle, points, hull.simplices.astype(np.int64))[0].max())

@@ -51,6 +51,7 @@ def test_models_of_other_shapes_are_refused(trained, tmp_path):
     assert result.returncode != 0 and "other weights" in result.stderr and not (tmp_path / "both").exists()
 
 
+@pytest.mark.slow
 def test_the_curve_of_a_mean_goes_back_over_its_last_model(gdtool, trained, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(SCRIPT.parent)
     from model_curve import chain

@@ -68,7 +68,8 @@ def single(tmp_path_factory):
     return *run(folder, "one", 1), folder / "one" / "validation.csv"
 
 
-@pytest.mark.parametrize("processes, accumulate, shard", [(1, 2, False), (2, 1, False), (2, 2, True)], ids=["accumulated", "ddp", "fsdp"])
+@pytest.mark.parametrize("processes, accumulate, shard", [(1, 2, False), (2, 1, False), pytest.param(2, 2, True, marks=pytest.mark.slow)],
+                         ids=["accumulated", "ddp", "fsdp"])
 def test_the_curve_is_that_of_one_process(single, tmp_path, processes, accumulate, shard):
     """Same global batch of four: in two parts one after the other, in two processes, and with the weights split too."""
     curve, tensors = run(tmp_path, "many", processes, accumulate, shard)
@@ -83,6 +84,7 @@ def test_the_curve_is_that_of_one_process(single, tmp_path, processes, accumulat
             np.testing.assert_allclose(tensors[name], single[1][name], atol=2e-3, err_msg=name)
 
 
+@pytest.mark.slow
 def test_two_stopped_processes_resume_bit_for_bit(tmp_path):
     whole = run(tmp_path, "whole", 2)
     run(tmp_path, "stopped", 2, steps=3)

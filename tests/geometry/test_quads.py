@@ -11,6 +11,7 @@ from tests.geometry.engines import whole
 from tests.geometry.solids import assembly, bored_box, cube, plane, sphere, torus, volume
 
 
+@pytest.mark.slow
 def test_large_parts_are_not_torn_down_for_small_ones():
     """An assembly with more pins than the count has quads to spare, all of slivers, which the quick collapse does not touch."""
     vertices, faces = assembly(60, 128)

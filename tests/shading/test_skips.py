@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 import torch
 
 import gdtool.shading.direct as direct
 import gdtool.shading.render as render
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.cameras import rig
+from gdtool.geometry import rays
 from gdtool.geometry.rays import is_convex
 from gdtool.shading.direct import DirectLight
 from gdtool.shading.prefilter import LADDER
@@ -19,6 +21,21 @@ from gdtool.shading.render import Renderer
 from gdtool.shading.studio import studio
 from tests.geometry.solids import cube
 from tests.shading.test_render import GREY, four_colors, quad, sphere
+
+
+@pytest.mark.parametrize("most", [0, 10**18], ids=["by the hull", "by pairs"])
+def test_convex_is_what_lies_on_its_hull(most, monkeypatch):
+    monkeypatch.setattr(rays, "_MOST_BY_PAIRS", most)
+    ball = sphere(rings=24)
+    turned = ball.vertices @ np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    assert is_convex(ball.vertices, ball.faces) and is_convex(turned * [1, 2, 3], ball.faces) and is_convex(ball.vertices, ball.faces[:, ::-1])
+    assert is_convex(ball.vertices, ball.faces[:500]) and is_convex(ball.vertices * [1, 0, 1], ball.faces[:60])  # open; in a plane
+    for corner in (0, 300, 1199):
+        dented = ball.vertices.copy()
+        dented[corner] *= 0.98
+        assert not is_convex(dented, ball.faces)
+    two = np.concatenate([ball.vertices, ball.vertices * 0.5])
+    assert not is_convex(two, np.concatenate([ball.faces, ball.faces + len(ball.vertices)]))
 
 
 def test_convex_objects_need_no_shadow_rays(monkeypatch):
