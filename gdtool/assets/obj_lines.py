@@ -147,21 +147,23 @@ def _at_once(data: bytes) -> ObjLines | None:
             names.take(line.split(), line)
             at.append(row)
             group.append(names.current)
-        (vertices, colors), (uvs, _), (normals, _) = (_numbers(text, starts, ends, kinds[key], width) for key, width in (("v", 3), ("vt", 2), ("vn", 3)))
+        payloads = {key: _payload(text, starts, ends, kinds[key], len(key)) for key in kinds}
+        (vertices, colors), (uvs, _), (normals, _) = (_numbers(*payloads[key], width) for key, width in (("v", 3), ("vt", 2), ("vn", 3)))
         rows = np.flatnonzero(of_f)
-        corners, sizes = _corners(text, starts, ends, of_f, [np.cumsum(kinds[key])[rows] for key in ("v", "vt", "vn")])
+        corners, sizes = _corners(*payloads["f"], [np.cumsum(kinds[key])[rows] for key in ("v", "vt", "vn")])
     except (_Unlike, IndexError):
         return None
     groups = np.array(group, np.int64)[np.searchsorted(at, rows, "right") - 1]
     return ObjLines(vertices, colors, uvs, normals, corners, sizes, groups, tuple(names.places), tuple(names.libraries))
 
 
-def _payload(text: np.ndarray, starts: np.ndarray, ends: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The bytes of some lines with their keys blanked, and where each of these begins there."""
+def _payload(text: np.ndarray, starts: np.ndarray, ends: np.ndarray, rows: np.ndarray, letters: int) -> tuple[np.ndarray, np.ndarray]:
+    """The bytes of some lines with their keys, of so many letters, blanked, and where each line begins there."""
     length = ends - starts + 1
     own = text[np.repeat(rows, length)]
     begin = np.cumsum(length[rows]) - length[rows]
-    own[begin] = ord(" ")
+    for i in range(letters):
+        own[begin + i] = ord(" ")
     return own, begin
 
 
@@ -184,13 +186,10 @@ def _parsed(payload: np.ndarray, kind: type, count: int) -> np.ndarray:
     return out
 
 
-def _numbers(text: np.ndarray, starts: np.ndarray, ends: np.ndarray, rows: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """The first `width` numbers of each line, and the three after these where there are so many, (lines, width) and (lines or 0, 3)."""
-    payload, begin = _payload(text, starts, ends, rows)
+def _numbers(payload: np.ndarray, begin: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """The first `width` numbers of each line, and the fourth to sixth where there are so many, (lines, width) and (lines or 0, 3)."""
     if not len(begin):
         return np.empty((0, width)), np.empty((0, 3))
-    if width == 2 or text[starts[np.argmax(rows)] + 1] == ord("n"):
-        payload[begin + 1] = ord(" ")
     words = _words(payload)
     each, odd = divmod(len(words), len(begin))
     if odd or each < width:
@@ -202,9 +201,8 @@ def _numbers(text: np.ndarray, starts: np.ndarray, ends: np.ndarray, rows: np.nd
     return found[:, :width].copy(), found[:, 3:6].copy() if each >= 6 else np.empty((0, 3))
 
 
-def _corners(text: np.ndarray, starts: np.ndarray, ends: np.ndarray, rows: np.ndarray, counts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _corners(payload: np.ndarray, begin: np.ndarray, counts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """corners and sizes of ObjLines; counts: how many v, vt and vn each of the lines has before it."""
-    payload, begin = _payload(text, starts, ends, rows)
     words = _words(payload)
     sizes = np.diff(np.searchsorted(words, begin), append=len(words))
     if (sizes < 3).any():

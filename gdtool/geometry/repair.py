@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.core.errors import InputError
+from gdtool.geometry.normals import face_normals
 from gdtool.geometry.rows import unique_rows
 
 # Welding joins vertices closer than this share of the longest side: far below any detail, far above rounding.
 WELD_SHARE = 1e-7
 
 
+_FAN = 64  # edges at a vertex; of more a walk around it step by step takes too long
 _FEW = 4000  # keys, below which sorting is quicker than building a sparse matrix
 
 
@@ -268,26 +270,26 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
         if count:
             report[name] = int(count)
 
-    extent = float(np.ptp(compact(vertices, faces)[0], 0).max())
+    used = np.ascontiguousarray(compact(vertices, faces)[0].T)
+    extent = float((used.max(1) - used.min(1)).max())
     if not extent > 0:
         raise InputError(subject, "all its faces lie in one point")
-    area = _areas(vertices / extent, faces)
-    if not (area > 0).any():
+    sides = face_normals(vertices / extent, faces)
+    if not sides[1].any():
         raise InputError(subject, "no face has an area")
-    repeated = (faces == np.roll(faces, 1, 1)).any(1)
-    note("degenerate_faces", repeated.sum())
-    faces = faces[~repeated]
+    repeated = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
+    if repeated.any():
+        note("degenerate_faces", repeated.sum())
+        faces, sides = faces[~repeated], tuple(side[~repeated] for side in sides)
     if not len(faces):
         raise InputError(subject, "no face has an area")
     twins = _twins(faces) if _plain(faces) else None
     closed = is_watertight(faces) if twins is None else True
-    if closed:
-        vertices, faces = compact(vertices, faces)
     if closed and (_vertices_manifold(faces) if twins is None else _one_fan_each(faces, twins)):
-        if _volume(vertices / extent, faces) < 0:
+        if _volume(vertices / extent, faces, *sides) < 0:
             report["turned_inside_out"] = True
             faces = faces[:, ::-1].copy()
-        return vertices, faces, report, True
+        return *compact(vertices, faces), report, True
     if not closed:
         # A closed mesh is left as its indices say: welding could join sheets that only touch.
         welded = _weld(vertices, faces, extent * WELD_SHARE)
@@ -300,7 +302,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
     faces = faces[np.sort(first)]
     if not len(faces):
         raise InputError(subject, "no face has an area")
-    flat = _areas(vertices / extent, faces) == 0
+    flat = face_normals(vertices / extent, faces)[1] == 0
     if flat.any() and not is_watertight(faces):
         # In a closed mesh a flat face is a seam that keeps it closed.
         note("zero_area_faces", flat.sum())
@@ -317,7 +319,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
         note("nonmanifold_vertices", (number > 1).sum())
         vertices, faces = one_vertex_per_fan(vertices, faces, fans)
     closed = is_watertight(faces)
-    if closed and _volume(vertices / extent, faces) < 0:
+    if closed and _volume(vertices / extent, faces, *face_normals(vertices / extent, faces)) < 0:
         report["turned_inside_out"] = True
         faces = faces[:, ::-1].copy()
     return vertices, faces, report, closed
@@ -330,27 +332,32 @@ def _vertices_manifold(faces: np.ndarray) -> bool:
 
 
 def _one_fan_each(faces: np.ndarray, twins: np.ndarray) -> bool:
+    """As _vertices_manifold: whether who walks around each vertex, from an edge that leaves it to the next one, meets all that do."""
+    n, start = len(twins), faces.ravel()
+    turn = twins.take(np.arange(n, dtype=np.int32).reshape(-1, 3)[:, [2, 0, 1]].ravel())
+    number = np.bincount(start)
+    one = np.empty(len(number), np.int32)
+    one[start] = np.arange(n, dtype=np.int32)
+    home = one.take(np.flatnonzero(number))
+    left, at, steps = number.take(start.take(home)), turn.take(home), 1
+    while len(home) and steps < _FAN:
+        back = at == home
+        if (left[back] != steps).any():
+            return False
+        on = np.flatnonzero(~back)
+        home, left, at, steps = home.take(on), left.take(on), turn.take(at.take(on)), steps + 1
+    if not len(home):
+        return True
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
-    # From an edge that leaves a vertex to the next one that does: its cycles are the fans.
-    n = len(twins)
-    before = np.arange(n).reshape(-1, 3)[:, [2, 0, 1]].ravel()
-    turn = csr_array((np.ones(n, np.int8), twins[before], np.arange(n + 1)), (n, n))
-    return connected_components(turn, True, "strong", return_labels=False) == int((np.bincount(faces.ravel()) > 0).sum())
+    # Around some there are very many: the walks are the cycles of a graph.
+    graph = csr_array((np.ones(n, np.int8), turn, np.arange(n + 1)), (n, n))
+    return connected_components(graph, True, "strong", return_labels=False) == int((number > 0).sum())
 
 
-def _areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    from gdtool.geometry.normals import face_normals
-
-    return face_normals(vertices, faces)[1]
-
-
-def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Signed volume within a closed mesh of triangles (f, 3)."""
-    from gdtool.geometry.normals import face_normals
-
-    normals, areas = face_normals(vertices, faces)
+def _volume(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, areas: np.ndarray) -> float:
+    """Signed volume within a closed mesh of triangles (f, 3), whose normals (f, 3) and areas (f,) are known."""
     corners = (vertices - vertices[faces[0, 0]]).take(faces[:, 0], 0)
     return float(np.einsum("ij,ij,i", corners, normals, areas, optimize=False) / 3)
 

@@ -127,17 +127,14 @@ def _read(inputs: Inputs, out: Output):
             out.warn(f"{inputs.name}: {text}")
         vertices, faces = scene.vertices, scene.faces.astype(np.int64)
     check(vertices, faces, _path(inputs))
-    used = np.zeros(len(vertices), bool)
-    used[faces] = True
-    extent = float(np.ptp(vertices[used], 0).max())
+    kept, faces = compact(vertices, faces)
+    extent = float(np.ptp(kept, 0).max())
     if not 1e-150 < extent < 1e150:
         raise InputError(_path(inputs), f"its longest side is {extent:g}, which cannot be computed with", "scale it")
-    matrix = unit_box(vertices[used])
-    vertices = transform_points(invert_similarity(matrix), vertices)
+    matrix = unit_box(kept)
     if quads is not None:
         _, quads = compact(vertices, quads)
-    kept, faces = compact(vertices, faces)
-    return kept, faces, matrix, quads
+    return transform_points(invert_similarity(matrix), kept), faces, matrix, quads
 
 
 def _meets(quads, options: Options) -> bool:
