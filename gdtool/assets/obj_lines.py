@@ -127,7 +127,7 @@ class _Unlike(Exception):
 
 def _at_once(data: bytes) -> ObjLines | None:
     """None where lines of one kind are not all alike, or any is wrong: which one, _one_by_one tells."""
-    if b"\\\n" in data or b"\\\r" in data or data.count(b"\r") != data.count(b"\r\n"):
+    if b"\\\n" in data or b"\r" in data and (b"\\\r" in data or data.count(b"\r") != data.count(b"\r\n")):
         return None
     text = np.frombuffer(data + b"\n", np.uint8)
     ends = np.flatnonzero(text == ord("\n"))
@@ -159,9 +159,12 @@ def _at_once(data: bytes) -> ObjLines | None:
 
 def _payload(text: np.ndarray, starts: np.ndarray, ends: np.ndarray, rows: np.ndarray, letters: int) -> tuple[np.ndarray, np.ndarray]:
     """The bytes of some lines with their keys, of so many letters, blanked, and where each line begins there."""
-    length = ends - starts + 1
-    own = text[np.repeat(rows, length)]
-    begin = np.cumsum(length[rows]) - length[rows]
+    which = np.flatnonzero(rows)
+    begin, length = starts[which], ends[which] - starts[which] + 1
+    if len(which) and which[-1] - which[0] == len(which) - 1:  # one behind the other
+        own, begin = text[begin[0]:begin[0] + length.sum()].copy(), begin - begin[0]
+    else:
+        own, begin = text[np.repeat(rows, ends - starts + 1)] if len(which) else text[:0].copy(), np.cumsum(length) - length
     for i in range(letters):
         own[begin + i] = ord(" ")
     return own, begin
@@ -172,6 +175,14 @@ def _words(payload: np.ndarray) -> np.ndarray:
     inside = payload > ord(" ")
     inside[1:] &= ~inside[:-1]  # read before it is written: numpy copies what overlaps
     return np.flatnonzero(inside)
+
+
+def _alike(words: np.ndarray, begin: np.ndarray) -> np.ndarray | None:
+    """The words (w,) of each of the lines (lines, words of each); None where some have more than others."""
+    if not len(begin) or len(words) % len(begin):
+        return None
+    table = words.reshape(len(begin), -1)
+    return None if not table.size or (table[:, 0] < begin).any() or (table[:-1, -1] >= begin[1:]).any() else table
 
 
 def _parsed(payload: np.ndarray, kind: type, count: int) -> np.ndarray:
@@ -190,29 +201,30 @@ def _numbers(payload: np.ndarray, begin: np.ndarray, width: int) -> tuple[np.nda
     """The first `width` numbers of each line, and the fourth to sixth where there are so many, (lines, width) and (lines or 0, 3)."""
     if not len(begin):
         return np.empty((0, width)), np.empty((0, 3))
-    words = _words(payload)
-    each, odd = divmod(len(words), len(begin))
-    if odd or each < width:
+    table = _alike(_words(payload), begin)
+    if table is None or table.shape[1] < width:
         raise _Unlike
-    table = words.reshape(len(begin), each)
-    if (table[:, 0] < begin).any() or (table[:-1, -1] >= begin[1:]).any():
-        raise _Unlike
-    found = _parsed(payload, np.float64, len(words)).reshape(len(begin), each)
-    return found[:, :width].copy(), found[:, 3:6].copy() if each >= 6 else np.empty((0, 3))
+    found = _parsed(payload, np.float64, table.size).reshape(table.shape)
+    return found[:, :width].copy(), found[:, 3:6].copy() if table.shape[1] >= 6 else np.empty((0, 3))
 
 
 def _corners(payload: np.ndarray, begin: np.ndarray, counts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """corners and sizes of ObjLines; counts: how many v, vt and vn each of the lines has before it."""
     words = _words(payload)
-    sizes = np.diff(np.searchsorted(words, begin), append=len(words))
+    if (table := _alike(words, begin)) is not None:
+        sizes = np.full(len(begin), table.shape[1])
+    else:
+        sizes = np.diff(np.searchsorted(words, begin), append=len(words))
     if (sizes < 3).any():
         raise _Unlike
     if not len(words):
         return np.empty((0, 3), np.int64), sizes
     slash = payload == ord("/")
-    slashes, double = int(slash.sum()), int((slash[1:] & slash[:-1]).sum())
-    payload[slash] = ord(" ")
-    parts = _words(payload)
+    slashes, double, parts = int(slash.sum()), 0, words
+    if slashes:
+        double = int((slash[1:] & slash[:-1]).sum())
+        payload[slash] = ord(" ")
+        parts = _words(payload)
     each, odd = divmod(len(parts), len(words))
     if odd or (parts[::each or 1] != words).any():
         raise _Unlike

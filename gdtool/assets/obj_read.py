@@ -12,6 +12,7 @@ from gdtool.assets.obj_materials import obj_materials
 from gdtool.assets.polygons import triangulate
 from gdtool.assets.scene import Scene
 from gdtool.core.errors import InputError
+from gdtool.geometry.repair import renumbered
 from gdtool.geometry.rows import unique_rows
 
 
@@ -36,7 +37,11 @@ def read_obj(path: str | Path) -> Scene:
         if (corners[:, 2] >= 0).any():
             notes.append("normals are only on some faces and are ignored")
         corners = corners * (1, 1, 0) - (0, 0, 1)
-    unique, _, corner_idx = unique_rows(corners)
+    if (corners[:, 1:] < 0).all():
+        places, corner_idx = renumbered(corners[:, 0], len(vertices))
+        unique = np.stack([places, *np.full((2, len(places)), -1)], -1)
+    else:
+        unique, _, corner_idx = unique_rows(corners)
     faces, polygon_idx = triangulate(vertices, corners[:, 0], lines.sizes)
     used = np.unique(lines.groups).tolist()
     materials, material_notes = obj_materials(path, list(lines.libraries), [lines.names[i] for i in used], len(colors) > 0)

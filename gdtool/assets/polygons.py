@@ -12,6 +12,8 @@ def triangulate(vertices: np.ndarray, corners: np.ndarray, sizes: np.ndarray) ->
     A quad is cut along corners 0 and 2, unless it is concave there; larger polygons are cut by their ears.
     """
     first = np.cumsum(sizes) - sizes
+    if (sizes == 3).all():
+        return np.arange(3 * len(sizes)).reshape(-1, 3), np.arange(len(sizes))
     triangles, owners = [], []
     of_three = np.flatnonzero(sizes == 3)
     triangles.append(first[of_three, None] + np.arange(3))
