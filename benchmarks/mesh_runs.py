@@ -32,7 +32,7 @@ def as_commanded() -> None:
     from gdtool.core import child
 
     child.forget_nursery()
-    child.prepare("gdtool.geometry.simplify")
+    child.prepare("gdtool.geometry.simplify_child")
 
 
 def blender(way: str, vertices: np.ndarray, faces: np.ndarray, argument: object, python: Path, limit: float) -> tuple[dict[str, np.ndarray], dict]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import cache
+from importlib import import_module
 
 import numpy as np
 
@@ -32,7 +33,7 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
     are laid apart meanwhile, so that none is drawn onto another.
     """
     if len(faces) > _needed(request):
-        prepare("gdtool.geometry.simplify")
+        prepare("gdtool.geometry.simplify_child")
     edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
     if (pieces := spread(vertices, faces, _GAP * edge)) is not None:
         out, quads, record = _remeshed(pieces.vertices, faces, edge, request)
@@ -118,6 +119,7 @@ def _simplified(vertices: np.ndarray, faces: np.ndarray, edge: float, request: R
         # Not before: the engines' start would slow what this process does alone, the tree's building holds the interpreter's lock.
         prepare_engines(request.quads, request)
         fine()
+        import_module("scipy.spatial")  # what comes next would wait for it
 
     if len(faces) <= _needed(request):
         prepare_engines(request.quads, request)

@@ -7,8 +7,6 @@ from functools import cache
 from itertools import combinations, combinations_with_replacement
 
 import numpy as np
-import scipy.sparse  # noqa: F401 - what repair and sharpen need, read before a child is forked
-import scipy.spatial  # noqa: F401
 
 from gdtool.core.child import ChildFailed, begin
 from gdtool.core.errors import InputError
@@ -267,7 +265,7 @@ def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit:
         if moved != 0 and way != "collapse" and not careful:
             break  # what cannot be collapsed are folds, of bevels that were drawn out where there is no crease
         try:
-            running = begin("gdtool.geometry.simplify:reduced", vertices, faces.astype(np.int32), way, arguments, even, crease_degrees,
+            running = begin("gdtool.geometry.simplify_child:reduced", vertices, faces.astype(np.int32), way, arguments, even, crease_degrees,
                             seconds=seconds, memory_mb=16000)
             meanwhile()
             *out, moved = running.result()

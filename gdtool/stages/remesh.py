@@ -42,7 +42,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Remesh one surface or mesh file."""
-    prepare("gdtool.geometry.simplify")  # for remesh()'s first child, while the mesh is read
+    prepare("gdtool.geometry.simplify_child")  # for remesh()'s first child, while the mesh is read
 
     import numpy as np
 

@@ -35,7 +35,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Unwrap one mesh."""
-    prepare("gdtool.geometry.simplify")  # for unwrap()'s first child, while the mesh is read
+    prepare("gdtool.geometry.simplify_child")  # for unwrap()'s first child, while the mesh is read
 
     import numpy as np
 
