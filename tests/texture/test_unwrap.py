@@ -289,3 +289,18 @@ def test_orders_are_not_searched_for_more_charts_where_few_fill_the_square():
     # Where it fills much less, the next ones are leapt over, though never the last.
     strips = grid(2, (3.0, 0.3))
     assert best_packed([strips, few, many], 1 / 512)[::3] == (2, 1) and best_packed([strips, many], 1 / 512)[::3] == (1, 0)
+
+
+@pytest.mark.parametrize("minor", [0.07, 0.12])
+def test_ways_leapt_over_cost_no_coverage_and_a_seam_or_two(monkeypatch, minor):
+    """The tolerance of that skip: .02 of the square and eight charts, against every way to cut being packed."""
+    vertices, faces, _ = torus(96, 20, 0.35, minor)
+    found = []
+    for gains in (unwrap_pack._NEXT_GAINS, np.inf):
+        monkeypatch.setattr(unwrap_pack, "_NEXT_GAINS", gains)
+        laid = unwrap.unwrap(vertices, faces, unwrap.Request(size=1024, padding=4))
+        leapt = [why for what, why, _ in laid.skipped if what.startswith("packing")]
+        assert len(leapt) == (gains < np.inf)
+        found.append(unwrap.figures(vertices, faces, laid.uv, laid.face_uvs))
+    quick, whole = found
+    assert quick["coverage"] > whole["coverage"] - 0.02 and quick["charts"] <= whole["charts"] + 8 and quick["overlap"] == 0
