@@ -110,6 +110,10 @@ class Running:
         self._timed_out = True
         self._process.kill()
 
+    def kill(self) -> None:
+        """End it, where nobody will ask for its result."""
+        self._process.kill()
+
     def _converse(self, request: bytes) -> None:
         for told in (lambda: self._process.stdin.write(request), self._process.stdin.close):
             with contextlib.suppress(BrokenPipeError):  # it is dead already: result() says of what

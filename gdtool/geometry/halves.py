@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable
 
 import numpy as np
 
 from gdtool.core.child import ChildFailed, beside
+from gdtool.core.threads import cores
 from gdtool.geometry.normals import face_normals
 
 Collapse = Callable[..., tuple[np.ndarray, np.ndarray]]  # (vertices, faces, target_faces, unit, keep_border)
@@ -23,7 +23,7 @@ _RINGS, _SEAM_UNIT = 3, 0.1  # of triangles about the rim that are collapsed onc
 def worth_halving(faces: np.ndarray, target_faces: int) -> bool:
     """Whether two processes collapse triangles (f, 3) sooner than one: there are many, few are left, and the mesh is closed, so that
     the border of each half is the rim where it was cut."""
-    return (sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1 and len(faces) > LARGE and target_faces < _MOST_LEFT * len(faces)
+    return (sys.platform == "linux" and cores() > 1 and len(faces) > LARGE and target_faces < _MOST_LEFT * len(faces)
             and even(faces))
 
 

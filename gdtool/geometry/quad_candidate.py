@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse.csgraph  # noqa: F401 - what repair needs, read before a child is forked
 
 from gdtool.geometry import repair
 from gdtool.geometry.features import Constraints
@@ -101,7 +100,9 @@ class Candidate:
         return self.outline.far < _NEAR_OUTLINE
 
     def draw(self, part: Part) -> None:
-        """Drawn onto the surface, and judged there."""
+        """Drawn onto the surface, and judged there, once."""
+        if self.drawn is not None:
+            return
         subdivisions, surface = self.way.subdivisions, part.surface
         self.drawn = drawn(self.outline, surface, part.features, part.request)
         vertices, quads, _ = self.drawn

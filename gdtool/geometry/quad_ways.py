@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from gdtool.core.child import ChildFailed, begin, prepare
+from gdtool.geometry.quad_ahead import Ahead
 from gdtool.geometry.quad_candidate import Candidate, Way
 from gdtool.geometry.quad_fit import FAR_EDGES, TOO_COARSE, settled
 from gdtool.geometry.quad_task import Part, Record, Request
@@ -15,6 +16,9 @@ from gdtool.geometry.quad_task import Part, Record, Request
 _TRIES, _MOST_MORE = 3, 2.0  # of one way, to come near enough to the count; times what was asked for before
 _MOST_TORN = 0.1  # of the quads may be missing from a result that another density may mend
 _SHORTEST_RUN = 0.05  # seconds
+# Megabytes that an engine has, and more for each quad and triangle: several times what it needs, but for holes that Instant Meshes
+# fills for ever, with half a gigabyte a second.
+_MEMORY = 2000, 4e-3
 _MANY = 3000  # quads of a mesh that is tried coarser and subdivided
 
 Found = tuple[np.ndarray, np.ndarray, str]  # vertices (v, 3), quads (q, 4), the way that they were made
@@ -35,7 +39,7 @@ def _ways(quads: int, request: Request) -> list[Way]:
 def prepare_engines(quads: int, request: Request) -> None:
     """Start the children of the first way now (core.child.prepare)."""
     if request.engine != "split":
-        prepare("gdtool.geometry.quad_candidate")
+        prepare("gdtool.geometry.quad_child")
 
 
 def _between(gave: list[tuple[float, int]], wanted: float) -> float | None:
@@ -58,6 +62,7 @@ class Trial:
         self._passable: Candidate | None = None
         self._second_best: Candidate | None = None
         self._given_up: set[str] = set()
+        self._ahead = Ahead(part)
 
     def run(self) -> Found | None:
         """The first way's quads that stand up to judgement, settled; None when none does."""
@@ -102,7 +107,11 @@ class Trial:
                 self._second_best = best
             if not usable:
                 return self._failed(way, best.fault, torn=best.off(wanted) < -_MOST_TORN)
-            taken = self._drawn(self._of_count([one for one in candidates if one.fault == best.fault], extra))
+            like = [one for one in candidates if one.fault == best.fault]
+            if way.subdivisions and len(like) > 1:
+                self._ahead.begin(*like[:2])
+            taken = self._drawn(self._of_count(like, extra))
+            self._ahead.stop()
             if taken is not None and taken.wrong is not None:
                 if taken.passable and self.part.counted(len(taken.drawn[1]), quads):
                     self._passable = taken
@@ -121,8 +130,9 @@ class Trial:
     def _candidates(self, way: Way, asked: list[float], wanted: float) -> list[Candidate]:
         """What comes of each number asked for, made side by side, the best first."""
         part, request, start = self.part, self.part.request, time.perf_counter()
-        running = [begin("gdtool.geometry.quad_candidate:candidate", part.vertices, part.faces, way, number,
-                         seconds=max(request.for_engines, _SHORTEST_RUN), memory_mb=request.memory_mb) for number in asked]
+        running = [begin("gdtool.geometry.quad_child:candidate", part.vertices, part.faces, way, number,
+                         seconds=max(request.for_engines, _SHORTEST_RUN),
+                         memory_mb=min(int(_MEMORY[0] + _MEMORY[1] * (number + len(part.faces))), request.memory_mb)) for number in asked]
         _ = part.features, part.surface, part.fine()  # found out while the children work
         out = []
         for child in running:
@@ -139,6 +149,7 @@ class Trial:
         for one in candidates:
             if one is not candidates[0] and not self.part.counted(one.count + extra, quads):
                 continue
+            self._ahead.fetch(one)
             one.trace(self.part)
             extra = len(one.outline.faces) - one.count
             if one.outline.hopeless or self.part.counted(one.count + extra, quads):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+
+from gdtool.core.threads import cores
 
 # Rays handed to Embree at a time: few enough that a chunk stays in the cache, enough that threads are busy.
 CHUNK = 1 << 16
@@ -97,7 +98,7 @@ class RayCaster:
 
         self.vertices = np.asarray(vertices, np.float64)
         self.faces = np.asarray(faces, np.int32)
-        self.threads = threads or len(os.sched_getaffinity(0))
+        self.threads = threads or cores()
         used = self.vertices[np.unique(self.faces)] if len(self.faces) else np.zeros((1, 3))
         low, high = used.min(0), used.max(0)
         self.center = (low + high) / 2

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from gdtool.assets.scene import Texture
+from gdtool.core.threads import cores
 from gdtool.images.color import linear_from_srgb
 
 # Rows that a thread works on when a level is built: bounds the memory of a 4k texture; and those decoded at a time, few
@@ -219,7 +219,7 @@ def _each_band(work, rows: int, band: int) -> None:
     """work(first row) of every band, on all cores."""
     starts = range(0, rows, band)
     if len(starts) > 1:
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        with ThreadPoolExecutor(cores()) as pool:
             list(pool.map(work, starts))
     else:
         work(0)

@@ -119,7 +119,7 @@ def test_a_child_has_the_place_and_the_environment_of_the_call(tmp_path, monkeyp
 def test_what_forks_children_is_started_again_where_it_died_and_has_one_thread(forks):
     if not forks:
         pytest.skip("children are started anew")
-    for module in ("gdtool.geometry.simplify_child", "gdtool.geometry.quad_candidate", "gdtool.texture.unwrap_charts", "gdtool.texture.unwrap_child",
+    for module in ("gdtool.geometry.simplify_child", "gdtool.geometry.quad_child", "gdtool.texture.unwrap_charts", "gdtool.texture.unwrap_child",
                    "gdtool.texture.unwrap_pack"):
         child.prepare(module)
     assert child.call("os:getppid", seconds=30) == child._nursery.process.pid

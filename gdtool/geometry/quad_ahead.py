@@ -1,0 +1,53 @@
+"""A candidate drawn in a child while the one before it is drawn here: where that one is not good, it is wanted next."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+
+import numpy as np
+
+from gdtool.core.child import ChildFailed, Running, begin
+from gdtool.core.threads import cores
+from gdtool.geometry.quad_candidate import Candidate
+from gdtool.geometry.quad_fit import farthest, surface_of
+from gdtool.geometry.quad_task import Part, Request
+
+_NICE = 10  # it only has what the others leave
+_DOUBT_EDGES = 2.0  # what is farther from the surface before it is drawn, often is not good
+_SHORTEST = 0.05  # seconds
+
+
+class Ahead:
+    """Candidates of one part that are drawn ahead."""
+
+    def __init__(self, part: Part):
+        self._part, self._running = part, {}
+
+    def begin(self, first: Candidate, one: Candidate) -> None:
+        """Have it traced and drawn, where there is a core to spare and the first one, drawn here, is in doubt."""
+        part, request = self._part, self._part.request
+        if cores() > 1 and farthest(surface_of(first.vertices, first.quads), part.surface) > _DOUBT_EDGES * part.edge:
+            self._running[id(one)] = begin("gdtool.geometry.quad_child:finished", one, part.vertices, part.faces, part.quads, part.edge, request,
+                                           seconds=max(request.for_engines, _SHORTEST), memory_mb=request.memory_mb)
+
+    def fetch(self, one: Candidate) -> None:
+        """Wait for one that was begun; all else is left as it is, to be done here."""
+        running: Running | None = self._running.pop(id(one), None)
+        if running is not None:
+            with contextlib.suppress(ChildFailed):
+                vars(one).update(vars(running.result()))
+
+    def stop(self) -> None:
+        """Give up those that nobody waited for."""
+        while self._running:
+            self._running.popitem()[1].kill()
+
+
+def finished(one: Candidate, vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float, request: Request) -> Candidate:
+    """What the child runs: the candidate traced and drawn."""
+    os.nice(_NICE)
+    part = Part(vertices, faces, quads, edge, request, fine=lambda: None)
+    one.trace(part)
+    one.draw(part)
+    return one

@@ -1,0 +1,12 @@
+"""What remesh's children run beside it, with all that they need, which is read before they are forked."""
+
+from __future__ import annotations
+
+import igl
+import scipy.sparse.csgraph
+import scipy.spatial
+
+from gdtool.geometry.quad_ahead import finished
+from gdtool.geometry.quad_candidate import candidate
+
+__all__ = ["candidate", "finished", "igl", "scipy"]
