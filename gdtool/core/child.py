@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gdtool.core import errors
-from gdtool.core.nursery import Forked, Nursery, die_with_parent
+from gdtool.core.nursery import Forked, Nursery, die_with_parent, python_running
 
 
 class ChildFailed(Exception):
@@ -90,7 +90,7 @@ def _started() -> Forked | subprocess.Popen:
         with contextlib.suppress(OSError):  # no such sockets to be had
             return _tell_nursery(Nursery.fork)
     code = f"from {__name__} import serve; serve()"
-    return subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=_SETTINGS | os.environ)
+    return subprocess.Popen(python_running(code), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=_SETTINGS | os.environ)
 
 
 class Running:

@@ -21,8 +21,15 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 _MESSAGE = 2**16  # bytes, at most
+
+
+def python_running(code: str) -> list[str]:
+    """The command of another Python that runs code beside this gdtool, whatever lies in the folder that it starts in."""
+    root = str(Path(__file__).resolve().parents[2])
+    return [sys.executable, "-P", "-c", f"import sys; sys.path.insert(0, {root!r}); import gdtool; del sys.path[0]; {code}"]
 
 
 class Nursery:
@@ -38,7 +45,7 @@ class Nursery:
         own, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             code = f"from gdtool.core.child import serve; from {__name__} import main; main(serve)"
-            return cls(own, subprocess.Popen([sys.executable, "-c", code, str(theirs.fileno())], pass_fds=[theirs.fileno()], env=environment,
+            return cls(own, subprocess.Popen([*python_running(code), str(theirs.fileno())], pass_fds=[theirs.fileno()], env=environment,
                                              stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
 
     def read(self, module: str) -> None:

@@ -266,3 +266,11 @@ def test_the_child_dies_with_its_parent(forks):
     parent.wait()
     time.sleep(0.3)
     assert children and not any(alive(pid) for pid in children)
+
+
+def test_what_lies_in_the_folder_is_not_taken_for_a_module(tmp_path, monkeypatch):
+    for name in ("socket", "pickle", "random", "numpy", "gdtool"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('not this one')")
+    monkeypatch.chdir(tmp_path)
+    child.forget_nursery()
+    assert child.call("tests.core.test_child:double", np.arange(3), seconds=20).tolist() == [0, 2, 4]
