@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from gdtool.assets.gltf_schema import Accessor, Document
-from gdtool.core.errors import InputError, ResourceError, from_os_error
+from gdtool.core.errors import InputError, ResourceError, bytes_of, from_os_error
 
 SUPPORTED = {
     "EXT_meshopt_compression", "EXT_texture_webp", "KHR_draco_mesh_compression", "KHR_materials_emissive_strength", "KHR_materials_ior",
@@ -37,12 +37,7 @@ class GltfFile:
     def __init__(self, path: Path):
         self.path = path
         self.notes: list[str] = []
-        try:
-            content = path.read_bytes()
-        except FileNotFoundError:
-            raise InputError(path, "does not exist") from None
-        except OSError as error:
-            raise from_os_error(error, path) from None
+        content = bytes_of(path)
         if content[:4] == b"glTF":
             text, self._binary = self._split(content)
         else:

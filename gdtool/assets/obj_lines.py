@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gdtool.core.errors import InputError, from_os_error
+from gdtool.core.errors import InputError, bytes_of
 
 _MOST = 2**31 - 1  # no file has as many vertices
 
@@ -35,12 +35,7 @@ class ObjLines:
 
 def read_lines(path: Path) -> ObjLines:
     """Read an OBJ. Raises InputError, with the line that is wrong, and OutputError."""
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(path, "does not exist") from None
-    except OSError as error:
-        raise from_os_error(error, path) from None
+    data = bytes_of(path)
     lines = _at_once(data)
     if lines is None:
         lines = _one_by_one(data.decode("utf-8", "replace"), path)

@@ -10,7 +10,7 @@ import numpy as np
 
 from gdtool.assets.ply import binary_ply, columns
 from gdtool.assets.scene import DEFAULT_MATERIAL, Scene
-from gdtool.core.errors import InputError, from_os_error
+from gdtool.core.errors import InputError, bytes_of
 from gdtool.geometry.rows import unique_rows
 
 _STL_HEADER = 84
@@ -36,12 +36,7 @@ def read_scan(path: str | Path) -> Scene:
     """
     path = Path(path)
     kind = path.suffix.lower()[1:]
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(path, "does not exist") from None
-    except OSError as error:
-        raise from_os_error(error, path) from None
+    data = bytes_of(path)
     scan = (_plain_stl if kind == "stl" else _plain_ply)(data) or _by_trimesh(data, kind, path)
     vertices, faces = scan.vertices, scan.faces
     if not len(faces):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from pathlib import Path
 
 
 class GdtoolError(Exception):
@@ -57,3 +58,13 @@ def from_os_error(error: OSError, subject: object) -> GdtoolError:
     }
     fact = error.strerror or str(error)
     return OutputError(error.filename or subject, fact[0].lower() + fact[1:], cures.get(error.errno, ""))
+
+
+def bytes_of(path: Path) -> bytes:
+    """What a file holds that the user named. Raises InputError where there is none, and as from_os_error() says."""
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(path, "does not exist") from None
+    except OSError as error:
+        raise from_os_error(error, path) from None

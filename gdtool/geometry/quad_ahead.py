@@ -15,7 +15,6 @@ from gdtool.geometry.quad_task import Part, Request
 
 _NICE = 10  # it only has what the others leave
 _DOUBT_EDGES = 2.0  # what is farther from the surface before it is drawn, often is not good
-_SHORTEST = 0.05  # seconds
 
 
 class Ahead:
@@ -29,7 +28,7 @@ class Ahead:
         part, request = self._part, self._part.request
         if cores() > 1 and farthest(surface_of(first.vertices, first.quads), part.surface) > _DOUBT_EDGES * part.edge:
             self._running[id(one)] = begin("gdtool.geometry.quad_child:finished", one, part.vertices, part.faces, part.quads, part.edge, request,
-                                           seconds=max(request.for_engines, _SHORTEST), memory_mb=request.memory_mb)
+                                           seconds=request.for_a_run, memory_mb=request.memory_mb)
 
     def fetch(self, one: Candidate) -> None:
         """Wait for one that was begun; all else is left as it is, to be done here."""

@@ -16,6 +16,7 @@ from gdtool.geometry.quad_shape import Surface
 
 COUNT_TOLERANCE = 0.03
 _ENGINES_SHARE, _LEAST_SECONDS = 0.7, 20.0
+_SHORTEST_RUN = 0.05  # seconds
 _NARROW_EDGES, _FEW_NARROW = 1.5, 0.05  # share of the creases' length
 _FEATURE_EDGES = 3  # quads long: shorter creases are noise
 
@@ -39,6 +40,11 @@ class Request:
     def for_engines(self) -> float:
         """Seconds in which engines may still be tried; below zero when what is not done by then goes without one."""
         return self.begun + _ENGINES_SHARE * self.seconds - time.monotonic()
+
+    @property
+    def for_a_run(self) -> float:
+        """Seconds that a child has, which works for an engine."""
+        return max(self.for_engines, _SHORTEST_RUN)
 
     @property
     def for_the_rest(self) -> float:

@@ -15,7 +15,6 @@ from gdtool.geometry.quad_task import Part, Record, Request
 
 _TRIES, _MOST_MORE = 3, 2.0  # of one way, to come near enough to the count; times what was asked for before
 _MOST_TORN = 0.1  # of the quads may be missing from a result that another density may mend
-_SHORTEST_RUN = 0.05  # seconds
 # Megabytes that an engine has, and more for each quad and triangle: several times what it needs, but for holes that Instant Meshes
 # fills for ever, with half a gigabyte a second.
 _MEMORY = 2000, 4e-3
@@ -110,8 +109,10 @@ class Trial:
             like = [one for one in candidates if one.fault == best.fault]
             if way.subdivisions and len(like) > 1:
                 self._ahead.begin(*like[:2])
-            taken = self._drawn(self._of_count(like, extra))
-            self._ahead.stop()
+            try:
+                taken = self._drawn(self._of_count(like, extra))
+            finally:
+                self._ahead.stop()
             if taken is not None and taken.wrong is not None:
                 if taken.passable and self.part.counted(len(taken.drawn[1]), quads):
                     self._passable = taken
@@ -131,7 +132,7 @@ class Trial:
         """What comes of each number asked for, made side by side, the best first."""
         part, request, start = self.part, self.part.request, time.perf_counter()
         running = [begin("gdtool.geometry.quad_child:candidate", part.vertices, part.faces, way, number,
-                         seconds=max(request.for_engines, _SHORTEST_RUN),
+                         seconds=request.for_a_run,
                          memory_mb=min(int(_MEMORY[0] + _MEMORY[1] * (number + len(part.faces))), request.memory_mb)) for number in asked]
         _ = part.features, part.surface, part.fine()  # found out while the children work
         out = []

@@ -164,7 +164,8 @@ def is_convex(vertices: np.ndarray, faces: np.ndarray, tolerance: float = 1e-6) 
     """Whether all faces lie on the hull of their corners, so that none hides another from outside.
 
     Each face's plane must have everything on one side (to tolerance, of the longest side). A scatter of faces is
-    tested first: nearly every mesh that is not convex fails there. Those of many faces are held against the hull (Qhull).
+    tested first: nearly every mesh that is not convex fails there. Those of many faces are held
+    against the hull (Qhull): no middle of a face may lie deeper in it than the tolerance.
     """
     from gdtool.geometry.normals import face_normals
 

@@ -224,3 +224,18 @@ def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypat
     corners = vertices[np.abs(vertices[:, None] - out[None]).max(-1).min(1) < 1e-9]
     assert len(corners) == 8
     assert left_out(surface_of(out, found), Surface(vertices, faces), (0.005,)) == [0.0]
+
+
+@pytest.mark.parametrize("given, least, most", [(16000, 2000, 2500), (500, 500, 500)])
+def test_an_engine_has_a_memory_limit_of_its_own_within_the_request(monkeypatch, given, least, most):
+    """It follows the quads and triangles: Instant Meshes fills some holes for ever."""
+    limits = []
+
+    def begin(*_, memory_mb, **more):
+        limits.append(memory_mb)
+        return Ended(ChildFailed("ran out"))
+
+    monkeypatch.setattr(quad_ways, "begin", begin)
+    vertices, faces = sphere(48, 0.45)
+    _, found, record = quads.remesh(vertices, faces, Request(quads=4000, memory_mb=given))
+    assert limits and all(least <= limit <= most for limit in limits) and record.engine == "pair and split" and whole(found)
