@@ -206,4 +206,4 @@ def _density(mesh, size: int) -> float:
     return float(size * (polygon_normals(flat, mesh.face_uvs)[1].sum() / area) ** 0.5)
 
 
-STAGE = Stage(name="unwrap", version=19, reads=("mesh", "mesh-file"), writes="atlas", Options=Options, run=run)
+STAGE = Stage(name="unwrap", version=20, reads=("mesh", "mesh-file"), writes="atlas", Options=Options, run=run)

@@ -25,7 +25,7 @@ def run_xatlas(vertices: np.ndarray, triangles: np.ndarray, max_cost: float) -> 
     charts = xatlas.ChartOptions()
     charts.max_cost = max_cost
     pack = xatlas.PackOptions()
-    pack.resolution = 256
+    pack.resolution = 16  # the atlas is not used
     atlas = xatlas.Atlas()
     atlas.add_mesh(np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(triangles, np.uint32))
     atlas.generate(charts, pack)
@@ -87,15 +87,22 @@ class Adjacency:
 
     def votes(self, label: np.ndarray, own: np.ndarray | float) -> np.ndarray:
         """(f,) the label around each face whose edges cost most to cut; own (f,) is added to the label it has."""
-        face = np.concatenate([self.pairs[:, 0], self.pairs[:, 1], np.arange(self.count)])
-        vote = np.concatenate([label[self.pairs[:, 1]], label[self.pairs[:, 0]], label])
-        weight = np.concatenate([self.cost, self.cost, np.broadcast_to(own, self.count)])
+        # A face among its own votes for its own label, whatever that costs.
+        apart = label[self.pairs[:, 0]] != label[self.pairs[:, 1]]
+        border = np.zeros(self.count, bool)
+        border[self.pairs[apart].ravel()] = True
+        faces_idx = np.flatnonzero(border)
+        near = border[self.pairs]
+        face = np.concatenate([self.pairs[near[:, 0], 0], self.pairs[near[:, 1], 1], faces_idx])
+        vote = np.concatenate([label[self.pairs[near[:, 0], 1]], label[self.pairs[near[:, 1], 0]], label[faces_idx]])
+        weight = np.concatenate([self.cost[near[:, 0]], self.cost[near[:, 1]], np.broadcast_to(own, self.count)[faces_idx]])
         width = int(label.max()) + 1
         key, inverse = np.unique(face * width + vote, return_inverse=True)
         total = np.bincount(inverse.ravel(), weight)
         order = np.lexsort((total, key // width))
-        last = np.append(np.flatnonzero(np.diff(key[order] // width)), len(order) - 1)
-        return key[order][last] % width
+        out = label.copy()
+        out[key[order] // width] = key[order] % width  # of several assignments to one element the last one stays
+        return out
 
 
 def find_charts(adjacency: Callable[[], Adjacency], vertices: np.ndarray, faces: np.ndarray, *, until: float,

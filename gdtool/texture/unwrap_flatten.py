@@ -33,9 +33,11 @@ def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, ma
     if not border.any():
         return Flat(None, "closed")
     surface, uv = Isometry(vertices, triangles), _seen(vertices, triangles)
-    disk = len(vertices) - len(edges.ends) + len(triangles) == 1 and edges.count.max() == 2
+    disk = is_disk(len(vertices), triangles, edges)
     if uv is not None and surface.stretch(uv) < good_stretch and not lies_on_itself(uv, triangles, edges, disk):
         return Flat(uv)
+    if not disk and _handles(len(vertices), triangles, edges):
+        return Flat(None, "has a handle")
     uv = _conformal(vertices, triangles, edges.ends[border])
     if uv is None or not upright(uv, triangles):
         if not disk:
@@ -43,10 +45,16 @@ def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, ma
         uv = _tutte(vertices, triangles)
         if uv is None or not upright(uv, triangles):
             return Flat(None, "folds")
+    uv = _scaled(uv, triangles, surface.area)
     uv, reached = _isometric(vertices, triangles, uv, surface, good_stretch, max_stretch)
     if reached > max_stretch:
         return Flat(None, "stretches")
     return Flat(None, "overlaps itself", uv) if lies_on_itself(uv, triangles, edges, disk) else Flat(uv)
+
+
+def is_disk(vertices: int, triangles: np.ndarray, edges: Edges) -> bool:
+    """Whether triangles (t, 3) of so many vertices, connected, with these edges, are a disk."""
+    return vertices - len(edges.ends) + len(triangles) == 1 and edges.count.max() == 2
 
 
 def _areas(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -60,9 +68,24 @@ def upright(uv: np.ndarray, triangles: np.ndarray) -> bool:
     return bool(np.isfinite(area).all() and (area > 1e-10 * max(area.max(initial=0), 1e-300)).all())
 
 
-def _scaled(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    total, flat = face_normals(vertices, triangles)[1].sum(), _areas(uv, triangles).sum()
-    return (uv - uv.mean(0)) * (total / max(flat, 1e-300)) ** 0.5
+def _handles(vertices: int, triangles: np.ndarray, edges: Edges) -> bool:
+    """Whether triangles (t, 3) of so many vertices, connected, each vertex with one fan, with these edges, have handles: no part of the plane
+    has any. By Euler's formula, from the loops of their rim."""
+    if edges.count.max() > 2:
+        return False
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    rim = edges.ends[edges.count == 1]
+    corners, local = np.unique(rim, return_inverse=True)
+    one, two = local.reshape(-1, 2).T
+    loops = connected_components(coo_matrix((np.ones(len(one)), (one, two)), (len(corners),) * 2), False)[0]
+    return 2 - loops > vertices - len(edges.ends) + len(triangles)
+
+
+def _scaled(uv: np.ndarray, triangles: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """uv (v, 2) about its centre, as large as the triangles (t, 3) are, area (t,)."""
+    return (uv - uv.mean(0)) * (area.sum() / max(_areas(uv, triangles).sum(), 1e-300)) ** 0.5
 
 
 def onto_plane(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
@@ -83,7 +106,7 @@ def _seen(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
     x = np.cross([0.0, 1.0, 0.0] if abs(mean[1]) < 0.9 else [1.0, 0.0, 0.0], mean)
     x /= np.linalg.norm(x)
     uv = np.stack([vertices @ x, vertices @ np.cross(mean, x)], -1)
-    return _scaled(vertices, triangles, uv) if upright(uv, triangles) else None
+    return _scaled(uv, triangles, area) if upright(uv, triangles) else None
 
 
 def _conformal(vertices: np.ndarray, triangles: np.ndarray, border: np.ndarray) -> np.ndarray | None:
@@ -102,9 +125,27 @@ def _conformal(vertices: np.ndarray, triangles: np.ndarray, border: np.ndarray) 
         return None
     if not np.isfinite(uv).all():
         return None
-    if _areas(uv, triangles).sum() < 0:
-        uv = uv * [1.0, -1.0]
-    return _scaled(vertices, triangles, uv)
+    return uv * [1.0, -1.0] if _areas(uv, triangles).sum() < 0 else uv
+
+
+def conformal_from(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> np.ndarray | None:
+    """uv (v, 2) with what is not finite among the corners of triangles (t, 3) laid by the least-squares conformal map that keeps the rest;
+    None where less than two of these are given, or they have no area."""
+    import igl
+
+    own, local = np.unique(triangles, return_inverse=True)
+    given = np.isfinite(uv[own, 0])
+    if given.sum() < 2:
+        return None
+    if not given.all():
+        try:
+            laid = np.asarray(igl.lscm(np.ascontiguousarray(vertices[own]), np.ascontiguousarray(local.reshape(-1, 3), np.int64),
+                                       np.flatnonzero(given), np.ascontiguousarray(uv[own[given]]))[0])
+        except RuntimeError:  # as in _conformal()
+            return None
+        uv = uv.copy()
+        uv[own[~given]] = laid[~given]
+    return uv
 
 
 def _tutte(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
@@ -129,9 +170,7 @@ def _tutte(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
     inner = np.setdiff1d(np.arange(n), loop)
     if len(inner):
         uv[inner] = spsolve(laplacian[inner][:, inner].tocsc(), -laplacian[inner][:, loop] @ uv[loop]).reshape(len(inner), 2)
-    if _areas(uv, triangles).sum() < 0:
-        uv = uv * [1.0, -1.0]
-    return _scaled(vertices, triangles, uv)
+    return uv * [1.0, -1.0] if _areas(uv, triangles).sum() < 0 else uv
 
 
 def _isometric(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray, surface: Isometry, good_stretch: float,
@@ -148,7 +187,7 @@ def _isometric(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray, surf
         found = np.asarray(igl.slim_solve(state, steps))[:, :2]
         if not np.isfinite(found).all() or not upright(found, triangles):
             break
-        best, last, before = _scaled(vertices, triangles, found), before, surface.stretch(found)
+        best, last, before = _scaled(found, triangles, surface.area), before, surface.stretch(found)
         gained = last - before
         if before < good_stretch or gained < 2e-4 or before - _RELIED_GAIN * gained > max_stretch:
             break
@@ -191,6 +230,10 @@ class Isometry:
         (u, v), (s, t), (e, f, g) = (uv[b] - uv[a]).T, (uv[c] - uv[a]).T, self._metric
         flat = np.abs(u * t - v * s)
         return (e * (s * s + t * t) - 2 * f * (u * s + v * t) + g * (u * u + v * v)) / (2 * np.maximum(flat, 1e-150) ** 2), flat / 2
+
+    def at_scale(self, uv: np.ndarray) -> float:
+        """L2 stretch where one unit of uv is one of the surface: below 1 where it lies larger."""
+        return float(np.sqrt((self.area * self.squared(uv)[0]).sum() / max(self.area.sum(), 1e-300)))
 
     def stretch(self, uv: np.ndarray) -> float:
         """As stretch()."""

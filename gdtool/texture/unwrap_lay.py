@@ -25,7 +25,7 @@ from gdtool.texture.unwrap_peel import onto_neighbours, peel
 
 _WHOLE = 1.4  # stretch of all charts together over 1, in units of what is good for one: with more the worst are cut
 _MOST_RELIEVED = 16, 0.5  # charts that are cut for that: so many, and this share of all
-_BESIDE = 4000  # faces of several charts, from which on some of them are laid flat in a child
+_BESIDE = 1000  # faces of several charts, from which on some of them are laid flat in a child
 _MOST_BESIDE, _BYTES = 10_000, 4  # charts whose numbers, of so many bytes each, a pipe holds
 _SLACK = 5.0  # seconds that it has to start and to stop
 _LATE = "was left when the time was over"
@@ -185,22 +185,25 @@ def _relieve(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, part
         value = stretch(points, triangles.astype(np.int64), uv) ** 2 - 1
         return float(adjacency.area[faces_idx].sum()) * value if np.isfinite(value) else 0.0
 
-    queue = [(-excess(chart), i) for i, chart in enumerate(laid.charts)]
+    values = [excess(chart) for chart in laid.charts]
+    total, gone = sum(values), set()
+    queue = [(-value, i) for i, value in enumerate(values) if value > 0 and len(laid.charts[i][0]) > 1]
     heapq.heapify(queue)
-    total, gone = -sum(value for value, _ in queue), set()
     while total > allowed and len(gone) < most and queue:
-        value, worst = heapq.heappop(queue)
-        faces_idx = laid.charts[worst][0]
-        if len(faces_idx) < 2:
-            continue
-        halves = further(_halves(adjacency, part, faces_idx))
-        added = [(-excess(chart), len(laid.charts) + i) for i, chart in enumerate(halves.charts)]
-        total += value - sum(more for more, _ in added)
+        # At once all those that have to be cut even if the parts of the worse ones do not stretch at all.
+        worst, rest = [], total
+        while rest > allowed and len(gone) + len(worst) < most and queue:
+            worst.append(heapq.heappop(queue))
+            rest += worst[-1][0]
+        gone.update(i for _, i in worst)
+        halves = further([half for _, i in worst for half in _halves(adjacency, part, laid.charts[i][0])])
+        values = [excess(chart) for chart in halves.charts]
+        total = rest + sum(values)
+        for i, value in enumerate(values):
+            if value > 0 and len(halves.charts[i][0]) > 1:
+                heapq.heappush(queue, (-value, len(laid.charts) + i))
         laid.add(halves)
-        laid.cut["stretches more than most"] += 1
-        gone.add(worst)
-        for one in added:
-            heapq.heappush(queue, one)
+        laid.cut["stretches more than most"] += len(worst)
     laid.charts = [chart for i, chart in enumerate(laid.charts) if i not in gone]
 
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.folders.mesh import triangulated
+from gdtool.geometry.repair import edges_of
 from gdtool.texture.unwrap_charts import Adjacency, own_corners
-from gdtool.texture.unwrap_flatten import flatten, overlapping
+from gdtool.texture.unwrap_flatten import Isometry, conformal_from, flatten, is_disk, lies_on_itself, overlapping, upright
 from gdtool.texture.unwrap_join import joined_stretch
 
 _MOST = 0.2  # of a chart's area, that is taken off; where more lies on itself the chart is cut
 _NEIGHBOURS = 3  # charts that a piece is offered to
 _WORK = 3  # faces that are laid flat again for that, in all, in units of the mesh's
+_STAYS = 4  # times a piece's faces: a chart of more stays as it lies, and the piece is laid beside it
+_STRETCH = 1.1  # of a piece beside such a chart, at its scale, either way
 
 
 def peel(adjacency: Adjacency, faces_idx: np.ndarray, triangles: np.ndarray, face_idx: np.ndarray, overlapped: np.ndarray) -> np.ndarray | None:
@@ -37,7 +40,7 @@ def onto_neighbours(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarra
     """Which of the pieces lie flat with none of the charts beside them; the others join one, in place.
 
     charts (faces_idx, corners, uv, triangles), as flatten_all() returns them; pieces: a face of the chart that it lay on, and is not
-    offered to again, and its faces.
+    offered to again, and its faces. Chart and piece together stretch no more than two charts that are joined may.
     """
     owner, number = np.full((2, adjacency.count), -1)
     for i, chart in enumerate(charts):
@@ -58,14 +61,36 @@ def onto_neighbours(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarra
             faces_idx = np.concatenate([charts[i][0], piece])
             work += len(faces_idx)
             points, corners = own_corners(vertices, faces[faces_idx])
-            triangles, _ = triangulated(corners)
-            uv = flatten(points, triangles.astype(np.int64), good_stretch, joined_stretch(good_stretch)).uv
+            triangles, most = triangulated(corners)[0].astype(np.int64), joined_stretch(good_stretch)
+            if len(charts[i][0]) > _STAYS * len(piece):
+                uv = _laid_beside(points, corners, triangles, charts[i], most)
+            else:
+                uv = flatten(points, triangles, good_stretch, most).uv
             if uv is not None:
                 charts[i], owner[piece] = (faces_idx, corners, uv, triangles), i
                 break
         else:
             left.append((home, piece))
     return left
+
+
+def _laid_beside(points: np.ndarray, corners: np.ndarray, triangles: np.ndarray, chart: tuple, most: float) -> np.ndarray | None:
+    """uv (v, 2) of a chart and a piece, points (v, 3), corners (k, 4) of the chart's faces and then the piece's, triangles (t, 3) of both:
+    the chart as it lies, the piece conformally from their seam on. None where it does not lie flat so, or a cut of the chart would close."""
+    _, old, lies, own = chart
+    at = corners[:len(old)][old >= 0]
+    uv = np.full((len(points), 2), np.nan)
+    uv[at] = lies[old[old >= 0]]
+    if (uv[at] != lies[old[old >= 0]]).any():
+        return None
+    piece = triangles[len(own):]
+    uv = conformal_from(points, piece, uv)
+    if uv is None or not upright(uv, triangles):
+        return None
+    by_piece, edges = Isometry(points, piece).at_scale(uv), edges_of(triangles)
+    if not 1 / _STRETCH < by_piece < _STRETCH or Isometry(points, triangles).stretch(uv) > most:
+        return None
+    return None if lies_on_itself(uv, triangles, edges, is_disk(len(points), triangles, edges)) else uv
 
 
 def _rows_of(number: np.ndarray, rows: np.ndarray, count: int) -> list[np.ndarray]:

@@ -102,7 +102,7 @@ class Shapes:
     """
 
     def __init__(self, boxed: list, cells_per_unit: float, gap: float, side: int, share: float = 0.0):
-        self.stride, self.uv, self.shapes, self.runs, self.bits, self._rim = side + 1, [], [], [], [], []
+        self.stride, self.uv, self.shapes, self.runs, self.bits, self._rim, self._turns = side + 1, [], [], [], [], [], []
         self._windows: dict[int, tuple[dict, dict]] = {}
         self._meetings: dict[int, int] = {}
         for uv, rim in boxed:
@@ -114,6 +114,8 @@ class Shapes:
             pairs = [_runs(mask, self.stride) if small else ([], []) for mask in masks[:2]]
             self.runs.append([pairs[turn % 2][turn // 2] for turn in range(4)])
             self.bits.append([bits_of(mask, self.stride) if small else 0 for mask in masks])
+            seen = list(zip(self.bits[-1], self.shapes[-1], strict=True))
+            self._turns.append([turn for turn in range(4) if seen[turn] not in seen[:turn]])  # turned onto itself a chart finds what it found
             own = self.bits[-1][0]
             within = own & own << 1 & own >> 1 & own << self.stride & own >> self.stride
             self._rim.append(own.bit_count() - within.bit_count())  # cells that can touch others
@@ -133,7 +135,7 @@ class Shapes:
         walls = taken << 1 | taken >> 1 | taken << stride | taken >> stride | border
         windows = {}, {}
         best = None
-        for turn in range(4):
+        for turn in self._turns[i]:
             h, w = self.shapes[i][turn]
             if max(h, w) > side:
                 continue

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gdtool.core.child import ChildFailed
+from gdtool.folders.mesh import triangulated
 from gdtool.texture import unwrap, unwrap_charts, unwrap_pack
 from gdtool.texture.raster import owner_count
 from gdtool.texture.unwrap_flatten import Flat, flatten, stretch
@@ -14,6 +15,7 @@ from gdtool.texture.unwrap_pack import pack
 from gdtool.texture.unwrap_shapes import upright_box
 from tests.geometry.solids import cube
 from tests.texture.shapes import torus
+from tests.texture.test_unwrap_join import sheet
 
 CUBE_QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 SMALL = unwrap.Request(size=512, padding=4)
@@ -174,6 +176,16 @@ def test_stretch_of_known_maps():
 def test_closed_mesh_cannot_lie_flat():
     vertices, triangles = cube()
     assert flatten(vertices, triangles, 1.001, 1.1) == Flat(None, "closed")
+
+
+@pytest.mark.parametrize("holes", [1, 2, 5])
+def test_a_torus_with_holes_has_a_handle_and_a_bent_sheet_with_holes_lies_flat(holes):
+    vertices, faces, _ = torus(24, 12)
+    assert flatten(vertices, np.delete(triangulated(faces)[0], 40 * np.arange(holes), 0), 1.001, 1.1) == Flat(None, "has a handle")
+    vertices, faces = sheet(20, bend=1.0)
+    triangles = triangulated(np.delete(faces, 42 + 42 * np.arange(holes), 0))[0]
+    flat = flatten(vertices, triangles, 1.001, 1.1)
+    assert flat.reason == "" and stretch(vertices, triangles, flat.uv) < 1.001
 
 
 def test_four_squares_pack_tight_and_turned_ones_are_set_upright():

@@ -6,8 +6,8 @@ import pytest
 from gdtool.folders.mesh import triangulated
 from gdtool.geometry.repair import edges_of
 from gdtool.texture import unwrap_lay
-from gdtool.texture.unwrap_charts import Adjacency
-from gdtool.texture.unwrap_flatten import lies_on_itself, overlapping
+from gdtool.texture.unwrap_charts import Adjacency, own_corners
+from gdtool.texture.unwrap_flatten import lies_on_itself, overlapping, stretch
 from gdtool.texture.unwrap_peel import onto_neighbours, peel
 from tests.texture.test_unwrap_join import GOOD, sheet
 
@@ -90,3 +90,19 @@ def test_a_piece_goes_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
     assert left(piece, [dome], 1 + 1e-9)[0] == 1
     monkeypatch.setattr("gdtool.texture.unwrap_peel._WORK", -1)
     assert left(piece)[0] == 1
+
+
+@pytest.mark.parametrize(("columns", "stays"), [(1, True), (4, False)])
+def test_a_chart_much_larger_than_a_piece_stays_as_it_lies(columns, stays):
+    vertices, faces = sheet(12, bend=1.0)
+    column = np.arange(144) % 12
+    piece, own = np.flatnonzero(column < columns), np.flatnonzero(column >= columns)
+    points, corners = own_corners(vertices, faces[own])
+    # Bent and slanted: laid anew it would not come to lie so.
+    lies = np.stack([np.arcsin(points[:, 0]), points[:, 1] + 0.01 * points[:, 0]], -1)
+    charts = [(own, corners, lies, triangulated(corners)[0])]
+    assert not onto_neighbours(Adjacency(vertices, faces), vertices, faces, charts, [(int(piece[0]), piece)], 1.01)
+    faces_idx, corners, uv, triangles = charts[0]
+    assert sorted(faces_idx) == list(range(144)) and not overlapping(uv, triangles).any()
+    assert (uv[:len(lies)] == lies).all() == stays
+    assert stretch(own_corners(vertices, faces[faces_idx])[0], triangles, uv) < 1.02

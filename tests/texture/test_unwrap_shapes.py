@@ -40,6 +40,17 @@ def test_places_are_free_and_none_is_found_in_a_full_square():
     assert shapes.placed(0, (1 << 41 * 40) - 1, border, 40, 0.5) is None
 
 
+def test_a_chart_is_not_turned_onto_itself():
+    square, oblong = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]), np.array([[0, 0], [3, 0], [3, 1], [0, 1.0]])
+    wedge, triangles = np.array([[0, 0], [3, 0], [3, 1], [0, 2.0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    shapes = Shapes([(uv, rim_of(uv, triangles)) for uv in (square, oblong, wedge)], 8.0, 1.5, 60)
+    assert shapes._turns == [[0], [0, 1], [0, 1, 2, 3]]
+    taken = shapes.cells(2, shapes.placed(2, 0, shapes.border(60), 60, 0.5))
+    less = [shapes.placed(i, taken, shapes.border(60), 60, 0.5) for i in range(2)]
+    shapes._turns = [[0, 1, 2, 3]] * 3
+    assert less == [shapes.placed(i, taken, shapes.border(60), 60, 0.5) for i in range(2)]
+
+
 def test_what_charts_leave_free_of_each_other_is_what_is_not_taken():
     ring, sides = rim_of(RING, RING_TRIANGLES), np.random.default_rng(5).uniform(1, 9, (6, 2))
     square, triangles = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]), np.array([[0, 1, 2], [0, 2, 3]])
