@@ -11,9 +11,8 @@ from gdtool.core.child import ChildFailed, Running, begin
 from gdtool.core.threads import cores
 from gdtool.geometry.quad_candidate import Candidate
 from gdtool.geometry.quad_fit import farthest, surface_of
-from gdtool.geometry.quad_task import Part, Request
+from gdtool.geometry.quad_task import NICE, Part, Request
 
-_NICE = 10  # it only has what the others leave
 _DOUBT_EDGES = 2.0  # what is farther from the surface before it is drawn, often is not good
 
 
@@ -45,7 +44,7 @@ class Ahead:
 
 def finished(one: Candidate, vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float, request: Request) -> Candidate:
     """What the child runs: the candidate traced and drawn."""
-    os.nice(_NICE)
+    os.nice(NICE)
     part = Part(vertices, faces, quads, edge, request, fine=lambda: None)
     one.trace(part)
     one.draw(part)

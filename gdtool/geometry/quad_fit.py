@@ -105,17 +105,22 @@ def _unfolded(vertices: np.ndarray, faces: np.ndarray, surface: Surface, feature
     return ease(vertices, faces, surface, features, constraints, tips=tips)
 
 
-def fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarray, faces: np.ndarray,
-            request: Request, fine: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """What split_to_quads made, each piece evened out on the surface where that makes better quads; only its vertices move."""
+def evened(quad_vertices: np.ndarray, quad_faces: np.ndarray, surface: Surface, request: Request) -> tuple[np.ndarray, Constraints]:
+    """Vertices of quads of a surface evened out on it, whatever becomes of the quads, and what they are held to."""
     edge = (polygon_normals(quad_vertices, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
-    features = find_features(vertices, faces, request.crease_degrees or 181.0, 3 * edge)
-    surface = Surface(vertices, faces)
+    features = find_features(surface.vertices, surface.faces, request.crease_degrees or 181.0, 3 * edge)
     traced, constraints = trace(quad_vertices, quad_faces, features, edge)
     constraints = untied(traced, quad_faces, constraints)
     traced = relax(onto(traced, surface, features, constraints), quad_faces, surface, features, constraints, request.smooth_iterations)
     traced, constraints = _squared(traced, quad_faces, surface, features, constraints, request)
-    traced, constraints = _unfolded(traced, quad_faces, surface, features, constraints)
+    return _unfolded(traced, quad_faces, surface, features, constraints)
+
+
+def better(quad_vertices: np.ndarray, quad_faces: np.ndarray, traced: np.ndarray, constraints: Constraints, surface: Surface, request: Request,
+           fine: Surface) -> np.ndarray:
+    """Vertices of quads as they are or, balanced about the input before it was simplified, as evened() left them, each piece and each quad
+    where that makes it better."""
+    edge = (polygon_normals(quad_vertices, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
     if request.smooth_iterations:
         traced = balance(traced, quad_faces, fine, constraints)
     # Pieces that are a few quads wide fold and shrink when their vertices are evened out: they stay as they were split, and
@@ -133,7 +138,7 @@ def fitted(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarr
     least = _NO_AREA * edge**2
     flat = polygon_normals(np.where(stays[:, None], quad_vertices, traced), quad_faces)[1] < least
     stays[quad_faces[flat & (polygon_normals(traced, quad_faces)[1] >= least)]] = False
-    return np.where(stays[:, None], quad_vertices, traced), quad_faces
+    return np.where(stays[:, None], quad_vertices, traced)
 
 
 def _let_go(surface: Surface, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, distance: float) -> np.ndarray:

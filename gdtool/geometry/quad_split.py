@@ -1,4 +1,8 @@
-"""Quads without an engine, by a construction that cannot fail: even triangles, joined in pairs, every face cut in quads."""
+"""Quads without an engine, by a construction that cannot fail: even triangles, joined in pairs, every face cut in quads.
+
+Quads (split_count(faces, quads), 4) of any triangle mesh, in one way or the other: no piece is lost, closed and manifold where the triangles
+are. vertices (v, 3) in a unit box, faces (f, 3); seconds and memory_mb: limits of each run in a child, whose failure costs evenness alone.
+"""
 
 from __future__ import annotations
 
@@ -18,25 +22,14 @@ _APART = 1e-6  # of the size, between vertices that coincide
 
 
 def split_count(faces: np.ndarray, quads: int) -> int:
-    """How many quads split_to_quads makes where so many are asked for: enough for every piece."""
+    """How many quads are made where so many are asked for: enough for every piece."""
     return max(quads, 12 * components(faces)[0])
 
 
-def split_to_quads(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float, seconds: float,
-                   memory_mb: int) -> tuple[np.ndarray, np.ndarray]:
-    """Quads (split_count(faces, quads), 4) of any triangle mesh; no piece is lost, closed and manifold where the triangles are.
-
-    vertices (v, 3) in a unit box, faces (f, 3). Creases sharper than crease_degrees are kept; seconds and memory_mb: limits
-    of each run in a child, whose failure costs evenness alone.
-    """
-    quads = split_count(faces, quads)
-    even = _even(vertices, faces, quads, crease_degrees, seconds, memory_mb)
-    return pair_and_split(*even, quads) if even is not None else _by_collapse(vertices, faces, quads, seconds)
-
-
-def _even(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float, seconds: float,
-          memory_mb: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Even triangles of the same topology that split into so many quads; None where there are none, as on what is small and intricate."""
+def of_even(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float, seconds: float,
+            memory_mb: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Quads of even triangles of the same topology, creases sharper than crease_degrees kept; None where there are none that split into so
+    many, as on what is small and intricate."""
     triangles = int(quads / _QUADS_PER_TRIANGLE)
     few_vertices, few = simplify(vertices, faces, 2 * triangles, seconds=seconds, careful=True, measured=False)[:2]
     try:
@@ -47,7 +40,7 @@ def _even(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: f
     if not 2.1 * len(found) <= quads <= 3 * len(found):
         return None
     out, found = compact(out, found)
-    return (out, found) if topology(found) == topology(faces) and np.isfinite(out).all() else None
+    return pair_and_split(out, found, quads) if topology(found) == topology(faces) and np.isfinite(out).all() else None
 
 
 def even_triangles(vertices: np.ndarray, faces: np.ndarray, triangles: int, crease_degrees: float) -> tuple[np.ndarray, np.ndarray]:
@@ -77,8 +70,8 @@ def even_triangles(vertices: np.ndarray, faces: np.ndarray, triangles: int, crea
     return vertices, found
 
 
-def _by_collapse(vertices: np.ndarray, faces: np.ndarray, quads: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """pair_and_split of the mesh's own triangles, cut in four or collapsed to the right number."""
+def of_own(vertices: np.ndarray, faces: np.ndarray, quads: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    """Quads of the mesh's own triangles, cut in four or collapsed to the right number."""
     import igl
 
     triangles = max(int(quads / _QUADS_PER_TRIANGLE), 4)

@@ -13,10 +13,10 @@ from gdtool.core.child import prepare
 from gdtool.core.threads import mapped
 from gdtool.geometry.halves import even
 from gdtool.geometry.normals import face_normals
-from gdtool.geometry.quad_fit import farthest, fitted
+from gdtool.geometry.quad_fallback import split
+from gdtool.geometry.quad_fit import farthest
 from gdtool.geometry.quad_pieces import SMALL_PIECE_QUADS, apart, by_size, joined, well_made
 from gdtool.geometry.quad_shape import Surface
-from gdtool.geometry.quad_split import split_to_quads
 from gdtool.geometry.quad_spread import spread
 from gdtool.geometry.quad_task import Part, Record, Request
 from gdtool.geometry.quad_ways import Found, Trial, prepare_engines
@@ -100,8 +100,7 @@ def _quads_of(part: Part, record: Record) -> list[Found]:
                 record.add(own)
             return out
     start = time.perf_counter()
-    split = split_to_quads(part.vertices, part.faces, part.quads, part.request.crease_degrees, part.request.for_the_rest, part.request.memory_mb)
-    found = *fitted(*split, part.vertices, part.faces, part.request, part.fine()), "pair and split"
+    found = *split(part), "pair and split"
     record.clock("fallback", start)
     return [found]
 

@@ -33,7 +33,7 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
 
     monkeypatch.setattr(quad_split, "simplify", losing)
     asked = 1800  # 800 triangles, of which 1.15 times as many lose the piece and 1.3 times keep it
-    out, found = quad_split._by_collapse(vertices, faces, asked, 60.0)
+    out, found = quad_split.of_own(vertices, faces, asked, 60.0)
     assert tried[:3] == [800, 919, 1040] and repair.components(found)[0] == 2
     assert asked < len(found) < 1.5 * asked < 1.8 * len(faces)
 
@@ -53,7 +53,7 @@ def test_even_triangles_are_sought_no_longer_than_they_come_nearer_to_their_numb
 def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
     """Pins with few triangles around: what bends too much stays single, and there are fewer triangles for it."""
     vertices, faces = joined(*((pin[0] + (0.3 * k, 0, 0), pin[1]) for k, pin in enumerate([rod(24)] * 8)))
-    _, found = quad_split._by_collapse(vertices, faces, 400, 60.0)
+    _, found = quad_split.of_own(vertices, faces, 400, 60.0)
     assert abs(len(found) / 400 - 1) < 0.1 and repair.components(found)[0] == 8 and repair.is_watertight(found)
 
 
@@ -84,7 +84,8 @@ def test_quads_without_area_are_evened_out_where_their_neighbours_stay(monkeypat
     split[b], split[d] = split[a], split[c]
     assert polygon_normals(split, quad_faces)[1][100] < 1e-12
     monkeypatch.setattr(quad_fit, "_let_go", lambda *given: np.arange(len(quad_faces)))
-    out, _ = quad_fit.fitted(split, quad_faces, vertices, faces, Request(quads=600), Surface(vertices, faces))
+    surface, request = Surface(vertices, faces), Request(quads=600)
+    out = quad_fit.better(split, quad_faces, *quad_fit.evened(split, quad_faces, surface, request), surface, request, surface)
     edge = (polygon_normals(out, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
     assert polygon_normals(out, quad_faces)[1].min() > 1e-4 * edge**2
     touched = np.isin(quad_faces, quad_faces[100]).any(1)
