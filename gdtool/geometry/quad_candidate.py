@@ -10,7 +10,21 @@ from gdtool.geometry import repair
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import scaled_jacobian, valences
 from gdtool.geometry.quad_engines import ENGINES
-from gdtool.geometry.quad_fit import CUT_OFF, CUT_SUBDIVIDED, FAR_EDGES, FAR_SUBDIVIDED, STICKS_OUT, Outline, drawn, fault_of, outlined, sticks_out
+from gdtool.geometry.quad_fit import (
+    CUT_OFF,
+    CUT_SUBDIVIDED,
+    FAR_EDGES,
+    FAR_SUBDIVIDED,
+    LEAVES_OUT,
+    STICKS_OUT,
+    Outline,
+    drawn,
+    fault_of,
+    left_out,
+    outlined,
+    sticks_out,
+    surface_of,
+)
 from gdtool.geometry.quad_glide import cancel_pairs
 from gdtool.geometry.quad_shape import fill_holes, remove_doublets
 from gdtool.geometry.quad_task import Part
@@ -20,6 +34,7 @@ LOST, ADDED, PIECES = "handles are lost", "handles are added", "pieces are lost 
 _NEAR_EDGES, _LEAST_JACOBIAN = 0.75, 0.2  # nearer and squarer than this, a result is taken without a look at others
 _NEAR_OUTLINE = 0.9  # edge lengths: shaping hardly brings what is farther within _NEAR_EDGES
 _OUT_EDGES = 0.55  # what sticks out less is finer than a quad
+_BARE_EDGES, _BARE_SHARE = 2.0, 0.02  # surface so far from an engine's quads is no matter of tips, and how much of it is too much
 _MENDINGS = 4  # rounds of filling holes and parting what meets at a vertex
 
 
@@ -88,6 +103,11 @@ class Candidate:
     def usable(self, part: Part) -> bool:
         """Without a fault, or with one that is finer than its quads."""
         return self.fault is None or self.fault == LOST and sticks_out(self.vertices, self.quads, part.surface) < 2 * _OUT_EDGES * part.edge
+
+    def leaves_out(self, part: Part) -> str | None:
+        """What is wrong with it before it is drawn, where it does without parts of the surface that drawing does not bring back."""
+        bare = left_out(surface_of(self.vertices, self.quads), part.surface, (_BARE_EDGES * part.edge,))[0]
+        return f"{LEAVES_OUT} {bare:.1%} of the surface" if bare > _BARE_SHARE else None
 
     def trace(self, part: Part) -> None:
         """Find its outline, once."""

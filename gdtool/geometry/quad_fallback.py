@@ -20,35 +20,49 @@ _WORTH_A_CHILD = 20000  # triangles
 Evened = tuple[np.ndarray, np.ndarray, np.ndarray, Constraints]  # quads as they were split, vertices and faces; the vertices evened out, held to these
 
 
-def split(part: Part) -> tuple[np.ndarray, np.ndarray]:
-    """Quads of any part (quad_split), evened out on its surface where that makes better ones."""
-    request, quads = part.request, split_count(part.faces, part.quads)
-    ahead = _ahead(part, quads)
-    try:
-        found = of_even(part.vertices, part.faces, quads, request.crease_degrees, request.for_the_rest, request.memory_mb)
-        if found is not None:
-            done = *found, *evened(*found, part.surface, request)
-        else:
-            done = _fetched(ahead) or own_evened(part.vertices, part.faces, quads, request, part.surface)
-    finally:
-        if ahead is not None:
-            ahead.kill()
+def split(part: Part, ahead: Running | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Quads of any part (quad_split), evened out on its surface where that makes better ones; ahead: as begun() gave it."""
+    request = part.request
+    done = _fetched(ahead) or split_evened(part.vertices, part.faces, part.quads, request, part.surface)
     return better(*done, part.surface, request, part.fine()), done[1]
 
 
+def begun(part: Part) -> Running | None:
+    """A child that splits and evens out what has fewer triangles than it is to have quads, as an engine often fails on it, which is soon done;
+    None for others, and where there is no core to spare."""
+    if cores() == 1 or len(part.faces) >= part.quads:
+        return None
+    return _begin("split_evened", part.vertices, part.faces, part.quads, part.request)
+
+
+def split_evened(vertices: np.ndarray, faces: np.ndarray, quads: int, request: Request, surface: Surface | None = None, nice: int = 0) -> Evened:
+    """About so many quads of even triangles, else of the mesh's own; nice: what a child that may not be needed gives way by."""
+    if nice:
+        os.nice(nice)
+    quads = split_count(faces, quads)
+    ahead = _begin("own_evened", vertices, faces, quads, request) if cores() > 1 and len(faces) >= _WORTH_A_CHILD else None
+    surface = Surface(vertices, faces) if surface is None else surface
+    try:
+        found = of_even(vertices, faces, quads, request.crease_degrees, request.for_the_rest, request.memory_mb)
+        if found is not None:
+            return *found, *evened(*found, surface, request)
+        return _fetched(ahead) or own_evened(vertices, faces, quads, request, surface)
+    finally:
+        if ahead is not None:
+            ahead.kill()
+
+
 def own_evened(vertices: np.ndarray, faces: np.ndarray, quads: int, request: Request, surface: Surface | None = None, nice: int = 0) -> Evened:
-    """So many quads of a mesh's own triangles; nice: what a child that may not be needed gives way by."""
+    """So many quads of the mesh's own triangles."""
     if nice:
         os.nice(nice)
     found = of_own(vertices, faces, quads, request.for_the_rest)
     return *found, *evened(*found, Surface(vertices, faces) if surface is None else surface, request)
 
 
-def _ahead(part: Part, quads: int) -> Running | None:
-    if cores() == 1 or len(part.faces) < _WORTH_A_CHILD:
-        return None
-    return begin("gdtool.geometry.quad_child:own_evened", part.vertices, part.faces, quads, part.request, nice=NICE,
-                 seconds=part.request.for_the_rest, memory_mb=part.request.memory_mb)
+def _begin(name: str, vertices: np.ndarray, faces: np.ndarray, quads: int, request: Request) -> Running:
+    return begin(f"gdtool.geometry.quad_child:{name}", vertices, faces, quads, request, nice=NICE, seconds=request.for_the_rest,
+                 memory_mb=request.memory_mb)
 
 
 def _fetched(ahead: Running | None) -> Evened | None:

@@ -29,7 +29,7 @@ _LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost 
 _MOST_FOLDED = 0.01  # of the quads
 _CUT_EDGES = 0.25  # surface so far from the quads lies beyond an edge that they cut off
 CUT_OFF, CUT_SUBDIVIDED = 0.0125, 0.005  # how much of it may, as paired triangles keep its edges; of a subdivided result, after which finer ones come
-TOO_COARSE = _STRAYS, _LEAVES_OUT, STICKS_OUT, _CUTS_OFF = "strays", "leaves out", "sticks out", "cuts off"
+TOO_COARSE = _STRAYS, LEAVES_OUT, STICKS_OUT, _CUTS_OFF = "strays", "leaves out", "sticks out", "cuts off"
 _FOLDED, _LET_GO = 0.05, 0.25  # scaled Jacobian; edge lengths
 
 
@@ -162,7 +162,7 @@ def fault_of(vertices: np.ndarray, quads: np.ndarray, surface: Surface, edge: fl
         return f"{_STRAYS} {far:.2g} edge lengths from the surface", far
     left, cut = left_out(mine, surface, (_LOST_EDGES * edge, _CUT_EDGES * edge))
     if left > _LOST_SHARE:
-        return f"{_LEAVES_OUT} {left:.1%} of the surface", far
+        return f"{LEAVES_OUT} {left:.1%} of the surface", far
     if (over := sticks_out(vertices, quads, surface) / edge) > limit:
         return f"{STICKS_OUT} {over:.2g} edge lengths", far
     if (folded := float((scaled_jacobian(vertices, quads) <= 0).mean())) > _MOST_FOLDED:

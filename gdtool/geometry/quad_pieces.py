@@ -6,7 +6,7 @@ import numpy as np
 
 from gdtool.geometry import repair
 from gdtool.geometry.distance import closest_points
-from gdtool.geometry.quad_candidate import judged
+from gdtool.geometry.quad_candidate import Candidate, judged
 from gdtool.geometry.quad_fit import CUT_OFF, drawn, fault_of, outlined, settled
 from gdtool.geometry.quad_split import split_count
 from gdtool.geometry.quad_task import COUNT_TOLERANCE, Part
@@ -16,6 +16,7 @@ SMALL_PIECE_QUADS = 48
 _MOST_ALONE, _ALONE, _FEWEST = 16, 300, 6  # pieces that are remeshed one by one; quads of one that is, and of any
 # Of the quads of a piece, that there may be more or fewer in any case, and at most; the rest of the tolerance goes by the root of their number.
 _SURELY, _MOST_OFF = 0.02, 0.15
+_MADE_UP = 0.5  # of the quads of the other pieces, that these may have more or fewer of than their share
 _ON_ONE, _MOST_APART = 0.9, 1.5  # of a component's quads lie on the piece that they stand for; edge lengths that a piece strays
 
 
@@ -33,24 +34,31 @@ def by_size(part: Part) -> tuple[Part | None, Part]:
     return few, part.of(~small[piece], max(quads - few.quads, 4))
 
 
-def well_made(part: Part, whole: Found | None) -> tuple[Found | None, np.ndarray]:
+def well_made(part: Part, whole: Candidate | None) -> tuple[Found | None, np.ndarray]:
     """Of an engine's quads of all pieces those of the pieces on which they stand up to judgement, finished; which these are (pieces,) bool."""
     (count, piece), good = part.pieces, np.zeros(part.pieces[0], bool)
     if whole is None or count > part.quads / SMALL_PIECE_QUADS:
         return None, good
     parts = [part.of(piece == k, 0) for k in range(count)]
-    quads = [judged(*quads, own.vertices, own.faces) for own, quads in zip(parts, quads_by_piece(*whole[:2], part), strict=True)]
+    quads = [judged(*quads, own.vertices, own.faces) for own, quads in zip(parts, quads_by_piece(whole.vertices, whole.quads, part), strict=True)]
     good[:] = [fault is None for fault, _, _ in quads]
     if not good.any():
         return None, good
-    these = part.of(good[piece], part.quads)
-    these_quads = joined([own[1:] for own, fits in zip(quads, good, strict=True) if fits])
-    outline = outlined(*these_quads, these.surface, these.features, 0, part.request)
-    done = settled(*drawn(outline, these.surface, these.features, part.request), part.fine(), part.request)
-    made = quads_by_piece(*done, part)
+    of_these = whole.drawn
+    if of_these is None or not good.all():
+        these = part.of(good[piece], part.quads)
+        outline = outlined(*joined([own[1:] for own, fits in zip(quads, good, strict=True) if fits]), these.surface, these.features, 0, part.request)
+        of_these = drawn(outline, these.surface, these.features, part.request)
+    made = quads_by_piece(*settled(*of_these, part.fine(), part.request), part)
     for k in np.flatnonzero(good):
         good[k] = len(made[k][1]) > 0 and fault_of(*made[k], parts[k].surface, part.edge, _MOST_APART, CUT_OFF)[0] is None
-    return ((*joined([made[k] for k in np.flatnonzero(good)]), whole[2]) if good.any() else None), good
+    if not good.any():
+        return None, good
+    found = *joined([made[k] for k in np.flatnonzero(good)]), whole.way.label
+    rest = part.quads * part.piece_areas[~good].sum() / part.piece_areas.sum()
+    if abs(part.quads - len(found[1]) - rest) > max(COUNT_TOLERANCE * part.quads, _MADE_UP * rest):
+        return None, np.zeros_like(good)  # the others could not make up for so many or so few
+    return found, good
 
 
 def apart(part: Part, done: np.ndarray, quads: int) -> list[Part]:

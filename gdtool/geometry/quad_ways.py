@@ -7,9 +7,10 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from gdtool.core.child import ChildFailed, begin, prepare
+from gdtool.core.child import ChildFailed, Running, begin, prepare
 from gdtool.geometry.quad_ahead import Ahead
 from gdtool.geometry.quad_candidate import Candidate, Way
+from gdtool.geometry.quad_fallback import begun
 from gdtool.geometry.quad_fit import FAR_EDGES, TOO_COARSE, settled
 from gdtool.geometry.quad_task import Part, Record, Request
 
@@ -55,16 +56,27 @@ class Trial:
 
     def __init__(self, part: Part, record: Record):
         self.part, self.record = part, record
-        self.whole: Found | None = None  # of several pieces what an engine made of all of them, mended where it could be
+        self.whole: Candidate | None = None  # of several pieces what an engine made of all of them
         self._several = part.pieces[0] > 1  # what fails together can go piece by piece
         self._over = False
         self._passable: Candidate | None = None
         self._second_best: Candidate | None = None
         self._given_up: set[str] = set()
         self._ahead = Ahead(part)
+        self.fallback: Running | None = None  # begun where an engine's last quads are in doubt: quad_fallback.begun
 
     def run(self) -> Found | None:
         """The first way's quads that stand up to judgement, settled; None when none does."""
+        done = True
+        try:
+            found = self._first()
+            done = found is not None
+            return found
+        finally:
+            if done and self.fallback is not None:
+                self.fallback.kill()
+
+    def _first(self) -> Found | None:
         for way in _ways(self.part.quads, self.part.request):
             if self.part.request.for_engines <= 0:
                 self.record.failed.append(f"{way.label}: not tried, the time is over")
@@ -95,7 +107,9 @@ class Trial:
             count, counted, usable = best.count, self.part.counted(best.count, wanted), best.usable(self.part)
             together = self._several and not way.subdivisions
             if together and len(best.quads):
-                self.whole = best.vertices, best.quads, way.label
+                self.whole = best
+            if (together or usable and (self._several or not counted)) and len(best.quads) and (bare := best.leaves_out(self.part)):
+                return self._failed(way, bare)
             if not counted and (usable or together):
                 if turn and count * _MOST_MORE < wanted:
                     break  # small pieces are lost however many are asked for
@@ -106,6 +120,8 @@ class Trial:
                 self._second_best = best
             if not usable:
                 return self._failed(way, best.fault, torn=best.off(wanted) < -_MOST_TORN)
+            if not way.subdivisions and not self._several and self.fallback is None:
+                self.fallback = begun(self.part)
             like = [one for one in candidates if one.fault == best.fault]
             if way.subdivisions and len(like) > 1:
                 self._ahead.begin(*like[:2])

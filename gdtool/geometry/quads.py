@@ -83,6 +83,7 @@ def _coarse(vertices: np.ndarray, faces: np.ndarray, edge: float, request: Reque
 
 def _quads_of(part: Part, record: Record) -> list[Found]:
     """The quads of a mesh, or those of parts of it that were made in different ways."""
+    ahead = None
     if not part.given_up and part.quads >= SMALL_PIECE_QUADS and part.request.engine != "split":
         trial = Trial(part, record)
         if (found := trial.run()) is not None:
@@ -99,8 +100,9 @@ def _quads_of(part: Part, record: Record) -> list[Found]:
                 out += made
                 record.add(own)
             return out
+        ahead = trial.fallback
     start = time.perf_counter()
-    found = *split(part), "pair and split"
+    found = *split(part, ahead), "pair and split"
     record.clock("fallback", start)
     return [found]
 

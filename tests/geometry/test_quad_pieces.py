@@ -5,6 +5,7 @@ import pytest
 
 from gdtool.folders.mesh import triangulated
 from gdtool.geometry import quad_candidate, quad_pieces, quad_ways, quads, repair
+from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import distance_figures, topology_figures
 from gdtool.geometry.quad_task import Part, Request
 from tests.geometry.engines import in_this_process, whole
@@ -69,6 +70,21 @@ def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless)
     small = found[(out[found][..., 2] < 0.15).all(1)]
     assert topology_figures(*repair.compact(out, small))["irregular_share"] < 0.1  # eight of a ball's hundred; of paired triangles a fifth and more
     assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.02
+
+
+@pytest.mark.parametrize("wanted, kept", [(1.0, True), (1.2, False)])
+def test_pieces_are_kept_as_they_were_drawn_where_the_others_can_make_up_for_their_count(monkeypatch, wanted, kept):
+    """Two balls of which an engine's quads are those of both: all are kept, or none where there are a sixth too few; none is drawn again."""
+    meshes = [sphere(24, 0.3, (x, 0, 0)) for x in (-0.4, 0.4)]
+    out, found = quad_pieces.joined([quads.remesh(*mesh, Request(quads=500, engine="split"))[:2] for mesh in meshes])
+    part = Part(*joined(*meshes), round(wanted * len(found)), 0.05, Request(), None)
+    part.fine = lambda: part.surface
+    whole = quad_candidate.Candidate(quad_ways.Way("instant-meshes", 0, (1.0,), 30.0), len(found), None, out, found)
+    whole.drawn = out, found, Constraints.none(len(out))
+    monkeypatch.setattr(quad_pieces, "outlined", None)
+    made, good = quad_pieces.well_made(part, whole)
+    assert good.all() == good.any() == kept and (made is None) != kept
+    assert not kept or len(made[1]) == len(found) and made[2] == "instant-meshes"
 
 
 def test_small_piece_is_not_lost():

@@ -46,6 +46,22 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
     assert outcome == "a crash" or "strays" in record.failed[0]
 
 
+def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(monkeypatch):
+    """Half a ball, a tenth too few quads; a whole one lacks nothing, nor one without a cap that its tip can be drawn over."""
+    vertices, faces = sphere(24, 0.4)
+    out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
+    part = Part(vertices, faces, 1000, 0.045, Request(), None)
+    height = out[found].mean(1)[:, 2]
+    left = [Candidate(quad_ways.Way("instant-meshes", 0, (1.0,), 30.0), 1000, None, *repair.compact(out, found[height < most])).leaves_out(part)
+            for most in (1.0, 0.37, 0.0)]
+    assert left[:2] == [None, None] and "leaves out 3" in left[2]
+    calls = in_this_process(monkeypatch, lambda *_: repair.compact(out, found[height < 0.0]))
+    monkeypatch.setattr(quad_candidate, "judged", lambda vertices, found, *_: (None, vertices, found))
+    monkeypatch.setattr(quad_ways.Trial, "_drawn", None)
+    _, _, record = quads.remesh(vertices, faces, Request(quads=1000))
+    assert len(calls) == 1 and record.engine == "pair and split" and "leaves out" in record.failed[0]
+
+
 def with_tunnel(vertices, faces, length):
     """A ball with a tunnel, a triangle wide, from its top to a triangle about so far away."""
     centre = vertices[faces].mean(1)
