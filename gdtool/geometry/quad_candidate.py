@@ -175,9 +175,9 @@ def judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarr
         return "not watertight, though the input is", quad_vertices, quad_faces
     if not repair.is_manifold(quad_faces):
         return "not manifold", quad_vertices, quad_faces
-    quad_faces = cancel_pairs(quad_vertices, quad_faces)
     if repair.components(quad_faces)[0] != pieces:
-        return PIECES, quad_vertices, quad_faces
+        return PIECES, quad_vertices, quad_faces  # what of it is kept is judged again, piece by piece
+    quad_faces = cancel_pairs(quad_vertices, quad_faces)
     if closed and (more := repair.euler_number(quad_faces) - repair.euler_number(faces)):
         return LOST if more > 0 else ADDED, quad_vertices, quad_faces
     return None, quad_vertices, quad_faces
