@@ -10,6 +10,7 @@ import numpy as np
 
 from gdtool.core.child import ChildFailed, begin
 from gdtool.core.errors import InputError
+from gdtool.core.threads import cores
 from gdtool.geometry import repair
 from gdtool.geometry.halves import in_halves, worth_halving
 from gdtool.geometry.normals import face_normals
@@ -185,7 +186,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     vertices (v, 3), faces (f, 3), attributes (v, a) or None. Returns vertices, faces, attributes (read at the closest
     point of the input) and a report: faces, method, and error, the largest distance of the result's vertices and of the
     input's vertices (at most 20,000 of them) to the other surface, in units of the input. A closed, manifold
-    input stays so (closed says whether it is; asked only of what does not come out closed). With crease_degrees, bevels are drawn out first to
+    input stays so (closed says whether it is, soon). With crease_degrees, bevels are drawn out first to
     creases that turn by more, unless what comes of it cannot be collapsed; the report says how many vertices moved (creases).
     `careful` takes the slow way first, for meshes with more small parts than triangles to
     spare: the quick one reaches any number, even by tearing down what is large. With `near` the quick one keeps nearer to the surface, its
@@ -211,8 +212,13 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     edge = _edge(unit, faces, target_faces)
     is_closed, pieces = cache(closed or (lambda: repair.is_watertight(faces))), cache(lambda: repair.components(faces)[0])
 
+    def beside() -> None:
+        if closed is not None and cores() > 1 and is_closed():
+            pieces()  # asked for where what comes out is in several
+        meanwhile()
+
     def collapsed(crease_degrees: float) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str], int | None]:
-        return _collapsed(unit, faces, target_faces, edge if near else _UNIT, even, crease_degrees, careful, seconds, is_closed, meanwhile)
+        return _collapsed(unit, faces, target_faces, edge if near else _UNIT, even, crease_degrees, careful, seconds, is_closed, beside)
 
     found, method, reasons, moved = collapsed(crease_degrees)
     if found is None and moved != 0:
