@@ -10,15 +10,19 @@ from functools import cached_property
 import numpy as np
 
 from gdtool.geometry import repair
+from gdtool.geometry.distance import sample_surface
 from gdtool.geometry.features import Features, find_features
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_shape import Surface
+from gdtool.geometry.rays import RayCaster, dot
 
 COUNT_TOLERANCE = 0.03
 NICE = 10  # of children whose work may not be needed: they have what the others leave
 _ENGINES_SHARE, _LEAST_SECONDS = 0.7, 20.0
 _SHORTEST_RUN = 0.05  # seconds
 _NARROW_EDGES, _FEW_NARROW = 1.5, 0.05  # share of the creases' length
+_WALL_EDGES, _PARALLEL, _FEW_THIN = 2.0, 0.9, 7e-4  # cosine between the two sides of a wall; share of the surface
+_RAYS, _OFF = 20_000, 1e-4  # edge lengths under the surface that they start
 _FEATURE_EDGES = 3  # quads long: shorter creases are noise
 
 
@@ -113,6 +117,16 @@ class Part:
         """Whether more than a few creases lie in pairs closer together than _NARROW_EDGES, as on thin plates and small bevels; not asked of
         what has more triangles than quads."""
         return len(self.faces) < self.quads and self.features.in_strips(_NARROW_EDGES * self.edge) > _FEW_NARROW
+
+    @cached_property
+    def thin(self) -> bool:
+        """Whether more than a little of the surface bounds walls thinner than two quads are wide, as rays into it tell. Wedges are none."""
+        points, face_idx = sample_surface(self.vertices, self.faces, _RAYS, np.random.default_rng(0))[:2]
+        normals = face_normals(self.vertices, self.faces)[0]
+        inward = -normals[face_idx]
+        hits = RayCaster(self.vertices, self.faces, 1).first_hit(points + _OFF * self.edge * inward, inward)
+        out_again = dot(normals[hits.face_idx].T, inward.T) > _PARALLEL
+        return bool((hits.found & out_again & (hits.distance < _WALL_EDGES * self.edge)).mean() > _FEW_THIN)
 
     @cached_property
     def features(self) -> Features:

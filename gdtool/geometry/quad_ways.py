@@ -27,7 +27,7 @@ Found = tuple[np.ndarray, np.ndarray, str]  # vertices (v, 3), quads (q, 4), the
 def _ways(quads: int, request: Request) -> list[Way]:
     """In the order to try.
 
-    A coarser mesh subdivided has a quarter of the irregular vertices; it fails where features are finer than its quads.
+    A coarser mesh subdivided has a quarter of the irregular vertices; it fails where features, or walls, are finer than its quads.
     """
     engine = "instant-meshes" if request.engine == "auto" else request.engine
     out = [Way(engine, 1, (0.985, 1.005), request.crease_degrees)] if engine == "instant-meshes" and quads >= _MANY else []
@@ -150,7 +150,13 @@ class Trial:
         running = [begin("gdtool.geometry.quad_child:candidate", part.vertices, part.faces, way, number,
                          seconds=request.for_a_run,
                          memory_mb=min(int(_MEMORY[0] + _MEMORY[1] * (number + len(part.faces))), request.memory_mb)) for number in asked]
-        _ = part.features, part.surface, part.fine()  # found out while the children work
+        # Found out while the children work.
+        if way.subdivisions and part.thin:
+            for child in running:
+                child.kill()
+            self.record.failed.append(f"{way.label}: given up, walls are thinner than its quads")
+            running = []
+        _ = part.features, part.surface, part.fine()
         out = []
         for child in running:
             try:

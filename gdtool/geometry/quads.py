@@ -120,7 +120,8 @@ def _simplified(vertices: np.ndarray, faces: np.ndarray, edge: float, request: R
         # Not before: the engines' start would slow what this process does alone, the tree's building holds the interpreter's lock.
         prepare_engines(request.quads, request)
         fine()
-        import_module("scipy.spatial")  # what comes next would wait for it
+        for module in ("scipy.spatial", "embreex.mesh_construction", "embreex.rtcore_scene"):  # what comes next would wait for them
+            import_module(module)
 
     if len(faces) <= _needed(request):
         prepare_engines(request.quads, request)

@@ -19,6 +19,9 @@ class Ended:
     def __init__(self, outcome):
         self.outcome = outcome
 
+    def kill(self):
+        pass
+
     def result(self):
         if isinstance(self.outcome, Exception):
             raise self.outcome

@@ -62,6 +62,22 @@ def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(mon
     assert len(calls) == 1 and record.engine == "pair and split" and "leaves out" in record.failed[0]
 
 
+@pytest.mark.parametrize("thickness, thin", [(0.03, True), (0.05, False)])
+def test_a_coarser_mesh_is_given_up_where_walls_are_thinner_than_quads(thickness, thin):
+    vertices, faces = cube()
+    vertices = vertices * (0.9, 0.9, thickness)
+    part = Part(vertices, faces, 4000, (2 * 0.81 / 4000) ** 0.5, Request(), None)
+    assert part.thin == thin
+    wedge = np.where(vertices[:, :1] < 0, vertices * (1, 1, 0.01), vertices * (1, 1, 0.7 / thickness))
+    assert not Part(wedge, faces, 4000, 0.02, Request(), None).thin
+    # One side of a sheet is no wall, nor is what lies outside, before it.
+    assert not Part(vertices, faces[:2], 4000, part.edge, Request(), None).thin
+    assert not Part(vertices, faces[:, ::-1], 4000, part.edge, Request(), None).thin
+    # Without creases, or its narrow sides tell.
+    _, found, record = quads.remesh(vertices, faces, Request(quads=4000, crease_degrees=0.0))
+    assert whole(found) and any("walls" in text for text in record.failed) == thin and not (thin and "1 subdivision" in record.engine)
+
+
 def with_tunnel(vertices, faces, length):
     """A ball with a tunnel, a triangle wide, from its top to a triangle about so far away."""
     centre = vertices[faces].mean(1)
