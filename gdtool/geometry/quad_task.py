@@ -120,7 +120,10 @@ class Part:
 
     @cached_property
     def thin(self) -> bool:
-        """Whether more than a little of the surface bounds walls thinner than two quads are wide, as rays into it tell. Wedges are none."""
+        """Whether more than a little of the surface bounds walls thinner than two quads are wide, as rays into it tell. Wedges are none;
+        not asked of what has fewer triangles than quads, as a coarser mesh may do there all the same."""
+        if len(self.faces) < self.quads:
+            return False
         points, face_idx = sample_surface(self.vertices, self.faces, _RAYS, np.random.default_rng(0))[:2]
         normals = face_normals(self.vertices, self.faces)[0]
         inward = -normals[face_idx]

@@ -2,6 +2,7 @@
 
 import time
 
+import igl
 import numpy as np
 import pytest
 
@@ -9,6 +10,7 @@ from gdtool.core.child import ChildFailed
 from gdtool.folders.mesh import triangulated
 from gdtool.geometry import quad_candidate, quad_ways, quads, repair
 from gdtool.geometry.features import Constraints
+from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_candidate import Candidate
 from gdtool.geometry.quad_fit import Outline, fault_of, left_out, surface_of
 from gdtool.geometry.quad_shape import Surface
@@ -64,14 +66,17 @@ def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(mon
 
 @pytest.mark.parametrize("thickness, thin", [(0.03, True), (0.05, False)])
 def test_a_coarser_mesh_is_given_up_where_walls_are_thinner_than_quads(thickness, thin):
-    vertices, faces = cube()
+    vertices, faces = igl.upsample(*cube(), 5)
     vertices = vertices * (0.9, 0.9, thickness)
     part = Part(vertices, faces, 4000, (2 * 0.81 / 4000) ** 0.5, Request(), None)
     assert part.thin == thin
-    wedge = np.where(vertices[:, :1] < 0, vertices * (1, 1, 0.01), vertices * (1, 1, 0.7 / thickness))
+    wedge = vertices.copy()
+    wedge[:, 2] *= 0.01 + (wedge[:, 0] + 0.45) / 0.9 * 0.7 / thickness
     assert not Part(wedge, faces, 4000, 0.02, Request(), None).thin
     # One side of a sheet is no wall, nor is what lies outside, before it.
-    assert not Part(vertices, faces[:2], 4000, part.edge, Request(), None).thin
+    assert not Part(vertices, faces[face_normals(vertices, faces)[0][:, 2] > 0.5], 2000, part.edge, Request(), None).thin
+    # A coarse mesh is not asked.
+    assert not Part(cube()[0] * (0.9, 0.9, thickness), cube()[1], 4000, part.edge, Request(), None).thin
     assert not Part(vertices, faces[:, ::-1], 4000, part.edge, Request(), None).thin
     # Without creases, or its narrow sides tell.
     _, found, record = quads.remesh(vertices, faces, Request(quads=4000, crease_degrees=0.0))
