@@ -19,7 +19,7 @@ def rim_points(target) -> tuple[np.ndarray, np.ndarray]:
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    from gdtool.geometry.repair import edges_of
+    from gdtool.geometry.topology import edges_of
 
     edges = edges_of(target.face_uvs)
     edge_idx, pairs = edges.face_pairs()

@@ -12,14 +12,13 @@ A crease of the truth is recalled where a sharp edge (30 degrees) of the result 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import time
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-from fine_meshes import SOLIDS, Fine, models_in, of_model, of_solid
+from fine_meshes import Fine, models_in, of_model, of_solid
 from measure import busy, machine, number, say, table
 from mesh_runs import arguments, as_commanded, beside, blender, cost_since, plot
 from rows import Rows

@@ -43,11 +43,11 @@ def peer(path: Path, faces: int) -> dict:
     from gdtool.assets.load import load_scene
     from gdtool.core.child import call
     from gdtool.folders.mesh import triangulated
-    from gdtool.geometry import mesh_quality, repair
+    from gdtool.geometry import mesh_quality, repair, topology
     from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
 
     scene = load_scene(path)
-    vertices, triangles = repair.compact(scene.vertices, scene.faces.astype(np.int64))
+    vertices, triangles = topology.compact(scene.vertices, scene.faces.astype(np.int64))
     vertices, triangles, *_ = repair.clean(transform_points(invert_similarity(unit_box(vertices)), vertices), triangles, path)
     start = time.perf_counter()
     out, found = call("gdtool.geometry.quad_engines:run_instant_meshes", vertices.astype(np.float32), triangles.astype(np.int32), faces, 30.0,

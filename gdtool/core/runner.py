@@ -23,8 +23,7 @@ from gdtool import __version__
 from gdtool.core import child, log, sources
 from gdtool.core.errors import GdtoolError, InputError, ResourceError, UsageError, from_os_error
 from gdtool.core.folder import Folder, find_ancestor, is_folder, open_folder
-from gdtool.core.manifest import (MANIFEST, InputEntry, Manifest, RunRecord, check_files, digest_of, encode, list_files,
-                                  read_manifest)
+from gdtool.core.manifest import MANIFEST, InputEntry, Manifest, RunRecord, check_files, digest_of, encode, list_files, read_manifest
 from gdtool.core.publish import clear_stale, locked, partial_path, publish, workspace_path
 from gdtool.core.sources import Source
 from gdtool.core.stage import Inputs, Output, Stage

@@ -12,7 +12,6 @@ from gdtool.core.errors import ResourceError
 from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.weights import pretrained_part
 
-
 CHUNK = 4  # images that go through the VAE at once: its memory does not grow with the batch
 
 

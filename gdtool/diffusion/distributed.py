@@ -21,7 +21,6 @@ import torch
 import torch.distributed as dist
 from torch import nn
 
-
 # The first process decodes the data and makes validation pictures while the others wait for it, which PyTorch allows for
 # 10 or 30 minutes. torchrun ends all when one dies, so a long wait hides nothing.
 PATIENCE = timedelta(days=2)

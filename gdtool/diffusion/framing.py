@@ -22,8 +22,6 @@ def frame(image: np.ndarray, size: int, extent: float = FRONT_EXTENT) -> np.ndar
     image (h, w, 4): linear color, straight alpha, float32 -> (size, size, 4) of the same kind. Filtered on
     premultiplied linear values, so no background color leaks in.
     """
-    import torch
-    import torch.nn.functional as F
 
     rows, columns = np.nonzero(image[..., 3] > 0.5)
     top, bottom, left, right = rows.min(), rows.max() + 1, columns.min(), columns.max() + 1

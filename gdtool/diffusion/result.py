@@ -13,7 +13,6 @@ from gdtool.diffusion.paint import repainted
 from gdtool.fields.sights import backproject
 from gdtool.folders.views import Views
 
-
 # The model's coverage at which outlines overlap the true ones most, at no cost in color; at one half they hold 4 % too little.
 OUTLINE = 0.45
 # Metal or not: the power by which a model's leaning is taken for its answer. From 3 on nothing is gained on held-out objects; edges stay soft.

@@ -75,7 +75,7 @@ def grid_step(cameras: list[Camera], resolution: int) -> float:
 
 def depth_for(cameras: list[Camera], mask: np.ndarray, normal: np.ndarray, alike: dict[str, np.ndarray] | None = None) -> np.ndarray:
     """Depth (k, h, w) from normals (k, h, w, 3) and silhouettes; alike: albedo, roughness and metallic views where there are any."""
-    from gdtool.fields.carve import hull_bounds, silhouettes_outvoted
+    from gdtool.fields.carve import hull_bounds
     from gdtool.fields.integrate import depth_from_normals
 
     sights = prepare_all(cameras, mask, None, None)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gdtool.fields.networks import FREQUENCIES, MaterialNetwork, SdfNetwork
-from gdtool.fields.surface_sampling import (first_crossing, implicit_points, median_of_cdf, neus_weights, secant_root, unit)
+from gdtool.fields.surface_sampling import first_crossing, implicit_points, median_of_cdf, neus_weights, secant_root, unit
 from gdtool.shading.closed_form import shade
 from gdtool.shading.lights import fibonacci
 from gdtool.shading.sg import SphericalGaussians

@@ -8,7 +8,7 @@ from gdtool.fields.materials import neighbour_matrix
 from gdtool.fields.sights import WEAK, Sight, hull_distance, tangent_distance
 from gdtool.geometry.grids import components, keep_faces, signed_volume
 from gdtool.geometry.normals import face_normals, vertex_normals
-from gdtool.geometry.repair import edges_of
+from gdtool.geometry.topology import edges_of
 
 WAVELENGTH = 36.0  # steps: shorter bumps go where the normals show none
 FOLD_DEGREES = 150.0  # a fold's least angle between the normals of its sides

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gdtool.geometry.repair import edges_of
 from gdtool.geometry.sharpen import dihedral_degrees
+from gdtool.geometry.topology import edges_of
 
 _CORNER_TURN_DEGREES = 50.0
 _THINNEST = 0.05  # height over longest side of a triangle that has no direction of its own: simplifying folds some over

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.geometry.repair import components, edges_of
+from gdtool.geometry.topology import components, edges_of
 
 
 def columns_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -6,7 +6,6 @@ import numpy as np
 
 from gdtool.geometry.rays import dot
 
-
 _CHUNK = 2**14  # faces at a time: what they need in between stays in the cache
 
 

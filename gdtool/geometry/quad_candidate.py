@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gdtool.geometry import repair
+from gdtool.geometry import repair, topology
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import scaled_jacobian, valences
 from gdtool.geometry.quad_engines import ENGINES
@@ -157,11 +157,11 @@ def judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarr
     whole = (np.sort(quad_faces, 1)[:, 1:] != np.sort(quad_faces, 1)[:, :-1]).all(1)
     if not whole.any():
         return "no quads", quad_vertices, quad_faces
-    quad_vertices, quad_faces = repair.compact(quad_vertices, quad_faces[whole])
-    closed = repair.is_watertight(faces)
-    pieces = repair.components(faces)[0]
+    quad_vertices, quad_faces = topology.compact(quad_vertices, quad_faces[whole])
+    closed = topology.is_watertight(faces)
+    pieces = topology.components(faces)[0]
     for turn in range(_MENDINGS):
-        if turn and (not closed or repair.is_watertight(quad_faces)):
+        if turn and (not closed or topology.is_watertight(quad_faces)):
             break
         if closed:
             quad_vertices, quad_faces = fill_holes(quad_vertices, quad_faces)
@@ -171,13 +171,13 @@ def judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarr
         quad_vertices, quad_faces = repair.without_crumbs(quad_vertices, quad_faces, pieces)
         if not len(quad_faces):
             return "no quads", quad_vertices, quad_faces
-    if closed and not repair.is_watertight(quad_faces):
+    if closed and not topology.is_watertight(quad_faces):
         return "not watertight, though the input is", quad_vertices, quad_faces
-    if not repair.is_manifold(quad_faces):
+    if not topology.is_manifold(quad_faces):
         return "not manifold", quad_vertices, quad_faces
-    if repair.components(quad_faces)[0] != pieces:
+    if topology.components(quad_faces)[0] != pieces:
         return PIECES, quad_vertices, quad_faces  # what of it is kept is judged again, piece by piece
     quad_faces = cancel_pairs(quad_vertices, quad_faces)
-    if closed and (more := repair.euler_number(quad_faces) - repair.euler_number(faces)):
+    if closed and (more := topology.euler_number(quad_faces) - topology.euler_number(faces)):
         return LOST if more > 0 else ADDED, quad_vertices, quad_faces
     return None, quad_vertices, quad_faces

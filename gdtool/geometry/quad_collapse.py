@@ -7,7 +7,7 @@ import numpy as np
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import scaled_jacobian
 from gdtool.geometry.quad_shape import Surface, incidence, neighbours
-from gdtool.geometry.repair import edges_of, renumbered
+from gdtool.geometry.topology import edges_of, renumbered
 
 _FOLDED = 0.05  # scaled Jacobian
 _GAIN = 0.1  # of the worst scaled Jacobian around it, for which a quad goes

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.geometry.repair import compact, components, edges_of, topology, without_crumbs
+from gdtool.geometry.repair import without_crumbs
+from gdtool.geometry.topology import compact, components, edges_of, invariants
 from gdtool.geometry.unpinch import unpinched
 
 _FACES_PER_QUAD = 4
@@ -21,11 +22,11 @@ def run_on_few(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degre
     from gdtool.geometry.simplify import collapse
 
     if len(faces) > _FACES_PER_QUAD * quads:
-        wanted = topology(faces)
+        wanted = invariants(faces)
         few_vertices, few = compact(*collapse(vertices, faces, _FACES_PER_QUAD * quads, 5.0))
-        if topology(few) != wanted:  # most often for sheets that meet in an edge
+        if invariants(few) != wanted:  # most often for sheets that meet in an edge
             few_vertices, few = without_crumbs(*unpinched(few_vertices, few), components(faces)[0])
-        if topology(few) == wanted:
+        if invariants(few) == wanted:
             vertices, faces = few_vertices, few
     return run_instant_meshes(vertices, faces, quads, crease_degrees)
 

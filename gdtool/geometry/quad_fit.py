@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gdtool.geometry import repair
+from gdtool.geometry import topology
 from gdtool.geometry.features import Constraints, Features, find_features, trace, untied
 from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian
 from gdtool.geometry.quad_collapse import without_folded
@@ -125,7 +125,7 @@ def better(quad_vertices: np.ndarray, quad_faces: np.ndarray, traced: np.ndarray
         traced = balance(traced, quad_faces, fine, constraints)
     # Pieces that are a few quads wide fold and shrink when their vertices are evened out: they stay as they were split, and
     # elsewhere the vertices of quads that folded or let go of a corner.
-    count, piece = repair.components(quad_faces)
+    count, piece = topology.components(quad_faces)
     split, evened = (scaled_jacobian(v, quad_faces) for v in (quad_vertices, traced))
     worse = (np.bincount(piece, evened, count) < np.bincount(piece, split, count))[piece]
     worse[_let_go(surface, quad_vertices, traced, quad_faces, _LET_GO * edge)] = True

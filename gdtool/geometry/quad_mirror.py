@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gdtool.geometry import repair
+from gdtool.geometry import topology
 from gdtool.geometry.features import Constraints, Features
 from gdtool.geometry.mesh_quality import scaled_jacobian
 from gdtool.geometry.normals import face_normals
@@ -49,7 +49,7 @@ def half_of(vertices: np.ndarray, faces: np.ndarray, axis: int) -> tuple[np.ndar
     lowest, highest = sign[faces].min(1), sign[faces].max(1)
     whole, split = faces[(lowest >= 0) & (highest > 0)], faces[(lowest < 0) & (highest > 0)]
     if not len(split):
-        return repair.compact(vertices, whole)
+        return topology.compact(vertices, whole)
     # Each corner on this side, and each crossing of an edge that changes sides, in the order round the face.
     following = np.roll(split, -1, 1)
     crosses = sign[split] * sign[following] < 0
@@ -64,7 +64,7 @@ def half_of(vertices: np.ndarray, faces: np.ndarray, axis: int) -> tuple[np.ndar
     ring = np.stack([np.where(sign[split] >= 0, split, -1), crossing], -1).reshape(-1, 6)
     ring = np.take_along_axis(ring, np.argsort(ring < 0, 1, kind="stable"), 1)
     more = ring[:, 3] >= 0
-    return repair.compact(np.concatenate([vertices, added]), np.concatenate([whole, ring[:, :3], ring[more][:, [0, 2, 3]]]))
+    return topology.compact(np.concatenate([vertices, added]), np.concatenate([whole, ring[:, :3], ring[more][:, [0, 2, 3]]]))
 
 
 def joined_with_mirror(vertices: np.ndarray, quads: np.ndarray, axis: int, edge: float,
@@ -73,14 +73,14 @@ def joined_with_mirror(vertices: np.ndarray, quads: np.ndarray, axis: int, edge:
 
     Quads that this folds are unfolded on `surface`.
     """
-    edges = repair.edges_of(quads)
+    edges = topology.edges_of(quads)
     rim = np.zeros(len(vertices), bool)
     rim[edges.ends[edges.count == 1].ravel()] = True
     seam = rim & (np.abs(vertices[:, axis]) < _SEAM_EDGES * edge)
     vertices = vertices.copy()
     vertices[:, axis] = np.where(seam, 0.0, np.maximum(vertices[:, axis], _INSIDE_EDGES * edge))
     if surface is not None and scaled_jacobian(vertices, quads).min() < _LEAST_JACOBIAN:
-        theirs = repair.edges_of(surface.faces)
+        theirs = topology.edges_of(surface.faces)
         segments = theirs.ends[theirs.count == 1]
         segments = segments[(np.abs(surface.vertices[segments, axis]) < _SNAP_EDGES * edge).all(1)]
         outline = Features(surface.vertices, segments, np.zeros(len(segments), np.int64), np.zeros(0, np.int64))
@@ -113,11 +113,11 @@ def remesh_mirrored(vertices: np.ndarray, faces: np.ndarray, request: Request, a
     if moved is not None:
         record.figures["crease_vertices_restored"] = moved
     fault = None
-    if repair.is_watertight(faces):
+    if topology.is_watertight(faces):
         out, quads = fill_holes(out, quads)
-        fault = None if repair.is_watertight(quads) else "it does not close along the plane"
-        fault = fault or (None if repair.components(quads)[0] == repair.components(faces)[0] else "pieces are lost or joined")
-    if fault is None and not repair.is_manifold(quads):
+        fault = None if topology.is_watertight(quads) else "it does not close along the plane"
+        fault = fault or (None if topology.components(quads)[0] == topology.components(faces)[0] else "pieces are lost or joined")
+    if fault is None and not topology.is_manifold(quads):
         fault = "it is not manifold"
     if fault is None and scaled_jacobian(out, quads).min() <= 0 and request.smooth_iterations:
         fault = f"{int((scaled_jacobian(out, quads) <= 0).sum())} quads are folded"

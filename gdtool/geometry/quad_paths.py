@@ -9,7 +9,7 @@ import numpy as np
 from gdtool.geometry.features import Constraints, closest_on_segments
 from gdtool.geometry.mesh_quality import columns_of
 from gdtool.geometry.quad_shape import Surface
-from gdtool.geometry.repair import edges_of
+from gdtool.geometry.topology import edges_of
 
 _FLAT = 1e-3  # a quad whose diagonals pass within this share of its size needs no choice
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.geometry import repair
+from gdtool.geometry import topology
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.quad_candidate import Candidate, judged
 from gdtool.geometry.quad_fit import CUT_OFF, drawn, fault_of, outlined, settled
@@ -89,12 +89,12 @@ def apart(part: Part, done: np.ndarray, quads: int) -> list[Part]:
 
 def quads_by_piece(vertices: np.ndarray, quads: np.ndarray, part: Part) -> list[tuple[np.ndarray, np.ndarray]]:
     """Vertices and quads of each piece: of the components of a quad mesh those that lie on it; what lies on two is nobody's."""
-    (count, piece), (components, label) = part.pieces, repair.components(quads)
+    (count, piece), (components, label) = part.pieces, topology.components(quads)
     on = piece[closest_points(vertices[quads].mean(1), part.vertices, part.faces)[1]]
     share = np.zeros((components, count))
     np.add.at(share, (label, on), 1)
     owner = np.where(share.max(1) >= _ON_ONE * share.sum(1), share.argmax(1), -1)
-    return [repair.compact(vertices, quads[owner[label] == k]) for k in range(count)]
+    return [topology.compact(vertices, quads[owner[label] == k]) for k in range(count)]
 
 
 def joined(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:

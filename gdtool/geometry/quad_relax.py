@@ -8,7 +8,7 @@ from gdtool.geometry.features import Constraints, Features
 from gdtool.geometry.mesh_quality import columns_of, cross, polygon_normals, scaled_jacobian, worst_jacobian
 from gdtool.geometry.quad_shape import Slide, Surface, normals_below, relax, still_vertices
 from gdtool.geometry.quad_unfold import unfold
-from gdtool.geometry.repair import edges_of
+from gdtool.geometry.topology import edges_of
 
 _SQUARE_SHARE = 0.4  # of the way from the nearest rectangle to the nearest square
 _POOR = 0.6  # quads with a smaller scaled Jacobian pull harder

@@ -10,7 +10,7 @@ from gdtool.geometry.distance import SearchTree
 from gdtool.geometry.features import Constraints, Features, closest_on_segments
 from gdtool.geometry.mesh_quality import polygon_normals, valences
 from gdtool.geometry.normals import face_normals
-from gdtool.geometry.repair import Edges, compact, corner_fans, edges_of
+from gdtool.geometry.topology import Edges, compact, corner_fans, edges_of
 
 _EXACT_EVERY = 5  # steps between two searches for the closest point; the others stay in its plane
 _BENT_COSINE = 0.97  # between a quad's normal and that of the surface below its centre

@@ -11,8 +11,8 @@ import numpy as np
 from gdtool.core.child import ChildFailed, call
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_shape import subdivide
-from gdtool.geometry.repair import compact, components, edges_of, is_manifold, topology
 from gdtool.geometry.simplify import simplify
+from gdtool.geometry.topology import compact, components, edges_of, invariants, is_manifold
 
 _QUADS_PER_TRIANGLE = 2.25  # of pair_and_split, where most triangles find a partner
 _EVEN_COUNT = 0.03  # even_triangles come so near to the number asked for
@@ -40,7 +40,7 @@ def of_even(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees:
     if not 2.1 * len(found) <= quads <= 3 * len(found):
         return None
     out, found = compact(out, found)
-    return pair_and_split(out, found, quads) if topology(found) == topology(faces) and np.isfinite(out).all() else None
+    return pair_and_split(out, found, quads) if invariants(found) == invariants(faces) and np.isfinite(out).all() else None
 
 
 def even_triangles(vertices: np.ndarray, faces: np.ndarray, triangles: int, crease_degrees: float) -> tuple[np.ndarray, np.ndarray]:
@@ -61,7 +61,7 @@ def even_triangles(vertices: np.ndarray, faces: np.ndarray, triangles: int, crea
             maxsurfdist=pymeshlab.PureValue(edge / 10))
         mesh = meshes.current_mesh()
         vertices, found = np.asarray(mesh.vertex_matrix()), np.asarray(mesh.face_matrix(), np.int64)
-        if abs(len(found) / triangles - 1) < _EVEN_COUNT or not len(found) or topology(found) != topology(faces):
+        if abs(len(found) / triangles - 1) < _EVEN_COUNT or not len(found) or invariants(found) != invariants(faces):
             break  # what one length tears, another tears as well
         before, off = off, abs(np.log(len(found) / triangles))
         if off > _NEARER * before:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.geometry import repair
+from gdtool.geometry import topology
 from gdtool.geometry.distance import closest_points
 
 _MOST_FACES, _MOST_PIECES = 200_000, 1000  # of larger meshes pieces are not looked for; more pieces are left where they are
@@ -31,7 +31,7 @@ def spread(vertices: np.ndarray, faces: np.ndarray, gap: float) -> Spread | None
     """
     if len(faces) > _MOST_FACES:
         return None
-    count, piece = repair.components(faces)
+    count, piece = topology.components(faces)
     if not 1 < count <= _MOST_PIECES:
         return None
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)

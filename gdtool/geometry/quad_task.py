@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from gdtool.geometry import repair
+from gdtool.geometry import topology
 from gdtool.geometry.distance import sample_surface
 from gdtool.geometry.features import Features, find_features
 from gdtool.geometry.normals import face_normals
@@ -92,7 +92,7 @@ class Part:
 
     def of(self, faces: np.ndarray, quads: int, given_up: bool = False, tolerance: float = COUNT_TOLERANCE) -> Part:
         """Some of the triangles: faces (f,) bool."""
-        return Part(*repair.compact(self.vertices, self.faces[faces]), quads, self.edge, self.request, self.fine, given_up, tolerance)
+        return Part(*topology.compact(self.vertices, self.faces[faces]), quads, self.edge, self.request, self.fine, given_up, tolerance)
 
     def counted(self, count: int, wanted: float) -> bool:
         """Whether so many quads are about as many as wanted."""
@@ -101,7 +101,7 @@ class Part:
     @cached_property
     def pieces(self) -> tuple[int, np.ndarray]:
         """How many, and which each triangle belongs to."""
-        return repair.components(self.faces)
+        return topology.components(self.faces)
 
     @cached_property
     def piece_areas(self) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from gdtool.geometry.distance import closest_points, sample_surface
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.quad_shape import Surface
-from gdtool.geometry.repair import components, edges_of, euler_number
+from gdtool.geometry.topology import components, edges_of, euler_number
 
 _BARE, _CLOSE, _STRAYS = 0.5, 0.75, 1.0  # edge lengths from the quads: what belongs to a tip, what is near enough, what makes one
 _TIP = 1.5  # edge lengths that a tip measures at most which one vertex reaches

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.geometry.mesh_quality import valences
-from gdtool.geometry.repair import compact
+from gdtool.geometry.topology import compact
 
 
 def cancel_irregular(vertices: np.ndarray, faces: np.ndarray, rounds: int = 4) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ import numpy as np
 from gdtool.geometry.features import Constraints, Features, closest_on_segments
 from gdtool.geometry.mesh_quality import worst_jacobian
 from gdtool.geometry.quad_shape import Lists, Surface, incidence, neighbours, normals_below
-from gdtool.geometry.repair import edges_of
+from gdtool.geometry.topology import edges_of
 
 _LET_OFF_BELOW = 0.22  # a vertex leaves its feature for a quad with a smaller scaled Jacobian only
 _LOOSE_ROUNDS = 4

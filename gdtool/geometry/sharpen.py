@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 
 from gdtool.geometry.normals import face_normals, vertex_normals
 from gdtool.geometry.rays import dot
-from gdtool.geometry.repair import Edges, compact, edges_of, renumbered
+from gdtool.geometry.topology import Edges, compact, edges_of, renumbered
 
 _NEIGHBOURS = 24
 _RINGS = 5  # of faces around a bevel, among which the sides are

@@ -11,13 +11,12 @@ import numpy as np
 from gdtool.core.child import ChildFailed, begin
 from gdtool.core.errors import InputError
 from gdtool.core.threads import cores
-from gdtool.geometry import repair
+from gdtool.geometry import repair, topology
 from gdtool.geometry.halves import in_halves, worth_halving
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.rows import unique_rows
 from gdtool.geometry.sharpen import corners_of, restore_creases
 from gdtool.geometry.unpinch import unpinched
-
 
 _PACES, _UNIT = (4.0, 3.0, 8.0), 0.5  # how steeply the collapse's bound rises, tried in turn; the unit of lengths, in sizes of the mesh
 _BY_WAY = 6  # times the triangles asked for, to which the quicker collapse still goes well
@@ -55,7 +54,7 @@ def uneven(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     taken down to its last triangles instead.
     """
     some = np.arange(len(vertices)) % max(len(vertices) // _SAMPLE, 1) == 0
-    around, few = repair.renumbered(faces[np.flatnonzero(corners_of(faces, len(vertices)) @ some)], len(vertices))
+    around, few = topology.renumbered(faces[np.flatnonzero(corners_of(faces, len(vertices)) @ some)], len(vertices))
     if _flat(vertices[around], few)[some[around]].sum() / some.sum() < _FEW_FLAT:
         return vertices
     flat = np.flatnonzero(_flat(vertices, faces))
@@ -149,7 +148,7 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
         _, first, _ = unique_rows(np.sort(merged, 1))
         merged = merged[np.sort(first)]
         if len(merged) or cells > 4000:
-            return repair.compact(out, merged)
+            return topology.compact(out, merged)
         cells *= 2
 
 
@@ -210,7 +209,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
         raise InputError("mesh", "all its faces lie in one point")
     unit = (vertices - centre) / extent
     edge = _edge(unit, faces, target_faces)
-    is_closed, pieces = cache(closed or (lambda: repair.is_watertight(faces))), cache(lambda: repair.components(faces)[0])
+    is_closed, pieces = cache(closed or (lambda: topology.is_watertight(faces))), cache(lambda: topology.components(faces)[0])
 
     def beside() -> None:
         if closed is not None and cores() > 1 and is_closed():
@@ -231,8 +230,8 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
             found = None
     if found is None:
         return vertices, faces, attributes, {"faces": len(faces), "method": "none", "error": 0.0, "creases": 0, "failed": "; ".join(reasons)}
-    out_vertices, out_faces = repair.compact(*found)
-    if repair.components(out_faces)[0] > 1 and is_closed():
+    out_vertices, out_faces = topology.compact(*found)
+    if topology.components(out_faces)[0] > 1 and is_closed():
         out_vertices, out_faces = repair.without_crumbs(out_vertices, out_faces, pieces())
     out_attributes = None
     if attributes is not None:
@@ -297,7 +296,7 @@ def _sound(vertices: np.ndarray, faces: np.ndarray, closed: bool, target_faces: 
     """Whether a native result can be used: finite, in range, not empty, closed when the input was."""
     if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
         return False
-    return not closed or (repair.is_watertight(faces) and repair.is_manifold(faces))
+    return not closed or (topology.is_watertight(faces) and topology.is_manifold(faces))
 
 
 def deviation(vertices_a: np.ndarray, faces_a: np.ndarray, vertices_b: np.ndarray, faces_b: np.ndarray, limit: int = 20000) -> float:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.geometry.repair import Edges, corner_fans, edges_of, one_vertex_per_fan
+from gdtool.geometry.repair import one_vertex_per_fan
+from gdtool.geometry.topology import Edges, corner_fans, edges_of
 
 
 def unpinched(vertices: np.ndarray, faces: np.ndarray, rounds: int = 3) -> tuple[np.ndarray, np.ndarray]:

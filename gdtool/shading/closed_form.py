@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gdtool.cameras import Camera, rays
-from gdtool.shading.brdf import (Brdf, alpha_of, clamp_cosine, f0_of, fresnel, ndf, visibility)
+from gdtool.shading.brdf import Brdf, alpha_of, clamp_cosine, f0_of, fresnel, ndf, visibility
 from gdtool.shading.sg import MAX_SHARPNESS, SphericalGaussians, cosine_integral, dot, integral, normalize, product
 
 # The mirror-direction forms divide by n·o; grazing pixels are few and nothing closed-form is good there.

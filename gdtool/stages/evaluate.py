@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from gdtool.assets.scene import Scene
-    from gdtool.folders.views import Views
 
 READS = ("views", "surface", "mesh", "atlas", "asset", "renders", "model-file", "mesh-file")
 GEOMETRY = ("surface", "mesh", "atlas", "asset")

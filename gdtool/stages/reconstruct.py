@@ -43,8 +43,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Reconstruct one views folder."""
-    from gdtool.fields.appearance import appearance
     from gdtool.fields.align import agreement
+    from gdtool.fields.appearance import appearance
     from gdtool.fields.fusion import BUMPY, SMALL, align_depth, finest_pixel, fuse_within, grid_step, is_closed_manifold, prepare_all, silhouettes_outvoted
     from gdtool.folders.surface import Surface, write_surface
     from gdtool.folders.views import read_views

@@ -103,7 +103,8 @@ def _read(inputs: Inputs, out: Output):
     import numpy as np
 
     from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
-    from gdtool.geometry.repair import check, compact
+    from gdtool.geometry.repair import check
+    from gdtool.geometry.topology import compact
 
     main, quads = inputs.main, None
     if hasattr(main, "content"):
@@ -138,9 +139,9 @@ def _read(inputs: Inputs, out: Output):
 
 
 def _meets(quads, options: Options) -> bool:
-    from gdtool.geometry import repair
+    from gdtool.geometry import topology
 
-    return abs(len(quads) / options.faces - 1) <= 0.03 and repair.is_watertight(quads) and repair.is_manifold(quads)
+    return abs(len(quads) / options.faces - 1) <= 0.03 and topology.is_watertight(quads) and topology.is_manifold(quads)
 
 
 def _decimated(vertices, faces, options: Options, out: Output):

@@ -48,10 +48,10 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     import torch
 
     from gdtool.cameras import rig
+    from gdtool.diffusion import wonder3d
     from gdtool.diffusion.data import to_tensor_condition
     from gdtool.diffusion.encoding import BACKGROUND
     from gdtool.diffusion.familiarity import doubts, read_ranges, unfamiliar
-    from gdtool.diffusion import wonder3d
     from gdtool.diffusion.result import views_from_images
     from gdtool.diffusion.weights import load_model
     from gdtool.folders.views import write_views
@@ -142,10 +142,10 @@ def _condition(inputs: Inputs, options: Options, config, out: Output):
 
     import numpy as np
 
+    from gdtool.diffusion import wonder3d
     from gdtool.diffusion.framing import FRONT_EXTENT, frame, framed_side, whole_frame
     from gdtool.images.color import linear_from_srgb
     from gdtool.images.io import read_image
-    from gdtool.diffusion import wonder3d
     from gdtool.images.mask import foreground
 
     image = read_image(inputs.main)

@@ -44,6 +44,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     import torch
 
+    from gdtool.core.kinds import ModelContent
     from gdtool.diffusion import distributed, familiarity
     from gdtool.diffusion.curve import draw_curve
     from gdtool.diffusion.data import Objects, decode_dataset, from_bytes
@@ -51,7 +52,6 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.diffusion.report import append_validation, card, validation
     from gdtool.diffusion.tensorboard import Events
     from gdtool.diffusion.weights import save_model
-    from gdtool.core.kinds import ModelContent
     from gdtool.images.io import write_png
 
     torch.set_num_threads(out.threads)

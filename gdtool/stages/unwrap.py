@@ -40,7 +40,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     import numpy as np
 
     from gdtool.folders.mesh import QuadMesh, write_mesh
-    from gdtool.geometry import repair
+    from gdtool.geometry import topology
     from gdtool.images.io import write_png
     from gdtool.texture import unwrap_preview
     from gdtool.texture.unwrap import Request, figures, islands, unwrap
@@ -89,7 +89,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     quads = int(mesh.is_quad.sum())
     out.content = AtlasContent(
         vertices=len(mesh.vertices), quads=quads, triangles=len(mesh.faces) - quads, charts=report["charts"], size=options.size,
-        padding=padding, coverage=report["coverage"], watertight=repair.is_watertight(mesh.faces), report=report | {"kept": kept},
+        padding=padding, coverage=report["coverage"], watertight=topology.is_watertight(mesh.faces), report=report | {"kept": kept},
         tried=tuple(tried),
         source_from_world=tuple(float(x) for x in matrix.ravel()))
 

@@ -112,7 +112,7 @@ def _check_model(folder: Folder) -> Iterator[str]:
 
 def _check_surface(folder: Folder) -> Iterator[str]:
     from gdtool.folders.surface import read_surface
-    from gdtool.geometry.repair import is_watertight
+    from gdtool.geometry.topology import is_watertight
 
     surface = read_surface(folder)
     if is_watertight(surface.faces) != folder.content.watertight:

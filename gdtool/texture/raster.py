@@ -168,7 +168,7 @@ def between_centres(uv: np.ndarray, faces: np.ndarray, owner: np.ndarray) -> tup
     owner (size, size) as from owners_of. Charts smaller than a texel, and slivers' ends, cover no texel's centre; lookups on
     them would read what the charts around them are continued with. Texels beside owned ones are left to extend_owners.
     """
-    from gdtool.geometry.repair import edges_of
+    from gdtool.geometry.topology import edges_of
 
     size, wide = owner.shape[0], owner.shape[0] + 2
     edges = edges_of(faces)

@@ -157,7 +157,7 @@ def islands(vertices: np.ndarray, faces: np.ndarray, face_uvs: np.ndarray) -> tu
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    from gdtool.geometry.repair import edges_of
+    from gdtool.geometry.topology import edges_of
 
     edges = edges_of(faces)
     order = edges.order

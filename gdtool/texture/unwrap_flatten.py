@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gdtool.geometry.normals import face_normals
-from gdtool.geometry.repair import Edges, edges_of
+from gdtool.geometry.topology import Edges, edges_of
 from gdtool.texture.raster import owned_texels, owner_count
 
 _SLIM_STEPS = (2, 2, 4, 6, 8)

@@ -1,7 +1,6 @@
 """Protected children: results, errors, crashes, time and memory limits."""
 
 import os
-import signal
 import subprocess
 import sys
 import time

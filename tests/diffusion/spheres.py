@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.cameras import rig, rays
+from gdtool.cameras import rays, rig
 from gdtool.folders.views import Views
 
 LIGHT = {"kind": "spherical_gaussians", "axes": [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], "sharpness": [1.0, 4.0],

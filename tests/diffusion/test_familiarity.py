@@ -4,8 +4,19 @@ import numpy as np
 import pytest
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.familiarity import (DOUBTS, FILE, PictureRange, doubts, limits, picture_figures, ranges, read_ranges,
-                                          result_figures, unfamiliar, write_ranges)
+from gdtool.diffusion.familiarity import (
+    DOUBTS,
+    FILE,
+    PictureRange,
+    doubts,
+    limits,
+    picture_figures,
+    ranges,
+    read_ranges,
+    result_figures,
+    unfamiliar,
+    write_ranges,
+)
 
 
 def box(width, height, brightness, noise=0.02, size=32, seed=0):

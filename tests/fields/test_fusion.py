@@ -14,7 +14,7 @@ from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import components, signed_volume
 from gdtool.geometry.metrics import inside
 from gdtool.geometry.normals import vertex_normals
-from gdtool.geometry.repair import euler_number
+from gdtool.geometry.topology import euler_number
 
 from .shapes import cube, gradient, sphere, torus, two_balls, views_of
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.core.child import ChildFailed
-from gdtool.geometry import quad_ahead, quad_candidate, quad_fallback, quad_ways, repair
+from gdtool.geometry import quad_ahead, quad_candidate, quad_fallback, quad_ways, topology
 
 
 def whole(faces) -> bool:
     """All quads, watertight and manifold."""
-    return faces.min() >= 0 and repair.is_watertight(faces) and repair.is_manifold(faces)
+    return faces.min() >= 0 and topology.is_watertight(faces) and topology.is_manifold(faces)
 
 
 class Ended:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.core import child
-from gdtool.geometry import halves, repair, simplify
+from gdtool.geometry import halves, simplify, topology
 from tests.conftest import ROOT
 from tests.geometry.solids import joined, plane, sphere, torus
 
@@ -45,15 +45,15 @@ def shapes():
 @pytest.mark.parametrize("name", ["torus", "two balls across the cut", "ball"])
 def test_the_halves_are_one_mesh_again_as_good_as_collapsed_whole(shapes, name):
     vertices, faces = shapes[name]
-    out, found = repair.compact(*halved(vertices, faces, 6000))
-    whole, whole_faces = repair.compact(*at_pace(simplify.shaken(vertices, faces), faces, 6000, UNIT, False))
-    assert abs(len(found) - 6000) <= 2 and repair.is_watertight(found) and repair.is_manifold(found)
-    assert repair.topology(found) == repair.topology(faces)
+    out, found = topology.compact(*halved(vertices, faces, 6000))
+    whole, whole_faces = topology.compact(*at_pace(simplify.shaken(vertices, faces), faces, 6000, UNIT, False))
+    assert abs(len(found) - 6000) <= 2 and topology.is_watertight(found) and topology.is_manifold(found)
+    assert topology.invariants(found) == topology.invariants(faces)
     assert simplify.deviation(vertices, faces, out, found) < 1.5 * simplify.deviation(vertices, faces, whole, whole_faces)
     # About the seam, at the middle of the longest side, the edges are about as long as elsewhere, and none much shorter.
     across = np.ptp(vertices, 0).argmax()
     seam = np.median(vertices[faces[:, 0], across])
-    ends = out[repair.edges_of(found).ends]
+    ends = out[topology.edges_of(found).ends]
     length, near = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1), abs(ends[..., across] - seam).min(1) < 0.05
     assert near.sum() > 200 and 0.8 < np.median(length[near]) / np.median(length[~near]) < 1.25
     assert np.quantile(length[near], 0.02) > 0.7 * np.quantile(length[~near], 0.02)
@@ -112,7 +112,7 @@ def test_even_triangles_are_collapsed_in_halves_and_whole_where_these_fail(monke
     monkeypatch.setattr(simplify, "worth_halving", lambda faces, target_faces: True)
     monkeypatch.setattr(simplify, "in_halves", lambda *given: asked.append(given[3:]))
     out, found, moved = simplify.reduced(vertices, faces, "collapse", (600, 4.0, UNIT), True)
-    assert asked == [(600, UNIT)] and len(found) == 600 and repair.is_watertight(found) and moved == 0
+    assert asked == [(600, UNIT)] and len(found) == 600 and topology.is_watertight(found) and moved == 0
     simplify.reduced(vertices, faces, "collapse", (600, 4.0, UNIT), False)
     simplify.reduced(*plane(20), "collapse_topology", (600,), True)
     assert len(asked) == 1

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gdtool.geometry import repair
+from gdtool.geometry import topology
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import scaled_jacobian
 from gdtool.geometry.quad_collapse import without_folded
@@ -28,7 +28,7 @@ def opened(vertices: np.ndarray, faces: np.ndarray, at: int, apart: float) -> tu
         out[own] = np.where(faces[own] == at, len(vertices), faces[own])
     side = vertices[ring[1][(ring[1].index(at) + 1) % 4]] - vertices[at]
     new = [at, two, len(vertices), one]
-    if not repair.is_watertight(np.concatenate([out, [new]])):
+    if not topology.is_watertight(np.concatenate([out, [new]])):
         new = new[::-1]
     return np.concatenate([vertices, (vertices[at] - apart * side)[None]]), np.concatenate([out, [new]]), new
 
@@ -37,10 +37,10 @@ def opened(vertices: np.ndarray, faces: np.ndarray, at: int, apart: float) -> tu
 def test_a_folded_quad_goes_and_its_surroundings_stay(apart):
     vertices, faces = quad_torus()
     torn, quads, _ = opened(vertices, faces, 17, apart)
-    assert repair.is_watertight(quads) and len(quads) == len(faces) + 1 and scaled_jacobian(torn, quads).min() < 0.05
+    assert topology.is_watertight(quads) and len(quads) == len(faces) + 1 and scaled_jacobian(torn, quads).min() < 0.05
     out, found, _ = without_folded(torn, quads, surface_of(vertices, faces), Constraints.none(len(torn)))
-    assert len(found) == len(faces) and len(out) == len(vertices) and repair.is_watertight(found) and repair.is_manifold(found)
-    assert repair.euler_number(found) == repair.euler_number(faces)
+    assert len(found) == len(faces) and len(out) == len(vertices) and topology.is_watertight(found) and topology.is_manifold(found)
+    assert topology.euler_number(found) == topology.euler_number(faces)
     assert scaled_jacobian(out, found).min() > 0.8 * scaled_jacobian(vertices, faces).min()
     assert len(np.unique(np.concatenate([out, vertices]).round(9), axis=0)) <= len(vertices) + 1
 

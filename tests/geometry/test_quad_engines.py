@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gdtool.geometry import quad_engines, repair, simplify
+from gdtool.geometry import quad_engines, simplify, topology
 from tests.geometry.solids import sphere
 
 
@@ -25,9 +25,9 @@ def test_what_is_collapsed_is_given_where_its_tears_can_be_mended(monkeypatch):
         return np.concatenate([few_vertices, [[0.0, 0.0, 2.0]]]), np.concatenate([few, [[a, b, tip], [b, a, tip]]])
 
     monkeypatch.setattr(simplify, "collapse", tearing)
-    assert not repair.is_watertight(tearing()[1])
+    assert not topology.is_watertight(tearing()[1])
     found = given(monkeypatch, vertices, faces, 300)
-    assert len(few) <= len(found) < len(few) + 12 and repair.topology(found) == repair.topology(faces)
+    assert len(few) <= len(found) < len(few) + 12 and topology.invariants(found) == topology.invariants(faces)
     # What loses half of it is not: the engine has the mesh as it was.
     monkeypatch.setattr(simplify, "collapse", lambda *_: (few_vertices, few[: len(few) // 2]))
     assert given(monkeypatch, vertices, faces, 300) is faces

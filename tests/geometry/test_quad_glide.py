@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.geometry import quad_candidate, repair
+from gdtool.geometry import quad_candidate, topology
 from gdtool.geometry.mesh_quality import valences
 from gdtool.geometry.quad_candidate import Way, candidate
 from gdtool.geometry.quad_glide import cancel_pairs
@@ -40,7 +40,7 @@ def test_what_was_pulled_apart_closes(apart):
     torn = sheared(quads, [(i * n + 3, i * n + 4) for i in range(2, 2 + apart)])
     assert irregular(points, torn) == 4
     found = cancel_pairs(points, torn)
-    assert irregular(points, found) == 0 and repair.is_watertight(found) and repair.is_manifold(found)
+    assert irregular(points, found) == 0 and topology.is_watertight(found) and topology.is_manifold(found)
     assert len(found) == len(quads)
 
 
@@ -77,7 +77,7 @@ def test_creases_stay():
     points, quads = quad_cube(3)
     ends, _, degrees = dihedral_degrees(points, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]))
     crease = {tuple(sorted(edge)) for edge in ends[degrees > 45].tolist()}
-    flat = [tuple(sorted(edge)) for edge in repair.edges_of(quads).ends.tolist() if tuple(sorted(edge)) not in crease]
+    flat = [tuple(sorted(edge)) for edge in topology.edges_of(quads).ends.tolist() if tuple(sorted(edge)) not in crease]
     rng, torn = np.random.default_rng(0), quads
     for edge in rng.permutation(flat)[:40].tolist():
         try:
@@ -85,12 +85,12 @@ def test_creases_stay():
         except StopIteration:  # turned away before
             continue
         valence = valences(turned, len(points))[0]
-        if valence.min() > 2 and repair.is_manifold(turned):
+        if valence.min() > 2 and topology.is_manifold(turned):
             torn = turned
     found = cancel_pairs(points, torn)
-    kept = {tuple(sorted(edge)) for edge in repair.edges_of(found).ends.tolist()}
+    kept = {tuple(sorted(edge)) for edge in topology.edges_of(found).ends.tolist()}
     assert crease <= kept
-    assert repair.is_watertight(found) and repair.is_manifold(found) and irregular(points, found) < irregular(points, torn) / 2
+    assert topology.is_watertight(found) and topology.is_manifold(found) and irregular(points, found) < irregular(points, torn) / 2
 
 
 def test_an_engine_s_quads_have_fewer(monkeypatch):
@@ -99,5 +99,5 @@ def test_an_engine_s_quads_have_fewer(monkeypatch):
     found = candidate(vertices / 2, faces, way, 8000)
     monkeypatch.setattr(quad_candidate, "cancel_pairs", lambda _, quads: quads)
     before = candidate(vertices / 2, faces, way, 8000)
-    assert found.fault is None and found.count == before.count and repair.is_watertight(found.quads)
+    assert found.fault is None and found.count == before.count and topology.is_watertight(found.quads)
     assert irregular(found.vertices, found.quads) < 0.9 * irregular(before.vertices, before.quads)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.geometry import repair
+from gdtool.geometry import topology
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_mirror import half_of, joined_with_mirror, mirror_plane
 from tests.geometry.solids import cube, sphere, torus
@@ -16,9 +16,9 @@ def test_half_has_half_the_area_and_ends_at_the_plane(axis):
     half_vertices, half = half_of(vertices, faces, axis)
     whole = face_normals(vertices, faces)[1].sum()
     assert face_normals(half_vertices, half)[1].sum() == pytest.approx(whole / 2, rel=0.02)
-    edges = repair.edges_of(half)
+    edges = topology.edges_of(half)
     rim = np.unique(edges.ends[edges.count == 1])
-    assert repair.is_manifold(half) and not edges.turned.any() and half_vertices[:, axis].min() == 0
+    assert topology.is_manifold(half) and not edges.turned.any() and half_vertices[:, axis].min() == 0
     assert (half_vertices[rim, axis] == 0).all() and len(rim) > 10
 
 
@@ -40,5 +40,5 @@ def test_halves_of_a_box_close():
     half = vertices.copy()
     half[:, 0] = np.where(half[:, 0] < 0, 0.02, half[:, 0])  # the open end near the plane
     out, found = joined_with_mirror(half, quads[~side], 0, 0.5)
-    assert len(found) == 10 and repair.is_watertight(found) and np.ptp(out[:, 0]) == pytest.approx(1)
+    assert len(found) == 10 and topology.is_watertight(found) and np.ptp(out[:, 0]) == pytest.approx(1)
     assert (np.abs(out[:, 0]) < 1e-12).sum() == 4

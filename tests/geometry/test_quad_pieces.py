@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.folders.mesh import triangulated
-from gdtool.geometry import quad_candidate, quad_pieces, quad_ways, quads, repair
+from gdtool.geometry import quad_candidate, quad_pieces, quad_ways, quads, topology
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import distance_figures, topology_figures
 from gdtool.geometry.quad_task import Part, Request
@@ -33,7 +33,7 @@ def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
 
     monkeypatch.setattr(quad_ways.Trial, "run", fails_together)
     out, found, _ = quads.remesh(vertices, faces, Request(quads=4000))
-    assert tried == [2, 1, 1] and repair.components(found)[0] == 2 and whole(found)
+    assert tried == [2, 1, 1] and topology.components(found)[0] == 2 and whole(found)
     assert abs(len(found) / 4000 - 1) <= 0.03
 
 
@@ -41,10 +41,10 @@ def test_pieces_side_by_side_come_out_as_one_after_the_other(monkeypatch):
     vertices, faces = joined(*(sphere(32, 0.2, (0.5 * k, 0, 0)) for k in range(3)))
     real = quad_candidate.judged
     in_this_process(monkeypatch)
-    monkeypatch.setattr(quad_candidate, "judged", lambda *mesh: ("together", *mesh[:2]) if repair.components(mesh[3])[0] > 1 else real(*mesh))
+    monkeypatch.setattr(quad_candidate, "judged", lambda *mesh: ("together", *mesh[:2]) if topology.components(mesh[3])[0] > 1 else real(*mesh))
     monkeypatch.setattr(quad_pieces, "quads_by_piece", lambda *given: [(np.zeros((0, 3)), np.zeros((0, 4), np.int64))] * 3)
     (one, one_faces, one_record), (two, two_faces, two_record) = (quads.remesh(vertices, faces, Request(quads=1500, threads=n)) for n in (1, 3))
-    assert np.array_equal(one, two) and np.array_equal(one_faces, two_faces) and repair.components(two_faces)[0] == 3
+    assert np.array_equal(one, two) and np.array_equal(one_faces, two_faces) and topology.components(two_faces)[0] == 3
     assert two_record.failed == one_record.failed and set(two_record.seconds) == set(one_record.seconds)
 
 
@@ -58,7 +58,7 @@ def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless)
 
     def fails(quad_vertices, quad_faces, of_vertices, of_faces):
         fault, *mended = real(quad_vertices, quad_faces, of_vertices, of_faces)
-        bad = repair.components(of_faces)[0] > 1 or hopeless and np.ptp(of_vertices, 0).max() > 0.5
+        bad = topology.components(of_faces)[0] > 1 or hopeless and np.ptp(of_vertices, 0).max() > 0.5
         return "not watertight, though the input is" if bad else fault, *mended
 
     in_this_process(monkeypatch)
@@ -66,9 +66,9 @@ def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless)
     monkeypatch.setattr(quad_pieces, "judged", fails)
     out, found, record = quads.remesh(vertices, faces, Request(quads=4000))
     assert record.engine == ("instant-meshes; pair and split" if hopeless else "instant-meshes")
-    assert repair.components(found)[0] == 21 and whole(found) and abs(len(found) / 4000 - 1) <= 0.03
+    assert topology.components(found)[0] == 21 and whole(found) and abs(len(found) / 4000 - 1) <= 0.03
     small = found[(out[found][..., 2] < 0.15).all(1)]
-    assert topology_figures(*repair.compact(out, small))["irregular_share"] < 0.1  # eight of a ball's hundred; of paired triangles a fifth and more
+    assert topology_figures(*topology.compact(out, small))["irregular_share"] < 0.1  # eight of a ball's hundred; of paired triangles a fifth and more
     assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.02
 
 
@@ -90,7 +90,7 @@ def test_pieces_are_kept_as_they_were_drawn_where_the_others_can_make_up_for_the
 def test_small_piece_is_not_lost():
     vertices, faces = joined(sphere(40, 0.7), sphere(40, 0.05, (0.9, 0.9, 0.9)))
     out, found, record = quads.remesh(vertices / 2, faces, Request(quads=1000))
-    assert repair.components(found)[0] == 2 and whole(found) and "pair and split" in record.engine
+    assert topology.components(found)[0] == 2 and whole(found) and "pair and split" in record.engine
     assert np.linalg.norm(out - 0.45, axis=1).min() < 0.05
 
 
@@ -101,5 +101,5 @@ def test_the_count_holds_where_small_pieces_take_more_than_their_share():
     trays = [(vertices + 0.05 * corner + 0.3, faces[:-2]) for corner in corners]
     vertices, faces = joined(sphere(60, 0.25), *trays)
     out, found, _ = quads.remesh(vertices, faces, Request(quads=4000, engine="split"))
-    assert abs(len(found) / 4000 - 1) < 0.03 and repair.components(found)[0] == 101
+    assert abs(len(found) / 4000 - 1) < 0.03 and topology.components(found)[0] == 101
     assert 1000 < (np.linalg.norm(out, axis=1)[found].max(1) < 0.27).sum() < 2700

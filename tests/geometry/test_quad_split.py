@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.folders.mesh import triangulated
-from gdtool.geometry import quad_fit, quad_split, quads, repair, simplify
+from gdtool.geometry import quad_fit, quad_split, quads, simplify, topology
 from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, shape_figures
 from gdtool.geometry.quad_shape import Surface
 from gdtool.geometry.quad_split import pair_and_split
@@ -34,7 +34,7 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
     monkeypatch.setattr(quad_split, "simplify", losing)
     asked = 1800  # 800 triangles, of which 1.15 times as many lose the piece and 1.3 times keep it
     out, found = quad_split.of_own(vertices, faces, asked, 60.0)
-    assert tried[:3] == [800, 919, 1040] and repair.components(found)[0] == 2
+    assert tried[:3] == [800, 919, 1040] and topology.components(found)[0] == 2
     assert asked < len(found) < 1.5 * asked < 1.8 * len(faces)
 
 
@@ -54,7 +54,7 @@ def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
     """Pins with few triangles around: what bends too much stays single, and there are fewer triangles for it."""
     vertices, faces = joined(*((pin[0] + (0.3 * k, 0, 0), pin[1]) for k, pin in enumerate([rod(24)] * 8)))
     _, found = quad_split.of_own(vertices, faces, 400, 60.0)
-    assert abs(len(found) / 400 - 1) < 0.1 and repair.components(found)[0] == 8 and repair.is_watertight(found)
+    assert abs(len(found) / 400 - 1) < 0.1 and topology.components(found)[0] == 8 and topology.is_watertight(found)
 
 
 @pytest.mark.parametrize("shape", ["slivers", "coincident"])
@@ -70,7 +70,7 @@ def test_splitting_makes_square_quads_of_any_triangles(shape):
     vertices = vertices / np.ptp(vertices, 0).max()
     out, found, record = quads.remesh(vertices, faces, Request(quads=3000, engine="split"))
     assert record.engine == "pair and split" and whole(found) and abs(len(found) / 3000 - 1) <= 0.03
-    assert repair.components(found)[0] == repair.components(faces)[0]
+    assert topology.components(found)[0] == topology.components(faces)[0]
     figures = shape_figures(out, found)
     assert figures["jacobian_mean"] > 0.85 and figures["folded_share"] == 0 and figures["angle_deviation_deg"] < 18
     assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.01

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gdtool.geometry import quads, repair
+from gdtool.geometry import quads, topology
 from gdtool.geometry.mesh_quality import scaled_jacobian
 from gdtool.geometry.quad_spread import spread
 from gdtool.geometry.quad_task import Request
@@ -18,7 +18,7 @@ def test_pieces_are_laid_apart_and_brought_back():
     """Side by side, one inside the other, and of unlike size."""
     vertices, faces = boxes(((0.4, 0.3, 0.5), (0, 0, 0)), ((0.4, 0.3, 0.5), (0, 0.301, 0)), ((0.1, 0.1, 0.1), (0, 0, 0)), ((0.9, 0.05, 0.05), (0, 0, 0.4)))
     found = spread(vertices, faces, 0.1)
-    _, piece = repair.components(faces)
+    _, piece = topology.components(faces)
     boxes_of = [(found.vertices[faces[piece == k]].min((0, 1)), found.vertices[faces[piece == k]].max((0, 1))) for k in range(4)]
     for i, (low, high) in enumerate(boxes_of):
         for other_low, other_high in boxes_of[:i]:
@@ -38,8 +38,8 @@ def test_quads_of_one_piece_are_not_drawn_onto_another():
     """Two balls, one in the other, a tenth of a quad apart: each keeps its radius. Not laid apart both come to lie between the two."""
     vertices, faces = joined(sphere(48, 0.4), sphere(48, 0.397))
     out, found, record = quads.remesh(vertices, faces, Request(quads=3000))
-    assert "instant-meshes" in record.engine and scaled_jacobian(out, found).min() > 0.2 and repair.is_watertight(found)
-    count, piece = repair.components(found)
+    assert "instant-meshes" in record.engine and scaled_jacobian(out, found).min() > 0.2 and topology.is_watertight(found)
+    count, piece = topology.components(found)
     assert count == 2
     inner, outer = sorted((np.linalg.norm(out[np.unique(found[piece == k])], axis=1) for k in range(2)), key=np.mean)
     assert inner.max() < 0.3985 < outer.min()

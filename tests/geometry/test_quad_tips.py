@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from gdtool.geometry import quad_fit, quads, repair
+from gdtool.folders.mesh import triangulated
+from gdtool.geometry import quad_fit, quads, topology
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import distance_figures, scaled_jacobian
 from gdtool.geometry.normals import face_normals
-from gdtool.folders.mesh import triangulated
 from gdtool.geometry.quad_fit import farthest, surface_of
 from gdtool.geometry.quad_shape import Surface
 from gdtool.geometry.quad_task import Request
@@ -42,7 +42,7 @@ def test_a_horn_is_drawn_out(length, bend):
     assert farthest(surface_of(vertices, faces), surface) > 1.4 * edge
     out, found, constraints, tips, _, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge, most_added=0.3)
     assert farthest(surface_of(out, found), surface) < 0.8 * edge
-    assert repair.is_watertight(found) and repair.is_manifold(found) and repair.euler_number(found) == 2
+    assert topology.is_watertight(found) and topology.is_manifold(found) and topology.euler_number(found) == 2
     assert len(faces) < len(found) < 1.2 * len(faces)
     assert len(tips) and constraints.fixed[tips].all() and len(constraints.curve) == len(out)
     apex = surface.vertices[surface.vertices[:, 0].argmax()]
@@ -110,7 +110,7 @@ def test_paths_along_creases_end_where_a_tip_is_drawn_out():
     curve[around] = 0
     held = Constraints(curve, np.zeros(len(vertices), bool), path, np.zeros(len(path), int))
     _, found, constraints, tips, _, _ = draw_out(vertices, faces, held, Surface(*horned(0.2)), edge)
-    edges = set(map(tuple, repair.edges_of(found).ends.tolist()))
+    edges = set(map(tuple, topology.edges_of(found).ends.tolist()))
     assert 0.8 * len(path) < len(constraints.path) < len(path)
     assert all(tuple(sorted(ends)) in edges for ends in constraints.path.tolist()) and (constraints.curve[tips] < 0).all()
 
@@ -121,7 +121,7 @@ def test_an_engine_that_cuts_a_horn_short_is_still_taken(monkeypatch):
     edge = (4 * np.pi * 0.4**2 / 2000) ** 0.5
     out, found, record = quads.remesh(vertices, faces, asked)
     figures = distance_figures(out, triangulated(found)[0], vertices, faces, 20000)
-    assert "instant-meshes" in record.engine and abs(len(found) / 2000 - 1) <= 0.03 and repair.is_watertight(found)
+    assert "instant-meshes" in record.engine and abs(len(found) / 2000 - 1) <= 0.03 and topology.is_watertight(found)
     assert figures["hausdorff"] < 2 * edge and (scaled_jacobian(out, found) <= 0).mean() < 0.003
     in_this_process(monkeypatch)
     monkeypatch.setattr(quad_fit, "draw_out", lambda v, f, constraints, *_: (v, f, constraints, None, 0.0, np.zeros(1)))

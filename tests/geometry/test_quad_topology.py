@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gdtool.geometry import repair
+from gdtool.geometry import topology
 from gdtool.geometry.mesh_quality import valences
 from gdtool.geometry.quad_topology import cancel_irregular
 from tests.geometry.solids import quad_torus
@@ -27,9 +27,9 @@ def opened(points: np.ndarray, quads: np.ndarray, v: int) -> tuple[np.ndarray, n
 def test_an_opened_vertex_closes_again():
     points, quads = quad_torus()
     more_points, more = opened(points, quads, 40)
-    assert repair.is_watertight(more) and (valences(more, len(more_points))[0] != 4).sum() == 4
+    assert topology.is_watertight(more) and (valences(more, len(more_points))[0] != 4).sum() == 4
     out, found = cancel_irregular(more_points, more)
-    assert len(found) == len(quads) and repair.is_watertight(found) and repair.is_manifold(found)
+    assert len(found) == len(quads) and topology.is_watertight(found) and topology.is_manifold(found)
     assert (valences(found, len(out))[0] == 4).all()
 
 

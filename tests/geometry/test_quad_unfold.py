@@ -7,7 +7,7 @@ from gdtool.geometry.features import Constraints, find_features
 from gdtool.geometry.mesh_quality import scaled_jacobian
 from gdtool.geometry.quad_shape import Surface, incidence, neighbours
 from gdtool.geometry.quad_unfold import _apart, unfold
-from gdtool.geometry.repair import edges_of
+from gdtool.geometry.topology import edges_of
 from tests.geometry.solids import cube, plane, quad_cube
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from gdtool.core.child import ChildFailed
 from gdtool.folders.mesh import triangulated
-from gdtool.geometry import quad_candidate, quad_ways, quads, repair
+from gdtool.geometry import quad_candidate, quad_ways, quads, topology
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_candidate import Candidate
@@ -54,10 +54,10 @@ def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(mon
     out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
     part = Part(vertices, faces, 1000, 0.045, Request(), None)
     height = out[found].mean(1)[:, 2]
-    left = [Candidate(quad_ways.Way("instant-meshes", 0, (1.0,), 30.0), 1000, None, *repair.compact(out, found[height < most])).leaves_out(part)
+    left = [Candidate(quad_ways.Way("instant-meshes", 0, (1.0,), 30.0), 1000, None, *topology.compact(out, found[height < most])).leaves_out(part)
             for most in (1.0, 0.37, 0.0)]
     assert left[:2] == [None, None] and "leaves out 3" in left[2]
-    calls = in_this_process(monkeypatch, lambda *_: repair.compact(out, found[height < 0.0]))
+    calls = in_this_process(monkeypatch, lambda *_: topology.compact(out, found[height < 0.0]))
     monkeypatch.setattr(quad_candidate, "judged", lambda vertices, found, *_: (None, vertices, found))
     monkeypatch.setattr(quad_ways.Trial, "_drawn", None)
     _, _, record = quads.remesh(vertices, faces, Request(quads=1000))
@@ -103,11 +103,11 @@ def test_a_handle_is_given_up_only_where_it_is_finer_than_a_quad(monkeypatch, sh
     vertices, faces = sphere(96, 0.4)
     out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
     vertices, faces = with_tunnel(vertices, faces, 0.07) if given_up else bored_ball()
-    assert repair.is_watertight(faces) and repair.is_manifold(faces) and repair.euler_number(faces) == 0
+    assert topology.is_watertight(faces) and topology.is_manifold(faces) and topology.euler_number(faces) == 0
     in_this_process(monkeypatch, lambda *_: (out, found))  # an engine that makes a ball of it
     _, found, record = quads.remesh(vertices, faces, Request(quads=1000))
     assert whole(found) and (record.engine == "instant-meshes, handles are lost") == given_up
-    assert repair.euler_number(found) == (2 if given_up else 0)
+    assert topology.euler_number(found) == (2 if given_up else 0)
 
 
 def test_torn_output_is_not_believed(monkeypatch):
@@ -126,7 +126,7 @@ def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
     assert len(corners) == 4 and len(sides) == 4
     torn = np.delete(faces, [*corners[1:], *sides], 0)
     fault, out, found = quad_candidate.judged(vertices, torn, vertices, triangulated(faces)[0])
-    assert fault is None and whole(found) and repair.components(found)[0] == 1 and len(found) < len(faces)
+    assert fault is None and whole(found) and topology.components(found)[0] == 1 and len(found) < len(faces)
     assert volume(out, triangulated(found)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.folders.mesh import triangulated
-from gdtool.geometry import quads, repair, simplify
+from gdtool.geometry import quads, simplify, topology
 from gdtool.geometry.mesh_quality import distance_figures, shape_figures
 from gdtool.geometry.quad_task import Request
 from tests.geometry.engines import whole
@@ -17,7 +17,7 @@ def test_large_parts_are_not_torn_down_for_small_ones():
     vertices, faces = assembly(60, 128)
     out, found, record = quads.remesh(vertices, faces, Request(quads=3000))
     assert any("the quick collapse stopped" in line for line in record.failed) and record.figures["simplified_to"] == 20000
-    assert abs(len(found) / 3000 - 1) < 0.1 and whole(found) and repair.components(found)[0] == 61
+    assert abs(len(found) / 3000 - 1) < 0.1 and whole(found) and topology.components(found)[0] == 61
     assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.015
 
 
@@ -70,7 +70,7 @@ def test_coarse_cube_is_filled_with_quads():
 
 def test_open_plane_stays_open_and_flat():
     out, found, _ = quads.remesh(*plane(), Request(quads=400))
-    assert repair.is_manifold(found) and np.abs(out[:, 2]).max() < 1e-9
+    assert topology.is_manifold(found) and np.abs(out[:, 2]).max() < 1e-9
     area = distance_figures(out, triangulated(found)[0], *plane(), 2000)
     assert area["hausdorff"] < 0.03  # less than an edge length: the boundary is where it was
 

@@ -4,43 +4,24 @@ import numpy as np
 import pytest
 
 from gdtool.core.errors import InputError
-from gdtool.geometry import repair
+from gdtool.geometry import repair, topology
 from gdtool.geometry.unpinch import unpinched
-from tests.geometry.solids import cube, joined, plane, torus, volume
+from tests.geometry.solids import cube, joined, plane, volume
 
 
 def test_cube_is_watertight_and_passes_unchanged():
     vertices, faces = cube(2.0)
-    assert repair.is_watertight(faces) and repair.is_manifold(faces)
+    assert topology.is_watertight(faces) and topology.is_manifold(faces)
     out_vertices, out_faces, report, closed = repair.clean(vertices, faces)
     assert closed and report == {} and (out_vertices == vertices).all() and (out_faces == faces).all()
     assert volume(out_vertices, out_faces) == pytest.approx(8)
-
-
-def test_plane_is_manifold_and_not_watertight():
-    _, faces = plane(3)
-    edges = repair.edges_of(faces)
-    assert (edges.count == 1).sum() == 12
-    assert repair.is_manifold(faces) and not repair.is_watertight(faces)
-
-
-def test_torus_has_euler_characteristic_zero():
-    vertices, faces = torus()
-    assert len(vertices) - len(repair.edges_of(faces).ends) + len(faces) == 0
-
-
-def test_quads_and_triangles_share_edges():
-    faces = np.array([[0, 1, 2, 3], [1, 4, 2, -1]])
-    edges = repair.edges_of(faces)
-    assert len(edges.ends) == 6 and edges.count.max() == 2 and not edges.turned.any()
-    assert edges.face_pairs()[1].tolist() == [[0, 1]]
 
 
 def test_soup_is_welded():
     vertices, faces = cube()
     soup, soup_faces = vertices[faces].reshape(-1, 3), np.arange(36).reshape(-1, 3)
     out_vertices, out_faces, report, closed = repair.clean(soup, soup_faces)
-    assert len(out_vertices) == 8 and closed and repair.is_watertight(out_faces) and report == {"welded_vertices": 28}
+    assert len(out_vertices) == 8 and closed and topology.is_watertight(out_faces) and report == {"welded_vertices": 28}
 
 
 def test_two_cubes_at_one_edge_become_two_manifolds():
@@ -48,10 +29,10 @@ def test_two_cubes_at_one_edge_become_two_manifolds():
     vertices, faces = joined(one, (two[0] + [1, 1, 0], two[1]))
     _, first, inverse = np.unique(vertices.round(6), axis=0, return_index=True, return_inverse=True)
     shared = first[inverse.ravel()][faces]
-    assert not repair.is_manifold(shared)
+    assert not topology.is_manifold(shared)
     out_vertices, out_faces, report, closed = repair.clean(vertices, shared)
     assert closed and report["nonmanifold_edges"] == 1
-    assert repair.is_watertight(out_faces) and repair.is_manifold(out_faces) and repair.components(out_faces)[0] == 2
+    assert topology.is_watertight(out_faces) and topology.is_manifold(out_faces) and topology.components(out_faces)[0] == 2
     assert volume(out_vertices, out_faces) == pytest.approx(2)
 
 
@@ -60,16 +41,16 @@ def test_bow_tie_is_parted():
     vertices, faces = joined(one, (two[0] + 1, two[1]))
     _, first, inverse = np.unique(vertices.round(6), axis=0, return_index=True, return_inverse=True)
     shared = first[inverse.ravel()][faces]
-    assert repair.is_watertight(shared) and not repair.is_manifold(shared) and len(repair.split_vertices(shared)) == 1
+    assert topology.is_watertight(shared) and not topology.is_manifold(shared) and len(topology.split_vertices(shared)) == 1
     out_vertices, out_faces, report, closed = repair.clean(vertices, shared)
-    assert closed and report == {"nonmanifold_vertices": 1} and repair.is_manifold(out_faces) and len(out_vertices) == 16
+    assert closed and report == {"nonmanifold_vertices": 1} and topology.is_manifold(out_faces) and len(out_vertices) == 16
 
 
 def test_turned_faces_are_turned_back():
     vertices, faces = cube()
     faces[3] = faces[3][::-1]
     out_vertices, out_faces, report, closed = repair.clean(vertices, faces)
-    assert closed and report["turned_edges"] == 3 and repair.is_watertight(out_faces) and volume(out_vertices, out_faces) == pytest.approx(1)
+    assert closed and report["turned_edges"] == 3 and topology.is_watertight(out_faces) and volume(out_vertices, out_faces) == pytest.approx(1)
 
 
 def test_inside_out_is_turned():
@@ -108,11 +89,6 @@ def test_scale_does_not_matter(scale):
 
 
 def test_sheets_that_meet_in_an_edge_are_parted():
-    import numpy as np
-
-    from gdtool.geometry import repair
-    from tests.geometry.solids import cube
-
     vertices, faces = cube()
     # Two cubes side by side along one edge, which then has four faces.
     shift = np.array([1.0, 1.0, 0])
@@ -121,38 +97,7 @@ def test_sheets_that_meet_in_an_edge_are_parted():
     _, joined = np.unique(both, axis=0, return_inverse=True)
     points = np.unique(both, axis=0)
     pinched = joined.ravel()[np.concatenate([faces, faces + 8])]
-    assert len(points) == 14 and not repair.is_watertight(pinched)
+    assert len(points) == 14 and not topology.is_watertight(pinched)
     out, parted = unpinched(points, pinched)
-    assert repair.is_watertight(parted) and repair.is_manifold(parted)
-    assert repair.components(parted)[0] == 2 and len(out) == 16
-
-
-def test_edges_count_as_sorting_does():
-    import numpy as np
-
-    from gdtool.geometry import repair
-
-    rng = np.random.default_rng(0)
-    faces = rng.integers(0, 40, (300, 4))
-    faces[::3, 3] = -1
-    edges = repair.edges_of(faces)
-    half = np.sort(edges.half_ends, 1)
-    ends, inverse, count = np.unique(half, axis=0, return_inverse=True, return_counts=True)
-    assert (edges.ends == ends).all() and (edges.count == count).all() and (edges.half_edge_idx == inverse.ravel()).all()
-    assert (edges.order == np.argsort(inverse.ravel(), kind="stable")).all()
-
-
-@pytest.mark.parametrize("change", ["none", "turned", "opened", "doubled", "wedge"])
-def test_watertight_as_the_edges_say(change):
-    _, faces = torus(20)
-    faces = {"none": faces, "turned": np.concatenate([faces[:1, ::-1], faces[1:]]), "opened": faces[1:],
-             "doubled": np.concatenate([faces, faces[:1]]), "wedge": np.concatenate([faces, faces[:1], faces[:1, ::-1]])}[change]
-    edges = repair.edges_of(faces)
-    assert repair.is_watertight(faces) == bool((edges.count == 2).all() and not edges.turned.any()) == (change == "none")
-
-
-def test_unused_vertices_go_and_triangles_among_quads_stay():
-    vertices = np.arange(21.0).reshape(7, 3)
-    out, faces = repair.compact(vertices, np.array([[1, 2, 4, 5], [1, 5, 6, -1]], np.int32))
-    assert (out == vertices[[1, 2, 4, 5, 6]]).all() and (faces == [[0, 1, 2, 3], [0, 3, 4, -1]]).all() and faces.dtype == np.int64
-    assert repair.compact(out, faces)[0] is out
+    assert topology.is_watertight(parted) and topology.is_manifold(parted)
+    assert topology.components(parted)[0] == 2 and len(out) == 16

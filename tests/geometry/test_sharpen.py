@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.geometry import repair, sharpen
+from gdtool.geometry import sharpen, topology
 from gdtool.geometry.features import find_features
 from gdtool.geometry.normals import face_normals
 from tests.geometry.solids import bored_box, cube, sphere, torus, volume
@@ -25,7 +25,7 @@ def test_creases_restored_keep_the_mesh_closed_and_their_input(kind):
     out, found, report = sharpen.restore_creases(vertices, faces)
     assert (vertices == before).all() and (faces == before_faces).all()
     assert report["moved"] > 300 and 0 < report["largest_move"] < 0.1 and 0 < report["bevel_share"] < 0.25
-    assert len(found) < len(faces) - 200 and repair.topology(found) == repair.topology(faces)
+    assert len(found) < len(faces) - 200 and topology.invariants(found) == topology.invariants(faces)
     assert len(np.unique(found)) == len(out) and np.linalg.norm(out - [0.8, 0.6, 0.5], axis=1).min() < 0.02
     true = 1.6 * 1.2 * 1.0 - np.pi * 0.3**2
     assert abs(volume(out, found) - true) < 0.3 * abs(volume(vertices, faces) - true)
@@ -35,7 +35,7 @@ def test_bevels_collapse_onto_vertices_they_had():
     vertices, faces = bored_box(32)
     longest = 0.6 * np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1).max()
     out, found = sharpen.collapse_bevels(vertices, faces, np.ones(len(vertices), bool), longest)
-    assert len(found) < 0.9 * len(faces) and repair.topology(found) == repair.topology(faces)
+    assert len(found) < 0.9 * len(faces) and topology.invariants(found) == topology.invariants(faces)
     assert {tuple(place) for place in out.tolist()} < {tuple(place) for place in vertices.tolist()}
     for moved, longest in ((np.zeros(len(vertices), bool), longest), (np.ones(len(vertices), bool), 0.0)):
         same, same_faces = sharpen.collapse_bevels(vertices, faces, moved, longest)
@@ -44,7 +44,7 @@ def test_bevels_collapse_onto_vertices_they_had():
 
 def test_edges_collapsed_at_once_are_those_collapsed_one_by_one():
     vertices, faces = bored_box(24)
-    edges = repair.edges_of(faces).ends
+    edges = topology.edges_of(faces).ends
     edges = edges[np.random.default_rng(0).permutation(len(edges))]
     longest = 0.9 * np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1).max()
     together, alone = (sharpen._Rims(vertices, faces.astype(np.int64), longest) for _ in range(2))
@@ -57,7 +57,7 @@ def test_edges_collapsed_at_once_are_those_collapsed_one_by_one():
 def test_bevels_of_marching_cubes_become_creases():
     vertices, faces = bored_box()
     sharp, sharp_faces, report = sharpen.restore_creases(vertices, faces)
-    assert report["moved"] > 300 and repair.is_watertight(sharp_faces) and repair.is_manifold(sharp_faces)
+    assert report["moved"] > 300 and topology.is_watertight(sharp_faces) and topology.is_manifold(sharp_faces)
     corner = np.array([0.8, 0.6, 0.5])
     before, after = (np.linalg.norm(v - corner, axis=1).min() for v in (vertices, sharp))
     assert after < 0.2 * before

@@ -5,14 +5,14 @@ import pytest
 
 from gdtool.core.child import ChildFailed
 from gdtool.core.errors import InputError
-from gdtool.geometry import repair, simplify
+from gdtool.geometry import simplify, topology
 from tests.geometry.solids import assembly, bored_box, cube, joined, plane, quad_cube, sphere, volume
 
 
 def test_sphere_keeps_shape_and_topology():
     vertices, faces = sphere(40)
     out, out_faces, _, report = simplify.simplify(vertices, faces, 800)
-    assert 0.9 * 800 <= len(out_faces) <= 800 and repair.is_watertight(out_faces) and repair.is_manifold(out_faces)
+    assert 0.9 * 800 <= len(out_faces) <= 800 and topology.is_watertight(out_faces) and topology.is_manifold(out_faces)
     assert report["method"] == "quadric collapse" and 0 < report["error"] < 0.02
     # The error is an upper bound for the vertices of both (all of them are below the sampling limit).
     radius = np.linalg.norm(out, axis=1)
@@ -35,7 +35,7 @@ def test_nothing_to_do():
 def test_target_one_is_not_empty():
     vertices, faces = sphere(16)
     _, out, _, _ = simplify.simplify(vertices, faces, 1)
-    assert len(out) >= 4 and repair.is_watertight(out)
+    assert len(out) >= 4 and topology.is_watertight(out)
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1e12])
@@ -65,7 +65,7 @@ def test_index_out_of_range_never_reaches_the_library():
 
 def test_two_pieces_stay_two():
     vertices, faces = joined(sphere(24, 0.4, (-0.5, 0, 0)), sphere(24, 0.4, (0.5, 0, 0)))
-    assert repair.components(simplify.simplify(vertices, faces, 400)[1])[0] == 2
+    assert topology.components(simplify.simplify(vertices, faces, 400)[1])[0] == 2
 
 
 def test_slivers_that_the_quick_collapse_does_not_touch():
@@ -73,7 +73,7 @@ def test_slivers_that_the_quick_collapse_does_not_touch():
     vertices, faces = assembly(60, 48)
     out, found, _, report = simplify.simplify(vertices, faces, 900)
     assert report["method"].endswith("topology kept") and "the quick collapse stopped" in report["failed"]
-    assert len(found) <= 900 and report["error"] < 0.02 and repair.topology(found) == repair.topology(faces)
+    assert len(found) <= 900 and report["error"] < 0.02 and topology.invariants(found) == topology.invariants(faces)
 
 
 def test_flat_parts_go_first_however_they_lie():
@@ -81,8 +81,8 @@ def test_flat_parts_go_first_however_they_lie():
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
     vertices, quads = quad_cube(6)
     vertices, faces = vertices @ (turn * np.linalg.det(turn)), np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])
-    out, found = repair.compact(*simplify.collapse(simplify.uneven(vertices, faces), faces, 200, 5.0))
-    assert len(found) == 200 and repair.is_watertight(found) and repair.is_manifold(found)
+    out, found = topology.compact(*simplify.collapse(simplify.uneven(vertices, faces), faces, 200, 5.0))
+    assert len(found) == 200 and topology.is_watertight(found) and topology.is_manifold(found)
     assert simplify.deviation(vertices, faces, out, found) < 1e-3 and volume(out, found) == pytest.approx(1, abs=1e-4)
     assert len(simplify.collapse(vertices, faces, 200, 5.0)[1]) > 5000
     # Only what lies in a side moves: at an edge of the cube the middle of the normals' squares has a determinant of nought too.
@@ -101,7 +101,7 @@ def test_creases_are_drawn_out_unless_that_cannot_be_collapsed(monkeypatch):
         return np.linalg.norm(vertices - corner, axis=1).min()
 
     out, found, _, report = simplify.simplify(vertices, faces, 2000, crease_degrees=30.0)
-    assert report["creases"] > 300 and len(found) <= 2000 and repair.is_watertight(found) and off(out) < 0.2 * off(vertices)
+    assert report["creases"] > 300 and len(found) <= 2000 and topology.is_watertight(found) and off(out) < 0.2 * off(vertices)
     begin = simplify.begin
 
     class Torn:
@@ -124,7 +124,7 @@ def test_creases_are_drawn_out_unless_that_cannot_be_collapsed(monkeypatch):
     assert (found := simplify.simplify(vertices, faces, 2000, crease_degrees=30.0)[3])["faces"] <= 2000 and found["creases"] == 0
     monkeypatch.setattr(simplify, "begin", lambda *given, **limits: Torn(begin(*given, **limits)) if restored(given) else begin(*given, **limits))
     out, found, _, report = simplify.simplify(vertices, faces, 2000, crease_degrees=30.0)
-    assert report["creases"] == 0 and "creases restored" in report["failed"] and repair.is_watertight(found)
+    assert report["creases"] == 0 and "creases restored" in report["failed"] and topology.is_watertight(found)
     assert off(out) > 0.5 * off(vertices)
 
 
@@ -133,8 +133,8 @@ def test_even_leaves_triangles_of_one_size():
 
     def spread(even):
         out, found = simplify.simplify(vertices, faces, 1500, even=even, measured=False)[:2]
-        edges = repair.edges_of(found)
-        assert repair.is_watertight(found) and abs(len(found) / 1500 - 1) < 0.02
+        edges = topology.edges_of(found)
+        assert topology.is_watertight(found) and abs(len(found) / 1500 - 1) < 0.02
         tenth, most = np.quantile(np.linalg.norm(out[edges.ends[:, 0]] - out[edges.ends[:, 1]], axis=1), (0.1, 0.9))
         return most / tenth
 
@@ -179,7 +179,7 @@ def test_the_collapse_that_keeps_the_topology_keeps_what_coincides():
     two = one[0] * (-1, 1, 1) + (2 * top[0], 0, 0), one[1][:, ::-1]
     vertices, faces = joined(one, two)
     out, found = simplify.collapse_topology(vertices, faces, 600)
-    assert repair.topology(found) == repair.topology(faces) and len(found) <= 600
+    assert topology.invariants(found) == topology.invariants(faces) and len(found) <= 600
 
 
 def test_where_the_quick_collapse_gives_up_it_still_goes_most_of_the_way(monkeypatch):
@@ -187,7 +187,7 @@ def test_where_the_quick_collapse_gives_up_it_still_goes_most_of_the_way(monkeyp
     vertices, faces = sphere(64)
     assert len(faces) > 20_000
     whole, by_way = simplify.collapse_topology(vertices, faces, 1000), simplify.collapse_by_way(vertices, faces, 1000)
-    assert len(by_way[1]) == 1000 and repair.is_watertight(by_way[1])
+    assert len(by_way[1]) == 1000 and topology.is_watertight(by_way[1])
     assert simplify.deviation(vertices, faces, *by_way) < 1.5 * simplify.deviation(vertices, faces, *whole)
     called, begin = [], simplify.begin
     monkeypatch.setattr(simplify, "begin", lambda *given, **how: called.append(given[3]) or begin(*given, **how))

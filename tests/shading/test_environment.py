@@ -8,8 +8,8 @@ import torch
 
 from gdtool.core.errors import InputError
 from gdtool.shading.environment import BUNDLED, METERED_WHITE, Environment, load_environment
-from gdtool.shading.prefilter import IrradianceMap
 from gdtool.shading.lights import direction, paint, random_lobes
+from gdtool.shading.prefilter import IrradianceMap
 from gdtool.shading.sg_fit import fit_sg
 from gdtool.shading.studio import studio
 

@@ -10,7 +10,7 @@ import torch
 
 import gdtool.shading.direct as direct
 import gdtool.shading.render as render
-from gdtool.assets.scene import Material, Scene, Texture
+from gdtool.assets.scene import Scene, Texture
 from gdtool.cameras import rig
 from gdtool.geometry import rays
 from gdtool.geometry.rays import is_convex

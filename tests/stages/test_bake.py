@@ -12,7 +12,7 @@ from gdtool.folders.mesh import QuadMesh, write_obj
 from gdtool.folders.views import Views, write_views
 from gdtool.images.io import read_image, write_png
 from tests.stages.bake_folders import finish, fresh, make_chain, torus_atlas, torus_views, write_atlas
-from tests.texture.shapes import albedo_of, psnr
+from tests.texture.shapes import psnr
 
 FAST = ("--size", 128, "--ao-rays", 16)
 

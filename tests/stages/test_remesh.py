@@ -8,7 +8,7 @@ import pytest
 
 from gdtool.core.folder import open_folder
 from gdtool.folders.mesh import read_mesh
-from gdtool.geometry import repair
+from gdtool.geometry import topology
 from tests.geometry.solids import bored_box, cube, joined, sphere, write_obj
 
 
@@ -24,7 +24,7 @@ def test_obj_to_quads_in_its_normalised_frame(gdtool, tmp_path):
     assert run.stdout == "ball.asset/mesh\n"
     folder = open_folder(tmp_path / "ball.asset/mesh")
     mesh = read_mesh(folder)
-    assert abs(len(mesh.faces) / 600 - 1) <= 0.03 and mesh.is_quad.all() and repair.is_watertight(mesh.faces)
+    assert abs(len(mesh.faces) / 600 - 1) <= 0.03 and mesh.is_quad.all() and topology.is_watertight(mesh.faces)
     assert np.ptp(mesh.vertices, 0).max() == pytest.approx(1, abs=0.02)
     assert folder.content.watertight and folder.content.triangles == 0
     matrix = np.array(folder.content.source_from_world).reshape(4, 4)

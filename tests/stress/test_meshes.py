@@ -11,7 +11,7 @@ import pytest
 
 from gdtool.core.folder import open_folder
 from gdtool.folders.mesh import read_mesh
-from gdtool.geometry import repair
+from gdtool.geometry import topology
 from tests.geometry.solids import bored_box, cube, joined, sphere, write_obj
 
 SHARED = Path(os.environ.get("GDTOOL_MESHES", Path(__file__).parents[3] / "shared/assets/mesh"))
@@ -88,7 +88,7 @@ def survives(gdtool, source, faces: int = 200) -> None:
         assert last and ": " in last[0] and not Path(source).with_name("made").exists()
         return
     mesh = read_mesh(open_folder(Path(source).with_name("made") / "mesh"))
-    assert np.isfinite(mesh.vertices).all() and mesh.is_quad.all() and repair.is_manifold(mesh.faces)
+    assert np.isfinite(mesh.vertices).all() and mesh.is_quad.all() and topology.is_manifold(mesh.faces)
     small = "--size", 256, "--padding", 1
     for stage in (("unwrap", "made/mesh", *small), ("unwrap", source, "--redo", *small, "-o", "made/own")):
         run = gdtool(*stage)
@@ -119,10 +119,10 @@ def test_public(gdtool, tmp_path, path):
 
 @slow
 def test_five_million_faces(gdtool, tmp_path):
-    from gdtool.geometry.repair import is_watertight
-
     import igl
     import trimesh
+
+    from gdtool.geometry.topology import is_watertight
 
     vertices, faces = igl.upsample(*sphere(72), 4)  # a grid of marching cubes as fine would take tens of gigabytes
     vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)

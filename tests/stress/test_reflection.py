@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from gdtool.shading import brdf as models
 from gdtool.shading.closed_form import disney_mean, fresnel_loss, shade, shade_parts
 from gdtool.shading.sg import SphericalGaussians, normalize
-from tests.stress.references import N, NODES, ULP, WEIGHTS, direction, light, reflected
+from tests.stress.references import NODES, ULP, WEIGHTS, N, direction, light, reflected
 
 settings.register_profile("stress", derandomize=True, deadline=None, print_blob=True)
 settings.load_profile("stress")

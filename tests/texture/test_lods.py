@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
-
 from gdtool.stages import bake
 from gdtool.texture import lods
 from gdtool.texture.lods import coarser, drift

@@ -1,0 +1,53 @@
+"""What the indices of a mesh tell: edges, pieces, whether it is closed and manifold."""
+
+import numpy as np
+import pytest
+
+from gdtool.geometry import topology
+from tests.geometry.solids import plane, torus
+
+
+def test_plane_is_manifold_and_not_watertight():
+    _, faces = plane(3)
+    edges = topology.edges_of(faces)
+    assert (edges.count == 1).sum() == 12
+    assert topology.is_manifold(faces) and not topology.is_watertight(faces)
+
+
+def test_torus_has_euler_characteristic_zero():
+    vertices, faces = torus()
+    assert len(vertices) - len(topology.edges_of(faces).ends) + len(faces) == 0 == topology.euler_number(faces)
+
+
+def test_quads_and_triangles_share_edges():
+    faces = np.array([[0, 1, 2, 3], [1, 4, 2, -1]])
+    edges = topology.edges_of(faces)
+    assert len(edges.ends) == 6 and edges.count.max() == 2 and not edges.turned.any()
+    assert edges.face_pairs()[1].tolist() == [[0, 1]]
+
+
+def test_edges_count_as_sorting_does():
+    rng = np.random.default_rng(0)
+    faces = rng.integers(0, 40, (300, 4))
+    faces[::3, 3] = -1
+    edges = topology.edges_of(faces)
+    half = np.sort(edges.half_ends, 1)
+    ends, inverse, count = np.unique(half, axis=0, return_inverse=True, return_counts=True)
+    assert (edges.ends == ends).all() and (edges.count == count).all() and (edges.half_edge_idx == inverse.ravel()).all()
+    assert (edges.order == np.argsort(inverse.ravel(), kind="stable")).all()
+
+
+@pytest.mark.parametrize("change", ["none", "turned", "opened", "doubled", "wedge"])
+def test_watertight_as_the_edges_say(change):
+    _, faces = torus(20)
+    faces = {"none": faces, "turned": np.concatenate([faces[:1, ::-1], faces[1:]]), "opened": faces[1:],
+             "doubled": np.concatenate([faces, faces[:1]]), "wedge": np.concatenate([faces, faces[:1], faces[:1, ::-1]])}[change]
+    edges = topology.edges_of(faces)
+    assert topology.is_watertight(faces) == bool((edges.count == 2).all() and not edges.turned.any()) == (change == "none")
+
+
+def test_unused_vertices_go_and_triangles_among_quads_stay():
+    vertices = np.arange(21.0).reshape(7, 3)
+    out, faces = topology.compact(vertices, np.array([[1, 2, 4, 5], [1, 5, 6, -1]], np.int32))
+    assert (out == vertices[[1, 2, 4, 5, 6]]).all() and (faces == [[0, 1, 2, 3], [0, 3, 4, -1]]).all() and faces.dtype == np.int64
+    assert topology.compact(out, faces)[0] is out
