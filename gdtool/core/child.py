@@ -32,6 +32,7 @@ class ChildFailed(Exception):
 # time of a quadric collapse. A child ends soon; it keeps what it has.
 # OpenBLAS starts a thread for each core as numpy is imported, which takes a third of a child's start-up; none multiplies dense matrices.
 _SETTINGS = {"OPENBLAS_NUM_THREADS": "1", "MALLOC_MMAP_THRESHOLD_": str(2**30), "MALLOC_TRIM_THRESHOLD_": str(2**32), "MALLOC_TOP_PAD_": str(2**26)}
+_NICE = 10
 _FORKS = sys.platform == "linux"
 _nursery: Nursery | None = None
 _asking = threading.Lock()
@@ -125,6 +126,12 @@ class Running:
             with _asking:
                 spent.add(self._process)
 
+    def if_done(self) -> Any:
+        """result(), or None where the child failed: for what can be done here as well."""
+        with contextlib.suppress(ChildFailed):
+            return self.result()
+        return None
+
     def result(self) -> Any:
         """What the function returned. A GdtoolError raised in the child is raised here; ChildFailed for all else."""
         try:
@@ -149,15 +156,16 @@ class Running:
         raise ChildFailed(f"{function}: {value}")
 
 
-def begin(function: str, *args: Any, seconds: float, memory_mb: int | None = None, **kwargs: Any) -> Running:
+def begin(function: str, *args: Any, seconds: float, memory_mb: int | None = None, in_case: bool = False, **kwargs: Any) -> Running:
     """Start "package.module:function"(*args, **kwargs) in a child process, which gets the arguments as they are now.
 
-    memory_mb limits the growth of the child's address space over what it has after importing.
+    memory_mb limits the growth of the child's address space over what it has after importing. in_case: what it does may not be needed, so
+    that it gives way to all others.
     """
     place = None
     with contextlib.suppress(OSError):  # it may have been deleted
         place = os.getcwd()
-    request = pickle.dumps((place, sys.path, _SETTINGS | os.environ)) + pickle.dumps((function, args, kwargs, memory_mb), protocol=5)
+    request = pickle.dumps((place, sys.path, _SETTINGS | os.environ)) + pickle.dumps((function, args, kwargs, memory_mb, in_case), protocol=5)
     return Running(function, _started(), request, seconds)
 
 
@@ -226,12 +234,14 @@ def serve(nursery: Nursery | None = None) -> None:
         os.environ.update(environment)
         with contextlib.suppress(OSError, TypeError):
             os.chdir(place)
-        function, args, kwargs, memory_mb = pickle.load(asked)
+        function, args, kwargs, memory_mb, in_case = pickle.load(asked)
     module, name = function.split(":")
     try:
         target = getattr(importlib.import_module(module), name)
         if memory_mb is not None and sys.platform == "linux":
             _limit_memory(memory_mb)
+        if in_case:
+            os.nice(_NICE)
         answer = ("done", target(*args, **kwargs))
     except errors.GdtoolError as error:
         answer = ("error", type(error)(error.subject, error.fact, error.cure))

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-
 import numpy as np
 
-from gdtool.core.child import ChildFailed, Running, begin
+from gdtool.core.child import Running, begin
 from gdtool.core.threads import cores
 from gdtool.geometry.quad_candidate import Candidate
 from gdtool.geometry.quad_fit import farthest, surface_of
-from gdtool.geometry.quad_task import NICE, Part, Request
+from gdtool.geometry.quad_task import Part, Request
 
 _DOUBT_EDGES = 2.0  # what is farther from the surface before it is drawn, often is not good
 
@@ -20,21 +17,21 @@ class Ahead:
     """Candidates of one part that are drawn ahead."""
 
     def __init__(self, part: Part):
-        self._part, self._running = part, {}
+        self._part = part
+        self._running: dict[int, Running] = {}
 
     def begin(self, first: Candidate, one: Candidate) -> None:
         """Have it traced and drawn, where there is a core to spare and the first one, drawn here, is in doubt."""
         part, request = self._part, self._part.request
         if cores() > 1 and farthest(surface_of(first.vertices, first.quads), part.surface) > _DOUBT_EDGES * part.edge:
             self._running[id(one)] = begin("gdtool.geometry.quad_child:finished", one, part.vertices, part.faces, part.quads, part.edge, request,
-                                           seconds=request.for_a_run, memory_mb=request.memory_mb)
+                                           seconds=request.for_a_run, memory_mb=request.memory_mb, in_case=True)
 
     def fetch(self, one: Candidate) -> None:
         """Wait for one that was begun; all else is left as it is, to be done here."""
-        running: Running | None = self._running.pop(id(one), None)
-        if running is not None:
-            with contextlib.suppress(ChildFailed):
-                vars(one).update(vars(running.result()))
+        running = self._running.pop(id(one), None)
+        if running is not None and (done := running.if_done()) is not None:
+            vars(one).update(vars(done))
 
     def stop(self) -> None:
         """Give up those that nobody waited for."""
@@ -44,7 +41,6 @@ class Ahead:
 
 def finished(one: Candidate, vertices: np.ndarray, faces: np.ndarray, quads: int, edge: float, request: Request) -> Candidate:
     """What the child runs: the candidate traced and drawn."""
-    os.nice(NICE)
     part = Part(vertices, faces, quads, edge, request, fine=lambda: None)
     one.trace(part)
     one.draw(part)

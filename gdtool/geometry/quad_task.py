@@ -17,7 +17,6 @@ from gdtool.geometry.quad_shape import Surface
 from gdtool.geometry.rays import RayCaster, dot
 
 COUNT_TOLERANCE = 0.03
-NICE = 10  # of children whose work may not be needed: they have what the others leave
 _ENGINES_SHARE, _LEAST_SECONDS = 0.7, 20.0
 _SHORTEST_RUN = 0.05  # seconds
 _NARROW_EDGES, _FEW_NARROW = 1.5, 0.05  # share of the creases' length

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import heapq
 import os
 import threading
@@ -13,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gdtool.core.child import ChildFailed, begin, prepare
+from gdtool.core.child import begin, prepare
 from gdtool.folders.mesh import triangulated
 from gdtool.geometry.mesh_quality import polygon_normals
 from gdtool.geometry.repair import one_vertex_per_fan
@@ -91,9 +90,8 @@ def _lay_beside(*given, **more: bool) -> Laid:
     shared, there = os.dup(queue), {}
 
     def beside() -> None:  # it may not have begun yet: nothing waits for that
-        with contextlib.suppress(ChildFailed):
-            there.update(begin("gdtool.texture.unwrap_child:lay_next", f"/proc/{os.getpid()}/fd/{shared}", *given, **more,
-                               seconds=min(max(by[1] - time.monotonic(), 0.0), 3600.0) + _SLACK).result())
+        there.update(begin("gdtool.texture.unwrap_child:lay_next", f"/proc/{os.getpid()}/fd/{shared}", *given, **more,
+                           seconds=min(max(by[1] - time.monotonic(), 0.0), 3600.0) + _SLACK).if_done() or {})
         os.close(shared)
 
     thread = threading.Thread(target=beside, daemon=True)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gdtool.core.child import ChildFailed, begin
+from gdtool.core.child import begin
 from gdtool.texture.unwrap_settle import ROUGH, Fine
 from gdtool.texture.unwrap_shapes import Shapes, rim_of, upright_box
 
@@ -151,11 +151,7 @@ def _improved(shapes: Shapes, found: list[Layout], tries: int, until: float, bes
     here, there = ([(shapes, found[0], each, chain, until) for chain in range(first, _CHAINS, 2)] for first in (0, 1))
     if beside:
         child = begin("gdtool.texture.unwrap_pack:chains", there, seconds=min(max(until - time.monotonic(), 0.0), 3600.0) + _SLACK)
-        more = chains(here)
-        try:
-            more += child.result()
-        except ChildFailed:
-            more += chains(there)
+        more = chains(here) + (child.if_done() or chains(there))
     else:
         more = chains(here + there)
     return sorted(found + more, key=lambda layout: layout.side)

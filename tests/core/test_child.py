@@ -90,6 +90,12 @@ def test_arrays_go_there_and_back_whatever_the_function_prints():
     assert (child.call("tests.core.test_child:double", np.arange(5), noise="text", seconds=30) == np.arange(5) * 2).all()
 
 
+def test_what_may_not_be_needed_gives_way_to_others_and_fails_silently():
+    given = child.begin("os:getpriority", os.PRIO_PROCESS, 0, seconds=30, in_case=True)
+    assert given.if_done() == min(os.getpriority(os.PRIO_PROCESS, 0) + child._NICE, 19)
+    assert child.begin("tests.core.test_child:crash", seconds=30, in_case=True).if_done() is None
+
+
 def test_what_is_prepared_is_read_already_and_what_cannot_be_is_told_when_it_is_asked_for(tmp_path, forks):
     (tmp_path / "marked_module.py").write_text("import os\nread_by = os.getpid()\ndef asked():\n    return os.getpid(), read_by\n")
     sys.path.append(str(tmp_path))
