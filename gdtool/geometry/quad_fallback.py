@@ -7,9 +7,10 @@ import numpy as np
 from gdtool.core.child import Running, begin
 from gdtool.core.threads import cores
 from gdtool.geometry.features import Constraints
+from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_fit import better, evened
 from gdtool.geometry.quad_shape import Surface
-from gdtool.geometry.quad_split import of_even, of_own, split_count
+from gdtool.geometry.quad_split import few_for_even, of_even, of_own, split_count
 from gdtool.geometry.quad_task import Part, Request
 
 _WORTH_A_CHILD = 20000  # triangles
@@ -20,7 +21,12 @@ Evened = tuple[np.ndarray, np.ndarray, np.ndarray, Constraints]  # quads as they
 def split(part: Part, ahead: Running | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Quads of any part (quad_split), evened out on its surface where that makes better ones; ahead: as begun() gave it."""
     request = part.request
-    done = ahead and ahead.if_done() or split_evened(part.vertices, part.faces, part.quads, request, part.surface)
+    if part.cut is not None:
+        given = part.vertices, part.faces, part.cut, request
+        child = _begin("cut_evened", *given) if cores() > 1 and request.threads > 1 else None  # other pieces keep this process busy
+        done = child and child.if_done() or cut_evened(*given)
+    else:
+        done = ahead and ahead.if_done() or split_evened(part.vertices, part.faces, part.quads, request, part.surface)
     return better(*done, part.surface, request, part.fine()), done[1]
 
 
@@ -35,13 +41,15 @@ def begun(part: Part) -> Running | None:
 def split_evened(vertices: np.ndarray, faces: np.ndarray, quads: int, request: Request, surface: Surface | None = None) -> Evened:
     """About so many quads of even triangles, else of the mesh's own."""
     quads = split_count(faces, quads)
+    if few_for_even(faces, quads):
+        return own_evened(vertices, faces, quads, request, surface)
     ahead = _begin("own_evened", vertices, faces, quads, request) if cores() > 1 and len(faces) >= _WORTH_A_CHILD else None
-    surface = Surface(vertices, faces) if surface is None else surface
+    ground = _ground(vertices, faces, quads, request, surface)
     try:
-        found = of_even(vertices, faces, quads, request.crease_degrees, request.for_the_rest, request.memory_mb)
+        found = of_even(vertices, faces, quads, request.crease_degrees, request.for_the_rest, request.memory_mb, lambda: ground.features)
         if found is not None:
-            return *found, *evened(*found, surface, request)
-        return ahead and ahead.if_done() or own_evened(vertices, faces, quads, request, surface)
+            return _evened(found, ground)
+        return ahead and ahead.if_done() or own_evened(vertices, faces, quads, request, ground.surface)
     finally:
         if ahead is not None:
             ahead.kill()
@@ -49,10 +57,27 @@ def split_evened(vertices: np.ndarray, faces: np.ndarray, quads: int, request: R
 
 def own_evened(vertices: np.ndarray, faces: np.ndarray, quads: int, request: Request, surface: Surface | None = None) -> Evened:
     """So many quads of the mesh's own triangles."""
-    found = of_own(vertices, faces, quads, request.for_the_rest)
-    return *found, *evened(*found, Surface(vertices, faces) if surface is None else surface, request)
+    ground = _ground(vertices, faces, quads, request, surface)
+    return _evened(of_own(vertices, faces, quads, request.for_the_rest, lambda: ground.features), ground)
 
 
-def _begin(name: str, vertices: np.ndarray, faces: np.ndarray, quads: int, request: Request) -> Running:
-    return begin(f"gdtool.geometry.quad_child:{name}", vertices, faces, quads, request, seconds=request.for_the_rest, memory_mb=request.memory_mb,
+def cut_evened(vertices: np.ndarray, faces: np.ndarray, cut: tuple[np.ndarray, np.ndarray], request: Request) -> Evened:
+    """Quads that were made before."""
+    return _evened(cut, _ground(vertices, faces, len(cut[1]), request))
+
+
+def _ground(vertices: np.ndarray, faces: np.ndarray, quads: int, request: Request, surface: Surface | None = None) -> Part:
+    """What so many quads are evened out on: the surface and its features, those for their own edge length."""
+    surface = Surface(vertices, faces) if surface is None else surface
+    ground = Part(vertices, faces, quads, (face_normals(vertices, faces)[1].sum() / quads) ** 0.5, request, lambda: surface)
+    ground.surface = surface
+    return ground
+
+
+def _evened(found: tuple[np.ndarray, np.ndarray], ground: Part) -> Evened:
+    return *found, *evened(*found, ground.surface, ground.features, ground.request)
+
+
+def _begin(name: str, vertices: np.ndarray, faces: np.ndarray, made: int | tuple[np.ndarray, np.ndarray], request: Request) -> Running:
+    return begin(f"gdtool.geometry.quad_child:{name}", vertices, faces, made, request, seconds=request.for_the_rest, memory_mb=request.memory_mb,
                  in_case=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gdtool.geometry import topology
-from gdtool.geometry.features import Constraints, Features, find_features, trace, untied
+from gdtool.geometry.features import Constraints, Features, trace, untied
 from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian
 from gdtool.geometry.quad_collapse import without_folded
 from gdtool.geometry.quad_paths import crossed, cut_along_features, held_at_centres, to_rim
@@ -105,10 +105,9 @@ def _unfolded(vertices: np.ndarray, faces: np.ndarray, surface: Surface, feature
     return ease(vertices, faces, surface, features, constraints, tips=tips)
 
 
-def evened(quad_vertices: np.ndarray, quad_faces: np.ndarray, surface: Surface, request: Request) -> tuple[np.ndarray, Constraints]:
+def evened(quad_vertices: np.ndarray, quad_faces: np.ndarray, surface: Surface, features: Features, request: Request) -> tuple[np.ndarray, Constraints]:
     """Vertices of quads of a surface evened out on it, whatever becomes of the quads, and what they are held to."""
     edge = (polygon_normals(quad_vertices, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
-    features = find_features(surface.vertices, surface.faces, request.crease_degrees or 181.0, 3 * edge)
     traced, constraints = trace(quad_vertices, quad_faces, features, edge)
     constraints = untied(traced, quad_faces, constraints)
     traced = relax(onto(traced, surface, features, constraints), quad_faces, surface, features, constraints, request.smooth_iterations)

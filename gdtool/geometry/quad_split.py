@@ -1,21 +1,26 @@
 """Quads without an engine, by a construction that cannot fail: even triangles, joined in pairs, every face cut in quads.
 
 Quads (split_count(faces, quads), 4) of any triangle mesh, in one way or the other: no piece is lost, closed and manifold where the triangles
-are. vertices (v, 3) in a unit box, faces (f, 3); seconds and memory_mb: limits of each run in a child, whose failure costs evenness alone.
+are. vertices (v, 3) in a unit box, faces (f, 3); seconds and memory_mb: limits of each run in a child, whose failure costs evenness alone;
+meanwhile: called while one works.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
 from gdtool.core.child import ChildFailed, call
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_shape import subdivide
+from gdtool.geometry.quad_task import QUADS_OF_A_PIECE
 from gdtool.geometry.simplify import simplify
-from gdtool.geometry.topology import compact, components, edges_of, invariants, is_manifold
+from gdtool.geometry.topology import compact, components, edges_of, handles, invariants, is_manifold
 
 _QUADS_PER_TRIANGLE = 2.25  # of pair_and_split, where most triangles find a partner
 _EVEN_COUNT = 0.03  # even_triangles come so near to the number asked for
+_FOR_A_HANDLE, _FOR_A_PIECE = 80, 12  # triangles: of fewer, even ones lose some handles or pieces
 _NEARER = 0.5  # each length tried brings the logarithm of their number so much nearer, where it can be had
 _TRIES = 3
 _APART = 1e-6  # of the size, between vertices that coincide
@@ -23,15 +28,21 @@ _APART = 1e-6  # of the size, between vertices that coincide
 
 def split_count(faces: np.ndarray, quads: int) -> int:
     """How many quads are made where so many are asked for: enough for every piece."""
-    return max(quads, 12 * components(faces)[0])
+    return max(quads, QUADS_OF_A_PIECE * components(faces)[0])
 
 
-def of_even(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float, seconds: float,
-            memory_mb: int) -> tuple[np.ndarray, np.ndarray] | None:
+def few_for_even(faces: np.ndarray, quads: int) -> bool:
+    """Whether so many quads would be of too few even triangles to keep all pieces and handles."""
+    triangles, pieces = quads / _QUADS_PER_TRIANGLE, components(faces)[0]
+    return triangles < _FOR_A_PIECE * pieces or triangles < _FOR_A_HANDLE * handles(faces, pieces)
+
+
+def of_even(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float, seconds: float, memory_mb: int,
+            meanwhile: Callable[[], object] = lambda: None) -> tuple[np.ndarray, np.ndarray] | None:
     """Quads of even triangles of the same topology, creases sharper than crease_degrees kept; None where there are none that split into so
     many, as on what is small and intricate."""
     triangles = int(quads / _QUADS_PER_TRIANGLE)
-    few_vertices, few = simplify(vertices, faces, 2 * triangles, seconds=seconds, careful=True, measured=False)[:2]
+    few_vertices, few = simplify(vertices, faces, 2 * triangles, seconds=seconds, careful=True, measured=False, meanwhile=meanwhile)[:2]
     try:
         out, found = call("gdtool.geometry.quad_split:even_triangles", few_vertices, few, triangles, crease_degrees, seconds=seconds,
                           memory_mb=memory_mb)
@@ -70,7 +81,7 @@ def even_triangles(vertices: np.ndarray, faces: np.ndarray, triangles: int, crea
     return vertices, found
 
 
-def of_own(vertices: np.ndarray, faces: np.ndarray, quads: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+def of_own(vertices: np.ndarray, faces: np.ndarray, quads: int, seconds: float, meanwhile: Callable[[], object] = lambda: None) -> tuple[np.ndarray, np.ndarray]:
     """Quads of the mesh's own triangles, cut in four or collapsed to the right number."""
     import igl
 
@@ -79,7 +90,7 @@ def of_own(vertices: np.ndarray, faces: np.ndarray, quads: int, seconds: float) 
         vertices, faces = (np.asarray(x) for x in igl.upsample(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64), 1))
     best = None
     for _ in range(_TRIES):
-        found = pair_and_split(*_collapsed(vertices, faces, triangles, seconds), quads)
+        found = pair_and_split(*_collapsed(vertices, faces, triangles, seconds, meanwhile), quads)
         if best is None or abs(len(found[1]) - quads) < abs(len(best[1]) - quads):
             best = found
         if abs(len(found[1]) / quads - 1) < _EVEN_COUNT:
@@ -88,13 +99,14 @@ def of_own(vertices: np.ndarray, faces: np.ndarray, quads: int, seconds: float) 
     return best
 
 
-def _collapsed(vertices: np.ndarray, faces: np.ndarray, triangles: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+def _collapsed(vertices: np.ndarray, faces: np.ndarray, triangles: int, seconds: float, meanwhile: Callable[[], object]) -> tuple[np.ndarray, np.ndarray]:
     """So many triangles, or a few more: a collapse that loses pieces is tried again more gently before the mesh is taken as it is."""
     pieces = components(faces)[0]
     for factor in (1.0, 1.15, 1.3, 1.6, 2.0, 4.0):
         if factor * triangles >= len(faces):
             break
-        out, out_faces, _, _ = simplify(vertices, faces, int(factor * triangles), seconds=seconds, careful=True, measured=False)
+        out, out_faces, _, _ = simplify(vertices, faces, int(factor * triangles), seconds=seconds, careful=True, measured=False,
+                                          meanwhile=meanwhile)
         if components(out_faces)[0] == pieces and is_manifold(out_faces) >= is_manifold(faces):
             return out, out_faces
     return vertices, faces

@@ -17,6 +17,7 @@ from gdtool.geometry.quad_shape import Surface
 from gdtool.geometry.rays import RayCaster, dot
 
 COUNT_TOLERANCE = 0.03
+QUADS_OF_A_PIECE = 12  # at least
 _ENGINES_SHARE, _LEAST_SECONDS = 0.7, 20.0
 _SHORTEST_RUN = 0.05  # seconds
 _NARROW_EDGES, _FEW_NARROW = 1.5, 0.05  # share of the creases' length
@@ -88,6 +89,7 @@ class Part:
     fine: Callable[[], Surface]  # the whole input as it was before it was simplified
     given_up: bool = False  # no engine is tried
     tolerance: float = COUNT_TOLERANCE  # share of the quads that there may be more or fewer
+    cut: tuple[np.ndarray, np.ndarray] | None = None  # quads of its own triangles, where these were made before
 
     def of(self, faces: np.ndarray, quads: int, given_up: bool = False, tolerance: float = COUNT_TOLERANCE) -> Part:
         """Some of the triangles: faces (f,) bool."""
@@ -101,6 +103,15 @@ class Part:
     def pieces(self) -> tuple[int, np.ndarray]:
         """How many, and which each triangle belongs to."""
         return topology.components(self.faces)
+
+    @property
+    def crumbs(self) -> bool:
+        """Whether it is pieces of fewer quads each than the least that one is made of."""
+        return self.quads < QUADS_OF_A_PIECE * self.pieces[0]
+
+    @cached_property
+    def handles(self) -> int:
+        return topology.handles(self.faces, self.pieces[0])
 
     @cached_property
     def piece_areas(self) -> np.ndarray:

@@ -19,6 +19,7 @@ _MOST_TORN = 0.1  # of the quads may be missing from a result that another densi
 # Megabytes that an engine has, and more for each quad and triangle: several times what it needs, but for holes that Instant Meshes
 # fills for ever, with half a gigabyte a second.
 _MEMORY = 2000, 4e-3
+_FOR_A_HANDLE = 250  # quads: a coarser mesh subdivided to fewer loses some
 _MANY = 3000  # quads of a mesh that is tried coarser and subdivided
 
 Found = tuple[np.ndarray, np.ndarray, str]  # vertices (v, 3), quads (q, 4), the way that they were made
@@ -82,8 +83,8 @@ class Trial:
                 self.record.failed.append(f"{way.label}: not tried, the time is over")
                 self._over = True
                 return self._passed() or self._bridged()
-            if way.subdivisions and self.part.narrow:
-                self.record.failed.append(f"{way.label}: not tried, its quads are wider than the strips between creases")
+            if way.subdivisions and (why := self._hopeless()):
+                self.record.failed.append(f"{way.label}: not tried, {why}")
                 continue
             tried = not way.subdivisions and self._passable is not None
             if way.engine not in self._given_up and (found := self._by(way)) is not None:
@@ -93,6 +94,12 @@ class Trial:
             if tried or self._second_best is not None:
                 break  # what one density bridges, another does too
         return self._passed() or self._bridged()
+
+    def _hopeless(self) -> str | None:
+        """What is known to be wrong with a coarser mesh subdivided before it is made."""
+        if self.part.quads < _FOR_A_HANDLE * self.part.handles:
+            return f"so few quads lose some of {self.part.handles} handles"
+        return "its quads are wider than the strips between creases" if self.part.narrow else None
 
     def _by(self, way: Way) -> Found | None:
         quads = self.part.quads

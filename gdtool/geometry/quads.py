@@ -17,12 +17,14 @@ from gdtool.geometry.quad_fallback import split
 from gdtool.geometry.quad_fit import farthest
 from gdtool.geometry.quad_pieces import SMALL_PIECE_QUADS, apart, by_size, joined, well_made
 from gdtool.geometry.quad_shape import Surface
+from gdtool.geometry.quad_split import of_own, split_count
 from gdtool.geometry.quad_spread import spread
 from gdtool.geometry.quad_task import Part, Record, Request
 from gdtool.geometry.quad_ways import Found, Trial, prepare_engines
 from gdtool.geometry.simplify import SHAKEN, median_edge, simplify
 
 _GAP = 8.0  # edge lengths between pieces: none of what is asked of a surface reaches so far
+_FOR_A_HANDLE = 100  # quads: with fewer engines lose some
 _SHAKEN_OFF = 3.0  # of the noise that keeps triangles even, which moves few of their corners farther off the surface
 
 
@@ -47,10 +49,19 @@ def _remeshed(vertices: np.ndarray, faces: np.ndarray, edge: float, request: Req
     record, fine = Record(), cache(lambda: Surface(vertices, faces))
     whole = _coarse(vertices, faces, edge, request, record, fine)
     few, large = by_size(whole)
-    done = _quads_of(few, record) if few is not None else []
     # Small pieces cannot always be made of as few quads as asked for; the count holds for the sum.
-    large.quads = max(request.quads - sum(len(found) for _, found, _ in done), 4)
-    done = _quads_of(large, record) + done
+    if few is None:
+        done = _quads_of(large, record)
+    elif few.crumbs:
+        start = time.perf_counter()
+        few.cut = of_own(few.vertices, few.faces, split_count(few.faces, few.quads), request.for_the_rest)
+        record.clock("fallback", start)
+        large.quads = max(request.quads - len(few.cut[1]), 4)
+        done = _side_by_side([large, few], record)
+    else:
+        small = _quads_of(few, record)
+        large.quads = max(request.quads - sum(len(found) for _, found, _ in small), 4)
+        done = _quads_of(large, record) + small
     record.source = fine()
     record.engine = "; ".join(dict.fromkeys(way for _, _, way in done))
     return *joined([found[:2] for found in done]), record
@@ -84,7 +95,7 @@ def _coarse(vertices: np.ndarray, faces: np.ndarray, edge: float, request: Reque
 def _quads_of(part: Part, record: Record) -> list[Found]:
     """The quads of a mesh, or those of parts of it that were made in different ways."""
     ahead = None
-    if not part.given_up and part.quads >= SMALL_PIECE_QUADS and part.request.engine != "split":
+    if _for_engines(part, record):
         trial = Trial(part, record)
         if (found := trial.run()) is not None:
             return [found]
@@ -93,18 +104,37 @@ def _quads_of(part: Part, record: Record) -> list[Found]:
             found, good = well_made(part, trial.whole)
             left = apart(part, good, part.quads - (len(found[1]) if found is not None else 0))
             record.clock("pieces", start)
-            records = [Record() for _ in left]
-            rest = mapped(lambda k: _quads_of(left[k], records[k]), range(len(left)), min(part.request.threads, len(left)))
-            out = [] if found is None else [found]
-            for own, made in zip(records, rest, strict=True):
-                out += made
-                record.add(own)
-            return out
+            return ([] if found is None else [found]) + _side_by_side(left, record)
         ahead = trial.fallback
     start = time.perf_counter()
     found = *split(part, ahead), "pair and split"
     record.clock("fallback", start)
     return [found]
+
+
+def _side_by_side(parts: list[Part], record: Record) -> list[Found]:
+    """_quads_of() of each part."""
+    records, out = [Record() for _ in parts], []
+    made = mapped(lambda k: _quads_of(parts[k], records[k]), range(len(parts)), min(parts[0].request.threads, len(parts)) if parts else 1)
+    for own, found in zip(records, made, strict=True):
+        out += found
+        record.add(own)
+    return out
+
+
+def _for_engines(part: Part, record: Record) -> bool:
+    """Whether engines are to be tried on a part."""
+    if part.given_up or part.quads < SMALL_PIECE_QUADS or part.request.engine == "split":
+        return False
+    why, pieces = None, part.pieces[0]
+    if part.request.engine == "auto":
+        if part.crumbs:
+            why = f"{pieces} pieces of so few quads"
+        elif pieces == 1 and part.quads < _FOR_A_HANDLE * part.handles:
+            why = f"so few quads lose some of {part.handles} handles"
+    if why:
+        record.failed.append(f"engines: not tried, {why}")
+    return why is None
 
 
 def _needed(request: Request) -> int:

@@ -174,6 +174,19 @@ def euler_number(faces: np.ndarray) -> int:
     return len(np.unique(faces[faces >= 0])) - len(edges_of(faces).ends) + len(faces)
 
 
+def handles(faces: np.ndarray, pieces: int, edges: Edges | None = None) -> int:
+    """How many handles a manifold of so many pieces has, by Euler's formula, from the loops of its rim; edges: its own, where they are known."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    edges = edges_of(faces) if edges is None else edges
+    rim = edges.ends[edges.count == 1]
+    corners, local = np.unique(rim, return_inverse=True)
+    one, two = local.reshape(-1, 2).T
+    loops = connected_components(coo_matrix((np.ones(len(one)), (one, two)), (len(corners),) * 2), False)[0] if len(rim) else 0
+    return pieces - (loops + len(np.unique(faces[faces >= 0])) - len(edges.ends) + len(faces)) // 2
+
+
 def invariants(faces: np.ndarray) -> tuple[bool, bool, int, int]:
     """Watertight, manifold, pieces, Euler number: what a mesh must not change in when it is made coarser or even."""
     if (twins := twins_of(faces)) is not None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gdtool.geometry.normals import face_normals
-from gdtool.geometry.topology import Edges, edges_of
+from gdtool.geometry.topology import Edges, edges_of, handles
 from gdtool.texture.raster import owned_texels, owner_count
 
 _SLIM_STEPS = (2, 2, 4, 6, 8)
@@ -36,7 +36,7 @@ def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, ma
     disk = is_disk(len(vertices), triangles, edges)
     if uv is not None and surface.stretch(uv) < good_stretch and not lies_on_itself(uv, triangles, edges, disk):
         return Flat(uv)
-    if not disk and _handles(len(vertices), triangles, edges):
+    if not disk and edges.count.max() == 2 and handles(triangles, 1, edges):  # no part of the plane has any
         return Flat(None, "has a handle")
     uv = _conformal(vertices, triangles, edges.ends[border])
     if uv is None or not upright(uv, triangles):
@@ -66,21 +66,6 @@ def upright(uv: np.ndarray, triangles: np.ndarray) -> bool:
     """Whether all triangles (t, 3) in uv (v, 2) have an area and are counter-clockwise."""
     area = _areas(uv, triangles)
     return bool(np.isfinite(area).all() and (area > 1e-10 * max(area.max(initial=0), 1e-300)).all())
-
-
-def _handles(vertices: int, triangles: np.ndarray, edges: Edges) -> bool:
-    """Whether triangles (t, 3) of so many vertices, connected, each vertex with one fan, with these edges, have handles: no part of the plane
-    has any. By Euler's formula, from the loops of their rim."""
-    if edges.count.max() > 2:
-        return False
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    rim = edges.ends[edges.count == 1]
-    corners, local = np.unique(rim, return_inverse=True)
-    one, two = local.reshape(-1, 2).T
-    loops = connected_components(coo_matrix((np.ones(len(one)), (one, two)), (len(corners),) * 2), False)[0]
-    return 2 - loops > vertices - len(edges.ends) + len(triangles)
 
 
 def _scaled(uv: np.ndarray, triangles: np.ndarray, area: np.ndarray) -> np.ndarray:

@@ -49,6 +49,15 @@ def torus(n: int = 40) -> tuple[np.ndarray, np.ndarray]:
     return marching(lambda x, y, z: np.hypot(np.hypot(x, z) - 0.65, y) - 0.28, n, 1.03)
 
 
+def lattice(cells: int = 3, n: int = 40) -> tuple[np.ndarray, np.ndarray]:
+    """A cube of what Schwarz' P surface bounds, of so many periods along an edge: of three, 28 handles."""
+    def field(x, y, z):
+        waves = sum(np.cos(np.pi * cells * (axis / 0.9 + 1)) for axis in (x, y, z))
+        return np.maximum(waves, 20 * (np.maximum(np.maximum(abs(x), abs(y)), abs(z)) - 0.9))
+
+    return marching(field, n)
+
+
 def bored_box(n: int = 56) -> tuple[np.ndarray, np.ndarray]:
     """A box of half sides 0.8, 0.6, 0.5 with a bore of radius 0.3 along z: twelve straight creases and two circles."""
     def field(x, y, z):

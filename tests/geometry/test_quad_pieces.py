@@ -94,6 +94,18 @@ def test_small_piece_is_not_lost():
     assert np.linalg.norm(out - 0.45, axis=1).min() < 0.05
 
 
+def test_pieces_of_a_few_quads_each_are_not_given_to_an_engine(monkeypatch):
+    """Twenty boxes of about eight quads each beside a ball: an engine sees the ball alone; large and small ones are made side by side."""
+    vertices, faces = cube(0.02)
+    vertices, faces = joined(sphere(48, 0.4), *((vertices + (0.45, 0.05 * k - 0.5, 0), faces) for k in range(20)))
+    tried, run = [], quad_ways.Trial.run
+    monkeypatch.setattr(quad_ways.Trial, "run", lambda trial: tried.append(trial.part.pieces[0]) or run(trial))
+    one, two = (quads.remesh(vertices, faces, Request(quads=4000, threads=threads)) for threads in (1, 2))
+    assert tried == [1, 1] and "engines: not tried, 20 pieces of so few quads" in one[2].failed
+    assert np.array_equal(one[0], two[0]) and np.array_equal(one[1], two[1])
+    assert topology.components(one[1])[0] == 21 and whole(one[1]) and abs(len(one[1]) / 4000 - 1) <= 0.03
+
+
 def test_the_count_holds_where_small_pieces_take_more_than_their_share():
     """A tray of ten triangles comes out of the fallback as two dozen quads however few are asked for."""
     corners = np.stack(np.meshgrid(*[np.arange(5)] * 3, indexing="ij"), -1).reshape(-1, 3)[:100]

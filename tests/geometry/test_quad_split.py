@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from gdtool.folders.mesh import triangulated
-from gdtool.geometry import quad_fit, quad_split, quads, simplify, topology
+from gdtool.geometry import quad_fallback, quad_fit, quad_split, quads, simplify, topology
+from gdtool.geometry.features import NO_FEATURES
 from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, shape_figures
 from gdtool.geometry.quad_shape import Surface
 from gdtool.geometry.quad_split import pair_and_split
 from gdtool.geometry.quad_task import Request
 from tests.geometry.engines import whole
-from tests.geometry.solids import cube, joined, rod, sphere, volume
+from tests.geometry.solids import cube, joined, rod, sphere, torus, volume
 
 
 def test_pairing_gives_the_asked_count_exactly():
@@ -50,6 +51,17 @@ def test_even_triangles_are_sought_no_longer_than_they_come_nearer_to_their_numb
     assert abs(len(quad_split.even_triangles(*sphere(24), 500, 30.0)[1]) / 500 - 1) < 0.05 and 1 <= len(runs) <= 4
 
 
+@pytest.mark.parametrize("mesh, quads, few", [(sphere(24), 100, False), (sphere(24), 20, True), (torus(24), 200, False), (torus(24), 120, True),
+                                              (joined(*[sphere(8)] * 9), 260, False), (joined(*[sphere(8)] * 9), 240, True)])
+def test_even_triangles_that_would_be_too_few_are_not_sought(monkeypatch, mesh, quads, few):
+    """Twelve for a piece, and eighty for a handle."""
+    sought = []
+    monkeypatch.setattr(quad_fallback, "of_even", lambda *given: sought.append(given))
+    monkeypatch.setattr(quad_fallback, "split_count", lambda faces, quads: quads)
+    _, faces, *_ = quad_fallback.split_evened(*mesh, quads, Request(quads=quads))
+    assert quad_split.few_for_even(mesh[1], quads) == few and len(sought) == (not few) and topology.is_watertight(faces)
+
+
 def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
     """Pins with few triangles around: what bends too much stays single, and there are fewer triangles for it."""
     vertices, faces = joined(*((pin[0] + (0.3 * k, 0, 0), pin[1]) for k, pin in enumerate([rod(24)] * 8)))
@@ -85,7 +97,7 @@ def test_quads_without_area_are_evened_out_where_their_neighbours_stay(monkeypat
     assert polygon_normals(split, quad_faces)[1][100] < 1e-12
     monkeypatch.setattr(quad_fit, "_let_go", lambda *given: np.arange(len(quad_faces)))
     surface, request = Surface(vertices, faces), Request(quads=600)
-    out = quad_fit.better(split, quad_faces, *quad_fit.evened(split, quad_faces, surface, request), surface, request, surface)
+    out = quad_fit.better(split, quad_faces, *quad_fit.evened(split, quad_faces, surface, NO_FEATURES, request), surface, request, surface)
     edge = (polygon_normals(out, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
     assert polygon_normals(out, quad_faces)[1].min() > 1e-4 * edge**2
     touched = np.isin(quad_faces, quad_faces[100]).any(1)

@@ -6,9 +6,10 @@ import pytest
 from gdtool.folders.mesh import triangulated
 from gdtool.geometry import quads, simplify, topology
 from gdtool.geometry.mesh_quality import distance_figures, shape_figures
+from gdtool.geometry.quad_engines import ENGINES
 from gdtool.geometry.quad_task import Request
-from tests.geometry.engines import whole
-from tests.geometry.solids import assembly, bored_box, cube, plane, sphere, torus, volume
+from tests.geometry.engines import in_this_process, whole
+from tests.geometry.solids import assembly, bored_box, cube, lattice, plane, sphere, torus, volume
 
 
 @pytest.mark.slow
@@ -49,6 +50,23 @@ def test_torus_keeps_its_hole():
     out, found, _ = quads.remesh(vertices / 2, faces, Request(quads=1500))
     assert whole(found) and len(out) == len(found)  # Euler characteristic 0: E = 2F, V = F
     assert volume(out, found) == pytest.approx(2 * np.pi**2 * 0.65 * 0.28**2 / 8, rel=0.02)
+
+
+@pytest.mark.parametrize("each, ways", [(70, {"engines"}), (220, {"instant-meshes, 1 subdivision"})])
+def test_a_net_of_so_many_handles_that_engines_lose_some_keeps_all(each, ways):
+    """With few quads for each handle what would fail is not tried: no engine, or only none that starts from fewer still."""
+    vertices, faces = lattice()
+    out, found, record = quads.remesh(vertices / 2, faces, Request(quads=28 * each))
+    assert whole(found) and topology.handles(found, 1) == 28 and abs(len(found) / (28 * each) - 1) <= 0.03
+    assert ways == {line.split(":")[0] for line in record.failed if "not tried" in line and "28 handles" in line}
+    assert record.engine == ("pair and split" if each < 100 else "instant-meshes")
+    assert shape_figures(out, found)["jacobian_mean"] > 0.75 and shape_figures(out, found)["folded_share"] < 1e-3
+
+
+def test_an_engine_that_is_asked_for_is_tried_whatever_the_handles(monkeypatch):
+    tried = in_this_process(monkeypatch, lambda *given: ENGINES["instant-meshes"](*given))
+    quads.remesh(*lattice(), Request(quads=1000, engine="instant-meshes"))
+    assert tried
 
 
 def test_creases_lie_on_quad_edges():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.geometry import topology
-from tests.geometry.solids import plane, torus
+from tests.geometry.solids import joined, lattice, plane, sphere, torus
 
 
 def test_plane_is_manifold_and_not_watertight():
@@ -17,6 +17,16 @@ def test_plane_is_manifold_and_not_watertight():
 def test_torus_has_euler_characteristic_zero():
     vertices, faces = torus()
     assert len(vertices) - len(topology.edges_of(faces).ends) + len(faces) == 0 == topology.euler_number(faces)
+
+
+@pytest.mark.parametrize("mesh, cut, handles", [(sphere(12), 0, 0), (torus(20), 0, 1), (torus(20), 40, 1), (plane(4), 0, 0), (lattice(), 0, 28),
+                                                (joined(torus(20), sphere(12), plane(4)), 0, 1)], ids=["ball", "ring", "open ring", "sheet", "net", "several"])
+def test_handles(mesh, cut, handles):
+    """As many as there are however many loops the rim has."""
+    vertices, faces = mesh
+    faces = faces[cut:]
+    pieces = topology.components(faces)[0]
+    assert topology.handles(faces, pieces) == topology.handles(faces, pieces, topology.edges_of(faces)) == handles
 
 
 def test_quads_and_triangles_share_edges():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from gdtool.core.child import ChildFailed
 from gdtool.texture import unwrap_lay
 from gdtool.texture.unwrap import Request, figures, unwrap
 from gdtool.texture.unwrap_flatten import overlapping, stretch
@@ -77,7 +78,7 @@ def test_half_laid_in_a_child_is_what_is_laid_in_turn(monkeypatch, child):
     monkeypatch.setattr(unwrap_lay, "_BESIDE", np.inf if child == "none" else 4000)
     if child == "is gone":
         def fails(*_):
-            raise unwrap_lay.ChildFailed("is gone")
+            raise ChildFailed("is gone")
 
         monkeypatch.setattr("gdtool.core.child.Running.result", fails)
     charts, why = unwrap_lay.flatten_all(*how)
