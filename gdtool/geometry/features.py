@@ -11,6 +11,7 @@ from gdtool.geometry.topology import edges_of
 
 _CORNER_TURN_DEGREES = 50.0
 _THINNEST = 0.05  # height over longest side of a triangle that has no direction of its own: simplifying folds some over
+_SHORT_EDGES = 8.0  # around a curve that reaches no farther, vertices are found by their tree, around others along an axis
 _CHOICES = 4  # vertices that a curve may be drawn from where it has no corner of its own: the nearest may be another's
 _HANGING = 2.0  # times what is short: a corner from which longer segments go is drawn less far, for each would leave the surface all along
 _STRAIGHT = 0.35  # the sine of a quad's corner below which features may not hold both its sides
@@ -219,8 +220,12 @@ def trace(vertices: np.ndarray, faces: np.ndarray, features: Features, edge: flo
             continue
         local_points = features.points[segments]
         low, high = local_points.min((0, 1)) - 1.5 * edge, local_points.max((0, 1)) + 1.5 * edge
-        slab = np.sort(by_x[np.searchsorted(sorted_x, low[0]):np.searchsorted(sorted_x, high[0], "right")])
-        near = slab[((vertices[slab] >= low) & (vertices[slab] <= high)).all(1)]
+        if (radius := np.linalg.norm(high - low) / 2) < _SHORT_EDGES * edge:
+            around = np.array(tree.query_ball_point((low + high) / 2, radius, return_sorted=True), np.int64)
+        else:
+            around = np.sort(by_x[np.searchsorted(sorted_x, low[0]):np.searchsorted(sorted_x, high[0], "right")])
+        place = vertices[around]
+        near = around[((place >= low) & (place <= high)).all(1)]
         far, _, _ = closest_on_segments(vertices[near], features.points, segments)
         near, far = near[far < 1.5 * edge], far[far < 1.5 * edge]
         allowed[live], number[live] = np.inf, -1  # of the curve before
