@@ -9,5 +9,6 @@ import scipy.spatial
 from gdtool.geometry.quad_ahead import finished
 from gdtool.geometry.quad_candidate import candidate
 from gdtool.geometry.quad_fallback import cut_evened, own_evened, split_evened
+from gdtool.geometry.quads import quads_of
 
-__all__ = ["candidate", "cut_evened", "finished", "igl", "own_evened", "scipy", "split_evened"]
+__all__ = ["candidate", "cut_evened", "finished", "igl", "own_evened", "quads_of", "scipy", "split_evened"]

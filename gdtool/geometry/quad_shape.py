@@ -159,6 +159,14 @@ class Lists:
     def __getitem__(self, key: int) -> np.ndarray:
         return self.value[self.start[key]:self.start[key + 1]]
 
+    def lengths(self, keys: np.ndarray) -> np.ndarray:
+        return self.start[keys + 1] - self.start[keys]
+
+    def rows(self, keys: np.ndarray) -> np.ndarray:
+        """The lists of keys (k,), none of which is empty, as rows: short ones end in their last value again and again."""
+        length = self.lengths(keys)
+        return self.value[self.start[keys][:, None] + np.minimum(np.arange(length.max()), length[:, None] - 1)]
+
 
 def incidence(faces: np.ndarray, count: int) -> Lists:
     """The faces around each vertex."""

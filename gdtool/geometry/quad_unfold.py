@@ -13,6 +13,7 @@ _LET_OFF_BELOW = 0.22  # a vertex leaves its feature for a quad with a smaller s
 _LOOSE_ROUNDS = 4
 _GAIN = 1e-3  # of the worst scaled Jacobian, for which a vertex moves
 _ANGLES = np.arange(8) * (np.pi / 4)
+_PLACES = 4 + 2 * len(_ANGLES)
 _NEAR, _FAR = 0.12, 0.35  # of the mean distance to the neighbours: radii of the rings of places
 
 
@@ -44,12 +45,15 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
         if most_visits < 0:
             break
         may = touched[~(constraints.fixed[touched] & (not loose)) & (~boundary | held)[touched]]
-        for batch in _apart(may, faces, ring, near):
+        for batch in _apart(may, faces, ring):
             batch = batch[~settled[batch]]
             if not len(batch):
                 continue
-            around = np.stack([ring[v] for v in batch])
-            places = _places(vertices, batch, faces[around], np.stack([near[v] for v in batch]))
+            around, size = ring.rows(batch), np.stack([ring.lengths(batch), near.lengths(batch)], -1)
+            places = np.empty((len(batch), _PLACES, 3))
+            for alike in {tuple(one) for one in size.tolist()}:
+                of = (size == alike).all(1)
+                places[of] = _places(vertices, batch[of], faces[ring.rows(batch[of])], near.rows(batch[of]))
             tied = held[batch] & (not loose)
             if not tied.all():
                 places[~tied, 1:] = surface.closest(places[~tied, 1:].reshape(-1, 3))[2].reshape(-1, places.shape[1] - 1, 3)
@@ -63,19 +67,21 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
     return vertices
 
 
-def _apart(chosen: np.ndarray, faces: np.ndarray, ring: Lists, near: Lists) -> list[np.ndarray]:
-    """The chosen vertices (n,) in batches: of one share no face, and have as many faces and as many neighbours."""
-    batches: dict[tuple[int, int, int], list[int]] = {}
+def _apart(chosen: np.ndarray, faces: np.ndarray, ring: Lists) -> list[np.ndarray]:
+    """The chosen vertices (n,) in batches: those of one share no face."""
+    batches: list[list[int]] = []
     color: dict[int, int] = {}
     for v in chosen.tolist():
         taken = {color.get(u) for u in faces[ring[v]].ravel().tolist()}
         color[v] = next(c for c in range(len(taken) + 1) if c not in taken)
-        batches.setdefault((color[v], len(ring[v]), len(near[v])), []).append(v)
-    return [np.array(batches[key]) for key in sorted(batches)]
+        if color[v] == len(batches):
+            batches.append([])
+        batches[color[v]].append(v)
+    return [np.array(batch) for batch in batches]
 
 
 def _places(vertices: np.ndarray, batch: np.ndarray, quads: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """(n, p, 3) places that vertices (n,) may move to, the first of them where they are; quads (n, k, 4) and neighbours (n, m) around them."""
+    """(n, _PLACES, 3) places that vertices (n,) may move to, the first of them where they are; quads (n, k, 4) and neighbours (n, m) around them."""
     here, beside = vertices[batch][:, None], vertices[near]
     mean = beside.mean(1, keepdims=True)
     spread = np.linalg.norm(beside - mean, axis=2).mean(1)[:, None, None]

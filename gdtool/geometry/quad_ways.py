@@ -162,7 +162,8 @@ class Trial:
             for child in running:
                 child.kill()
             self.record.failed.append(f"{way.label}: given up, walls are thinner than its quads")
-            running = []
+            self.record.clock("engine", start)
+            return []
         _ = part.features, part.surface, part.fine()
         out = []
         for child in running:

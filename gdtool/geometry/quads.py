@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from importlib import import_module
+from threading import Lock
 
 import numpy as np
 
-from gdtool.core.child import prepare
+from gdtool.core.child import begin, prepare
 from gdtool.core.threads import mapped
 from gdtool.geometry.halves import even
 from gdtool.geometry.normals import face_normals
@@ -24,6 +26,7 @@ from gdtool.geometry.quad_ways import Found, Trial, prepare_engines
 from gdtool.geometry.simplify import SHAKEN, median_edge, simplify
 
 _GAP = 8.0  # edge lengths between pieces: none of what is asked of a surface reaches so far
+_SOON_READ = 200_000  # triangles
 _FOR_A_HANDLE = 100  # quads: with fewer engines lose some
 _SHAKEN_OFF = 3.0  # of the noise that keeps triangles even, which moves few of their corners farther off the surface
 
@@ -113,13 +116,36 @@ def _quads_of(part: Part, record: Record) -> list[Found]:
 
 
 def _side_by_side(parts: list[Part], record: Record) -> list[Found]:
-    """_quads_of() of each part."""
-    records, out = [Record() for _ in parts], []
-    made = mapped(lambda k: _quads_of(parts[k], records[k]), range(len(parts)), min(parts[0].request.threads, len(parts)) if parts else 1)
-    for own, found in zip(records, made, strict=True):
+    """_quads_of() of each part: one here, the others meanwhile in children, where those soon read the input; threads wait for one another."""
+    threads, here, out = min(parts[0].request.threads, len(parts)) if parts else 1, Lock(), []
+
+    def made(part: Part) -> tuple[list[Found], Record]:
+        if part.cut is not None:  # these wait for a child of their own
+            return quads_of(part)
+        fine, free = part.fine(), here.acquire(blocking=False)
+        try:
+            done = None
+            if not free and len(fine.faces) <= _SOON_READ:
+                request, alone = part.request, replace(part, fine=None, request=replace(part.request, threads=1))
+                done = begin("gdtool.geometry.quad_child:quads_of", alone, fine.vertices, fine.faces, seconds=request.for_the_rest,
+                             memory_mb=request.memory_mb).if_done()
+            return done or quads_of(part)
+        finally:
+            if free:
+                here.release()
+
+    for found, own in mapped(made, parts, threads):
         out += found
         record.add(own)
     return out
+
+
+def quads_of(part: Part, *fine: np.ndarray) -> tuple[list[Found], Record]:
+    """The quads of a part, and the record of how; fine: vertices and faces of the input, in a child."""
+    if fine:
+        part.fine = cache(lambda: Surface(*fine))
+    record = Record()
+    return _quads_of(part, record), record
 
 
 def _for_engines(part: Part, record: Record) -> bool:

@@ -48,6 +48,21 @@ def test_pieces_side_by_side_come_out_as_one_after_the_other(monkeypatch):
     assert two_record.failed == one_record.failed and set(two_record.seconds) == set(one_record.seconds)
 
 
+@pytest.mark.parametrize("child", ["works", "is gone", "reads too much"])
+def test_pieces_made_in_children_come_out_as_here(monkeypatch, child):
+    """One is made here, another meanwhile in a child, or here too where that fails or the input is large."""
+    vertices, faces = joined(sphere(48, 0.25, (0, -0.2, 0)), sphere(40, 0.2, (0, 0.4, 0)), sphere(32, 0.15, (0.5, 0, 0)))
+    run, begun, begin = quad_ways.Trial.run, [], quads.begin
+    monkeypatch.setattr(quad_ways.Trial, "run", lambda trial: None if trial.part.pieces[0] > 1 else run(trial))
+    in_turn = quads.remesh(vertices, faces, Request(quads=3000))
+    name = "gdtool.geometry.quad_child:" + ("none" if child == "is gone" else "quads_of")
+    monkeypatch.setattr(quads, "begin", lambda _, *given, **more: begun.append(given) or begin(name, *given, **more))
+    monkeypatch.setattr(quads, "_SOON_READ", 0 if child == "reads too much" else len(faces))
+    out, found, record = quads.remesh(vertices, faces, Request(quads=3000, threads=2))
+    assert bool(begun) == (child != "reads too much") and record.engine == in_turn[2].engine and record.failed == in_turn[2].failed
+    assert np.array_equal(out, in_turn[0]) and np.array_equal(found, in_turn[1]) and topology.components(found)[0] == 3
+
+
 @pytest.mark.parametrize("hopeless", [False, True])
 def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless):
     """Of more than go one by one; where one of them fails, too, whatever is tried, it alone is paired triangles."""

@@ -5,9 +5,8 @@ import pytest
 
 from gdtool.geometry.features import Constraints, find_features
 from gdtool.geometry.mesh_quality import scaled_jacobian
-from gdtool.geometry.quad_shape import Surface, incidence, neighbours
+from gdtool.geometry.quad_shape import Surface, incidence
 from gdtool.geometry.quad_unfold import _apart, unfold
-from gdtool.geometry.topology import edges_of
 from tests.geometry.solids import cube, plane, quad_cube
 
 
@@ -71,9 +70,18 @@ def test_vertices_on_a_crease_slide_along_it():
 @pytest.mark.parametrize("mesh", [grid(7), quad_cube(2)])
 def test_batches_share_no_face_and_hold_all(mesh):
     vertices, faces = mesh
-    ring, near = incidence(faces, len(vertices)), neighbours(edges_of(faces).ends, len(vertices))
-    batches = _apart(np.arange(len(vertices)), faces, ring, near)
+    batches = _apart(np.arange(len(vertices)), faces, incidence(faces, len(vertices)))
     assert sorted(np.concatenate(batches)) == list(range(len(vertices)))
     for batch in batches:
         assert np.isin(faces, batch).sum(1).max() == 1
-        assert len({(len(ring[v]), len(near[v])) for v in batch}) == 1
+
+
+def test_vertices_of_a_batch_move_as_each_would_alone(monkeypatch):
+    """Whatever number of faces and neighbours the others have: folds beside the rim, in corners and within."""
+    vertices, faces, _ = folded(9)
+    vertices[[12, 38, 56], 1] += 0.2
+    how = faces, Surface(*plane()), find_features(*plane(), 181.0, 1.0), Constraints.none(len(vertices))
+    together, whole = unfold(vertices, *how), _apart
+    monkeypatch.setattr("gdtool.geometry.quad_unfold._apart", lambda *given: [batch[k:k + 1] for batch in whole(*given) for k in range(len(batch))])
+    np.testing.assert_array_equal(unfold(vertices, *how), together)
+    assert (together != vertices).any(1).sum() > 10
