@@ -46,6 +46,7 @@ PEERS_PYTHON ?=
 bench-assets: venv
 	$(BIN)/python benchmarks/remesh.py $(wildcard $(MESHES)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
 	$(BIN)/python benchmarks/remesh_draws.py
+	$(BIN)/python benchmarks/remesh_nets.py
 	$(BIN)/python benchmarks/remesh_models.py $(wildcard $(MESHES)) $(wildcard $(TEXTURED))
 	$(BIN)/python benchmarks/unwrap.py $(wildcard $(MESHES)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
 	$(BIN)/python benchmarks/bake.py $(wildcard $(TEXTURED)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))

@@ -27,7 +27,7 @@ from gdtool.geometry.simplify import SHAKEN, median_edge, simplify
 
 _GAP = 8.0  # edge lengths between pieces: none of what is asked of a surface reaches so far
 _SOON_READ = 200_000  # triangles
-_FOR_A_HANDLE = 100  # quads: with fewer engines lose some
+_FOR_A_HANDLE = 100  # quads: with fewer engines lose some (benchmarks/remesh_nets.py)
 _SHAKEN_OFF = 3.0  # of the noise that keeps triangles even, which moves few of their corners farther off the surface
 
 
