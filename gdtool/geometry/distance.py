@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 _LARGE = 200_000  # triangles from which fcpw's tree is built in a quarter of the time
-_WORTH_THREADS, _ALONE = 1000, 10000  # libigl searches with all threads from more than so many points on
 
 
 class SearchTree:
@@ -39,14 +37,8 @@ def _igl_search(vertices: np.ndarray, faces: np.ndarray) -> _Search:
     tree = igl.AABB()
     tree.init(vertices, faces)
 
-    def one(points: np.ndarray) -> tuple[np.ndarray, ...]:
-        return tuple(np.asarray(x) for x in tree.squared_distance(vertices, faces, points))
-
     def search(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        if not _WORTH_THREADS < len(points) <= _ALONE:
-            return one(points)
-        with ThreadPoolExecutor(2) as pool:
-            return tuple(np.concatenate(part) for part in zip(*pool.map(one, np.array_split(points, 2)), strict=True))
+        return tuple(np.asarray(x) for x in tree.squared_distance(vertices, faces, points))
 
     return search
 
@@ -96,6 +88,31 @@ def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> np.ndarra
         away = ((points[:, None] - on_sides) ** 2).sum(-1)
         out[beside] = on_sides[np.arange(len(beside)), away.argmin(1)]
     return out
+
+
+def bisected(vertices: np.ndarray, faces: np.ndarray, longest: float, most: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (w, 3), faces (g, 3) and the face (g,) that each is of: the same surface, in faces without an edge of more than longest.
+
+    Their longest edges are cut in the middle, again and again while there are no more than `most` faces; neighbours do not share the new
+    vertices. A search tree finds closest points on them sooner: the boxes of long faces are mostly air.
+    """
+    whole, corners = np.arange(len(faces)), vertices[faces]
+    done: list[tuple[np.ndarray, np.ndarray]] = []
+    while len(whole):
+        squared = ((np.roll(corners, -1, 1) - corners) ** 2).sum(-1)
+        long = squared.max(1) > longest * longest
+        if not long.any() or len(whole) + long.sum() + sum(len(some) for some, _ in done) > most:
+            break
+        done.append((whole[~long], corners[~long]))
+        # Corners are turned round so that the edge to cut is that from the first to the second.
+        turned = (squared[long].argmax(1)[:, None] + np.arange(3)) % 3
+        a, b, c = np.take_along_axis(corners[long], turned[..., None], 1).transpose(1, 0, 2)
+        middle = (a + b) / 2
+        whole, corners = np.repeat(whole[long], 2), np.stack([a, middle, c, middle, b, c], 1).reshape(-1, 3, 3)
+    if not done:
+        return vertices, faces, whole
+    whole, corners = (np.concatenate(parts) for parts in zip(*done, (whole, corners), strict=True))
+    return corners.reshape(-1, 3), np.arange(len(corners) * 3).reshape(-1, 3), whole
 
 
 def closest_points(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

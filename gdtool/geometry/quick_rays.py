@@ -12,14 +12,12 @@ class QuickCaster(RayCaster):
 
     def quick_hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """First hits of rays (n, 3) from either side: face_idx (n,) int32, -1 = miss; distance (n,) float32 along unit
-        directions (n, 3); barycentric (n, 3) float32. Places are good to 1e-7 of the mesh's extent."""
+        directions (n, 3); barycentric (n, 3) float32, component by component in memory. Places are good to 1e-7 of the mesh's extent."""
         if not len(self.faces) or not len(origins):
-            return np.full(len(origins), -1, np.int32), np.full(len(origins), np.inf, np.float32), np.zeros((len(origins), 3), np.float32)
+            return np.full(len(origins), -1, np.int32), np.full(len(origins), np.inf, np.float32), np.zeros((3, len(origins)), np.float32).T
         found = self._scene.run(self.localised(origins), np.ascontiguousarray(directions, np.float32), query="INTERSECT", output=True)
         u, v = found["u"], found["v"]
-        barycentric = np.empty((len(u), 3), np.float32)
-        barycentric[:, 0], barycentric[:, 1], barycentric[:, 2] = 1 - u - v, u, v
-        return found["primID"], found["tfar"] * np.float32(1 / self.scale), barycentric
+        return found["primID"], found["tfar"] * np.float32(1 / self.scale), np.stack([1 - u - v, u, v]).T
 
     def quick_occluded(self, origins: np.ndarray, directions: np.ndarray, max_distance: float = np.inf) -> np.ndarray:
         """(n,) bool: whether anything lies within max_distance along rays from origins (n, 3) in unit directions (n, 3)."""

@@ -2,20 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+
+_AT_ONCE = 1 << 15  # numbers: what is computed of them stays in the cache
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
     """Linear values [0, 1] -> sRGB-encoded [0, 1] (IEC 61966-2-1); float32 stays float32. Negative values give 0."""
     x = np.asarray(linear)
-    x = np.maximum(x if x.dtype.kind == "f" else x.astype(np.float32), 0)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 0.0031308), 1 / 2.4) - 0.055).astype(x.dtype)
+    return _by_blocks(_encoded, x if x.dtype.kind == "f" else x.astype(np.float32))
+
+
+def _encoded(x: np.ndarray) -> np.ndarray:
+    x = np.maximum(x, 0)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 0.0031308), 1 / 2.4) - 0.055)
 
 
 def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
     """sRGB-encoded [0, 1] (or uint8, uint16 as stored) -> linear [0, 1], float32 unless float64 is given."""
-    x = unit_range(encoded)
-    return np.where(x <= 0.04045, x / 12.92, np.power((np.maximum(x, 0.04045) + 0.055) / 1.055, 2.4)).astype(x.dtype)
+    return _by_blocks(_decoded, unit_range(encoded))
+
+
+def _decoded(x: np.ndarray) -> np.ndarray:
+    return np.where(x <= 0.04045, x / 12.92, np.power((np.maximum(x, 0.04045) + 0.055) / 1.055, 2.4))
+
+
+def _by_blocks(curve: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
+    """curve of each of x, some at a time."""
+    if x.size <= _AT_ONCE:
+        return curve(x).astype(x.dtype)
+    flat = x.ravel()
+    out = np.empty_like(flat)
+    for start in range(0, flat.size, _AT_ONCE):
+        out[start:start + _AT_ONCE] = curve(flat[start:start + _AT_ONCE])
+    return out.reshape(x.shape)
 
 
 def unit_range(image: np.ndarray) -> np.ndarray:

@@ -154,7 +154,7 @@ def bake(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: 
         for name, value in found.items():
             # setdefault is atomic: threads that come first at the same time agree on one array.
             if name not in values:
-                values.setdefault(name, np.empty((len(texels), *value.shape[1:]), np.float32))
+                values.setdefault(name, np.empty((*value.shape[:0:-1], len(texels)), np.float32).T)
             values[name][part] = value
         by_ray[part] = places.by_ray
 

@@ -170,8 +170,9 @@ def _stored(texels: Texels, layers: dict[str, list[_Plane]], bits: dict[str, int
         image = plane.gutters.fill(texels.image(plane.values if plane.encoding is None else plane.encoding(np.clip(plane.values, 0, 1))))
         if name == "normal":
             normal[k] = image
-        else:
-            out[name][..., k] = quantise(image, bits[name])
+            return
+        for row in range(0, texels.size, _ROWS_AT_ONCE):
+            out[name][row:row + _ROWS_AT_ONCE, :, k] = quantise(image[row:row + _ROWS_AT_ONCE], bits[name])
 
     def turn(row: int) -> None:
         rows = [normal[k][row:row + _ROWS_AT_ONCE] for k in range(3)]

@@ -177,7 +177,7 @@ def from_scene(scene: Scene, source_from_world: np.ndarray, footprint: Callable[
         # einsum: a product of so thin matrices by BLAS keeps a second thread busy with waiting.
         normal = read["normal"] if unturned else np.einsum("nk,ck->nc", read["normal"], turn)
         # Files whose winding and normals disagree are common; the winding says which side is outside.
-        inward = dot(normal, source.face_normals_32[places.face_idx]) < 0
+        inward = dot(normal, source.normals_of(places.face_idx)) < 0
         if inward.any():
             normal[inward] *= -1
         out = {name: read[name] for name in kept}

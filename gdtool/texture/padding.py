@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 _ROWS_AT_ONCE = 32  # few enough that what is computed of them stays in the cache
@@ -47,7 +49,8 @@ class Gutters:
             value *= weight
             value += (1 - weight) * _doubled(filled, value.shape)
             filled = value
-        np.copyto(channel, _doubled(filled, channel.shape), where=self._empty)
+        for rows, band in _doubled_rows(filled, channel.shape):
+            np.copyto(channel[rows], band, where=self._empty[rows])
         if self._far is not None:
             channel[self._far] = background
         return channel
@@ -63,21 +66,29 @@ def _summed(image: np.ndarray) -> np.ndarray:
 
 
 def _doubled(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """image (h, w) at twice the size, cut to shape, between texels linear: a texel's centre lies a quarter of a coarse
-    texel from its parent's, so weights are three quarters and one."""
+    """image (h, w) at twice the size, cut to shape, between texels linear."""
+    out = np.empty(shape, image.dtype)
+    for rows, band in _doubled_rows(image, shape):
+        out[rows] = band
+    return out
+
+
+def _doubled_rows(image: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[slice, np.ndarray]]:
+    """_doubled's rows, some at a time. A texel's centre lies a quarter of a coarse texel from its parent's, so weights are three quarters
+    and one."""
     height, width = image.shape
-    out = np.empty((2 * height, 2 * width), image.dtype)
     for first in range(0, height, _ROWS_AT_ONCE):
         rows = np.arange(first, min(first + _ROWS_AT_ONCE, height))
-        near = image[rows] * np.float32(0.75)
+        near, out = image[rows] * np.float32(0.75), np.empty((2 * len(rows), 2 * width), image.dtype)
         for side in (0, 1):
             beside = image[np.clip(rows + 2 * side - 1, 0, height - 1)] * np.float32(0.25)
             beside += near
-            column, other, line = beside * np.float32(0.75), beside * np.float32(0.25), out[2 * first + side:2 * rows[-1] + 2:2]
+            column, other, line = beside * np.float32(0.75), beside * np.float32(0.25), out[side::2]
             np.add(column[:, 1:], other[:, :-1], out=line[:, 2::2])
             np.add(column[:, :-1], other[:, 1:], out=line[:, 1:-1:2])
             line[:, 0], line[:, -1] = column[:, 0] + other[:, 0], column[:, -1] + other[:, -1]
-    return out[:shape[0], :shape[1]]
+        end = min(2 * first + len(out), shape[0])
+        yield slice(2 * first, end), out[:end - 2 * first, :shape[1]]
 
 
 def push_pull(image: np.ndarray, mask: np.ndarray) -> np.ndarray:

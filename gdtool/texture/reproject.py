@@ -8,12 +8,15 @@ from threading import Lock
 
 import numpy as np
 
+from gdtool.geometry.distance import barycentric_of, bisected
 from gdtool.geometry.normals import face_normals
 from gdtool.texture.tangents import dot, weld
 
 # A place on the source is on the right side when its face's normal agrees with the mesh's normal: dot product above this.
 AGREEMENT = 0.1
 _RETRIES = 4
+# Faces with an edge of more than this share of the source are cut for the search of closest points, while there are no more than so many.
+_LONG, _MOST_CUT = 1 / 16, 100_000
 
 
 class Nearest:
@@ -25,17 +28,17 @@ class Nearest:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, chosen: np.ndarray | None = None):
         import igl
 
-        self._vertices = np.ascontiguousarray(vertices, np.float64)
-        self._faces = np.ascontiguousarray(faces if chosen is None else faces[chosen], np.int64)
-        self._chosen = chosen
+        some = faces if chosen is None else faces[chosen]
+        cut_vertices, cut, whole = bisected(vertices, some, _LONG * float(np.ptp(vertices, axis=0).max(initial=0)), _MOST_CUT)
+        self._vertices, self._faces = np.ascontiguousarray(cut_vertices, np.float64), np.ascontiguousarray(cut, np.int64)
+        self._face_idx = (whole if chosen is None else chosen[whole]).astype(np.int32)
         self._tree = igl.AABB()
         self._tree.init(self._vertices, self._faces)
 
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """face_idx (n,) into all faces and the closest point (n, 3) to each of points (n, 3)."""
         _, face, point = self._tree.squared_distance(self._vertices, self._faces, np.ascontiguousarray(points, np.float64))
-        face = face.reshape(-1)
-        return (face if self._chosen is None else self._chosen[face]).astype(np.int32), np.asarray(point).reshape(-1, 3).copy()
+        return self._face_idx[face.reshape(-1)], np.asarray(point).reshape(-1, 3).copy()
 
 
 class Source:
@@ -46,12 +49,19 @@ class Source:
 
         self.vertices, self.faces = np.asarray(vertices, np.float64), faces
         self.face_normals = face_normals(vertices, faces)[0]
-        self.face_normals_32 = self.face_normals.astype(np.float32)
         self.extent = float(np.ptp(self.vertices, axis=0).max())
         self.caster = QuickCaster(vertices, faces)
         self.nearest = Nearest(self.vertices, faces)
         self._facing: dict[tuple[int, float], Nearest | None] = {}
         self._lock = Lock()
+
+    @cached_property
+    def _quick_normals(self) -> np.ndarray:
+        return np.ascontiguousarray(self.face_normals.T, np.float32)
+
+    def normals_of(self, face_idx: np.ndarray) -> np.ndarray:
+        """(n, 3) float32 unit normals of faces, component by component in memory."""
+        return np.take(self._quick_normals, face_idx, axis=1).T
 
     @cached_property
     def twins(self) -> np.ndarray:
@@ -79,8 +89,9 @@ class Source:
         face, _ = self.nearest.closest(points)
         if not len(face) or (dot(self.face_normals[face], normals) < 0).mean() < 0.9:
             return False
-        self.face_normals, self.face_normals_32 = -self.face_normals, -self.face_normals_32
+        self.face_normals = -self.face_normals
         self._facing.clear()
+        self.__dict__.pop("_quick_normals", None)
         return True
 
     def at(self, face_idx: np.ndarray, barycentric: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -124,7 +135,7 @@ def _march(points: np.ndarray, directions: np.ndarray, normals: np.ndarray, reac
     face, t, barycentric = source.caster.quick_hits(points - directions * points.dtype.type(start), directions)
     t -= np.float32(start)
     near = (face >= 0) & (t <= reach)
-    cosine = dot(source.face_normals_32[face], normals)
+    cosine = dot(source.normals_of(face), normals)
     good = near & (cosine > AGREEMENT)
     back = near & (cosine < -AGREEMENT) & (not through)
     # The other side of a wall: step through it and look on.
@@ -139,7 +150,7 @@ def _march(points: np.ndarray, directions: np.ndarray, normals: np.ndarray, reac
         t += travelled
         near = (hit_face >= 0) & (t <= reach[active])
         active, hit_face, hit_at, t = active[near], hit_face[near], hit_at[near], t[near]
-        agrees = dot(source.face_normals_32[hit_face], normals[active]) > AGREEMENT
+        agrees = dot(source.normals_of(hit_face), normals[active]) > AGREEMENT
         found = active[agrees]
         face[found], distance[found], barycentric[found] = hit_face[agrees], np.abs(t[agrees]), hit_at[agrees]
         active, travelled = active[~agrees], t[~agrees] + start
@@ -178,9 +189,7 @@ def _slide_off_edges(points: np.ndarray, normals: np.ndarray, source: Source, me
 
     At a crease that remeshing cut off, the normal leads past the edge to a place well away from the nearest one.
     """
-    from gdtool.geometry.distance import barycentric_of
-
-    cosine = dot(source.face_normals_32[face], normals)
+    cosine = dot(source.normals_of(face), normals)
     slanted = np.flatnonzero(met & (cosine > AGREEMENT) & (cosine < 0.99))
     away = source.at(face[slanted], barycentric[slanted], source.vertices) - points[slanted]
     # How far beside the nearest place the ray went, were the face a plane.
@@ -197,8 +206,6 @@ def _slide_off_edges(points: np.ndarray, normals: np.ndarray, source: Source, me
 
 def _turn_over(source: Source, places: np.ndarray, face: np.ndarray, barycentric: np.ndarray) -> None:
     """Move those of the places (k,) that lie on a face with a twin to the twin; changes face, barycentric."""
-    from gdtool.geometry.distance import barycentric_of
-
     if not len(places):
         return
     twin = source.twins[face[places]]
@@ -214,8 +221,6 @@ def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source
     place in any direction where the normal meets none. So nothing is read from the other side of a thin wall. A sheet without
     another side is read from behind, and nothing through it.
     """
-    from gdtool.geometry.distance import barycentric_of
-
     start = 2e-5 * source.extent
     face, distance, barycentric, behind = _march(points, -normals, normals, reach, source, start, through=False)
     # Two sheets that look the same way have a third between them: outward cannot be nearer than what is this near.
@@ -234,5 +239,5 @@ def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source
     by_ray[lost] = False
     _slide_off_edges(points, normals, source, by_ray, face, barycentric)
     for some in (behind, lost):
-        from_behind[some] = dot(source.face_normals_32[face[some]], normals[some]) <= 0
+        from_behind[some] = dot(source.normals_of(face[some]), normals[some]) <= 0
     return Places(face, barycentric, by_ray, from_behind)

@@ -150,7 +150,7 @@ def encode_tangent_space(normal: np.ndarray, tangent: np.ndarray, sign: np.ndarr
     nn, tt, nt = dot(normal, normal), dot(tangent, tangent), dot(normal, tangent)
     along, up = dot(world, tangent), dot(world, normal)
     # The frame's inverse, up to a positive factor: the dual of each axis from the others' products.
-    out = np.stack([along * nn - up * nt, sign * dot(world, across), up * tt - along * nt], -1)
+    out = np.stack([along * nn - up * nt, sign * dot(world, across), up * tt - along * nt]).T
     lost = nn * tt - nt * nt <= 1e-9
     if lost.any():
         out[lost] = (0.0, 0.0, 1.0)

@@ -78,8 +78,9 @@ class Target:
 
     @cached_property
     def packed(self) -> np.ndarray:
-        """(t, 3, 10) float32 of the corners: position, normal, tangent with its handedness. One gather reads all."""
-        return np.concatenate([self.vertices[self.faces], self.normals, self.tangents], -1).astype(np.float32)
+        """(3, 10, t) float32 of the triangles' corners: position, normal, tangent and its handedness."""
+        corners = np.concatenate([self.vertices[self.faces], self.normals, self.tangents], -1)
+        return np.ascontiguousarray(corners.transpose(1, 2, 0), np.float32)
 
 
 @dataclass(frozen=True)
@@ -140,15 +141,22 @@ def texels_of(target: Target, size: int, rings: int = 2, threads: int = 1) -> Te
 
 
 def surface_at(target: Target, face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Positions (n, 3), normals (n, 3), tangents (n, 3) and handedness (n,) at places on the target, float32.
+    """Positions (n, 3), normals (n, 3), tangents (n, 3) and handedness (n,) at places on the target, float32, component by component
+    in memory: sums over components then run over numbers that lie side by side.
 
     Normals and tangents as viewers interpolate them, not normalised (see tangents.frames_of)."""
-    packed, weights = target.packed, barycentric.astype(np.float32, copy=False)
-    at = np.take(packed, face_idx, axis=0)
-    out = at[:, 0] * weights[:, :1]
-    for k in (1, 2):
-        out += at[:, k] * weights[:, k:k + 1]
-    return out[:, :3], out[:, 3:6], out[:, 6:9], at[:, 0, 9]
+    first, *others = target.packed
+    face_idx, weights = np.asarray(face_idx, np.intp), np.ascontiguousarray(barycentric.T, np.float32)
+    out, more = np.empty((9, len(face_idx)), np.float32), np.empty(len(face_idx), np.float32)
+    for component, values in enumerate(out):
+        # "clip": "raise" would read into a copy first.
+        np.take(first[component], face_idx, out=values, mode="clip")
+        values *= weights[0]
+        for corner, weight in zip(others, weights[1:], strict=True):
+            np.take(corner[component], face_idx, out=more, mode="clip")
+            more *= weight
+            values += more
+    return out[:3].T, out[3:6].T, out[6:].T, np.take(first[9], face_idx)
 
 
 def points_at(target: Target, face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

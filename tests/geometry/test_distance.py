@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.geometry import distance
-from gdtool.geometry.distance import SearchTree, barycentric_of, closest_on_triangles, closest_points, sample_surface, winding_number
+from gdtool.geometry.distance import SearchTree, barycentric_of, bisected, closest_on_triangles, closest_points, sample_surface, winding_number
 from tests.geometry.solids import sphere
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
@@ -73,6 +73,27 @@ def test_a_search_tree_finds_what_a_single_search_does(monkeypatch, large, place
         np.testing.assert_allclose(away, want[0], rtol=0, atol=5e-7 if large == 0 else 2e-9)
         np.testing.assert_allclose(np.linalg.norm(points - point, axis=1), away, atol=1e-9)
         np.testing.assert_allclose(closest_on_triangles(points, vertices[faces[face_idx]]), point, atol=1e-9)
+
+
+def test_cut_faces_are_the_same_surface_with_the_same_sides():
+    vertices, faces = np.array([[0, 0, 0], [8, 0.01, 0], [0, 0.1, 0], [0.5, 0.5, 1.0]]), np.array([[0, 1, 2], [0, 2, 3], [2, 1, 3], [1, 1, 1]])
+    cut_vertices, cut, whole = bisected(vertices, faces, 0.5, 1000)
+    corners = cut_vertices[cut]
+    assert len(cut) > 40 and np.linalg.norm(np.roll(corners, -1, 1) - corners, axis=-1).max() <= 0.5
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    theirs = np.cross(*(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2))) / 2
+    for k in range(3):  # vectors: an upturned part would take away from the sum
+        np.testing.assert_allclose(np.bincount(whole, area[:, k], len(faces)), theirs[:, k], atol=1e-12)
+    assert np.linalg.norm(area, axis=1).sum() == pytest.approx(np.linalg.norm(theirs, axis=1).sum())
+    points = np.random.default_rng(0).uniform(-1, 9, (500, 3))
+    np.testing.assert_allclose(closest_points(points, cut_vertices, cut)[2], closest_points(points, vertices, faces)[2], atol=1e-12)
+
+
+def test_faces_are_cut_no_further_than_the_most_and_short_ones_not_at_all():
+    assert len(bisected(SQUARE, HALVES, 1e-3, 100)[1]) <= 100
+    vertices, faces, whole = bisected(SQUARE, HALVES, 2.0, 100)
+    assert vertices is SQUARE and faces is HALVES and whole.tolist() == [0, 1]
+    assert len(bisected(SQUARE, HALVES[:0], 1e-3, 100)[1]) == 0
 
 
 def test_without_fcpw_a_large_mesh_is_searched_by_libigl(monkeypatch):
