@@ -114,8 +114,8 @@ def beside_blender(python: Path, asset: Path, folder: Path, size: int, samples: 
 def shape(case: Case) -> float:
     """Distance that 99 % of the model's surface keep to the quad mesh, share of the extent."""
     from gdtool.assets.load import load_scene
-    from gdtool.folders.mesh import triangulated
     from gdtool.geometry.distance import closest_points, sample_surface
+    from gdtool.geometry.topology import triangulated
 
     scene, low = load_scene(case.glb), read_low(case)
     points = sample_surface(scene.vertices, scene.faces, 20_000, np.random.default_rng(0))[0]

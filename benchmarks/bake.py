@@ -117,7 +117,7 @@ def with_gutters(texels, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]
 
 def blender(python: Path, case: Case, size: int, samples: int, occlusion: int, out: Path, limit: float) -> dict[str, float]:
     """Cost of Blender's bake; its maps go to out (.npz). Raises RuntimeError."""
-    from gdtool.folders.mesh import triangulated
+    from gdtool.geometry.topology import triangulated
     from gdtool.stages.bake import target_of
 
     mesh = read_low(case)

@@ -95,7 +95,7 @@ class Seams:
     """Points to either side of the charts' seams and of other edges, and the model's material there."""
 
     def __init__(self, truth: Truth, size: int):
-        from gdtool.texture.tangents import edge_pairs
+        from gdtool.geometry.tangents import edge_pairs
         from gdtool.texture.target import texel_width
 
         target, rng = truth.target, np.random.default_rng(1)

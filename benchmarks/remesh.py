@@ -82,8 +82,8 @@ def crease_figures(creases: np.ndarray, vertices: np.ndarray, triangles: np.ndar
 
 def score(fine: Fine, vertices: np.ndarray, quads: np.ndarray) -> dict:
     """Figures of one result against its input."""
-    from gdtool.folders.mesh import triangulated
     from gdtool.geometry.mesh_quality import distance_figures, shape_figures, topology_figures
+    from gdtool.geometry.topology import triangulated
 
     triangles = triangulated(quads)[0]
     diagonal = float(np.linalg.norm(np.ptp(fine.vertices, 0)))

@@ -42,9 +42,9 @@ def ours(path: Path, faces: int) -> dict:
 def peer(path: Path, faces: int) -> dict:
     from gdtool.assets.load import load_scene
     from gdtool.core.child import call
-    from gdtool.folders.mesh import triangulated
     from gdtool.geometry import mesh_quality, repair, topology
     from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
+    from gdtool.geometry.topology import triangulated
 
     scene = load_scene(path)
     vertices, triangles = topology.compact(scene.vertices, scene.faces.astype(np.int64))

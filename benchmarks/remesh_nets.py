@@ -42,10 +42,10 @@ def net(kind: str, cells: int, grid: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def measured(vertices: np.ndarray, faces: np.ndarray, count: int) -> dict:
-    from gdtool.folders.mesh import triangulated
     from gdtool.geometry import mesh_quality, topology
     from gdtool.geometry.quad_task import Request
     from gdtool.geometry.quads import remesh
+    from gdtool.geometry.topology import triangulated
 
     start = time.perf_counter()
     out, quads, record = remesh(vertices, faces, Request(quads=count, threads=2))

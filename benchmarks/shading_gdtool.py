@@ -38,7 +38,7 @@ def main() -> None:
     from gdtool.shading.studio import studio
 
     # What the renderer imports when it first needs it: no renderer's seconds have its imports in them.
-    for module in ("embreex.mesh_construction", "gdtool.shading.closed_form", "gdtool.shading.prefilter", "gdtool.texture.tangents", "torch.quasirandom"):
+    for module in ("embreex.mesh_construction", "gdtool.shading.closed_form", "gdtool.shading.prefilter", "gdtool.geometry.tangents", "torch.quasirandom"):
         importlib.import_module(module)
     scene = normalised(load_scene(asked.model))
     if asked.converged:

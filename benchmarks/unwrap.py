@@ -68,7 +68,7 @@ def smart_project(vertices: np.ndarray, faces: np.ndarray, asked: argparse.Names
 
 def overlapping(faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray) -> int:
     """Texels of FINE² that more than one triangle owns."""
-    from gdtool.folders.mesh import triangulated
+    from gdtool.geometry.topology import triangulated
     from gdtool.texture.raster import owner_count
     from gdtool.texture.unwrap import corner_triangles
 
@@ -78,7 +78,7 @@ def overlapping(faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray) -> int:
 def measure(name: str, vertices: np.ndarray, faces: np.ndarray, ways: list[str], asked: argparse.Namespace, rows: Rows) -> None:
     """A row for each way that has none yet; one that fails says why. faces (f, 4). Keeps pictures of the layouts."""
     from gdtool.core.child import ChildFailed, call
-    from gdtool.folders.mesh import triangulated
+    from gdtool.geometry.topology import triangulated
     from gdtool.images.io import write_png
     from gdtool.texture.unwrap import figures, islands
     from gdtool.texture.unwrap_preview import checkerboard, layout

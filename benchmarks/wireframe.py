@@ -11,9 +11,9 @@ _SHOWN = 1.2  # of the half width of the model: with more of it the quads cannot
 
 def wireframe(vertices: np.ndarray, faces: np.ndarray, size: int = 420) -> np.ndarray:
     """(size, size, 3) in [0, 1]: the middle of the mesh from front right and above, its edges drawn; faces (f, 4)."""
-    from gdtool.folders.mesh import triangulated
     from gdtool.geometry.mesh_quality import polygon_normals
     from gdtool.geometry.rays import RayCaster
+    from gdtool.geometry.topology import triangulated
 
     centre, diagonal = (vertices.max(0) + vertices.min(0)) / 2, float(np.linalg.norm(np.ptp(vertices, 0)))
     back = np.array([0.5, 0.45, 0.75])

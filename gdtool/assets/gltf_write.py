@@ -92,7 +92,7 @@ def _split(scene: Scene, material: Material, faces: np.ndarray, uv_slots: list[i
         return used, local, _unit_tangents(scene.tangents[used], normals[used])
     if material.normal_texture.uv_set not in uv_slots:
         return used, local, None
-    from gdtool.texture.tangents import corner_tangents, weld
+    from gdtool.geometry.tangents import corner_tangents, weld
 
     tangents = corner_tangents(scene.vertices, faces, normals, scene.uvs[material.normal_texture.uv_set], faces).reshape(-1, 4)
     corner = faces.reshape(-1, 1)

@@ -31,17 +31,6 @@ class QuadMesh:
         return self.faces[:, 3] >= 0
 
 
-def triangulated(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (t, 3) of quads (f, 4), each cut along corners 0 and 2, and the face (t,) each comes from."""
-    quads = np.flatnonzero(faces[:, 3] >= 0)
-    if not len(quads):
-        return faces[:, :3].astype(np.int32), np.arange(len(faces), dtype=np.int32)
-    triangles = np.concatenate([faces[:, :3], faces[quads][:, [0, 2, 3]]])
-    face_idx = np.concatenate([np.arange(len(faces)), quads])
-    order = np.argsort(face_idx, kind="stable")
-    return triangles[order].astype(np.int32), face_idx[order].astype(np.int32)
-
-
 def write_obj(path: Path, mesh: QuadMesh, header: tuple[str, ...] = ()) -> None:
     """Write v, vt (v up, OBJ's convention) and f lines; header lines come first."""
     lines = [*header]

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from gdtool.folders.mesh import triangulated
 from gdtool.geometry.quad_task import Record, Request
 from gdtool.geometry.quads import remesh
 from gdtool.geometry.simplify import deviation
+from gdtool.geometry.topology import triangulated
 
 _FEWEST = 64
 _CLOSE_ENOUGH = 1.15  # counts nearer than this to each other are not told apart

@@ -16,6 +16,7 @@ from gdtool.geometry.quad_relax import balance, ease, square_up
 from gdtool.geometry.quad_shape import Surface, onto, relax, subdivide
 from gdtool.geometry.quad_tips import draw_out
 from gdtool.geometry.quad_unfold import unfold
+from gdtool.geometry.topology import triangulated
 
 if TYPE_CHECKING:
     from gdtool.geometry.quad_task import Request
@@ -142,7 +143,6 @@ def better(quad_vertices: np.ndarray, quad_faces: np.ndarray, traced: np.ndarray
 
 def _let_go(surface: Surface, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, distance: float) -> np.ndarray:
     """Faces (k,) that stood for surface farther than `distance` from them, and twice as far as before, once their vertices moved."""
-    from gdtool.folders.mesh import triangulated
     from gdtool.geometry.distance import closest_points, sample_surface
 
     points = sample_surface(surface.vertices, surface.faces, 20000, np.random.default_rng(0))[0]
@@ -173,8 +173,6 @@ def fault_of(vertices: np.ndarray, quads: np.ndarray, surface: Surface, edge: fl
 
 def surface_of(vertices: np.ndarray, quads: np.ndarray) -> Surface:
     """The surface of the triangles that quads are cut into."""
-    from gdtool.folders.mesh import triangulated
-
     return Surface(vertices, triangulated(quads)[0])
 
 

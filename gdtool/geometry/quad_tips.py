@@ -9,7 +9,7 @@ import numpy as np
 from gdtool.geometry.distance import closest_points, sample_surface
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.quad_shape import Surface
-from gdtool.geometry.topology import components, edges_of, euler_number
+from gdtool.geometry.topology import components, edges_of, euler_number, triangulated
 
 _BARE, _CLOSE, _STRAYS = 0.5, 0.75, 1.0  # edge lengths from the quads: what belongs to a tip, what is near enough, what makes one
 _TIP = 1.5  # edge lengths that a tip measures at most which one vertex reaches
@@ -30,8 +30,6 @@ def draw_out(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, 
     constraints, in which the tips are fixed, the tips' vertices (t,), how far the surface was from the quads at most before the last
     vertices moved, and how far samples (n,) spread over its area were.
     """
-    from gdtool.folders.mesh import triangulated
-
     step = max(len(surface.vertices) // _POINTS, 1)
     points = samples = np.concatenate([surface.vertices[::step], sample_surface(surface.vertices, surface.faces, _POINTS // 2, np.random.default_rng(0))[0]])
     most, given = len(faces) * (1 + most_added), constraints

@@ -169,6 +169,17 @@ def components(faces: np.ndarray) -> tuple[int, np.ndarray]:
     return connected_components(coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), (len(faces),) * 2), False)
 
 
+def triangulated(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles (t, 3) of quads (f, 4), each cut along corners 0 and 2, and the face (t,) each comes from."""
+    quads = np.flatnonzero(faces[:, 3] >= 0)
+    if not len(quads):
+        return faces[:, :3].astype(np.int32), np.arange(len(faces), dtype=np.int32)
+    triangles = np.concatenate([faces[:, :3], faces[quads][:, [0, 2, 3]]])
+    face_idx = np.concatenate([np.arange(len(faces)), quads])
+    order = np.argsort(face_idx, kind="stable")
+    return triangles[order].astype(np.int32), face_idx[order].astype(np.int32)
+
+
 def euler_number(faces: np.ndarray) -> int:
     """Vertices that are used, less edges, plus faces."""
     return len(np.unique(faces[faces >= 0])) - len(edges_of(faces).ends) + len(faces)

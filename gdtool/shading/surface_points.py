@@ -169,7 +169,7 @@ class SurfaceLookup:
         if scene.tangents is not None and texture.uv_set == 0:
             self._tangents[0] = _columns(scene.tangents)
             return
-        from gdtool.texture.tangents import corner_tangents
+        from gdtool.geometry.tangents import corner_tangents
 
         own = scene.normals is None
         normals = self.face_normals if own else scene.normals

@@ -261,7 +261,7 @@ def target_of(mesh):
     """The triangles to bake into, and the quad (t,) each comes from."""
     import numpy as np
 
-    from gdtool.folders.mesh import triangulated
+    from gdtool.geometry.topology import triangulated
     from gdtool.texture.target import Target
 
     faces, face_idx = triangulated(mesh.faces)

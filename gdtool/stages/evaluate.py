@@ -152,7 +152,8 @@ def read_geometry(source: Source) -> Geometry:
         surface = read_surface(source)
         return Geometry(surface.vertices, surface.faces, 0, matrix)
     if source.kind in ("mesh", "atlas"):
-        from gdtool.folders.mesh import read_mesh, triangulated
+        from gdtool.folders.mesh import read_mesh
+        from gdtool.geometry.topology import triangulated
 
         mesh = read_mesh(source)
         return Geometry(mesh.vertices, triangulated(mesh.faces)[0], int(mesh.is_quad.sum()), matrix)

@@ -46,9 +46,10 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     import numpy as np
 
-    from gdtool.folders.mesh import QuadMesh, triangulated, write_mesh
+    from gdtool.folders.mesh import QuadMesh, write_mesh
     from gdtool.geometry import mesh_quality, repair
     from gdtool.geometry.quad_task import Record
+    from gdtool.geometry.topology import triangulated
 
     with out.step("read"):
         vertices, faces, matrix, quads = _read(inputs, out)
@@ -114,7 +115,8 @@ def _read(inputs: Inputs, out: Output):
         return surface.vertices, surface.faces.astype(np.int64), np.array(main.content.source_from_world).reshape(4, 4), None
     mesh = None
     if not isinstance(main, str) and main.suffix.lower() == ".obj":
-        from gdtool.folders.mesh import read_obj, triangulated
+        from gdtool.folders.mesh import read_obj
+        from gdtool.geometry.topology import triangulated
 
         mesh = read_obj(main)
         vertices, faces = mesh.vertices, triangulated(mesh.faces)[0].astype(np.int64)

@@ -10,8 +10,8 @@ import numpy as np
 
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.folders.mesh import QuadMesh
+from gdtool.geometry.tangents import weld
 from gdtool.texture.maps import Maps
-from gdtool.texture.tangents import weld
 from gdtool.texture.target import Target
 
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gdtool.core.threads import mapped
+from gdtool.geometry.tangents import dot, encode_tangent_space, unit
 from gdtool.texture.occlusion import openness
 from gdtool.texture.picture import Picture
 from gdtool.texture.project_views import Sight, observe, steadiness
 from gdtool.texture.reproject import Places, Source, reproject
 from gdtool.texture.supersample import supersample
-from gdtool.texture.tangents import dot, encode_tangent_space, unit
 from gdtool.texture.target import TEXELS_AT_ONCE, Target, Texels, surface_at
 
 # Looks the material of places up: dict of albedo (n, 3) linear, roughness (n,), metallic (n,), normal (n, 3) unit in

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.core.threads import mapped
-from gdtool.texture.tangents import dot, unit
+from gdtool.geometry.tangents import dot, unit
 from gdtool.texture.target import TEXELS_AT_ONCE, Target, Texels, surface_at, texels_of
 
 

@@ -13,11 +13,11 @@ from gdtool.folders.surface import Surface
 from gdtool.folders.views import Views
 from gdtool.geometry.frames import invert_similarity, transform_points
 from gdtool.geometry.normals import vertex_normals
+from gdtool.geometry.tangents import dot
 from gdtool.texture.bake import Lookup, ViewsOfSource, vertex_lookup, with_views
 from gdtool.texture.picture import Picture
 from gdtool.texture.project_views import pixel_footprint, sight_of
 from gdtool.texture.reproject import Places, Source
-from gdtool.texture.tangents import dot
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.cameras import Camera, project, rays
-from gdtool.texture.tangents import dot, unit
+from gdtool.geometry.tangents import dot, unit
 
 # Below this cosine between normal and viewing direction a view has stretched its pixels too far to be read.
 GRAZING = 0.12

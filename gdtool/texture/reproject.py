@@ -10,7 +10,7 @@ import numpy as np
 
 from gdtool.geometry.distance import barycentric_of, bisected
 from gdtool.geometry.normals import face_normals
-from gdtool.texture.tangents import dot, weld
+from gdtool.geometry.tangents import dot, weld
 
 # A place on the source is on the right side when its face's normal agrees with the mesh's normal: dot product above this.
 AGREEMENT = 0.1

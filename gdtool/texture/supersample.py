@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 
 from gdtool.core.threads import mapped
+from gdtool.geometry.tangents import unit
 from gdtool.texture.raster import Barycentrics, owners_of
-from gdtool.texture.tangents import unit
 from gdtool.texture.target import TEXELS_AT_ONCE, Target, Texels
 
 # Neighbouring texels that differ by no more than this, in stored units, are of one piece: eight steps of 8 bits.

@@ -9,8 +9,8 @@ import numpy as np
 
 from gdtool.core.threads import mapped
 from gdtool.geometry.normals import face_normals
+from gdtool.geometry.tangents import corner_tangents, edge_pairs, frames_of
 from gdtool.texture.raster import Barycentrics, between_centres, centres_in, extend_owners, owners_of
-from gdtool.texture.tangents import corner_tangents, edge_pairs, frames_of
 
 CREASE_DEGREES = 45.0
 # Texels at a time: few enough that what is computed of them stays near the cache, enough that libigl, which looks for nearest points

@@ -11,7 +11,7 @@ from importlib import import_module
 import numpy as np
 
 from gdtool.core.child import ChildFailed, begin, prepare
-from gdtool.folders.mesh import triangulated
+from gdtool.geometry.topology import triangulated
 from gdtool.texture.raster import owner_count
 from gdtool.texture.unwrap_charts import Adjacency, find_charts
 from gdtool.texture.unwrap_cut import cut_to_pack

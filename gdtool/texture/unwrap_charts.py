@@ -8,10 +8,9 @@ from collections.abc import Callable
 import numpy as np
 
 from gdtool.core.child import ChildFailed, call
-from gdtool.folders.mesh import triangulated
 from gdtool.geometry.mesh_quality import polygon_normals
 from gdtool.geometry.repair import one_vertex_per_fan
-from gdtool.geometry.topology import edges_of
+from gdtool.geometry.topology import edges_of, triangulated
 
 _PROXY_TRIANGLES = 6000
 _CREASE_DEGREES = 30.0

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from gdtool.folders.mesh import triangulated
+from gdtool.geometry.topology import triangulated
 from gdtool.texture.unwrap_charts import Adjacency
 
 _ANGLES = np.radians(np.arange(0, 180, 15.0))

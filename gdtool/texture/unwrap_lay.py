@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gdtool.core.child import begin, prepare
-from gdtool.folders.mesh import triangulated
 from gdtool.geometry.mesh_quality import polygon_normals
 from gdtool.geometry.repair import one_vertex_per_fan
+from gdtool.geometry.topology import triangulated
 from gdtool.texture.unwrap_charts import Adjacency, bisect, own_corners
 from gdtool.texture.unwrap_cut import connected, part_of
 from gdtool.texture.unwrap_flatten import Flat, flatten, onto_plane, stretch, upright

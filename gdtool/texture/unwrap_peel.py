@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.folders.mesh import triangulated
-from gdtool.geometry.topology import edges_of
+from gdtool.geometry.topology import edges_of, triangulated
 from gdtool.texture.unwrap_charts import Adjacency, own_corners
 from gdtool.texture.unwrap_flatten import Isometry, conformal_from, flatten, is_disk, lies_on_itself, overlapping, upright
 from gdtool.texture.unwrap_join import joined_stretch

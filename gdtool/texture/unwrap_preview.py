@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.folders.mesh import triangulated
+from gdtool.geometry.topology import triangulated
 from gdtool.texture.raster import rasterize_uv
 from gdtool.texture.unwrap import corner_triangles
 

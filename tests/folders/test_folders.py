@@ -11,10 +11,11 @@ from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
 from gdtool.core.manifest import Manifest
 from gdtool.core.stage import Output
-from gdtool.folders.mesh import QuadMesh, read_obj, triangulated, write_obj
+from gdtool.folders.mesh import QuadMesh, read_obj, write_obj
 from gdtool.folders.records import read_cameras, read_record, write_cameras, write_record
 from gdtool.folders.surface import Surface, read_surface, write_surface, write_surface_ply
 from gdtool.folders.views import Views, read_views, write_views
+from gdtool.geometry.topology import triangulated
 
 CUBE = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float) - 0.5
 QUADS = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]], np.int32)
@@ -116,13 +117,6 @@ def test_quads_come_back_with_their_texture_coordinates():
     mixed = QuadMesh(CUBE, np.concatenate([QUADS[:5], [[1, 3, 7, -1], [1, 7, 5, -1]]]).astype(np.int32))
     write_obj(Path("m.obj"), mixed)
     assert np.array_equal(read_obj(Path("m.obj")).faces, mixed.faces)
-
-
-def test_triangulation_cuts_between_first_and_third_corner_and_keeps_volume():
-    triangles, face_idx = triangulated(QUADS)
-    assert len(triangles) == 12 and np.array_equal(face_idx, np.repeat(np.arange(6), 2))
-    a, b, c = (CUBE[triangles[:, i]] for i in range(3))
-    assert np.isclose((a * np.cross(b, c)).sum() / 6, 1)  # outward: positive volume
 
 
 @pytest.mark.parametrize("text, words", [("v 0 0 0\nf 1 2 3\n", "out of range"), ("v 0 0\n", "line 1"), ("v 0 0 0\n", "no faces"),

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from gdtool.folders.mesh import triangulated
 from gdtool.geometry import quad_candidate, quad_pieces, quad_ways, quads, topology
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import distance_figures, topology_figures
 from gdtool.geometry.quad_task import Part, Request
+from gdtool.geometry.topology import triangulated
 from tests.geometry.engines import in_this_process, whole
 from tests.geometry.solids import cube, joined, sphere
 

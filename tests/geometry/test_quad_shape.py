@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from gdtool.folders.mesh import triangulated
 from gdtool.geometry.mesh_quality import scaled_jacobian, shape_figures, topology_figures
 from gdtool.geometry.quad_shape import fill_holes, remove_doublets, subdivide
+from gdtool.geometry.topology import triangulated
 from tests.geometry.engines import around, inner_face, whole
 from tests.geometry.solids import cube, quad_cube, volume
 

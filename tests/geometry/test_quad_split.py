@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from gdtool.folders.mesh import triangulated
 from gdtool.geometry import quad_fallback, quad_fit, quad_split, quads, simplify, topology
 from gdtool.geometry.features import NO_FEATURES
 from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, shape_figures
 from gdtool.geometry.quad_shape import Surface
 from gdtool.geometry.quad_split import pair_and_split
 from gdtool.geometry.quad_task import Request
+from gdtool.geometry.topology import triangulated
 from tests.geometry.engines import whole
 from tests.geometry.solids import cube, joined, rod, sphere, torus, volume
 

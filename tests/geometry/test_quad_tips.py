@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from gdtool.folders.mesh import triangulated
 from gdtool.geometry import quad_fit, quads, topology
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import distance_figures, scaled_jacobian
@@ -12,6 +11,7 @@ from gdtool.geometry.quad_fit import farthest, surface_of
 from gdtool.geometry.quad_shape import Surface
 from gdtool.geometry.quad_task import Request
 from gdtool.geometry.quad_tips import draw_out
+from gdtool.geometry.topology import triangulated
 from tests.geometry.engines import in_this_process
 from tests.geometry.solids import quad_cube, sphere
 

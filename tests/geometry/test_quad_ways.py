@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from gdtool.core.child import ChildFailed
-from gdtool.folders.mesh import triangulated
 from gdtool.geometry import quad_candidate, quad_ways, quads, topology
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.normals import face_normals
@@ -15,6 +14,7 @@ from gdtool.geometry.quad_candidate import Candidate
 from gdtool.geometry.quad_fit import Outline, fault_of, left_out, surface_of
 from gdtool.geometry.quad_shape import Surface
 from gdtool.geometry.quad_task import Part, Record, Request
+from gdtool.geometry.topology import triangulated
 from tests.geometry.engines import Ended, around, in_this_process, inner_face, whole
 from tests.geometry.solids import cube, marching, quad_cube, sphere, torus, volume
 

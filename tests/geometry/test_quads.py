@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from gdtool.folders.mesh import triangulated
 from gdtool.geometry import quads, simplify, topology
 from gdtool.geometry.mesh_quality import distance_figures, shape_figures
 from gdtool.geometry.quad_engines import ENGINES
 from gdtool.geometry.quad_task import Request
+from gdtool.geometry.topology import triangulated
 from tests.geometry.engines import in_this_process, whole
 from tests.geometry.solids import assembly, bored_box, cube, lattice, plane, sphere, torus, volume
 

@@ -19,6 +19,15 @@ def test_torus_has_euler_characteristic_zero():
     assert len(vertices) - len(topology.edges_of(faces).ends) + len(faces) == 0 == topology.euler_number(faces)
 
 
+def test_triangulation_cuts_between_first_and_third_corner_and_keeps_volume():
+    corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float) - 0.5
+    quads = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])
+    triangles, face_idx = topology.triangulated(quads)
+    assert len(triangles) == 12 and np.array_equal(face_idx, np.repeat(np.arange(6), 2))
+    a, b, c = (corners[triangles[:, i]] for i in range(3))
+    assert np.isclose((a * np.cross(b, c)).sum() / 6, 1)  # outward: positive volume
+
+
 @pytest.mark.parametrize("mesh, cut, handles", [(sphere(12), 0, 0), (torus(20), 0, 1), (torus(20), 40, 1), (plane(4), 0, 0), (lattice(), 0, 28),
                                                 (joined(torus(20), sphere(12), plane(4)), 0, 1)], ids=["ball", "ring", "open ring", "sheet", "net", "several"])
 def test_handles(mesh, cut, handles):

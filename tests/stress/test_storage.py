@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gdtool.assets.scene import Texture
+from gdtool.geometry.tangents import corner_tangents
 from gdtool.images.color import decode_normal, encode_normal, linear_from_srgb, srgb_from_linear
 from gdtool.images.io import read_image, write_png
 from gdtool.shading.reflection import frame
 from gdtool.shading.textures import TextureReader
 from gdtool.texture.maps import quantise
 from gdtool.texture.raster import owner_count
-from gdtool.texture.tangents import corner_tangents
 from tests.texture.test_raster import exact_owner
 
 settings.register_profile("stress", derandomize=True, deadline=None, print_blob=True)

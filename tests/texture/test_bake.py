@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from gdtool.geometry.tangents import decode_tangent_space
 from gdtool.texture.bake import bake, occlusion_tracer, vertex_lookup
 from gdtool.texture.maps import make_maps
 from gdtool.texture.occlusion import bake_occlusion, openness
 from gdtool.texture.raster import rasterize_uv
 from gdtool.texture.reproject import Source, vertex_reach
-from gdtool.texture.tangents import decode_tangent_space
 from gdtool.texture.target import Target, corner_normals, points_at, texels_of
 from tests.texture.shapes import albedo_of, psnr, sphere, torus, triangles_of, unwrapped
 

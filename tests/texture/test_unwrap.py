@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gdtool.core.child import ChildFailed
-from gdtool.folders.mesh import triangulated
+from gdtool.geometry.topology import triangulated
 from gdtool.texture import unwrap, unwrap_charts, unwrap_pack
 from gdtool.texture.raster import owner_count
 from gdtool.texture.unwrap_flatten import Flat, flatten, stretch
@@ -57,7 +57,7 @@ def test_torus_has_even_density_and_gap():
     # Charts stay 4 texels of 512 apart: growing each by a texel and a half makes none meet.
     from scipy.ndimage import binary_dilation
 
-    from gdtool.folders.mesh import triangulated
+    from gdtool.geometry.topology import triangulated
 
     _, face_idx = triangulated(faces)
     corners = unwrap.corner_triangles(result.face_uvs, face_idx)
@@ -256,7 +256,7 @@ def ring_of_quads(around=96, across=10):
 
 
 def test_a_ring_is_cut_into_arcs_that_keep_their_coordinates():
-    from gdtool.folders.mesh import triangulated
+    from gdtool.geometry.topology import triangulated
     from gdtool.texture.unwrap_charts import Adjacency
     from gdtool.texture.unwrap_cut import cut_to_pack
 

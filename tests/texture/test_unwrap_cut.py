@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gdtool.folders.mesh import triangulated
+from gdtool.geometry.topology import triangulated
 from gdtool.texture.unwrap_charts import Adjacency
 from gdtool.texture.unwrap_cut import cut_to_pack
 

@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from gdtool.folders.mesh import triangulated
+from gdtool.geometry.topology import triangulated
 from gdtool.texture import unwrap_lay
 from gdtool.texture.unwrap_charts import Adjacency
 from gdtool.texture.unwrap_join import _brought_over, joined

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.folders.mesh import triangulated
-from gdtool.geometry.topology import edges_of
+from gdtool.geometry.topology import edges_of, triangulated
 from gdtool.texture import unwrap_lay
 from gdtool.texture.unwrap_charts import Adjacency, own_corners
 from gdtool.texture.unwrap_flatten import lies_on_itself, overlapping, stretch

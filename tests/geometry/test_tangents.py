@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gdtool.texture.tangents import corner_tangents, decode_tangent_space, encode_tangent_space, frames_of
+from gdtool.geometry.tangents import corner_tangents, decode_tangent_space, encode_tangent_space, frames_of
 
 
 def plane(n=4, turned=0.0):
