@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gdtool.geometry.rays import cross, dot
+
 _LARGE = 200_000  # triangles from which fcpw's tree is built in a quarter of the time
 
 
@@ -166,15 +168,14 @@ def sample_surface(vertices: np.ndarray, faces: np.ndarray, count: int,
 
 def barycentric_of(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """(n, 3) barycentric coordinates of points (n, 3) in the planes of triangles (n, 3, 3); zero-area ones give (1, 0, 0)."""
-    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    e0, e1, e2 = b - a, c - a, points - a
-    normal = np.cross(e0, e1)
-    squared = (normal * normal).sum(1)
+    a, b, c = np.ascontiguousarray(triangles.transpose(1, 2, 0))
+    e0, e1, e2 = b - a, c - a, points.T - a
+    normal = cross(e0, e1)
+    squared = dot(normal, normal)
     good = squared > 0
     # Cross products instead of the Gram determinant, which cancels on slivers.
     over = np.where(good, 1 / np.where(good, squared, 1), 0)
-    v = (np.cross(e2, e1) * normal).sum(1) * over
-    w = (np.cross(e0, e2) * normal).sum(1) * over
+    v, w = dot(cross(e2, e1), normal) * over, dot(cross(e0, e2), normal) * over
     return np.stack([1 - v - w, v, w], -1)
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from gdtool.core.child import Running, begin
 from gdtool.core.threads import cores
 from gdtool.geometry.quad_candidate import Candidate
-from gdtool.geometry.quad_fit import farthest, surface_of
 from gdtool.geometry.quad_task import Part, Request
 
 _DOUBT_EDGES = 2.0  # what is farther from the surface before it is drawn, often is not good
@@ -23,7 +22,7 @@ class Ahead:
     def begin(self, first: Candidate, one: Candidate) -> None:
         """Have it traced and drawn, where there is a core to spare and the first one, drawn here, is in doubt."""
         part, request = self._part, self._part.request
-        if cores() > 1 and farthest(surface_of(first.vertices, first.quads), part.surface) > _DOUBT_EDGES * part.edge:
+        if cores() > 1 and first.astray(part) > _DOUBT_EDGES:
             self._running[id(one)] = begin("gdtool.geometry.quad_child:finished", one, part.vertices, part.faces, part.quads, part.edge, request,
                                            seconds=request.for_a_run, memory_mb=request.memory_mb, in_case=True)
 

@@ -19,6 +19,7 @@ from gdtool.geometry.quad_fit import (
     STICKS_OUT,
     Outline,
     drawn,
+    farthest,
     fault_of,
     left_out,
     outlined,
@@ -77,6 +78,7 @@ class Candidate:
     least: float = -1.0  # their worst scaled Jacobian
     wrong: str | None = None  # what of them does not do on the surface
     passable: bool = False  # a subdivided one that is wrong: whether it would do without the subdivision
+    _astray: float | None = None
 
     @property
     def count(self) -> int:
@@ -108,6 +110,12 @@ class Candidate:
         """What is wrong with it before it is drawn, where it does without parts of the surface that drawing does not bring back."""
         bare = left_out(surface_of(self.vertices, self.quads), part.surface, (_BARE_EDGES * part.edge,))[0]
         return f"{LEAVES_OUT} {bare:.1%} of the surface" if bare > _BARE_SHARE else None
+
+    def astray(self, part: Part) -> float:
+        """How far the surface is from it as the engine left it, in edge lengths."""
+        if self._astray is None:
+            self._astray = farthest(surface_of(self.vertices, self.quads), part.surface) / part.edge
+        return self._astray
 
     def trace(self, part: Part) -> None:
         """Find its outline, once."""

@@ -21,6 +21,7 @@ _MOST_TORN = 0.1  # of the quads may be missing from a result that another densi
 _MEMORY = 2000, 4e-3
 _FOR_A_HANDLE = 250  # quads: a coarser mesh subdivided to fewer loses some
 _MANY = 3000  # quads of a mesh that is tried coarser and subdivided
+_DOUBT_EDGES, _NEARER = 1.75, 0.75  # so far from the surface the best hardly comes out good: one at so many times its distance goes before it
 
 Found = tuple[np.ndarray, np.ndarray, str]  # vertices (v, 3), quads (q, 4), the way that they were made
 
@@ -131,7 +132,10 @@ class Trial:
                 self.fallback = begun(self.part)
             like = [one for one in candidates if one.fault == best.fault]
             if way.subdivisions and len(like) > 1:
-                self._ahead.begin(*like[:2])
+                like = self._nearer_first(like, wanted)
+                if like[0] is best:
+                    self._ahead.begin(*like[:2])
+                best = like[0]
             try:
                 taken = self._drawn(self._of_count(like, extra))
             finally:
@@ -173,6 +177,13 @@ class Trial:
                 self.record.failed.append(f"{way.label}: {failure}")
         self.record.clock("engine", start)
         return sorted(out, key=lambda one: one.rank(wanted, part.tolerance))
+
+    def _nearer_first(self, candidates: list[Candidate], wanted: float) -> list[Candidate]:
+        """The second before the first where the first is in doubt, and the second much nearer to the surface."""
+        first, second, *others = candidates
+        far = first.astray(self.part)
+        nearer = far > _DOUBT_EDGES and self.part.counted(second.count, wanted) and second.astray(self.part) < _NEARER * far
+        return [second, first, *others] if nearer else candidates
 
     def _of_count(self, candidates: list[Candidate], extra: int) -> Iterator[Candidate]:
         """Those that have about as many quads as asked for once tips are drawn out of theirs, at the first `extra` more, and those that are hopeless."""

@@ -46,14 +46,14 @@ def _meet(origins: np.ndarray, directions: np.ndarray, triangles: np.ndarray) ->
     """intersect_planes for triangles (9, n): a corner and two edges. Component by component, so that every sum runs over
     numbers that lie side by side."""
     o, d, a, e1, e2 = origins.T, directions.T, triangles[:3], triangles[3:6], triangles[6:]
-    p = _cross(d, e2)
+    p = cross(d, e2)
     determinant = dot(e1, p)
     flat = determinant == 0
     inverse = 1.0 / (np.where(flat, 1.0, determinant) if flat.any() else determinant)
     s = [o[i] - a[i] for i in range(3)]
     u = dot(s, p)
     u *= inverse
-    q = _cross(s, e1)
+    q = cross(s, e1)
     v = dot(d, q)
     v *= inverse
     distance = dot(e2, q)
@@ -67,7 +67,7 @@ def _meet(origins: np.ndarray, directions: np.ndarray, triangles: np.ndarray) ->
     return distance, weights.T
 
 
-def _cross(a, b) -> list[np.ndarray]:
+def cross(a, b) -> list[np.ndarray]:
     """Vector products of vectors given as three arrays (n,)."""
     out = []
     for j, k in ((1, 2), (2, 0), (0, 1)):
