@@ -97,6 +97,7 @@ def bisected(vertices: np.ndarray, faces: np.ndarray, longest: float, most: int)
 
     Their longest edges are cut in the middle, again and again while there are no more than `most` faces; neighbours do not share the new
     vertices. A search tree finds closest points on them sooner: the boxes of long faces are mostly air.
+    As trimesh.remesh.subdivide_to_size, but with a limit, which a mesh of many long faces needs, and without an import of .3 s.
     """
     whole, corners = np.arange(len(faces)), vertices[faces]
     done: list[tuple[np.ndarray, np.ndarray]] = []

@@ -21,7 +21,7 @@ _MOST_TORN = 0.1  # of the quads may be missing from a result that another densi
 _MEMORY = 2000, 4e-3
 _FOR_A_HANDLE = 250  # quads: a coarser mesh subdivided to fewer loses some
 _MANY = 3000  # quads of a mesh that is tried coarser and subdivided
-_DOUBT_EDGES, _NEARER = 1.75, 0.75  # so far from the surface the best hardly comes out good: one at so many times its distance goes before it
+_ASTRAY_EDGES, _NEARER = 1.75, 0.75  # so far from the surface the best may not come out good: one at so many times its distance goes before it
 
 Found = tuple[np.ndarray, np.ndarray, str]  # vertices (v, 3), quads (q, 4), the way that they were made
 
@@ -182,7 +182,7 @@ class Trial:
         """The second before the first where the first is in doubt, and the second much nearer to the surface."""
         first, second, *others = candidates
         far = first.astray(self.part)
-        nearer = far > _DOUBT_EDGES and self.part.counted(second.count, wanted) and second.astray(self.part) < _NEARER * far
+        nearer = far > _ASTRAY_EDGES and self.part.counted(second.count, wanted) and second.astray(self.part) < _NEARER * far
         return [second, first, *others] if nearer else candidates
 
     def _of_count(self, candidates: list[Candidate], extra: int) -> Iterator[Candidate]:

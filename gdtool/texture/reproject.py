@@ -49,19 +49,16 @@ class Source:
 
         self.vertices, self.faces = np.asarray(vertices, np.float64), faces
         self.face_normals = face_normals(vertices, faces)[0]
+        self._normal_rows = np.ascontiguousarray(self.face_normals.T, np.float32)
         self.extent = float(np.ptp(self.vertices, axis=0).max())
         self.caster = QuickCaster(vertices, faces)
         self.nearest = Nearest(self.vertices, faces)
         self._facing: dict[tuple[int, float], Nearest | None] = {}
         self._lock = Lock()
 
-    @cached_property
-    def _quick_normals(self) -> np.ndarray:
-        return np.ascontiguousarray(self.face_normals.T, np.float32)
-
     def normals_of(self, face_idx: np.ndarray) -> np.ndarray:
         """(n, 3) float32 unit normals of faces, component by component in memory."""
-        return np.take(self._quick_normals, face_idx, axis=1).T
+        return np.take(self._normal_rows, face_idx, axis=1).T
 
     @cached_property
     def twins(self) -> np.ndarray:
@@ -89,9 +86,8 @@ class Source:
         face, _ = self.nearest.closest(points)
         if not len(face) or (dot(self.face_normals[face], normals) < 0).mean() < 0.9:
             return False
-        self.face_normals = -self.face_normals
+        self.face_normals, self._normal_rows = -self.face_normals, -self._normal_rows
         self._facing.clear()
-        self.__dict__.pop("_quick_normals", None)
         return True
 
     def at(self, face_idx: np.ndarray, barycentric: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -48,17 +48,16 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
     assert outcome == "a crash" or "strays" in record.failed[0]
 
 
-@pytest.mark.parametrize("most, count, order", [(0.3, 1000, [1, 0]), (0.3, 900, [0, 1]), (0.39, 1000, [0, 1])],
-                         ids=["far", "of another count", "in no doubt"])
-def test_of_two_the_one_much_nearer_to_the_surface_comes_first_where_the_other_is_in_doubt(most, count, order):
-    """A ball without its cap, and a whole one."""
+@pytest.mark.parametrize("tops, wanted, order", [((0.3, 1.0), 1000, [1, 0]), ((0.3, 1.0), 1100, [0, 1]), ((0.39, 1.0), 1000, [0, 1]),
+                                                  ((0.3, 0.3), 875, [0, 1])], ids=["far", "of another count", "in no doubt", "both far"])
+def test_of_two_the_one_much_nearer_to_the_surface_comes_first_where_the_other_is_in_doubt(tops, wanted, order):
+    """Balls without a cap, and whole ones."""
     vertices, faces = sphere(24, 0.4)
     out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
     part = Part(vertices, faces, 1000, 0.045, Request(), None)
     way = quad_ways.Way("instant-meshes", 0, (1.0,), 30.0)
-    two = [Candidate(way, 1000, None, *topology.compact(out, found[out[found].mean(1)[:, 2] < height])) for height in (most, 1.0)]
-    two[1].quads = two[1].quads[:count]
-    assert quad_ways.Trial(part, Record())._nearer_first(two, 1000) == [two[k] for k in order]
+    two = [Candidate(way, 1000, None, *topology.compact(out, found[out[found].mean(1)[:, 2] < height])) for height in tops]
+    assert [id(one) for one in quad_ways.Trial(part, Record())._nearer_first(two, wanted)] == [id(two[k]) for k in order]
 
 
 def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(monkeypatch):
