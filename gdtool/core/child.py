@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import importlib
+import io
 import os
 import pickle
 import signal
@@ -94,6 +95,22 @@ def _started() -> Forked | subprocess.Popen:
     return subprocess.Popen(python_running(code), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=_SETTINGS | os.environ)
 
 
+class _Pickler(pickle.Pickler):
+    """Writes numpy's types by their names: it would have each array that is read be of a type of its own, which ufunc.at has no quick loops for."""
+
+    def reducer_override(self, thing: Any) -> Any:
+        numpy = sys.modules.get("numpy")
+        if numpy is not None and isinstance(thing, numpy.dtype) and thing.kind in "biufc" and thing.isnative:
+            return numpy.dtype, (thing.str,)
+        return NotImplemented
+
+
+def _pickled(thing: Any) -> bytes:
+    file = io.BytesIO()
+    _Pickler(file, protocol=5).dump(thing)
+    return file.getvalue()
+
+
 class Running:
     """A call under way in a child: result() waits for it."""
 
@@ -165,7 +182,7 @@ def begin(function: str, *args: Any, seconds: float, memory_mb: int | None = Non
     place = None
     with contextlib.suppress(OSError):  # it may have been deleted
         place = os.getcwd()
-    request = pickle.dumps((place, sys.path, _SETTINGS | os.environ)) + pickle.dumps((function, args, kwargs, memory_mb, in_case), protocol=5)
+    request = pickle.dumps((place, sys.path, _SETTINGS | os.environ)) + _pickled((function, args, kwargs, memory_mb, in_case))
     return Running(function, _started(), request, seconds)
 
 
@@ -188,7 +205,7 @@ def beside(function: Callable[..., Any], *args: Any) -> Callable[[], Any]:
             os.close(receive)
             answer = function(*args)
             with os.fdopen(send, "wb") as file:
-                pickle.dump(answer, file, protocol=5)
+                _Pickler(file, protocol=5).dump(answer)
         finally:
             os._exit(0)
     os.close(send)
@@ -250,5 +267,5 @@ def serve(nursery: Nursery | None = None) -> None:
     except Exception as error:  # reported to the parent, which knows a fallback
         answer = ("failed", f"{type(error).__name__}: {error}")
     with os.fdopen(answer_to, "wb") as file:
-        pickle.dump(answer, file, protocol=5)
+        _Pickler(file, protocol=5).dump(answer)
     os._exit(0)  # a native library may hang or crash in its own teardown; the answer is out

@@ -8,6 +8,7 @@ import numpy as np
 
 from gdtool.geometry.rays import cross, dot
 
+_CELLS = 39  # along each axis: (39 + 1)^3 numbers fit 16 bits
 _LARGE = 200_000  # triangles from which fcpw's tree is built in a quarter of the time
 
 
@@ -64,13 +65,22 @@ def _fcpw_search(vertices: np.ndarray, faces: np.ndarray) -> _Search | None:
     scene.build(fcpw.aggregate_type.bvh_longest_axis_center, True, False, True)  # searched as quickly as the others, built in half their time
 
     def search(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        found = fcpw.interaction_3D_list()
-        scene.find_closest_points(single(points), np.full(len(points), np.inf, np.float32), found)
-        face_idx = np.fromiter((one.primitive_index for one in found), np.int64, len(points))
+        found, face_idx = fcpw.interaction_3D_list(), np.empty(len(points), np.int64)
+        asked = single(points)
+        order = _by_place(asked)
+        scene.find_closest_points(asked.take(order, 0), np.full(len(points), np.inf, np.float32), found)
+        face_idx[order] = np.fromiter((one.primitive_index for one in found), np.int64, len(points))
         point = closest_on_triangles(points, vertices[faces[face_idx]])
         return ((points - point) ** 2).sum(1), face_idx, point
 
     return search
+
+
+def _by_place(points: np.ndarray) -> np.ndarray:
+    """An order (n,) of points (n, 3) in which those near to one another follow one another: what is read for one is still in the cache for the next."""
+    low, high = points.min(0), points.max(0)
+    cell = ((points - low) * (_CELLS / (float((high - low).max()) or 1.0))).astype(np.uint16)
+    return np.argsort((cell[:, 0] * (_CELLS + 1) + cell[:, 1]) * (_CELLS + 1) + cell[:, 2], kind="stable")  # of 16 bits: in linear time
 
 
 def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -14,7 +14,11 @@ def columns_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Cross product of a (3, ...) and b (3, ...)."""
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    for product, (j, k) in zip(out, ((1, 2), (2, 0), (0, 1)), strict=True):
+        np.multiply(a[j], b[k], out=product)
+        product -= a[k] * b[j]
+    return out
 
 
 def polygon_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -35,25 +39,25 @@ def _normal_of(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def corner_jacobians(vertices: np.ndarray, quads: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(q, 4) scaled Jacobian at each corner: sine of its angle seen along the face normal, 1 square, <= 0 folded."""
-    return _corner_sines(columns_of(vertices, quads), normals.T).T
+    return _corner_sines(columns_of(vertices, quads), normals.T)[0].T
 
 
-def _corner_sines(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(4, q) scaled Jacobians of quads with corners (3, 4, q) about normals (3, q)."""
+def _corner_sines(p: np.ndarray, *normals: np.ndarray) -> list[np.ndarray]:
+    """Scaled Jacobians (4, q) of quads with corners (3, 4, q) about each of normals (3, q)."""
     after = np.empty_like(p)
     np.subtract(p[:, 1:], p[:, :-1], out=after[:, :-1])
     np.subtract(p[:, 0], p[:, -1], out=after[:, -1])
     length = np.sqrt(after[0] * after[0] + after[1] * after[1] + after[2] * after[2])
-    before = after[:, [3, 0, 1, 2]]
-    turn = cross(before, after)
-    along = turn[0] * normals[0] + turn[1] * normals[1] + turn[2] * normals[2]
-    return along / np.maximum(length * length[[3, 0, 1, 2]], 1e-300)
+    turn = cross(after[:, [3, 0, 1, 2]], after)
+    over = np.maximum(length * length[[3, 0, 1, 2]], 1e-300)
+    return [(turn[0] * n[0] + turn[1] * n[1] + turn[2] * n[2]) / over for n in normals]
 
 
 def worst_jacobian(vertices: np.ndarray, quads: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """(q,) smallest scaled Jacobian of each quad, about its own normal and about `normals` (q, 3): the worse of both."""
     p = columns_of(vertices, quads)
-    return np.minimum(_corner_sines(p, _normal_of(p)[0]).min(0), _corner_sines(p, normals.T).min(0))
+    own, other = _corner_sines(p, _normal_of(p)[0], normals.T)
+    return np.minimum(own, other).min(0)
 
 
 def scaled_jacobian(vertices: np.ndarray, quads: np.ndarray) -> np.ndarray:
@@ -61,7 +65,7 @@ def scaled_jacobian(vertices: np.ndarray, quads: np.ndarray) -> np.ndarray:
     if not len(quads):
         return np.zeros(0)
     p = columns_of(vertices, quads)
-    return _corner_sines(p, _normal_of(p)[0]).min(0)
+    return _corner_sines(p, _normal_of(p)[0])[0].min(0)
 
 
 def valences(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -4,27 +4,28 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.geometry.rays import dot
+from gdtool.geometry.rays import cross, dot
 
-_CHUNK = 2**14  # faces at a time: what they need in between stays in the cache
+CHUNK = 2**14  # faces at a time: what they need in between stays in the cache
 
 
 def face_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit normals (f, 3) and areas (f,) of triangles; zero-area faces have normal 0."""
     # A row per coordinate: several times faster than (f, 3) products.
-    x, y, z = np.ascontiguousarray(vertices.T)
+    rows = np.ascontiguousarray(vertices.T)
     kind = np.result_type(vertices, np.float32)
     normals, area = np.empty((len(faces), 3), kind), np.empty(len(faces), kind)
-    for i in range(0, len(faces), _CHUNK):
-        a, b, c = np.ascontiguousarray(faces[i:i + _CHUNK].T, np.intp)
-        xa, ya, za = x[a], y[a], z[a]
-        ux, uy, uz, wx, wy, wz = x[b] - xa, y[b] - ya, z[b] - za, x[c] - xa, y[c] - ya, z[c] - za
-        nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
-        length = np.sqrt(nx * nx + ny * ny + nz * nz)
-        over = 1 / np.maximum(length, np.finfo(kind).tiny)
-        normals[i:i + _CHUNK] = np.stack([nx * over, ny * over, nz * over], -1)
-        area[i:i + _CHUNK] = length / 2
+    for i in range(0, len(faces), CHUNK):
+        normals[i:i + CHUNK].T[:], area[i:i + CHUNK] = normals_of(rows, np.ascontiguousarray(faces[i:i + CHUNK].T, np.intp))
     return normals, area
+
+
+def normals_of(position: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals (3, f) and areas (f,) of triangles: position (3, v), corners (3, f). Quickest of some CHUNK at a time."""
+    a, b, c = (position.take(corner, 1) for corner in corners)
+    normal = cross(b - a, c - a)
+    length = np.sqrt(dot(normal, normal))
+    return normal * (1 / np.maximum(length, np.finfo(length.dtype).tiny)), length / 2
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from gdtool.geometry import repair, topology
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import scaled_jacobian, valences
-from gdtool.geometry.quad_engines import ENGINES
+from gdtool.geometry.quad_engines import ENGINES, on_few
 from gdtool.geometry.quad_fit import (
     CUT_OFF,
     CUT_SUBDIVIDED,
@@ -151,13 +151,16 @@ class Candidate:
 
 def candidate(vertices: np.ndarray, faces: np.ndarray, way: Way, asked: float) -> Candidate:
     """What the child runs."""
-    engine = ENGINES["on few" if way.engine == "instant-meshes" and way.subdivisions else way.engine]
-    found = engine(vertices.astype(np.float32), faces.astype(np.int32), max(int(asked / way.children), 16), way.degrees)
-    return Candidate(way, asked, *judged(*found, vertices, faces))
+    quads, wanted = max(int(asked / way.children), 16), topology.invariants(faces)
+    mesh = vertices.astype(np.float32), faces.astype(np.int32)
+    if way.engine == "instant-meshes" and way.subdivisions:
+        mesh = on_few(*mesh, quads, wanted)
+    return Candidate(way, asked, *judged(*ENGINES[way.engine](*mesh, quads, way.degrees), wanted))
 
 
-def judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> tuple[str | None, np.ndarray, np.ndarray]:
-    """What is wrong with an engine's result, or None, and the result without its small defects."""
+def judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, wanted: topology.Invariants) -> tuple[str | None, np.ndarray, np.ndarray]:
+    """What is wrong with an engine's result for a surface of these invariants, or None, and the result without its small defects."""
+    closed, _, pieces, euler_number = wanted
     if quad_faces.ndim != 2 or quad_faces.shape[1] != 4 or not len(quad_faces):
         return "no quads", quad_vertices, quad_faces
     if quad_faces.min() < 0 or quad_faces.max() >= len(quad_vertices) or not np.isfinite(quad_vertices).all():
@@ -166,8 +169,6 @@ def judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarr
     if not whole.any():
         return "no quads", quad_vertices, quad_faces
     quad_vertices, quad_faces = topology.compact(quad_vertices, quad_faces[whole])
-    closed = topology.is_watertight(faces)
-    pieces = topology.components(faces)[0]
     for turn in range(_MENDINGS):
         if turn and (not closed or topology.is_watertight(quad_faces)):
             break
@@ -186,6 +187,6 @@ def judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, vertices: np.ndarr
     if topology.components(quad_faces)[0] != pieces:
         return PIECES, quad_vertices, quad_faces  # what of it is kept is judged again, piece by piece
     quad_faces = cancel_pairs(quad_vertices, quad_faces)
-    if closed and (more := topology.euler_number(quad_faces) - topology.euler_number(faces)):
+    if closed and (more := topology.euler_number(quad_faces) - euler_number):
         return LOST if more > 0 else ADDED, quad_vertices, quad_faces
     return None, quad_vertices, quad_faces

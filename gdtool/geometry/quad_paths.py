@@ -53,7 +53,7 @@ def cut_along_features(vertices: np.ndarray, faces: np.ndarray, surface: Surface
     apart = np.sqrt(((middle[0] - middle[1]) ** 2).sum(0))
     size = np.sqrt(((p[:, 0] - p[:, 2]) ** 2).sum(0))
     bent = np.flatnonzero(apart > _FLAT * size)
-    first, second = (surface.closest(np.ascontiguousarray(m[:, bent].T))[0] for m in middle)
+    first, second = surface.closest(middle[:, :, bent].transpose(0, 2, 1).reshape(-1, 3))[0].reshape(2, -1)
     turned = bent[second < first]
     out = faces.copy()
     out[turned] = np.roll(faces[turned], -1, 1)

@@ -40,7 +40,7 @@ def well_made(part: Part, whole: Candidate | None) -> tuple[Found | None, np.nda
     if whole is None or count > part.quads / SMALL_PIECE_QUADS:
         return None, good
     parts = [part.of(piece == k, 0) for k in range(count)]
-    quads = [judged(*quads, own.vertices, own.faces) for own, quads in zip(parts, quads_by_piece(whole.vertices, whole.quads, part), strict=True)]
+    quads = [judged(*quads, topology.invariants(own.faces)) for own, quads in zip(parts, quads_by_piece(whole.vertices, whole.quads, part), strict=True)]
     good[:] = [fault is None for fault, _, _ in quads]
     if not good.any():
         return None, good

@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.sparse import csr_array
 
-from gdtool.geometry.normals import face_normals, vertex_normals
+from gdtool.geometry.normals import CHUNK, face_normals, normals_of, vertex_normals
 from gdtool.geometry.rays import dot
 from gdtool.geometry.topology import Edges, compact, edges_of, renumbered
 
@@ -86,37 +85,38 @@ def _drawn_out(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float,
     """Which vertices (n,) of restore_creases move, where to (n, 3), about how long edges are, and the share of bevel vertices."""
     from scipy.spatial import cKDTree
 
-    normals, area = face_normals(vertices, faces)
-    bevel, rough = np.zeros(len(vertices), bool), np.zeros(len(faces), bool)
-    corners = corners_of(faces, len(vertices))
-    faces_at = corners.T.tocsr()
+    maybe, used = _maybe_bent(vertices, faces, crease_degrees / 2)
     # Only faces with both ends of a bent edge among their corners can have one: few of a fine mesh.
-    maybe = _maybe_bent(normals, faces_at, crease_degrees / 2)
-    few = np.flatnonzero(corners @ maybe.astype(np.int8) > 1)
-    ends, pairs, angle = dihedral_degrees(vertices, faces[few])
+    few = np.flatnonzero(corners_in(faces, maybe) > 1)
+    ends, pairs, angle = dihedral_degrees(vertices, faces.take(few, 0))
     bent = angle > crease_degrees / 2
-    bevel[ends[bent].ravel()] = True
-    rough[few[pairs[bent].ravel()]] = True
-    at, bevel_share = np.flatnonzero(bevel), float(bevel.sum() / (np.diff(faces_at.indptr) > 0).sum())
-    near_bevel, marked, ring = np.zeros(len(faces), bool), bevel.copy(), at
-    for _ in range(_RINGS):
-        before = near_bevel.copy()
-        near_bevel[faces_at[ring].indices] = True
-        found = faces.take(np.flatnonzero(near_bevel > before), 0)
-        before = marked.copy()
-        marked[found] = True
-        ring = np.flatnonzero(marked > before)
-    side = np.flatnonzero(near_bevel & ~rough & (area > 0))
-    if not len(at) or bevel_share > _LARGEST_SHARE or len(side) < _NEIGHBOURS:
+    bevel = np.zeros(len(vertices), bool)
+    bevel[ends[bent]] = True
+    at = np.flatnonzero(bevel)
+    bevel_share = len(at) / max(used, 1)
+    if not len(at) or bevel_share > _LARGEST_SHARE:
+        return at[:0], vertices[:0], 0.0, bevel_share
+    marked, around = bevel.copy(), np.flatnonzero(corners_in(faces, bevel))
+    near_bevel = around
+    for _ in range(1, _RINGS):
+        marked[faces.take(near_bevel, 0)] = True
+        near_bevel = np.flatnonzero(corners_in(faces, marked))
+    side = np.zeros(len(faces), bool)
+    side[near_bevel] = True
+    side[few[pairs[bent]]] = False  # they are the bevel
+    side = faces.take(np.flatnonzero(side), 0)
+    normals, area = face_normals(vertices, side)
+    side, normals = side[area > 0], normals[area > 0]
+    if len(side) < _NEIGHBOURS:
         return at[:0], vertices[:0], 0.0, bevel_share
     sampled = vertices[faces[::max(len(faces) // 20000, 1)]]
     edge = np.median(np.linalg.norm(sampled - np.roll(sampled, 1, 1), axis=-1))  # of a grid's mesh all edges are about a cell
-    centroid = sum(vertices.take(corner, 0) for corner in faces[side].T) / 3
+    centroid = sum(vertices.take(corner, 0) for corner in side.T) / 3
     distance, near = cKDTree(centroid).query(vertices[at], k=_NEIGHBOURS, workers=2)
-    around, its_faces = renumbered(faces[np.unique(faces_at[at].indices)], len(vertices))
-    own = vertex_normals(vertices[around], its_faces)[bevel[around]]
+    own_places, own_faces = renumbered(faces.take(around, 0), len(vertices))
+    own = vertex_normals(vertices[own_places], own_faces)[bevel[own_places]]
     # A row per coordinate (3, k, p) from here on.
-    n, c = (np.ascontiguousarray(rows.T).take(np.ascontiguousarray(near.T), 1) for rows in (normals.take(side, 0), centroid))
+    n, c = (np.ascontiguousarray(rows.T).take(np.ascontiguousarray(near.T), 1) for rows in (normals, centroid))
     valid = (distance.T < _FARTHEST_EDGES * edge) & (dot(n, own.T) > 0.1)
     cluster, sides, spread = _sides(n, valid, crease_degrees * 0.8)
     point, residual = _meeting_point(vertices[at], n, c, cluster, sides)
@@ -127,22 +127,33 @@ def _drawn_out(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float,
     return at[good], point[good], edge, bevel_share
 
 
-def corners_of(faces: np.ndarray, count: int) -> csr_array:
-    """(f, count) bool: which vertices are corners of each of faces (f, 3). Products with it are several times faster than indexing."""
-    return csr_array((np.ones(faces.size, bool), faces.ravel(), np.arange(0, faces.size + 1, 3)), (len(faces), count))
+def corners_in(faces: np.ndarray, marked: np.ndarray) -> np.ndarray:
+    """(f,) int8: how many corners of each of faces (f, 3) are marked (v,) bool."""
+    out = np.empty(len(faces), np.int8)
+    for i in range(0, len(faces), CHUNK):
+        a, b, c = marked.view(np.int8).take(faces[i:i + CHUNK]).T
+        out[i:i + CHUNK] = a + b + c
+    return out
 
 
-def _maybe_bent(normals: np.ndarray, faces_at: csr_array, degrees: float) -> np.ndarray:
-    """(v,) bool: vertices that may have two faces whose normals differ by more than `degrees`; none that has is left out.
+def _maybe_bent(vertices: np.ndarray, faces: np.ndarray, degrees: float) -> tuple[np.ndarray, int]:
+    """(v,) bool: vertices that may have two faces whose normals differ by more than `degrees`, none that has is left out; and how many
+    vertices have faces.
 
-    faces_at (v, f) are the faces of each. Of d unit normals two of which are a chord c apart the mean is no longer than
-    sqrt(1 - c^2 / (2 d)): the variance is the mean squared distance of the pairs, and each other normal is at least c / 2
-    from one of the two.
+    Of d unit normals two of which are a chord c apart the mean is no longer than sqrt(1 - c^2 / (2 d)): the variance is the mean
+    squared distance of the pairs, and each other normal is at least c / 2 from one of the two.
     """
-    total = faces_at @ normals.astype(float, copy=False)
-    number = np.diff(faces_at.indptr).astype(float)
+    total, number = np.zeros((3, len(vertices))), np.zeros(len(vertices))
+    rows = np.ascontiguousarray(vertices.T)
+    for i in range(0, len(faces), CHUNK):
+        corners = np.ascontiguousarray(faces[i:i + CHUNK].T, np.intp)
+        normals = normals_of(rows, corners)[0]
+        for corner in corners:
+            np.add.at(number, corner, 1.0)
+            for sums, values in zip(total, normals, strict=True):
+                np.add.at(sums, corner, values)
     chord = 2 * np.sin(np.radians(degrees) / 2)
-    return number**2 - np.einsum("vi,vi->v", total, total) > 0.99 * chord**2 / 2 * number - 1e-9
+    return number**2 - dot(total, total) > 0.99 * chord**2 / 2 * number - 1e-9, int(np.count_nonzero(number))
 
 
 def _sides(normals: np.ndarray, valid: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -200,7 +211,7 @@ def collapse_bevels(vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, 
     vertices (v, 3), faces (f, 3), moved (v,) bool. An edge collapses only where the mesh stays manifold (link condition,
     Dey et al. 1999) and no face with an area turns over; shorter ones first. Returns compact vertices and faces.
     """
-    touches = corners_of(faces, len(vertices)) @ moved.astype(np.int8)
+    touches = corners_in(faces, moved)
     rims = faces[np.flatnonzero(touches > 1)].astype(np.int64)
     half = np.concatenate([rims[:, [i, (i + 1) % 3]] for i in range(3)])
     half = np.sort(half[moved[half].all(1)], 1)

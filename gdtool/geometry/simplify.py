@@ -15,7 +15,7 @@ from gdtool.geometry import repair, topology
 from gdtool.geometry.halves import in_halves, worth_halving
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.rows import unique_rows
-from gdtool.geometry.sharpen import corners_of, restore_creases
+from gdtool.geometry.sharpen import corners_in, restore_creases
 from gdtool.geometry.unpinch import unpinched
 
 _PACES, _UNIT = (4.0, 3.0, 8.0), 0.5  # how steeply the collapse's bound rises, tried in turn; the unit of lengths, in sizes of the mesh
@@ -54,7 +54,7 @@ def uneven(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     taken down to its last triangles instead.
     """
     some = np.arange(len(vertices)) % max(len(vertices) // _SAMPLE, 1) == 0
-    around, few = topology.renumbered(faces[np.flatnonzero(corners_of(faces, len(vertices)) @ some)], len(vertices))
+    around, few = topology.renumbered(faces[np.flatnonzero(corners_in(faces, some))], len(vertices))
     if _flat(vertices[around], few)[some[around]].sum() / some.sum() < _FEW_FLAT:
         return vertices
     flat = np.flatnonzero(_flat(vertices, faces))

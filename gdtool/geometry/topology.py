@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -198,12 +199,21 @@ def handles(faces: np.ndarray, pieces: int, edges: Edges | None = None) -> int:
     return pieces - (loops + len(np.unique(faces[faces >= 0])) - len(edges.ends) + len(faces)) // 2
 
 
-def invariants(faces: np.ndarray) -> tuple[bool, bool, int, int]:
-    """Watertight, manifold, pieces, Euler number: what a mesh must not change in when it is made coarser or even."""
+class Invariants(NamedTuple):
+    """What a mesh must not change in when it is made coarser or even."""
+
+    watertight: bool
+    manifold: bool
+    pieces: int
+    euler_number: int
+
+
+def invariants(faces: np.ndarray) -> Invariants:
+    """Of a mesh of faces (f, 3) or (f, 4)."""
     if (twins := twins_of(faces)) is not None:
         corners = len(np.unique(faces))
-        return True, one_fan_each(faces, twins), _pieces(twins)[0], corners - len(faces) // 2
-    return is_watertight(faces), is_manifold(faces), components(faces)[0], euler_number(faces)
+        return Invariants(True, one_fan_each(faces, twins), _pieces(twins)[0], corners - len(faces) // 2)
+    return Invariants(is_watertight(faces), is_manifold(faces), components(faces)[0], euler_number(faces))
 
 
 def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.geometry import normals as normals_of
+from gdtool.geometry import normals as normals_module
 from gdtool.geometry.normals import face_normals, vertex_normals
 from tests.geometry.solids import sphere
 
@@ -20,7 +20,7 @@ def test_faces_without_area_have_no_normal_and_spoil_none(kind):
 def test_normals_are_the_same_however_many_faces_are_taken_at_a_time(monkeypatch):
     vertices, faces = sphere(24)
     whole = face_normals(vertices, faces)
-    monkeypatch.setattr(normals_of, "_CHUNK", 100)
+    monkeypatch.setattr(normals_module, "CHUNK", 100)
     assert all(np.array_equal(one, other) for one, other in zip(whole, face_normals(vertices, faces), strict=True))
     assert (whole[0] * vertices[faces].mean(1)).sum(1).min() > 0.7 and abs(np.linalg.norm(whole[0], axis=1) - 1).max() < 1e-6
     assert (vertex_normals(vertices, faces) * vertices).sum(1).min() > 0.79

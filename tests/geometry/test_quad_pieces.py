@@ -41,7 +41,7 @@ def test_pieces_side_by_side_come_out_as_one_after_the_other(monkeypatch):
     vertices, faces = joined(*(sphere(32, 0.2, (0.5 * k, 0, 0)) for k in range(3)))
     real = quad_candidate.judged
     in_this_process(monkeypatch)
-    monkeypatch.setattr(quad_candidate, "judged", lambda *mesh: ("together", *mesh[:2]) if topology.components(mesh[3])[0] > 1 else real(*mesh))
+    monkeypatch.setattr(quad_candidate, "judged", lambda *mesh: ("together", *mesh[:2]) if mesh[2].pieces > 1 else real(*mesh))
     monkeypatch.setattr(quad_pieces, "quads_by_piece", lambda *given: [(np.zeros((0, 3)), np.zeros((0, 4), np.int64))] * 3)
     (one, one_faces, one_record), (two, two_faces, two_record) = (quads.remesh(vertices, faces, Request(quads=1500, threads=n)) for n in (1, 3))
     assert np.array_equal(one, two) and np.array_equal(one_faces, two_faces) and topology.components(two_faces)[0] == 3
@@ -71,9 +71,9 @@ def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless)
     vertices, faces = joined(*balls, (large[0] + (0.4, 0.3, 0.5), large[1]))
     real = quad_candidate.judged
 
-    def fails(quad_vertices, quad_faces, of_vertices, of_faces):
-        fault, *mended = real(quad_vertices, quad_faces, of_vertices, of_faces)
-        bad = topology.components(of_faces)[0] > 1 or hopeless and np.ptp(of_vertices, 0).max() > 0.5
+    def fails(quad_vertices, quad_faces, wanted):
+        fault, *mended = real(quad_vertices, quad_faces, wanted)
+        bad = wanted.pieces > 1 or hopeless and np.ptp(quad_vertices, 0).max() > 0.5
         return "not watertight, though the input is" if bad else fault, *mended
 
     in_this_process(monkeypatch)

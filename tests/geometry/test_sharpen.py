@@ -5,14 +5,14 @@ import pytest
 
 from gdtool.geometry import sharpen, topology
 from gdtool.geometry.features import find_features
-from gdtool.geometry.normals import face_normals
 from tests.geometry.solids import bored_box, cube, sphere, torus, volume
 
 
 @pytest.mark.parametrize("solid", [sphere, torus, bored_box])
 def test_no_bent_edge_is_left_out(solid):
     vertices, faces = solid(40)
-    maybe = sharpen._maybe_bent(face_normals(vertices, faces)[0], sharpen.corners_of(faces, len(vertices)).T.tocsr(), 15.0)
+    maybe, used = sharpen._maybe_bent(np.concatenate([vertices, vertices[:3]]), faces, 15.0)
+    assert used == len(vertices)
     ends, _, angle = sharpen.dihedral_degrees(vertices, faces)
     assert maybe[ends[angle > 15]].all()
 
