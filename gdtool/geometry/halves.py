@@ -10,13 +10,13 @@ import numpy as np
 from gdtool.core.child import ChildFailed, beside
 from gdtool.core.threads import cores
 from gdtool.geometry.normals import face_normals
+from gdtool.geometry.topology import even
 
 Collapse = Callable[..., tuple[np.ndarray, np.ndarray]]  # (vertices, faces, target_faces, unit, keep_border)
 LARGE = 200_000  # triangles from which a second process pays
 _MOST_LEFT = 0.15  # of the triangles: where more are left, the rim, which stays as fine as it was, is too much of a half
 _RIM_FACES = 2.25  # triangles that a half is left with for each vertex of its rim
 _MOST_ON_RIM = 0.25  # of the triangles asked for
-_CHUNK = 2**14  # triangles at a time: what they need in between stays in the cache
 _RINGS, _SEAM_UNIT = 3, 0.1  # of triangles about the rim that are collapsed once the halves are one; the unit that this is done in, in that of the halves
 
 
@@ -87,19 +87,3 @@ def _seam_collapsed(collapse: Collapse, vertices: np.ndarray, faces: np.ndarray,
     number[rest] = np.arange(len(rest))
     place = np.concatenate([number[border], len(rest) + np.arange(len(made_vertices) - len(border))])
     return np.concatenate([vertices[rest], made_vertices[len(border):]]), np.concatenate([number[faces[~about]], place[made]])
-
-
-def even(faces: np.ndarray) -> bool:
-    """Whether each edge of faces (f, 3) is one of an even number of them, by the exclusive or of hashes (splitmix64's): wrong once in 2^64.
-
-    A manifold whose faces all look out is watertight where it is so; that is told in a tenth of the time that topology.is_watertight takes.
-    """
-    together = np.uint64(0)
-    for i in range(0, len(faces), _CHUNK):
-        start = np.ascontiguousarray(faces[i:i + _CHUNK].T, np.uint64)
-        end = start[[1, 2, 0]]
-        key = np.minimum(start, end) << np.uint64(32) | np.maximum(start, end)
-        key = (key ^ key >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
-        key = (key ^ key >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
-        together ^= np.bitwise_xor.reduce(key ^ key >> np.uint64(31), axis=None)
-    return not together

@@ -13,7 +13,6 @@ import numpy as np
 
 from gdtool.core.child import begin, prepare
 from gdtool.core.threads import mapped
-from gdtool.geometry.halves import even
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_fallback import split
 from gdtool.geometry.quad_fit import farthest
@@ -24,6 +23,7 @@ from gdtool.geometry.quad_spread import spread
 from gdtool.geometry.quad_task import Part, Record, Request
 from gdtool.geometry.quad_ways import Found, Trial, prepare_engines
 from gdtool.geometry.simplify import SHAKEN, median_edge, simplify
+from gdtool.geometry.topology import even
 
 _GAP = 8.0  # edge lengths between pieces: none of what is asked of a surface reaches so far
 _SOON_READ = 200_000  # triangles

@@ -6,8 +6,8 @@ import numpy as np
 
 from gdtool.core.errors import InputError
 from gdtool.geometry.normals import face_normals
-from gdtool.geometry.rows import unique_rows
-from gdtool.geometry.topology import compact, components, corner_fans, edges_of, is_watertight, one_fan_each, twins_of
+from gdtool.geometry.rows import first_rows, unique_rows
+from gdtool.geometry.topology import compact, components, corner_fans, edges_of, even, is_watertight, one_fan_each, twins_of
 
 # Welding joins vertices closer than this share of the longest side: far below any detail, far above rounding.
 WELD_SHARE = 1e-7
@@ -51,22 +51,24 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
         faces, sides = faces[~repeated], tuple(side[~repeated] for side in sides)
     if not len(faces):
         raise InputError(subject, "no face has an area")
-    closed = (twins := twins_of(faces)) is not None
-    if closed and one_fan_each(faces, twins):
+    twins = _twins(faces)
+    if twins is None:
+        # A closed mesh is left as its indices say: welding could join sheets that only touch.
+        welded = _weld(vertices, faces, extent * WELD_SHARE)
+        note("welded_vertices", _used(faces, len(vertices)) - _used(welded, len(vertices)))
+        repeated = (welded == np.roll(welded, 1, 1)).any(1)
+        note("degenerate_faces", repeated.sum() + report.get("degenerate_faces", 0))
+        faces, sides = welded[~repeated], tuple(side[~repeated] for side in sides)
+        if (twins := _twins(faces)) is not None and _twice(twins):
+            twins = None
+    if twins is not None and one_fan_each(faces, twins):
         if _volume(vertices / extent, faces, *sides) < 0:
             report["turned_inside_out"] = True
             faces = faces[:, ::-1].copy()
         return *compact(vertices, faces), report, True
-    if not closed:
-        # A closed mesh is left as its indices say: welding could join sheets that only touch.
-        welded = _weld(vertices, faces, extent * WELD_SHARE)
-        note("welded_vertices", len(np.unique(faces)) - len(np.unique(welded)))
-        repeated = (welded == np.roll(welded, 1, 1)).any(1)
-        note("degenerate_faces", repeated.sum() + report.get("degenerate_faces", 0))
-        faces = welded[~repeated]
-    _, first, _ = unique_rows(np.sort(faces, 1))
+    first = first_rows(np.sort(faces, 1))
     note("duplicate_faces", len(faces) - len(first))
-    faces = faces[np.sort(first)]
+    faces = faces[first]
     if not len(faces):
         raise InputError(subject, "no face has an area")
     flat = face_normals(vertices / extent, faces)[1] == 0
@@ -81,15 +83,34 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
         note("turned_edges", edges.turned.sum())
         vertices, faces = _split(vertices, faces)
         faces = _oriented(vertices, faces)
-    fans, number = corner_fans(faces)
+        edges = edges_of(faces)
+    fans, number = corner_fans(faces, edges=edges)
+    closed = bool((edges.count == 2).all() and not edges.turned.any())  # fans that part keep their edges
     if (number > 1).any():
         note("nonmanifold_vertices", (number > 1).sum())
         vertices, faces = one_vertex_per_fan(vertices, faces, fans)
-    closed = is_watertight(faces)
     if closed and _volume(vertices / extent, faces, *face_normals(vertices / extent, faces)) < 0:
         report["turned_inside_out"] = True
         faces = faces[:, ::-1].copy()
     return vertices, faces, report, closed
+
+
+def _used(faces: np.ndarray, count: int) -> int:
+    """How many of `count` vertices faces use."""
+    marked = np.zeros(count, bool)
+    marked[faces] = True
+    return int(marked.sum())
+
+
+def _twins(faces: np.ndarray) -> np.ndarray | None:
+    """twins_of(faces), soon where there are none."""
+    return twins_of(faces) if even(faces) else None
+
+
+def _twice(twins: np.ndarray) -> bool:
+    """Whether there are two triangles with the same corners among those that have twins (3 f,)."""
+    beside = twins.reshape(-1, 3) // 3
+    return bool(((beside[:, 0] == beside[:, 1]) & (beside[:, 1] == beside[:, 2])).any())
 
 
 def without_crumbs(vertices: np.ndarray, faces: np.ndarray, pieces: int) -> tuple[np.ndarray, np.ndarray]:

@@ -13,13 +13,9 @@ def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rows (n, k), integers or floating point without NaN; 0 and -0 are one number.
     """
     rows = np.asarray(rows)
-    whole = np.issubdtype(rows.dtype, np.integer)
-    words = rows.astype(np.int64) if whole else rows.astype(np.float64) + 0.0  # + 0.0: -0 is 0
-    key = np.zeros(len(rows), np.uint64)
-    for column in np.ascontiguousarray(words.T).view(np.uint64):
-        key = (key ^ column) * _MIX[0]
-        key = (key ^ key >> np.uint64(29)) * _MIX[1]
-    order = np.argsort(key ^ key >> np.uint64(32))
+    words = _words(rows)
+    key = _hashes(words)
+    order = np.argsort(key)
     sorted_key = key.take(order)
     start = np.flatnonzero(np.concatenate([np.ones(min(len(rows), 1), bool), sorted_key[1:] != sorted_key[:-1]]))
     first = np.minimum.reduceat(order, start) if len(rows) else order
@@ -32,3 +28,23 @@ def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     place = np.empty(len(start), np.int64)
     place[rising] = np.arange(len(start))
     return words.take(first.take(rising), 0).astype(rows.dtype), first.take(rising), place.take(group)
+
+
+def first_rows(rows: np.ndarray) -> np.ndarray:
+    """Where each of the rows (n, k) that differ is first (u,), in rising order: unique_rows' second, sooner where all differ."""
+    key = np.sort(_hashes(_words(rows)))
+    return np.sort(unique_rows(rows)[1]) if (key[1:] == key[:-1]).any() else np.arange(len(rows))
+
+
+def _words(rows: np.ndarray) -> np.ndarray:
+    """Rows of 64 bits each, the same for equal ones."""
+    return rows.astype(np.int64) if np.issubdtype(rows.dtype, np.integer) else rows.astype(np.float64) + 0.0  # + 0.0: -0 is 0
+
+
+def _hashes(words: np.ndarray) -> np.ndarray:
+    """(n,) uint64: the same for equal rows (n, k) of 64 bits each."""
+    key = np.zeros(len(words), np.uint64)
+    for column in np.ascontiguousarray(words.T).view(np.uint64):
+        key = (key ^ column) * _MIX[0]
+        key = (key ^ key >> np.uint64(29)) * _MIX[1]
+    return key ^ key >> np.uint64(32)

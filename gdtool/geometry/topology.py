@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 _FAN = 64  # edges at a vertex; of more a walk around it step by step takes too long
+_CHUNK = 2**14  # triangles at a time: what they need in between stays in the cache
 _FEW = 4000  # keys, below which sorting is quicker than building a sparse matrix
 
 
@@ -90,6 +91,22 @@ def twins_of(faces: np.ndarray) -> np.ndarray | None:
     return out
 
 
+def even(faces: np.ndarray) -> bool:
+    """Whether each edge of faces (f, 3) is one of an even number of them, by the exclusive or of hashes (splitmix64's): wrong once in 2^64.
+
+    A manifold whose faces all look out is watertight where it is so; that is told in a tenth of the time that topology.is_watertight takes.
+    """
+    together = np.uint64(0)
+    for i in range(0, len(faces), _CHUNK):
+        start = np.ascontiguousarray(faces[i:i + _CHUNK].T, np.uint64)
+        end = start[[1, 2, 0]]
+        key = np.minimum(start, end) << np.uint64(32) | np.maximum(start, end)
+        key = (key ^ key >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
+        key = (key ^ key >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
+        together ^= np.bitwise_xor.reduce(key ^ key >> np.uint64(31), axis=None)
+    return not together
+
+
 def is_watertight(faces: np.ndarray) -> bool:
     """Every edge has exactly two faces, which walk it in opposite directions."""
     faces = np.asarray(faces)
@@ -115,15 +132,16 @@ def split_vertices(faces: np.ndarray) -> np.ndarray:
     return np.flatnonzero(corner_fans(faces)[1] > 1)
 
 
-def corner_fans(faces: np.ndarray, mates: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def corner_fans(faces: np.ndarray, mates: np.ndarray | None = None, edges: Edges | None = None) -> tuple[np.ndarray, np.ndarray]:
     """The fan (f, c) each face corner belongs to (numbered over the mesh), and the number of fans at each vertex.
 
-    Fans go on across edges of exactly two faces, and across mates (k, 2), pairs of half edges that belong together.
+    Fans go on across edges of exactly two faces, and across mates (k, 2), pairs of half edges that belong together. edges: those of the
+    faces, where they are known.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    edges = edges_of(faces)
+    edges = edges or edges_of(faces)
     used = np.asarray(faces) >= 0
     corner_idx = np.full(faces.shape, -1, np.int64)
     corner_idx[used] = np.arange(int(used.sum()))

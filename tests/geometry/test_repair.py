@@ -6,7 +6,7 @@ import pytest
 from gdtool.core.errors import InputError
 from gdtool.geometry import repair, topology
 from gdtool.geometry.unpinch import unpinched
-from tests.geometry.solids import cube, joined, plane, volume
+from tests.geometry.solids import cube, joined, plane, sphere, volume
 
 
 def test_cube_is_watertight_and_passes_unchanged():
@@ -22,6 +22,27 @@ def test_soup_is_welded():
     soup, soup_faces = vertices[faces].reshape(-1, 3), np.arange(36).reshape(-1, 3)
     out_vertices, out_faces, report, closed = repair.clean(soup, soup_faces)
     assert len(out_vertices) == 8 and closed and topology.is_watertight(out_faces) and report == {"welded_vertices": 28}
+
+
+def test_what_welding_closes_is_not_looked_at_further(monkeypatch):
+    """As in a file whose numbers were rounded: an edge of no length, its two faces left out by who wrote it."""
+    vertices, faces = sphere(24)
+    a, b = faces[0, :2].tolist()
+    vertices[b] = vertices[a]
+    torn = faces[~((faces == a).any(1) & (faces == b).any(1))]
+    assert len(torn) == len(faces) - 2 and not topology.is_watertight(torn)
+    monkeypatch.setattr(repair, "corner_fans", None)
+    out, found, report, closed = repair.clean(vertices, torn)
+    assert closed and topology.is_watertight(found) and topology.is_manifold(found) and report == {"welded_vertices": 1}
+    assert np.array_equal(np.sort(out[found].reshape(-1, 9), 0), np.sort(vertices[torn].reshape(-1, 9), 0))
+    _, turned, report, closed = repair.clean(vertices, torn[:, ::-1])
+    assert closed and np.array_equal(turned, found[:, ::-1][:, ::-1]) and report == {"welded_vertices": 1, "turned_inside_out": True}
+
+
+def test_two_faces_back_to_back_are_one_once_welded():
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]] * 2, float)
+    _, found, report, closed = repair.clean(vertices, np.array([[0, 1, 2], [3, 5, 4]]))
+    assert len(found) == 1 and not closed and report == {"welded_vertices": 3, "duplicate_faces": 1}
 
 
 def test_two_cubes_at_one_edge_become_two_manifolds():
