@@ -67,7 +67,7 @@ def _fcpw_search(vertices: np.ndarray, faces: np.ndarray) -> _Search | None:
     def search(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         found, face_idx = fcpw.interaction_3D_list(), np.empty(len(points), np.int64)
         asked = single(points)
-        order = _by_place(asked)
+        order = by_place(asked)
         scene.find_closest_points(asked.take(order, 0), np.full(len(points), np.inf, np.float32), found)
         face_idx[order] = np.fromiter((one.primitive_index for one in found), np.int64, len(points))
         point = closest_on_triangles(points, vertices[faces[face_idx]])
@@ -76,7 +76,7 @@ def _fcpw_search(vertices: np.ndarray, faces: np.ndarray) -> _Search | None:
     return search
 
 
-def _by_place(points: np.ndarray) -> np.ndarray:
+def by_place(points: np.ndarray) -> np.ndarray:
     """An order (n,) of points (n, 3) in which those near to one another follow one another: what is read for one is still in the cache for the next."""
     low, high = points.min(0), points.max(0)
     cell = ((points - low) * (_CELLS / (float((high - low).max()) or 1.0))).astype(np.uint16)

@@ -53,10 +53,9 @@ def _corner_sines(p: np.ndarray, *normals: np.ndarray) -> list[np.ndarray]:
     return [(turn[0] * n[0] + turn[1] * n[1] + turn[2] * n[2]) / over for n in normals]
 
 
-def worst_jacobian(vertices: np.ndarray, quads: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(q,) smallest scaled Jacobian of each quad, about its own normal and about `normals` (q, 3): the worse of both."""
-    p = columns_of(vertices, quads)
-    own, other = _corner_sines(p, _normal_of(p)[0], normals.T)
+def worst_jacobian(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(q,) smallest scaled Jacobian of each quad with corners (3, 4, q), about its own normal and about `normals` (3, q): the worse of both."""
+    own, other = _corner_sines(p, _normal_of(p)[0], normals)
     return np.minimum(own, other).min(0)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.geometry import repair, topology
+from gdtool.geometry.distance import by_place
 from gdtool.geometry.features import Constraints
 from gdtool.geometry.mesh_quality import scaled_jacobian, valences
 from gdtool.geometry.quad_engines import ENGINES, on_few
@@ -155,7 +156,18 @@ def candidate(vertices: np.ndarray, faces: np.ndarray, way: Way, asked: float) -
     mesh = vertices.astype(np.float32), faces.astype(np.int32)
     if way.engine == "instant-meshes" and way.subdivisions:
         mesh = on_few(*mesh, quads, wanted)
-    return Candidate(way, asked, *judged(*ENGINES[way.engine](*mesh, quads, way.degrees), wanted))
+    fault, *found = judged(*ENGINES[way.engine](*mesh, quads, way.degrees), wanted)
+    return Candidate(way, asked, fault, *_by_place(*found))
+
+
+def _by_place(vertices: np.ndarray, quads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same mesh, its vertices and quads in an order in which those near to one another follow one another: what reads it finds them in the cache."""
+    if not len(quads):
+        return vertices, quads
+    order = by_place(vertices)
+    number = np.empty(len(order), np.int64)
+    number[order] = np.arange(len(order))
+    return vertices[order], number[quads[by_place(vertices[quads].mean(1))]]
 
 
 def judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, wanted: topology.Invariants) -> tuple[str | None, np.ndarray, np.ndarray]:

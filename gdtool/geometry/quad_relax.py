@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from gdtool.geometry.distance import closest_points
 from gdtool.geometry.features import Constraints, Features
 from gdtool.geometry.mesh_quality import columns_of, cross, polygon_normals, scaled_jacobian, worst_jacobian
 from gdtool.geometry.quad_shape import Slide, Surface, normals_below, relax, still_vertices
 from gdtool.geometry.quad_unfold import unfold
-from gdtool.geometry.topology import edges_of
+from gdtool.geometry.topology import edges_of, triangulated
 
 _SQUARE_SHARE = 0.4  # of the way from the nearest rectangle to the nearest square
 _POOR = 0.6  # quads with a smaller scaled Jacobian pull harder
@@ -16,6 +17,7 @@ _NORMALS_EVERY = 6
 _THIN = 0.3  # quads of a smaller scaled Jacobian stay where they are balanced
 _FEW_BAD, _MOST_IN_VAIN = 8, 2  # more bad quads than these are given up after so many rounds in a row that leave most of them
 _MOST_LEFT = 0.75
+_BARE = 0.5  # edge lengths
 
 
 def square_up(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
@@ -35,22 +37,23 @@ def square_up(vertices: np.ndarray, faces: np.ndarray, surface: Surface, feature
     slide = Slide(surface, features, constraints)
     for turn in range(iterations + 1):
         if turn % _NORMALS_EVERY == 0:
-            normals = normals_below(vertices, faces, surface)
-        quality = worst_jacobian(vertices, faces, normals)
+            normals = np.ascontiguousarray(normals_below(vertices, faces, surface).T)
+        p = columns_of(vertices, faces)
+        quality = worst_jacobian(p, normals)
         rank = (-int((quality < 0.2).sum()), float(quality.mean()))
         if best_rank is None or rank > best_rank:
             best, best_rank = vertices, rank
         if turn == iterations:
             break
         weight = 1 + 6 * np.clip(_POOR - quality, 0, 1)
-        asked = _rectangles(columns_of(vertices, faces), normals.T).reshape(3, -1)
+        asked = _rectangles(p, normals).reshape(3, -1)
         shares = np.tile(weight, 4)
         total = np.maximum(np.bincount(flat, shares, len(vertices)), 1e-300)
         target = np.stack([np.bincount(flat, shares * asked[i], len(vertices)) for i in range(3)], -1) / total[:, None]
         moved = vertices + strength * (target - vertices)
         moved[still] = vertices[still]
         vertices = slide.step(moved, vertices, turn == iterations - 1)
-    return slide.exact(best)
+    return best if best is slide.placed else slide.exact(best)
 
 
 def balance(vertices: np.ndarray, faces: np.ndarray, surface: Surface, constraints: Constraints) -> np.ndarray:
@@ -120,7 +123,8 @@ def ease(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Fe
          least: float = 0.2, rounds: int = 6, tips: np.ndarray | None = None) -> tuple[np.ndarray, Constraints]:
     """Surroundings of quads that stay worse than `least` let off their feature curves and evened out; what got better is kept.
 
-    tips: vertices that stay fixed, for evened out they would shrink back. A path along a crease that winds cannot be straightened by moving vertices; here it is given up for a few quads.
+    A path along a crease that winds cannot be straightened by moving vertices; here it is given up for a few quads. Evened out, corners
+    and tips of the surface shrink back: where that would leave them bare, the vertices at corners stay. tips: vertices that stay anyway.
     """
     in_vain, left = 0, np.inf
     for turn in range(rounds):
@@ -139,20 +143,30 @@ def ease(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Fe
             near[tips] = False
         used, local = np.unique(faces[own], return_inverse=True)
         local = local.reshape(-1, 4)
-        # Off their curves inside; where they were at the rim.
-        curve, fixed = np.where(near, -1, constraints.curve), constraints.fixed & ~near
+        before = vertices[used]
         mesh_rim = still_vertices(edges_of(faces), len(vertices), constraints) & ~constraints.fixed
-        mine = Constraints(np.full(len(used), -1), (~near | mesh_rim)[used], constraints.path[:0], constraints.path_curve[:0])
-        trial = relax(vertices[used], local, surface, features, mine, 10 + 10 * turn)
-        trial = square_up(trial, local, surface, features, mine, 10)
-        trial = unfold(trial, local, surface, features, mine, most_visits=1500)
-        before, after = scaled_jacobian(vertices[used], local), scaled_jacobian(trial, local)
-        if _faults(after, least) < _faults(before, least):
-            vertices = vertices.copy()
-            vertices[used] = trial
-            kept = ~near[constraints.path].any(1)
-            constraints = Constraints(curve, fixed, constraints.path[kept], constraints.path_curve[kept])
+        for loose in (near, near & ~constraints.fixed):
+            # Off their curves inside; where they were at the rim.
+            mine = Constraints(np.full(len(used), -1), (~loose | mesh_rim)[used], constraints.path[:0], constraints.path_curve[:0])
+            trial = relax(before, local, surface, features, mine, 10 + 10 * turn)
+            trial = square_up(trial, local, surface, features, mine, 10)
+            trial = unfold(trial, local, surface, features, mine, most_visits=1500)
+            if _faults(scaled_jacobian(trial, local), least) >= _faults(scaled_jacobian(before, local), least):
+                break
+            if not _leaves_bare(before, trial, local):
+                vertices = vertices.copy()
+                vertices[used] = trial
+                kept = ~loose[constraints.path].any(1)
+                constraints = Constraints(np.where(loose, -1, constraints.curve), constraints.fixed & ~loose, constraints.path[kept],
+                                          constraints.path_curve[kept])
+                break
     return vertices, constraints
+
+
+def _leaves_bare(before: np.ndarray, after: np.ndarray, faces: np.ndarray) -> bool:
+    """Whether some of the places of vertices (v, 3) are far from the quads (f, 4) once these have moved."""
+    edge = (polygon_normals(before, faces)[1].sum() / len(faces)) ** 0.5
+    return bool(closest_points(before, after, triangulated(faces)[0])[0].max() > _BARE * edge)
 
 
 def _faults(jacobian: np.ndarray, least: float) -> tuple[int, int, float]:

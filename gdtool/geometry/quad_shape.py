@@ -83,6 +83,7 @@ class Slide:
         self._curves = [(slice(start, end), features.segments[features.curve == curve[start]]) for start, end in pairwise([*first, len(curve)])]
         self._normals: np.ndarray | None = None
         self._steps = 0
+        self.placed: np.ndarray | None = None  # what exact() gave last
 
     def exact(self, vertices: np.ndarray) -> np.ndarray:
         """Vertices on the surface; those on a feature curve on that curve; fixed ones where they are."""
@@ -97,6 +98,7 @@ class Slide:
         out[self._held] = held
         line = self._points[ends[:, 1]] - self._points[ends[:, 0]]
         self._lines = line / np.maximum(np.linalg.norm(line, axis=1), 1e-300)[:, None]
+        self.placed = out
         return out
 
     def step(self, moved: np.ndarray, vertices: np.ndarray, last: bool) -> np.ndarray:

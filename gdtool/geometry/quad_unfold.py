@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.geometry.features import Constraints, Features, closest_on_segments
-from gdtool.geometry.mesh_quality import worst_jacobian
+from gdtool.geometry.mesh_quality import columns_of, worst_jacobian
 from gdtool.geometry.quad_shape import Lists, Surface, incidence, neighbours, normals_below
 from gdtool.geometry.topology import edges_of
 
@@ -32,12 +32,13 @@ def unfold(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: 
     held = constraints.curve >= 0
     vertices = vertices.copy()
     normals = normals_below(vertices, faces, surface)
+    below = np.ascontiguousarray(normals.T)
     settled = np.zeros(len(vertices), bool)  # found no better place, and nothing beside them moved since
     for turn in range(rounds):
         loose = turn >= rounds - _LOOSE_ROUNDS
         if turn == rounds - _LOOSE_ROUNDS:
             settled &= ~held & ~constraints.fixed
-        bad = worst_jacobian(vertices, faces, normals) < (_LET_OFF_BELOW if loose else least)
+        bad = worst_jacobian(columns_of(vertices, faces), below) < (_LET_OFF_BELOW if loose else least)
         if not bad.any():
             break
         touched = np.unique(faces[bad])
@@ -97,7 +98,7 @@ def _best(vertices: np.ndarray, batch: np.ndarray, quads: np.ndarray, normals: n
     n, p, k = *places.shape[:2], quads.shape[1]
     corners = np.where((quads == batch[:, None, None])[:, None, ..., None], places[:, :, None, None], vertices[quads][:, None])
     # Against the surface's normal and the quad's own: a quad may be folded in one and not in the other.
-    got = worst_jacobian(corners.reshape(-1, 3), np.arange(n * p * k * 4).reshape(-1, 4), np.repeat(normals[:, None], p, 1).reshape(-1, 3))
+    got = worst_jacobian(np.ascontiguousarray(corners.reshape(-1, 4, 3).T), np.repeat(normals[:, None], p, 1).reshape(-1, 3).T)
     got = got.reshape(n, p, k).min(2)
     best = got.argmax(1)
     return best, got[np.arange(n), best] > got[:, 0] + _GAIN

@@ -199,4 +199,4 @@ def _way(vertices, faces, options: Options, out: Output):
     return partial(remesh_mirrored, axis=axis), figures
 
 
-STAGE = Stage(name="remesh", version=36, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)
+STAGE = Stage(name="remesh", version=37, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)

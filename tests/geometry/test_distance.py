@@ -75,6 +75,15 @@ def test_a_search_tree_finds_what_a_single_search_does(monkeypatch, large, place
         np.testing.assert_allclose(closest_on_triangles(points, vertices[faces[face_idx]]), point, atol=1e-9)
 
 
+def test_points_in_the_order_of_place_follow_those_near_to_them():
+    points = np.random.default_rng(3).uniform(-1, 1, (4000, 3)).astype(np.float32) + np.float32(1e3)
+    order = distance.by_place(points)
+    assert np.array_equal(np.sort(order), np.arange(4000))
+    steps = [np.linalg.norm(np.diff(some, axis=0), axis=1).mean() for some in (points, points[order])]
+    assert steps[1] < 0.5 * steps[0]
+    assert np.array_equal(distance.by_place(np.repeat(points[:1], 5, 0)), np.arange(5))  # all in one place: as they come
+
+
 def test_cut_faces_are_the_same_surface_with_the_same_sides():
     vertices, faces = np.array([[0, 0, 0], [8, 0.01, 0], [0, 0.1, 0], [0.5, 0.5, 1.0]]), np.array([[0, 1, 2], [0, 2, 3], [2, 1, 3], [1, 1, 1]])
     cut_vertices, cut, whole = bisected(vertices, faces, 0.5, 1000)

@@ -1,11 +1,15 @@
 """Squaring quads: folds undone on the surface, straight corners let off their curves."""
 
 import numpy as np
+import pytest
 
+from gdtool.geometry import quad_relax
+from gdtool.geometry.distance import closest_points
 from gdtool.geometry.features import Constraints, Features, untied
 from gdtool.geometry.mesh_quality import scaled_jacobian
 from gdtool.geometry.quad_relax import balance, ease, square_up
 from gdtool.geometry.quad_shape import Surface
+from gdtool.geometry.topology import triangulated
 from tests.geometry.solids import plane, sphere
 
 NO_FEATURES = Features(np.zeros((0, 3)), np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
@@ -52,6 +56,30 @@ def test_a_corner_pinned_in_the_wrong_place_is_eased():
     pinned = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
     out, left = ease(bent, quads, Surface(*plane()), NO_FEATURES, pinned)
     assert scaled_jacobian(out, quads).min() >= 0.2 and not left.fixed[40]
+
+
+@pytest.mark.parametrize("moved, by", [(49, (0.1, -0.1, 0)), (41, (0, 0.2, 0))])
+@pytest.mark.parametrize("height", [0.15, 0.25])
+def test_a_tip_beside_folded_quads_stays_where_easing_would_draw_it_back(monkeypatch, height, moved, by):
+    vertices, quads = grid()
+    tip = 40
+    vertices[tip, 2] = height
+    triangles = triangulated(quads)[0]
+    surface, held = Surface(vertices, triangles.astype(np.int64)), Constraints.none(len(vertices))
+    held.fixed[tip] = True
+    bent = vertices.copy()
+    bent[moved] += by
+    bent = surface.closest(bent)[2]
+    assert scaled_jacobian(bent, quads).min() < 0
+
+    def bare(out):
+        return closest_points(vertices[[tip]], out, triangles)[0][0] * 8  # edges are 1/8 long
+
+    out, left = ease(bent, quads, surface, NO_FEATURES, held)
+    assert scaled_jacobian(out, quads).min() > 0.5 and bare(out) < 1e-9 and left.fixed[tip]
+    monkeypatch.setattr(quad_relax, "_leaves_bare", lambda *_: False)
+    out, left = ease(bent, quads, surface, NO_FEATURES, held)
+    assert bare(out) > 0.75 and not left.fixed[tip]
 
 
 def test_easing_folds_nothing_that_was_not_folded():

@@ -142,6 +142,24 @@ def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
     assert volume(out, triangulated(found)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
 
 
+def test_candidates_are_in_the_order_of_place(monkeypatch):
+    """Whatever order an engine leaves its quads in."""
+    vertices, faces = quad_cube(3)
+    rng = np.random.default_rng(1)
+    mixed, number = rng.permutation(len(vertices)), np.empty(len(vertices), np.int64)
+    number[mixed] = np.arange(len(vertices))
+    monkeypatch.setitem(quad_candidate.ENGINES, "quadriflow", lambda *_: (vertices[mixed], rng.permutation(number[faces])))
+    one = quad_candidate.candidate(vertices, triangulated(faces)[0], quad_candidate.Way("quadriflow", 0, (1.0,), 30.0), len(faces))
+    assert one.fault is None and len(one.quads) == len(faces)
+
+    def places(v, q):
+        return sorted(map(tuple, v[q].reshape(len(q), 12).tolist()))
+
+    assert places(one.vertices, one.quads) == places(vertices, faces)
+    ends = topology.edges_of(one.quads).ends
+    assert np.abs(np.diff(ends, axis=1)).mean() < 0.3 * len(vertices) / 3  # a third of them, on average, where it is by chance
+
+
 def test_output_without_area_is_no_quads():
     vertices, faces = quad_cube(1)
     assert quad_candidate.judged(vertices, faces[:, [0, 1, 1, 0]], topology.invariants(faces))[0] == "no quads"
