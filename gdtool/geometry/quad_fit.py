@@ -31,6 +31,7 @@ _MOST_FOLDED = 0.01  # of the quads
 _CUT_EDGES = 0.25  # surface so far from the quads lies beyond an edge that they cut off
 CUT_OFF, CUT_SUBDIVIDED = 0.0125, 0.005  # how much of it may, as paired triangles keep its edges; of a subdivided result, after which finer ones come
 TOO_COARSE = _STRAYS, LEAVES_OUT, STICKS_OUT, _CUTS_OFF = "strays", "leaves out", "sticks out", "cuts off"
+_MOST_BARE = 0.8  # edge lengths that a corner may be from quads, rather than that they stay folded
 _FOLDED, _LET_GO = 0.05, 0.25  # scaled Jacobian; edge lengths
 
 
@@ -78,9 +79,13 @@ def drawn(outline: Outline, surface: Surface, features: Features, request: Reque
     if outline.far > _LIKELY * outline.limit and farthest(surface_of(vertices, faces), surface) > outline.limit * outline.edge:
         return vertices, faces, constraints  # what unfolds quads brings them no nearer
     vertices, constraints = _unfolded(vertices, faces, surface, features, constraints, outline.tips)
+    fixed = np.flatnonzero(constraints.fixed)
     vertices, faces, constraints = without_folded(vertices, faces, surface, constraints)
     if len(faces) < len(outline.faces):
         vertices = unfold(vertices, faces, surface, features, constraints)
+    if (scaled_jacobian(vertices, faces) <= 0).any():
+        tips = np.flatnonzero(constraints.fixed)[np.isin(fixed, outline.tips)]  # what was fixed is there still, in its order
+        vertices, constraints = ease(vertices, faces, surface, features, constraints, 0.0, tips=tips, most_bare=_MOST_BARE)
     return vertices, faces, constraints
 
 

@@ -17,7 +17,6 @@ _NORMALS_EVERY = 6
 _THIN = 0.3  # quads of a smaller scaled Jacobian stay where they are balanced
 _FEW_BAD, _MOST_IN_VAIN = 8, 2  # more bad quads than these are given up after so many rounds in a row that leave most of them
 _MOST_LEFT = 0.75
-_BARE = 0.5  # edge lengths
 
 
 def square_up(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
@@ -120,11 +119,12 @@ def _rectangles(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def ease(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
-         least: float = 0.2, rounds: int = 6, tips: np.ndarray | None = None) -> tuple[np.ndarray, Constraints]:
+         least: float = 0.2, rounds: int = 6, tips: np.ndarray | None = None, most_bare: float = 0.5) -> tuple[np.ndarray, Constraints]:
     """Surroundings of quads that stay worse than `least` let off their feature curves and evened out; what got better is kept.
 
     A path along a crease that winds cannot be straightened by moving vertices; here it is given up for a few quads. Evened out, corners
-    and tips of the surface shrink back: where that would leave them bare, the vertices at corners stay. tips: vertices that stay anyway.
+    and tips of the surface shrink back: where that would leave them bare by more than most_bare edge lengths, the vertices at corners
+    stay. tips: vertices that stay anyway.
     """
     in_vain, left = 0, np.inf
     for turn in range(rounds):
@@ -153,7 +153,7 @@ def ease(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Fe
             trial = unfold(trial, local, surface, features, mine, most_visits=1500)
             if _faults(scaled_jacobian(trial, local), least) >= _faults(scaled_jacobian(before, local), least):
                 break
-            if not _leaves_bare(before, trial, local):
+            if not _leaves_bare(before, trial, local, most_bare):
                 vertices = vertices.copy()
                 vertices[used] = trial
                 kept = ~loose[constraints.path].any(1)
@@ -163,10 +163,10 @@ def ease(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Fe
     return vertices, constraints
 
 
-def _leaves_bare(before: np.ndarray, after: np.ndarray, faces: np.ndarray) -> bool:
-    """Whether some of the places of vertices (v, 3) are far from the quads (f, 4) once these have moved."""
+def _leaves_bare(before: np.ndarray, after: np.ndarray, faces: np.ndarray, most: float) -> bool:
+    """Whether some of the places of vertices (v, 3) are more than so many edge lengths from the quads (f, 4) once these have moved."""
     edge = (polygon_normals(before, faces)[1].sum() / len(faces)) ** 0.5
-    return bool(closest_points(before, after, triangulated(faces)[0])[0].max() > _BARE * edge)
+    return bool(closest_points(before, after, triangulated(faces)[0])[0].max() > most * edge)
 
 
 def _faults(jacobian: np.ndarray, least: float) -> tuple[int, int, float]:

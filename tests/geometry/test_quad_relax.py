@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from gdtool.geometry import quad_relax
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.features import Constraints, Features, untied
 from gdtool.geometry.mesh_quality import scaled_jacobian
@@ -60,7 +59,7 @@ def test_a_corner_pinned_in_the_wrong_place_is_eased():
 
 @pytest.mark.parametrize("moved, by", [(49, (0.1, -0.1, 0)), (41, (0, 0.2, 0))])
 @pytest.mark.parametrize("height", [0.15, 0.25])
-def test_a_tip_beside_folded_quads_stays_where_easing_would_draw_it_back(monkeypatch, height, moved, by):
+def test_a_tip_beside_folded_quads_stays_where_easing_would_draw_it_back(height, moved, by):
     vertices, quads = grid()
     tip = 40
     vertices[tip, 2] = height
@@ -77,9 +76,8 @@ def test_a_tip_beside_folded_quads_stays_where_easing_would_draw_it_back(monkeyp
 
     out, left = ease(bent, quads, surface, NO_FEATURES, held)
     assert scaled_jacobian(out, quads).min() > 0.5 and bare(out) < 1e-9 and left.fixed[tip]
-    monkeypatch.setattr(quad_relax, "_leaves_bare", lambda *_: False)
-    out, left = ease(bent, quads, surface, NO_FEATURES, held)
-    assert bare(out) > 0.75 and not left.fixed[tip]
+    out, left = ease(bent, quads, surface, NO_FEATURES, held, most_bare=2.0)
+    assert 0.75 < bare(out) < 2 and not left.fixed[tip]
 
 
 def test_easing_folds_nothing_that_was_not_folded():
