@@ -85,7 +85,7 @@ def drawn(outline: Outline, surface: Surface, features: Features, request: Reque
         vertices = unfold(vertices, faces, surface, features, constraints)
     if (scaled_jacobian(vertices, faces) <= 0).any():
         tips = np.flatnonzero(constraints.fixed)[np.isin(fixed, outline.tips)]  # what was fixed is there still, in its order
-        vertices, constraints = ease(vertices, faces, surface, features, constraints, 0.0, tips=tips, most_bare=_MOST_BARE)
+        vertices, constraints = ease(vertices, faces, surface, features, constraints, _FOLDED, tips=tips, most_bare=_MOST_BARE)
     return vertices, faces, constraints
 
 
