@@ -13,7 +13,7 @@ from gdtool.core.errors import InputError
 from gdtool.core.threads import cores
 from gdtool.geometry import repair, topology
 from gdtool.geometry.halves import in_halves, worth_halving
-from gdtool.geometry.normals import face_normals
+from gdtool.geometry.normals import CHUNK, face_normals
 from gdtool.geometry.rows import unique_rows
 from gdtool.geometry.sharpen import corners_in, restore_creases
 from gdtool.geometry.unpinch import unpinched
@@ -22,7 +22,6 @@ _PACES, _UNIT = (4.0, 3.0, 8.0), 0.5  # how steeply the collapse's bound rises, 
 _BY_WAY = 6  # times the triangles asked for, to which the quicker collapse still goes well
 _UNEVEN, _FLAT = 1e-3, 1e-14  # edge lengths that what is flat is moved by; determinant of the mean of its normals' squares
 SHAKEN = 0.03  # edge lengths that all is moved by where the triangles are to be even
-_CHUNK = 2**14  # faces at a time: what they need in between stays in the cache
 _FEW_FLAT, _SAMPLE = 0.01, 20000  # of the vertices: so few stop no collapse; how many of them tell
 _STUCK, _FEW = 1.25, 32  # triangles in units of those asked for, and so many more, that a collapse may leave
 
@@ -35,8 +34,8 @@ def shaken(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """
     position = np.ascontiguousarray(vertices, np.float32)
     far = np.full(len(vertices), median_edge(vertices, faces) ** 2, np.float32)
-    for i in range(0, len(faces), _CHUNK):
-        corners = np.ascontiguousarray(faces[i:i + _CHUNK].T, np.intp)
+    for i in range(0, len(faces), CHUNK):
+        corners = np.ascontiguousarray(faces[i:i + CHUNK].T, np.intp)
         shortest = np.full(corners.shape[1], np.inf, np.float32)
         for one, other in combinations(corners, 2):
             side = position.take(one, 0) - position.take(other, 0)

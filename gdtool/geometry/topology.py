@@ -94,7 +94,7 @@ def twins_of(faces: np.ndarray) -> np.ndarray | None:
 def even(faces: np.ndarray) -> bool:
     """Whether each edge of faces (f, 3) is one of an even number of them, by the exclusive or of hashes (splitmix64's): wrong once in 2^64.
 
-    A manifold whose faces all look out is watertight where it is so; that is told in a tenth of the time that topology.is_watertight takes.
+    A manifold whose faces all look out is watertight where it is so; that is told in a tenth of the time that is_watertight takes.
     """
     together = np.uint64(0)
     for i in range(0, len(faces), _CHUNK):
