@@ -312,7 +312,7 @@ def test_ways_leapt_over_cost_no_coverage_and_a_seam_or_two(monkeypatch, around,
         monkeypatch.setattr(unwrap_pack, "_NEXT_GAINS", gains)
         laid = unwrap.unwrap(vertices, faces, unwrap.Request(size=1024, padding=4))
         leapt = [why for what, why, _ in laid.skipped if what.startswith("packing")]
-        assert len(leapt) == (gains < np.inf)
+        assert len(leapt) == (gains < np.inf) and not laid.failed
         found.append(unwrap.figures(vertices, faces, laid.uv, laid.face_uvs))
     quick, whole = found
     assert quick["coverage"] > whole["coverage"] - 0.02 and quick["charts"] <= whole["charts"] + 8 and quick["overlap"] == 0
