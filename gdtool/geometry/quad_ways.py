@@ -195,6 +195,7 @@ class Trial:
             one.trace(self.part)
             extra = len(one.outline.faces) - one.count
             if one.outline.hopeless or self.part.counted(one.count + extra, quads):
+                self._ahead.traced(one)
                 yield one
 
     def _drawn(self, candidates: Iterable[Candidate]) -> Candidate | None:

@@ -20,6 +20,7 @@ def test_drawn_ahead_or_in_turn(monkeypatch, child):
     monkeypatch.setattr(quad_ahead, "begin", lambda *given, **limits: begun.append(given) or begin(*given, **limits))
     monkeypatch.setattr(quad_ahead, "cores", lambda: 2)
     monkeypatch.setattr(quad_ahead, "_DOUBT_EDGES", 0.0)
+    monkeypatch.setattr(quad_ahead, "_SURE_EDGES", 0.0)
     kill = quad_ahead.Running.kill
     monkeypatch.setattr(quad_ahead.Running, "kill", lambda self: killed.append(self) or kill(self))
     if child == "is gone":
@@ -27,6 +28,17 @@ def test_drawn_ahead_or_in_turn(monkeypatch, child):
     out, found, record = quads.remesh(vertices, faces, Request(quads=4000))
     assert len(begun) == 1 and len(killed) == (child == "is not wanted") and record.engine == in_turn[2].engine
     assert np.array_equal(out, in_turn[0]) and np.array_equal(found, in_turn[1])
+
+
+def test_what_was_begun_is_given_up_once_the_first_one_is_traced(monkeypatch):
+    monkeypatch.setattr(quad_ahead, "cores", lambda: 2)
+    monkeypatch.setattr(quad_ahead, "_DOUBT_EDGES", 0.0)
+    happened, begin, kill, draw = [], quad_ahead.begin, quad_ahead.Running.kill, Candidate.draw
+    monkeypatch.setattr(quad_ahead, "begin", lambda *given, **limits: happened.append("begun") or begin(*given, **limits))
+    monkeypatch.setattr(quad_ahead.Running, "kill", lambda self: happened.append("killed") or kill(self))
+    monkeypatch.setattr(Candidate, "draw", lambda self, part: happened.append("drawn") or draw(self, part))
+    quads.remesh(*sphere(96, 0.45), Request(quads=4000))
+    assert happened == ["begun", "killed", "drawn"]
 
 
 def test_a_first_one_near_to_the_surface_is_not_in_doubt(monkeypatch):
