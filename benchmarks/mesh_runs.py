@@ -71,14 +71,16 @@ def arguments(text: str, models: str, peers: str) -> argparse.ArgumentParser:
     return parser
 
 
-def beside(rows: list[dict], peers: list[str]) -> str:
-    """A table: our seconds on each model, and their ratio to those of each peer that ran in the same hour; machines differ, ratios less."""
+def beside(rows: list[dict], peers: list[str], also: tuple[str, ...] = ()) -> str:
+    """A table: our seconds on each model, those of other ways of ours, and the ratio of the first to those of each peer that ran in the
+    same hour; machines differ, ratios less."""
     took = {(row["model"], row["way"]): row["seconds"] for row in rows if "seconds" in row}
     peers = [peer for peer in peers if any(way == peer for _, way in took)]
     ours = {model: seconds for (model, way), seconds in took.items() if way == "ours"}
-    lines = [[model, number(seconds), *(number(seconds / took[model, peer] if (model, peer) in took else None, 2) for peer in peers)]
+    lines = [[model, number(seconds), *(number(took.get((model, way))) for way in also),
+              *(number(seconds / took[model, peer] if (model, peer) in took else None, 2) for peer in peers)]
              for model, seconds in ours.items()]
-    return table(["model", "our seconds", *(f"ratio to {peer}" for peer in peers)], lines)
+    return table(["model", "our seconds", *also, *(f"ratio to {peer}" for peer in peers)], lines)
 
 
 def plot(rows: list[dict], path: Path, error: str, label: str, logarithmic: bool) -> None:

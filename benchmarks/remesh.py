@@ -6,7 +6,8 @@ Writes remesh.md, remesh.json, remesh.png and the wireframes remesh_sheet.png, r
 knobs are swept on the solids of --sweep, pyQuadriFlow runs on the models of --slow-on; everything else, with Blender's
 QuadriFlow through a Python that has bpy, on everything. Every run is a child process with a time limit; seconds are of its
 wall clock and of the processor, from arrays in memory to arrays in memory, for ours and Instant Meshes of the quickest of --runs: a
-shared machine takes longer now and then, by up to a half. Lengths are shares of the bounding box' diagonal.
+shared machine takes longer now and then, by up to a half. "of a file": positions in single precision, as files have them, which
+repair.clean gets first, as in the command. Lengths are shares of the bounding box' diagonal.
 A crease of the truth is recalled where a sharp edge (30 degrees) of the result is within 0.2 % of the diagonal.
 """
 
@@ -25,13 +26,14 @@ from mesh_runs import arguments, as_commanded, beside, blender, cost_since, plot
 from rows import Rows
 from wireframe import file_name, sheet, wireframe
 
+OF_A_FILE = "ours, of a file"
 WAYS = {
-    "ours": {}, "ours, not restored": {"restore_creases": False}, "ours, not smoothed": {"smooth_iterations": 0},
+    "ours": {}, OF_A_FILE: {"of_a_file": True}, "ours, not restored": {"restore_creases": False}, "ours, not smoothed": {"smooth_iterations": 0},
     "ours, smoothed 20": {"smooth_iterations": 20}, "ours, no engine": {"engine": "split"},
 }
 BLENDER = "Blender QuadriFlow"
 SLOW = "QuadriFlow"
-REPEATED = ("ours", "Instant Meshes")
+EVERYWHERE, REPEATED = ("ours", OF_A_FILE), ("ours", OF_A_FILE, "Instant Meshes")
 PEERS = {"Instant Meshes": "pynanoinstantmeshes", "QuadriFlow": "pyQuadriFlow"}
 COLUMNS = ("model", "way", "seconds", "processor", "peak MB", "quads", "watertight", "irregular", "jacobian", "least", "zero area", "mean",
            "hausdorff", "crease mean", "crease recall")
@@ -42,8 +44,15 @@ def ours(vertices: np.ndarray, faces: np.ndarray, quads: int, options: dict) -> 
     as_commanded()
     from gdtool.geometry.quad_task import Request
     from gdtool.geometry.quads import remesh
+    from gdtool.geometry.repair import clean
 
+    options = dict(options)
+    of_a_file = options.pop("of_a_file", False)
+    if of_a_file:
+        vertices = vertices.astype(np.float32)
     start = time.perf_counter()
+    if of_a_file:
+        vertices, faces, *_ = clean(vertices, faces)
     threads = len(os.sched_getaffinity(0))  # as the command has
     out, found, record = remesh(vertices, faces, Request(quads=quads, threads=threads, **options))
     return out, found, cost_since(start), record.engine
@@ -141,7 +150,7 @@ def main() -> None:
     rows = Rows(asked.out / "remesh.json", {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept", "minutes", "end")})
 
     def ways(name: str) -> list[str]:
-        out = [way for way in WAYS if way == "ours" or name in asked.sweep.split(",")]
+        out = [way for way in WAYS if way in EVERYWHERE or name in asked.sweep.split(",")]
         out += [way for way, package in PEERS.items() if find_spec(package) and (way != SLOW or name in asked.slow_on.split(","))]
         out += [BLENDER] if asked.peers_python else []
         return [way for way in out if not asked.only or way in asked.only.split(",")]
@@ -152,8 +161,9 @@ def main() -> None:
                                for row in rows.rows))
         failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows.rows if "failed" in row)
         head = (f"# Remesh: {asked.faces} quads from {asked.input} triangles\n\n"
-                f"`make bench-assets`, {machine()}. {note}\n\nSeconds of {' and '.join(REPEATED)} are the least of {asked.runs} runs, the others' of one.\n\n")
-        (asked.out / "remesh.md").write_text(head + beside(rows.rows, [*PEERS, BLENDER]) + "\n\n" + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "")
+                f"`make bench-assets`, {machine()}. {note}\n\nSeconds of {'; '.join(REPEATED)} are the least of {asked.runs} runs, the others' of one.\n\n")
+        foot = f"\nFailed:\n\n{failed}\n" if failed else ""
+        (asked.out / "remesh.md").write_text(head + beside(rows.rows, [*PEERS, BLENDER], (OF_A_FILE,)) + "\n\n" + text + "\n" + foot
                                              + "\n![time against error](remesh.png)\n\n![wireframes](remesh_sheet.png)\n")
         plot(rows.rows, asked.out / "remesh.png", "mean", "mean distance, share of the diagonal", True)
         sheet(asked.kept / "pictures", list(dict.fromkeys(row["model"] for row in rows.rows)), ["ours", "Instant Meshes", BLENDER],
