@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
 from gdtool.core.errors import InputError
@@ -38,34 +40,39 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
         if count:
             report[name] = int(count)
 
-    used = np.ascontiguousarray(compact(vertices, faces)[0].T)
-    extent = float((used.max(1) - used.min(1)).max())
+    vertices, faces = compact(vertices, faces)
+    rows = np.ascontiguousarray(vertices.T)
+    extent = float((rows.max(1) - rows.min(1)).max())
     if not extent > 0:
         raise InputError(subject, "all its faces lie in one point")
-    sides = face_normals(vertices / extent, faces)
+    with ThreadPoolExecutor(1) as pool:
+        measured = pool.submit(face_normals, vertices / extent, faces)
+        fans = _one_fan(faces)
+        sides = measured.result()
     if not sides[1].any():
         raise InputError(subject, "no face has an area")
     repeated = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
     if repeated.any():
         note("degenerate_faces", repeated.sum())
         faces, sides = faces[~repeated], tuple(side[~repeated] for side in sides)
+        fans = _one_fan(faces)
     if not len(faces):
         raise InputError(subject, "no face has an area")
-    twins = _twins(faces)
-    if twins is None:
+    if fans is None:
         # A closed mesh is left as its indices say: welding could join sheets that only touch.
         welded = _weld(vertices, faces, extent * WELD_SHARE)
         note("welded_vertices", _used(faces, len(vertices)) - _used(welded, len(vertices)))
         repeated = (welded == np.roll(welded, 1, 1)).any(1)
         note("degenerate_faces", repeated.sum() + report.get("degenerate_faces", 0))
         faces, sides = welded[~repeated], tuple(side[~repeated] for side in sides)
-        if (twins := _twins(faces)) is not None and _twice(twins):
-            twins = None
-    if twins is not None and one_fan_each(faces, twins):
+        fans = _one_fan(faces, doubled=False)
+    if fans:
+        if report:
+            vertices, faces = compact(vertices, faces)
         if _volume(vertices / extent, faces, *sides) < 0:
             report["turned_inside_out"] = True
             faces = faces[:, ::-1].copy()
-        return *compact(vertices, faces), report, True
+        return vertices, faces, report, True
     first = first_rows(np.sort(faces, 1))
     note("duplicate_faces", len(faces) - len(first))
     faces = faces[first]
@@ -102,9 +109,11 @@ def _used(faces: np.ndarray, count: int) -> int:
     return int(marked.sum())
 
 
-def _twins(faces: np.ndarray) -> np.ndarray | None:
-    """twins_of(faces), soon where there are none."""
-    return twins_of(faces) if even(faces) else None
+def _one_fan(faces: np.ndarray, doubled: bool = True) -> bool | None:
+    """Whether the faces around each vertex of a closed mesh form one fan; None of an open one. doubled: also where two have the same corners."""
+    if not even(faces) or (twins := twins_of(faces)) is None:
+        return None
+    return (doubled or not _twice(twins)) and one_fan_each(faces, twins)
 
 
 def _twice(twins: np.ndarray) -> bool:
