@@ -33,9 +33,9 @@ class Ahead:
         if running is not None and (done := running.if_done()) is not None:
             vars(one).update(vars(done))
 
-    def traced(self, first: Candidate) -> None:
-        """Give up what was begun where the first one, now that its outline is known, is in doubt no longer."""
-        if first.outline.far < _SURE_EDGES:
+    def traced(self, first: Candidate, counted: bool) -> None:
+        """Give up what was begun where the first one, now that its outline is known, is in doubt no longer, or no other has the number of quads."""
+        if first.outline.far < _SURE_EDGES or not counted:
             self.stop()
 
     def stop(self) -> None:

@@ -195,7 +195,7 @@ class Trial:
             one.trace(self.part)
             extra = len(one.outline.faces) - one.count
             if one.outline.hopeless or self.part.counted(one.count + extra, quads):
-                self._ahead.traced(one)
+                self._ahead.traced(one, any(self.part.counted(other.count + extra, quads) for other in candidates[1:]))
                 yield one
 
     def _drawn(self, candidates: Iterable[Candidate]) -> Candidate | None:

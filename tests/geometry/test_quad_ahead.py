@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.geometry import quad_ahead, quads
+from gdtool.geometry import quad_ahead, quad_candidate, quads
 from gdtool.geometry.quad_candidate import Candidate
 from gdtool.geometry.quad_task import Request
 from tests.geometry.solids import sphere
@@ -30,7 +30,14 @@ def test_drawn_ahead_or_in_turn(monkeypatch, child):
     assert np.array_equal(out, in_turn[0]) and np.array_equal(found, in_turn[1])
 
 
-def test_what_was_begun_is_given_up_once_the_first_one_is_traced(monkeypatch):
+@pytest.mark.parametrize("why", ["near", "alone of the number"])
+def test_what_was_begun_is_given_up_once_the_first_one_is_traced(monkeypatch, why):
+    if why != "near":
+        monkeypatch.setattr(quad_ahead, "_SURE_EDGES", 0.0)
+        outlined, count = quad_candidate.outlined, Candidate.count
+        # Once the first has its outline, tips that were drawn out make the other one too many.
+        monkeypatch.setattr(quad_candidate, "outlined", lambda *given: monkeypatch.setattr(
+            Candidate, "count", property(lambda self: count.fget(self) * (1 if self.outline is not None else 2))) or outlined(*given))
     monkeypatch.setattr(quad_ahead, "cores", lambda: 2)
     monkeypatch.setattr(quad_ahead, "_DOUBT_EDGES", 0.0)
     happened, begin, kill, draw = [], quad_ahead.begin, quad_ahead.Running.kill, Candidate.draw
