@@ -22,7 +22,9 @@ class Rows:
         return any(row["model"] == model and row["way"] == way for row in self.rows)
 
     def add(self, row: dict) -> None:
-        self.rows.append(row)
+        """Behind the others of its model, so that what is measured again stays in its place."""
+        behind = max((i for i, one in enumerate(self.rows, 1) if one["model"] == row["model"]), default=len(self.rows))
+        self.rows.insert(behind, row)
         self.write(False)
 
     def write(self, complete: bool) -> None:
