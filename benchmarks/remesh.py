@@ -28,7 +28,7 @@ from wireframe import file_name, sheet, wireframe
 
 OF_A_FILE = "ours, of a file"
 WAYS = {
-    "ours": {}, OF_A_FILE: {"of_a_file": True}, "ours, not restored": {"restore_creases": False}, "ours, not smoothed": {"smooth_iterations": 0},
+    "ours": {}, OF_A_FILE: {}, "ours, not restored": {"restore_creases": False}, "ours, not smoothed": {"smooth_iterations": 0},
     "ours, smoothed 20": {"smooth_iterations": 20}, "ours, no engine": {"engine": "split"},
 }
 BLENDER = "Blender QuadriFlow"
@@ -39,15 +39,13 @@ COLUMNS = ("model", "way", "seconds", "processor", "peak MB", "quads", "watertig
            "hausdorff", "crease mean", "crease recall")
 
 
-def ours(vertices: np.ndarray, faces: np.ndarray, quads: int, options: dict) -> tuple:
+def ours(vertices: np.ndarray, faces: np.ndarray, quads: int, options: dict, of_a_file: bool = False) -> tuple:
     """In a child: vertices, quads, cost, the engine taken."""
     as_commanded()
     from gdtool.geometry.quad_task import Request
     from gdtool.geometry.quads import remesh
     from gdtool.geometry.repair import clean
 
-    options = dict(options)
-    of_a_file = options.pop("of_a_file", False)
     if of_a_file:
         vertices = vertices.astype(np.float32)
     start = time.perf_counter()
@@ -121,8 +119,8 @@ def measure(fine: Fine, ways: list[str], asked: argparse.Namespace, rows: Rows) 
                 made, cost = blender("quadriflow", fine.vertices, triangles, asked.faces, asked.peers_python, asked.limit)
                 found = made["vertices"], made["faces"], cost, BLENDER
             else:
-                run, which = ("peer", way) if way in PEERS else ("ours", WAYS[way])
-                found = min((call(f"remesh:{run}", fine.vertices, fine.faces, asked.faces, which, seconds=asked.limit, memory_mb=16000)
+                run, *given = ("peer", way) if way in PEERS else ("ours", WAYS[way], way == OF_A_FILE)
+                found = min((call(f"remesh:{run}", fine.vertices, fine.faces, asked.faces, *given, seconds=asked.limit, memory_mb=16000)
                              for _ in range(asked.runs if way in REPEATED else 1)), key=lambda one: one[2]["seconds"])
             row = {"model": fine.name, "way": way, "engine": found[3], **found[2], **score(fine, *found[:2])}
             if way == "ours":
