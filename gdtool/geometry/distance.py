@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gdtool.geometry.rays import cross, dot
+from gdtool.geometry.vectors import cross, dot
 
 _CELLS = 39  # along each axis: (39 + 1)^3 numbers fit 16 bits
 _LARGE = 200_000  # triangles from which fcpw's tree is built in a quarter of the time

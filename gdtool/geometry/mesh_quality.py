@@ -5,20 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.geometry.topology import components, edges_of
+from gdtool.geometry.vectors import cross, dot
 
 
 def columns_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(3, c, f) coordinates of the corners of faces (f, c): whole rows to compute with, several times faster than (f, c, 3)."""
     return np.ascontiguousarray(vertices.T).take(np.ascontiguousarray(faces.T), axis=1)
-
-
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross product of a (3, ...) and b (3, ...)."""
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    for product, (j, k) in zip(out, ((1, 2), (2, 0), (0, 1)), strict=True):
-        np.multiply(a[j], b[k], out=product)
-        product -= a[k] * b[j]
-    return out
 
 
 def polygon_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -33,7 +25,7 @@ def polygon_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
 def _normal_of(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit normals (3, q) and areas (q,) of quads with corners (3, 4, q)."""
     vector = cross(p[:, 2] - p[:, 0], p[:, 3] - p[:, 1])
-    length = np.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+    length = np.sqrt(dot(vector, vector))
     return vector / np.maximum(length, 1e-300), length / 2
 
 
@@ -47,10 +39,10 @@ def _corner_sines(p: np.ndarray, *normals: np.ndarray) -> list[np.ndarray]:
     after = np.empty_like(p)
     np.subtract(p[:, 1:], p[:, :-1], out=after[:, :-1])
     np.subtract(p[:, 0], p[:, -1], out=after[:, -1])
-    length = np.sqrt(after[0] * after[0] + after[1] * after[1] + after[2] * after[2])
+    length = np.sqrt(dot(after, after))
     turn = cross(after[:, [3, 0, 1, 2]], after)
     over = np.maximum(length * length[[3, 0, 1, 2]], 1e-300)
-    return [(turn[0] * n[0] + turn[1] * n[1] + turn[2] * n[2]) / over for n in normals]
+    return [dot(turn, n) / over for n in normals]
 
 
 def worst_jacobian(p: np.ndarray, normals: np.ndarray) -> np.ndarray:

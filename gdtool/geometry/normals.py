@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.geometry.rays import cross, dot
+from gdtool.geometry.vectors import cross, dot
 
 CHUNK = 2**14  # faces at a time: what they need in between stays in the cache
 

@@ -6,10 +6,11 @@ import numpy as np
 
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.features import Constraints, Features
-from gdtool.geometry.mesh_quality import columns_of, cross, polygon_normals, scaled_jacobian, worst_jacobian
+from gdtool.geometry.mesh_quality import columns_of, polygon_normals, scaled_jacobian, worst_jacobian
 from gdtool.geometry.quad_shape import Slide, Surface, normals_below, relax, still_vertices
 from gdtool.geometry.quad_unfold import unfold
 from gdtool.geometry.topology import edges_of, triangulated
+from gdtool.geometry.vectors import cross, dot
 
 _SQUARE_SHARE = 0.4  # of the way from the nearest rectangle to the nearest square
 _POOR = 0.6  # quads with a smaller scaled Jacobian pull harder
@@ -99,8 +100,8 @@ def _rectangles(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
     x /= np.maximum(length, 1e-300)
     y = cross(normals, x)
     z = np.empty(offset.shape[1:], np.complex128)
-    z.real = offset[0] * x[0] + offset[1] * x[1] + offset[2] * x[2]
-    z.imag = offset[0] * y[0] + offset[1] * y[1] + offset[2] * y[2]
+    z.real = dot(offset, x)
+    z.imag = dot(offset, y)
     size = np.sqrt((z.real**2 + z.imag**2).mean(0))
     # The nearest square; one that is folded has hardly any, so it gets the size it takes up.
     a = (z[0] - 1j * z[1] - z[2] + 1j * z[3]) / 4

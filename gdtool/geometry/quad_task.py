@@ -14,7 +14,8 @@ from gdtool.geometry.distance import sample_surface
 from gdtool.geometry.features import Features, find_features
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_shape import Surface
-from gdtool.geometry.rays import RayCaster, dot
+from gdtool.geometry.rays import RayCaster
+from gdtool.geometry.vectors import dot
 
 COUNT_TOLERANCE = 0.03
 QUADS_OF_A_PIECE = 12  # at least

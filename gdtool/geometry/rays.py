@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.core.threads import cores
+from gdtool.geometry.vectors import cross, dot
 
 # Rays handed to Embree at a time: few enough that a chunk stays in the cache, enough that threads are busy.
 CHUNK = 1 << 16
@@ -65,24 +66,6 @@ def _meet(origins: np.ndarray, directions: np.ndarray, triangles: np.ndarray) ->
     np.clip(weights, 0.0, 1.0, out=weights)
     weights /= weights[0] + weights[1] + weights[2]
     return distance, weights.T
-
-
-def cross(a, b) -> list[np.ndarray]:
-    """Vector products of vectors given as three arrays (n,)."""
-    out = []
-    for j, k in ((1, 2), (2, 0), (0, 1)):
-        product = a[j] * b[k]
-        product -= a[k] * b[j]
-        out.append(product)
-    return out
-
-
-def dot(a, b) -> np.ndarray:
-    """(n,) scalar products of vectors given as three arrays (n,), as (3, n) is."""
-    out = a[0] * b[0]
-    out += a[1] * b[1]
-    out += a[2] * b[2]
-    return out
 
 
 class RayCaster:

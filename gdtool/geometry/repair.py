@@ -45,18 +45,15 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
     extent = float((rows.max(1) - rows.min(1)).max())
     if not extent > 0:
         raise InputError(subject, "all its faces lie in one point")
+    repeated = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
+    if repeated.any():
+        note("degenerate_faces", repeated.sum())
+        faces = faces[~repeated]
     with ThreadPoolExecutor(1) as pool:
         measured = pool.submit(face_normals, vertices / extent, faces)
         fans = _one_fan(faces)
         sides = measured.result()
     if not sides[1].any():
-        raise InputError(subject, "no face has an area")
-    repeated = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
-    if repeated.any():
-        note("degenerate_faces", repeated.sum())
-        faces, sides = faces[~repeated], tuple(side[~repeated] for side in sides)
-        fans = _one_fan(faces)
-    if not len(faces):
         raise InputError(subject, "no face has an area")
     if fans is None:
         # A closed mesh is left as its indices say: welding could join sheets that only touch.

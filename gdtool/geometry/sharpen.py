@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 
 from gdtool.geometry.normals import CHUNK, face_normals, normals_of, vertex_normals
-from gdtool.geometry.rays import dot
 from gdtool.geometry.topology import Edges, compact, edges_of, renumbered
+from gdtool.geometry.vectors import dot
 
 _NEIGHBOURS = 24
 _RINGS = 5  # of faces around a bevel, among which the sides are

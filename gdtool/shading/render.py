@@ -21,7 +21,8 @@ import numpy as np
 
 from gdtool.assets.scene import Scene
 from gdtool.cameras import Camera, project, rays
-from gdtool.geometry.rays import RayCaster, dot, is_convex
+from gdtool.geometry.rays import RayCaster, is_convex
+from gdtool.geometry.vectors import dot
 from gdtool.images.color import srgb_from_linear
 from gdtool.shading.environment import Environment
 from gdtool.shading.pattern import pixel_pattern

@@ -13,7 +13,7 @@ import numpy as np
 
 from gdtool.assets.scene import Scene, Texture
 from gdtool.geometry.normals import face_normals
-from gdtool.geometry.rays import dot
+from gdtool.geometry.vectors import dot
 from gdtool.shading.textures import TextureReader, same_layout
 
 ATTRIBUTES = ("albedo", "roughness", "metallic", "normal", "geometric_normal", "alpha", "emissive")

@@ -96,6 +96,7 @@ def test_duplicate_and_flat_faces_go():
     (np.array([[0, 0, 0], [1, 0, 0], [0, np.nan, 0.0]]), np.array([[0, 1, 2]]), "vertex 2 is not finite"),
     (np.ones((3, 3)), np.array([[0, 1, 2]]), "one point"),
     (np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]]), np.array([[0, 1, 2]]), "no face has an area"),
+    (np.eye(3), np.array([[0, 0, 1], [1, 2, 2]]), "no face has an area"),
 ])
 def test_refused(vertices, faces, fact):
     with pytest.raises(InputError, match=fact):
