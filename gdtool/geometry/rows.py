@@ -14,26 +14,39 @@ def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     rows = np.asarray(rows)
     words = _words(rows)
-    key = _hashes(words)
-    order = np.argsort(key)
-    sorted_key = key.take(order)
-    start = np.flatnonzero(np.concatenate([np.ones(min(len(rows), 1), bool), sorted_key[1:] != sorted_key[:-1]]))
-    first = np.minimum.reduceat(order, start) if len(rows) else order
-    group = np.empty(len(rows), np.int64)
-    group[order] = np.repeat(np.arange(len(start)), np.diff(start, append=len(rows)))
-    if not np.array_equal(words.take(first, 0).take(group, 0), words):  # two rows of one hash
-        distinct, first, group = np.unique(words, axis=0, return_index=True, return_inverse=True)
-        return distinct.astype(rows.dtype), first, group.reshape(-1)
+    first, group = _grouped(words)
     rising = np.lexsort(words.take(first, 0).T[::-1])
-    place = np.empty(len(start), np.int64)
-    place[rising] = np.arange(len(start))
+    place = np.empty(len(first), np.int64)
+    place[rising] = np.arange(len(first))
     return words.take(first.take(rising), 0).astype(rows.dtype), first.take(rising), place.take(group)
+
+
+def first_equal(rows: np.ndarray) -> np.ndarray:
+    """Which of the rows (n, k) each is equal to, the first of them (n,): unique_rows' second at its third, in half the time."""
+    first, group = _grouped(_words(np.asarray(rows)))
+    return first.take(group)
 
 
 def first_rows(rows: np.ndarray) -> np.ndarray:
     """Where each of the rows (n, k) that differ is first (u,), in rising order: unique_rows' second, sooner where all differ."""
-    key = np.sort(_hashes(_words(rows)))
-    return np.sort(unique_rows(rows)[1]) if (key[1:] == key[:-1]).any() else np.arange(len(rows))
+    words = _words(rows)
+    key = np.sort(_hashes(words))
+    return np.sort(_grouped(words)[0]) if (key[1:] == key[:-1]).any() else np.arange(len(rows))
+
+
+def _grouped(words: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of rows (n, k) of 64 bits each where those that differ are first (u,), in no order, and which of these each is (n,)."""
+    key = _hashes(words)
+    order = np.argsort(key)
+    sorted_key = key.take(order)
+    start = np.flatnonzero(np.concatenate([np.ones(min(len(words), 1), bool), sorted_key[1:] != sorted_key[:-1]]))
+    first = np.minimum.reduceat(order, start) if len(words) else order
+    group = np.empty(len(words), np.int64)
+    group[order] = np.repeat(np.arange(len(start)), np.diff(start, append=len(words)))
+    if np.array_equal(words.take(first, 0).take(group, 0), words):
+        return first, group
+    _, first, group = np.unique(words, axis=0, return_index=True, return_inverse=True)  # two rows of one hash
+    return first, group.reshape(-1)
 
 
 def _words(rows: np.ndarray) -> np.ndarray:

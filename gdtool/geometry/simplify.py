@@ -14,7 +14,7 @@ from gdtool.core.threads import cores
 from gdtool.geometry import repair, topology
 from gdtool.geometry.halves import in_halves, worth_halving
 from gdtool.geometry.normals import CHUNK, face_normals
-from gdtool.geometry.rows import unique_rows
+from gdtool.geometry.rows import first_rows, unique_rows
 from gdtool.geometry.sharpen import corners_in, restore_creases
 from gdtool.geometry.unpinch import unpinched
 
@@ -144,8 +144,7 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
         out = np.stack([np.bincount(inverse, vertices[:, i]) for i in range(3)], -1) / np.bincount(inverse)[:, None]
         merged = inverse[faces]
         merged = merged[(merged != np.roll(merged, 1, 1)).all(1)]
-        _, first, _ = unique_rows(np.sort(merged, 1))
-        merged = merged[np.sort(first)]
+        merged = merged[first_rows(np.sort(merged, 1))]
         if len(merged) or cells > 4000:
             return topology.compact(out, merged)
         cells *= 2

@@ -19,5 +19,6 @@ def test_unique_rows_are_those_of_numpy(kind, count, width, mix, monkeypatch):
     assert distinct.dtype == kind and np.array_equal(distinct, true) and not np.signbit(distinct[distinct == 0]).any()
     assert np.array_equal(first, true_first) and np.array_equal(which, true_which.reshape(-1))
     assert np.array_equal(rows.first_rows(given), np.sort(true_first))
+    assert np.array_equal(rows.first_equal(given), true_first[true_which.reshape(-1)])
     some = given[np.sort(true_first)]
     assert np.array_equal(rows.first_rows(some), np.arange(len(some)))
