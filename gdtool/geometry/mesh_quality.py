@@ -112,7 +112,8 @@ def distance_figures(vertices: np.ndarray, triangles: np.ndarray, source_vertice
         points, face_idx, _ = sample_surface(*one, count, rng)
         distance, other_idx, _ = source.closest(points) if source is not None and other is theirs else closest_points(points, *other)
         distances.append(distance)
-        cosine = (face_normals(*one)[0][face_idx] * face_normals(*other)[0][other_idx]).sum(1)
+        here, there = (face_normals(v, f[index])[0] for (v, f), index in ((one, face_idx), (other, other_idx)))
+        cosine = (here * there).sum(1)
         angles.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
     return {"distance_mean": float((distances[0].mean() + distances[1].mean()) / 2), "hausdorff": float(max(d.max() for d in distances)),
             "normal_deg": float(np.concatenate(angles).mean())}
