@@ -13,7 +13,7 @@ import numpy as np
 
 from gdtool.geometry.normals import CHUNK, face_normals, normals_of, vertex_normals
 from gdtool.geometry.topology import Edges, compact, edges_of, renumbered
-from gdtool.geometry.vectors import dot
+from gdtool.geometry.vectors import cross, dot
 
 _NEIGHBOURS = 24
 _RINGS = 5  # of faces around a bevel, among which the sides are
@@ -303,6 +303,5 @@ class _Rims:
 def _vector_area(position: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Twice the area of triangles as a vector, and its square (4, n); position (3, v), corners (3, n)."""
     p, q, r = (position[:, corner] for corner in corners)
-    u, v = q - p, r - p
-    area = np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+    area = cross(q - p, r - p)
     return np.concatenate([area, dot(area, area)[None]])
