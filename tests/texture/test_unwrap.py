@@ -196,7 +196,7 @@ def test_four_squares_pack_tight_and_turned_ones_are_set_upright():
     places, scale = pack([(square @ turn * s, triangles) for s in (1, 1, 1, 1)], 0.01)
     for uv in places:
         assert uv.min() >= 0 and uv.max() <= 1
-        assert np.cross(uv[1] - uv[0], uv[3] - uv[0]) > 0  # turned, never mirrored
+        assert np.linalg.det([uv[1] - uv[0], uv[3] - uv[0]]) > 0  # turned, never mirrored
         assert np.linalg.norm(uv[1] - uv[0]) == pytest.approx(scale)
     assert 4 * scale**2 > 0.8
     assert (owner_count(np.concatenate(places), np.concatenate([triangles + 4 * i for i in range(4)]), 512) <= 1).all()
@@ -222,7 +222,7 @@ def test_hundreds_of_charts_fill_the_square_better_than_shelves_do():
 
     rng = np.random.default_rng(0)
     charts = [(corners * rng.uniform(0.2, 1), np.array([[0, 1, 2]])) for corners in rng.uniform(0, 1, (200, 1, 3, 2))[:, 0]]
-    charts = [(uv if np.cross(uv[1] - uv[0], uv[2] - uv[0]) > 0 else uv[::-1], t) for uv, t in charts]
+    charts = [(uv if np.linalg.det([uv[1] - uv[0], uv[2] - uv[0]]) > 0 else uv[::-1], t) for uv, t in charts]
     places, scale = pack(charts, 1 / 512)
     assert min(uv.min() for uv in places) >= 0 and max(uv.max() for uv in places) <= 1
     assert (owner_count(np.concatenate(places), np.arange(3 * len(charts)).reshape(-1, 3), 2048) <= 1).all()
