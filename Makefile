@@ -35,8 +35,8 @@ bench: venv
 	$(BIN)/python benchmarks/pipeline.py
 
 # Remesh and unwrap beside their peers, over solids and the models in $(MESHES), bake and the finished asset over the textured models
-# in $(TEXTURED); with PEERS_PYTHON, a Python that has bpy, beside Blender. Each stops after about twelve minutes and goes on where it was:
-# run it again while the last line says so.
+# in $(TEXTURED); with PEERS_PYTHON, a Python that has bpy, beside Blender, with pyQuadriFlow (the extra quadriflow) beside that as well.
+# Each stops after about twelve minutes and goes on where it was: run it again while the last line says so.
 ASSETS ?= ../shared/assets/mesh
 MESHES ?= $(foreach name,bunny/bunny wingnut/wingnut torus/torus penguin/penguin spot/spot fish/fish,$(ASSETS)/odedstein/$(name).obj) \
 	$(foreach name,animal potion nascar,$(ASSETS)/threestudio/$(name).obj) \
