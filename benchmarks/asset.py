@@ -227,6 +227,8 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--kept", type=Path, default=Path("out/bench_meshes"))
     asked = parser.parse_args()
+    if not asked.models:
+        say("no models are named: the peers' case alone")
     import torch
 
     torch.set_num_threads(1)  # shading runs in threads of its own

@@ -220,6 +220,8 @@ def main() -> None:
     parser.add_argument("--limit", type=int, default=12, help="models at most")
     parser.add_argument("--kept", type=Path, default=Path("out/bench_meshes"))
     asked = parser.parse_args()
+    if not asked.models:
+        say("no models are named: the peers' case alone")
     os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # the children import this file
     end, note, left = time.monotonic() + 60 * asked.minutes, busy(), 0
     rows = Rows(asked.out / "bake.json", {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept", "minutes")})

@@ -140,6 +140,8 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=3, help="of ours and of Instant Meshes on each model")
     parser.add_argument("--slow-on", default="part,knobs", help="models that pyQuadriFlow runs on")
     asked = parser.parse_args()
+    if not asked.models:
+        say("no models are named: the solids alone")
     asked.end = time.monotonic() + 60 * asked.minutes
     os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # the children import this file
     if not asked.peers_python:

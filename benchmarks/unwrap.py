@@ -138,6 +138,8 @@ def main() -> None:
     parser.add_argument("--input", type=int, default=1_000_000, help="triangles that remesh gets")
     parser.add_argument("--sweep", default="part,spot", help="models that the knobs are swept on")
     asked = parser.parse_args()
+    if not asked.models:
+        say("no models are named: the solids alone")
     settings = {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept", "minutes")}
     asked.end = time.monotonic() + 60 * asked.minutes
     os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # the children import this file

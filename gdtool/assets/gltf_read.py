@@ -11,6 +11,7 @@ from gdtool.assets.gltf_document import GltfFile
 from gdtool.assets.gltf_materials import MaterialReader
 from gdtool.assets.gltf_schema import Node, Primitive
 from gdtool.assets.scene import DEFAULT_MATERIAL, Material, Scene
+from gdtool.geometry.topology import repeats
 
 
 @dataclass
@@ -189,8 +190,7 @@ def _triangles(indices: np.ndarray, mode: int) -> np.ndarray:
     i = np.arange(len(indices) - 2)
     corners = (i, i + 1 + i % 2, i + 2 - i % 2) if mode == 5 else (i + 1, i + 2, np.zeros_like(i))
     faces = indices[np.stack(corners, 1)]
-    repeated = (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
-    return faces[~repeated]  # strips join by empty triangles
+    return faces[~repeats(faces)]  # strips join by empty triangles
 
 
 def _joint_matrices(file: GltfFile, node: Node, worlds: list[np.ndarray], primitive: Primitive, count: int, subject: str) -> np.ndarray | None:

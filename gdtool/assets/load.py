@@ -9,6 +9,7 @@ import numpy as np
 
 from gdtool.assets.scene import Scene
 from gdtool.core.errors import InputError
+from gdtool.geometry.vectors import cross, dot
 
 _CHUNK = 2**14  # faces at a time: what they need in between stays in the cache
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
@@ -77,9 +78,8 @@ def _degenerate(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, bo
         a, b, c = (rows.take(corner, 1) for corner in np.ascontiguousarray(faces[i:i + _CHUNK].T))
         empty[i:i + _CHUNK] = (a == b).all(0) | (b == c).all(0) | (c == a).all(0)
         if not has_area:
-            u, w = b - a, c - a
-            squared = (u[1] * w[2] - u[2] * w[1])**2 + (u[2] * w[0] - u[0] * w[2])**2 + (u[0] * w[1] - u[1] * w[0])**2
-            has_area = bool((squared > 1e-32).any())
+            normal = cross(b - a, c - a)
+            has_area = bool((dot(normal, normal) > 1e-32).any())
     return empty, has_area
 
 

@@ -14,7 +14,7 @@ from gdtool.cameras import rays as camera_rays
 from gdtool.geometry.distance import closest_points, sample_surface, winding_number
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.rays import RayCaster
-from gdtool.geometry.rows import unique_rows
+from gdtool.geometry.rows import first_equal
 
 # What lies within this of the first hit counts as seen: half a pixel of 256 across 1.44, in units of the truth's size.
 SEEN_TOLERANCE = 2e-3
@@ -27,7 +27,7 @@ SYNC_FOV = float(np.degrees(2 * np.arctan(32 / 35 / 2)))
 
 def weld(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """faces (f, 3) with vertices of equal position named by one index: glTF splits them at seams."""
-    return unique_rows(vertices)[2][faces]
+    return first_equal(vertices)[faces]
 
 
 def is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:

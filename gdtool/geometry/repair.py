@@ -9,7 +9,7 @@ import numpy as np
 from gdtool.core.errors import InputError
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.rows import first_equal, first_rows
-from gdtool.geometry.topology import compact, components, corner_fans, edges_of, even, is_watertight, one_fan_each, twins_of
+from gdtool.geometry.topology import compact, components, corner_fans, edges_of, even, is_watertight, one_fan_each, repeats, twins_of
 
 # Welding joins vertices closer than this share of the longest side: far below any detail, far above rounding.
 WELD_SHARE = 1e-7
@@ -45,7 +45,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
     extent = float((rows.max(1) - rows.min(1)).max())
     if not extent > 0:
         raise InputError(subject, "all its faces lie in one point")
-    repeated = _repeats(faces)
+    repeated = repeats(faces)
     if repeated.any():
         note("degenerate_faces", repeated.sum())
         faces = faces[~repeated]
@@ -59,7 +59,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
         # A closed mesh is left as its indices say: welding could join sheets that only touch.
         welded = _weld(vertices, faces, extent * WELD_SHARE)
         note("welded_vertices", _used(faces, len(vertices)) - _used(welded, len(vertices)))
-        kept = np.flatnonzero(~_repeats(welded))
+        kept = np.flatnonzero(~repeats(welded))
         note("degenerate_faces", len(welded) - len(kept) + report.get("degenerate_faces", 0))
         faces, sides = welded.take(kept, 0), tuple(side.take(kept, 0) for side in sides)
         fans = _one_fan(faces, doubled=False)
@@ -97,11 +97,6 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
         report["turned_inside_out"] = True
         faces = faces[:, ::-1].copy()
     return vertices, faces, report, closed
-
-
-def _repeats(faces: np.ndarray) -> np.ndarray:
-    """(f,) bool: triangles that have a vertex twice."""
-    return (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
 
 
 def _used(faces: np.ndarray, count: int) -> int:

@@ -143,7 +143,7 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
         _, _, inverse = unique_rows(grid)
         out = np.stack([np.bincount(inverse, vertices[:, i]) for i in range(3)], -1) / np.bincount(inverse)[:, None]
         merged = inverse[faces]
-        merged = merged[(merged != np.roll(merged, 1, 1)).all(1)]
+        merged = merged[~topology.repeats(merged)]
         merged = merged[first_rows(np.sort(merged, 1))]
         if len(merged) or cells > 4000:
             return topology.compact(out, merged)

@@ -234,6 +234,11 @@ def invariants(faces: np.ndarray) -> Invariants:
     return Invariants(is_watertight(faces), is_manifold(faces), components(faces)[0], euler_number(faces))
 
 
+def repeats(faces: np.ndarray) -> np.ndarray:
+    """(f,) bool: triangles (f, 3) that have a vertex twice."""
+    return (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
+
+
 def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Without the vertices that no face uses."""
     used, faces = renumbered(faces, len(vertices))
