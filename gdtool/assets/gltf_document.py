@@ -16,7 +16,8 @@ import msgspec
 import numpy as np
 
 from gdtool.assets.gltf_schema import Accessor, Document
-from gdtool.core.errors import InputError, ResourceError, bytes_of, from_os_error
+from gdtool.core.errors import InputError, ResourceError, from_os_error
+from gdtool.core.reading import bytes_of
 
 SUPPORTED = {
     "EXT_meshopt_compression", "EXT_texture_webp", "KHR_draco_mesh_compression", "KHR_materials_emissive_strength", "KHR_materials_ior",

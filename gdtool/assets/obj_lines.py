@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gdtool.core.errors import InputError, bytes_of
+from gdtool.core.errors import InputError
+from gdtool.core.reading import bytes_of
 
 _MOST = 2**31 - 1  # no file has as many vertices
 

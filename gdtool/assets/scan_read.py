@@ -10,7 +10,8 @@ import numpy as np
 
 from gdtool.assets.ply import binary_ply, columns
 from gdtool.assets.scene import DEFAULT_MATERIAL, Scene
-from gdtool.core.errors import InputError, bytes_of
+from gdtool.core.errors import InputError
+from gdtool.core.reading import bytes_of
 from gdtool.geometry.rows import unique_rows
 
 _STL_HEADER = 84

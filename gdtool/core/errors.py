@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-from pathlib import Path
 
 
 class GdtoolError(Exception):
@@ -46,25 +45,31 @@ class ResourceError(GdtoolError):
     exit_code = 5
 
 
+# What to do about an error of the system, by its number.
+_CURES = {
+    errno.ENOSPC: "free some space or choose another -o",
+    errno.EDQUOT: "free some space or choose another -o",
+    errno.EFBIG: "raise the file size limit or choose another -o",
+    errno.EROFS: "choose another -o",
+    errno.EACCES: "check the permissions",
+    errno.EPERM: "check the permissions",
+    errno.ENOENT: "check the path",
+    errno.ENOTDIR: "check the path: one of its folders is a file",
+    errno.EISDIR: "name a file inside it",
+    errno.EMFILE: "raise the limit of open files (ulimit -n)",
+    errno.EIO: "check the disk",
+}
+# A name that no file can have is a fault of what was given, not of the disk.
+_BAD_NAMES = {errno.ENAMETOOLONG: "shorten the name", errno.ELOOP: "remove the loop of links", errno.EILSEQ: "rename it"}
+
+
 def from_os_error(error: OSError, subject: object) -> GdtoolError:
-    """The error to report for an OSError: what failed is in its file name, else in subject."""
-    cures = {
-        errno.ENOSPC: "free some space or choose another -o",
-        errno.EDQUOT: "free some space or choose another -o",
-        errno.EFBIG: "raise the file size limit or choose another -o",
-        errno.EROFS: "choose another -o",
-        errno.EACCES: "check the permissions",
-        errno.EPERM: "check the permissions",
-    }
-    fact = error.strerror or str(error)
-    return OutputError(error.filename or subject, fact[0].lower() + fact[1:], cures.get(error.errno, ""))
+    """The error to report for an OSError: what failed is in its file name, else in subject.
 
-
-def bytes_of(path: Path) -> bytes:
-    """What a file holds that the user named. Raises InputError where there is none, and as from_os_error() says."""
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(path, "does not exist") from None
-    except OSError as error:
-        raise from_os_error(error, path) from None
+    InputError for names that are too long or lead in a circle, OutputError for all else.
+    """
+    fact = error.strerror or str(error) or type(error).__name__
+    fact, place = fact[0].lower() + fact[1:], error.filename or subject
+    if error.errno in _BAD_NAMES:
+        return InputError(place, fact, _BAD_NAMES[error.errno])
+    return OutputError(place, fact, _CURES.get(error.errno, "check that the disk and the folder can be used"))

@@ -13,8 +13,9 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from gdtool.core.errors import InputError, from_os_error
+from gdtool.core.errors import InputError
 from gdtool.core.kinds import CONTENTS, Content, Scalar
+from gdtool.core.reading import read_json
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -100,15 +101,6 @@ def encode(manifest: Manifest) -> bytes:
         return json.dumps(msgspec.to_builtins(manifest), indent=1).encode() + b"\n"
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in out:
-            raise InputError("", f"key {key!r} appears twice")
-        out[key] = value
-    return out
-
-
 def _nearest(message: str, types: tuple[type, ...]) -> str:
     """A hint for msgspec's unknown field message: the known field nearest to the unknown one."""
     unknown = re.search(r"unknown field `([^`]+)`", message)
@@ -117,20 +109,6 @@ def _nearest(message: str, types: tuple[type, ...]) -> str:
     known = {field for one in types for field in one.__struct_fields__}
     near = difflib.get_close_matches(unknown[1], known, n=1)
     return f"did you mean {near[0]!r}?" if near else ""
-
-
-def read_json(path: Path) -> Any:
-    """Parse a JSON file strictly. Raises InputError with the line of a fault, or when a key appears twice."""
-    try:
-        return json.loads(path.read_bytes(), object_pairs_hook=_unique)
-    except InputError as error:
-        raise InputError(path, error.fact) from None
-    except (UnicodeDecodeError, RecursionError) as error:
-        raise InputError(path, f"is not JSON ({type(error).__name__})") from None
-    except json.JSONDecodeError as error:
-        raise InputError(path, f"is not JSON: {error.msg} in line {error.lineno}") from None
-    except OSError as error:
-        raise from_os_error(error, path) from None
 
 
 def decode(raw: Any, path: Path) -> Manifest:

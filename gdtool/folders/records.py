@@ -12,7 +12,7 @@ from msgspec import Meta
 
 from gdtool.cameras import Camera
 from gdtool.core.errors import InputError
-from gdtool.core.manifest import read_json
+from gdtool.core.reading import read_json
 
 Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Meta(gt=0)]

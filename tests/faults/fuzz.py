@@ -75,7 +75,8 @@ def read_points(path: Path) -> None:
 
 
 def read_record(path: Path) -> None:
-    from gdtool.core.manifest import decode, read_json
+    from gdtool.core.manifest import decode
+    from gdtool.core.reading import read_json
 
     decode(read_json(path), path)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from gdtool.cameras import Camera
 from gdtool.core.errors import InputError
-from gdtool.core.manifest import read_json
+from gdtool.core.reading import read_json
 from gdtool.folders.adapters import Pictures, linear_color, stacked
 
 LOOKS_LIKE = "a transforms.json"

@@ -1,0 +1,149 @@
+"""Turn names that stand inside files into paths, and refuse those that lead elsewhere.
+
+A manifest, a dataset index, an archive, a glTF or an OBJ comes from a stranger. A name in it becomes a path only through
+path_inside(), so that no file outside the folder it belongs to is ever read or written.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from urllib.parse import unquote
+
+from gdtool.core.errors import InputError
+
+MAX_NAME_BYTES = 255  # of one component: NAME_MAX of Linux and macOS file systems
+MAX_PATH_BYTES = 4095  # of a whole path: PATH_MAX of Linux, less its final NUL
+
+CURE = "rename it to letters, digits, dots, dashes and underscores"
+
+_DRIVE = re.compile(r"[A-Za-z]:")
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
+# Bytes of a file name that is not UTF-8, as Python holds them (PEP 383); any other lone surrogate names no file.
+_BYTE_ESCAPES = range(0xDC80, 0xDD00)
+
+
+def text_fault(text: str, byte_escapes: bool = False) -> str | None:
+    """What makes text unfit to be a name or a line of output; None where nothing does.
+
+    NUL, control characters (C0, DEL, C1) and lone surrogates. byte_escapes: accept U+DC80 to U+DCFF, which stand for the
+    bytes of a name on disk that is not UTF-8.
+    """
+    for character in text:
+        code = ord(character)
+        if code == 0:
+            return "holds a NUL character"
+        if code < 0x20 or 0x7F <= code < 0xA0:
+            return f"holds the control character U+{code:04X}"
+        if 0xD800 <= code < 0xE000 and not (byte_escapes and code in _BYTE_ESCAPES):
+            return f"holds the lone surrogate U+{code:04X}"
+    return None
+
+
+def name_fault(text: str, byte_escapes: bool = False) -> str | None:
+    """What makes text unfit to be one component of a path; None where nothing does."""
+    if not text:
+        return "is empty"
+    if text in (".", ".."):
+        return "is no name of its own"
+    if "/" in text or "\\" in text:
+        return "holds a separator"
+    if _DRIVE.match(text):
+        return "begins with a drive"
+    fault = text_fault(text, byte_escapes)
+    if fault is None and len(os.fsencode(text)) > MAX_NAME_BYTES:
+        return f"is longer than {MAX_NAME_BYTES} bytes"
+    return fault
+
+
+def checked_name(text: str, subject: object, what: str) -> str:
+    """text, which names one file, folder or object and nothing below or above it.
+
+    subject: the file that the name stands in, and what: what it names there, for the message. Raises InputError.
+    """
+    fault = name_fault(text)
+    if fault:
+        raise InputError(subject, f"{what} {shown(text)} {fault}", CURE)
+    return text
+
+
+def path_inside(folder: Path, relative: str, subject: object, what: str, *, levels_up: int = 0, byte_escapes: bool = False) -> Path:
+    """The path that a name inside a file stands for: folder / relative, below folder, links followed.
+
+    relative: components with forward slashes; an absolute one, a drive, a backslash, control characters, lone surrogates and over-long names
+    are refused. levels_up: how many folders above `folder` still belong to it. subject: the file that holds the name; what: what it names.
+    The path need not exist. Raises InputError.
+    """
+    parts = relative_parts(relative, subject, what, levels_up=levels_up, byte_escapes=byte_escapes)
+    path = folder.joinpath(*parts)
+    try:
+        root, target = folder.resolve(), path.resolve()
+    except (OSError, RuntimeError):  # a loop of links
+        raise InputError(subject, f"{what} {shown(relative)} is a link that leads nowhere", "replace the link by the file itself") from None
+    for _ in range(levels_up):
+        root = root.parent
+    if not target.is_relative_to(root):
+        raise InputError(subject, f"{what} {shown(relative)} is a link that leaves {folder}", "replace the link by the file itself")
+    return path
+
+
+def relative_parts(relative: str, subject: object, what: str, *, levels_up: int | None = 0, byte_escapes: bool = False) -> tuple[str, ...]:
+    """The components of a relative path in a file, "." left out and ".." kept. Raises InputError as path_inside() does.
+
+    levels_up: how far ".." may lead above the start; None: as far as it likes.
+    """
+    parts: list[str] = []
+    depth = 0
+    fault = "is empty" if not relative else "is absolute" if relative.startswith(("/", "\\")) else None
+    for part in relative.split("/"):
+        if fault:
+            break
+        if part in ("", "."):
+            continue
+        if part == "..":
+            depth -= 1
+            if levels_up is not None and depth < -levels_up:
+                fault = "leaves its folder"
+        else:
+            fault = name_fault(part, byte_escapes)
+            depth += 1
+        parts.append(part)
+    if not fault and not parts:
+        fault = "names no file"
+    if not fault and len(os.fsencode(relative)) > MAX_PATH_BYTES:
+        fault = f"is longer than {MAX_PATH_BYTES} bytes"
+    if fault:
+        cure = "put the file beside or below the one that names it" if fault in ("is absolute", "leaves its folder", "begins with a drive") else CURE
+        raise InputError(subject, f"{what} {shown(relative)} {fault}", cure)
+    return tuple(parts)
+
+
+def uri_path(folder: Path, uri: str, subject: object, what: str, *, levels_up: int = 0) -> Path:
+    """The path of the file that a relative URI or a customary file name in a model stands for.
+
+    It is percent-decoded first and judged then. A file that is really called as the URI is written, percent signs and all,
+    goes before; backslashes are taken for slashes. A scheme (file:, http:, C:) is refused. Raises InputError.
+    """
+    decoded = unquote(uri)
+    for text in (uri, decoded):
+        if _SCHEME.match(text):
+            raise InputError(subject, f"{what} {shown(uri)} names another place than a file", "put the file beside or below the one that names it")
+    literal, plain = uri.replace("\\", "/"), decoded.replace("\\", "/")
+    path = path_inside(folder, plain, subject, what, levels_up=levels_up)
+    if literal != plain and text_fault(literal) is None:
+        written = path_inside(folder, literal, subject, what, levels_up=levels_up)
+        if written.is_file():
+            return written
+    return path
+
+
+def shown(text: str, most: int = 80) -> str:
+    """text in quotes for a message: escaped, and cut where it is long."""
+    return ascii(text) if len(text) <= most else ascii(text[:most]) + "…"
+
+
+def name_from_path(text: str) -> str:
+    """An object's name from a file's: bytes that are not UTF-8 are read as Latin-1, control characters become underscores."""
+    plain = "".join(chr(ord(c) - 0xDC00) if ord(c) in _BYTE_ESCAPES else c for c in text)
+    return "".join("_" if text_fault(c) else c for c in plain) or "_"

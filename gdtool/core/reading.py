@@ -1,0 +1,125 @@
+"""Read what a user names: regular files only, and JSON whose numbers, strings and nesting are bounded."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+from gdtool.core.errors import InputError, from_os_error
+from gdtool.core.names import shown, text_fault
+
+MAX_INTEGER_DIGITS = 19  # of a 64-bit integer
+
+_SPECIAL = ((stat.S_ISFIFO, "a FIFO"), (stat.S_ISSOCK, "a socket"), (stat.S_ISCHR, "a device"), (stat.S_ISBLK, "a device"))
+
+
+def require_regular_file(path: Path) -> None:
+    """Raise InputError unless path is a regular file or a link to one: reading a FIFO or a device may never end.
+
+    OutputError where it cannot be looked at.
+    """
+    try:
+        mode = os.stat(path).st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(path, "does not exist", "check the path") from None
+    except ValueError:  # a NUL in the name
+        raise InputError(shown(str(path)), "is no name of a file", "check the path") from None
+    except OSError as error:
+        if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
+            raise InputError(shown(str(path)), error.strerror.lower() if error.strerror else "is no name of a file", "check the path") from None
+        raise from_os_error(error, path) from None
+    kind = next((name for test, name in _SPECIAL if test(mode)), None)
+    if kind:
+        raise InputError(path, f"is {kind}, not a file", "write its content to a file and name that")
+    if stat.S_ISDIR(mode):
+        raise InputError(path, "is a folder, not a file", "name a file inside it")
+
+
+def bytes_of(path: Path) -> bytes:
+    """The bytes of a file that the user named. Raises InputError where it is no regular file, OutputError where it cannot be read."""
+    require_regular_file(path)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise from_os_error(error, path) from None
+
+
+def read_json(path: Path) -> Any:
+    """Parse a JSON file strictly, as parse_json does. Raises InputError, OutputError."""
+    return parse_json(bytes_of(path), path)
+
+
+def parse_json(content: bytes | str, subject: object) -> Any:
+    """Parse JSON strictly: lists, dicts, strings, finite floats, 64-bit integers, booleans and None.
+
+    Raises InputError that names subject and the place: for text that is not JSON, a key that appears twice, NaN and infinities, numbers
+    beyond float64 or 64 bits, nesting deeper than Python's parser goes (some 1000 levels), and strings with lone surrogates that stand for no byte of a file name.
+    """
+    try:
+        text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
+        value = json.loads(text, object_pairs_hook=_unique, parse_int=_integer, parse_float=_float, parse_constant=_constant)
+    except _Refused as fault:
+        raise InputError(subject, str(fault), "correct that entry") from None
+    except RecursionError:
+        raise InputError(subject, "is nested too deeply (some 1000 levels)", "write it flatter") from None
+    except UnicodeDecodeError as error:
+        raise InputError(subject, f"is not JSON (byte {error.start} is not UTF-8)", "save it as UTF-8") from None
+    except json.JSONDecodeError as error:
+        raise InputError(subject, f"is not JSON: {error.msg} in line {error.lineno}", "correct that line") from None
+    place = _unfit_string(value)
+    if place:
+        raise InputError(subject, place, "correct that entry")
+    return value
+
+
+class _Refused(Exception):
+    """A value of the JSON is not one that gdtool takes; str() says which and why."""
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in out:
+            raise _Refused(f"key {shown(key)} appears twice")
+        out[key] = value
+    return out
+
+
+def _integer(text: str) -> int:
+    if len(text.lstrip("-")) > MAX_INTEGER_DIGITS or not -(2**63) <= int(text) < 2**63:
+        raise _Refused(f"holds the integer {text[:24]}{'…' if len(text) > 24 else ''}, beyond 64 bits")
+    return int(text)
+
+
+def _float(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise _Refused(f"holds the number {text[:24]}{'…' if len(text) > 24 else ''}, beyond double precision")
+    return value
+
+
+def _constant(text: str) -> float:
+    raise _Refused(f"holds {text}, which JSON has no word for")
+
+
+def _unfit_string(value: Any) -> str | None:
+    """Where a string of a parsed JSON holds a lone surrogate, and which; None where none does."""
+    waiting: list[tuple[str, Any]] = [("", value)]
+    while waiting:
+        place, one = waiting.pop()
+        if isinstance(one, dict):
+            waiting += [(f"{place}.{key}", inner) for key, inner in one.items()]
+            waiting += [(f"key {shown(key)} of {place or 'the whole'}", key) for key in one if not key.isascii()]
+        elif isinstance(one, list):
+            waiting += [(f"{place}[{i}]", inner) for i, inner in enumerate(one) if isinstance(inner, (str, dict, list))]
+        elif isinstance(one, str) and not one.isascii():
+            surrogates = "".join(c for c in one if "\ud800" <= c <= "\udfff")
+            fault = text_fault(surrogates, byte_escapes=True)
+            if fault:
+                return f"{place.lstrip('.')} {fault}"
+    return None
