@@ -13,6 +13,8 @@ from urllib.parse import unquote
 from gdtool.core.errors import InputError, ResourceError, UsageError
 from gdtool.core.folder import Folder, is_folder, open_folder
 from gdtool.core.manifest import digest_of, file_sha256
+from gdtool.core.names import name_from_path
+from gdtool.core.reading import require_regular_file
 
 PROCEDURAL = re.compile(r"procedural:(\d+)(?:\.\.(\d+))?$")
 
@@ -79,8 +81,8 @@ def resolve(text: str, kinds: tuple[str, ...], reader: str, allow_missing: bool 
         if not folder_kinds and not is_folder(path):
             raise InputError(path, f"is a folder, but {reader} reads {_words(kinds)}")
         return open_folder(path, folder_kinds or ("a file",), reader)
-    if not path.exists() and not allow_missing:
-        raise InputError(path, "does not exist")
+    if not (allow_missing and not os.path.lexists(path)):
+        require_regular_file(path)
     if path.exists() and len(folder_kinds) == len(kinds):
         raise InputError(path, f"is a file, but {reader} reads a {_words(kinds)} folder")
     return path
@@ -119,7 +121,7 @@ def name_of(source: Source) -> str:
         return source.name
     if isinstance(source, str):
         return "procedural-" + source.split(":")[1].zfill(6)
-    return source.resolve().name if source.is_dir() else source.stem
+    return name_from_path(source.resolve().name if source.is_dir() else source.stem)
 
 
 def digest(source: Source) -> str:
@@ -164,10 +166,12 @@ def _sidecars(path: Path) -> list[Path]:
 
 
 def relative_to(path: Path | str, folder: Path) -> str:
-    """path as seen from folder, forward slashes; procedural:SEED stays as it is."""
+    """path as seen from where folder really lies, forward slashes; procedural:SEED stays as it is."""
     if isinstance(path, str):
         return path
-    return Path(os.path.relpath(path.absolute(), folder.absolute())).as_posix()
+    # Where both really lie, but for a link that the path itself is: ".." from a folder reached by a link does not lead back along the link.
+    real = Path(os.path.realpath(path.parent), path.name) if path.name not in ("", "..") else path.resolve()
+    return Path(os.path.relpath(real, os.path.realpath(folder))).as_posix()
 
 
 __all__ = ["Source", "digest", "expand", "incoming", "name_of", "relative_to", "resolve"]
