@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gdtool.core import log
+from gdtool.core import ending, log
 from gdtool.core.errors import OutputError
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
@@ -54,9 +54,9 @@ def locked(target: Path, wait_seconds: float = 3600.0) -> Iterator[None]:
             told = True
         time.sleep(0.05)
     try:
-        yield
+        with ending.certainly(lambda: path.unlink(missing_ok=True)):
+            yield
     finally:
-        path.unlink(missing_ok=True)
         os.close(handle)
 
 

@@ -19,8 +19,8 @@ import msgspec
 
 import gdtool
 from gdtool import __version__
-from gdtool.core import child, log, sources
-from gdtool.core.errors import GdtoolError, InputError, ResourceError, UsageError, from_os_error
+from gdtool.core import child, ending, log, sources
+from gdtool.core.errors import GdtoolError, InputError, ResourceError, UsageError, from_exception, from_os_error
 from gdtool.core.folder import Folder, is_folder, open_folder
 from gdtool.core.manifest import MANIFEST, InputEntry, Manifest, RunRecord, check_files, digest_of, encode, list_files, read_manifest
 from gdtool.core.ownership import output_place, refuse_index, refuse_loss, refuse_overlap
@@ -177,13 +177,16 @@ def run_one(stage: Stage, given: list[Source], options: Any, flags: dict[str, st
         return Result(named, stage.writes, "would run")
     second = second_inputs(stage, source, flags)
     refuse_overlap(target, _places(second.found.values()))
+    inputs = Inputs(source, sources.name_of(source), second.found, tuple(given))
+    if stage.check is not None:
+        stage.check(inputs, options, settings.device)
     roles = [("source", one) for one in given] + [(flag, one) for flag, one in second.found.items() if one is not None]
     digests = [(role, sources.digest(one)) for role, one in roles]
     keyed = option_record(options, None)
     key = key_of(stage.name, stage.version, keyed, digests)
     recorded = option_record(options, target)
     start = time.perf_counter()
-    with _parents(target), locked(target):
+    with _parents(target), locked(target), contextlib.ExitStack() as at_end:
         clear_stale(target)
         reason = "asked by --force" if settings.force else stale_reason(target, stage, key, recorded, digests)
         if reason is None:
@@ -195,11 +198,12 @@ def run_one(stage: Stage, given: list[Source], options: Any, flags: dict[str, st
         log.say(f"{named}: running {stage.name} ({reason})")
         partial = partial_path(target, key)
         out = Output(partial, workspace_path(target, key), settings.threads or os.cpu_count() or 1, settings.device)
+        at_end.enter_context(ending.certainly(functools.partial(_drop_workspace, stage, out.place_of_workspace)))
+        at_end.enter_context(ending.certainly(functools.partial(remove_tree, partial)))
         for text in second.warnings:
             out.warn(text)
         try:
             partial.mkdir()
-            inputs = Inputs(source, sources.name_of(source), second.found, tuple(given))
             try:
                 stage.run(inputs, options, out)
             except MemoryError:
@@ -219,13 +223,26 @@ def run_one(stage: Stage, given: list[Source], options: Any, flags: dict[str, st
             refuse_loss(target, stage.writes)  # again: the run may have taken hours
             publish(partial, target)
             clear_workspaces(target)
-        except OSError as error:
-            raise from_os_error(error, target) from error
-        finally:
-            remove_tree(partial)
+        except BaseException as error:
+            if _is_resumable(stage, out.place_of_workspace):
+                log.say(f"{named}: what is done so far is kept in {out.place_of_workspace}; the same command goes on from it")
+            if isinstance(error, OSError):
+                raise from_os_error(error, target) from error
+            raise
     seconds = time.perf_counter() - start
     log.say(f"{named}: done in {seconds:.1f} s" + (f", skipped {len(out.skipped)}" if out.skipped else ""))
     return Result(named, stage.writes, "done", seconds, tuple(f"{s.what}: {s.reason}" for s in out.skipped))
+
+
+def _is_resumable(stage: Stage, workspace: Path) -> bool:
+    """Whether the same run can go on from what is in its workspace."""
+    return bool(stage.checkpoint) and (workspace / stage.checkpoint).is_file()
+
+
+def _drop_workspace(stage: Stage, workspace: Path) -> None:
+    """Remove a workspace that no run can go on from."""
+    if not _is_resumable(stage, workspace):
+        remove_tree(workspace)
 
 
 def _places(inputs: Iterable[Source | None]) -> list[Path]:
@@ -238,14 +255,14 @@ def _parents(target: Path) -> Iterator[None]:
     """Make the folders above target; what stays empty, because the run failed, goes again."""
     made = [folder for folder in target.parents if not folder.exists()]
     target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        yield
-    finally:
-        for folder in made:
-            try:
+
+    def remove_empty() -> None:
+        with contextlib.suppress(OSError):
+            for folder in made:
                 folder.rmdir()
-            except OSError:
-                break
+
+    with ending.certainly(remove_empty):
+        yield
 
 
 def _record(out: Output, start: float) -> RunRecord:
@@ -290,10 +307,13 @@ def _attempt(stage: Stage, text: str, *, options: Any, flags: dict[str, str | No
     try:
         source = sources.resolve(text, stage.reads, stage.name, allow_missing=settings.dry_run)
         return run_one(stage, [source], options, flags, settings)
-    except OSError as error:
-        return from_os_error(error, text)
-    except GdtoolError as error:
-        return error
+    except Exception as error:  # the other sources go on
+        if ending.received is not None:
+            raise
+        problem = from_exception(error, text)
+        if problem is not error:
+            problem.__cause__ = error
+        return problem
 
 
 def _on_cluster(work: functools.partial, stream: Iterator[str], settings: Settings) -> Iterator[Result | GdtoolError]:
