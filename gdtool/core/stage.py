@@ -58,6 +58,9 @@ class Stage:
 
     reads: folder kinds, and "image-file", "model-file", "mesh-file" for files. version rises when results change.
     gathers: all sources go into one run (train). dataset: several results share a root with an index.
+    check(inputs, options, device) is called before any work: it raises a GdtoolError for what the run would find out only at its end
+    (a file that an option names, a package, a device), and takes no time. checkpoint: the file of the workspace that a later run goes on
+    from; without it a failed run leaves no workspace.
     """
 
     name: str
@@ -69,6 +72,8 @@ class Stage:
     second_inputs: dict[str, SecondInput | str] = field(default_factory=dict)
     gathers: bool = False
     dataset: bool = False
+    check: Callable[[Inputs, Any, str], None] | None = None
+    checkpoint: str = ""
 
     def second(self, flag: str) -> SecondInput:
         """The declaration of a second input."""
@@ -80,7 +85,7 @@ class Output:
     """The unpublished folder a run writes into, and the record it keeps of the run."""
 
     def __init__(self, folder: Path, workspace: Path, threads: int, device: str):
-        self.folder, self._workspace = folder, workspace
+        self.folder, self.place_of_workspace = folder, workspace
         self.threads, self.device = threads, device
         self.content: Content | None = None
         self.seconds: dict[str, float] = {}
@@ -96,8 +101,8 @@ class Output:
     @property
     def workspace(self) -> Path:
         """A folder that survives a kill and is removed when the result is published: checkpoints, caches."""
-        self._workspace.mkdir(parents=True, exist_ok=True)
-        return self._workspace
+        self.place_of_workspace.mkdir(parents=True, exist_ok=True)
+        return self.place_of_workspace
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:

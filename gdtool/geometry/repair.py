@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from gdtool.core.errors import InputError
+from gdtool.core.native import imported
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.rows import first_equal, first_rows
 from gdtool.geometry.topology import compact, components, corner_fans, edges_of, even, is_watertight, one_fan_each, repeats, twins_of
@@ -155,8 +156,7 @@ def _weld(vertices: np.ndarray, faces: np.ndarray, distance: float) -> np.ndarra
 
 def _split(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cut along edges of more than two faces, faces that walk an edge alike turned first where that helps."""
-    import igl
-
+    igl = imported("igl")
     faces = np.asarray(igl.bfs_orient(np.ascontiguousarray(faces))[0])
     vertices, faces, _ = igl.split_nonmanifold(np.ascontiguousarray(vertices), np.ascontiguousarray(faces))
     return np.asarray(vertices), np.asarray(faces)
@@ -164,8 +164,7 @@ def _split(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def _oriented(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Each closed piece turned to face outward; open ones keep the majority of the directions they had."""
-    import igl
-
+    igl = imported("igl")
     faces = np.asarray(igl.bfs_orient(np.ascontiguousarray(faces))[0]).copy()
     count, piece = components(faces)
     a, b, c = (vertices[faces[:, i]] for i in range(3))

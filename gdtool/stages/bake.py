@@ -195,7 +195,7 @@ def _read_origin(inputs: Inputs, options: Options, matrix, target, out: Output):
     """What to bake from: the surface (with its views), a model named by --model, or the model that was remeshed."""
     from pathlib import Path
 
-    from gdtool.core.folder import find_source
+    from gdtool.core.provenance import find_source
     from gdtool.texture.origin import from_scene, from_surface
 
     surface, views = inputs.second["surface"], inputs.second["views"]
@@ -220,7 +220,7 @@ def _read_origin(inputs: Inputs, options: Options, matrix, target, out: Output):
         return from_surface(read_surface(surface), read, field, None if read is None else _read_picture(views, read, out))
     named = options.model
     if named is None and hasattr(inputs.main, "content"):
-        named = find_source(inputs.main)
+        named = find_source(inputs.main, "name the model to bake from with --model")
         if named is not None and not named.startswith("procedural:") and Path(named).suffix.lower() not in (".glb", ".gltf", ".obj", ".ply", ".stl"):
             named = None
     if named is None:

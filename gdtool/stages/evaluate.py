@@ -20,7 +20,8 @@ import msgspec
 from msgspec import Meta
 
 from gdtool.core.errors import InputError, UsageError
-from gdtool.core.folder import Folder, ancestors, find_ancestor, open_folder
+from gdtool.core.folder import Folder, open_folder
+from gdtool.core.provenance import ancestors, find_ancestor, origins
 from gdtool.core.sources import Source, name_of
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ def evaluate(result: Source, reference: Source | None, options: Options, views: 
     if report["kind"] in ("views", "renders"):
         return report | _pictures(result, reference)
     if views is None and isinstance(result, Folder):
-        found = find_ancestor(result, "views")
+        found = find_ancestor(result, "views", "name the views with --views")
         views = open_folder(found.path) if found else None
     if views is None and _kind(reference) == "views":
         views = reference
@@ -118,14 +119,16 @@ def _truth_along(result: Source) -> Source | None:
     """The model that a result was made from: a file or procedural:SEED, or the views that carry their model; or None."""
     if not isinstance(result, Folder):
         return None
-    chain = [result, *ancestors(result)]
+    cure = "name what to measure against with --reference"
+    chain = [result, *ancestors(result, cure)]
     for folder in chain:
-        for entry in folder.manifest.inputs:
-            path = Path(folder.path, entry.path)
-            if entry.path.startswith("procedural:"):
-                return entry.path
-            if path.suffix.lower() in MODEL_SUFFIXES and path.is_file():
-                return path
+        generated = next((entry.path for entry in folder.manifest.inputs if entry.path.startswith("procedural:")), None)
+        if generated:
+            return generated
+        for origin in origins(folder):
+            if origin.path.suffix.lower() in MODEL_SUFFIXES and origin.path.is_file():
+                origin.require_same(cure)
+                return origin.path
     return next((folder for folder in chain if folder.kind == "views" and folder.content.model), None)
 
 
@@ -238,7 +241,7 @@ def _pictures(result: Folder, reference: Source | None) -> Report:
     from gdtool.images.metrics import resized_views, views_metrics
 
     if reference is None:
-        reference = next((folder for folder in ancestors(result) if folder.kind == result.kind), None)
+        reference = next((folder for folder in ancestors(result, "name one with --reference") if folder.kind == result.kind), None)
         if reference is None:
             raise UsageError(result.path, f"has no other {result.kind} along its provenance chain", "name one with --reference")
         reference = open_folder(reference.path)

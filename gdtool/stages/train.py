@@ -204,13 +204,9 @@ def _objects(inputs: Inputs, workspace):
     import itertools
     from pathlib import Path
 
-    from gdtool.core.folder import open_folder
+    from gdtool.core.folder import dataset_objects
 
     parts, total = [], 0
-
-    def opened(paths):
-        return (open_folder(path, ("views",), "train", check=False) for path in paths)
-
     for source in inputs.all:
         if isinstance(source, Path):
             from gdtool.diffusion.archives import object_count, views_of
@@ -218,9 +214,8 @@ def _objects(inputs: Inputs, workspace):
             total += object_count(source)
             parts.append(views_of(source, workspace))
             continue
-        paths = [source.path] if source.kind == "views" else [source.file(one.path) for one in source.content.objects]
-        total += len(paths)
-        parts.append(opened(paths))
+        total += 1 if source.kind == "views" else len(source.content.objects)
+        parts.append([source] if source.kind == "views" else dataset_objects(source))
     return itertools.chain.from_iterable(parts), total
 
 
