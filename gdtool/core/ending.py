@@ -56,6 +56,8 @@ def listen() -> Callable[[], None]:
             signal.signal(number, _stop)
 
     def undo() -> None:
+        global received
+        received = None
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
         signal.set_wakeup_fd(wakeup)
