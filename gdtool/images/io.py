@@ -134,7 +134,7 @@ def _channels(path: Path, names: list[str]) -> list[int]:
     if {"R", "G", "B"} <= set(names):
         wanted = ["R", "G", "B", *(["A"] if "A" in names else [])]
         return [names.index(name) for name in wanted]
-    if len(names) <= 4:
+    if 1 <= len(names) <= 4:
         return list(range(len(names)))
     if "Y" in names:
         return [names.index("Y")]
