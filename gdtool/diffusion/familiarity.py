@@ -115,7 +115,7 @@ def read_ranges(folder: Path) -> dict[str, PictureRange]:
     from gdtool.core.reading import read_json
 
     path = Path(folder) / FILE
-    if not path.is_file():
+    if not path.exists():
         return {}
     try:
         return msgspec.convert(read_json(path), dict[str, PictureRange])

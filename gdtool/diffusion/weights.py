@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import msgspec
 import torch
 
-from gdtool.core.errors import InputError
-from gdtool.core.memory import require_memory
+from gdtool.core import memory
+from gdtool.core.errors import InputError, ResourceError
 from gdtool.core.reading import read_json, require_regular_file
 from gdtool.core.sources import hub_folder
 from gdtool.diffusion.config import ModelConfig
@@ -30,7 +30,7 @@ def read_tensors(path: Path, cure: str = NO_MODEL) -> tuple[dict[str, torch.Tens
     """Tensors and metadata of a safetensors file.
 
     Raises InputError, with the cure where it is not there, when it is no regular file, is damaged or holds NaN or infinity;
-    ResourceError when it is larger than what one input may take of the memory.
+    ResourceError when it is larger than the memory.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -41,7 +41,7 @@ def read_tensors(path: Path, cure: str = NO_MODEL) -> tuple[dict[str, torch.Tens
                              f"convert it to safetensors: python -m gdtool.diffusion.convert {shlex.quote(str(pickles[0]))}")
         raise InputError(path, "does not exist", cure)
     require_regular_file(path)
-    require_memory(path.stat().st_size, path, "its weights", "run it on a machine with more memory, or take a smaller model")
+    _require_memory(path.stat().st_size, path, "its weights")
     try:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
@@ -99,7 +99,7 @@ def configured(fields: object, subject: object) -> ModelConfig:
 
 
 def require_room(config: ModelConfig, bytes_per_weight: int, subject: object) -> Model:
-    """The network's structure without numbers. Raises ResourceError where its weights would take more memory than one input may.
+    """The network's structure without numbers. Raises ResourceError where its weights would take more memory than there is.
 
     bytes_per_weight: what is held for each weight, for example BYTES_TO_LOAD.
     """
@@ -107,9 +107,16 @@ def require_room(config: ModelConfig, bytes_per_weight: int, subject: object) ->
 
     shape = structure(config)
     weights = parameter_count(shape)
-    require_memory(weights * bytes_per_weight, subject, f"its network of {weights / 1e6:,.1f} million weights",
-                   "run it on a machine with more memory, or take a model with fewer channels")
+    _require_memory(weights * bytes_per_weight, subject, f"its network of {weights / 1e6:,.1f} million weights")
     return shape
+
+
+def _require_memory(size: int, subject: object, what: str) -> None:
+    """Raise ResourceError when size bytes are more than all the memory that this process may have: what takes less may still fit."""
+    most = memory.most_held() / memory.SHARE
+    if size > most:
+        raise ResourceError(subject, f"{what} would take {size / 2**30:.1f} GiB of memory, more than the {most / 2**30:.1f} GiB that there are",
+                            "take a smaller model, or run it on a machine with more memory")
 
 
 def load_model(folder: Path) -> Model:
