@@ -1,11 +1,9 @@
-"""The gdtool command line: a group that imports a command only when it is named."""
+"""The gdtool command line. Nothing but signals and the list of commands is imported before main() listens to signals."""
 
 from __future__ import annotations
 
-import importlib
 import os
-
-import click
+import sys
 
 # Subcommand: what --help says of it. The module is the name with underscores.
 COMMANDS = {
@@ -23,46 +21,38 @@ COMMANDS = {
 }
 
 
-class LazyGroup(click.Group):
-    """Commands of COMMANDS and of the entry point group gdtool.commands, each loaded when it is asked for."""
-
-    def list_commands(self, ctx):
-        return [*COMMANDS, *sorted(set(_plugins()) - set(COMMANDS))]
-
-    def get_command(self, ctx, name):
-        if name in COMMANDS:
-            return importlib.import_module("." + name.replace("-", "_"), __name__).command
-        plugin = _plugins().get(name)
-        return plugin.load() if plugin else None
-
-    def format_commands(self, ctx, formatter):
-        plugins = {name: "(plugin)" for name in _plugins() if name not in COMMANDS}
-        with formatter.section("Commands"):
-            formatter.write_dl(list((COMMANDS | plugins).items()))
-
-
-def _plugins():
-    from importlib.metadata import entry_points
-
-    return {point.name: point for point in entry_points(group="gdtool.commands")}
-
-
-@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
-@click.version_option(package_name="gdtool")
-def cli():
-    """One image, or one PBR model, to an engine-ready 3D asset.
-
-    Each command reads folders and writes a folder, and prints its path: so commands form pipes.
-
-    \b
-    gdtool sample-views cat.png | gdtool reconstruct | gdtool remesh | gdtool unwrap | gdtool bake | gdtool relight
-    """
-
-
-def main():
+def main() -> None:
     """Run the command line and exit with one of its documented codes."""
-    from ._common import guarded
-
+    _open_streams()
+    # Files that a umask would close to their own user could not be finished, nor removed.
+    os.umask(os.umask(0o077) & 0o077)
     # Threads that wait for one another by spinning take ten times as long where something else has one of the cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    from gdtool.core import ending
+
+    ending.listen()  # before click and all else: Ctrl-C is quiet from the start
+    try:
+        from ._common import guarded
+        from ._group import cli
+    except BaseException as error:
+        if ending.received is not None:
+            sys.exit(128 + ending.received)
+        if not isinstance(error, Exception) or "--debug" in sys.argv:
+            raise
+        from gdtool.core import errors, log
+
+        problem = errors.from_exception(error, "gdtool")
+        log.line(str(problem))
+        sys.exit(problem.exit_code)
     guarded(cli)
+
+
+def _open_streams() -> None:
+    """Open /dev/null in the place of standard streams that the caller closed: a file of the user's would get their numbers."""
+    for number, name in ((0, "stdin"), (1, "stdout"), (2, "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this one
+        if number and getattr(sys, name) is None:
+            setattr(sys, name, open(number, "w", encoding="utf-8", errors="backslashreplace", closefd=False))

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import math
 import os
+import re
 import signal
 import sys
 import types
@@ -14,69 +18,115 @@ from typing import Any, Literal
 import click
 import msgspec
 
-from gdtool.core import log
-from gdtool.core.errors import GdtoolError, UsageError, from_os_error
+from gdtool.core import ending, log
+from gdtool.core.errors import GdtoolError, UsageError, from_exception, from_os_error
+from gdtool.core.names import shown, text_fault
 from gdtool.core.stage import Stage
 
-INTERRUPTED, TERMINATED, BROKEN_PIPE = 130, 143, 141
-
-
-class _Terminated(BaseException):
-    """SIGTERM, raised where the program is, so that it cleans up on its way out."""
+BROKEN_PIPE = 141  # as a shell reports SIGPIPE
 
 
 def guarded(group: click.Command) -> None:
-    """Run the group; every way out has its exit code, and none shows a traceback for what a user or a file did."""
-    debug = "--debug" in sys.argv
+    """Run the group and exit: every way out has its exit code, and only --debug shows tracebacks."""
+    undo = ending.listen()
+    try:
+        sys.exit(_code_of(group))
+    finally:
+        undo()
 
-    def terminate(*_):
-        raise _Terminated
 
-    signal.signal(signal.SIGTERM, terminate)
+def _code_of(group: click.Command) -> int:
+    """Run the group; the exit code of whatever it returns or raises."""
     try:
         # Not group.main(): click would turn a broken pipe into exit code 1.
         with group.make_context("gdtool", sys.argv[1:]) as context:
             code = group.invoke(context)
-        code = code if isinstance(code, int) else 0
         sys.stdout.flush()
+        code = code if isinstance(code, int) else 0
     except click.exceptions.Exit as error:
         code = error.exit_code
+    except click.Abort:
+        code = 128 + signal.SIGINT
     except click.ClickException as error:
-        error.show()
-        code = error.exit_code
-    except (click.Abort, KeyboardInterrupt):
-        code = INTERRUPTED
-    except _Terminated:
-        code = TERMINATED
+        code = _usage(error)
+    except KeyboardInterrupt as error:
+        code = 128 + getattr(error, "number", signal.SIGINT)
     except BrokenPipeError:
-        # Nothing reads stdout any more; keep the interpreter from flushing it again at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = BROKEN_PIPE
-    except GdtoolError as error:
-        if debug:
-            raise
-        report(error)
-        code = error.exit_code
-    except OSError as error:
-        if debug:
-            raise
-        problem = from_os_error(error, "gdtool")
-        report(problem)
-        code = problem.exit_code
-    except MemoryError:
-        print("gdtool: out of memory; lower the resolution or free memory", file=sys.stderr)
-        code = 5
-    sys.exit(code)
+    except Exception as error:
+        code = tell(error, "gdtool").exit_code if ending.received is None else 0
+    if ending.received:  # whatever a library made of it on the way
+        code = 128 + ending.received
+        if ending.received == getattr(signal, "SIGXCPU", None):
+            log.line("gdtool: the limit of processor time is reached; raise it (ulimit -t)")
+    ending.ignore()
+    _close_stdout()
+    return code
+
+
+def _usage(error: click.ClickException) -> int:
+    """Tell what is wrong with the command line in one line; without any arguments the help, as click does."""
+    if isinstance(error, getattr(click.exceptions, "NoArgsIsHelpError", ())):
+        error.show()
+        return error.exit_code
+    context = getattr(error, "ctx", None)
+    place = context.command_path if context is not None else "gdtool"
+    text = " ".join(error.format_message().split()).rstrip(".")
+    log.line(f"{place}: {text[:1].lower() + text[1:]}; see {place} --help")
+    return error.exit_code
+
+
+def _close_stdout() -> None:
+    """Where stdout cannot be written (its reader has left, its disk is full), keep the interpreter from flushing it again."""
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def tell(error: Exception, subject: object) -> GdtoolError:
+    """Report an exception that was raised while working on subject, with its traceback under --debug; what it counts as."""
+    problem = from_exception(error, subject)
+    if debugging():
+        import traceback
+
+        traceback.print_exception(problem.__cause__ or error)
+    report(problem)
+    return problem
+
+
+def debugging() -> bool:
+    """Whether --debug is among the arguments."""
+    return "--debug" in sys.argv
 
 
 def report(error: GdtoolError) -> None:
     """One line on stderr."""
-    report_text(str(error))
+    report_text(str(error).removeprefix("gdtool: "))
 
 
 def report_text(text: str) -> None:
-    """A line on stderr; names that are not UTF-8 are shown with replacement characters."""
-    print(f"gdtool: {text}".encode(errors="surrogateescape").decode(errors="replace"), file=sys.stderr, flush=True)
+    """A line of gdtool's on stderr."""
+    log.line(f"gdtool: {text}")
+
+
+def emit(content: bytes) -> None:
+    """Write a result to stdout at once. Raises OutputError where it cannot be written, BrokenPipeError where nobody reads it."""
+    try:
+        sys.stdout.flush()
+        sys.stdout.buffer.write(content)
+        sys.stdout.buffer.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise from_os_error(error, "stdout") from None
+
+
+def exit_code(failed: list[GdtoolError], done: int) -> int:
+    """0 where nothing failed, the code that all failures share where nothing was done, else 1."""
+    codes = {error.exit_code for error in failed}
+    return 0 if not failed else codes.pop() if not done and len(codes) == 1 else 1
 
 
 VERBOSITY = {
@@ -84,6 +134,37 @@ VERBOSITY = {
     ("-v", "--verbose"): "Tell steps and skips.",
     ("--debug",): "Show tracebacks.",
 }
+
+
+class IntegerRange(click.IntRange):
+    """An integer between bounds."""
+
+    name = "integer"
+
+
+class FiniteRange(click.FloatRange):
+    """A float between bounds; not NaN, which is never outside of them."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{number} is not a finite number.", param, ctx)
+        return number
+
+
+class Text(click.ParamType):
+    """A string without control characters: names with line breaks would be two lines in a pipe."""
+
+    name = "text"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        fault = text_fault(value, byte_escapes=True)
+        if fault:
+            self.fail(f"{shown(value)} {fault}", param, ctx)
+        return value
+
+
+TEXT = Text()
 
 
 def verbosity_options(function: Callable) -> Callable:
@@ -117,15 +198,13 @@ def option_from_field(field: Any, hint: Any) -> click.Option:
         return click.Option([f"--{name}"], type=click.Choice([str(a) for a in typing.get_args(inner)]), **common)
     if typing.get_origin(inner) is tuple:
         common["default"] = ",".join(field.default or ())
-        return click.Option([f"--{name}"], metavar="A,B,…", callback=lambda _c, _p, v: tuple(x for x in v.split(",") if x), **common)
+        return click.Option([f"--{name}"], type=TEXT, metavar="A,B,…", callback=lambda _c, _p, v: tuple(x for x in v.split(",") if x), **common)
     if inner in (int, float):
-        bounds = {"min": meta.ge if meta.ge is not None else meta.gt, "max": meta.le if meta.le is not None else meta.lt,
+        lowest, highest = (meta.ge, meta.gt), (meta.le, meta.lt)
+        bounds = {"min": next((x for x in lowest if x is not None), None), "max": next((x for x in highest if x is not None), None),
                   "min_open": meta.gt is not None, "max_open": meta.lt is not None}
-        kind = (click.IntRange if inner is int else click.FloatRange)
-        if inner is int:
-            return click.Option([f"--{name}"], type=kind(bounds["min"], bounds["max"]), **common)
-        return click.Option([f"--{name}"], type=kind(**bounds), **common)
-    return click.Option([f"--{name}"], type=str, **common)
+        return click.Option([f"--{name}"], type=(IntegerRange if inner is int else FiniteRange)(**bounds), **common)
+    return click.Option([f"--{name}"], type=TEXT, **common)
 
 
 def options_from(struct: type) -> list[click.Option]:
@@ -139,31 +218,42 @@ def build_options(struct: type, values: dict[str, Any]) -> Any:
     try:
         return msgspec.convert({field.name: values[field.name] for field in msgspec.structs.fields(struct)}, struct)
     except msgspec.ValidationError as error:
-        raise UsageError("options", str(error)) from None
+        raise UsageError("options", str(error), "give the option a value that --help names") from None
+
+
+_SHARD = re.compile(r"([0-9]{1,9})/([0-9]{1,9})")
 
 
 def shard_of(text: str | None) -> tuple[int, int]:
     """The I and N of I/N. Raises UsageError."""
     if text is None:
         return 1, 1
-    part, _, parts = text.partition("/")
-    if not (part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
-        raise UsageError(f"--shard {text}", "is not I/N with I from 1 to N")
-    return int(part), int(parts)
+    match = _SHARD.fullmatch(text)
+    if not match or not 1 <= int(match[1]) <= int(match[2]):
+        raise UsageError(f"--shard {text}", "is not I/N with I from 1 to N", "give 1/N to N/N, one to each job")
+    return int(match[1]), int(match[2])
 
 
-def help_of(text: str) -> str:
-    """A module docstring as click help: pasted examples keep their line breaks."""
+def help_of(module: types.ModuleType) -> str:
+    """A module's docstring as click help: pasted examples keep their line breaks. Under python -OO it is read from the source."""
+    text = module.__doc__
+    if text is None:
+        import ast
+
+        text = ast.get_docstring(ast.parse(Path(module.__file__).read_text(encoding="utf-8")), clean=False) or ""
     return text.replace("Example:\n", "\b\nExample:\n").replace("Examples:\n", "\b\nExamples:\n")
+
+
+# The most that --threads takes: more than any machine has.
+MOST_THREADS = 1024
 
 
 def stage_command(stage: Stage, help: str) -> click.Command:
     """The command line of a stage."""
 
     def invoke(**values: Any) -> int:
-        import json
-
         from gdtool.core.runner import Settings, run_all
+        from gdtool.stages.early import require_device
 
         set_verbosity(values["quiet"], values["verbose"])
         arguments = values["sources"]
@@ -174,45 +264,41 @@ def stage_command(stage: Stage, help: str) -> click.Command:
         )
         flags = {flag: values["second_" + flag] for flag in stage.second_inputs}
         options = build_options(stage.Options, values)
+        if not settings.ray:  # a node of the cluster may have a device that this machine has not
+            require_device(settings.device)
         failed: list[GdtoolError] = []
         done = 0
         for result in run_all(stage, arguments, options, flags, settings):
             if isinstance(result, GdtoolError):
-                if values["debug"]:
-                    raise result
-                report(result)
-                failed.append(result)
+                failed.append(tell(result, "gdtool"))
                 continue
             done += 1
             if values["as_json"]:
-                print(json.dumps({"folder": str(result.path), "kind": result.kind, "status": result.status,
-                                  "seconds": round(result.seconds, 3), "skipped": list(result.skipped)}), flush=True)
+                record = {"folder": str(result.path), "kind": result.kind, "status": result.status,
+                          "seconds": round(result.seconds, 3), "skipped": list(result.skipped)}
+                emit(json.dumps(record).encode() + b"\n")
             else:
-                sys.stdout.buffer.write(os.fsencode(result.path) + b"\n")
-                sys.stdout.buffer.flush()
-        if not failed:
-            return 0
-        codes = {error.exit_code for error in failed}
-        return codes.pop() if not done and len(codes) == 1 else 1
+                emit(os.fsencode(result.path) + b"\n")
+        return exit_code(failed, done)
 
-    params: list[click.Parameter] = [click.Argument(["sources"], nargs=-1, type=str)]
+    params: list[click.Parameter] = [click.Argument(["sources"], nargs=-1, type=TEXT)]
     params += options_from(stage.Options)
     for flag in stage.second_inputs:
         second = stage.second(flag)
         text = second.help or f"The {second.kind} to use" + ("; found along the provenance chain without it." if second.search else ".")
-        params.append(click.Option([f"--{flag}", f"second_{flag}"], metavar="PATH", help=text))
+        params.append(click.Option([f"--{flag}", f"second_{flag}"], type=TEXT, metavar="PATH", help=text))
     if stage.dataset:
         text = "Only every Nth source from the Ith on, for job arrays that share -o: 1/N to N/N."
-        params.append(click.Option(["--shard"], metavar="I/N", help=text))
+        params.append(click.Option(["--shard"], type=TEXT, metavar="I/N", help=text))
         text = "Fan out on the Ray cluster at ADDRESS, a source a task; local: on this machine's cores. Nodes share the folders. Needs gdtool[ray]."
-        params.append(click.Option(["--ray"], metavar="ADDRESS", help=text))
+        params.append(click.Option(["--ray"], type=TEXT, metavar="ADDRESS", help=text))
     params += [
-        click.Option(["-o", "--output"], metavar="DIR", help="Output folder; for several sources the parent of NAME.asset/KIND."),
+        click.Option(["-o", "--output"], type=TEXT, metavar="DIR", help="Output folder; for several sources the parent of NAME.asset/KIND."),
         click.Option(["-n", "--dry-run"], is_flag=True, help="Print what would be made."),
         click.Option(["-f", "--force"], is_flag=True, help="Run even when up to date."),
         click.Option(["--json", "as_json"], is_flag=True, help="Print one JSON object per source."),
-        click.Option(["--threads"], type=click.IntRange(0), default=0, help="Threads; 0: all cores."),
+        click.Option(["--threads"], type=IntegerRange(0, MOST_THREADS), default=0, help="Threads; 0: all cores."),
         click.Option(["--device"], type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True, help="Where networks run."),
     ]
     params += [click.Option(list(flags), is_flag=True, help=text) for flags, text in VERBOSITY.items()]
-    return click.Command(stage.name, callback=invoke, params=params, help=help_of(help))
+    return click.Command(stage.name, callback=invoke, params=params, help=help)

@@ -2,6 +2,6 @@
 
 from gdtool.stages import import_views as stage
 
-from ._common import stage_command
+from ._common import help_of, stage_command
 
-command = stage_command(stage.STAGE, help=stage.__doc__)
+command = stage_command(stage.STAGE, help=help_of(stage))

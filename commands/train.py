@@ -6,9 +6,9 @@ import click
 
 from gdtool.stages import train as stage
 
-from ._common import build_options, stage_command
+from ._common import build_options, help_of, stage_command
 
-command = stage_command(stage.STAGE, help=stage.__doc__)
+command = stage_command(stage.STAGE, help=help_of(stage))
 command.params.append(click.Option(["--plan"], is_flag=True, help="Tell memory, FLOPs and time of the training, computed from its structure; no data."))
 _train = command.callback
 

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from pathlib import Path
 
 import click
 
-from gdtool.core import sources
-from gdtool.core.errors import InputError, ResourceError
+from gdtool.core import ending, sources
+from gdtool.core.errors import InputError
 from gdtool.stages import validate as stage
 
-from ._common import help_of, report, report_text, set_verbosity, verbosity_options
+from ._common import TEXT, emit, help_of, report_text, set_verbosity, tell, verbosity_options
 
 SHOWN = 10  # the first faults are enough to start mending
 
 
-@click.command("validate", help=help_of(stage.__doc__))
-@click.argument("paths", metavar="[SOURCES]...", nargs=-1)
+@click.command("validate", help=help_of(stage))
+@click.argument("paths", metavar="[SOURCES]...", nargs=-1, type=TEXT)
 @verbosity_options
 def command(paths, as_json, quiet, verbose, debug):
     set_verbosity(quiet, verbose)
@@ -27,20 +26,20 @@ def command(paths, as_json, quiet, verbose, debug):
     for text in sources.incoming(paths):
         try:
             found = list(stage.faults(Path(text)))
-        except ResourceError as error:
-            report(error)
-            code = error.exit_code
+        except Exception as error:  # the path could not be checked, which says nothing of its validity
+            if ending.received is not None:
+                raise
+            code = tell(error, text).exit_code
             continue
         if found and not code:
             code = InputError.exit_code
         if as_json:
-            print(json.dumps({"path": text, "valid": not found, "faults": found}), flush=True)
+            emit(json.dumps({"path": text, "valid": not found, "faults": found}).encode() + b"\n")
             continue
         for fault in found[:SHOWN]:
             report_text(fault)
         if len(found) > SHOWN:
             report_text(f"{text}: {len(found) - SHOWN} more faults (--json lists all)")
         if not found:
-            sys.stdout.buffer.write(b"valid: " + os.fsencode(text) + b"\n")
-            sys.stdout.buffer.flush()
+            emit(b"valid: " + os.fsencode(text) + b"\n")
     return code

@@ -22,11 +22,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from gdtool.core import errors
+from gdtool.core.errors import ChildFailed
 from gdtool.core.nursery import Forked, Nursery, die_with_parent, python_running
-
-
-class ChildFailed(Exception):
-    """The child crashed, ran out of time or memory, or ended without a result; str() says which."""
 
 
 # glibc gives large blocks back at once, and native vectors that grow fault their pages in again and again: a sixth of the
@@ -263,7 +260,11 @@ def serve(nursery: Nursery | None = None) -> None:
     except errors.GdtoolError as error:
         answer = ("error", type(error)(error.subject, error.fact, error.cure))
     except MemoryError:
-        answer = ("failed", f"needs more than {memory_mb} MB")
+        answer = ("failed", "ran out of memory" if memory_mb is None else f"needs more than {memory_mb} MB")
+    except ImportError as error:
+        # A shared library that the system lacks is told: a fallback would hide why the result is worse.
+        library = None if isinstance(error, ModuleNotFoundError) else errors.missing_library(error)
+        answer = ("error", library) if library else ("failed", f"{type(error).__name__}: {error}")
     except Exception as error:  # reported to the parent, which knows a fallback
         answer = ("failed", f"{type(error).__name__}: {error}")
     with os.fdopen(answer_to, "wb") as file:

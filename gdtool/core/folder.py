@@ -1,4 +1,4 @@
-"""Folders that stages read: opening, checking, and walking back along what they were made from."""
+"""Folders that stages read: opening and checking."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from gdtool.core.errors import InputError
 from gdtool.core.kinds import MADE_BY, Content
 from gdtool.core.manifest import MANIFEST, Manifest, check_files, read_manifest
+from gdtool.core.names import path_inside
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Folder:
         return self.manifest.name
 
     def file(self, relative: str) -> Path:
-        """Path of a file of the folder."""
+        """Path of a file of the folder. relative: of gdtool's own making, or a name that the manifest's check has let pass."""
         return self.path / relative
 
 
@@ -52,41 +53,20 @@ def open_folder(path: Path | str, kinds: tuple[str, ...] = (), reader: str = "",
     manifest = read_manifest(path)
     if kinds and manifest.kind not in kinds:
         raise InputError(path, f"holds {manifest.kind}, but {reader or 'this'} reads {' or '.join(kinds)}",
-                         f"run gdtool {MADE_BY[kinds[0]]} first")
+                         f"run gdtool {MADE_BY[kinds[0]]} first" if kinds[0] in MADE_BY else f"name a file for {reader}")
     if check:
         check_files(path, manifest)
     return Folder(path, manifest)
 
 
-def ancestors(folder: Folder) -> Iterator[Folder]:
-    """The folders that this one was made from, nearest first, as far as they still lie where the manifests say."""
-    queue, seen = [folder], {folder.path.resolve()}
-    while queue:
-        current = queue.pop(0)
-        for entry in current.manifest.inputs:
-            path = Path(current.path, entry.path)
-            if not is_folder(path) or path.resolve() in seen:
-                continue
-            seen.add(path.resolve())
-            found = open_folder(path, check=False)
-            yield found
-            queue.append(found)
+def dataset_objects(dataset: Folder) -> Iterator[Folder]:
+    """The views folders that a dataset lists, in its order; their files are not checked.
 
-
-def find_ancestor(folder: Folder, kind: str) -> Folder | None:
-    """The nearest folder of a kind along the provenance chain (the folder itself included), or None."""
-    if folder.kind == kind:
-        return folder
-    return next((f for f in ancestors(folder) if f.kind == kind), None)
-
-
-def find_source(folder: Folder) -> str | None:
-    """The first input along the chain that is not a folder: a file path, procedural:SEED, or None."""
-    for one in (folder, *ancestors(folder)):
-        for entry in one.manifest.inputs:
-            if entry.path.startswith("procedural:"):
-                return entry.path
-            path = Path(one.path, entry.path)
-            if path.is_file():
-                return str(path)
-    return None
+    Raises InputError for one that leaves the dataset, is missing, or is not the one listed (another digest).
+    """
+    for entry in dataset.content.objects:
+        path = path_inside(dataset.path, entry.path, dataset.path / MANIFEST, "object")
+        found = open_folder(path, ("views",), "a dataset", check=False)
+        if found.manifest.digest != entry.digest:
+            raise InputError(path, "is not the folder that the dataset lists (other digest)", f"run gdtool render-dataset into {dataset.path} again")
+        yield found

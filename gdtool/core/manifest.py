@@ -7,7 +7,8 @@ import hashlib
 import json
 import os
 import re
-from pathlib import Path, PurePosixPath
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
@@ -15,6 +16,7 @@ from msgspec import Meta
 
 from gdtool.core.errors import InputError
 from gdtool.core.kinds import CONTENTS, Content, Scalar
+from gdtool.core.names import checked_name, path_inside, relative_parts
 from gdtool.core.reading import read_json
 
 FORMAT = 1
@@ -124,12 +126,24 @@ def decode(raw: Any, path: Path) -> Manifest:
         content = msgspec.convert(raw["content"], CONTENTS[manifest.kind])
     except msgspec.ValidationError as error:
         fact = str(error)
-        raise InputError(path, fact[0].lower() + fact[1:], _nearest(fact, nested)) from None
-    for entry in manifest.files:
-        pure = PurePosixPath(entry.path)
-        if pure.is_absolute() or ".." in pure.parts or "\\" in entry.path or not pure.parts:
-            raise InputError(path, f"file path {entry.path!r} leaves the folder")
+        raise InputError(path, fact[0].lower() + fact[1:], _nearest(fact, nested) or "see docs/format.md for the fields") from None
+    checked_name(manifest.name, path, "name")
+    for one in (*(entry.path for entry in manifest.files), *_files_named_in(content)):
+        relative_parts(one, path, "file path")
+    for view in getattr(content, "views", ()):
+        checked_name(view, path, "view")
+    for entry in manifest.inputs:
+        if not entry.path.startswith("procedural:"):
+            relative_parts(entry.path, path, "input path", levels_up=None, byte_escapes=True)
     return msgspec.structs.replace(manifest, content=content)
+
+
+def _files_named_in(content: Content) -> Iterator[str]:
+    """Paths below the folder that its content names besides those of `files`."""
+    yield from (entry.path for entry in getattr(content, "objects", ()))
+    yield from getattr(content, "maps", {}).values()
+    yield from getattr(content, "lods", ())
+    yield from filter(None, [getattr(content, "usd", "")])
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -137,21 +151,24 @@ def read_manifest(folder: Path) -> Manifest:
     path = folder / MANIFEST
     if not path.is_file():
         fact = "has no manifest.json" if folder.is_dir() else ("is not a folder" if folder.exists() else "does not exist")
-        raise InputError(folder, fact, "a folder is whole only with its manifest")
+        raise InputError(folder, fact, "name a folder that a gdtool command has written" if folder.exists() else "check the path")
     return decode(read_json(path), path)
 
 
 def check_files(folder: Path, manifest: Manifest) -> None:
     """Raises InputError when a listed file is missing, leaves the folder by a link, or has another size or hash."""
-    root = folder.resolve()
     for entry in manifest.files:
-        path = folder / entry.path
+        path = path_inside(folder, entry.path, folder / MANIFEST, "file")
         if not path.is_file():
-            raise InputError(path, "is listed in the manifest but missing")
-        if not path.resolve().is_relative_to(root):
-            raise InputError(path, "is a link that leaves the folder")
+            raise InputError(path, "is listed in the manifest but missing", f"put it back, or run {_maker(manifest)} again")
         if path.stat().st_size != entry.size or file_sha256(path) != entry.sha256:
-            raise InputError(path, "is not the file that the manifest lists (other size or hash)")
+            raise InputError(path, "is not the file that the manifest lists (other size or hash)",
+                             f"put the file back, or move it away and run {_maker(manifest)} again")
+
+
+def _maker(manifest: Manifest) -> str:
+    """What wrote a folder, for a message."""
+    return f"gdtool {manifest.stage}" if manifest.key else "the program that wrote it"
 
 
 def list_files(folder: Path) -> tuple[FileEntry, ...]:

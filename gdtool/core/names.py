@@ -144,6 +144,9 @@ def shown(text: str, most: int = 80) -> str:
 
 
 def name_from_path(text: str) -> str:
-    """An object's name from a file's: bytes that are not UTF-8 are read as Latin-1, control characters become underscores."""
+    """An object's name from a file's: bytes that are not UTF-8 are read as Latin-1, and what no name may hold becomes underscores."""
     plain = "".join(chr(ord(c) - 0xDC00) if ord(c) in _BYTE_ESCAPES else c for c in text)
-    return "".join("_" if text_fault(c) else c for c in plain) or "_"
+    name = "".join("_" if c in "/\\" or text_fault(c) else c for c in plain)
+    if _DRIVE.match(name):
+        name = name.replace(":", "_", 1)
+    return "_" if name in ("", ".", "..") else name

@@ -1,23 +1,27 @@
 """Atomic publishing: a folder appears whole or not at all, whatever kills the run.
 
 Beside the target `surface` live, while a run works on it: `.surface.lock`, `.surface.<key>.partial` (what is being
-written) and, for stages that resume, `.surface.<key>.work`.
+written), `.surface.<key>.old` (what it replaces, for a moment, where the system cannot swap two folders) and, for stages that resume,
+`.surface.<key>.work`; <key> is the first twelve hexadecimal digits of the run's key.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import fcntl
 import os
+import re
 import shutil
+import stat
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gdtool.core import log
+from gdtool.core import ending, log
 from gdtool.core.errors import OutputError
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
@@ -29,7 +33,10 @@ def locked(target: Path, wait_seconds: float = 3600.0) -> Iterator[None]:
     path = target.parent / f".{target.name}.lock"
     deadline, told = time.monotonic() + wait_seconds, False
     while True:
-        handle = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
+        handle = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o666)
+        if os.fstat(handle).st_size:  # a lock of ours is empty, and is removed in the end
+            os.close(handle)
+            raise OutputError(path, "is in the way of the output's lock, and gdtool did not write it", "move it away, or choose another -o")
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             # The holder before us removes the file when it is done: a lock on a removed file guards nothing.
@@ -47,53 +54,88 @@ def locked(target: Path, wait_seconds: float = 3600.0) -> Iterator[None]:
             told = True
         time.sleep(0.05)
     try:
-        yield
+        with ending.certainly(lambda: path.unlink(missing_ok=True)):
+            yield
     finally:
-        path.unlink(missing_ok=True)
         os.close(handle)
+
+
+KEY_DIGITS = 12  # of the key, in the names beside the target
 
 
 def partial_path(target: Path, key: str) -> Path:
     """Where the run with this key writes."""
-    return target.parent / f".{target.name}.{key[:12]}.partial"
+    return _beside(target, key, "partial")
 
 
 def workspace_path(target: Path, key: str) -> Path:
     """Where the run with this key keeps what a later run can resume from."""
-    return target.parent / f".{target.name}.{key[:12]}.work"
+    return _beside(target, key, "work")
 
 
-def clear_stale(target: Path, key: str) -> None:
-    """Remove what killed runs left beside the target, except the workspace of this key. The lock must be held."""
-    keep = workspace_path(target, key).name
-    old = target.parent / f".{target.name}.old"
-    if old.exists():
+def _beside(target: Path, key: str, use: str) -> Path:
+    return target.parent / f".{target.name}.{key[:KEY_DIGITS]}.{use}"
+
+
+def _left_beside(target: Path, *uses: str) -> list[Path]:
+    """Folders that runs of this output, and of no other, have left beside it."""
+    pattern = re.compile(re.escape(f".{target.name}.") + f"[0-9a-f]{{{KEY_DIGITS}}}" + r"\.(" + "|".join(uses) + ")")
+    return sorted(path for path in target.parent.iterdir() if pattern.fullmatch(path.name) and path.is_dir() and not path.is_symlink())
+
+
+def clear_stale(target: Path) -> None:
+    """Remove what killed runs left half written beside the target. The lock must be held: so no run that is left of is alive.
+
+    Workspaces stay, those of other options too: they may hold hours of a training. clear_workspaces() removes them after a publication.
+    """
+    for old in _left_beside(target, "old"):
         if target.exists():
-            shutil.rmtree(old, ignore_errors=True)
+            remove_tree(old)
         else:  # killed between the two renames of a file system without exchange
             old.rename(target)
-    for path in target.parent.glob(f".{glob_escape(target.name)}.*"):
-        if path.suffix in (".partial", ".work") and path.name != keep and path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
+    for path in _left_beside(target, "partial"):
+        remove_tree(path)
 
 
-def glob_escape(name: str) -> str:
-    """A name as a glob pattern that matches only itself."""
-    return "".join(f"[{c}]" if c in "*?[" else c for c in name)
+def clear_workspaces(target: Path) -> None:
+    """Remove what runs of this output could have resumed from: it is finished. The lock must be held."""
+    for path in _left_beside(target, "work"):
+        remove_tree(path)
+
+
+def remove_tree(folder: Path) -> None:
+    """Remove a folder of our own as far as the system lets us, also where a umask has left it without permissions. A link is not followed."""
+    if folder.is_symlink() or not folder.is_dir():
+        return
+
+    with contextlib.suppress(OSError):
+        folder.chmod(folder.stat().st_mode | stat.S_IRWXU)
+        for root, folders, _ in os.walk(folder):
+            for path in (Path(root, name) for name in folders):
+                if not path.is_symlink():  # before os.walk looks into it
+                    path.chmod(path.stat().st_mode | stat.S_IRWXU)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def require_replaceable(target: Path) -> None:
+    """Raise OutputError where the folder at target could not be removed once it is replaced: it, or a folder in it, is closed to this user."""
+    for root, _, _ in os.walk(target):
+        if not os.access(root, os.W_OK | os.X_OK):
+            raise OutputError(root, "cannot be replaced: it is closed to writing", "check its permissions or choose another -o")
 
 
 def publish(partial: Path, target: Path) -> None:
-    """Put a finished folder in the target's place in one step."""
+    """Put a finished folder in the target's place in one step, and remove what stood there."""
     if not target.exists():
         partial.rename(target)
         return
     if _exchange(partial, target):
-        shutil.rmtree(partial, ignore_errors=True)
+        remove_tree(partial)
         return
-    old = target.parent / f".{target.name}.old"
+    old = partial.with_suffix(".old")
     target.rename(old)
     partial.rename(target)
-    shutil.rmtree(old, ignore_errors=True)
+    remove_tree(old)
 
 
 def _exchange(a: Path, b: Path) -> bool:

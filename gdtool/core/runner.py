@@ -9,9 +9,8 @@ import functools
 import itertools
 import os
 import resource
-import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -20,11 +19,13 @@ import msgspec
 
 import gdtool
 from gdtool import __version__
-from gdtool.core import child, log, sources
-from gdtool.core.errors import GdtoolError, InputError, ResourceError, UsageError, from_os_error
-from gdtool.core.folder import Folder, find_ancestor, is_folder, open_folder
+from gdtool.core import child, ending, log, sources
+from gdtool.core.errors import GdtoolError, InputError, ResourceError, UsageError, from_exception, from_os_error
+from gdtool.core.folder import Folder, is_folder, open_folder
 from gdtool.core.manifest import MANIFEST, InputEntry, Manifest, RunRecord, check_files, digest_of, encode, list_files, read_manifest
-from gdtool.core.publish import clear_stale, locked, partial_path, publish, workspace_path
+from gdtool.core.ownership import output_place, refuse_index, refuse_loss, refuse_overlap
+from gdtool.core.provenance import find_ancestor, missing_origin
+from gdtool.core.publish import clear_stale, clear_workspaces, locked, partial_path, publish, remove_tree, require_replaceable, workspace_path
 from gdtool.core.sources import Source
 from gdtool.core.stage import Inputs, Output, Stage
 
@@ -70,36 +71,63 @@ def default_output(stage: Stage, source: Source, output: Path | None, several: b
     return Path(f"{name}.asset") / stage.writes
 
 
-def second_inputs(stage: Stage, source: Source, given: dict[str, str | None]) -> dict[str, Folder | Path | None]:
-    """The stage's other inputs: what the flags name, else what lies along the provenance chain."""
+@dataclass(frozen=True)
+class SecondInputs:
+    """The stage's other inputs by flag, None where there is none, and what to warn of."""
+
+    found: dict[str, Folder | Path | None]
+    warnings: tuple[str, ...] = ()
+
+
+def second_inputs(stage: Stage, source: Source, given: dict[str, str | None]) -> SecondInputs:
+    """The stage's other inputs: what the flags name, else what lies along the provenance chain.
+
+    Raises InputError where a folder on the way there was replaced since, UsageError where a required one is not there.
+    """
     out: dict[str, Folder | Path | None] = {}
+    warnings = []
     for flag in stage.second_inputs:
         wanted = stage.second(flag)
+        gone = None
         if given.get(flag):
             kinds = (wanted.kind, sources.PICTURES) if wanted.foreign else (wanted.kind,)
             place = sources.hub_folder(given[flag]) if wanted.foreign else given[flag]
             out[flag] = sources.resolve(place, kinds, f"--{flag} of {stage.name}")
         elif wanted.search and isinstance(source, Folder):
-            found = find_ancestor(source, wanted.kind)
+            found = find_ancestor(source, wanted.kind, f"run the stages after it again, or name it with --{flag}")
             out[flag] = open_folder(found.path) if found else None
+            gone = None if found else missing_origin(source)
         elif wanted.default:
             out[flag] = open_folder(Path(gdtool.__file__).parent / wanted.default, (wanted.kind,), stage.name)
         else:
             out[flag] = None
+        moved = f"{gone.path}, which {gone.of.kind} {gone.of.path} was made from, is gone" if gone else ""
         if out[flag] is None and wanted.required:
-            raise UsageError(sources.name_of(source), f"has no {wanted.kind} along its provenance chain", f"name one with --{flag}")
-    return out
+            raise UsageError(sources.name_of(source), moved or f"has no {wanted.kind} along its provenance chain", f"name one with --{flag}")
+        if moved:
+            warnings.append(f"no {wanted.kind} found: {moved}; name one with --{flag} where there is one")
+    return SecondInputs(out, tuple(warnings))
 
 
 def option_record(options: Any, folder: Path | None) -> dict[str, Any]:
     """Options as plain values; files by digest (folder None, for the key) or by path relative to folder."""
     record = msgspec.to_builtins(options)
     for field in msgspec.structs.fields(options):
-        extra = getattr(getattr(field.type, "__metadata__", (None,))[0], "extra", None) or {}
         value = record.get(field.name)
-        if extra.get("file") and isinstance(value, str) and Path(value).is_file():
+        if names_file(field) and isinstance(value, str) and Path(value).is_file():
             record[field.name] = sources.digest(Path(value)) if folder is None else sources.relative_to(Path(value), folder)
     return record
+
+
+def names_file(field: Any) -> bool:
+    """Whether a field of a stage's Options names a file."""
+    extra = getattr(getattr(field.type, "__metadata__", (None,))[0], "extra", None) or {}
+    return bool(extra.get("file"))
+
+
+def key_of(stage: str, version: int, options: dict[str, Any], inputs: list[tuple[str, str]]) -> str:
+    """What tells one result of a stage from another: sha256 of its name, version, options (files by digest), and (role, digest) of its inputs."""
+    return digest_of([stage, version, options, inputs])
 
 
 def stale_reason(target: Path, stage: Stage, key: str, options: dict[str, Any], inputs: list[tuple[str, str]]) -> str | None:
@@ -141,35 +169,41 @@ def _refuse_other_source(target: Path, stage: Stage, source: Source, chosen: boo
 def run_one(stage: Stage, given: list[Source], options: Any, flags: dict[str, str | None], settings: Settings) -> Result:
     """Run a stage on one source (or, when it gathers, on all of them) and publish the result."""
     source = given[0]
-    target = default_output(stage, source, settings.output, settings.several and not stage.gathers)
-    if target.exists() and not target.is_dir():
-        raise UsageError(target, "is a file", "name a folder with -o")
-    for one in given:
-        if isinstance(one, Folder) and target.resolve() == one.path.resolve():
-            raise UsageError(target, "is both source and output", "name another output with -o")
+    named = default_output(stage, source, settings.output, settings.several and not stage.gathers)
+    target = output_place(named)
+    refuse_overlap(target, _places(given))
     _refuse_other_source(target, stage, source, settings.output is not None and not settings.several)
     if settings.dry_run:
-        return Result(target, stage.writes, "would run")
+        return Result(named, stage.writes, "would run")
     second = second_inputs(stage, source, flags)
-    roles = [("source", one) for one in given] + [(flag, one) for flag, one in second.items() if one is not None]
+    refuse_overlap(target, _places(second.found.values()))
+    inputs = Inputs(source, sources.name_of(source), second.found, tuple(given))
+    if stage.check is not None:
+        stage.check(inputs, options)
+    roles = [("source", one) for one in given] + [(flag, one) for flag, one in second.found.items() if one is not None]
     digests = [(role, sources.digest(one)) for role, one in roles]
     keyed = option_record(options, None)
-    key = digest_of([stage.name, stage.version, keyed, digests])
+    key = key_of(stage.name, stage.version, keyed, digests)
     recorded = option_record(options, target)
     start = time.perf_counter()
-    with _parents(target), locked(target):
-        clear_stale(target, key)
+    with _parents(target), locked(target), contextlib.ExitStack() as at_end:
+        clear_stale(target)
         reason = "asked by --force" if settings.force else stale_reason(target, stage, key, recorded, digests)
         if reason is None:
             os.utime(target / MANIFEST)
-            log.say(f"{target}: up to date")
-            return Result(target, stage.writes, "up to date")
-        log.say(f"{target}: running {stage.name} ({reason})")
+            log.say(f"{named}: up to date")
+            return Result(named, stage.writes, "up to date")
+        refuse_loss(target, stage.writes)
+        require_replaceable(target)
+        log.say(f"{named}: running {stage.name} ({reason})")
         partial = partial_path(target, key)
         out = Output(partial, workspace_path(target, key), settings.threads or os.cpu_count() or 1, settings.device)
+        at_end.enter_context(ending.certainly(functools.partial(_drop_workspace, stage, out.place_of_workspace)))
+        at_end.enter_context(ending.certainly(functools.partial(remove_tree, partial)))
+        for text in second.warnings:
+            out.warn(text)
         try:
             partial.mkdir()
-            inputs = Inputs(source, sources.name_of(source), second, tuple(given))
             try:
                 stage.run(inputs, options, out)
             except MemoryError:
@@ -186,15 +220,34 @@ def run_one(stage: Stage, given: list[Source], options: Any, flags: dict[str, st
                 warnings=tuple(out.warnings), files=list_files(partial), run=_record(out, start),
             )
             (partial / MANIFEST).write_bytes(encode(manifest))
+            refuse_loss(target, stage.writes)  # again: the run may have taken hours
             publish(partial, target)
-            shutil.rmtree(out._workspace, ignore_errors=True)
-        except OSError as error:
-            raise from_os_error(error, target) from error
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+            clear_workspaces(target)
+        except BaseException as error:
+            if _is_resumable(stage, out.place_of_workspace):
+                log.say(f"{named}: what is done so far is kept in {out.place_of_workspace}; the same command goes on from it")
+            if isinstance(error, OSError):
+                raise from_os_error(error, target) from error
+            raise
     seconds = time.perf_counter() - start
-    log.say(f"{target}: done in {seconds:.1f} s" + (f", skipped {len(out.skipped)}" if out.skipped else ""))
-    return Result(target, stage.writes, "done", seconds, tuple(f"{s.what}: {s.reason}" for s in out.skipped))
+    log.say(f"{named}: done in {seconds:.1f} s" + (f", skipped {len(out.skipped)}" if out.skipped else ""))
+    return Result(named, stage.writes, "done", seconds, tuple(f"{s.what}: {s.reason}" for s in out.skipped))
+
+
+def _is_resumable(stage: Stage, workspace: Path) -> bool:
+    """Whether the same run can go on from what is in its workspace."""
+    return bool(stage.checkpoint) and (workspace / stage.checkpoint).is_file()
+
+
+def _drop_workspace(stage: Stage, workspace: Path) -> None:
+    """Remove a workspace that no run can go on from."""
+    if not _is_resumable(stage, workspace):
+        remove_tree(workspace)
+
+
+def _places(inputs: Iterable[Source | None]) -> list[Path]:
+    """Where inputs lie, generated objects left out."""
+    return [one.path if isinstance(one, Folder) else one for one in inputs if isinstance(one, (Folder, Path))]
 
 
 @contextlib.contextmanager
@@ -202,14 +255,14 @@ def _parents(target: Path) -> Iterator[None]:
     """Make the folders above target; what stays empty, because the run failed, goes again."""
     made = [folder for folder in target.parents if not folder.exists()]
     target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        yield
-    finally:
-        for folder in made:
-            try:
+
+    def remove_empty() -> None:
+        with contextlib.suppress(OSError):
+            for folder in made:
                 folder.rmdir()
-            except OSError:
-                break
+
+    with ending.certainly(remove_empty):
+        yield
 
 
 def _record(out: Output, start: float) -> RunRecord:
@@ -234,11 +287,10 @@ def write_dataset_index(root: Path, results: list[Result]) -> Path:
     """Write or extend the dataset manifest at root over the views folders made below it."""
     from gdtool.core.kinds import DatasetContent, DatasetObject
 
+    refuse_index(root)
     objects: dict[str, str] = {}
     if is_folder(root):
         old = read_manifest(root)
-        if old.kind != "dataset":
-            raise UsageError(root, f"holds {old.kind}", "name another output with -o")
         objects = {one.path: one.digest for one in old.content.objects if is_folder(root / one.path)}
     for result in results:
         objects[result.path.relative_to(root).as_posix()] = read_manifest(result.path).digest
@@ -255,10 +307,13 @@ def _attempt(stage: Stage, text: str, *, options: Any, flags: dict[str, str | No
     try:
         source = sources.resolve(text, stage.reads, stage.name, allow_missing=settings.dry_run)
         return run_one(stage, [source], options, flags, settings)
-    except OSError as error:
-        return from_os_error(error, text)
-    except GdtoolError as error:
-        return error
+    except Exception as error:  # the other sources go on
+        if ending.received is not None:
+            raise
+        problem = from_exception(error, text)
+        if problem is not error:
+            problem.__cause__ = error
+        return problem
 
 
 def _on_cluster(work: functools.partial, stream: Iterator[str], settings: Settings) -> Iterator[Result | GdtoolError]:
@@ -291,6 +346,8 @@ def run_all(stage: Stage, arguments: tuple[str, ...], options: Any, flags: dict[
         several = len(first) > 1
         stream = itertools.chain(first, stream)
     settings = dataclasses.replace(settings, several=several)
+    if stage.dataset and several and settings.output is not None:
+        refuse_index(settings.output)
     work = functools.partial(_attempt, stage, options=options, flags=flags, settings=settings)
     done: list[Result] = []
     for result in _on_cluster(work, stream, settings) if settings.ray else map(work, stream):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import re
@@ -13,52 +14,86 @@ from urllib.parse import unquote
 from gdtool.core.errors import InputError, ResourceError, UsageError
 from gdtool.core.folder import Folder, is_folder, open_folder
 from gdtool.core.manifest import digest_of, file_sha256
+from gdtool.core.names import name_from_path, shown, text_fault
+from gdtool.core.reading import MAX_INTEGER_DIGITS, parse_json, require_regular_file
 
-PROCEDURAL = re.compile(r"procedural:(\d+)(?:\.\.(\d+))?$")
+PROCEDURAL = re.compile(r"procedural:([0-9]+)(?:\.\.([0-9]+))?")
 
 Source = Folder | Path | str  # a str is procedural:SEED
 PICTURES = "pictures"  # a kind of source: a folder of another program, without a manifest
 
 
 def expand(text: str) -> Iterator[str]:
-    """procedural:A..B becomes its seeds, one by one; anything else is itself."""
-    match = PROCEDURAL.match(text)
-    if match and match[2]:
-        for seed in range(int(match[1]), int(match[2]) + 1):
-            yield f"procedural:{seed}"
-    else:
-        if text.startswith("procedural:") and not match:
-            raise UsageError(text, "is not procedural:SEED or procedural:FIRST..LAST")
+    """procedural:A..B becomes its seeds, one by one; anything else is itself. Raises UsageError for anything else after procedural:."""
+    if not text.startswith("procedural:"):
         yield text
+        return
+    match = PROCEDURAL.fullmatch(text)
+    if not match:
+        raise UsageError(shown(text), "is not procedural:SEED or procedural:FIRST..LAST", "give whole numbers, as in procedural:0..9")
+    if any(len(digits) > MAX_INTEGER_DIGITS or int(digits) >= 2**63 for digits in (match[1], match[2] or "0")):
+        raise UsageError(shown(text), "has a seed beyond 64 bits", f"give seeds up to {2**63 - 1}")
+    first = int(match[1])
+    last = first if match[2] is None else int(match[2])
+    if last < first:
+        raise UsageError(shown(text), "ends before it begins", f"write procedural:{last}..{first}")
+    for seed in range(first, last + 1):
+        yield f"procedural:{seed}" if match[2] else text
 
 
 def incoming(arguments: tuple[str, ...]) -> Iterator[str]:
     """Sources in order: the arguments, or without any the lines of stdin, each as soon as it arrives.
 
-    Raises UsageError when both are empty: a pipe whose first stage failed fails as a whole.
+    Raises UsageError when both are empty: a pipe whose first stage failed fails as a whole. Also for what can be no source, before any of
+    the arguments is worked on.
     """
     empty = True
+    for text in arguments:
+        next(expand(_checked(text)))
     for text in arguments or _lines():
         empty = False
         yield from expand(text)
-    if empty:
+    if empty and (sys.stdin is None or sys.stdin.isatty()):
         raise UsageError("stdin", "gave no sources", "name files or folders, or pipe their paths in")
+    if empty:
+        cure = "the command before the pipe has failed or printed nothing: see its message, or name files or folders"
+        raise UsageError("stdin", "gave no sources", cure)
+
+
+MAX_LINE_BYTES = 2**20  # of stdin; a line of --json with all that was skipped takes some thousands
 
 
 def _lines() -> Iterator[str]:
+    """The sources that stdin names, a line each: paths, or objects of --json. Raises UsageError."""
     if sys.stdin is None or sys.stdin.isatty():
         return
-    for raw in iter(sys.stdin.buffer.readline, b""):
+    for raw in iter(functools.partial(sys.stdin.buffer.readline, MAX_LINE_BYTES + 1), b""):
+        if len(raw) > MAX_LINE_BYTES:
+            raise UsageError("stdin", f"has a line of more than {MAX_LINE_BYTES} bytes", "pipe paths in, one a line")
         line = os.fsdecode(raw.rstrip(b"\r\n"))
         if line.startswith("{"):
-            try:
-                line = json.loads(line)["folder"]
-            except (ValueError, KeyError, TypeError):
-                raise UsageError("stdin", f"line {line[:60]!r} is neither a path nor an object of --json") from None
-            if line is None:
-                continue
+            line = _folder_of(raw, line)
         if line:
-            yield line
+            yield _checked(line)
+
+
+def _folder_of(raw: bytes, line: str) -> str | None:
+    """The folder that a line of --json names; None where it names none. Raises UsageError."""
+    try:
+        record = parse_json(raw, "stdin")
+    except InputError as error:
+        raise UsageError("stdin", f"line {shown(line, 60)} {error.fact}", "pipe in paths, or what --json prints") from None
+    if isinstance(record, dict) and "folder" in record and isinstance(record["folder"], str | None):
+        return record["folder"]
+    raise UsageError("stdin", f"line {shown(line, 60)} is neither a path nor an object of --json", "pipe in paths, or what --json prints")
+
+
+def _checked(text: str) -> str:
+    """A source, which has to be one line. Raises UsageError for control characters and NUL."""
+    fault = text_fault(text, byte_escapes=True)
+    if fault:
+        raise UsageError(shown(text), fault, "rename it without that character")
+    return text
 
 
 # Where an .obj's texture is looked for: beside its library, or as in Google Scanned Objects' layout, which is the last.
@@ -79,8 +114,8 @@ def resolve(text: str, kinds: tuple[str, ...], reader: str, allow_missing: bool 
         if not folder_kinds and not is_folder(path):
             raise InputError(path, f"is a folder, but {reader} reads {_words(kinds)}")
         return open_folder(path, folder_kinds or ("a file",), reader)
-    if not path.exists() and not allow_missing:
-        raise InputError(path, "does not exist")
+    if not (allow_missing and not os.path.lexists(path)):
+        require_regular_file(path)
     if path.exists() and len(folder_kinds) == len(kinds):
         raise InputError(path, f"is a file, but {reader} reads a {_words(kinds)} folder")
     return path
@@ -119,7 +154,7 @@ def name_of(source: Source) -> str:
         return source.name
     if isinstance(source, str):
         return "procedural-" + source.split(":")[1].zfill(6)
-    return source.resolve().name if source.is_dir() else source.stem
+    return name_from_path(source.resolve().name if source.is_dir() else source.stem)
 
 
 def digest(source: Source) -> str:
@@ -164,10 +199,12 @@ def _sidecars(path: Path) -> list[Path]:
 
 
 def relative_to(path: Path | str, folder: Path) -> str:
-    """path as seen from folder, forward slashes; procedural:SEED stays as it is."""
+    """path as seen from where folder really lies, forward slashes; procedural:SEED stays as it is."""
     if isinstance(path, str):
         return path
-    return Path(os.path.relpath(path.absolute(), folder.absolute())).as_posix()
+    # Where both really lie, but for a link that the path itself is: ".." from a folder reached by a link does not lead back along the link.
+    real = Path(os.path.realpath(path.parent), path.name) if path.name not in ("", "..") else path.resolve()
+    return Path(os.path.relpath(real, os.path.realpath(folder))).as_posix()
 
 
 __all__ = ["Source", "digest", "expand", "incoming", "name_of", "relative_to", "resolve"]

@@ -17,6 +17,11 @@ from gdtool.core.kinds import Content
 from gdtool.core.manifest import Skip
 from gdtool.core.sources import Source
 
+# What numeric options take at most: more than anybody means, so that what is asked for is finite and fits the manifest.
+MOST_SEED = 2**63 - 1  # a 64-bit integer
+MOST_SECONDS = 7 * 86400.0  # a week
+LEAST_EXPOSURE, MOST_EXPOSURE = 1e-4, 1e4  # factors on radiance, 13 stops either way
+
 # An option that names a file: its content enters the key, its path relative to the output the manifest.
 FILE = {"file": True}
 
@@ -58,6 +63,9 @@ class Stage:
 
     reads: folder kinds, and "image-file", "model-file", "mesh-file" for files. version rises when results change.
     gathers: all sources go into one run (train). dataset: several results share a root with an index.
+    check(inputs, options) is called before any work: it raises a GdtoolError for what the run would find out only later (a file that an
+    option names, a package that it needs), and takes no time. checkpoint: the file of the workspace that a later run goes on
+    from; without it a failed run leaves no workspace.
     """
 
     name: str
@@ -69,6 +77,8 @@ class Stage:
     second_inputs: dict[str, SecondInput | str] = field(default_factory=dict)
     gathers: bool = False
     dataset: bool = False
+    check: Callable[[Inputs, Any], None] | None = None
+    checkpoint: str = ""
 
     def second(self, flag: str) -> SecondInput:
         """The declaration of a second input."""
@@ -80,7 +90,7 @@ class Output:
     """The unpublished folder a run writes into, and the record it keeps of the run."""
 
     def __init__(self, folder: Path, workspace: Path, threads: int, device: str):
-        self.folder, self._workspace = folder, workspace
+        self.folder, self.place_of_workspace = folder, workspace
         self.threads, self.device = threads, device
         self.content: Content | None = None
         self.seconds: dict[str, float] = {}
@@ -96,8 +106,8 @@ class Output:
     @property
     def workspace(self) -> Path:
         """A folder that survives a kill and is removed when the result is published: checkpoints, caches."""
-        self._workspace.mkdir(parents=True, exist_ok=True)
-        return self._workspace
+        self.place_of_workspace.mkdir(parents=True, exist_ok=True)
+        return self.place_of_workspace
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:

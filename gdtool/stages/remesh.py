@@ -16,9 +16,9 @@ import msgspec
 from msgspec import Meta
 
 from gdtool.core.child import prepare
-from gdtool.core.errors import InputError
+from gdtool.core.errors import InputError, UsageError
 from gdtool.core.kinds import MeshContent
-from gdtool.core.stage import Inputs, Output, Stage
+from gdtool.core.stage import MOST_SECONDS, Inputs, Output, Stage
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -36,8 +36,28 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     engine: Annotated[Literal["auto", "instant-meshes", "quadriflow", "split"], Meta(
         description="auto is instant-meshes with fallbacks; quadriflow needs pyQuadriFlow; split needs no engine")] = "auto"
     smooth_iterations: Annotated[int, Meta(ge=0, le=100, description="rounds of evening out the quads on the surface")] = 5
-    seconds: Annotated[float, Meta(gt=0, description="time limit; engines are tried in the first 70 % of it, what is not done by then is paired triangles")] = 120.0
+    seconds: Annotated[float, Meta(gt=0, le=MOST_SECONDS, description="time limit; engines are tried in the first 70 % of it, what is not done by then is paired triangles")] = 120.0
     keep: Annotated[bool, Meta(description="pass a mesh through that already meets the request")] = True
+
+
+# Share of the longest side: a closed surface would need billions of smaller quads.
+LEAST_QUAD_SIZE = 1e-5
+
+# The package that each engine needs, by its module, and how to get it.
+_ENGINE_PACKAGES = {"instant-meshes": ("pynanoinstantmeshes", "pip install pynanoinstantmeshes, or use --engine split"),
+                    "quadriflow": ("pyQuadriFlow", "pip install 'gdtool[quadriflow]', or use --engine auto")}
+
+
+def check(inputs: Inputs, options: Options) -> None:
+    """Raise what --quad-size and the package of --engine would stop the run with."""
+    from gdtool.stages import early
+
+    if 0 < options.quad_size < LEAST_QUAD_SIZE:
+        raise UsageError(f"--quad-size {options.quad_size:g}", f"is smaller than {LEAST_QUAD_SIZE:g} of the longest side", "use 0 to go by --faces")
+
+    if options.engine in _ENGINE_PACKAGES and not options.triangles:
+        module, cure = _ENGINE_PACKAGES[options.engine]
+        early.require_installed(module, f"--engine {options.engine}", cure)
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
@@ -133,7 +153,7 @@ def _read(inputs: Inputs, out: Output):
     kept, faces = compact(vertices, faces)
     extent = float(np.ptp(kept, 0).max())
     if not 1e-150 < extent < 1e150:
-        raise InputError(_path(inputs), f"its longest side is {extent:g}, which cannot be computed with", "scale it")
+        raise InputError(_path(inputs), f"its longest side is {extent:g}, which cannot be computed with", "scale it to about 1")
     matrix = unit_box(kept)
     if quads is not None:
         _, quads = compact(vertices, quads)
@@ -199,4 +219,4 @@ def _way(vertices, faces, options: Options, out: Output):
     return partial(remesh_mirrored, axis=axis), figures
 
 
-STAGE = Stage(name="remesh", version=37, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)
+STAGE = Stage(name="remesh", version=37, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run, check=check)

@@ -9,12 +9,20 @@ Example:
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
+
 from gdtool.core.errors import InputError
-from gdtool.core.folder import Folder, is_folder, open_folder
+from gdtool.core.folder import Folder, dataset_objects, open_folder
 from gdtool.core.kinds import CONTENTS
+from gdtool.core.manifest import MANIFEST, check_files
+from gdtool.core.runner import key_of, names_file
+from gdtool.core.sources import digest
+
+STAGES = ("render-dataset", "train", "sample-views", "import-views", "reconstruct", "remesh", "unwrap", "bake", "relight")
 
 
 def faults(path: Path) -> Iterator[str]:
@@ -33,6 +41,7 @@ def faults(path: Path) -> Iterator[str]:
     listed = {entry.path for entry in folder.manifest.files}
     for name in sorted(_needed(folder) - listed):
         yield f"{folder.file(name)}: {folder.kind} needs it, and the manifest does not list it"
+    yield from _check_key(folder)
     yield from _read(lambda: CHECKS[folder.kind](folder))
 
 
@@ -41,6 +50,29 @@ def _read(check: Callable[[], Iterator[str]]) -> Iterator[str]:
         yield from check()
     except InputError as error:
         yield str(error)
+
+
+def _check_key(folder: Folder) -> Iterator[str]:
+    """That the key is the one that the stage, its version, the options and the inputs give.
+
+    Nothing is said of a manifest without a key or of another program's stage, nor where an option names a file that lies elsewhere by now: its digest is part of the key.
+    """
+    manifest = folder.manifest
+    if not manifest.key or manifest.stage not in STAGES:
+        return
+    options = dict(manifest.options)
+    stage = importlib.import_module("gdtool.stages." + manifest.stage.replace("-", "_")).STAGE
+    for name in (field.name for field in msgspec.structs.fields(stage.Options) if names_file(field)):
+        value = options.get(name)
+        if not isinstance(value, str) or not value.startswith(".."):
+            continue  # not given, or one of the stage's built-in names
+        path = folder.path.resolve() / value
+        if not path.is_file():
+            return
+        options[name] = digest(path)
+    given = [(entry.role, entry.digest) for entry in manifest.inputs]
+    if key_of(manifest.stage, manifest.stage_version, options, given) != manifest.key:
+        yield f"{folder.path / MANIFEST}: options and inputs are not those that the key was made of; run gdtool {manifest.stage} again"
 
 
 def _needed(folder: Folder) -> set[str]:
@@ -88,12 +120,9 @@ def _check_views(folder: Folder) -> Iterator[str]:
 
 
 def _check_dataset(folder: Folder) -> Iterator[str]:
-    for entry in folder.content.objects:
-        path = folder.path / entry.path
-        if not is_folder(path):
-            yield f"{path}: is listed in the dataset but has no manifest"
-        elif open_folder(path, ("views",), "a dataset").manifest.digest != entry.digest:
-            yield f"{path}: is not the folder that the dataset lists (other digest)"
+    for views in dataset_objects(folder):
+        check_files(views.path, views.manifest)
+    yield from ()
 
 
 def _check_model(folder: Folder) -> Iterator[str]:

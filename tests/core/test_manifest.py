@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from gdtool.core.errors import InputError
-from gdtool.core.folder import find_ancestor, open_folder
+from gdtool.core.folder import open_folder
+from gdtool.core.provenance import find_ancestor
 from gdtool.core.runner import Settings, run_all
 from tests.core.toy import STAGE, Options
 
@@ -33,8 +34,12 @@ def edited(folder, change):
     (lambda m: m.update(conten=1), "did you mean 'content'?"),
     (lambda m: m["content"].update(frame=1), "did you mean 'frames'?"),
     (lambda m: m["content"].pop("frames"), "frames"),
-    (lambda m: m["files"].append({"path": "../x", "size": 1, "sha256": "0" * 64}), "leaves the folder"),
-    (lambda m: m["files"].append({"path": "/x", "size": 1, "sha256": "0" * 64}), "leaves the folder"),
+    (lambda m: m["files"].append({"path": "../x", "size": 1, "sha256": "0" * 64}), "leaves its folder"),
+    (lambda m: m["files"].append({"path": "/x", "size": 1, "sha256": "0" * 64}), "is absolute"),
+    (lambda m: m.update(name="../../x"), "separator"),
+    (lambda m: m.update(name="a\nb"), "control character"),
+    (lambda m: m.update(name="x" * 300), "longer than 255 bytes"),
+    (lambda m: m["inputs"][0].update(path="/etc/passwd"), "is absolute"),
     (lambda m: m["files"].append({"path": "x", "size": 1, "sha256": "0" * 64}), "missing"),
     (lambda m: m["files"][0].update(sha256="0" * 64), "hash"),
 ])
@@ -60,7 +65,7 @@ def test_duplicate_keys_bad_json_and_missing_manifests(folder):
 def test_links_that_leave_the_folder_are_refused(folder):
     shutil.move(folder / "000.png", "outside.png")
     (folder / "000.png").symlink_to(Path("outside.png").absolute())
-    with pytest.raises(InputError, match="leaves the folder"):
+    with pytest.raises(InputError, match="link that leaves"):
         open_folder(folder)
 
 

@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from gdtool.core.errors import InputError, UsageError
-from gdtool.core.folder import find_source, open_folder
+from gdtool.core.folder import open_folder
 from gdtool.core.manifest import read_manifest
+from gdtool.core.provenance import find_source
 from gdtool.core.runner import Settings, run_all
 from tests.conftest import ROOT
 from tests.core.toy import STAGE, Options
@@ -63,7 +64,6 @@ def test_second_run_does_nothing_and_says_so(capsys):
 
 @pytest.mark.parametrize("change, reason", [
     (lambda: Path("cat.png").write_bytes(b"dog"), "source changed"),
-    (lambda: Path("cat.asset/renders/000.png").write_bytes(b"cut"), "damaged"),
     (lambda: Path("cat.asset/renders/000.png").unlink(), "damaged"),
 ])
 def test_stale_results_are_made_again_with_the_reason(change, reason, capsys):
@@ -222,5 +222,5 @@ def test_a_folder_that_ships_with_gdtool_is_an_input_like_any_other():
     from gdtool.core.runner import second_inputs
     from gdtool.stages.sample_views import STAGE as sample_views
 
-    found = second_inputs(sample_views, Path("cat.png"), {"model": None})["model"]
+    found = second_inputs(sample_views, Path("cat.png"), {"model": None}).found["model"]
     assert found.kind == "model" and found.name == "default"

@@ -71,7 +71,7 @@ DAMAGE = {
     "missing": (lambda f: (f / "mask/back.png").unlink(), "missing"),
     "changed": (lambda f: (f / "mask/back.png").write_bytes((f / "mask/front.png").read_bytes()[::-1]), "hash"),
     "parent": (manifest(lambda m: m["files"].append({"path": "../../x", "size": 1, "sha256": "0" * 64})), "leaves"),
-    "absolute": (manifest(lambda m: m["files"].append({"path": "/etc/hostname", "size": 1, "sha256": "0" * 64})), "leaves"),
+    "absolute": (manifest(lambda m: m["files"].append({"path": "/etc/hostname", "size": 1, "sha256": "0" * 64})), "is absolute"),
     "link": (outside, "leaves"),
     "fewer_cameras": (camera(lambda c: c.pop()), "views that the manifest lists"),
     "no_camera": (camera(lambda c: c.clear()), "cameras.json"),

@@ -1,0 +1,63 @@
+"""The group of all commands: it imports a command only when it is named."""
+
+from __future__ import annotations
+
+import importlib
+
+import click
+
+from gdtool.core.errors import ResourceError, first_line
+
+from . import COMMANDS
+
+# Not the docstring of cli(): python -OO has none.
+HELP = """One image, or one PBR model, to an engine-ready 3D asset.
+
+    Each command reads folders and writes a folder, and prints its path: so commands form pipes.
+
+    \b
+    gdtool sample-views cat.png | gdtool reconstruct | gdtool remesh | gdtool unwrap | gdtool bake | gdtool relight
+    """
+
+
+class LazyGroup(click.Group):
+    """Commands of COMMANDS and of the entry point group gdtool.commands, each loaded when it is asked for."""
+
+    def list_commands(self, ctx):
+        return [*COMMANDS, *sorted(set(_plugins()) - set(COMMANDS))]
+
+    def get_command(self, ctx, name):
+        if name in COMMANDS:
+            return importlib.import_module("." + name.replace("-", "_"), __package__).command
+        plugin = _plugins().get(name)
+        return _loaded(plugin) if plugin else None
+
+    def format_commands(self, ctx, formatter):
+        plugins = {name: "(plugin)" for name in _plugins() if name not in COMMANDS}
+        with formatter.section("Commands"):
+            formatter.write_dl(list((COMMANDS | plugins).items()))
+
+
+def _plugins():
+    from importlib.metadata import entry_points
+
+    return {point.name: point for point in entry_points(group="gdtool.commands")}
+
+
+def _loaded(plugin) -> click.Command:
+    """The command that an entry point names. Raises ResourceError where it cannot be imported or is no command."""
+    package = plugin.dist.name if plugin.dist is not None else plugin.module
+    cure = f"pip uninstall {package}, or install a release of it that works with this gdtool"
+    try:
+        command = plugin.load()
+    except (Exception, SystemExit) as error:  # of a stranger's module
+        raise ResourceError(f"plugin {plugin.name}", f"cannot be loaded ({type(error).__name__}: {first_line(error)})", cure) from error
+    if not isinstance(command, click.Command):
+        raise ResourceError(f"plugin {plugin.name}", f"{plugin.value} is no click command", cure)
+    return command
+
+
+@click.group(cls=LazyGroup, help=HELP, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(package_name="gdtool")
+def cli():
+    pass

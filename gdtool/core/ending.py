@@ -1,0 +1,127 @@
+"""End in order when a signal asks for it: an exception in the main thread, the clean-up, and the exit code 128 + signal.
+
+The exception can only be raised between two steps of Python. Where a native call keeps the main thread for longer than
+GRACE, a second thread runs the clean-up and ends the process. It cannot do so inside a native call that holds the
+interpreter's lock: nothing of Python runs until that returns.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+# Seconds that the main thread has to unwind. With the clean-up after it, an interrupted command ends within two seconds.
+GRACE = 1.2
+
+# SIGXCPU: the soft limit of processor time (ulimit -t) is reached.
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGXCPU")
+SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
+
+# Seconds between the soft and the hard limit of processor time, for the clean-up.
+_CPU_RESERVE = 2
+
+received: int | None = None  # the first signal that asked for the end
+_clean_ups: list[Callable[[], None]] = []
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal asked this process to end. A KeyboardInterrupt, so that libraries let it pass."""
+
+    def __init__(self, number: int):
+        self.number = number
+        super().__init__(number)
+
+
+def listen() -> Callable[[], None]:
+    """Have the signals of SIGNALS raise Stopped in the main thread, once; those that the caller ignores stay ignored.
+
+    Returns what undoes it. Where it is done already, it does nothing, and so does what it returns.
+    """
+    global received
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    if _stop in before.values():
+        return lambda: None
+    received = None
+    _leave_time_to_clean_up()
+    heard, tell = os.pipe()
+    os.set_blocking(tell, False)
+    _start_thread(heard)
+    wakeup = signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:
+            signal.signal(number, _stop)
+
+    def undo() -> None:
+        global received
+        received = None
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        signal.set_wakeup_fd(wakeup)
+        os.close(tell)  # the thread ends
+
+    return undo
+
+
+def ignore() -> None:
+    """Raise nothing from now on, where the process is about to end; the thread still ends it when that takes too long."""
+    global received
+    received = received or 0
+
+
+@contextmanager
+def certainly(clean_up: Callable[[], None]) -> Iterator[None]:
+    """Run clean_up at the end of the block, and also where the process is ended out of a native call.
+
+    It may run twice, at the same time from two threads.
+    """
+    _clean_ups.append(clean_up)
+    try:
+        yield
+    finally:
+        clean_up()
+        _clean_ups.remove(clean_up)
+
+
+def _stop(number: int, _frame: object) -> None:
+    global received
+    if received is not None:  # a second Ctrl-C does not cut the clean-up short
+        return
+    received = number
+    raise Stopped(number)
+
+
+def _start_thread(heard: int) -> None:
+    import _thread
+
+    with contextlib.suppress(RuntimeError):  # no thread to be had: a native call is then waited for
+        _thread.start_new_thread(_watch, (heard,))
+
+
+def _watch(heard: int) -> None:
+    """Wait for a signal, which is written to the pipe whatever the main thread does; end the process GRACE later."""
+    try:
+        while told := os.read(heard, 1):
+            if told[0] not in SIGNALS or signal.getsignal(told[0]) is not _stop:
+                continue
+            time.sleep(GRACE)
+            if signal.getsignal(told[0]) is _stop:  # it has not been undone
+                for clean_up in reversed(_clean_ups):
+                    with contextlib.suppress(Exception):
+                        clean_up()
+                os._exit(128 + told[0])
+    finally:
+        os.close(heard)
+
+
+def _leave_time_to_clean_up() -> None:
+    """Where the limit of processor time is a hard one, the kernel kills without a signal to handle: be told before."""
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource
+
+        soft, hard = resource.getrlimit(resource.RLIMIT_CPU)
+        if hard != resource.RLIM_INFINITY and (soft == resource.RLIM_INFINITY or soft > hard - _CPU_RESERVE):
+            resource.setrlimit(resource.RLIMIT_CPU, (max(hard - _CPU_RESERVE, 1), hard))

@@ -1,0 +1,102 @@
+"""Decide whether a folder at the place of an output may be replaced: only what gdtool wrote there, and nobody changed since.
+
+What stands at an output's place may be somebody's work. It is replaced only if it is empty, or a folder of the same kind that a stage
+wrote, with no file beside those that its manifest lists and each of those as it was written. `--force` does not change that.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from gdtool.core.errors import InputError, UsageError
+from gdtool.core.manifest import MANIFEST, Manifest, file_sha256, read_manifest
+from gdtool.core.names import text_fault
+
+CURE = "name another output with -o"
+
+
+def output_place(path: Path) -> Path:
+    """Where an output really lies: path, or what the link at path points to. A link is followed once, and stays.
+
+    Raises UsageError for a link to a link, a name that holds a line break, another control character or NUL, and for anything at the place
+    that is no folder.
+    """
+    fault = text_fault(str(path), byte_escapes=True)
+    if fault:
+        raise UsageError(ascii(str(path)), fault, CURE)
+    place = path
+    if path.is_symlink():
+        place = path.parent / os.readlink(path)
+        if place.is_symlink():
+            raise UsageError(path, "is a link to a link", "name the folder itself with -o")
+    if place.exists() and not place.is_dir():
+        raise UsageError(path, "is a file", CURE)
+    return place
+
+
+def refuse_overlap(place: Path, sources: Iterable[Path]) -> None:
+    """Raise UsageError where the output is one of the sources, holds one, or lies inside one: it would erase or change what it is made from."""
+    here = place.resolve()
+    for source in sources:
+        there = source.resolve()
+        if here == there:
+            raise UsageError(place, "is both source and output", CURE)
+        if here in there.parents:
+            raise UsageError(place, f"holds the source {source}", CURE)
+        if there in here.parents and there.is_dir():
+            raise UsageError(place, f"lies inside the source {source}", CURE)
+
+
+def refuse_loss(place: Path, kind: str) -> None:
+    """Raise UsageError, naming the file, where replacing the folder at place by a result of this kind would lose something of the user's.
+
+    Reads every listed file, to compare its digest.
+    """
+    if not os.path.lexists(place):
+        return
+    present = _files_below(place)
+    if not present:
+        return
+    manifest = _own_manifest(place, present)
+    if manifest.kind != kind:
+        raise UsageError(place, f"holds {manifest.kind}, not {kind}", CURE)
+    if not (manifest.stage and manifest.stage_version and manifest.key):
+        raise UsageError(place / MANIFEST, "was not written by a stage of gdtool (no stage, version and key)", CURE)
+    listed = {entry.path: entry for entry in manifest.files}
+    for relative in present:
+        if relative == MANIFEST:
+            continue
+        path = place / relative
+        if relative not in listed:
+            raise UsageError(path, "is not a file that gdtool wrote there", f"move it away, or {CURE}")
+        if path.is_symlink() or path.stat().st_size != listed[relative].size or file_sha256(path) != listed[relative].sha256:
+            raise UsageError(path, "was changed after gdtool wrote it", f"move it away, or {CURE}")
+
+
+def refuse_index(root: Path) -> None:
+    """Raise UsageError where root has a manifest.json that is no dataset index of gdtool's: writing the index would lose it."""
+    if not (root / MANIFEST).exists():
+        return
+    manifest = _own_manifest(root, [MANIFEST])
+    if manifest.kind != "dataset" or not manifest.tool_version:
+        raise UsageError(root / MANIFEST, f"describes {manifest.kind}, not a dataset that gdtool wrote", CURE)
+
+
+def _own_manifest(place: Path, present: list[str]) -> Manifest:
+    if MANIFEST not in present:
+        raise UsageError(place / present[0], "is in the way, and gdtool did not write that folder", CURE)
+    try:
+        return read_manifest(place)
+    except InputError as error:
+        raise UsageError(place / MANIFEST, f"is no manifest of gdtool's ({error.fact})", CURE) from None
+
+
+def _files_below(folder: Path) -> list[str]:
+    """All that is no plain folder below a folder, relative, sorted: files, links, and whatever else stands there."""
+    out = []
+    for root, folders, names in os.walk(folder):
+        names += [name for name in folders if Path(root, name).is_symlink()]
+        out += [Path(root, name).relative_to(folder).as_posix() for name in names]
+    return sorted(out)
