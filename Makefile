@@ -27,9 +27,12 @@ extras-test: venv
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[hub,usd,ray,matting,tensorboard]" onnx
 	$(BIN)/python -m pytest tests/diffusion/test_pretrained.py tests/diffusion/test_wonder3d.py tests/diffusion/test_plan.py tests/stages/test_bake_usd.py tests/stages/test_ray.py tests/images/test_matting.py tests/stages/test_train.py
 
-# Ten minutes of damaged files for every reader; what breaks one stays as a test.
+# A quarter of an hour: damaged files for every reader (what breaks one stays as a test), the whole command line over damaged folders,
+# and a run killed at eleven exact and fifty random moments.
 fuzz: venv
-	$(BIN)/python -m tests.faults.fuzz 10
+	$(BIN)/python -m tests.faults.kills
+	$(BIN)/python -m tests.faults.fuzz 6
+	$(BIN)/python -m tests.faults.fuzz_commands 7
 
 bench: venv
 	$(BIN)/python benchmarks/pipeline.py

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from gdtool.assets.gltf_schema import DracoPrimitive, Primitive
 
 
+_CURE = "export it again, or without Draco compression"
+
+
 def read_draco(file: GltfFile, packed: DracoPrimitive, primitive: Primitive, subject: str) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Attributes (count, ...) float64 by name and triangle indices (3f,) of a compressed primitive.
 
@@ -22,26 +25,26 @@ def read_draco(file: GltfFile, packed: DracoPrimitive, primitive: Primitive, sub
         import DracoPy
     except ImportError:
         raise ResourceError(file.path, "is compressed with Draco, which needs the package DracoPy", "pip install DracoPy") from None
-    content = file.view(packed.buffer_view)
+    content = bytes(file.view(packed.buffer_view))
     for index in (primitive.attributes["POSITION"], *([primitive.indices] if primitive.indices is not None else [])):
-        file.check_memory(file.item(file.document.accessors, index, "accessor").count * 48, subject)
+        file.check_memory(file.item(file.document.accessors, index, "accessor").count * 48, subject, "export it with fewer faces")
     try:
         mesh = DracoPy.decode(content)
         stored = {item["unique_id"]: np.asarray(item["data"]) for item in mesh.attributes}
         indices = np.asarray(mesh.faces).reshape(-1).astype(np.int64)
     except Exception as error:  # the binding raises types of its own and bare ones
-        raise file.refuse(f"{subject}: its Draco stream does not decode ({str(error)[:80] or type(error).__name__})") from None
+        raise file.refuse(f"{subject}: its Draco stream does not decode ({str(error)[:80] or type(error).__name__})", _CURE) from None
     out = {}
     for name, identity in packed.attributes.items():
         if name.startswith("_"):
             continue
         if identity not in stored:
-            raise file.refuse(f"{subject}: its Draco stream holds no {name}")
+            raise file.refuse(f"{subject}: its Draco stream holds no {name}", _CURE)
         record = file.item(file.document.accessors, primitive.attributes[name], "accessor") if name in primitive.attributes else None
         array = stored[identity]
         array = array.reshape(len(array), -1)
         whole = array.dtype.kind in "iu" and (name.startswith("COLOR_") or (record is not None and record.normalized))
         out[name] = np.maximum(array / np.iinfo(array.dtype).max, -1.0) if whole else array.astype(np.float64)
     if "POSITION" not in out:
-        raise file.refuse(f"{subject}: its Draco stream holds no POSITION")
+        raise file.refuse(f"{subject}: its Draco stream holds no POSITION", _CURE)
     return out, indices

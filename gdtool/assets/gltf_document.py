@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import os
-import re
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,8 +14,10 @@ import msgspec
 import numpy as np
 
 from gdtool.assets.gltf_schema import Accessor, Document
-from gdtool.core.errors import InputError, ResourceError, from_os_error
-from gdtool.core.reading import bytes_of
+from gdtool.core.errors import InputError, from_os_error
+from gdtool.core.memory import require_memory
+from gdtool.core.names import shown, uri_path
+from gdtool.core.reading import bytes_of, require_regular_file
 
 SUPPORTED = {
     "EXT_meshopt_compression", "EXT_texture_webp", "KHR_draco_mesh_compression", "KHR_materials_emissive_strength", "KHR_materials_ior",
@@ -25,14 +25,19 @@ SUPPORTED = {
 }
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _SHAPES = {"SCALAR": (), "VEC2": (2,), "VEC3": (3,), "VEC4": (4,), "MAT2": (2, 2), "MAT3": (3, 3), "MAT4": (4, 4)}
-_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
+# Bytes of one object of the JSON once it is decoded, with what is made of a node: a node of three characters takes this much.
+_OBJECT_BYTES = 600
+
+EXPORT = "export it again as glTF 2.0"
+COPY = "copy or download it again"
+SIMPLIFY = "export it with fewer faces or fewer instances"
 
 
 class GltfFile:
     """An opened .glb or .gltf: its decoded document, and bytes and accessors on demand.
 
-    Raises InputError for whatever the specification forbids and is looked at, ResourceError where an accessor alone
-    would not fit in memory.
+    Buffers, buffer views and the chunks of a GLB are views of what was read, not copies. Raises InputError for whatever the
+    specification forbids and is looked at, ResourceError for what would take more memory than one input may.
     """
 
     def __init__(self, path: Path):
@@ -44,98 +49,108 @@ class GltfFile:
         else:
             text, self._binary = content, None
         self.document = self._decode(text)
-        self._buffers: dict[int, bytes] = {}
-        self._views: dict[int, bytes] = {}
+        self._buffers: dict[int, memoryview] = {}
+        self._views: dict[int, memoryview] = {}
+        self._unpacked = 0  # bytes of decompressed buffer views
         for name in self.document.extensions_required:
             if name not in SUPPORTED:
-                raise InputError(path, f"requires the extension {name}, which gdtool does not know", "export it without")
+                raise InputError(path, f"requires the extension {printed(name)}, which gdtool does not know", "export it without that extension")
         ignored = sorted(set(self.document.extensions_used) - SUPPORTED)
-        self.notes += [f"extension {name} is ignored" for name in ignored]
+        self.notes += [f"extension {printed(name)} is ignored" for name in ignored]
 
-    def refuse(self, fact: str, cure: str = "") -> InputError:
+    def refuse(self, fact: str, cure: str) -> InputError:
         """The error to raise for a fault of this file."""
         return InputError(self.path, fact, cure)
 
     def item(self, items: Sequence[Any], index: int, what: str) -> Any:
         """items[index]; InputError when there is none."""
         if index >= len(items):
-            raise self.refuse(f"refers to {what} {index}, but has {len(items)}")
+            raise self.refuse(f"refers to {what} {index}, but has {len(items)}", EXPORT)
         return items[index]
 
-    def _split(self, content: bytes) -> tuple[bytes, bytes | None]:
+    def _split(self, content: bytes) -> tuple[bytes, memoryview | None]:
         """JSON and binary chunks of a GLB (specification, section 4.4)."""
         if len(content) < 20:
-            raise self.refuse("is cut short (a GLB has at least 20 bytes)")
+            raise self.refuse("is cut short (a GLB has at least 20 bytes)", COPY)
         version, length = struct.unpack_from("<II", content, 4)
         if version != 2:
-            raise self.refuse(f"is binary glTF {version}, gdtool reads 2")
+            raise self.refuse(f"is binary glTF {version}, gdtool reads 2", "export it as glTF 2.0")
         if length != len(content):
-            raise self.refuse(f"says it has {length} bytes, but has {len(content)}")
-        chunks: list[tuple[bytes, bytes]] = []
+            raise self.refuse(f"says it has {length} bytes, but has {len(content)}", COPY)
+        chunks: list[tuple[bytes, memoryview]] = []
         at = 12
         while at < length:
             if at + 8 > length:
-                raise self.refuse("is cut short within a chunk's header")
+                raise self.refuse("is cut short within a chunk's header", COPY)
             size, kind = struct.unpack_from("<I4s", content, at)
             if at + 8 + size > length:
-                raise self.refuse(f"has a chunk of {size} bytes that reaches past its end")
-            chunks.append((kind, content[at + 8:at + 8 + size]))
+                raise self.refuse(f"has a chunk of {size} bytes that reaches past its end", COPY)
+            chunks.append((kind, memoryview(content)[at + 8:at + 8 + size]))
             at += 8 + size
         if not chunks or chunks[0][0] != b"JSON":
-            raise self.refuse("does not begin with a JSON chunk")
-        return chunks[0][1], chunks[1][1] if len(chunks) > 1 and chunks[1][0] == b"BIN\0" else None
+            raise self.refuse("does not begin with a JSON chunk", EXPORT)
+        return bytes(chunks[0][1]), chunks[1][1] if len(chunks) > 1 and chunks[1][0] == b"BIN\0" else None
 
     def _decode(self, text: bytes) -> Document:
+        self.check_memory(text.count(b"{") * _OBJECT_BYTES, f"its JSON of {text.count(b'{'):,} objects", SIMPLIFY)
         try:
             document = msgspec.json.decode(text.removeprefix(b"\xef\xbb\xbf").rstrip(b"\0 "), type=Document)
         except msgspec.ValidationError as error:
             fact = str(error)
-            raise self.refuse(f"is not valid glTF: {fact[:1].lower() + fact[1:]}") from None
+            raise self.refuse(f"is not valid glTF: {fact[:1].lower() + fact[1:]}", EXPORT) from None
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise self.refuse(f"is not glTF ({error})") from None
+            raise self.refuse(f"is not glTF ({error})", EXPORT) from None
         version = document.asset.version.split(".")[0]
         if version != "2" or document.asset.min_version not in ("2.0", "2"):
-            raise self.refuse(f"is glTF {document.asset.version}, gdtool reads 2.0", "export it as glTF 2.0")
+            raise self.refuse(f"is glTF {printed(document.asset.version)}, gdtool reads 2.0", "export it as glTF 2.0")
         return document
 
     def resolve(self, uri: str, what: str) -> bytes | Path:
-        """Bytes of a data: URI, or the path of the file a relative one names."""
+        """Bytes of a data: URI, or the path of the regular file that a relative one names, within the folder of this file.
+
+        Percent-encoded characters are decoded first and links followed; what leads outside is refused. Raises InputError.
+        """
         if uri[:5].lower() == "data:":
             head, comma, body = uri[5:].partition(",")
             if not comma:
-                raise self.refuse(f"{what} has a data: URI without data")
+                raise self.refuse(f"{what} has a data: URI without data", EXPORT)
             try:
                 return base64.b64decode(unquote(body), validate=True) if head.lower().endswith(";base64") else unquote_to_bytes(body)
             except (binascii.Error, ValueError):
-                raise self.refuse(f"{what} has a data: URI that is not base64") from None
-        if _SCHEME.match(uri) or uri.startswith(("/", "\\")) or "\0" in uri:
-            raise self.refuse(f"{what} has the URI {uri[:60]!r}; gdtool reads relative ones only", "put the file beside the model")
-        path = self.path.parent / unquote(uri)
-        if not path.is_file():
-            raise self.refuse(f"{what} is in {uri[:80]!r}, which does not exist")
+                raise self.refuse(f"{what} has a data: URI that is not base64", EXPORT) from None
+        path = uri_path(self.path.parent, uri, self.path, f"the URI of {what}")
+        if not path.exists():
+            raise self.refuse(f"{what} is in {shown(uri)}, which does not exist", "put that file beside the model or embed it in a .glb")
+        require_regular_file(path)
         return path
 
-    def buffer(self, index: int) -> bytes:
+    def buffer(self, index: int) -> memoryview:
         """The bytes of a buffer, byteLength of them."""
         if index not in self._buffers:
             record = self.item(self.document.buffers, index, "buffer")
             if record.uri is not None:
                 content = self.resolve(record.uri, f"buffer {index}")
                 if isinstance(content, Path):
-                    try:
-                        content = content.read_bytes()
-                    except OSError as error:
-                        raise from_os_error(error, content) from None
+                    content = self._read_buffer(content, record.byte_length, index)
             elif index == 0 and self._binary is not None:
                 content = self._binary
             else:
-                raise self.refuse(f"buffer {index} has no URI and the file no binary chunk for it")
+                raise self.refuse(f"buffer {index} has no URI and the file no binary chunk for it", EXPORT)
             if len(content) < record.byte_length:
-                raise self.refuse(f"buffer {index} has {len(content)} bytes, not the {record.byte_length} it says")
-            self._buffers[index] = content[:record.byte_length]
+                raise self.refuse(f"buffer {index} has {len(content)} bytes, not the {record.byte_length} it says", COPY)
+            self._buffers[index] = memoryview(content)[:record.byte_length]
         return self._buffers[index]
 
-    def view(self, index: int) -> bytes:
+    def _read_buffer(self, path: Path, length: int, index: int) -> bytes:
+        """The first length bytes of a file, fewer where it has fewer."""
+        try:
+            self.check_memory(min(path.stat().st_size, length), f"buffer {index}", SIMPLIFY)
+            with open(path, "rb") as file:
+                return file.read(length)
+        except OSError as error:
+            raise from_os_error(error, path) from None
+
+    def view(self, index: int) -> memoryview:
         """The bytes of a buffer view, decompressed where EXT_meshopt_compression packs them."""
         if index not in self._views:
             record = self.item(self.document.buffer_views, index, "buffer view")
@@ -144,28 +159,27 @@ class GltfFile:
                 from gdtool.assets.meshopt import decode_view
 
                 source = self._slice(self.buffer(packed.buffer), packed.byte_offset, packed.byte_length, index)
-                self.check_memory(packed.count * packed.byte_stride, f"buffer view {index}")
-                self._views[index] = decode_view(source, packed, self.refuse)
+                self._unpacked += packed.count * packed.byte_stride
+                self.check_memory(self._unpacked, f"decompressing buffer view {index} and those before it", SIMPLIFY)
+                self._views[index] = memoryview(decode_view(bytes(source), packed, self.path))
             else:
                 self._views[index] = self._slice(self.buffer(record.buffer), record.byte_offset, record.byte_length, index)
         return self._views[index]
 
-    def _slice(self, content: bytes, offset: int, length: int, index: int) -> bytes:
+    def _slice(self, content: memoryview, offset: int, length: int, index: int) -> memoryview:
         if offset + length > len(content):
-            raise self.refuse(f"buffer view {index} reaches past the end of its buffer ({offset + length} of {len(content)} bytes)")
+            raise self.refuse(f"buffer view {index} reaches past the end of its buffer ({offset + length} of {len(content)} bytes)", EXPORT)
         return content[offset:offset + length]
 
-    def check_memory(self, size: int, what: str) -> None:
-        """ResourceError when size bytes are more than half of this machine's memory."""
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        if size > memory // 2:
-            raise ResourceError(self.path, f"{what} would take {size / 2**30:.1f} GiB of this machine's {memory / 2**30:.1f}", "use a smaller model")
+    def check_memory(self, size: int, what: str, cure: str) -> None:
+        """ResourceError when size bytes are more than one input may take."""
+        require_memory(size, self.path, what, cure)
 
     def accessor(self, index: int) -> tuple[np.ndarray, Accessor]:
         """The stored numbers of an accessor, (count, ...) in their own type with sparse values set in, and its record."""
         record: Accessor = self.item(self.document.accessors, index, "accessor")
         dtype, shape = np.dtype(_DTYPES[record.component_type]), _SHAPES[record.type]
-        self.check_memory(record.count * dtype.itemsize * int(np.prod(shape)), f"accessor {index}")
+        self.check_memory(record.count * dtype.itemsize * int(np.prod(shape)), f"accessor {index}", SIMPLIFY)
         if record.buffer_view is None:
             out = np.zeros((record.count, *shape), dtype)
         else:
@@ -186,21 +200,21 @@ class GltfFile:
         size = column_stride * rows
         stride = stride or size
         if stride < size:
-            raise self.refuse(f"accessor {index} has elements of {size} bytes, {stride} apart")
+            raise self.refuse(f"accessor {index} has elements of {size} bytes, {stride} apart", EXPORT)
         if offset + stride * (count - 1) + size > len(content):
             raise self.refuse(f"accessor {index} reaches past the end of its buffer view "
-                              f"({offset + stride * (count - 1) + size} of {len(content)} bytes)")
+                              f"({offset + stride * (count - 1) + size} of {len(content)} bytes)", EXPORT)
         inner = (column_stride, dtype.itemsize) if rows > 1 else (dtype.itemsize,) * len(shape)
         return np.ndarray((count, *shape), dtype, content, offset, (stride, *inner))
 
     def _overridden(self, base: np.ndarray, sparse: Any, index: int) -> np.ndarray:
         if sparse.count > len(base):
-            raise self.refuse(f"accessor {index} overrides {sparse.count} of its {len(base)} elements")
+            raise self.refuse(f"accessor {index} overrides {sparse.count} of its {len(base)} elements", EXPORT)
         dtype = np.dtype(_DTYPES[sparse.indices.component_type])
         where = self._strided(sparse.indices.buffer_view, sparse.indices.byte_offset, None, sparse.count, dtype, (), index).astype(np.int64)
         values = self._strided(sparse.values.buffer_view, sparse.values.byte_offset, None, sparse.count, base.dtype, base.shape[1:], index)
         if where.max() >= len(base) or (np.diff(where) <= 0).any():
-            raise self.refuse(f"accessor {index} has sparse indices out of range or order")
+            raise self.refuse(f"accessor {index} has sparse indices out of range or order", EXPORT)
         out = base.copy()
         out[where] = values
         return out
@@ -214,3 +228,8 @@ class GltfFile:
         if record.component_type == 5126 or not (record.normalized or always_normalized):
             return stored.astype(np.float64)
         return np.maximum(stored.astype(np.float64) / np.iinfo(stored.dtype).max, -1.0)
+
+
+def printed(name: str) -> str:
+    """A name from the file for a message: as it is where it is printable, else escaped."""
+    return name if name.isprintable() and len(name) <= 80 else shown(name)

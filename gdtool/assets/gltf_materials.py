@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from gdtool.assets.gltf_document import GltfFile
+from gdtool.assets.gltf_document import EXPORT, GltfFile
 from gdtool.assets.gltf_schema import MaterialRecord, SpecularGlossiness, TextureInfo
 from gdtool.assets.scene import Material, Texture
 
 _WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _DIELECTRIC_F0 = 0.04
+# Of one pixel of a converted material: two maps of up to four 16-bit channels at the common size, each through a row copy, and 4 + 3 bytes out.
+_CONVERTED_BYTES = 2 * 2 * 8 + 7
 
 
 class MaterialReader:
@@ -21,12 +23,16 @@ class MaterialReader:
     def __init__(self, file: GltfFile):
         self.file = file
         self._images: dict[int, np.ndarray] = {}
+        self._held = 0  # bytes of the decoded images
 
     def material(self, index: int) -> Material:
         """Material `index` of the file, specular-glossiness converted to metallic-roughness."""
         record: MaterialRecord = self.file.item(self.file.document.materials, index, "material")
         extensions, surface = record.extensions, record.pbr_metallic_roughness
         strength = extensions.KHR_materials_emissive_strength.emissive_strength if extensions.KHR_materials_emissive_strength else 1.0
+        emissive = tuple(max(0.0, x) * strength for x in record.emissive_factor)
+        if not np.isfinite(emissive).all():
+            raise self.file.refuse(f"material {index}: its emission is not finite", "lower its emissive strength")
         specular = extensions.KHR_materials_specular
         if specular and (specular.specular_texture or specular.specular_color_texture or specular.specular_color_factor != (1.0, 1.0, 1.0)):
             self.file.notes.append(f"material {index}: specular colour and textures are ignored")
@@ -35,7 +41,7 @@ class MaterialReader:
             base_color=_unit(surface.base_color_factor),
             metallic=_unit((surface.metallic_factor,))[0],
             roughness=_unit((surface.roughness_factor,))[0],
-            emissive=tuple(max(0.0, x) * strength for x in record.emissive_factor),
+            emissive=emissive,
             alpha_mode=record.alpha_mode,
             alpha_cutoff=record.alpha_cutoff,
             double_sided=record.double_sided,
@@ -85,15 +91,17 @@ class MaterialReader:
             if record.uri is not None:
                 content = self.file.resolve(record.uri, f"image {index}")
             elif record.buffer_view is not None:
-                content = self.file.view(record.buffer_view)
+                content = bytes(self.file.view(record.buffer_view))
             else:
-                raise self.file.refuse(f"image {index} has neither a URI nor a buffer view")
+                raise self.file.refuse(f"image {index} has neither a URI nor a buffer view", EXPORT)
             if isinstance(content, Path):
                 image = read_image(content)
             else:
                 image = decode_image(content, f"{self.file.path}: image {index}")
             if image.shape[2] < 3:
                 image = np.concatenate([np.repeat(image[..., :1], 3, -1), image[..., 1:]], -1)
+            self._held += image.nbytes
+            self.file.check_memory(self._held, f"image {index} and those before it", "export it with smaller textures")
             self._images[index] = image
         return self._images[index]
 
@@ -120,6 +128,8 @@ class MaterialReader:
             raise self.file.refuse(f"material {index} is specular-glossiness with two different texture lookups, which gdtool cannot convert",
                                    "export it as metallic-roughness")
         height, width = max(t.image.shape[0] for t in given), max(t.image.shape[1] for t in given)
+        size = height * width * _CONVERTED_BYTES
+        self.file.check_memory(size, f"converting material {index} at {width}x{height} pixels", "export it as metallic-roughness")
 
         def pixels(texture: Texture | None) -> np.ndarray:
             image = np.full((1, 1, 4), 255, np.uint8) if texture is None else texture.image

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from gdtool.assets.gltf_document import GltfFile
+from gdtool.assets.gltf_document import EXPORT, SIMPLIFY, GltfFile, printed
+from gdtool.assets.gltf_geometry import check_geometry
 from gdtool.assets.gltf_materials import MaterialReader
 from gdtool.assets.gltf_schema import Node, Primitive
 from gdtool.assets.scene import DEFAULT_MATERIAL, Material, Scene
 from gdtool.geometry.topology import repeats
+
+_UV_SET = re.compile(r"TEXCOORD_[0-9]{1,3}")
+_UNSKINNED = "export it without the skin"
 
 
 @dataclass
@@ -26,18 +31,27 @@ class Part:
     uvs: tuple[np.ndarray | None, ...] = ()
     colors: np.ndarray | None = None
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all its arrays."""
+        return sum(a.nbytes for a in (self.vertices, self.faces, self.normals, self.tangents, self.colors, *self.uvs) if a is not None)
+
 
 def read_gltf(path: str | Path) -> Scene:
     """Read the default scene of a .glb or .gltf: every triangle of every node, in world space and in rest pose.
 
     Skins stand as their joints do without animation; morph targets at their default weights. Strips and fans become
     triangles, points and lines are left out (and noted). A primitive without a material gets DEFAULT_MATERIAL.
-    Raises InputError naming the file and the fault; required extensions that are not known are refused by name.
+    Raises InputError naming the file and the fault, required extensions that are not known by name; ResourceError with the
+    prediction, before any geometry is decoded, where all of it would take more memory than one input may.
     """
     file = GltfFile(Path(path))
     parts: list[Part] = []
+    held = 0
     worlds = _world_matrices(file)
-    for index in _visible(file):
+    visible = _visible(file)
+    check_geometry(file, visible)
+    for index in visible:
         node = file.document.nodes[index]
         if node.mesh is None:
             continue
@@ -48,6 +62,8 @@ def read_gltf(path: str | Path) -> Scene:
             if part is not None:
                 matrices = _joint_matrices(file, node, worlds, primitive, len(part.vertices), subject)
                 parts.append(_compact(_placed(part, worlds[index] if matrices is None else matrices)))
+                held += parts[-1].nbytes
+                file.check_memory(held, f"{subject} and the geometry before it", SIMPLIFY)  # Draco streams may hold more than is said
     if not parts:
         raise file.refuse("has no faces", "export the model with its meshes")
     return _joined(file, parts)
@@ -61,9 +77,12 @@ def _visible(file: GltfFile) -> list[int]:
     else:
         children = {child for node in document.nodes for child in node.children}
         roots = [i for i in range(len(document.nodes)) if i not in children]
-    out, stack = [], list(reversed(roots))
+    out, stack, seen = [], list(reversed(roots)), set()
     while stack:
         index = stack.pop()
+        if index in seen:
+            raise file.refuse(f"its scene shows node {index} twice", "name each root node once in the scene, and no child")
+        seen.add(index)
         out.append(index)
         stack += reversed(file.item(document.nodes, index, "node").children)
     return out
@@ -77,7 +96,7 @@ def _world_matrices(file: GltfFile) -> list[np.ndarray]:
         for child in node.children:
             file.item(nodes, child, "node")
             if parent[child] >= 0 or child == index:
-                raise file.refuse(f"node {child} has two parents or is its own: the nodes must be a tree")
+                raise file.refuse(f"node {child} has two parents or is its own: the nodes must be a tree", EXPORT)
             parent[child] = index
     worlds: list[np.ndarray | None] = [None] * len(nodes)
     stack = [i for i in range(len(nodes)) if parent[i] < 0]
@@ -88,9 +107,9 @@ def _world_matrices(file: GltfFile) -> list[np.ndarray]:
         stack += nodes[index].children
     for index, world in enumerate(worlds):
         if world is None:
-            raise file.refuse(f"node {index} is part of a cycle: the nodes must be a tree")
+            raise file.refuse(f"node {index} is part of a cycle: the nodes must be a tree", EXPORT)
         if not np.isfinite(world).all():
-            raise file.refuse(f"node {index} has a transform that is not finite")
+            raise file.refuse(f"node {index} has a transform that is not finite", "reset the transform of that node")
     return worlds
 
 
@@ -98,12 +117,12 @@ def _local_matrix(file: GltfFile, node: Node, index: int) -> np.ndarray:
     if node.matrix is not None:
         matrix = np.array(node.matrix, np.float64).reshape(4, 4).T  # stored by columns
         if not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
-            raise file.refuse(f"node {index} has a matrix that is not affine")
+            raise file.refuse(f"node {index} has a matrix that is not affine", "reset the transform of that node")
         return matrix
     x, y, z, w = node.rotation
     length = np.sqrt(x * x + y * y + z * z + w * w)
     if not 0.9 < length < 1.1:
-        raise file.refuse(f"node {index} has a rotation that is not a unit quaternion (length {length:.3g})")
+        raise file.refuse(f"node {index} has a rotation that is not a unit quaternion (length {length:.3g})", "reset the rotation of that node")
     x, y, z, w = x / length, y / length, z / length, w / length
     out = np.eye(4)
     out[:3, :3] = [[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -134,36 +153,36 @@ def _read_primitive(file: GltfFile, primitive: Primitive, weights: tuple[float, 
         if primitive.indices is not None:
             stored, record = file.accessor(primitive.indices)
             if record.type != "SCALAR" or stored.dtype.kind != "u":
-                raise file.refuse(f"{subject}: its indices are not unsigned integers")
+                raise file.refuse(f"{subject}: its indices are not unsigned integers", EXPORT)
             indices = stored.astype(np.int64)
     count = len(attributes["POSITION"])
     for name, width in (("POSITION", 3), ("NORMAL", 3), ("TANGENT", 4), *((n, 2) for n in attributes if n.startswith("TEXCOORD_"))):
         if name in attributes and attributes[name].shape[1:] != (width,):
-            raise file.refuse(f"{subject}: {name} is not a vector of {width}")
+            raise file.refuse(f"{subject}: {printed(name)} is not a vector of {width}", EXPORT)
     for name, array in attributes.items():
         if len(array) != count:
-            raise file.refuse(f"{subject}: {name} has {len(array)} elements, POSITION {count}")
+            raise file.refuse(f"{subject}: {printed(name)} has {len(array)} elements, POSITION {count}", EXPORT)
     _add_targets(file, primitive, weights, attributes, subject)
     if not np.isfinite(attributes["POSITION"]).all():
-        raise file.refuse(f"{subject}: vertex {int(np.argwhere(~np.isfinite(attributes['POSITION']))[0][0])} is not finite")
+        raise file.refuse(f"{subject}: vertex {int(np.argwhere(~np.isfinite(attributes['POSITION']))[0][0])} is not finite", "remove that vertex or move it to a finite place")
     if indices is None:
         indices = np.arange(count)
     if len(indices) and indices.max() >= count:
-        raise file.refuse(f"{subject}: refers to vertex {int(indices.max())}, but has {count}")
+        raise file.refuse(f"{subject}: refers to vertex {int(indices.max())}, but has {count}", EXPORT)
     faces = _triangles(indices, primitive.mode)
     if not len(faces):
         file.notes.append(f"{subject}: has no faces")
         return None
-    sets = [int(name[9:]) for name in attributes if name.startswith("TEXCOORD_") and name[9:].isdigit()]
+    sets = [int(name[9:]) for name in attributes if _UV_SET.fullmatch(name)]
     uvs = tuple(attributes.get(f"TEXCOORD_{i}") for i in range(max(sets, default=-1) + 1 if max(sets, default=0) < 32 else 0))
     colors = attributes.get("COLOR_0")
     if colors is not None:
         if colors.shape[1:] not in ((3,), (4,)):
-            raise file.refuse(f"{subject}: COLOR_0 is neither RGB nor RGBA")
+            raise file.refuse(f"{subject}: COLOR_0 is neither RGB nor RGBA", EXPORT)
         colors = np.concatenate([colors[:, :3], colors[:, 3:] if colors.shape[1] == 4 else np.ones((count, 1))], 1)
     for name, arrays in (("a texture coordinate", uvs), ("a vertex color", (colors,)), ("a normal", (attributes.get("NORMAL"),))):
         if any(a is not None and not np.isfinite(a).all() for a in arrays):
-            raise file.refuse(f"{subject}: {name} is not finite")
+            raise file.refuse(f"{subject}: {name} is not finite", "export it without that attribute")
     tangents = attributes.get("TANGENT")
     if tangents is not None and not np.isfinite(tangents).all():
         file.notes.append(f"{subject}: its tangents are not finite and are left out")
@@ -177,7 +196,7 @@ def _add_targets(file: GltfFile, primitive: Primitive, weights: tuple[float, ...
             if weight and name in target and name in attributes:
                 delta = file.floats(target[name])
                 if delta.shape != attributes[name].shape:
-                    raise file.refuse(f"{subject}: a morph target's {name} has another shape")
+                    raise file.refuse(f"{subject}: a morph target's {name} has another shape", "export it without morph targets")
                 attributes[name] = attributes[name] + weight * delta
 
 
@@ -205,7 +224,7 @@ def _joint_matrices(file: GltfFile, node: Node, worlds: list[np.ndarray], primit
     if skin.inverse_bind_matrices is not None:
         inverse = file.floats(skin.inverse_bind_matrices)
         if inverse.shape[1:] != (4, 4) or len(inverse) < len(joints):
-            raise file.refuse(f"skin {node.skin} has {len(inverse)} inverse bind matrices for {len(joints)} joints")
+            raise file.refuse(f"skin {node.skin} has {len(inverse)} inverse bind matrices for {len(joints)} joints", _UNSKINNED)
         joints = joints @ inverse[:len(joints)].transpose(0, 2, 1)  # stored by columns
     out, total = np.zeros((count, 4, 4)), np.zeros(count)
     for k in range(8):
@@ -214,14 +233,14 @@ def _joint_matrices(file: GltfFile, node: Node, worlds: list[np.ndarray], primit
         index, _ = file.accessor(primitive.attributes[f"JOINTS_{k}"])
         weight = file.floats(primitive.attributes[f"WEIGHTS_{k}"], always_normalized=True)
         if index.shape != (count, 4) or weight.shape != (count, 4) or index.dtype.kind != "u" or not np.isfinite(weight).all():
-            raise file.refuse(f"{subject}: its joints and weights are not four a vertex")
+            raise file.refuse(f"{subject}: its joints and weights are not four a vertex", _UNSKINNED)
         if (index[weight > 0] >= len(joints)).any():
-            raise file.refuse(f"{subject}: refers to a joint out of range (its skin has {len(joints)})")
+            raise file.refuse(f"{subject}: refers to a joint out of range (its skin has {len(joints)})", _UNSKINNED)
         for j in range(4):
             out += weight[:, j, None, None] * joints[np.where(weight[:, j] > 0, index[:, j], 0)]
         total += weight.sum(1)
     if not (total > 0).all():
-        raise file.refuse(f"{subject}: a vertex has no skin weight")
+        raise file.refuse(f"{subject}: a vertex has no skin weight", "normalize the weights of all its vertices, or export it without the skin")
     return out / total[:, None, None]
 
 
@@ -282,7 +301,7 @@ def _joined(file: GltfFile, parts: list[Part]) -> Scene:
     for material in materials:
         for texture in (material.base_color_texture, material.metallic_roughness_texture, material.normal_texture):
             if texture is not None and texture.uv_set >= set_count:
-                raise file.refuse(f"material {material.name!r} looks up texture coordinates {texture.uv_set}, which no mesh has")
+                raise file.refuse(f"material {material.name!r} looks up texture coordinates {texture.uv_set}, which no mesh has", "export it with that UV map")
     uvs = []
     for k in range(set_count):
         given = [part.uvs[k] if k < len(part.uvs) else None for part in parts]

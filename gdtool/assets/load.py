@@ -9,9 +9,15 @@ import numpy as np
 
 from gdtool.assets.scene import Scene
 from gdtool.core.errors import InputError
+from gdtool.core.memory import require_memory
+from gdtool.core.reading import require_regular_file
 from gdtool.geometry.vectors import cross, dot
 
 _CHUNK = 2**14  # faces at a time: what they need in between stays in the cache
+_MAX_SEED_DIGITS = 19  # of a 64-bit integer
+# Bytes that a byte of the file takes while it is read, with its arrays: measured on grids of 90,000 vertices, as text where that is more.
+# glTF counts its geometry from its JSON, OBJ in obj_lines.
+_HELD_PER_BYTE = {".ply": 17, ".stl": 8}
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 
 
@@ -25,15 +31,15 @@ def load_scene(source: str | Path) -> Scene:
         from gdtool.assets.procedural import generate
 
         seed = source.removeprefix("procedural:")
-        if not seed.isdigit():
-            raise InputError(source, "is not procedural:SEED")
+        if not (seed.isascii() and seed.isdigit() and len(seed) <= _MAX_SEED_DIGITS):
+            raise InputError(source, f"is not procedural:SEED, a number of at most {_MAX_SEED_DIGITS} digits", "name it like procedural:7")
         return replace(generate(int(seed)), name="procedural-" + seed.zfill(6))
     path = Path(source)
     suffix = path.suffix.lower()
-    if path.is_dir():
-        raise InputError(path, "is a folder, not a model")
-    if suffix not in SUFFIXES:
-        raise InputError(path, f"is not a model that gdtool reads ({', '.join(SUFFIXES)})")
+    if suffix not in SUFFIXES and not path.is_dir():
+        raise InputError(path, f"is not a model that gdtool reads ({', '.join(SUFFIXES)})", "export it as .glb")
+    require_regular_file(path)
+    require_memory(path.stat().st_size * _HELD_PER_BYTE.get(suffix, 1), path, "its content", "simplify it or split it into several files")
     if suffix in (".glb", ".gltf"):
         from gdtool.assets.gltf_read import read_gltf as read
     elif suffix == ".obj":
@@ -47,23 +53,23 @@ def _checked(scene: Scene, path: Path) -> Scene:
     """The scene without faces of which two corners coincide; those whose three lie on a line stay, being seams that keep a
     mesh closed. Raises InputError for what no stage can work on."""
     if not len(scene.faces):
-        raise InputError(path, "has no faces")
+        raise InputError(path, "has no faces", "export the model with its faces")
     if scene.faces.min() < 0 or scene.faces.max() >= len(scene.vertices):
-        raise InputError(path, f"a face refers to a vertex out of range (there are {len(scene.vertices)})")
+        raise InputError(path, f"a face refers to a vertex out of range (there are {len(scene.vertices)})", "export it again with all its vertices")
     named = np.zeros(len(scene.vertices), bool)
     named[scene.faces] = True
     used = scene.vertices[named]
     if not np.isfinite(used).all():
-        raise InputError(path, f"vertex {int(np.argwhere(~np.isfinite(scene.vertices))[0][0])} is not finite")
+        raise InputError(path, f"vertex {int(np.argwhere(~np.isfinite(scene.vertices))[0][0])} is not finite", "remove that vertex or move it to a finite place")
     low, high = used.min(0), used.max(0)
     extent = float((high - low).max())
     if not np.isfinite(extent) or extent > 1e100:
         raise InputError(path, f"is {extent:.3g} units large", "scale it down")
     if extent == 0:
-        raise InputError(path, "has all its vertices in one point")
+        raise InputError(path, "has all its vertices in one point", "export it at a scale that its file format can hold")
     empty, has_area = _degenerate((scene.vertices - low) / extent, scene.faces)
     if not has_area:
-        raise InputError(path, "has only faces without area")
+        raise InputError(path, "has only faces without area", "export it with faces that have an area")
     if empty.any():
         scene = replace(scene, faces=scene.faces[~empty], material_idx=scene.material_idx[~empty],
                         notes=(*scene.notes, f"{int(empty.sum())} faces with two corners in one place are left out"))

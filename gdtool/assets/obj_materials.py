@@ -9,11 +9,12 @@ import numpy as np
 
 from gdtool.assets.scene import DEFAULT_MATERIAL, Material, Texture
 from gdtool.core.errors import GdtoolError
-from gdtool.core.sources import TEXTURE_PLACES
+from gdtool.core.memory import require_memory
+from gdtool.core.reading import bytes_of
+from gdtool.core.references import is_readable, library_folder, map_name, obj_libraries, obj_texture
 
-_OPTION_WORDS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-bm": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-mm": 2, "-texres": 1, "-type": 1,
-                 "-o": 3, "-s": 3, "-t": 3}
 _CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}
+_MERGED_BYTES = 48  # of one pixel while two maps become one: four float32 channels, resized, clipped, scaled and rounded
 
 
 def obj_materials(path: Path, libraries: list[str], names: list[str], has_colors: bool) -> tuple[tuple[Material, ...], list[str]]:
@@ -23,28 +24,26 @@ def obj_materials(path: Path, libraries: list[str], names: list[str], has_colors
     Ks reflects at all: (2 / (Ns + 2))^(1/4), the GGX width of that Blinn-Phong lobe; else 0.5. metallic: map_Pm, Pm,
     else 0. norm, or a map_Bump that is blue all over, is the normal map. Ke, map_Ke, d, Tr and map_d are read, Ni is
     not (exporters fill it at will). Faces without a material are DEFAULT_MATERIAL; white where vertices have colours.
-    A missing library or texture is noted and its defaults taken.
+    A missing library or texture is noted and its defaults taken; one that lies elsewhere than core/references.py allows, or is no
+    regular file, is an InputError. ResourceError for textures that together take more memory than one input may.
     """
     notes: list[str] = []
     records: dict[str, dict[str, list[str]]] = {}
-    places: dict[str, Path] = {}
-    for line in libraries:
-        # one name with spaces, or several names
-        options = [line] if _beside(path.parent, line).is_file() else line.split()
-        for name in options:
-            library = _beside(path.parent, name)
-            if not library.is_file():
+    textures = _Textures(path, notes)
+    places: dict[str, tuple[Path, str]] = {}
+    for line in dict.fromkeys(libraries):
+        for name, library in obj_libraries(path, line):
+            if not is_readable(library):
                 notes.append(f"material library {name} is missing")
                 continue
             for key, record in _read_library(library).items():
                 records.setdefault(key, record)
-                places.setdefault(key, library.parent)
+                places.setdefault(key, (library, library_folder(name)))
     default = replace(DEFAULT_MATERIAL, base_color=(1.0, 1.0, 1.0, 1.0)) if has_colors else DEFAULT_MATERIAL
     out = []
-    images: dict[Path, np.ndarray | None] = {}
     for name in names:
         if name in records:
-            out.append(_material(name, records[name], places[name], images, notes))
+            out.append(_material(name, records[name], places[name], textures, notes))
         else:
             notes.append(f"material {name!r} is not defined: a dielectric of roughness 0.5" if name
                          else "faces without a material are a dielectric of roughness 0.5")
@@ -52,18 +51,11 @@ def obj_materials(path: Path, libraries: list[str], names: list[str], has_colors
     return tuple(out), list(dict.fromkeys(notes))
 
 
-def _beside(folder: Path, name: str) -> Path:
-    """The file a name in an OBJ or MTL means; of an absolute one only the last part, beside the model."""
-    plain = name.strip().strip('"').replace("\\", "/")
-    absolute = plain.startswith("/") or plain[1:3] == ":/"
-    return folder / (plain.rsplit("/", 1)[-1] if absolute else plain)
-
-
 def _read_library(path: Path) -> dict[str, dict[str, list[str]]]:
     """Material name to statements, keyword in lower case to words."""
     out: dict[str, dict[str, list[str]]] = {}
     current: dict[str, list[str]] | None = None
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in bytes_of(path).decode("utf-8", "replace").splitlines():
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
@@ -74,7 +66,7 @@ def _read_library(path: Path) -> dict[str, dict[str, list[str]]]:
     return out
 
 
-def _material(name: str, record: dict[str, list[str]], folder: Path, images: dict[Path, np.ndarray | None], notes: list[str]) -> Material:
+def _material(name: str, record: dict[str, list[str]], place: tuple[Path, str], textures: _Textures, notes: list[str]) -> Material:
     def numbers(key: str) -> list[float]:
         try:
             values = [float(word) for word in record.get(key, [])]
@@ -84,7 +76,7 @@ def _material(name: str, record: dict[str, list[str]], folder: Path, images: dic
         return values if np.isfinite(values).all() else []
 
     def image(key: str) -> np.ndarray | None:
-        return _image(record[key], folder, images, notes) if key in record else None
+        return textures.image(record[key], *place) if key in record else None
 
     def unit(x: float) -> float:
         return min(1.0, max(0.0, x))
@@ -104,11 +96,13 @@ def _material(name: str, record: dict[str, list[str]], folder: Path, images: dic
     if color_map is not None:
         color_map = _spread(color_map)
         if alpha_map is not None:
+            _require_merged(textures.model, color_map, alpha_map)
             color_map = _with_alpha(color_map, alpha_map)
             out = replace(out, alpha_mode="BLEND")
         out = replace(out, base_color_texture=Texture(color_map, "srgb"))
     roughness_map, metallic_map = image("map_pr"), image("map_pm")
     if roughness_map is not None or metallic_map is not None:
+        _require_merged(textures.model, roughness_map, metallic_map)
         packed = _packed(roughness_map, metallic_map)
         out = replace(out, metallic_roughness_texture=Texture(packed), roughness=1.0 if roughness_map is not None else roughness,
                       metallic=1.0 if metallic_map is not None else metallic)
@@ -126,45 +120,54 @@ def _material(name: str, record: dict[str, list[str]], folder: Path, images: dic
     return out
 
 
-def _image(words: list[str], folder: Path, images: dict[Path, np.ndarray | None], notes: list[str]) -> np.ndarray | None:
-    """The image of a map statement, its one channel where -imfchan asks for it; None (and a note) when it cannot be read."""
-    channel, i = None, 0
-    while i < len(words) and words[i] in _OPTION_WORDS:
-        count = _OPTION_WORDS[words[i]]
-        if words[i] == "-imfchan" and i + 1 < len(words):
-            channel = _CHANNELS.get(words[i + 1])
-        # -o, -s and -t take one to three numbers
-        taken = 0
-        while taken < count and i + 1 + taken < len(words) - 1 and (count < 3 or _is_number(words[i + 1 + taken])):
-            taken += 1
-        i += 1 + taken
-    name = " ".join(words[i:])
-    path = next((found for found in (_beside(folder / place, name) for place in TEXTURE_PLACES) if found.is_file()), _beside(folder, name))
-    if path not in images:
+class _Textures:
+    """The images of one model's materials: each is read once."""
+
+    def __init__(self, model: Path, notes: list[str]):
+        self.model, self.notes = model, notes
+        self._images: dict[Path, np.ndarray | None] = {}
+        self._held = 0  # bytes
+
+    def image(self, words: list[str], library: Path, folder: str) -> np.ndarray | None:
+        """The image of a texture statement, its one channel where -imfchan asks for it; None (and a note) when it cannot be read.
+
+        words: those behind the keyword; library: the .mtl, and folder: its place relative to the model's.
+        """
+        name, letter = map_name(words)
+        path = obj_texture(self.model, name, library, "the texture", folder)
+        if path is None:
+            self.notes.append("a texture has no name and is left out")
+            return None
+        if path not in self._images:
+            self._images[path] = self._read(path, name)
+        image, channel = self._images[path], _CHANNELS.get(letter or "")
+        if image is not None and channel is not None and channel < image.shape[2]:
+            return image[..., channel:channel + 1]
+        return image
+
+    def _read(self, path: Path, name: str) -> np.ndarray | None:
         from gdtool.images.io import read_image
 
         try:
-            images[path] = read_image(path)
+            image = read_image(path)
         except GdtoolError as error:
-            notes.append(f"texture {name}: {error.fact} and is left out")
-            images[path] = None
-    image = images[path]
-    if image is not None and channel is not None and channel < image.shape[2]:
-        return image[..., channel:channel + 1]
-    return image
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+            self.notes.append(f"texture {name}: {error.fact} and is left out")
+            return None
+        self._held += image.nbytes
+        require_memory(self._held, self.model, f"the texture {name} and those before it", "scale the textures down")
+        return image
 
 
 def _spread(image: np.ndarray) -> np.ndarray:
     """Grey (and alpha) to RGB (and alpha)."""
     return np.concatenate([np.repeat(image[..., :1], 3, -1), image[..., 1:]], -1) if image.shape[2] < 3 else image
+
+
+def _require_merged(model: Path, *maps: np.ndarray | None) -> None:
+    """Raise ResourceError when maps that become one, as high as the highest and as wide as the widest, would take too much memory."""
+    given = [one for one in maps if one is not None]
+    height, width = max(one.shape[0] for one in given), max(one.shape[1] for one in given)
+    require_memory(height * width * _MERGED_BYTES, model, f"merging two maps at {width}x{height} pixels", "make the maps of one material equally large")
 
 
 def _resized(image: np.ndarray, height: int, width: int) -> np.ndarray:

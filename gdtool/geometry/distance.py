@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gdtool.core.native import imported, imported_if_installed
 from gdtool.geometry.vectors import cross, dot
 
 _CELLS = 39  # along each axis: (39 + 1)^3 numbers fit 16 bits
@@ -35,8 +36,7 @@ _Search = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]  # p
 
 
 def _igl_search(vertices: np.ndarray, faces: np.ndarray) -> _Search:
-    import igl
-
+    igl = imported("igl")
     tree = igl.AABB()
     tree.init(vertices, faces)
 
@@ -48,9 +48,8 @@ def _igl_search(vertices: np.ndarray, faces: np.ndarray) -> _Search:
 
 def _fcpw_search(vertices: np.ndarray, faces: np.ndarray) -> _Search | None:
     """None where there is no fcpw: it has no wheel for every machine."""
-    try:
-        import fcpw
-    except ImportError:
+    fcpw = imported_if_installed("fcpw")
+    if fcpw is None:
         return None
     low, high = vertices.min(0), vertices.max(0)
     middle, scale = (low + high) / 2, float((high - low).max()) or 1.0
@@ -134,8 +133,7 @@ def closest_points(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) 
     Vertices that no face uses are no surface. Zero-area faces count as the segment or point that they are. Raises
     ValueError for a mesh without faces.
     """
-    import igl
-
+    igl = imported("igl")
     if not len(faces):
         raise ValueError("a mesh without faces has no closest point")
     if not len(points):
@@ -149,8 +147,7 @@ def winding_number(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) 
 
     An approximation for far points: good to about 1e-2, so compare it with 0.5, not with 0 or 1.
     """
-    import igl
-
+    igl = imported("igl")
     if not len(faces) or not len(points):
         return np.zeros(len(points))
     points, vertices = _doubles(points, vertices)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gdtool.core.native import imported
 from gdtool.geometry.sharpen import dihedral_degrees
 from gdtool.geometry.topology import edges_of
 
@@ -157,8 +158,7 @@ def _tidy(points: np.ndarray, segments: np.ndarray, short: float) -> Features:
 
 def closest_on_segments(queries: np.ndarray, points: np.ndarray, segments: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For queries (n, 3): distance (n,), segment (n,) and the closest point (n, 3) on segments (s, 2) of points (p, 3)."""
-    import igl
-
+    igl = imported("igl")
     squared, segment, point = igl.point_mesh_squared_distance(
         np.ascontiguousarray(queries, np.float64), np.ascontiguousarray(points, np.float64), np.ascontiguousarray(segments, np.int64))[:3]
     return np.sqrt(np.maximum(squared, 0)), np.asarray(segment), np.asarray(point)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gdtool.core.native import imported
 from gdtool.geometry.repair import without_crumbs
 from gdtool.geometry.topology import Invariants, compact, edges_of, invariants
 from gdtool.geometry.unpinch import unpinched
@@ -35,8 +36,7 @@ def run_instant_meshes(vertices: np.ndarray, faces: np.ndarray, quads: int, crea
     Its deterministic mode, so that equal input gives equal files. Intrinsic smoothing leaves a tenth fewer irregular
     vertices, but its quads keep to creases less well.
     """
-    import pynanoinstantmeshes
-
+    pynanoinstantmeshes = imported("pynanoinstantmeshes")
     out, found = pynanoinstantmeshes.remesh(
         np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.uint32), vertex_count=max(quads // 4, 4), rosy=4, posy=4,
         creaseAngle=float(crease_degrees), align_to_boundaries=bool((edges_of(faces).count == 1).any()), extrinsic=True,
@@ -46,8 +46,7 @@ def run_instant_meshes(vertices: np.ndarray, faces: np.ndarray, quads: int, crea
 
 def run_quadriflow(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float) -> tuple[np.ndarray, np.ndarray]:
     """QuadriFlow (Huang et al. 2018) through pyQuadriFlow, an optional package. It ends the process on non-manifold input."""
-    from pyQuadriFlow import pyQuadriFlow
-
+    pyQuadriFlow = imported("pyQuadriFlow.pyQuadriFlow")
     found = pyQuadriFlow.pyquadriflow(int(quads), 0, np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32),
                                       crease_degrees > 0, False, False, False, False)
     return np.asarray(found["vertices"], np.float64), np.asarray(found["faces"], np.int64)

@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gdtool.core.child import ChildFailed, call
+from gdtool.core.native import imported
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_shape import subdivide
 from gdtool.geometry.quad_task import QUADS_OF_A_PIECE
@@ -58,8 +59,7 @@ def even_triangles(vertices: np.ndarray, faces: np.ndarray, triangles: int, crea
     """Triangles of even size and shape, about as many as asked: MeshLab's isotropic remeshing (Botsch & Kobbelt 2004, "A
     remeshing approach to multiresolution modeling"). Creases sharper than crease_degrees stay, a tenth of an edge is the
     farthest that the surface moves. Unchecked."""
-    import pymeshlab
-
+    pymeshlab = imported("pymeshlab")
     # MeshLab joins vertices that coincide, which closes slits and leaves edges of four faces.
     apart = np.random.default_rng(0).uniform(-1, 1, vertices.shape) * _APART * np.ptp(vertices, 0).max()
     own = np.ascontiguousarray(vertices + apart, np.float64), np.ascontiguousarray(faces, np.int32)
@@ -83,8 +83,7 @@ def even_triangles(vertices: np.ndarray, faces: np.ndarray, triangles: int, crea
 
 def of_own(vertices: np.ndarray, faces: np.ndarray, quads: int, seconds: float, meanwhile: Callable[[], object] = lambda: None) -> tuple[np.ndarray, np.ndarray]:
     """Quads of the mesh's own triangles, cut in four or collapsed to the right number."""
-    import igl
-
+    igl = imported("igl")
     triangles = max(int(quads / _QUADS_PER_TRIANGLE), 4)
     while len(faces) < triangles:
         vertices, faces = (np.asarray(x) for x in igl.upsample(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64), 1))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gdtool.core.native import imported
 from gdtool.core.threads import cores
 from gdtool.geometry.vectors import cross, dot
 
@@ -76,9 +77,8 @@ class RayCaster:
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, threads: int | None = None):
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
+        TriangleMesh = imported("embreex.mesh_construction").TriangleMesh
+        EmbreeScene = imported("embreex.rtcore_scene").EmbreeScene
         self.vertices = np.asarray(vertices, np.float64)
         self.faces = np.asarray(faces, np.int32)
         self.threads = threads or cores()

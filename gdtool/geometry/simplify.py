@@ -10,6 +10,7 @@ import numpy as np
 
 from gdtool.core.child import ChildFailed, begin
 from gdtool.core.errors import InputError
+from gdtool.core.native import imported
 from gdtool.core.threads import cores
 from gdtool.geometry import repair, topology
 from gdtool.geometry.halves import in_halves, worth_halving
@@ -84,8 +85,7 @@ def collapse(vertices: np.ndarray, faces: np.ndarray, target_faces: int, aggress
     mesh: in a large unit the first rounds take what they meet, which leaves even triangles; in a small one it takes the flattest
     first, which leaves a fifth of the error.
     """
-    import fast_simplification
-
+    fast_simplification = imported("fast_simplification")
     out_vertices, out_faces = fast_simplification.simplify(
         np.ascontiguousarray(vertices / unit, np.float32), np.ascontiguousarray(faces, np.int32), target_count=target_faces, agg=aggressiveness,
         preserve_border=keep_border)
@@ -113,8 +113,7 @@ def collapse_topology(vertices: np.ndarray, faces: np.ndarray, target_faces: int
 
     Without its cleaning afterwards, which joins what coincides.
     """
-    import pymeshlab
-
+    pymeshlab = imported("pymeshlab")
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int32)))
     meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=target_faces, preservetopology=True, preservenormal=True, planarquadric=True,
@@ -204,7 +203,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     low, high = rows.min(1), rows.max(1)
     centre, extent = (low + high) / 2, float((high - low).max())
     if not extent > 0:
-        raise InputError("mesh", "all its faces lie in one point")
+        raise InputError("mesh", "all its faces lie in one point", repair.NO_AREA)
     unit = (vertices - centre) / extent
     edge = _edge(unit, faces, target_faces)
     is_closed, pieces = cache(closed or (lambda: topology.is_watertight(faces))), cache(lambda: topology.components(faces)[0])

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.core.errors import InputError
+from gdtool.core.native import imported
 
 INSETS = (0.02, 0.06)  # widths of the frame that is taken for background, as shares of the picture
 AGREEMENT = 0.85  # least overlap of what the two frames give; docs/benchmarks/cutout.md says how well it tells
 
 
-def cut_out(color: np.ndarray, subject: object = "image", cure: str = "") -> np.ndarray:
+def cut_out(color: np.ndarray, subject: object, cure: str) -> np.ndarray:
     """Boolean mask (h, w) of the one subject inside a picture, color (h, w, 3) sRGB in [0, 1].
 
     The colors along the picture's frame are taken for background. Done with two widths of the frame: where the results
@@ -31,9 +32,9 @@ def both_frames(color: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 
 def _grabcut(color: np.ndarray, inset: float) -> np.ndarray:
     """The largest piece of what GrabCut finds, its holes kept."""
-    import cv2
     from scipy import ndimage
 
+    cv2 = imported("cv2")
     height, width = color.shape[:2]
     picture = np.ascontiguousarray(np.rint(np.clip(color[..., ::-1], 0, 1) * 255).astype(np.uint8))
     margin_x, margin_y = (max(2, round(inset * side)) for side in (width, height))

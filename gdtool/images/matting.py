@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gdtool.core.errors import InputError, ResourceError
+from gdtool.core.native import imported_if_installed
 
 SIDE = 320  # pixels, where the file leaves its input's size open
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's pictures, as it was trained with
@@ -19,12 +20,11 @@ def saliency(color: np.ndarray, network: str | Path) -> np.ndarray:
     the first counts, stretched to [0, 1] as the authors do. Raises ResourceError without onnxruntime, InputError for a file
     that is no such network or gives nothing finite.
     """
-    try:
-        import onnxruntime
-    except ImportError:
-        raise ResourceError("--matting", "needs the package onnxruntime", "pip install 'gdtool[matting]', or give a mask with --mask") from None
     from skimage.transform import resize
 
+    onnxruntime = imported_if_installed("onnxruntime")
+    if onnxruntime is None:
+        raise ResourceError("--matting", "needs the package onnxruntime", "pip install 'gdtool[matting]', or give a mask with --mask")
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = 4  # what is wrong with a file is said below, in one line
     try:

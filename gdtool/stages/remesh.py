@@ -78,8 +78,8 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
     import numpy as np
 
     from gdtool.folders.mesh import QuadMesh, write_mesh
-    from gdtool.geometry import mesh_quality, repair
-    from gdtool.geometry.quad_task import Record
+    from gdtool.geometry import mesh_quality, repair, shells
+    from gdtool.geometry.quad_task import QUADS_OF_A_PIECE, Record, count_reason
     from gdtool.geometry.topology import triangulated
     from gdtool.stages.limits import require_time
 
@@ -99,6 +99,8 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
             out.warn(f"{inputs.name}: the surface is open; its boundaries are kept")
         if not options.triangles:
             require_time(SECONDS_PER_QUAD * options.faces, options.seconds, "--seconds", inputs.name, "lower --faces")
+        if inner := shells.told(vertices, faces):
+            out.warn(f"{inputs.name}: {inner}")
         found_vertices, found, record = (_decimated if options.triangles else _quads)(vertices, faces, options, out)
     with out.step("measure"):
         figures = record.figures | mesh_quality.topology_figures(found_vertices, found) | mesh_quality.shape_figures(found_vertices, found)
@@ -106,7 +108,8 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
             figures |= mesh_quality.distance_figures(found_vertices, triangulated(found)[0], vertices, faces, 20000, source=record.source)
     asked = options.triangles or (len(found) if options.max_deviation else options.faces)
     if record.engine != "passed through" and abs(len(found) / asked - 1) > 0.03 and (not options.triangles or len(found) > asked):
-        out.warn(f"{inputs.name}: {len(found)} faces, not the {asked} asked for")
+        why = count_reason(faces, len(found), asked, record.failed, 4 if options.triangles else QUADS_OF_A_PIECE)
+        out.warn(f"{inputs.name}: {len(found)} faces, not the {asked} asked for: {why}")
     with out.step("write"):
         write_mesh(out, QuadMesh(found_vertices, found.astype(np.int32)))
     is_quad = found[:, 3] >= 0

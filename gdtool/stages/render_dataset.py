@@ -78,6 +78,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     from gdtool.assets.load import load_scene
     from gdtool.folders.views import Views, write_views
+    from gdtool.geometry import shells
     from gdtool.shading.render import Renderer
 
     given: Folder | None = inputs.second.get("cameras")
@@ -86,6 +87,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         scene = load_scene(source)
     for note in scene.notes:
         out.warn(note)
+    generated = isinstance(inputs.main, str)  # parts of generated objects overlap as their makers meant it
+    if not generated and (inner := shells.told(scene.vertices, scene.faces, welded=False)):
+        out.warn(inner)
     _filter(scene, inputs.name, options)
     scene, source_from_world = _placed(scene, inputs, given, options)
     cameras = _cameras(given, options)
@@ -110,7 +114,6 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         if options.condition_views:
             _write_conditions(out, renderer, lamps.direct, options, rng)
     with out.step("write"):
-        generated = isinstance(inputs.main, str)
         if generated:
             from gdtool.assets.gltf_write import write_glb
 

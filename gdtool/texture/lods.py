@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gdtool.core.child import ChildFailed, call
+from gdtool.core.native import imported
 from gdtool.texture.target import Target
 
 
@@ -20,10 +21,9 @@ def collapse_textured(vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.nd
 
     vertices (v, 3), faces (t, 3), corner_uvs (t, 3, 2) of the corners. Returns the same of about target_faces triangles.
     """
-    import pymeshlab
-
     from gdtool.images.io import write_png
 
+    pymeshlab = imported("pymeshlab")
     with tempfile.TemporaryDirectory(prefix="gdtool-") as folder:
         # The filter wants a mesh with a texture, which only a file can give it.
         write_png(Path(folder, "blank.png"), np.zeros((2, 2, 3), np.uint8))

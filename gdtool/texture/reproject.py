@@ -8,6 +8,7 @@ from threading import Lock
 
 import numpy as np
 
+from gdtool.core.native import imported
 from gdtool.geometry.distance import barycentric_of, bisected
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.tangents import dot, weld
@@ -26,8 +27,7 @@ class Nearest:
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, chosen: np.ndarray | None = None):
-        import igl
-
+        igl = imported("igl")
         some = faces if chosen is None else faces[chosen]
         cut_vertices, cut, whole = bisected(vertices, some, _LONG * float(np.ptp(vertices, axis=0).max(initial=0)), _MOST_CUT)
         self._vertices, self._faces = np.ascontiguousarray(cut_vertices, np.float64), np.ascontiguousarray(cut, np.int64)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gdtool.core.child import ChildFailed, call
+from gdtool.core.native import imported
 from gdtool.geometry.mesh_quality import polygon_normals
 from gdtool.geometry.repair import one_vertex_per_fan
 from gdtool.geometry.topology import edges_of, triangulated
@@ -20,8 +21,7 @@ _SMALLEST_SHARE = 0.003  # of the area; a smaller chart joins a neighbour if it 
 
 def run_xatlas(vertices: np.ndarray, triangles: np.ndarray, max_cost: float) -> np.ndarray:
     """(t,) chart of each triangle, by xatlas; runs in a child, because xatlas can hang. Triangles it drops have chart -1."""
-    import xatlas
-
+    xatlas = imported("xatlas")
     charts = xatlas.ChartOptions()
     charts.max_cost = max_cost
     pack = xatlas.PackOptions()

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gdtool.core.native import imported
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.topology import Edges, edges_of, handles
 from gdtool.texture.raster import owned_texels, owner_count
@@ -95,8 +96,7 @@ def _seen(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
 
 
 def _conformal(vertices: np.ndarray, triangles: np.ndarray, border: np.ndarray) -> np.ndarray | None:
-    import igl
-
+    igl = imported("igl")
     rim = np.unique(border)
     one = rim[np.linalg.norm(vertices[rim] - vertices[rim].mean(0), axis=1).argmax()]
     two = rim[np.linalg.norm(vertices[rim] - vertices[one], axis=1).argmax()]
@@ -116,8 +116,7 @@ def _conformal(vertices: np.ndarray, triangles: np.ndarray, border: np.ndarray) 
 def conformal_from(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> np.ndarray | None:
     """uv (v, 2) with what is not finite among the corners of triangles (t, 3) laid by the least-squares conformal map that keeps the rest;
     None where less than two of these are given, or they have no area."""
-    import igl
-
+    igl = imported("igl")
     own, local = np.unique(triangles, return_inverse=True)
     given = np.isfinite(uv[own, 0])
     if given.sum() < 2:
@@ -135,10 +134,10 @@ def conformal_from(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) 
 
 def _tutte(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
     """Uniform-weight embedding onto a circle (Tutte 1963): never folds."""
-    import igl
     from scipy.sparse import coo_matrix, diags
     from scipy.sparse.linalg import spsolve
 
+    igl = imported("igl")
     loops = igl.boundary_loop_all(np.ascontiguousarray(triangles, np.int64))
     if len(loops) != 1:
         return None
@@ -161,8 +160,7 @@ def _tutte(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
 def _isometric(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray, surface: Isometry, good_stretch: float,
                max_stretch: float) -> tuple[np.ndarray, float]:
     """uv after SLIM, and its stretch: until good_stretch, until it gains little, or until it is clear that it will not come to max_stretch."""
-    import igl
-
+    igl = imported("igl")
     best, before = uv, surface.stretch(uv)
     if before < good_stretch:
         return best, before

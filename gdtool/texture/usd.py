@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gdtool.core.errors import OutputError, ResourceError
+from gdtool.core.native import imported_if_installed
 from gdtool.folders.mesh import QuadMesh
 from gdtool.texture.maps import Maps
 
@@ -19,11 +20,9 @@ MESH, MATERIAL = "/asset/mesh", "/asset/material"
 
 
 def require() -> None:
-    """Raises ResourceError without usd-core."""
-    try:
-        import pxr.Usd  # noqa: F401
-    except ImportError:
-        raise ResourceError("usd-core", "is not installed, and --usd needs it", "pip install 'gdtool[usd]'") from None
+    """Raise ResourceError where usd-core is not installed or cannot be loaded."""
+    if imported_if_installed("pxr.Usd") is None:
+        raise ResourceError("usd-core", "is not installed, and --usd needs it", "pip install 'gdtool[usd]'")
 
 
 def write_usd(path: Path, mesh: QuadMesh, normals_idx: np.ndarray, normals: np.ndarray, maps: Maps, files: dict[str, str],

@@ -1,7 +1,6 @@
 """What the system does to a run: a full disk, a place that cannot be written, signals, a second process, a lost reader."""
 
 import os
-import random
 import resource
 import signal
 import subprocess
@@ -11,6 +10,7 @@ import time
 import pytest
 
 from gdtool.core.folder import open_folder
+from tests.faults import kills
 from tests.faults.files import leftovers, lines_of, quad_cube
 
 CELLS = 60
@@ -108,34 +108,13 @@ def test_stopped_then_completed(tmp_path, cube, sign, code):
     assert process.communicate()[0] == "cube.asset/mesh\n" and process.returncode == 0
 
 
-def killed_at_random(tmp_path, cube, times, seed):
-    """Kill forced runs over an older result; after each kill the folder is whole, and the next run finishes."""
-    quad_cube(tmp_path / "old.obj", 4)
-    assert subprocess.run([*REMESH[:-1], "96", "old.obj", "-o", "out", "-q"]).returncode == 0
-    old, new = open_folder(tmp_path / "out").manifest.digest, None
-    begin = time.perf_counter()
-    assert subprocess.run([*REMESH, cube, "-o", "alone", "-q"], capture_output=True).returncode == 0
-    usual = time.perf_counter() - begin
-    new = open_folder(tmp_path / "alone").manifest.digest
-    rng = random.Random(seed)
-    for _ in range(times):
-        process = start(cube, "-o", "out", "--force", "-q")
-        time.sleep(usual * (0.2 + 0.9 * rng.random()))
-        process.kill()
-        process.communicate()
-        assert open_folder(tmp_path / "out").manifest.digest in (old, new)  # raises when a file is missing or cut
-    process = start(cube, "-o", "out", "-q")
-    process.communicate()
-    assert process.returncode == 0 and open_folder(tmp_path / "out").manifest.digest == new and leftovers(tmp_path) == []
-
-
-def test_killed_at_random_moments(tmp_path, cube):
-    killed_at_random(tmp_path, cube, 5, 0)
+def test_killed_at_exact_and_random_moments():
+    assert kills.main(random_kills=3, exact_kills=11) == 0
 
 
 @pytest.mark.slow
-def test_killed_at_fifty_random_moments(tmp_path, cube):
-    killed_at_random(tmp_path, cube, 50, 1)
+def test_killed_at_fifty_random_moments():
+    assert kills.main(random_kills=50, exact_kills=11, seed=1) == 0
 
 
 def test_two_processes_on_one_output(tmp_path, cube):

@@ -1,0 +1,35 @@
+"""How much memory the content of one input may take, judged before it is read.
+
+A small file can stand for a large result: a compressed picture, a mesh that many nodes use, a sparse archive. Readers
+predict the bytes they are going to hold, copies included, and ask here first.
+"""
+
+from __future__ import annotations
+
+import os
+
+from gdtool.core.errors import ResourceError
+
+# What is read is held beside what is made from it: half is left to the stage.
+SHARE = 0.5
+
+
+def most_held() -> int:
+    """Bytes that one input may take: SHARE of this machine's memory, or of the limit on the address space (RLIMIT_AS) where that is smaller."""
+    most = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        import resource
+    except ImportError:  # Windows
+        return int(most * SHARE)
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return int(SHARE * (most if limit == resource.RLIM_INFINITY else min(most, limit)))
+
+
+def require_memory(size: int, subject: object, what: str, cure: str, most: int | None = None) -> None:
+    """Raise ResourceError, with the prediction, when size bytes are more than one input may take.
+
+    subject: the input; what: the part of it that would take them. most: a smaller limit in bytes than most_held().
+    """
+    limit = most_held() if most is None else min(most, most_held())
+    if size > limit:
+        raise ResourceError(subject, f"{what} would take {size / 2**30:.1f} GiB of memory, more than the {limit / 2**30:.1f} GiB for one input", cure)

@@ -1,0 +1,102 @@
+"""Native packages that do not load: the command ends and says what to install, it never goes on with a worse result."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from gdtool.core import child
+from gdtool.core.errors import ResourceError
+from gdtool.core.native import imported, imported_if_installed
+from gdtool.geometry import quad_split, repair, simplify
+from gdtool.geometry.distance import _fcpw_search, closest_points, winding_number
+from gdtool.geometry.quad_engines import run_instant_meshes, run_quadriflow
+from gdtool.geometry.quad_task import Request
+from gdtool.geometry.quads import remesh
+from gdtool.geometry.rays import RayCaster
+from gdtool.images.cutout import both_frames
+from gdtool.texture import lods, unwrap_charts, unwrap_flatten
+from gdtool.texture.reproject import Nearest
+from tests.faults.files import quad_cube
+from tests.geometry.solids import sphere
+
+NO_LIBRARY = "libGL.so.1: cannot open shared object file: No such file or directory"
+TRIANGLE = np.eye(3), np.array([[0, 1, 2]])
+
+
+@pytest.fixture
+def broken(tmp_path, monkeypatch):
+    """broken(module, text): what imports the module gets ImportError(text), in this process and in children."""
+
+    def put(module, text=NO_LIBRARY):
+        package = tmp_path / "broken" / module
+        package.mkdir(parents=True)
+        (package / "__init__.py").write_text(f"raise ImportError({text!r})\n")
+        monkeypatch.syspath_prepend(tmp_path / "broken")
+        for name in [name for name in sys.modules if name.split(".")[0] == module]:
+            monkeypatch.delitem(sys.modules, name)
+
+    yield put
+    child.forget_nursery()  # it has read the broken package
+
+
+USES = {
+    "igl": [lambda: closest_points(np.zeros((1, 3)), *TRIANGLE), lambda: winding_number(np.zeros((1, 3)), *TRIANGLE), lambda: Nearest(*TRIANGLE),
+            lambda: repair._split(*TRIANGLE), lambda: quad_split.of_own(*TRIANGLE, 16, 1.0),
+            lambda: unwrap_flatten._conformal(*TRIANGLE, np.array([0, 1, 2]))],
+    "fcpw": [lambda: _fcpw_search(*TRIANGLE)],
+    "embreex": [lambda: RayCaster(*TRIANGLE)],
+    "fast_simplification": [lambda: simplify.collapse(*TRIANGLE, 1, 5.0)],
+    "pymeshlab": [lambda: simplify.collapse_topology(*TRIANGLE, 1), lambda: quad_split.even_triangles(*TRIANGLE, 10, 30.0),
+                  lambda: lods.collapse_textured(*TRIANGLE, np.zeros((1, 3, 2)), 1)],
+    "pynanoinstantmeshes": [lambda: run_instant_meshes(*TRIANGLE, 100, 30.0)],
+    "xatlas": [lambda: unwrap_charts.run_xatlas(*TRIANGLE, 2.0)],
+    "cv2": [lambda: both_frames(np.zeros((40, 40, 3)))],
+}
+
+
+@pytest.mark.parametrize("module", USES)
+def test_a_missing_shared_library_is_told_with_the_package_that_brings_it(broken, module):
+    broken(module)
+    for use in USES[module]:
+        with pytest.raises(ResourceError, match=f"^libGL.so.1: is not installed, and {module} needs it; apt install libgl1$"):
+            use()
+
+
+def test_a_library_of_unknown_origin_is_named(broken):
+    broken("igl", "libodd.so.7: cannot open shared object file: No such file or directory")
+    with pytest.raises(ResourceError, match="^libodd.so.7: is not installed, and igl needs it; install the system package that holds libodd.so.7$"):
+        imported("igl")
+
+
+def test_a_package_that_is_not_installed_is_told_with_the_line_that_installs_it():
+    with pytest.raises(ResourceError, match="^no_such_package: is not installed; pip install no_such_package$"):
+        imported("no_such_package.part")
+    assert imported_if_installed("no_such_package.part") is None
+
+
+def test_a_package_that_cannot_be_loaded_is_not_taken_for_one_that_is_not_installed(broken):
+    broken("fcpw", "numpy.core.multiarray failed to import\nmore lines")
+    with pytest.raises(ResourceError, match=r"^fcpw: cannot be loaded \(numpy.core.multiarray failed to import\); pip install --force-reinstall fcpw$"):
+        imported_if_installed("fcpw")
+
+
+def test_quadriflow_without_its_package_is_an_error(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyQuadriFlow", None)  # as where it is not installed
+    with pytest.raises(ResourceError, match=r"pip install 'gdtool\[quadriflow\]'"):
+        run_quadriflow(*TRIANGLE, 100, 30.0)
+
+
+@pytest.mark.parametrize("module, engine", [("pymeshlab", "split"), ("pynanoinstantmeshes", "auto"), ("fast_simplification", "auto")])
+def test_remesh_falls_back_from_no_missing_library(broken, module, engine):
+    broken(module)
+    with pytest.raises(ResourceError, match=f"libGL.so.1: is not installed, and {module} needs it"):
+        remesh(*sphere(24), Request(quads=3000, engine=engine))
+
+
+def test_remesh_ends_with_exit_code_5(broken, gdtool_here, tmp_path):
+    broken("pymeshlab")
+    quad_cube(tmp_path / "cube.obj", 20)
+    done = gdtool_here("remesh", "cube.obj", "--faces", 1000, "--engine", "split", "-o", "out")
+    assert done.returncode == 5 and "apt install libgl1" in done.stderr, done.stderr
+    assert not (tmp_path / "out").exists()
