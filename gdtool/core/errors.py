@@ -94,7 +94,8 @@ _DEBIAN_PACKAGES = {
 }
 _NO_LIBRARY = re.compile(r"([\w+.-]+\.so[.\d]*): cannot open shared object file")
 # What torch, OpenCV and C++ say when memory runs out; numpy and Python raise MemoryError.
-_NO_MEMORY = re.compile(r"out of memory|bad_alloc|can't allocate memory|not enough memory|insufficient memory|failed to allocate|unable to allocate", re.I)
+_NO_MEMORY = re.compile(r"out of memory|bad_alloc|can't allocate memory|not enough memory|insufficient memory|failed to allocate|unable to allocate"
+                        r"|failed to map segment|cannot allocate memory", re.I)
 _NO_THREAD = re.compile(r"can't start new thread|resource temporarily unavailable", re.I)
 _NO_DEVICE = re.compile(r"found no nvidia driver|not compiled with cuda|no cuda gpus are available|cuda (driver )?error|cudnn", re.I)
 _MOST_SHOWN = 200  # characters of another program's message
@@ -132,7 +133,7 @@ def from_exception(error: Exception, subject: object) -> GdtoolError:
     found: GdtoolError | None = None
     first = first_line(error)
     native = isinstance(error, RuntimeError) or type(error).__module__.partition(".")[0] in ("cv2", "torch", "scipy")
-    if isinstance(error, MemoryError) or native and _NO_MEMORY.search(str(error)):
+    if isinstance(error, MemoryError) or (native or isinstance(error, ImportError)) and _NO_MEMORY.search(str(error)):
         found = ResourceError(subject, "ran out of memory", "lower the resolution or free memory")
     elif isinstance(error, OSError):
         found = from_os_error(error, subject)

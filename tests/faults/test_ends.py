@@ -92,6 +92,7 @@ class OutOfMemoryError(RuntimeError):
     (no_array(), ResourceError, "ran out of memory"),
     (RuntimeError("[enforce fail at alloc_cpu.cpp:114] . DefaultCPUAllocator: can't allocate memory: you tried to allocate 1 bytes."), ResourceError,
      "ran out of memory"),
+    (ImportError("libtorch_cpu.so: failed to map segment from shared object"), ResourceError, "ran out of memory"),
     (RuntimeError("std::bad_alloc"), ResourceError, "ran out of memory"),
     (OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"), ResourceError, "ran out of memory"),
     (RuntimeError("can't start new thread"), ResourceError, "ulimit"),
