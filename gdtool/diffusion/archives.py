@@ -91,12 +91,16 @@ def views_of(archive: Path, workspace: Path) -> Iterator[Folder]:
         shutil.rmtree(root, ignore_errors=True)
 
 
+class _LongHeader(Exception):
+    """An extended header claims more than MAX_HEADER_BYTES; no error of tarfile's, which it would take for another format."""
+
+
 class _BoundedHeader(tarfile.TarInfo):
     """A header whose extended parts are not read when they claim to be large."""
 
     def _proc_member(self, tar: tarfile.TarFile):
         if self.type in _EXTENDED and self.size > MAX_HEADER_BYTES:
-            raise tarfile.ReadError(f"an extended header of {self.size} bytes")
+            raise _LongHeader(f"has an extended header of {self.size} bytes, more than {MAX_HEADER_BYTES}")
         return super()._proc_member(tar)
 
 
@@ -119,9 +123,13 @@ def _malformed(archive: Path) -> Iterator[None]:
     """What tarfile and the decompressors raise for bytes that are no tar becomes one InputError."""
     try:
         yield
+    except _LongHeader as error:
+        raise InputError(archive, str(error), _PACK) from None
     except (tarfile.TarError, EOFError, OSError, zlib.error, lzma.LZMAError, RecursionError, ValueError, OverflowError) as error:
-        fact = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(archive, f"is not a whole tar file ({fact[:80]})", _PACK) from None
+        fact = " ".join(str(error).split())[:80] or type(error).__name__
+        if "could not be opened successfully" in fact:  # tarfile goes on with each format's reason
+            fact = "it is in no format that tarfile knows"
+        raise InputError(archive, f"is not a whole tar file ({fact})", _PACK) from None
 
 
 def _members(archive: Path, tar: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
@@ -133,6 +141,8 @@ def _members(archive: Path, tar: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
         if member is None:
             return
         tar.members.clear()  # tarfile keeps each header otherwise
+        if member.issparse():
+            raise InputError(archive, f"holds the sparse file {shown(member.name)}", "pack it again without sparse files")
         count, size = count + 1, size + member.size + tarfile.BLOCKSIZE
         if count > MAX_MEMBERS:
             raise ResourceError(archive, f"holds more than {MAX_MEMBERS:,} members", "split it into several archives")
@@ -140,8 +150,6 @@ def _members(archive: Path, tar: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
             raise ResourceError(archive, f"would unpack to more than {size / 2**30:.1f} GiB, {size // packed} times its own size", "pack it uncompressed")
         if not member.isfile():
             continue
-        if member.issparse():
-            raise InputError(archive, f"holds the sparse file {shown(member.name)}", "pack it again without sparse files")
         relative_parts(member.name, archive, "member", byte_escapes=True)
         yield member
 
