@@ -10,6 +10,7 @@ Example:
 
 from __future__ import annotations
 
+import contextlib
 from typing import Annotated, Literal
 
 import msgspec
@@ -49,7 +50,15 @@ def check(inputs: Inputs, options: Options) -> None:
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
-    """Reconstruct one views folder."""
+    """Reconstruct one views folder. Raises ResourceError where it takes longer than --budget by far (stages/limits.py)."""
+    from gdtool.stages.limits import held_to
+
+    cure = f"raise --budget to {max(round(2 * options.budget), 1)}, or leave it out"
+    with held_to(options.budget, "--budget", inputs.name, cure) if options.budget else contextlib.nullcontext():
+        _run(inputs, options, out)
+
+
+def _run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.fields.align import agreement
     from gdtool.fields.appearance import appearance
     from gdtool.fields.fusion import BUMPY, SMALL, align_depth, finest_pixel, fuse_within, grid_step, is_closed_manifold, prepare_all, silhouettes_outvoted

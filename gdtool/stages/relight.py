@@ -60,6 +60,7 @@ def check(inputs: Inputs, options: Options) -> None:
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Light one asset or model."""
+    import contextlib
     import dataclasses
     import time
 
@@ -78,6 +79,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.shading.rigs import turntable
     from gdtool.shading.savings import savings
     from gdtool.shading.studio import studio
+    from gdtool.stages.limits import held_to
 
     torch.set_num_threads(1)  # shading runs in threads of its own
     with out.step("read"):
@@ -90,7 +92,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         environment, lobes, record = studio(options.env or "mid", options.seed, fit=options.light == "sg")
     cameras = turntable(options.views, options.size, options.elevation, options.fov)
     frames, clipped = [], []
-    with out.step("render"):
+    cure = "raise --budget, or lower --size or --views"
+    held = contextlib.nullcontext() if options.budget is None else held_to(options.budget, "--budget", inputs.name, cure)
+    with held, out.step("render"):
         renderer = Renderer(scene, out.threads)
         direct = color = None
         if options.light != "sg":

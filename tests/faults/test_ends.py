@@ -22,7 +22,7 @@ from gdtool.core.errors import GdtoolError, InputError, OutputError, ResourceErr
 from tests.conftest import ROOT
 from tests.core import toy
 from tests.faults import toy_runs
-from tests.faults.files import leftovers, lines_of
+from tests.faults.files import leftovers, lines_of, quad_cube
 
 GDTOOL = [sys.executable, "-m", "gdtool"]
 TOY = [sys.executable, "-m", "tests.core.toy"]
@@ -231,6 +231,48 @@ def test_signals_that_the_caller_ignores_stay_ignored(tmp_path, pictures):
     until(lambda: list(tmp_path.glob("a.asset/.renders.*.partial")), process)
     process.send_signal(signal.SIGHUP)
     assert process.communicate() == ("a.asset/renders\n", "") and process.returncode == 0
+
+
+# Time limits.
+
+
+def test_a_time_limit_ends_a_step_of_python_with_its_error():
+    late = ResourceError("mesh", "is not done after 0.1 s", "raise --seconds to 1")
+    before = time.monotonic()
+    with pytest.raises(ResourceError) as caught, ending.time_limit(0.1, late):
+        try:
+            while True:
+                time.sleep(0.01)
+        except Exception:  # a fallback
+            time.sleep(60)
+    assert caught.value is late and time.monotonic() - before < 2
+    with ending.time_limit(0.2, late):
+        pass
+    time.sleep(0.3)  # it does not ring any more
+
+
+def test_a_time_limit_ends_a_native_call_with_its_error(tmp_path, pictures):
+    process = start([*RUNS, "late", "a.png", "-q"])
+    out, told = process.communicate(timeout=20)
+    assert process.returncode == 5 and out == "" and told == "gdtool: a: is not done after 0.3 s; raise --seconds to 1\n"
+    assert leftovers(tmp_path) == [] and not (tmp_path / "a.asset").exists()
+
+
+def test_a_stage_with_seconds_ends_by_twice_of_them_and_5():
+    from gdtool.stages import limits
+
+    assert limits.OVER * 10 + limits.MORE - limits._UNWIND + ending.GRACE < 25
+    limits.require_time(20.0, 10.0, "--seconds", "mesh", "lower --faces")
+    with pytest.raises(ResourceError, match="mesh: needs about 220 s in the quickest way, and --seconds 10 allows less; raise --seconds to 220, or lower"):
+        limits.require_time(220.0, 10.0, "--seconds", "mesh", "lower --faces")
+
+
+def test_more_quads_than_the_time_allows_are_refused_at_once(gdtool_here, tmp_path):
+    quad_cube(tmp_path / "cube.obj", 4)
+    begin = time.monotonic()
+    done = gdtool_here("remesh", "cube.obj", "--faces", 2_000_000, "--seconds", 10, "-q")
+    assert done.returncode == 5 and "raise --seconds to 220" in done.stderr and len(lines_of(done.stderr)) == 1
+    assert time.monotonic() - begin < 10 and leftovers(tmp_path) == []
 
 
 # Standard streams, the environment, plugins.

@@ -5,6 +5,8 @@ import dataclasses
 import sys
 import time
 
+from gdtool.core import ending
+from gdtool.core.errors import ResourceError
 from tests.core import toy
 
 
@@ -22,6 +24,12 @@ def native(inputs, options, out):
     libc, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(64)  # all zeros: an open mutex
     for _ in range(2):
         libc.pthread_mutex_lock(mutex)  # the second waits for the first
+
+
+def late(inputs, options, out):
+    """native() under a time limit."""
+    with ending.time_limit(0.3, ResourceError(inputs.name, "is not done after 0.3 s", "raise --seconds to 1")):
+        native(inputs, options, out)
 
 
 def pooled(inputs, options, out):
