@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from gdtool.core.errors import InputError
-from gdtool.core.reading import bytes_of
+from gdtool.core.memory import require_memory
+from gdtool.core.reading import bytes_of, require_regular_file
 
+HELD_PER_BYTE = 11  # bytes that a byte of the file takes while it is read, with its arrays: measured on grids of 90,000 vertices
 _MOST = 2**31 - 1  # no file has as many vertices
 
 
@@ -36,12 +38,14 @@ class ObjLines:
 
 def read_lines(path: Path) -> ObjLines:
     """Read an OBJ. Raises InputError, with the line that is wrong, and OutputError."""
+    require_regular_file(path)
+    require_memory(path.stat().st_size * HELD_PER_BYTE, path, "its content", "simplify it or split it into several files")
     data = bytes_of(path)
     lines = _at_once(data)
     if lines is None:
         lines = _one_by_one(data.decode("utf-8", "replace"), path)
     if not len(lines.sizes):
-        raise InputError(path, "has no faces")
+        raise InputError(path, "has no faces", "export the model with its faces")
     return lines
 
 
@@ -97,7 +101,7 @@ def _one_by_one(text: str, path: Path) -> ObjLines:
             else:
                 names.take(words, line)
         except (ValueError, IndexError, OverflowError) as error:
-            raise InputError(path, f"line {number} is not what OBJ says ({error})") from None
+            raise InputError(path, f"line {number} is not what OBJ says ({str(error)[:120]})", "correct that line or export it again") from None
     return ObjLines(np.array(vertices, np.float64).reshape(-1, 3), np.array(colors, np.float64).reshape(-1, 3), np.array(uvs, np.float64).reshape(-1, 2),
                     np.array(normals, np.float64).reshape(-1, 3), np.array(corners, np.int64).reshape(-1, 3), np.array(sizes, np.int64),
                     np.array(groups, np.int64), tuple(names.places), tuple(names.libraries))

@@ -29,9 +29,9 @@ def read_obj(path: str | Path) -> Scene:
     notes: list[str] = []
     for column, array, what in ((0, vertices, "vertex"), (1, uvs, "texture coordinate"), (2, normals, "normal")):
         if corners[:, column].max() >= len(array):
-            raise InputError(path, f"a face refers to {what} {int(corners[:, column].max()) + 1}, but there are {len(array)}")
+            raise InputError(path, f"a face refers to {what} {int(corners[:, column].max()) + 1}, but there are {len(array)}", "export it again with all its elements")
         if not np.isfinite(array).all():
-            raise InputError(path, f"{what} {int(np.argwhere(~np.isfinite(array))[0][0]) + 1} is not finite")
+            raise InputError(path, f"{what} {int(np.argwhere(~np.isfinite(array))[0][0]) + 1} is not finite", "replace it by finite numbers")
     has_normals = (corners[:, 2] >= 0).all()
     if not has_normals:
         if (corners[:, 2] >= 0).any():
@@ -52,7 +52,7 @@ def read_obj(path: str | Path) -> Scene:
         from gdtool.images.color import linear_from_srgb
 
         if not np.isfinite(colors).all():
-            raise InputError(path, "a vertex color is not finite")
+            raise InputError(path, "a vertex color is not finite", "export it without vertex colors")
         encoded = np.clip(colors / 255 if colors.max() > 1 else colors, 0, 1)
         vertex_colors = np.concatenate([linear_from_srgb(encoded), np.ones((len(encoded), 1))], 1)[unique[:, 0]]
     elif len(colors):

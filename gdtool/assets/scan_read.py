@@ -41,13 +41,13 @@ def read_scan(path: str | Path) -> Scene:
     scan = (_plain_stl if kind == "stl" else _plain_ply)(data) or _by_trimesh(data, kind, path)
     vertices, faces = scan.vertices, scan.faces
     if not len(faces):
-        raise InputError(path, "has no faces")
+        raise InputError(path, "has no faces", "export the model with its faces")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(path, f"a face refers to a vertex out of range (there are {len(vertices)})")
+        raise InputError(path, f"a face refers to a vertex out of range (there are {len(vertices)})", "export it again with all its vertices")
     notes = ["has no material: a dielectric of roughness 0.5", *scan.notes]
     if kind == "stl":
         if not np.isfinite(vertices).all():
-            raise InputError(path, "has a vertex that is not finite")
+            raise InputError(path, "has a vertex that is not finite", "remove that vertex or move it to a finite place")
         vertices, _, place = unique_rows(vertices)
         return Scene(vertices.astype(np.float64), place.astype(np.int32)[faces], name=path.stem, notes=tuple(notes))
     material, colors, normals = DEFAULT_MATERIAL, None, None
@@ -100,9 +100,9 @@ def _by_trimesh(data: bytes, kind: str, path: Path) -> _Scan:
     try:
         mesh = trimesh.load(io.BytesIO(data), file_type=kind, process=False, force="mesh")
     except Exception as error:  # the parsers raise whatever the malformed bytes lead to
-        raise InputError(path, f"is not a {kind.upper()} file that can be read ({type(error).__name__}: {str(error)[:60]})") from None
+        raise InputError(path, f"is not a {kind.upper()} file that can be read ({type(error).__name__}: {str(error)[:60]!r})", f"export it again as binary {kind.upper()}") from None
     if not hasattr(mesh, "faces"):
-        raise InputError(path, "has no faces")
+        raise InputError(path, "has no faces", "export the model with its faces")
     vertices, faces = np.asarray(mesh.vertices, np.float64).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3)
     stored = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
     names = getattr(getattr(stored, "dtype", None), "names", None) or (stored if isinstance(stored, dict) else ())

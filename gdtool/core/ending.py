@@ -25,6 +25,7 @@ SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name
 _CPU_RESERVE = 2
 
 received: int | None = None  # the first signal that asked for the end
+_deaf = False
 _clean_ups: list[Callable[[], None]] = []
 
 
@@ -41,11 +42,11 @@ def listen() -> Callable[[], None]:
 
     Returns what undoes it. Where it is done already, it does nothing, and so does what it returns.
     """
-    global received
+    global received, _deaf
     before = {number: signal.getsignal(number) for number in SIGNALS}
     if _stop in before.values():
         return lambda: None
-    received = None
+    received, _deaf = None, False
     _leave_time_to_clean_up()
     heard, tell = os.pipe()
     os.set_blocking(tell, False)
@@ -56,8 +57,8 @@ def listen() -> Callable[[], None]:
             signal.signal(number, _stop)
 
     def undo() -> None:
-        global received
-        received = None
+        global received, _deaf
+        received, _deaf = None, False
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
         signal.set_wakeup_fd(wakeup)
@@ -68,8 +69,8 @@ def listen() -> Callable[[], None]:
 
 def ignore() -> None:
     """Raise nothing from now on, where the process is about to end; the thread still ends it when that takes too long."""
-    global received
-    received = received or 0
+    global _deaf
+    _deaf = True
 
 
 @contextmanager
@@ -88,7 +89,7 @@ def certainly(clean_up: Callable[[], None]) -> Iterator[None]:
 
 def _stop(number: int, _frame: object) -> None:
     global received
-    if received is not None:  # a second Ctrl-C does not cut the clean-up short
+    if received is not None or _deaf:  # a second Ctrl-C does not cut the clean-up short
         return
     received = number
     raise Stopped(number)

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import functools
-import json
 import os
 import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from urllib.parse import unquote
 
 from gdtool.core.errors import InputError, ResourceError, UsageError
 from gdtool.core.folder import Folder, is_folder, open_folder
 from gdtool.core.manifest import digest_of, file_sha256
 from gdtool.core.names import name_from_path, shown, text_fault
 from gdtool.core.reading import MAX_INTEGER_DIGITS, parse_json, require_regular_file
+from gdtool.core.references import referred_files
 
 PROCEDURAL = re.compile(r"procedural:([0-9]+)(?:\.\.([0-9]+))?")
 
@@ -96,10 +95,6 @@ def _checked(text: str) -> str:
     return text
 
 
-# Where an .obj's texture is looked for: beside its library, or as in Google Scanned Objects' layout, which is the last.
-TEXTURE_PLACES = ("", "textures", "../textures", "../materials/textures")
-
-
 def resolve(text: str, kinds: tuple[str, ...], reader: str, allow_missing: bool = False) -> Source:
     """Open what a source names. Raises InputError when it is missing or of the wrong kind."""
     if text.startswith("procedural:"):
@@ -168,34 +163,7 @@ def digest(source: Source) -> str:
     if source.is_dir():
         files = sorted(path for path in source.rglob("*") if path.is_file())
         return digest_of([[path.relative_to(source).as_posix(), file_sha256(path)] for path in files])
-    return digest_of([file_sha256(path) for path in (source, *_sidecars(source)) if path.is_file()])
-
-
-def _sidecars(path: Path) -> list[Path]:
-    """Files that a .gltf or .obj refers to."""
-    suffix = path.suffix.lower()
-    try:
-        if suffix == ".gltf":
-            document = json.loads(path.read_bytes())
-            uris = [item.get("uri") for key in ("buffers", "images") for item in document.get(key, [])]
-            return [path.parent / unquote(uri) for uri in uris if isinstance(uri, str) and not uri.startswith("data:")]
-        if suffix == ".obj":
-            out = []
-            with open(path, encoding="utf-8", errors="replace") as file:
-                for line in file:
-                    if line.startswith("mtllib "):
-                        out.append(path.parent / line[7:].strip())
-            for library in list(out):
-                if library.is_file():
-                    for line in library.read_text(errors="replace").splitlines():
-                        words = line.split()
-                        if len(words) > 1 and words[0].lower().startswith(("map_", "bump", "norm")):
-                            names = {words[-1], line.split(maxsplit=1)[1].strip()}  # a name may hold spaces or follow options
-                            out += [library.parent / place / name for place in TEXTURE_PLACES for name in sorted(names)]
-            return out
-    except (OSError, ValueError, AttributeError):
-        return []  # the reader will say what is wrong with it
-    return []
+    return digest_of([file_sha256(path) for path in (source, *referred_files(source)) if path.is_file()])
 
 
 def relative_to(path: Path | str, folder: Path) -> str:

@@ -10,6 +10,9 @@ import numpy as np
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
 from gdtool.core.stage import Output
+from gdtool.folders.records import file_of
+
+_UNWRAP = "run gdtool unwrap on the mesh again"
 
 
 @dataclass(frozen=True)
@@ -57,15 +60,15 @@ def read_obj(path: Path) -> QuadMesh:
     place = _cut(lines.sizes)
     quads, corners = (np.where(place >= 0, lines.corners[:, column].astype(np.int32)[place], -1) for column in (0, 1))
     if quads.max() >= len(points):
-        raise InputError(path, f"a face refers to a vertex out of range (there are {len(points)})")
+        raise InputError(path, f"a face refers to a vertex out of range (there are {len(points)})", "export the mesh again with all its vertices")
     if not np.isfinite(points).all():
-        raise InputError(path, f"vertex {int(np.argwhere(~np.isfinite(points))[0][0]) + 1} is not finite")
+        raise InputError(path, f"vertex {int(np.argwhere(~np.isfinite(points))[0][0]) + 1} is not finite", "remove that vertex or move it to a finite place")
     if (corners[quads >= 0] < 0).any():
         return QuadMesh(points, quads)
     if corners.max() >= len(coordinates):
-        raise InputError(path, f"a face refers to a texture coordinate out of range (there are {len(coordinates)})")
+        raise InputError(path, f"a face refers to a texture coordinate out of range (there are {len(coordinates)})", _UNWRAP)
     if not np.isfinite(coordinates).all():
-        raise InputError(path, "has a texture coordinate that is not finite")
+        raise InputError(path, "has a texture coordinate that is not finite", _UNWRAP)
     return QuadMesh(points, quads, coordinates, corners)
 
 
@@ -86,4 +89,4 @@ def write_mesh(out: Output, mesh: QuadMesh) -> None:
 
 def read_mesh(folder: Folder) -> QuadMesh:
     """The mesh of a mesh or atlas folder. Raises InputError."""
-    return read_obj(folder.file("mesh.obj"))
+    return read_obj(file_of(folder, "mesh.obj"))

@@ -12,8 +12,12 @@ from msgspec import Meta
 
 from gdtool.cameras import Camera
 from gdtool.core.errors import InputError
+from gdtool.core.folder import Folder
+from gdtool.core.manifest import MANIFEST
+from gdtool.core.names import checked_name, path_inside
 from gdtool.core.reading import read_json
 
+MAX_SIDE = 16384  # pixels of a view: no larger picture is read
 Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Meta(gt=0)]
 
@@ -23,8 +27,8 @@ class CameraRecord(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_.-]+$")]
     projection: Literal["orthographic", "perspective"]
-    width: Annotated[int, Meta(ge=1)]
-    height: Annotated[int, Meta(ge=1)]
+    width: Annotated[int, Meta(ge=1, le=MAX_SIDE)]
+    height: Annotated[int, Meta(ge=1, le=MAX_SIDE)]
     world_from_camera: Annotated[tuple[float, ...], Meta(min_length=16, max_length=16, description="rigid, row-major")]
     half_width: Annotated[float, Meta(ge=0, description="orthographic: the image covers ±half_width across")] = 0.0
     fx: Annotated[float, Meta(ge=0, description="perspective: focal length in pixels")] = 0.0
@@ -52,12 +56,17 @@ class Light(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     fit_error: Annotated[dict[str, float], Meta(description="errors of the fit, by name")] = {}
 
 
+def file_of(folder: Folder, relative: str) -> Path:
+    """Path of a file of a folder, which lies below it, links followed. Raises InputError."""
+    return path_inside(folder.path, relative, folder.path / MANIFEST, "file")
+
+
 def _convert(path: Path, kind: type) -> Any:
     try:
         return msgspec.convert(read_json(path), kind)
     except msgspec.ValidationError as error:
         fact = str(error)
-        raise InputError(path, fact[0].lower() + fact[1:]) from None
+        raise InputError(path, fact[0].lower() + fact[1:], f"write it as schemas/{path.stem}.schema.json says") from None
 
 
 def _write(path: Path, record: Any) -> None:
@@ -68,22 +77,23 @@ def read_cameras(path: Path) -> list[Camera]:
     """Read cameras.json. Raises InputError for poses that are not rigid, near ≥ far, or a repeated name."""
     out = []
     for record in _convert(path, Cameras).cameras:
+        checked_name(record.name, path, "camera")
         pose = np.array(record.world_from_camera, np.float64).reshape(4, 4)
         rotation = pose[:3, :3]
-        rigid = np.isfinite(pose).all() and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+        rigid = np.abs(rotation).max() < 2 and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
         if not (rigid and np.linalg.det(rotation) > 0 and np.allclose(pose[3], (0, 0, 0, 1))):
-            raise InputError(path, f"camera {record.name!r}: world_from_camera is not rigid (rotation and translation)")
+            raise InputError(path, f"camera {record.name!r}: world_from_camera is not rigid (rotation and translation)", "remove scale and shear from it")
         if record.near >= record.far:
-            raise InputError(path, f"camera {record.name!r}: near {record.near:g} is not below far {record.far:g}")
+            raise InputError(path, f"camera {record.name!r}: near {record.near:g} is not below far {record.far:g}", "write near < far")
         needed = ("half_width",) if record.projection == "orthographic" else ("fx", "fy")
         for key in needed:
             if getattr(record, key) <= 0:
-                raise InputError(path, f"camera {record.name!r}: {record.projection} needs {key} > 0")
+                raise InputError(path, f"camera {record.name!r}: {record.projection} needs {key} > 0", f"write {key}")
         fields = {f: getattr(record, f) for f in record.__struct_fields__}
         out.append(Camera(**{**fields, "world_from_camera": pose}))
     names = [camera.name for camera in out]
     if len(set(names)) < len(names):
-        raise InputError(path, "two cameras have one name")
+        raise InputError(path, "two cameras have one name", "give each camera a name of its own")
     return out
 
 
@@ -102,7 +112,7 @@ def read_record(path: Path) -> dict[str, Any]:
     """Read light.json as plain values: axes, sharpness and amplitudes become float64 arrays (k, 3), (k,), (k, 3)."""
     light = _convert(path, Light)
     if not len(light.axes) == len(light.sharpness) == len(light.amplitudes):
-        raise InputError(path, "axes, sharpness and amplitudes differ in number")
+        raise InputError(path, "axes, sharpness and amplitudes differ in number", "write one of each for every lobe")
     return {"kind": light.kind, "axes": np.array(light.axes, np.float64).reshape(-1, 3), "sharpness": np.array(light.sharpness, np.float64),
             "amplitudes": np.array(light.amplitudes, np.float64).reshape(-1, 3), "environment": light.environment, "fit_error": light.fit_error}
 

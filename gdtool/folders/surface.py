@@ -12,14 +12,16 @@ from gdtool.assets.ply import binary_ply, columns
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
 from gdtool.core.kinds import IDENTITY, SurfaceContent
+from gdtool.core.reading import bytes_of
 from gdtool.core.stage import Output
-from gdtool.folders.records import read_record, write_record
+from gdtool.folders.records import file_of, read_record, write_record
 
 # albedo is 8-bit sRGB under the names that viewers show.
 _VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"), ("red", "u1"),
                     ("green", "u1"), ("blue", "u1"), ("roughness", "<f4"), ("metallic", "<f4"), ("confidence", "<f4")])
 # What the confidence was made of, where it is known.
 _EVIDENCE = [("views", "u1"), ("residual", "<f4")]
+_AGAIN = "run gdtool reconstruct on the views again"
 _FACE = np.dtype([("count", "u1"), ("idx", "<i4", 3)])
 
 
@@ -91,21 +93,21 @@ def read_surface(folder: Folder) -> Surface:
     """
     from gdtool.images.color import linear_from_srgb
 
-    path = folder.file("surface.ply")
+    path = file_of(folder, "surface.ply")
     try:
-        vertex, faces = binary_ply(path.read_bytes())
+        vertex, faces = binary_ply(bytes_of(path))
     except ValueError as error:
-        raise InputError(path, str(error)) from None
+        raise InputError(path, str(error), "write it as schemas/surface.md says") from None
     names = vertex.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
-        raise InputError(path, "has no x, y, z")
+        raise InputError(path, "has no x, y, z", "write these properties for each vertex")
     if not len(faces):
-        raise InputError(path, "has no faces")
+        raise InputError(path, "has no faces", _AGAIN)
     if faces.min() < 0 or faces.max() >= len(vertex):
-        raise InputError(path, f"a face refers to vertex {int(faces.max())} of {len(vertex)}")
+        raise InputError(path, f"a face refers to vertex {int(faces.max())} of {len(vertex)}", _AGAIN)
     vertices = columns(vertex, "x y z")
     if not np.isfinite(vertices).all():
-        raise InputError(path, f"vertex {int(np.argwhere(~np.isfinite(vertices))[0][0])} is not finite")
+        raise InputError(path, f"vertex {int(np.argwhere(~np.isfinite(vertices))[0][0])} is not finite", _AGAIN)
 
     def column(name: str, default: float) -> np.ndarray:
         return np.clip(vertex[name], 0, 1).astype(np.float32) if name in names else np.full(len(vertex), default, np.float32)
@@ -115,6 +117,6 @@ def read_surface(folder: Folder) -> Surface:
     else:
         albedo = np.full((len(vertex), 3), 0.8, np.float32)
     normals = columns(vertex, "nx ny nz").astype(np.float32) if {"nx", "ny", "nz"} <= set(names) else None
-    light = read_record(folder.file("light.json")) if folder.content.light else None
+    light = read_record(file_of(folder, "light.json")) if folder.content.light else None
     return Surface(vertices, faces.astype(np.int32), albedo.astype(np.float32), column("roughness", 0.5), column("metallic", 0.0),
                    column("confidence", 0.0), normals, light, *(np.asarray(vertex[name]) if name in names else None for name, _ in _EVIDENCE))

@@ -11,10 +11,12 @@ from gdtool.cameras import Camera
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
 from gdtool.core.kinds import DOMAINS, IDENTITY, ViewsContent
+from gdtool.core.memory import require_memory
 from gdtool.core.stage import Output
-from gdtool.folders.records import read_cameras, read_record, write_cameras, write_record
+from gdtool.folders.records import file_of, read_cameras, read_record, write_cameras, write_record
 
 CHANNELS = {"color": 3, "normal": 3, "depth": 1, "albedo": 3, "roughness": 1, "metallic": 1, "closed_form": 3}
+_PASSING = 5  # copies of one domain's pictures while they are stacked, decoded and masked
 
 
 @dataclass(frozen=True)
@@ -41,31 +43,36 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
     from gdtool.images.color import decode_normal, linear_from_srgb
     from gdtool.images.io import read_image
 
-    cameras = read_cameras(folder.file("cameras.json"))
+    cameras = read_cameras(file_of(folder, "cameras.json"))
     content: ViewsContent = folder.content
     if tuple(camera.name for camera in cameras) != tuple(content.views):
-        raise InputError(folder.file("cameras.json"), "does not hold the views that the manifest lists, in that order")
+        raise InputError(folder.file("cameras.json"), "does not hold the views that the manifest lists, in that order",
+                         "list the same views in both")
     wanted = [d for d in content.domains if domains is None or d in domains]
 
     def load(domain: str, view: str, camera: Camera) -> np.ndarray:
-        path = folder.file(f"{domain}/{view}.{'exr' if domain == 'depth' else 'png'}")
+        path = file_of(folder, f"{domain}/{view}.{'exr' if domain == 'depth' else 'png'}")
         image = read_image(path)
         if image.shape[:2] != (camera.height, camera.width):
-            raise InputError(path, f"is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}")
+            raise InputError(path, f"is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}",
+                             "scale the picture, or write its size into cameras.json")
         channels = CHANNELS.get(domain, 1)
         image = image.reshape(camera.height, camera.width, -1)
         if image.shape[2] < channels:
-            raise InputError(path, f"has {image.shape[2]} channels, {domain} has {channels}")
+            raise InputError(path, f"has {image.shape[2]} channels, {domain} has {channels}", f"save it with {channels} channels")
         image = image[..., :channels]
         if image.dtype.kind == "u":
             image = image.astype(np.float32) / np.iinfo(image.dtype).max
         elif not np.isfinite(image).all():
             row, column = np.argwhere(~np.isfinite(image))[0][:2]
-            raise InputError(path, f"is not finite at row {row}, column {column}")
+            raise InputError(path, f"is not finite at row {row}, column {column}", "give that pixel a finite value")
         return image if channels == 3 else image[..., 0]
 
     if len({(camera.height, camera.width) for camera in cameras}) > 1:
-        raise InputError(folder.file("cameras.json"), "has cameras of different sizes")
+        raise InputError(folder.file("cameras.json"), "has cameras of different sizes", "render all views at one size")
+    channels = sum(CHANNELS.get(domain, 1) for domain in wanted)
+    size = len(cameras) * cameras[0].height * cameras[0].width * (channels + 1 + _PASSING * max((CHANNELS.get(domain, 1) for domain in wanted), default=1)) * 4
+    require_memory(size, folder.path, f"{len(cameras)} views of {cameras[0].width}x{cameras[0].height} pixels", "render fewer or smaller views")
     mask = np.stack([load("mask", c.name, c) for c in cameras]).astype(np.float32)
     images = {}
     for domain in wanted:
@@ -76,7 +83,7 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
             stack = linear_from_srgb(stack).astype(np.float32)
         inside = mask > 0
         images[domain] = np.where(inside[..., None] if stack.ndim == 4 else inside, stack, 0).astype(np.float32)
-    light = read_record(folder.file("light.json")) if content.light else None
+    light = read_record(file_of(folder, "light.json")) if content.light else None
     return Views(cameras, images, mask, light)
 
 
@@ -93,12 +100,14 @@ def read_picture(folder: Folder, cameras: list[Camera]) -> tuple[np.ndarray, Cam
         return None
     camera = next((camera for camera in cameras if camera.name == content.picture), None)
     if camera is None:
-        raise InputError(folder.path, f"the manifest says that picture.png shows the view {content.picture!r}, which it does not hold")
-    path = folder.file("picture.png")
+        raise InputError(folder.path, f"the manifest says that picture.png shows the view {content.picture!r}, which it does not hold",
+                         "name one of its views, or none")
+    path = file_of(folder, "picture.png")
     image = unit_range(read_image(path))
     h, w = image.shape[:2]
     if image.ndim != 3 or image.shape[2] != 4 or h % camera.height or w % camera.width or h // camera.height != w // camera.width:
-        raise InputError(path, f"is {w}x{h}, not RGBA of a multiple of its view's {camera.width}x{camera.height}")
+        raise InputError(path, f"is {w}x{h}, not RGBA of a multiple of its view's {camera.width}x{camera.height}",
+                         "scale it to a whole multiple of the view")
     return np.concatenate([linear_from_srgb(image[..., :3]), image[..., 3:]], -1).astype(np.float32), camera
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from pathlib import Path
@@ -10,17 +11,24 @@ from typing import BinaryIO
 from gdtool.core.errors import InputError, ResourceError
 
 MAX_SIDE = 16384  # pixels
+MAX_FILE_BYTES = 2 << 30  # of an image file: twice what the largest picture takes as stored
+_BLOCK = 1 << 20  # bytes of a PNG's chunk at a time
+
+COPY = "copy or download it again"
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def check_container(path: Path, head: bytes, file: BinaryIO) -> None:
-    """Raise InputError for an empty, cut or animated file, ResourceError for a huge PNG; head is its first 64 bytes, file is open for reading.
+    """Raise InputError for an empty, cut or animated file, ResourceError for a huge PNG or a file beyond MAX_FILE_BYTES; head is its first 64 bytes, file is open for reading.
 
     Decoders print to stderr or fill with grey where a file ends early, so this looks first.
     """
     if not head:
-        raise InputError(path, "is empty")
+        raise InputError(path, "is empty", COPY)
+    size = os.fstat(file.fileno()).st_size
+    if size > MAX_FILE_BYTES:
+        raise ResourceError(path, f"is a file of {size / 2**30:.1f} GiB, more than {MAX_FILE_BYTES >> 30} for a picture", "scale it down")
     if head.startswith(PNG):
         _check_png(path, file)
     elif head.startswith(b"\xff\xd8\xff"):
@@ -45,16 +53,19 @@ def _check_png(path: Path, file: BinaryIO) -> None:
     while True:
         header = file.read(8)
         if len(header) < 8:
-            raise InputError(path, "is cut short (no end of the PNG)")
+            raise InputError(path, "is cut short (no end of the PNG)", COPY)
         length, kind = struct.unpack(">I4s", header)
         if length >= 1 << 31:
-            raise InputError(path, "is damaged (a PNG chunk of impossible length)")
-        body = file.read(length)
+            raise InputError(path, "is damaged (a PNG chunk of impossible length)", COPY)
+        body = file.read(min(length, _BLOCK))
+        checksum, left = zlib.crc32(body, zlib.crc32(kind)), length - len(body)
+        while left and (block := file.read(min(left, _BLOCK))):
+            checksum, left = zlib.crc32(block, checksum), left - len(block)
         crc = file.read(4)
-        if len(body) < length or len(crc) < 4:
-            raise InputError(path, "is cut short (no end of the PNG)")
-        if zlib.crc32(body, zlib.crc32(kind)) != struct.unpack(">I", crc)[0]:
-            raise InputError(path, f"is damaged (bad checksum in the PNG's {kind.decode() if kind.isalpha() and kind.isascii() else 'chunks'})")
+        if left or len(crc) < 4:
+            raise InputError(path, "is cut short (no end of the PNG)", COPY)
+        if checksum != struct.unpack(">I", crc)[0]:
+            raise InputError(path, f"is damaged (bad checksum in the PNG's {kind.decode() if kind.isalpha() and kind.isascii() else 'chunks'})", COPY)
         if kind == b"IHDR" and length >= 8 and max(struct.unpack_from(">II", body)) > MAX_SIDE:
             raise ResourceError(path, "is {}x{} pixels, more than {} a side".format(*struct.unpack_from(">II", body), MAX_SIDE), "scale it down")
         if kind == b"acTL" and length >= 4 and struct.unpack(">I", body[:4])[0] > 1:
@@ -78,6 +89,6 @@ def _check_jpeg(path: Path, file: BinaryIO) -> None:
         at += 2 + struct.unpack_from(">H", content, at + 2)[0]
         if marker == 0xDA:
             if content.find(b"\xff\xd9", at) < 0:
-                raise InputError(path, "is cut short (no end of the JPEG)")
+                raise InputError(path, "is cut short (no end of the JPEG)", COPY)
             return
-    raise InputError(path, "is damaged or cut short (the JPEG has no picture)")
+    raise InputError(path, "is damaged or cut short (the JPEG has no picture)", COPY)

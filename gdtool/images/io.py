@@ -15,10 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from gdtool.core.errors import InputError, OutputError, ResourceError, from_os_error
+from gdtool.core.memory import require_memory
+from gdtool.core.reading import require_regular_file
 from gdtool.core.threads import mapped
-from gdtool.images.containers import MAX_SIDE, check_container, suffix_of
+from gdtool.images.containers import COPY, MAX_SIDE, check_container, suffix_of
 
-MAX_BYTES = 1 << 30  # of decoded pixels
+MAX_BYTES = 1 << 30  # of the pixels as stored, all channels of the file: OpenImageIO's own limit is set to it
+MAX_HELD = 4 << 30  # bytes while one picture is read: the pixels as stored, as decoded, and one copy where they are turned or put in order
+_ROWS = 256  # rows at a time where pixels are checked and changed in place
 
 _TYPES = {"uint8": ("uint8", np.uint8), "uint16": ("uint16", np.uint16), "half": ("float", np.float32),
           "float": ("float", np.float32), "double": ("float", np.float32)}
@@ -29,25 +33,22 @@ def read_image(path: str | Path) -> np.ndarray:
 
     1 channel is grey, 2 grey and alpha, 3 RGB, 4 RGBA; alpha is straight (EXR's premultiplied colours are divided).
     Palettes are expanded, EXIF rotation is applied. Raises InputError for what is not one whole still image in grey or
-    RGB, or holds values that are not finite; ResourceError beyond 16384 pixels a side or 1 GiB; OutputError when the
-    file cannot be read.
+    RGB, is no regular file, or holds values that are not finite; ResourceError beyond 16384 pixels a side, 1 GiB as stored, or
+    MAX_HELD or half of the memory while it is read; OutputError when the file cannot be read.
     """
     path = Path(path)
+    require_regular_file(path)
     try:
         with open(path, "rb") as file:
             head = file.read(64)
             check_container(path, head, file)
-    except IsADirectoryError:
-        raise InputError(path, "is a folder, not an image") from None
-    except FileNotFoundError:
-        raise InputError(path, "does not exist") from None
     except OSError as error:
         raise from_os_error(error, path) from None
     with _plain_name(path) as name, _quiet() if suffix_of(head) == ".exr" else contextlib.nullcontext():
         try:
             return _read(path, name)
         except UnicodeDecodeError:  # OpenImageIO's binding hands names and messages out of the file over as text
-            raise InputError(path, "is damaged (its header is not text where it should be)") from None
+            raise InputError(path, "is damaged (its header is not text where it should be)", COPY) from None
 
 
 def decode_image(content: bytes, subject: str) -> np.ndarray:
@@ -73,32 +74,35 @@ def _read(path: Path, name: str) -> np.ndarray:
         fact = oiio.geterror().replace(name, "").strip().split("\n")[0]
         if "exceeds" in fact or "limit" in fact:
             raise ResourceError(path, f"is larger than gdtool reads ({MAX_SIDE} pixels a side, {MAX_BYTES >> 30} GiB)", "scale it down")
-        raise InputError(path, f"is not an image that can be read ({_lower(fact) or 'unknown format'})")
+        raise InputError(path, f"is not an image that can be read ({_lower(fact) or 'unknown format'})", "save it as PNG, JPEG or EXR")
     try:
         spec = source.spec()
         _check_spec(path, spec)
         if str(spec.format) not in _TYPES:
             raise InputError(path, f"stores {spec.format} pixels", "save it in 8 or 16 bits or as float")
         kind, dtype = _TYPES[str(spec.format)]
-        pixels = source.read_image(kind)
+        channels, orientation = _channels(path, list(spec.channelnames)), spec.get_int_attribute("Orientation", 1)
+        first, last = min(channels), max(channels) + 1
+        _check_held(path, spec, last - first, np.dtype(dtype).itemsize, orientation != 1 or channels != list(range(first, last)))
+        pixels = source.read_image(kind) if last - first == spec.nchannels else source.read_image(0, 0, first, last, kind)
         # A truncated file can come back as zeros with success: only the error flag tells.
         if pixels is None or source.has_error:
             fact = source.geterror().replace(name, "").strip().split("\n")[0]
-            raise InputError(path, f"is damaged or cut short ({_lower(fact) or 'the pixels cannot be read'})")
+            raise InputError(path, f"is damaged or cut short ({_lower(fact) or 'the pixels cannot be read'})", COPY)
         file_format = source.format_name()
         if source.seek_subimage(1, 0):
             raise InputError(path, "holds several images or an animation", "save the one that is meant as a still")
         source.geterror()
     finally:
         source.close()
-    pixels = np.asarray(pixels, dtype).reshape(spec.height, spec.width, spec.nchannels)
-    pixels = _ordered_channels(path, pixels, list(spec.channelnames))
+    pixels = np.asarray(pixels, dtype).reshape(spec.height, spec.width, last - first)
+    if channels != list(range(first, last)):
+        pixels = pixels[..., [channel - first for channel in channels]]
     if dtype == np.float32:
         _check_finite(path, pixels)
         if file_format == "openexr" and pixels.shape[2] in (2, 4):
-            alpha = pixels[..., -1:]
-            pixels[..., :-1] = np.where(alpha > 0, pixels[..., :-1] / np.where(alpha > 0, alpha, 1), pixels[..., :-1])
-    return np.ascontiguousarray(_upright(pixels, spec.get_int_attribute("Orientation", 1)))
+            _divide_by_alpha(pixels)
+    return np.ascontiguousarray(_upright(pixels, orientation))
 
 
 def _lower(text: str) -> str:
@@ -107,8 +111,8 @@ def _lower(text: str) -> str:
 
 def _check_spec(path: Path, spec) -> None:
     if spec.width > MAX_SIDE or spec.height > MAX_SIDE or spec.image_bytes() > MAX_BYTES:
-        raise ResourceError(path, f"is {spec.width}x{spec.height} pixels, more than {MAX_SIDE} a side or {MAX_BYTES >> 30} GiB",
-                            "scale it down")
+        raise ResourceError(path, f"is {spec.width}x{spec.height} pixels in {spec.nchannels} channels ({spec.image_bytes() / 2**30:.1f} GiB), more than "
+                            f"{MAX_SIDE} a side or {MAX_BYTES >> 30} GiB", "scale it down")
     if spec.depth > 1 or spec.deep:
         raise InputError(path, "is a volume or a deep image", "flatten it")
     spaces = {spec.get_string_attribute(key).lower() for key in ("jpeg:ColorSpace", "tiff:ColorSpace", "psd:ColorMode", "oiio:ColorSpace")}
@@ -118,23 +122,40 @@ def _check_spec(path: Path, spec) -> None:
         raise InputError(path, "is an animation", "save one frame as a still")
 
 
-def _ordered_channels(path: Path, pixels: np.ndarray, names: list[str]) -> np.ndarray:
-    """The channels that make grey, grey and alpha, RGB or RGBA, out of whatever a multi-channel file holds besides."""
+def _check_held(path: Path, spec, channels: int, itemsize: int, copied: bool) -> None:
+    """Raise ResourceError when reading so many channels, of itemsize bytes as decoded, takes more than MAX_HELD or half of the memory."""
+    pixels = spec.width * spec.height * channels
+    size = pixels * spec.format.size() + pixels * itemsize * (2 if copied else 1)
+    require_memory(size, path, f"reading {spec.width}x{spec.height} pixels in {channels} channels", "scale it down", MAX_HELD)
+
+
+def _channels(path: Path, names: list[str]) -> list[int]:
+    """Which channels make grey, grey and alpha, RGB or RGBA, in that order, of whatever a multi-channel file holds besides."""
     if {"R", "G", "B"} <= set(names):
         wanted = ["R", "G", "B", *(["A"] if "A" in names else [])]
-        return pixels[..., [names.index(name) for name in wanted]]
-    if pixels.shape[2] <= 4:
-        return pixels
+        return [names.index(name) for name in wanted]
+    if 1 <= len(names) <= 4:
+        return list(range(len(names)))
     if "Y" in names:
-        return pixels[..., [names.index("Y")]]
+        return [names.index("Y")]
     raise InputError(path, f"has the channels {', '.join(names[:8])}", "save grey or RGB with or without alpha")
 
 
 def _check_finite(path: Path, pixels: np.ndarray) -> None:
-    bad = ~np.isfinite(pixels)
-    if bad.any():
-        row, column, channel = np.argwhere(bad)[0]
-        raise InputError(path, f"is not finite at row {row}, column {column} ({pixels[row, column, channel]})")
+    for start in range(0, len(pixels), _ROWS):
+        bad = ~np.isfinite(pixels[start:start + _ROWS])
+        if bad.any():
+            row, column, channel = np.argwhere(bad)[0]
+            value = pixels[start + row, column, channel]
+            raise InputError(path, f"is not finite at row {start + row}, column {column} ({value})", "give that pixel a finite value")
+
+
+def _divide_by_alpha(pixels: np.ndarray) -> None:
+    """Turn premultiplied colors (h, w, 2 or 4) into straight ones where alpha is above 0, in place."""
+    for start in range(0, len(pixels), _ROWS):
+        rows = pixels[start:start + _ROWS]
+        alpha = rows[..., -1:]
+        rows[..., :-1] = np.where(alpha > 0, rows[..., :-1] / np.where(alpha > 0, alpha, 1), rows[..., :-1])
 
 
 def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
@@ -237,13 +258,13 @@ def _again(path: Path) -> np.ndarray:
     with _plain_name(path) as name:
         source = oiio.ImageInput.open(name)
         if source is None:
-            raise InputError(path, "cannot be read again")
+            raise InputError(path, "cannot be read again", COPY)
         spec = source.spec()
         pixels = source.read_image("float")
         failed = source.has_error
         source.close()
     if pixels is None or failed:
-        raise InputError(path, "cannot be read again")
+        raise InputError(path, "cannot be read again", COPY)
     return np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)
 
 

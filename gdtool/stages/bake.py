@@ -47,12 +47,12 @@ def check(inputs: Inputs, options: Options) -> None:
     """Raise what --model, --usd and a missing surface would stop the run with."""
     from gdtool.stages import early
 
+    if options.usd != "none":
+        early.require_package("pxr.Usd", "--usd", "pip install 'gdtool[usd]', or leave out --usd")
     if options.model is not None:
         early.require_model("--model", options.model)
     elif inputs.second["surface"] is None:
         _named_model(inputs, options)
-    if options.usd != "none":
-        early.require_package("pxr.Usd", "--usd", "pip install 'gdtool[usd]', or leave out --usd")
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:

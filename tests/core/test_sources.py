@@ -2,7 +2,8 @@
 
 import pytest
 
-from gdtool.core.sources import TEXTURE_PLACES, digest
+from gdtool.core.references import TEXTURE_PLACES
+from gdtool.core.sources import digest
 
 
 @pytest.mark.parametrize("place", TEXTURE_PLACES)

@@ -40,7 +40,7 @@ def adapter(folder: Path, name: str = "auto") -> ModuleType:
         if module.recognises(folder):
             return module
     wanted = "a Wonder3D output, a transforms.json or a cameras.json with pictures" if name == "auto" else import_module(f"{__name__}.{name}").LOOKS_LIKE
-    raise InputError(folder, f"does not hold {wanted}", "see gdtool import-views --help")
+    raise InputError(folder, f"does not hold {wanted}", "name a folder that does")
 
 
 def linear_color(image: np.ndarray) -> np.ndarray:
@@ -55,5 +55,5 @@ def stacked(parts: list[np.ndarray], paths: list[Path]) -> np.ndarray:
     """Images of one size as one array. Raises InputError naming the first of another size."""
     for part, path in zip(parts, paths, strict=True):
         if part.shape != parts[0].shape:
-            raise InputError(path, f"is {part.shape[1]}x{part.shape[0]}, {paths[0].name} {parts[0].shape[1]}x{parts[0].shape[0]}", "views have one size")
+            raise InputError(path, f"is {part.shape[1]}x{part.shape[0]}, {paths[0].name} {parts[0].shape[1]}x{parts[0].shape[0]}", "scale all views to one size")
     return np.stack(parts)

@@ -12,6 +12,9 @@ import numpy as np
 
 from gdtool.core.errors import InputError
 from gdtool.core.kinds import DOMAINS
+from gdtool.core.memory import require_memory
+from gdtool.core.names import path_inside
+from gdtool.core.references import is_readable
 from gdtool.folders.adapters import Pictures, linear_color, stacked
 from gdtool.folders.records import read_cameras
 
@@ -35,7 +38,13 @@ def read(folder: Path) -> Pictures:
         paths = [_find(folder, domain, camera.name) for camera in cameras]
         if not all(paths):
             continue
-        stored = [read_image(path).reshape(*_size(path, camera, read_image(path)), -1) for path, camera in zip(paths, cameras, strict=True)]
+        stored = []
+        for path, camera in zip(paths, cameras, strict=True):
+            image = read_image(path)
+            stored.append(image.reshape(*_size(path, camera, image), -1))
+            passing = sum(x.nbytes for x in stored) * 4 // stored[0].itemsize * 2  # as float32, each alone and stacked
+            held = sum(x.nbytes for x in images.values()) + passing
+            require_memory(held, folder, f"pictures up to {domain}/{camera.name}", "scale the pictures down or list fewer cameras")
         first = first or domain
         if domain == "color":
             masks = stored
@@ -49,12 +58,13 @@ def read(folder: Path) -> Pictures:
         else:
             images[domain] = stacked([unit_range(image[..., 0]).astype(np.float32) for image in stored], paths)
     if not images:
-        raise InputError(folder, "has no domain with a picture of every view in cameras.json", f"for example color/{cameras[0].name}.png")
+        raise InputError(folder, "has no domain with a picture of every view in cameras.json", f"add pictures, for example color/{cameras[0].name}.png")
     mask = []
     for k, camera in enumerate(cameras):
         given = _find(folder, "mask", camera.name)
         if given is None and masks is None:
-            raise InputError(folder / "mask", f"has no picture of {camera.name}, and there is no color to tell the subject by")
+            raise InputError(folder / "mask", f"has no picture of {camera.name}, and there is no color to tell the subject by",
+                             f"add mask/{camera.name}.png")
         if given is None:
             mask.append(foreground(masks[k], subject=_find(folder, "color", camera.name)))
         else:
@@ -65,11 +75,17 @@ def read(folder: Path) -> Pictures:
 
 
 def _find(folder: Path, domain: str, view: str) -> Path | None:
-    places = [folder / domain / view] + ([folder / view] if domain == "color" else [])
-    return next((place.with_name(place.name + suffix) for place in places for suffix in _SUFFIXES if place.with_name(place.name + suffix).is_file()), None)
+    places = [f"{domain}/"] + ([""] if domain == "color" else [])
+    for place in places:
+        for suffix in _SUFFIXES:
+            path = path_inside(folder, f"{place}{view}{suffix}", folder / "cameras.json", "picture")
+            if is_readable(path):
+                return path
+    return None
 
 
 def _size(path: Path, camera, image: np.ndarray) -> tuple[int, int]:
     if image.shape[:2] != (camera.height, camera.width):
-        raise InputError(path, f"is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}")
+        raise InputError(path, f"is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}",
+                         "scale the picture, or write its size into cameras.json")
     return image.shape[:2]

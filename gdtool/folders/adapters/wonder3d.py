@@ -39,7 +39,7 @@ def read(folder: Path) -> Pictures:
     if all(colors):
         images["color"] = stacked([linear_color(read_image(path)) for path in colors], colors)
         if images["color"].shape[:3] != mask.shape:
-            raise InputError(colors[0], "has another size than its normals")
+            raise InputError(colors[0], "has another size than its normals", "scale colors and normals to one size")
     if mask.shape[1] != mask.shape[2]:
-        raise InputError(paths[0], "is not square, as Wonder3D's views are")
+        raise InputError(paths[0], "is not square, as Wonder3D's views are", "crop the views to squares")
     return Pictures(rig("wonder3d", mask.shape[1]), images, mask)
