@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 
 # Subcommand: what --help says of it. The module is the name with underscores.
 COMMANDS = {
@@ -21,8 +22,14 @@ COMMANDS = {
 }
 
 
-def main() -> None:
-    """Run the command line and exit with one of its documented codes."""
+def _cli() -> object:
+    from ._group import cli
+
+    return cli
+
+
+def main(load: Callable[[], object] = _cli) -> None:
+    """Run the click command that load() gives, which may import what it likes, and exit with one of the documented codes."""
     _open_streams()
     # Files that a umask would close to their own user could not be finished, nor removed.
     os.umask(os.umask(0o077) & 0o077)
@@ -33,7 +40,8 @@ def main() -> None:
     ending.listen()  # before click and all else: Ctrl-C is quiet from the start
     try:
         from ._common import guarded
-        from ._group import cli
+
+        command = load()
     except BaseException as error:
         if ending.received is not None:
             sys.exit(128 + ending.received)
@@ -44,7 +52,7 @@ def main() -> None:
         problem = errors.from_exception(error, "gdtool")
         log.line(str(problem))
         sys.exit(problem.exit_code)
-    guarded(cli)
+    guarded(command)
 
 
 def _open_streams() -> None:

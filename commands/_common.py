@@ -136,6 +136,12 @@ VERBOSITY = {
 }
 
 
+class IntegerRange(click.IntRange):
+    """An integer between bounds."""
+
+    name = "integer"
+
+
 class FiniteRange(click.FloatRange):
     """A float between bounds; not NaN, which is never outside of them."""
 
@@ -197,7 +203,7 @@ def option_from_field(field: Any, hint: Any) -> click.Option:
         lowest, highest = (meta.ge, meta.gt), (meta.le, meta.lt)
         bounds = {"min": next((x for x in lowest if x is not None), None), "max": next((x for x in highest if x is not None), None),
                   "min_open": meta.gt is not None, "max_open": meta.lt is not None}
-        return click.Option([f"--{name}"], type=(click.IntRange if inner is int else FiniteRange)(**bounds), **common)
+        return click.Option([f"--{name}"], type=(IntegerRange if inner is int else FiniteRange)(**bounds), **common)
     return click.Option([f"--{name}"], type=TEXT, **common)
 
 
@@ -212,7 +218,7 @@ def build_options(struct: type, values: dict[str, Any]) -> Any:
     try:
         return msgspec.convert({field.name: values[field.name] for field in msgspec.structs.fields(struct)}, struct)
     except msgspec.ValidationError as error:
-        raise UsageError("options", str(error), "see --help for what each option takes") from None
+        raise UsageError("options", str(error), "give the option a value that --help names") from None
 
 
 _SHARD = re.compile(r"([0-9]{1,9})/([0-9]{1,9})")
@@ -247,6 +253,7 @@ def stage_command(stage: Stage, help: str) -> click.Command:
 
     def invoke(**values: Any) -> int:
         from gdtool.core.runner import Settings, run_all
+        from gdtool.stages.early import require_device
 
         set_verbosity(values["quiet"], values["verbose"])
         arguments = values["sources"]
@@ -257,6 +264,8 @@ def stage_command(stage: Stage, help: str) -> click.Command:
         )
         flags = {flag: values["second_" + flag] for flag in stage.second_inputs}
         options = build_options(stage.Options, values)
+        if not settings.ray:  # a node of the cluster may have a device that this machine has not
+            require_device(settings.device)
         failed: list[GdtoolError] = []
         done = 0
         for result in run_all(stage, arguments, options, flags, settings):
@@ -288,7 +297,7 @@ def stage_command(stage: Stage, help: str) -> click.Command:
         click.Option(["-n", "--dry-run"], is_flag=True, help="Print what would be made."),
         click.Option(["-f", "--force"], is_flag=True, help="Run even when up to date."),
         click.Option(["--json", "as_json"], is_flag=True, help="Print one JSON object per source."),
-        click.Option(["--threads"], type=click.IntRange(0, MOST_THREADS), default=0, help="Threads; 0: all cores."),
+        click.Option(["--threads"], type=IntegerRange(0, MOST_THREADS), default=0, help="Threads; 0: all cores."),
         click.Option(["--device"], type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True, help="Where networks run."),
     ]
     params += [click.Option(list(flags), is_flag=True, help=text) for flags, text in VERBOSITY.items()]

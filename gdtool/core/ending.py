@@ -10,9 +10,14 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
+
+from gdtool.core import log
+from gdtool.core.errors import GdtoolError
 
 # Seconds that the main thread has to unwind. With the clean-up after it, an interrupted command ends within two seconds.
 GRACE = 1.2
@@ -21,10 +26,17 @@ GRACE = 1.2
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGXCPU")
 SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 
+# Seconds after which a time limit that was met in the middle of an import is looked at again.
+_AGAIN = 0.1
+
 # Seconds between the soft and the hard limit of processor time, for the clean-up.
 _CPU_RESERVE = 2
 
+_ALARM = getattr(signal, "SIGALRM", None)  # of time limits
+
 received: int | None = None  # the first signal that asked for the end
+_deaf = False
+_late: GdtoolError | None = None  # what to tell when the time limit of the work under way is over
 _clean_ups: list[Callable[[], None]] = []
 
 
@@ -41,11 +53,11 @@ def listen() -> Callable[[], None]:
 
     Returns what undoes it. Where it is done already, it does nothing, and so does what it returns.
     """
-    global received
+    global received, _deaf
     before = {number: signal.getsignal(number) for number in SIGNALS}
     if _stop in before.values():
         return lambda: None
-    received = None
+    received, _deaf = None, False
     _leave_time_to_clean_up()
     heard, tell = os.pipe()
     os.set_blocking(tell, False)
@@ -56,6 +68,8 @@ def listen() -> Callable[[], None]:
             signal.signal(number, _stop)
 
     def undo() -> None:
+        global received, _deaf
+        received, _deaf = None, False
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
         signal.set_wakeup_fd(wakeup)
@@ -66,8 +80,8 @@ def listen() -> Callable[[], None]:
 
 def ignore() -> None:
     """Raise nothing from now on, where the process is about to end; the thread still ends it when that takes too long."""
-    global received
-    received = received or 0
+    global _deaf
+    _deaf = True
 
 
 @contextmanager
@@ -84,12 +98,63 @@ def certainly(clean_up: Callable[[], None]) -> Iterator[None]:
         _clean_ups.remove(clean_up)
 
 
-def _stop(number: int, _frame: object) -> None:
+class TimeOver(BaseException):
+    """The time limit of the work under way is over. No Exception, so that no fallback takes it for a failure of its own."""
+
+
+@contextmanager
+def time_limit(seconds: float, late: GdtoolError) -> Iterator[None]:
+    """Raise `late` in a block that takes longer than so many seconds, and end the process with it where a native call goes on for GRACE more.
+
+    Of the main thread; elsewhere, and where the system has no SIGALRM, there is no limit. It cannot be nested.
+    """
+    global _late
+    if _ALARM is None or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before, _late = signal.signal(_ALARM, _ring), late
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    except TimeOver:
+        raise late from None
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        _late = None
+        signal.signal(_ALARM, before)
+
+
+def _ring(_number: int, frame: FrameType | None) -> None:
+    if _is_importing(frame):
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN)
+    elif _late is not None and received is None:
+        raise TimeOver
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
     global received
-    if received is not None:  # a second Ctrl-C does not cut the clean-up short
+    if received is not None or _deaf:  # a second Ctrl-C does not cut the clean-up short
         return
     received = number
+    if _is_importing(frame):  # a native module that an exception leaves half initialised aborts the process
+        _end(number)
     raise Stopped(number)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _end(number: int, code: int | None = None) -> None:
+    """Clean up and end the process here and now, with the code of a signal or another one."""
+    for clean_up in reversed(_clean_ups):
+        with contextlib.suppress(Exception):
+            clean_up()
+    os._exit(128 + number if code is None else code)
 
 
 def _start_thread(heard: int) -> None:
@@ -103,14 +168,18 @@ def _watch(heard: int) -> None:
     """Wait for a signal, which is written to the pipe whatever the main thread does; end the process GRACE later."""
     try:
         while told := os.read(heard, 1):
+            if told[0] == _ALARM:
+                late = _late
+                time.sleep(GRACE)
+                if late is not None and _late is late:  # the block has not been left
+                    log.line(f"gdtool: {late}")
+                    _end(0, late.exit_code)
+                continue
             if told[0] not in SIGNALS or signal.getsignal(told[0]) is not _stop:
                 continue
             time.sleep(GRACE)
             if signal.getsignal(told[0]) is _stop:  # it has not been undone
-                for clean_up in reversed(_clean_ups):
-                    with contextlib.suppress(Exception):
-                        clean_up()
-                os._exit(128 + told[0])
+                _end(told[0])
     finally:
         os.close(heard)
 

@@ -3,22 +3,13 @@
 from __future__ import annotations
 
 import importlib
-import re
 from types import ModuleType
 
-from gdtool.core.errors import ResourceError
+from gdtool.core.errors import GdtoolError, ResourceError, first_line, missing_library
 
-# The Debian package of a shared library that wheels expect from the system.
-_DEBIAN = {
-    "libEGL.so.1": "libegl1", "libGL.so.1": "libgl1", "libGLU.so.1": "libglu1-mesa", "libOpenGL.so.0": "libopengl0", "libGLX.so.0": "libglx0",
-    "libX11.so.6": "libx11-6", "libXext.so.6": "libxext6", "libXrender.so.1": "libxrender1", "libSM.so.6": "libsm6", "libICE.so.6": "libice6",
-    "libglib-2.0.so.0": "libglib2.0-0", "libgthread-2.0.so.0": "libglib2.0-0", "libgomp.so.1": "libgomp1", "libstdc++.so.6": "libstdc++6",
-    "libfontconfig.so.1": "libfontconfig1", "libfreetype.so.6": "libfreetype6", "libtbb.so.12": "libtbb12", "libz.so.1": "zlib1g",
-}
 # What pip installs, where that is not the module's name.
 _DISTRIBUTIONS = {"cv2": "opencv-python-headless", "fast_simplification": "fast-simplification", "igl": "libigl", "pxr": "gdtool[usd]",
                   "pyQuadriFlow": "gdtool[quadriflow]", "onnxruntime": "gdtool[matting]"}
-_NO_LIBRARY = re.compile(r"([\w.+-]+\.so[\w.]*): (?:cannot open shared object file|file not found)")
 
 
 def imported(module: str) -> ModuleType:
@@ -44,20 +35,19 @@ def imported_if_installed(module: str) -> ModuleType | None:
         raise import_error(error, module) from None
 
 
-def import_error(error: ImportError | OSError, module: str) -> ResourceError:
+def import_error(error: ImportError | OSError, module: str) -> GdtoolError:
     """The error to report for a failed import of `module`."""
     package = module.partition(".")[0]
     distribution = _DISTRIBUTIONS.get(package, package)
-    install = f"pip install '{distribution}'" if "[" in distribution else f"pip install {distribution}"
-    if isinstance(error, ModuleNotFoundError) and _is_of(error.name, module):
-        return ResourceError(package, "is not installed", install)
-    missing = _NO_LIBRARY.search(str(error))
-    if missing:
-        library = missing[1]
-        return ResourceError(package, f"needs {library}, which this system does not have",
-                             f"apt install {_DEBIAN[library]}" if library in _DEBIAN else f"install the system package that holds {library}")
-    lines = str(error).strip().splitlines()
-    return ResourceError(package, f"cannot be loaded ({lines[0] if lines else type(error).__name__})", install.replace("install", "install --force-reinstall"))
+    install = f"'{distribution}'" if "[" in distribution else distribution
+    if isinstance(error, ModuleNotFoundError):
+        if _is_of(error.name, module):
+            return ResourceError(package, "is not installed", f"pip install {install}")
+    else:
+        found = missing_library(ImportError(str(error), name=package))
+        if found:
+            return found
+    return ResourceError(package, f"cannot be loaded ({first_line(error)})", f"pip install --force-reinstall {install}")
 
 
 def _is_of(missing: str | None, module: str) -> bool:

@@ -108,16 +108,13 @@ def remove_tree(folder: Path) -> None:
     if folder.is_symlink() or not folder.is_dir():
         return
 
-    def opened(function, path, _):
-        with contextlib.suppress(OSError):
-            for one in (os.path.dirname(path), path):
-                if not os.path.islink(one):
-                    os.chmod(one, os.stat(one).st_mode | stat.S_IRWXU)
-            function(path)
-
     with contextlib.suppress(OSError):
-        os.chmod(folder, folder.stat().st_mode | stat.S_IRWXU)
-    shutil.rmtree(folder, onerror=opened)
+        folder.chmod(folder.stat().st_mode | stat.S_IRWXU)
+        for root, folders, _ in os.walk(folder):
+            for path in (Path(root, name) for name in folders):
+                if not path.is_symlink():  # before os.walk looks into it
+                    path.chmod(path.stat().st_mode | stat.S_IRWXU)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def require_replaceable(target: Path) -> None:

@@ -179,7 +179,7 @@ def run_one(stage: Stage, given: list[Source], options: Any, flags: dict[str, st
     refuse_overlap(target, _places(second.found.values()))
     inputs = Inputs(source, sources.name_of(source), second.found, tuple(given))
     if stage.check is not None:
-        stage.check(inputs, options, settings.device)
+        stage.check(inputs, options)
     roles = [("source", one) for one in given] + [(flag, one) for flag, one in second.found.items() if one is not None]
     digests = [(role, sources.digest(one)) for role, one in roles]
     keyed = option_record(options, None)

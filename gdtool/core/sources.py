@@ -55,7 +55,8 @@ def incoming(arguments: tuple[str, ...]) -> Iterator[str]:
     if empty and (sys.stdin is None or sys.stdin.isatty()):
         raise UsageError("stdin", "gave no sources", "name files or folders, or pipe their paths in")
     if empty:
-        raise UsageError("stdin", "gave no sources; the command before the pipe has failed or printed nothing", "see its message, or name files or folders")
+        cure = "the command before the pipe has failed or printed nothing: see its message, or name files or folders"
+        raise UsageError("stdin", "gave no sources", cure)
 
 
 MAX_LINE_BYTES = 2**20  # of stdin; a line of --json with all that was skipped takes some thousands

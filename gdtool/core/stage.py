@@ -17,6 +17,11 @@ from gdtool.core.kinds import Content
 from gdtool.core.manifest import Skip
 from gdtool.core.sources import Source
 
+# What numeric options take at most: more than anybody means, so that what is asked for is finite and fits the manifest.
+MOST_SEED = 2**63 - 1  # a 64-bit integer
+MOST_SECONDS = 7 * 86400.0  # a week
+LEAST_EXPOSURE, MOST_EXPOSURE = 1e-4, 1e4  # factors on radiance, 13 stops either way
+
 # An option that names a file: its content enters the key, its path relative to the output the manifest.
 FILE = {"file": True}
 
@@ -58,8 +63,8 @@ class Stage:
 
     reads: folder kinds, and "image-file", "model-file", "mesh-file" for files. version rises when results change.
     gathers: all sources go into one run (train). dataset: several results share a root with an index.
-    check(inputs, options, device) is called before any work: it raises a GdtoolError for what the run would find out only at its end
-    (a file that an option names, a package, a device), and takes no time. checkpoint: the file of the workspace that a later run goes on
+    check(inputs, options) is called before any work: it raises a GdtoolError for what the run would find out only later (a file that an
+    option names, a package that it needs), and takes no time. checkpoint: the file of the workspace that a later run goes on
     from; without it a failed run leaves no workspace.
     """
 
@@ -72,7 +77,7 @@ class Stage:
     second_inputs: dict[str, SecondInput | str] = field(default_factory=dict)
     gathers: bool = False
     dataset: bool = False
-    check: Callable[[Inputs, Any, str], None] | None = None
+    check: Callable[[Inputs, Any], None] | None = None
     checkpoint: str = ""
 
     def second(self, flag: str) -> SecondInput:

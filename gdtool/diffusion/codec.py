@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch.utils.checkpoint import checkpoint
 
 from gdtool.core.errors import ResourceError
+from gdtool.core.native import imported_if_installed
 from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.weights import pretrained_part
 
@@ -49,10 +50,10 @@ class VaeCodec:
     def __init__(self, config: ModelConfig, vae=None):
         self.side = config.image_size // 8
         if vae is None:
-            try:
-                from diffusers import AutoencoderKL
-            except ImportError:
-                raise ResourceError("diffusers", "is not installed, and the vae codec needs it", "pip install 'gdtool[hub]'") from None
+            if imported_if_installed("diffusers") is None:
+                raise ResourceError("diffusers", "is not installed, and the vae codec needs it", "pip install 'gdtool[hub]'")
+            from diffusers import AutoencoderKL
+
             vae = AutoencoderKL.from_pretrained(pretrained_part(config, "vae"), use_safetensors=True)
         self.vae = vae.requires_grad_(False).eval()
 

@@ -5,9 +5,13 @@ Everything a model folder needs to be rebuilt is ModelConfig (its config.json); 
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
+from msgspec import Meta
+
+from gdtool.cameras.camera import SIX_VIEWS
+from gdtool.core.names import text_fault
 
 # The order of the domains is the order of the one-hot switcher and of every (…, domain, view, …) axis; color is primary.
 DOMAINS = ("color", "normal", "depth", "albedo", "roughness", "metallic")
@@ -15,25 +19,37 @@ DOMAINS = ("color", "normal", "depth", "albedo", "roughness", "metallic")
 CLASS_WIDTH = 2 * (3 + len(DOMAINS))
 
 
+# Bounds of what a configuration file may ask for: far above any model that was trained, low enough that a network's structure
+# is known in a second and its memory can be predicted before it is made.
+Pixels = Annotated[int, Meta(ge=1, le=4096)]
+Width = Annotated[int, Meta(ge=1, le=16384)]  # channels
+Layers = Annotated[int, Meta(ge=1, le=64)]
+Rate = Annotated[float, Meta(ge=0, le=10)]  # learning rate
+Share = Annotated[float, Meta(ge=0, le=1)]
+Weight = Annotated[float, Meta(ge=0, le=1e6)]  # of a part of the loss
+MAX_LEVELS = 8  # resolutions of the UNet
+ENCODER_HEAD_WIDTH = 64  # channels of each attention head of the patch encoder
+
+
 class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Shape of the network, of its inputs and of its noise. Sizes in pixels unless said otherwise."""
 
-    image_size: int = 64
-    views: tuple[str, ...] = ("front", "front_right", "right", "back", "left", "front_left")
-    domains: tuple[str, ...] = DOMAINS
+    image_size: Pixels = 64
+    views: Annotated[tuple[str, ...], Meta(min_length=1)] = ("front", "front_right", "right", "back", "left", "front_left")
+    domains: Annotated[tuple[str, ...], Meta(min_length=1)] = DOMAINS
     # codec: "vae" is Stable Diffusion's (factor 8, 4 channels), "patch" is space-to-depth of the pixels.
     codec: Literal["vae", "patch"] = "patch"
-    patch: int = 4
+    patch: Pixels = 4
     condition_alpha: bool = True  # the mask as fourth channel of the condition latent; patch codec only
     mirror_back: bool = True  # the view from behind gets the mirrored condition latent: its silhouette is exactly that
     # UNet, in Stable Diffusion's structure and key names.
-    channels: tuple[int, ...] = (48, 128, 128)
+    channels: Annotated[tuple[Width, ...], Meta(min_length=1, max_length=MAX_LEVELS)] = (48, 128, 128)
     attention_levels: tuple[bool, ...] = (False, True, True)
-    layers_per_block: int = 1
-    heads: int = 0  # heads per attention; 0: as many as give head_width
-    head_width: int = 32
-    norm_groups: int = 16
-    feed_forward: int = 2  # width of the gated feed-forward in units of the token's width
+    layers_per_block: Layers = 1
+    heads: Annotated[int, Meta(ge=0, le=1024)] = 0  # heads per attention; 0: as many as give head_width
+    head_width: Width = 32
+    norm_groups: Width = 16
+    feed_forward: Annotated[int, Meta(ge=1, le=64)] = 2  # width of the gated feed-forward in units of the token's width
     time_scale_shift: bool = True  # the time embedding scales and shifts (True) or only shifts (Stable Diffusion)
     position_embedding: bool = True  # learned, in front of each transformer
     condition_skip: bool = True  # prediction += learned gate(domain, view) * condition's pixels; x-prediction only
@@ -47,71 +63,117 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     convention: Literal["gdtool", "wonder3d"] = "gdtool"
     # image encoder: "clip" is one projected embedding as one token, "patch" a small transformer over the image's patches
     encoder: Literal["clip", "patch"] = "patch"
-    encoder_width: int = 192
-    encoder_layers: int = 4
-    encoder_patch: int = 8
+    encoder_width: Width = 192
+    encoder_layers: Annotated[int, Meta(ge=0, le=64)] = 4
+    encoder_patch: Pixels = 8
     # noise
     prediction: Literal["epsilon", "v", "x"] = "x"
     # scale of the network's noisy input: "unit" is variance preserving; "shrunk" is the linear estimate of x_0 from it, so
     # that pure noise, which says nothing, comes in as nothing (x-prediction only)
     noisy_input: Literal["unit", "shrunk"] = "unit"
-    timesteps: int = 1000
+    timesteps: Annotated[int, Meta(ge=2, le=100_000)] = 1000
     noise_schedule: Literal["scaled_linear", "cosine"] = "cosine"
-    sampling_steps: int = 50  # denoising steps of sample-views when none are asked for: what measured best for this model
+    sampling_steps: Annotated[int, Meta(ge=1, le=1000)] = 50  # denoising steps of sample-views when none are asked for: what measured best for this model
     # the mean of what is made of the picture and of its mirror image; twice the time. Patch codec and own convention only.
     sampling_mirrored: bool = False
     # encoded background of color and albedo while training; sampling uses the first
-    backgrounds: tuple[Literal["white", "grey", "black"], ...] = ("grey",)
+    backgrounds: Annotated[tuple[Literal["white", "grey", "black"], ...], Meta(min_length=1)] = ("grey",)
     # where the pretrained parts of the paper's configuration live: a local folder or a hub id
     pretrained: str = ""
     revision: str = ""  # branch, tag or commit of a hub id; "": its main branch
+
+    def __post_init__(self) -> None:
+        """Raise ValueError, which msgspec reports as its ValidationError, where the fields do not fit one another."""
+        fault = _fault(self)
+        if fault:
+            raise ValueError(fault)
+
+
+def _fault(config: ModelConfig) -> str | None:
+    """The first field that no network can be made of, with what it has to be; None where all fit."""
+    known = [name for name, _ in SIX_VIEWS]
+    for field, values, names in (("views", config.views, known), ("domains", config.domains, DOMAINS)):
+        unknown = [value for value in values if value not in names]
+        if unknown:
+            return f"{field} names {unknown[0]!r}, which is none of {', '.join(names)}"
+        if len(set(values)) < len(values):
+            return f"{field} names one twice"
+    levels = len(config.channels)
+    for field, values in (("attention_levels", config.attention_levels), ("row_attention", config.row_attention)):
+        if len(values) != levels and (values or field == "attention_levels"):
+            return f"{field} has {len(values)} entries, channels has {levels}"
+    for field, text in (("pretrained", config.pretrained), ("revision", config.revision)):
+        fault = text_fault(text)
+        if fault:
+            return f"{field} {fault}"
+    patch, field = (8, "8 (the vae's factor)") if config.codec == "vae" else (config.patch, f"patch {config.patch}")
+    if config.image_size % patch:
+        return f"image_size is {config.image_size}, not a multiple of {field}"
+    if (config.image_size // patch) % 2 ** (levels - 1):
+        return f"image_size / {field} is {config.image_size // patch}, which cannot be halved {levels - 1} times for {levels} levels of channels"
+    if config.channels[0] % 2:
+        return f"channels[0] is {config.channels[0]}, which has to be even"
+    for i, width in enumerate(config.channels):
+        if width % config.norm_groups:
+            return f"channels[{i}] is {width}, not a multiple of norm_groups {config.norm_groups}"
+        attends = config.attention_levels[i] or any(config.row_attention[i:i + 1]) or i == levels - 1
+        heads = config.heads or max(width // config.head_width, 1)
+        if attends and width % heads:
+            return f"channels[{i}] is {width}, not a multiple of its {heads} heads (heads, head_width)"
+    if config.encoder == "patch":
+        if config.image_size % config.encoder_patch:
+            return f"image_size is {config.image_size}, not a multiple of encoder_patch {config.encoder_patch}"
+        heads = max(config.encoder_width // ENCODER_HEAD_WIDTH, 1)
+        if config.encoder_width % heads:
+            return f"encoder_width is {config.encoder_width}, not a multiple of its {heads} heads of {ENCODER_HEAD_WIDTH} channels"
+    return None
 
 
 class Phase(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A part of the training: until `share` of it is over, each step sees so many domains and views of an object."""
 
-    share: float = 1.0
-    domains: int = 6
-    views: int = 6
-    learning_rate: float = 1e-3
-    batch: int = 0  # objects per step of this phase; 0: the run's
+    share: Share = 1.0
+    domains: Annotated[int, Meta(ge=1, le=6)] = 6
+    views: Annotated[int, Meta(ge=1, le=6)] = 6
+    learning_rate: Rate = 1e-3
+    batch: Annotated[int, Meta(ge=0, le=1_000_000)] = 0  # objects per step of this phase; 0: the run's
 
 
 class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a model is trained; `steps` are optimiser steps, `batch` counts objects per step over all accumulations."""
 
-    batch: int = 8
-    accumulate: int = 1
-    steps: int = 4000
+    batch: Annotated[int, Meta(ge=1, le=1_000_000)] = 8
+    accumulate: Annotated[int, Meta(ge=1, le=1_000_000)] = 1
+    steps: Annotated[int, Meta(ge=1, le=10**9)] = 4000
     # The last phase sees all images at once, as sampling does; few objects then, so that a step costs about the same.
-    phases: tuple[Phase, ...] = (Phase(share=0.6, domains=3, views=3), Phase(share=0.8, domains=6, views=3, batch=4),
-                                 Phase(share=1.0, domains=6, views=6, batch=2))
+    phases: Annotated[tuple[Phase, ...], Meta(min_length=1, max_length=100)] = (Phase(share=0.6, domains=3, views=3), Phase(share=0.8, domains=6, views=3, batch=4),
+                                                                               Phase(share=1.0, domains=6, views=6, batch=2))
     optimizer: Literal["adamw", "muon"] = "adamw"  # muon: for the matrices inside the network
-    warmup: int = 50
+    warmup: Annotated[int, Meta(ge=1, le=10**9)] = 50
     decay: bool = True  # cosine to a twentieth of the learning rate over the run
-    weight_decay: float = 1e-2
-    betas: tuple[float, float] = (0.9, 0.999)
-    clip: float = 1.0
-    class_rate: float = 1.0  # learning rate of the class embedding in units of the others'
-    ema: float = 0.999
-    snr_gamma: float = 5.0  # min-SNR: a clean image's error is weighted by min(SNR, gamma) …
-    snr_floor: float = 1.0  # … and at least by this, or a model that samples in few steps never learns the first one
+    weight_decay: Share = 1e-2
+    betas: tuple[Annotated[float, Meta(ge=0, lt=1)], Annotated[float, Meta(ge=0, lt=1)]] = (0.9, 0.999)
+    clip: Annotated[float, Meta(gt=0, le=1e6)] = 1.0
+    class_rate: Weight = 1.0  # learning rate of the class embedding in units of the others'
+    ema: Share = 0.999
+    snr_gamma: Weight = 5.0  # min-SNR: a clean image's error is weighted by min(SNR, gamma) …
+    snr_floor: Weight = 1.0  # … and at least by this, or a model that samples in few steps never learns the first one
     # of each domain's values in the error, in the order of DOMAINS; the coverage beside the scalars' always weighs 1. Depth's
     # spread inside an object is a tenth of the others', so at 1 it is not learned. Patch codec only.
-    domain_weights: tuple[float, float, float, float, float, float] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    domain_weights: tuple[Weight, Weight, Weight, Weight, Weight, Weight] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
     # whose values are compared by distance instead of its square: one step of sampling then gives their median, which is
     # sharper than their mean and nearer on average. Patch codec only.
-    absolute_domains: tuple[str, ...] = ()
-    pure_noise: float = 0.6  # share of samples at the last timestep
-    drop_embedding: float = 0.05
-    drop_both: float = 0.05
-    drop_latent: float = 0.05
-    tilted: float = 0.5  # share of condition images from a random elevation, or in perspective, where the data have them
+    absolute_domains: tuple[Literal[DOMAINS], ...] = ()
+    pure_noise: Share = 0.6  # share of samples at the last timestep
+    drop_embedding: Share = 0.05
+    drop_both: Share = 0.05
+    drop_latent: Share = 0.05
+    tilted: Share = 0.5  # share of condition images from a random elevation, or in perspective, where the data have them
     mirror: bool = True
     hue: bool = True
-    pbr_weight: float = 0.1
-    pbr_snr: float = 1.0  # supervision by rendering acts only where the SNR is above this
-    pbr_pixels: int = 768  # per object
+    pbr_weight: Weight = 0.1
+    pbr_snr: Weight = 1.0  # supervision by rendering acts only where the SNR is above this
+    pbr_pixels: Annotated[int, Meta(ge=1, le=10**9)] = 768  # per object
     precision: Literal["float32", "bfloat16"] = "bfloat16"
 
 

@@ -7,8 +7,9 @@ import torch.nn.functional as F
 from torch import nn
 
 from gdtool.core.errors import ResourceError
+from gdtool.core.native import imported_if_installed
 from gdtool.diffusion.attention import Attention, FeedForward, learned_position
-from gdtool.diffusion.config import ModelConfig
+from gdtool.diffusion.config import ENCODER_HEAD_WIDTH, ModelConfig
 from gdtool.diffusion.weights import pretrained_part
 
 
@@ -36,7 +37,7 @@ class PatchEncoder(nn.Module):
         self.patch = p
         self.embed = nn.Linear(4 * p * p, width)
         self.position = learned_position((config.image_size // p) ** 2, width)
-        self.layers = nn.ModuleList(EncoderLayer(width, max(width // 64, 1)) for _ in range(config.encoder_layers))
+        self.layers = nn.ModuleList(EncoderLayer(width, max(width // ENCODER_HEAD_WIDTH, 1)) for _ in range(config.encoder_layers))
         self.norm = nn.LayerNorm(width)
 
     def forward(self, rgba):
@@ -58,10 +59,10 @@ class ClipEncoder(nn.Module):
     def __init__(self, config: ModelConfig, clip=None):
         super().__init__()
         if clip is None:
-            try:
-                from transformers import CLIPVisionModelWithProjection
-            except ImportError:
-                raise ResourceError("transformers", "is not installed, and the clip encoder needs it", "pip install 'gdtool[hub]'") from None
+            if imported_if_installed("transformers") is None:
+                raise ResourceError("transformers", "is not installed, and the clip encoder needs it", "pip install 'gdtool[hub]'")
+            from transformers import CLIPVisionModelWithProjection
+
             clip = CLIPVisionModelWithProjection.from_pretrained(pretrained_part(config, "image_encoder"), use_safetensors=True)
         self.antialias = config.convention == "wonder3d"
         # in a list, so that its weights are neither trained nor saved with ours

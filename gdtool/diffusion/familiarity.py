@@ -112,11 +112,12 @@ def write_ranges(path: Path, known: dict[str, PictureRange]) -> None:
 def read_ranges(folder: Path) -> dict[str, PictureRange]:
     """What a model folder says of its training pictures; nothing for one that does not. Raises InputError when damaged."""
     from gdtool.core.errors import InputError
+    from gdtool.core.reading import read_json
 
     path = Path(folder) / FILE
-    if not path.is_file():
+    if not path.exists():
         return {}
     try:
-        return msgspec.json.decode(path.read_bytes(), type=dict[str, PictureRange])
-    except msgspec.DecodeError as error:
+        return msgspec.convert(read_json(path), dict[str, PictureRange])
+    except msgspec.ValidationError as error:
         raise InputError(path, str(error), "copy or train the model again") from None

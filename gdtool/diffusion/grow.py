@@ -8,6 +8,8 @@ predicts, each pixel a square.
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 import torch
 
@@ -18,16 +20,21 @@ from gdtool.diffusion.config import ModelConfig
 def resized(config: ModelConfig, size: int) -> ModelConfig:
     """The configuration at another image size (pixels), with patches that keep the number of tokens. Raises InputError."""
     if size % config.image_size and config.image_size % size:
-        raise InputError("size", f"{size} is neither a multiple nor a divisor of the configuration's {config.image_size}")
+        raise InputError("size", f"{size} is neither a multiple nor a divisor of the configuration's {config.image_size}",
+                         f"give {config.image_size} times a whole number, or a part of it, such as {config.image_size // 2}")
     patches = {}
     for name in ("patch", "encoder_patch"):
         if (name == "patch" and config.codec != "patch") or (name == "encoder_patch" and config.encoder != "patch"):
             continue
         value = getattr(config, name) * size
         if value % config.image_size:
-            raise InputError("size", f"{size} leaves no whole pixel in a patch of {getattr(config, name)}")
+            raise InputError("size", f"{size} leaves no whole pixel in a patch of {getattr(config, name)}",
+                             f"give a multiple of {config.image_size // math.gcd(config.image_size, getattr(config, name))}")
         patches[name] = value // config.image_size
-    return msgspec.structs.replace(config, image_size=size, **patches)
+    try:
+        return msgspec.structs.replace(config, image_size=size, **patches)
+    except ValueError as fault:
+        raise InputError("size", f"{size} does not fit the configuration: {fault}", f"give a multiple of {config.image_size}") from None
 
 
 def grown(tensors: dict[str, torch.Tensor], small: ModelConfig, large: ModelConfig) -> dict[str, torch.Tensor]:
@@ -40,7 +47,7 @@ def grown(tensors: dict[str, torch.Tensor], small: ModelConfig, large: ModelConf
         return tensors
     if small.codec != "patch" or large.image_size % small.image_size or resized(small, large.image_size) != large:
         raise InputError("start", f"is a model of {small.image_size} px that cannot be grown to {large.image_size} px",
-                         "only the size may differ, by a whole factor, and the codec must be patch")
+                         "start from a model of the patch codec that differs in nothing but a size which is a whole number of times smaller")
     factor = large.image_size // small.image_size
     out = dict(tensors)
     out["unet.conv_in.weight"] = _squares(tensors["unet.conv_in.weight"], 1, small.patch, factor) / factor**2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import torch
 from torch import nn
@@ -10,9 +11,9 @@ from torch import nn
 from gdtool.cameras.camera import SIX_VIEWS
 from gdtool.diffusion import wonder3d
 from gdtool.diffusion.attention import Layout
-from gdtool.diffusion.codec import make_codec
+from gdtool.diffusion.codec import PatchCodec, make_codec
 from gdtool.diffusion.config import DOMAINS, ModelConfig
-from gdtool.diffusion.encoder import make_encoder
+from gdtool.diffusion.encoder import PatchEncoder, make_encoder
 from gdtool.diffusion.schedule import clean_from_prediction, input_scale, signal_and_noise
 from gdtool.diffusion.unet import UNet
 
@@ -74,3 +75,14 @@ class Model(nn.Module):
 
 def parameter_count(model: nn.Module) -> int:
     return sum(p.numel() for p in model.parameters())
+
+
+def structure(config: ModelConfig, device: str = "meta") -> Model:
+    """The model's trained parts on a device; what is frozen and loaded (VAE, CLIP) is stood in for by its shapes."""
+    with torch.device(device):
+        if config.codec == "vae":
+            codec = SimpleNamespace(side=config.image_size // 8, latent_channels=4, condition_channels=4)
+        else:
+            codec = PatchCodec(config)
+        encoder = PatchEncoder(config) if config.encoder == "patch" else torch.nn.Identity()
+        return Model(config, codec, encoder).to(device)

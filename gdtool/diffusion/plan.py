@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import weakref
 from pathlib import Path
-from types import SimpleNamespace
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -18,12 +17,11 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from gdtool.diffusion import attention
 from gdtool.diffusion.attention import Layout
-from gdtool.diffusion.codec import CHUNK, PatchCodec, VaeCodec
+from gdtool.diffusion.codec import CHUNK, VaeCodec
 from gdtool.diffusion.config import DOMAINS, ModelConfig, Phase, TrainConfig
-from gdtool.diffusion.encoder import PatchEncoder
 from gdtool.diffusion.encoding import PLANES
 from gdtool.diffusion.losses import LIT, rendering_error, view_directions
-from gdtool.diffusion.model import Model, parameter_count
+from gdtool.diffusion.model import Model, parameter_count, structure
 from gdtool.diffusion.schedule import signal_and_noise
 
 # Dense bfloat16 peak in FLOP/s, memory in bytes, NVLink in bytes/s in one direction (NVIDIA's data sheets, SXM parts).
@@ -82,17 +80,6 @@ def fused_attention():
         yield
     finally:
         attention.attend = before
-
-
-def structure(config: ModelConfig, device: str = "meta") -> Model:
-    """The model's trained parts on a device; what is frozen and loaded (VAE, CLIP) is stood in for by its shapes."""
-    with torch.device(device):
-        if config.codec == "vae":
-            codec = SimpleNamespace(side=config.image_size // 8, latent_channels=4, condition_channels=4)
-        else:
-            codec = PatchCodec(config)
-        encoder = PatchEncoder(config) if config.encoder == "patch" else torch.nn.Identity()
-        return Model(config, codec, encoder).to(device)
 
 
 def step_cost(config: ModelConfig, domains: int, views: int, objects: int, *, fused: bool, dtype=torch.bfloat16, device: str = "meta") -> dict[str, float]:

@@ -37,7 +37,7 @@ def sample_images(model: Model, rgba: torch.Tensor, *, domains: tuple[str, ...] 
     can = config.codec == "patch" and config.convention == "gdtool" and all(MIRRORED_VIEW.get(name, name) in config.views for name in config.views)
     mirror = config.sampling_mirrored and can if mirror is None else mirror
     if mirror and not can:
-        raise InputError("mirror", "only a model of the patch codec, in gdtool's convention, with views on both sides is sampled with the mirrored picture")
+        raise InputError("mirror", "only a model of the patch codec, in gdtool's convention, with views on both sides is sampled with the mirrored picture", "pass mirror=None")
     rgba = torch.cat([rgba, rgba.flip(-1)]) if mirror else rgba
     b = len(rgba)
     wanted = [d for d in config.domains if d in domains]

@@ -16,13 +16,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 import torch
 
 from gdtool.core.errors import InputError
+from gdtool.core.reading import parse_json
 from gdtool.diffusion import distributed
 from gdtool.diffusion.attention import Layout
 from gdtool.diffusion.config import DOMAINS, ModelConfig, Phase, TrainConfig
@@ -235,7 +236,7 @@ def load_checkpoint(state: State, workspace: Path, identity: str) -> bool:
     if not path.is_file():
         return False
     tensors, metadata = read_tensors(path)
-    record = json.loads(metadata["state"])
+    record = _record(metadata, path)
     if record["identity"] != identity:
         raise InputError(path, "belongs to a run with another configuration", "remove it or train with the same options")
     with torch.no_grad():
@@ -248,6 +249,20 @@ def load_checkpoint(state: State, workspace: Path, identity: str) -> bool:
                     key: value if key == "step" else distributed.sharded(value.to(p.device), p) for key, value in moments.items()})
     state.step, state.seconds = record["step"], record["seconds"]
     return True
+
+
+def _record(metadata: dict[str, str], path: Path) -> dict[str, Any]:
+    """The step, seconds and identity in a checkpoint's metadata. Raises InputError where they are not there."""
+    try:
+        return msgspec.to_builtins(msgspec.convert(parse_json(metadata.get("state", ""), path), _Record))
+    except msgspec.ValidationError as error:
+        raise InputError(path, f"is not a checkpoint of gdtool ({error})", "remove it, and the training starts anew") from None
+
+
+class _Record(msgspec.Struct, forbid_unknown_fields=True):
+    step: Annotated[int, msgspec.Meta(ge=0)]
+    seconds: Annotated[float, msgspec.Meta(ge=0)]
+    identity: str
 
 
 def run_training(model: Model, objects: Objects, train: TrainConfig, workspace: Path, *, seed: int, minutes: float | None = None,
@@ -292,7 +307,7 @@ def run_training(model: Model, objects: Objects, train: TrainConfig, workspace: 
 def _tell_skipped(state: State, warn: Callable[[str], None]) -> None:
     if state.skipped >= MOST_SKIPPED:
         raise InputError("training", f"has a gradient that is not finite in {MOST_SKIPPED} steps up to {state.step}",
-                         "lower the learning rate, train in float32, or look at the data; the checkpoint has finite weights")
+                         "lower learning_rate, or set precision to float32, in the configuration; the checkpoint has finite weights")
     if state.skipped:
         warn(f"step {state.step} is left out: its gradient is not finite ({state.skipped} in a row)")
 

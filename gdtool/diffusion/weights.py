@@ -4,29 +4,44 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import torch
 
-from gdtool.core.errors import InputError
+from gdtool.core import memory
+from gdtool.core.errors import InputError, ResourceError
+from gdtool.core.reading import read_json, require_regular_file
 from gdtool.core.sources import hub_folder
-from gdtool.diffusion.config import DOMAINS, ModelConfig
+from gdtool.diffusion.config import ModelConfig
+
+if TYPE_CHECKING:
+    from gdtool.diffusion.model import Model
 
 WEIGHTS = "model.safetensors"
 PICKLES = ("*.bin", "*.pt", "*.pth", "*.ckpt", "*.pkl")
+BYTES_TO_LOAD = 10  # held for each weight while a model is read: 2 in the file, 4 of the float32 copy, 4 of the network
+OTHER_WEIGHTS = "give the config.json that these weights were trained with"
+OTHER_START = 'set "pretrained" to a Stable Diffusion 1 of that structure, such as lambdalabs/sd-image-variations-diffusers'
+NO_MODEL = "give a model folder that gdtool train has written"
 
 
-def read_tensors(path: Path, cure: str = "gdtool train writes it") -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    """Tensors and metadata of a safetensors file. Raises InputError, with the cure where it is not there, and when it is damaged or
-    holds NaN or infinity."""
+def read_tensors(path: Path, cure: str = NO_MODEL) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+    """Tensors and metadata of a safetensors file.
+
+    Raises InputError, with the cure where it is not there, when it is no regular file, is damaged or holds NaN or infinity;
+    ResourceError when it is larger than the memory.
+    """
     from safetensors import SafetensorError, safe_open
 
-    if not path.is_file():
+    if not path.exists():
         pickles = [p for pattern in PICKLES for p in path.parent.glob(pattern)]
         if pickles:
             raise InputError(pickles[0], "is a pickle, which can run code and is never opened",
                              f"convert it to safetensors: python -m gdtool.diffusion.convert {shlex.quote(str(pickles[0]))}")
         raise InputError(path, "does not exist", cure)
+    require_regular_file(path)
+    _require_memory(path.stat().st_size, path, "its weights")
     try:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
@@ -34,8 +49,8 @@ def read_tensors(path: Path, cure: str = "gdtool train writes it") -> tuple[dict
     except (SafetensorError, OSError) as error:
         raise InputError(path, f"is not a whole safetensors file ({error})", "copy or train it again") from None
     for name, tensor in tensors.items():
-        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
-            raise InputError(path, f"tensor {name} holds NaN or infinite weights")
+        if tensor.is_floating_point() and not bool(torch.isfinite(tensor if tensor.element_size() > 1 else tensor.float()).all()):
+            raise InputError(path, f"tensor {name} holds NaN or infinite weights", "copy the file again from where it came, or train again")
     return tensors, metadata
 
 
@@ -50,49 +65,73 @@ def pretrained_part(config: ModelConfig, part: str) -> Path:
         revision = f" --revision {config.revision}" if config.revision else ""
         raise InputError(config.pretrained, f"has no safetensors in {part}/ on the hub, and a pickle can run code and is never opened",
                          f"hf download {config.pretrained}{revision} --local-dir DIR && python -m gdtool.diffusion.convert DIR, "
-                         'then --config with {"model": {"pretrained": "DIR"}}')
+                         'then set "pretrained" to DIR in the model configuration')
     return folder / part
 
 
 def check_shapes(path: Path, tensors: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> None:
-    """Raises InputError naming the first tensor that is missing, unknown or of another shape."""
+    """Raise InputError that names the first tensor that is missing, unknown, of another shape or not of floating-point numbers."""
     for name, tensor in wanted.items():
         if name not in tensors:
-            raise InputError(path, f"lacks tensor {name}", "its config.json belongs to other weights")
+            raise InputError(path, f"lacks tensor {name}", OTHER_WEIGHTS)
         if tensors[name].shape != tensor.shape:
-            raise InputError(path, f"tensor {name} has shape {tuple(tensors[name].shape)}, the configuration needs {tuple(tensor.shape)}")
+            raise InputError(path, f"tensor {name} has shape {tuple(tensors[name].shape)}, the configuration needs {tuple(tensor.shape)}", OTHER_WEIGHTS)
+        if not tensors[name].is_floating_point():
+            raise InputError(path, f"tensor {name} holds {str(tensors[name].dtype).removeprefix('torch.')}, no floating-point numbers", "save it as float16 or float32")
     unknown = sorted(set(tensors) - set(wanted))
     if unknown:
-        raise InputError(path, f"holds a tensor {unknown[0]} that the configuration does not know")
+        raise InputError(path, f"holds a tensor {unknown[0]} that the configuration does not know", OTHER_WEIGHTS)
 
 
 def read_config(path: Path) -> ModelConfig:
+    """The configuration in a model folder's config.json. Raises InputError that names the field, and what it has to be."""
+    if not path.exists():
+        raise InputError(path, "does not exist", NO_MODEL)
+    return configured(read_json(path), path)
+
+
+def configured(fields: object, subject: object) -> ModelConfig:
+    """A ModelConfig of parsed JSON. Raises InputError that names subject, the field and its bound."""
     try:
-        config = msgspec.json.decode(path.read_bytes(), type=ModelConfig)
-    except FileNotFoundError:
-        raise InputError(path, "does not exist", "gdtool train writes it") from None
-    except (msgspec.ValidationError, msgspec.DecodeError) as error:
-        raise InputError(path, str(error)) from None
-    if not set(config.domains) <= set(DOMAINS):
-        raise InputError(path, f"names an unknown domain; known: {', '.join(DOMAINS)}")
-    if len(config.channels) != len(config.attention_levels):
-        raise InputError(path, "channels and attention_levels differ in length")
-    return config
+        return msgspec.convert(fields, ModelConfig)
+    except msgspec.ValidationError as error:
+        raise InputError(subject, str(error), "correct that field, or copy the file again from where the model came") from None
 
 
-def load_model(folder: Path):
-    """The Model of a folder, in evaluation mode, float32. Raises InputError for what is wrong with its files."""
+def require_room(config: ModelConfig, bytes_per_weight: int, subject: object) -> Model:
+    """The network's structure without numbers. Raises ResourceError where its weights would take more memory than there is.
+
+    bytes_per_weight: what is held for each weight, for example BYTES_TO_LOAD.
+    """
+    from gdtool.diffusion.model import parameter_count, structure
+
+    shape = structure(config)
+    weights = parameter_count(shape)
+    _require_memory(weights * bytes_per_weight, subject, f"its network of {weights / 1e6:,.1f} million weights")
+    return shape
+
+
+def _require_memory(size: int, subject: object, what: str) -> None:
+    """Raise ResourceError when size bytes are more than all the memory that this process may have: what takes less may still fit."""
+    most = memory.most_held() / memory.SHARE
+    if size > most:
+        raise ResourceError(subject, f"{what} would take {size / 2**30:.1f} GiB of memory, more than the {most / 2**30:.1f} GiB that there are",
+                            "take a smaller model, or run it on a machine with more memory")
+
+
+def load_model(folder: Path) -> Model:
+    """The Model of a folder, in evaluation mode, float32.
+
+    Raises InputError for what is wrong with its files, ResourceError where it does not fit in memory. Nothing of the size of
+    its weights is allocated before the configuration and the weights are known to fit one another.
+    """
     from gdtool.diffusion.model import Model
 
     config = read_config(folder / "config.json")
+    wanted = require_room(config, BYTES_TO_LOAD, folder).state_dict()
     tensors, _ = read_tensors(folder / WEIGHTS)
-    with torch.device("meta"):
-        wanted = Model(config, codec=None).state_dict() if config.codec == "patch" else None
-    if wanted is not None:
-        check_shapes(folder / WEIGHTS, tensors, wanted)
+    check_shapes(folder / WEIGHTS, tensors, wanted)
     model = Model(config)
-    if wanted is None:
-        check_shapes(folder / WEIGHTS, tensors, model.state_dict())
     model.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
     return model.eval().requires_grad_(False)
 
@@ -115,14 +154,14 @@ def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
     own = unet.state_dict()
     for name, tensor in tensors.items():
         if name not in own:
-            raise InputError("pretrained weights", f"hold a tensor {name} that this network has not")
+            raise InputError("pretrained weights", f"hold a tensor {name} that this network has not", OTHER_START)
         target = own[name]
         if name in ("conv_in.weight", "class_embedding.linear_1.weight") and tensor.shape[1] <= target.shape[1]:
             grown = torch.zeros_like(target)
             grown[:, : tensor.shape[1]] = tensor
             tensor = grown
         if tensor.shape != target.shape:
-            raise InputError("pretrained weights", f"tensor {name} has shape {tuple(tensor.shape)}, needed is {tuple(target.shape)}")
+            raise InputError("pretrained weights", f"tensor {name} has shape {tuple(tensor.shape)}, needed is {tuple(target.shape)}", OTHER_START)
         own[name] = tensor
     unet.load_state_dict(own)
     return sorted(set(own) - set(tensors))

@@ -7,12 +7,15 @@ xxlong0/Wonder3D (mvdiffusion/models/transformer_mv2d.py, data/single_image_data
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Annotated, TypeVar
 
+import msgspec
 import torch
+from msgspec import Meta
 
 from gdtool.core.errors import InputError
+from gdtool.core.reading import read_json
 from gdtool.diffusion.config import DOMAINS, ModelConfig
 
 # Elevation and azimuth (radians) of each view relative to the picture's, as its pipeline has them, in half precision.
@@ -25,6 +28,32 @@ UNET = "unet/diffusion_pytorch_model.safetensors"
 NEAREST_NORMAL = 3**0.5 - 1  # from white (1, 1, 1), encoded, to the nearest unit normal
 LEGACY = ((".attn_joint_twice.", ".attn_joint_mid."), (".norm_joint_twice.", ".norm_joint_mid."),
           (".attn_joint.", ".attn_joint_last."), (".norm_joint.", ".norm_joint_last."))
+
+
+OTHER_FOLDER = "give a Wonder3D v1 folder, or a model folder of gdtool train"
+
+
+class _UNet(msgspec.Struct):
+    """What is read of unet/config.json; diffusers' defaults."""
+
+    block_out_channels: tuple[int, ...] = ()
+    down_block_types: tuple[str, ...] = ()
+    cross_attention_dim: int = 768
+    attention_head_dim: int | tuple[int, ...] = 8
+    sample_size: Annotated[int, Meta(ge=1, le=512)] = 32  # of the latents: an eighth of the pixels
+    layers_per_block: int = 2
+    norm_num_groups: int = 32
+    multiview_attention: bool = True
+    in_channels: int = 0
+    class_embed_type: str | None = None
+    projection_class_embeddings_input_dim: int | None = None
+
+
+class _Scheduler(msgspec.Struct):
+    """What is read of scheduler/scheduler_config.json."""
+
+    beta_schedule: str | None = None
+    prediction_type: str = "epsilon"
 
 
 def recognises(folder: Path) -> bool:
@@ -46,45 +75,47 @@ def renamed(name: str) -> str:
 
 def read_config(folder: Path, tensors: dict[str, torch.Tensor]) -> ModelConfig:
     """The configuration that unet/config.json and scheduler/ describe. Raises InputError for another structure."""
+    from gdtool.diffusion.weights import configured
+
     path = folder / "unet" / "config.json"
-    own = _json(path)
-    scheduler = _json(folder / "scheduler" / "scheduler_config.json")
-    heads = own.get("attention_head_dim", 8)
-    facts = {"in_channels": (own.get("in_channels"), 8), "class_embed_type": (own.get("class_embed_type"), "projection"),
-             "projection_class_embeddings_input_dim": (own.get("projection_class_embeddings_input_dim"), LABEL_WIDTH),
-             "beta_schedule": (scheduler.get("beta_schedule"), "scaled_linear"), "prediction_type": (scheduler.get("prediction_type", "epsilon"), "epsilon")}
+    own = _read(path, _UNet)
+    scheduler = _read(folder / "scheduler" / "scheduler_config.json", _Scheduler)
+    facts = {"in_channels": (own.in_channels, 8), "class_embed_type": (own.class_embed_type, "projection"),
+             "projection_class_embeddings_input_dim": (own.projection_class_embeddings_input_dim, LABEL_WIDTH),
+             "beta_schedule": (scheduler.beta_schedule, "scaled_linear"), "prediction_type": (scheduler.prediction_type, "epsilon")}
     for name, (found, wanted) in facts.items():
         if found != wanted:
-            raise InputError(path, f"has {name} {found!r}, Wonder3D {wanted!r}", "give a Wonder3D v1 folder, or a model folder of gdtool train")
-    if not isinstance(heads, int):
-        raise InputError(path, "has another number of heads at each level")
-    return ModelConfig(
-        image_size=8 * own.get("sample_size", 32), domains=("color", "normal"), codec="vae", condition_alpha=False, mirror_back=False,
-        channels=tuple(own["block_out_channels"]), attention_levels=tuple("CrossAttn" in kind for kind in own["down_block_types"]),
-        layers_per_block=own.get("layers_per_block", 2), heads=heads, norm_groups=own.get("norm_num_groups", 32), feed_forward=4,
-        time_scale_shift=False, position_embedding=False, condition_skip=False, multi_view=own.get("multiview_attention", True),
-        cross_domain="joint_last" if any(".attn_joint_last." in name for name in tensors) else "joint", convention="wonder3d",
-        encoder="clip", encoder_width=own["cross_attention_dim"], prediction="epsilon", noise_schedule="scaled_linear",
-        backgrounds=("white",), pretrained=str(folder))
+            raise InputError(path, f"has {name} {found!r}, Wonder3D {wanted!r}", OTHER_FOLDER)
+    if not isinstance(own.attention_head_dim, int):
+        raise InputError(path, "has another number of heads at each level", OTHER_FOLDER)
+    return configured({
+        "image_size": 8 * own.sample_size, "domains": ("color", "normal"), "codec": "vae", "condition_alpha": False, "mirror_back": False,
+        "channels": own.block_out_channels, "attention_levels": ["CrossAttn" in kind for kind in own.down_block_types],
+        "layers_per_block": own.layers_per_block, "heads": own.attention_head_dim, "norm_groups": own.norm_num_groups, "feed_forward": 4,
+        "time_scale_shift": False, "position_embedding": False, "condition_skip": False, "multi_view": own.multiview_attention,
+        "cross_domain": "joint_last" if any(".attn_joint_last." in name for name in tensors) else "joint", "convention": "wonder3d",
+        "encoder": "clip", "encoder_width": own.cross_attention_dim, "prediction": "epsilon", "noise_schedule": "scaled_linear",
+        "backgrounds": ("white",), "pretrained": str(folder)}, path)
 
 
 def load(folder: Path):
     """The Model of a published folder, in evaluation mode, float32. Every tensor is used, and none is missing, else InputError."""
     from gdtool.diffusion.model import Model
-    from gdtool.diffusion.weights import check_shapes, read_tensors
+    from gdtool.diffusion.weights import BYTES_TO_LOAD, check_shapes, read_tensors, require_room
 
-    if _json(folder / "unet" / "config.json").get("in_channels") == 4:
+    if _read(folder / "unet" / "config.json", _UNet).in_channels == 4:
         raise InputError(folder, "is a Stable Diffusion that makes single pictures, such as Image Variations: a training starts from it, it has no views",
                          "give a model folder of gdtool train, or Wonder3D's; gdtool train --preset paper trains one from it")
     if not (folder / UNET).is_file() and not list((folder / "unet").glob("*.bin")):
         raise InputError(folder / UNET, "does not exist", "where the hub has pickles alone: hf download ID --local-dir DIR && "
-                         "python -m gdtool.diffusion.convert DIR, then --model DIR")
+                         "python -m gdtool.diffusion.convert DIR, then give DIR as the model")
     tensors, _ = read_tensors(folder / UNET)
     for part, name in (("vae", "diffusion_pytorch_model"), ("image_encoder", "model")):
         read_tensors(folder / part / f"{name}.safetensors")  # a pickle or a damaged file is named before a library opens it
     tensors = {renamed(name): tensor.float() for name, tensor in tensors.items()}
-    model = Model(read_config(folder, tensors))
-    check_shapes(folder / UNET, tensors, model.unet.state_dict())
+    config = read_config(folder, tensors)
+    check_shapes(folder / UNET, tensors, require_room(config, BYTES_TO_LOAD, folder).unet.state_dict())
+    model = Model(config)
     model.unet.load_state_dict(tensors)
     return model.eval().requires_grad_(False)
 
@@ -99,10 +130,14 @@ def premultiplied_normals(x: torch.Tensor) -> torch.Tensor:
     return m * n / n.norm(dim=-3, keepdim=True).clamp_min(1e-6)
 
 
-def _json(path: Path) -> dict:
+_Typed = TypeVar("_Typed")
+
+
+def _read(path: Path, kind: type[_Typed]) -> _Typed:
+    """A JSON file of a type. Raises InputError that names the field where it is another."""
+    if not path.exists():
+        raise InputError(path, "does not exist", "copy the whole folder")
     try:
-        return json.loads(path.read_bytes())
-    except FileNotFoundError:
-        raise InputError(path, "does not exist", "copy the whole folder") from None
-    except ValueError as error:
-        raise InputError(path, f"is not JSON ({error})") from None
+        return msgspec.convert(read_json(path), kind)
+    except msgspec.ValidationError as error:
+        raise InputError(path, str(error), "copy the file again from where the model came") from None

@@ -25,6 +25,7 @@ _NARROW_EDGES, _FEW_NARROW = 1.5, 0.05  # share of the creases' length
 _WALL_EDGES, _PARALLEL, _FEW_THIN = 2.0, 0.9, 7e-4  # cosine between the two sides of a wall; share of the surface
 _RAYS, _OFF = 20_000, 1e-4  # edge lengths under the surface that they start
 _FEATURE_EDGES = 3  # quads long: shorter creases are noise
+_FACES_OF_A_HANDLE = 40  # about as few as were found to keep one: 40 of a torus of one handle, 21 a handle of a lattice of 28
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,23 @@ class Record:
         self.failed += other.failed
         for name, seconds in other.seconds.items():
             self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+
+
+def count_reason(faces: np.ndarray, made: int, asked: int, tried: list[str], of_a_piece: int = QUADS_OF_A_PIECE) -> str:
+    """Why a mesh got `made` faces and not those asked for, as far as that is known.
+
+    faces (f, 3): the manifold that they were made from; tried: what failed on the way; of_a_piece: the fewest faces of a piece.
+    """
+    pieces = topology.components(faces)[0]
+    if made < asked:
+        reason = "no way that was tried came nearer to the count"
+    elif asked < of_a_piece * pieces:
+        reason = f"it has {pieces} separate pieces, and each takes at least {of_a_piece} faces or so"
+    elif asked < _FACES_OF_A_HANDLE * (handles := topology.handles(faces, pieces)):
+        reason = f"fewer would close some of its {handles} handles"
+    else:
+        reason = "fewer would change its shape, or its topology"
+    return f"{reason} ({'; '.join(tried)})" if tried else reason
 
 
 @dataclass

@@ -14,17 +14,18 @@ from gdtool.geometry.topology import compact, components, corner_fans, edges_of,
 
 # Welding joins vertices closer than this share of the longest side: far below any detail, far above rounding.
 WELD_SHARE = 1e-7
+NO_AREA = "give a mesh with at least one triangle that has an area"
 
 
 def check(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> None:
     """Raise InputError when there is nothing to work on, an index is out of range or a coordinate is not finite."""
     if not len(faces):
-        raise InputError(subject, "has no faces")
+        raise InputError(subject, "has no faces", NO_AREA)
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(subject, f"a face refers to vertex {int(faces.max() if faces.min() >= 0 else faces.min())} of {len(vertices)}")
+        raise InputError(subject, f"a face refers to vertex {int(faces.max() if faces.min() >= 0 else faces.min())} of {len(vertices)}", "remove that face, or export the mesh again")
     bad = ~np.isfinite(vertices).all(1)
     if bad.any():
-        raise InputError(subject, f"vertex {int(np.argmax(bad))} is not finite ({int(bad.sum())} such)")
+        raise InputError(subject, f"vertex {int(np.argmax(bad))} is not finite ({int(bad.sum())} such)", "remove such vertices with their faces")
 
 
 def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> tuple[np.ndarray, np.ndarray, dict[str, int | bool], bool]:
@@ -45,7 +46,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
     rows = np.ascontiguousarray(vertices.T)
     extent = float((rows.max(1) - rows.min(1)).max())
     if not extent > 0:
-        raise InputError(subject, "all its faces lie in one point")
+        raise InputError(subject, "all its faces lie in one point", NO_AREA)
     repeated = repeats(faces)
     if repeated.any():
         note("degenerate_faces", repeated.sum())
@@ -55,7 +56,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
         fans = _one_fan(faces)
         sides = measured.result()
     if not sides[1].any():
-        raise InputError(subject, "no face has an area")
+        raise InputError(subject, "no face has an area", NO_AREA)
     if fans is None:
         # A closed mesh is left as its indices say: welding could join sheets that only touch.
         welded = _weld(vertices, faces, extent * WELD_SHARE)
@@ -75,7 +76,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
     note("duplicate_faces", len(faces) - len(first))
     faces = faces[first]
     if not len(faces):
-        raise InputError(subject, "no face has an area")
+        raise InputError(subject, "no face has an area", NO_AREA)
     flat = face_normals(vertices / extent, faces)[1] == 0
     if flat.any() and not is_watertight(faces):
         # In a closed mesh a flat face is a seam that keeps it closed.

@@ -203,7 +203,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
     low, high = rows.min(1), rows.max(1)
     centre, extent = (low + high) / 2, float((high - low).max())
     if not extent > 0:
-        raise InputError("mesh", "all its faces lie in one point")
+        raise InputError("mesh", "all its faces lie in one point", repair.NO_AREA)
     unit = (vertices - centre) / extent
     edge = _edge(unit, faces, target_faces)
     is_closed, pieces = cache(closed or (lambda: topology.is_watertight(faces))), cache(lambda: topology.components(faces)[0])

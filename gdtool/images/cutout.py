@@ -11,7 +11,7 @@ INSETS = (0.02, 0.06)  # widths of the frame that is taken for background, as sh
 AGREEMENT = 0.85  # least overlap of what the two frames give; docs/benchmarks/cutout.md says how well it tells
 
 
-def cut_out(color: np.ndarray, subject: object = "image", cure: str = "") -> np.ndarray:
+def cut_out(color: np.ndarray, subject: object, cure: str) -> np.ndarray:
     """Boolean mask (h, w) of the one subject inside a picture, color (h, w, 3) sRGB in [0, 1].
 
     The colors along the picture's frame are taken for background. Done with two widths of the frame: where the results

@@ -29,14 +29,14 @@ def foreground(image: np.ndarray, mask: np.ndarray | None = None, subject: objec
     if mask is not None:
         coverage = _mask_coverage(mask)
         if coverage.shape != image.shape[:2]:
-            raise InputError(subject, f"is {image.shape[1]}x{image.shape[0]}, its mask {coverage.shape[1]}x{coverage.shape[0]}")
+            raise InputError(subject, f"is {image.shape[1]}x{image.shape[0]}, its mask {coverage.shape[1]}x{coverage.shape[0]}", "scale the mask to the size of the picture")
         if not (coverage > 0.5).any():
             raise InputError(subject, "has an empty mask", "paint the subject white in it")
         return coverage
     if image.shape[2] in (2, 4):
         alpha = np.clip(unit_range(image[..., -1]), 0, 1).astype(np.float32)
         if not (alpha > 0.5).any():
-            raise InputError(subject, "is transparent everywhere", "save it with a visible subject")
+            raise InputError(subject, "is transparent everywhere", "save it with a subject that is opaque")
         if (alpha < 0.5).any():
             return alpha
     if network is not None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from gdtool.core.errors import InputError
+from gdtool.core.reading import MAX_INTEGER_DIGITS
 from gdtool.shading.environment import Environment, load_environment
 from gdtool.shading.lights import paint, random_lobes
 from gdtool.shading.sg import SphericalGaussians
@@ -24,8 +25,8 @@ def studio(source: str, seed: int = 0, fit: bool = True) -> tuple[Environment, S
 
     if source.startswith("random:"):
         number = source.removeprefix("random:")
-        if not number.isdigit():
-            raise InputError(source, "is not random:NUMBER")
+        if not (number.isascii() and number.isdigit() and len(number) <= MAX_INTEGER_DIGITS):
+            raise InputError(source, "is not random:NUMBER", f"write random: and a whole number of at most {MAX_INTEGER_DIGITS} digits, as in random:7")
         axes, sharpness, amplitudes = random_lobes(np.random.default_rng(int(number)))
         environment = paint(axes, sharpness, amplitudes, RANDOM_HEIGHT, source).metered()
         lobes = SphericalGaussians(*(torch.tensor(x, dtype=torch.float64) for x in (axes, sharpness, amplitudes * environment.scale)))

@@ -19,7 +19,7 @@ from msgspec import Meta
 
 from gdtool.core.errors import InputError, ResourceError
 from gdtool.core.kinds import AssetContent
-from gdtool.core.stage import Inputs, Output, SecondInput, Stage, file_option
+from gdtool.core.stage import MOST_SEED, Inputs, Output, SecondInput, Stage, file_option
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -29,7 +29,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     samples: Annotated[int, Meta(ge=1, le=64, description="samples per texel where neighbouring texels differ: 1, 4, 9, …; without it 4 where a texel is much wider than the source's detail, else 1")] | None = None
     ao: Annotated[bool, Meta(description="trace ambient occlusion")] = True
     ao_rays: Annotated[int, Meta(ge=1, le=65536, description="rays per traced point of ambient occlusion")] = 64
-    padding: Annotated[int, Meta(ge=0, description="texels of gutter around charts; 0: all that is free")] = 0
+    padding: Annotated[int, Meta(ge=0, le=16384, description="texels of gutter around charts; 0: all that is free")] = 0
     bits: Annotated[int, Meta(ge=8, le=16, multiple_of=8, description="bits per channel of the maps, 8 or 16")] = 8
     normal_map: Annotated[Literal["auto", "on", "off"], Meta(description="auto leaves it out where it would be flat")] = "auto"
     normal_convention: Annotated[Literal["opengl", "directx"], Meta(description="green channel of normal.png; .glb is always opengl")] = "opengl"
@@ -40,7 +40,19 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     usd: Annotated[Literal["none", "usda", "usdz"], Meta(description="write OpenUSD with UsdPreviewSurface as well (needs usd-core)")] = "none"
     source_frame: Annotated[bool, Meta(description="write vertices in the source's own frame instead of the normalised one")] = False
     model: file_option("model or mesh file, with its textures, to bake from instead of the surface") = None
-    seed: Annotated[int, Meta(ge=0, description="seed of the occlusion rays")] = 0
+    seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="seed of the occlusion rays")] = 0
+
+
+def check(inputs: Inputs, options: Options) -> None:
+    """Raise what --model, --usd and a missing surface would stop the run with."""
+    from gdtool.stages import early
+
+    if options.usd != "none":
+        early.require_package("pxr.Usd", "--usd", "pip install 'gdtool[usd]', or leave out --usd")
+    if options.model is not None:
+        early.require_model("--model", options.model)
+    elif inputs.second["surface"] is None:
+        _named_model(inputs, options)
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
@@ -51,10 +63,6 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.texture.reproject import vertex_reach
     from gdtool.texture.target import texel_width, texels_of
 
-    if options.usd != "none":
-        from gdtool.texture.usd import require
-
-        require()
     with out.step("read"):
         mesh, matrix = _read_mesh(inputs, options)
     with out.step("frames"):
@@ -193,9 +201,6 @@ def _read_mesh(inputs: Inputs, options: Options):
 
 def _read_origin(inputs: Inputs, options: Options, matrix, target, out: Output):
     """What to bake from: the surface (with its views), a model named by --model, or the model that was remeshed."""
-    from pathlib import Path
-
-    from gdtool.core.provenance import find_source
     from gdtool.texture.origin import from_scene, from_surface
 
     surface, views = inputs.second["surface"], inputs.second["views"]
@@ -218,13 +223,7 @@ def _read_origin(inputs: Inputs, options: Options, matrix, target, out: Output):
         field = material_field(surface.file("field.safetensors"), out.device) if known else None
         read = read if read is not None and read.images else None
         return from_surface(read_surface(surface), read, field, None if read is None else _read_picture(views, read, out))
-    named = options.model
-    if named is None and hasattr(inputs.main, "content"):
-        named = find_source(inputs.main, "name the model to bake from with --model")
-        if named is not None and not named.startswith("procedural:") and Path(named).suffix.lower() not in (".glb", ".gltf", ".obj", ".ply", ".stl"):
-            named = None
-    if named is None:
-        raise InputError(_path(inputs), "has no surface to bake from along its provenance chain", "name one with --surface or --model")
+    named = _named_model(inputs, options)
     from gdtool.assets.load import load_scene
     from gdtool.texture.target import texel_width
 
@@ -234,6 +233,23 @@ def _read_origin(inputs: Inputs, options: Options, matrix, target, out: Output):
         return 0.5 * texel_width(target, size) / samples**0.5
 
     return from_scene(load_scene(named), matrix, footprint)
+
+
+def _named_model(inputs: Inputs, options: Options) -> str:
+    """The model to bake from: of --model, else the one that was remeshed. Raises InputError where there is none."""
+    from pathlib import Path
+
+    from gdtool.assets.load import SUFFIXES
+    from gdtool.core.provenance import find_source
+
+    named = options.model
+    if named is None and hasattr(inputs.main, "content"):
+        named = find_source(inputs.main, "name the model to bake from with --model")
+        if named is not None and not named.startswith("procedural:") and Path(named).suffix.lower() not in SUFFIXES:
+            named = None
+    if named is None:
+        raise InputError(_path(inputs), "has no surface to bake from along its provenance chain", "name one with --surface or --model")
+    return named
 
 
 def _fineness(options: Options, target, detail: float) -> tuple[int, int]:
@@ -310,6 +326,6 @@ def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx
 
 
 STAGE = Stage(
-    name="bake", version=13, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run,
+    name="bake", version=13, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run, check=check,
     second_inputs={"surface": SecondInput("surface", help="The surface to bake from; found along the provenance chain without it."),
                    "views": SecondInput("views", help="Views of it; found along the provenance chain without it.")})

@@ -23,6 +23,7 @@ from gdtool.core.errors import InputError, UsageError
 from gdtool.core.folder import Folder, open_folder
 from gdtool.core.provenance import ancestors, find_ancestor, origins
 from gdtool.core.sources import Source, name_of
+from gdtool.core.stage import MOST_SEED
 
 if TYPE_CHECKING:
     import numpy as np
@@ -50,7 +51,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     threshold: Annotated[float, Meta(gt=0, le=1, description="distance that counts as a match in the F-score, largest extent of the truth 1")] = 0.01
     syncdreamer: Annotated[bool, Meta(description="measure by the protocol of the published tables too")] = True
     render: Annotated[bool, Meta(description="render an asset or a model through the cameras of the views and compare the pictures")] = True
-    seed: Annotated[int, Meta(ge=0, description="of the drawn points")] = 0
+    seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="of the drawn points")] = 0
 
 
 @dataclass(frozen=True)
@@ -246,13 +247,14 @@ def _pictures(result: Folder, reference: Source | None) -> Report:
             raise UsageError(result.path, f"has no other {result.kind} along its provenance chain", "name one with --reference")
         reference = open_folder(reference.path)
     if _kind(reference) != result.kind:
-        cure = f"run gdtool render-dataset {_place(reference)} --cameras {result.path} first" if result.kind == "views" else "name a renders folder"
+        cure = f"run gdtool render-dataset {_place(reference)} --cameras {result.path} first" if result.kind == "views" else "name a renders folder with --reference"
         raise InputError(_place(reference), f"holds {_kind(reference)}, but the result holds {result.kind}", cure)
     read = _read_renders if result.kind == "renders" else _read_views
     (images, mask, names), (true_images, true_mask, true_names) = read(result), read(reference)
     shared = [name for name in true_names if name in names]
     if not shared:
-        raise InputError(result.path, f"has no view in common with {reference.path} ({', '.join(true_names)})")
+        raise InputError(result.path, f"has no view in common with {reference.path} ({', '.join(true_names)})",
+                         f"run gdtool render-dataset with --cameras {reference.path}" if result.kind == "views" else "render both with the same --views")
     if result.kind == "views":
         _check_cameras(result, reference, shared)
     pick, true_pick = [names.index(name) for name in shared], [true_names.index(name) for name in shared]
@@ -278,7 +280,7 @@ def _read_renders(folder: Folder) -> tuple[dict[str, np.ndarray], np.ndarray, li
     names = [f"{i:03d}" for i in range(folder.content.frames)]
     frames = [read_image(folder.file(f"{name}.png")) for name in names]
     if len({frame.shape for frame in frames}) > 1 or frames[0].shape[2] != 4:
-        raise InputError(folder.path, "has frames of different sizes, or without alpha")
+        raise InputError(folder.path, "has frames of different sizes, or without alpha", "run gdtool relight again")
     stack = np.stack(frames).astype(np.float32) / np.iinfo(frames[0].dtype).max
     return {"color": linear_from_srgb(stack[..., :3]).astype(np.float32)}, stack[..., 3], names
 

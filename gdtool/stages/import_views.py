@@ -47,7 +47,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         pictures = module.read(inputs.main)
     cameras, images, mask = pictures.cameras, dict(pictures.images), np.where(pictures.mask > 1 / 512, pictures.mask, 0).astype(np.float32)
     if not (mask > 0.5).any():
-        raise InputError(inputs.main, "every mask is empty", "the pictures show no object")
+        raise InputError(inputs.main, "every mask is empty", "give pictures with an alpha, or white masks as mask/VIEW.png")
     matrix = np.eye(4)  # of this world into ours
     if (pictures.up if options.up == "auto" else options.up) == "z":
         matrix[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]

@@ -10,6 +10,7 @@ Example:
 
 from __future__ import annotations
 
+import contextlib
 from typing import Annotated, Literal
 
 import msgspec
@@ -18,7 +19,7 @@ from msgspec import Meta
 from gdtool.core import log
 from gdtool.core.errors import InputError, UsageError
 from gdtool.core.kinds import DOMAINS
-from gdtool.core.stage import Inputs, Output, Stage
+from gdtool.core.stage import MOST_SECONDS, MOST_SEED, Inputs, Output, Stage
 
 # Below this share of points that another view confirms, depth and normals say less of the shape than the silhouettes do.
 LEAST_AGREEMENT = 0.25
@@ -36,13 +37,28 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     precision: Annotated[Literal["float32", "bfloat16"], Meta(description="paper: of the networks' layers while the first shape is fitted; the end is always float32")] = "float32"
     root: Annotated[Literal["secant", "median"], Meta(description="paper: surface point between two samples of a ray")] = "secant"
     brdf: Annotated[Literal["gltf", "paper"], Meta(description="paper: reflection model that color is fitted with")] = "gltf"
-    budget: Annotated[float, Meta(ge=0, description="seconds to be done in: grid takes a coarser grid, paper shortens its schedule; 0: as long as it helps")] = 0.0
+    budget: Annotated[float, Meta(ge=0, le=MOST_SECONDS, description="seconds to be done in: grid takes a coarser grid, paper shortens its schedule; 0: as long as it helps")] = 0.0
     ignore: Annotated[tuple[str, ...], Meta(description="domains to leave out, for example depth,normal")] = ()
-    seed: Annotated[int, Meta(ge=0, description="seed of everything random")] = 0
+    seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="seed of everything random")] = 0
+
+
+def check(inputs: Inputs, options: Options) -> None:
+    """Raise UsageError for domains that there are not."""
+    unknown = sorted(set(options.ignore) - set(DOMAINS))
+    if unknown:
+        raise UsageError("--ignore", f"{unknown[0]!r} is no domain", f"choose from {', '.join(DOMAINS)}")
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
-    """Reconstruct one views folder."""
+    """Reconstruct one views folder. Raises ResourceError where it takes longer than --budget by far (stages/limits.py)."""
+    from gdtool.stages.limits import held_to
+
+    cure = f"raise --budget to {max(round(2 * options.budget), 1)}, or leave it out"
+    with held_to(options.budget, "--budget", inputs.name, cure) if options.budget else contextlib.nullcontext():
+        _run(inputs, options, out)
+
+
+def _run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.fields.align import agreement
     from gdtool.fields.appearance import appearance
     from gdtool.fields.fusion import BUMPY, SMALL, align_depth, finest_pixel, fuse_within, grid_step, is_closed_manifold, prepare_all, silhouettes_outvoted
@@ -50,9 +66,6 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.folders.views import read_views
     from gdtool.geometry.normals import vertex_normals
 
-    unknown = sorted(set(options.ignore) - set(DOMAINS))
-    if unknown:
-        raise UsageError("--ignore", f"{unknown[0]!r} is no domain", f"choose from {', '.join(DOMAINS)}")
     folder, clock = inputs.main, _clock(options)
     with out.step("read"):
         views = read_views(folder, tuple(d for d in DOMAINS if d not in options.ignore))
@@ -84,7 +97,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         try:
             shape, coarser = fuse_within(sights, step, noise, outvoted, clock, normal is not None, grow, folder.content.picture)
         except ValueError as error:
-            raise InputError(folder.path, str(error), "check the masks and cameras") from None
+            raise InputError(folder.path, str(error), "give masks and cameras of one object") from None
     if shape.bumps is None or shape.bumps <= BUMPY:
         out.skip("surface by normals", f"it is within {shape.bumps:.1f} degrees of them" if shape.bumps is not None
                  else "there are none" if normal is None
@@ -206,17 +219,17 @@ def _check_cameras(folder, cameras, vertices) -> None:
 
     for camera in cameras:
         if project(camera, vertices)[1].min() <= 0:
-            raise InputError(folder.file("cameras.json"), f"camera {camera.name!r} is inside the object or looks away from it", "check the poses")
+            raise InputError(folder.file("cameras.json"), f"camera {camera.name!r} is inside the object or looks away from it", "give it a world_from_camera outside the object, -z towards it")
 
 
 def _check_masks(path, views, out: Output) -> None:
     """Warn about views that show nothing. Raises InputError when none shows anything."""
     shown = [(views.mask[k] > 0.5).any() for k in range(len(views.cameras))]
     if not any(shown):
-        raise InputError(path, "every mask is empty", "the views show no object")
+        raise InputError(path, "every mask is empty", "paint the object white in the masks")
     for name, good in zip(views.names, shown, strict=True):
         if not good:
             out.warn(f"view {name}: its mask is empty; the view is left out")
 
 
-STAGE = Stage(name="reconstruct", version=18, reads=("views",), writes="surface", Options=Options, run=run)
+STAGE = Stage(name="reconstruct", version=18, reads=("views",), writes="surface", Options=Options, run=run, check=check)

@@ -19,7 +19,7 @@ from msgspec import Meta
 from gdtool.core.errors import UsageError
 from gdtool.core.folder import Folder
 from gdtool.core.kinds import RendersContent
-from gdtool.core.stage import Inputs, Output, Stage, file_option
+from gdtool.core.stage import LEAST_EXPOSURE, MOST_EXPOSURE, MOST_SECONDS, MOST_SEED, Inputs, Output, Stage, file_option
 
 # Samples per pixel at which a view ends that was to end by itself.
 OPEN_ENDED = 4096
@@ -36,21 +36,31 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     light: Annotated[Literal["sampled", "prefiltered", "sg"], Meta(description="how --env lights: sampled, exact direct light with shadows; prefiltered, the light averaged over reflection lobes, shadows from a few rays; sg, closed form of sixteen spherical Gaussians, no shadows")] = "sampled"
     samples: Annotated[int, Meta(ge=1, le=4096, description="the most samples per pixel; pixels whose mean is known get fewer, at least 4")] = 64
     light_samples: Annotated[int, Meta(ge=0, le=1024, description="directions per sample, from the light and from the reflection each; 0, prefiltered only: no shadows")] = 4
-    budget: Annotated[float, Meta(gt=0, description="seconds for the rendering of all views, up to 4096 samples per pixel; the pictures then depend on the machine")] | None = None
+    budget: Annotated[float, Meta(gt=0, le=MOST_SECONDS, description="seconds for the rendering of all views, up to 4096 samples per pixel; the pictures then depend on the machine")] | None = None
     target_psnr: Annotated[float, Meta(ge=10, le=60, description="dB, estimated while rendering, at which a view is done, up to 4096 samples per pixel")] | None = None
-    exposure: Annotated[float, Meta(gt=0, description="factor on the color; 1: a white card in the light's brightest direction has radiance 0.8")] = 1.0
+    exposure: Annotated[float, Meta(ge=LEAST_EXPOSURE, le=MOST_EXPOSURE, description="factor on the color; 1: a white card in the light's brightest direction has radiance 0.8")] = 1.0
     brdf: Annotated[Literal["gltf", "paper"], Meta(description="reflection model; gltf is what engines use")] = "gltf"
-    seed: Annotated[int, Meta(ge=0, description="seed of everything random")] = 0
+    seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="seed of everything random")] = 0
 
 
-def run(inputs: Inputs, options: Options, out: Output) -> None:
-    """Light one asset or model."""
+def check(inputs: Inputs, options: Options) -> None:
+    """Raise what --env and options that exclude one another would stop the run with."""
+    from gdtool.shading.environment import BUNDLED
+    from gdtool.stages import early
+
     if options.budget is not None and options.target_psnr is not None:
-        raise UsageError("--budget and --target-psnr", "exclude each other", "give one")
+        raise UsageError("--budget and --target-psnr", "exclude each other", "leave one of them out")
     if options.light == "sampled" and not options.light_samples:
         raise UsageError("--light-samples 0", "leaves --light sampled without light", "use --light prefiltered")
     if options.light == "sg" and (options.budget, options.target_psnr) != (None, None):
         raise UsageError("--light sg", "is free of noise", "leave out --budget and --target-psnr")
+    early.require_fov(options.fov)
+    early.require_environment("--env", options.env or "mid", BUNDLED)
+
+
+def run(inputs: Inputs, options: Options, out: Output) -> None:
+    """Light one asset or model."""
+    import contextlib
     import dataclasses
     import time
 
@@ -69,6 +79,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.shading.rigs import turntable
     from gdtool.shading.savings import savings
     from gdtool.shading.studio import studio
+    from gdtool.stages.limits import held_to
 
     torch.set_num_threads(1)  # shading runs in threads of its own
     with out.step("read"):
@@ -81,7 +92,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         environment, lobes, record = studio(options.env or "mid", options.seed, fit=options.light == "sg")
     cameras = turntable(options.views, options.size, options.elevation, options.fov)
     frames, clipped = [], []
-    with out.step("render"):
+    cure = "raise --budget, or lower --size or --views"
+    held = contextlib.nullcontext() if options.budget is None else held_to(options.budget, "--budget", inputs.name, cure)
+    with held, out.step("render"):
         renderer = Renderer(scene, out.threads)
         direct = color = None
         if options.light != "sg":
@@ -124,4 +137,4 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
                                  source_from_world=tuple(float(x) for x in matrix.ravel()), report=report)
 
 
-STAGE = Stage(name="relight", version=6, reads=("asset", "model-file"), writes="renders", Options=Options, run=run)
+STAGE = Stage(name="relight", version=6, reads=("asset", "model-file"), writes="renders", Options=Options, run=run, check=check)

@@ -16,9 +16,9 @@ import msgspec
 from msgspec import Meta
 
 from gdtool.core.child import prepare
-from gdtool.core.errors import InputError
+from gdtool.core.errors import InputError, UsageError
 from gdtool.core.kinds import MeshContent
-from gdtool.core.stage import Inputs, Output, Stage
+from gdtool.core.stage import MOST_SECONDS, Inputs, Output, Stage
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -36,20 +36,52 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     engine: Annotated[Literal["auto", "instant-meshes", "quadriflow", "split"], Meta(
         description="auto is instant-meshes with fallbacks; quadriflow needs pyQuadriFlow; split needs no engine")] = "auto"
     smooth_iterations: Annotated[int, Meta(ge=0, le=100, description="rounds of evening out the quads on the surface")] = 5
-    seconds: Annotated[float, Meta(gt=0, description="time limit; engines are tried in the first 70 % of it, what is not done by then is paired triangles")] = 120.0
+    seconds: Annotated[float, Meta(gt=0, le=MOST_SECONDS, description="time limit; engines are tried in the first 70 % of it, what is not done by then is paired triangles; after twice the limit and 5 s the run fails")] = 120.0
     keep: Annotated[bool, Meta(description="pass a mesh through that already meets the request")] = True
 
 
+# Of the quickest way, paired triangles, with what comes before and after (400,000 quads of procedural:7, two cores of 2.5 GHz).
+SECONDS_PER_QUAD = 1.1e-4
+
+# Share of the longest side: a closed surface would need billions of smaller quads.
+LEAST_QUAD_SIZE = 1e-5
+
+# The package that each engine needs, by its module, and how to get it.
+_ENGINE_PACKAGES = {"instant-meshes": ("pynanoinstantmeshes", "pip install pynanoinstantmeshes, or use --engine split"),
+                    "quadriflow": ("pyQuadriFlow", "pip install 'gdtool[quadriflow]', or use --engine auto")}
+
+
+def check(inputs: Inputs, options: Options) -> None:
+    """Raise what --quad-size and the package of --engine would stop the run with."""
+    from gdtool.stages import early
+
+    if 0 < options.quad_size < LEAST_QUAD_SIZE:
+        raise UsageError(f"--quad-size {options.quad_size:g}", f"is smaller than {LEAST_QUAD_SIZE:g} of the longest side", "use 0 to go by --faces")
+
+    if options.engine in _ENGINE_PACKAGES and not options.triangles:
+        module, cure = _ENGINE_PACKAGES[options.engine]
+        early.require_installed(module, f"--engine {options.engine}", cure)
+
+
 def run(inputs: Inputs, options: Options, out: Output) -> None:
-    """Remesh one surface or mesh file."""
+    """Remesh one surface or mesh file. Raises ResourceError where it takes longer than --seconds by far (stages/limits.py)."""
+    from gdtool.stages.limits import held_to
+
+    cure = f"raise --seconds to {max(round(SECONDS_PER_QUAD * options.faces), round(2 * options.seconds), 1)}, or lower --faces"
+    with held_to(options.seconds, "--seconds", inputs.name, cure):
+        _run(inputs, options, out)
+
+
+def _run(inputs: Inputs, options: Options, out: Output) -> None:
     prepare("gdtool.geometry.simplify_child")  # for remesh()'s first child, while the mesh is read
 
     import numpy as np
 
     from gdtool.folders.mesh import QuadMesh, write_mesh
-    from gdtool.geometry import mesh_quality, repair
-    from gdtool.geometry.quad_task import Record
+    from gdtool.geometry import mesh_quality, repair, shells
+    from gdtool.geometry.quad_task import QUADS_OF_A_PIECE, Record, count_reason
     from gdtool.geometry.topology import triangulated
+    from gdtool.stages.limits import require_time
 
     with out.step("read"):
         vertices, faces, matrix, quads = _read(inputs, out)
@@ -65,6 +97,10 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
                                                              else name.replace("_", " ") for name, value in repairs.items()))
         if not closed:
             out.warn(f"{inputs.name}: the surface is open; its boundaries are kept")
+        if inner := shells.told(vertices, faces):
+            out.warn(f"{inputs.name}: {inner}")
+        if not options.triangles:
+            require_time(SECONDS_PER_QUAD * options.faces, options.seconds, "--seconds", inputs.name, "lower --faces")
         found_vertices, found, record = (_decimated if options.triangles else _quads)(vertices, faces, options, out)
     with out.step("measure"):
         figures = record.figures | mesh_quality.topology_figures(found_vertices, found) | mesh_quality.shape_figures(found_vertices, found)
@@ -72,7 +108,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             figures |= mesh_quality.distance_figures(found_vertices, triangulated(found)[0], vertices, faces, 20000, source=record.source)
     asked = options.triangles or (len(found) if options.max_deviation else options.faces)
     if record.engine != "passed through" and abs(len(found) / asked - 1) > 0.03 and (not options.triangles or len(found) > asked):
-        out.warn(f"{inputs.name}: {len(found)} faces, not the {asked} asked for")
+        why = count_reason(faces, len(found), asked, record.failed, 4 if options.triangles else QUADS_OF_A_PIECE)
+        out.warn(f"{inputs.name}: {len(found)} faces, not the {asked} asked for: {why}")
     with out.step("write"):
         write_mesh(out, QuadMesh(found_vertices, found.astype(np.int32)))
     is_quad = found[:, 3] >= 0
@@ -133,7 +170,7 @@ def _read(inputs: Inputs, out: Output):
     kept, faces = compact(vertices, faces)
     extent = float(np.ptp(kept, 0).max())
     if not 1e-150 < extent < 1e150:
-        raise InputError(_path(inputs), f"its longest side is {extent:g}, which cannot be computed with", "scale it")
+        raise InputError(_path(inputs), f"its longest side is {extent:g}, which cannot be computed with", "scale it to about 1")
     matrix = unit_box(kept)
     if quads is not None:
         _, quads = compact(vertices, quads)
@@ -199,4 +236,4 @@ def _way(vertices, faces, options: Options, out: Output):
     return partial(remesh_mirrored, axis=axis), figures
 
 
-STAGE = Stage(name="remesh", version=37, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run)
+STAGE = Stage(name="remesh", version=37, reads=("surface", "mesh-file"), writes="mesh", Options=Options, run=run, check=check)

@@ -21,7 +21,7 @@ from msgspec import Meta
 from gdtool.core.errors import InputError, UsageError
 from gdtool.core.folder import Folder
 from gdtool.core.kinds import DOMAINS
-from gdtool.core.stage import Inputs, Output, SecondInput, Stage, file_option
+from gdtool.core.stage import LEAST_EXPOSURE, MOST_EXPOSURE, MOST_SEED, Inputs, Output, SecondInput, Stage, file_option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -43,7 +43,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     samples: Annotated[int, Meta(ge=1, le=1024, description="the most samples per pixel; pixels whose mean is known get fewer, at least 4")] = 16
     light_samples: Annotated[int, Meta(ge=1, le=1024, description="directions per sample, from the light and from the reflection each")] = 4
     light: file_option("random (seeded by the object's name), random:NUMBER, dark, mid, bright, or a lat-long .hdr or .exr file") = "random"
-    exposure: Annotated[float, Meta(gt=0, description="factor on the color; 1: a white card in the light's brightest direction has radiance 0.8")] = 1.0
+    exposure: Annotated[float, Meta(ge=LEAST_EXPOSURE, le=MOST_EXPOSURE, description="factor on the color; 1: a white card in the light's brightest direction has radiance 0.8")] = 1.0
     rig: Annotated[Literal["six", "wonder3d", "turntable", "sphere"], Meta(description="where the cameras stand")] = "six"
     views: Annotated[int, Meta(ge=1, le=1000, description="how many cameras, for turntable and sphere")] = 8
     elevation: Annotated[float, Meta(ge=-89, le=89, description="of the turntable's cameras, degrees")] = 0.0
@@ -54,20 +54,31 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     turn: Annotated[float, Meta(ge=0, le=180, description="turn the object about the vertical, by its name and --seed, by up to so many degrees either way")] = 0.0
     condition_views: Annotated[int, Meta(ge=0, le=1000, description="pictures from the front at random elevation, projection and scale")] = 0
     filter: Annotated[Literal["all", "complete-pbr"], Meta(description="complete-pbr: refuse a model when more than 5 % of its area lacks a base color or metallic-roughness texture")] = "all"
-    seed: Annotated[int, Meta(ge=0, description="seed of everything random, together with the object's name")] = 0
+    seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="seed of everything random, together with the object's name")] = 0
 
 
-def run(inputs: Inputs, options: Options, out: Output) -> None:
-    """Render one model."""
+def check(inputs: Inputs, options: Options) -> None:
+    """Raise what --light and options that contradict one another would stop the run with."""
+    from gdtool.shading.environment import BUNDLED
+    from gdtool.stages import early
+
     unknown = sorted(set(options.domains) - set(ALL))
     if unknown:
         raise UsageError("--domains", f"{unknown[0]!r} is no domain", f"choose from {', '.join(ALL)}")
     if options.turn and inputs.second.get("cameras") is not None:
-        raise UsageError("--turn", "does not go with --cameras, whose folder says how the object stands")
+        raise UsageError("--turn", "does not go with --cameras, whose folder says how the object stands", "leave out one of the two")
+    early.require_fov(options.fov)
+    if options.light not in (None, "random"):
+        early.require_environment("--light", options.light, BUNDLED)
+
+
+def run(inputs: Inputs, options: Options, out: Output) -> None:
+    """Render one model."""
     import numpy as np
 
     from gdtool.assets.load import load_scene
     from gdtool.folders.views import Views, write_views
+    from gdtool.geometry import shells
     from gdtool.shading.render import Renderer
 
     given: Folder | None = inputs.second.get("cameras")
@@ -76,6 +87,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         scene = load_scene(source)
     for note in scene.notes:
         out.warn(note)
+    generated = isinstance(inputs.main, str)  # parts of generated objects overlap as their makers meant it
+    if not generated and (inner := shells.told(scene.vertices, scene.faces, welded=False)):
+        out.warn(inner)
     _filter(scene, inputs.name, options)
     scene, source_from_world = _placed(scene, inputs, given, options)
     cameras = _cameras(given, options)
@@ -93,14 +107,13 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     wanted = [d for d in ALL if d in options.domains]
     mask = np.stack([frame["mask"] for frame in frames])
     if not mask.any():
-        raise InputError(inputs.name, "is not in the picture of any camera", "check --cameras, or leave out --no-normalize")
+        raise InputError(inputs.name, "is not in the picture of any camera", "name views of this object with --cameras, or leave out --no-normalize")
     views = Views(cameras, {d: np.stack([frame[d] for frame in frames]) for d in wanted}, mask, light)
 
     with out.step("conditions"):
         if options.condition_views:
             _write_conditions(out, renderer, lamps.direct, options, rng)
     with out.step("write"):
-        generated = isinstance(inputs.main, str)
         if generated:
             from gdtool.assets.gltf_write import write_glb
 
@@ -135,7 +148,7 @@ def _filter(scene: Scene, name: str, options: Options) -> None:
     area = face_normals(scene.vertices, scene.faces)[1]
     share = float(area[complete[scene.material_idx]].sum() / max(area.sum(), 1e-300))
     if share < 0.95:
-        raise InputError(name, f"has complete PBR textures on {share:.0%} of its area only", "dropped by --filter complete-pbr")
+        raise InputError(name, f"has complete PBR textures on {share:.0%} of its area only", "leave out --filter to take it all the same")
 
 
 def _placed(scene: Scene, inputs: Inputs, given: Folder | None, options: Options) -> tuple[Scene, np.ndarray]:
@@ -285,6 +298,6 @@ def _tell_skips(out: Output, renderer: Renderer, options: Options, lamps: _Lamps
 
 
 STAGE = Stage(
-    name="render-dataset", version=7, reads=("model-file", "asset"), writes="views", Options=Options, run=run, dataset=True,
+    name="render-dataset", version=7, reads=("model-file", "asset"), writes="views", Options=Options, run=run, check=check, dataset=True,
     second_inputs={"cameras": SecondInput("views", search=False, help="Views folder whose cameras, frame and light are used again.")},
 )

@@ -21,7 +21,7 @@ import msgspec
 from msgspec import Meta
 
 from gdtool.core.errors import InputError, ResourceError, UsageError
-from gdtool.core.stage import Inputs, Output, SecondInput, Stage, file_option
+from gdtool.core.stage import MOST_SEED, Inputs, Output, SecondInput, Stage, file_option
 
 EVERY = ("color", "normal", "depth", "albedo", "roughness", "metallic")
 FINEST = 8  # pixels of picture.png across one of a view
@@ -34,13 +34,30 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     guided_to: Annotated[float, Meta(ge=0, le=1, description="Most noise that guidance acts at; outside there is none, and half the time.")] = 1.0
     scheduler: Annotated[Literal["ddim", "dpm"], Meta(description="Sampler: DDIM or DPM-Solver++.")] = "ddim"
     mirror: Annotated[bool, Meta(description="Take the mean with what the picture's mirror image gives, where the model is one that gains from it; twice the time.")] = True
-    seed: Annotated[int, Meta(ge=0, description="Seed of the noise, the same for every object whatever the order.")] = 0
+    seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="Seed of the noise, the same for every object whatever the order.")] = 0
     domains: Annotated[tuple[str, ...], Meta(description="Domains to write; color is made in any case, being the primary.")] = EVERY
     mask: file_option("Image that is bright where the subject is.") = None
     matting: file_option("ONNX file of a network that cuts the subject out of any background: u2net.onnx, u2netp.onnx or silueta.onnx (needs gdtool[matting]).") = None
     crop: Annotated[bool, Meta(description="Centre the subject and scale it as in training.")] = True
     precision: Annotated[Literal["float32", "bfloat16"], Meta(description="Arithmetic of the networks.")] = "float32"
     compile: Annotated[bool, Meta(description="Compile the network first (torch.compile, needs a C++ compiler): two minutes the first time, ten seconds afterwards, then a third less time a step.")] = False
+
+
+def check(inputs: Inputs, options: Options) -> None:
+    """Raise what --mask and --matting would stop the run with."""
+    from gdtool.stages import early
+
+    if options.mask is not None:
+        mask, image = early.require_picture("--mask", options.mask), early.require_picture("the source", str(inputs.main))
+        if sorted(mask) != sorted(image):  # a camera held upright swaps the two
+            raise _wrong_size(options.mask, mask, image)
+    if options.matting is not None:
+        early.require_file("--matting", options.matting)
+        early.require_package("onnxruntime", "--matting", "pip install 'gdtool[matting]', or give a mask with --mask")
+
+
+def _wrong_size(mask: str, size: tuple[int, int], wanted: tuple[int, int]) -> InputError:
+    return InputError(mask, f"is {size[0]}x{size[1]}, the image {wanted[0]}x{wanted[1]}", f"scale it to {wanted[0]}x{wanted[1]}")
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
@@ -69,7 +86,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     unknown = [d for d in domains if d not in config.domains]
     if unknown or not domains:
         raise UsageError("--domains", f"{unknown[0] if unknown else 'nothing'} is not a domain of this model",
-                         f"it has {','.join(config.domains)}")
+                         f"choose from {','.join(config.domains)}")
     with out.step("condition"):
         condition, picture = _condition(inputs, options, config, out)
     with out.step("sample"):
@@ -150,10 +167,10 @@ def _condition(inputs: Inputs, options: Options, config, out: Output):
 
     image = read_image(inputs.main)
     if min(image.shape[:2]) < 32:
-        raise InputError(inputs.main, f"is {image.shape[1]}x{image.shape[0]} pixels; the model needs 32 at least")
+        raise InputError(inputs.main, f"is {image.shape[1]}x{image.shape[0]} pixels; the model needs 32 at least", "give a larger picture")
     given = read_image(Path(options.mask)) if options.mask is not None else None
     if given is not None and given.shape[:2] != image.shape[:2]:
-        raise InputError(options.mask, f"is {given.shape[1]}x{given.shape[0]}, the image {image.shape[1]}x{image.shape[0]}")
+        raise _wrong_size(options.mask, given.shape[1::-1], image.shape[1::-1])
     alpha = foreground(image, given, inputs.main, out.warn, options.matting)
     if not (alpha > 0.5).any():
         raise InputError(inputs.main, "shows no subject: its mask is empty", "give one with --mask")
@@ -173,6 +190,6 @@ def _condition(inputs: Inputs, options: Options, config, out: Output):
     return condition, picture
 
 
-STAGE = Stage(name="sample-views", version=12, reads=("image-file",), writes="views", Options=Options, run=run,
+STAGE = Stage(name="sample-views", version=12, reads=("image-file",), writes="views", Options=Options, run=run, check=check,
               second_inputs={"model": SecondInput("model", search=False, default="models/default", foreign=True,
                                               help="Model folder of gdtool train, or Wonder3D v1 as a folder or hub id; the bundled model without it.")})

@@ -18,8 +18,14 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from gdtool.core.errors import InputError
-from gdtool.core.stage import Inputs, Output, SecondInput, Stage, file_option
+from gdtool.core.errors import InputError, UsageError
+from gdtool.core.reading import read_json
+from gdtool.core.stage import MOST_SEED, Inputs, Output, SecondInput, Stage, file_option
+
+
+MOST_STEPS = 10**9
+MOST_MINUTES = 525_600.0  # a year
+HELD_OUT = 4  # objects, or all but one where there are no more
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -28,14 +34,27 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
                         Meta(description="Part of the method to leave out or change; color_normal: Wonder3D's two domains.")] = "none"
     config: file_option("JSON file of changes to it: {\"model\": {...}, \"train\": {...}}.") = None
     size: Annotated[int, Meta(ge=16, le=1024, description="Width and height of a view in pixels, patches in proportion, so at the same cost; a smaller model of --start is grown to it.")] | None = None
-    steps: Annotated[int, Meta(ge=1, description="Optimiser steps; without it the preset's.")] | None = None
-    minutes: Annotated[float, Meta(gt=0, description="Stop after so many minutes of training; the learning rate falls accordingly.")] | None = None
-    batch: Annotated[int, Meta(ge=1, description="Objects per step; without it the preset's.")] | None = None
-    seed: Annotated[int, Meta(ge=0, description="Seed of weights, data order and noise.")] = 0
-    held_out: Annotated[int, Meta(ge=0, description="Last objects of the data that are not trained on but shown in validation images.")] = 4
-    checkpoint_every: Annotated[int, Meta(ge=1, description="Steps between checkpoints.")] = 100
-    validate_every: Annotated[int, Meta(ge=1, description="Steps between validation images.")] = 500
+    steps: Annotated[int, Meta(ge=1, le=MOST_STEPS, description="Optimiser steps; without it the preset's.")] | None = None
+    minutes: Annotated[float, Meta(gt=0, le=MOST_MINUTES, description="Stop after so many minutes of training; the learning rate falls accordingly.")] | None = None
+    batch: Annotated[int, Meta(ge=1, le=65536, description="Objects per step; without it the preset's.")] | None = None
+    seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="Seed of weights, data order and noise.")] = 0
+    held_out: Annotated[int, Meta(ge=0, le=1_000_000, description="Last objects of the data that are not trained on but shown in validation images.")] = HELD_OUT
+    checkpoint_every: Annotated[int, Meta(ge=1, le=MOST_STEPS, description="Steps between checkpoints.")] = 100
+    validate_every: Annotated[int, Meta(ge=1, le=MOST_STEPS, description="Steps between validation images.")] = 500
     tensorboard: Annotated[bool, Meta(description="Write TensorBoard's event files as well, into the run's workspace and the model (needs tensorboard).")] = False
+
+
+def check(inputs: Inputs, options: Options) -> None:
+    """Raise what --config, --tensorboard and --held-out would stop the run with."""
+    from gdtool.stages import early
+
+    configured(options)
+    if options.tensorboard:
+        early.require_package("torch.utils.tensorboard", "--tensorboard", "pip install 'gdtool[tensorboard]', or leave it out")
+    count = _object_count(inputs)
+    # Of fewer objects than the default holds out, one is left to train on: that is no mistake of the user's.
+    if options.held_out >= count and options.held_out != HELD_OUT:
+        raise UsageError(f"--held-out {options.held_out}", f"leaves none of the {count} objects to train on", f"hold out at most {count - 1}")
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
@@ -58,7 +77,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     model_config, train_config = configured(options)
     start = inputs.second["start"]
     with out.step("decode"):
-        folders, count = _objects(inputs, out.workspace)
+        folders, count = _objects(inputs, out.workspace), _object_count(inputs)
         objects = decode_dataset(folders, count, model_config, out.workspace, warn=out.warn)
     held = min(options.held_out, len(objects) - 1)
     used = len(objects) - held
@@ -177,21 +196,19 @@ def configured(options: Options):
     if options.config is not None:
         path = Path(options.config)
         try:
-            changes = msgspec.json.decode(path.read_bytes(), type=dict[Literal["model", "train"], dict])
-        except FileNotFoundError:
-            raise InputError(path, "does not exist") from None
-        except msgspec.DecodeError as error:
-            raise InputError(path, str(error)) from None
+            changes = msgspec.convert(read_json(path), dict[Literal["model", "train"], dict])
+        except msgspec.ValidationError as error:
+            raise InputError(path, str(error), 'write {"model": {...}, "train": {...}} with names and values of docs/training.md') from None
         for part, name in zip(parts, ("model", "train"), strict=True):
             part.update(changes.get(name, {}))
     flags = {"steps": options.steps, "batch": options.batch}
     parts[1].update({name: value for name, value in flags.items() if value is not None})
     if options.minutes is not None and options.steps is None:
-        parts[1]["steps"] = 10**9  # the minutes decide
+        parts[1]["steps"] = MOST_STEPS  # the minutes decide
     try:
         model, train = (msgspec.convert(part, type(own)) for part, own in zip(parts, preset, strict=True))
     except msgspec.ValidationError as error:
-        raise InputError(options.config or "configuration", str(error)) from None
+        raise InputError(options.config or "configuration", str(error), "correct that value in the file of --config") from None
     if options.size is not None:
         from gdtool.diffusion.grow import resized
 
@@ -200,24 +217,32 @@ def configured(options: Options):
 
 
 def _objects(inputs: Inputs, workspace):
-    """The views folders among the sources, those of datasets and archives opened one by one, and how many there are."""
+    """The views folders among the sources, those of datasets and archives opened one by one."""
     import itertools
     from pathlib import Path
 
     from gdtool.core.folder import dataset_objects
 
-    parts, total = [], 0
+    parts = []
     for source in inputs.all:
         if isinstance(source, Path):
-            from gdtool.diffusion.archives import object_count, views_of
+            from gdtool.diffusion.archives import views_of
 
-            total += object_count(source)
             parts.append(views_of(source, workspace))
             continue
-        total += 1 if source.kind == "views" else len(source.content.objects)
         parts.append([source] if source.kind == "views" else dataset_objects(source))
-    return itertools.chain.from_iterable(parts), total
+    return itertools.chain.from_iterable(parts)
 
 
-STAGE = Stage(name="train", version=3, reads=("dataset", "views", "archive-file"), writes="model", Options=Options, run=run, gathers=True,
+def _object_count(inputs: Inputs) -> int:
+    """How many views folders _objects() gives; of archives only the headers are read."""
+    from pathlib import Path
+
+    from gdtool.diffusion.archives import object_count
+
+    return sum(object_count(source) if isinstance(source, Path) else 1 if source.kind == "views" else len(source.content.objects)
+               for source in inputs.all)
+
+
+STAGE = Stage(name="train", version=3, reads=("dataset", "views", "archive-file"), writes="model", Options=Options, run=run, check=check, checkpoint="checkpoint.safetensors", gathers=True,
               second_inputs={"start": SecondInput("model", search=False, help="Model folder whose weights to start from.")})

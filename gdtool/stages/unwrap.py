@@ -18,7 +18,7 @@ from msgspec import Meta
 from gdtool.core.child import prepare
 from gdtool.core.errors import InputError
 from gdtool.core.kinds import AtlasContent
-from gdtool.core.stage import Inputs, Output, Stage
+from gdtool.core.stage import MOST_SECONDS, Inputs, Output, Stage
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -30,11 +30,23 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     max_stretch: Annotated[float, Meta(gt=1, le=100, description="a chart with more L2 stretch is cut")] = 1.1
     symmetry: Annotated[Literal["none", "x", "y", "z"], Meta(description="faces that mirror others along this axis share their texels")] = "none"
     redo: Annotated[bool, Meta(description="make new texture coordinates even where the mesh has valid ones")] = False
-    seconds: Annotated[float, Meta(gt=0, description="time limit; charts are shaped in the first 60 % of it, what is left then goes in simpler ways")] = 120.0
+    seconds: Annotated[float, Meta(gt=0, le=MOST_SECONDS, description="time limit; charts are shaped in the first 60 % of it, what is left then goes in simpler ways; after twice the limit and 5 s the run fails")] = 120.0
+
+
+# Of the quickest way, charts by the side that faces look at, with what comes before and after (400,000 quads, two cores of 2.5 GHz).
+SECONDS_PER_FACE = 1.2e-4
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
-    """Unwrap one mesh."""
+    """Unwrap one mesh. Raises ResourceError where it takes longer than --seconds by far (stages/limits.py)."""
+    from gdtool.stages.limits import held_to
+
+    cure = f"raise --seconds to {max(round(2 * options.seconds), 1)}, or run gdtool remesh with fewer --faces before"
+    with held_to(options.seconds, "--seconds", inputs.name, cure):
+        _run(inputs, options, out)
+
+
+def _run(inputs: Inputs, options: Options, out: Output) -> None:
     prepare("gdtool.geometry.simplify_child")  # for unwrap()'s first child, while the mesh is read
 
     import numpy as np
@@ -42,6 +54,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.folders.mesh import QuadMesh, write_mesh
     from gdtool.geometry import topology
     from gdtool.images.io import write_png
+    from gdtool.stages.limits import require_time
     from gdtool.texture import unwrap_preview
     from gdtool.texture.unwrap import Request, figures, islands, unwrap
     from gdtool.texture.unwrap_mirror import with_twins
@@ -58,6 +71,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         else:
             out.warn(f"{inputs.name}: its texture coordinates are not kept: {reason}")
     if not kept:
+        require_time(SECONDS_PER_FACE * len(mesh.faces), options.seconds, "--seconds", inputs.name, "run gdtool remesh with fewer --faces before")
         request = Request(size=options.size, padding=padding, max_stretch=options.max_stretch, seconds=options.seconds)
         with out.step("unwrap"):
             twin, corner = _twins(mesh, options, inputs, out)
@@ -130,11 +144,11 @@ def _read(inputs: Inputs, out: Output):
             mesh = _from_scene(main, inputs, out)
         matrix = None
     if not np.isfinite(mesh.vertices).all():
-        raise InputError(_path(inputs), f"vertex {int(np.argmin(np.isfinite(mesh.vertices).all(1)))} is not finite")
+        raise InputError(_path(inputs), f"vertex {int(np.argmin(np.isfinite(mesh.vertices).all(1)))} is not finite", "run gdtool remesh on the model it was made from")
     used = np.unique(mesh.faces[mesh.faces >= 0])
     extent = float(np.ptp(mesh.vertices[used], 0).max()) if len(used) else 0.0
     if not 1e-150 < extent < 1e150:
-        raise InputError(_path(inputs), f"its longest side is {extent:g}, which cannot be computed with")
+        raise InputError(_path(inputs), f"its longest side is {extent:g}, which cannot be computed with", "scale it to about 1")
     if matrix is None:
         matrix = unit_box(mesh.vertices[used])
         mesh = QuadMesh(transform_points(invert_similarity(matrix), mesh.vertices), mesh.faces, mesh.uv, mesh.face_uvs)
@@ -153,7 +167,7 @@ def _from_scene(main, inputs: Inputs, out: Output):
     for text in scene.notes:
         out.warn(f"{inputs.name}: {text}")
     if not len(scene.faces):
-        raise InputError(_path(inputs), "has no faces")
+        raise InputError(_path(inputs), "has no faces", "name a file with a mesh, not points or lines")
     vertices, _, joined = unique_rows(scene.vertices)
     filler = np.full((len(scene.faces), 1), -1, np.int32)
     corners = np.concatenate([scene.faces, filler], 1).astype(np.int32)
@@ -171,7 +185,7 @@ def _without_degenerate(mesh, inputs: Inputs, out: Output):
     ordered = np.sort(corners, 1)
     good = (ordered[:, 1:] != ordered[:, :-1]).all(1) & (polygon_normals(mesh.vertices, mesh.faces)[1] > 0)
     if not good.any():
-        raise InputError(_path(inputs), "no face has an area")
+        raise InputError(_path(inputs), "no face has an area", "name a mesh whose faces span a surface")
     if good.all():
         return mesh
     out.warn(f"{inputs.name}: left out {int((~good).sum())} faces without area")

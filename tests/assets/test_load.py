@@ -150,5 +150,5 @@ def test_procedural_objects_by_their_seed():
     one, again = load_scene("procedural:7"), load_scene("procedural:7")
     assert one.name == "procedural-000007"
     np.testing.assert_array_equal(one.vertices, again.vertices)
-    with pytest.raises(InputError, match="procedural:SEED"):
+    with pytest.raises(InputError, match="name it like procedural:7"):
         load_scene("procedural:seven")

@@ -199,3 +199,34 @@ def test_the_index_of_several_does_not_replace_a_manifest_of_the_users():
     with pytest.raises(UsageError, match="no manifest of gdtool's"):
         list(run_all(stage, ("a.png", "b.png"), Options(), {}, Settings(output=Path("out"), several=True)))
     assert Path("out/manifest.json").read_text() == '{"name": "my web app"}' and not Path("out/a.asset").exists()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as another user")
+def test_an_old_output_of_another_user_stops_the_run_before_it_starts(made):
+    """It could not be removed once it is replaced: it would be left beside the new one."""
+    os.chown(".", 65534, 65534)
+    pid = os.fork()
+    if not pid:
+        os.setuid(65534)
+        (error,) = run("cat.png", output=made)
+        right = isinstance(error, OutputError) and "closed to writing" in str(error)
+        os._exit(0 if right else 1)
+    assert os.waitpid(pid, 0)[1] == 0
+    assert sorted(path.name for path in Path().iterdir()) == ["cat.png", "out"] and open_folder(made)
+
+
+def test_a_partial_folder_without_permissions_is_removed():
+    """A umask of 777 leaves such folders; root needs no permissions, others do."""
+    pid = os.fork()
+    if not pid:
+        if os.geteuid() == 0:
+            os.chown(".", 65534, 65534)
+            os.setuid(65534)
+        folder = Path(f".out.{'0' * 12}.partial/deep")
+        folder.mkdir(parents=True)
+        (folder / "file").write_text("x")
+        folder.chmod(0)
+        folder.parent.chmod(0)
+        clear_stale(Path("out"))
+        os._exit(len(list(Path().iterdir())))
+    assert os.waitpid(pid, 0)[1] == 0

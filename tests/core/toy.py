@@ -1,6 +1,5 @@
 """A stage that needs nothing but core, for tests: copies its source and can be slow, fail or warn."""
 
-import sys
 import time
 from typing import Annotated
 
@@ -33,7 +32,11 @@ def run(inputs, options, out):
 STAGE = Stage(name="toy", version=1, reads=("image-file",), writes="renders", Options=Options, run=run)
 
 if __name__ == "__main__":
-    from gdtool.commands import _common
+    from gdtool.commands import main
 
-    _common.guarded(_common.stage_command(STAGE, "Toy."))
-    sys.exit()
+    def command():
+        from gdtool.commands._common import stage_command
+
+        return stage_command(STAGE, "Toy.")
+
+    main(command)

@@ -5,9 +5,18 @@ import json
 import shutil
 import struct
 
+import numpy as np
 import pytest
 from PIL import Image
 
+from gdtool.assets.gltf_write import glb_bytes
+from gdtool.assets.scene import Material, Scene
+from gdtool.core.errors import InputError
+from gdtool.core.folder import dataset_objects, open_folder
+from gdtool.core.runner import Settings, run_all
+from gdtool.images.io import write_exr
+from gdtool.stages import relight, remesh, validate
+from tests.faults.files import CUBE, QUADS, quad_cube
 from tests.fields.shapes import torus, views_folder, views_of
 
 
@@ -48,3 +57,73 @@ def test_what_cannot_be_read_here_is_not_called_faulty(gdtool, good, tmp_path):
     done = gdtool("validate", large(tmp_path / "x.gltf"), good)
     assert done.returncode == 5 and "x.png" in done.stderr and "16400" in done.stderr
     assert done.stdout == f"valid: {good}\n"
+
+
+def result(tmp_path):
+    quad_cube(tmp_path / "cube.obj", 2)
+    (done,) = run_all(remesh.STAGE, ("cube.obj",), remesh.Options(faces=24), {}, Settings(output=tmp_path / "mesh"))
+    return done.path
+
+
+def test_options_that_are_not_what_the_key_was_made_of(tmp_path):
+    folder = result(tmp_path)
+    assert list(validate.faults(folder)) == []
+    record = json.loads((folder / "manifest.json").read_text())
+    record["options"]["faces"] = 5000
+    (folder / "manifest.json").write_text(json.dumps(record))
+    (fault,) = validate.faults(folder)
+    assert "not those that the key was made of" in fault and "gdtool remesh" in fault
+
+
+def test_inputs_that_are_not_what_the_key_was_made_of(tmp_path):
+    folder = result(tmp_path)
+    record = json.loads((folder / "manifest.json").read_text())
+    record["inputs"][0]["digest"] = "0" * 64
+    (folder / "manifest.json").write_text(json.dumps(record))
+    assert "not those that the key was made of" in list(validate.faults(folder))[0]
+
+
+def test_a_key_of_which_a_file_is_a_part(tmp_path):
+    """An option that names a file enters the key by digest; once the file is gone that cannot be checked."""
+    write_exr(tmp_path / "sky.exr", np.ones((8, 16, 3), np.float32))
+    options = relight.Options(env="sky.exr", views=1, size=16, samples=1, light_samples=1)
+    triangles = np.concatenate([QUADS[:, [0, 1, 2]], QUADS[:, [0, 2, 3]]]).astype(np.int32)
+    (tmp_path / "cube.glb").write_bytes(glb_bytes(Scene(CUBE, triangles, (Material(),))))
+    (done,) = run_all(relight.STAGE, ("cube.glb",), options, {}, Settings(output=tmp_path / "renders"))
+    assert list(validate.faults(done.path)) == []
+    write_exr(tmp_path / "sky.exr", 2 * np.ones((8, 16, 3), np.float32))
+    assert "the key was made of" in list(validate.faults(done.path))[0]
+    (tmp_path / "sky.exr").unlink()
+    assert list(validate.faults(done.path)) == []
+
+
+def dataset(tmp_path, good, entry):
+    root = tmp_path / "data"
+    shutil.copytree(good, root / "ring.asset/views")
+    shutil.copytree(good, tmp_path / "outside/views")
+    content = {"objects": [entry]}
+    (root / "manifest.json").write_text(json.dumps({"kind": "dataset", "name": "data", "stage": "mine", "content": content, "files": []}))
+    return root
+
+
+def test_a_dataset_that_lists_a_folder_outside(tmp_path, good):
+    right = open_folder(good).manifest.digest
+    assert list(validate.faults(dataset(tmp_path, good, {"path": "ring.asset/views", "digest": right}))) == []
+    shutil.rmtree(tmp_path / "data")
+    shutil.rmtree(tmp_path / "outside")
+    (fault,) = validate.faults(dataset(tmp_path, good, {"path": "../outside/views", "digest": right}))
+    assert "leaves its folder" in fault
+
+
+def test_a_dataset_that_lists_another_folder_by_its_digest(tmp_path, good):
+    root = dataset(tmp_path, good, {"path": "ring.asset/views", "digest": "0" * 64})
+    (fault,) = validate.faults(root)
+    assert "not the folder that the dataset lists" in fault
+    with pytest.raises(InputError, match="not the folder that the dataset lists"):
+        list(dataset_objects(open_folder(root)))
+
+
+def test_a_dataset_that_lists_a_link_out_of_it(tmp_path, good):
+    root = dataset(tmp_path, good, {"path": "link", "digest": open_folder(good).manifest.digest})
+    (root / "link").symlink_to(tmp_path / "outside/views")
+    assert "link that leaves" in list(validate.faults(root))[0]
