@@ -66,7 +66,7 @@ def _convert(path: Path, kind: type) -> Any:
         return msgspec.convert(read_json(path), kind)
     except msgspec.ValidationError as error:
         fact = str(error)
-        raise InputError(path, fact[0].lower() + fact[1:], f"write it as schemas/{path.stem}.schema.json says") from None
+        raise InputError(path, fact[0].lower() + fact[1:], f"write it as schemas/{kind.__name__.lower()}.schema.json says") from None
 
 
 def _write(path: Path, record: Any) -> None:
