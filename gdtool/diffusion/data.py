@@ -80,7 +80,7 @@ def decode_object(folder: Folder, config: ModelConfig) -> tuple[np.ndarray, np.n
     order = [views.names.index(name) for name in config.views]
     size, own = config.image_size, views.mask.shape[-1]
     if views.mask.shape[-2] != own or own % size:
-        raise InputError(folder.path, f"has views of {own} px, not a multiple of the model's {size}", f"render it at {size} pixels or a multiple")
+        raise InputError(folder.path, f"has views of {own} px, not a multiple of the model's {size}", f"run gdtool render-dataset --size {size}")
     planes = planes_from_images({d: x[order] for d, x in views.images.items()}, views.mask[order])
     front = np.concatenate([views.images["color"][order[0]], views.mask[order[0]][..., None]], -1)
     extent = bounding_side(front[..., 3]) / own
