@@ -97,10 +97,10 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
                                                              else name.replace("_", " ") for name, value in repairs.items()))
         if not closed:
             out.warn(f"{inputs.name}: the surface is open; its boundaries are kept")
-        if inner := shells.told(vertices, faces):
-            out.warn(f"{inputs.name}: {inner}")
         if not options.triangles:
             require_time(SECONDS_PER_QUAD * options.faces, options.seconds, "--seconds", inputs.name, "lower --faces")
+        if inner := shells.told(vertices, faces):
+            out.warn(f"{inputs.name}: {inner}")
         found_vertices, found, record = (_decimated if options.triangles else _quads)(vertices, faces, options, out)
     with out.step("measure"):
         figures = record.figures | mesh_quality.topology_figures(found_vertices, found) | mesh_quality.shape_figures(found_vertices, found)

@@ -15,11 +15,14 @@ Example:
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
+from gdtool.core.ending import certainly
 from gdtool.core.errors import InputError, ResourceError, UsageError
 from gdtool.core.stage import MOST_SEED, Inputs, Output, SecondInput, Stage, file_option
 
@@ -129,6 +132,35 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         write_views(out, views, conditions=1, picture=shown, report=report)
 
 
+@contextlib.contextmanager
+def _compiler_cache() -> Iterator[None]:
+    """Have PyTorch keep what it compiles in the user's cache folder, or where that cannot be written in one that is removed.
+
+    By itself it leaves a folder in TMPDIR. TORCHINDUCTOR_CACHE_DIR, where it is set, is respected.
+    """
+    import os
+    import shutil
+    import tempfile
+    from pathlib import Path
+
+    name = "TORCHINDUCTOR_CACHE_DIR"
+    if name in os.environ:
+        yield
+        return
+    with contextlib.ExitStack() as at_end:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "gdtool", "torchinductor")
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+            if not os.access(cache, os.W_OK | os.X_OK):
+                raise PermissionError
+        except OSError:
+            cache = Path(tempfile.mkdtemp(prefix="gdtool-"))
+            at_end.enter_context(certainly(lambda: shutil.rmtree(cache, ignore_errors=True)))
+        os.environ[name] = str(cache)
+        at_end.callback(os.environ.pop, name)
+        yield
+
+
 def _sampled(model, compiled: bool, rgba, **setting):
     """sample_images(), of the compiled network where that is asked for. Raises ResourceError where it cannot be compiled."""
     from gdtool.diffusion.sampling import sample_images
@@ -139,7 +171,8 @@ def _sampled(model, compiled: bool, rgba, **setting):
 
     model.unet.compile()
     try:
-        return sample_images(model, rgba, **setting)
+        with _compiler_cache():
+            return sample_images(model, rgba, **setting)
     except TorchDynamoException as failure:
         raise ResourceError("--compile", f"PyTorch cannot compile the network here: {str(failure).strip().splitlines()[0]}",
                             "leave it out, or install a C++ compiler") from None
