@@ -12,9 +12,7 @@ from msgspec import Meta
 
 from gdtool.cameras import Camera
 from gdtool.core.errors import InputError
-from gdtool.core.folder import Folder
-from gdtool.core.manifest import MANIFEST
-from gdtool.core.names import checked_name, path_inside
+from gdtool.core.names import checked_name
 from gdtool.core.reading import read_json
 
 MAX_SIDE = 16384  # pixels of a view: no larger picture is read
@@ -54,11 +52,6 @@ class Light(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     amplitudes: tuple[Vector3, ...]
     environment: Annotated[str, Meta(description="name of the environment it was fitted to; empty: recovered")] = ""
     fit_error: Annotated[dict[str, float], Meta(description="errors of the fit, by name")] = {}
-
-
-def file_of(folder: Folder, relative: str) -> Path:
-    """Path of a file of a folder, which lies below it, links followed. Raises InputError."""
-    return path_inside(folder.path, relative, folder.path / MANIFEST, "file")
 
 
 def _convert(path: Path, kind: type) -> Any:
