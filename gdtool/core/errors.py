@@ -14,9 +14,9 @@ class GdtoolError(Exception):
 
     exit_code = 1
 
-    def __init__(self, subject: object, fact: str, cure: str = ""):
+    def __init__(self, subject: object, fact: str, cure: str):
         self.subject, self.fact, self.cure = str(subject), fact, cure
-        super().__init__(f"{subject}: {fact}" + (f"; {cure}" if cure else ""))
+        super().__init__(f"{subject}: {fact}; {cure}")
 
     def __reduce__(self):
         return type(self), (self.subject, self.fact, self.cure)

@@ -33,8 +33,8 @@ class Folder:
         return self.manifest.name
 
     def file(self, relative: str) -> Path:
-        """Path of a file of the folder. relative: of gdtool's own making, or a name that the manifest's check has let pass."""
-        return self.path / relative
+        """Path of a file of the folder, which lies below it, links followed. Raises InputError for a name or a link that leads elsewhere."""
+        return path_inside(self.path, relative, self.path / MANIFEST, "file")
 
 
 def is_folder(path: Path) -> bool:

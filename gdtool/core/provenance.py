@@ -51,10 +51,10 @@ def origins(folder: Folder) -> Iterator[Origin]:
             yield Origin(folder, entry, Path(os.path.normpath(folder.path.resolve().joinpath(*parts))))
 
 
-def ancestors(folder: Folder, cure: str = "") -> Iterator[Folder]:
+def ancestors(folder: Folder, cure: str) -> Iterator[Folder]:
     """The folders that this one was made from, nearest first, as far as they still lie where the manifests say; a model's network is none.
 
-    cure: what to do about a folder that was replaced since, for the message; without one, making this folder again.
+    cure: what to do about a folder that was replaced since, for the message.
     Raises InputError for one that was replaced since.
     """
     queue, seen = [folder], {folder.path.resolve()}
@@ -66,30 +66,30 @@ def ancestors(folder: Folder, cure: str = "") -> Iterator[Folder]:
             seen.add(path)
             if read_manifest(path).kind == "model":  # what it was made with, not what of
                 continue
-            origin.require_same(cure or f"run gdtool {origin.of.manifest.stage} {origin.path} again")
+            origin.require_same(cure)
             # Shown as the user would write it, where the chain lies beside the folder that was given.
             found = open_folder(Path(os.path.normpath(origin.of.path / origin.entry.path)), check=False)
             yield found if found.path.resolve() == path else open_folder(path, check=False)
             queue.append(found)
 
 
-def find_ancestor(folder: Folder, kind: str, cure: str = "") -> Folder | None:
+def find_ancestor(folder: Folder, kind: str, cure: str) -> Folder | None:
     """The nearest folder of a kind along the provenance chain (the folder itself included), or None. Raises as ancestors() does."""
     if folder.kind == kind:
         return folder
     return next((found for found in ancestors(folder, cure) if found.kind == kind), None)
 
 
-def missing_origin(folder: Folder) -> Origin | None:
-    """The first thing along the provenance chain that lies no more where the manifests say; None where all is there."""
-    for one in (folder, *ancestors(folder)):
+def missing_origin(folder: Folder, cure: str) -> Origin | None:
+    """The first thing along the provenance chain that lies no more where the manifests say; None where all is there. Raises as ancestors() does."""
+    for one in (folder, *ancestors(folder, cure)):
         for origin in origins(one):
             if origin.is_gone:
                 return origin
     return None
 
 
-def find_source(folder: Folder, cure: str = "") -> str | None:
+def find_source(folder: Folder, cure: str) -> str | None:
     """The first input along the chain that is not a folder: a file path, procedural:SEED, or None.
 
     Raises InputError where the file or a folder on the way was replaced since; cure as for ancestors().
@@ -100,6 +100,6 @@ def find_source(folder: Folder, cure: str = "") -> str | None:
                 return entry.path
         for origin in origins(one):
             if origin.path.is_file():
-                origin.require_same(cure or f"run gdtool {one.manifest.stage} {origin.path} again")
+                origin.require_same(cure)
                 return str(origin.path)
     return None

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gdtool.core.errors import InputError, from_os_error
+from gdtool.core.memory import require_memory
 from gdtool.core.names import shown, text_fault
 
 MAX_INTEGER_DIGITS = 19  # of a 64-bit integer
@@ -41,8 +42,12 @@ def require_regular_file(path: Path) -> None:
 
 
 def bytes_of(path: Path) -> bytes:
-    """The bytes of a file that the user named. Raises InputError where it is no regular file, OutputError where it cannot be read."""
+    """The bytes of a file that the user named.
+
+    Raises InputError where it is no regular file, ResourceError where it is larger than one input may be, OutputError where it cannot be read.
+    """
     require_regular_file(path)
+    require_memory(path.stat().st_size, path, "its content", "give a smaller file")
     try:
         return path.read_bytes()
     except OSError as error:

@@ -94,9 +94,10 @@ def second_inputs(stage: Stage, source: Source, given: dict[str, str | None]) ->
             place = sources.hub_folder(given[flag]) if wanted.foreign else given[flag]
             out[flag] = sources.resolve(place, kinds, f"--{flag} of {stage.name}")
         elif wanted.search and isinstance(source, Folder):
-            found = find_ancestor(source, wanted.kind, f"run the stages after it again, or name it with --{flag}")
+            cure = f"run the stages after it again, or name it with --{flag}"
+            found = find_ancestor(source, wanted.kind, cure)
             out[flag] = open_folder(found.path) if found else None
-            gone = None if found else missing_origin(source)
+            gone = None if found else missing_origin(source, cure)
         elif wanted.default:
             out[flag] = open_folder(Path(gdtool.__file__).parent / wanted.default, (wanted.kind,), stage.name)
         else:

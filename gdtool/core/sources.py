@@ -11,6 +11,7 @@ from pathlib import Path
 
 from gdtool.core.errors import InputError, ResourceError, UsageError
 from gdtool.core.folder import Folder, is_folder, open_folder
+from gdtool.core.kinds import MADE_BY
 from gdtool.core.manifest import digest_of, file_sha256
 from gdtool.core.names import name_from_path, shown, text_fault
 from gdtool.core.reading import MAX_INTEGER_DIGITS, parse_json, require_regular_file
@@ -107,12 +108,13 @@ def resolve(text: str, kinds: tuple[str, ...], reader: str, allow_missing: bool 
         return path
     if path.is_dir() or path.name == "manifest.json":
         if not folder_kinds and not is_folder(path):
-            raise InputError(path, f"is a folder, but {reader} reads {_words(kinds)}")
+            raise InputError(path, f"is a folder, but {reader} reads {_words(kinds)}", f"name a file in {path}")
         return open_folder(path, folder_kinds or ("a file",), reader)
     if not (allow_missing and not os.path.lexists(path)):
         require_regular_file(path)
     if path.exists() and len(folder_kinds) == len(kinds):
-        raise InputError(path, f"is a file, but {reader} reads a {_words(kinds)} folder")
+        raise InputError(path, f"is a file, but {reader} reads a {_words(kinds)} folder",
+                         f"name a folder that gdtool {MADE_BY[folder_kinds[0]]} has written" if folder_kinds[0] in MADE_BY else "name the folder that it lies in")
     return path
 
 
@@ -140,7 +142,8 @@ def hub_folder(text: str, revision: str = "") -> str:
     try:
         return snapshot_download(text, revision=revision or None, allow_patterns=["*.json", "*.safetensors"])
     except Exception as error:  # of several libraries: no network, no such id, no permission
-        raise InputError(text, f"is no folder here, and the hub does not give it ({type(error).__name__})") from None
+        raise InputError(text, f"is no folder here, and the hub does not give it ({type(error).__name__})",
+                         "check the id and the network, or give a local folder") from None
 
 
 def name_of(source: Source) -> str:

@@ -6,16 +6,35 @@ of an object share a key and stand together: KEY.manifest.json, KEY.color.front.
 
 from __future__ import annotations
 
+import lzma
+import os
 import shutil
 import tarfile
 import tempfile
+import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
+from typing import BinaryIO
 
-from gdtool.core.errors import InputError
+from gdtool.core.errors import InputError, ResourceError, from_os_error
 from gdtool.core.folder import Folder, open_folder
+from gdtool.core.names import CURE, name_fault, path_inside, relative_parts, shown
+from gdtool.core.reading import require_regular_file
 
 MANIFEST = "manifest.json"
+
+MAX_MEMBERS = 1 << 24  # of an archive: some 300,000 objects of 50 files
+MAX_OBJECT_MEMBERS = 20_000  # of one views folder: 1000 views of seven pictures each fit twice
+MAX_OBJECT_BYTES = 16 << 30  # unpacked, of one views folder: what lies on the disk at a time
+# Of a compressed archive, unpacked over packed: PNG and EXR are packed already, and padding with zeros gives some 20 for the smallest pictures.
+MAX_RATIO = 200
+MIN_JUDGED_BYTES = 64 << 20  # unpacked; below it a ratio says nothing and harms nothing
+MAX_HEADER_BYTES = 1 << 20  # of an extended header (long names, PAX records), which is read whole
+
+_PACK = "pack it again with tar, plain or compressed"
+_EXTENDED = (tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE)
+_BLOCK = 1 << 20  # bytes copied at a time
 
 
 def placed(member: str) -> tuple[str, str]:
@@ -30,12 +49,13 @@ def placed(member: str) -> tuple[str, str]:
 
 
 def object_count(archive: Path) -> int:
-    """How many views folders a .tar holds; reads its headers only. Raises InputError."""
-    try:
-        with tarfile.open(archive) as tar:
-            count = sum(placed(member.name)[1] == MANIFEST for member in tar if member.isfile())
-    except (tarfile.TarError, EOFError, OSError) as error:
-        raise InputError(archive, f"is not a whole tar file ({error})") from None
+    """How many views folders a .tar holds; reads its headers only.
+
+    Raises InputError for what is no whole tar of regular files with names that stay inside, ResourceError for more members or
+    bytes than the limits above.
+    """
+    with _opened_tar(archive) as tar:
+        count = sum(placed(member.name)[1] == MANIFEST for member in _members(archive, tar))
     if not count:
         raise InputError(archive, "holds no views folder", "pack what render-dataset writes")
     return count
@@ -44,40 +64,131 @@ def object_count(archive: Path) -> int:
 def views_of(archive: Path, workspace: Path) -> Iterator[Folder]:
     """The views folders of a .tar in their order, each unpacked under workspace and removed again.
 
-    An object's members must stand together, as tar and WebDataset write them. Raises InputError.
+    An object's members must stand together, as tar and WebDataset write them. Each header is judged before its content is
+    unpacked. Raises InputError and ResourceError as object_count(), OutputError where workspace cannot be written.
     """
-    with tarfile.open(archive) as tar:
-        root = Path(tempfile.mkdtemp(dir=workspace, prefix="unpacked-"))
-        try:
+    root = Path(tempfile.mkdtemp(dir=workspace, prefix="unpacked-"))
+    try:
+        with _opened_tar(archive) as tar:
             current = None
-            for member in tar:
-                if not member.isfile():
-                    continue
+            for member in _members(archive, tar):
                 name, relative = placed(member.name)
                 if name != current:
                     if current is not None:
                         yield _opened(archive, root, current)
                     shutil.rmtree(root)
                     root.mkdir()
-                    current = name
-                if ".." in PurePosixPath(relative).parts or PurePosixPath(relative).is_absolute():
-                    raise InputError(archive, f"holds {member.name}, which points outside")
-                target = root / _safe(name) / "views" / relative
-                target.parent.mkdir(parents=True, exist_ok=True)
-                with tar.extractfile(member) as source, open(target, "wb") as out:
-                    shutil.copyfileobj(source, out)
+                    current, count, size = name, 0, 0
+                count, size = count + 1, size + member.size
+                if count > MAX_OBJECT_MEMBERS or size > MAX_OBJECT_BYTES:
+                    raise ResourceError(archive, f"would unpack more than {MAX_OBJECT_MEMBERS:,} files or {MAX_OBJECT_BYTES >> 30} GiB for {shown(name)}",
+                                        "render fewer or smaller views of one object")
+                target = path_inside(_place(root, name, archive), relative, archive, "member", byte_escapes=True)
+                _unpack(archive, tar, member, target)
             if current is not None:
                 yield _opened(archive, root, current)
-        finally:
-            shutil.rmtree(root, ignore_errors=True)
+    finally:
+        shutil.rmtree(root, ignore_errors=True)
 
 
-def _safe(name: str) -> str:
-    return name.replace("/", "_").replace("..", "_")
+class _LongHeader(Exception):
+    """An extended header claims more than MAX_HEADER_BYTES; no error of tarfile's, which it would take for another format."""
+
+
+class _BoundedHeader(tarfile.TarInfo):
+    """A header whose extended parts are not read when they claim to be large."""
+
+    def _proc_member(self, tar: tarfile.TarFile):
+        if self.type in _EXTENDED and self.size > MAX_HEADER_BYTES:
+            raise _LongHeader(f"has an extended header of {self.size} bytes, more than {MAX_HEADER_BYTES}")
+        return super()._proc_member(tar)
+
+
+@contextmanager
+def _opened_tar(archive: Path) -> Iterator[tarfile.TarFile]:
+    require_regular_file(archive)
+    try:
+        file = open(archive, "rb")
+    except OSError as error:
+        raise from_os_error(error, archive) from None
+    with file:
+        with _malformed(archive):
+            tar = tarfile.open(fileobj=file, tarinfo=_BoundedHeader)
+        with tar:
+            yield tar
+
+
+@contextmanager
+def _malformed(archive: Path) -> Iterator[None]:
+    """What tarfile and the decompressors raise for bytes that are no tar becomes one InputError."""
+    try:
+        yield
+    except _LongHeader as error:
+        raise InputError(archive, str(error), _PACK) from None
+    except (tarfile.TarError, EOFError, OSError, zlib.error, lzma.LZMAError, RecursionError, ValueError, OverflowError) as error:
+        fact = " ".join(str(error).split())[:80] or type(error).__name__
+        if "could not be opened successfully" in fact:  # tarfile goes on with each format's reason
+            fact = "it is in no format that tarfile knows"
+        raise InputError(archive, f"is not a whole tar file ({fact})", _PACK) from None
+
+
+def _members(archive: Path, tar: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
+    """The regular files of an archive, each judged by its header: its name, its kind, and what it adds to the limits."""
+    packed, count, size = max(os.stat(archive).st_size, 1), 0, 0
+    while True:
+        with _malformed(archive):
+            member = tar.next()
+        if member is None:
+            return
+        tar.members.clear()  # tarfile keeps each header otherwise
+        if member.issparse():
+            raise InputError(archive, f"holds the sparse file {shown(member.name)}", "pack it again without sparse files")
+        count, size = count + 1, size + member.size + tarfile.BLOCKSIZE
+        if count > MAX_MEMBERS:
+            raise ResourceError(archive, f"holds more than {MAX_MEMBERS:,} members", "split it into several archives")
+        if size > MIN_JUDGED_BYTES and size > MAX_RATIO * packed:
+            raise ResourceError(archive, f"would unpack to more than {size / 2**30:.1f} GiB, {size // packed} times its own size", "pack it uncompressed")
+        if not member.isfile():
+            continue
+        relative_parts(member.name, archive, "member", byte_escapes=True)
+        yield member
+
+
+def _unpack(archive: Path, tar: tarfile.TarFile, member: tarfile.TarInfo, target: Path) -> None:
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        out = open(target, "wb")
+    except OSError as error:
+        if isinstance(error, (FileExistsError, NotADirectoryError, IsADirectoryError)):
+            raise InputError(archive, f"holds {shown(member.name)} both as a file and as a folder", _PACK) from None
+        raise from_os_error(error, target) from None
+    with out:
+        with _malformed(archive):
+            source: BinaryIO = tar.extractfile(member)
+        left = member.size
+        while left:
+            with _malformed(archive):
+                block = source.read(min(left, _BLOCK))
+            if not block:
+                raise InputError(archive, f"is not a whole tar file (it ends within {shown(member.name)})", _PACK)
+            try:
+                out.write(block)
+            except OSError as error:
+                raise from_os_error(error, target) from None
+            left -= len(block)
+
+
+def _place(root: Path, name: str, archive: Path) -> Path:
+    """The folder under root that an object is unpacked into: called by its name, which data.py takes for the object's."""
+    safe = archive.stem if name == "." else name.replace("/", "_").replace("..", "_")
+    fault = name_fault(safe, byte_escapes=True)
+    if fault:
+        raise InputError(archive, f"object {shown(name)} {fault}", CURE)
+    return root / safe / "views"
 
 
 def _opened(archive: Path, root: Path, name: str) -> Folder:
-    folder = root / _safe(name) / "views"
+    folder = _place(root, name, archive)
     if not (folder / MANIFEST).is_file():
-        raise InputError(archive, f"has {name} in pieces, or without its manifest", "pack each views folder as one")
+        raise InputError(archive, f"has {shown(name)} in pieces, or without its manifest", "pack each views folder as one")
     return open_folder(folder, ("views",), "train", check=False)

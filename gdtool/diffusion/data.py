@@ -6,6 +6,7 @@ Every choice of a step comes from a generator seeded by (seed, step), so a resum
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,9 @@ import torch
 
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
+from gdtool.core.manifest import MANIFEST
+from gdtool.core.names import path_inside
+from gdtool.core.reading import read_json
 from gdtool.diffusion.config import ModelConfig, TrainConfig
 from gdtool.diffusion.encoding import PLANE_COUNT, PLANES, mirrored_order, planes_from_images
 
@@ -76,13 +80,13 @@ def decode_object(folder: Folder, config: ModelConfig) -> tuple[np.ndarray, np.n
     order = [views.names.index(name) for name in config.views]
     size, own = config.image_size, views.mask.shape[-1]
     if views.mask.shape[-2] != own or own % size:
-        raise InputError(folder.path, f"has views of {own} px, not a multiple of the model's {size}", f"render with --size {size}")
+        raise InputError(folder.path, f"has views of {own} px, not a multiple of the model's {size}", f"run gdtool render-dataset --size {size}")
     planes = planes_from_images({d: x[order] for d, x in views.images.items()}, views.mask[order])
     front = np.concatenate([views.images["color"][order[0]], views.mask[order[0]][..., None]], -1)
     extent = bounding_side(front[..., 3]) / own
     conditions = [condition_plane(front)]
     for path in sorted(folder.path.glob("condition/*.png")):
-        image = read_image(path)
+        image = read_image(path_inside(folder.path, f"condition/{path.name}", folder.path / MANIFEST, "condition image", byte_escapes=True))
         image = image.astype(np.float32) / np.iinfo(image.dtype).max
         if image.ndim == 3 and image.shape[2] == 4 and image[..., 3].max() > 0.5:
             image = np.concatenate([linear_from_srgb(image[..., :3]), image[..., 3:]], -1)
@@ -130,8 +134,10 @@ def decode_dataset(folders: Iterable[Folder], count: int, config: ModelConfig, c
             names.append(folder.path.parent.name if folder.path.name == "views" else folder.name)
         for array in arrays.values():
             array.flush()
-        names_file.write_text(json.dumps(names))
-    names = json.loads(names_file.read_text())
+        part = names_file.with_suffix(".part")
+        part.write_text(json.dumps(names))
+        os.replace(part, names_file)  # a killed run leaves no half of it
+    names = read_json(names_file)
     if not names:
         raise InputError("dataset", "has no object that can be trained on", "render it with gdtool render-dataset")
     loaded = {name: np.load(cache / f"{name}.npy", mmap_mode="r")[: len(names)] for name in files}

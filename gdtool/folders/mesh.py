@@ -10,7 +10,6 @@ import numpy as np
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
 from gdtool.core.stage import Output
-from gdtool.folders.records import file_of
 
 _UNWRAP = "run gdtool unwrap on the mesh again"
 
@@ -89,4 +88,4 @@ def write_mesh(out: Output, mesh: QuadMesh) -> None:
 
 def read_mesh(folder: Folder) -> QuadMesh:
     """The mesh of a mesh or atlas folder. Raises InputError."""
-    return read_obj(file_of(folder, "mesh.obj"))
+    return read_obj(folder.file("mesh.obj"))

@@ -12,9 +12,7 @@ from msgspec import Meta
 
 from gdtool.cameras import Camera
 from gdtool.core.errors import InputError
-from gdtool.core.folder import Folder
-from gdtool.core.manifest import MANIFEST
-from gdtool.core.names import checked_name, path_inside
+from gdtool.core.names import checked_name
 from gdtool.core.reading import read_json
 
 MAX_SIDE = 16384  # pixels of a view: no larger picture is read
@@ -56,17 +54,12 @@ class Light(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     fit_error: Annotated[dict[str, float], Meta(description="errors of the fit, by name")] = {}
 
 
-def file_of(folder: Folder, relative: str) -> Path:
-    """Path of a file of a folder, which lies below it, links followed. Raises InputError."""
-    return path_inside(folder.path, relative, folder.path / MANIFEST, "file")
-
-
 def _convert(path: Path, kind: type) -> Any:
     try:
         return msgspec.convert(read_json(path), kind)
     except msgspec.ValidationError as error:
         fact = str(error)
-        raise InputError(path, fact[0].lower() + fact[1:], f"write it as schemas/{path.stem}.schema.json says") from None
+        raise InputError(path, fact[0].lower() + fact[1:], f"write it as schemas/{kind.__name__.lower()}.schema.json says") from None
 
 
 def _write(path: Path, record: Any) -> None:

@@ -14,7 +14,7 @@ from gdtool.core.folder import Folder
 from gdtool.core.kinds import IDENTITY, SurfaceContent
 from gdtool.core.reading import bytes_of
 from gdtool.core.stage import Output
-from gdtool.folders.records import file_of, read_record, write_record
+from gdtool.folders.records import read_record, write_record
 
 # albedo is 8-bit sRGB under the names that viewers show.
 _VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"), ("red", "u1"),
@@ -93,7 +93,7 @@ def read_surface(folder: Folder) -> Surface:
     """
     from gdtool.images.color import linear_from_srgb
 
-    path = file_of(folder, "surface.ply")
+    path = folder.file("surface.ply")
     try:
         vertex, faces = binary_ply(bytes_of(path))
     except ValueError as error:
@@ -117,6 +117,6 @@ def read_surface(folder: Folder) -> Surface:
     else:
         albedo = np.full((len(vertex), 3), 0.8, np.float32)
     normals = columns(vertex, "nx ny nz").astype(np.float32) if {"nx", "ny", "nz"} <= set(names) else None
-    light = read_record(file_of(folder, "light.json")) if folder.content.light else None
+    light = read_record(folder.file("light.json")) if folder.content.light else None
     return Surface(vertices, faces.astype(np.int32), albedo.astype(np.float32), column("roughness", 0.5), column("metallic", 0.0),
                    column("confidence", 0.0), normals, light, *(np.asarray(vertex[name]) if name in names else None for name, _ in _EVIDENCE))

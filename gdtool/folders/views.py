@@ -13,7 +13,7 @@ from gdtool.core.folder import Folder
 from gdtool.core.kinds import DOMAINS, IDENTITY, ViewsContent
 from gdtool.core.memory import require_memory
 from gdtool.core.stage import Output
-from gdtool.folders.records import file_of, read_cameras, read_record, write_cameras, write_record
+from gdtool.folders.records import read_cameras, read_record, write_cameras, write_record
 
 CHANNELS = {"color": 3, "normal": 3, "depth": 1, "albedo": 3, "roughness": 1, "metallic": 1, "closed_form": 3}
 _PASSING = 5  # copies of one domain's pictures while they are stacked, decoded and masked
@@ -43,7 +43,7 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
     from gdtool.images.color import decode_normal, linear_from_srgb
     from gdtool.images.io import read_image
 
-    cameras = read_cameras(file_of(folder, "cameras.json"))
+    cameras = read_cameras(folder.file("cameras.json"))
     content: ViewsContent = folder.content
     if tuple(camera.name for camera in cameras) != tuple(content.views):
         raise InputError(folder.file("cameras.json"), "does not hold the views that the manifest lists, in that order",
@@ -51,7 +51,7 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
     wanted = [d for d in content.domains if domains is None or d in domains]
 
     def load(domain: str, view: str, camera: Camera) -> np.ndarray:
-        path = file_of(folder, f"{domain}/{view}.{'exr' if domain == 'depth' else 'png'}")
+        path = folder.file(f"{domain}/{view}.{'exr' if domain == 'depth' else 'png'}")
         image = read_image(path)
         if image.shape[:2] != (camera.height, camera.width):
             raise InputError(path, f"is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}",
@@ -83,7 +83,7 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
             stack = linear_from_srgb(stack).astype(np.float32)
         inside = mask > 0
         images[domain] = np.where(inside[..., None] if stack.ndim == 4 else inside, stack, 0).astype(np.float32)
-    light = read_record(file_of(folder, "light.json")) if content.light else None
+    light = read_record(folder.file("light.json")) if content.light else None
     return Views(cameras, images, mask, light)
 
 
@@ -102,7 +102,7 @@ def read_picture(folder: Folder, cameras: list[Camera]) -> tuple[np.ndarray, Cam
     if camera is None:
         raise InputError(folder.path, f"the manifest says that picture.png shows the view {content.picture!r}, which it does not hold",
                          "name one of its views, or none")
-    path = file_of(folder, "picture.png")
+    path = folder.file("picture.png")
     image = unit_range(read_image(path))
     h, w = image.shape[:2]
     if image.ndim != 3 or image.shape[2] != 4 or h % camera.height or w % camera.width or h // camera.height != w // camera.width:

@@ -75,5 +75,5 @@ def test_wrong_kind_names_the_stage_that_makes_the_right_one(folder):
 
 
 def test_the_folder_itself_is_its_own_nearest_ancestor(folder):
-    assert find_ancestor(open_folder(folder), "renders").path == folder
-    assert find_ancestor(open_folder(folder), "views") is None
+    assert find_ancestor(open_folder(folder), "renders", "make it again").path == folder
+    assert find_ancestor(open_folder(folder), "views", "make it again") is None

@@ -15,6 +15,8 @@ from gdtool.core.runner import Settings, run_all, second_inputs
 from gdtool.core.stage import SecondInput
 from tests.core.toy import STAGE, Options
 
+CURE = "make it again"
+
 
 def copy(inputs, options, out):
     out.path("000.png").write_bytes(inputs.main.file("000.png").read_bytes() + b"+")
@@ -39,15 +41,15 @@ def chain():
 
 
 def test_the_chain_is_found_and_paths_stay_readable(chain):
-    assert [folder.path for folder in ancestors(chain)] == [Path("a/first")]
-    assert Path(find_source(chain)).read_bytes() == b"cat" and missing_origin(chain) is None
+    assert [folder.path for folder in ancestors(chain, CURE)] == [Path("a/first")]
+    assert Path(find_source(chain, CURE)).read_bytes() == b"cat" and missing_origin(chain, CURE) is None
 
 
 def test_a_folder_that_was_replaced_is_told_and_refused(chain):
     Path("cat.png").write_bytes(b"dog")
     run(STAGE, "cat.png", "a/first")
     with pytest.raises(InputError, match="renders is not the one that renders a/second was made from"):
-        list(ancestors(chain))
+        list(ancestors(chain, CURE))
     with pytest.raises(InputError, match="name it with --views"):
         second_inputs(NEXT, chain, {})
 
@@ -55,13 +57,13 @@ def test_a_folder_that_was_replaced_is_told_and_refused(chain):
 def test_a_source_file_that_was_replaced_is_told_and_refused(chain):
     Path("cat.png").write_bytes(b"dog")
     with pytest.raises(InputError, match="source is not the one"):
-        find_source(chain)
+        find_source(chain, CURE)
 
 
 def test_what_was_moved_is_told(chain):
     shutil.move("a/first", "elsewhere")
-    assert find_ancestor(chain, "views") is None
-    assert missing_origin(chain).path == Path.cwd() / "a/first"
+    assert find_ancestor(chain, "views", CURE) is None
+    assert missing_origin(chain, CURE).path == Path.cwd() / "a/first"
     (warning,) = second_inputs(NEXT, chain, {}).warnings
     assert "a/first" in warning and "is gone" in warning and "--views" in warning
 
@@ -73,13 +75,13 @@ def test_a_path_through_a_linked_folder_records_where_things_really_lie():
     Path("disk/cat.png").write_bytes(b"another, where the dots would lead from the linked folder")
     folder = run(STAGE, "cat.png", "link/out")
     assert folder.manifest.inputs[0].path == "../../../cat.png"
-    assert Path(find_source(folder)).read_bytes() == b"cat"
+    assert Path(find_source(folder, CURE)).read_bytes() == b"cat"
     again = run(NEXT, "link/out", "link/second")
-    assert [one.manifest.digest for one in ancestors(again)] == [folder.manifest.digest]
+    assert [one.manifest.digest for one in ancestors(again, CURE)] == [folder.manifest.digest]
     moved = Path("b/c/d")
     moved.mkdir(parents=True)
     os.rename("disk", "b/c/d/disk")  # a chain that moves as a whole is whole
-    assert [one.manifest.digest for one in ancestors(open_folder(moved / "disk/deep/second"))] == [folder.manifest.digest]
+    assert [one.manifest.digest for one in ancestors(open_folder(moved / "disk/deep/second"), CURE)] == [folder.manifest.digest]
 
 
 def test_an_absolute_input_in_a_manifest_is_refused(chain):

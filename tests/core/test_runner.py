@@ -49,7 +49,7 @@ def test_result_is_whole_and_described():
     assert folder.manifest.inputs[0].path == "../../cat.png"
     assert folder.manifest.skipped[0].reason == "nothing to polish"
     assert str(Path.cwd()) not in (result.path / "manifest.json").read_text()
-    assert Path(find_source(folder)).read_bytes() == b"cat"
+    assert Path(find_source(folder, "make it again")).read_bytes() == b"cat"
     assert leftovers() == []
 
 

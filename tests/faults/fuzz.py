@@ -71,7 +71,7 @@ def read_points(path: Path) -> None:
     try:
         binary_ply(path.read_bytes())
     except ValueError as error:
-        raise InputError(path, str(error)) from None
+        raise InputError(path, str(error), "export it again") from None
 
 
 def read_record(path: Path) -> None:

@@ -40,7 +40,7 @@ def adapter(folder: Path, name: str = "auto") -> ModuleType:
         if module.recognises(folder):
             return module
     wanted = "a Wonder3D output, a transforms.json or a cameras.json with pictures" if name == "auto" else import_module(f"{__name__}.{name}").LOOKS_LIKE
-    raise InputError(folder, f"does not hold {wanted}", "name a folder that does")
+    raise InputError(folder, f"does not hold {wanted}", "name the folder that holds it")
 
 
 def linear_color(image: np.ndarray) -> np.ndarray:

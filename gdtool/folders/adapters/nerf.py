@@ -65,7 +65,7 @@ def _camera(path: Path, record: dict[str, Any], name: str, width: int, height: i
         if not isinstance(found, (int, float)) or isinstance(found, bool):
             raise InputError(path, f"frame {name}: {key} is missing or no number", f"write {key} as a number")
         if not least <= found <= _MOST_PIXELS:
-            raise InputError(path, f"frame {name}: {key} is {found:g}, not within {least:g} to {_MOST_PIXELS:g}", f"correct {key}")
+            raise InputError(path, f"frame {name}: {key} is {found:g}, not within {least:g} to {_MOST_PIXELS:g}", f"write {key} within these bounds")
         return float(found)
 
     for key in _DISTORTION:
