@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 
 from gdtool.core import log
@@ -96,6 +97,17 @@ def certainly(clean_up: Callable[[], None]) -> Iterator[None]:
     finally:
         clean_up()
         _clean_ups.remove(clean_up)
+
+
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """A folder of this process in the system's folder for temporary files, removed at the end of the block whatever ends it."""
+    import shutil
+    import tempfile
+
+    folder = Path(tempfile.mkdtemp(prefix="gdtool-"))
+    with certainly(lambda: shutil.rmtree(folder, ignore_errors=True)):
+        yield folder
 
 
 class TimeOver(BaseException):

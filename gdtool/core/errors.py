@@ -92,10 +92,13 @@ _DEBIAN_PACKAGES = {
     "libICE.so.6": "libice6", "libxcb.so.1": "libxcb1", "libglib-2.0.so.0": "libglib2.0-0", "libgthread-2.0.so.0": "libglib2.0-0",
     "libz.so.1": "zlib1g", "libfontconfig.so.1": "libfontconfig1", "libfreetype.so.6": "libfreetype6", "libdbus-1.so.3": "libdbus-1-3",
 }
+# What the loader says where the address space, not the library, is what is missing.
+_NOT_MAPPED = re.compile(r"failed to map segment|cannot allocate memory|cannot create shared object descriptor", re.I)
+# How much an allocation that failed asked for, in the words of numpy and of torch.
+_ASKED = re.compile(r"(?:unable|tried) to allocate ([\d.]+) ?(bytes|[KMGT]i?B)", re.I)
 _NO_LIBRARY = re.compile(r"([\w+.-]+\.so[.\d]*): cannot open shared object file")
 # What torch, OpenCV and C++ say when memory runs out; numpy and Python raise MemoryError.
-_NO_MEMORY = re.compile(r"out of memory|bad_alloc|can't allocate memory|not enough memory|insufficient memory|failed to allocate|unable to allocate"
-                        r"|failed to map segment|cannot allocate memory", re.I)
+_NO_MEMORY = re.compile(r"out of memory|bad_alloc|can't allocate memory|not enough memory|insufficient memory|failed to allocate|unable to allocate", re.I)
 _NO_THREAD = re.compile(r"can't start new thread|resource temporarily unavailable", re.I)
 _NO_DEVICE = re.compile(r"found no nvidia driver|not compiled with cuda|no cuda gpus are available|cuda (driver )?error|cudnn", re.I)
 _MOST_SHOWN = 200  # characters of another program's message
@@ -133,10 +136,12 @@ def from_exception(error: Exception, subject: object) -> GdtoolError:
     found: GdtoolError | None = None
     first = first_line(error)
     native = isinstance(error, RuntimeError) or type(error).__module__.partition(".")[0] in ("cv2", "torch", "scipy")
-    if isinstance(error, MemoryError) or (native or isinstance(error, ImportError)) and _NO_MEMORY.search(str(error)):
-        found = ResourceError(subject, "ran out of memory", "lower the resolution or free memory")
+    if isinstance(error, MemoryError) or native and _NO_MEMORY.search(str(error)):
+        found = ResourceError(subject, "ran out of memory" + asked_for(error), "lower the resolution or free memory")
     elif isinstance(error, OSError):
         found = from_os_error(error, subject)
+    elif isinstance(error, ImportError) and is_unmapped(error):
+        found = ResourceError(subject, f"ran out of memory while {error.name or 'a library'} was loaded", "free memory or raise its limit (ulimit -v)")
     elif isinstance(error, ImportError):
         found = missing_library(error)
     elif isinstance(error, ChildFailed):
@@ -146,6 +151,20 @@ def from_exception(error: Exception, subject: object) -> GdtoolError:
     elif isinstance(error, (RuntimeError, AssertionError)) and _NO_DEVICE.search(str(error)):
         found = ResourceError(subject, f"the device failed ({first})", "run it on the cpu")
     return found or internal_error(error, subject)
+
+
+def is_unmapped(error: BaseException) -> bool:
+    """Whether an import failed because there was no memory to load a library into."""
+    return bool(_NOT_MAPPED.search(str(error)))
+
+
+def asked_for(error: BaseException) -> str:
+    """How much the allocation that failed asked for, in parentheses; empty where the message does not say."""
+    found = _ASKED.search(str(error))
+    if not found:
+        return ""
+    amount, unit = float(found[1]), found[2]
+    return f" (it asked for {amount / 2**30:.2f} GiB)" if unit == "bytes" else f" (it asked for {amount:g} {unit})"
 
 
 def internal_error(error: BaseException, subject: object) -> GdtoolError:

@@ -1,11 +1,12 @@
-"""Import packages that bring native code; what keeps one from loading becomes an error with the package that removes it."""
+"""Packages that bring native code: import them, or say what is missing, and ask for the memory that they cannot do without."""
 
 from __future__ import annotations
 
 import importlib
+import os
 from types import ModuleType
 
-from gdtool.core.errors import GdtoolError, ResourceError, first_line, missing_library
+from gdtool.core.errors import GdtoolError, ResourceError, first_line, is_unmapped, missing_library
 
 # What pip installs, where that is not the module's name.
 _DISTRIBUTIONS = {"cv2": "opencv-python-headless", "fast_simplification": "fast-simplification", "igl": "libigl", "pxr": "gdtool[usd]",
@@ -35,8 +36,13 @@ def imported_if_installed(module: str) -> ModuleType | None:
         raise import_error(error, module) from None
 
 
-def import_error(error: ImportError | OSError, module: str) -> GdtoolError:
-    """The error to report for a failed import of `module`."""
+def import_error(error: ImportError | OSError, module: str) -> GdtoolError | MemoryError:
+    """The error to report for a failed import of `module`.
+
+    MemoryError where there was no room for it: in a child with a memory limit that is a reason to fall back, elsewhere exit code 5.
+    """
+    if is_unmapped(error):
+        return MemoryError(f"no memory to load {module}")
     package = module.partition(".")[0]
     distribution = _DISTRIBUTIONS.get(package, package)
     install = f"'{distribution}'" if "[" in distribution else distribution
@@ -48,6 +54,25 @@ def import_error(error: ImportError | OSError, module: str) -> GdtoolError:
         if found:
             return found
     return ResourceError(package, f"cannot be loaded ({first_line(error)})", f"pip install --force-reinstall {install}")
+
+
+def require_address_space(size: int, what: str) -> None:
+    """Raise MemoryError when the limit on this process's address space (RLIMIT_AS) leaves less than size bytes; without a limit do nothing.
+
+    For libraries that crash where an allocation fails. what: names the memory in the message.
+    """
+    try:
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit == resource.RLIM_INFINITY:
+            return
+        with open("/proc/self/statm") as file:
+            left = limit - int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    except (ImportError, OSError):  # Windows, or no /proc to tell what is used
+        return
+    if size > left:
+        raise MemoryError(f"unable to allocate {size / 2**30:.2f} GiB for {what}: {max(left, 0) / 2**30:.2f} GiB of the limit are left")
 
 
 def _is_of(missing: str | None, module: str) -> bool:

@@ -20,7 +20,7 @@ import msgspec
 import gdtool
 from gdtool import __version__
 from gdtool.core import child, ending, log, sources
-from gdtool.core.errors import GdtoolError, InputError, ResourceError, UsageError, from_exception, from_os_error
+from gdtool.core.errors import GdtoolError, InputError, ResourceError, UsageError, asked_for, from_exception, from_os_error
 from gdtool.core.folder import Folder, is_folder, open_folder
 from gdtool.core.manifest import MANIFEST, InputEntry, Manifest, RunRecord, check_files, digest_of, encode, list_files, read_manifest
 from gdtool.core.ownership import output_place, refuse_index, refuse_loss, refuse_overlap
@@ -207,8 +207,8 @@ def run_one(stage: Stage, given: list[Source], options: Any, flags: dict[str, st
             partial.mkdir()
             try:
                 stage.run(inputs, options, out)
-            except MemoryError:
-                raise ResourceError(inputs.name, f"{stage.name} ran out of memory", "lower the resolution or free memory") from None
+            except MemoryError as error:
+                raise ResourceError(inputs.name, f"{stage.name} ran out of memory{asked_for(error)}", "lower the resolution or free memory") from None
             if out.content is None:
                 raise RuntimeError(f"{stage.name} gave no content")
             entries = [

@@ -23,11 +23,16 @@ def convert(source: str, target: str) -> int:
     kept = {name: x.detach().clone().contiguous() for name, x in tensors.items() if isinstance(x, torch.Tensor)}
     if not kept:
         raise ValueError("holds no tensors")
-    partial = Path(f"{target}.partial")
+    partial = partial_of(target)
     save_file(kept, partial, metadata={"format": "pt"})
     partial.chmod(0o644)
     partial.replace(target)
     return len(kept)
+
+
+def partial_of(target: str | Path) -> Path:
+    """Where the child writes before the file is whole."""
+    return Path(f"{target}.partial")
 
 
 def main(arguments: list[str]) -> int:
@@ -44,6 +49,8 @@ def main(arguments: list[str]) -> int:
         except ChildFailed as error:
             print(f"convert: {path}: is not a pickle of tensors alone ({str(error).splitlines()[-1][:200]})", file=sys.stderr)
             return 3
+        finally:
+            partial_of(target).unlink(missing_ok=True)  # of a child that was killed
         print(f"{target}: {count} tensors", file=sys.stderr)
     return 0
 

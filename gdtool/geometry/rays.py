@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gdtool.core.native import imported
+from gdtool.core.native import imported, require_address_space
 from gdtool.core.threads import cores
 from gdtool.geometry.vectors import cross, dot
 
@@ -15,6 +15,9 @@ from gdtool.geometry.vectors import cross, dot
 CHUNK = 1 << 16
 # Corners above which a mesh is not tested for being convex: a second of work.
 MAX_CONVEX = 200_000
+# Address space that Embree reserves while it builds a tree, and crashes without: 200 MB whatever the mesh is, and for each face twice
+# what was measured for 20 to 500 thousand of them on two cores.
+_TREE_BYTES, _FACE_BYTES = 200_000_000, 400
 _MOST_BY_PAIRS = 20_000_000  # faces times corners; of more the hull is quicker
 
 
@@ -74,9 +77,11 @@ class RayCaster:
 
     vertices (v, 3), faces (f, 3). The mesh is moved into a unit box before it is rounded to Embree's single precision,
     so that neither a far origin nor an odd unit costs accuracy; all arguments and results are in the caller's frame.
+    Raises MemoryError where a limit on the address space leaves too little.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, threads: int | None = None):
+        require_address_space(_TREE_BYTES + _FACE_BYTES * len(faces), f"rays at {len(faces)} faces")
         TriangleMesh = imported("embreex.mesh_construction").TriangleMesh
         EmbreeScene = imported("embreex.rtcore_scene").EmbreeScene
         self.vertices = np.asarray(vertices, np.float64)

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from gdtool.core.ending import temporary_folder
 from gdtool.core.errors import InputError, OutputError, ResourceError, from_os_error
 from gdtool.core.memory import require_memory
 from gdtool.core.reading import require_regular_file
@@ -53,9 +53,9 @@ def read_image(path: str | Path) -> np.ndarray:
 
 def decode_image(content: bytes, subject: str) -> np.ndarray:
     """Read an image from memory, as read_image does; subject names it in errors."""
-    with tempfile.TemporaryDirectory(prefix="gdtool-") as folder:
+    with temporary_folder() as folder:
         # OpenImageIO's Python reader opens names only.
-        path = Path(folder, "image" + suffix_of(content))
+        path = folder / ("image" + suffix_of(content))
         path.write_bytes(content)
         try:
             return read_image(path)
@@ -200,8 +200,8 @@ def write_exr(path: str | Path, image: np.ndarray) -> None:
 
 def encode_png(image: np.ndarray, bits: int = 8) -> bytes:
     """The bytes of the file that write_png writes."""
-    with tempfile.TemporaryDirectory(prefix="gdtool-") as folder:
-        path = Path(folder, "image.png")
+    with temporary_folder() as folder:
+        path = folder / "image.png"
         write_png(path, image, bits)
         return path.read_bytes()
 
@@ -293,7 +293,7 @@ def _plain_name(path: Path, writing: bool = False) -> Iterator[str]:
         str(path).encode()
         yield str(path)
     except UnicodeEncodeError:
-        with tempfile.TemporaryDirectory(prefix="gdtool-") as folder:
-            link = Path(folder, "image" + (path.suffix if writing else ""))
+        with temporary_folder() as folder:
+            link = folder / ("image" + (path.suffix if writing else ""))
             link.symlink_to(os.path.abspath(path))
             yield str(link)

@@ -22,7 +22,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from gdtool.core.ending import certainly
+from gdtool.core.ending import temporary_folder
 from gdtool.core.errors import InputError, ResourceError, UsageError
 from gdtool.core.stage import MOST_SEED, Inputs, Output, SecondInput, Stage, file_option
 
@@ -139,8 +139,6 @@ def _compiler_cache() -> Iterator[None]:
     By itself it leaves a folder in TMPDIR. TORCHINDUCTOR_CACHE_DIR, where it is set, is respected.
     """
     import os
-    import shutil
-    import tempfile
     from pathlib import Path
 
     name = "TORCHINDUCTOR_CACHE_DIR"
@@ -154,8 +152,7 @@ def _compiler_cache() -> Iterator[None]:
             if not os.access(cache, os.W_OK | os.X_OK):
                 raise PermissionError
         except OSError:
-            cache = Path(tempfile.mkdtemp(prefix="gdtool-"))
-            at_end.enter_context(certainly(lambda: shutil.rmtree(cache, ignore_errors=True)))
+            cache = at_end.enter_context(temporary_folder())
         os.environ[name] = str(cache)
         at_end.callback(os.environ.pop, name)
         yield

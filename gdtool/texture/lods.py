@@ -6,40 +6,41 @@ full mesh that it stands for; `drift` measures how nearly.
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from gdtool.core.child import ChildFailed, call
+from gdtool.core.ending import temporary_folder
 from gdtool.core.native import imported
 from gdtool.texture.target import Target
 
 
-def collapse_textured(vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def collapse_textured(vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray, target_faces: int,
+                      folder: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What the child runs: MeshLab's quadric collapse in position and texture space (Garland & Heckbert 1998), seams kept.
 
-    vertices (v, 3), faces (t, 3), corner_uvs (t, 3, 2) of the corners. Returns the same of about target_faces triangles.
+    vertices (v, 3), faces (t, 3), corner_uvs (t, 3, 2) of the corners. folder: where its files may be; whoever starts the child removes it,
+    since a child that is killed cannot. Returns the same of about target_faces triangles.
     """
     from gdtool.images.io import write_png
 
     pymeshlab = imported("pymeshlab")
-    with tempfile.TemporaryDirectory(prefix="gdtool-") as folder:
-        # The filter wants a mesh with a texture, which only a file can give it.
-        write_png(Path(folder, "blank.png"), np.zeros((2, 2, 3), np.uint8))
-        Path(folder, "full.mtl").write_text("newmtl one\nmap_Kd blank.png\n")
-        lines = ["mtllib full.mtl", "usemtl one", *("v %.9g %.9g %.9g" % tuple(p) for p in vertices.tolist())]
-        lines += ["vt %.9g %.9g" % tuple(p) for p in corner_uvs.reshape(-1, 2).tolist()]
-        lines += ["f " + " ".join(f"{v + 1}/{3 * k + i + 1}" for i, v in enumerate(face)) for k, face in enumerate(faces.tolist())]
-        path = Path(folder, "full.obj")
-        path.write_text("\n".join(lines) + "\n")
-        meshes = pymeshlab.MeshSet()
-        meshes.load_new_mesh(str(path))
-        meshes.meshing_decimation_quadric_edge_collapse_with_texture(targetfacenum=target_faces, preserveboundary=True, preservenormal=True,
-                                                                     optimalplacement=True, planarquadric=True)
-        mesh = meshes.current_mesh()
-        return (np.asarray(mesh.vertex_matrix()), np.asarray(mesh.face_matrix(), np.int64),
-                np.asarray(mesh.wedge_tex_coord_matrix()).reshape(-1, 3, 2))
+    # The filter wants a mesh with a texture, which only a file can give it.
+    write_png(Path(folder, "blank.png"), np.zeros((2, 2, 3), np.uint8))
+    Path(folder, "full.mtl").write_text("newmtl one\nmap_Kd blank.png\n")
+    lines = ["mtllib full.mtl", "usemtl one", *("v %.9g %.9g %.9g" % tuple(p) for p in vertices.tolist())]
+    lines += ["vt %.9g %.9g" % tuple(p) for p in corner_uvs.reshape(-1, 2).tolist()]
+    lines += ["f " + " ".join(f"{v + 1}/{3 * k + i + 1}" for i, v in enumerate(face)) for k, face in enumerate(faces.tolist())]
+    path = Path(folder, "full.obj")
+    path.write_text("\n".join(lines) + "\n")
+    meshes = pymeshlab.MeshSet()
+    meshes.load_new_mesh(str(path))
+    meshes.meshing_decimation_quadric_edge_collapse_with_texture(targetfacenum=target_faces, preserveboundary=True, preservenormal=True,
+                                                                 optimalplacement=True, planarquadric=True)
+    mesh = meshes.current_mesh()
+    return (np.asarray(mesh.vertex_matrix()), np.asarray(mesh.face_matrix(), np.int64),
+            np.asarray(mesh.wedge_tex_coord_matrix()).reshape(-1, 3, 2))
 
 
 def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[Target | None, str]:
@@ -48,8 +49,9 @@ def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[
     It has more where fewer would tear a seam.
     """
     try:
-        vertices, faces, uv = call("gdtool.texture.lods:collapse_textured", target.vertices, target.faces.astype(np.int64),
-                                   target.uv[target.face_uvs], target_faces, seconds=seconds, memory_mb=8000)
+        with temporary_folder() as folder:
+            vertices, faces, uv = call("gdtool.texture.lods:collapse_textured", target.vertices, target.faces.astype(np.int64),
+                                       target.uv[target.face_uvs], target_faces, str(folder), seconds=seconds, memory_mb=8000)
     except ChildFailed as failure:
         return None, str(failure)
     if not len(faces) or not np.isfinite(vertices).all() or not np.isfinite(uv).all():

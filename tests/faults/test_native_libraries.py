@@ -48,7 +48,7 @@ USES = {
     "embreex": [lambda: RayCaster(*TRIANGLE)],
     "fast_simplification": [lambda: simplify.collapse(*TRIANGLE, 1, 5.0)],
     "pymeshlab": [lambda: simplify.collapse_topology(*TRIANGLE, 1), lambda: quad_split.even_triangles(*TRIANGLE, 10, 30.0),
-                  lambda: lods.collapse_textured(*TRIANGLE, np.zeros((1, 3, 2)), 1)],
+                  lambda: lods.collapse_textured(*TRIANGLE, np.zeros((1, 3, 2)), 1, ".")],
     "pynanoinstantmeshes": [lambda: run_instant_meshes(*TRIANGLE, 100, 30.0)],
     "xatlas": [lambda: unwrap_charts.run_xatlas(*TRIANGLE, 2.0)],
     "cv2": [lambda: both_frames(np.zeros((40, 40, 3)))],
