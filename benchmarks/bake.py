@@ -194,8 +194,8 @@ def run(case: Case, truth: Truth, way: str, size: int, samples: int, asked: argp
         try:
             # Cost is taken without the maps kept for scoring, which need memory of their own.
             if way == "ours":
-                row = call("bake:ours", case, size, True, "", seconds=200, memory_mb=12000)
-                call("bake:ours", case, size, False, str(at), seconds=200, memory_mb=12000)
+                row = call(ours, case, size, True, "", seconds=200, memory_mb=12000)
+                call(ours, case, size, False, str(at), seconds=200, memory_mb=12000)
             else:
                 row = blender(asked.peers_python, case, size, samples, 0, at, 200)
         except (ChildFailed, RuntimeError, subprocess.TimeoutExpired) as failure:

@@ -16,23 +16,22 @@ from measure import number, table
 
 def cost_since(start: float) -> dict[str, float]:
     """In a child process: seconds since start (of time.perf_counter), and of the processor in all; peak memory of the largest process."""
-    from gdtool.core import child
-
     own, children = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     # A process' own ru_maxrss begins with that of the one that started it; VmHWM is its own.
     status = Path("/proc/self/status").read_text() if Path("/proc/self/status").exists() else ""
     peak = next((int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")), own.ru_maxrss)
     seconds = time.perf_counter() - start
-    return {"seconds": seconds, "processor": sum(u.ru_utime + u.ru_stime for u in (own, children)) + child.spent.seconds,
-            "peak MB": max(peak / 1024, children.ru_maxrss / 1024, child.spent.peak_mb)}
+    return {"seconds": seconds, "processor": sum(u.ru_utime + u.ru_stime for u in (own, children)),
+            "peak MB": max(peak / 1024, children.ru_maxrss / 1024)}
 
 
 def as_commanded() -> None:
     """In a child process: start where a command does that reads a mesh next."""
     from gdtool.core import child
+    from gdtool.geometry.simplify import CHILD_MODULES, reduced
 
-    child.forget_nursery()
-    child.prepare("gdtool.geometry.simplify_child")
+    child.end_waiting()
+    child.prepare(reduced, CHILD_MODULES)
 
 
 def blender(way: str, vertices: np.ndarray, faces: np.ndarray, argument: object, python: Path, limit: float) -> tuple[dict[str, np.ndarray], dict]:

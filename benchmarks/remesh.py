@@ -51,8 +51,7 @@ def ours(vertices: np.ndarray, faces: np.ndarray, quads: int, options: dict, of_
     start = time.perf_counter()
     if of_a_file:
         vertices, faces, *_ = clean(vertices, faces)
-    threads = len(os.sched_getaffinity(0))  # as the command has
-    out, found, record = remesh(vertices, faces, Request(quads=quads, threads=threads, **options))
+    out, found, record = remesh(vertices, faces, Request(quads=quads, **options))
     return out, found, cost_since(start), record.engine
 
 
@@ -119,8 +118,8 @@ def measure(fine: Fine, ways: list[str], asked: argparse.Namespace, rows: Rows) 
                 made, cost = blender("quadriflow", fine.vertices, triangles, asked.faces, asked.peers_python, asked.limit)
                 found = made["vertices"], made["faces"], cost, BLENDER
             else:
-                run, *given = ("peer", way) if way in PEERS else ("ours", WAYS[way], way == OF_A_FILE)
-                found = min((call(f"remesh:{run}", fine.vertices, fine.faces, asked.faces, *given, seconds=asked.limit, memory_mb=16000)
+                run, *given = (peer, way) if way in PEERS else (ours, WAYS[way], way == OF_A_FILE)
+                found = min((call(run, fine.vertices, fine.faces, asked.faces, *given, seconds=asked.limit, memory_mb=16000)
                              for _ in range(asked.runs if way in REPEATED else 1)), key=lambda one: one[2]["seconds"])
             row = {"model": fine.name, "way": way, "engine": found[3], **found[2], **score(fine, *found[:2])}
             if way == "ours":

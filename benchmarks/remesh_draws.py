@@ -16,7 +16,7 @@ import numpy as np
 from fine_meshes import models_in, of_model, of_solid
 from measure import busy, machine, number, say, table
 from mesh_runs import arguments
-from remesh import score
+from remesh import ours, score
 from rows import Rows
 
 _NOISE = 1e-7  # of the size
@@ -64,7 +64,7 @@ def main() -> None:
             rng = np.random.default_rng(draw)
             moved = fine.vertices + (_NOISE if draw else 0.0) * np.ptp(fine.vertices, 0).max() * rng.uniform(-1, 1, fine.vertices.shape)
             try:
-                found = call("remesh:ours", moved, fine.faces, asked.faces, {}, seconds=asked.limit, memory_mb=16000)
+                found = call(ours, moved, fine.faces, asked.faces, {}, seconds=asked.limit, memory_mb=16000)
                 row = {**found[2], **score(fine, *found[:2])}
             except ChildFailed as failure:
                 row = {"failed": str(failure)}

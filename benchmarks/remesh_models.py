@@ -44,13 +44,14 @@ def peer(path: Path, faces: int) -> dict:
     from gdtool.core.child import call
     from gdtool.geometry import mesh_quality, repair, topology
     from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
+    from gdtool.geometry.quad_engines import run_instant_meshes
     from gdtool.geometry.topology import triangulated
 
     scene = load_scene(path)
     vertices, triangles = topology.compact(scene.vertices, scene.faces.astype(np.int64))
     vertices, triangles, *_ = repair.clean(transform_points(invert_similarity(unit_box(vertices)), vertices), triangles, path)
     start = time.perf_counter()
-    out, found = call("gdtool.geometry.quad_engines:run_instant_meshes", vertices.astype(np.float32), triangles.astype(np.int32), faces, 30.0,
+    out, found = call(run_instant_meshes, vertices.astype(np.float32), triangles.astype(np.int32), faces, 30.0,
                       seconds=120, memory_mb=16000)
     seconds = time.perf_counter() - start
     report = mesh_quality.topology_figures(out, found) | mesh_quality.shape_figures(out, found)

@@ -48,7 +48,7 @@ def measured(vertices: np.ndarray, faces: np.ndarray, count: int) -> dict:
     from gdtool.geometry.topology import triangulated
 
     start = time.perf_counter()
-    out, quads, record = remesh(vertices, faces, Request(quads=count, threads=2))
+    out, quads, record = remesh(vertices, faces, Request(quads=count))
     seconds = time.perf_counter() - start
     shape = mesh_quality.shape_figures(out, quads)
     return {"seconds": seconds, "quads": len(quads), "handles": topology.handles(quads, topology.components(quads)[0]), "jacobian": shape["jacobian_mean"],

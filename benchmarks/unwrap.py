@@ -94,9 +94,9 @@ def measure(name: str, vertices: np.ndarray, faces: np.ndarray, ways: list[str],
                 uv, face_uvs, cost = smart_project(vertices, faces, asked)
             elif way in PEERS:
                 mine = np.concatenate([triangles, np.full((len(triangles), 1), -1)], 1)
-                uv, face_uvs, cost = call("unwrap:peer", vertices, triangles, PEERS[way], seconds=asked.limit, memory_mb=16000)
+                uv, face_uvs, cost = call(peer, vertices, triangles, PEERS[way], seconds=asked.limit, memory_mb=16000)
             else:
-                uv, face_uvs, cost = call("unwrap:ours", vertices, faces, WAYS[way], seconds=asked.limit, memory_mb=16000)
+                uv, face_uvs, cost = call(ours, vertices, faces, WAYS[way], seconds=asked.limit, memory_mb=16000)
             row = {"model": name, "way": way, **cost, **figures(vertices, mine, uv, face_uvs, SIZE), "overlap": overlapping(mine, uv, face_uvs)}
             if way in ("ours", "xatlas", BLENDER):
                 chart = islands(vertices, mine, face_uvs)[0]

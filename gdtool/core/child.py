@@ -1,8 +1,7 @@
 """Run one function in a killable child process with a time and a memory limit.
 
-Native mesh code hangs, crashes or calls exit() on hard input (FAULTS.md). The child gets its arguments and gives its
-result by pickle over pipes of our own; it dies with its parent, however the parent dies. On Linux it is forked by a process
-that has read numpy and what else children need (nursery.py), elsewhere started anew.
+Native mesh libraries hang, crash or call exit() on hard input; in a child that costs one attempt, not the run. A child gets its
+arguments and gives its result by pickle over pipes, and dies with its parent, however the parent ends.
 """
 
 from __future__ import annotations
@@ -17,107 +16,82 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from gdtool.core import errors
 from gdtool.core.errors import ChildFailed
-from gdtool.core.nursery import Forked, Nursery, die_with_parent, python_running
 
-
-# glibc gives large blocks back at once, and native vectors that grow fault their pages in again and again: a sixth of the
-# time of a quadric collapse. A child ends soon; it keeps what it has.
-# OpenBLAS starts a thread for each core as numpy is imported, which takes a third of a child's start-up; none multiplies dense matrices.
+# The environment of a child. glibc gives large blocks back to the system at once, so that native vectors which grow fault their pages in
+# again and again: a sixth of the time of a quadric collapse. OpenBLAS starts a thread for each core as numpy is imported, a third
+# of a child's start-up, and no child multiplies dense matrices.
 _SETTINGS = {"OPENBLAS_NUM_THREADS": "1", "MALLOC_MMAP_THRESHOLD_": str(2**30), "MALLOC_TRIM_THRESHOLD_": str(2**32), "MALLOC_TOP_PAD_": str(2**26)}
-_NICE = 10
-_FORKS = sys.platform == "linux"
-_nursery: Nursery | None = None
-_asking = threading.Lock()
+
+# Children that import a module meanwhile and wait for a request, by that module.
+_waiting: dict[str, list[subprocess.Popen]] = {}
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_waiting.clear)  # a copy of this process must not use the pipes of the original
 
 
-@dataclass
-class Spent:
-    """By what forks children and those that have ended: they are no children of this process to the system (RUSAGE_CHILDREN)."""
-
-    seconds: float = 0.0  # of the processor
-    peak_mb: float = 0.0  # resident in one of them
-    _nursery: float = 0.0
-
-    def add(self, child: Forked) -> None:
-        self.seconds += child.seconds + max(child.nursery_seconds - self._nursery, 0)
-        self._nursery = max(child.nursery_seconds, self._nursery)
-        self.peak_mb = max(self.peak_mb, child.peak_mb)
+def prepare(function: Callable[..., Any], modules: Sequence[str] = (), count: int = 1) -> None:
+    """Have `count` children wait for begin() of `function`: they import its module, and `modules`, while this process goes on."""
+    module = _module_of(function)
+    waiting = _waiting.setdefault(module, [])
+    with contextlib.suppress(OSError):  # then begin() starts it, and tells what fails
+        while len(waiting) < count:
+            waiting.append(_started((module, *modules)))
 
 
-spent = Spent()
+def begin(function: Callable[..., Any], *args: Any, seconds: float, memory_mb: int | None = None, **kwargs: Any) -> Running:
+    """Start function(*args, **kwargs) in a child process, which gets a copy of the arguments as they are now.
+
+    function: at the top level of a module. seconds: it is killed after so many. memory_mb: how much the child's address space may
+    grow beyond what it has after importing (Linux). The thread that calls this must outlive the child: the system ends a child with the
+    thread that started it.
+    """
+    module = _module_of(function)
+    waiting = _waiting.get(module)
+    place = None
+    with contextlib.suppress(OSError):  # it may have been deleted
+        place = os.getcwd()
+    request = _pickled((place, module, function.__qualname__, args, kwargs, memory_mb))
+    process = waiting.pop() if waiting else _started((module,))
+    return Running(f"{module}:{function.__qualname__}", process, request, seconds)
 
 
-def prepare(module: str) -> None:
-    """Have a module that the next children will ask for read now, by the process that forks them: that then costs those no time."""
-    if _FORKS:
-        with contextlib.suppress(OSError):
-            _tell_nursery(lambda nursery: nursery.read(module))
+def call(function: Callable[..., Any], *args: Any, seconds: float, memory_mb: int | None = None, **kwargs: Any) -> Any:
+    """Return begin(...).result(): raises ChildFailed, or the GdtoolError that the function raised."""
+    return begin(function, *args, seconds=seconds, memory_mb=memory_mb, **kwargs).result()
 
 
-def _tell_nursery(tell: Callable[[Nursery], Any]) -> Any:
-    """What comes of telling the nursery, a new one where there is none or it is no more."""
-    global _nursery
-    with _asking:
-        if _nursery is not None:
-            with contextlib.suppress(OSError):
-                return tell(_nursery)
-        _nursery = Nursery.start(_SETTINGS | os.environ)
-        return tell(_nursery)
+def end_waiting() -> None:
+    """End the children that were prepared and never asked for anything."""
+    while _waiting:
+        for process in _waiting.popitem()[1]:
+            process.kill()
+            process.communicate()
 
 
-def forget_nursery() -> None:
-    """Have the next children forked by a process that reads what they need anew, as in a command that has just been started."""
-    global _nursery, _asking, spent
-    _asking, spent = threading.Lock(), Spent()
-    if _nursery is not None:
-        _nursery.leave()
-        _nursery = None
-
-
-if _FORKS:
-    os.register_at_fork(after_in_child=forget_nursery)  # a copy of this process has children of its own
-
-
-def _started() -> Forked | subprocess.Popen:
-    if _FORKS:
-        with contextlib.suppress(OSError):  # no such sockets to be had
-            return _tell_nursery(Nursery.fork)
-    code = f"from {__name__} import serve; serve()"
-    return subprocess.Popen(python_running(code), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=_SETTINGS | os.environ)
-
-
-class _Pickler(pickle.Pickler):
-    """Writes numpy's types by their names: it would have each array that is read be of a type of its own, which ufunc.at has no quick loops for."""
-
-    def reducer_override(self, thing: Any) -> Any:
-        numpy = sys.modules.get("numpy")
-        if numpy is not None and isinstance(thing, numpy.dtype) and thing.kind in "biufc" and thing.isnative:
-            return numpy.dtype, (thing.str,)
-        return NotImplemented
-
-
-def _pickled(thing: Any) -> bytes:
-    file = io.BytesIO()
-    _Pickler(file, protocol=5).dump(thing)
-    return file.getvalue()
+def _module_of(function: Callable[..., Any]) -> str:
+    """The name that a child imports the function's module by; of a script that is running, the name of its file."""
+    if function.__module__ != "__main__":
+        return function.__module__
+    main = sys.modules["__main__"]
+    return main.__spec__.name if main.__spec__ else Path(main.__file__).stem
 
 
 class Running:
-    """A call under way in a child: result() waits for it."""
+    """A call under way in a child process."""
 
-    def __init__(self, function: str, process: Forked | subprocess.Popen, request: bytes, seconds: float):
-        self._function, self._process, self._timed_out = function, process, False
-        self._answer, self._noise = b"", b""
+    def __init__(self, name: str, process: subprocess.Popen, request: bytes, seconds: float):
+        self._name, self._process, self._timed_out = name, process, False
+        self._answer, self._printed = b"", b""
         self._timer = threading.Timer(seconds, self._stop)
         self._timer.daemon = True
         self._timer.start()
-        # A child that still starts takes in what it is asked when it can, and one that is done ends, whenever result() is asked for.
+        # The pipes are served from now on, so that the child never waits for result() to be asked for.
         self._talk = threading.Thread(target=self._converse, args=(request,), daemon=True)
         self._talk.start()
 
@@ -125,97 +99,110 @@ class Running:
         self._timed_out = True
         self._process.kill()
 
+    def _converse(self, request: bytes) -> None:
+        self._answer, self._printed = self._process.communicate(request)
+        self._timer.cancel()
+
     def kill(self) -> None:
-        """End it, where nobody will ask for its result."""
+        """End the child, where nobody will ask for its result."""
         self._process.kill()
 
-    def _converse(self, request: bytes) -> None:
-        for told in (lambda: self._process.stdin.write(request), self._process.stdin.close):
-            with contextlib.suppress(BrokenPipeError):  # it is dead already: result() says of what
-                told()
-        self._process.stdin = None  # communicate() would flush it
-        self._answer, self._noise = self._process.communicate()
-        self._timer.cancel()
-        if isinstance(self._process, Forked):
-            with _asking:
-                spent.add(self._process)
-
-    def if_done(self) -> Any:
-        """result(), or None where the child failed: for what can be done here as well."""
-        with contextlib.suppress(ChildFailed):
-            return self.result()
-        return None
-
     def result(self) -> Any:
-        """What the function returned. A GdtoolError raised in the child is raised here; ChildFailed for all else."""
+        """Wait for what the function returns. Raises the GdtoolError that it raised, and ChildFailed for everything else."""
         try:
             self._talk.join()
         except BaseException:
             self._process.kill()
             self._talk.join()
             raise
-        process, function = self._process, self._function
+        code = self._process.returncode
         if self._timed_out:
-            raise ChildFailed(f"{function} took longer than {self._timer.interval:g} s")
-        if process.returncode < 0:
-            raise ChildFailed(f"{function} died of {signal.Signals(-process.returncode).name}")
+            raise ChildFailed(f"{self._name} took longer than {self._timer.interval:g} s")
+        if code < 0:
+            raise ChildFailed(f"{self._name} died of {signal.Signals(-code).name}")
         if not self._answer:
-            last = self._noise.decode(errors="replace").strip().splitlines()[-1:]
-            raise ChildFailed(f"{function} ended with exit code {process.returncode} and no result" + "".join(f" ({x})" for x in last))
+            last = self._printed.decode(errors="replace").strip().splitlines()[-1:]
+            raise ChildFailed(f"{self._name} ended with exit code {code} and no result" + "".join(f" ({line})" for line in last))
         status, value = pickle.loads(self._answer)
         if status == "done":
             return value
         if status == "error":
             raise value
-        raise ChildFailed(f"{function}: {value}")
+        raise ChildFailed(f"{self._name}: {value}")
 
 
-def begin(function: str, *args: Any, seconds: float, memory_mb: int | None = None, in_case: bool = False, **kwargs: Any) -> Running:
-    """Start "package.module:function"(*args, **kwargs) in a child process, which gets the arguments as they are now.
-
-    memory_mb limits the growth of the child's address space over what it has after importing. in_case: what it does may not be needed, so
-    that it gives way to all others.
-    """
-    place = None
-    with contextlib.suppress(OSError):  # it may have been deleted
-        place = os.getcwd()
-    request = pickle.dumps((place, sys.path, _SETTINGS | os.environ)) + _pickled((function, args, kwargs, memory_mb, in_case))
-    return Running(function, _started(), request, seconds)
-
-
-def call(function: str, *args: Any, seconds: float, memory_mb: int | None = None, **kwargs: Any) -> Any:
-    """begin(...).result(): raises ChildFailed, and a GdtoolError that was raised in the child."""
-    return begin(function, *args, seconds=seconds, memory_mb=memory_mb, **kwargs).result()
+def _started(modules: tuple[str, ...]) -> subprocess.Popen:
+    """Start a child that imports modules and then waits for its request."""
+    root = str(Path(__file__).resolve().parents[2])
+    # The gdtool beside this file, and nothing of the folder that the child starts in.
+    code = f"import sys; sys.path.insert(0, {root!r}); import gdtool; from {__name__} import serve; serve()"
+    process = subprocess.Popen([sys.executable, "-P", "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                               env=_SETTINGS | os.environ)
+    with contextlib.suppress(BrokenPipeError):  # it is dead already: result() says of what
+        process.stdin.write(pickle.dumps((sys.path, modules)))
+        process.stdin.flush()
+    return process
 
 
-def beside(function: Callable[..., Any], *args: Any) -> Callable[[], Any]:
-    """Begin function(*args) in a copy of this process, which shares its memory until written to; what is returned waits for what it returns.
+class _Pickler(pickle.Pickler):
+    """Pickle numpy's types by name: an array that is read would otherwise have a copy of its type, for which ufunc.at has no fast loops."""
 
-    For what runs in a child (begin): only a process without other threads can be copied. The copy dies with it. Linux only. Waiting raises
-    ChildFailed where the copy failed.
-    """
-    receive, send = os.pipe()
-    pid = os.fork()
-    if not pid:
+    def reducer_override(self, value: Any) -> Any:
+        numpy = sys.modules.get("numpy")
+        if numpy is not None and isinstance(value, numpy.dtype) and value.kind in "biufc" and value.isnative:
+            return numpy.dtype, (value.str,)
+        return NotImplemented
+
+
+def _pickled(value: Any) -> bytes:
+    file = io.BytesIO()
+    _Pickler(file, protocol=5).dump(value)
+    return file.getvalue()
+
+
+def serve() -> None:
+    """Be the child: read modules to import and a request from stdin, and write the answer to stdout."""
+    _die_with_parent()
+    # Native libraries print to stdout; the answer goes out through a descriptor that they do not know.
+    answer_to = os.dup(1)
+    os.dup2(2, 1)
+    gc.disable()  # a child ends soon, and the collector would look at a hundred thousand objects again and again
+    with os.fdopen(0, "rb", closefd=False) as file:
+        sys.path[:], modules = pickle.load(file)
+        for module in modules:
+            with contextlib.suppress(Exception):  # told when a function of it is asked for
+                importlib.import_module(module)
         try:
-            die_with_parent()
-            os.close(receive)
-            answer = function(*args)
-            with os.fdopen(send, "wb") as file:
-                _Pickler(file, protocol=5).dump(answer)
-        finally:
+            place, module, name, args, kwargs, memory_mb = pickle.load(file)
+        except EOFError:  # it was prepared and is not needed
             os._exit(0)
-    os.close(send)
+    with contextlib.suppress(OSError, TypeError):
+        os.chdir(place)
+    answer = _answer(module, name, args, kwargs, memory_mb)
+    with os.fdopen(answer_to, "wb") as file:
+        file.write(_pickled(answer))
+    os._exit(0)  # a native library may hang or crash in its own teardown; the answer is out
 
-    def result() -> Any:
-        with os.fdopen(receive, "rb") as file:
-            answer = file.read()
-        os.waitpid(pid, 0)
-        if not answer:
-            raise ChildFailed(f"{function.__name__} died in a copy of the process")
-        return pickle.loads(answer)
 
-    return result
+def _answer(module: str, name: str, args: tuple, kwargs: dict[str, Any], memory_mb: int | None) -> tuple[str, Any]:
+    """Run the function: "done" and its result, "error" and a GdtoolError, or "failed" and why."""
+    try:
+        function = importlib.import_module(module)
+        for part in name.split("."):
+            function = getattr(function, part)
+        if memory_mb is not None and sys.platform == "linux":
+            _limit_memory(memory_mb)
+        return "done", function(*args, **kwargs)
+    except errors.GdtoolError as error:
+        return "error", type(error)(error.subject, error.fact, error.cure)
+    except MemoryError:
+        return "failed", "ran out of memory" if memory_mb is None else f"needs more than {memory_mb} MB"
+    except ImportError as error:
+        # A shared library that the system lacks is told: a fallback would hide why the result is worse.
+        library = None if isinstance(error, ModuleNotFoundError) else errors.missing_library(error)
+        return ("error", library) if library else ("failed", f"{type(error).__name__}: {error}")
+    except Exception as error:  # the parent knows a fallback
+        return "failed", f"{type(error).__name__}: {error}"
 
 
 def _limit_memory(megabytes: int) -> None:
@@ -229,44 +216,9 @@ def _limit_memory(megabytes: int) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 
-def serve(nursery: Nursery | None = None) -> None:
-    """What a child runs: what it is asked comes from stdin, the answer goes to stdout, all else that is printed to stderr.
+def _die_with_parent() -> None:
+    """Have this process killed when the one that started it ends."""
+    if sys.platform == "linux":
+        import ctypes
 
-    nursery: where it was forked, and where children of its own come from; None for one that was started.
-    """
-    global _nursery
-    if nursery is None:
-        die_with_parent()
-    _nursery = nursery
-    # Native libraries print to stdout; the answer goes out through a descriptor they do not know.
-    answer_to = os.dup(1)
-    os.dup2(2, 1)
-    gc.disable()  # it looks at a hundred thousand small objects again and again as they become more; a child ends soon
-    with os.fdopen(0, "rb", closefd=False) as asked:
-        place, sys.path[:], environment = pickle.load(asked)
-        os.environ.clear()
-        os.environ.update(environment)
-        with contextlib.suppress(OSError, TypeError):
-            os.chdir(place)
-        function, args, kwargs, memory_mb, in_case = pickle.load(asked)
-    module, name = function.split(":")
-    try:
-        target = getattr(importlib.import_module(module), name)
-        if memory_mb is not None and sys.platform == "linux":
-            _limit_memory(memory_mb)
-        if in_case:
-            os.nice(_NICE)
-        answer = ("done", target(*args, **kwargs))
-    except errors.GdtoolError as error:
-        answer = ("error", type(error)(error.subject, error.fact, error.cure))
-    except MemoryError:
-        answer = ("failed", "ran out of memory" if memory_mb is None else f"needs more than {memory_mb} MB")
-    except ImportError as error:
-        # A shared library that the system lacks is told: a fallback would hide why the result is worse.
-        library = None if isinstance(error, ModuleNotFoundError) else errors.missing_library(error)
-        answer = ("error", library) if library else ("failed", f"{type(error).__name__}: {error}")
-    except Exception as error:  # reported to the parent, which knows a fallback
-        answer = ("failed", f"{type(error).__name__}: {error}")
-    with os.fdopen(answer_to, "wb") as file:
-        _Pickler(file, protocol=5).dump(answer)
-    os._exit(0)  # a native library may hang or crash in its own teardown; the answer is out
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG

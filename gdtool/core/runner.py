@@ -281,7 +281,7 @@ def _peak_memory_mb() -> float:
         own = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 1024
     except (OSError, StopIteration):
         own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return max(own, children, child.spent.peak_mb)
+    return max(own, children)
 
 
 def write_dataset_index(root: Path, results: list[Result]) -> Path:

@@ -45,7 +45,7 @@ def main(arguments: list[str]) -> int:
     for path in paths:
         target = path.with_name(NAMES.get(path.name, path.stem + ".safetensors"))
         try:
-            count = call("gdtool.diffusion.convert:convert", str(path), str(target), seconds=600, memory_mb=20000)
+            count = call(convert, str(path), str(target), seconds=600, memory_mb=20000)
         except ChildFailed as error:
             print(f"convert: {path}: is not a pickle of tensors alone ({str(error).splitlines()[-1][:200]})", file=sys.stderr)
             return 3

@@ -45,7 +45,7 @@ def of_even(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees:
     triangles = int(quads / _QUADS_PER_TRIANGLE)
     few_vertices, few = simplify(vertices, faces, 2 * triangles, seconds=seconds, careful=True, measured=False, meanwhile=meanwhile)[:2]
     try:
-        out, found = call("gdtool.geometry.quad_split:even_triangles", few_vertices, few, triangles, crease_degrees, seconds=seconds,
+        out, found = call(even_triangles, few_vertices, few, triangles, crease_degrees, seconds=seconds,
                           memory_mb=memory_mb)
     except ChildFailed:
         return None

@@ -39,7 +39,6 @@ class Request:
     restore_creases: bool = True
     seconds: float = 120.0  # from when the request is made; engines have a share of them, the rest is for what needs none
     memory_mb: int = 16000
-    threads: int = 1  # pieces that go one by one are done side by side
     least_jacobian: float = 0.0  # a coarser mesh subdivided is passed over where its worst quad is worse
     begun: float = field(default_factory=time.monotonic)
 

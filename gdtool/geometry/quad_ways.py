@@ -7,13 +7,13 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from gdtool.core.child import ChildFailed, Running, begin, prepare
-from gdtool.geometry.quad_ahead import Ahead
-from gdtool.geometry.quad_candidate import Candidate, Way
-from gdtool.geometry.quad_fallback import begun
+from gdtool.core.child import ChildFailed, begin, prepare
+from gdtool.geometry.quad_candidate import Candidate, Way, candidate
 from gdtool.geometry.quad_fit import FAR_EDGES, TOO_COARSE, settled
+from gdtool.geometry.simplify import CHILD_MODULES
 from gdtool.geometry.quad_task import Part, Record, Request
 
+_AT_ONCE = 2  # candidates of the first way
 _TRIES, _MOST_MORE = 3, 2.0  # of one way, to come near enough to the count; times what was asked for before
 _MOST_TORN = 0.1  # of the quads may be missing from a result that another density may mend
 # Megabytes that an engine has, and more for each quad and triangle: several times what it needs, but for holes that Instant Meshes
@@ -41,7 +41,7 @@ def _ways(quads: int, request: Request) -> list[Way]:
 def prepare_engines(quads: int, request: Request) -> None:
     """Start the children of the first way now (core.child.prepare)."""
     if request.engine != "split":
-        prepare("gdtool.geometry.quad_child")
+        prepare(candidate, CHILD_MODULES, _AT_ONCE)
 
 
 def _between(gave: list[tuple[float, int]], wanted: float) -> float | None:
@@ -64,21 +64,9 @@ class Trial:
         self._passable: Candidate | None = None
         self._second_best: Candidate | None = None
         self._given_up: set[str] = set()
-        self._ahead = Ahead(part)
-        self.fallback: Running | None = None  # begun where an engine's last quads are in doubt: quad_fallback.begun
 
     def run(self) -> Found | None:
         """The first way's quads that stand up to judgement, settled; None when none does."""
-        done = True
-        try:
-            found = self._first()
-            done = found is not None
-            return found
-        finally:
-            if done and self.fallback is not None:
-                self.fallback.kill()
-
-    def _first(self) -> Found | None:
         for way in _ways(self.part.quads, self.part.request):
             if self.part.request.for_engines <= 0:
                 self.record.failed.append(f"{way.label}: not tried, the time is over")
@@ -128,18 +116,11 @@ class Trial:
                 self._second_best = best
             if not usable:
                 return self._failed(way, best.fault, torn=best.off(wanted) < -_MOST_TORN)
-            if not way.subdivisions and not self._several and self.fallback is None:
-                self.fallback = begun(self.part)
             like = [one for one in candidates if one.fault == best.fault]
             if way.subdivisions and len(like) > 1:
                 like = self._nearer_first(like, wanted)
-                if like[0] is best:
-                    self._ahead.begin(*like[:2])
                 best = like[0]
-            try:
-                taken = self._drawn(self._of_count(like, extra))
-            finally:
-                self._ahead.stop()
+            taken = self._drawn(self._of_count(like, extra))
             if taken is not None and taken.wrong is not None:
                 if taken.passable and self.part.counted(len(taken.drawn[1]), quads):
                     self._passable = taken
@@ -158,7 +139,7 @@ class Trial:
     def _candidates(self, way: Way, asked: list[float], wanted: float) -> list[Candidate]:
         """What comes of each number asked for, made side by side, the best first."""
         part, request, start = self.part, self.part.request, time.perf_counter()
-        running = [begin("gdtool.geometry.quad_child:candidate", part.vertices, part.faces, way, number,
+        running = [begin(candidate, part.vertices, part.faces, way, number,
                          seconds=request.for_a_run,
                          memory_mb=min(int(_MEMORY[0] + _MEMORY[1] * (number + len(part.faces))), request.memory_mb)) for number in asked]
         # Found out while the children work.
@@ -191,11 +172,9 @@ class Trial:
         for one in candidates:
             if one is not candidates[0] and not self.part.counted(one.count + extra, quads):
                 continue
-            self._ahead.fetch(one)
             one.trace(self.part)
             extra = len(one.outline.faces) - one.count
             if one.outline.hopeless or self.part.counted(one.count + extra, quads):
-                self._ahead.traced(one, any(self.part.counted(other.count + extra, quads) for other in candidates[1:]))
                 yield one
 
     def _drawn(self, candidates: Iterable[Candidate]) -> Candidate | None:

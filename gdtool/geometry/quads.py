@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from importlib import import_module
-from threading import Lock
 
 import numpy as np
 
-from gdtool.core.child import begin, prepare
-from gdtool.core.threads import mapped
+from gdtool.core.child import prepare
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.quad_fallback import split
 from gdtool.geometry.quad_fit import farthest
@@ -22,11 +19,10 @@ from gdtool.geometry.quad_split import of_own, split_count
 from gdtool.geometry.quad_spread import spread
 from gdtool.geometry.quad_task import Part, Record, Request
 from gdtool.geometry.quad_ways import Found, Trial, prepare_engines
-from gdtool.geometry.simplify import SHAKEN, median_edge, simplify
+from gdtool.geometry.simplify import CHILD_MODULES, SHAKEN, median_edge, reduced, simplify
 from gdtool.geometry.topology import even
 
 _GAP = 8.0  # edge lengths between pieces: none of what is asked of a surface reaches so far
-_SOON_READ = 200_000  # triangles
 _FOR_A_HANDLE = 100  # quads: with fewer engines lose some (benchmarks/remesh_nets.py)
 _SHAKEN_OFF = 3.0  # of the noise that keeps triangles even, which moves few of their corners farther off the surface
 
@@ -38,7 +34,7 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
     are laid apart meanwhile, so that none is drawn onto another.
     """
     if len(faces) > _needed(request):
-        prepare("gdtool.geometry.simplify_child")
+        prepare(reduced, CHILD_MODULES)
     edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
     if (pieces := spread(vertices, faces, _GAP * edge)) is not None:
         out, quads, record = _remeshed(pieces.vertices, faces, edge, request)
@@ -60,7 +56,7 @@ def _remeshed(vertices: np.ndarray, faces: np.ndarray, edge: float, request: Req
         few.cut = of_own(few.vertices, few.faces, split_count(few.faces, few.quads), request.for_the_rest)
         record.clock("fallback", start)
         large.quads = max(request.quads - len(few.cut[1]), 4)
-        done = _side_by_side([large, few], record)
+        done = _quads_of(large, record) + _quads_of(few, record)
     else:
         small = _quads_of(few, record)
         large.quads = max(request.quads - sum(len(found) for _, found, _ in small), 4)
@@ -97,7 +93,6 @@ def _coarse(vertices: np.ndarray, faces: np.ndarray, edge: float, request: Reque
 
 def _quads_of(part: Part, record: Record) -> list[Found]:
     """The quads of a mesh, or those of parts of it that were made in different ways."""
-    ahead = None
     if _for_engines(part, record):
         trial = Trial(part, record)
         if (found := trial.run()) is not None:
@@ -107,45 +102,11 @@ def _quads_of(part: Part, record: Record) -> list[Found]:
             found, good = well_made(part, trial.whole)
             left = apart(part, good, part.quads - (len(found[1]) if found is not None else 0))
             record.clock("pieces", start)
-            return ([] if found is None else [found]) + _side_by_side(left, record)
-        ahead = trial.fallback
+            return ([] if found is None else [found]) + [piece for one in left for piece in _quads_of(one, record)]
     start = time.perf_counter()
-    found = *split(part, ahead), "pair and split"
+    found = *split(part), "pair and split"
     record.clock("fallback", start)
     return [found]
-
-
-def _side_by_side(parts: list[Part], record: Record) -> list[Found]:
-    """_quads_of() of each part: one here, the others meanwhile in children, where those soon read the input; threads wait for one another."""
-    threads, here, out = min(parts[0].request.threads, len(parts)) if parts else 1, Lock(), []
-
-    def made(part: Part) -> tuple[list[Found], Record]:
-        if part.cut is not None:  # these wait for a child of their own
-            return quads_of(part)
-        fine, free = part.fine(), here.acquire(blocking=False)
-        try:
-            done = None
-            if not free and len(fine.faces) <= _SOON_READ:
-                request, alone = part.request, replace(part, fine=None, request=replace(part.request, threads=1))
-                done = begin("gdtool.geometry.quad_child:quads_of", alone, fine.vertices, fine.faces, seconds=request.for_the_rest,
-                             memory_mb=request.memory_mb).if_done()
-            return done or quads_of(part)
-        finally:
-            if free:
-                here.release()
-
-    for found, own in mapped(made, parts, threads):
-        out += found
-        record.add(own)
-    return out
-
-
-def quads_of(part: Part, *fine: np.ndarray) -> tuple[list[Found], Record]:
-    """The quads of a part, and the record of how; fine: vertices and faces of the input, in a child."""
-    if fine:
-        part.fine = cache(lambda: Surface(*fine))
-    record = Record()
-    return _quads_of(part, record), record
 
 
 def _for_engines(part: Part, record: Record) -> bool:

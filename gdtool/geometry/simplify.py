@@ -13,12 +13,12 @@ from gdtool.core.errors import InputError
 from gdtool.core.native import imported
 from gdtool.core.threads import cores
 from gdtool.geometry import repair, topology
-from gdtool.geometry.halves import in_halves, worth_halving
 from gdtool.geometry.normals import CHUNK, face_normals
 from gdtool.geometry.rows import first_rows, unique_rows
 from gdtool.geometry.sharpen import corners_in, restore_creases
 from gdtool.geometry.unpinch import unpinched
 
+CHILD_MODULES = ("scipy.sparse.csgraph", "scipy.spatial")  # that a child imports while it waits (core.child.prepare)
 _PACES, _UNIT = (4.0, 3.0, 8.0), 0.5  # how steeply the collapse's bound rises, tried in turn; the unit of lengths, in sizes of the mesh
 _BY_WAY = 6  # times the triangles asked for, to which the quicker collapse still goes well
 _UNEVEN, _FLAT = 1e-3, 1e-14  # edge lengths that what is flat is moved by; determinant of the mean of its normals' squares
@@ -77,8 +77,7 @@ def _flat(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return (0 < determinant) & (determinant < _FLAT)
 
 
-def collapse(vertices: np.ndarray, faces: np.ndarray, target_faces: int, aggressiveness: float, unit: float = 1.0,
-             keep_border: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def collapse(vertices: np.ndarray, faces: np.ndarray, target_faces: int, aggressiveness: float, unit: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """What the child runs: fast-simplification's quadric collapse (Garland & Heckbert 1997), with lengths in units of `unit`.
 
     It takes all edges whose error is below a bound that rises from round to round, from the same number whatever the size of the
@@ -87,8 +86,7 @@ def collapse(vertices: np.ndarray, faces: np.ndarray, target_faces: int, aggress
     """
     fast_simplification = imported("fast_simplification")
     out_vertices, out_faces = fast_simplification.simplify(
-        np.ascontiguousarray(vertices / unit, np.float32), np.ascontiguousarray(faces, np.int32), target_count=target_faces, agg=aggressiveness,
-        preserve_border=keep_border)
+        np.ascontiguousarray(vertices / unit, np.float32), np.ascontiguousarray(faces, np.int32), target_count=target_faces, agg=aggressiveness)
     return np.asarray(out_vertices, np.float64) * unit, np.asarray(out_faces, np.int64)
 
 
@@ -157,20 +155,8 @@ def reduced(vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple,
     if crease_degrees:
         vertices, faces, creases = restore_creases(vertices, faces, crease_degrees)
         moved = int(creases["moved"])
-    return *_reduced((shaken if even else uneven)(vertices, faces), faces.astype(np.int32, copy=False), way, arguments, even), moved
-
-
-def _reduced(vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple, even: bool) -> tuple[np.ndarray, np.ndarray]:
-    if even and way == "collapse" and worth_halving(faces, arguments[0]):
-        # Only of even triangles it is known how many of them each half is to have.
-        target_faces, pace, unit = arguments
-
-        def at_pace(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit: float, keep_border: bool) -> tuple[np.ndarray, np.ndarray]:
-            return collapse(vertices, faces, target_faces, pace, unit, keep_border)
-
-        if (found := in_halves(at_pace, vertices, faces, target_faces, unit)) is not None:
-            return found
-    return globals()[way](vertices, faces, *arguments)
+    vertices = (shaken if even else uneven)(vertices, faces)
+    return *globals()[way](vertices, faces.astype(np.int32, copy=False), *arguments), moved
 
 
 def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attributes: np.ndarray | None = None, *,
@@ -267,7 +253,7 @@ def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit:
         if moved != 0 and way != "collapse" and not careful:
             break  # what cannot be collapsed are folds, of bevels that were drawn out where there is no crease
         try:
-            running = begin("gdtool.geometry.simplify_child:reduced", vertices, faces.astype(np.int32), way, arguments, even, crease_degrees,
+            running = begin(reduced, vertices, faces.astype(np.int32), way, arguments, even, crease_degrees,
                             seconds=seconds, memory_mb=16000)
             meanwhile()
             *out, moved = running.result()

@@ -73,7 +73,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
 
 def _run(inputs: Inputs, options: Options, out: Output) -> None:
-    prepare("gdtool.geometry.simplify_child")  # for remesh()'s first child, while the mesh is read
+    from gdtool.geometry.simplify import CHILD_MODULES, reduced
+
+    prepare(reduced, CHILD_MODULES)  # for remesh()'s first child, while the mesh is read
 
     import numpy as np
 
@@ -204,7 +206,7 @@ def _quads(vertices, faces, options: Options, out: Output):
     from gdtool.geometry.quad_task import Request
 
     request = Request(quads=options.faces, crease_degrees=options.crease_angle, engine=options.engine, seconds=options.seconds,
-                      smooth_iterations=options.smooth_iterations, restore_creases=options.restore_creases, threads=out.threads)
+                      smooth_iterations=options.smooth_iterations, restore_creases=options.restore_creases)
     way, apart = _way(vertices, faces, options, out)
     if options.max_deviation:
         vertices, quads, record, reached = coarsest(vertices, faces, request, options.max_deviation, way)

@@ -47,7 +47,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
 
 def _run(inputs: Inputs, options: Options, out: Output) -> None:
-    prepare("gdtool.geometry.simplify_child")  # for unwrap()'s first child, while the mesh is read
+    from gdtool.geometry.simplify import CHILD_MODULES, reduced
+
+    prepare(reduced, CHILD_MODULES)  # for unwrap()'s first child, while the mesh is read
 
     import numpy as np
 

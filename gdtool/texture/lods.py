@@ -50,7 +50,7 @@ def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[
     """
     try:
         with temporary_folder() as folder:
-            vertices, faces, uv = call("gdtool.texture.lods:collapse_textured", target.vertices, target.faces.astype(np.int64),
+            vertices, faces, uv = call(collapse_textured, target.vertices, target.faces.astype(np.int64),
                                        target.uv[target.face_uvs], target_faces, str(folder), seconds=seconds, memory_mb=8000)
     except ChildFailed as failure:
         return None, str(failure)

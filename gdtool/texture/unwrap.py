@@ -11,9 +11,10 @@ from importlib import import_module
 import numpy as np
 
 from gdtool.core.child import ChildFailed, begin, prepare
+from gdtool.geometry.simplify import CHILD_MODULES, reduced
 from gdtool.geometry.topology import triangulated
 from gdtool.texture.raster import owner_count
-from gdtool.texture.unwrap_charts import Adjacency, find_charts
+from gdtool.texture.unwrap_charts import Adjacency, find_charts, run_xatlas
 from gdtool.texture.unwrap_cut import cut_to_pack
 from gdtool.texture.unwrap_flatten import singular_values, stretch
 from gdtool.texture.unwrap_lay import flatten_all
@@ -57,21 +58,20 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
     """
     begun = time.monotonic()
     found_by, shaped_by, projected_by, hung_by, packed_by = (begun + share * request.seconds for share in _SHARES)
-    prepare("gdtool.geometry.simplify_child")
+    prepare(reduced, CHILD_MODULES)
     extent = float(np.ptp(vertices[np.unique(faces[faces >= 0])], 0).max())
     unit = (vertices - vertices.mean(0)) / (extent if extent > 0 else 1.0)
 
     @cache
     def adjacency() -> Adjacency:  # asked for first while a child simplifies the mesh
-        for module in ("gdtool.texture.unwrap_charts", "gdtool.texture.unwrap_child"):
-            prepare(module)
+        prepare(run_xatlas)
+        prepare(flatten_all, (*CHILD_MODULES, "igl"))
         return Adjacency(unit, faces)
 
     label, part, proxy, failed = find_charts(adjacency, unit, faces, until=found_by, max_cost=request.max_cost)
     try:
-        child = begin("gdtool.texture.unwrap_child:flatten_all", unit, faces, label, request.good_stretch, request.max_stretch, proxy,
+        child = begin(flatten_all, unit, faces, label, request.good_stretch, request.max_stretch, proxy,
                       (shaped_by, projected_by), part, seconds=max(hung_by - time.monotonic(), _SHORTEST), memory_mb=8000)
-        prepare("gdtool.texture.unwrap_pack")
         import_module("scipy.spatial")  # packing would wait for it
         flat, more = child.result()
     except ChildFailed as failure:

@@ -123,7 +123,7 @@ def find_charts(adjacency: Callable[[], Adjacency], vertices: np.ndarray, faces:
     if report["method"] == "vertex clustering":
         proxy_vertices, proxy = vertices, triangles
     try:
-        chart = call("gdtool.texture.unwrap_charts:run_xatlas", proxy_vertices.astype(np.float32), proxy.astype(np.int32), max_cost,
+        chart = call(run_xatlas, proxy_vertices.astype(np.float32), proxy.astype(np.int32), max_cost,
                      seconds=max(until - time.monotonic(), _SHORTEST), memory_mb=8000)
         centre = vertices[np.where(faces < 0, faces[:, :1], faces)].mean(1)
         label = chart[closest_points(centre, proxy_vertices, proxy)[1]]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import os
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -12,7 +10,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gdtool.core.child import begin, prepare
 from gdtool.geometry.mesh_quality import polygon_normals
 from gdtool.geometry.repair import one_vertex_per_fan
 from gdtool.geometry.topology import triangulated
@@ -24,9 +21,6 @@ from gdtool.texture.unwrap_peel import onto_neighbours, peel
 
 _WHOLE = 1.4  # stretch of all charts together over 1, in units of what is good for one: with more the worst are cut
 _MOST_RELIEVED = 16, 0.5  # charts that are cut for that: so many, and this share of all
-_BESIDE = 1000  # faces of several charts, from which on some of them are laid flat in a child
-_MOST_BESIDE, _BYTES = 10_000, 4  # charts whose numbers, of so many bytes each, a pipe holds
-_SLACK = 5.0  # seconds that it has to start and to stop
 _LATE = "was left when the time was over"
 
 
@@ -57,13 +51,11 @@ def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good
     charts are laid flat by projection alone, cut until that works. by: when, on the clock time.monotonic, projection alone goes on
     with what is left, and when each face of that becomes a chart. part (f,): what stays together where a chart is cut, if it can.
     """
-    if proxy is not None and len(faces) >= _BESIDE:
-        prepare("gdtool.texture.unwrap_child")
     adjacency, part = Adjacency(vertices, faces), label if part is None else part
     vertices, faces = one_vertex_per_fan(vertices, faces)
 
     def further(sets: list[np.ndarray], **how: bool) -> Laid:
-        return _lay_beside(adjacency, vertices, faces, label, part, sets, good_stretch, max_stretch, by, **how)
+        return lay(adjacency, vertices, faces, label, part, sets, good_stretch, max_stretch, by, **how)
 
     if proxy is None:
         laid = further(_sets(label), projected=True)
@@ -76,50 +68,6 @@ def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good
     if time.monotonic() < by[0]:
         _relieve(adjacency, vertices, faces, part, laid, further, good_stretch)
     return laid.charts, laid.reasons()
-
-
-def _lay_beside(*given, **more: bool) -> Laid:
-    """lay(), in a child too where many faces are to be laid: each takes the next largest set until none is left."""
-    sets, by = given[5], given[8]
-    if sum(map(len, sets)) < _BESIDE or not 1 < len(sets) <= _MOST_BESIDE:
-        return lay(*given, **more)
-    queue, end = os.pipe()
-    for number in sorted(range(len(sets)), key=lambda i: -len(sets[i])):
-        os.write(end, number.to_bytes(_BYTES, "little"))
-    os.close(end)
-    shared, there = os.dup(queue), {}
-
-    def beside() -> None:  # it may not have begun yet: nothing waits for that
-        there.update(begin("gdtool.texture.unwrap_child:lay_next", f"/proc/{os.getpid()}/fd/{shared}", *given, **more,
-                           seconds=min(max(by[1] - time.monotonic(), 0.0), 3600.0) + _SLACK).if_done() or {})
-        os.close(shared)
-
-    thread = threading.Thread(target=beside, daemon=True)
-    thread.start()
-    try:
-        own = _next(queue, given, more)
-    finally:
-        os.close(queue)
-    if len(own) < len(sets):
-        thread.join()
-    laid = Laid()
-    for i, faces_idx in enumerate(sets):
-        laid.add(own.get(i) or there.get(i) or lay(*given[:5], [faces_idx], *given[6:], **more))
-    return laid
-
-
-def lay_next(path: str, *given, **more: bool) -> dict[int, Laid]:
-    """What the child runs: lay() of each of the sets that it comes to take from the queue, a pipe of their numbers."""
-    queue = os.open(path, os.O_RDONLY)
-    return _next(queue, given, more)
-
-
-def _next(queue: int, given: tuple, more: dict[str, bool]) -> dict[int, Laid]:
-    laid = {}
-    while number := os.read(queue, _BYTES):
-        i = int.from_bytes(number, "little")
-        laid[i] = lay(*given[:5], [given[5][i]], *given[6:], **more)
-    return laid
 
 
 def lay(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, part: np.ndarray, sets: list[np.ndarray],

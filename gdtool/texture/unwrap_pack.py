@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gdtool.core.child import begin
 from gdtool.texture.unwrap_settle import ROUGH, Fine
 from gdtool.texture.unwrap_shapes import Shapes, rim_of, upright_box
 
@@ -25,7 +24,6 @@ WELL_PACKED = 0.67  # of the square, by a draft: charts that fill as much stay a
 _NEXT_GAINS = 0.09  # of the square, that cutting one step further gains at most, mostly
 _TRIES, _TRIES_OF_DRAFT = 3600, 150  # charts placed in search of better orders, at last and to tell ways to cut apart
 _CHAINS = 4  # of changes of orders
-_SLACK = 5.0  # seconds that the child has to start and to stop
 _MOVES = 0.25  # by which some charts change their place in the order, typically, in units of its length
 _OFTEN = 20  # tries of a chain, from which on it is kept where two charts meet
 _MOST_BY_SEARCH = 160  # charts for which orders are searched
@@ -93,7 +91,7 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, ways: list[tup
         if found and searched:
             if share == _OWN[0] and Fine(boxed, shapes, cells_per_unit, [found[0].side], gap, ROUGH).apart(found[0].at) is None:
                 continue  # one in the other, as arcs of rings are
-            found = _improved(shapes, found, _TRIES, until, beside=True)
+            found = _improved(shapes, found, _TRIES, until)
             best = found[:_SETTLED]
             packed = Fine(boxed, shapes, cells_per_unit, [one.side for one in best], gap).settled([one.at for one in best])
             if packed:
@@ -142,24 +140,15 @@ def _drafted(boxed: list, area: float, gap: float, share: float, ways: list[tupl
     return cells, shapes, []
 
 
-def _improved(shapes: Shapes, found: list[Layout], tries: int, until: float, beside: bool = False) -> list[Layout]:
+def _improved(shapes: Shapes, found: list[Layout], tries: int, until: float) -> list[Layout]:
     """The layouts, and better ones, best first: of small changes of the best order, in several chains: each soon ends where no small
-    change helps. tries: charts placed; beside: half of the chains in a child."""
+    change helps. tries: charts placed."""
     if not found or tries < _CHAINS * len(found[0].order):
         return found
     each = tries // len(found[0].order) // _CHAINS
-    here, there = ([(shapes, found[0], each, chain, until) for chain in range(first, _CHAINS, 2)] for first in (0, 1))
-    if beside:
-        child = begin("gdtool.texture.unwrap_pack:chains", there, seconds=min(max(until - time.monotonic(), 0.0), 3600.0) + _SLACK)
-        more = chains(here) + (child.if_done() or chains(there))
-    else:
-        more = chains(here + there)
+    numbers = sorted(range(_CHAINS), key=lambda number: number % 2)  # of layouts of one size the first chain's is taken
+    more = [layout for number in numbers for layout in _chain(shapes, found[0], each, number, until)]
     return sorted(found + more, key=lambda layout: layout.side)
-
-
-def chains(several: list[tuple]) -> list[Layout]:
-    """The layouts of several chains, _chain()'s arguments each."""
-    return [layout for one in several for layout in _chain(*one)]
 
 
 def _chain(shapes: Shapes, best: Layout, tries: int, number: int, until: float) -> list[Layout]:

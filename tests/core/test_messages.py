@@ -253,7 +253,7 @@ def test_an_option_of_another_command_is_found():
 def test_rooms_are_reached_through_imports_and_child_functions():
     assert commands_of("gdtool/texture/usd.py") == {"bake"}
     assert commands_of("gdtool/stages/remesh.py") == {"remesh"}
-    assert "unwrap" in commands_of("gdtool/texture/unwrap_child.py")  # named in a string alone
+    assert "unwrap" in commands_of("gdtool/texture/unwrap_lay.py")
     assert commands_of("gdtool/core/errors.py") == set(COMMANDS)
     for (file, function), (allowed, reason) in EXCEPTIONS.items():
         assert allowed and reason and any(one.name == function for one in functions(FILES[file])), f"{file}: {function} is gone"

@@ -166,9 +166,8 @@ def needs_a_library():
 
 
 def test_a_library_that_a_child_lacks_is_told_and_not_worked_around():
-    child.prepare("tests.faults.test_ends")
     with pytest.raises(ResourceError, match="libGL.so.1: is not installed, and pymeshlab needs it; apt install libgl1"):
-        child.call("tests.faults.test_ends:needs_a_library", seconds=60)
+        child.call(needs_a_library, seconds=60)
 
 
 # Signals.

@@ -75,7 +75,7 @@ def wait_in_a_folder(folder):
 
 def test_a_child_that_meets_its_limit_says_so():
     with pytest.raises(ChildFailed, match="needs more than 200 MB"):
-        call("tests.faults.test_memory:grow_beyond_the_limit", seconds=30, memory_mb=200)
+        call(grow_beyond_the_limit, seconds=30, memory_mb=200)
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_a_failed_collapse_leaves_no_temporary_folder(monkeypatch, tmp_path, who
 
 
 def test_children_that_fail_are_gone():
-    running = child.begin("tests.faults.test_memory:wait_in_a_folder", None, seconds=0.3)
+    running = child.begin(wait_in_a_folder, None, seconds=0.3)
     with pytest.raises(ChildFailed, match="took longer than 0.3 s"):
         running.result()
     assert running._process.returncode is not None and running._process.returncode < 0

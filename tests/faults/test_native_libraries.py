@@ -37,7 +37,7 @@ def broken(tmp_path, monkeypatch):
             monkeypatch.delitem(sys.modules, name)
 
     yield put
-    child.forget_nursery()  # it has read the broken package
+    child.end_waiting()  # they have read the broken package
 
 
 USES = {

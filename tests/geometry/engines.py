@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.core.child import ChildFailed
-from gdtool.geometry import quad_ahead, quad_candidate, quad_fallback, quad_ways, topology
+from gdtool.geometry import quad_candidate, quad_ways, topology
 
 
 def whole(faces) -> bool:
@@ -42,8 +42,6 @@ def in_this_process(monkeypatch, engine=None) -> list:
     if engine is not None:
         monkeypatch.setattr(quad_candidate, "ENGINES", dict.fromkeys(quad_candidate.ENGINES, engine))
     monkeypatch.setattr(quad_ways, "begin", begin)
-    for module in (quad_ahead, quad_fallback):
-        monkeypatch.setattr(module, "cores", lambda: 1)  # nor is anything else done elsewhere
     return calls
 
 

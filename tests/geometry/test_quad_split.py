@@ -8,7 +8,7 @@ from gdtool.geometry.features import NO_FEATURES
 from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, shape_figures
 from gdtool.geometry.quad_shape import Surface
 from gdtool.geometry.quad_split import pair_and_split
-from gdtool.geometry.quad_task import Request
+from gdtool.geometry.quad_task import Part, Request
 from gdtool.geometry.topology import triangulated
 from tests.geometry.engines import whole
 from tests.geometry.solids import cube, joined, rod, sphere, torus, volume
@@ -58,8 +58,11 @@ def test_even_triangles_that_would_be_too_few_are_not_sought(monkeypatch, mesh, 
     sought = []
     monkeypatch.setattr(quad_fallback, "of_even", lambda *given: sought.append(given))
     monkeypatch.setattr(quad_fallback, "split_count", lambda faces, quads: quads)
-    _, faces, *_ = quad_fallback.split_evened(*mesh, quads, Request(quads=quads))
-    assert quad_split.few_for_even(mesh[1], quads) == few and len(sought) == (not few) and topology.is_watertight(faces)
+    part = Part(*mesh, quads, 0.1, Request(quads=quads), lambda: Surface(*mesh))
+    _, faces = quad_fallback.split(part)
+    assert quad_split.few_for_even(mesh[1], quads) == few
+    assert len(sought) == (not few)
+    assert topology.is_watertight(faces)
 
 
 def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():

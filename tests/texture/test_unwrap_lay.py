@@ -64,30 +64,6 @@ def test_what_cannot_be_relieved_ends(monkeypatch):
     assert sorted(np.concatenate([chart[0] for chart in charts])) == list(range(len(faces)))
 
 
-@pytest.mark.parametrize("child", ["none", "works", "is gone"])
-def test_half_laid_in_a_child_is_what_is_laid_in_turn(monkeypatch, child):
-    vertices, faces, centre = ball()
-    label = (centre > 0) @ [1, 2, 4]
-    how = vertices, faces, label, 1.002, 1.1, (vertices, faces[:, :3])
-    monkeypatch.setattr(unwrap_lay, "joined", lambda *given: label)
-    monkeypatch.setattr(unwrap_lay, "_BESIDE", np.inf)
-    in_turn = unwrap_lay.flatten_all(*how)
-    assert len(in_turn[0]) >= 8
-    begun, begin = [], unwrap_lay.begin
-    monkeypatch.setattr(unwrap_lay, "begin", lambda *args, **more: begun.append(args) or begin(*args, **more))
-    monkeypatch.setattr(unwrap_lay, "_BESIDE", np.inf if child == "none" else 4000)
-    if child == "is gone":
-        def fails(*_):
-            raise ChildFailed("is gone")
-
-        monkeypatch.setattr("gdtool.core.child.Running.result", fails)
-    charts, why = unwrap_lay.flatten_all(*how)
-    assert len(begun) == (child != "none") and sorted(why) == sorted(in_turn[1])
-    for one, other in zip(charts, in_turn[0], strict=True):
-        for a, b in zip(one, other, strict=True):
-            np.testing.assert_array_equal(a, b)
-
-
 def test_a_chart_is_cut_between_its_parts_and_without_any_through_the_middle():
     from gdtool.texture.unwrap_charts import Adjacency
     from tests.texture.test_unwrap_join import sheet

@@ -88,28 +88,6 @@ def test_upright_is_the_smallest_rectangle_with_its_longer_side_along_u():
     assert np.ptp(upright_box(RING @ turn), 0) == pytest.approx([9, 7], rel=1e-3)
 
 
-def test_chains_beside_each_other_find_what_they_find_in_turn(monkeypatch):
-    from gdtool.core.child import ChildFailed
-    from gdtool.texture import unwrap_pack
-
-    sides = np.random.default_rng(3).uniform(1, 5, (14, 2))
-    charts = [(np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]) * side, np.array([[0, 1, 2], [0, 2, 3]])) for side in sides]
-    boxed, area = unwrap_pack._boxed(charts)
-
-    def search(beside):
-        _, shapes, found = unwrap_pack._drafted(boxed, area, 0.002, unwrap_pack._OWN[0], [])
-        return unwrap_pack._improved(shapes, found, 800, np.inf, beside)
-
-    in_turn = search(False)
-    assert len(in_turn) > 1 and search(True) == in_turn
-
-    def fails(*_, **__):
-        raise ChildFailed("is gone")
-
-    monkeypatch.setattr("gdtool.core.child.Running.result", fails)
-    assert search(True) == in_turn
-
-
 def test_no_orders_are_sought_for_a_grid_on_which_charts_do_not_come_apart(monkeypatch):
     """They are where any part of a cell counts, and where even those layouts cannot be settled on whole cells."""
     from gdtool.texture import unwrap_pack

@@ -123,7 +123,7 @@ def cases() -> list[Case]:
 # --------------------------------------------------------------------------------------------------------------- sources
 
 
-def write_sources(folder: Path, base: Path) -> None:
+def write_sources(folder: Path, site: Path) -> None:
     """Write what the cases read: meshes made here, and pictures of views that the base renders."""
     import numpy as np
     import OpenImageIO as oiio
@@ -171,7 +171,7 @@ def write_sources(folder: Path, base: Path) -> None:
     write_picture(folder / "opaque.png", paper)
 
     with tempfile.TemporaryDirectory() as made:
-        gdtool(base, Path(made), ("render-dataset", "procedural:5", "--rig", "wonder3d", "--size", "96", "-o", "views"))
+        gdtool(site, Path(made), ("render-dataset", "procedural:5", "--rig", "wonder3d", "--size", "96", "-o", "views"))
         views = Path(made, "views")
         disturbed(views, folder / "plain", rng)
         names = json.loads((views / "manifest.json").read_text())["content"]["views"]
@@ -235,20 +235,31 @@ def nerf(views: Path, folder: Path, names: list[str]) -> None:
 # --------------------------------------------------------------------------------------------------------------- running
 
 
-def gdtool(tree: Path, folder: Path, words: tuple[str, ...]) -> subprocess.CompletedProcess:
-    """Run the gdtool of a checkout in a folder."""
-    env = {**os.environ, "PYTHONPATH": str(tree), "GDTOOL_CACHE": "", "COLUMNS": "80"}
+def importable(tree: Path, folder: Path) -> Path:
+    """A folder from which Python imports the gdtool of a checkout, as it is installed: with commands/ and schemas/ inside."""
+    package = folder / "gdtool"
+    shutil.rmtree(folder, ignore_errors=True)
+    package.mkdir(parents=True)
+    for path in (*(tree / "gdtool").iterdir(), tree / "commands", tree / "schemas"):
+        if path.name != "__pycache__":
+            (package / path.name).symlink_to(path)
+    return folder
+
+
+def gdtool(site: Path, folder: Path, words: tuple[str, ...]) -> subprocess.CompletedProcess:
+    """Run the gdtool that is imported from a folder, in another."""
+    env = {**os.environ, "PYTHONPATH": str(site), "COLUMNS": "80"}
     return subprocess.run([sys.executable, "-m", "gdtool", *words], cwd=folder, env=env, capture_output=True, text=True, timeout=SECONDS)
 
 
-def run_all(tree: Path, folder: Path, chosen: list[Case]) -> None:
+def run_all(site: Path, folder: Path, chosen: list[Case]) -> None:
     """Run the cases in a folder that holds the sources; what was run already is not run again."""
     for number, case in enumerate(chosen):
         told = folder / f"{case.name}.stdout"
         if told.exists():
             continue
         words = case.words if case.words[0] in ("evaluate", "validate") else (*case.words, "-o", case.name)
-        done = gdtool(tree, folder, words)
+        done = gdtool(site, folder, words)
         (folder / f"{case.name}.stderr").write_text(done.stderr)
         told.write_text(f"exit code {done.returncode}\n{done.stdout}")
         print(f"{folder.name} {number + 1}/{len(chosen)} {case.name}: exit code {done.returncode}", file=sys.stderr, flush=True)
@@ -402,6 +413,7 @@ def main() -> int:
     work = options.work or Path(tempfile.mkdtemp(prefix="compare-"))
     work.mkdir(parents=True, exist_ok=True)
     base = checkout(options.base, work)
+    sites = importable(base, work / "base.site"), importable(options.tree.resolve(), work / "tree.site")
     before, after = work / f"{base.name}.results", work / "tree.results"
     shutil.rmtree(after, ignore_errors=True)
     chosen = [case for case in cases() if not case.needs or options.assets and (options.assets / case.needs).exists()]
@@ -409,7 +421,7 @@ def main() -> int:
     if not (before / "sources").exists():
         shutil.rmtree(before, ignore_errors=True)
         before.mkdir()
-        write_sources(before / "sources.partial", base)
+        write_sources(before / "sources.partial", sites[0])
         (before / "sources.partial").rename(before / "sources")
     after.mkdir()
     shutil.copytree(before / "sources", after / "sources", symlinks=True)
@@ -423,8 +435,8 @@ def main() -> int:
                         shutil.copy(path, (folder / "assets" / needed).parent)
     if options.only:
         chosen = _with_what_they_read(chosen, options.only)
-    run_all(base, before, chosen)
-    run_all(options.tree.resolve(), after, chosen)
+    for site, folder in zip(sites, (before, after), strict=True):
+        run_all(site, folder, chosen)
     comparison = Comparison(before, after, Sentences(SENTENCES))
     for case in chosen:
         comparison.case(case)
