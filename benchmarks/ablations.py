@@ -6,7 +6,7 @@ Every variant is `gdtool train --ablation` at 64 px on the same objects in the s
 benchmarks/model_training.json says but that all steps see all six domains, since supervision by rendering needs the maps
 together, that fewer of them are of pure noise, where it does not act, and that the network is half as wide: it learns more in
 the minutes there are. Each model samples the held-out objects' pictures (front view) in one step and in eight; consistency
-(gdtool/diffusion/consistency.py: no truth needed) and the error over the five unseen views (model_quality.py) are means over the objects, then mean ± standard deviation over the seeds. The last
+(gdtool/diffusion/reports/consistency.py: no truth needed) and the error over the five unseen views (model_quality.py) are means over the objects, then mean ± standard deviation over the seeds. The last
 columns are paired: the variant's figure less the whole method's of the same seed. Trainings are kept in --work and go on
 where they were; they may share the machine, only their seconds suffer. Some seven minutes a training on a core.
 """
@@ -22,9 +22,9 @@ import torch
 from measure import gdtool, machine, say, table
 from model_quality import figures, sampled_views, true_views, views_folders
 
-from gdtool.diffusion.consistency import consistency
-from gdtool.diffusion.data import decode_object
-from gdtool.diffusion.weights import load_model
+from gdtool.diffusion.reports.consistency import consistency
+from gdtool.diffusion.data.objects import decode_object
+from gdtool.diffusion.checkpoint.weights import load_model
 
 VARIANTS = {"none": "the whole method", "no_cross_domain": "no attention across domains", "no_pbr": "no supervision by rendering"}
 SIZE = 64

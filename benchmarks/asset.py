@@ -45,10 +45,10 @@ BUFFERS = ("albedo", "roughness", "metallic", "normal")
 
 def lit(scene, light: str, size: int, samples: int, threads: int, views: slice = slice(None)) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Views.images of a scene under a light (color linear, and the material buffers, (k, h, w[, c])), and its coverage."""
-    from gdtool.shading.direct import DirectLight
-    from gdtool.shading.render import Renderer
-    from gdtool.shading.rigs import turntable
-    from gdtool.shading.studio import studio
+    from gdtool.shading.render.direct import DirectLight
+    from gdtool.shading.render.render import Renderer
+    from gdtool.shading.render.rigs import turntable
+    from gdtool.shading.lights.studio import studio
 
     renderer = Renderer(scene, threads)
     color = DirectLight(renderer, studio(light, 0, fit=False)[0], 8, 0, mode="prefiltered").color()
@@ -135,8 +135,8 @@ def beside_three(asset: Path) -> dict[str, float]:
 
 def charts(case: Case, size: int) -> np.ndarray:
     """(size, size, 3) of the texture coordinates."""
-    from gdtool.texture.unwrap import islands
-    from gdtool.texture.unwrap_preview import layout
+    from gdtool.unwrap.pipeline import islands
+    from gdtool.unwrap.preview import layout
 
     low = read_low(case)
     faces, face_uvs = low.faces.astype(np.int64), low.face_uvs.astype(np.int64)

@@ -64,12 +64,12 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     from gdtool.assets.load import load_scene
     from gdtool.images.io import encode_pngs
     from gdtool.stages.bake import target_of
-    from gdtool.texture.bake import bake, occlusion_tracer
-    from gdtool.texture.maps import make_maps
-    from gdtool.texture.occlusion import bake_occlusion
-    from gdtool.texture.origin import from_scene
-    from gdtool.texture.reproject import vertex_reach
-    from gdtool.texture.target import samples_for, texel_width, texels_of
+    from gdtool.bake.pipeline import bake, occlusion_tracer
+    from gdtool.bake.maps import make_maps
+    from gdtool.bake.occlusion import bake_occlusion
+    from gdtool.bake.origin import from_scene
+    from gdtool.bake.reproject import vertex_reach
+    from gdtool.bake.target import samples_for, texel_width, texels_of
 
     threads = len(os.sched_getaffinity(0))
     scene, mesh = load_scene(case.glb), read_low(case)
@@ -107,7 +107,7 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
 def with_gutters(texels, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """What texels read as the floats of maps that are filled as ours are: albedo (s, s, 3) linear, roughness, metallic, normal as stored."""
     from gdtool.images.color import linear_from_srgb, srgb_from_linear
-    from gdtool.texture.padding import fill_gutters
+    from gdtool.bake.padding import fill_gutters
 
     read = {name: values[name] for name in ("roughness", "metallic")} | {"albedo": srgb_from_linear(np.clip(values["albedo"], 0, 1)),
                                                                         "normal": values["tangent_normal"] * 0.5 + 0.5}

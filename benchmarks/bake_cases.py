@@ -46,8 +46,8 @@ def textured_part():
     from gdtool.assets.scene import Material, Scene, Texture
     from gdtool.geometry.normals import vertex_normals
     from gdtool.images.color import srgb_from_linear
-    from gdtool.texture.padding import push_pull
-    from gdtool.texture.raster import rasterize_uv
+    from gdtool.bake.padding import push_pull
+    from gdtool.geometry.uv_raster import rasterize_uv
 
     vertices, faces = marched(part, PART_TRIANGLES)
     vertices = unit(vertices)[0]
@@ -69,10 +69,10 @@ def textured_part():
 def quads_for(scene, quads: int = QUADS) -> dict[str, np.ndarray]:
     """A quad mesh of a scene's shape with texture coordinates, by gdtool's own remesh and unwrap."""
     from gdtool.geometry import repair
-    from gdtool.geometry.quad_task import Request
-    from gdtool.geometry.quads import remesh
-    from gdtool.texture.unwrap import Request as Charts
-    from gdtool.texture.unwrap import unwrap
+    from gdtool.remesh.task import Request
+    from gdtool.remesh.pipeline import remesh
+    from gdtool.unwrap.pipeline import Request as Charts
+    from gdtool.unwrap.pipeline import unwrap
 
     vertices, faces, *_ = repair.clean(scene.vertices, scene.faces)
     low, low_faces, _ = remesh(vertices, faces.astype(np.int64), Request(quads=quads))

@@ -38,8 +38,8 @@ def rim_error(target, albedo: np.ndarray, level: int) -> float:
     """dB (sRGB) between albedo (s, s, 3) linear read at the charts' rims in its mip level of `level` texels, and the same
     with each chart alone in the map: means of its own texels only, the nearest of them carried on."""
     from gdtool.images.color import srgb_from_linear
-    from gdtool.texture.padding import push_pull
-    from gdtool.texture.target import texels_of
+    from gdtool.bake.padding import push_pull
+    from gdtool.bake.target import texels_of
 
     size = albedo.shape[0]
     uv, chart, own = rim_points(target)

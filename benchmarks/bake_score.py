@@ -18,7 +18,7 @@ class Truth:
 
     def __init__(self, case: Case):
         from gdtool.assets.load import load_scene
-        from gdtool.shading.surface_points import SurfaceLookup
+        from gdtool.shading.render.surface_points import SurfaceLookup
         from gdtool.stages.bake import target_of
 
         self.scene = load_scene(case.glb)
@@ -45,7 +45,7 @@ class Truth:
     def at(self, size: int) -> dict[str, np.ndarray]:
         """texel (n,), face_idx (n,), barycentric (n, 3), and albedo (sRGB), roughness, metallic, normal of the model there."""
         if size not in self._of:
-            from gdtool.texture.target import texels_of
+            from gdtool.bake.target import texels_of
 
             texels, target = texels_of(self.target, size, rings=0), self.target
             chosen = np.sort(np.random.default_rng(0).choice(texels.inside, min(CHOSEN, texels.inside), replace=False))
@@ -96,7 +96,7 @@ class Seams:
 
     def __init__(self, truth: Truth, size: int):
         from gdtool.geometry.tangents import edge_pairs
-        from gdtool.texture.target import texel_width
+        from gdtool.bake.target import texel_width
 
         target, rng = truth.target, np.random.default_rng(1)
         one, two = edge_pairs(target.faces)

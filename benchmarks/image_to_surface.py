@@ -23,8 +23,8 @@ from model_quality import DEFAULT_MODEL, nearest_to, views_folders
 from rows import Rows
 
 from gdtool.core.folder import Folder, open_folder
-from gdtool.diffusion.data import decode_object
-from gdtool.diffusion.weights import load_model
+from gdtool.diffusion.data.objects import decode_object
+from gdtool.diffusion.checkpoint.weights import load_model
 
 KEYS = ("surface_distance", "surface_iou", "surface_f_score", "surface_normal_degrees", "syncdreamer_chamfer", "syncdreamer_iou",
         "syncdreamer_icp_chamfer", "syncdreamer_icp_iou")

@@ -33,7 +33,7 @@ FIGURES = (("albedo_psnr", "albedo dB"), ("scaled_albedo_psnr", "albedo dB, scal
 def true_albedo(vertices: np.ndarray, truth) -> np.ndarray:
     """Linear albedo (v, 3) of the true scene at the points of its surface nearest to the vertices."""
     from gdtool.geometry.distance import barycentric_of, closest_points
-    from gdtool.shading.surface_points import surface_attributes
+    from gdtool.shading.render.surface_points import surface_attributes
 
     _, face_idx, points = closest_points(vertices, truth.vertices, truth.faces)
     share = barycentric_of(points, truth.vertices[truth.faces[face_idx]])
@@ -60,7 +60,7 @@ def light_share(found: np.ndarray, true: np.ndarray, color: np.ndarray, weight: 
 
 def found_materials(way: str, views, surface, normals: np.ndarray, step: float):
     """The surface with the materials that way finds, and the processor's seconds it took."""
-    from gdtool.fields.appearance import appearance
+    from gdtool.fields.appearance.appearance import appearance
 
     images, light = views.images, views.light
     if way != MATERIAL_VIEWS:
@@ -74,7 +74,7 @@ def found_materials(way: str, views, surface, normals: np.ndarray, step: float):
 
 def fused_color(views, surface, normals: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Lit linear color (v, 3) that the views show on the surface, and the weight (v,) of the views that show it."""
-    from gdtool.fields.materials import fuse, observe, spread
+    from gdtool.fields.appearance.materials import fuse, observe, spread
 
     seen = observe(views.cameras, views.mask, surface.vertices, surface.faces, normals, 0.5 * step)
     value, weight, _ = fuse(views.images["color"], views.mask, seen)

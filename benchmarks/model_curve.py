@@ -20,8 +20,8 @@ from model_mean import STAGE as MEAN
 from model_quality import DEFAULT_MODEL, figures, sampled_views, true_views, views_folders
 
 from gdtool.core.folder import open_folder
-from gdtool.diffusion.data import decode_object
-from gdtool.diffusion.weights import load_model
+from gdtool.diffusion.data.objects import decode_object
+from gdtool.diffusion.checkpoint.weights import load_model
 
 NOTE = ("Minutes are of the clock, of runs on one core or two, alone or beside other work, as the card says; the first rows are at 64 px, where views are "
         "easier to match. The line in the picture goes through all of them and is drawn on to ten times the training: what a faster machine would add "

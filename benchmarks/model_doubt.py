@@ -30,12 +30,12 @@ from scipy.stats import rankdata, spearmanr
 from gdtool.cameras import rig
 from gdtool.core.folder import open_folder
 from gdtool.core.manifest import MANIFEST, encode, list_files
-from gdtool.diffusion.data import decode_object
-from gdtool.diffusion.encoding import BACKGROUND
-from gdtool.diffusion.familiarity import DOUBTS, FILE, doubts, limits, read_ranges, unfamiliar, write_ranges
-from gdtool.diffusion.result import views_from_images
-from gdtool.diffusion.sampling import sample_images
-from gdtool.diffusion.weights import load_model
+from gdtool.diffusion.data.objects import decode_object
+from gdtool.diffusion.network.encoding import BACKGROUND
+from gdtool.diffusion.inference.familiarity import DOUBTS, FILE, doubts, limits, read_ranges, unfamiliar, write_ranges
+from gdtool.diffusion.inference.result import views_from_images
+from gdtool.diffusion.inference.sampling import sample_images
+from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.folders.views import Views
 from gdtool.images.io import read_image
 

@@ -26,7 +26,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
-    from gdtool.diffusion.weights import load_model, save_model
+    from gdtool.diffusion.checkpoint.weights import load_model, save_model
 
     models = [load_model(folder.path) for folder in inputs.all]
     last = inputs.all[-1]

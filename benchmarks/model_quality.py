@@ -38,12 +38,12 @@ from gdtool.cameras import rig
 from gdtool.core.folder import open_folder
 from gdtool.core.manifest import MANIFEST, list_files
 from gdtool.core.manifest import encode as encode_manifest
-from gdtool.diffusion import familiarity
-from gdtool.diffusion.data import decode_object
-from gdtool.diffusion.encoding import BACKGROUND, encode
-from gdtool.diffusion.result import views_from_images
-from gdtool.diffusion.sampling import sample_images
-from gdtool.diffusion.weights import load_model
+from gdtool.diffusion.inference import familiarity
+from gdtool.diffusion.data.objects import decode_object
+from gdtool.diffusion.network.encoding import BACKGROUND, encode
+from gdtool.diffusion.inference.result import views_from_images
+from gdtool.diffusion.inference.sampling import sample_images
+from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.folders.views import Views, read_views
 from gdtool.images.color import srgb_from_linear
 from gdtool.images.metrics import normal_degrees, over_white, psnr, resized_views, scalar_error, ssim

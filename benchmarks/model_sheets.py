@@ -17,12 +17,12 @@ from model_quality import DEFAULT_MODEL, views_folders
 
 from gdtool.cameras import rig
 from gdtool.cameras.camera import DISTANCE
-from gdtool.diffusion.data import condition_plane, decode_object
-from gdtool.diffusion.encoding import BACKGROUND, SLAB
-from gdtool.diffusion.framing import frame
-from gdtool.diffusion.result import views_from_images
-from gdtool.diffusion.sampling import sample_images
-from gdtool.diffusion.weights import load_model
+from gdtool.diffusion.data.objects import condition_plane, decode_object
+from gdtool.diffusion.network.encoding import BACKGROUND, SLAB
+from gdtool.diffusion.data.framing import frame
+from gdtool.diffusion.inference.result import views_from_images
+from gdtool.diffusion.inference.sampling import sample_images
+from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.images.color import linear_from_srgb
 from gdtool.images.io import read_image, write_png
 from gdtool.images.metrics import over_white

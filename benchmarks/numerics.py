@@ -20,8 +20,8 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from gdtool.shading import sg  # noqa: E402
-from gdtool.shading.closed_form import shade_parts  # noqa: E402
+from gdtool.shading.bsdf import sg  # noqa: E402
+from gdtool.shading.bsdf.closed_form import shade_parts  # noqa: E402
 from tests.stress.references import N, direction, light, reflected, ring_integrals, sphere_integral  # noqa: E402
 
 SHARPNESS = (0.1, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8)

@@ -7,7 +7,7 @@ r"""What the picture that views were made of adds to the albedo that is baked fr
     python benchmarks/picture.py out/fine -o docs/benchmarks
 
 Each object's front view in 512 px is the picture and the truth. The albedo at the model's size, the bundled model's and
-the true one, is enlarged (bilinear: what a bake from the views alone shows) and sharpened by gdtool.texture.picture, and by
+the true one, is enlarged (bilinear: what a bake from the views alone shows) and sharpened by gdtool.bake.picture, and by
 the picture's whole detail without the local gain. PSNR in sRGB where the object covers the pixel, SSIM over white.
 """
 
@@ -22,9 +22,9 @@ import torch
 from measure import machine, number, table
 from model_quality import DEFAULT_MODEL, sampled_views, views_folders
 
-import gdtool.texture.picture as picture
-from gdtool.diffusion.data import to_tensor_condition
-from gdtool.diffusion.weights import load_model
+import gdtool.bake.picture as picture
+from gdtool.diffusion.data.objects import to_tensor_condition
+from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.folders.views import read_views
 from gdtool.images.color import srgb_from_linear
 from gdtool.images.metrics import over_white, psnr, resized, ssim

@@ -106,9 +106,9 @@ def normals_beside(vertices: np.ndarray, faces: np.ndarray, views) -> float:
 
 def skips(views) -> list[dict]:
     """CPU seconds of the grid method with a step left out and done, and how far the result moves (world units)."""
-    from gdtool.fields.align import disagreement
-    from gdtool.fields.carve import carve, combined_distance
-    from gdtool.fields.fusion import align_depth, bring_together, grid_step, prepare_all
+    from gdtool.fields.views.depth_alignment import disagreement
+    from gdtool.fields.grid.carve import carve, combined_distance
+    from gdtool.fields.grid.fusion import align_depth, bring_together, grid_step, prepare_all
 
     depth, normal, colors = views.images["depth"], views.images["normal"], [views.images[domain] for domain in ("albedo", "color")]
     step = grid_step(views.cameras, 0)

@@ -18,9 +18,9 @@ def looks(surface, truth, size: int = 192) -> dict:
     from gdtool.cameras import camera_at, rays
     from gdtool.geometry.rays import RayCaster
     from gdtool.images.color import srgb_from_linear
-    from gdtool.shading.closed_form import shade
-    from gdtool.shading.sg import SphericalGaussians
-    from gdtool.shading.surface_points import surface_attributes
+    from gdtool.shading.bsdf.closed_form import shade
+    from gdtool.shading.bsdf.sg import SphericalGaussians
+    from gdtool.shading.render.surface_points import surface_attributes
 
     light = SphericalGaussians(torch.tensor([[0.48, 0.64, 0.6], [-0.8, 0.36, 0.48], [0.0, 0.6, -0.8]]), torch.tensor([20.0, 6.0, 4.0]),
                                torch.tensor([[3.0, 2.8, 2.5], [0.6, 0.8, 1.0], [0.7, 0.6, 0.6]]))

@@ -42,8 +42,8 @@ COLUMNS = ("model", "way", "seconds", "processor", "peak MB", "quads", "watertig
 def ours(vertices: np.ndarray, faces: np.ndarray, quads: int, options: dict, of_a_file: bool = False) -> tuple:
     """In a child: vertices, quads, cost, the engine taken."""
     as_commanded()
-    from gdtool.geometry.quad_task import Request
-    from gdtool.geometry.quads import remesh
+    from gdtool.remesh.task import Request
+    from gdtool.remesh.pipeline import remesh
     from gdtool.geometry.repair import clean
 
     if of_a_file:
@@ -57,10 +57,10 @@ def ours(vertices: np.ndarray, faces: np.ndarray, quads: int, options: dict, of_
 
 def peer(vertices: np.ndarray, faces: np.ndarray, quads: int, name: str) -> tuple:
     """In a child: an engine as its users call it."""
-    from gdtool.geometry import quad_engines
+    from gdtool.remesh.engines import adapters
 
     start = time.perf_counter()
-    run = quad_engines.run_instant_meshes if name == "Instant Meshes" else quad_engines.run_quadriflow
+    run = adapters.run_instant_meshes if name == "Instant Meshes" else adapters.run_quadriflow
     out, found = run(vertices.astype(np.float32), faces.astype(np.int32), quads, 30.0)
     return out, found, cost_since(start), name
 

@@ -44,7 +44,7 @@ def peer(path: Path, faces: int) -> dict:
     from gdtool.core.child import call
     from gdtool.geometry import mesh_quality, repair, topology
     from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
-    from gdtool.geometry.quad_engines import run_instant_meshes
+    from gdtool.remesh.engines.adapters import run_instant_meshes
     from gdtool.geometry.topology import triangulated
 
     scene = load_scene(path)

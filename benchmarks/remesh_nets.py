@@ -43,8 +43,8 @@ def net(kind: str, cells: int, grid: int) -> tuple[np.ndarray, np.ndarray]:
 
 def measured(vertices: np.ndarray, faces: np.ndarray, count: int) -> dict:
     from gdtool.geometry import mesh_quality, topology
-    from gdtool.geometry.quad_task import Request
-    from gdtool.geometry.quads import remesh
+    from gdtool.remesh.task import Request
+    from gdtool.remesh.pipeline import remesh
     from gdtool.geometry.topology import triangulated
 
     start = time.perf_counter()
@@ -57,14 +57,17 @@ def measured(vertices: np.ndarray, faces: np.ndarray, count: int) -> dict:
 
 
 def main() -> None:
-    from gdtool.geometry import quad_split, quad_ways, quads, topology
+    from gdtool.geometry import topology
+    from gdtool.remesh import pipeline as quads
+    from gdtool.remesh.engines import search
+    from gdtool.remesh.fallback import pair_and_split
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--out", type=Path, default=Path("docs/benchmarks"))
     parser.add_argument("--grid", type=int, default=140, help="points along an edge that the nets are marched on")
     given = parser.parse_args()
     head, rows = busy(), []
-    limits = {module: module._FOR_A_HANDLE for module in (quads, quad_ways, quad_split)}
+    limits = {module: module._FOR_A_HANDLE for module in (quads, search, pair_and_split)}
     for kind, cells in NETS:
         vertices, faces = net(kind, cells, given.grid)
         handles = topology.handles(faces, topology.components(faces)[0])

@@ -7,7 +7,7 @@ clock and by processor seconds, because other work may run meanwhile. Two errors
 from the same noise (over white, all six views), and those of benchmarks/model_quality.py against the truth, over the five
 unseen views. Every object goes through all settings before the next one starts. Start-up is a whole command on one picture,
 its sampling and writing taken off. Consistency is that of the model's default sampling beside the true views
-(gdtool/diffusion/consistency.py says what each figure is). Written as it goes; ten minutes on two quiet cores at 128 px.
+(gdtool/diffusion/reports/consistency.py says what each figure is). Written as it goes; ten minutes on two quiet cores at 128 px.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ import torch
 from measure import busy, gdtool, machine, number, say, seconds_axis, table
 from model_quality import DEFAULT_MODEL, figures, sampled_views, true_views, views_folders
 
-from gdtool.diffusion.consistency import consistency
-from gdtool.diffusion.data import decode_object
-from gdtool.diffusion.weights import load_model
+from gdtool.diffusion.reports.consistency import consistency
+from gdtool.diffusion.data.objects import decode_object
+from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.folders.views import Views
 from gdtool.images.metrics import over_white, psnr
 

@@ -32,13 +32,13 @@ def main() -> None:
     torch.set_num_threads(1)
     from gdtool.assets.load import load_scene
     from gdtool.cameras import rig
-    from gdtool.shading import render
-    from gdtool.shading.closed_form import closed_form_image
-    from gdtool.shading.direct import DirectLight
-    from gdtool.shading.studio import studio
+    from gdtool.shading.render import render
+    from gdtool.shading.bsdf.closed_form import closed_form_image
+    from gdtool.shading.render.direct import DirectLight
+    from gdtool.shading.lights.studio import studio
 
     # What the renderer imports when it first needs it: no renderer's seconds have its imports in them.
-    for module in ("embreex.mesh_construction", "gdtool.shading.closed_form", "gdtool.shading.prefilter", "gdtool.geometry.tangents", "torch.quasirandom"):
+    for module in ("embreex.mesh_construction", "gdtool.shading.bsdf.closed_form", "gdtool.shading.lights.prefilter", "gdtool.geometry.tangents", "torch.quasirandom"):
         importlib.import_module(module)
     scene = normalised(load_scene(asked.model))
     if asked.converged:

@@ -42,7 +42,7 @@ def times(texture: Texture | None, factor: np.ndarray, channels: slice) -> np.nd
 def for_mitsuba(scene: Scene) -> dict[str, np.ndarray]:
     """Arrays of each material's mesh: vertices, faces, normals or none, uv, vertex colors or none, and its inputs, each an
     image or a number. The UV set and transform are those of the base color, else of the normal map."""
-    from gdtool.shading.textures import transform_uv
+    from gdtool.shading.render.textures import transform_uv
 
     out = {}
     for number, material in enumerate(scene.materials):
@@ -72,7 +72,7 @@ def exported(model: str, env: str, folder: Path, seed: int = 0) -> dict[str, str
     from gdtool.assets.load import load_scene
     from gdtool.cameras import rig
     from gdtool.images.io import write_exr
-    from gdtool.shading.studio import studio
+    from gdtool.shading.lights.studio import studio
 
     folder.mkdir(parents=True, exist_ok=True)
     scene = normalised(load_scene(model))

@@ -38,7 +38,7 @@ COLUMNS = ("model", "way", "seconds", "processor", "charts", "coverage", "overla
 def ours(vertices: np.ndarray, faces: np.ndarray, options: dict) -> tuple:
     """In a child: texture coordinates, faces into them, cost."""
     as_commanded()
-    from gdtool.texture.unwrap import Request, unwrap
+    from gdtool.unwrap.pipeline import Request, unwrap
 
     start = time.perf_counter()
     out = unwrap(vertices, faces, Request(size=SIZE, padding=PADDING, **options))
@@ -69,8 +69,8 @@ def smart_project(vertices: np.ndarray, faces: np.ndarray, asked: argparse.Names
 def overlapping(faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray) -> int:
     """Texels of FINE² that more than one triangle owns."""
     from gdtool.geometry.topology import triangulated
-    from gdtool.texture.raster import owner_count
-    from gdtool.texture.unwrap import corner_triangles
+    from gdtool.geometry.uv_raster import owner_count
+    from gdtool.unwrap.pipeline import corner_triangles
 
     return int((owner_count(uv, corner_triangles(face_uvs, triangulated(faces)[1]), FINE) > 1).sum())
 
@@ -80,8 +80,8 @@ def measure(name: str, vertices: np.ndarray, faces: np.ndarray, ways: list[str],
     from gdtool.core.child import ChildFailed, call
     from gdtool.geometry.topology import triangulated
     from gdtool.images.io import write_png
-    from gdtool.texture.unwrap import figures, islands
-    from gdtool.texture.unwrap_preview import checkerboard, layout
+    from gdtool.unwrap.pipeline import figures, islands
+    from gdtool.unwrap.preview import checkerboard, layout
 
     triangles = triangulated(faces)[0].astype(np.int64)
     for way in ways:
@@ -112,8 +112,8 @@ def measure(name: str, vertices: np.ndarray, faces: np.ndarray, ways: list[str],
 
 def quads_of(source: str | Path, faces: int, triangles: int, kept: Path) -> tuple[str, np.ndarray, np.ndarray]:
     """Name, vertices and quads (f, 4) of a solid or a model file, remeshed unless it is quads."""
-    from gdtool.geometry.quad_task import Request
-    from gdtool.geometry.quads import remesh
+    from gdtool.remesh.task import Request
+    from gdtool.remesh.pipeline import remesh
 
     if isinstance(source, Path) and source.suffix.lower() == ".obj":
         from gdtool.folders.mesh import read_obj

@@ -21,8 +21,8 @@ def main() -> None:
     from gdtool.cameras import camera_at
     from gdtool.images.color import srgb_from_linear
     from gdtool.images.io import write_png
-    from gdtool.shading.environment import load_environment
-    from gdtool.shading.render import render_color
+    from gdtool.shading.lights.load import load_environment
+    from gdtool.shading.render.color import render_color
 
     out = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).with_name("demo.png")
     camera = camera_at(0.0, ELEVATION, name="photograph", size=SIZE, **LENS)

@@ -16,7 +16,7 @@ def picture(scene, light) -> np.ndarray:
     """(SIZE, SIZE, 3) sRGB over white."""
     from gdtool.cameras import camera_at
     from gdtool.images.color import srgb_from_linear
-    from gdtool.shading.render import render_color
+    from gdtool.shading.render.color import render_color
 
     camera = camera_at(25.0, 18.0, name="sheet", size=SIZE, half_width=0.66)
     color, mask = render_color(scene, camera, light, samples=4, light_samples=6)
@@ -27,7 +27,7 @@ def main() -> None:
     from gdtool.assets.procedural import generate, kinds
     from gdtool.images.contact import contact_sheet
     from gdtool.images.io import write_png
-    from gdtool.shading.environment import load_environment
+    from gdtool.shading.lights.load import load_environment
 
     first, count = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 48
     out = sys.argv[3] if len(sys.argv) > 3 else "procedural.png"

@@ -19,7 +19,7 @@ import msgspec
 
 import gdtool
 from gdtool import __version__
-from gdtool.core import child, ending, log, sources
+from gdtool.core import ending, log, sources
 from gdtool.core.errors import GdtoolError, InputError, ResourceError, UsageError, asked_for, from_exception, from_os_error
 from gdtool.core.folder import Folder, is_folder, open_folder
 from gdtool.core.manifest import MANIFEST, InputEntry, Manifest, RunRecord, check_files, digest_of, encode, list_files, read_manifest

@@ -57,11 +57,11 @@ def check(inputs: Inputs, options: Options) -> None:
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Bake one atlas."""
-    from gdtool.texture.bake import bake, occlusion_tracer
-    from gdtool.texture.maps import make_maps
-    from gdtool.texture.occlusion import bake_occlusion
-    from gdtool.texture.reproject import vertex_reach
-    from gdtool.texture.target import texel_width, texels_of
+    from gdtool.bake.pipeline import bake, occlusion_tracer
+    from gdtool.bake.maps import make_maps
+    from gdtool.bake.occlusion import bake_occlusion
+    from gdtool.bake.reproject import vertex_reach
+    from gdtool.bake.target import texel_width, texels_of
 
     with out.step("read"):
         mesh, matrix = _read_mesh(inputs, options)
@@ -116,7 +116,7 @@ _FEWER = 0.9  # of the level before: what cannot come down to what is asked is w
 def _levels(target, count: int, out: Output, report: dict) -> list:
     """The coarser targets, finest first; what they cost in place goes to report."""
     from gdtool.core.threads import mapped
-    from gdtool.texture.lods import coarser, drift
+    from gdtool.bake.lods import coarser, drift
 
     counts = [max(len(target.faces) >> k, 4) for k in range(1, count)]
     levels, most = [], len(target.faces)
@@ -201,13 +201,13 @@ def _read_mesh(inputs: Inputs, options: Options):
 
 def _read_origin(inputs: Inputs, options: Options, matrix, target, out: Output):
     """What to bake from: the surface (with its views), a model named by --model, or the model that was remeshed."""
-    from gdtool.texture.origin import from_scene, from_surface
+    from gdtool.bake.origin import from_scene, from_surface
 
     surface, views = inputs.second["surface"], inputs.second["views"]
     if options.model is None and surface is not None:
         from gdtool.folders.surface import read_surface
         from gdtool.folders.views import read_views
-        from gdtool.texture.origin import material_field
+        from gdtool.bake.origin import material_field
 
         read = None
         if not options.project_views:
@@ -225,7 +225,7 @@ def _read_origin(inputs: Inputs, options: Options, matrix, target, out: Output):
         return from_surface(read_surface(surface), read, field, None if read is None else _read_picture(views, read, out))
     named = _named_model(inputs, options)
     from gdtool.assets.load import load_scene
-    from gdtool.texture.target import texel_width
+    from gdtool.bake.target import texel_width
 
     def footprint(detail: float) -> float:
         size, samples = _fineness(options, target, detail)
@@ -254,7 +254,7 @@ def _named_model(inputs: Inputs, options: Options) -> str:
 
 def _fineness(options: Options, target, detail: float) -> tuple[int, int]:
     """Size of the maps, and samples of a texel where the source varies, for a source whose detail is so wide."""
-    from gdtool.texture.target import samples_for, size_for, texel_width
+    from gdtool.bake.target import samples_for, size_for, texel_width
 
     size = options.size or size_for(target, detail)
     return size, samples_for(texel_width(target, size), detail) if options.samples is None else round(options.samples**0.5) ** 2
@@ -263,7 +263,7 @@ def _fineness(options: Options, target, detail: float) -> tuple[int, int]:
 def _read_picture(folder, views, out: Output):
     """The picture that the views were made of, where the folder holds it and they hold an albedo to put its detail on."""
     from gdtool.folders.views import read_picture
-    from gdtool.texture.picture import picture_of
+    from gdtool.bake.picture import picture_of
 
     found = read_picture(folder, views.cameras)
     if found is None or "albedo" not in views.images:
@@ -278,7 +278,7 @@ def target_of(mesh):
     import numpy as np
 
     from gdtool.geometry.topology import triangulated
-    from gdtool.texture.target import Target
+    from gdtool.bake.target import Target
 
     faces, face_idx = triangulated(mesh.faces)
     # The same cut for the texture corners: cut a mesh whose faces are the corners' numbers.
@@ -290,7 +290,7 @@ def target_of(mesh):
 
 
 def _check_overlap(target, inputs: Inputs, out: Output) -> None:
-    from gdtool.texture.raster import owner_count
+    from gdtool.geometry.uv_raster import owner_count
 
     count = owner_count(target.uv, target.face_uvs, 512)
     share = float((count > 1).sum() / max((count > 0).sum(), 1))
@@ -305,7 +305,7 @@ def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx
     import dataclasses
 
     from gdtool.geometry.frames import transform_points
-    from gdtool.texture.asset import write_models
+    from gdtool.bake.asset import write_models
 
     if options.source_frame:
         turn = matrix[:3, :3] / (matrix[:3, 0] ** 2).sum() ** 0.5

@@ -90,7 +90,7 @@ def require_environment(option: str, value: str, names: tuple[str, ...]) -> None
         raise InputError(error.subject, error.fact, cure if error.fact == "does not exist" else error.cure) from None
     header = _header(value)
     if header is None or not header[2] or abs(header[0] / header[1] - 2) > 0.1:
-        from gdtool.shading.environment import load_environment
+        from gdtool.shading.lights.load import load_environment
 
         load_environment(value)  # says what is wrong
 

@@ -310,7 +310,7 @@ def _rendered(result: Source, views: Folder) -> Report:
 
     from gdtool.folders.views import read_views
     from gdtool.images.metrics import views_metrics
-    from gdtool.shading.render import Renderer
+    from gdtool.shading.render.render import Renderer
 
     truth = read_views(views, RENDERED)
     scenes = _scenes(result)

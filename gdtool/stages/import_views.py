@@ -100,9 +100,9 @@ def normalisation(cameras: list[Camera], mask: np.ndarray) -> np.ndarray | None:
     """
     import numpy as np
 
-    from gdtool.fields.carve import hull_bounds
-    from gdtool.fields.fusion import prepare_all
-    from gdtool.fields.sights import hull_distance, pixel_footprint
+    from gdtool.fields.grid.carve import hull_bounds
+    from gdtool.fields.grid.fusion import prepare_all
+    from gdtool.fields.views.prepared_view import hull_distance, pixel_footprint
 
     axes = np.stack([camera.backward for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]

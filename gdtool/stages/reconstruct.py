@@ -59,9 +59,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
 
 def _run(inputs: Inputs, options: Options, out: Output) -> None:
-    from gdtool.fields.align import agreement
-    from gdtool.fields.appearance import appearance
-    from gdtool.fields.fusion import BUMPY, SMALL, align_depth, finest_pixel, fuse_within, grid_step, is_closed_manifold, prepare_all, silhouettes_outvoted
+    from gdtool.fields.views.depth_alignment import agreement
+    from gdtool.fields.appearance.appearance import appearance
+    from gdtool.fields.grid.fusion import BUMPY, SMALL, align_depth, finest_pixel, fuse_within, grid_step, is_closed_manifold, prepare_all, silhouettes_outvoted
     from gdtool.folders.surface import Surface, write_surface
     from gdtool.folders.views import read_views
     from gdtool.geometry.normals import vertex_normals
@@ -140,9 +140,9 @@ def _fit(views, sights, shape, options: Options, out: Output):
     sights: the aligned views. Where there are normals and no depth, theirs is what holds the surface in its place: normals
     alone let it drift.
     """
-    from gdtool.fields.fusion import is_closed_manifold
-    from gdtool.fields.paper import PaperOptions, extract_network, fit_networks
-    from gdtool.fields.refine import keep_pieces
+    from gdtool.fields.grid.fusion import is_closed_manifold
+    from gdtool.fields.neural.paper import PaperOptions, extract_network, fit_networks
+    from gdtool.fields.grid.refine import keep_pieces
 
     images = _with_depth(views, sights)
     volume = 0 if "depth" in images else options.steps // 3
@@ -176,7 +176,7 @@ def _with_depth(views, sights) -> dict:
 
 def _use_fit(fit, vertices, views, look, options: Options, out: Output) -> None:
     """Put the material network's values, where views supervised it, and the fitted light into look; save the networks."""
-    from gdtool.fields.paper import light_record, network_materials, save_field
+    from gdtool.fields.neural.paper import light_record, network_materials, save_field
 
     values = network_materials(fit.material, vertices, out.device)
     supervised = [name for name in ("albedo", "roughness", "metallic") if name in views.images]
@@ -189,7 +189,7 @@ def _use_fit(fit, vertices, views, look, options: Options, out: Output) -> None:
 
 def _normals(views, out: Output):
     """Normal views (k, h, w, 3); None where there are none, or where they contradict the depth."""
-    from gdtool.fields.align import normals_fit_depth
+    from gdtool.fields.views.depth_alignment import normals_fit_depth
 
     normal, depth = views.images.get("normal"), views.images.get("depth")
     if normal is None or depth is None:
@@ -203,7 +203,7 @@ def _normals(views, out: Output):
 
 def _depth(views, out: Output):
     """Depth views (k, h, w); without them, what the normals give, matched from view to view; None without either."""
-    from gdtool.fields.fusion import depth_for
+    from gdtool.fields.grid.fusion import depth_for
 
     if "depth" in views.images or "normal" not in views.images:
         out.skip("matching of views", "depth views say where the surface is" if "depth" in views.images else "there are no normals to match")

@@ -45,7 +45,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 def check(inputs: Inputs, options: Options) -> None:
     """Raise what --env and options that exclude one another would stop the run with."""
-    from gdtool.shading.environment import BUNDLED
+    from gdtool.shading.lights.bundled import BUNDLED
     from gdtool.stages import early
 
     if options.budget is not None and options.target_psnr is not None:
@@ -73,12 +73,12 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.images.color import srgb_from_linear
     from gdtool.images.contact import contact_sheet
     from gdtool.images.io import write_png
-    from gdtool.shading.closed_form import closed_form_image
-    from gdtool.shading.direct import DirectLight
-    from gdtool.shading.render import Goal, Renderer
-    from gdtool.shading.rigs import turntable
-    from gdtool.shading.savings import savings
-    from gdtool.shading.studio import studio
+    from gdtool.shading.bsdf.closed_form import closed_form_image
+    from gdtool.shading.render.direct import DirectLight
+    from gdtool.shading.render.render import Goal, Renderer
+    from gdtool.shading.render.rigs import turntable
+    from gdtool.shading.render.skipped_work import savings
+    from gdtool.shading.lights.studio import studio
     from gdtool.stages.limits import held_to
 
     torch.set_num_threads(1)  # shading runs in threads of its own

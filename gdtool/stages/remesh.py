@@ -81,7 +81,7 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
 
     from gdtool.folders.mesh import QuadMesh, write_mesh
     from gdtool.geometry import mesh_quality, repair, shells
-    from gdtool.geometry.quad_task import QUADS_OF_A_PIECE, Record, count_reason
+    from gdtool.remesh.task import QUADS_OF_A_PIECE, Record, count_reason
     from gdtool.geometry.topology import triangulated
     from gdtool.stages.limits import require_time
 
@@ -188,7 +188,7 @@ def _meets(quads, options: Options) -> bool:
 def _decimated(vertices, faces, options: Options, out: Output):
     import numpy as np
 
-    from gdtool.geometry.quad_task import Record
+    from gdtool.remesh.task import Record
     from gdtool.geometry.simplify import simplify
 
     if options.symmetry != "none":
@@ -202,8 +202,8 @@ def _decimated(vertices, faces, options: Options, out: Output):
 
 
 def _quads(vertices, faces, options: Options, out: Output):
-    from gdtool.geometry.quad_count import coarsest
-    from gdtool.geometry.quad_task import Request
+    from gdtool.remesh.face_budget import coarsest
+    from gdtool.remesh.task import Request
 
     request = Request(quads=options.faces, crease_degrees=options.crease_angle, engine=options.engine, seconds=options.seconds,
                       smooth_iterations=options.smooth_iterations, restore_creases=options.restore_creases)
@@ -224,8 +224,8 @@ def _way(vertices, faces, options: Options, out: Output):
     """What makes the quads, and figures of the mirror plane that was looked for."""
     from functools import partial
 
-    from gdtool.geometry.quad_mirror import AXES, mirror_plane, remesh_mirrored
-    from gdtool.geometry.quads import remesh
+    from gdtool.remesh.symmetry import AXES, mirror_plane, remesh_mirrored
+    from gdtool.remesh.pipeline import remesh
 
     if options.symmetry == "none":
         return remesh, {}

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
     from gdtool.assets.scene import Scene
     from gdtool.cameras import Camera
-    from gdtool.shading.direct import DirectLight
-    from gdtool.shading.environment import Environment
-    from gdtool.shading.render import Renderer
-    from gdtool.shading.sg import SphericalGaussians
+    from gdtool.shading.render.direct import DirectLight
+    from gdtool.shading.lights.environment import Environment
+    from gdtool.shading.render.render import Renderer
+    from gdtool.shading.bsdf.sg import SphericalGaussians
 
 ALL = (*DOMAINS, "closed_form")
 
@@ -59,7 +59,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 def check(inputs: Inputs, options: Options) -> None:
     """Raise what --light and options that contradict one another would stop the run with."""
-    from gdtool.shading.environment import BUNDLED
+    from gdtool.shading.lights.bundled import BUNDLED
     from gdtool.stages import early
 
     unknown = sorted(set(options.domains) - set(ALL))
@@ -79,7 +79,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.assets.load import load_scene
     from gdtool.folders.views import Views, write_views
     from gdtool.geometry import shells
-    from gdtool.shading.render import Renderer
+    from gdtool.shading.render.render import Renderer
 
     given: Folder | None = inputs.second.get("cameras")
     source = inputs.main.file("asset.glb") if isinstance(inputs.main, Folder) else inputs.main
@@ -214,7 +214,7 @@ def _asset_of(source: Any) -> Folder | None:
 
 
 def _cameras(given: Folder | None, options: Options) -> list[Camera]:
-    from gdtool.shading.rigs import sphere, turntable
+    from gdtool.shading.render.rigs import sphere, turntable
 
     if given is not None:
         from gdtool.folders.records import read_cameras
@@ -243,8 +243,8 @@ class _Lamps(NamedTuple):
 def _light(renderer: Renderer, inputs: Inputs, given: Folder | None, options: Options) -> _Lamps:
     import torch
 
-    from gdtool.shading.direct import DirectLight
-    from gdtool.shading.studio import studio
+    from gdtool.shading.render.direct import DirectLight
+    from gdtool.shading.lights.studio import studio
 
     # Shading runs in threads of its own, a chunk each; torch's own would only wait for each other.
     torch.set_num_threads(1)
@@ -262,7 +262,7 @@ def _light(renderer: Renderer, inputs: Inputs, given: Folder | None, options: Op
 def _view(renderer: Renderer, camera: Camera, lamps: _Lamps | None, options: Options) -> dict[str, np.ndarray]:
     frame = renderer.buffers(camera, options.samples, lamps.direct.color(options.exposure) if "color" in options.domains else None)
     if "closed_form" in options.domains:
-        from gdtool.shading.closed_form import closed_form_image
+        from gdtool.shading.bsdf.closed_form import closed_form_image
 
         frame["closed_form"] = closed_form_image(frame, camera, lamps.lobes, options.brdf) * options.exposure
     return frame
@@ -274,7 +274,7 @@ def _write_conditions(out: Output, renderer: Renderer, direct: DirectLight, opti
     from gdtool.folders.records import write_cameras
     from gdtool.images.color import srgb_from_linear
     from gdtool.images.io import write_png
-    from gdtool.shading.rigs import condition_camera
+    from gdtool.shading.render.rigs import condition_camera
 
     cameras = [condition_camera(rng, f"{i:03d}", options.size) for i in range(options.condition_views)]
     frames = renderer.each(lambda camera: renderer.buffers(camera, options.samples, direct.color(options.exposure)), cameras)
@@ -286,7 +286,7 @@ def _write_conditions(out: Output, renderer: Renderer, direct: DirectLight, opti
 
 def _tell_skips(out: Output, renderer: Renderer, options: Options, lamps: _Lamps | None) -> None:
     """What the scene did not need."""
-    from gdtool.shading.savings import savings
+    from gdtool.shading.render.skipped_work import savings
 
     if lamps is None:
         out.skip("light", "neither color, closed_form nor condition images are asked for")

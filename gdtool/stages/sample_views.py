@@ -68,12 +68,12 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     import torch
 
     from gdtool.cameras import rig
-    from gdtool.diffusion import wonder3d
-    from gdtool.diffusion.data import to_tensor_condition
-    from gdtool.diffusion.encoding import BACKGROUND
-    from gdtool.diffusion.familiarity import doubts, read_ranges, unfamiliar
-    from gdtool.diffusion.result import views_from_images
-    from gdtool.diffusion.weights import load_model
+    from gdtool.diffusion.checkpoint import wonder3d
+    from gdtool.diffusion.data.objects import to_tensor_condition
+    from gdtool.diffusion.network.encoding import BACKGROUND
+    from gdtool.diffusion.inference.familiarity import doubts, read_ranges, unfamiliar
+    from gdtool.diffusion.inference.result import views_from_images
+    from gdtool.diffusion.checkpoint.weights import load_model
     from gdtool.folders.views import write_views
     from gdtool.images.color import srgb_from_linear
     from gdtool.images.io import write_png
@@ -160,7 +160,7 @@ def _compiler_cache() -> Iterator[None]:
 
 def _sampled(model, compiled: bool, rgba, **setting):
     """sample_images(), of the compiled network where that is asked for. Raises ResourceError where it cannot be compiled."""
-    from gdtool.diffusion.sampling import sample_images
+    from gdtool.diffusion.inference.sampling import sample_images
 
     if not compiled:
         return sample_images(model, rgba, **setting)
@@ -189,8 +189,8 @@ def _condition(inputs: Inputs, options: Options, config, out: Output):
 
     import numpy as np
 
-    from gdtool.diffusion import wonder3d
-    from gdtool.diffusion.framing import FRONT_EXTENT, frame, framed_side, whole_frame
+    from gdtool.diffusion.checkpoint import wonder3d
+    from gdtool.diffusion.data.framing import FRONT_EXTENT, frame, framed_side, whole_frame
     from gdtool.images.color import linear_from_srgb
     from gdtool.images.io import read_image
     from gdtool.images.mask import foreground

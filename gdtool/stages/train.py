@@ -64,13 +64,14 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     import torch
 
     from gdtool.core.kinds import ModelContent
-    from gdtool.diffusion import distributed, familiarity
-    from gdtool.diffusion.curve import draw_curve
-    from gdtool.diffusion.data import Objects, decode_dataset, from_bytes
-    from gdtool.diffusion.model import parameter_count
-    from gdtool.diffusion.report import append_validation, card, validation
-    from gdtool.diffusion.tensorboard import Events
-    from gdtool.diffusion.weights import save_model
+    from gdtool.diffusion.inference import familiarity
+    from gdtool.diffusion.training import distributed
+    from gdtool.diffusion.reports.curve import draw_curve
+    from gdtool.diffusion.data.objects import Objects, decode_dataset, from_bytes
+    from gdtool.diffusion.network.model import parameter_count
+    from gdtool.diffusion.reports.report import append_validation, card, validation
+    from gdtool.diffusion.training.tensorboard import Events
+    from gdtool.diffusion.checkpoint.weights import save_model
     from gdtool.images.io import write_png
 
     torch.set_num_threads(out.threads)
@@ -130,21 +131,21 @@ def _train(order: dict, objects, **how):
     """What every process does: the same model, the same data, its own part of each batch."""
     import torch
 
-    from gdtool.diffusion.model import Model
-    from gdtool.diffusion.training import run_training
-    from gdtool.diffusion.weights import check_shapes, load_model
+    from gdtool.diffusion.network.model import Model
+    from gdtool.diffusion.training.loop import run_training
+    from gdtool.diffusion.checkpoint.weights import check_shapes, load_model
 
     torch.manual_seed(order["seed"])
     model = Model(order["model"])
     if order["start"] is not None:
-        from gdtool.diffusion.grow import grown
+        from gdtool.diffusion.network.grow import grown
 
         loaded = load_model(order["start"])
         tensors = grown(loaded.state_dict(), loaded.config, order["model"])
         check_shapes(order["start"], tensors, model.state_dict())
         model.load_state_dict(tensors)
     elif order["model"].codec == "vae":
-        from gdtool.diffusion.pretrained import start_from_pretrained
+        from gdtool.diffusion.checkpoint.pretrained import start_from_pretrained
 
         start_from_pretrained(model)
     return run_training(model, objects, order["train"], order["workspace"], seed=order["seed"], minutes=order["minutes"],
@@ -155,8 +156,8 @@ def follow(threads: int) -> None:
     """What a process of torchrun that is not the first does: wait for the first one's order, train with it, and end."""
     import torch
 
-    from gdtool.diffusion import distributed
-    from gdtool.diffusion.data import Objects, decode_dataset
+    from gdtool.diffusion.training import distributed
+    from gdtool.diffusion.data.objects import Objects, decode_dataset
 
     if threads:
         torch.set_num_threads(threads)
@@ -170,14 +171,14 @@ def follow(threads: int) -> None:
 
 def dismiss() -> None:
     """The first process of several, its work done, lets the others go, also where it had nothing to do, and ends."""
-    from gdtool.diffusion import distributed
+    from gdtool.diffusion.training import distributed
 
     distributed.leave()
 
 
 def plan(options: Options, as_json: bool) -> str:
     """What the training would cost, as text or as one JSON object."""
-    from gdtool.diffusion.plan import plan_of, text_of
+    from gdtool.diffusion.reports.plan import plan_of, text_of
 
     report = plan_of(*configured(options))
     return msgspec.json.encode(report).decode() if as_json else text_of(report)
@@ -210,7 +211,7 @@ def configured(options: Options):
     except msgspec.ValidationError as error:
         raise InputError(options.config or "configuration", str(error), "correct that value in the file of --config") from None
     if options.size is not None:
-        from gdtool.diffusion.grow import resized
+        from gdtool.diffusion.network.grow import resized
 
         model = resized(model, options.size)
     return model, train
@@ -226,7 +227,7 @@ def _objects(inputs: Inputs, workspace):
     parts = []
     for source in inputs.all:
         if isinstance(source, Path):
-            from gdtool.diffusion.archives import views_of
+            from gdtool.diffusion.data.archives import views_of
 
             parts.append(views_of(source, workspace))
             continue
@@ -238,7 +239,7 @@ def _object_count(inputs: Inputs) -> int:
     """How many views folders _objects() gives; of archives only the headers are read."""
     from pathlib import Path
 
-    from gdtool.diffusion.archives import object_count
+    from gdtool.diffusion.data.archives import object_count
 
     return sum(object_count(source) if isinstance(source, Path) else 1 if source.kind == "views" else len(source.content.objects)
                for source in inputs.all)

@@ -57,9 +57,9 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.geometry import topology
     from gdtool.images.io import write_png
     from gdtool.stages.limits import require_time
-    from gdtool.texture import unwrap_preview
-    from gdtool.texture.unwrap import Request, figures, islands, unwrap
-    from gdtool.texture.unwrap_mirror import with_twins
+    from gdtool.unwrap import preview as unwrap_preview
+    from gdtool.unwrap.pipeline import Request, figures, islands, unwrap
+    from gdtool.unwrap.symmetry import with_twins
 
     with out.step("read"):
         mesh, matrix = _read(inputs, out)
@@ -114,7 +114,7 @@ def _twins(mesh, options: Options, inputs: Inputs, out: Output):
     """What mirror_twins says; nothing has a twin without --symmetry."""
     import numpy as np
 
-    from gdtool.texture.unwrap_mirror import mirror_twins
+    from gdtool.unwrap.symmetry import mirror_twins
 
     if options.symmetry == "none":
         return np.full(len(mesh.faces), -1), np.full(mesh.faces.shape, -1)
@@ -198,7 +198,7 @@ def _invalid(mesh) -> str | None:
     """Why texture coordinates cannot be kept; None when they can."""
     import numpy as np
 
-    from gdtool.texture.unwrap import figures
+    from gdtool.unwrap.pipeline import figures
 
     if not np.isfinite(mesh.uv).all():
         return "some are not finite"

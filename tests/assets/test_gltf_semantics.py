@@ -8,10 +8,10 @@ import pytest
 from gdtool.assets.gltf_read import read_gltf
 from gdtool.cameras import camera_at
 from gdtool.core.errors import InputError
-from gdtool.shading.direct import DirectLight
-from gdtool.shading.environment import Environment
-from gdtool.shading.render import Renderer, render_buffers
-from gdtool.shading.surface_points import surface_attributes
+from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.lights.environment import Environment
+from gdtool.shading.render.render import Renderer, render_buffers
+from gdtool.shading.render.surface_points import surface_attributes
 from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad, with_textures
 
 CORNER = np.array([0]), np.array([[1.0, 0.0, 0.0]])

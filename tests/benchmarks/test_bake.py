@@ -65,7 +65,7 @@ def test_what_lies_beside_charts_is_seen_along_their_rims_at_a_coarse_level(case
 
     target, maps = Truth(case).target, perfect(case)
     gutter = np.ones((SIZE, SIZE), bool)
-    from gdtool.texture.raster import owners_of
+    from gdtool.geometry.uv_raster import owners_of
 
     gutter.ravel()[owners_of(target.uv, target.face_uvs, SIZE) >= 0] = False
     good = rim_error(target, maps["albedo"], 32)

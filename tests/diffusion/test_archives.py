@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.archives import object_count, placed, views_of
+from gdtool.diffusion.data.archives import object_count, placed, views_of
 from gdtool.folders.views import read_views
 from tests.stages.dataset import write_spheres
 

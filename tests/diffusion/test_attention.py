@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gdtool.diffusion.attention import Attention, CrossDomainAttention, Layout, RowAttention, TransformerBlock
+from gdtool.diffusion.network.attention import Attention, CrossDomainAttention, Layout, RowAttention, TransformerBlock
 
 
 def block(cross_domain="two_way", multi_view=True):

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from gdtool.diffusion import codec as codecs
-from gdtool.diffusion.codec import CHUNK, PatchCodec, VaeCodec
+from gdtool.diffusion.network import codec as codecs
+from gdtool.diffusion.network.codec import CHUNK, PatchCodec, VaeCodec
 from gdtool.diffusion.config import PRESETS
-from gdtool.diffusion.data import draw
-from gdtool.diffusion.model import Model
-from gdtool.diffusion.training import choose, losses, phase_at
+from gdtool.diffusion.data.objects import draw
+from gdtool.diffusion.network.model import Model
+from gdtool.diffusion.training.loop import choose, losses, phase_at
 from tests.diffusion.test_training import MODEL, TRAIN, spheres
 
 

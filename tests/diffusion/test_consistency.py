@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gdtool.cameras import rig
-from gdtool.diffusion.consistency import consistency, reprojection, rerendered_psnr, slope_degrees
+from gdtool.diffusion.reports.consistency import consistency, reprojection, rerendered_psnr, slope_degrees
 from tests.diffusion.spheres import sphere_views
 
 VIEWS = sphere_views(0, 64)
@@ -26,8 +26,8 @@ def test_lit_maps_are_their_color():
     """Color made of the maps by the closed form under a known light comes back; against a constant color it does not."""
     import torch
 
-    from gdtool.shading.closed_form import shade
-    from gdtool.shading.sg import SphericalGaussians
+    from gdtool.shading.bsdf.closed_form import shade
+    from gdtool.shading.bsdf.sg import SphericalGaussians
 
     light = SphericalGaussians(torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]), torch.tensor([2.0, 4.0]), torch.tensor([[0.6, 0.6, 0.6], [0.3, 0.2, 0.1]]))
     maps = {d: torch.from_numpy(VIEWS.images[d]) for d in ("normal", "albedo", "roughness", "metallic")}

@@ -13,11 +13,11 @@ SCRIPT = """
 import sys
 from pathlib import Path
 import msgspec, torch
-from gdtool.diffusion import distributed
+from gdtool.diffusion.training import distributed
 from gdtool.diffusion.config import Phase
-from gdtool.diffusion.model import Model
-from gdtool.diffusion.report import append_validation, validation
-from gdtool.diffusion.training import run_training
+from gdtool.diffusion.network.model import Model
+from gdtool.diffusion.reports.report import append_validation, validation
+from gdtool.diffusion.training.loop import run_training
 from tests.diffusion.test_training import MODEL, TRAIN, spheres
 
 torch.set_num_threads(1)

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from gdtool.diffusion.config import DOMAINS
-from gdtool.diffusion.encoding import coverage, decode, encode, mirrored, planes_from_images
-from gdtool.diffusion.framing import FRONT_EXTENT, frame, whole_frame
+from gdtool.diffusion.network.encoding import coverage, decode, encode, mirrored, planes_from_images
+from gdtool.diffusion.data.framing import FRONT_EXTENT, frame, whole_frame
 from tests.diffusion.spheres import sphere_views
 
 
@@ -85,7 +85,7 @@ def test_whole_frame_pads_to_a_square():
 def test_the_pictures_silhouette_is_the_front_views_and_mirrored_the_backs(sphere):
     """Whatever the network guessed: here a sphere everywhere, and a picture that shows a slanted shape."""
     from gdtool.cameras import rig
-    from gdtool.diffusion.result import views_from_images
+    from gdtool.diffusion.inference.result import views_from_images
 
     views, planes = sphere
     encoded = encode(planes, tuple(range(6)), torch.tensor([0.0]))[0]
@@ -104,7 +104,7 @@ def test_the_pictures_silhouette_is_the_front_views_and_mirrored_the_backs(spher
 
 def test_mirrored_images_are_the_images_of_the_mirrored_object():
     from gdtool.cameras import rig
-    from gdtool.diffusion.data import mirror
+    from gdtool.diffusion.data.objects import mirror
 
     generator, names = torch.Generator().manual_seed(0), tuple(camera.name for camera in rig("six", 8))
     planes = 2 * torch.rand(6, 13, 8, 8, generator=generator) - 1
@@ -116,7 +116,7 @@ def test_mirrored_images_are_the_images_of_the_mirrored_object():
 
 
 def test_what_is_nearly_metal_is_metal_and_edges_stay_soft():
-    from gdtool.diffusion.result import decided
+    from gdtool.diffusion.inference.result import decided
 
     given = torch.linspace(0, 1, 101, dtype=torch.float64)
     out = decided(given)
@@ -128,7 +128,7 @@ def test_what_is_nearly_metal_is_metal_and_edges_stay_soft():
 
 def test_only_metallic_is_decided(sphere):
     from gdtool.cameras import rig
-    from gdtool.diffusion.result import decided, views_from_images
+    from gdtool.diffusion.inference.result import decided, views_from_images
 
     views, _ = sphere
     grey = np.full(views.mask.shape, 0.3, np.float32)
@@ -143,7 +143,7 @@ def test_only_metallic_is_decided(sphere):
 def test_views_from_opposite_sides_get_one_outline():
     """A model that guesses the outline from the right larger than from the left: both get the mean."""
     from gdtool.cameras import rig
-    from gdtool.diffusion.result import tied
+    from gdtool.diffusion.inference.result import tied
 
     cameras = rig("six", 8)
     names, soft = [camera.name for camera in cameras], torch.rand(6, 8, 8, generator=torch.Generator().manual_seed(1))
@@ -156,8 +156,8 @@ def test_views_from_opposite_sides_get_one_outline():
 
 def test_depth_stays_within_the_outlines_that_other_views_show():
     """Of a ball whose right side the model draws too far out and whose front too far in; what is right stays."""
-    from gdtool.diffusion.result import within_silhouettes
-    from gdtool.fields.sights import backproject
+    from gdtool.diffusion.inference.result import within_silhouettes
+    from gdtool.fields.views.prepared_view import backproject
     from tests.fields.shapes import sphere, views_of
 
     cameras, images, mask = views_of(lambda points: sphere(points, 0.4), 64)
@@ -192,7 +192,7 @@ def test_depth_stays_within_the_outlines_that_other_views_show():
 def test_an_outline_between_pixels_keeps_depth_to_a_fraction_of_one():
     """Of a wall that leans by a fifth of a pixel a row: no steps of whole pixels in the depth of the view that faces it."""
     from gdtool.cameras import rig
-    from gdtool.diffusion.result import within_silhouettes
+    from gdtool.diffusion.inference.result import within_silhouettes
 
     size, lean = 64, 1 / 5
     cameras = rig("six", size)

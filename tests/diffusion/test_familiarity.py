@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.familiarity import (
+from gdtool.diffusion.inference.familiarity import (
     DOUBTS,
     FILE,
     PictureRange,

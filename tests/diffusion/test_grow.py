@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.attention import Layout
+from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.config import PRESETS
-from gdtool.diffusion.grow import grown, resized
-from gdtool.diffusion.model import Model
+from gdtool.diffusion.network.grow import grown, resized
+from gdtool.diffusion.network.model import Model
 
 SMALL = msgspec.structs.replace(PRESETS["tiny"][0], image_size=16, channels=(8, 16), head_width=8, encoder_width=16)
 

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion import wonder3d
+from gdtool.diffusion.checkpoint import wonder3d
 from gdtool.diffusion.config import PRESETS
-from gdtool.diffusion.encoder import ClipEncoder
-from gdtool.diffusion.weights import pretrained_part
+from gdtool.diffusion.network.encoder import ClipEncoder
+from gdtool.diffusion.network.tensors import pretrained_part
 
 PAPER = PRESETS["paper"][0]
 

@@ -3,10 +3,10 @@
 import numpy as np
 import torch
 
-from gdtool.diffusion.codec import make_codec
+from gdtool.diffusion.network.codec import make_codec
 from gdtool.diffusion.config import PRESETS, TrainConfig
-from gdtool.diffusion.encoding import encode, planes_from_images
-from gdtool.diffusion.losses import image_error, linear, rendering_error, view_directions
+from gdtool.diffusion.network.encoding import encode, planes_from_images
+from gdtool.diffusion.training.losses import image_error, linear, rendering_error, view_directions
 from gdtool.images.color import linear_from_srgb
 from tests.diffusion.spheres import LIGHT, sphere_views
 

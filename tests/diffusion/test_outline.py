@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
-from gdtool.diffusion.outline import draw_part, grown_masks, lost_part
+from gdtool.diffusion.inference.outline import draw_part, grown_masks, lost_part
 from tests.fields.shapes import cube, sphere, torus, views_of
 
 SIZE = 96

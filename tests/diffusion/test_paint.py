@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.diffusion.paint import repainted
+from gdtool.diffusion.inference.paint import repainted
 
 SIZE = 64
 

@@ -6,11 +6,11 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
-from gdtool.diffusion.attention import Layout
+from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.config import PRESETS, Phase
-from gdtool.diffusion.model import Model, parameter_count
-from gdtool.diffusion.plan import frozen_cost, phase_cost, plan_of, rendering_share, step_cost
-from gdtool.diffusion.training import new_state, train_step
+from gdtool.diffusion.network.model import Model, parameter_count
+from gdtool.diffusion.reports.plan import frozen_cost, phase_cost, plan_of, rendering_share, step_cost
+from gdtool.diffusion.training.loop import new_state, train_step
 from tests.diffusion.test_training import spheres
 
 CONFIG = msgspec.structs.replace(PRESETS["tiny"][0], image_size=32, channels=(32, 64), encoder_width=32)

@@ -6,11 +6,11 @@ import msgspec
 import pytest
 import torch
 
-from gdtool.diffusion.attention import Layout
+from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.config import PRESETS
-from gdtool.diffusion.model import Model
-from gdtool.diffusion.pretrained import start_from_pretrained
-from gdtool.diffusion.weights import read_tensors
+from gdtool.diffusion.network.model import Model
+from gdtool.diffusion.checkpoint.pretrained import start_from_pretrained
+from gdtool.diffusion.network.tensors import read_tensors
 from tests.stages.dataset import write_spheres
 
 diffusers = pytest.importorskip("diffusers", reason="needs pip install 'gdtool[hub]'")

@@ -8,12 +8,13 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion import optimizer, training
+from gdtool.diffusion.training import loop as training, optimizer
 from gdtool.diffusion.config import DOMAINS, PRESETS, Phase
-from gdtool.diffusion.data import LIGHTS, Objects, draw, from_bytes, mirror, object_order, permute_colors, to_bytes
-from gdtool.diffusion.encoding import PLANES, planes_from_images
-from gdtool.diffusion.model import Model, class_labels
-from gdtool.diffusion.training import CHECKPOINT, choose, learning_rate, new_state, phase_at, run_training
+from gdtool.diffusion.data.objects import LIGHTS, Objects, draw, from_bytes, mirror, object_order, permute_colors, to_bytes
+from gdtool.diffusion.network.encoding import PLANES, planes_from_images
+from gdtool.diffusion.network.labels import class_labels
+from gdtool.diffusion.network.model import Model
+from gdtool.diffusion.training.loop import CHECKPOINT, choose, learning_rate, new_state, phase_at, run_training
 from tests.diffusion.spheres import LIGHT, sphere_views
 
 MODEL, TRAIN = PRESETS["tiny"]

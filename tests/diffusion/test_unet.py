@@ -5,13 +5,13 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.attention import Layout
+from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.config import PRESETS
-from gdtool.diffusion.encoding import mirrored
-from gdtool.diffusion.model import Model
-from gdtool.diffusion.sampling import sample_images
-from gdtool.diffusion.unet import UNet
-from gdtool.diffusion.weights import load_stable_diffusion
+from gdtool.diffusion.network.encoding import mirrored
+from gdtool.diffusion.network.model import Model
+from gdtool.diffusion.inference.sampling import sample_images
+from gdtool.diffusion.network.unet import UNet
+from gdtool.diffusion.checkpoint.weights import load_stable_diffusion
 
 TINY = msgspec.structs.replace(PRESETS["tiny"][0], channels=(8, 16), head_width=8, encoder_width=16, image_size=16)
 PAPER = PRESETS["paper"][0]

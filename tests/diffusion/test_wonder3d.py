@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion import wonder3d
-from gdtool.diffusion.attention import Layout, TransformerBlock
+from gdtool.diffusion.checkpoint import wonder3d
+from gdtool.diffusion.network.labels import class_labels
+from gdtool.diffusion.network.attention import Layout, TransformerBlock
 from gdtool.diffusion.config import DOMAINS, ModelConfig
-from gdtool.diffusion.weights import read_tensors
+from gdtool.diffusion.network.tensors import read_tensors
 
 SMALL = {"block_out_channels": (8, 16, 16, 16), "norm_num_groups": 4, "attention_head_dim": 2, "cross_attention_dim": 24, "layers_per_block": 2}
 
@@ -85,7 +86,7 @@ def test_the_new_attention_starts_as_its_bias_alone():
 
 
 def test_camera_embedding_verbatim():
-    labels = wonder3d.class_labels(ModelConfig(convention="wonder3d"))
+    labels = class_labels(ModelConfig(convention="wonder3d"))
     elevation = [0.0, -0.2362, -0.1686, 0.5220, 0.6904, 0.3733]
     azimuth = [0.0, 0.8125, 1.6934, 3.1406, 4.8359, 5.5859]
     assert labels.shape == (6, 6, 10)
@@ -196,8 +197,8 @@ def test_without_joint_attention_an_image_gets_what_diffusers_gives_it(folder):
 
 def test_guidance_is_the_step_from_nothing_to_the_condition(folder):
     """One step at guidance 3, restated: without = zero embedding, zero latent, the same camera labels."""
-    from gdtool.diffusion.encoding import encode_condition
-    from gdtool.diffusion.sampling import sample_images
+    from gdtool.diffusion.network.encoding import encode_condition
+    from gdtool.diffusion.inference.sampling import sample_images
 
     model = wonder3d.load(folder)
     rgba = torch.rand(1, 4, 64, 64) * 2 - 1

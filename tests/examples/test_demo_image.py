@@ -12,7 +12,7 @@ def test_the_demo_image_is_the_demo_object_from_the_front(monkeypatch):
     from gdtool.assets.load import load_scene
     from gdtool.cameras import camera_at
     from gdtool.images.io import read_image
-    from gdtool.shading.render import render_buffers
+    from gdtool.shading.render.render import render_buffers
 
     monkeypatch.setattr(sys, "path", [str(EXAMPLES), *sys.path])
     import make_demo_image as script

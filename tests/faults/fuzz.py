@@ -88,7 +88,7 @@ def read_cameras(path: Path) -> None:
 
 
 def read_weights(path: Path) -> None:
-    from gdtool.diffusion.weights import read_tensors
+    from gdtool.diffusion.network.tensors import read_tensors
 
     read_tensors(path)
 

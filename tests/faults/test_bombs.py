@@ -19,12 +19,12 @@ from gdtool.assets.load import load_scene
 from gdtool.core import memory
 from gdtool.core.errors import InputError, ResourceError
 from gdtool.core.folder import open_folder
-from gdtool.diffusion import archives
-from gdtool.diffusion.archives import object_count, views_of
+from gdtool.diffusion.data import archives
+from gdtool.diffusion.data.archives import object_count, views_of
 from gdtool.folders.views import read_views
 from gdtool.images import io as image_io
 from gdtool.images.io import read_image, write_exr, write_png
-from gdtool.shading.environment import load_environment
+from gdtool.shading.lights.load import load_environment
 from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad
 from tests.conftest import ROOT
 from tests.fields.shapes import torus, views_folder, views_of as seen

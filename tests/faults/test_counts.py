@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from gdtool.geometry.quad_task import count_reason
+from gdtool.remesh.task import count_reason
 from tests.geometry.solids import cube, joined, lattice, sphere, torus, write_obj
 
 

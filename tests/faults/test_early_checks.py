@@ -82,7 +82,7 @@ def test_lights_that_are_there_pass(files):
     for value in ("dark", "mid", "bright", "random:7", f"random:{2**63 - 1}", "light.exr"):
         early.require_environment("--env", value, ("dark", "mid", "bright"))
     with pytest.raises(Exception, match="black everywhere"):
-        from gdtool.shading.environment import load_environment
+        from gdtool.shading.lights.load import load_environment
 
         load_environment("black.exr")
     name = "caf\udce9.exr"

@@ -351,7 +351,7 @@ def test_a_workspace_stays_only_where_a_run_can_go_on_from_it(tmp_path, pictures
 
 
 def test_train_keeps_the_file_that_it_resumes_from():
-    from gdtool.diffusion.training import CHECKPOINT
+    from gdtool.diffusion.training.loop import CHECKPOINT
     from gdtool.stages.train import STAGE
 
     assert STAGE.checkpoint == CHECKPOINT

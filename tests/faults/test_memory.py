@@ -14,8 +14,8 @@ from gdtool.core import child
 from gdtool.core.child import ChildFailed, call
 from gdtool.core.errors import ResourceError, from_exception
 from gdtool.core.native import import_error, require_address_space
-from gdtool.texture import lods
-from tests.texture.test_lods import target
+from gdtool.bake import lods
+from tests.bake.test_lods import target
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits on the address space are Linux's")
 

@@ -10,13 +10,14 @@ from safetensors.torch import save_file
 
 from gdtool.core import memory
 from gdtool.core.errors import InputError, ResourceError
-from gdtool.diffusion import wonder3d
+from gdtool.diffusion.checkpoint import wonder3d
 from gdtool.diffusion.config import PRESETS
-from gdtool.diffusion.familiarity import read_ranges
-from gdtool.diffusion.grow import resized
-from gdtool.diffusion.model import Model
-from gdtool.diffusion.training import CHECKPOINT, load_checkpoint
-from gdtool.diffusion.weights import load_model, read_config, read_tensors, save_model
+from gdtool.diffusion.inference.familiarity import read_ranges
+from gdtool.diffusion.network.grow import resized
+from gdtool.diffusion.network.model import Model
+from gdtool.diffusion.training.loop import CHECKPOINT, load_checkpoint
+from gdtool.diffusion.checkpoint.weights import load_model, read_config, save_model
+from gdtool.diffusion.network.tensors import read_tensors
 from gdtool.stages.train import Options, configured
 from tests.faults.test_checkpoints import changed
 

@@ -8,15 +8,18 @@ import pytest
 from gdtool.core import child
 from gdtool.core.errors import ResourceError
 from gdtool.core.native import imported, imported_if_installed
-from gdtool.geometry import quad_split, repair, simplify
+from gdtool.geometry import repair, simplify
+from gdtool.remesh.fallback import pair_and_split
 from gdtool.geometry.distance import _fcpw_search, closest_points, winding_number
-from gdtool.geometry.quad_engines import run_instant_meshes, run_quadriflow
-from gdtool.geometry.quad_task import Request
-from gdtool.geometry.quads import remesh
+from gdtool.remesh.engines.adapters import run_instant_meshes, run_quadriflow
+from gdtool.remesh.task import Request
+from gdtool.remesh.pipeline import remesh
 from gdtool.geometry.rays import RayCaster
 from gdtool.images.cutout import both_frames
-from gdtool.texture import lods, unwrap_charts, unwrap_flatten
-from gdtool.texture.reproject import Nearest
+from gdtool.bake import lods
+from gdtool.unwrap.parameterize import flatten
+from gdtool.unwrap.segment import charts
+from gdtool.bake.reproject import Nearest
 from tests.faults.files import quad_cube
 from tests.geometry.solids import sphere
 
@@ -42,15 +45,15 @@ def broken(tmp_path, monkeypatch):
 
 USES = {
     "igl": [lambda: closest_points(np.zeros((1, 3)), *TRIANGLE), lambda: winding_number(np.zeros((1, 3)), *TRIANGLE), lambda: Nearest(*TRIANGLE),
-            lambda: repair._split(*TRIANGLE), lambda: quad_split.of_own(*TRIANGLE, 16, 1.0),
-            lambda: unwrap_flatten._conformal(*TRIANGLE, np.array([0, 1, 2]))],
+            lambda: repair._split(*TRIANGLE), lambda: pair_and_split.of_own(*TRIANGLE, 16, 1.0),
+            lambda: flatten._conformal(*TRIANGLE, np.array([0, 1, 2]))],
     "fcpw": [lambda: _fcpw_search(*TRIANGLE)],
     "embreex": [lambda: RayCaster(*TRIANGLE)],
     "fast_simplification": [lambda: simplify.collapse(*TRIANGLE, 1, 5.0)],
-    "pymeshlab": [lambda: simplify.collapse_topology(*TRIANGLE, 1), lambda: quad_split.even_triangles(*TRIANGLE, 10, 30.0),
+    "pymeshlab": [lambda: simplify.collapse_topology(*TRIANGLE, 1), lambda: pair_and_split.even_triangles(*TRIANGLE, 10, 30.0),
                   lambda: lods.collapse_textured(*TRIANGLE, np.zeros((1, 3, 2)), 1, ".")],
     "pynanoinstantmeshes": [lambda: run_instant_meshes(*TRIANGLE, 100, 30.0)],
-    "xatlas": [lambda: unwrap_charts.run_xatlas(*TRIANGLE, 2.0)],
+    "xatlas": [lambda: charts.run_xatlas(*TRIANGLE, 2.0)],
     "cv2": [lambda: both_frames(np.zeros((40, 40, 3)))],
 }
 

@@ -11,7 +11,7 @@ from gdtool.assets.load import load_scene
 from gdtool.core.errors import InputError
 from gdtool.core.folder import open_folder
 from gdtool.core.sources import digest
-from gdtool.diffusion.archives import object_count, views_of
+from gdtool.diffusion.data.archives import object_count, views_of
 from gdtool.folders.adapters import nerf, plain
 from gdtool.folders.views import read_views
 from gdtool.images.io import encode_png, write_png

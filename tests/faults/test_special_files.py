@@ -14,13 +14,13 @@ from gdtool.assets.load import load_scene
 from gdtool.core.errors import InputError
 from gdtool.core.folder import open_folder
 from gdtool.core.sources import digest
-from gdtool.diffusion.archives import object_count
+from gdtool.diffusion.data.archives import object_count
 from gdtool.folders.adapters import nerf, plain
 from gdtool.folders.mesh import read_obj
 from gdtool.folders.records import write_cameras
 from gdtool.folders.views import read_views
 from gdtool.images.io import read_image
-from gdtool.shading.environment import load_environment
+from gdtool.shading.lights.load import load_environment
 from tests.fields.shapes import torus, views_folder, views_of
 from tests.faults.test_paths_in_files import gltf, obj
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from gdtool.fields.light import Visibility, fit_amplitudes, materials_from_color, recover_light, unoccluded, visibility
-from gdtool.fields.materials import Observations, confidence, fuse, spread
-from gdtool.shading.closed_form import shade
-from gdtool.shading.lights import fibonacci
-from gdtool.shading.sg import SphericalGaussians
+from gdtool.fields.appearance.light import Visibility, fit_amplitudes, materials_from_color, recover_light, unoccluded, visibility
+from gdtool.fields.appearance.materials import Observations, confidence, fuse, spread
+from gdtool.shading.bsdf.closed_form import shade
+from gdtool.shading.sampling import fibonacci
+from gdtool.shading.bsdf.sg import SphericalGaussians
 
 
 def directions(count, seed=0):

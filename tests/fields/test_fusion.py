@@ -5,11 +5,11 @@ import pytest
 import trimesh
 
 from gdtool.cameras import rig
-from gdtool.fields.align import Corrections, agreement, corrections, disagreement, normals_fit_depth, slope_rows
-from gdtool.fields.carve import silhouettes_outvoted
-from gdtool.fields.fusion import BUMPY, align_depth, depth_for, folds, fuse_views, grid_step, is_closed_manifold, prepare_all
-from gdtool.fields.refine import _inside_silhouettes, bumpiness, drop_debris, follow_normals, refine
-from gdtool.fields.sights import free_distance, hull_distance, prepare, silhouette_distance, with_edge
+from gdtool.fields.views.depth_alignment import Corrections, agreement, corrections, disagreement, normals_fit_depth, slope_rows
+from gdtool.fields.grid.carve import silhouettes_outvoted
+from gdtool.fields.grid.fusion import BUMPY, align_depth, depth_for, folds, fuse_views, grid_step, is_closed_manifold, prepare_all
+from gdtool.fields.grid.refine import _inside_silhouettes, bumpiness, drop_debris, follow_normals, refine
+from gdtool.fields.views.prepared_view import free_distance, hull_distance, prepare, silhouette_distance, with_edge
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import components, signed_volume
 from gdtool.geometry.metrics import inside
@@ -66,7 +66,7 @@ def test_edges_are_drawn_out(monkeypatch):
         return np.array([closest_points(edge, shape.vertices, shape.faces)[0].mean() for edge in edges])
 
     sharp = missed()
-    monkeypatch.setattr("gdtool.fields.fusion.with_creases", lambda vertices, faces, *_: (vertices, faces))
+    monkeypatch.setattr("gdtool.fields.grid.fusion.with_creases", lambda vertices, faces, *_: (vertices, faces))
     blunt = missed()
     assert (sharp < blunt).all() and sharp.mean() < 0.85 * blunt.mean()
 

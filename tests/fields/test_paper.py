@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from gdtool.fields.networks import FREQUENCIES, SdfNetwork
-from gdtool.fields.networks_fit import Pixels, fit_distances, one_cycle, start, train
-from gdtool.fields.paper import closest_approach
+from gdtool.fields.neural.networks import FREQUENCIES, SdfNetwork
+from gdtool.fields.neural.fit import Pixels, fit_distances, one_cycle, start, train
+from gdtool.fields.neural.paper import closest_approach
 
 RADIUS = 0.3
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gdtool.cameras import project
-from gdtool.fields.fusion import align_depth, grid_step
-from gdtool.fields.photometric import Picture, color_rows
+from gdtool.fields.grid.fusion import align_depth, grid_step
+from gdtool.fields.views.photometric import Picture, color_rows
 
 from .shapes import sphere, views_of
 

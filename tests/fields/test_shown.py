@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from gdtool.fields.fusion import fuse_views, grid_step, is_closed_manifold, prepare_all
-from gdtool.fields.shown import lost_pixels, opposite, restore_shown
+from gdtool.fields.grid.fusion import fuse_views, grid_step, is_closed_manifold, prepare_all
+from gdtool.fields.grid.shown import lost_pixels, opposite, restore_shown
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import grid_over
 

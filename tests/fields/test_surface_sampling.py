@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from gdtool.fields import surface_sampling as ss
-from gdtool.fields.networks import ENCODED, MaterialNetwork, SdfNetwork, encode
+from gdtool.fields.neural import surface_sampling as ss
+from gdtool.fields.neural.networks import ENCODED, MaterialNetwork, SdfNetwork, encode
 
 
 def exact_alpha(f0, f1, s):

@@ -14,7 +14,7 @@ def cube(side: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
 
 def quad_cube(rounds: int) -> tuple[np.ndarray, np.ndarray]:
     """A cube of 6 * 4**rounds quads."""
-    from gdtool.geometry.quad_shape import subdivide
+    from gdtool.remesh.fit.surface_projection import subdivide
 
     vertices, faces = cube()[0], np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     for _ in range(rounds):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.fields.fusion import is_closed_manifold
+from gdtool.fields.grid.fusion import is_closed_manifold
 from gdtool.geometry.grids import components, edge_counts, extract, fine_points, grid_over, keep_faces, signed_volume
 
 

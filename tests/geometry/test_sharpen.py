@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.geometry import sharpen, topology
-from gdtool.geometry.features import find_features
+from gdtool.remesh.fit.feature_curves import find_features
 from tests.geometry.solids import bored_box, cube, sphere, torus, volume
 
 

@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
-from gdtool.shading import brdf as models
-from gdtool.shading.closed_form import shade, shade_parts
-from gdtool.shading.sg import SphericalGaussians, evaluate, normalize
+from gdtool.shading.bsdf import brdf as models
+from gdtool.shading.bsdf.closed_form import shade, shade_parts
+from gdtool.shading.bsdf.sg import SphericalGaussians, evaluate, normalize
 
 N = torch.tensor([0.0, 0.0, 1.0])
 

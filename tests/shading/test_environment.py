@@ -7,11 +7,13 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.shading.environment import BUNDLED, METERED_WHITE, Environment, load_environment
-from gdtool.shading.lights import direction, paint, random_lobes
-from gdtool.shading.prefilter import IrradianceMap
-from gdtool.shading.sg_fit import fit_sg
-from gdtool.shading.studio import studio
+from gdtool.shading.lights.bundled import BUNDLED
+from gdtool.shading.lights.environment import METERED_WHITE, Environment
+from gdtool.shading.lights.load import load_environment
+from gdtool.shading.lights.bundled import direction, paint, random_lobes
+from gdtool.shading.lights.prefilter import IrradianceMap
+from gdtool.shading.lights.sg_fit import fit_sg
+from gdtool.shading.lights.studio import studio
 
 
 def test_directions_of_pixels():

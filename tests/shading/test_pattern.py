@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from gdtool.shading.pattern import pixel_pattern
-from gdtool.shading.render import SPREAD, SPREAD_POWER
+from gdtool.shading.render.pattern import pixel_pattern
+from gdtool.shading.render.render import SPREAD, SPREAD_POWER
 
 
 @pytest.mark.parametrize("count", [4, 8, 16, 32, 64])

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from gdtool.cameras import rig
-from gdtool.shading.direct import DirectLight
-from gdtool.shading.environment import Environment
-from gdtool.shading.prefilter import LightPyramid, Prefiltered, filtered_light, octahedral, octahedral_directions, read_octahedral
-from gdtool.shading.render import Goal, Renderer
-from gdtool.shading.studio import studio
+from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.lights.environment import Environment
+from gdtool.shading.lights.prefilter import LightPyramid, Prefiltered, filtered_light, octahedral, octahedral_directions, read_octahedral
+from gdtool.shading.render.render import Goal, Renderer
+from gdtool.shading.lights.studio import studio
 from tests.shading.test_render import GREY, sphere, uniform
 
 

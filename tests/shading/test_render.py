@@ -9,10 +9,11 @@ import pytest
 
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.cameras import camera_at, rays, rig
-from gdtool.shading.environment import Environment
-from gdtool.shading.pattern import pixel_pattern
-from gdtool.shading.render import Renderer, render_buffers, render_color
-from gdtool.shading.surface_points import surface_attributes
+from gdtool.shading.lights.environment import Environment
+from gdtool.shading.render.pattern import pixel_pattern
+from gdtool.shading.render.color import render_color
+from gdtool.shading.render.render import Renderer, render_buffers
+from gdtool.shading.render.surface_points import surface_attributes
 
 GREY = Material(base_color=(0.5, 0.25, 0.125, 1.0), metallic=0.0, roughness=0.5)
 
@@ -180,7 +181,7 @@ def test_white_furnace_of_sampled_light():
 
 def test_lambert_quad_under_a_hemisphere_and_its_shadow():
     """Under light from above the horizon only, a plain facing it gets albedo; a roof over it takes the light away."""
-    from gdtool.shading.brdf import MIN_ROUGHNESS
+    from gdtool.shading.bsdf.brdf import MIN_ROUGHNESS
 
     floor = quad(dataclasses.replace(GREY, base_color=(0.5, 0.5, 0.5, 1), roughness=1.0))
     camera = rig("six", 32)[0]

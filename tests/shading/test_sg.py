@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gdtool.shading import sg
+from gdtool.shading.bsdf import sg
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(300)
 SHARPNESS = [0.0, 1e-30, 1e-8, 1e-4, 0.01, 0.3, 0.5, 1.0, 3.0, 10.0, 100.0, 1e4, 1e6, 1e8, 1e10]

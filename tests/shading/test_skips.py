@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import torch
 
-import gdtool.shading.direct as direct
-import gdtool.shading.render as render
+import gdtool.shading.render.direct as direct
+import gdtool.shading.render.render as render
 from gdtool.assets.scene import Scene, Texture
 from gdtool.cameras import rig
 from gdtool.geometry import rays
 from gdtool.geometry.rays import is_convex
-from gdtool.shading.direct import DirectLight
-from gdtool.shading.prefilter import LADDER
-from gdtool.shading.reflection import Surface
-from gdtool.shading.render import Renderer
-from gdtool.shading.studio import studio
+from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.lights.prefilter import LADDER
+from gdtool.shading.bsdf.reflection import Surface
+from gdtool.shading.render.render import Renderer
+from gdtool.shading.lights.studio import studio
 from tests.geometry.solids import cube
 from tests.shading.test_render import GREY, four_colors, quad, sphere
 
@@ -82,7 +82,7 @@ def test_skipping_even_pixels_changes_nothing_that_counts(monkeypatch):
 
 def test_a_texture_of_one_value_is_a_factor():
     """Not looked up, and the picture is the same to the bit; the manifest's skip names it."""
-    from gdtool.shading.savings import savings
+    from gdtool.shading.render.skipped_work import savings
 
     flat = Texture(np.full((8, 8, 3), (200, 100, 50), np.uint8), "srgb")
     scene = quad(dataclasses.replace(GREY, base_color_texture=flat, metallic_roughness_texture=Texture(four_colors().image)), uv_scale=1.7)

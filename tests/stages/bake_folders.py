@@ -17,7 +17,7 @@ from gdtool.folders.mesh import QuadMesh, write_mesh
 from gdtool.folders.surface import Surface, write_surface
 from gdtool.folders.views import Views, write_views
 from gdtool.geometry.rays import RayCaster
-from tests.texture.shapes import albedo_of, torus, triangles_of, unwrapped
+from tests.bake.shapes import albedo_of, torus, triangles_of, unwrapped
 
 
 def finish(path: Path, kind: str, content, inputs: dict[str, Path]) -> Path:

@@ -12,7 +12,7 @@ from gdtool.folders.mesh import QuadMesh, write_obj
 from gdtool.folders.views import Views, write_views
 from gdtool.images.io import read_image, write_png
 from tests.stages.bake_folders import finish, fresh, make_chain, torus_atlas, torus_views, write_atlas
-from tests.texture.shapes import psnr
+from tests.bake.shapes import psnr
 
 FAST = ("--size", 128, "--ao-rays", 16)
 
@@ -29,7 +29,7 @@ def rendered_albedo(asset: Path, views: Views | None = None, facing: float = 0.0
     from gdtool.cameras import rays
     from gdtool.geometry.rays import RayCaster
     from gdtool.images.color import srgb_from_linear
-    from gdtool.shading.surface_points import SurfaceLookup
+    from gdtool.shading.render.surface_points import SurfaceLookup
 
     scene, views = load_scene(asset / "asset.glb"), views or torus_views()
     lookup, caster = SurfaceLookup(scene), RayCaster(scene.vertices, scene.faces)

@@ -34,7 +34,7 @@ def egg(subdivisions=3):
 def egg_views(vertices, faces, size=48):
     """Six true views with all that is constant on an egg of one material."""
     from gdtool.assets.scene import Material, Scene
-    from gdtool.shading.render import Renderer
+    from gdtool.shading.render.render import Renderer
 
     scene = Scene(vertices, faces, (Material("egg", base_color=(0.5, 0.25, 0.1, 1), metallic=0.25, roughness=0.75),))
     renderer, cameras = Renderer(scene), rig("six", size)

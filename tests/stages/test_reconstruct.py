@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gdtool.core.folder import open_folder
-from gdtool.fields.fusion import is_closed_manifold
+from gdtool.fields.grid.fusion import is_closed_manifold
 from gdtool.folders.surface import read_surface
 from tests.fields.shapes import material, torus, two_balls, views_folder, views_of
 

@@ -45,7 +45,7 @@ def test_triangles_only_decimates(gdtool, tmp_path):
 
 
 def test_mesh_that_meets_the_request_is_passed_through(gdtool, tmp_path):
-    from tests.texture.shapes import torus
+    from tests.bake.shapes import torus
 
     vertices, quads, _ = torus(40, 20)
     write_obj(tmp_path / "ring.obj", vertices, quads)

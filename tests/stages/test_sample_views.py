@@ -15,8 +15,8 @@ from gdtool.core.errors import InputError
 from gdtool.core.kinds import ModelContent
 from gdtool.core.manifest import MANIFEST, Manifest, encode, list_files
 from gdtool.diffusion.config import PRESETS
-from gdtool.diffusion.model import Model
-from gdtool.diffusion.weights import load_model, save_model
+from gdtool.diffusion.network.model import Model
+from gdtool.diffusion.checkpoint.weights import load_model, save_model
 from gdtool.images.io import read_image, write_png
 
 CONFIG = msgspec.structs.replace(PRESETS["tiny"][0], channels=(8, 16), head_width=8, encoder_width=16, image_size=16)
@@ -222,6 +222,6 @@ def test_a_result_that_the_model_is_unsure_of_is_told(gdtool, picture, tiny_mode
 
 def test_loading_a_model_leaves_pytorchs_compiler_out():
     # It takes a second to import, and one operation on the meta device, where shapes are checked, can do that.
-    code = ("import sys; from pathlib import Path; import gdtool.models; from gdtool.diffusion.weights import load_model; "
+    code = ("import sys; from pathlib import Path; import gdtool.models; from gdtool.diffusion.checkpoint.weights import load_model; "
             "load_model(Path(gdtool.models.__file__).parent / 'default'); print([m for m in ('torch._dynamo', 'sympy') if m in sys.modules])")
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

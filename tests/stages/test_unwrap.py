@@ -8,7 +8,7 @@ import pytest
 
 from gdtool.core.folder import open_folder
 from gdtool.folders.mesh import QuadMesh, read_mesh, write_obj
-from tests.texture.shapes import torus
+from tests.bake.shapes import torus
 
 
 def content(path):

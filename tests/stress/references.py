@@ -8,8 +8,8 @@ import mpmath
 import numpy as np
 import torch
 
-from gdtool.shading import brdf as models
-from gdtool.shading.sg import SphericalGaussians, evaluate, normalize
+from gdtool.shading.bsdf import brdf as models
+from gdtool.shading.bsdf.sg import SphericalGaussians, evaluate, normalize
 
 ULP = float(np.finfo(np.float32).eps)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(300)

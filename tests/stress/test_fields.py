@@ -12,8 +12,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gdtool.fields import surface_sampling as ss
-from gdtool.fields.networks import ENCODED, FREQUENCIES, MaterialNetwork, SdfNetwork, encode
+from gdtool.fields.neural import surface_sampling as ss
+from gdtool.fields.neural.networks import ENCODED, FREQUENCIES, MaterialNetwork, SdfNetwork, encode
 
 settings.register_profile("stress", derandomize=True, deadline=None, print_blob=True)
 settings.load_profile("stress")
@@ -161,9 +161,9 @@ def test_a_row_with_nan_spoils_no_other_row():
 
 
 def test_diffusion_network_in_bfloat16():
-    from gdtool.diffusion.attention import Layout
+    from gdtool.diffusion.network.attention import Layout
     from gdtool.diffusion.config import PRESETS
-    from gdtool.diffusion.model import Model
+    from gdtool.diffusion.network.model import Model
 
     torch.manual_seed(0)
     model = Model(msgspec.structs.replace(PRESETS["tiny"][0], channels=(16, 32), head_width=8, encoder_width=16, image_size=16)).eval()

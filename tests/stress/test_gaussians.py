@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gdtool.shading import sg
+from gdtool.shading.bsdf import sg
 from tests.stress.references import ANGLES, SHARPNESS, ULP, product_of_lobes, ring_integrals, sphere_integral
 
 settings.register_profile("stress", derandomize=True, deadline=None, print_blob=True)

@@ -14,9 +14,9 @@ from scipy.stats import t as student
 
 from gdtool.assets.scene import Material, Scene
 from gdtool.cameras import camera_at
-from gdtool.shading.direct import DirectLight
-from gdtool.shading.lights import bundled
-from gdtool.shading.render import Renderer
+from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.lights.bundled import bundled
+from gdtool.shading.render.render import Renderer
 from tests.stress.test_scenes import ball
 
 SIZE, DRAWS, SAMPLES = 12, 24, 16

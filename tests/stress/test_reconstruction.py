@@ -13,8 +13,8 @@ import pytest
 
 from gdtool.cameras import rays, rig
 from gdtool.core.folder import open_folder
-from gdtool.fields.carve import silhouettes_outvoted
-from gdtool.fields.fusion import align_depth, fuse_views, grid_step, is_closed_manifold
+from gdtool.fields.grid.carve import silhouettes_outvoted
+from gdtool.fields.grid.fusion import align_depth, fuse_views, grid_step, is_closed_manifold
 from gdtool.folders.surface import read_surface
 from gdtool.folders.views import Views
 from gdtool.geometry.distance import closest_points

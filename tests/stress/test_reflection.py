@@ -11,9 +11,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gdtool.shading import brdf as models
-from gdtool.shading.closed_form import disney_mean, fresnel_loss, shade, shade_parts
-from gdtool.shading.sg import SphericalGaussians, normalize
+from gdtool.shading.bsdf import brdf as models
+from gdtool.shading.bsdf.closed_form import disney_mean, fresnel_loss, shade, shade_parts
+from gdtool.shading.bsdf.sg import SphericalGaussians, normalize
 from tests.stress.references import NODES, ULP, WEIGHTS, N, direction, light, reflected
 
 settings.register_profile("stress", derandomize=True, deadline=None, print_blob=True)

@@ -11,12 +11,12 @@ import torch
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.cameras import camera_at
 from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
-from gdtool.shading.closed_form import closed_form_image, shade
-from gdtool.shading.direct import DirectLight
-from gdtool.shading.environment import Environment
-from gdtool.shading.lights import bundled
-from gdtool.shading.render import Renderer
-from gdtool.shading.sg import SphericalGaussians
+from gdtool.shading.bsdf.closed_form import closed_form_image, shade
+from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.lights.environment import Environment
+from gdtool.shading.lights.bundled import bundled
+from gdtool.shading.render.render import Renderer
+from gdtool.shading.bsdf.sg import SphericalGaussians
 
 SHINY = Material(base_color=(1, 1, 1, 1), metallic=1.0, roughness=0.0)
 MATERIALS = {

@@ -15,11 +15,11 @@ from gdtool.assets.scene import Texture
 from gdtool.geometry.tangents import corner_tangents
 from gdtool.images.color import decode_normal, encode_normal, linear_from_srgb, srgb_from_linear
 from gdtool.images.io import read_image, write_png
-from gdtool.shading.reflection import frame
-from gdtool.shading.textures import TextureReader
-from gdtool.texture.maps import quantise
-from gdtool.texture.raster import owner_count
-from tests.texture.test_raster import exact_owner
+from gdtool.shading.bsdf.reflection import frame
+from gdtool.shading.render.textures import TextureReader
+from gdtool.bake.maps import quantise
+from gdtool.geometry.uv_raster import owner_count
+from tests.geometry.test_uv_raster import exact_owner
 
 settings.register_profile("stress", derandomize=True, deadline=None, print_blob=True)
 settings.load_profile("stress")
@@ -113,7 +113,7 @@ def test_texels_around_a_shared_vertex_have_one_owner(place):
     uv = np.array([[0, 0], [48, 0], [48, 48], [0, 48], place]) / 48
     faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
     assert (owner_count(uv, faces, 12) == 1).all()
-    from gdtool.texture.raster import rasterize_uv
+    from gdtool.geometry.uv_raster import rasterize_uv
 
     np.testing.assert_array_equal(rasterize_uv(uv, faces, 12)[0], exact_owner(uv, faces, 12))
 

@@ -55,7 +55,7 @@ def inner(coverage: np.ndarray) -> np.ndarray:
 def main() -> None:
     from gdtool.images.io import write_exr
     from gdtool.images.metrics import psnr
-    from gdtool.shading.studio import studio
+    from gdtool.shading.lights.studio import studio
 
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("asset", type=Path)

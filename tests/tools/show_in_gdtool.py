@@ -16,9 +16,9 @@ from gdtool.cameras import rig
 from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
 from gdtool.images.color import srgb_from_linear
 from gdtool.images.io import write_png
-from gdtool.shading.direct import DirectLight
-from gdtool.shading.render import Renderer, render_buffers
-from gdtool.shading.studio import studio
+from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.render.render import Renderer, render_buffers
+from gdtool.shading.lights.studio import studio
 
 
 def main(model: str, out: str, mode: str = "lit") -> None:

@@ -1,0 +1,84 @@
+"""Coarser levels of a finished mesh that share its atlas: seam-preserving decimation after unwrapping.
+
+The same maps serve every level, because a point of a coarse level has about the texture coordinates of the point of the
+full mesh that it stands for; `drift` measures how nearly.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gdtool.core.child import ChildFailed, call
+from gdtool.core.ending import temporary_folder
+from gdtool.core.native import imported
+from gdtool.bake.target import Target
+
+
+def collapse_textured(vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray, target_faces: int,
+                      folder: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the child runs: MeshLab's quadric collapse in position and texture space (Garland & Heckbert 1998), seams kept.
+
+    vertices (v, 3), faces (t, 3), corner_uvs (t, 3, 2) of the corners. folder: where its files may be; whoever starts the child removes it,
+    since a child that is killed cannot. Returns the same of about target_faces triangles.
+    """
+    from gdtool.images.io import write_png
+
+    pymeshlab = imported("pymeshlab")
+    # The filter wants a mesh with a texture, which only a file can give it.
+    write_png(Path(folder, "blank.png"), np.zeros((2, 2, 3), np.uint8))
+    Path(folder, "full.mtl").write_text("newmtl one\nmap_Kd blank.png\n")
+    lines = ["mtllib full.mtl", "usemtl one", *("v %.9g %.9g %.9g" % tuple(p) for p in vertices.tolist())]
+    lines += ["vt %.9g %.9g" % tuple(p) for p in corner_uvs.reshape(-1, 2).tolist()]
+    lines += ["f " + " ".join(f"{v + 1}/{3 * k + i + 1}" for i, v in enumerate(face)) for k, face in enumerate(faces.tolist())]
+    path = Path(folder, "full.obj")
+    path.write_text("\n".join(lines) + "\n")
+    meshes = pymeshlab.MeshSet()
+    meshes.load_new_mesh(str(path))
+    meshes.meshing_decimation_quadric_edge_collapse_with_texture(targetfacenum=target_faces, preserveboundary=True, preservenormal=True,
+                                                                 optimalplacement=True, planarquadric=True)
+    mesh = meshes.current_mesh()
+    return (np.asarray(mesh.vertex_matrix()), np.asarray(mesh.face_matrix(), np.int64),
+            np.asarray(mesh.wedge_tex_coord_matrix()).reshape(-1, 3, 2))
+
+
+def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[Target | None, str]:
+    """A target of about target_faces triangles with the texture coordinates of the full one, or None and why not.
+
+    It has more where fewer would tear a seam.
+    """
+    try:
+        with temporary_folder() as folder:
+            vertices, faces, uv = call(collapse_textured, target.vertices, target.faces.astype(np.int64),
+                                       target.uv[target.face_uvs], target_faces, str(folder), seconds=seconds, memory_mb=8000)
+    except ChildFailed as failure:
+        return None, str(failure)
+    if not len(faces) or not np.isfinite(vertices).all() or not np.isfinite(uv).all():
+        return None, "the collapse left nothing"
+    uv, corner = np.unique(np.round(uv.reshape(-1, 2), 7), axis=0, return_inverse=True)
+    return Target.of(vertices, faces, uv, corner.reshape(-1, 3)), ""
+
+
+def drift(level: Target, full: Target, size: int = 1024, count: int = 20_000) -> dict[str, float]:
+    """How far the level's surface is from the full mesh's at the same texture coordinates, as a share of its extent.
+
+    drift_mean, drift_p99; outside: share of the level's surface whose texture coordinates lie in no chart.
+    """
+    from gdtool.geometry.distance import sample_surface
+    from gdtool.geometry.uv_raster import Barycentrics, extend_owners, owners_of
+
+    points, face_idx, barycentric = sample_surface(level.vertices, level.faces, count, np.random.default_rng(0))
+    uv = np.einsum("nk,nkc->nc", barycentric, level.uv[level.face_uvs[face_idx]])
+    owner = owners_of(full.uv, full.face_uvs, size)
+    inside = Barycentrics(full.uv, full.face_uvs)
+    # A chart's border texel may have its centre outside: two rings are what bilinear lookups can reach.
+    ring, ring_owner, _ = extend_owners(inside, owner.reshape(size, size), 2)
+    owner[ring] = ring_owner
+    column, row = np.clip((uv * size).astype(np.int64), 0, size - 1).T
+    face = owner[row * size + column]
+    known = face >= 0
+    at = inside.at(face[known], uv[known, 0], uv[known, 1])
+    there = np.einsum("nk,nkc->nc", np.clip(at, -1, 2), full.vertices[full.faces[face[known]]])
+    apart = np.linalg.norm(there - points[known], axis=1) / float(np.ptp(full.vertices, axis=0).max())
+    return {"drift_mean": float(apart.mean()), "drift_p99": float(np.percentile(apart, 99)), "outside": float(1 - known.mean())}

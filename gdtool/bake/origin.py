@@ -1,0 +1,191 @@
+"""What a bake reads from: a surface with its views, or a model with its textures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gdtool.assets.scene import Scene
+from gdtool.folders.surface import Surface
+from gdtool.folders.views import Views
+from gdtool.geometry.frames import invert_similarity, transform_points
+from gdtool.geometry.normals import vertex_normals
+from gdtool.geometry.tangents import dot
+from gdtool.bake.pipeline import Lookup, ViewsOfSource, vertex_lookup, with_views
+from gdtool.bake.picture import Picture
+from gdtool.bake.project_views import pixel_footprint, sight_of
+from gdtool.bake.reproject import Places, Source
+
+
+@dataclass(frozen=True)
+class Origin:
+    """A source in the normalised frame, its material lookup, its vertex normals (v, 3), and how its surface is drawn.
+
+    label says where materials come from, for the report. detail is the width of the finest detail that the source holds,
+    in the normalised frame: a texel of its textures, half a pixel of its views, a pixel of the picture they were made of or half an edge of its mesh.
+    """
+
+    source: Source
+    lookup: Lookup
+    normals: np.ndarray
+    label: str
+    alpha_mode: str = "OPAQUE"
+    alpha_cutoff: float = 0.5
+    double_sided: bool = False
+    detail: float = 0.0
+
+
+def material_field(path: Path, device: str = "cpu") -> Callable[[np.ndarray], dict[str, np.ndarray]]:
+    """The material network of a surface's field.safetensors: points (n, 3) to albedo (n, 3), roughness (n,), metallic (n,).
+
+    Raises InputError for a file that is damaged or holds another network.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    from gdtool.core.errors import InputError
+    from gdtool.fields.neural.networks import MaterialNetwork
+    from gdtool.fields.neural.paper import network_materials
+
+    network = MaterialNetwork()
+    try:
+        tensors = load_file(str(path))
+        network.load_state_dict({name.removeprefix("material."): value for name, value in tensors.items() if name.startswith("material.")})
+    except (SafetensorError, RuntimeError, OSError) as error:
+        raise InputError(path, f"is not the material field that gdtool writes ({str(error).splitlines()[0]})", "run gdtool reconstruct again") from None
+    network = network.to(device).eval()
+
+    def at(points: np.ndarray) -> dict[str, np.ndarray]:
+        out = network_materials(network, points, device)
+        return {name: value if name == "albedo" else value[:, 0] for name, value in out.items()}
+
+    return at
+
+
+def from_surface(surface: Surface, views: Views | None, field: Callable[[np.ndarray], dict[str, np.ndarray]] | None = None,
+                 picture: Picture | None = None) -> Origin:
+    """A surface; views give material and normals where they see it well, its vertices elsewhere.
+
+    field (material_field) takes the vertices' place for the materials that no view shows. picture: what one of the views
+    was made of, for its finer detail.
+    """
+    source = Source(surface.vertices, surface.faces)
+    normals = surface.normals if surface.normals is not None else vertex_normals(surface.vertices, surface.faces)
+    attributes = {"albedo": surface.albedo, "roughness": surface.roughness, "metallic": surface.metallic, "confidence": surface.confidence}
+    lookup = vertex_lookup(source, attributes, normals.astype(np.float32))
+    images = dict(views.images) if views is not None else {}
+    label = "vertices"
+    if field is not None:
+        shown = [name for name in ("albedo", "roughness", "metallic") if name not in images]
+        if shown:
+            lookup, label = _with_field(lookup, source, field, shown), "field: " + " ".join(shown)
+    if "normal" in images and not _views_are_finer(views, source):
+        del images["normal"]
+    detail = 0.5 * _edge(source)
+    if not images:
+        return Origin(source, lookup, normals, label, detail=detail)
+    sights = [sight_of(camera, source.caster, mask) for camera, mask in zip(views.cameras, views.mask, strict=True)]
+    lookup, domains = with_views(lookup, source, ViewsOfSource(sights, images, views.mask, picture))
+    label = ("" if label == "vertices" else label + ", ") + "views: " + " ".join(domains)
+    detail = min(detail, 0.5 * _view_pixel(views))
+    if picture is not None and "albedo" in domains:
+        label, detail = label + ", picture: albedo", min(detail, _view_pixel(views) / picture.finer)
+    return Origin(source, lookup, normals, label, detail=detail)
+
+
+def _with_field(lookup: Lookup, source: Source, field: Callable[[np.ndarray], dict[str, np.ndarray]], names: list[str]) -> Lookup:
+    def looked(places: Places) -> dict[str, np.ndarray]:
+        read = field(source.at(places.face_idx, places.barycentric, source.vertices))
+        return {**lookup(places), **{name: read[name] for name in names}}
+
+    return looked
+
+
+def _views_are_finer(views: Views, source: Source) -> bool:
+    """Whether a view's pixel is no larger than the surface's typical edge, so that its normals can hold more detail."""
+    return _view_pixel(views) <= 1.5 * _edge(source)
+
+
+def _edge(source: Source) -> float:
+    """Typical edge of the source's triangles."""
+    corners = source.vertices[source.faces]
+    return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1)))
+
+
+def _view_pixel(views: Views) -> float:
+    """What a view's pixel spans in the middle of its depth range."""
+    camera = views.cameras[0]
+    return float(pixel_footprint(camera, (camera.near + camera.far) / 2))
+
+
+def texture_detail(scene: Scene) -> float | None:
+    """What a texel of a scene's finest textures spans on its surface, in its units: the median over the area that has
+    textures; None where nothing has."""
+    from gdtool.geometry.normals import face_normals
+
+    area = face_normals(scene.vertices, scene.faces)[1]
+    widths, weights = [], []
+    for index in np.unique(scene.material_idx):
+        material, faces = scene.materials[index], scene.material_idx == index
+        textures = (material.base_color_texture, material.metallic_roughness_texture, material.normal_texture, material.emissive_texture)
+        found = [t for t in textures if t is not None and t.uv_set < len(scene.uvs) and scene.uvs[t.uv_set] is not None]
+        if not found:
+            continue
+        density = np.zeros(int(faces.sum()))
+        for texture in found:
+            u, v = (scene.uvs[texture.uv_set][scene.faces[faces][:, k]] - scene.uvs[texture.uv_set][scene.faces[faces][:, 0]] for k in (1, 2))
+            height, width = texture.image.shape[:2]
+            covered = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) * abs(texture.scale[0] * texture.scale[1])
+            density = np.maximum(density, covered * height * width)
+        there = (density > 0) & (area[faces] > 0)
+        widths.append(np.sqrt(area[faces][there] / density[there]))
+        weights.append(area[faces][there])
+    if not widths or not sum(map(len, widths)):
+        return None
+    spans, weight = np.concatenate(widths), np.concatenate(weights)
+    order = np.argsort(spans)
+    return float(spans[order][np.searchsorted(np.cumsum(weight[order]), weight.sum() / 2)])
+
+
+def from_scene(scene: Scene, source_from_world: np.ndarray, footprint: Callable[[float], float] = lambda detail: 0.0) -> Origin:
+    """A model with its own textures, in its own frame; source_from_world (4, 4) takes the normalised frame there.
+
+    footprint(detail) is the width, in the normalised frame, that the model's textures are averaged over where they are read, when
+    the model's detail (see Origin) is known.
+    """
+    from gdtool.shading.render.surface_points import SurfaceLookup
+
+    matrix = invert_similarity(source_from_world)
+    turn = matrix[:3, :3] / np.sqrt((matrix[:3, 0] ** 2).sum())
+    turn, unturned = turn.astype(np.float32), bool(np.allclose(turn, np.eye(3), atol=1e-9))
+    source = Source(transform_points(matrix, scene.vertices), scene.faces)
+    normals = scene.normals @ turn.T if scene.normals is not None else vertex_normals(source.vertices, source.faces)
+
+    # Single precision places a texel of a 16384² texture within 1/1000 of itself, in half the time.
+    points = SurfaceLookup(replace(scene, normals=None if scene.normals is None else scene.normals.astype(np.float32),
+                                   uvs=tuple(None if uv is None else uv.astype(np.float32) for uv in scene.uvs)))
+    own = texture_detail(scene)
+    # Vertex colors, or nothing but factors: the mesh says how fine it is.
+    detail = 0.5 * _edge(source) if own is None else own / float(np.sqrt((source_from_world[:3, 0] ** 2).sum()))
+    width = footprint(detail) * np.sqrt((source_from_world[:3, 0] ** 2).sum())
+
+    def lookup(places: Places) -> dict[str, np.ndarray]:
+        read = points.attributes(places.face_idx, places.barycentric, np.full(len(places.face_idx), width, np.float32))
+        # einsum: a product of so thin matrices by BLAS keeps a second thread busy with waiting.
+        normal = read["normal"] if unturned else np.einsum("nk,ck->nc", read["normal"], turn)
+        # Files whose winding and normals disagree are common; the winding says which side is outside.
+        inward = dot(normal, source.normals_of(places.face_idx)) < 0
+        if inward.any():
+            normal[inward] *= -1
+        out = {name: read[name] for name in kept}
+        return {**out, "confidence": np.ones(len(normal), np.float32), "normal": normal}
+
+    modes = {material.alpha_mode for material in scene.materials}
+    mode = next((m for m in ("BLEND", "MASK") if m in modes), "OPAQUE")
+    shines = any(max(material.emissive) > 0 for material in scene.materials)
+    kept = ["albedo", "roughness", "metallic", *(["alpha"] if mode != "OPAQUE" else []), *(["emissive"] if shines else [])]
+    cutoffs = [m.alpha_cutoff for m in scene.materials if m.alpha_mode == "MASK"]
+    return Origin(source, lookup, normals, "model", mode, cutoffs[0] if cutoffs else 0.5, any(m.double_sided for m in scene.materials), detail)

@@ -1,0 +1,109 @@
+"""Several samples to a texel, where one does not stand for all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+
+import numpy as np
+
+from gdtool.core.threads import mapped
+from gdtool.geometry.tangents import unit
+from gdtool.geometry.uv_raster import Barycentrics, owners_of
+from gdtool.bake.target import TEXELS_AT_ONCE, Target, Texels
+
+# Neighbouring texels that differ by no more than this, in stored units, are of one piece: eight steps of 8 bits.
+TOLERANCE = 0.03
+_COMPARED = ("albedo", "roughness", "metallic", "tangent_normal", "alpha", "emissive")
+_ROWS_AT_ONCE = 64
+
+
+def varying(texels: Texels, values: dict[str, np.ndarray], threads: int = 1, tolerance: float = TOLERANCE) -> np.ndarray:
+    """(m,) indices of the texels that differ by more than tolerance, in anything as it is stored, from one of the eight beside them."""
+    from gdtool.images.color import srgb_from_linear
+
+    size, mask = texels.size, texels.mask()
+    out = np.zeros((size, size), bool)
+    for name in _COMPARED:
+        if name not in values:
+            continue
+        for channel in np.moveaxis(values[name].reshape(len(texels), -1), 1, 0):
+            image = texels.image(srgb_from_linear(np.clip(channel, 0, 1)) if name in ("albedo", "emissive") else channel)
+
+            def compare(row: int, image: np.ndarray = image) -> None:
+                rows, first = slice(max(row - 1, 0), row + _ROWS_AT_ONCE + 1), min(row, 1)
+                low, high = (_extreme(np.where(mask[rows], image[rows], worst), pick)[first:first + _ROWS_AT_ONCE]
+                             for worst, pick in ((np.float32(np.inf), np.minimum), (np.float32(-np.inf), np.maximum)))
+                out[row:row + _ROWS_AT_ONCE] |= high - low > tolerance
+
+            for _ in mapped(compare, list(range(0, size, _ROWS_AT_ONCE)), threads):
+                pass
+    return np.flatnonzero(out.ravel()[texels.texel])
+
+
+def _extreme(image: np.ndarray, pick: Callable) -> np.ndarray:
+    """(h, w) of image (h, w): what pick finds among each texel and the eight beside it."""
+    for axis in (0, 1):
+        image = np.moveaxis(image, axis, 0)
+        out = image.copy()
+        pick(out[1:], image[:-1], out=out[1:])
+        pick(out[:-1], image[1:], out=out[:-1])
+        image = np.moveaxis(out, 0, axis)
+    return image
+
+
+def supersample(target: Target, texels: Texels, values: dict[str, np.ndarray], read: Callable[[np.ndarray, np.ndarray], dict[str, np.ndarray]],
+                samples: int, threads: int = 1) -> float:
+    """Change values (n, …) of the texels that vary to means over samples, a square number, of each; the share of texels that vary.
+
+    read(face_idx, barycentric) says what values has of any places on the target. A sample is read in the triangle that owns its
+    place, and does not count where none does: so a texel has the mean of what its charts cover of it. Where they cover no sample
+    it keeps what it has. Color is averaged by how much of it is seen, tangent_normal made a unit vector again.
+    """
+    side, size, chosen = int(round(samples**0.5)), texels.size, varying(texels, values, threads)
+    barycentrics, texel = Barycentrics(target.uv, target.face_uvs), texels.texel[chosen]
+    offsets = [((k % side + 0.5) / side, (k // side + 0.5) / side) for k in range(side * side)]
+
+    def owners(offset: tuple[float, float]) -> np.ndarray:
+        return owners_of(target.uv + (0.5 - np.array(offset)) / size, target.face_uvs, size)[texel]
+
+    owned = list(mapped(owners, offsets, threads))
+
+    def run(part: slice) -> None:
+        def taken() -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+            for (along, down), owner in zip(offsets, owned, strict=True):
+                there = np.flatnonzero(owner[part] >= 0)
+                face_idx, at = owner[part][there], texel[part][there]
+                place = np.clip(barycentrics.at(face_idx, (at % size + along) / size, (at // size + down) / size), 0, 1)
+                yield there, read(face_idx, (place / place.sum(1, keepdims=True)).astype(np.float32))
+
+        known, means = _means(taken(), part.stop - part.start, values)
+        for name, mean in means.items():
+            values[name][chosen[part][known]] = mean
+
+    step = TEXELS_AT_ONCE // 4
+    for _ in mapped(run, [slice(s, min(s + step, len(chosen))) for s in range(0, len(chosen), step)], threads):
+        pass
+    return float((chosen < texels.inside).sum() / max(texels.inside, 1))
+
+
+def _means(taken: Iterable[tuple[np.ndarray, dict[str, np.ndarray]]], count: int, like: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Which of count texels have samples, known (m,), and the means (m, …) of those, of what like names.
+
+    taken: for one sample of each texel after another, the texels (k,) that have it and what was read there."""
+    total = {name: np.zeros((count, *value.shape[1:]), np.float32) for name, value in like.items()}
+    samples, shown = np.zeros(count, np.float32), np.zeros(count, np.float32)
+    for there, found in taken:
+        samples[there] += 1
+        if "alpha" in found:
+            seen = np.maximum(found["alpha"], np.float32(1e-4))
+            shown[there] += seen
+            found["albedo"] = found["albedo"] * seen[:, None]
+        for name, sums in total.items():
+            sums[there] += found[name]
+    known = np.flatnonzero(samples)
+    out = {}
+    for name, sums in total.items():
+        weight = (shown if name == "albedo" and "alpha" in total else samples)[known]
+        mean = sums[known] / weight.reshape(-1, *[1] * (sums.ndim - 1))
+        out[name] = unit(mean) if name == "tangent_normal" else mean
+    return known, out

@@ -1,0 +1,106 @@
+"""Model folders on disk: config.json and model.safetensors. Nothing is ever unpickled."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import torch
+
+from gdtool.core.errors import InputError
+from gdtool.core.reading import read_json
+from gdtool.diffusion.config import ModelConfig
+from gdtool.diffusion.network.model import Model, parameter_count, structure
+from gdtool.diffusion.network.tensors import NO_MODEL, read_tensors, require_weights_fit
+
+WEIGHTS = "model.safetensors"
+BYTES_TO_LOAD = 10  # held for each weight while a model is read: 2 in the file, 4 of the float32 copy, 4 of the network
+OTHER_WEIGHTS = "give the config.json that these weights were trained with"
+OTHER_START = 'set "pretrained" to a Stable Diffusion 1 of that structure, such as lambdalabs/sd-image-variations-diffusers'
+
+
+def check_shapes(path: Path, tensors: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> None:
+    """Raise InputError that names the first tensor that is missing, unknown, of another shape or not of floating-point numbers."""
+    for name, tensor in wanted.items():
+        if name not in tensors:
+            raise InputError(path, f"lacks tensor {name}", OTHER_WEIGHTS)
+        if tensors[name].shape != tensor.shape:
+            raise InputError(path, f"tensor {name} has shape {tuple(tensors[name].shape)}, the configuration needs {tuple(tensor.shape)}", OTHER_WEIGHTS)
+        if not tensors[name].is_floating_point():
+            raise InputError(path, f"tensor {name} holds {str(tensors[name].dtype).removeprefix('torch.')}, no floating-point numbers", "save it as float16 or float32")
+    unknown = sorted(set(tensors) - set(wanted))
+    if unknown:
+        raise InputError(path, f"holds a tensor {unknown[0]} that the configuration does not know", OTHER_WEIGHTS)
+
+
+def read_config(path: Path) -> ModelConfig:
+    """The configuration in a model folder's config.json. Raises InputError that names the field, and what it has to be."""
+    if not path.exists():
+        raise InputError(path, "does not exist", NO_MODEL)
+    return configured(read_json(path), path)
+
+
+def configured(fields: object, subject: object) -> ModelConfig:
+    """A ModelConfig of parsed JSON. Raises InputError that names subject, the field and its bound."""
+    try:
+        return msgspec.convert(fields, ModelConfig)
+    except msgspec.ValidationError as error:
+        raise InputError(subject, str(error), "correct that field, or copy the file again from where the model came") from None
+
+
+def require_room(config: ModelConfig, bytes_per_weight: int, subject: object) -> Model:
+    """The network's structure without numbers. Raises ResourceError where its weights would take more memory than there is.
+
+    bytes_per_weight: what is held for each weight, for example BYTES_TO_LOAD.
+    """
+    shape = structure(config)
+    weights = parameter_count(shape)
+    require_weights_fit(weights * bytes_per_weight, subject, f"its network of {weights / 1e6:,.1f} million weights")
+    return shape
+
+
+def load_model(folder: Path) -> Model:
+    """The Model of a folder, in evaluation mode, float32.
+
+    Raises InputError for what is wrong with its files, ResourceError where it does not fit in memory. Nothing of the size of
+    its weights is allocated before the configuration and the weights are known to fit one another.
+    """
+    config = read_config(folder / "config.json")
+    wanted = require_room(config, BYTES_TO_LOAD, folder).state_dict()
+    tensors, _ = read_tensors(folder / WEIGHTS)
+    check_shapes(folder / WEIGHTS, tensors, wanted)
+    model = Model(config)
+    model.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+    return model.eval().requires_grad_(False)
+
+
+def save_model(path_of, config: ModelConfig, tensors: dict[str, torch.Tensor]) -> None:
+    """Write config.json and model.safetensors in half precision; path_of maps a name to where it is written."""
+    from safetensors.torch import save
+
+    Path(path_of("config.json")).write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=1) + b"\n")
+    half = {name: tensor.detach().to("cpu", torch.float16).contiguous() for name, tensor in tensors.items()}
+    Path(path_of(WEIGHTS)).write_bytes(save(half))  # save_file would make it readable by its owner only
+
+
+def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
+    """Start a UNet from Stable Diffusion's weights (diffusers names): conv_in grows by the condition's channels, class
+    labels by the domains, both with zeros. Returns the names that stay as initialised (the parts that are new).
+
+    Raises InputError for a tensor that is not known here or has another shape.
+    """
+    own = unet.state_dict()
+    for name, tensor in tensors.items():
+        if name not in own:
+            raise InputError("pretrained weights", f"hold a tensor {name} that this network has not", OTHER_START)
+        target = own[name]
+        if name in ("conv_in.weight", "class_embedding.linear_1.weight") and tensor.shape[1] <= target.shape[1]:
+            grown = torch.zeros_like(target)
+            grown[:, : tensor.shape[1]] = tensor
+            tensor = grown
+        if tensor.shape != target.shape:
+            raise InputError("pretrained weights", f"tensor {name} has shape {tuple(tensor.shape)}, needed is {tuple(target.shape)}", OTHER_START)
+        own[name] = tensor
+    unet.load_state_dict(own)
+    return sorted(set(own) - set(tensors))
+

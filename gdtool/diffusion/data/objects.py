@@ -1,0 +1,204 @@
+"""Training data: views folders decoded once into memory-mapped arrays, and the batches drawn from them.
+
+Every choice of a step comes from a generator seeded by (seed, step), so a resumed run sees what an unbroken one would.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gdtool.core.errors import InputError
+from gdtool.core.folder import Folder
+from gdtool.core.manifest import MANIFEST
+from gdtool.core.names import path_inside
+from gdtool.core.reading import read_json
+from gdtool.diffusion.config import ModelConfig, TrainConfig
+from gdtool.diffusion.network.encoding import PLANE_COUNT, PLANES, mirrored_order, planes_from_images
+
+LIGHTS = 16
+
+
+@dataclass(frozen=True)
+class Objects:
+    """Decoded objects. planes (n, k, 13, h, w) uint8; conditions (n, c, 4, h, w) uint8, the front view first; 127 is 0
+    in both. lights (n, 16, 7) float32: axis, sharpness, amplitude."""
+
+    planes: np.ndarray
+    conditions: np.ndarray
+    lights: np.ndarray
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.planes)
+
+
+def to_bytes(x: np.ndarray) -> np.ndarray:
+    """[-1, 1] -> 0…254, 0 exactly at 127."""
+    return np.round((np.clip(x, -1, 1) + 1) * 127).astype(np.uint8)
+
+
+def from_bytes(x: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.array(x)).float() / 127 - 1  # a copy: memory maps are read-only
+
+
+def shrink(image: np.ndarray, size: int) -> np.ndarray:
+    """Box filter of (…, h, w) down to (…, size, size); the values must be premultiplied."""
+    if image.shape[-1] == size:
+        return image
+    factor = image.shape[-1] // size
+    return image.reshape(*image.shape[:-2], size, factor, size, factor).mean((-3, -1))
+
+
+def condition_plane(image: np.ndarray) -> np.ndarray:
+    """A condition image (h, w, 4), linear color and straight alpha in [0, 1] -> (4, h, w) premultiplied encoded."""
+    from gdtool.images.color import srgb_from_linear
+
+    alpha = image[..., 3]
+    color = (2 * srgb_from_linear(np.clip(image[..., :3], 0, 1)) - 1) * alpha[..., None]
+    return np.concatenate([np.moveaxis(color, -1, 0), 2 * alpha[None] - 1]).astype(np.float32)
+
+
+def decode_object(folder: Folder, config: ModelConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One object as (planes (k, 13, h, w), conditions (c, 4, h, w), light (16, 7)), premultiplied and encoded."""
+    from gdtool.diffusion.data.framing import frame
+    from gdtool.folders.views import read_views
+    from gdtool.images.color import linear_from_srgb
+    from gdtool.images.io import read_image
+
+    views = read_views(folder, config.domains)
+    missing = [name for name in config.views if name not in views.names]
+    lacking = [domain for domain in config.domains if domain not in views.images]
+    if missing or lacking:
+        raise InputError(folder.path, f"lacks {', '.join(missing + lacking)}", "render it again with the default rig and all domains")
+    order = [views.names.index(name) for name in config.views]
+    size, own = config.image_size, views.mask.shape[-1]
+    if views.mask.shape[-2] != own or own % size:
+        raise InputError(folder.path, f"has views of {own} px, not a multiple of the model's {size}", f"run gdtool render-dataset --size {size}")
+    planes = planes_from_images({d: x[order] for d, x in views.images.items()}, views.mask[order])
+    front = np.concatenate([views.images["color"][order[0]], views.mask[order[0]][..., None]], -1)
+    extent = bounding_side(front[..., 3]) / own
+    conditions = [condition_plane(front)]
+    for path in sorted(folder.path.glob("condition/*.png")):
+        image = read_image(path_inside(folder.path, f"condition/{path.name}", folder.path / MANIFEST, "condition image", byte_escapes=True))
+        image = image.astype(np.float32) / np.iinfo(image.dtype).max
+        if image.ndim == 3 and image.shape[2] == 4 and image[..., 3].max() > 0.5:
+            image = np.concatenate([linear_from_srgb(image[..., :3]), image[..., 3:]], -1)
+            # Centred, and as large as the front view: a picture's scale is what the rig's scale is relative to.
+            conditions.append(condition_plane(frame(image, size, extent)))
+    conditions = [shrink(c, size) for c in conditions]
+    light = np.zeros((LIGHTS, 7), np.float32)
+    if views.light is not None:
+        rows = np.concatenate([views.light["axes"], views.light["sharpness"][:, None], views.light["amplitudes"]], 1)
+        light[: len(rows)] = rows[:LIGHTS]
+    light[:, 2] += (light[:, :3] == 0).all(1)  # an unused light still needs a unit axis
+    return shrink(planes, size), np.stack(conditions), light
+
+
+def bounding_side(alpha: np.ndarray) -> float:
+    """Longest side in pixels of the bounding box of alpha (h, w) > 0.5."""
+    rows, columns = np.nonzero(alpha > 0.5)
+    return float(max(np.ptp(rows), np.ptp(columns)) + 1) if len(rows) else float(alpha.shape[0])
+
+
+def decode_dataset(folders: Iterable[Folder], count: int, config: ModelConfig, cache: Path, conditions: int = 5,
+                   warn=lambda text: None) -> Objects:
+    """Decode views folders into cache (kept between runs) and map the arrays.
+
+    An object that cannot be used is left out with a warning. conditions: most condition images kept per object; objects
+    that have fewer repeat theirs. Raises InputError when no object is usable.
+    """
+    h, k = config.image_size, len(config.views)
+    names_file = cache / "objects.json"
+    files = {"planes": ((k, PLANE_COUNT, h, h), np.uint8), "conditions": ((conditions, 4, h, h), np.uint8), "lights": ((LIGHTS, 7), np.float32)}
+    if not names_file.is_file():
+        arrays = {name: np.lib.format.open_memmap(cache / f"{name}.npy", "w+", dtype, (count, *shape))
+                  for name, (shape, dtype) in files.items()}
+        names: list[str] = []
+        for folder in folders:
+            try:
+                planes, rgba, light = decode_object(folder, config)
+            except InputError as error:
+                warn(f"left out: {error}")
+                continue
+            i = len(names)
+            arrays["planes"][i] = to_bytes(planes)
+            arrays["conditions"][i] = to_bytes(rgba)[np.arange(conditions) % len(rgba)]
+            arrays["lights"][i] = light
+            names.append(folder.path.parent.name if folder.path.name == "views" else folder.name)
+        for array in arrays.values():
+            array.flush()
+        part = names_file.with_suffix(".part")
+        part.write_text(json.dumps(names))
+        os.replace(part, names_file)  # a killed run leaves no half of it
+    names = read_json(names_file)
+    if not names:
+        raise InputError("dataset", "has no object that can be trained on", "render it with gdtool render-dataset")
+    loaded = {name: np.load(cache / f"{name}.npy", mmap_mode="r")[: len(names)] for name in files}
+    return Objects(**loaded, names=tuple(names))
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What a step sees: planes (b, k, 13, h, w), condition (b, 4, h, w), lights (b, 16, 7); no background yet."""
+
+    planes: torch.Tensor
+    condition: torch.Tensor
+    lights: torch.Tensor
+
+
+def object_order(count: int, step: int, batch: int, seed: int) -> np.ndarray:
+    """Indices of a step's objects: a new permutation each pass over the data."""
+    positions = step * batch + np.arange(batch)
+    epochs = positions // count
+    orders = {epoch: np.random.default_rng((seed, 1, int(epoch))).permutation(count) for epoch in np.unique(epochs)}
+    return np.array([orders[epoch][position % count] for epoch, position in zip(epochs, positions, strict=True)])
+
+
+def draw(objects: Objects, idx: np.ndarray, config: ModelConfig, train: TrainConfig, generators: Sequence[np.random.Generator]) -> Batch:
+    """Batch of the objects idx with random condition images, mirrored and with permuted color channels; a generator each."""
+    planes, rgba, lights = [], [], []
+    for i, generator in zip(idx, generators, strict=True):
+        tilted = generator.random() < train.tilted and objects.conditions.shape[1] > 1
+        pick = int(generator.integers(1, objects.conditions.shape[1])) if tilted else 0
+        one = (from_bytes(objects.planes[i]), from_bytes(objects.conditions[i, pick]), torch.from_numpy(np.array(objects.lights[i])))
+        if train.mirror and generator.random() < 0.5:
+            one = mirror(*one, config.views)
+        if train.hue:
+            one = permute_colors(*one, generator.permutation(3))
+        for out, value in zip((planes, rgba, lights), one, strict=True):
+            out.append(value)
+    return Batch(torch.stack(planes), torch.stack(rgba), torch.stack(lights))
+
+
+def mirror(planes, rgba, light, views: tuple[str, ...]):
+    """The mirror image of an object about its x = 0 plane: views swap sides, x of normals and lights turns round."""
+    order = mirrored_order(views)
+    planes = planes[order].flip(-1)
+    x = PLANES["normal"].start
+    planes[:, x] = -planes[:, x]
+    light = light.clone()
+    light[:, 0] = -light[:, 0]
+    return planes, rgba.flip(-1), light
+
+
+def permute_colors(planes, rgba, light, order):
+    """Permute red, green and blue of color, albedo, condition and light: light transport is the same for each channel."""
+    planes, rgba, light = planes.clone(), rgba.clone(), light.clone()
+    for domain in ("color", "albedo"):
+        start = PLANES[domain].start
+        planes[:, start: start + 3] = planes[:, [start + int(j) for j in order]]
+    rgba[:3] = rgba[[int(j) for j in order]]
+    light[:, 4:] = light[:, [4 + int(j) for j in order]]
+    return planes, rgba, light
+
+
+def to_tensor_condition(image: np.ndarray) -> torch.Tensor:
+    """condition_plane of one framed image (h, w, 4) linear, as a batch of one."""
+    return torch.from_numpy(condition_plane(image)).unsqueeze(0)

@@ -1,0 +1,135 @@
+"""The picture's outline in the guessed views: what the picture shows and another view leaves no room for is drawn into it.
+
+Of the object's outline from the front everything is known; of the others a model makes a guess, from which thin parts
+(ribbons, arms, spires) fade first. A part of the picture behind which the other outlines have no common point is put where
+they come nearest to having one and where the front view's depth has it, as thick as it is wide up to a bound, and every
+view shows it there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gdtool.cameras import Camera, project
+from gdtool.fields.views.prepared_view import backproject, bilinear
+
+LEAST = 2  # pixels across: narrower is the outlines' own error
+BESIDE = 2  # pixels of what is shown anyhow that a part takes along, so that it is joined
+DEPTH_SIGMA = 0.08  # world units: of the front view's depth, against the other outlines
+FAINT = 0.02  # coverage that counts as none
+SMOOTH = 1.5  # pixels: of a part's place
+THIN, THICK = 1.0, 3.0  # pixels: half a part's thickness at least and at most
+RANGE = 0.75  # world units about the origin in which it is looked for
+PER_PIXEL = 2  # places a pixel
+LEAST_FACING = 0.2  # cosine: what a view shows faces it
+
+
+@dataclass(frozen=True)
+class Part:
+    """Pixels (row, column) of the known view, each (n,), the depth of the part's middle behind them and half its thickness
+    there, world units; outward (n, 3): unit, to the nearest outline; lost (n,): where no other outline leaves room."""
+
+    row: np.ndarray
+    column: np.ndarray
+    middle: np.ndarray
+    half: np.ndarray
+    outward: np.ndarray
+    lost: np.ndarray
+
+
+def lost_part(soft: np.ndarray, mask: np.ndarray, cameras: list[Camera], known: int, depth: np.ndarray | None) -> Part | None:
+    """What the mask of the known view shows and the other masks (k, h, w) leave no room for; None for nothing.
+
+    soft (k, h, w): coverage as the model guessed it. depth (h, w): of the known view, where there is one.
+    """
+    from scipy.ndimage import binary_dilation, binary_opening, distance_transform_edt, gaussian_filter
+
+    camera, shown = cameras[known], mask[known] > 0.5
+    guessed = [k for k, other in enumerate(cameras) if abs(float(other.backward @ camera.backward)) < 0.99]
+    if not guessed or not shown.any() or camera.projection != "orthographic":
+        return None
+    pixel = camera.pixel_size
+    row, column = np.nonzero(shown)
+    origin = float(np.linalg.norm(camera.position))
+    places = origin + np.arange(-RANGE, RANGE, pixel / PER_PIXEL)
+    start = backproject(camera, np.zeros(shown.shape))[row, column]
+    points = (start[:, None] - places[None, :, None] * camera.backward).reshape(-1, 3)
+    least, score = np.ones(len(points)), np.zeros(len(points))
+    for k in guessed:
+        pixels = project(cameras[k], points)[0]
+        least = np.minimum(least, bilinear(mask[k][..., None], pixels)[:, 0])
+        score += np.log(np.maximum(bilinear(gaussian_filter(soft[k], 1.0)[..., None], pixels)[:, 0], FAINT))
+    least, score = least.reshape(len(row), -1), score.reshape(len(row), -1)
+    lost = np.zeros(shown.shape, bool)
+    lost[row, column] = least.max(1) <= 0.5
+    lost = binary_opening(lost, np.ones((LEAST, LEAST)))
+    if not lost.any():
+        return None
+    within = distance_transform_edt(shown) - 0.5  # of a pixel's centre
+    half = np.clip(within, THIN, THICK) * pixel
+    if depth is not None:
+        score -= 0.5 * ((places - (depth + half)[row, column][:, None]) / DEPTH_SIGMA) ** 2
+    place, certain = np.zeros(shown.shape), np.zeros(shown.shape)
+    place[row, column], certain[row, column] = places[score.argmax(1)], 1.0
+    zone = binary_dilation(lost, iterations=BESIDE) & shown
+    weight = gaussian_filter(np.where(zone, certain, 0.0), SMOOTH)
+    middle = gaussian_filter(np.where(zone, place, 0.0), SMOOTH) / np.maximum(weight, 1e-9)
+    at = np.nonzero(zone)
+    down, right = np.gradient(gaussian_filter(within, 1.0))
+    outward = down[at][:, None] * camera.world_from_camera[:3, 1] - right[at][:, None] * camera.world_from_camera[:3, 0]
+    return Part(*at, middle[at], half[at], outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9), lost[at])
+
+
+def grown_masks(part: Part, mask: np.ndarray, cameras: list[Camera], known: int) -> np.ndarray:
+    """Masks (k, h, w) of which every one shows the part."""
+    out = mask.copy()
+    for k in range(len(cameras)):
+        if k != known:
+            row, column, *_ = _shown(part, mask.shape[1:], cameras, known, k)
+            out[k][row, column] = 1.0
+    return out
+
+
+def draw_part(part: Part, images: dict[str, np.ndarray], mask: np.ndarray, cameras: list[Camera], known: int) -> None:
+    """Put the part into the images (k, h, w[, c]) of all domains, in place: the known view's own values, at the depth at
+    which each view sees it, with the normals of a rod along the part.
+
+    mask (k, h, w): before the part was drawn.
+    """
+    own = {domain: image[known].copy() for domain, image in images.items()}
+    for k in range(len(cameras)):
+        row, column, depth, normal, source = _shown(part, mask.shape[1:], cameras, known, k)
+        put = part.lost[source] if k == known else mask[k][row, column] <= 0.5
+        if k != known and "depth" in images:
+            put |= images["depth"][k][row, column] > depth
+        row, column, depth, normal, source = row[put], column[put], depth[put], normal[put], source[put]
+        fresh = mask[k][row, column] <= 0.5
+        for domain, image in images.items():
+            if domain == "depth":
+                image[k][row, column] = depth
+            elif k != known:
+                drawn = normal if domain == "normal" else own[domain][part.row[source], part.column[source]]
+                image[k][row[fresh], column[fresh]] = drawn[fresh]
+
+
+def _shown(part: Part, shape: tuple[int, int], cameras: list[Camera], known: int, k: int) -> tuple[np.ndarray, ...]:
+    """Pixels (row, column) of view k in which the part is nearest to it; its depth there, its normal (n, 3), and which of
+    the part's pixels it is."""
+    camera = cameras[known]
+    steps = np.linspace(-1.0, 1.0, 2 * int(np.ceil(part.half.max() / camera.pixel_size)) * PER_PIXEL + 1)
+    start = backproject(camera, np.zeros(shape))[part.row, part.column]
+    places = part.middle[:, None] + part.half[:, None] * steps
+    points = start[:, None] - places[..., None] * camera.backward
+    pixels, depth = project(cameras[k], points.reshape(-1, 3))
+    column, row = np.floor(pixels).astype(int).T
+    good = (column >= 0) & (row >= 0) & (column < shape[1]) & (row < shape[0])
+    depth = np.clip(depth, cameras[k].near, cameras[k].far)
+    order = np.argsort(depth[good], kind="stable")
+    flat, first = np.unique((row[good] * shape[1] + column[good])[order], return_index=True)
+    chosen = np.flatnonzero(good)[order][first]
+    source, across = chosen // len(steps), steps[chosen % len(steps)][:, None]
+    normal = part.outward[source] * np.sqrt(1 - across**2) - across * camera.backward
+    normal += cameras[k].backward * np.maximum(LEAST_FACING - normal @ cameras[k].backward, 0.0)[:, None]
+    return flat // shape[1], flat % shape[1], depth[chosen], normal / np.linalg.norm(normal, axis=1, keepdims=True), source

@@ -1,0 +1,81 @@
+"""The image encoder: tokens that every view and domain attends to."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from gdtool.core.errors import ResourceError
+from gdtool.core.native import imported_if_installed
+from gdtool.diffusion.network.attention import Attention, FeedForward, learned_position
+from gdtool.diffusion.config import ENCODER_HEAD_WIDTH, ModelConfig
+from gdtool.diffusion.network.tensors import pretrained_part
+
+
+class EncoderLayer(nn.Module):
+    def __init__(self, width: int, heads: int):
+        super().__init__()
+        self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.attn = Attention(width, heads)
+        self.ff = FeedForward(width, 2)
+
+    def forward(self, x):
+        x = x + self.attn(self.norm1(x))
+        return x + self.ff(self.norm2(x))
+
+
+class PatchEncoder(nn.Module):
+    """A small transformer over the condition's patches, learned with the rest: (b, 4, h, w) -> (b, tokens, width).
+
+    It runs once per object, not once per image, so depth is cheap here.
+    """
+
+    def __init__(self, config: ModelConfig):
+        super().__init__()
+        width, p = config.encoder_width, config.encoder_patch
+        self.patch = p
+        self.embed = nn.Linear(4 * p * p, width)
+        self.position = learned_position((config.image_size // p) ** 2, width)
+        self.layers = nn.ModuleList(EncoderLayer(width, max(width // ENCODER_HEAD_WIDTH, 1)) for _ in range(config.encoder_layers))
+        self.norm = nn.LayerNorm(width)
+
+    def forward(self, rgba):
+        x = self.embed(F.pixel_unshuffle(rgba, self.patch).flatten(2).transpose(1, 2)) + self.position
+        for layer in self.layers:
+            x = layer(x)
+        return self.norm(x)
+
+
+class ClipEncoder(nn.Module):
+    """CLIP ViT-L/14's projected embedding as one 768-wide token, frozen, as Stable Diffusion Image Variations has it.
+
+    Its model card resizes tensors, bicubic without antialiasing; Wonder3D has CLIP's own processor do it, with.
+    """
+
+    # mean and deviation of CLIP's training images (openai/clip-vit-large-patch14, preprocessor_config.json)
+    MEAN, DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+
+    def __init__(self, config: ModelConfig, clip=None):
+        super().__init__()
+        if clip is None:
+            if imported_if_installed("transformers") is None:
+                raise ResourceError("transformers", "is not installed, and the clip encoder needs it", "pip install 'gdtool[hub]'")
+            from transformers import CLIPVisionModelWithProjection
+
+            clip = CLIPVisionModelWithProjection.from_pretrained(pretrained_part(config, "image_encoder"), use_safetensors=True)
+        self.antialias = config.convention == "wonder3d"
+        # in a list, so that its weights are neither trained nor saved with ours
+        self.frozen = [clip.requires_grad_(False).eval()]
+
+    def forward(self, rgba):
+        clip = self.frozen[0].to(rgba.device)
+        image = F.interpolate(0.5 + 0.5 * rgba[:, :3], size=(224, 224), mode="bicubic", antialias=self.antialias)
+        image = image.clamp(0, 1) if self.antialias else image  # as pictures of 8 bits are
+        mean, deviation = (torch.tensor(x, device=rgba.device)[:, None, None] for x in (self.MEAN, self.DEVIATION))
+        with torch.no_grad():
+            return clip((image - mean) / deviation).image_embeds.unsqueeze(1)
+
+
+def make_encoder(config: ModelConfig) -> nn.Module:
+    return ClipEncoder(config) if config.encoder == "clip" else PatchEncoder(config)

@@ -1,0 +1,183 @@
+"""The denoising network: Stable Diffusion's UNet, its transformers reading across views and domains.
+
+Key names and arithmetic are those of diffusers' UNet2DConditionModel (version 1 family), own code because importing
+diffusers takes three seconds and its blocks do not know which images belong to one object.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+from torch.utils.checkpoint import checkpoint
+
+from gdtool.diffusion.network.attention import Layout, RowAttention, Transformer
+from gdtool.diffusion.config import CLASS_WIDTH, DOMAINS, ModelConfig
+from gdtool.diffusion.network.labels import WONDER3D_LABEL_WIDTH
+
+
+def sinusoid(t: torch.Tensor, width: int) -> torch.Tensor:
+    """(n,) timesteps -> (n, width): cosines, then sines, frequencies 10000^(-i / (width / 2))."""
+    half = width // 2
+    frequency = torch.exp(-math.log(10000.0) * torch.arange(half, device=t.device, dtype=torch.float32) / half)
+    angle = t.float()[:, None] * frequency
+    return torch.cat([angle.cos(), angle.sin()], -1)
+
+
+class Embedding(nn.Module):
+    def __init__(self, inputs: int, width: int):
+        super().__init__()
+        self.linear_1 = nn.Linear(inputs, width)
+        self.linear_2 = nn.Linear(width, width)
+
+    def forward(self, x):
+        return self.linear_2(F.silu(self.linear_1(x)))
+
+
+class Resnet(nn.Module):
+    def __init__(self, inputs: int, outputs: int, embedding: int, groups: int, scale_shift: bool):
+        super().__init__()
+        self.norm1 = nn.GroupNorm(groups, inputs)
+        self.conv1 = nn.Conv2d(inputs, outputs, 3, padding=1)
+        self.time_emb_proj = nn.Linear(embedding, 2 * outputs if scale_shift else outputs)
+        self.norm2 = nn.GroupNorm(groups, outputs)
+        self.conv2 = nn.Conv2d(outputs, outputs, 3, padding=1)
+        self.conv_shortcut = nn.Conv2d(inputs, outputs, 1) if inputs != outputs else None
+        self.scale_shift = scale_shift
+
+    def forward(self, x, embedding):
+        h = self.conv1(F.silu(self.norm1(x)))
+        e = self.time_emb_proj(F.silu(embedding))[:, :, None, None]
+        if self.scale_shift:
+            scale, shift = e.chunk(2, 1)
+            h = torch.addcmul(shift, self.norm2(h), 1 + scale)
+        else:
+            h = self.norm2(h + e)
+        h = self.conv2(F.silu(h))
+        return h + (x if self.conv_shortcut is None else self.conv_shortcut(x))
+
+
+class Downsample(nn.Module):
+    def __init__(self, width: int):
+        super().__init__()
+        self.conv = nn.Conv2d(width, width, 3, stride=2, padding=1)
+
+    def forward(self, x):
+        return self.conv(x)
+
+
+class Upsample(nn.Module):
+    def __init__(self, width: int):
+        super().__init__()
+        self.conv = nn.Conv2d(width, width, 3, padding=1)
+
+    def forward(self, x):
+        return self.conv(F.interpolate(x, scale_factor=2.0, mode="nearest"))
+
+
+class Block(nn.Module):
+    """Residual blocks with attention along rows and a transformer after each (or neither), then a change of resolution (or none)."""
+
+    def __init__(self, inputs: list[int], width: int, side: int, config: ModelConfig, *, attention: bool, embedding: int,
+                 rows: bool = False, down: bool = False, up: bool = False):
+        super().__init__()
+        heads = config.heads or max(width // config.head_width, 1)
+        self.resnets = nn.ModuleList(
+            Resnet(n, width, embedding, config.norm_groups, config.time_scale_shift) for n in inputs)
+        self.row_attentions = nn.ModuleList(RowAttention(width, heads, side, config.norm_groups) for _ in inputs) if rows else None
+        self.attentions = nn.ModuleList(
+            Transformer(width, heads, config.encoder_width, side if config.position_embedding else None,
+                        config.norm_groups, config) for _ in inputs) if attention else None
+        self.downsamplers = nn.ModuleList([Downsample(width)]) if down else None
+        self.upsamplers = nn.ModuleList([Upsample(width)]) if up else None
+
+
+class UNet(nn.Module):
+    """Predicts, for every image of an object, what config.prediction says.
+
+    forward: noisy (n, c, h, w) latents and condition (n, e, h, w) latents, n = layout.images in the order (object,
+    domain, view); timestep (b,); label (n, CLASS_WIDTH); context (b, m, encoder_width) -> (n, c, h, w).
+    """
+
+    def __init__(self, config: ModelConfig, latent_channels: int, condition_channels: int, side: int):
+        super().__init__()
+        self.config = config
+        widths, width0 = config.channels, config.channels[0]
+        embedding = 4 * width0
+        self.conv_in = nn.Conv2d(latent_channels + condition_channels, width0, 3, padding=1)
+        self.time_embedding = Embedding(width0, embedding)
+        self.class_embedding = Embedding(WONDER3D_LABEL_WIDTH if config.convention == "wonder3d" else CLASS_WIDTH, embedding)
+        common = dict(config=config, embedding=embedding)
+        last = len(widths) - 1
+        self.down_blocks, skips, previous = nn.ModuleList(), [width0], width0
+        sides = [side >> i for i in range(len(widths))]
+        rows = config.row_attention or (False,) * len(widths)
+        for i, width in enumerate(widths):
+            inputs = [previous] + [width] * (config.layers_per_block - 1)
+            self.down_blocks.append(
+                Block(inputs, width, sides[i], attention=config.attention_levels[i], rows=rows[i], down=i < last, **common))
+            skips += [width] * (config.layers_per_block + (i < last))
+            previous = width
+        self.mid_block = Block([previous, previous], previous, sides[-1], attention=True, **common)
+        del self.mid_block.attentions[1:]  # residual block, transformer, residual block
+        self.up_blocks = nn.ModuleList()
+        for i, width in reversed(list(enumerate(widths))):
+            inputs = []
+            for _ in range(config.layers_per_block + 1):
+                inputs.append(previous + skips.pop())
+                previous = width
+            self.up_blocks.append(
+                Block(inputs, width, sides[i], attention=config.attention_levels[i], rows=rows[i], up=i > 0, **common))
+        self.conv_norm_out = nn.GroupNorm(config.norm_groups, width0)
+        self.conv_out = nn.Conv2d(width0, latent_channels, 3, padding=1)
+        self.latent_channels = latent_channels
+        if config.condition_skip:
+            # A gate per (domain, view) on the condition's own pixels. The front color view nearly is the condition.
+            gate = torch.zeros(len(DOMAINS), len(config.views))
+            gate[0, 0] = 1.0
+            self.condition_gate = nn.Parameter(gate)
+            nn.init.zeros_(self.conv_out.weight)
+            nn.init.zeros_(self.conv_out.bias)
+
+    def forward(self, noisy, condition, timestep, label, context, layout: Layout, view_idx=None):
+        per_object = len(layout.domains) * layout.views
+        embedding = self.time_embedding(sinusoid(timestep, self.config.channels[0]))
+        embedding = embedding.repeat_interleave(per_object, 0) + self.class_embedding(label)
+        x = self.conv_in(torch.cat([noisy, condition], 1))
+        skips = [x]
+        for block in self.down_blocks:
+            for j in range(len(block.resnets)):
+                x = self._layer(block, j, x, embedding, context, layout)
+                skips.append(x)
+            if block.downsamplers:
+                x = block.downsamplers[0](x)
+                skips.append(x)
+        for j in range(2):
+            x = self._layer(self.mid_block, j, x, embedding, context, layout)
+        for block in self.up_blocks:
+            for j in range(len(block.resnets)):
+                x = torch.cat([x, skips.pop()], 1)
+                x = self._layer(block, j, x, embedding, context, layout)
+            if block.upsamplers:
+                x = block.upsamplers[0](x)
+        out = self.conv_out(F.silu(self.conv_norm_out(x)))
+        if self.config.condition_skip:
+            views = torch.arange(layout.views) if view_idx is None else view_idx
+            gate = self.condition_gate[list(layout.domains)][:, views].reshape(-1).repeat(layout.objects)
+            out = out + gate[:, None, None, None] * condition[:, : self.latent_channels]
+        return out
+
+    def _layer(self, block, j, x, embedding, context, layout):
+        def run(x, embedding, context):
+            x = block.resnets[j](x, embedding)
+            if block.row_attentions:
+                x = block.row_attentions[j](x, layout)
+            if block.attentions and j < len(block.attentions):
+                x = block.attentions[j](x, context, layout)
+            return x
+
+        if self.config.gradient_checkpointing and self.training:
+            return checkpoint(run, x, embedding, context, use_reentrant=False)
+        return run(x, embedding, context)

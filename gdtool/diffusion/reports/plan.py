@@ -1,0 +1,271 @@
+"""What a training will cost before it is run: memory and FLOPs of a step, and the time on one and on eight GPUs.
+
+Nothing is tabled but the GPUs: the network is built on PyTorch's meta device (shapes without numbers), a step is run
+there forward and backward, FLOPs are counted by torch.utils.flop_counter and memory by following every storage. So are
+the VAE's encoding, its decoding for the loss by rendering, and CLIP; the shading itself is run on a few numbers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import weakref
+from pathlib import Path
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import FlopCounterMode
+
+from gdtool.diffusion.network import attention
+from gdtool.diffusion.network.attention import Layout
+from gdtool.diffusion.network.codec import CHUNK, VaeCodec
+from gdtool.diffusion.config import DOMAINS, ModelConfig, Phase, TrainConfig
+from gdtool.diffusion.network.encoding import PLANES
+from gdtool.diffusion.training.losses import LIT, rendering_error, view_directions
+from gdtool.diffusion.network.model import Model, parameter_count, structure
+from gdtool.diffusion.network.schedule import signal_and_noise
+
+# Dense bfloat16 peak in FLOP/s, memory in bytes, NVLink in bytes/s in one direction (NVIDIA's data sheets, SXM parts).
+GPUS = {"A100 80 GB": (312e12, 80e9, 300e9), "H100 80 GB": (989e12, 80e9, 450e9), "H200 141 GB": (989e12, 141e9, 450e9)}
+UTILISATION = 0.35  # of the peak: what training a UNet of this size in bfloat16 commonly reaches; the one assumption here
+# Held for each weight: itself, its gradient, two moments and the average in float32, and autocast's copy in bfloat16.
+BYTES_PER_WEIGHT = 4 + 4 + 8 + 4
+GB = 1e9
+
+
+class LiveBytes(TorchDispatchMode):
+    """The most bytes that the results of operations, those of autograd among them, held at once."""
+
+    def __init__(self):
+        super().__init__()
+        self.live = self.peak = 0
+        self.seen: dict[int, int] = {}
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        out = function(*args, **(kwargs or {}))
+        given = {x.untyped_storage()._cdata for x in _tensors(args)}
+        for x in _tensors(out):
+            storage = x.untyped_storage()
+            key, size = storage._cdata, storage.nbytes()
+            if key in given or key in self.seen:  # a view, or written in place
+                continue
+            self.seen[key] = size
+            self.live += size
+            self.peak = max(self.peak, self.live)
+            weakref.finalize(storage, self._freed, key)
+        return out
+
+    def _freed(self, key: int) -> None:
+        self.live -= self.seen.pop(key, 0)
+
+
+def _tensors(x):
+    if isinstance(x, torch.Tensor):
+        yield x
+    elif isinstance(x, list | tuple):
+        for one in x:
+            yield from _tensors(one)
+
+
+@contextlib.contextmanager
+def fused_attention():
+    """Attention as GPUs compute it, without a matrix of weights in memory."""
+    before = attention.attend
+
+    def fused(q, k, v):
+        flat = (x.flatten(0, -4) for x in (q, k, v))
+        return torch.ops.aten._scaled_dot_product_flash_attention(*flat)[0].view(*q.shape[:-1], v.shape[-1])
+
+    attention.attend = fused
+    try:
+        yield
+    finally:
+        attention.attend = before
+
+
+def step_cost(config: ModelConfig, domains: int, views: int, objects: int, *, fused: bool, dtype=torch.bfloat16, device: str = "meta") -> dict[str, float]:
+    """FLOPs and peak bytes beyond the weights of one forward and backward pass over so many objects.
+
+    fused: attention as on a GPU, else as attend() does it on this device. dtype: of what is computed.
+    """
+    # Two passes: the counter's own record of modules keeps tensors alive that checkpointing would have freed.
+    counter, memory = FlopCounterMode(display=False), LiveBytes()
+    _one_step(config, domains, views, objects, fused, dtype, device, counter)
+    model = _one_step(config, domains, views, objects, fused, dtype, device, memory)
+    gradients = sum(p.numel() * p.element_size() for p in model.parameters() if p.grad is not None)
+    return {"flops": float(counter.get_total_flops()), "bytes": float(memory.peak - gradients)}
+
+
+def _one_step(config: ModelConfig, domains: int, views: int, objects: int, fused: bool, dtype, device: str, watch) -> Model:
+    """A forward and backward pass under `watch`; the model with its gradients."""
+    model = structure(config, device).to(dtype).train()
+    layout = Layout(objects, tuple(range(len(DOMAINS)))[:domains], views)
+    view_idx = torch.arange(views)
+    shape = model.latent_shape(layout)
+    with torch.device(device):
+        noisy, clean = torch.zeros(shape, dtype=dtype), torch.zeros(shape)
+        condition = torch.zeros(shape[0], model.codec.condition_channels, *shape[2:], dtype=dtype)
+        rgba = torch.zeros(objects, 4, config.image_size, config.image_size, dtype=dtype)
+        context = torch.zeros(objects, 1, config.encoder_width, dtype=dtype)
+        model.labels, t = model.labels.to(dtype), torch.zeros(objects, dtype=torch.long)
+        model.signal, model.deviation = model.signal.to(dtype), model.deviation.to(dtype)
+    # sinusoid() computes in float32, which the weights here are not: what it gives is cast
+    hook = model.unet.time_embedding.register_forward_pre_hook(lambda module, args: (args[0].to(dtype),))
+    with fused_attention() if fused else contextlib.nullcontext(), watch:
+        if config.encoder == "patch":
+            context = model.encoder(rgba)
+        predicted = model.predict_clean(noisy, condition, t, context, layout, view_idx)
+        (predicted - clean).square().mean().backward()
+    hook.remove()
+    return model
+
+
+def frozen_cost(config: ModelConfig) -> dict[str, float] | None:
+    """What the frozen VAE and CLIP cost; None without diffusers.
+
+    FLOPs: encode and decode per image (decode with what a gradient through it takes), object for CLIP. Bytes:
+    encode_bytes and decode_bytes at once (they do not grow with the batch), weights_bytes in float32.
+    """
+    cost = dict.fromkeys(("encode", "decode", "object", "encode_bytes", "decode_bytes", "weights_bytes"), 0.0)
+    try:
+        if config.codec == "vae":
+            codec = VaeCodec(config, frozen_part(config, "vae"))
+            shape = (CHUNK, 4, codec.side, codec.side)
+            images = torch.zeros(CHUNK, 3, config.image_size, config.image_size, device="meta")
+            cost["encode"], cost["encode_bytes"] = _counted(lambda: codec.encode(images))
+            cost["decode"], cost["decode_bytes"] = _counted(
+                lambda: codec.decode(torch.zeros(shape, device="meta", requires_grad=True)).sum().backward())
+            cost["encode"], cost["decode"] = cost["encode"] / CHUNK, cost["decode"] / CHUNK
+            cost["weights_bytes"] += 4.0 * parameter_count(codec.vae)
+        if config.encoder == "clip":
+            clip = frozen_part(config, "image_encoder").requires_grad_(False)
+            cost["object"], _ = _counted(lambda: clip(torch.zeros(1, 3, 224, 224, device="meta")))
+            cost["weights_bytes"] += 4.0 * parameter_count(clip)
+    except ImportError:
+        return None
+    return cost
+
+
+def frozen_part(config: ModelConfig, part: str) -> torch.nn.Module:
+    """The vae or image_encoder that a local config.pretrained describes, else Stable Diffusion Image Variations', without numbers."""
+    from diffusers import AutoencoderKL
+    from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
+
+    described = Path(config.pretrained) / part / "config.json" if config.pretrained else Path()
+    with torch.device("meta"):
+        if part == "image_encoder":
+            return CLIPVisionModelWithProjection(CLIPVisionConfig.from_json_file(described) if described.is_file() else CLIPVisionConfig(
+                hidden_size=1024, intermediate_size=4096, projection_dim=768, num_hidden_layers=24, num_attention_heads=16, image_size=224, patch_size=14))
+        if described.is_file():
+            return AutoencoderKL.from_config(AutoencoderKL.load_config(described.parent))
+        return AutoencoderKL(down_block_types=("DownEncoderBlock2D",) * 4, up_block_types=("UpDecoderBlock2D",) * 4,
+                             block_out_channels=(128, 256, 512, 512), layers_per_block=2, latent_channels=4)
+
+
+def _counted(call) -> tuple[float, float]:
+    """FLOPs and peak bytes of a call."""
+    counter, memory = FlopCounterMode(display=False), LiveBytes()
+    with counter:
+        call()
+    with memory:
+        call()
+    return float(counter.get_total_flops()), float(memory.peak)
+
+
+def rendering_share(config: ModelConfig, train: TrainConfig, domains: int) -> float:
+    """Of the objects of a step, how many the loss by rendering sees on average."""
+    lit = {DOMAINS.index(d) for d in LIT} <= {DOMAINS.index(d) for d in config.domains} and domains == len(config.domains)
+    if not lit or train.pbr_weight == 0:
+        return 0.0
+    signal, deviation = signal_and_noise(config)
+    near = (signal / deviation).square() > train.pbr_snr
+    return float(near.float().mean()) * (1 - train.pure_noise) + train.pure_noise * float(near[-1])
+
+
+def shading_bytes(config: ModelConfig, train: TrainConfig, views: int) -> float:
+    """The most that the loss by rendering of one object holds, its decoded images among it."""
+    shape = (len(LIT), views, 3, config.image_size, config.image_size)
+    planes = torch.ones(views, PLANES["mask"].stop, *shape[-2:])
+    lights = torch.tensor([[0.0, 0, 1, 1, 1, 1, 1]]).repeat(16, 1)
+    order = {DOMAINS.index(d): j for j, d in enumerate(LIT)}
+    memory, start = LiveBytes(), torch.rand(shape)
+    with memory:
+        predicted = start.clone().requires_grad_()
+        rendering_error(predicted, start, order, planes, lights, view_directions(config)[:views], train.pbr_pixels, 0.0, torch.Generator()).backward()
+    return float(memory.peak)
+
+
+def data_bytes(config: ModelConfig, domains: int, views: int) -> float:
+    """What one object of a step takes as data: its planes, their encoding, and clean, noise, noisy and condition latents."""
+    codec = structure(config).codec
+    pixels, latent = config.image_size**2, codec.side**2
+    images = domains * views
+    return 4.0 * (PLANES["mask"].stop * pixels * (len(config.views) + views) + images * 3 * pixels
+                  + images * latent * (3 * codec.latent_channels + codec.condition_channels))
+
+
+def plan_of(config: ModelConfig, train: TrainConfig) -> dict:
+    """The report of `gdtool train --plan`: weights, and for each phase FLOPs, memory and seconds of a step."""
+    weights = parameter_count(structure(config))
+    frozen = frozen_cost(config)
+    report: dict = {"weights": weights, "weights_bytes": weights * BYTES_PER_WEIGHT, "steps": train.steps, "utilisation": UTILISATION,
+                    "frozen_parts_counted": frozen is not None, "phases": [], "hours": {}}
+    done, hours = 0.0, {(gpu, n): 0.0 for gpu in GPUS for n in (1, 8)}
+    for phase in train.phases:
+        steps, done = round((phase.share - done) * train.steps), phase.share
+        own = phase_cost(config, train, phase, frozen, weights)
+        report["phases"].append({"steps": steps, **own})
+        for gpu, (peak, _, link) in GPUS.items():
+            for n in (1, 8):
+                exchange = 0.0 if n == 1 else 2 * (n - 1) / n * weights * 4 / link  # ring all-reduce of float32 gradients
+                hours[gpu, n] += steps * (own["flops_per_step"] / (n * peak * UTILISATION) + exchange) / 3600
+    for gpu, (_, capacity, _) in GPUS.items():
+        # each part of a batch is split over the GPUs
+        fits = {str(n): max(p["bytes"] - p["growing_bytes"] * (1 - -(-p["objects_at_once"] // n) / p["objects_at_once"])
+                            for p in report["phases"]) < 0.9 * capacity for n in (1, 8)}
+        report["hours"][gpu] = {"1": hours[gpu, 1], "8": hours[gpu, 8], "fits": fits}
+    return report
+
+
+def phase_cost(config: ModelConfig, train: TrainConfig, phase: Phase, frozen: dict | None, weights: int, *, fused: bool = True) -> dict:
+    """FLOPs of a step of a phase, averaged over the timesteps, and the most bytes that one holds.
+
+    The loss by rendering is decoded and held for as many objects as have little noise: on average in FLOPs, all in bytes.
+    """
+    domains, views = min(phase.domains, len(config.domains)), min(phase.views, len(config.views))
+    batch = phase.batch or train.batch
+    part = -(-batch // train.accumulate)
+    dtype = torch.bfloat16 if train.precision == "bfloat16" else torch.float32
+    one, two = (step_cost(config, domains, views, n, fused=fused, dtype=dtype) for n in (1, 2))
+    # both are affine in the number of objects: measured at one and two, not assumed
+    flops, network = (one[key] + (two[key] - one[key]) * (part - 1) for key in ("flops", "bytes"))
+    share = rendering_share(config, train, domains)
+    data = part * data_bytes(config, domains, views)
+    rendering = part * shading_bytes(config, train, views) if share else 0.0
+    conditions = 1 + (config.mirror_back and "back" in config.views)
+    own = frozen or dict.fromkeys(("encode", "decode", "object", "encode_bytes", "decode_bytes", "weights_bytes"), 0.0)
+    encoding = own["encode"] * (domains * views + conditions)
+    decoding = own["decode"] * share * len(LIT) * views
+    growing = data + network + rendering
+    held = max(data + own["encode_bytes"], growing + (own["decode_bytes"] if share else 0.0))
+    copies = weights * 2 if dtype == torch.bfloat16 else 0
+    return {"domains": domains, "views": views, "batch": batch, "objects_at_once": part,
+            "flops_per_step": flops * batch / part + batch * (encoding + decoding + own["object"]),
+            "vae_flops_per_step": batch * (encoding + decoding), "rendering_share": share, "rendering_bytes": rendering,
+            "growing_bytes": growing, "activation_bytes": held, "bytes": weights * BYTES_PER_WEIGHT + copies + own["weights_bytes"] + held}
+
+
+def text_of(report: dict) -> str:
+    """The report as lines for a terminal."""
+    lines = [f"{report['weights'] / 1e6:.1f} million weights: {report['weights_bytes'] / GB:.2f} GB with gradients, moments and average",
+             "", "phase  steps    batch  at once  domains x views  PFLOP/step  activations  memory"]
+    for i, p in enumerate(report["phases"], 1):
+        lines.append(f"{i:5d}  {p['steps']:<7d}  {p['batch']:5d}  {p['objects_at_once']:7d}  {p['domains']:7d} x {p['views']:<5d}  "
+                     f"{p['flops_per_step'] / 1e15:10.4g}  {p['activation_bytes'] / GB:8.2f} GB  {p['bytes'] / GB:6.2f} GB")
+    lines += ["", f"estimated at {report['utilisation']:.0%} of the peak in bfloat16:"]
+    for gpu, row in report["hours"].items():
+        one, eight = (f"{row[n]:8.1f} h{'' if row['fits'][n] else ' (does not fit: raise accumulate)'}" for n in ("1", "8"))
+        lines.append(f"{gpu:12s}  1 GPU {one}   8 GPUs {eight}")
+    if not report["frozen_parts_counted"]:
+        lines.append("not counted: the frozen VAE and CLIP (pip install 'gdtool[hub]')")
+    return "\n".join(lines)
+

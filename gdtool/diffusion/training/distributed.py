@@ -1,0 +1,159 @@
+"""Several processes, started by torchrun: who does which part of a batch, and what they agree on.
+
+    torchrun --nproc_per_node 8 -m -- gdtool train objects --preset paper --device cuda -o my-model
+
+PyTorch's own engine does the work: DistributedDataParallel, or with GDTOOL_SHARD=1 fully_shard (FSDP2), which splits
+weights, gradients and moments. With one process every function here is the identity. The first process alone runs the
+stage and writes; the others follow() it and see the same data through the memory-mapped arrays in its workspace.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from dataclasses import replace
+from datetime import timedelta
+from typing import Any
+
+import numpy as np
+import torch
+import torch.distributed as dist
+from torch import nn
+
+# The first process decodes the data and makes validation pictures while the others wait for it, which PyTorch allows for
+# 10 or 30 minutes. torchrun ends all when one dies, so a long wait hides nothing.
+PATIENCE = timedelta(days=2)
+
+
+def size() -> int:
+    return dist.get_world_size() if dist.is_initialized() else 1
+
+
+def rank() -> int:
+    return dist.get_rank() if dist.is_initialized() else 0
+
+
+def start() -> None:
+    """Join the other processes, when torchrun started several and they have not met."""
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1 and not dist.is_initialized():
+        dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo", timeout=PATIENCE)
+        if torch.cuda.is_available():
+            torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+
+
+def send(order: Any) -> None:
+    """The first process tells the others what to run; None: nothing."""
+    if size() > 1:
+        dist.broadcast_object_list([order], src=0)
+
+
+def leave() -> None:
+    """End this process, and as the first one the others, whether they were given work or wait for it still. With one
+    process nothing; with several it does not return.
+
+    It leaves without the interpreter's own end: DDP keeps the group's threads alive, and one of them that lets go of its
+    last tensor while the interpreter ends aborts the process (pytorch/pytorch#179291; seen once in 40 runs).
+    """
+    if int(os.environ.get("WORLD_SIZE", "1")) < 2:
+        return
+    if not dist.is_initialized():
+        start()
+        send(None)
+    dist.destroy_process_group()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
+
+
+def receive() -> Any:
+    """What the first process sends."""
+    start()
+    order = [None]
+    dist.broadcast_object_list(order, src=0)
+    return order[0]
+
+
+def share_of(part: np.ndarray) -> np.ndarray:
+    """This process's part of an array."""
+    return np.array_split(part, size())[rank()]
+
+
+def total(figures: dict[str, float]) -> dict[str, float]:
+    """Sums over all processes; they may know different names."""
+    if size() == 1:
+        return figures
+    every: list = [None] * size()
+    dist.all_gather_object(every, figures)
+    return {name: sum(one.get(name, 0.0) for one in every) for name in dict.fromkeys(name for one in every for name in one)}
+
+
+def wrap(objective: nn.Module) -> nn.Module:
+    """objective for all processes: DDP, or its model's layers sharded by FSDP2. As it is with one process."""
+    if size() == 1:
+        return objective
+    if os.environ.get("GDTOOL_SHARD") == "1":
+        from torch.distributed.fsdp import fully_shard
+
+        from gdtool.diffusion.network.attention import RowAttention, Transformer
+        from gdtool.diffusion.network.unet import Resnet
+
+        for module in objective.modules():
+            if isinstance(module, Resnet | Transformer | RowAttention):
+                fully_shard(module)
+        return fully_shard(objective)
+    # Not every step sees every domain and view, so not every weight has a gradient.
+    return nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
+
+
+def synchronised(objective: nn.Module, last: bool):
+    """Gradients are exchanged after the last part of a batch only."""
+    if isinstance(objective, nn.parallel.DistributedDataParallel) and not last:
+        return objective.no_sync()
+    return contextlib.nullcontext()
+
+
+def is_sharded(model: nn.Module) -> bool:
+    return any(hasattr(p, "full_tensor") for p in model.parameters())
+
+
+def local(x: torch.Tensor, whole: bool = False) -> torch.Tensor:
+    """This process's part of a tensor (whole: all of it), without its history."""
+    x = x.detach()
+    if not hasattr(x, "to_local"):
+        return x
+    return x.full_tensor() if whole else x.to_local()
+
+
+def whole(x: torch.Tensor, like: torch.Tensor | None = None) -> torch.Tensor:
+    """All of a tensor of which each process holds a part, itself or as its local part (then like says how it is split)."""
+    if like is not None and hasattr(like, "full_tensor") and not hasattr(x, "full_tensor"):
+        from torch.distributed.tensor import DTensor
+
+        x = DTensor.from_local(x, like.device_mesh, like.placements, shape=like.shape, stride=like.stride())
+    return x.full_tensor() if hasattr(x, "full_tensor") else x
+
+
+def sharded(x: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    """A whole tensor as `like` is split."""
+    if not hasattr(like, "full_tensor"):
+        return x
+    from torch.distributed.tensor import distribute_tensor
+
+    return distribute_tensor(x.to(like.device), like.device_mesh, like.placements)
+
+
+def gathered(state):
+    """state with whole weights and averages, for writing and for validation; every process takes part. state stays as it is."""
+    if not is_sharded(state.model):
+        return state
+    from gdtool.diffusion.network.model import Model
+
+    own = dict(state.model.named_parameters())
+    average = {name: whole(x, own[name]) for name, x in state.average.items()}
+    weights = {name: whole(p.detach()) for name, p in own.items()}
+    config = state.model.config
+    encoder = state.model.encoder if config.encoder == "clip" else None  # frozen, and so not split
+    model = Model(config, state.model.codec, encoder).to(next(iter(weights.values())).device).train()
+    model.load_state_dict(weights, strict=False)
+    return replace(state, model=model, average=average)

@@ -1,0 +1,324 @@
+"""The training loop, top to bottom: draw, noise, predict, compare, step, average, write down.
+
+A run is a pure function of data, configuration and seed: each step's choices come from (seed, step) and those of each
+of its objects from (seed, step, place in the batch), so that it does not matter how a batch is split over accumulations
+and processes; a checkpoint holds all else (weights, their average, the optimiser's moments), so that a resumed run is
+bit for bit the unbroken one. Several processes: torchrun starts them, distributed.py holds what they do differently.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import torch
+
+from gdtool.core.errors import InputError
+from gdtool.core.reading import parse_json
+from gdtool.diffusion.training import distributed
+from gdtool.diffusion.network.attention import Layout
+from gdtool.diffusion.config import DOMAINS, ModelConfig, Phase, TrainConfig
+from gdtool.diffusion.data.objects import Batch, Objects, draw, object_order
+from gdtool.diffusion.network.encoding import BACKGROUND, encode, encode_condition
+from gdtool.diffusion.training.losses import LIT, image_error, rendering_error, view_directions
+from gdtool.diffusion.network.model import Model
+from gdtool.diffusion.training.optimizer import MOMENTS, make_optimizer, restore_moments
+from gdtool.diffusion.inference.sampling import precision_context
+from gdtool.diffusion.network.schedule import loss_weight
+from gdtool.diffusion.network.tensors import read_tensors
+
+CHECKPOINT = "checkpoint.safetensors"
+MOST_SKIPPED = 10  # steps in a row with a gradient that is not finite: the run is lost
+
+
+@dataclass
+class State:
+    """Everything that changes while training."""
+
+    model: Model
+    optimizer: Any  # torch.optim.Optimizer, or what is as one: optimizer.py
+    average: dict[str, torch.Tensor]
+    objective: torch.nn.Module
+    step: int = 0
+    seconds: float = 0.0
+    skipped: int = 0  # steps in a row
+
+
+@dataclass(frozen=True)
+class Step:
+    """The random choices of one step that all its objects share, and what its objects draw theirs from."""
+
+    domains: tuple[int, ...]
+    views: torch.Tensor
+    seed: int
+    number: int
+
+    def choices(self, place: int) -> tuple[np.random.Generator, torch.Generator]:
+        """The generators of the object at this place of the step's batch."""
+        choices = np.random.default_rng((self.seed, 3, self.number, place))
+        return choices, torch.Generator().manual_seed(int(choices.integers(2**62)))
+
+
+class Objective(torch.nn.Module):
+    """losses() as a module: what DDP and FSDP wrap, so that their hooks see the forward pass."""
+
+    def __init__(self, model: Model, train: TrainConfig):
+        super().__init__()
+        self.model, self.train_config = model, train
+
+    def forward(self, batch: Batch, step: Step, generators: list[torch.Generator]) -> dict[str, torch.Tensor]:
+        return losses(self.model, batch, step, generators, self.train_config)
+
+
+def new_state(model: Model, train: TrainConfig) -> State:
+    """The state before the first step; wrapped for all processes."""
+    objective = distributed.wrap(Objective(model, train))
+    optimizer = make_optimizer(model, train)
+    average = {name: distributed.local(p).clone() for name, p in model.named_parameters()}
+    return State(model, optimizer, average, objective)
+
+
+def progress_of(state: State, train: TrainConfig, minutes: float | None) -> float:
+    """How much of the run is over, 0…1: by steps, or by minutes where those are given and sooner spent."""
+    return min(max(state.step / train.steps, state.seconds / 60 / minutes if minutes else 0.0), 1.0)
+
+
+def phase_at(progress: float, train: TrainConfig) -> Phase:
+    return next((phase for phase in train.phases if progress < phase.share), train.phases[-1])
+
+
+def learning_rate(state: State, progress: float, train: TrainConfig) -> float:
+    rate = phase_at(progress, train).learning_rate * min((state.step + 1) / train.warmup, 1.0)
+    return rate * (0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * progress))) if train.decay else rate
+
+
+def choose(config: ModelConfig, phase: Phase, seed: int, step: int) -> Step:
+    """Which domains and views a step sees: color always where it is primary and more than one domain is drawn."""
+    choices = np.random.default_rng((seed, 2, step))
+    own = [DOMAINS.index(d) for d in config.domains]
+    if phase.domains >= len(own):
+        domains = tuple(own)
+    elif phase.domains == 1 or config.cross_domain == "none":
+        domains = tuple(sorted(choices.permutation(own)[: phase.domains].tolist()))
+    else:
+        domains = (0, *sorted(choices.permutation(own[1:])[: phase.domains - 1].tolist()))
+    views = torch.from_numpy(np.sort(choices.permutation(len(config.views))[: phase.views]))
+    return Step(domains, views, seed, step)
+
+
+def losses(model: Model, batch: Batch, step: Step, generators: list[torch.Generator], train: TrainConfig) -> dict[str, torch.Tensor]:
+    """The objective of one micro-batch and its parts by name; every figure is a mean over its objects.
+
+    generators: one for each object, from which all that is random about it comes.
+    """
+    config, b, device = model.config, len(batch.planes), batch.planes.device
+    layout = Layout(b, step.domains, len(step.views))
+    n = layout.images // b
+
+    # per object: timestep, whether it is the last one, what is dropped, background
+    dice = torch.stack([torch.rand(4, generator=generator) for generator in generators])
+    background = torch.tensor([BACKGROUND[config.backgrounds[int(x * len(config.backgrounds))]] for x in dice[:, 3]], device=device)
+    planes = batch.planes[:, step.views]
+    truth = encode(planes, step.domains, background)  # (b, d, k, 3, h, w)
+    clean = model.codec.encode(truth.flatten(0, 2))
+    rgba = encode_condition(batch.condition, background)
+
+    # One timestep per object: sampling never sees anything else.
+    t = (dice[:, 0] * config.timesteps).long()
+    t = torch.where(dice[:, 1] < train.pure_noise, config.timesteps - 1, t).to(device)
+    noise = torch.cat([torch.randn(n, *clean.shape[1:], generator=generator) for generator in generators]).to(device)
+    a, s = model.levels(t, layout)
+    noisy = a * clean + s * noise
+
+    drop = dice[:, 2].to(device)
+    embedding_off = drop < train.drop_embedding + train.drop_both
+    latent_off = (drop >= train.drop_embedding) & (drop < train.drop_embedding + train.drop_both + train.drop_latent)
+    with precision_context(device, train.precision):
+        context = model.encoder(rgba) * ~embedding_off[:, None, None]
+        condition = model.condition_latents(rgba, layout, step.views) * ~latent_off.repeat_interleave(n)[:, None, None, None]
+        predicted = model.predict_clean(noisy, condition, t, context, layout, step.views)
+
+    counted, square = image_error(predicted, clean, b, step.domains, config, train)  # (b, d) each
+    weight = loss_weight(model.signal[t], model.deviation[t], train.snr_gamma, train.snr_floor)
+    total = (weight[:, None] * counted).mean()
+    parts = {DOMAINS[i]: square[:, j].mean().detach() for j, i in enumerate(step.domains)}
+
+    snr = (model.signal[t] / model.deviation[t]).square()
+    near = torch.nonzero(snr > train.pbr_snr).flatten()
+    if train.pbr_weight > 0 and len(near) and {1, 3, 4, 5} <= set(step.domains):
+        # decoded and shaded: what light is computed from, of the objects that it is computed for
+        lit = [j for j, i in enumerate(step.domains) if DOMAINS[i] in LIT]
+        latents = predicted.unflatten(0, (b, len(step.domains), -1))[:, lit]
+        directions = view_directions(config)[step.views].to(device)
+        order = {step.domains[j]: place for place, j in enumerate(lit)}
+        rendered = []
+        for i in near.tolist():
+            images = model.codec.decode(latents[i].flatten(0, 1)).unflatten(0, latents.shape[1:3])
+            error = rendering_error(images, truth[i][lit], order, planes[i], batch.lights[i], directions, train.pbr_pixels,
+                                    float(background[i]), generators[i])
+            rendered.append(snr[i].clamp(max=train.snr_gamma) * error)
+        parts["rendering"] = (torch.stack(rendered).sum() / b).detach()
+        total = total + train.pbr_weight * torch.stack(rendered).sum() / b
+    return {"loss": total, **parts}
+
+
+def train_step(state: State, objects: Objects, train: TrainConfig, seed: int, minutes: float | None, device: str) -> dict[str, float]:
+    """One optimiser step over the phase's objects in `accumulate` parts; updates state."""
+    config, progress = state.model.config, progress_of(state, train, minutes)
+    phase = phase_at(progress, train)
+    step = choose(config, phase, seed, state.step)
+    rate = learning_rate(state, progress, train)
+    for group in state.optimizer.param_groups:
+        group["lr"] = rate * group["rate"]
+    idx = object_order(len(objects), state.step, phase.batch or train.batch, seed)
+    places, sums = np.arange(len(idx)), {}
+    # Every process takes its share of each part of the batch; its gradients' mean is what the processes agree on.
+    if len(idx) < distributed.size():
+        raise InputError("batch", f"of {len(idx)} objects is less than one for each of {distributed.size()} processes", "raise --batch")
+    count = min(train.accumulate, len(idx) // distributed.size())
+    parts_of = [distributed.share_of(part) for part in np.array_split(places, count)]
+    for number, part in enumerate(parts_of):
+        choices, generators = zip(*(step.choices(int(place)) for place in part), strict=True)
+        batch = draw(objects, idx[part], config, train, choices)
+        batch = Batch(batch.planes.to(device), batch.condition.to(device), batch.lights.to(device))
+        with distributed.synchronised(state.objective, number == len(parts_of) - 1):
+            parts = state.objective(batch, step, list(generators))
+            share = len(part) / len(idx)
+            (parts["loss"] * share * distributed.size()).backward()
+        for name, value in parts.items():
+            sums[name] = sums.get(name, 0.0) + float(value.detach()) * share
+    sums = distributed.total(sums)
+    norm = distributed.local(torch.nn.utils.clip_grad_norm_(state.model.parameters(), train.clip), whole=True)
+    finite = bool(torch.isfinite(norm))
+    if finite:  # a step that is not finite is left out rather than the whole run lost
+        state.optimizer.step()
+    state.skipped = 0 if finite else state.skipped + 1
+    state.optimizer.zero_grad(set_to_none=True)
+    state.step += 1
+    keep = min(train.ema, (1 + state.step) / (10 + state.step))
+    names = list(state.average)
+    own = {name: distributed.local(p) for name, p in state.model.named_parameters()}
+    torch._foreach_lerp_([state.average[n] for n in names], [own[n] for n in names], 1 - keep)
+    return {"step": state.step, "rate": rate, "norm": float(norm), "skipped": int(not finite), **sums}
+
+
+def save_checkpoint(state: State, workspace: Path, identity: str) -> None:
+    """Write weights, average and moments beside the old checkpoint, then replace it."""
+    from safetensors.torch import save_file
+
+    tensors = {}
+    for name, p in state.model.named_parameters():
+        tensors[f"model/{name}"] = distributed.whole(p.detach())
+        tensors[f"average/{name}"] = distributed.whole(state.average[name], p)
+        for key, value in state.optimizer.state.get(p, {}).items():
+            tensors[f"{key}/{name}"] = distributed.whole(value)
+    if distributed.rank() != 0:
+        return
+    tensors = {name: x.cpu().contiguous() for name, x in tensors.items()}
+    record = json.dumps({"step": state.step, "seconds": state.seconds, "identity": identity})
+    partial = workspace / f".{CHECKPOINT}.partial"
+    save_file(tensors, str(partial), metadata={"state": record})
+    os.replace(partial, workspace / CHECKPOINT)
+
+
+def load_checkpoint(state: State, workspace: Path, identity: str) -> bool:
+    """Bring state to the workspace's checkpoint, if there is one. Raises InputError when it belongs to another run."""
+    path = workspace / CHECKPOINT
+    if not path.is_file():
+        return False
+    tensors, metadata = read_tensors(path)
+    record = _record(metadata, path)
+    if record["identity"] != identity:
+        raise InputError(path, "belongs to a run with another configuration", "remove it or train with the same options")
+    with torch.no_grad():
+        for name, p in state.model.named_parameters():
+            p.copy_(distributed.sharded(tensors[f"model/{name}"], p))
+            state.average[name].copy_(distributed.local(distributed.sharded(tensors[f"average/{name}"], p)))
+            moments = {key: tensors[f"{key}/{name}"] for key in MOMENTS if f"{key}/{name}" in tensors}
+            if moments:
+                restore_moments(state.optimizer, p, {
+                    key: value if key == "step" else distributed.sharded(value.to(p.device), p) for key, value in moments.items()})
+    state.step, state.seconds = record["step"], record["seconds"]
+    return True
+
+
+def _record(metadata: dict[str, str], path: Path) -> dict[str, Any]:
+    """The step, seconds and identity in a checkpoint's metadata. Raises InputError where they are not there."""
+    try:
+        return msgspec.to_builtins(msgspec.convert(parse_json(metadata.get("state", ""), path), _Record))
+    except msgspec.ValidationError as error:
+        raise InputError(path, f"is not a checkpoint of gdtool ({error})", "remove it, and the training starts anew") from None
+
+
+class _Record(msgspec.Struct, forbid_unknown_fields=True):
+    step: Annotated[int, msgspec.Meta(ge=0)]
+    seconds: Annotated[float, msgspec.Meta(ge=0)]
+    identity: str
+
+
+def run_training(model: Model, objects: Objects, train: TrainConfig, workspace: Path, *, seed: int, minutes: float | None = None,
+                 checkpoint_every: int = 200, validate_every: int = 1000, validate: Callable[[State], None] = lambda state: None,
+                 device: str = "cpu", warn: Callable[[str], None] = lambda message: None, log: Callable[[dict], None] = lambda record: None,
+                 progress=lambda iterable, total, label: iterable) -> State:
+    """Train until the steps or the minutes are spent; resumes from workspace. The first process writes workspace/loss.csv, and gives
+    each of its rows to log.
+
+    Raises InputError when MOST_SKIPPED steps in a row had a gradient that is not finite; before that warns of each.
+    """
+    identity = msgspec.json.encode([model.config, train, seed, len(objects)]).decode()
+    torch.manual_seed(seed)
+    state = new_state(model.to(device).train(), train)
+    state.average = {name: x.to(device) for name, x in state.average.items()}
+    resumed = load_checkpoint(state, workspace, identity)
+    log_path = workspace / "loss.csv"
+    with open(log_path if distributed.rank() == 0 else os.devnull, "r+" if resumed and log_path.is_file() else "w", newline="") as file:
+        writer = _continued(file, state.step if resumed else 0, model.config.domains)
+        bar = iter(progress(range(state.step, train.steps), train.steps, "training"))
+        while progress_of(state, train, minutes) < 1:
+            start = time.perf_counter()
+            record = train_step(state, objects, train, seed, minutes, device)
+            state.seconds += distributed.total({"s": time.perf_counter() - start})["s"] / distributed.size()
+            writer.writerow({k: (f"{v:.6g}" if isinstance(v, float) else v) for k, v in record.items()} | {"seconds": f"{state.seconds:.1f}"})
+            file.flush()
+            log(record)
+            _tell_skipped(state, warn)
+            next(bar, None)
+            if state.step % checkpoint_every == 0:
+                save_checkpoint(state, workspace, identity)
+            if state.step % validate_every == 0:
+                whole = distributed.gathered(state)
+                if distributed.rank() == 0:
+                    validate(whole)
+        for _ in bar:
+            break
+    save_checkpoint(state, workspace, identity)
+    return distributed.gathered(state)
+
+
+def _tell_skipped(state: State, warn: Callable[[str], None]) -> None:
+    if state.skipped >= MOST_SKIPPED:
+        raise InputError("training", f"has a gradient that is not finite in {MOST_SKIPPED} steps up to {state.step}",
+                         "lower learning_rate, or set precision to float32, in the configuration; the checkpoint has finite weights")
+    if state.skipped:
+        warn(f"step {state.step} is left out: its gradient is not finite ({state.skipped} in a row)")
+
+
+def _continued(file, step: int, domains: tuple[str, ...]) -> csv.DictWriter:
+    """A writer of the log that keeps the rows up to step; rows after a checkpoint will be written again."""
+    columns = ["step", "seconds", "loss", "rate", "norm", "skipped", *domains, "rendering"]
+    kept = [row for row in csv.DictReader(file) if int(row["step"]) <= step] if step else []
+    file.seek(0)
+    file.truncate() if file.name != os.devnull else None
+    writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore")
+    writer.writeheader()
+    writer.writerows(kept)
+    return writer

@@ -1,0 +1,78 @@
+"""What training minimises: the clean image's error, and the error of its rendering in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from gdtool.cameras.camera import rig
+from gdtool.diffusion.config import DOMAINS, ModelConfig, TrainConfig
+from gdtool.diffusion.network.encoding import PLANES, SCALARS, decode
+
+SOFTNESS = 0.02  # of the absolute error: its gradient is continuous at 0
+LIT = ("normal", "albedo", "roughness", "metallic")  # what the closed form is made of
+
+
+def linear(srgb: torch.Tensor) -> torch.Tensor:
+    """sRGB decoding, differentiable (IEC 61966-2-1)."""
+    high = ((srgb.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4
+    return torch.where(srgb <= 0.04045, srgb / 12.92, high)
+
+
+def image_error(predicted: torch.Tensor, clean: torch.Tensor, objects: int, domains: tuple[int, ...], config: ModelConfig,
+                train: TrainConfig) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean error of latents (b d k, c, h, w) per object and domain, (b, d): as the training counts it, and plainly squared.
+
+    train.domain_weights are of each domain's values; the coverage in a scalar domain's third channel weighs 1. In
+    train.absolute_domains the values count by their distance, of a normal in all three axes, rounded off below SOFTNESS
+    (Charbonnier's loss), all else by its square. The VAE's latents have no channel of coverage and are weighted as a whole.
+    """
+    square = (predicted - clean).float().square()
+    if config.codec != "patch":
+        square = square.mean((1, 2, 3)).unflatten(0, (objects, len(domains), -1)).mean(2)
+        return square * square.new_tensor([train.domain_weights[i] for i in domains]), square
+    square = square.unflatten(1, (3, -1)).unflatten(0, (objects, len(domains), -1))  # (b, d, k, 3, patch², h, w)
+    counted = []
+    for j, i in enumerate(domains):
+        value, coverage = square[:, j].split((2, 1) if DOMAINS[i] in SCALARS else (3, 0), dim=2)
+        if DOMAINS[i] in train.absolute_domains:
+            value = ((value.mean(2, keepdim=True) + SOFTNESS**2).sqrt() - SOFTNESS).expand_as(value)
+        counted.append(torch.cat([train.domain_weights[i] * value, coverage], 2).flatten(1).mean(1))
+    return torch.stack(counted, 1), square.flatten(2).mean(2)
+
+
+def view_directions(config: ModelConfig) -> torch.Tensor:
+    """(k, 3) from the object toward each camera of the rig."""
+    by_name = {camera.name: camera.backward for camera in rig("six", config.image_size)}
+    return torch.tensor(np.stack([by_name[name] for name in config.views]), dtype=torch.float32)
+
+
+def rendering_error(predicted: torch.Tensor, truth: torch.Tensor, order: dict[int, int], planes: torch.Tensor, lights: torch.Tensor, views: torch.Tensor,
+                    pixels: int, background: float, generator: torch.Generator) -> torch.Tensor:
+    """Mean squared difference of the closed-form renderings of predicted and true maps under the object's light.
+
+    predicted, truth (d, k, 3, h, w) encoded images of one object; order: index into DOMAINS to position along d; planes (k, 13, h, w); lights (16, 7);
+    views (k, 3). Radiance c is compared as c / (1 + c), or the few highlights would be all that counts. At random
+    foreground pixels, float32 throughout. 0 for an object that is not seen.
+    """
+    from gdtool.shading.bsdf.closed_form import shade
+    from gdtool.shading.bsdf.sg import SphericalGaussians
+
+    mask = 0.5 + 0.5 * planes[:, PLANES["mask"].start]
+    inside = torch.nonzero(mask > 0.9)
+    if len(inside) == 0:
+        return predicted.sum() * 0
+    chosen = inside[torch.randint(len(inside), (pixels,), generator=generator)]
+    k, row, column = chosen.unbind(1)
+    light = SphericalGaussians(lights[:, :3], lights[:, 3], lights[:, 4:])
+
+    def render(images: torch.Tensor) -> torch.Tensor:
+        picked = images[:, k, :, row, column].transpose(0, 1)  # (d, pixels, 3)
+        values = decode({d: picked[order[DOMAINS.index(d)]][..., None, None] for d in LIT}, mask[k, row, column][:, None, None], background)
+        flat = {d: x.flatten(1) for d, x in values.items()}
+        radiance = shade(flat["normal"], views[k], linear(flat["albedo"]), flat["roughness"][:, 0], flat["metallic"][:, 0], light)
+        return radiance / (1 + radiance)
+
+    with torch.no_grad():
+        target = render(truth.float())
+    return ((render(predicted.float()) - target) ** 2).mean()

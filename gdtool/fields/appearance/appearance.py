@@ -1,0 +1,80 @@
+"""Materials, confidence and light of a reconstructed surface, from whatever the views hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gdtool.fields.appearance.materials import confidence, fuse, observe, spread
+
+MATERIALS = ("albedo", "roughness", "metallic")
+
+
+@dataclass
+class Appearance:
+    """albedo (v, 3), roughness, metallic, confidence (v,); views (v,) uint8 and residual (v,) as of a Surface; light: record
+    of light.json or None; figures; what was skipped."""
+
+    albedo: np.ndarray
+    roughness: np.ndarray
+    metallic: np.ndarray
+    confidence: np.ndarray
+    views: np.ndarray
+    residual: np.ndarray
+    light: dict | None = None
+    figures: dict[str, float | str] = field(default_factory=dict)
+    skipped: list[tuple[str, str]] = field(default_factory=list)
+
+
+def appearance(cameras, mask: np.ndarray, images: dict[str, np.ndarray], vertices: np.ndarray, faces: np.ndarray,
+               normals: np.ndarray, step: float, light: dict | None, seed: int,
+               shadows: bool = True) -> Appearance:
+    """Fuse the material views; recover the light from color; take from color what no material view gives.
+
+    shadows: whether color is explained with what the surface hides from the light, or as if nothing were hidden.
+    """
+    from gdtool.fields.appearance.light import color_samples, materials_from_color, recover_light, unoccluded, visibility
+
+    rng = np.random.default_rng(seed)
+    seen = observe(cameras, mask, vertices, faces, normals, 0.5 * step)
+    weight = seen.weight.sum(0)
+    out = Appearance(np.full((len(vertices), 3), 0.5, np.float32), np.full(len(vertices), 0.5, np.float32),
+                     np.zeros(len(vertices), np.float32), (1 - np.exp(-4 * weight)).astype(np.float32),
+                     (seen.weight > 0).sum(0).astype(np.uint8), np.zeros(len(vertices), np.float32))
+    fused = {}
+    for name in (*MATERIALS, "color"):
+        if name in images and (name != "color" or "albedo" not in images):
+            stack = images[name]
+            value, weight, residual = fuse(stack if stack.ndim == 4 else stack[..., None], mask, seen)
+            fused[name] = np.clip(spread(value, weight, faces), 0, 1)
+            if name in ("albedo", "color"):
+                out.confidence, out.residual = confidence(weight, residual), residual.astype(np.float32)
+                out.figures[f"{name}_residual"] = float(np.average(residual, weights=weight + 1e-9))
+    for name in MATERIALS:
+        if name in fused:
+            setattr(out, name, fused[name] if name == "albedo" else fused[name][:, 0])
+    if "color" not in images:
+        out.skipped.append(("light", "there is no color to recover it from"))
+        return out
+    samples = color_samples(cameras, images["color"], mask, seen, vertices, rng)
+    if len(samples[0]) < 64:
+        out.skipped.append(("light", "too few pixels of color are seen and not clipped"))
+        out.albedo = fused.get("color", out.albedo)
+        return out
+    reaches = visibility(vertices, faces, normals, 0.5 * step, rng) if shadows else unoccluded(normals)
+    if "albedo" in fused:
+        vertex, view, color = samples
+        out.light, residual = recover_light(normals[vertex], view, color, out.albedo[vertex], out.roughness[vertex],
+                                            out.metallic[vertex], reaches.at(vertex), light)
+    else:
+        albedo, roughness, metallic, out.light, residual = materials_from_color(normals, fused["color"], weight, reaches,
+                                                                                samples, light)
+        out.albedo = spread(albedo, weight, faces)
+        # A roughness or metallic view, where there is one, says more than the single number found.
+        out.roughness = out.roughness if "roughness" in fused else np.full(len(vertices), roughness, np.float32)
+        out.metallic = out.metallic if "metallic" in fused else np.full(len(vertices), metallic, np.float32)
+        # Solved, not seen: later stages should prefer anything better.
+        out.confidence = 0.5 * out.confidence
+    out.figures["light_residual"] = residual
+    return out

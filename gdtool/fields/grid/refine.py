@@ -1,0 +1,232 @@
+"""The grid method's second half: move the extracted mesh onto what the views measured, and smooth what none sees."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.fields.appearance.materials import neighbour_matrix
+from gdtool.fields.views.prepared_view import WEAK, Sight, hull_distance, tangent_distance
+from gdtool.geometry.grids import components, keep_faces, signed_volume
+from gdtool.geometry.normals import face_normals, vertex_normals
+from gdtool.geometry.topology import edges_of
+
+WAVELENGTH = 36.0  # steps: shorter bumps go where the normals show none
+FOLD_DEGREES = 150.0  # a fold's least angle between the normals of its sides
+_SEEN_FACES = 24  # faces that views measured, enough for a piece to be real
+_HOLLOW_FACES = 12  # and for a hollow, of which they see little through a mouth that the grid closes
+
+
+def measured_planes(sights: list[Sight], vertices: np.ndarray, normals: np.ndarray, reach: float):
+    """Quadratic data term of each vertex: matrix (v, 3, 3) and vector (v, 3) of sum w (n·u + s)^2, and sum w (v,).
+
+    Planes farther than reach (world units) or turned away from the vertex's normal are another surface.
+    """
+    matrix = np.zeros((len(vertices), 3, 3), np.float32)
+    vector = np.zeros((len(vertices), 3), np.float32)
+    total = np.zeros(len(vertices), np.float32)
+    for sight in sights:
+        if sight.planes is None:
+            continue
+        distance, weight, normal, _ = tangent_distance(sight, vertices)
+        same = (np.abs(distance) < reach) & (weight > WEAK) & ((normal * normals).sum(1) > 0.5)
+        weight = np.where(same, weight, 0.0).astype(np.float32)
+        distance = np.where(same, distance, 0.0).astype(np.float32)
+        matrix += (weight[:, None] * normal)[:, :, None] * normal[:, None, :]
+        vector -= (weight * distance)[:, None] * normal
+        total += weight
+    return matrix, vector, total
+
+
+def refine(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: float, *, reach: float, rounds: int = 2,
+           smoothness: float = 0.2, iterations: int = 40) -> np.ndarray:
+    """New positions (v, 3): least squares of distances to the measured planes and of the umbrella Laplacian.
+
+    Seen vertices follow the planes; unseen ones minimise bending, held where the carving put them and inside
+    the silhouettes.
+    """
+    from scipy.sparse import diags
+
+    umbrella, start = _umbrella(faces, len(vertices)), vertices
+    for _ in range(rounds):
+        matrix, vector, total = measured_planes(sights, vertices, vertex_normals(vertices, faces), reach)
+        unseen = np.exp(-10.0 * total)
+        bending = diags((smoothness + unseen).astype(np.float32))
+        energy = (umbrella.T @ bending @ umbrella).tocsr().astype(np.float32)
+        hold = (0.003 + 0.2 * unseen)[:, None].astype(np.float32)
+
+        def apply(u, matrix=matrix, energy=energy, hold=hold):
+            return np.einsum("vij,vj->vi", matrix, u) + energy @ u + hold * u
+
+        right = vector - energy @ vertices.astype(np.float32) + hold * (start - vertices).astype(np.float32)
+        diagonal = np.einsum("vii->vi", matrix) + energy.diagonal()[:, None] + hold
+        move = conjugate_gradients(apply, right, diagonal, iterations)
+        length = np.linalg.norm(move, axis=1, keepdims=True)
+        vertices = vertices + move * np.minimum(1.0, step / np.maximum(length, 1e-12))
+    return _unfold(_inside_silhouettes(vertices, start, sights, 0.25 * step), start, faces)
+
+
+def follow_normals(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: float, *, reach: float, rounds: int = 3,
+                   bending: float = 1.0, iterations: int = 300) -> np.ndarray:
+    """New positions (v, 3) of a surface fused from views that disagree: where it lies it says itself, what form it has their normals.
+
+    Depths that differ a little from view to view leave bumps, which are low and steep; the normals show none. Every
+    vertex moves along its own normal, so that edges come to lie across the normals shown there, and is held where it was
+    (Nehab et al., "Efficiently Combining Positions and Normals for Precise 3D Geometry", 2005): bumps shorter than about
+    WAVELENGTH go. What no view shows moves along with what is around it. reach: how far off a view's surface may be
+    (world units).
+    """
+    from scipy.sparse import csr_array, diags_array
+
+    start, ends = vertices, edges_of(faces).ends
+    a, b = ends.T
+    hold = 2 * (2 * np.pi / WAVELENGTH) ** 2
+    umbrella = _umbrella(faces, len(vertices))
+
+    def differences(at_a: np.ndarray, at_b: np.ndarray) -> csr_array:
+        """Matrix (e, v) of at_a (e,) times the value at an edge's one end less at_b (e,) times that at the other."""
+        return csr_array((np.stack([at_a, -at_b], 1).ravel(), ends.ravel(), np.arange(0, 2 * len(ends) + 1, 2)), (len(ends), len(vertices)))
+
+    for _ in range(rounds):
+        own = vertex_normals(vertices, faces)
+        shown, trust = shown_normals(sights, vertices, own, reach)
+        across = shown[a] + shown[b]
+        across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
+        along = vertices[a] - vertices[b]
+        stiff = 1 / np.maximum(np.linalg.norm(along, axis=1) / step, 0.1)
+        known = stiff * np.minimum(trust[a], trust[b])
+        slant = differences(np.einsum("ei,ei->e", across, own[a]), np.einsum("ei,ei->e", across, own[b]))
+        level = differences(np.ones(len(ends)), np.ones(len(ends)))
+        matrix = slant.T @ diags_array(known) @ slant + level.T @ diags_array(stiff - known) @ level + bending * umbrella.T @ umbrella
+        right = (-slant.T @ (known * np.einsum("ei,ei->e", across, along))
+                 - bending * umbrella.T @ np.einsum("vi,vi->v", own, umbrella @ vertices)
+                 - hold * np.einsum("vi,vi->v", own, vertices - start))
+        move = conjugate_gradients(lambda u, matrix=matrix: matrix @ u + hold * u, right[:, None], (matrix.diagonal() + hold)[:, None], iterations)
+        vertices = vertices + np.clip(move, -step, step) * own
+    return _unfold(_inside_silhouettes(vertices, start, sights, 0.25 * step), start, faces)
+
+
+def shown_normals(sights: list[Sight], vertices: np.ndarray, normals: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normal (v, 3) that the views show at the vertices of a surface, and the trust in it (v,) in 0..1, 0 where none does.
+
+    normals (v, 3): the surface's own; what a view shows farther than reach (world units) away, or turned away from them,
+    is another surface.
+    """
+    total = np.zeros((len(vertices), 3))
+    for sight in sights:
+        if sight.planes is None:
+            continue
+        distance, weight, normal, _ = tangent_distance(sight, vertices)
+        same = (np.abs(distance) < reach) & (weight > WEAK) & ((normal * normals).sum(1) > 0.3)
+        total += np.where(same, weight, 0.0)[:, None] * normal
+    length = np.linalg.norm(total, axis=1)
+    return total / np.maximum(length, 1e-12)[:, None], np.clip(length / 0.1, 0, 1)
+
+
+def bumpiness(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], reach: float) -> float:
+    """Median degrees between the normals of a surface and those that the views show there; 0 where they show none."""
+    own = vertex_normals(vertices, faces)
+    shown, trust = shown_normals(sights, vertices, own, reach)
+    cosine = np.einsum("vi,vi->v", shown, own)[trust > 0.5]
+    return float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1)))) if len(cosine) else 0.0
+
+
+def _umbrella(faces: np.ndarray, count: int):
+    """Sparse (count, count): a vertex less the mean of its neighbours."""
+    from scipy.sparse import diags, identity
+
+    graph = neighbour_matrix(faces, count)
+    degree = np.asarray(graph.sum(1)).ravel()
+    return (identity(count, format="csr", dtype=np.float32) - diags(1 / np.maximum(degree, 1)) @ graph).tocsr()
+
+
+def conjugate_gradients(apply, right: np.ndarray, diagonal: np.ndarray, iterations: int) -> np.ndarray:
+    """Jacobi-preconditioned conjugate gradients from zero, for a symmetric positive operator on (v, 3) arrays."""
+    x = np.zeros_like(right)
+    r = right.copy()
+    z = r / diagonal
+    p, rz = z, float((r * z).sum())
+    first = rz
+    for _ in range(iterations):
+        if rz <= 1e-8 * first:
+            break
+        q = apply(p)
+        step = rz / float((p * q).sum())
+        x += step * p
+        r -= step * q
+        z = r / diagonal
+        rz, before = float((r * z).sum()), rz
+        p = z + rz / before * p
+    return x
+
+
+def _inside_silhouettes(vertices: np.ndarray, start: np.ndarray, sights: list[Sight], slack: float) -> np.ndarray:
+    """Vertices that left a silhouette by more than slack, and farther than they began, go back along their way until they have not."""
+    share = np.ones(len(vertices))
+    for sight in sights:
+        before, after = hull_distance(sight, start), hull_distance(sight, vertices)
+        limit = np.maximum(before, 0) + slack
+        left = np.flatnonzero(after > limit)
+        # Of one that began beyond the border of a picture that cuts the object no way is known: all of it.
+        known = np.isfinite(before[left])
+        begun = np.where(known, before[left], 0.0)
+        share[left] = np.minimum(share[left], known * (limit[left] - begun) / (after[left] - begun))
+    return start + share[:, None] * (vertices - start)
+
+
+def _unfold(vertices: np.ndarray, start: np.ndarray, faces: np.ndarray, rounds: int = 8) -> np.ndarray:
+    """Vertices of faces that turned over on the way from start, or folded onto a neighbour, go back half of their way, and
+    those around them less of theirs, until none has."""
+    before, _ = face_normals(start, faces)
+    beside = edges_of(faces).face_pairs()[1]
+    folded_before = _folded(before, beside)
+    share = np.ones(len(vertices))
+    moved = vertices
+    for _ in range(rounds):
+        after, _ = face_normals(vertices, faces)
+        turned = (before * after).sum(1) < 0
+        turned[beside[_folded(after, beside) & ~folded_before]] = True
+        if not turned.any():
+            break
+        less = np.ones(len(vertices))
+        for factor in (0.5, 0.7, 0.85):  # ring by ring
+            around = faces[turned].ravel()
+            less[around] = np.minimum(less[around], factor)
+            turned = (less[faces] < 1).any(1)
+        share *= less
+        vertices = start + share[:, None] * (moved - start)
+    return vertices
+
+
+def _folded(normals: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """Which of the pairs of neighbouring faces (k, 2) lie back to back."""
+    return np.einsum("ij,ij->i", normals[beside[:, 0]], normals[beside[:, 1]]) < np.cos(np.radians(FOLD_DEGREES))
+
+
+def drop_debris(vertices: np.ndarray, faces: np.ndarray, support: np.ndarray, step: float, hollows: bool = False) -> tuple[np.ndarray, np.ndarray, int]:
+    """The mesh without inner bubbles and without pieces that are tiny or that no view supports (v,): and how many went.
+
+    The largest piece always stays. hollows: an inner wall that views saw stays too (of views that agree: others see through walls).
+    """
+    labels, volume = _pieces(vertices, faces)
+    held = np.bincount(labels, support[faces].mean(1) > 0.02)
+    # Of a plate seen edge-on only the rim has support: a few faces say that it is there.
+    seen = np.where(volume > 0, (held > 0.2 * np.bincount(labels)) | (held >= _SEEN_FACES), hollows & (held >= _HOLLOW_FACES))
+    keep = (np.abs(volume) > (2 * step) ** 3) & seen
+    keep[np.argmax(volume)] = True
+    vertices, faces, _ = keep_faces(vertices, faces, keep[labels])
+    return vertices, faces, int((~keep).sum())
+
+
+def keep_pieces(vertices: np.ndarray, faces: np.ndarray, step: float, share: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
+    """The pieces that hold more than share of the largest one's volume, and no bubbles."""
+    labels, volume = _pieces(vertices, faces)
+    vertices, faces, _ = keep_faces(vertices, faces, (volume > max(share * volume.max(), (2 * step) ** 3))[labels])
+    return vertices, faces
+
+
+def _pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Label (f,) of the piece of each face, and each piece's signed volume."""
+    labels = components(faces, len(vertices))
+    order = np.argsort(labels, kind="stable")
+    bounds = np.searchsorted(labels[order], np.arange(int(labels.max()) + 2))
+    return labels, np.array([signed_volume(vertices, faces[order[a:b]]) for a, b in zip(bounds[:-1], bounds[1:], strict=True)])

@@ -1,0 +1,101 @@
+"""What the picture shows and the fused views lost: wings, chimneys, twigs that the other views look through.
+
+Of views that a model made of one picture, that picture's outline alone is no guess. Each of its pixels has something behind it: where
+the views together leave nothing there, it is put between the depths that the picture's own view and the one that faces it have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gdtool.cameras import project
+from gdtool.fields.views.prepared_view import Sight, bilinear, pixel_footprint
+from gdtool.geometry.grids import Grid, dilate
+
+LEAST = 8  # pixels that hang together; fewer are the outline's own error
+ACROSS, AWAY = 2, 2.5  # pixels, both ways and from what is there: what is narrower and nearer lies along an edge
+BESIDE = 2  # pixels of what is there anyhow that a part takes along, so that it is joined
+FLATTEST, THINNEST = 0.6, 1.0  # steps: half of what a part measures at least across the picture, and along the view
+ROUND, WIDEST = 0.7, 3.0  # of its half width, up to so many pixels, it is thick at least
+NEAR = 0.25  # steps outside the surface at which a sample still stands for it: half a cell is lost between samples
+SMOOTH = 1.0  # pixels: of the depths
+_CHUNK = 1 << 16
+
+
+def opposite(sights: Sequence[Sight], known: Sight) -> Sight | None:
+    """The view that faces a view, both orthographic and of one size, so that one shows the other's outline mirrored; None where there is none."""
+    facing = known.camera.world_from_camera[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
+    for sight in sights:
+        if known.camera.projection == sight.camera.projection == "orthographic" and known.mask.shape == sight.mask.shape \
+                and known.camera.pixel_size == sight.camera.pixel_size and np.allclose(sight.camera.world_from_camera[:3, :3], facing, atol=1e-6):
+            return sight
+    return None
+
+
+def lost_pixels(values: np.ndarray, grid: Grid, sight: Sight) -> np.ndarray:
+    """Pixels (h, w) bool of a view's mask behind which the grid of signed distances has no inside; without specks and edges."""
+    from scipy.ndimage import binary_opening, distance_transform_edt, label
+
+    h, w = sight.mask.shape
+    inside = np.argwhere(values < NEAR * grid.step)
+    pixels = np.floor(project(sight.camera, grid.points(inside))[0]).astype(np.int64)
+    pixels = pixels[((pixels >= 0) & (pixels < (w, h))).all(1)]
+    lost = sight.mask > 0.5
+    lost[pixels[:, 1], pixels[:, 0]] = False
+    regions, count = label(lost, np.ones((3, 3)))
+    away = distance_transform_edt(lost | (sight.mask <= 0.5)) > AWAY
+    telling = lost & (away | binary_opening(lost, np.ones((ACROSS, ACROSS))))
+    kept = np.bincount(regions.ravel(), telling.ravel(), count + 1) >= LEAST
+    kept[0] = False
+    return kept[regions]
+
+
+def restore_shown(values: np.ndarray, grid: Grid, sights: Sequence[Sight], known: Sight) -> tuple[np.ndarray, float]:
+    """Signed distances (a, b, c) float32 with an inside behind all that the known view shows, and the share of its mask that had none.
+
+    values: negative inside, the distances from which the surface will be taken. Without a view from the other side a part is as thick as it
+    is wide, up to WIDEST pixels.
+    """
+    from scipy.ndimage import distance_transform_edt, maximum_filter
+
+    lost = lost_pixels(values, grid, known) if known.points is not None else np.zeros(known.mask.shape, bool)
+    if not lost.any():
+        return values, 0.0
+    camera, mask = known.camera, known.mask > 0.5
+    zone = dilate(lost, BESIDE) & mask
+    first = _depth(known, zone)
+    other = opposite(sights, known)
+    foot = pixel_footprint(camera, np.where(first > 0, first, 1.0))
+    wide = np.minimum(distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1], WIDEST) * foot
+    last = first + 2 * wide
+    if other is not None and other.points is not None:
+        between = float((other.camera.position - camera.position) @ -camera.backward)
+        behind = _depth(other, zone[:, ::-1])[:, ::-1]
+        last = np.where(behind > 0, between - behind, last)
+    middle, half = (first + last) / 2, np.maximum((last - first) / 2, np.maximum(ROUND * wide, THINNEST * grid.step))
+    edge = np.maximum(np.where(zone, 0.5 - distance_transform_edt(zone), distance_transform_edt(~zone) - 0.5), known.silhouette) * foot
+    edge -= np.maximum(FLATTEST * grid.step - maximum_filter(-edge, 3), 0.0)
+    # Beyond the zone the nearest values within it.
+    nearest = tuple(distance_transform_edt(~(zone & (first > 0)), return_distances=False, return_indices=True))
+    slab = np.stack([middle[nearest], half[nearest], edge], -1).astype(np.float32)
+    out = values.copy()
+    flat = out.reshape(-1)
+    for start in range(0, flat.size, _CHUNK):
+        index = np.stack(np.unravel_index(np.arange(start, min(start + _CHUNK, flat.size)), grid.shape), -1)
+        pixels, depth = project(camera, grid.points(index))
+        at = bilinear(slab, pixels)
+        distance = np.maximum(np.abs(depth - at[:, 0]) - at[:, 1], at[:, 2])
+        flat[start:start + _CHUNK] = np.minimum(flat[start:start + _CHUNK], distance)
+    return out, float(lost.sum() / mask.sum())
+
+
+def _depth(sight: Sight, zone: np.ndarray) -> np.ndarray:
+    """Depth (h, w) along the axis of a view, aligned and smoothed, within the zone; 0 where it has none."""
+    from scipy.ndimage import gaussian_filter
+
+    has = zone & (sight.weight > 0)
+    depth = (sight.points - sight.camera.position) @ -sight.camera.backward
+    total = gaussian_filter(has.astype(np.float64), SMOOTH)
+    return np.where(zone & (total > 1e-3), gaussian_filter(np.where(has, depth, 0.0), SMOOTH) / np.maximum(total, 1e-3), 0.0)

@@ -1,0 +1,346 @@
+"""Make disagreeing views agree: how far apart their surfaces lie, and a smooth depth correction for each view.
+
+Generated views are each plausible but do not fit one another: one is a little deeper, another bent. What they share is
+enough to find, for every view, the smooth change of depth that brings its surface onto the others'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import chain, combinations
+
+import numpy as np
+
+from gdtool.cameras import Camera, project, rays
+from gdtool.fields.views.photometric import Picture, color_rows
+from gdtool.fields.views.prepared_view import Sight, hull_distance, pixel_footprint, tangent_distance
+
+CONTROL = 15  # control points along a side of a view's correction
+LARGEST = 0.06  # world units: no correction is larger
+PRIOR_SIZE = 0.01  # world units: how large a correction is expected to be
+PRIOR = 0.005  # what that expectation counts beside the matches
+SLOPE_LENGTH = 0.2  # world units over which normals go wrong by as much as depth does
+SLOPES, RIMS, EXTENTS = 0.4, 0.01, 0.3  # what the other evidence counts; rims lie beside curved outlines, so they only settle silhouettes
+COLORS = 0.002  # world units: a color as wrong as usual counts like a plane so far off
+WALL = 1.5  # pixels: what lies between surfaces that two views see from opposite sides is at least so thick
+RIM_COSINE = 0.15  # normals this square to an axis belong to the outline
+
+
+def disagreement(sights: list[Sight], reach: float = 0.06, stride: int = 3, share: float = 0.5) -> float:
+    """Median distance (world units) between one view's points and another's surface where both see the same part.
+
+    share: of the points that lie nearer than what is returned, for another quantile. 0 when no two views have depth in
+    common.
+    """
+    gaps = [np.abs(m.distance) for m in _matches(sights, reach, stride)]
+    gaps = np.concatenate(gaps) if gaps else np.zeros(0)
+    return float(np.quantile(gaps, share)) if len(gaps) else 0.0
+
+
+def _sparse(sight: Sight, stride: int) -> np.ndarray:
+    """(h, w) bool: every stride-th pixel along both axes that has a surface worth comparing."""
+    chosen = np.zeros(sight.mask.shape, bool)
+    chosen[::stride, ::stride] = True
+    return chosen & (sight.weight > 0.1) & ~sight.broken
+
+
+def agreement(sights: list[Sight], reach: float = 0.04, stride: int = 3) -> float:
+    """Share of the points that should be seen by another view, facing it, that it has within reach (world units).
+
+    True views give 0.6 and more (the rest is occluded there), views of different things nearly 0. 1 when no view faces
+    what another shows.
+    """
+    confirmed = asked = 0
+    for i, first in enumerate(sights):
+        if first.planes is None:
+            continue
+        chosen = _sparse(first, stride)
+        points, normals = first.points[chosen].astype(np.float64), first.planes[chosen][:, :3]
+        for j, second in enumerate(sights):
+            facing = normals @ second.camera.backward > 0.5
+            if i == j or second.planes is None or not facing.any():
+                continue
+            distance, weight, _, _ = tangent_distance(second, points[facing])
+            confirmed += int(((weight > 0.1) & (np.abs(distance) < reach)).sum())
+            asked += int(facing.sum())
+    return confirmed / asked if asked else 1.0
+
+
+def normals_fit_depth(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray, normal: np.ndarray) -> float:
+    """Share of the pixels whose normal lies within 60 degrees of what the slope of the depth says; 1 when none can be judged.
+
+    mask (k, h, w), depth (k, h, w), normal (k, h, w, 3). True views give 0.9 and more, however rough a normal map.
+    """
+    good = judged = 0
+    for camera, covered, distance, given in zip(cameras, mask, depth, normal, strict=True):
+        origins, directions = rays(camera)
+        points = origins + directions * (distance / np.maximum(-(directions @ camera.backward), 1e-9))[..., None]
+        across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
+        slope = np.cross(down, across)  # toward the camera: rows run down
+        slope /= np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-30)
+        whole = covered > 0.99
+        inside = whole[1:-1, 1:-1] & whole[1:-1, 2:] & whole[1:-1, :-2] & whole[2:, 1:-1] & whole[:-2, 1:-1]
+        inside &= slope @ camera.backward > 0.3  # not across an edge of the depth
+        good += int(((slope * given[1:-1, 1:-1]).sum(-1)[inside] > 0.5).sum())
+        judged += int(inside.sum())
+    return good / judged if judged else 1.0
+
+
+class _Match:
+    """Points of view i measured against view j: rows of the linear system."""
+
+    def __init__(self, i, j, points, distance, weight, normal, here, there):
+        self.i, self.j, self.points, self.distance, self.weight = i, j, points, distance, weight
+        self.normal, self.here, self.there = normal, here, there
+
+
+def _matches(sights: list[Sight], reach: float, stride: int, walls: float = 0.0):
+    """Pairs of views that see the same surface: same direction of normal and within reach of each other's plane.
+
+    With walls, pairs that see the two sides of one wall and leave it thinner than so many pixels, or less than nothing; the
+    distance is then how much it lacks.
+    """
+    for i, first in enumerate(sights):
+        if first.planes is None:
+            continue
+        chosen = _sparse(first, stride)
+        points = first.points[chosen].astype(np.float64)
+        normals = first.planes[chosen][:, :3]
+        own = first.weight[chosen]
+        for j, second in enumerate(sights):
+            if i == j or second.planes is None:
+                continue
+            distance, weight, normal, _ = tangent_distance(second, points)
+            cosine = (normal * normals).sum(1)
+            wall = walls * pixel_footprint(second.camera, float(np.linalg.norm(second.camera.position)))
+            same = cosine > 0.8 if walls == 0 else (cosine < -0.8) & (distance > -wall)
+            same &= (np.abs(distance) < reach) & (weight > 0.1)
+            if same.any():
+                yield _Match(i, j, points[same], distance[same] + wall, np.minimum(weight, own)[same], normal[same],
+                             project(first.camera, points[same])[0], project(second.camera, points[same])[0])
+
+
+def _control_weights(pixels: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Bilinear weights (n, 4) and control indices (n, 4) of pixel positions (n, 2) in a view's control grid."""
+    h, w = shape
+    x = np.clip(pixels[:, 0] / w, 0, 1) * (CONTROL - 1)
+    y = np.clip(pixels[:, 1] / h, 0, 1) * (CONTROL - 1)
+    column = np.minimum(x.astype(int), CONTROL - 2)
+    row = np.minimum(y.astype(int), CONTROL - 2)
+    fx, fy = x - column, y - row
+    weights = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], 1)
+    corner = row * CONTROL + column
+    return weights, np.stack([corner, corner + 1, corner + CONTROL, corner + CONTROL + 1], 1)
+
+
+def _bending() -> np.ndarray:
+    """Second differences (r, CONTROL^2) of a control grid along both axes, over a tenth of its side squared."""
+    rows = []
+    for a in range(CONTROL):
+        for b in range(1, CONTROL - 1):
+            for place in ([(a, b - 1), (a, b), (a, b + 1)], [(b - 1, a), (b, a), (b + 1, a)]):
+                row = np.zeros((CONTROL, CONTROL))
+                for (r, c), value in zip(place, (1, -2, 1), strict=True):
+                    row[r, c] = value
+                rows.append(row.ravel())
+    return np.array(rows) * ((CONTROL - 1) / 10) ** 2
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """What to change so that the views meet: control (k, CONTROL^2), world units to add to the depth of each view, and
+    edge (k,), world units that each silhouette is too small all around."""
+
+    control: np.ndarray
+    edge: np.ndarray
+
+    @classmethod
+    def none(cls, count: int) -> Corrections:
+        """Nothing to change."""
+        return cls(np.zeros((count, CONTROL * CONTROL)), np.zeros(count))
+
+    def depth(self, k: int, shape: tuple[int, int]) -> np.ndarray:
+        """Image (h, w) to add to the depth of view k."""
+        h, w = shape
+        x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
+        weights, places = _control_weights(np.stack([x, y], -1).reshape(-1, 2), shape)
+        image = (self.control[k][places] * weights).sum(1).reshape(h, w)
+        return np.clip(image, -LARGEST, LARGEST)
+
+
+class _System:
+    """Rows of a linear least squares over the control values of all views and the offset of every silhouette."""
+
+    def __init__(self, count: int):
+        self.count, self.unknowns = count, count * (CONTROL * CONTROL + 1)
+        self.rows: list[tuple] = []
+
+    def add(self, coefficients: np.ndarray, places: np.ndarray, target: np.ndarray, weight: np.ndarray) -> None:
+        """coefficients (n, c) at unknowns places (n, c) shall sum to target (n,)."""
+        self.rows.append((coefficients, places, target, weight))
+
+    def of_view(self, k: int, control: np.ndarray) -> np.ndarray:
+        return control + k * CONTROL * CONTROL
+
+    def edge(self, k: int) -> int:
+        return self.count * CONTROL * CONTROL + k
+
+    def solve(self, prior: np.ndarray) -> Corrections:
+        from scipy.sparse import csr_matrix
+
+        # All rows in one sparse matrix: its square is made dense but once.
+        place = np.concatenate([places.ravel() for _, places, _, _ in self.rows])
+        value = np.concatenate([(coefficients * np.sqrt(weight)[:, None]).ravel() for coefficients, _, _, weight in self.rows])
+        width = np.concatenate([np.full(len(target), places.shape[1]) for _, places, target, _ in self.rows])
+        rows = csr_matrix((value, place, np.concatenate([[0], np.cumsum(width)])), (len(width), self.unknowns))
+        vector = rows.T @ np.concatenate([np.sqrt(weight) * target for _, _, target, weight in self.rows])
+        matrix = prior + (rows.T @ rows).toarray()
+        found = np.linalg.solve(matrix, vector)
+        size = self.count * CONTROL * CONTROL
+        return Corrections(found[:size].reshape(self.count, -1), found[size:])
+
+
+def corrections(sights: list[Sight], slopes: list[tuple], before: Corrections, reach: float, stiffness: float = 1.0,
+                stride: int = 3, pictures: Sequence[list[Picture]] = ()) -> Corrections:
+    """The whole correction of views that `before` has already been applied to, by one robust linear least squares.
+
+    A point of one view, moved along its ray, lies on another view's plane, moved along its own, and has the color that the
+    other shows there (pictures: of every view, once for each domain of colors); what two views see from opposite sides keeps
+    a thickness; the corrected depth rises as the normals say (slopes: see slope_rows, of the views as they were given);
+    what one view sees edge-on lies on its silhouette; two silhouettes reach equally far along the direction that both show
+    at full length. Priors keep corrections small and smooth. What all views of a point get wrong in common the planes
+    cannot tell, but all else can.
+    """
+    system, size = _System(len(sights)), CONTROL * CONTROL
+    total = 0.0
+    matches = list(_matches(sights, reach, stride))
+    for m in matches:
+        for of_view in pictures:
+            slope, difference, weight = color_rows(m.points, m.here, m.there, of_view[m.i], of_view[m.j], m.weight)
+            weights, places = _control_weights(m.here, sights[m.i].mask.shape)
+            done = (before.control[m.i][places] * weights).sum(1)
+            system.add(weights * slope[:, None], system.of_view(m.i, places), slope * done - difference, COLORS**2 * weight)
+    for m in chain(matches, _matches(sights, reach, stride, WALL)):
+        weight = m.weight / (1 + (m.distance / (0.5 * reach)) ** 2) ** 2
+        total += weight.sum()
+        w_here, c_here = _control_weights(m.here, sights[m.i].mask.shape)
+        w_there, c_there = _control_weights(m.there, sights[m.j].mask.shape)
+        # More depth moves a point along the viewing direction, that is against `backward`.
+        slope_here = -(m.normal @ sights[m.i].camera.backward)[:, None]
+        slope_there = (m.normal @ sights[m.j].camera.backward)[:, None]
+        coefficients = np.concatenate([w_here * slope_here, w_there * slope_there], 1)
+        places = np.concatenate([system.of_view(m.i, c_here), system.of_view(m.j, c_there)], 1)
+        done = (before.control[m.i][c_here] * w_here).sum(1) * slope_here[:, 0] + (before.control[m.j][c_there] * w_there).sum(1) * slope_there[:, 0]
+        system.add(coefficients, places, done - m.distance, weight)
+    if total == 0:
+        return before
+    per_view = total / len(sights)
+    unit = PRIOR * per_view / size  # a control's prior: what a match of one view's average control counts, times PRIOR
+    for k, (coefficients, places, target, weight) in enumerate(slopes):
+        share = SLOPES * PRIOR * SLOPE_LENGTH**2 * per_view / max(weight.sum(), 1e-12)
+        system.add(coefficients, system.of_view(k, places), target, share * weight)
+    _add_rims(system, sights, before, reach, per_view)
+    _add_extents(system, sights, before, per_view)
+    prior = np.zeros((system.unknowns, system.unknowns))
+    bending = _bending()
+    one = stiffness * PRIOR * bending.T @ bending * per_view / size + unit * np.eye(size)
+    for k, sight in enumerate(sights):
+        prior[k * size:(k + 1) * size, k * size:(k + 1) * size] = one
+        foot = float(np.median(pixel_footprint(sight.camera, np.linalg.norm(sight.camera.position))))
+        prior[system.edge(k), system.edge(k)] = PRIOR * per_view * (PRIOR_SIZE / foot) ** 2
+    return system.solve(prior)
+
+
+def slope_rows(sight: Sight, stride: int = 2, apart: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What the normals say of a view's depth correction: coefficients (n, 8) and control indices (n, 8) of its slope, the
+    slope that fits (n,) and weights (n,). Across `apart` pixels, where the surface is smooth."""
+    h, w = sight.mask.shape
+    good = (sight.weight > 0.1) & ~sight.rough & ~sight.broken
+    normal, parts = sight.planes[..., :3], []
+    for axis in (0, 1):
+        ahead = [slice(None, -apart) if a == axis else slice(None) for a in (0, 1)]
+        behind = [slice(apart, None) if a == axis else slice(None) for a in (0, 1)]
+        middle = [slice(apart // 2, -(apart // 2)) if a == axis else slice(None) for a in (0, 1)]
+        first, second, between = tuple(ahead), tuple(behind), tuple(middle)
+        chosen = good[first] & good[second] & good[between]
+        chosen[np.arange(chosen.shape[0]) % stride > 0] = False
+        chosen[:, np.arange(chosen.shape[1]) % stride > 0] = False
+        step = (sight.points[second] - sight.points[first])[chosen].astype(np.float64)
+        n = normal[between][chosen].astype(np.float64)
+        facing = n @ sight.camera.backward
+        across = np.linalg.norm(step - np.outer(step @ sight.camera.backward, sight.camera.backward), axis=1)
+        slope = (n * step).sum(1) / np.maximum(facing * across, 1e-9)
+        keep = (np.abs(slope) < 0.5) & (facing > 0.3)
+        row, column = (x[keep] for x in np.nonzero(chosen))
+        place = np.stack([column, row], 1) + 0.5
+        there = place + apart * np.eye(2)[1 - axis]
+        w_a, c_a = _control_weights(place, (h, w))
+        w_b, c_b = _control_weights(there, (h, w))
+        scale = 1 / across[keep][:, None]
+        # Height over the plane must vanish: moved apart by more depth, the far end sinks.
+        parts.append((np.concatenate([-w_a * scale, w_b * scale], 1), np.concatenate([c_a, c_b], 1), slope[keep], facing[keep] ** 2))
+    return tuple(np.concatenate(x) for x in zip(*parts, strict=True))
+
+
+def _add_rims(system: _System, sights: list[Sight], before: Corrections, reach: float, per_view: float) -> None:
+    """Points whose normal is square to another view's axis and that lie at its silhouette's edge: they lie on it."""
+    for i, first in enumerate(sights):
+        if first.planes is None:
+            continue
+        chosen = _sparse(first, 1) & ~first.rough
+        points, normals = first.points[chosen].astype(np.float64), first.planes[chosen][:, :3].astype(np.float64)
+        for j, second in enumerate(sights):
+            if i == j:
+                continue
+            square = np.abs(normals @ second.camera.backward) < RIM_COSINE
+            p, n = points[square], normals[square]
+            if len(p) == 0:
+                continue
+            distance = hull_distance(second, p)
+            with np.errstate(invalid="ignore"):  # -inf on both sides of a picture's border that cuts the object
+                outward = (hull_distance(second, p + 0.01 * n) - distance) / 0.01
+            near = (np.abs(distance) < reach) & (outward > 0.9) & np.isfinite(distance)
+            if not near.any():
+                continue
+            p, n, distance = p[near], n[near], distance[near]
+            weights, control = _control_weights(project(first.camera, p)[0], first.mask.shape)
+            slope = -(n @ first.camera.backward)
+            coefficients = np.concatenate([weights * slope[:, None], np.full((len(p), 1), -1.0)], 1)
+            places = np.concatenate([system.of_view(i, control), np.full((len(p), 1), system.edge(j))], 1)
+            done = (before.control[i][control] * weights).sum(1) * slope - before.edge[j]
+            weight = 1 / (1 + (distance / (0.5 * reach)) ** 2) ** 2
+            system.add(coefficients, places, done - distance, weight * RIMS * per_view / max(len(p), 100))
+
+
+def _add_extents(system: _System, sights: list[Sight], before: Corrections, per_view: float) -> None:
+    """Along the direction square to both axes two orthographic silhouettes reach equally far."""
+    outlines = [_outline(s) for s in sights]
+    for i, j in combinations(range(len(sights)), 2):
+        if outlines[i] is None or outlines[j] is None:
+            continue
+        along = np.cross(sights[i].camera.backward, sights[j].camera.backward)
+        length = np.linalg.norm(along)
+        if length < 0.1:  # nearly opposite: their silhouettes are one, mirrored; the others tie them
+            continue
+        foot = sights[i].camera.pixel_size
+        for sign in (1, -1):
+            gap = float((outlines[i] @ along).max() - (outlines[j] @ along).max()) / length if sign > 0 else \
+                -float((outlines[i] @ along).min() - (outlines[j] @ along).min()) / length
+            if abs(gap) < 8 * foot:  # more is no matter of the edge
+                coefficients, places = np.array([[1.0, -1.0]]), np.array([[system.edge(i), system.edge(j)]])
+                system.add(coefficients, places, np.array([before.edge[i] - before.edge[j] - gap]), np.array([EXTENTS * per_view]))
+
+
+def _outline(sight: Sight) -> np.ndarray | None:
+    """World points (n, 3) of an orthographic silhouette's contour; None when it is cut off or perspective."""
+    from skimage.measure import find_contours
+
+    if sight.cropped or sight.camera.projection != "orthographic":
+        return None
+    lines = find_contours(-np.pad(sight.silhouette, 1, constant_values=1.0), 0.0)
+    if not lines:
+        return None
+    place = np.concatenate(lines) - 0.5
+    origins, _ = rays(sight.camera, place[:, ::-1])
+    return origins

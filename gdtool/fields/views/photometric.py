@@ -1,0 +1,67 @@
+"""What the colors say of how far away a view's surface is: a point looks alike in all views that see it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gdtool.cameras import Camera, project, rays
+from gdtool.fields.views.prepared_view import bilinear, pixel_footprint
+
+BLUR = 0.05  # of how far off surfaces may be: so far are colors blurred, or from afar their slopes would mislead
+LEAST_NOISE = 0.02  # linear: no views' colors are taken to agree better
+_STEP = 1e-3  # world units, for the derivative of a projection
+_GAIN = 2.0  # one view is at most so many times as bright as another
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A view's colors (h, w, 3), blurred inside its mask, and their slopes per pixel along x and y."""
+
+    camera: Camera
+    color: np.ndarray
+    across: np.ndarray
+    down: np.ndarray
+
+    @classmethod
+    def of(cls, camera: Camera, image: np.ndarray, mask: np.ndarray, reach: float) -> Picture:
+        """image (h, w, 3) linear, mask (h, w) coverage; reach: world units that surfaces may be off by."""
+        from scipy.ndimage import gaussian_filter
+
+        pixels = BLUR * reach / float(pixel_footprint(camera, float(np.linalg.norm(camera.position))))
+        cover = (mask > 0.9).astype(np.float32)
+        share = np.maximum(gaussian_filter(cover, pixels), 1e-6)
+        color = np.stack([gaussian_filter(image[..., c] * cover, pixels) / share for c in range(3)], -1)
+        down, across = np.gradient(color, axis=(0, 1))
+        return cls(camera, color, across, down)
+
+
+def color_rows(points: np.ndarray, here: np.ndarray, there: np.ndarray, first: Picture, second: Picture, trust: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How a view's depth has to change for its points to look like what another view shows at their places.
+
+    points (n, 3) that the first view shows at pixels here (n, 2) and that fall on pixels there (n, 2) of the second; trust
+    (n,). Returns the slope (n,) of the difference in color per world unit of the first view's depth, the difference (n,)
+    that it shall undo, and weights (n,): one over the variance that the two views' colors differ by, less for outliers. Each
+    channel of a view may be brighter or have an offset.
+    """
+    own, shown = bilinear(first.color, here), bilinear(second.color, there)
+    _, direction = rays(first.camera, here)
+    farther = points + _STEP * direction / np.maximum(-(direction @ first.camera.backward), 1e-9)[:, None]
+    moved = (project(second.camera, farther)[0] - there) / _STEP
+    slope = bilinear(second.across, there) * moved[:, :1] + bilinear(second.down, there) * moved[:, 1:]
+    weight = trust
+    for _ in range(3):
+        difference = shown - np.stack([_matched(x, y, weight) for x, y in zip(own.T, shown.T, strict=True)], -1)
+        noise = max(1.5 * float(np.median(np.abs(difference))), LEAST_NOISE)  # 1.5: from a median to a standard deviation
+        weight = trust / (1 + (difference**2).mean(1) / (2 * noise) ** 2) ** 2
+    size = np.linalg.norm(slope, axis=1)
+    return size, (slope * difference).sum(1) / np.maximum(size, 1e-9), weight / noise**2
+
+
+def _matched(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """x (n,) with the gain and offset that bring it nearest to y (n,)."""
+    total = max(float(weight.sum()), 1e-12)
+    from_x, from_y = x - (weight * x).sum() / total, y - (weight * y).sum() / total
+    gain = (weight * from_x * from_y).sum() / max(float((weight * from_x**2).sum()), 1e-12)
+    return y - from_y + np.clip(gain, 1 / _GAIN, _GAIN) * from_x

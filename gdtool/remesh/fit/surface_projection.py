@@ -1,0 +1,250 @@
+"""Shaping of a quad mesh: regular subdivision, relaxing on the surface it stands for, holes and doublets."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from gdtool.geometry.distance import SearchTree
+from gdtool.remesh.fit.feature_curves import Constraints, Features, closest_on_segments
+from gdtool.geometry.mesh_quality import polygon_normals, valences
+from gdtool.geometry.normals import face_normals
+from gdtool.geometry.topology import Edges, compact, corner_fans, edges_of
+
+_EXACT_EVERY = 5  # steps between two searches for the closest point; the others stay in its plane
+_BENT_COSINE = 0.97  # between a quad's normal and that of the surface below its centre
+
+
+class Surface(SearchTree):
+    """A triangle mesh that points are projected to, with the normals (f, 3) of its faces."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray):
+        super().__init__(vertices, faces)
+        self.normals = face_normals(self.vertices, self.faces)[0]
+
+
+def subdivide(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints | None = None):
+    """Each face cut into one quad per corner: quads into four, triangles into three.
+
+    faces (f, 4), -1 as fourth corner of triangles. Returns vertices (edge midpoints and face centres added behind the
+    old ones), faces (4 q + 3 t, 4), and the constraints with the paths halved.
+    """
+    edges = edges_of(faces)
+    used = faces >= 0
+    centre = np.where(used[..., None], vertices[np.where(used, faces, 0)], 0).sum(1) / used.sum(1)[:, None]
+    v, e = len(vertices), len(edges.ends)
+    out = np.concatenate([vertices, vertices[edges.ends].mean(1), centre])
+    # Half edges come in the order of used corners; the one before a corner is the previous of its face.
+    next_edge = np.full(faces.shape, -1, np.int64)
+    next_edge[used] = edges.half_edge_idx
+    previous_edge = np.roll(next_edge, 1, 1)
+    triangle = ~used[:, 3]
+    previous_edge[triangle, 0] = next_edge[triangle, 2]
+    face_idx = np.repeat(np.arange(len(faces)), used.sum(1))
+    quads = np.stack([faces[used], v + next_edge[used], v + e + face_idx, v + previous_edge[used]], -1)
+    if constraints is None:
+        return out, quads, None
+    width = v + 1
+    key = edges.ends[:, 0] * width + edges.ends[:, 1]
+    path = np.sort(constraints.path, 1)
+    edge_idx = np.searchsorted(key, path[:, 0] * width + path[:, 1])
+    curve, fixed = np.full(len(out), -1), np.zeros(len(out), bool)
+    curve[:v], fixed[:v] = constraints.curve, constraints.fixed
+    curve[v + edge_idx] = constraints.path_curve
+    halves = np.concatenate([np.stack([path[:, 0], v + edge_idx], -1), np.stack([path[:, 1], v + edge_idx], -1)])
+    return out, quads, Constraints(curve, fixed, halves, np.tile(constraints.path_curve, 2))
+
+
+def _average_matrix(pairs: np.ndarray, count: int):
+    from scipy.sparse import coo_matrix, diags
+
+    rows = np.concatenate([pairs[:, 0], pairs[:, 1]])
+    columns = np.concatenate([pairs[:, 1], pairs[:, 0]])
+    matrix = coo_matrix((np.ones(len(rows)), (rows, columns)), (count, count)).tocsr()
+    return (diags(1 / np.maximum(np.asarray(matrix.sum(1)).ravel(), 1)) @ matrix).tocsr()
+
+
+def onto(vertices: np.ndarray, surface: Surface, features: Features, constraints: Constraints) -> np.ndarray:
+    """Vertices on the surface; those on a feature curve on that curve; fixed ones where they are."""
+    return Slide(surface, features, constraints).exact(vertices)
+
+
+class Slide:
+    """Brings vertices that move in small steps back: exactly, or to the plane or line that they were on last."""
+
+    def __init__(self, surface: Surface, features: Features, constraints: Constraints):
+        self._surface, self._points = surface, features.points
+        self._free = np.flatnonzero((constraints.curve < 0) & ~constraints.fixed)
+        held = np.flatnonzero(constraints.curve >= 0)
+        self._held = held[np.argsort(constraints.curve[held], kind="stable")]  # curve by curve
+        curve = constraints.curve[self._held]
+        first = np.flatnonzero(np.diff(curve, prepend=-1)).tolist()
+        self._curves = [(slice(start, end), features.segments[features.curve == curve[start]]) for start, end in pairwise([*first, len(curve)])]
+        self._normals: np.ndarray | None = None
+        self._steps = 0
+        self.placed: np.ndarray | None = None  # what exact() gave last
+
+    def exact(self, vertices: np.ndarray) -> np.ndarray:
+        """Vertices on the surface; those on a feature curve on that curve; fixed ones where they are."""
+        out = vertices.copy()
+        _, face_idx, point = self._surface.closest(vertices[self._free])
+        out[self._free] = point
+        self._normals = self._surface.normals[face_idx]
+        held, ends = vertices[self._held], np.zeros((len(self._held), 2), np.int64)
+        for own, segments in self._curves:
+            _, segment, held[own] = closest_on_segments(held[own], self._points, segments)
+            ends[own] = segments[segment]
+        out[self._held] = held
+        line = self._points[ends[:, 1]] - self._points[ends[:, 0]]
+        self._lines = line / np.maximum(np.linalg.norm(line, axis=1), 1e-300)[:, None]
+        self.placed = out
+        return out
+
+    def step(self, moved: np.ndarray, vertices: np.ndarray, last: bool) -> np.ndarray:
+        """Where `moved` (v, 3) goes that came from `vertices` on the surface; exact in the last step and every few."""
+        self._steps += 1
+        if last or self._normals is None or self._steps % _EXACT_EVERY == 0:
+            return self.exact(moved)
+        out, way = moved.copy(), moved - vertices
+        for own, direction, start, sign in ((self._free, self._normals, moved, -1), (self._held, self._lines, vertices, 1)):
+            out[own] = start[own] + sign * np.einsum("ni,ni->n", way[own], direction)[:, None] * direction
+        return out
+
+
+def relax(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
+          iterations: int, strength: float = 0.6) -> np.ndarray:
+    """Vertices evened out along the surface: each moves toward the mean of its neighbours and back onto the surface."""
+    edges = edges_of(faces)
+    average = _average_matrix(edges.ends, len(vertices))
+    along = _average_matrix(constraints.path, len(vertices)) if len(constraints.path) else None
+    held = (constraints.curve >= 0) & ~constraints.fixed
+    if along is not None:
+        held &= np.diff(along.indptr) == 2  # where a path breaks off its end would draw back, and leave the feature bare
+    still = still_vertices(edges, len(vertices), constraints)
+    slide = Slide(surface, features, constraints)
+    for turn in range(iterations):
+        target = average @ vertices
+        if along is not None:
+            target[held] = (along @ vertices)[held]
+        moved = vertices + strength * (target - vertices)
+        moved[still] = vertices[still]
+        vertices = slide.step(moved, vertices, turn == iterations - 1)
+    return vertices
+
+
+def still_vertices(edges: Edges, count: int, constraints: Constraints) -> np.ndarray:
+    """(v,) bool: of `count` vertices those that may not move: corners of features, and boundaries that no curve leads."""
+    boundary = np.zeros(count, bool)
+    boundary[edges.ends[edges.count != 2].ravel()] = True
+    return constraints.fixed | (boundary & (constraints.curve < 0))
+
+
+def normals_below(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> np.ndarray:
+    """(f, 3) unit normal of the surface under each quad: at its centre, of one beside which it is bent also half-way to its corners."""
+    corners = vertices[faces]
+    centre = corners.mean(1, keepdims=True)
+    below = surface.normals[surface.closest(centre[:, 0])[1]]
+    bent = np.flatnonzero((below * polygon_normals(vertices, faces)[0]).sum(1) < _BENT_COSINE)
+    inner = ((corners[bent] + centre[bent]) / 2).reshape(-1, 3)
+    below[bent] += surface.normals[surface.closest(inner)[1]].reshape(len(bent), 4, 3).sum(1)
+    return below / np.maximum(np.linalg.norm(below, axis=1), 1e-300)[:, None]
+
+
+class Lists:
+    """Lists of values (n,), each under its key (n,) of 0…count − 1, in their order: lists[key] is an array."""
+
+    def __init__(self, key: np.ndarray, value: np.ndarray, count: int):
+        self.value = value[np.argsort(key, kind="stable")]
+        self.start = np.concatenate([[0], np.cumsum(np.bincount(key, minlength=count))])
+
+    def __getitem__(self, key: int) -> np.ndarray:
+        return self.value[self.start[key]:self.start[key + 1]]
+
+    def lengths(self, keys: np.ndarray) -> np.ndarray:
+        return self.start[keys + 1] - self.start[keys]
+
+    def rows(self, keys: np.ndarray) -> np.ndarray:
+        """The lists of keys (k,), none of which is empty, as rows: short ones end in their last value again and again."""
+        length = self.lengths(keys)
+        return self.value[self.start[keys][:, None] + np.minimum(np.arange(length.max()), length[:, None] - 1)]
+
+
+def incidence(faces: np.ndarray, count: int) -> Lists:
+    """The faces around each vertex."""
+    return Lists(faces.ravel(), np.arange(faces.size) // faces.shape[1], count)
+
+
+def neighbours(ends: np.ndarray, count: int) -> Lists:
+    """The vertices that edges (e, 2) join to each."""
+    return Lists(ends.T.ravel(), ends[:, ::-1].T.ravel(), count)
+
+
+def fill_holes(vertices: np.ndarray, faces: np.ndarray, longest: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    """Quads (f, 4) with boundary loops of an even number of edges, at most `longest`, closed by quads around a new vertex.
+
+    Where two holes meet at a vertex, each is closed by itself.
+    """
+    edges = edges_of(faces)
+    border = edges.count[edges.half_edge_idx] == 1
+    half = edges.half_ends[border]
+    if not len(half):
+        return vertices, faces
+    fans = corner_fans(faces)[0]
+    leaving, arriving = fans.ravel()[border], np.roll(fans, -1, 1).ravel()[border]
+    starts: dict[int, list[int]] = {}
+    for k, vertex in enumerate(half[:, 0].tolist()):
+        starts.setdefault(vertex, []).append(k)
+    following = []
+    for k, vertex in enumerate(half[:, 1].tolist()):
+        ways = starts.get(vertex, [])
+        if len(ways) == 2:  # a hole's border comes by one of the two fans and leaves by the other
+            ways = [on for on in ways if leaving[on] != arriving[k]]
+        following.append(ways[0] if len(ways) == 1 else None)  # where more holes meet, which way on is not said
+    new_points, new_faces, seen = [], [], set()
+    for start in range(len(half)):
+        loop, k = [], start
+        while k is not None and k not in seen and len(loop) <= longest:
+            seen.add(k)
+            loop.append(int(half[k, 0]))
+            k = following[k]
+        if k != start or len(loop) % 2 or not 4 <= len(loop) <= longest or len(set(loop)) < len(loop):
+            continue
+        loop = loop[::-1]  # the hole's faces walk its edges the other way
+        if len(loop) == 4:
+            new_faces.append(loop)
+            continue
+        centre = len(vertices) + len(new_points)
+        new_points.append(vertices[loop].mean(0))
+        new_faces.extend([centre, loop[i - 1], loop[i], loop[(i + 1) % len(loop)]] for i in range(0, len(loop), 2))
+    if not new_faces:
+        return vertices, faces
+    return np.concatenate([vertices, *(p[None] for p in new_points)]), np.concatenate([faces, np.array(new_faces, faces.dtype)])
+
+
+def remove_doublets(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Inner vertices of two edges removed, their two quads joined into one (Daniels et al. 2008, doublet collapse)."""
+    for _ in range(8):
+        valence, inner = valences(faces, len(vertices))
+        doublets = np.flatnonzero(inner & (valence == 2))
+        if not len(doublets):
+            break
+        ring = incidence(faces, len(vertices))
+        dead = np.zeros(len(faces), bool)
+        faces = faces.copy()
+        touched: set[int] = set()
+        for v in doublets.tolist():
+            pair = ring[v]
+            if len(pair) != 2 or set(faces[pair].ravel().tolist()) & touched:
+                continue
+            one, two = faces[pair[0]].tolist(), faces[pair[1]].tolist()
+            opposite = one[(one.index(v) + 2) % 4], two[(two.index(v) + 2) % 4]
+            if opposite[0] == opposite[1]:
+                continue
+            touched.update(one, two)
+            faces[pair[0], one.index(v)] = opposite[1]
+            dead[pair[1]] = True
+        if not dead.any():
+            break
+        faces = faces[~dead]
+    return compact(vertices, faces)

@@ -1,0 +1,132 @@
+"""Reflection of surface points as scalars per pair of point and direction: evaluated, and sampled by visible normals."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gdtool.shading.lights.environment import LUMINANCE
+
+MIN_SPECULAR_SHARE = 0.1
+# Normal maps may turn a normal away from the eye: such points are shaded as seen at grazing.
+MIN_VIEW_COSINE = 0.02
+
+
+def tensor_of(x: np.ndarray):
+    """A float32 tensor of an array."""
+    import torch
+
+    return torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)
+
+
+def rows_of(x: np.ndarray, part: slice = slice(None)):
+    """A (c, n) float32 tensor of vectors (n, c)."""
+    return tensor_of(x.T[:, part])
+
+
+class Surface:
+    """Reflection of n points toward the eye: evaluated and sampled for k directions each, vectors as three (k, n) tensors.
+
+    toward (n, 3) unit, values as of SurfaceLookup.attributes, part of both is taken.
+    """
+
+    def __init__(self, toward: np.ndarray, values: dict[str, np.ndarray], part: slice, brdf: str):
+        from gdtool.shading.bsdf.brdf import alpha_of
+
+        self.brdf = brdf
+        self.normal, self.view, self.geometric = (rows_of(x, part) for x in (values["normal"], toward, values["geometric_normal"]))
+        self.albedo, self.metallic, self.roughness = rows_of(values["albedo"], part), tensor_of(values["metallic"][part]), tensor_of(values["roughness"][part])
+        # As brdf.f0_of.
+        self.f0 = tensor_of(values["f0"][part]) * (1 - self.metallic) + self.albedo * self.metallic
+        self.alpha = alpha_of(self.roughness)
+        self.n_v_exact = (self.normal * self.view).sum(0)
+        self.n_v = self.n_v_exact.clamp_min(MIN_VIEW_COSINE)
+        strongest = self.f0.amax(0)
+        reflect = strongest + (1 - strongest) * (1 - self.n_v) ** 5
+        diffuse = self.albedo.amax(0) * (1 - self.metallic)
+        self.share = (reflect / (reflect + diffuse).clamp_min(1e-6)).clamp(MIN_SPECULAR_SHARE, 1.0)
+
+    def lifted(self, position: np.ndarray, offset: float):
+        """(3, n) tensor of positions (n, 3) moved a little off the surface, to the seen side."""
+        import torch
+
+        return torch.from_numpy((position.T + np.float32(offset) * self.geometric.numpy()).astype(np.float32))
+
+    def brightness(self, terms, luminance):
+        """(k, n) about how bright directions of a luminance (k, n) are reflected, from the terms of evaluate."""
+        import torch
+
+        weights = torch.from_numpy(LUMINANCE.astype(np.float32))
+        f0, diffuse = weights @ self.f0, weights @ self.albedo * (1 - self.metallic)
+        return luminance * (f0 * terms[0] + (1 - f0) * terms[1] + diffuse * terms[2])
+
+    def evaluate(self, x, y, z):
+        """[D V c, D V c w, d c / π, d c w / π] with c = n·l and d the diffuse model's factor; density of sample(); and whether
+        the direction is above the horizon of both the shading and the true normal."""
+        from gdtool.shading.bsdf.brdf import disney_diffuse, ndf, visibility_gltf, visibility_paper
+
+        nx, ny, nz = self.normal
+        vx, vy, vz = self.view
+        gx, gy, gz = self.geometric
+        n_l = nx * x + ny * y + nz * z
+        l_v = vx * x + vy * y + vz * z
+        above = (n_l > 0) & (gx * x + gy * y + gz * z > 0)
+        cosine = n_l.clamp(0, 1)
+        # |l + v|² = 2 + 2 l·v, so the half vector itself is not needed.
+        n_h = ((n_l + self.n_v_exact) * (2 + 2 * l_v).clamp_min(1e-12).rsqrt()).clamp(0, 1)
+        v_h = (0.5 + 0.5 * l_v).clamp(0, 1).sqrt()
+        d = ndf(self.alpha, n_h)
+        if self.brdf == "gltf":
+            v = visibility_gltf(self.alpha, cosine, self.n_v)
+            diffuse = cosine * (1 / math.pi)
+        else:
+            v = visibility_paper(self.roughness, cosine, self.n_v)
+            diffuse = cosine * (1 / math.pi) * disney_diffuse(self.roughness, cosine, self.n_v.clamp(0, 1), v_h)
+        t = 1 - v_h
+        w = (t * t) * (t * t) * t
+        specular = d * v * cosine
+        # Visible normals (Heitz 2018): p = D G1(v) / (4 n·v) with Smith's G1.
+        a2 = self.alpha * self.alpha
+        g1 = 2 / (1 + (a2 + (1 - a2) * self.n_v * self.n_v).sqrt() / self.n_v)
+        density = d * (self.share * g1 / (4 * self.n_v)) + cosine * ((1 - self.share) * (1 / math.pi))
+        return (specular, specular * w, diffuse, diffuse * w), density, above
+
+    def sample(self, u, v, pick):
+        """Directions (three (k, n)) from uniform numbers (k, n): visible normals mirrored, or cosine-weighted."""
+        import torch
+
+        (tx, ty, tz), (bx, by, bz) = frame(*self.normal)
+        (nx, ny, nz), (vx, vy, vz) = self.normal, self.view
+        a = self.alpha
+        ex, ey = tx * vx + ty * vy + tz * vz, bx * vx + by * vy + bz * vz
+        length = (ex * ex + ey * ey + self.n_v * self.n_v).rsqrt()
+        ex, ey, ez = ex * length, ey * length, self.n_v * length
+        # Spherical caps (Dupuy & Benyoub 2023).
+        sx, sy = a * ex, a * ey
+        length = (sx * sx + sy * sy + ez * ez).rsqrt()
+        sx, sy, sz = sx * length, sy * length, ez * length
+        phi = 2 * math.pi * v
+        cos_phi, sin_phi = phi.cos(), phi.sin()
+        z = (1 - u) * (1 + sz) - sz
+        ring = (1 - z * z).clamp_min(0).sqrt()
+        mx, my, mz = a * (ring * cos_phi + sx), a * (ring * sin_phi + sy), (z + sz).clamp_min(1e-6)
+        length = (mx * mx + my * my + mz * mz).rsqrt()
+        mx, my, mz = mx * length, my * length, mz * length
+        twice = 2 * (mx * ex + my * ey + mz * ez)
+        radius = u.sqrt()
+        glossy = pick < self.share
+        x = torch.where(glossy, twice * mx - ex, radius * cos_phi)
+        y = torch.where(glossy, twice * my - ey, radius * sin_phi)
+        z = torch.where(glossy, twice * mz - ez, (1 - u).clamp_min(0).sqrt())
+        return x * tx + y * bx + z * nx, x * ty + y * by + z * ny, x * tz + y * bz + z * nz
+
+
+def frame(x, y, z):
+    """Tangent and bitangent of unit normals, three components each (Duff et al. 2017)."""
+    import torch
+
+    sign = torch.where(z < 0, -1.0, 1.0)
+    a = -1 / (sign + z)
+    b = x * y * a
+    return (1 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)

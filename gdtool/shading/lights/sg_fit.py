@@ -1,0 +1,107 @@
+"""Fitting spherical Gaussians to an environment."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.shading.lights.environment import Environment
+from gdtool.shading.lights.bundled import COUNT
+from gdtool.shading.sampling import fibonacci
+from gdtool.shading.bsdf.sg import SphericalGaussians
+
+# Rows of the image that is fitted, and the logarithm of the sharpest lobe that its pixels can tell from a sharper one.
+ROWS = 32
+SHARPEST = float(np.log(250.0))
+# Diffuse color is nearly all irradiance: an error of 1 % there counts like one of about 5 % of the radiance.
+IRRADIANCE_WEIGHT = 30.0
+
+
+def fit_sg(environment: Environment, count: int = COUNT, seed: int = 0, steps: int = 300) -> tuple[SphericalGaussians, dict[str, float]]:
+    """count lobes that fit the radiance by solid angle, and the fit's error (see fit_error).
+
+    Half the lobes start on the brightest places (each hiding its surroundings from the next), half spread evenly; Adam
+    on axes, log sharpness and log amplitudes minimises the squared error of radiance raised to 1/2 plus that of
+    irradiance, so that neither the sun nor the sky is all that counts.
+    """
+    import torch
+
+    small = environment.shrunk(ROWS)
+    d = small.directions.reshape(-1, 3)
+    weight = np.repeat(small.solid_angles, small.image.shape[1])
+    radiance = small.image.reshape(-1, 3).astype(np.float64)
+    mean = float((radiance * weight[:, None]).sum() / (3 * weight.sum()))
+    if mean <= 0:
+        raise ValueError("an environment without light cannot be fitted")
+    radiance = radiance / mean
+    axes, sharpness, amplitudes = _start(d, radiance, weight, count, seed)
+
+    generator = torch.Generator().manual_seed(seed)
+    normals = torch.nn.functional.normalize(torch.randn(128, 3, generator=generator, dtype=torch.float64), dim=1).float()
+    directions, target = torch.tensor(d, dtype=torch.float32), torch.tensor(radiance, dtype=torch.float32)
+    area = torch.tensor(weight / weight.sum(), dtype=torch.float32)
+    transport = normals.matmul(directions.T).clamp_min(0) * area * 4
+    irradiance = transport @ target
+    parameters = [torch.tensor(x, dtype=torch.float32, requires_grad=True) for x in (axes, np.log(sharpness), np.log(amplitudes))]
+    optimizer = torch.optim.Adam(parameters, lr=0.05)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+    for _ in range(steps):
+        axis = torch.nn.functional.normalize(parameters[0], dim=1)
+        s, amplitude = parameters[1].clamp(-1.0, SHARPEST).exp(), parameters[2].clamp(-12.0, 12.0).exp()
+        fitted = torch.exp(s * (directions @ axis.T - 1)) @ amplitude
+        loss = (area[:, None] * (torch.sqrt(fitted + 0.01) - torch.sqrt(target + 0.01)) ** 2).sum()
+        loss = loss + IRRADIANCE_WEIGHT * ((transport @ fitted - irradiance) ** 2).mean() / (irradiance**2).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    with torch.no_grad():
+        axis = torch.nn.functional.normalize(parameters[0], dim=1)
+        lobes = SphericalGaussians(axis.double(), parameters[1].clamp(-1.0, SHARPEST).exp().double(), parameters[2].clamp(-12, 12).exp().double() * mean)
+    return lobes, fit_error(environment, lobes)
+
+
+def fit_error(environment: Environment, lobes: SphericalGaussians) -> dict[str, float]:
+    """radiance_rms: RMS over the sphere of the radiance's error, irradiance_rms and irradiance_max the same over normals,
+    each relative to the RMS (maximum) of the truth; energy: relative error of the total. Of the 32-row image."""
+    import torch
+
+    from gdtool.shading.bsdf.sg import cosine_integral, evaluate
+
+    small = environment.shrunk(ROWS)
+    d = torch.tensor(small.directions.reshape(-1, 3), dtype=torch.float64)
+    weight = torch.tensor(np.repeat(small.solid_angles, small.image.shape[1]), dtype=torch.float64)[:, None]
+    truth = torch.tensor(small.image.reshape(-1, 3), dtype=torch.float64)
+    g = lobes.to(torch.float64)
+    fitted = evaluate(g, d)
+    normals = torch.tensor(fibonacci(256))
+    received = torch.tensor(small.irradiance(normals.numpy()), dtype=torch.float64)
+    estimate = cosine_integral(g.sharpness, normals @ g.axes.T) @ g.amplitudes
+    return {
+        "radiance_rms": float(torch.sqrt((weight * (fitted - truth) ** 2).sum() / (weight * truth**2).sum())),
+        "irradiance_rms": float(torch.sqrt(((estimate - received) ** 2).mean() / (received**2).mean())),
+        "irradiance_max": float((estimate - received).abs().max() / received.max()),
+        "energy": float((weight * fitted).sum() / (weight * truth).sum() - 1),
+    }
+
+
+def _start(d: np.ndarray, radiance: np.ndarray, weight: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    peaks = count // 2
+    bright = radiance.sum(1)
+    hidden = bright.copy()
+    axes, sharpness = [], []
+    for _ in range(peaks):
+        at = int(hidden.argmax())
+        near = d @ d[at]
+        # As wide as the region above half of the peak.
+        region = weight[(near > 0.8) & (bright > 0.5 * bright[at])].sum()
+        axes.append(d[at])
+        sharpness.append(np.clip(2 * np.pi / max(region, 1e-3), 1.0, 500.0))
+        hidden = np.where(near > np.cos(max(2.0 / np.sqrt(sharpness[-1]), 0.25)), 0.0, hidden)
+    even = fibonacci(count - peaks)
+    axes = np.concatenate([np.array(axes).reshape(-1, 3), even])
+    sharpness = np.concatenate([sharpness, np.full(count - peaks, 4.0)])
+    nearest = np.array([radiance[(d @ axis).argmax()] for axis in axes])
+    broad = np.array([np.average(radiance, axis=0, weights=weight * np.exp(4 * (d @ axis - 1))) for axis in even])
+    amplitudes = np.concatenate([nearest[:peaks], 0.4 * broad])
+    jitter = np.random.default_rng(seed).normal(0, 0.01, axes.shape)
+    return axes + jitter, sharpness, np.maximum(amplitudes, 1e-3)

@@ -1,0 +1,45 @@
+"""Cameras for pictures: turntables, spheres, and the random ones of condition images."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.cameras import Camera, camera_at
+from gdtool.cameras.camera import DISTANCE, HALF_WIDTH
+
+
+def camera(azimuth: float, elevation: float, name: str, size: int, fov: float = 0.0, half_width: float = HALF_WIDTH) -> Camera:
+    """A camera that has the normalised object in full; fov (degrees across) 0 is orthographic.
+
+    A perspective camera stands where it sees a sphere of radius half_width in full.
+    """
+    if not fov:
+        return camera_at(azimuth, elevation, name=name, size=size, half_width=half_width)
+    return camera_at(azimuth, elevation, name=name, size=size, fov_degrees=fov, distance=half_width / np.sin(np.radians(fov) / 2))
+
+
+def turntable(views: int, size: int, elevation: float = 0.0, fov: float = 0.0, stops: tuple[tuple[str, float], ...] = ()) -> list[Camera]:
+    """Cameras evenly around the object, the first in front, going toward +X; or at named stops (name, azimuth)."""
+    stops = stops or tuple((f"{k:03d}", 360.0 * k / views) for k in range(views))
+    return [camera(azimuth, elevation, name, size, fov) for name, azimuth in stops]
+
+
+def sphere(views: int, size: int, fov: float = 0.0) -> list[Camera]:
+    """Cameras spread evenly over the sphere around the object."""
+    from gdtool.shading.sampling import fibonacci
+
+    out = []
+    for k, (x, y, z) in enumerate(fibonacci(views)):
+        out.append(camera(float(np.degrees(np.arctan2(x, z))), float(np.degrees(np.arcsin(y))), f"{k:03d}", size, fov))
+    return out
+
+
+def condition_camera(rng: np.random.Generator, name: str, size: int) -> Camera:
+    """A photographer in front of the object: elevation −15° to 30°, orthographic or perspective (20° to 60°), object
+    filling 60 to 100 % of what the rig's view leaves it."""
+    elevation, perspective = rng.uniform(-15, 30), rng.random() < 0.5
+    fov, scale = rng.uniform(20, 60), rng.uniform(0.6, 1.0)
+    return camera(0.0, float(elevation), name, size, float(fov) if perspective else 0.0, HALF_WIDTH / float(scale))
+
+
+__all__ = ["DISTANCE", "camera", "condition_camera", "sphere", "turntable"]

@@ -1,0 +1,67 @@
+"""The maps as they are stored, eight bits and gutters, against an analytic material: their error, and their seams."""
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gdtool.images.color import srgb_from_linear
+from gdtool.bake.pipeline import bake, vertex_lookup
+from gdtool.bake.maps import make_maps
+from gdtool.bake.reproject import Source, vertex_reach
+from gdtool.bake.target import Target, points_at, texels_of
+from tests.bake.shapes import albedo_of, psnr, torus, triangles_of, unwrapped
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+
+from bake_score import Seams  # noqa: E402
+
+SIZE = 1024
+
+
+def on_torus(points, major=0.35, minor=0.14):
+    ring = points * (1, 0, 1)
+    ring = major * ring / np.linalg.norm(ring, axis=1, keepdims=True)
+    away = points - ring
+    return ring + minor * away / np.linalg.norm(away, axis=1, keepdims=True)
+
+
+def material(points):
+    at = on_torus(points)
+    return {"albedo": srgb_from_linear(albedo_of(at)), "roughness": 0.5 + 0.8 * at[:, 0]}
+
+
+@pytest.fixture(scope="module")
+def stored():
+    """A dense torus baked onto a coarse one: its target, its texels and the maps' bytes as numbers of 0…1."""
+    fine, fine_quads, fine_normals = torus(640, 360)
+    coarse, quads, _ = torus(60, 30, minor=0.141)
+    faces = triangles_of(quads)
+    target = Target.of(coarse, faces, *unwrapped(coarse, faces, SIZE))
+    texels = texels_of(target, SIZE)
+    source = Source(fine, triangles_of(fine_quads))
+    attributes = {"albedo": albedo_of(fine), "roughness": 0.5 + 0.8 * fine[:, 0], "metallic": np.full(len(fine), 0.25)}
+    baked = bake(target, texels, source, vertex_lookup(source, attributes, fine_normals), vertex_reach(coarse, faces, source), threads=2)
+    maps = make_maps(texels, baked.values)
+    return target, texels, {"albedo": maps.base_color / 255, "roughness": maps.orm[..., 1:2] / 255}
+
+
+def test_stored_maps_are_the_material_to_55_db(stored):
+    target, texels, maps = stored
+    true = material(points_at(target, texels.face_idx, texels.barycentric)[0][:texels.inside])
+    for name, image in maps.items():
+        assert psnr(image.reshape(-1, image.shape[2])[texels.texel[:texels.inside]], true[name].reshape(texels.inside, -1)) >= 55
+
+
+def test_no_seam_shows(stored):
+    """The difference across seams is at most 1.2 times that across other edges; without gutters it is more."""
+    target, texels, maps = stored
+    seams = Seams(SimpleNamespace(target=target, material=material), SIZE)
+    for name, image in maps.items():
+        assert seams.ratio(name, image) <= 1.2
+        bare = np.zeros_like(image)
+        inside = texels.texel[:texels.inside]
+        bare.reshape(-1, image.shape[2])[inside] = image.reshape(-1, image.shape[2])[inside]
+        assert seams.ratio(name, bare) > 1.2

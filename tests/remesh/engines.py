@@ -1,0 +1,58 @@
+"""Stand-ins for engines, and candidates made in the test's own process."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gdtool.core.child import ChildFailed
+from gdtool.geometry import topology
+from gdtool.remesh.engines import candidate as quad_candidate, search
+
+
+def whole(faces) -> bool:
+    """All quads, watertight and manifold."""
+    return faces.min() >= 0 and topology.is_watertight(faces) and topology.is_manifold(faces)
+
+
+class Ended:
+    """A child that has ended, in the place of one that works."""
+
+    def __init__(self, outcome):
+        self.outcome = outcome
+
+    def kill(self):
+        pass
+
+    def result(self):
+        if isinstance(self.outcome, Exception):
+            raise self.outcome
+        return self.outcome
+
+
+def in_this_process(monkeypatch, engine=None) -> list:
+    """Candidates are made here, by `engine` in the place of every engine where one is given; the calls, as they come."""
+    calls = []
+
+    def begin(_, *given, **limits):
+        calls.append(given)
+        try:
+            return Ended(quad_candidate.candidate(*given))
+        except ChildFailed as failure:
+            return Ended(failure)
+
+    if engine is not None:
+        monkeypatch.setattr(quad_candidate, "ENGINES", dict.fromkeys(quad_candidate.ENGINES, engine))
+    monkeypatch.setattr(search, "begin", begin)
+    return calls
+
+
+def around(faces, middle) -> tuple[np.ndarray, np.ndarray]:
+    """The faces that touch face `middle` at one corner only, and those that share an edge with it."""
+    shared = np.isin(faces, faces[middle]).sum(1)
+    return np.flatnonzero(shared == 1), np.flatnonzero(shared == 2)
+
+
+def inner_face(vertices, faces) -> int:
+    """A face in the middle of a side of a cube."""
+    centre = vertices[faces].mean(1)
+    return int(np.linalg.norm(centre - [0.07, 0.07, centre[:, 2].max()], axis=1).argmin())

@@ -1,0 +1,65 @@
+"""Folded quads are taken out, and nothing else changes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gdtool.geometry import topology
+from gdtool.remesh.fit.feature_curves import Constraints
+from gdtool.geometry.mesh_quality import scaled_jacobian
+from gdtool.remesh.connectivity.diagonal_collapse import without_folded
+from gdtool.remesh.fit.shaping import surface_of
+from tests.geometry.solids import quad_torus
+
+
+def opened(vertices: np.ndarray, faces: np.ndarray, at: int, apart: float) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """A vertex of four quads doubled, with a quad between the two that is folded by so much of an edge; that quad."""
+    ring = [faces[(faces == at).any(1)][0].tolist()]
+    while len(ring) < 4:
+        before = ring[-1][(ring[-1].index(at) - 1) % 4]
+        ring.append(next(f for f in faces.tolist() if at in f and f[(f.index(at) + 1) % 4] == before))
+    one, two = (quad[(quad.index(at) + 1) % 4] for quad in (ring[0], ring[2]))
+    out = faces.copy()
+    for quad in ring[:2]:
+        own = (faces == quad).all(1)
+        out[own] = np.where(faces[own] == at, len(vertices), faces[own])
+    side = vertices[ring[1][(ring[1].index(at) + 1) % 4]] - vertices[at]
+    new = [at, two, len(vertices), one]
+    if not topology.is_watertight(np.concatenate([out, [new]])):
+        new = new[::-1]
+    return np.concatenate([vertices, (vertices[at] - apart * side)[None]]), np.concatenate([out, [new]]), new
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.2])
+def test_a_folded_quad_goes_and_its_surroundings_stay(apart):
+    vertices, faces = quad_torus()
+    torn, quads, _ = opened(vertices, faces, 17, apart)
+    assert topology.is_watertight(quads) and len(quads) == len(faces) + 1 and scaled_jacobian(torn, quads).min() < 0.05
+    out, found, _ = without_folded(torn, quads, surface_of(vertices, faces), Constraints.none(len(torn)))
+    assert len(found) == len(faces) and len(out) == len(vertices) and topology.is_watertight(found) and topology.is_manifold(found)
+    assert topology.euler_number(found) == topology.euler_number(faces)
+    assert scaled_jacobian(out, found).min() > 0.8 * scaled_jacobian(vertices, faces).min()
+    assert len(np.unique(np.concatenate([out, vertices]).round(9), axis=0)) <= len(vertices) + 1
+
+
+def test_what_is_held_stays():
+    vertices, faces = quad_torus()
+    torn, quads, new = opened(vertices, faces, 17, 0.1)
+    constraints = Constraints.none(len(torn))
+    constraints.curve[[new[0], new[2]]] = 0
+    out, found, _ = without_folded(torn, quads, surface_of(vertices, faces), replace(constraints, fixed=np.ones(len(torn), bool)))
+    assert out is torn and found is quads
+    # One of the two is held: it is the one that stays, where it was.
+    constraints.curve[new[2]] = -1
+    out, found, after = without_folded(torn, quads, surface_of(vertices, faces), constraints)
+    assert len(found) == len(faces) and (after.curve >= 0).sum() == 1
+    assert (out[after.curve >= 0] == torn[new[0]]).all()
+
+
+def test_nothing_happens_without_folded_quads():
+    vertices, faces = quad_torus()
+    out, found, _ = without_folded(vertices, faces, surface_of(vertices, faces), Constraints.none(len(vertices)))
+    assert out is vertices and found is faces

@@ -1,0 +1,104 @@
+"""Pairs of irregular vertices that are led together: what was pulled apart closes, creases stay, the mesh stays whole."""
+
+import numpy as np
+import pytest
+
+from gdtool.geometry import topology
+from gdtool.remesh.engines import candidate as quad_candidate
+from gdtool.geometry.mesh_quality import valences
+from gdtool.remesh.engines.candidate import Way, candidate
+from gdtool.remesh.connectivity.edge_rotation import cancel_pairs
+from gdtool.geometry.sharpen import dihedral_degrees
+from tests.geometry.solids import marching, plane, quad_cube, quad_torus
+
+
+def rotated(quads: np.ndarray, p: int, q: int) -> np.ndarray:
+    """The edge from p to q turned within the hexagon around it: it ends now at the corner before p in its first face."""
+    one = next(f for f in quads.tolist() if p in f and f[(f.index(p) + 1) % 4] == q)
+    two = next(f for f in quads.tolist() if q in f and f[(f.index(q) + 1) % 4] == p)
+    r, s = (one[(one.index(q) + i) % 4] for i in (1, 2))
+    t, u = (two[(two.index(p) + i) % 4] for i in (1, 2))
+    left = [f for f in quads.tolist() if f not in (one, two)]
+    return np.array([*left, [s, p, t, u], [u, q, r, s]])
+
+
+def sheared(quads: np.ndarray, columns: list[tuple[int, int]]) -> np.ndarray:
+    """The rungs of a row of quads turned one after the other: two pairs of irregular vertices, as far apart."""
+    for rung in columns:
+        quads = rotated(quads, *rung)
+    return quads
+
+
+def irregular(points, quads) -> int:
+    valence, inner = valences(quads, len(points))
+    return int((inner & (valence != 4)).sum())
+
+
+@pytest.mark.parametrize("apart", [1, 2, 5, 9])
+def test_what_was_pulled_apart_closes(apart):
+    n = 24
+    points, quads = quad_torus(n)
+    torn = sheared(quads, [(i * n + 3, i * n + 4) for i in range(2, 2 + apart)])
+    assert irregular(points, torn) == 4
+    found = cancel_pairs(points, torn)
+    assert irregular(points, found) == 0 and topology.is_watertight(found) and topology.is_manifold(found)
+    assert len(found) == len(quads)
+
+
+def test_what_is_too_far_apart_is_put_back():
+    n = 40
+    points, quads = quad_torus(n)
+    torn = sheared(quads, [(i * n + 3, i * n + 4) for i in range(2, 22)])
+    found = cancel_pairs(points, torn)
+    assert {frozenset(f) for f in found.tolist()} == {frozenset(f) for f in torn.tolist()}
+
+
+def test_a_regular_mesh_and_an_open_one_stay():
+    for points, quads in (quad_torus(), quad_cube(3)):
+        assert (np.sort(cancel_pairs(points, quads), 1) == np.sort(quads, 1)).all()
+    n = 8
+    points, _ = plane(n)
+    at = np.arange(n * n).reshape(n, n)
+    quads = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]], -1).reshape(-1, 4)
+    assert (cancel_pairs(points, quads) == quads).all()
+
+
+def test_a_band_with_one_side_stays():
+    """A Moebius band has no two sides: edges that two faces walk the same way cannot be turned."""
+    n = 20
+    at = np.arange(n * 5).reshape(n, 5)
+    following = np.concatenate([at[1:], at[:1, ::-1]])
+    quads = np.stack([at[:, :-1], following[:, :-1], following[:, 1:], at[:, 1:]], -1).reshape(-1, 4)
+    points = np.random.default_rng(0).standard_normal((n * 5, 3))
+    assert (cancel_pairs(points, quads) == quads).all()
+
+
+def test_creases_stay():
+    """Edges of a cube turn no more, whatever would cancel across them."""
+    points, quads = quad_cube(3)
+    ends, _, degrees = dihedral_degrees(points, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]))
+    crease = {tuple(sorted(edge)) for edge in ends[degrees > 45].tolist()}
+    flat = [tuple(sorted(edge)) for edge in topology.edges_of(quads).ends.tolist() if tuple(sorted(edge)) not in crease]
+    rng, torn = np.random.default_rng(0), quads
+    for edge in rng.permutation(flat)[:40].tolist():
+        try:
+            turned = rotated(torn, *edge)
+        except StopIteration:  # turned away before
+            continue
+        valence = valences(turned, len(points))[0]
+        if valence.min() > 2 and topology.is_manifold(turned):
+            torn = turned
+    found = cancel_pairs(points, torn)
+    kept = {tuple(sorted(edge)) for edge in topology.edges_of(found).ends.tolist()}
+    assert crease <= kept
+    assert topology.is_watertight(found) and topology.is_manifold(found) and irregular(points, found) < irregular(points, torn) / 2
+
+
+def test_an_engine_s_quads_have_fewer(monkeypatch):
+    vertices, faces = marching(lambda x, y, z: (np.hypot(x, y) - 0.6) ** 2 + z**2 - 0.06 - 0.02 * np.sin(7 * x), 48)
+    way = Way("instant-meshes", 1, (1.0,), 30.0)
+    found = candidate(vertices / 2, faces, way, 8000)
+    monkeypatch.setattr(quad_candidate, "cancel_pairs", lambda _, quads: quads)
+    before = candidate(vertices / 2, faces, way, 8000)
+    assert found.fault is None and found.count == before.count and topology.is_watertight(found.quads)
+    assert irregular(found.vertices, found.quads) < 0.9 * irregular(before.vertices, before.quads)

@@ -1,0 +1,43 @@
+"""Features across quads: their diagonal, the cut along it."""
+
+import numpy as np
+
+from gdtool.remesh.fit.feature_curves import Constraints, untied
+from gdtool.remesh.fit.feature_diagonals import crossed, cut_along_features, held_at_centres
+from gdtool.remesh.fit.surface_projection import Surface, subdivide
+
+
+def grid(n: int = 4):
+    """A flat grid of n x n unit quads."""
+    y, x = np.mgrid[:n + 1, :n + 1]
+    vertices = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1).astype(float)
+    corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
+    return vertices, np.stack([corner, corner + 1, corner + n + 2, corner + n + 1], -1)
+
+
+def test_a_path_round_a_corner_crosses_its_quad():
+    vertices, faces = grid()
+    walk = [5, 6, 11, 12]  # right, up, right: a staircase about the quads of corners 6 and 5
+    path = np.stack([walk[:-1], walk[1:]], -1)
+    curve = np.full(len(vertices), -1)
+    curve[walk] = 3
+    before = Constraints(curve, np.zeros(len(vertices), bool), path, np.full(3, 3))
+    # Of the two corners in the staircase one is let off here; the other stays.
+    after = Constraints(np.where(np.arange(len(vertices)) == 6, -1, curve), before.fixed, path[2:], np.full(1, 3))
+    face_idx, found = crossed(faces, before, after)
+    assert len(face_idx) == 1 and set(faces[face_idx[0]]) == {5, 6, 10, 11} and found.tolist() == [3]
+    new_vertices, _, halved = subdivide(vertices, faces, after)
+    held = held_at_centres(halved, len(new_vertices) - len(faces), face_idx, found)
+    added = np.flatnonzero(held.curve != halved.curve)
+    assert np.allclose(new_vertices[added], [[0.5, 1.5, 0]])
+    released = untied(vertices, faces, before)
+    assert (released.curve[[6, 11]] < 0).all() and not len(crossed(faces, before, before)[0])
+
+
+def test_bent_quads_are_cut_along_the_ridge():
+    ridge = np.array([[0, 0, 0], [2, 0, -1], [2, 2, 0], [0, 2, -1.0]])  # the ridge runs from the first corner to the third
+    surface = Surface(ridge, np.array([[0, 1, 2], [0, 2, 3]]))
+    for turn in range(4):
+        quad = np.roll([0, 1, 2, 3], turn)[None]
+        out = cut_along_features(ridge, quad, surface)[0]
+        assert out[0] in (0, 2) and np.roll(out, -int(np.argmin(out))).tolist() == [0, 1, 2, 3]

@@ -1,0 +1,39 @@
+"""Irregular vertices that cancel: one quad closes, the mesh stays whole."""
+
+import numpy as np
+
+from gdtool.geometry import topology
+from gdtool.geometry.mesh_quality import valences
+from gdtool.remesh.connectivity.irregular_vertices import cancel_irregular
+from tests.geometry.solids import quad_torus
+
+
+def opened(points: np.ndarray, quads: np.ndarray, v: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertex v of four quads split in two of three edges, with a new quad between: the inverse of closing one."""
+    mine = np.flatnonzero((quads == v).any(1))
+    after = {int(q[(q.tolist().index(v) + 1) % 4]): i for i, q in zip(mine, quads[mine], strict=True)}
+    before = {i: int(q[(q.tolist().index(v) - 1) % 4]) for i, q in zip(mine, quads[mine], strict=True)}
+    fan = [int(mine[0])]
+    while len(fan) < 4:
+        fan.append(after[before[fan[-1]]])
+    quads = quads.copy()
+    for i in fan[:2]:
+        quads[i][quads[i] == v] = len(points)
+    start = quads[fan[0]][(quads[fan[0]].tolist().index(len(points)) + 1) % 4]
+    end = before[fan[1]]
+    return np.concatenate([points, points[v:v + 1] * 1.01]), np.concatenate([quads, [[v, start, len(points), end]]])
+
+
+def test_an_opened_vertex_closes_again():
+    points, quads = quad_torus()
+    more_points, more = opened(points, quads, 40)
+    assert topology.is_watertight(more) and (valences(more, len(more_points))[0] != 4).sum() == 4
+    out, found = cancel_irregular(more_points, more)
+    assert len(found) == len(quads) and topology.is_watertight(found) and topology.is_manifold(found)
+    assert (valences(found, len(out))[0] == 4).all()
+
+
+def test_a_regular_mesh_stays():
+    points, quads = quad_torus()
+    out, found = cancel_irregular(points, quads)
+    assert (found == quads).all() and (out == points).all()

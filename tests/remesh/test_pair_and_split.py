@@ -1,0 +1,111 @@
+"""The fallback without an engine: triangles paired and split."""
+
+import numpy as np
+import pytest
+
+from gdtool.geometry import simplify, topology
+from gdtool.remesh import pipeline as quads
+from gdtool.remesh.fallback import pair_and_split as quad_split, smoothed
+from gdtool.remesh.fit import shaping
+from gdtool.remesh.fit.feature_curves import NO_FEATURES
+from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, shape_figures
+from gdtool.remesh.fit.surface_projection import Surface
+from gdtool.remesh.fallback.pair_and_split import pair_and_split
+from gdtool.remesh.task import Part, Request
+from gdtool.geometry.topology import triangulated
+from tests.remesh.engines import whole
+from tests.geometry.solids import cube, joined, rod, sphere, torus, volume
+
+
+def test_pairing_gives_the_asked_count_exactly():
+    vertices, faces = sphere(24)
+    for count in (3 * len(faces) - 500, int(2.2 * len(faces))):
+        out, found = pair_and_split(vertices, faces, count)
+        assert abs(len(found) - count) <= 1 and whole(found) and volume(out, found) > 0
+
+
+def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypatch):
+    """One whose gentler steps keep the small piece: a third more quads than asked for, and not the whole mesh's."""
+    small, large = sphere(8), sphere(24)
+    vertices, faces = joined((small[0] * 0.1 + 3, small[1]), large)
+    tried = []
+
+    def losing(vertices, faces, target, **how):
+        tried.append(target)
+        own = simplify.simplify(*large, target - (len(small[1]) if target > 1000 else 0), measured=False)
+        return (*(joined(small, own[:2]) if target > 1000 else own[:2]), None, {})
+
+    monkeypatch.setattr(quad_split, "simplify", losing)
+    asked = 1800  # 800 triangles, of which 1.15 times as many lose the piece and 1.3 times keep it
+    out, found = quad_split.of_own(vertices, faces, asked, 60.0)
+    assert tried[:3] == [800, 919, 1040] and topology.components(found)[0] == 2
+    assert asked < len(found) < 1.5 * asked < 1.8 * len(faces)
+
+
+def test_even_triangles_are_sought_no_longer_than_they_come_nearer_to_their_number(monkeypatch):
+    """A cube has twelve triangles whatever their edge; on a sphere any number is found."""
+    import pymeshlab
+
+    runs, mesh_set = [], pymeshlab.MeshSet
+    monkeypatch.setattr(pymeshlab, "MeshSet", lambda: runs.append(1) or mesh_set())
+    cubes = joined(*((cube()[0] + (3 * i, 0, 0), cube()[1]) for i in range(20)))
+    assert len(quad_split.even_triangles(*cubes, 100, 30.0)[1]) == 240 and len(runs) == 2
+    runs.clear()
+    assert abs(len(quad_split.even_triangles(*sphere(24), 500, 30.0)[1]) / 500 - 1) < 0.05 and 1 <= len(runs) <= 4
+
+
+@pytest.mark.parametrize("mesh, quads, few", [(sphere(24), 100, False), (sphere(24), 20, True), (torus(24), 200, False), (torus(24), 120, True),
+                                              (joined(*[sphere(8)] * 9), 260, False), (joined(*[sphere(8)] * 9), 240, True)])
+def test_even_triangles_that_would_be_too_few_are_not_sought(monkeypatch, mesh, quads, few):
+    """Twelve for a piece, and eighty for a handle."""
+    sought = []
+    monkeypatch.setattr(smoothed, "of_even", lambda *given: sought.append(given))
+    monkeypatch.setattr(smoothed, "split_count", lambda faces, quads: quads)
+    part = Part(*mesh, quads, 0.1, Request(quads=quads), lambda: Surface(*mesh))
+    _, faces = smoothed.split(part)
+    assert quad_split.few_for_even(mesh[1], quads) == few
+    assert len(sought) == (not few)
+    assert topology.is_watertight(faces)
+
+
+def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
+    """Pins with few triangles around: what bends too much stays single, and there are fewer triangles for it."""
+    vertices, faces = joined(*((pin[0] + (0.3 * k, 0, 0), pin[1]) for k, pin in enumerate([rod(24)] * 8)))
+    _, found = quad_split.of_own(vertices, faces, 400, 60.0)
+    assert abs(len(found) / 400 - 1) < 0.1 and topology.components(found)[0] == 8 and topology.is_watertight(found)
+
+
+@pytest.mark.parametrize("shape", ["slivers", "coincident"])
+def test_splitting_makes_square_quads_of_any_triangles(shape):
+    """What no engine manages is made even first: long slivers, and sheets that touch without being joined."""
+    if shape == "slivers":
+        vertices, faces = cube()
+        vertices = vertices * (1, 0.4, 0.15)  # twelve triangles
+    else:
+        vertices, faces = joined(cube(), cube())
+        vertices = vertices.copy()
+        vertices[8:, 0] += np.ptp(vertices[:8, 0])  # shares a side with the first
+    vertices = vertices / np.ptp(vertices, 0).max()
+    out, found, record = quads.remesh(vertices, faces, Request(quads=3000, engine="split"))
+    assert record.engine == "pair and split" and whole(found) and abs(len(found) / 3000 - 1) <= 0.03
+    assert topology.components(found)[0] == topology.components(faces)[0]
+    figures = shape_figures(out, found)
+    assert figures["jacobian_mean"] > 0.85 and figures["folded_share"] == 0 and figures["angle_deviation_deg"] < 18
+    assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.01
+
+
+def test_quads_without_area_are_evened_out_where_their_neighbours_stay(monkeypatch):
+    """A mesh of the fallback whose every vertex is to stay, but one quad was split without area."""
+    vertices, faces = sphere(24, 0.5)
+    split, quad_faces = pair_and_split(vertices, faces, 600)
+    a, b, c, d = quad_faces[100]
+    split[b], split[d] = split[a], split[c]
+    assert polygon_normals(split, quad_faces)[1][100] < 1e-12
+    monkeypatch.setattr(shaping, "_let_go", lambda *given: np.arange(len(quad_faces)))
+    surface, request = Surface(vertices, faces), Request(quads=600)
+    out = shaping.better(split, quad_faces, *shaping.evened(split, quad_faces, surface, NO_FEATURES, request), surface, request, surface)
+    edge = (polygon_normals(out, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
+    assert polygon_normals(out, quad_faces)[1].min() > 1e-4 * edge**2
+    touched = np.isin(quad_faces, quad_faces[100]).any(1)
+    kept = np.setdiff1d(quad_faces[~touched], quad_faces[touched])
+    assert np.array_equal(out[kept], split[kept])

@@ -1,0 +1,314 @@
+"""What an engine makes is mended, judged and not believed; whatever it does, a way through is found."""
+
+import time
+
+import igl
+import numpy as np
+import pytest
+
+from gdtool.core.child import ChildFailed
+from gdtool.geometry import topology
+from gdtool.remesh import pipeline as quads
+from gdtool.remesh.engines import candidate as quad_candidate, search
+from gdtool.remesh.fit.feature_curves import Constraints
+from gdtool.geometry.normals import face_normals
+from gdtool.remesh.engines.candidate import Candidate
+from gdtool.remesh.fit.shaping import Outline, fault_of, left_out, surface_of
+from gdtool.remesh.fit.surface_projection import Surface
+from gdtool.remesh.task import Part, Record, Request
+from gdtool.geometry.topology import triangulated
+from tests.remesh.engines import Ended, around, in_this_process, inner_face, whole
+from tests.geometry.solids import cube, marching, quad_cube, sphere, torus, volume
+
+
+@pytest.mark.parametrize("failure", ["died of SIGSEGV", "ended with exit code 0 and no result"])
+def test_dead_engine_is_replaced(monkeypatch, failure):
+    monkeypatch.setattr(search, "begin", lambda *_, **__: Ended(ChildFailed(failure)))
+    vertices, faces = torus()
+    _, found, record = quads.remesh(vertices / 2, faces, Request(quads=900))
+    assert record.engine == "pair and split" and any(failure in text for text in record.failed)
+    assert whole(found) and abs(len(found) / 900 - 1) <= 0.03
+
+
+@pytest.mark.parametrize("outcome, runs", [("a smaller sphere", 1), ("a crash", 3)])
+def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypatch, outcome, runs):
+    """Another density or no creases mend a seam that tore; a part that is too fine for the quads stays so."""
+    vertices, faces = sphere(24)
+    out, found, _ = quads.remesh(vertices / 2, faces, Request(quads=1000, engine="split"))
+
+    def engine(*_):
+        if outcome == "a crash":
+            raise ChildFailed("died of SIGSEGV")
+        return out / 2, found
+
+    calls = in_this_process(monkeypatch, engine)
+    # Drawn onto the large sphere the small one would become it.
+    monkeypatch.setattr(quad_candidate, "outlined", lambda vertices, faces, *_: Outline(
+        vertices, faces, Constraints.none(len(vertices)), tips=np.zeros(0, int), edge=1.0, far=0.0, limit=1.0, hopeless=True))
+    _, found, record = quads.remesh(vertices / 2, faces, Request(quads=1000))
+    assert len(calls) == runs and record.engine == "pair and split" and whole(found)
+    assert outcome == "a crash" or "strays" in record.failed[0]
+
+
+@pytest.mark.parametrize("tops, wanted, order", [((0.3, 1.0), 1000, [1, 0]), ((0.3, 1.0), 1100, [0, 1]), ((0.39, 1.0), 1000, [0, 1]),
+                                                  ((0.3, 0.3), 875, [0, 1])], ids=["far", "of another count", "in no doubt", "both far"])
+def test_of_two_the_one_much_nearer_to_the_surface_comes_first_where_the_other_is_in_doubt(tops, wanted, order):
+    """Balls without a cap, and whole ones."""
+    vertices, faces = sphere(24, 0.4)
+    out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
+    part = Part(vertices, faces, 1000, 0.045, Request(), None)
+    way = search.Way("instant-meshes", 0, (1.0,), 30.0)
+    two = [Candidate(way, 1000, None, *topology.compact(out, found[out[found].mean(1)[:, 2] < height])) for height in tops]
+    assert [id(one) for one in search.Trial(part, Record())._nearer_first(two, wanted)] == [id(two[k]) for k in order]
+
+
+def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(monkeypatch):
+    """Half a ball, a tenth too few quads; a whole one lacks nothing, nor one without a cap that its tip can be drawn over."""
+    vertices, faces = sphere(24, 0.4)
+    out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
+    part = Part(vertices, faces, 1000, 0.045, Request(), None)
+    height = out[found].mean(1)[:, 2]
+    left = [Candidate(search.Way("instant-meshes", 0, (1.0,), 30.0), 1000, None, *topology.compact(out, found[height < most])).leaves_out(part)
+            for most in (1.0, 0.37, 0.0)]
+    assert left[:2] == [None, None] and "leaves out 3" in left[2]
+    calls = in_this_process(monkeypatch, lambda *_: topology.compact(out, found[height < 0.0]))
+    monkeypatch.setattr(quad_candidate, "judged", lambda vertices, found, *_: (None, vertices, found))
+    monkeypatch.setattr(search.Trial, "_drawn", None)
+    _, _, record = quads.remesh(vertices, faces, Request(quads=1000))
+    assert len(calls) == 1 and record.engine == "pair and split" and "leaves out" in record.failed[0]
+
+
+@pytest.mark.parametrize("thickness, thin", [(0.03, True), (0.05, False)])
+def test_a_coarser_mesh_is_given_up_where_walls_are_thinner_than_quads(thickness, thin):
+    vertices, faces = igl.upsample(*cube(), 5)
+    vertices = vertices * (0.9, 0.9, thickness)
+    part = Part(vertices, faces, 4000, (2 * 0.81 / 4000) ** 0.5, Request(), None)
+    assert part.thin == thin
+    wedge = vertices.copy()
+    wedge[:, 2] *= 0.01 + (wedge[:, 0] + 0.45) / 0.9 * 0.7 / thickness
+    assert not Part(wedge, faces, 4000, 0.02, Request(), None).thin
+    # One side of a sheet is no wall, nor is what lies outside, before it.
+    assert not Part(vertices, faces[face_normals(vertices, faces)[0][:, 2] > 0.5], 2000, part.edge, Request(), None).thin
+    # A coarse mesh is not asked.
+    assert not Part(cube()[0] * (0.9, 0.9, thickness), cube()[1], 4000, part.edge, Request(), None).thin
+    assert not Part(vertices, faces[:, ::-1], 4000, part.edge, Request(), None).thin
+    # Without creases, or its narrow sides tell.
+    _, found, record = quads.remesh(vertices, faces, Request(quads=4000, crease_degrees=0.0))
+    assert whole(found) and any("walls" in text for text in record.failed) == thin and not (thin and "1 subdivision" in record.engine)
+
+
+def with_tunnel(vertices, faces, length):
+    """A ball with a tunnel, a triangle wide, from its top to a triangle about so far away."""
+    centre = vertices[faces].mean(1)
+    top = centre[:, 2].argmax()
+    other = np.abs(np.linalg.norm(centre - centre[top], axis=1) - length).argmin()
+    a, b = faces[top], faces[other][::-1]
+    b = min((np.roll(b, k) for k in range(3)), key=lambda b: np.linalg.norm(vertices[a] - vertices[b], axis=1).sum())
+    tube = [[a[k], a[(k + 1) % 3], b[k]] for k in range(3)] + [[a[(k + 1) % 3], b[(k + 1) % 3], b[k]] for k in range(3)]
+    return vertices, np.concatenate([np.delete(faces, [top, other], 0), tube])
+
+
+def bored_ball():
+    return marching(lambda x, y, z: np.maximum(np.sqrt(x * x + y * y + z * z) - 0.4, 0.06 - np.hypot(x, y)), 64, 0.5)
+
+
+@pytest.mark.parametrize("shape, given_up", [("a skin-deep tunnel", True), ("a bore", False)])
+def test_a_handle_is_given_up_only_where_it_is_finer_than_a_quad(monkeypatch, shape, given_up):
+    vertices, faces = sphere(96, 0.4)
+    out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
+    vertices, faces = with_tunnel(vertices, faces, 0.07) if given_up else bored_ball()
+    assert topology.is_watertight(faces) and topology.is_manifold(faces) and topology.euler_number(faces) == 0
+    in_this_process(monkeypatch, lambda *_: (out, found))  # an engine that makes a ball of it
+    _, found, record = quads.remesh(vertices, faces, Request(quads=1000))
+    assert whole(found) and (record.engine == "instant-meshes, handles are lost") == given_up
+    assert topology.euler_number(found) == (2 if given_up else 0)
+
+
+def test_torn_output_is_not_believed(monkeypatch):
+    # Three quads at one edge.
+    book = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [1, 0, 6, 7]])
+    in_this_process(monkeypatch, lambda *_: (np.random.default_rng(0).random((8, 3)), book))
+    vertices, faces = sphere(24)
+    _, found, record = quads.remesh(vertices / 2, faces, Request(quads=300))
+    assert whole(found) and record.engine == "pair and split" and any("pieces are lost" in text for text in record.failed)
+
+
+def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
+    vertices, faces = quad_cube(3)
+    middle = inner_face(vertices, faces)
+    corners, sides = around(faces, middle)
+    assert len(corners) == 4 and len(sides) == 4
+    torn = np.delete(faces, [*corners[1:], *sides], 0)
+    fault, out, found = quad_candidate.judged(vertices, torn, topology.invariants(faces))
+    assert fault is None and whole(found) and topology.components(found)[0] == 1 and len(found) < len(faces)
+    assert volume(out, triangulated(found)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
+
+
+def test_candidates_are_in_the_order_of_place(monkeypatch):
+    """Whatever order an engine leaves its quads in."""
+    vertices, faces = quad_cube(3)
+    rng = np.random.default_rng(1)
+    mixed, number = rng.permutation(len(vertices)), np.empty(len(vertices), np.int64)
+    number[mixed] = np.arange(len(vertices))
+    monkeypatch.setitem(quad_candidate.ENGINES, "quadriflow", lambda *_: (vertices[mixed], rng.permutation(number[faces])))
+    one = quad_candidate.candidate(vertices, triangulated(faces)[0], quad_candidate.Way("quadriflow", 0, (1.0,), 30.0), len(faces))
+    assert one.fault is None and len(one.quads) == len(faces)
+
+    def places(v, q):
+        return sorted(map(tuple, v[q].reshape(len(q), 12).tolist()))
+
+    assert places(one.vertices, one.quads) == places(vertices, faces)
+    ends = topology.edges_of(one.quads).ends
+    assert np.abs(np.diff(ends, axis=1)).mean() < 0.3 * len(vertices) / 3  # a third of them, on average, where it is by chance
+
+
+def test_output_without_area_is_no_quads():
+    vertices, faces = quad_cube(1)
+    assert quad_candidate.judged(vertices, faces[:, [0, 1, 1, 0]], topology.invariants(faces))[0] == "no quads"
+
+
+def test_quads_that_cut_edges_off_do_not_do():
+    vertices, faces = quad_cube(3)
+    surface, edge = Surface(vertices, triangulated(faces)[0]), 0.125 * np.ptp(vertices[:, 0])
+    assert fault_of(vertices, faces, surface, edge, 1.0, 0.005)[0] is None
+    cut = vertices.copy()
+    on_two = np.isclose(np.abs(vertices), np.abs(vertices).max()).sum(1) >= 2  # the cube's twelve edges
+    cut[on_two] *= 1 - 0.5 * edge / np.ptp(vertices[:, 0])
+    assert fault_of(cut, faces, surface, edge, 1.0, 0.5)[0] is None
+    assert fault_of(cut, faces, surface, edge, 1.0, 0.005)[0].startswith("cuts off")
+
+
+def test_surface_that_the_quads_do_without_is_measured():
+    vertices, faces = cube()
+    lid = faces[np.all(vertices[faces][:, :, 2] == vertices[:, 2].max(), 1)]
+    rest = np.array([f for f in faces.tolist() if f not in lid.tolist()])
+    surface = Surface(vertices, faces)
+    closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, rest))
+    assert left_out(surface_of(vertices, closed), surface, (0.1,)) == [0]
+    assert left_out(surface_of(vertices, opened), surface, (0.1, 2.0)) == pytest.approx([0.8**2 / 6, 0], abs=0.02)  # the lid but its rim
+
+
+def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_finer_one_comes(monkeypatch):
+    """Of a coarser mesh subdivided less is put up with than of a finer one, for the finer one comes after it; where it does not, it is better than none."""
+
+    engine = quad_candidate.ENGINES["instant-meshes"]
+
+    def torn(vertices, faces, quads, degrees):
+        if quads > 2000:
+            raise ChildFailed("died of SIGSEGV")
+        return engine(vertices, faces, quads, degrees)
+
+    calls = in_this_process(monkeypatch)
+    monkeypatch.setitem(quad_candidate.ENGINES, "instant-meshes", torn)
+    monkeypatch.setattr(quad_candidate, "fault_of", lambda *given: ("cuts off 0.7% of the surface" if given[-1] < 0.007 else None, 0.5))
+    vertices, faces = sphere(96, 0.45)
+    _, found, record = quads.remesh(vertices, faces, Request(quads=4000))
+    assert record.engine == "instant-meshes, 1 subdivision" and whole(found) and abs(len(found) / 4000 - 1) <= 0.03
+    assert "cuts off" in record.failed[0] and "SIGSEGV" in record.failed[1]
+    assert sum(not way.subdivisions for _, _, way, _ in calls) == 1
+    monkeypatch.setattr(quad_candidate, "FAR_SUBDIVIDED", 0.4)  # farther than that it is not unfolded
+    assert quads.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
+    monkeypatch.undo()
+    in_this_process(monkeypatch)
+    monkeypatch.setitem(quad_candidate.ENGINES, "instant-meshes", torn)
+    monkeypatch.setattr(quad_candidate, "fault_of", lambda *given: ("cuts off 2% of the surface", 0.5))
+    assert quads.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
+
+
+def test_when_the_time_is_over_no_engine_is_begun():
+    """What was asked for comes all the same, as paired triangles, and the record says why."""
+    vertices, faces = sphere(96, 0.45)
+    start = time.monotonic()
+    out, found, record = quads.remesh(vertices, faces, Request(quads=4000, seconds=0.0))
+    assert record.engine == "pair and split" and record.failed == ["instant-meshes, 1 subdivision: not tried, the time is over"]
+    assert whole(found) and abs(len(found) / 4000 - 1) <= 0.03 and time.monotonic() - start < 30
+
+
+def test_every_round_asks_for_two_densities():
+    way = search._ways(20000, Request())[0]
+    assert len(way.near(20000)) == 2 and np.mean(way.near(20000)) == pytest.approx(20000)
+    assert way.near(20000)[1] / way.near(20000)[0] == pytest.approx(way.factors[1] / way.factors[0])
+
+
+def test_what_is_asked_next_lies_between_what_gave_too_few_and_what_gave_too_many():
+    """An engine's count may jump by a twentieth: in proportion to the last answer what gave too many would be asked for again."""
+    gave = [(19700.0, 20868), (20100.0, 21164)]
+    assert search._between(gave, 20000) is None and search._between(gave, 22000) is None
+    gave += [(18691.0, 19164), (19070.0, 18844)]
+    assert search._between(gave, 20000) == pytest.approx(19186, abs=1)
+
+
+def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypatch):
+    """The first in rank where it will do, without a look at the other, and the other first where the first's outline leaves out more;
+    where none does, what comes nearest to it."""
+    way = search._ways(20000, Request())[0]
+    drawn = []
+
+    def candidate(far, least, wrong=None, outline=0.5):
+        found = Candidate(way, 1000, None, np.zeros((0, 3)), np.zeros((0, 4), int), far=far, least=least, wrong=wrong)
+        found.asked_of_outline = outline
+        return found
+
+    def outlined(one, part):
+        one.outline = one.asked_of_outline
+        return one.outline < 1
+
+    monkeypatch.setattr(Candidate, "promising", outlined)
+    monkeypatch.setattr(Candidate, "draw", lambda one, part: drawn.append(one))
+    choose = search.Trial(Part(*cube(), 1000, 0.1, Request(), None), Record())._drawn
+    good, better, bare, thin = candidate(0.5, 0.3), candidate(0.1, 0.9), candidate(0.9, 0.5), candidate(0.3, 0.1)
+    assert choose([good, better]) is good and drawn == [good] and choose([bare, good]) is good
+    assert choose([candidate(0.1, 0.9, "leaves out 1 % of the surface"), thin]) is thin
+    assert choose([bare, thin]) is bare and choose([candidate(2.0, 0.5), thin]) is thin
+    drawn.clear()
+    late = candidate(0.9, 0.3, outline=1.1)
+    assert choose([late, good]) is good and drawn == [good]
+    late.outline = None
+    drawn.clear()
+    assert choose([late, candidate(2.0, 0.5)]) is late and drawn[1] is late and len(drawn) == 2
+
+
+def test_the_quads_of_tips_count_before_any_are_drawn(monkeypatch):
+    """What has too many quads with those of its tips is not drawn; another that has as many tips but fewer quads is, and only then a new one asked for."""
+    way = search._ways(20000, Request())[0]
+    trial = search.Trial(Part(*cube(), 4000, 0.1, Request(), None), Record())
+
+    def candidate(count, tips, hopeless=False):
+        found = Candidate(way, count, None, np.zeros((0, 3)), np.zeros((count // 4, 4), int))
+        found.traced = Outline(np.zeros((0, 3)), np.zeros((count + tips, 4), int), None, np.zeros(0, int), 0.1, 0.0, 1.0, hopeless)
+        return found
+
+    monkeypatch.setattr(Candidate, "trace", lambda one, part: setattr(one, "outline", one.traced))
+    plain, far, fewer = candidate(4000, 0), candidate(4100, 100), candidate(3900, 100)
+    assert next(trial._of_count([plain, far], 0)) is plain and far.outline is None
+    assert list(trial._of_count([far, fewer, candidate(4080, 100)], 0)) == [fewer]
+    assert trial._drawn(trial._of_count([far, plain := candidate(4060, 0)], 0)) is None and plain.outline is None
+    assert list(trial._of_count([hopeless := candidate(4100, 100, hopeless=True)], 0)) == [hopeless]
+
+
+def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypatch):
+    """A plate hardly thicker than a quad: the engine is asked at full density alone, both rims are met, and the record says so."""
+    calls = in_this_process(monkeypatch)
+    vertices, faces = cube()
+    vertices = vertices * (1, 0.8, 0.02)
+    out, found, record = quads.remesh(vertices, faces, Request(quads=8000))
+    assert all(not way.subdivisions for _, _, way, _ in calls) and "not tried, its quads are wider" in record.failed[0]
+    assert record.engine == "instant-meshes" and whole(found)
+    corners = vertices[np.abs(vertices[:, None] - out[None]).max(-1).min(1) < 1e-9]
+    assert len(corners) == 8
+    assert left_out(surface_of(out, found), Surface(vertices, faces), (0.005,)) == [0.0]
+
+
+@pytest.mark.parametrize("given, least, most", [(16000, 2000, 2500), (500, 500, 500)])
+def test_an_engine_has_a_memory_limit_of_its_own_within_the_request(monkeypatch, given, least, most):
+    """It follows the quads and triangles: Instant Meshes fills some holes for ever."""
+    limits = []
+
+    def begin(*_, memory_mb, **more):
+        limits.append(memory_mb)
+        return Ended(ChildFailed("ran out"))
+
+    monkeypatch.setattr(search, "begin", begin)
+    vertices, faces = sphere(48, 0.45)
+    _, found, record = quads.remesh(vertices, faces, Request(quads=4000, memory_mb=given))
+    assert limits and all(least <= limit <= most for limit in limits) and record.engine == "pair and split" and whole(found)

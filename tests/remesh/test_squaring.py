@@ -1,0 +1,109 @@
+"""Squaring quads: folds undone on the surface, straight corners let off their curves."""
+
+import numpy as np
+import pytest
+
+from gdtool.geometry.distance import closest_points
+from gdtool.remesh.fit.feature_curves import Constraints, Features, untied
+from gdtool.geometry.mesh_quality import scaled_jacobian
+from gdtool.remesh.fit.squaring import balance, ease, square_up
+from gdtool.remesh.fit.surface_projection import Surface
+from gdtool.geometry.topology import triangulated
+from tests.geometry.solids import plane, sphere
+
+NO_FEATURES = Features(np.zeros((0, 3)), np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
+def grid(n=8):
+    line = np.linspace(-0.5, 0.5, n + 1)
+    x, y = np.meshgrid(line, line)
+    i = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
+    return np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1), np.stack([i, i + 1, i + n + 2, i + n + 1], -1)
+
+
+def test_folded_quads_are_turned_over_again_and_stay_on_the_surface():
+    vertices, quads = grid()
+    bent = vertices.copy()
+    bent[40] += [0.19, 0.17, 0]  # past its neighbour
+    assert scaled_jacobian(bent, quads).min() < 0
+    out = square_up(bent, quads, Surface(*plane()), NO_FEATURES, Constraints.none(len(vertices)), 20)
+    assert scaled_jacobian(out, quads).min() > 0.8 and np.abs(out[:, 2]).max() < 1e-12
+    rim = np.abs(vertices[:, :2]).max(1) > 0.49
+    assert np.array_equal(out[rim], vertices[rim])
+
+
+def test_middle_of_three_corners_in_a_row_is_let_off_its_curve():
+    vertices, quads = grid()
+    path = np.array([[38, 39], [39, 40], [40, 49], [49, 50]])  # straight, then round a quad's corner at 40
+    curve = np.full(len(vertices), -1)
+    curve[[39, 40, 49]] = 0
+    fixed = np.zeros(len(vertices), bool)
+    fixed[[38, 50]] = True
+    found = untied(vertices, quads, Constraints(curve, fixed, path, np.zeros(4, np.int64)))
+    assert found.curve[40] == -1 and found.curve[49] == -1 and found.curve[39] == 0
+    assert found.path.tolist() == [[38, 39]] and found.fixed[[38, 50]].all()
+    fixed[[40, 49]] = True  # true corners of the surface, square here: they stay
+    assert len(untied(vertices, quads, Constraints(curve, fixed, path, np.zeros(4, np.int64))).path) == 4
+
+
+def test_a_corner_pinned_in_the_wrong_place_is_eased():
+    vertices, quads = grid()
+    bent = vertices.copy()
+    bent[40] = bent[50] + [0.01, 0.01, 0]
+    fixed = np.zeros(len(vertices), bool)
+    fixed[40] = True
+    pinned = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
+    out, left = ease(bent, quads, Surface(*plane()), NO_FEATURES, pinned)
+    assert scaled_jacobian(out, quads).min() >= 0.2 and not left.fixed[40]
+
+
+@pytest.mark.parametrize("moved, by", [(49, (0.1, -0.1, 0)), (41, (0, 0.2, 0))])
+@pytest.mark.parametrize("height", [0.15, 0.25])
+def test_a_tip_beside_folded_quads_stays_where_easing_would_draw_it_back(height, moved, by):
+    vertices, quads = grid()
+    tip = 40
+    vertices[tip, 2] = height
+    triangles = triangulated(quads)[0]
+    surface, held = Surface(vertices, triangles.astype(np.int64)), Constraints.none(len(vertices))
+    held.fixed[tip] = True
+    bent = vertices.copy()
+    bent[moved] += by
+    bent = surface.closest(bent)[2]
+    assert scaled_jacobian(bent, quads).min() < 0
+
+    def bare(out):
+        return closest_points(vertices[[tip]], out, triangles)[0][0] * 8  # edges are 1/8 long
+
+    out, left = ease(bent, quads, surface, NO_FEATURES, held)
+    assert scaled_jacobian(out, quads).min() > 0.5 and bare(out) < 1e-9 and left.fixed[tip]
+    out, left = ease(bent, quads, surface, NO_FEATURES, held, most_bare=2.0)
+    assert 0.75 < bare(out) < 2 and not left.fixed[tip]
+
+
+def test_easing_folds_nothing_that_was_not_folded():
+    vertices, quads = grid()
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        fixed = rng.random(len(vertices)) < 0.2
+        pinned = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
+        bent = vertices + rng.normal(0, 0.06, vertices.shape) * (1, 1, 0)
+        before = scaled_jacobian(bent, quads)
+        after = scaled_jacobian(ease(bent, quads, Surface(*plane()), NO_FEATURES, pinned)[0], quads)
+        assert (after <= 0).sum() <= (before <= 0).sum()
+
+
+def test_balancing_lifts_quads_to_the_surface_but_leaves_thin_ones():
+    """A grid below the top of a ball, with a few corners nearly on the opposite diagonal."""
+    vertices, quads = grid()
+    vertices = vertices * 0.3
+    thin = quads[[10, 30, 50]]
+    vertices[thin[:, 0]] = 0.55 * vertices[thin[:, 1]] + 0.45 * vertices[thin[:, 3]]
+    ball = Surface(*sphere(48, 0.8))
+    vertices[:, 2] = np.sqrt(0.8**2 - (vertices[:, :2] ** 2).sum(1))
+    vertices = ball.closest(vertices)[2]
+    before = scaled_jacobian(vertices, quads)
+    out = balance(vertices, quads, ball, Constraints.none(len(vertices)))
+    after = scaled_jacobian(out, quads)
+    assert (before < 0.3).any() and (after[before < 0.3] >= before[before < 0.3] - 1e-12).all()
+    centre = np.abs(ball.closest(out[quads].mean(1))[0]).mean(), np.abs(ball.closest(vertices[quads].mean(1))[0]).mean()
+    assert centre[0] < 0.8 * centre[1]

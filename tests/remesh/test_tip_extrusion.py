@@ -1,0 +1,142 @@
+"""Tips: what sticks out of quads is drawn out of them, and nothing else changes."""
+
+import numpy as np
+import pytest
+
+from gdtool.geometry import topology
+from gdtool.remesh import pipeline
+from gdtool.remesh.fit import shaping
+from gdtool.remesh.fit.feature_curves import Constraints
+from gdtool.geometry.mesh_quality import distance_figures, scaled_jacobian
+from gdtool.geometry.normals import face_normals
+from gdtool.remesh.fit.shaping import farthest, surface_of
+from gdtool.remesh.fit.surface_projection import Surface
+from gdtool.remesh.task import Request
+from gdtool.remesh.fit.tip_extrusion import draw_out
+from gdtool.geometry.topology import triangulated
+from tests.remesh.engines import in_this_process
+from tests.geometry.solids import quad_cube, sphere
+
+
+def horned(length, width=0.05, bend=0.0):
+    """A sphere of radius 0.4 with a horn at +x, whose middle line bends toward +y."""
+    vertices, faces = sphere(160, 0.4)
+    away = np.linalg.norm(vertices[:, 1:], axis=1)
+    horn = (vertices[:, 0] > 0) & (away < width)
+    share = 1 - away[horn] / width
+    vertices[horn, 0] += length * share
+    vertices[horn, 1] += bend * share**2
+    return vertices, faces
+
+
+def ball(rounds=4):
+    """Quads on the sphere of radius 0.4, and their edge length."""
+    vertices, faces = quad_cube(rounds)
+    vertices = vertices - vertices.mean(0)
+    vertices *= 0.4 / np.linalg.norm(vertices, axis=1, keepdims=True)
+    return vertices, faces, (4 * np.pi * 0.4**2 / len(faces)) ** 0.5
+
+
+@pytest.mark.parametrize("length, bend", [(0.08, 0.0), (0.25, 0.0), (0.25, 0.15)])
+def test_a_horn_is_drawn_out(length, bend):
+    vertices, faces, edge = ball()
+    surface = Surface(*horned(length, bend=bend))
+    assert farthest(surface_of(vertices, faces), surface) > 1.4 * edge
+    out, found, constraints, tips, _, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge, most_added=0.3)
+    assert farthest(surface_of(out, found), surface) < 0.8 * edge
+    assert topology.is_watertight(found) and topology.is_manifold(found) and topology.euler_number(found) == 2
+    assert len(faces) < len(found) < 1.2 * len(faces)
+    assert len(tips) and constraints.fixed[tips].all() and len(constraints.curve) == len(out)
+    apex = surface.vertices[surface.vertices[:, 0].argmax()]
+    assert np.linalg.norm(out[tips] - apex, axis=1).min() < 0.9 * edge
+    # The quads away from the horn are those that were there.
+    same = (vertices == out[:len(vertices)]).all(1)
+    assert same.sum() > 0.97 * len(vertices) and (vertices[~same, 0] > 0.3).all()
+
+
+def test_no_more_quads_than_allowed_are_spent():
+    vertices, faces, edge = ball()
+    found = draw_out(vertices, faces, Constraints.none(len(vertices)), Surface(*horned(0.25)), edge, most_added=0.01)[1]
+    assert 0 < len(found) - len(faces) < 0.01 * len(faces) + 40  # those of the step that went over it
+
+
+def test_what_is_near_enough_is_left_alone():
+    vertices, faces, edge = ball()
+    surface = Surface(*horned(0.4 * edge))
+    out, found, _, tips, far, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
+    assert out is vertices and found is faces and not len(tips) and far == pytest.approx(0.4 * edge, rel=0.2)
+
+
+def test_what_is_bare_is_told_by_area_and_not_by_how_many_vertices_are_there():
+    """Creases have most of a simplified mesh's vertices: what is cut off along them is little of the surface all the same."""
+    vertices, faces, edge = ball()
+    fine, triangles = sphere(160, 0.4)
+    narrow = fine[:, 0] > 0.39
+    fine = np.where(narrow[:, None], fine * (1 + 0.4 * edge / 0.4), fine)  # lifted by less than what makes a tip
+    many = Surface(*_cut_in_four(fine, triangles, narrow[triangles].all(1), 3))
+    assert (many.vertices[:, 0] > 0.39).mean() > 0.5
+    far, away = draw_out(vertices, faces, Constraints.none(len(vertices)), many, edge)[4:]
+    share = face_normals(many.vertices, many.faces)[1] * (many.vertices[many.faces].mean(1)[:, 0] > 0.39)
+    assert far == pytest.approx(0.4 * edge, rel=0.2)
+    assert (away > 0.25 * edge).mean() == pytest.approx(share.sum() / face_normals(many.vertices, many.faces)[1].sum(), abs=0.01)
+
+
+def _cut_in_four(vertices, faces, which, rounds):
+    """Some of the faces cut at the middles of their edges, without those beside them."""
+    own, rest = faces[which], faces[~which]
+    for _ in range(rounds):
+        a, b, c = (vertices[own[:, i]] for i in range(3))
+        n, k = len(vertices), np.arange(len(own))
+        ab, bc, ca = n + k, n + len(own) + k, n + 2 * len(own) + k
+        vertices = np.concatenate([vertices, (a + b) / 2, (b + c) / 2, (c + a) / 2])
+        own = np.concatenate([np.stack(x, -1) for x in ((own[:, 0], ab, ca), (ab, own[:, 1], bc), (ca, bc, own[:, 2]), (ab, bc, ca))])
+    return vertices, np.concatenate([own, rest])
+
+
+def test_one_vertex_reaches_a_tip_that_is_less_than_an_edge_away():
+    vertices, faces, edge = ball()
+    surface = Surface(*horned(0.9 * edge))
+    assert 0.6 * edge < farthest(surface_of(vertices, faces), surface) < edge
+    out, found, constraints, tips, _, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
+    assert found is faces and farthest(surface_of(out, faces), surface) < 0.4 * edge
+    assert len(tips) == 1 and constraints.fixed[tips].all() and (out == vertices).all(1).sum() == len(vertices) - 1
+
+
+def test_paths_along_creases_end_where_a_tip_is_drawn_out():
+    """A path over the tip is no path of edges any more; the rest of it holds."""
+    vertices, faces, edge = ball()
+    around = np.flatnonzero((np.abs(vertices[:, 2]) < 1e-9))
+    around = around[np.argsort(np.arctan2(vertices[around, 1], vertices[around, 0]))]
+    path = np.stack([around, np.roll(around, -1)], -1)
+    curve = np.full(len(vertices), -1)
+    curve[around] = 0
+    held = Constraints(curve, np.zeros(len(vertices), bool), path, np.zeros(len(path), int))
+    _, found, constraints, tips, _, _ = draw_out(vertices, faces, held, Surface(*horned(0.2)), edge)
+    edges = set(map(tuple, topology.edges_of(found).ends.tolist()))
+    assert 0.8 * len(path) < len(constraints.path) < len(path)
+    assert all(tuple(sorted(ends)) in edges for ends in constraints.path.tolist()) and (constraints.curve[tips] < 0).all()
+
+
+def test_an_engine_that_cuts_a_horn_short_is_still_taken(monkeypatch):
+    vertices, faces = horned(0.35, 0.04)
+    asked = Request(quads=2000)
+    edge = (4 * np.pi * 0.4**2 / 2000) ** 0.5
+    out, found, record = pipeline.remesh(vertices, faces, asked)
+    figures = distance_figures(out, triangulated(found)[0], vertices, faces, 20000)
+    assert "instant-meshes" in record.engine and abs(len(found) / 2000 - 1) <= 0.03 and topology.is_watertight(found)
+    assert figures["hausdorff"] < 2 * edge and (scaled_jacobian(out, found) <= 0).mean() < 0.003
+    in_this_process(monkeypatch)
+    monkeypatch.setattr(shaping, "draw_out", lambda v, f, constraints, *_: (v, f, constraints, None, 0.0, np.zeros(1)))
+    assert pipeline.remesh(vertices, faces, asked)[2].engine == "pair and split"
+
+
+def test_what_is_held_on_a_blunt_tip_leaves_room_for_quads():
+    """Held as near to each other as the points that they were drawn to, they leave quads between them without area."""
+    vertices, faces, edge = ball()
+    fine, triangles = sphere(160, 0.4)
+    # A ridge some edges wide and a tenth of that thick: all vertices of its cap are drawn about as far.
+    blunt = (fine[:, 0] > 0) & (abs(fine[:, 1]) < 2.2 * edge) & (abs(fine[:, 2]) < 0.4 * edge)
+    fine[blunt, 0] += 1.4 * edge
+    out, _, _, tips, _, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), Surface(fine, triangles), edge, most_added=0.3)
+    apart = np.linalg.norm(out[tips][:, None] - out[tips], axis=-1)[np.triu_indices(len(tips), 1)]
+    assert len(tips) > 2 and apart.min() > 0.7 * edge

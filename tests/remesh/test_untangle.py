@@ -1,0 +1,87 @@
+"""Folded quads: mended where they are, on the surface and on their curves, and nothing else moves."""
+
+import numpy as np
+import pytest
+
+from gdtool.remesh.fit.feature_curves import Constraints, find_features
+from gdtool.geometry.mesh_quality import scaled_jacobian
+from gdtool.remesh.fit.surface_projection import Surface, incidence
+from gdtool.remesh.fit.untangle import _apart, unfold
+from tests.geometry.solids import cube, plane, quad_cube
+
+
+def grid(n):
+    """Square of side 1 in z = 0 of n * n quads."""
+    line = np.linspace(-0.5, 0.5, n + 1)
+    x, y = np.meshgrid(line, line)
+    i = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
+    return np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1), np.stack([i, i + 1, i + n + 2, i + n + 1], -1)
+
+
+def folded(n, step=0.25):
+    """A grid with some inner vertices, none beside another, pulled past their neighbours."""
+    vertices, faces = grid(n)
+    pulled = [y * (n + 1) + x for y in range(2, n - 1, 3) for x in range(2, n - 1, 3)]
+    vertices[pulled, 0] += step
+    return vertices, faces, np.array(pulled)
+
+
+def test_many_folds_are_mended_at_once_and_the_rest_stays():
+    vertices, faces, pulled = folded(12)
+    assert (scaled_jacobian(vertices, faces) <= 0).sum() >= len(pulled)
+    out = unfold(vertices, faces, Surface(*plane()), find_features(*plane(), 181.0, 1.0), Constraints.none(len(vertices)))
+    assert scaled_jacobian(out, faces).min() > 0.2 and np.abs(out[:, 2]).max() < 1e-12
+    touched = np.unique(faces[scaled_jacobian(vertices, faces) < 0.3])
+    around = np.unique(faces[np.isin(faces, touched).any(1)])
+    still = np.setdiff1d(np.arange(len(vertices)), around)
+    assert len(still) and np.array_equal(out[still], vertices[still])
+
+
+def test_what_is_fixed_leaves_its_place_in_the_last_rounds_only():
+    vertices, faces, pulled = folded(6)
+    fixed = np.zeros(len(vertices), bool)
+    fixed[pulled] = True
+    held = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
+    surface, features = Surface(*plane()), find_features(*plane(), 181.0, 1.0)
+    kept = unfold(vertices, faces, surface, features, held, most_visits=10)  # no visit is left for the last rounds
+    assert np.array_equal(kept[pulled], vertices[pulled])
+    out = unfold(vertices, faces, surface, features, held)
+    assert scaled_jacobian(out, faces).min() > scaled_jacobian(vertices, faces).min()
+
+
+def test_vertices_on_a_crease_slide_along_it():
+    vertices, faces = quad_cube(2)
+    surface, features = Surface(*cube()), find_features(*cube(), 30.0, 0.1)
+    top, front = np.isclose(vertices[:, 1], vertices[:, 1].max()), np.isclose(vertices[:, 2], vertices[:, 2].max())
+    on = np.flatnonzero(top & front)
+    on = on[np.argsort(vertices[on, 0])]
+    middles = features.points[features.segments].mean(1)
+    curve = features.curve[np.abs(middles - vertices[on].mean(0)).sum(1).argmin()]
+    held = np.full(len(vertices), -1)
+    held[on[1:-1]] = curve
+    moved = vertices.copy()
+    moved[on[1], 0] = vertices[on[2], 0] + 0.3 * (vertices[on[3], 0] - vertices[on[2], 0])  # past the next one
+    assert scaled_jacobian(moved, faces).min() <= 0
+    out = unfold(moved, faces, surface, features, Constraints(held, np.zeros(len(vertices), bool), np.zeros((0, 2), np.int64), np.zeros(0, np.int64)))
+    assert scaled_jacobian(out, faces).min() > 0.2
+    assert np.abs(out[on, 1:] - vertices[on, 1:]).max() < 1e-9
+
+
+@pytest.mark.parametrize("mesh", [grid(7), quad_cube(2)])
+def test_batches_share_no_face_and_hold_all(mesh):
+    vertices, faces = mesh
+    batches = _apart(np.arange(len(vertices)), faces, incidence(faces, len(vertices)))
+    assert sorted(np.concatenate(batches)) == list(range(len(vertices)))
+    for batch in batches:
+        assert np.isin(faces, batch).sum(1).max() == 1
+
+
+def test_vertices_of_a_batch_move_as_each_would_alone(monkeypatch):
+    """Whatever number of faces and neighbours the others have: folds beside the rim, in corners and within."""
+    vertices, faces, _ = folded(9)
+    vertices[[12, 38, 56], 1] += 0.2
+    how = faces, Surface(*plane()), find_features(*plane(), 181.0, 1.0), Constraints.none(len(vertices))
+    together, whole = unfold(vertices, *how), _apart
+    monkeypatch.setattr("gdtool.remesh.fit.untangle._apart", lambda *given: [batch[k:k + 1] for batch in whole(*given) for k in range(len(batch))])
+    np.testing.assert_array_equal(unfold(vertices, *how), together)
+    assert (together != vertices).any(1).sum() > 10
