@@ -3,13 +3,13 @@
     python benchmarks/ablations.py out/model/small_objects --held-out out/model/held_out -o docs/benchmarks
 
 Every variant is `gdtool train --ablation` at 64 px on the same objects in the same number of steps, for each seed, as
-benchmarks/model_training.json says but that all steps see all six domains, since supervision by rendering needs the maps
-together, that fewer of them are of pure noise, where it does not act, and that the network is half as wide: it learns more in
-the minutes there are. Each model samples the held-out objects' pictures (front view) in one step and in eight; consistency
-(gdtool/diffusion/reports/consistency.py: no truth needed) and the error over the five unseen views (model_quality.py) are means over the objects, then mean ± standard deviation over the seeds. The last
-columns are paired: the variant's figure less the whole method's of the same seed. Trainings are kept in --work and go on
-where they were; they may share the machine, only their seconds suffer. Some seven minutes a training on a core.
-"""
+benchmarks/model_training.json says but that all steps see all six domains, since supervision by rendering needs the
+maps together, that fewer of them are of pure noise, where it does not act, and that the network is half as wide: it
+learns more in the minutes there are. Each model samples the held-out objects' pictures (front view) in one step and in
+eight; consistency (gdtool/diffusion/reports/consistency.py: no truth needed) and the error over the five unseen views
+(model_quality.py) are means over the objects, then mean ± standard deviation over the seeds. The last columns are
+paired: the variant's figure less the whole method's of the same seed. Trainings are kept in --work and go on where they
+were; they may share the machine, only their seconds suffer. Some seven minutes a training on a core."""
 
 from __future__ import annotations
 
@@ -22,17 +22,28 @@ import torch
 from measure import gdtool, machine, say, table
 from model_quality import figures, sampled_views, true_views, views_folders
 
-from gdtool.diffusion.reports.consistency import consistency
-from gdtool.diffusion.data.objects import decode_object
 from gdtool.diffusion.checkpoint.weights import load_model
+from gdtool.diffusion.data.objects import decode_object
+from gdtool.diffusion.reports.consistency import consistency
 
-VARIANTS = {"none": "the whole method", "no_cross_domain": "no attention across domains", "no_pbr": "no supervision by rendering"}
+VARIANTS = {
+    "none": "the whole method",
+    "no_cross_domain": "no attention across domains",
+    "no_pbr": "no supervision by rendering",
+}
 SIZE = 64
 NETWORK = {"channels": [32, 64, 64], "encoder_width": 96}
 PHASES = [{"share": 0.5, "domains": 6, "views": 3, "batch": 4}, {"share": 1.0, "domains": 6, "views": 6, "batch": 2}]
 STEPS = (1, 8)  # of sampling
-SHOWN = {"rerendered_psnr": "re-rendered PSNR, dB", "slope_degrees": "normals to depth's slopes, °", "reprojection_depth": "reprojection",
-         "color_psnr_frame": "color PSNR, dB", "albedo_psnr_frame": "albedo PSNR, dB", "normal_degrees": "normals, °", "depth_error": "depth"}
+SHOWN = {
+    "rerendered_psnr": "re-rendered PSNR, dB",
+    "slope_degrees": "normals to depth's slopes, °",
+    "reprojection_depth": "reprojection",
+    "color_psnr_frame": "color PSNR, dB",
+    "albedo_psnr_frame": "albedo PSNR, dB",
+    "normal_degrees": "normals, °",
+    "depth_error": "depth",
+}
 
 
 def trained(variant: str, seed: int, arguments: argparse.Namespace) -> Path:
@@ -40,10 +51,32 @@ def trained(variant: str, seed: int, arguments: argparse.Namespace) -> Path:
     arguments.work.mkdir(parents=True, exist_ok=True)
     config = arguments.work / "training.json"
     common = json.loads(Path(__file__).with_name("model_training.json").read_text())["train"]
-    config.write_text(json.dumps({"model": NETWORK, "train": common | {"phases": PHASES, "pure_noise": 0.4, "ema": 0.99}}))
+    config.write_text(
+        json.dumps({"model": NETWORK, "train": common | {"phases": PHASES, "pure_noise": 0.4, "ema": 0.99}})
+    )
     model = arguments.work / f"{variant}-{seed}"
-    gdtool("train", *arguments.train, "--ablation", variant, "--size", str(SIZE), "--steps", str(arguments.steps), "--seed", str(seed), "--config", config,
-           "--held-out", "0", "--threads", "1", "-o", model, "--quiet", limit_seconds=24 * 3600)
+    gdtool(
+        "train",
+        *arguments.train,
+        "--ablation",
+        variant,
+        "--size",
+        str(SIZE),
+        "--steps",
+        str(arguments.steps),
+        "--seed",
+        str(seed),
+        "--config",
+        config,
+        "--held-out",
+        "0",
+        "--threads",
+        "1",
+        "-o",
+        model,
+        "--quiet",
+        limit_seconds=24 * 3600,
+    )
     return model
 
 
@@ -72,20 +105,37 @@ def markdown(record: dict) -> str:
     for steps in map(str, STEPS):
         rows = []
         for key, name in SHOWN.items():
-            by_seed = {variant: {seed: run[steps][key] for seed, run in runs.get(variant, {}).items()} for variant in VARIANTS}
+            by_seed = {
+                variant: {seed: run[steps][key] for seed, run in runs.get(variant, {}).items()} for variant in VARIANTS
+            }
             cells = [spread(list(values.values())) if values else "–" for values in by_seed.values()]
             for variant in list(VARIANTS)[1:]:
-                pairs = [by_seed[variant][seed] - value for seed, value in by_seed["none"].items() if seed in by_seed[variant]]
+                pairs = [
+                    by_seed[variant][seed] - value
+                    for seed, value in by_seed["none"].items()
+                    if seed in by_seed[variant]
+                ]
                 cells.append(spread(pairs) if pairs else "–")
             rows.append([name, *cells])
-        lines += [f"Sampled in {steps} step{'s' * (steps != '1')}:", "",
-                  table(["", *VARIANTS.values(), *(f"{name}, less the whole" for name in list(VARIANTS.values())[1:])], rows), ""]
-    return "\n".join([
-        "# What supervision by rendering and attention across the domains are worth", "",
-        f"{record['steps']} steps of training at {SIZE} px over {record['objects']} objects, seeds {', '.join(next(iter(runs.values()), {}))}; "
-        f"{record['held_out']} held-out objects, on {machine()}. Mean ± standard deviation over the seeds.", "", *lines,
-        "Higher is better for PSNR, lower for the others. Re-rendered PSNR, slopes and reprojection need no truth: they say how the "
-        "sampled domains and views fit one another.", ""])
+        lines += [
+            f"Sampled in {steps} step{'s' * (steps != '1')}:",
+            "",
+            table(["", *VARIANTS.values(), *(f"{name}, less the whole" for name in list(VARIANTS.values())[1:])], rows),
+            "",
+        ]
+    return "\n".join(
+        [
+            "# What supervision by rendering and attention across the domains are worth",
+            "",
+            f"{record['steps']} steps of training at {SIZE} px over {record['objects']} objects, seeds {', '.join(next(iter(runs.values()), {}))}; "
+            f"{record['held_out']} held-out objects, on {machine()}. Mean ± standard deviation over the seeds.",
+            "",
+            *lines,
+            "Higher is better for PSNR, lower for the others. Re-rendered PSNR, slopes and reprojection need no truth: they say how the "
+            "sampled domains and views fit one another.",
+            "",
+        ]
+    )
 
 
 def main() -> None:

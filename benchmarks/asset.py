@@ -2,14 +2,14 @@
 
     python benchmarks/asset.py [MODEL_OR_FOLDER ...] [--peers-python PATH] [-o docs/benchmarks] [--minutes 12]
 
-Each case of bake_cases.py (a model, and the quad mesh that gdtool's remesh and unwrap made of it) is baked by `gdtool bake`
-as a user runs it, 2048², with three coarser levels. Source and asset are then rendered alike from twelve azimuths under three
-lights, and compared: masked PSNR of the lit pictures (docs/metrics.md). With --peers-python (a Python that has bpy) Blender
-loads asset.glb and renders it from two sides, its base color without light and the whole lit; both are compared with gdtool's
-own pictures of the asset; so does three.js where tests/tools has its npm packages (tests/tools/compare_shown.py). shape: how
-far the quad mesh lies from the model, which no map can mend. Writes asset.md, asset.json and asset.jpg (the charts, and the
-pictures side by side) row by row: killed, or out of --minutes, it goes on where it was.
-"""
+Each case of bake_cases.py (a model, and the quad mesh that gdtool's remesh and unwrap made of it) is baked by `gdtool
+bake` as a user runs it, 2048², with three coarser levels. Source and asset are then rendered alike from twelve azimuths
+under three lights, and compared: masked PSNR of the lit pictures (docs/metrics.md). With --peers-python (a Python that
+has bpy) Blender loads asset.glb and renders it from two sides, its base color without light and the whole lit; both are
+compared with gdtool's own pictures of the asset; so does three.js where tests/tools has its npm packages
+(tests/tools/compare_shown.py). shape: how far the quad mesh lies from the model, which no map can mend. Writes
+asset.md, asset.json and asset.jpg (the charts, and the pictures side by side) row by row: killed, or out of --minutes,
+it goes on where it was."""
 
 from __future__ import annotations
 
@@ -38,17 +38,36 @@ PEER = Path(__file__).with_name("shading_blender.py")
 OWN = Path(__file__).with_name("shading_gdtool.py")
 TOOLS = Path(__file__).parents[1] / "tests/tools"
 LABELS = ["charts", *(f"{what}, {light}" for light in LIGHTS for what in ("source", "asset")), "asset", "in Blender"]
-COLUMNS = ("model", "seconds", "peak MB", *LIGHTS, "worst view", "floor", "base color dB", "roughness", "metallic", "normal deg", "shape",
-           "lod3 drift", "Blender base color dB", "Blender lit dB", "three.js base color dB", "three.js lit dB")
+COLUMNS = (
+    "model",
+    "seconds",
+    "peak MB",
+    *LIGHTS,
+    "worst view",
+    "floor",
+    "base color dB",
+    "roughness",
+    "metallic",
+    "normal deg",
+    "shape",
+    "lod3 drift",
+    "Blender base color dB",
+    "Blender lit dB",
+    "three.js base color dB",
+    "three.js lit dB",
+)
 BUFFERS = ("albedo", "roughness", "metallic", "normal")
 
 
-def lit(scene, light: str, size: int, samples: int, threads: int, views: slice = slice(None)) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Views.images of a scene under a light (color linear, and the material buffers, (k, h, w[, c])), and its coverage."""
+def lit(
+    scene, light: str, size: int, samples: int, threads: int, views: slice = slice(None)
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Views.images of a scene under a light (color linear, and the material buffers, (k, h, w[, c])), and its
+    coverage."""
+    from gdtool.shading.lights.studio import studio
     from gdtool.shading.render.direct import DirectLight
     from gdtool.shading.render.render import Renderer
     from gdtool.shading.render.rigs import turntable
-    from gdtool.shading.lights.studio import studio
 
     renderer = Renderer(scene, threads)
     color = DirectLight(renderer, studio(light, 0, fit=False)[0], 8, 0, mode="prefiltered").color()
@@ -61,7 +80,9 @@ def noise(scene, light: str, size: int, samples: int, threads: int) -> float:
     """PSNR in dB of one view with so many samples beside the same with four times as many."""
     from gdtool.images.metrics import color_metrics
 
-    (one, covered), (finer, finely) = (lit(scene, light, size, times * samples, threads, slice(1, 2)) for times in (1, 4))
+    (one, covered), (finer, finely) = (
+        lit(scene, light, size, times * samples, threads, slice(1, 2)) for times in (1, 4)
+    )
     return color_metrics(one["color"], covered, finer["color"], finely)["psnr_masked"]
 
 
@@ -77,17 +98,33 @@ def relit(case: Case, asset: Path, size: int, samples: int) -> tuple[dict[str, f
         while (quiet := noise(truth, light, size, count, threads)) < QUIET and count < MOST * samples:
             count *= 4
         floor = min(floor, quiet)
-        (true, true_mask), (ours, mask) = lit(truth, light, size, count, threads), lit(result, light, size, count, threads)
-        each = [color_metrics(ours["color"][k:k + 1], mask[k:k + 1], true["color"][k:k + 1], true_mask[k:k + 1])["psnr_masked"] for k in range(VIEWS)]
+        (true, true_mask), (ours, mask) = (
+            lit(truth, light, size, count, threads),
+            lit(result, light, size, count, threads),
+        )
+        each = [
+            color_metrics(ours["color"][k : k + 1], mask[k : k + 1], true["color"][k : k + 1], true_mask[k : k + 1])[
+                "psnr_masked"
+            ]
+            for k in range(VIEWS)
+        ]
         out[light], worst = float(np.mean(each)), min(worst, *each)
         pictures += [over_white(true["color"][1], true_mask[1]), over_white(ours["color"][1], mask[1])]
     buffers = views_metrics({k: ours[k] for k in BUFFERS}, mask, {k: true[k] for k in BUFFERS}, true_mask)
-    out |= {"worst view": worst, "floor": floor, "base color dB": buffers["albedo_psnr_masked"], "roughness": buffers["roughness_error"],
-            "metallic": buffers["metallic_error"], "normal deg": buffers["normal_degrees"]}
+    out |= {
+        "worst view": worst,
+        "floor": floor,
+        "base color dB": buffers["albedo_psnr_masked"],
+        "roughness": buffers["roughness_error"],
+        "metallic": buffers["metallic_error"],
+        "normal deg": buffers["normal_degrees"],
+    }
     return out, pictures
 
 
-def beside_blender(python: Path, asset: Path, folder: Path, size: int, samples: int) -> tuple[dict[str, float], list[np.ndarray]]:
+def beside_blender(
+    python: Path, asset: Path, folder: Path, size: int, samples: int
+) -> tuple[dict[str, float], list[np.ndarray]]:
     """How near gdtool's pictures of the asset are to Blender's, over the pixels that both see in full."""
     from shading_scene import exported
 
@@ -97,18 +134,52 @@ def beside_blender(python: Path, asset: Path, folder: Path, size: int, samples: 
     scene = exported(str(asset / "asset.glb"), "mid", folder)
     common = ["--size", str(size), "--samples", str(samples)]
     views = ",".join(f"{view}={scene['azimuths'][view]:g}" for view in PEER_VIEWS.split(","))
-    for command in ([python, PEER, scene["model"], scene["light"], folder / "blender.npz", "--views", views, "--half-width", scene["half_width"],
-                     "--light", "--buffers", *common],
-                    [sys.executable, OWN, scene["model"], "mid", folder / "own.npz", "--views", PEER_VIEWS, "--light", "sampled",
-                     "--light-samples", "8", *common]):
+    for command in (
+        [
+            python,
+            PEER,
+            scene["model"],
+            scene["light"],
+            folder / "blender.npz",
+            "--views",
+            views,
+            "--half-width",
+            scene["half_width"],
+            "--light",
+            "--buffers",
+            *common,
+        ],
+        [
+            sys.executable,
+            OWN,
+            scene["model"],
+            "mid",
+            folder / "own.npz",
+            "--views",
+            PEER_VIEWS,
+            "--light",
+            "sampled",
+            "--light-samples",
+            "8",
+            *common,
+        ],
+    ):
         done = subprocess.run([str(part) for part in command], capture_output=True, text=True, timeout=200, check=False)
         if done.returncode:
             raise Failed((done.stderr.strip().splitlines() or ["no message"])[-1])
     theirs, own = (dict(np.load(folder / name)) for name in ("blender.npz", "own.npz"))
     where = (theirs["mask"] > FULL) & (own["mask"] > FULL)
-    stored = {name: [np.clip(srgb_from_linear(one[name]), 0, 1) for one in (theirs, own)] for name in ("albedo", "color")}
-    pictures = [over_white(one["color"][0] / np.maximum(one["mask"][0], 1e-3)[..., None], one["mask"][0]) for one in (own, theirs)]
-    return {"Blender base color dB": psnr(*stored["albedo"], where), "Blender lit dB": psnr(*stored["color"], where)}, pictures
+    stored = {
+        name: [np.clip(srgb_from_linear(one[name]), 0, 1) for one in (theirs, own)] for name in ("albedo", "color")
+    }
+    pictures = [
+        over_white(one["color"][0] / np.maximum(one["mask"][0], 1e-3)[..., None], one["mask"][0])
+        for one in (own, theirs)
+    ]
+    return {
+        "Blender base color dB": psnr(*stored["albedo"], where),
+        "Blender lit dB": psnr(*stored["color"], where),
+    }, pictures
 
 
 def shape(case: Case) -> float:
@@ -119,12 +190,20 @@ def shape(case: Case) -> float:
 
     scene, low = load_scene(case.glb), read_low(case)
     points = sample_surface(scene.vertices, scene.faces, 20_000, np.random.default_rng(0))[0]
-    return float(np.quantile(closest_points(points, low.vertices, triangulated(low.faces)[0].astype(np.int64))[0], 0.99))
+    return float(
+        np.quantile(closest_points(points, low.vertices, triangulated(low.faces)[0].astype(np.int64))[0], 0.99)
+    )
 
 
 def beside_three(asset: Path) -> dict[str, float]:
     """How near gdtool's pictures of the asset are to three.js'. Raises Failed."""
-    done = subprocess.run([sys.executable, TOOLS / "compare_shown.py", asset / "asset.glb"], capture_output=True, text=True, timeout=200, check=False)
+    done = subprocess.run(
+        [sys.executable, TOOLS / "compare_shown.py", asset / "asset.glb"],
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+    )
     if done.returncode:
         raise Failed((done.stderr.strip().splitlines() or ["no message"])[-1])
     found = json.loads(done.stdout)
@@ -162,17 +241,28 @@ def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
     from gdtool.images.io import read_image
 
     rows.write(complete)
-    text = table(COLUMNS, ([number(row.get(name, "failed" if name == "seconds" and "failed" in row else None), 3) for name in COLUMNS]
-                           for row in rows.rows))
-    failed = "\n".join(f"- {row['model']}: {row[what]}" for row in rows.rows for what in ("failed", "peer failed") if what in row)
-    head = f"# Finished asset\n\n`python benchmarks/asset.py`, {machine()}. {note}\n\n`gdtool bake --size 2048 --lods 4 --source-frame` of the model's quad mesh: " \
-        f"seconds and memory of the whole command; masked PSNR of lit pictures against the model's, mean of {VIEWS} views under " \
-        f"{', '.join(LIGHTS)}, and the worst; floor: the model against itself " \
-        f"with four times the samples, one view, under the light where they differ most (below {QUIET:g} dB all get more); the buffers' errors; shape: how far 99 % " \
-        "of the model's surface lie from the quad mesh, and " \
-        "how far the coarsest level (an eighth) slid on its maps, shares of the extent; gdtool's pictures of the asset against Blender's and " \
+    text = table(
+        COLUMNS,
+        (
+            [number(row.get(name, "failed" if name == "seconds" and "failed" in row else None), 3) for name in COLUMNS]
+            for row in rows.rows
+        ),
+    )
+    failed = "\n".join(
+        f"- {row['model']}: {row[what]}" for row in rows.rows for what in ("failed", "peer failed") if what in row
+    )
+    head = (
+        f"# Finished asset\n\n`python benchmarks/asset.py`, {machine()}. {note}\n\n`gdtool bake --size 2048 --lods 4 --source-frame` of the model's quad mesh: "
+        f"seconds and memory of the whole command; masked PSNR of lit pictures against the model's, mean of {VIEWS} views under "
+        f"{', '.join(LIGHTS)}, and the worst; floor: the model against itself "
+        f"with four times the samples, one view, under the light where they differ most (below {QUIET:g} dB all get more); the buffers' errors; shape: how far 99 % "
+        "of the model's surface lie from the quad mesh, and "
+        "how far the coarsest level (an eighth) slid on its maps, shares of the extent; gdtool's pictures of the asset against Blender's and "
         "three.js'.\n\n"
-    (out / "asset.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![source and asset](asset.jpg)\n")
+    )
+    (out / "asset.md").write_text(
+        head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![source and asset](asset.jpg)\n"
+    )
     sheet, names = [], []
     for row in rows.rows:
         at = [kept / "pictures" / file_name(row["model"], f"asset {label}") for label in LABELS]
@@ -204,7 +294,9 @@ def measured(source: str | Path, asked: argparse.Namespace) -> dict:
             return row | {"failed": f"{type(failure).__name__}: {failure}"}
         try:
             if asked.peers_python:
-                figures, found = beside_blender(asked.peers_python, asset, Path(folder, "peer"), 2 * asked.size, 4 * asked.samples)
+                figures, found = beside_blender(
+                    asked.peers_python, asset, Path(folder, "peer"), 2 * asked.size, 4 * asked.samples
+                )
                 row |= figures
                 shown += [image[::2, ::2] for image in found]
             if (TOOLS / "node_modules/three").exists():
@@ -221,7 +313,9 @@ def main() -> None:
     parser.add_argument("models", nargs="*", type=Path)
     parser.add_argument("-o", "--out", type=Path, default=Path("docs/benchmarks"))
     parser.add_argument("--peers-python", type=Path)
-    parser.add_argument("--minutes", type=float, default=12.0, help="a model that did not begin by then is left for the next time")
+    parser.add_argument(
+        "--minutes", type=float, default=12.0, help="a model that did not begin by then is left for the next time"
+    )
     parser.add_argument("--limit", type=int, default=12, help="models at most")
     parser.add_argument("--size", type=int, default=256, help="of the pictures")
     parser.add_argument("--samples", type=int, default=16)
@@ -233,8 +327,11 @@ def main() -> None:
 
     torch.set_num_threads(1)  # shading runs in threads of its own
     end, note = time.monotonic() + 60 * asked.minutes, busy()
-    rows = Rows(asked.out / "asset.json", {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept", "minutes")})
-    sources = ["part", *list(filter(has_detail, models_in(asked.models)))[:asked.limit]]
+    rows = Rows(
+        asked.out / "asset.json",
+        {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept", "minutes")},
+    )
+    sources = ["part", *list(filter(has_detail, models_in(asked.models)))[: asked.limit]]
     left = []
     for source in sources:
         name = source if source == "part" else source.stem

@@ -1,12 +1,13 @@
-"""Time and memory against error of bake, beside Blender's Cycles in the same run, on the peers' bake case and public models.
+"""Time and memory against error of bake, beside Blender's Cycles in the same run, on the peers' bake case and public
+models.
 
     python benchmarks/bake.py [MODEL_OR_FOLDER ...] [--peers-python PATH] [-o docs/benchmarks] [--minutes 12] [--sizes 1024,2048,4096]
 
-Writes bake.md, bake.json and bake.jpg (the maps side by side) row by row: killed, or out of --minutes, it goes on where it
-was. Models that have neither a texture nor colors are left out; those that cannot be remeshed are named. The sizes are swept
-on the peers' case, the others have 2048². Errors: benchmarks/bake_score.py; along the charts' rims at the mip level of 256
-texels, which is what unwrap leaves room for: bake_mips.py. --peers-python is a Python that has bpy; without it Blender is left out.
-"""
+Writes bake.md, bake.json and bake.jpg (the maps side by side) row by row: killed, or out of --minutes, it goes on where
+it was. Models that have neither a texture nor colors are left out; those that cannot be remeshed are named. The sizes
+are swept on the peers' case, the others have 2048². Errors: benchmarks/bake_score.py; along the charts' rims at the mip
+level of 256 texels, which is what unwrap leaves room for: bake_mips.py. --peers-python is a Python that has bpy;
+without it Blender is left out."""
 
 from __future__ import annotations
 
@@ -28,8 +29,29 @@ from rows import Rows
 from wireframe import file_name
 
 PEER = Path(__file__).with_name("bake_blender.py")
-COLUMNS = ("model", "way", "size", "bake s", "bake cpu", "occlusion s", "png s", "peak MB", "albedo dB", "roughness dB", "metallic dB", "normal deg", "missed",
-           "8-bit albedo dB", "8-bit roughness dB", "8-bit normal deg", "seam albedo", "seam roughness", "unfilled", "rim at 256 dB", "occlusion rms")
+COLUMNS = (
+    "model",
+    "way",
+    "size",
+    "bake s",
+    "bake cpu",
+    "occlusion s",
+    "png s",
+    "peak MB",
+    "albedo dB",
+    "roughness dB",
+    "metallic dB",
+    "normal deg",
+    "missed",
+    "8-bit albedo dB",
+    "8-bit roughness dB",
+    "8-bit normal deg",
+    "seam albedo",
+    "seam roughness",
+    "unfilled",
+    "rim at 256 dB",
+    "occlusion rms",
+)
 MIP = 256
 KINDS = ("base color", "roughness", "normal")
 
@@ -62,14 +84,14 @@ class Clock:
 def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     """In a child: bake as the stage does, steps timed; the maps before they are stored go to out (.npz)."""
     from gdtool.assets.load import load_scene
-    from gdtool.images.io import encode_pngs
-    from gdtool.stages.bake import target_of
-    from gdtool.bake.pipeline import bake, occlusion_tracer
     from gdtool.bake.maps import make_maps
     from gdtool.bake.occlusion import bake_occlusion
     from gdtool.bake.origin import from_scene
+    from gdtool.bake.pipeline import bake, occlusion_tracer
     from gdtool.bake.reproject import vertex_reach
     from gdtool.bake.target import samples_for, texel_width, texels_of
+    from gdtool.images.io import encode_pngs
+    from gdtool.stages.bake import target_of
 
     threads = len(os.sched_getaffinity(0))
     scene, mesh = load_scene(case.glb), read_low(case)
@@ -79,7 +101,9 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     cost, clock = {}, Clock()
     texels = texels_of(target, size, threads=threads)
     reach = vertex_reach(target.vertices, target.faces, origin.source)
-    baked = bake(target, texels, origin.source, origin.lookup, reach, samples=samples_for(width, origin.detail), threads=threads)
+    baked = bake(
+        target, texels, origin.source, origin.lookup, reach, samples=samples_for(width, origin.detail), threads=threads
+    )
     wall, processor = clock()
     traced, trace = None, None
     clock()
@@ -94,10 +118,14 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     encode_pngs(images, threads=threads)
     cost["png s"], cost["png cpu"] = clock()
     cost["peak MB"] = peak_mb()
-    cost["unfilled"] = int(sum((~np.isfinite(v)).reshape(len(texels), -1).any(1)[:texels.inside].sum() for v in baked.values.values()))
+    cost["unfilled"] = int(
+        sum((~np.isfinite(v)).reshape(len(texels), -1).any(1)[: texels.inside].sum() for v in baked.values.values())
+    )
     if occlusion:
         some = np.random.default_rng(0).integers(0, texels.inside, 2000)
-        many = occlusion_tracer(target, origin.source, reach, origin.normals, 1024, 9, threads)(texels.face_idx[some], texels.barycentric[some])
+        many = occlusion_tracer(target, origin.source, reach, origin.normals, 1024, 9, threads)(
+            texels.face_idx[some], texels.barycentric[some]
+        )
         cost["occlusion rms"] = float(np.sqrt(np.mean((traced[some] - many) ** 2)))
     if out:
         np.savez(out, **with_gutters(texels, baked.values))
@@ -105,33 +133,64 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
 
 
 def with_gutters(texels, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What texels read as the floats of maps that are filled as ours are: albedo (s, s, 3) linear, roughness, metallic, normal as stored."""
-    from gdtool.images.color import linear_from_srgb, srgb_from_linear
+    """What texels read as the floats of maps that are filled as ours are: albedo (s, s, 3) linear, roughness, metallic,
+    normal as stored."""
     from gdtool.bake.padding import fill_gutters
+    from gdtool.images.color import linear_from_srgb, srgb_from_linear
 
-    read = {name: values[name] for name in ("roughness", "metallic")} | {"albedo": srgb_from_linear(np.clip(values["albedo"], 0, 1)),
-                                                                        "normal": values["tangent_normal"] * 0.5 + 0.5}
+    read = {name: values[name] for name in ("roughness", "metallic")} | {
+        "albedo": srgb_from_linear(np.clip(values["albedo"], 0, 1)),
+        "normal": values["tangent_normal"] * 0.5 + 0.5,
+    }
     maps = {name: fill_gutters(texels.image(value), texels.mask()) for name, value in read.items()}
     return maps | {"albedo": linear_from_srgb(maps["albedo"])}
 
 
-def blender(python: Path, case: Case, size: int, samples: int, occlusion: int, out: Path, limit: float) -> dict[str, float]:
+def blender(
+    python: Path, case: Case, size: int, samples: int, occlusion: int, out: Path, limit: float
+) -> dict[str, float]:
     """Cost of Blender's bake; its maps go to out (.npz). Raises RuntimeError."""
     from gdtool.geometry.topology import triangulated
     from gdtool.stages.bake import target_of
 
     mesh = read_low(case)
     target, low = target_of(mesh)[0], out.with_name("low.npz")
-    np.savez(low, vertices=mesh.vertices, triangles=triangulated(mesh.faces)[0], uv=target.uv[target.face_uvs] * (1, -1) + (0, 1))
-    done = subprocess.run([python, PEER, case.glb, low, out, "--size", str(size), "--samples", str(samples), "--occlusion", str(occlusion)],
-                          capture_output=True, text=True, timeout=limit, check=False)
+    np.savez(
+        low,
+        vertices=mesh.vertices,
+        triangles=triangulated(mesh.faces)[0],
+        uv=target.uv[target.face_uvs] * (1, -1) + (0, 1),
+    )
+    done = subprocess.run(
+        [
+            python,
+            PEER,
+            case.glb,
+            low,
+            out,
+            "--size",
+            str(size),
+            "--samples",
+            str(samples),
+            "--occlusion",
+            str(occlusion),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=limit,
+        check=False,
+    )
     said = [line for line in done.stdout.splitlines() if line.startswith("cost ")]
     if done.returncode or not said:
         raise RuntimeError((done.stderr.strip().splitlines() or ["no message"])[-1])
     found = json.loads(said[0][5:])
     shadow = found["seconds"].pop("occlusion", (None, None))
-    return {"bake s": sum(w for w, _ in found["seconds"].values()), "bake cpu": sum(c for _, c in found["seconds"].values()),
-            "occlusion s": shadow[0], "peak MB": found["peak_mb"]}
+    return {
+        "bake s": sum(w for w, _ in found["seconds"].values()),
+        "bake cpu": sum(c for _, c in found["seconds"].values()),
+        "occlusion s": shadow[0],
+        "peak MB": found["peak_mb"],
+    }
 
 
 def small(image: np.ndarray, width: int = 256) -> np.ndarray:
@@ -163,13 +222,23 @@ def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
     from gdtool.images.io import read_image
 
     rows.write(complete)
-    text = table(COLUMNS, ([number(row.get(name, "failed" if name == "size" and "failed" in row else None), 4) for name in COLUMNS] for row in rows.rows))
+    text = table(
+        COLUMNS,
+        (
+            [number(row.get(name, "failed" if name == "size" and "failed" in row else None), 4) for name in COLUMNS]
+            for row in rows.rows
+        ),
+    )
     failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows.rows if "failed" in row)
-    head = f"# Bake\n\n`python benchmarks/bake.py`, {machine()}. {note}\n\nbake: rasterising, reading, gutters and storing; seconds of the wall and of the " \
-        "processor. Errors before storing, and after 8 bits. seam: how much more the two sides of seams " \
-        "differ than in the model, over the same at other edges, or over 1 where those differ less. rim: the base color along the charts' rims in the mip level of " \
+    head = (
+        f"# Bake\n\n`python benchmarks/bake.py`, {machine()}. {note}\n\nbake: rasterising, reading, gutters and storing; seconds of the wall and of the "
+        "processor. Errors before storing, and after 8 bits. seam: how much more the two sides of seams "
+        "differ than in the model, over the same at other edges, or over 1 where those differ less. rim: the base color along the charts' rims in the mip level of "
         f"{MIP} texels, against each chart alone.\n\n"
-    (out / "bake.md").write_text(head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![maps](bake.jpg)\n")
+    )
+    (out / "bake.md").write_text(
+        head + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "") + "\n![maps](bake.jpg)\n"
+    )
     names = list(dict.fromkeys(row["model"] for row in rows.rows))
     sheet = []
     for name in names:
@@ -180,8 +249,11 @@ def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
         sheet.append(line)
     whole = [i for i, line in enumerate(sheet) if line[0] is not None]
     if whole:
-        table_of_maps = contact_sheet([sheet[i] for i in whole], labels_top=[*KINDS, *(f"{kind}, Blender" for kind in KINDS)],
-                                      labels_left=[names[i] for i in whole])
+        table_of_maps = contact_sheet(
+            [sheet[i] for i in whole],
+            labels_top=[*KINDS, *(f"{kind}, Blender" for kind in KINDS)],
+            labels_left=[names[i] for i in whole],
+        )
         Image.fromarray(table_of_maps).save(out / "bake.jpg", quality=85)
 
 
@@ -216,7 +288,9 @@ def main() -> None:
     parser.add_argument("--peers-python", type=Path)
     parser.add_argument("--sizes", default="1024,2048,4096", help="of the peers' case")
     parser.add_argument("--samples", default="1,16", help="Blender's, on the peers' case")
-    parser.add_argument("--minutes", type=float, default=12.0, help="a run that did not begin by then is left for the next time")
+    parser.add_argument(
+        "--minutes", type=float, default=12.0, help="a run that did not begin by then is left for the next time"
+    )
     parser.add_argument("--limit", type=int, default=12, help="models at most")
     parser.add_argument("--kept", type=Path, default=Path("out/bench_meshes"))
     asked = parser.parse_args()
@@ -224,13 +298,18 @@ def main() -> None:
         say("no models are named: the peers' case alone")
     os.environ["PYTHONPATH"] = str(Path(__file__).parent)  # the children import this file
     end, note, left = time.monotonic() + 60 * asked.minutes, busy(), 0
-    rows = Rows(asked.out / "bake.json", {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept", "minutes")})
-    sources = ["part", *list(filter(has_detail, models_in(asked.models)))[:asked.limit]]
+    rows = Rows(
+        asked.out / "bake.json",
+        {name: str(value) for name, value in vars(asked).items() if name not in ("out", "kept", "minutes")},
+    )
+    sources = ["part", *list(filter(has_detail, models_in(asked.models)))[: asked.limit]]
     for source in sources:
         name = source if isinstance(source, str) else source.stem
         runs = [("ours", int(size), 0) for size in (asked.sizes.split(",") if source == "part" else ["2048"])]
         if asked.peers_python:
-            runs += [("Blender", 2048, int(samples)) for samples in (asked.samples.split(",") if source == "part" else ["1"])]
+            runs += [
+                ("Blender", 2048, int(samples)) for samples in (asked.samples.split(",") if source == "part" else ["1"])
+            ]
         labels = [f"{way}, {samples} samples" if samples else f"{way}, {size}" for way, size, samples in runs]
         todo = [one for one in zip(runs, labels, strict=True) if not rows.has(name, one[1])]
         if not todo or rows.has(name, "prepare"):

@@ -1,10 +1,11 @@
-"""Bakes a case of bake_cases.py in Blender: python bake_blender.py MODEL.glb LOW.npz OUT.npz --size 2048 --samples 1   (pip install bpy)
+"""Bakes a case of bake_cases.py in Blender: python bake_blender.py MODEL.glb LOW.npz OUT.npz --size 2048 --samples 1
+(pip install bpy)
 
-Cycles, selected to active, as its manual has it: base color and metallic by emission (a diffuse bake of a metal is black),
-roughness and tangent-space normals by their own passes. LOW holds vertices, triangles and uv per corner (t, 3, 2) with v
-up. OUT gets albedo (linear, s, s, 3), roughness, metallic (s, s), normal (s, s, 3) as stored and before quantisation, and
-per corner of the triangles, in the file's frame, the normals, tangents and signs that Blender encoded them with. Prints its cost as JSON.
-"""
+Cycles, selected to active, as its manual has it: base color and metallic by emission (a diffuse bake of a metal is
+black), roughness and tangent-space normals by their own passes. LOW holds vertices, triangles and uv per corner (t, 3,
+2) with v up. OUT gets albedo (linear, s, s, 3), roughness, metallic (s, s), normal (s, s, 3) as stored and before
+quantisation, and per corner of the triangles, in the file's frame, the normals, tangents and signs that Blender encoded
+them with. Prints its cost as JSON."""
 
 from __future__ import annotations
 
@@ -67,7 +68,11 @@ def corners_of(mesh) -> dict[str, np.ndarray]:
     """Normals (t, 3, 3), tangents (t, 3, 3) and signs (t, 3) of the triangles' corners, Y up."""
     mesh.calc_tangents()
     out = {}
-    for name, attribute, width in (("corner_normals", "normal", 3), ("corner_tangents", "tangent", 3), ("corner_signs", "bitangent_sign", 1)):
+    for name, attribute, width in (
+        ("corner_normals", "normal", 3),
+        ("corner_tangents", "tangent", 3),
+        ("corner_signs", "bitangent_sign", 1),
+    ):
         values = np.empty(len(mesh.loops) * width, np.float32)
         mesh.loops.foreach_get(attribute, values)
         out[name] = values.reshape(-1, 3, 3) @ Z_UP if width == 3 else values.reshape(-1, 3)
@@ -92,7 +97,11 @@ def main() -> None:
     scene.render.engine, scene.cycles.device = "CYCLES", "CPU"
     scene.cycles.use_adaptive_sampling = scene.cycles.use_denoising = False
     scene.render.threads_mode, scene.render.threads = "FIXED", 2
-    scene.render.bake.use_selected_to_active, scene.render.bake.cage_extrusion, scene.render.bake.margin = True, asked.cage, 4
+    scene.render.bake.use_selected_to_active, scene.render.bake.cage_extrusion, scene.render.bake.margin = (
+        True,
+        asked.cage,
+        4,
+    )
     bpy.ops.object.select_all(action="DESELECT")
     for one in [*high, low]:
         one.select_set(True)
@@ -124,7 +133,11 @@ def main() -> None:
     bake("normal", "NORMAL")
     if asked.occlusion:
         bake("occlusion", "AO")
-    peak = next(int(line.split()[1]) / 1024 for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    peak = next(
+        int(line.split()[1]) / 1024
+        for line in Path("/proc/self/status").read_text().splitlines()
+        if line.startswith("VmHWM")
+    )
     np.savez(asked.out, **maps, **corners_of(mesh))
     print("cost " + json.dumps({"seconds": seconds, "peak_mb": peak}))
 

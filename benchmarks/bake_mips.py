@@ -24,7 +24,9 @@ def rim_points(target) -> tuple[np.ndarray, np.ndarray]:
     edges = edges_of(target.face_uvs)
     edge_idx, pairs = edges.face_pairs()
     count = len(target.face_uvs)
-    chart = connected_components(coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (count, count)), False)[1]
+    chart = connected_components(coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (count, count)), False)[
+        1
+    ]
     rim = edges.ends[edges.count == 1]
     length = np.linalg.norm(target.uv[rim[:, 0]] - target.uv[rim[:, 1]], axis=1)
     rng = np.random.default_rng(2)
@@ -35,11 +37,11 @@ def rim_points(target) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rim_error(target, albedo: np.ndarray, level: int) -> float:
-    """dB (sRGB) between albedo (s, s, 3) linear read at the charts' rims in its mip level of `level` texels, and the same
-    with each chart alone in the map: means of its own texels only, the nearest of them carried on."""
-    from gdtool.images.color import srgb_from_linear
+    """dB (sRGB) between albedo (s, s, 3) linear read at the charts' rims in its mip level of `level` texels, and the
+    same with each chart alone in the map: means of its own texels only, the nearest of them carried on."""
     from gdtool.bake.padding import push_pull
     from gdtool.bake.target import texels_of
+    from gdtool.images.color import srgb_from_linear
 
     size = albedo.shape[0]
     uv, chart, own = rim_points(target)

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from bake_cases import Case, read_low
 
-CHOSEN = 1_000_000  # texels that are scored: a few at creases, where the nearest face is a matter of chance, weigh little among so many
+# Texels that are scored: a few at creases, where the nearest face is a matter of chance, weigh little among so many.
+CHOSEN = 1_000_000
 SEAM_POINTS = 20_000
 
 
@@ -43,7 +44,8 @@ class Truth:
         return self._seams[size]
 
     def at(self, size: int) -> dict[str, np.ndarray]:
-        """texel (n,), face_idx (n,), barycentric (n, 3), and albedo (sRGB), roughness, metallic, normal of the model there."""
+        """texel (n,), face_idx (n,), barycentric (n, 3), and albedo (sRGB), roughness, metallic, normal of the model
+        there."""
         if size not in self._of:
             from gdtool.bake.target import texels_of
 
@@ -54,9 +56,16 @@ class Truth:
             read = self.material(points)
             # Models whose winding and normals disagree are common: outside is where the mesh that is baked has it.
             side = np.where((read["normal"] * target.normals[face_idx].mean(1)).sum(1) < 0, -1.0, 1.0)
-            self._of[size] = {"texel": texels.texel[chosen], "face_idx": face_idx, "barycentric": barycentric, "covered": texels.inside / size**2,
-                              "albedo": read["albedo"], "normal": _unit(read["normal"].astype(np.float64)) * side[:, None],
-                              "roughness": read["roughness"], "metallic": read["metallic"]}
+            self._of[size] = {
+                "texel": texels.texel[chosen],
+                "face_idx": face_idx,
+                "barycentric": barycentric,
+                "covered": texels.inside / size**2,
+                "albedo": read["albedo"],
+                "normal": _unit(read["normal"].astype(np.float64)) * side[:, None],
+                "roughness": read["roughness"],
+                "metallic": read["metallic"],
+            }
         return self._of[size]
 
 
@@ -69,17 +78,26 @@ def decibels(a: np.ndarray, b: np.ndarray) -> float:
     return float(min(-10 * np.log10(max(np.mean((np.asarray(a, np.float64) - b) ** 2), 1e-12)), 120))
 
 
-def texel_errors(truth: Truth, size: int, maps: dict[str, np.ndarray], corners: dict[str, np.ndarray] | None = None) -> dict[str, float]:
+def texel_errors(
+    truth: Truth, size: int, maps: dict[str, np.ndarray], corners: dict[str, np.ndarray] | None = None
+) -> dict[str, float]:
     """Errors of maps albedo (s, s, 3) sRGB, roughness, metallic (s, s) and normal (s, s, 3) as stored, all floats.
 
-    corners: the frames another baker encoded in (corner_normals, corner_tangents (t, 3, 3), corner_signs (t, 3)); ours else.
-    """
+    corners: the frames another baker encoded in (corner_normals, corner_tangents (t, 3, 3), corner_signs (t, 3)); ours
+    else."""
     true = truth.at(size)
     row, column = np.divmod(true["texel"].astype(np.int64), size)
     read = {name: image[row, column] for name, image in maps.items()}
     if corners is None:
-        corners = {"corner_normals": truth.target.normals, "corner_tangents": truth.target.tangents[..., :3], "corner_signs": truth.target.tangents[..., 3]}
-    normal, tangent = (np.einsum("nk,nkc->nc", true["barycentric"], corners[k][true["face_idx"]]) for k in ("corner_normals", "corner_tangents"))
+        corners = {
+            "corner_normals": truth.target.normals,
+            "corner_tangents": truth.target.tangents[..., :3],
+            "corner_signs": truth.target.tangents[..., 3],
+        }
+    normal, tangent = (
+        np.einsum("nk,nkc->nc", true["barycentric"], corners[k][true["face_idx"]])
+        for k in ("corner_normals", "corner_tangents")
+    )
     bitangent = np.cross(normal, tangent) * corners["corner_signs"][true["face_idx"], 0][:, None]
     local = 2.0 * read["normal"] - 1
     world = _unit(local[:, :1] * tangent + local[:, 1:2] * bitangent + local[:, 2:] * normal)
@@ -95,8 +113,8 @@ class Seams:
     """Points to either side of the charts' seams and of other edges, and the model's material there."""
 
     def __init__(self, truth: Truth, size: int):
-        from gdtool.geometry.tangents import edge_pairs
         from gdtool.bake.target import texel_width
+        from gdtool.geometry.tangents import edge_pairs
 
         target, rng = truth.target, np.random.default_rng(1)
         one, two = edge_pairs(target.faces)
@@ -109,27 +127,39 @@ class Seams:
                 self.sides = []
                 break
             pick, along = rng.choice(chosen, SEAM_POINTS), rng.uniform(0.1, 0.9, SEAM_POINTS)
-            pair = [_beside(target, half[pick], t, texel_width(target, size)) for half, t in ((one, along), (two, 1 - along))]
+            pair = [
+                _beside(target, half[pick], t, texel_width(target, size))
+                for half, t in ((one, along), (two, 1 - along))
+            ]
             read = [truth.material(points) for _, points in pair]
-            self.sides.append(([uv for uv, _ in pair], {name: np.abs(read[0][name] - read[1][name]).mean() for name in ("albedo", "roughness")}))
+            self.sides.append(
+                (
+                    [uv for uv, _ in pair],
+                    {name: np.abs(read[0][name] - read[1][name]).mean() for name in ("albedo", "roughness")},
+                )
+            )
 
     def ratio(self, name: str, image: np.ndarray) -> float | None:
-        """How much more the two sides of seams differ in the map (s, s, c) than in the model, over the same for other edges.
+        """How much more the two sides of seams differ in the map (s, s, c) than in the model, over the same for other
+        edges.
 
-        Where other edges differ less than in the model (of surfaces that lie in one another its nearest is a matter of chance)
-        the seams are held against the model.
-        The map is read bilinearly a texel to either side. Creases and parts' borders, where charts like to end, are steps of
-        the model: its own difference at the same points is what is divided by. None where there are no seams.
-        """
+        Where other edges differ less than in the model (of surfaces that lie in one another its nearest is a matter of
+        chance) the seams are held against the model. The map is read bilinearly a texel to either side. Creases and
+        parts' borders, where charts like to end, are steps of the model: its own difference at the same points is what
+        is divided by. None where there are no seams."""
         if not self.sides:
             return None
         step = 0.5 / 255
-        more = [(np.abs(bilinear(image, uv[0]) - bilinear(image, uv[1])).mean() + step) / (true[name] + step) for uv, true in self.sides]
+        more = [
+            (np.abs(bilinear(image, uv[0]) - bilinear(image, uv[1])).mean() + step) / (true[name] + step)
+            for uv, true in self.sides
+        ]
         return float(more[0] / max(more[1], 1.0))
 
 
 def _beside(target, half: np.ndarray, along: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Texture coordinates (n, 2) and positions (n, 3) `width` inside the triangles of half-edges (n,), `along` (n,) the edge."""
+    """Texture coordinates (n, 2) and positions (n, 3) `width` inside the triangles of half-edges (n,), `along` (n,) the
+    edge."""
     face, k = half // 3, half % 3
     corners = target.vertices[target.faces[face]]
     at = np.arange(len(face))
@@ -138,7 +168,11 @@ def _beside(target, half: np.ndarray, along: np.ndarray, width: float) -> tuple[
     height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / length
     inward = np.minimum(width / np.maximum(height, 1e-12), 0.5)
     weight = np.zeros((len(face), 3))
-    weight[at, k], weight[at, (k + 1) % 3], weight[at, (k + 2) % 3] = (1 - along) * (1 - inward), along * (1 - inward), inward
+    weight[at, k], weight[at, (k + 1) % 3], weight[at, (k + 2) % 3] = (
+        (1 - along) * (1 - inward),
+        along * (1 - inward),
+        inward,
+    )
     return np.einsum("nk,nkc->nc", weight, target.uv[target.face_uvs[face]]), np.einsum("nk,nkc->nc", weight, corners)
 
 
@@ -153,8 +187,11 @@ def bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
     return upper * (1 - fy) + lower * fy
 
 
-def scored(truth: Truth, maps: dict[str, np.ndarray], corners: dict[str, np.ndarray] | None = None) -> dict[str, float | None]:
-    """Errors before and after 8 bits, and across seams, of maps (linear albedo (s, s, 3), roughness, metallic, normal as stored)."""
+def scored(
+    truth: Truth, maps: dict[str, np.ndarray], corners: dict[str, np.ndarray] | None = None
+) -> dict[str, float | None]:
+    """Errors before and after 8 bits, and across seams, of maps (linear albedo (s, s, 3), roughness, metallic, normal
+    as stored)."""
     from gdtool.images.color import srgb_from_linear
 
     size = maps["albedo"].shape[0]

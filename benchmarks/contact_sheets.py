@@ -2,11 +2,10 @@
 
   python benchmarks/contact_sheets.py MODEL... --lights mid,a.hdr,b.hdr --peers-python PYTHON -o out/sheets
 
-Writes a sheet a light: a row a model, and the PSNR of gdtool's picture against each peer's. The renderers' scenes are close and not
-the same: Mitsuba has neither emission nor alpha, and vertex colors in place of a texture, not over it; Blender poses rigged models as their
-animation begins. Pictures that are there already are kept, so a killed run goes on. Do not publish
-sheets of models whose licence does not allow it.
-"""
+Writes a sheet a light: a row a model, and the PSNR of gdtool's picture against each peer's. The renderers' scenes are
+close and not the same: Mitsuba has neither emission nor alpha, and vertex colors in place of a texture, not over it;
+Blender poses rigged models as their animation begins. Pictures that are there already are kept, so a killed run goes
+on. Do not publish sheets of models whose licence does not allow it."""
 
 from __future__ import annotations
 
@@ -27,13 +26,48 @@ def pictures(model: str, light: str, place: Path, size: int, view: str, python: 
     if not all(path.exists() for path in done.values()):
         scene = exported(model, light, place)
         common = ("--size", str(size), "--views")
-        commands = {"gdtool": (sys.executable, str(HERE / "shading_gdtool.py"), model, light, str(done["gdtool"]), *common, view,
-                               "--samples", "64", "--light", "sampled")}
+        commands = {
+            "gdtool": (
+                sys.executable,
+                str(HERE / "shading_gdtool.py"),
+                model,
+                light,
+                str(done["gdtool"]),
+                *common,
+                view,
+                "--samples",
+                "64",
+                "--light",
+                "sampled",
+            )
+        }
         if has(python, "bpy"):
-            commands["Cycles"] = (str(python), str(HERE / "shading_blender.py"), scene["model"], scene["light"], str(done["Cycles"]), *common,
-                                  f"{view}={scene['azimuths'][view]:g}", "--half-width", str(scene["half_width"]), "--samples", "32", "--light", "--denoise")
+            commands["Cycles"] = (
+                str(python),
+                str(HERE / "shading_blender.py"),
+                scene["model"],
+                scene["light"],
+                str(done["Cycles"]),
+                *common,
+                f"{view}={scene['azimuths'][view]:g}",
+                "--half-width",
+                str(scene["half_width"]),
+                "--samples",
+                "32",
+                "--light",
+                "--denoise",
+            )
         if has(python, "mitsuba"):
-            commands["Mitsuba"] = (str(python), str(HERE / "shading_mitsuba.py"), scene["scene"], str(done["Mitsuba"]), *common, view, "--samples", "64")
+            commands["Mitsuba"] = (
+                str(python),
+                str(HERE / "shading_mitsuba.py"),
+                scene["scene"],
+                str(done["Mitsuba"]),
+                *common,
+                view,
+                "--samples",
+                "64",
+            )
         for name, command in commands.items():
             if not done[name].exists():
                 in_child(command)
@@ -59,14 +93,34 @@ def main() -> None:
         rows = []
         for model in asked.models:
             title = Path(model).stem.replace(":", "-")
-            found = pictures(model, light, asked.output / "work" / Path(light).stem / title, asked.size, asked.view, asked.peers_python)
+            found = pictures(
+                model,
+                light,
+                asked.output / "work" / Path(light).stem / title,
+                asked.size,
+                asked.view,
+                asked.peers_python,
+            )
             shown = {name: srgb_from_linear(np.clip(image, 0, 1)) for name, image in found.items()}
             rows.append([shown.get(name) for name in names])
             if "gdtool" in shown:
                 whole = np.ones(shown["gdtool"].shape[:2], bool)
-                rows_of_all.append({"light": light, "model": title, **{f"against {n}": round(psnr(shown["gdtool"], shown[n], whole), 1) for n in names[1:] if n in shown}})
+                rows_of_all.append(
+                    {
+                        "light": light,
+                        "model": title,
+                        **{
+                            f"against {n}": round(psnr(shown["gdtool"], shown[n], whole), 1)
+                            for n in names[1:]
+                            if n in shown
+                        },
+                    }
+                )
                 say(str(rows_of_all[-1]))
-            write_png(asked.output / f"{Path(light).stem}.png", contact_sheet(rows, list(names), [Path(m).stem[:16] for m in asked.models[:len(rows)]]))
+            write_png(
+                asked.output / f"{Path(light).stem}.png",
+                contact_sheet(rows, list(names), [Path(m).stem[:16] for m in asked.models[: len(rows)]]),
+            )
     (asked.output / "agreement.json").write_text(json.dumps(rows_of_all, indent=1) + "\n")
 
 

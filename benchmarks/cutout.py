@@ -1,4 +1,5 @@
-"""Cutting subjects out of backgrounds that are not plain: GrabCut's overlap with the truth, and how well its own check tells.
+"""Cutting subjects out of backgrounds that are not plain: GrabCut's overlap with the truth, and how well its own check
+tells.
 
     python benchmarks/cutout.py ../shared/assets/images ../shared/assets/hdr -o docs/benchmarks
 
@@ -29,7 +30,7 @@ def background(path: Path, rng: np.random.Generator) -> np.ndarray:
     image = srgb_from_linear(np.clip(image / np.percentile(image.mean(-1), 95), 0, 1))
     side = image.shape[0] // 3
     top, left = rng.integers(image.shape[0] // 3, image.shape[0] // 2), rng.integers(0, image.shape[1] - side)
-    return resize(image[top: top + side, left: left + side], (SIDE, SIDE), anti_aliasing=True)
+    return resize(image[top : top + side, left : left + side], (SIDE, SIDE), anti_aliasing=True)
 
 
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
@@ -39,12 +40,22 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
 def markdown(rows: list[dict]) -> str:
     accepted = [r for r in rows if r["agreement"] >= cutout.AGREEMENT]
     good = [r for r in rows if r["overlap"] >= 0.9]
-    return "\n".join([
-        "# Subjects on busy backgrounds", "", f"{len(rows)} pictures with known alpha over photographed environments, on {machine()}.",
-        f"Accepted (the two frames agree by {cutout.AGREEMENT} or more): {len(accepted)}, mean overlap with the truth "
-        f"{np.mean([r['overlap'] for r in accepted]) if accepted else float('nan'):.3f}, below 0.9 in {sum(r['overlap'] < 0.9 for r in accepted)}. "
-        f"Refused though good: {sum(r['agreement'] < cutout.AGREEMENT for r in good)}.", "",
-        table(["picture", "background", "overlap", "agreement"], [[r["picture"], r["background"], f"{r['overlap']:.3f}", f"{r['agreement']:.3f}"] for r in rows]), ""])
+    return "\n".join(
+        [
+            "# Subjects on busy backgrounds",
+            "",
+            f"{len(rows)} pictures with known alpha over photographed environments, on {machine()}.",
+            f"Accepted (the two frames agree by {cutout.AGREEMENT} or more): {len(accepted)}, mean overlap with the truth "
+            f"{np.mean([r['overlap'] for r in accepted]) if accepted else float('nan'):.3f}, below 0.9 in {sum(r['overlap'] < 0.9 for r in accepted)}. "
+            f"Refused though good: {sum(r['agreement'] < cutout.AGREEMENT for r in good)}.",
+            "",
+            table(
+                ["picture", "background", "overlap", "agreement"],
+                [[r["picture"], r["background"], f"{r['overlap']:.3f}", f"{r['agreement']:.3f}"] for r in rows],
+            ),
+            "",
+        ]
+    )
 
 
 def main() -> None:
@@ -66,7 +77,14 @@ def main() -> None:
         color = np.pad(image[..., :3] * image[..., 3:], ((margin, margin), (margin, margin), (0, 0)))
         for ground in grounds:
             _, wide, agreement = cutout.both_frames(color + background(ground, rng) * (1 - alpha[..., None]))
-            rows.append({"picture": path.stem, "background": ground.stem, "overlap": overlap(wide, alpha > 0.5), "agreement": agreement})
+            rows.append(
+                {
+                    "picture": path.stem,
+                    "background": ground.stem,
+                    "overlap": overlap(wide, alpha > 0.5),
+                    "agreement": agreement,
+                }
+            )
         say(f"  {path.name}")
         (arguments.output / "cutout.md").write_text(markdown(rows))
     print(markdown(rows))

@@ -1,4 +1,5 @@
-"""Meshes that remesh and unwrap are measured on: solids with creases in closed form, and public models, by marching cubes.
+"""Meshes that remesh and unwrap are measured on: solids with creases in closed form, and public models, by marching
+cubes.
 
 Each comes as vertices (v, 3) in a unit box, triangles (f, 3), about as many as asked, and its true creases as segments
 (s, 2, 3), None where they are not known. They are kept in a folder, because making one takes up to half a minute.
@@ -39,6 +40,7 @@ def part(x, y, z):
 
 def bracket(x, y, z):
     """Two plates at a right angle with a hole in one and a rib between: thin parts, long creases."""
+
     def box(cx, cy, cz, a, b, c):
         return np.maximum(np.maximum(abs(x - cx) - a, abs(y - cy) - b), abs(z - cz) - c)
 
@@ -70,8 +72,11 @@ def part_creases(count: int = 800) -> np.ndarray:
     curves.append(np.stack([ball[0] + radius * np.cos(turn), b * around, radius * np.sin(turn)], -1))
     for s in (-1, 1):
         for t in (-1, 1):
-            curves += [np.stack([a * line, s * b * one, t * c * one], -1), np.stack([s * a * one, b * line, t * c * one], -1),
-                       np.stack([s * a * one, t * b * one, c * line], -1)]
+            curves += [
+                np.stack([a * line, s * b * one, t * c * one], -1),
+                np.stack([s * a * one, b * line, t * c * one], -1),
+                np.stack([s * a * one, t * b * one, c * line], -1),
+            ]
     segments = np.concatenate([np.stack([p[:-1], p[1:]], 1) for p in curves])
     return segments[abs(part(*segments.mean(1).T)) < 1e-3]
 
@@ -82,7 +87,9 @@ def marched(field: Callable, triangles: int, half: float = 1.06) -> tuple[np.nda
 
     def at(n: int) -> tuple[np.ndarray, np.ndarray]:
         line = np.linspace(-half, half, n).astype(np.float32)
-        values = np.concatenate([field(*np.meshgrid(line[i:i + 16], line, line, indexing="ij")) for i in range(0, n, 16)])
+        values = np.concatenate(
+            [field(*np.meshgrid(line[i : i + 16], line, line, indexing="ij")) for i in range(0, n, 16)]
+        )
         vertices, faces, _, _ = marching_cubes(values, 0.0)
         return vertices * float(line[1] - line[0]) - half, faces.astype(np.int64)
 
@@ -91,7 +98,8 @@ def marched(field: Callable, triangles: int, half: float = 1.06) -> tuple[np.nda
 
 
 def solidified(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple[np.ndarray, np.ndarray]:
-    """A closed surface of about so many triangles around any model: zero set of its distance, signed by winding number."""
+    """A closed surface of about so many triangles around any model: zero set of its distance, signed by winding
+    number."""
     from skimage.measure import marching_cubes
 
     from gdtool.geometry.distance import closest_points, winding_number
@@ -108,7 +116,12 @@ def solidified(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple
         distance = closest_points(points, vertices, faces)[0]
         return np.where(winding_number(points, vertices, faces) > 0.5, -distance, distance)
 
-    centre = low + (np.stack(np.meshgrid(*(np.arange(b) for b in blocks), indexing="ij"), -1).reshape(-1, 3) + 0.5) * factor * step
+    centre = (
+        low
+        + (np.stack(np.meshgrid(*(np.arange(b) for b in blocks), indexing="ij"), -1).reshape(-1, 3) + 0.5)
+        * factor
+        * step
+    )
     coarse = signed(centre)
     values = np.repeat(np.repeat(np.repeat(coarse.reshape(blocks), factor, 0), factor, 1), factor, 2).astype(np.float32)
     values = np.pad(values, [(0, 1)] * 3, mode="edge")
@@ -126,13 +139,17 @@ def solidified(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple
     inside = values[tuple(index.T)] < 0
     inside[beside] = winding_number(points[beside], vertices, faces) > 0.5
     block = np.minimum(index // factor, blocks - 1)
-    inside[~beside] = _nearest_sign(index[~beside], index[beside], inside[beside], coarse.reshape(blocks), block[~beside])
+    inside[~beside] = _nearest_sign(
+        index[~beside], index[beside], inside[beside], coarse.reshape(blocks), block[~beside]
+    )
     values[tuple(index.T)] = np.where(inside, -distance, distance)
     found, out, _, _ = marching_cubes(values, 0.0)
     return found * step + low, out.astype(np.int64)
 
 
-def _nearest_sign(asked: np.ndarray, known: np.ndarray, inside: np.ndarray, coarse: np.ndarray, block: np.ndarray) -> np.ndarray:
+def _nearest_sign(
+    asked: np.ndarray, known: np.ndarray, inside: np.ndarray, coarse: np.ndarray, block: np.ndarray
+) -> np.ndarray:
     """Whether samples off the surface are inside: as the nearest sample beside it is."""
     from scipy.spatial import cKDTree
 
@@ -158,6 +175,7 @@ def models_in(places: Iterable[Path]) -> list[Path]:
 
 def of_solid(name: str, triangles: int, folder: Path) -> Fine:
     """One of SOLIDS."""
+
     def make() -> tuple[np.ndarray, np.ndarray]:
         return marched(SOLIDS[name], triangles)
 
@@ -168,6 +186,7 @@ def of_solid(name: str, triangles: int, folder: Path) -> Fine:
 
 def of_model(path: Path, triangles: int, folder: Path) -> Fine:
     """A model file, made solid; raises what reading it raises."""
+
     def make() -> tuple[np.ndarray, np.ndarray]:
         from gdtool.assets.load import load_scene
 

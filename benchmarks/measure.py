@@ -20,8 +20,8 @@ class Failed(Exception):
 
 @dataclass(frozen=True)
 class Cost:
-    """What one command took. peak_mb: largest resident set of the process or of one of its children; cpu_seconds: of the
-    process and its children, user and system, over all threads."""
+    """What one command took. peak_mb: largest resident set of the process or of one of its children; cpu_seconds: of
+    the process and its children, user and system, over all threads."""
 
     seconds: float
     peak_mb: float
@@ -70,7 +70,8 @@ def gdtool(*arguments: str | Path, limit_seconds: float = 1800) -> Cost:
         last = texts[1].strip().splitlines()[-1:] or ["no message"]
         late = f" after {limit_seconds:.0f} s" if seconds > limit_seconds else ""
         raise Failed(f"{arguments[0]} exited with {process.returncode}{late}: {last[0]}")
-    # A child's account begins with what this process held when it started it; below that only the child itself can tell.
+    # A child's account begins with what this process held when it started it; below that only the child itself can
+    # tell.
     account = usage.ru_maxrss / 1024
     return Cost(seconds, account if account > peak_mb() else high, texts[0], usage.ru_utime + usage.ru_stime)
 
@@ -82,18 +83,30 @@ def evaluate(result: Path, *arguments: str | Path) -> dict:
 
 def machine() -> str:
     """Processor and cores, for the head of a report."""
-    model = next((line.split(":", 1)[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")), "?")
+    model = next(
+        (
+            line.split(":", 1)[1].strip()
+            for line in Path("/proc/cpuinfo").read_text().splitlines()
+            if line.startswith("model name")
+        ),
+        "?",
+    )
     return f"{model}, {len(os.sched_getaffinity(0))} cores visible"
 
 
 def busy() -> str:
     """A sentence for the report when the machine had other work as the benchmark began, else nothing."""
     working, cores = _cores_at_work(), len(os.sched_getaffinity(0))
-    return f"Other work ran meanwhile ({working:.1f} of {cores} cores as it began): the times are upper bounds." if working > 0.3 * cores else ""
+    return (
+        f"Other work ran meanwhile ({working:.1f} of {cores} cores as it began): the times are upper bounds."
+        if working > 0.3 * cores
+        else ""
+    )
 
 
 def _cores_at_work(seconds: float = 1.0) -> float:
-    """How many cores work right now; the load of the last minute, which counts what ended since, where the kernel does not say."""
+    """How many cores work right now; the load of the last minute, which counts what ended since, where the kernel does
+    not say."""
     if not Path("/proc/stat").exists():
         return os.getloadavg()[0]
 

@@ -42,7 +42,8 @@ def corners(mesh) -> np.ndarray:
 
 
 def prepared(thing, vertices: np.ndarray) -> float:
-    """Enlarges the mesh and drops its tiniest edges; the factor. QuadriFlow calls a mesh with edges below 1e-4 not manifold."""
+    """Enlarges the mesh and drops its tiniest edges; the factor. QuadriFlow calls a mesh with edges below 1e-4 not
+    manifold."""
     import bmesh
 
     factor = 1000.0 / float(np.linalg.norm(np.ptp(vertices, 0)))
@@ -64,7 +65,9 @@ def main() -> None:
         factor = prepared(thing, given["vertices"]) if way == "quadriflow" else 1.0
     start = time.perf_counter()
     if way == "quadriflow":
-        state = bpy.ops.object.quadriflow_remesh(mode="FACES", target_faces=int(asked), use_preserve_sharp=True, use_mesh_symmetry=False, seed=0)
+        state = bpy.ops.object.quadriflow_remesh(
+            mode="FACES", target_faces=int(asked), use_preserve_sharp=True, use_mesh_symmetry=False, seed=0
+        )
         if "FINISHED" not in state:
             sys.exit("QuadriFlow was cancelled")
         seconds = time.perf_counter() - start

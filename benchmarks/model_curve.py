@@ -1,11 +1,12 @@
-"""Quality on held-out objects against the minutes of training that led to it: one point a model along its chain of starts.
+"""Quality on held-out objects against the minutes of training that led to it: one point a model along its chain of
+starts.
 
     python benchmarks/model_curve.py out/model/held_out --model out/model/model -o docs/benchmarks
 
-A model that was trained with --start goes back to the one it began with, and so on: the manifests say so, and for how long each
-was trained. Figures are those of model_quality.py (five unseen views), at each model's own size, in one step of sampling. The
-straight line through PSNR over the logarithm of the minutes is drawn on to ten times the longest training.
-"""
+A model that was trained with --start goes back to the one it began with, and so on: the manifests say so, and for how
+long each was trained. Figures are those of model_quality.py (five unseen views), at each model's own size, in one step
+of sampling. The straight line through PSNR over the logarithm of the minutes is drawn on to ten times the longest
+training."""
 
 from __future__ import annotations
 
@@ -20,13 +21,22 @@ from model_mean import STAGE as MEAN
 from model_quality import DEFAULT_MODEL, figures, sampled_views, true_views, views_folders
 
 from gdtool.core.folder import open_folder
-from gdtool.diffusion.data.objects import decode_object
 from gdtool.diffusion.checkpoint.weights import load_model
+from gdtool.diffusion.data.objects import decode_object
 
-NOTE = ("Minutes are of the clock, of runs on one core or two, alone or beside other work, as the card says; the first rows are at 64 px, where views are "
-        "easier to match. The line in the picture goes through all of them and is drawn on to ten times the training: what a faster machine would add "
-        "is an estimate by it, not a measurement.")
-SHOWN = ("color_psnr_frame", "color_ssim_frame", "albedo_psnr_frame", "normal_degrees", "depth_error", "silhouette_overlap")
+NOTE = (
+    "Minutes are of the clock, of runs on one core or two, alone or beside other work, as the card says; the first rows are at 64 px, where views are "
+    "easier to match. The line in the picture goes through all of them and is drawn on to ten times the training: what a faster machine would add "
+    "is an estimate by it, not a measurement."
+)
+SHOWN = (
+    "color_psnr_frame",
+    "color_ssim_frame",
+    "albedo_psnr_frame",
+    "normal_degrees",
+    "depth_error",
+    "silhouette_overlap",
+)
 
 
 def chain(path: Path) -> list[tuple[Path, float]]:
@@ -64,11 +74,19 @@ def draw(path: Path, points: list[dict]) -> None:
     minutes, psnr = (np.array([point[key] for point in points]) for key in ("minutes", "color_psnr_frame"))
     axis.plot(minutes, psnr, "o")
     for point in points:
-        axis.annotate(f"{point['size']} px", (point["minutes"], point["color_psnr_frame"]), textcoords="offset points", xytext=(6, -10), fontsize=8)
+        axis.annotate(
+            f"{point['size']} px",
+            (point["minutes"], point["color_psnr_frame"]),
+            textcoords="offset points",
+            xytext=(6, -10),
+            fontsize=8,
+        )
     if len(points) > 1:
         slope, offset = np.polyfit(np.log10(minutes), psnr, 1)
         on = np.array([minutes.min(), 10 * minutes.max()])
-        axis.plot(on, slope * np.log10(on) + offset, "--", linewidth=0.8, label=f"{slope:.2f} dB for ten times the training")
+        axis.plot(
+            on, slope * np.log10(on) + offset, "--", linewidth=0.8, label=f"{slope:.2f} dB for ten times the training"
+        )
         axis.legend()
     axis.set(xscale="log", xlabel="minutes of training", ylabel="color PSNR, five unseen views, dB")
     figure.tight_layout()
@@ -81,7 +99,12 @@ def main() -> None:
     parser.add_argument("held_out", nargs="+", type=Path)
     parser.add_argument("--model", type=Path, default=DEFAULT_MODEL)
     parser.add_argument("--limit", type=int, default=100, help="held-out objects at most")
-    parser.add_argument("--after", type=float, metavar="MINUTES", help="the model went on from one of so many minutes that is not here any more: its row, and those before, are kept")
+    parser.add_argument(
+        "--after",
+        type=float,
+        metavar="MINUTES",
+        help="the model went on from one of so many minutes that is not here any more: its row, and those before, are kept",
+    )
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks"))
     arguments = parser.parse_args()
     folders, points = views_folders(arguments.held_out)[: arguments.limit], []
@@ -94,8 +117,20 @@ def main() -> None:
         points.append({"minutes": minutes, **quality(path, folders)})
         say(f"  {path}: {minutes:.0f} minutes")
     rows = [[number(point["minutes"]), *(number(point[key]) for key in ("size", *SHOWN))] for point in points]
-    text = "\n".join(["# Quality against minutes of training", "", f"{len(folders)} held-out objects, one step of sampling of the picture alone, trained and measured on {machine()}.", "",
-                      table(["minutes", "px", *(key.replace("_", " ") for key in SHOWN)], rows), "", NOTE, "", "![PSNR against minutes](model_curve.png)", ""])
+    text = "\n".join(
+        [
+            "# Quality against minutes of training",
+            "",
+            f"{len(folders)} held-out objects, one step of sampling of the picture alone, trained and measured on {machine()}.",
+            "",
+            table(["minutes", "px", *(key.replace("_", " ") for key in SHOWN)], rows),
+            "",
+            NOTE,
+            "",
+            "![PSNR against minutes](model_curve.png)",
+            "",
+        ]
+    )
     arguments.output.mkdir(parents=True, exist_ok=True)
     (arguments.output / "model_curve.json").write_text(json.dumps(points, indent=1) + "\n")
     (arguments.output / "model_curve.md").write_text(text)

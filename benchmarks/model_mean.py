@@ -2,9 +2,8 @@
 
     python benchmarks/model_mean.py one-run the-next-run -o model
 
-Wortsman et al. 2022, "Model soups". The configuration, the loss curve and all else are those of the last one, which every other
-one must fit. What it is worth is for benchmarks/model_quality.py to say.
-"""
+Wortsman et al. 2022, "Model soups". The configuration, the loss curve and all else are those of the last one, which
+every other one must fit. What it is worth is for benchmarks/model_quality.py to say."""
 
 from __future__ import annotations
 
@@ -33,10 +32,16 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     weights = [model.state_dict() for model in models]
     for folder, other in zip(inputs.all, weights, strict=True):
         if {name: x.shape for name, x in other.items()} != {name: x.shape for name, x in weights[-1].items()}:
-            raise InputError(folder.path, f"it has other weights than {last.path}", "means are of models of one configuration")
+            raise InputError(
+                folder.path, f"it has other weights than {last.path}", "means are of models of one configuration"
+            )
     for path in sorted(p for p in last.path.rglob("*") if p.is_file() and p.name != MANIFEST):
         shutil.copyfile(path, out.path(str(path.relative_to(last.path))))
-    save_model(out.path, models[-1].config, {name: torch.stack([w[name].float() for w in weights]).mean(0) for name in weights[-1]})
+    save_model(
+        out.path,
+        models[-1].config,
+        {name: torch.stack([w[name].float() for w in weights]).mean(0) for name in weights[-1]},
+    )
     out.content = last.content
 
 
@@ -48,7 +53,13 @@ def main() -> None:
     parser.add_argument("models", nargs="+", type=Path, help="model folders; the last one gives all but the weights")
     parser.add_argument("-o", "--output", type=Path, required=True)
     arguments = parser.parse_args()
-    run_one(STAGE, [open_folder(path, ("model",)) for path in arguments.models], Options(), {}, Settings(output=arguments.output))
+    run_one(
+        STAGE,
+        [open_folder(path, ("model",)) for path in arguments.models],
+        Options(),
+        {},
+        Settings(output=arguments.output),
+    )
 
 
 if __name__ == "__main__":

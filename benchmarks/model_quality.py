@@ -16,10 +16,10 @@ Each object's front view is the picture. Figures are means over the five views t
 weighing the same: color and albedo PSNR over white, full frame ("frame") and over the true foreground only
 ("foreground"), in the stored encoding; SSIM of color over white; normals in degrees, depth as a share of the object's
 size, both where truth and result are foreground; roughness and metallic mean absolute error over the true foreground;
-overlap (intersection over union) of the silhouettes. "six" takes the front view in, as the paper's protocol does. Baselines: the mean of the training objects' views, and the
-training object whose front view is nearest (squared error of the picture over grey). The last columns compare the model's first
-number of steps with the nearest object by object: how far it is ahead on average, the standard error of that, the share on which it is.
-"""
+overlap (intersection over union) of the silhouettes. "six" takes the front view in, as the paper's protocol does.
+Baselines: the mean of the training objects' views, and the training object whose front view is nearest (squared error
+of the picture over grey). The last columns compare the model's first number of steps with the nearest object by object:
+how far it is ahead on average, the standard error of that, the share on which it is. """
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ from gdtool.cameras import rig
 from gdtool.core.folder import open_folder
 from gdtool.core.manifest import MANIFEST, list_files
 from gdtool.core.manifest import encode as encode_manifest
-from gdtool.diffusion.inference import familiarity
+from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.diffusion.data.objects import decode_object
-from gdtool.diffusion.network.encoding import BACKGROUND, encode
+from gdtool.diffusion.inference import familiarity
 from gdtool.diffusion.inference.result import views_from_images
 from gdtool.diffusion.inference.sampling import sample_images
-from gdtool.diffusion.checkpoint.weights import load_model
+from gdtool.diffusion.network.encoding import BACKGROUND, encode
 from gdtool.folders.views import Views, read_views
 from gdtool.images.color import srgb_from_linear
 from gdtool.images.metrics import normal_degrees, over_white, psnr, resized_views, scalar_error, ssim
@@ -67,8 +67,13 @@ def figures(result: Views, truth: Views) -> dict[str, float]:
     """Errors of one object over the views that are not the front one."""
     unseen = [k for k, name in enumerate(truth.names) if name != "front"]
     order = [result.names.index(truth.names[k]) for k in unseen]
-    six = [(over_white(result.images["color"][result.names.index(name)], result.mask[result.names.index(name)]),
-            over_white(truth.images["color"][k], truth.mask[k])) for k, name in enumerate(truth.names)]
+    six = [
+        (
+            over_white(result.images["color"][result.names.index(name)], result.mask[result.names.index(name)]),
+            over_white(truth.images["color"][k], truth.mask[k]),
+        )
+        for k, name in enumerate(truth.names)
+    ]
     true, mask = {d: x[unseen] for d, x in truth.images.items()}, truth.mask[unseen]
     own, own_mask = {d: x[order] for d, x in result.images.items()}, result.mask[order]
     out: dict[str, list[float]] = {}
@@ -81,11 +86,15 @@ def figures(result: Views, truth: Views) -> dict[str, float]:
                 a, b = (np.clip(srgb_from_linear(x[domain][k]), 0, 1) for x in (own, true))
                 out.setdefault(f"{domain}_psnr_foreground", []).append(psnr(a, b, full))
             if domain == "color":
-                out.setdefault("color_ssim_frame", []).append(ssim(over_white(own[domain][k], own_mask[k]), over_white(true[domain][k], mask[k])))
+                out.setdefault("color_ssim_frame", []).append(
+                    ssim(over_white(own[domain][k], own_mask[k]), over_white(true[domain][k], mask[k]))
+                )
         a, b = own_mask[k] > 0.5, mask[k] > 0.5
         out.setdefault("silhouette_overlap", []).append(float((a & b).sum() / max((a | b).sum(), 1)))
     single = {name: float(np.mean(values)) for name, values in out.items()}
-    single["color_psnr_six"], single["color_ssim_six"] = (float(np.mean([measure(a, b) for a, b in six])) for measure in (psnr, ssim))
+    single["color_psnr_six"], single["color_ssim_six"] = (
+        float(np.mean([measure(a, b) for a, b in six])) for measure in (psnr, ssim)
+    )
     single["normal_degrees"] = normal_degrees(own["normal"], own_mask, true["normal"], mask)
     both = (own_mask > 0.5) & (mask > 0.99)
     single["depth_error"] = float(np.abs(own["depth"] - true["depth"])[both].mean()) if both.any() else float("nan")
@@ -97,15 +106,27 @@ def figures(result: Views, truth: Views) -> dict[str, float]:
 def on_shared_pixels(results: list[Views], truth: Views) -> list[dict[str, float]]:
     """Normals' and depth's errors of several results over the same pixels: those that lie on the object in all of them.
 
-    Each result's own figures are taken where it overlaps with the truth; one that leaves out what is hard fares better there.
-    """
+    Each result's own figures are taken where it overlaps with the truth; one that leaves out what is hard fares better
+    there."""
     unseen = [k for k, name in enumerate(truth.names) if name != "front"]
     order = [[result.names.index(truth.names[k]) for k in unseen] for result in results]
-    mask = np.min([truth.mask[unseen], *(result.mask[places] for result, places in zip(results, order, strict=True))], 0)
+    mask = np.min(
+        [truth.mask[unseen], *(result.mask[places] for result, places in zip(results, order, strict=True))], 0
+    )
     both = (mask > 0.5) & (truth.mask[unseen] > 0.99)
-    return [{"normal_degrees_shared": normal_degrees(result.images["normal"][places], mask, truth.images["normal"][unseen], mask),
-             "depth_error_shared": float(np.abs(result.images["depth"][places] - truth.images["depth"][unseen])[both].mean()) if both.any() else float("nan")}
-            for result, places in zip(results, order, strict=True)]
+    return [
+        {
+            "normal_degrees_shared": normal_degrees(
+                result.images["normal"][places], mask, truth.images["normal"][unseen], mask
+            ),
+            "depth_error_shared": float(
+                np.abs(result.images["depth"][places] - truth.images["depth"][unseen])[both].mean()
+            )
+            if both.any()
+            else float("nan"),
+        }
+        for result, places in zip(results, order, strict=True)
+    ]
 
 
 def decoded(planes: torch.Tensor, config) -> Views:
@@ -113,7 +134,9 @@ def decoded(planes: torch.Tensor, config) -> Views:
     indices = tuple(range(6))
     images = encode(planes[None], indices, torch.zeros(1))[0]
     cameras = {camera.name: camera for camera in rig("six", config.image_size)}
-    return views_from_images({d: images[i] for i, d in enumerate(config.domains)}, [cameras[n] for n in config.views], 0.0, config.domains)[0]
+    return views_from_images(
+        {d: images[i] for i, d in enumerate(config.domains)}, [cameras[n] for n in config.views], 0.0, config.domains
+    )[0]
 
 
 def true_views(folder, size: int) -> Views:
@@ -127,8 +150,13 @@ def sampled_views(model, rgba: torch.Tensor, seed: int, **setting) -> Views:
     config = model.config
     cameras = {camera.name: camera for camera in rig("six", config.image_size)}
     images = sample_images(model, rgba, seed=seed, **setting)
-    return views_from_images({d: x[0].float() for d, x in images.items()}, [cameras[n] for n in config.views], BACKGROUND[config.backgrounds[0]],
-                             setting.get("domains", config.domains), (0.5 + 0.5 * rgba[0, 3]).numpy())[0]
+    return views_from_images(
+        {d: x[0].float() for d, x in images.items()},
+        [cameras[n] for n in config.views],
+        BACKGROUND[config.backgrounds[0]],
+        setting.get("domains", config.domains),
+        (0.5 + 0.5 * rgba[0, 3]).numpy(),
+    )[0]
 
 
 def nearest_to(condition: torch.Tensor, pictures: list[np.ndarray]) -> int:
@@ -137,8 +165,8 @@ def nearest_to(condition: torch.Tensor, pictures: list[np.ndarray]) -> int:
 
 
 def leads(own: list[dict[str, float]], other: list[dict[str, float]]) -> dict[str, dict[str, float]]:
-    """How far one way is ahead of another on the same objects: by how much on average (errors and angles are better small),
-    the standard error of that, and the share of the objects on which it is ahead."""
+    """How far one way is ahead of another on the same objects: by how much on average (errors and angles are better
+    small), the standard error of that, and the share of the objects on which it is ahead."""
     out: dict[str, dict[str, float]] = {"lead over the nearest": {}, "its standard error": {}, "ahead on": {}}
     for key in own[0]:
         lead = _sign(key) * np.array([a[key] - b[key] for a, b in zip(own, other, strict=True)])
@@ -151,16 +179,31 @@ def leads(own: list[dict[str, float]], other: list[dict[str, float]]) -> dict[st
 
 def report(means: dict[str, dict[str, float]], count: int, size: int, objects: str) -> str:
     """The table as Markdown, with what the paper has beside it, and where the model is not ahead."""
-    lines = [f"{count} {objects}, the five unseen views, {size} px:", "", "| | " + " | ".join(means) + " |",
-             "|---" * (len(means) + 1) + "|"]
+    lines = [
+        f"{count} {objects}, the five unseen views, {size} px:",
+        "",
+        "| | " + " | ".join(means) + " |",
+        "|---" * (len(means) + 1) + "|",
+    ]
     keys = list(dict.fromkeys(key for row in means.values() for key in row))
-    lines += [f"| {key.replace('_', ' ')} | " + " | ".join(f"{row[key]:.3f}" if key in row else "" for row in means.values()) + " |" for key in keys]
+    lines += [
+        f"| {key.replace('_', ' ')} | "
+        + " | ".join(f"{row[key]:.3f}" if key in row else "" for row in means.values())
+        + " |"
+        for key in keys
+    ]
     own = next(iter(means.values()))
-    lines += ["", f"By the paper's protocol, which takes the front view in (\"six\"), color has {own['color_psnr_six']:.2f} dB and SSIM "
-                  f"{own['color_ssim_six']:.3f}; the paper has 27.93 dB and 0.937, on other objects, with a model a hundred times as large."]
-    behind = [f"{key.replace('_', ' ')} ({own[key]:.3f} against {means[name][key]:.3f} of the {name})"
-              for name in ("nearest training object", "mean training object") for key in own
-              if key in means.get(name, {}) and _sign(key) * (own[key] - means[name][key]) < 0]
+    lines += [
+        "",
+        f'By the paper\'s protocol, which takes the front view in ("six"), color has {own["color_psnr_six"]:.2f} dB and SSIM '
+        f"{own['color_ssim_six']:.3f}; the paper has 27.93 dB and 0.937, on other objects, with a model a hundred times as large.",
+    ]
+    behind = [
+        f"{key.replace('_', ' ')} ({own[key]:.3f} against {means[name][key]:.3f} of the {name})"
+        for name in ("nearest training object", "mean training object")
+        for key in own
+        if key in means.get(name, {}) and _sign(key) * (own[key] - means[name][key]) < 0
+    ]
     if behind:
         lines += ["", "Behind: " + "; ".join(behind) + "."]
     return "\n".join(lines) + "\n"
@@ -180,7 +223,9 @@ def main() -> None:
     parser.add_argument("--scheduler", default="ddim", choices=["ddim", "dpm"])
     parser.add_argument("-o", "--output", type=Path, help="folder for NAME.json and NAME.md")
     parser.add_argument("--name", default="model_quality")
-    parser.add_argument("--objects", default="held-out procedural objects", help="what they are, for the table's heading")
+    parser.add_argument(
+        "--objects", default="held-out procedural objects", help="what they are, for the table's heading"
+    )
     parser.add_argument("--install", action="store_true", help="make it the bundled model")
     parser.add_argument("--note", default="", help="a line for the card: what the data were, how long it took")
     arguments = parser.parse_args()
@@ -212,7 +257,9 @@ def main() -> None:
             table.setdefault("mean training object", []).append(figures(decoded(mean, config), truth))
         print(f"{number + 1}: {folder.name}", flush=True)
     count = len(next(iter(table.values())))
-    means = {name: {key: float(np.nanmean([row[key] for row in rows])) for key in rows[0]} for name, rows in table.items()}
+    means = {
+        name: {key: float(np.nanmean([row[key] for row in rows])) for key in rows[0]} for name, rows in table.items()
+    }
     if trained:
         means |= leads(next(iter(table.values())), table["nearest training object"])
     for name in seconds:

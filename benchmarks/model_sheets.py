@@ -17,12 +17,12 @@ from model_quality import DEFAULT_MODEL, views_folders
 
 from gdtool.cameras import rig
 from gdtool.cameras.camera import DISTANCE
-from gdtool.diffusion.data.objects import condition_plane, decode_object
-from gdtool.diffusion.network.encoding import BACKGROUND, SLAB
+from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.diffusion.data.framing import frame
+from gdtool.diffusion.data.objects import condition_plane, decode_object
 from gdtool.diffusion.inference.result import views_from_images
 from gdtool.diffusion.inference.sampling import sample_images
-from gdtool.diffusion.checkpoint.weights import load_model
+from gdtool.diffusion.network.encoding import BACKGROUND, SLAB
 from gdtool.images.color import linear_from_srgb
 from gdtool.images.io import read_image, write_png
 from gdtool.images.metrics import over_white
@@ -53,13 +53,20 @@ def block(model, condition: np.ndarray) -> np.ndarray:
     rgba = torch.from_numpy(np.ascontiguousarray(condition, np.float32))[None]
     sampled = sample_images(model, rgba, steps=config.sampling_steps)
     alpha = 0.5 + 0.5 * condition[3]
-    views, _ = views_from_images({d: x[0] for d, x in sampled.items()}, [cameras[n] for n in config.views], BACKGROUND[config.backgrounds[0]],
-                              config.domains, alpha)
+    views, _ = views_from_images(
+        {d: x[0] for d, x in sampled.items()},
+        [cameras[n] for n in config.views],
+        BACKGROUND[config.backgrounds[0]],
+        config.domains,
+        alpha,
+    )
     out = np.ones((len(config.domains) * h, (len(config.views) + 1) * h, 3), np.float32)
     out[:h, :h] = np.moveaxis(0.5 * (condition[:3] + alpha) + 1 - alpha, 0, -1)  # premultiplied, over white
     for row, domain in enumerate(config.domains):
         for k in range(len(config.views)):
-            out[row * h: (row + 1) * h, (k + 1) * h: (k + 2) * h] = shown(domain, views.images[domain][k], views.mask[k])
+            out[row * h : (row + 1) * h, (k + 1) * h : (k + 2) * h] = shown(
+                domain, views.images[domain][k], views.mask[k]
+            )
     return np.clip(out, 0, 1)
 
 
@@ -69,12 +76,13 @@ def sheet(blocks: list[np.ndarray]) -> np.ndarray:
     out = np.full((rows * (height + GAP), COLUMNS * (width + GAP), 3), 0.6, np.float32)
     for i, one in enumerate(blocks):
         top, left = i // COLUMNS * (height + GAP), i % COLUMNS * (width + GAP)
-        out[top: top + height, left: left + width] = one
+        out[top : top + height, left : left + width] = one
     return out
 
 
 def credit(path: Path) -> str:
-    """Where a picture comes from and under what licence, as a SOURCES.tsv (path, repository, path there, licence) above it says."""
+    """Where a picture comes from and under what licence, as a SOURCES.tsv (path, repository, path there, licence) above
+    it says."""
     for folder in path.resolve().parents:
         if (folder / "SOURCES.tsv").is_file():
             for line in (folder / "SOURCES.tsv").read_text().splitlines():
@@ -94,14 +102,34 @@ def main() -> None:
     model = load_model(arguments.model)
     size = model.config.image_size
     pictures = [path for path in sorted(arguments.photographs.rglob("*.png")) if read_image(path).shape[-1] == 4]
-    write_png(arguments.output / "model_photographs.png", sheet([block(model, photograph(path, size)) for path in pictures[:COUNT]]))
+    write_png(
+        arguments.output / "model_photographs.png",
+        sheet([block(model, photograph(path, size)) for path in pictures[:COUNT]]),
+    )
     folders = views_folders([arguments.held_out])[:COUNT]
     lines = [f"{i + 1}. {path.stem}{credit(path)}" for i, path in enumerate(pictures[:COUNT])]
-    (arguments.output / "model_sheets.md").write_text("\n".join([
-        "# What the bundled model makes of twelve pictures and of twelve held-out objects", "",
-        "A block a picture: as the model is shown it, then its six views in color, normal, depth, albedo, roughness and metallic.", "",
-        "![twelve pictures](model_photographs.png)", "", "The pictures, row by row:", "", *lines, "", "![twelve held-out objects](model_held_out.png)", ""]))
-    write_png(arguments.output / "model_held_out.png", sheet([block(model, decode_object(folder, model.config)[1][0]) for folder in folders]))
+    (arguments.output / "model_sheets.md").write_text(
+        "\n".join(
+            [
+                "# What the bundled model makes of twelve pictures and of twelve held-out objects",
+                "",
+                "A block a picture: as the model is shown it, then its six views in color, normal, depth, albedo, roughness and metallic.",
+                "",
+                "![twelve pictures](model_photographs.png)",
+                "",
+                "The pictures, row by row:",
+                "",
+                *lines,
+                "",
+                "![twelve held-out objects](model_held_out.png)",
+                "",
+            ]
+        )
+    )
+    write_png(
+        arguments.output / "model_held_out.png",
+        sheet([block(model, decode_object(folder, model.config)[1][0]) for folder in folders]),
+    )
 
 
 if __name__ == "__main__":

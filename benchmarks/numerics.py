@@ -1,11 +1,11 @@
-"""What float32-safe forms buy: the paper's literal formulas and the usual textbook forms beside ours, all against float64.
+"""What float32-safe forms buy: the paper's literal formulas and the usual textbook forms beside ours, all against
+float64.
 
     python benchmarks/numerics.py                 writes docs/benchmarks/numerics.md, .json and .png
     python benchmarks/numerics.py -o /tmp/report
 
-Everything is computed in float32 as a program would; the reference is float64 quadrature, or for evaluation and products
-the exact formula in 50 digits. Only this file holds the literal forms.
-"""
+Everything is computed in float32 as a program would; the reference is float64 quadrature, or for evaluation and
+products the exact formula in 50 digits. Only this file holds the literal forms."""
 
 from __future__ import annotations
 
@@ -42,7 +42,11 @@ def literal_product(axis1, sharpness1, axis2, sharpness2):
 
 def literal_hemisphere(sharpness, cosine):
     """Meder & Brüderlin 2018 as printed: the upper hemisphere's integral, shared by a hyperbolic tangent."""
-    t = torch.sqrt(sharpness) * (1.6988 * sharpness**2 + 10.8438 * sharpness) / (sharpness**2 + 6.2201 * sharpness + 10.2415)
+    t = (
+        torch.sqrt(sharpness)
+        * (1.6988 * sharpness**2 + 10.8438 * sharpness)
+        / (sharpness**2 + 6.2201 * sharpness + 10.2415)
+    )
     share = 0.5 * (1 + torch.tanh(0.5 * t * cosine) / torch.tanh(0.5 * t))
     return 2 * torch.pi / sharpness * (1 - torch.exp(-sharpness)) * (share + (1 - share) * torch.exp(-sharpness))
 
@@ -78,7 +82,9 @@ def literal_specular(view, roughness, lights, keep_denominator: bool):
     masking = (n_v / (n_v * (1 - k) + k)) ** 2 / (4 * n_v * n_v if keep_denominator else 1)
     mirror = 2 * n_v * N - view
     axis, length, drop = literal_product(mirror, 2 / a2 / (4 * n_v), lights.axes[0], lights.sharpness[0])
-    return float(masking / (torch.pi * a2) * drop.exp() * literal_cosine_integral(length[None], sg.dot(axis, N)[None])[0])
+    return float(
+        masking / (torch.pi * a2) * drop.exp() * literal_cosine_integral(length[None], sg.dot(axis, N)[None])[0]
+    )
 
 
 def evaluation() -> list[dict]:
@@ -91,7 +97,13 @@ def evaluation() -> list[dict]:
         turn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)))[0]
         v, p, s = (v.double() @ turn.T).float(), turn[:, 2].float(), torch.tensor(value, dtype=F)
         exact = sg.lobe(p.double(), s.double(), v.double())
-        out.append({"sharpness": value, "textbook": worst(literal_lobe(p, s, v), exact), "ours": worst(sg.lobe(p, s, v), exact)})
+        out.append(
+            {
+                "sharpness": value,
+                "textbook": worst(literal_lobe(p, s, v), exact),
+                "ours": worst(sg.lobe(p, s, v), exact),
+            }
+        )
     return out
 
 
@@ -100,7 +112,8 @@ def worst(got, exact) -> float:
 
 
 def product() -> list[dict]:
-    """Largest error of the product's amplitude (relative) over gaps of 0.01 … 2 lobe widths, both lobes equally sharp."""
+    """Largest error of the product's amplitude (relative) over gaps of 0.01 … 2 lobe widths, both lobes equally
+    sharp."""
     out = []
     for value in SHARPNESS[1:]:
         errors = {"textbook": 0.0, "ours": 0.0}
@@ -111,7 +124,12 @@ def product() -> list[dict]:
             with mpmath.workdps(50):
                 a, b = ([mpmath.mpf(float(x)) for x in v] for v in (p1, p2))
                 a, b = ([x / mpmath.sqrt(sum(y * y for y in v)) for x in v] for v in (a, b))
-                exact = float(mpmath.exp(mpmath.sqrt(sum((x + y) ** 2 for x, y in zip(a, b, strict=True))) * mpmath.mpf(float(s)) - 2 * mpmath.mpf(float(s))))
+                exact = float(
+                    mpmath.exp(
+                        mpmath.sqrt(sum((x + y) ** 2 for x, y in zip(a, b, strict=True))) * mpmath.mpf(float(s))
+                        - 2 * mpmath.mpf(float(s))
+                    )
+                )
             for name, form in (("textbook", literal_product), ("ours", sg.product)):
                 errors[name] = max(errors[name], abs(float(form(p1, s, p2, s)[2].exp()) / exact - 1))
         out.append({"sharpness": value, **errors})
@@ -127,14 +145,28 @@ def integrals() -> tuple[list[dict], list[dict]]:
         exact, half = (torch.tensor(x) for x in ring_integrals(float(s[0]), c.double().numpy()))
         forms = {"paper": literal_cosine_integral, "one lobe": one_lobe_cosine_integral, "ours": sg.cosine_integral}
         got = {name: form(s, c).double() for name, form in forms.items()}
-        cosine_rows.append({"sharpness": value, **{name: float((x - exact).abs().max() / exact.max()) for name, x in got.items()},
-                            "paper's least value": float(got["paper"].min() / exact.max())})
-        half_rows.append({"sharpness": value, "Meder & Brüderlin": float((literal_hemisphere(s, c).double() - half).abs().max()) / sphere_integral(float(s[0])), "ours": float((sg.hemisphere_integral(s, c).double() - half).abs().max()) / sphere_integral(float(s[0]))})
+        cosine_rows.append(
+            {
+                "sharpness": value,
+                **{name: float((x - exact).abs().max() / exact.max()) for name, x in got.items()},
+                "paper's least value": float(got["paper"].min() / exact.max()),
+            }
+        )
+        half_rows.append(
+            {
+                "sharpness": value,
+                "Meder & Brüderlin": float((literal_hemisphere(s, c).double() - half).abs().max())
+                / sphere_integral(float(s[0])),
+                "ours": float((sg.hemisphere_integral(s, c).double() - half).abs().max())
+                / sphere_integral(float(s[0])),
+            }
+        )
     return cosine_rows, half_rows
 
 
 def specular() -> list[dict]:
-    """Relative L1 error over lamps about the mirror direction, views of 0, 40, 70 degrees, light of 2, 20, 200; F = 1."""
+    """Relative L1 error over lamps about the mirror direction, views of 0, 40, 70 degrees, light of 2, 20, 200; F =
+    1."""
     out = []
     for roughness in (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0):
         sums = dict.fromkeys(("paper as printed", "paper with V", "ours"), 0.0)
@@ -143,9 +175,19 @@ def specular() -> list[dict]:
             for sharpness in (2.0, 20.0, 200.0):
                 for tilt in (-20.0, 0.0, 10.0):
                     view, lights = direction(angle), light(direction(max(angle + tilt, 0.0), 180.0), sharpness)
-                    exact = float(reflected(view, torch.ones(3), roughness, 1.0, lights, "paper", rings=192, spokes=192)[1][0])
-                    ours = float(shade_parts(N, view, torch.ones(3), torch.tensor(roughness), torch.tensor(1.0), lights, "paper")[1][0])
-                    got = {"paper as printed": literal_specular(view, roughness, lights, False), "paper with V": literal_specular(view, roughness, lights, True), "ours": ours}
+                    exact = float(
+                        reflected(view, torch.ones(3), roughness, 1.0, lights, "paper", rings=192, spokes=192)[1][0]
+                    )
+                    ours = float(
+                        shade_parts(
+                            N, view, torch.ones(3), torch.tensor(roughness), torch.tensor(1.0), lights, "paper"
+                        )[1][0]
+                    )
+                    got = {
+                        "paper as printed": literal_specular(view, roughness, lights, False),
+                        "paper with V": literal_specular(view, roughness, lights, True),
+                        "ours": ours,
+                    }
                     # Each lamp counts alike, whatever its sharpness makes of its power.
                     scale = float(sg.integral(lights.sharpness[0]))
                     total += exact / scale
@@ -158,7 +200,10 @@ def specular() -> list[dict]:
 def table(rows: list[dict]) -> str:
     heads = list(rows[0])
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    lines += ["| " + " | ".join(f"{row[h]:g}" if i == 0 else f"{row[h]:.2g}" for i, h in enumerate(heads)) + " |" for row in rows]
+    lines += [
+        "| " + " | ".join(f"{row[h]:g}" if i == 0 else f"{row[h]:.2g}" for i, h in enumerate(heads)) + " |"
+        for row in rows
+    ]
     return "\n".join(lines)
 
 
@@ -169,7 +214,9 @@ def draw(path: Path, record: dict) -> None:
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(1, 4, figsize=(18, 4))
-    for axis, (name, rows) in zip(axes, [(n, record[n]) for n in ("evaluation", "product", "cosine", "specular")], strict=True):
+    for axis, (name, rows) in zip(
+        axes, [(n, record[n]) for n in ("evaluation", "product", "cosine", "specular")], strict=True
+    ):
         heads = [h for h in rows[0] if "least" not in h]
         for form in heads[1:]:
             axis.plot([r[heads[0]] for r in rows], [max(r[form], 1e-10) for r in rows], marker="o", label=form)
@@ -187,12 +234,23 @@ def main() -> None:
     folder = parser.parse_args().o
     torch.set_num_threads(1)
     cosine, hemisphere = integrals()
-    record = {"evaluation": evaluation(), "product": product(), "cosine": cosine, "hemisphere": hemisphere, "specular": specular()}
+    record = {
+        "evaluation": evaluation(),
+        "product": product(),
+        "cosine": cosine,
+        "hemisphere": hemisphere,
+        "specular": specular(),
+    }
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "numerics.json").write_text(json.dumps(record, indent=1) + "\n")
     draw(folder / "numerics.png", record)
     headings = {"evaluation": evaluation, "product": product, "specular": specular}
-    text = ["# What the stable forms buy", "", "Made by `python benchmarks/numerics.py`: float32 against float64. Plot: [numerics.png](numerics.png).", ""]
+    text = [
+        "# What the stable forms buy",
+        "",
+        "Made by `python benchmarks/numerics.py`: float32 against float64. Plot: [numerics.png](numerics.png).",
+        "",
+    ]
     text += ["## Evaluation of a lobe", "", f"{headings['evaluation'].__doc__}", "", table(record["evaluation"]), ""]
     text += ["## Product of two lobes", "", f"{headings['product'].__doc__}", "", table(record["product"]), ""]
     text += ["## Lobe times clamped cosine", "", f"{integrals.__doc__}", "", table(cosine), "", table(hemisphere), ""]

@@ -1,9 +1,10 @@
-"""What a user would run instead of `gdtool reconstruct`: screened Poisson, plain and capped, and a hull, plain and carved.
+"""What a user would run instead of `gdtool reconstruct`: screened Poisson, plain and capped, and a hull, plain and
+carved.
 
 All are classical and quick. A carved hull is the weighted truncated distance to the depth views cut by the silhouettes;
-a hull the silhouettes alone, which is all that views without depth give; capped Poisson is screened Poisson on the views' points and on those points of the carved hull's top and bottom that no
-view sees, without which it balloons there. Each gives vertices (v, 3) and faces (f, 3).
-"""
+a hull the silhouettes alone, which is all that views without depth give; capped Poisson is screened Poisson on the
+views' points and on those points of the carved hull's top and bottom that no view sees, without which it balloons
+there. Each gives vertices (v, 3) and faces (f, 3)."""
 
 from __future__ import annotations
 
@@ -38,7 +39,9 @@ def carved_field(views: Views, samples: int, truncation: float = 4.0) -> tuple[n
     hull = np.full((samples,) * 3, -limit, np.float32)
     silhouettes = []
     for mask in views.mask > 0.5:
-        silhouettes.append(np.where(mask, 0.5 - distance_transform_edt(mask), distance_transform_edt(~mask) - 0.5).astype(np.float32))
+        silhouettes.append(
+            np.where(mask, 0.5 - distance_transform_edt(mask), distance_transform_edt(~mask) - 0.5).astype(np.float32)
+        )
     for j in range(samples):
         x, z = np.meshgrid(axis, axis, indexing="ij")
         points = np.stack([x, np.full_like(x, axis[j]), z], -1).reshape(-1, 3)
@@ -75,7 +78,9 @@ def hull(views: Views, samples: int = 128) -> tuple[np.ndarray, np.ndarray]:
     return carved_hull(Views(views.cameras, {}, views.mask, None), samples)
 
 
-def screened_poisson(points: np.ndarray, normals: np.ndarray, depth: int, threads: int) -> tuple[np.ndarray, np.ndarray]:
+def screened_poisson(
+    points: np.ndarray, normals: np.ndarray, depth: int, threads: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Of points (n, 3) with normals (n, 3), on an octree of the given depth."""
     import pymeshlab
 
@@ -102,11 +107,14 @@ def capped_poisson(views: Views, depth: int = 7, threads: int = 2) -> tuple[np.n
     caps, face_idx, _ = sample_surface(vertices, faces, 60_000, np.random.default_rng(0))
     cap_normals = face_normals(vertices, faces)[0][face_idx]
     unseen = (cKDTree(points).query(caps)[0] > 2.5 * 2 * REACH / samples) & (np.abs(cap_normals[:, 1]) > 0.5)
-    return screened_poisson(np.concatenate([points, caps[unseen]]), np.concatenate([normals, cap_normals[unseen]]), depth, threads)
+    return screened_poisson(
+        np.concatenate([points, caps[unseen]]), np.concatenate([normals, cap_normals[unseen]]), depth, threads
+    )
 
 
 def available(deep: bool = True) -> dict:
-    """Name to function of the peers whose packages are installed; without deep, of those that need silhouettes alone."""
+    """Name to function of the peers whose packages are installed; without deep, of those that need silhouettes
+    alone."""
     from importlib.util import find_spec
 
     if not deep:

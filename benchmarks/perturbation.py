@@ -1,4 +1,5 @@
-"""A seeded imitation of what is wrong with generated views: they are plausible one by one and do not fit one another."""
+"""A seeded imitation of what is wrong with generated views: they are plausible one by one and do not fit one
+another."""
 
 from __future__ import annotations
 
@@ -50,7 +51,9 @@ def perturbed(views: Views, how: Perturbation) -> Views:
             inside = masks[k] > 0
             filled = stack[k][nearest[0], nearest[1]]
             stack[k] = np.where(inside if filled.ndim == 2 else inside[..., None], filled, 0)
-    return Views(views.cameras, {n: s.astype(np.float32) for n, s in images.items()}, masks.astype(np.float32), views.light)
+    return Views(
+        views.cameras, {n: s.astype(np.float32) for n, s in images.items()}, masks.astype(np.float32), views.light
+    )
 
 
 def smooth_field(rng: np.random.Generator, shape: tuple[int, int], wavelength: float) -> np.ndarray:

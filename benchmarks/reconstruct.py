@@ -6,12 +6,11 @@
     python benchmarks/reconstruct.py --sheet /tmp/objects.png --only bunny,spot --cases clean --budgets '' -o /tmp/report
     python benchmarks/reconstruct.py --assets none --procedural 1 --size 128 --budgets 2,5 -o /tmp/report
 
-Every model is rendered by `gdtool render-dataset`; the disturbed views are benchmarks/perturbation.py's. Ours runs by the
-command line, so that its seconds hold start-up, reading and writing; a peer's are the algorithm alone. Errors are the
-"surface" protocol of docs/metrics.md; materials are compared where the surface is met from four held-out cameras, and
-lit by a held-out light. Rows are kept as they are measured: a run that was stopped goes on where it was, --fresh begins
-anew. Nothing else should run meanwhile.
-"""
+Every model is rendered by `gdtool render-dataset`; the disturbed views are benchmarks/perturbation.py's. Ours runs by
+the command line, so that its seconds hold start-up, reading and writing; a peer's are the algorithm alone. Errors are
+the "surface" protocol of docs/metrics.md; materials are compared where the surface is met from four held-out cameras,
+and lit by a held-out light. Rows are kept as they are measured: a run that was stopped goes on where it was, --fresh
+begins anew. Nothing else should run meanwhile."""
 
 from __future__ import annotations
 
@@ -36,22 +35,40 @@ FIRST_SEED = 3_000_000  # procedural objects that the bundled model has not seen
 MODEL_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 LEFT_OUT = ("_col.obj",)  # collision shapes beside the models
 # Of ../shared/assets: ten Google Scanned Objects, then smooth, thin, flat and sharp-edged solids.
-SUITE = (*(f"gso/vima/{n}.obj" for n in ("mario_figure", "porcelain_cup", "toy_train", "lion_figure", "dinosaur_figure", "bull_figure", "can_opener", "hammer")),
-         "gso/aloha/Granimals_20_Wooden_ABC_Blocks_Wagon/meshes/model.obj", "gso/libero/glazed_rim_porcelain_ramekin/glazed_rim_porcelain_ramekin.obj",
-         *(f"mesh/odedstein/{n}/{n}.obj" for n in ("bunny", "spot", "penguin", "torus")),
-         *(f"mesh/trimesh/{n}" for n in ("fandisk.obj", "plate_holes.STL", "cycloidal.ply", "featuretype.STL")))
+SUITE = (
+    *(
+        f"gso/vima/{n}.obj"
+        for n in (
+            "mario_figure",
+            "porcelain_cup",
+            "toy_train",
+            "lion_figure",
+            "dinosaur_figure",
+            "bull_figure",
+            "can_opener",
+            "hammer",
+        )
+    ),
+    "gso/aloha/Granimals_20_Wooden_ABC_Blocks_Wagon/meshes/model.obj",
+    "gso/libero/glazed_rim_porcelain_ramekin/glazed_rim_porcelain_ramekin.obj",
+    *(f"mesh/odedstein/{n}/{n}.obj" for n in ("bunny", "spot", "penguin", "torus")),
+    *(f"mesh/trimesh/{n}" for n in ("fandisk.obj", "plate_holes.STL", "cycloidal.ply", "featuretype.STL")),
+)
 SEEDS, WAVELENGTHS = 5, (1 / 16, 1 / 8, 1 / 4)  # of --all; the default takes one pair a model, each in turn
 DEFAULT_DISTURBED, DEFAULT_BUDGETED, DEFAULT_COLOR, DEFAULT_NORMALS = 10, 2, 4, 10  # models
 IGNORED = {"normals": "depth", "color": "normal,depth,albedo,roughness,metallic"}  # domains, of the exact views
 PICTURED = 10  # models on the contact sheet
-ALWAYS = ("carved hull", "capped Poisson")  # peers run on every model; the others, which are worse, on the first of the default
+# Peers run on every model; the others, which are worse, on the first of the default.
+ALWAYS = ("carved hull", "capped Poisson")
 
 
 def models(given: argparse.Namespace) -> list[tuple[str, str]]:
     """Name and source of every model to take, procedural ones mixed in evenly."""
     found = [given.assets / path for path in SUITE if (given.assets / path).exists()]
     for place in given.models:
-        paths = [place] if place.is_file() else sorted(p for p in place.rglob("*") if p.suffix.lower() in MODEL_SUFFIXES)
+        paths = (
+            [place] if place.is_file() else sorted(p for p in place.rglob("*") if p.suffix.lower() in MODEL_SUFFIXES)
+        )
         found += [p for p in paths if not p.name.endswith(LEFT_OUT)][: given.limit or None]
     named = [((p.parent.parent.name if p.stem == "model" else p.stem), str(p)) for p in found]
     for i in range(given.procedural):
@@ -68,7 +85,14 @@ def publish(path: Path, views, cause: Path) -> Path:
     from gdtool.folders.views import write_views
 
     Options = msgspec.defstruct("Options", [], frozen=True, kw_only=True, forbid_unknown_fields=True)
-    stage = Stage(name="perturb", version=1, reads=("views",), writes="views", Options=Options, run=lambda i, o, out: write_views(out, views))
+    stage = Stage(
+        name="perturb",
+        version=1,
+        reads=("views",),
+        writes="views",
+        Options=Options,
+        run=lambda i, o, out: write_views(out, views),
+    )
     run_one(stage, [cause], Options(), {}, Settings(output=path, force=True))
     return path
 
@@ -80,7 +104,9 @@ def measured(vertices: np.ndarray, faces: np.ndarray, truth, views, surface=None
     if len(faces) == 0:
         return {"failed": "nothing came out"}
     found = surface_protocol(vertices, faces, truth.vertices, truth.faces, cameras=views.cameras, samples=40_000)
-    out = {name: float(found[name]) for name, _, _ in COLUMNS if name in found} | {"watertight": is_closed(vertices, faces)}
+    out = {name: float(found[name]) for name, _, _ in COLUMNS if name in found} | {
+        "watertight": is_closed(vertices, faces)
+    }
     out |= {"shown_normal_degrees": normals_beside(vertices, faces, views)}
     return out | (looks(surface, truth) if surface is not None else {})
 
@@ -88,8 +114,8 @@ def measured(vertices: np.ndarray, faces: np.ndarray, truth, views, surface=None
 def normals_beside(vertices: np.ndarray, faces: np.ndarray, views) -> float:
     """Mean degrees between a mesh's normals and the normal views (exact ones) where they are wholly covered.
 
-    A scan's few facets are shaded by smooth normals, which the views show: these, not the facets, are what can be known.
-    """
+    A scan's few facets are shaded by smooth normals, which the views show: these, not the facets, are what can be
+    known."""
     from gdtool.cameras import rays
     from gdtool.geometry.normals import face_normals
     from gdtool.geometry.rays import RayCaster
@@ -106,11 +132,15 @@ def normals_beside(vertices: np.ndarray, faces: np.ndarray, views) -> float:
 
 def skips(views) -> list[dict]:
     """CPU seconds of the grid method with a step left out and done, and how far the result moves (world units)."""
-    from gdtool.fields.views.depth_alignment import disagreement
     from gdtool.fields.grid.carve import carve, combined_distance
     from gdtool.fields.grid.fusion import align_depth, bring_together, grid_step, prepare_all
+    from gdtool.fields.views.depth_alignment import disagreement
 
-    depth, normal, colors = views.images["depth"], views.images["normal"], [views.images[domain] for domain in ("albedo", "color")]
+    depth, normal, colors = (
+        views.images["depth"],
+        views.images["normal"],
+        [views.images[domain] for domain in ("albedo", "color")],
+    )
     step = grid_step(views.cameras, 0)
     sights = prepare_all(views.cameras, views.mask, depth, normal)
 
@@ -118,21 +148,40 @@ def skips(views) -> list[dict]:
         start = time.process_time()
         return function(), time.process_time() - start
 
-    (_, before, after), checked = timed(lambda: align_depth(views.cameras, views.mask, depth, normal, step, colors=colors))
+    (_, before, after), checked = timed(
+        lambda: align_depth(views.cameras, views.mask, depth, normal, step, colors=colors)
+    )
     found = []
     if before == after:
-        (moved, _), forced = timed(lambda: bring_together(views.cameras, views.mask, depth, normal, sights, colors=colors))
-        found.append({"what": "alignment of views that agree", "done": checked + forced, "skipped": checked, "change": abs(disagreement(moved) - before)})
+        (moved, _), forced = timed(
+            lambda: bring_together(views.cameras, views.mask, depth, normal, sights, colors=colors)
+        )
+        found.append(
+            {
+                "what": "alignment of views that agree",
+                "done": checked + forced,
+                "skipped": checked,
+                "change": abs(disagreement(moved) - before),
+            }
+        )
     (grid, values, _), band = timed(lambda: carve(sights, step))
     limit = 3 * step
     points = np.stack(np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij"), -1).reshape(-1, 3)
     (dense, _), whole = timed(lambda: combined_distance(sights, grid.points(points), step, limit))
-    found.append({"what": "samples away from the surface", "done": whole, "skipped": band, "change": step * crossings_moved(dense.reshape(grid.shape), values)})
+    found.append(
+        {
+            "what": "samples away from the surface",
+            "done": whole,
+            "skipped": band,
+            "change": step * crossings_moved(dense.reshape(grid.shape), values),
+        }
+    )
     return found
 
 
 def crossings_moved(one: np.ndarray, other: np.ndarray) -> float:
-    """How far two grids' surfaces lie apart along the grid's edges, at most, in steps; 1 where only one of them crosses an edge."""
+    """How far two grids' surfaces lie apart along the grid's edges, at most, in steps; 1 where only one of them crosses
+    an edge."""
     farthest = 0.0
     for axis in range(3):
         place = []
@@ -148,12 +197,21 @@ def crossings_moved(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def cases_of(index: int, given: argparse.Namespace) -> list[str]:
-    """Which views of the index-th model are reconstructed: clean, normals (exact, without depth), color, perturbed SEED WAVELENGTH."""
+    """Which views of the index-th model are reconstructed: clean, normals (exact, without depth), color, perturbed SEED
+    WAVELENGTH."""
     if given.seeds:
-        disturbed = [f"perturbed {seed} {wavelength:g}" for wavelength in given.wavelengths for seed in range(given.seeds)]
+        disturbed = [
+            f"perturbed {seed} {wavelength:g}" for wavelength in given.wavelengths for seed in range(given.seeds)
+        ]
     else:
-        disturbed = [f"perturbed {index % SEEDS} {WAVELENGTHS[index % len(WAVELENGTHS)]:g}"] if index < DEFAULT_DISTURBED else []
-    fewer = [case for case, count in (("normals", DEFAULT_NORMALS), ("color", DEFAULT_COLOR)) if given.all or index < count]
+        disturbed = (
+            [f"perturbed {index % SEEDS} {WAVELENGTHS[index % len(WAVELENGTHS)]:g}"]
+            if index < DEFAULT_DISTURBED
+            else []
+        )
+    fewer = [
+        case for case, count in (("normals", DEFAULT_NORMALS), ("color", DEFAULT_COLOR)) if given.all or index < count
+    ]
     cases = ["clean", *disturbed, *fewer]
     return [case for case in cases if kind({"case": case}) in given.cases]
 
@@ -165,11 +223,20 @@ class Bench:
         from gdtool.stages.reconstruct import STAGE
 
         self.given, self.path = given, given.output / "reconstruct.json"
-        self.head = {"machine": machine(), "remark": busy(), "size": given.size, "version": STAGE.version, "options": given.options, "complete": False}
+        self.head = {
+            "machine": machine(),
+            "remark": busy(),
+            "size": given.size,
+            "version": STAGE.version,
+            "options": given.options,
+            "complete": False,
+        }
         self.records: list[dict] = []
         if self.path.exists() and not given.fresh:
             kept = json.loads(self.path.read_text())
-            if not kept.get("complete") and all(kept.get(k) == self.head[k] for k in ("machine", "size", "version", "options")):
+            if not kept.get("complete") and all(
+                kept.get(k) == self.head[k] for k in ("machine", "size", "version", "options")
+            ):
                 self.records = [r for r in kept["records"] if "failed" not in r]  # what failed is tried once more
                 self.head["remark"] = kept["remark"] or self.head["remark"]
                 say(f"going on after {len(self.records)} rows of {self.path}")
@@ -208,7 +275,10 @@ def measure(index: int, name: str, source: str, folder: Path, bench: Bench, pool
     from gdtool.geometry.frames import invert_similarity, transform_points
 
     given = bench.given
-    todo = {case: {m: t for m, t in tasks(index, case, given).items() if not bench.has(name, case, m)} for case in cases_of(index, given)}
+    todo = {
+        case: {m: t for m, t in tasks(index, case, given).items() if not bench.has(name, case, m)}
+        for case in cases_of(index, given)
+    }
     todo = {case: methods for case, methods in todo.items() if methods}
     if not todo:
         return
@@ -230,7 +300,11 @@ def measure(index: int, name: str, source: str, folder: Path, bench: Bench, pool
             arrays = replace(views, images={d: x for d, x in views.images.items() if d not in IGNORED[case].split(",")})
         made = []
         for method, how in methods.items():
-            record, mesh, surface = {"model": name, "source": source, "method": method, "case": case, "views_normal_degrees": shown}, None, None
+            record, mesh, surface = (
+                {"model": name, "source": source, "method": method, "case": case, "views_normal_degrees": shown},
+                None,
+                None,
+            )
             try:
                 if callable(how):
                     wall, cpu = time.perf_counter(), time.process_time()
@@ -251,14 +325,29 @@ def measure(index: int, name: str, source: str, folder: Path, bench: Bench, pool
         found = [pool.submit(measured, *mesh, truth, views, surface) if mesh else None for _, mesh, surface in made]
         for (record, _, _), errors in zip(made, found, strict=True):
             record |= errors.result() if errors else {}
-            say(f"    {case:<22}{record['method']:<18}" + (record.get("failed") or "  ".join(
-                f"{head} {number(record[n] * factor)}" for n, head, factor in (*COLUMNS, *MATERIALS) if n in record)))
+            say(
+                f"    {case:<22}{record['method']:<18}"
+                + (
+                    record.get("failed")
+                    or "  ".join(
+                        f"{head} {number(record[n] * factor)}"
+                        for n, head, factor in (*COLUMNS, *MATERIALS)
+                        if n in record
+                    )
+                )
+            )
             bench.records.append(record)
         bench.save()
         own = [m for r, m, _ in made if r["method"] == OURS]
-        others = sorted((r.get("distance", np.inf), i) for i, (r, _, _) in enumerate(made) if not r["method"].startswith(OURS))
+        others = sorted(
+            (r.get("distance", np.inf), i) for i, (r, _, _) in enumerate(made) if not r["method"].startswith(OURS)
+        )
         if given.sheet and own and index < PICTURED and case not in IGNORED:
-            keep_row(given.output, f"{name} {case}", [(truth.vertices, truth.faces), own[0], made[others[0][1]][1] if others else None])
+            keep_row(
+                given.output,
+                f"{name} {case}",
+                [(truth.vertices, truth.faces), own[0], made[others[0][1]][1] if others else None],
+            )
 
 
 def arguments() -> argparse.Namespace:
@@ -266,26 +355,87 @@ def arguments() -> argparse.Namespace:
         return [float(part) for part in text.split(",") if part]
 
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--assets", type=Path, default=Path(__file__).parents[2] / "shared" / "assets", help="folder that holds the models of the suite")
+    parser.add_argument(
+        "--assets",
+        type=Path,
+        default=Path(__file__).parents[2] / "shared" / "assets",
+        help="folder that holds the models of the suite",
+    )
     parser.add_argument("--procedural", type=int, default=4, help="number of procedural objects (default 4)")
-    parser.add_argument("--models", type=Path, action="append", default=[], metavar="DIR", help="also every model in this folder")
+    parser.add_argument(
+        "--models", type=Path, action="append", default=[], metavar="DIR", help="also every model in this folder"
+    )
     parser.add_argument("--limit", type=int, default=0, help="at most this many models of a folder")
-    parser.add_argument("--only", type=lambda t: t.split(","), default=[], help="of all these, the models of these names")
-    parser.add_argument("--all", action="store_true", help="five seeds at three wavelengths, budgets, color alone and all peers on every model")
+    parser.add_argument(
+        "--only", type=lambda t: t.split(","), default=[], help="of all these, the models of these names"
+    )
+    parser.add_argument(
+        "--all",
+        action="store_true",
+        help="five seeds at three wavelengths, budgets, color alone and all peers on every model",
+    )
     parser.add_argument("--size", type=int, default=256, help="width and height of the views (default 256)")
-    parser.add_argument("--seeds", type=int, default=0, help="disturbances of every model and wavelength (default: one of either a model, in turn)")
-    parser.add_argument("--wavelengths", type=numbers, default=list(WAVELENGTHS), help="with --seeds: of the disturbance, shares of the picture")
-    parser.add_argument("--budgets", type=numbers, default=[5, 10, 20, 40, 120], help="also run ours with --budget of these seconds, on the first models (default 5,10,20,40,120)")
-    parser.add_argument("--cases", type=lambda t: t.split(","), default=["clean", "perturbed", "normals", "color"], help="which views: clean,perturbed,normals,color (default all)")
-    parser.add_argument("--paper", action="store_true", help="the paper's method on all models of the case normals, minutes each (default: the first four)")
+    parser.add_argument(
+        "--seeds",
+        type=int,
+        default=0,
+        help="disturbances of every model and wavelength (default: one of either a model, in turn)",
+    )
+    parser.add_argument(
+        "--wavelengths",
+        type=numbers,
+        default=list(WAVELENGTHS),
+        help="with --seeds: of the disturbance, shares of the picture",
+    )
+    parser.add_argument(
+        "--budgets",
+        type=numbers,
+        default=[5, 10, 20, 40, 120],
+        help="also run ours with --budget of these seconds, on the first models (default 5,10,20,40,120)",
+    )
+    parser.add_argument(
+        "--cases",
+        type=lambda t: t.split(","),
+        default=["clean", "perturbed", "normals", "color"],
+        help="which views: clean,perturbed,normals,color (default all)",
+    )
+    parser.add_argument(
+        "--paper",
+        action="store_true",
+        help="the paper's method on all models of the case normals, minutes each (default: the first four)",
+    )
     parser.add_argument("--no-peers", dest="peers", action="store_false", help="leave the peers out")
     parser.add_argument("--fresh", action="store_true", help="measure every row anew")
-    parser.add_argument("--sheet", type=Path, metavar="PNG", help="where the pictures of the truth, ours and the best peer go (default: beside the report)")
-    parser.add_argument("--minutes", type=float, default=16, help="begin no model after this long; the next run goes on (default 16; 0: no end)")
+    parser.add_argument(
+        "--sheet",
+        type=Path,
+        metavar="PNG",
+        help="where the pictures of the truth, ours and the best peer go (default: beside the report)",
+    )
+    parser.add_argument(
+        "--minutes",
+        type=float,
+        default=16,
+        help="begin no model after this long; the next run goes on (default 16; 0: no end)",
+    )
     parser.add_argument("--no-sheet", action="store_true", help="no pictures")
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep (and find again) the folders of every model here")
-    parser.add_argument("--option", dest="options", action="append", default=[], help="further option of gdtool reconstruct, as --option=--method=paper")
-    parser.add_argument("-o", "--output", type=Path, default=Path(__file__).parents[1] / "docs" / "benchmarks", help="folder of the report")
+    parser.add_argument(
+        "--keep", type=Path, metavar="DIR", help="keep (and find again) the folders of every model here"
+    )
+    parser.add_argument(
+        "--option",
+        dest="options",
+        action="append",
+        default=[],
+        help="further option of gdtool reconstruct, as --option=--method=paper",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        default=Path(__file__).parents[1] / "docs" / "benchmarks",
+        help="folder of the report",
+    )
     given = parser.parse_args()
     given.sheet = None if given.no_sheet else given.sheet or given.output / "reconstruct_sheet.png"
     if given.all:
@@ -298,14 +448,22 @@ def main() -> None:
     given = arguments()
     given.output.mkdir(parents=True, exist_ok=True)
     bench, late, began = Bench(given), [], time.monotonic()
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:  # a fork of a process with OpenMP threads can hang
+    # A fork of a process with OpenMP threads can hang.
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         for index, (name, source) in enumerate(models(given)):
             if given.minutes and time.monotonic() - began > 60 * given.minutes:
                 late.append(name)
                 continue
             with tempfile.TemporaryDirectory() as folder:
                 try:
-                    measure(index, name, source, given.keep / name.replace(":", "-") if given.keep else Path(folder), bench, pool)
+                    measure(
+                        index,
+                        name,
+                        source,
+                        given.keep / name.replace(":", "-") if given.keep else Path(folder),
+                        bench,
+                        pool,
+                    )
                 except Failed as error:
                     say(f"{name}: left out: {error}")
     plot(bench.records, given.output / "reconstruct.png")

@@ -1,4 +1,5 @@
-"""How a reconstruction looks beside the truth: its materials at held-out views under a held-out light, and pictures of it."""
+"""How a reconstruction looks beside the truth: its materials at held-out views under a held-out light, and pictures of
+it."""
 
 from __future__ import annotations
 
@@ -7,12 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-MATERIALS = (("albedo_psnr", "albedo dB", 1), ("relit_psnr", "relit dB", 1), ("roughness_error", "roughness", 1), ("metallic_error", "metallic", 1))
+MATERIALS = (
+    ("albedo_psnr", "albedo dB", 1),
+    ("relit_psnr", "relit dB", 1),
+    ("roughness_error", "roughness", 1),
+    ("metallic_error", "metallic", 1),
+)
 CLAY, EDGE = np.array([0.78, 0.76, 0.73]), 224  # of the pictures: the surface's color, pixels along a side
 
 
 def looks(surface, truth, size: int = 192) -> dict:
-    """Albedo dB, roughness and metallic errors and the dB of a relit picture, seen by four cameras that the result was not made from."""
+    """Albedo dB, roughness and metallic errors and the dB of a relit picture, seen by four cameras that the result was
+    not made from."""
     import torch
 
     from gdtool.cameras import camera_at, rays
@@ -22,8 +29,11 @@ def looks(surface, truth, size: int = 192) -> dict:
     from gdtool.shading.bsdf.sg import SphericalGaussians
     from gdtool.shading.render.surface_points import surface_attributes
 
-    light = SphericalGaussians(torch.tensor([[0.48, 0.64, 0.6], [-0.8, 0.36, 0.48], [0.0, 0.6, -0.8]]), torch.tensor([20.0, 6.0, 4.0]),
-                               torch.tensor([[3.0, 2.8, 2.5], [0.6, 0.8, 1.0], [0.7, 0.6, 0.6]]))
+    light = SphericalGaussians(
+        torch.tensor([[0.48, 0.64, 0.6], [-0.8, 0.36, 0.48], [0.0, 0.6, -0.8]]),
+        torch.tensor([20.0, 6.0, 4.0]),
+        torch.tensor([[3.0, 2.8, 2.5], [0.6, 0.8, 1.0], [0.7, 0.6, 0.6]]),
+    )
     ours, true = RayCaster(surface.vertices, surface.faces), RayCaster(truth.vertices, truth.faces)
     error = {name: [] for name, _, _ in MATERIALS}
     for i in range(4):
@@ -35,23 +45,39 @@ def looks(surface, truth, size: int = 192) -> dict:
         if not both.any():
             continue
         corner, share = surface.faces[hits.face_idx[both]], hits.barycentric[both][..., None]
-        mine = {n: (np.asarray(getattr(surface, n)).reshape(len(surface.vertices), -1)[corner] * share).sum(1)
-                for n in ("albedo", "roughness", "metallic", "normals")}
+        mine = {
+            n: (np.asarray(getattr(surface, n)).reshape(len(surface.vertices), -1)[corner] * share).sum(1)
+            for n in ("albedo", "roughness", "metallic", "normals")
+        }
         found = surface_attributes(truth, true_hits.face_idx[both], true_hits.barycentric[both])
-        theirs = {n: np.asarray(found[n]).reshape(both.sum(), -1) for n in ("albedo", "roughness", "metallic", "normal")}
+        theirs = {
+            n: np.asarray(found[n]).reshape(both.sum(), -1) for n in ("albedo", "roughness", "metallic", "normal")
+        }
         toward = torch.as_tensor(np.ascontiguousarray(-directions[both], np.float32))
         pictures = []
         for one, normal in ((mine, mine["normals"]), (theirs, theirs["normal"])):
             normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-            lit = shade(torch.as_tensor(np.float32(normal)), toward, torch.as_tensor(np.float32(one["albedo"])), torch.as_tensor(np.float32(one["roughness"][:, 0])),
-                        torch.as_tensor(np.float32(one["metallic"][:, 0])), light)
+            lit = shade(
+                torch.as_tensor(np.float32(normal)),
+                toward,
+                torch.as_tensor(np.float32(one["albedo"])),
+                torch.as_tensor(np.float32(one["roughness"][:, 0])),
+                torch.as_tensor(np.float32(one["metallic"][:, 0])),
+                light,
+            )
             pictures.append(srgb_from_linear(np.clip(lit.numpy(), 0, 1)))
         squares = lambda a, b: float(np.mean((np.asarray(a, np.float64) - b) ** 2))  # noqa: E731
-        error["albedo_psnr"].append(squares(srgb_from_linear(np.clip(mine["albedo"], 0, 1)), srgb_from_linear(np.clip(theirs["albedo"], 0, 1))))
+        error["albedo_psnr"].append(
+            squares(srgb_from_linear(np.clip(mine["albedo"], 0, 1)), srgb_from_linear(np.clip(theirs["albedo"], 0, 1)))
+        )
         error["relit_psnr"].append(squares(*pictures))
         for name in ("roughness", "metallic"):
             error[f"{name}_error"].append(float(np.abs(mine[name] - theirs[name]).mean()))
-    return {name: (float(-10 * np.log10(max(np.mean(e), 1e-10))) if name.endswith("psnr") else float(np.mean(e))) for name, e in error.items() if e}
+    return {
+        name: (float(-10 * np.log10(max(np.mean(e), 1e-10))) if name.endswith("psnr") else float(np.mean(e)))
+        for name, e in error.items()
+        if e
+    }
 
 
 def picture(vertices: np.ndarray, faces: np.ndarray, size: int = EDGE) -> np.ndarray:
@@ -72,15 +98,19 @@ def picture(vertices: np.ndarray, faces: np.ndarray, size: int = EDGE) -> np.nda
 
 
 def keep_row(folder: Path, label: str, meshes: list) -> None:
-    """Keep pictures of meshes (vertices, faces), None for an empty place, until sheet() joins them: a stopped run loses none."""
+    """Keep pictures of meshes (vertices, faces), None for an empty place, until sheet() joins them: a stopped run loses
+    none."""
     place = folder / "reconstruct_pictures"
     place.mkdir(parents=True, exist_ok=True)
     name = f"{len(list(place.glob('*.npz'))):03d}.npz"
-    np.savez_compressed(place / name, label=label, **{str(i): picture(*mesh) for i, mesh in enumerate(meshes) if mesh is not None})
+    np.savez_compressed(
+        place / name, label=label, **{str(i): picture(*mesh) for i, mesh in enumerate(meshes) if mesh is not None}
+    )
 
 
 def sheet(folder: Path, heads: list[str], path: Path, done: bool) -> None:
-    """Write the contact sheet of the rows kept in folder, of a case measured twice the later one; forget them when done."""
+    """Write the contact sheet of the rows kept in folder, of a case measured twice the later one; forget them when
+    done."""
     from gdtool.images.contact import contact_sheet
     from gdtool.images.io import write_png
 

@@ -2,10 +2,10 @@
 
     python benchmarks/remesh_models.py [MODEL_OR_FOLDER ...] [-o docs/benchmarks] [--faces 20000]
 
-Writes remesh_models.md and remesh_models.json, row by row: killed, it goes on where it was. "as": what `gdtool remesh` took,
-and how many ways it passed over before. Distances are shares of the longest side; seconds are of the whole command, and of
-the engine's one call from arrays to arrays in a child; a peer that gives nothing in two minutes has a row without figures.
-"""
+Writes remesh_models.md and remesh_models.json, row by row: killed, it goes on where it was. "as": what `gdtool remesh`
+took, and how many ways it passed over before. Distances are shares of the longest side; seconds are of the whole
+command, and of the engine's one call from arrays to arrays in a child; a peer that gives nothing in two minutes has a
+row without figures."""
 
 from __future__ import annotations
 
@@ -20,7 +20,21 @@ from measure import Failed, busy, gdtool, machine, number, say, table
 from rows import Rows
 
 PEER = "Instant Meshes"
-COLUMNS = ("model", "way", "seconds", "quads", "watertight", "irregular", "jacobian", "least", "folded", "mean", "hausdorff", "normal deg", "as")
+COLUMNS = (
+    "model",
+    "way",
+    "seconds",
+    "quads",
+    "watertight",
+    "irregular",
+    "jacobian",
+    "least",
+    "folded",
+    "mean",
+    "hausdorff",
+    "normal deg",
+    "as",
+)
 
 
 def models_in(places: list[Path]) -> list[Path]:
@@ -36,7 +50,11 @@ def ours(path: Path, faces: int) -> dict:
         cost = gdtool("remesh", "--quiet", "--faces", str(faces), path, "-o", Path(folder) / "mesh")
         made = json.loads((Path(folder) / "mesh/manifest.json").read_text())
     content = made["content"]
-    return {"seconds": cost.seconds, "quads": content["quads"], "as": f"{content['engine']} ({len(content['tried'])})"} | figures_of(content["report"])
+    return {
+        "seconds": cost.seconds,
+        "quads": content["quads"],
+        "as": f"{content['engine']} ({len(content['tried'])})",
+    } | figures_of(content["report"])
 
 
 def peer(path: Path, faces: int) -> dict:
@@ -44,15 +62,24 @@ def peer(path: Path, faces: int) -> dict:
     from gdtool.core.child import call
     from gdtool.geometry import mesh_quality, repair, topology
     from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
-    from gdtool.remesh.engines.adapters import run_instant_meshes
     from gdtool.geometry.topology import triangulated
+    from gdtool.remesh.engines.adapters import run_instant_meshes
 
     scene = load_scene(path)
     vertices, triangles = topology.compact(scene.vertices, scene.faces.astype(np.int64))
-    vertices, triangles, *_ = repair.clean(transform_points(invert_similarity(unit_box(vertices)), vertices), triangles, path)
+    vertices, triangles, *_ = repair.clean(
+        transform_points(invert_similarity(unit_box(vertices)), vertices), triangles, path
+    )
     start = time.perf_counter()
-    out, found = call(run_instant_meshes, vertices.astype(np.float32), triangles.astype(np.int32), faces, 30.0,
-                      seconds=120, memory_mb=16000)
+    out, found = call(
+        run_instant_meshes,
+        vertices.astype(np.float32),
+        triangles.astype(np.int32),
+        faces,
+        30.0,
+        seconds=120,
+        memory_mb=16000,
+    )
     seconds = time.perf_counter() - start
     report = mesh_quality.topology_figures(out, found) | mesh_quality.shape_figures(out, found)
     report |= mesh_quality.distance_figures(out, triangulated(found)[0], vertices, triangles, 20000)
@@ -60,9 +87,16 @@ def peer(path: Path, faces: int) -> dict:
 
 
 def figures_of(report: dict) -> dict:
-    return {"watertight": bool(report["watertight"]), "irregular": report["irregular_share"], "jacobian": report["jacobian_mean"],
-            "least": report["jacobian_min"], "folded": report["folded_share"], "mean": report["distance_mean"],
-            "hausdorff": report["hausdorff"], "normal deg": report["normal_deg"]}
+    return {
+        "watertight": bool(report["watertight"]),
+        "irregular": report["irregular_share"],
+        "jacobian": report["jacobian_mean"],
+        "least": report["jacobian_min"],
+        "folded": report["folded_share"],
+        "mean": report["distance_mean"],
+        "hausdorff": report["hausdorff"],
+        "normal deg": report["normal_deg"],
+    }
 
 
 def main() -> None:
@@ -92,9 +126,11 @@ def main() -> None:
     rows.write(True)
     own = [row for row in rows.rows if row["way"] == "ours" and "quads" in row]
     fields = sum("pair and split" not in row["as"] for row in own)
-    text = (f"# Remesh on models as they come\n\nBy `benchmarks/remesh_models.py` on {machine()}, {given.faces} quads asked for. {head}\n\n"
-            + table(COLUMNS, [[number(row.get(name)) for name in COLUMNS] for row in rows.rows])
-            + f"\n\nOf {len(own)} models {fields} are field-aligned quads all over; {len(own) - fields} have parts of paired triangles, cut in quads.\n")
+    text = (
+        f"# Remesh on models as they come\n\nBy `benchmarks/remesh_models.py` on {machine()}, {given.faces} quads asked for. {head}\n\n"
+        + table(COLUMNS, [[number(row.get(name)) for name in COLUMNS] for row in rows.rows])
+        + f"\n\nOf {len(own)} models {fields} are field-aligned quads all over; {len(own) - fields} have parts of paired triangles, cut in quads.\n"
+    )
     (given.out / "remesh_models.md").write_text(text)
 
 

@@ -1,4 +1,5 @@
-"""Remesh on nets of many handles: what the limits on quads for each handle leave untried, beside all that was tried without them.
+"""Remesh on nets of many handles: what the limits on quads for each handle leave untried, beside all that was tried
+without them.
 
     python benchmarks/remesh_nets.py [-o docs/benchmarks] [--grid 140]
 
@@ -16,8 +17,30 @@ from pathlib import Path
 import numpy as np
 from measure import busy, machine, number, say, table
 
-COLUMNS = ("net", "handles of the net", "quads for each", "limits", "seconds", "quads", "handles", "jacobian", "least", "irregular", "hausdorff", "as")
-NETS = (("struts", 3), ("struts", 5), ("thin struts", 3), ("thin struts", 4), ("Schwarz P", 3), ("Schwarz P", 4), ("Schwarz P", 5), ("Schwarz P", 6))
+COLUMNS = (
+    "net",
+    "handles of the net",
+    "quads for each",
+    "limits",
+    "seconds",
+    "quads",
+    "handles",
+    "jacobian",
+    "least",
+    "irregular",
+    "hausdorff",
+    "as",
+)
+NETS = (
+    ("struts", 3),
+    ("struts", 5),
+    ("thin struts", 3),
+    ("thin struts", 4),
+    ("Schwarz P", 3),
+    ("Schwarz P", 4),
+    ("Schwarz P", 5),
+    ("Schwarz P", 6),
+)
 COUNTS = (20000, 10000)
 
 
@@ -43,17 +66,24 @@ def net(kind: str, cells: int, grid: int) -> tuple[np.ndarray, np.ndarray]:
 
 def measured(vertices: np.ndarray, faces: np.ndarray, count: int) -> dict:
     from gdtool.geometry import mesh_quality, topology
-    from gdtool.remesh.task import Request
-    from gdtool.remesh.pipeline import remesh
     from gdtool.geometry.topology import triangulated
+    from gdtool.remesh.pipeline import remesh
+    from gdtool.remesh.task import Request
 
     start = time.perf_counter()
     out, quads, record = remesh(vertices, faces, Request(quads=count))
     seconds = time.perf_counter() - start
     shape = mesh_quality.shape_figures(out, quads)
-    return {"seconds": seconds, "quads": len(quads), "handles": topology.handles(quads, topology.components(quads)[0]), "jacobian": shape["jacobian_mean"],
-            "least": shape["jacobian_min"], "irregular": mesh_quality.topology_figures(out, quads)["irregular_share"],
-            "hausdorff": mesh_quality.distance_figures(out, triangulated(quads)[0], vertices, faces, 20000)["hausdorff"], "as": record.engine}
+    return {
+        "seconds": seconds,
+        "quads": len(quads),
+        "handles": topology.handles(quads, topology.components(quads)[0]),
+        "jacobian": shape["jacobian_mean"],
+        "least": shape["jacobian_min"],
+        "irregular": mesh_quality.topology_figures(out, quads)["irregular_share"],
+        "hausdorff": mesh_quality.distance_figures(out, triangulated(quads)[0], vertices, faces, 20000)["hausdorff"],
+        "as": record.engine,
+    }
 
 
 def main() -> None:
@@ -76,11 +106,23 @@ def main() -> None:
                 for module, limit in limits.items():
                     module._FOR_A_HANDLE = limit if name == "as they are" else 0
                 say(f"{kind} {cells}: {count}, limits {name}")
-                rows.append({"net": f"{kind} {cells}", "handles of the net": handles, "quads for each": round(count / handles), "limits": name}
-                            | measured(vertices, faces, count))
-    text = table(COLUMNS, ([row[name] if isinstance(row[name], str) else number(row[name], 3) for name in COLUMNS] for row in rows))
+                rows.append(
+                    {
+                        "net": f"{kind} {cells}",
+                        "handles of the net": handles,
+                        "quads for each": round(count / handles),
+                        "limits": name,
+                    }
+                    | measured(vertices, faces, count)
+                )
+    text = table(
+        COLUMNS,
+        ([row[name] if isinstance(row[name], str) else number(row[name], 3) for name in COLUMNS] for row in rows),
+    )
     given.out.mkdir(parents=True, exist_ok=True)
-    (given.out / "remesh_nets.md").write_text(f"# Remesh on nets of many handles\n\nBy `benchmarks/remesh_nets.py` on {machine()}. {head}\n\n{text}\n")
+    (given.out / "remesh_nets.md").write_text(
+        f"# Remesh on nets of many handles\n\nBy `benchmarks/remesh_nets.py` on {machine()}. {head}\n\n{text}\n"
+    )
     print(text)
 
 

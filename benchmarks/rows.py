@@ -29,7 +29,9 @@ class Rows:
 
     def write(self, complete: bool) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        text = json.dumps({"machine": machine(), "settings": self.settings, "complete": complete, "rows": self.rows}, indent=1)
+        text = json.dumps(
+            {"machine": machine(), "settings": self.settings, "complete": complete, "rows": self.rows}, indent=1
+        )
         fresh = self.path.with_suffix(".part")
         fresh.write_text(text + "\n")
         fresh.replace(self.path)

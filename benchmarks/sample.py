@@ -1,14 +1,15 @@
-"""Sampling: time against error over scheduler, steps, the mirrored picture, guidance, precision and domains, on held-out objects.
+"""Sampling: time against error over scheduler, steps, the mirrored picture, guidance, precision and domains, on
+held-out objects.
 
     python benchmarks/sample.py --model my-model -o docs/benchmarks
 
-Without held-out folders it renders its own once (procedural:900000 and on, beside the cache of the last run). Timed by wall
-clock and by processor seconds, because other work may run meanwhile. Two errors: PSNR against the images that 50 steps of DDIM give
-from the same noise (over white, all six views), and those of benchmarks/model_quality.py against the truth, over the five
-unseen views. Every object goes through all settings before the next one starts. Start-up is a whole command on one picture,
-its sampling and writing taken off. Consistency is that of the model's default sampling beside the true views
-(gdtool/diffusion/reports/consistency.py says what each figure is). Written as it goes; ten minutes on two quiet cores at 128 px.
-"""
+Without held-out folders it renders its own once (procedural:900000 and on, beside the cache of the last run). Timed by
+wall clock and by processor seconds, because other work may run meanwhile. Two errors: PSNR against the images that 50
+steps of DDIM give from the same noise (over white, all six views), and those of benchmarks/model_quality.py against the
+truth, over the five unseen views. Every object goes through all settings before the next one starts. Start-up is a
+whole command on one picture, its sampling and writing taken off. Consistency is that of the model's default sampling
+beside the true views (gdtool/diffusion/reports/consistency.py says what each figure is). Written as it goes; ten
+minutes on two quiet cores at 128 px."""
 
 from __future__ import annotations
 
@@ -24,9 +25,9 @@ import torch
 from measure import busy, gdtool, machine, number, say, seconds_axis, table
 from model_quality import DEFAULT_MODEL, figures, sampled_views, true_views, views_folders
 
-from gdtool.diffusion.reports.consistency import consistency
-from gdtool.diffusion.data.objects import decode_object
 from gdtool.diffusion.checkpoint.weights import load_model
+from gdtool.diffusion.data.objects import decode_object
+from gdtool.diffusion.reports.consistency import consistency
 from gdtool.folders.views import Views
 from gdtool.images.metrics import over_white, psnr
 
@@ -40,20 +41,43 @@ SETTINGS = [
     *({"steps": 8, "guidance": guidance, "mirror": False} for guidance in (1.5, 3.0)),
     *({"steps": 1, "domains": domains, "mirror": False} for domains in (("color", "normal"), ("color",))),
 ]
-TRUE = ("color_psnr_frame", "color_ssim_frame", "albedo_psnr_frame", "normal_degrees", "depth_error", "silhouette_overlap")
+TRUE = (
+    "color_psnr_frame",
+    "color_ssim_frame",
+    "albedo_psnr_frame",
+    "normal_degrees",
+    "depth_error",
+    "silhouette_overlap",
+)
 SHOWN = ("seconds", "cpu_seconds", "reference_psnr", *TRUE)
 
 
 def label(setting: dict) -> str:
     domains = setting.get("domains")
-    return ", ".join([f"{setting.get('scheduler', 'ddim')} {setting['steps']}", *([f"guidance {setting['guidance']:g}"] if "guidance" in setting else []),
-                      *([setting["precision"]] if "precision" in setting else []), *(["+".join(domains)] if domains else []),
-                      *(["and mirrored"] if setting["mirror"] else [])])
+    return ", ".join(
+        [
+            f"{setting.get('scheduler', 'ddim')} {setting['steps']}",
+            *([f"guidance {setting['guidance']:g}"] if "guidance" in setting else []),
+            *([setting["precision"]] if "precision" in setting else []),
+            *(["+".join(domains)] if domains else []),
+            *(["and mirrored"] if setting["mirror"] else []),
+        ]
+    )
 
 
 def held_out_data(folder: Path, size: int, count: int) -> Path:
     """Rendered once into folder."""
-    gdtool("render-dataset", f"procedural:900000..{900000 + count - 1}", "--size", str(size), "--condition-views", "1", "-o", folder, "--quiet")
+    gdtool(
+        "render-dataset",
+        f"procedural:900000..{900000 + count - 1}",
+        "--size",
+        str(size),
+        "--condition-views",
+        "1",
+        "-o",
+        folder,
+        "--quiet",
+    )
     return folder
 
 
@@ -69,8 +93,11 @@ def start_up(model: Path, picture: Path) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as work:
         cost = gdtool("sample-views", picture, "--model", model, "-o", Path(work) / "views", "--quiet")
         steps = json.loads((Path(work) / "views" / "manifest.json").read_text())["run"]["seconds"]
-    return {"whole_seconds": cost.seconds, "peak_mb": cost.peak_mb,
-            "start_up_seconds": cost.seconds - sum(v for k, v in steps.items() if k in ("sample", "write", "condition"))}
+    return {
+        "whole_seconds": cost.seconds,
+        "peak_mb": cost.peak_mb,
+        "start_up_seconds": cost.seconds - sum(v for k, v in steps.items() if k in ("sample", "write", "condition")),
+    }
 
 
 def mean_of(group: list[dict], key: str) -> float | None:
@@ -81,14 +108,27 @@ def mean_of(group: list[dict], key: str) -> float | None:
 def markdown(record: dict) -> str:
     rows = [[name, *(number(mean_of(group, key)) for key in SHOWN)] for name, group in record["rows"].items()]
     start, agreement = record["start_up"], record["consistency"]
-    fits = [[key.replace("_", " "), *(number(mean_of(agreement[side], key)) for side in ("sampled", "true"))] for key in agreement["true"][0]]
-    return "\n".join([
-        "# Sampling: time against error", "",
-        f"{len(agreement['true'])} held-out objects of `procedural:900000` and on, {record['image_size']} px, two threads, on {machine()}. {record['remark']}",
-        f"Start-up (imports, weights) {start['start_up_seconds']:.1f} s, the whole command on one picture {start['whole_seconds']:.1f} s and {start['peak_mb']:.0f} MB.", "",
-        table(["sampler", *(name.replace("_", " ") for name in SHOWN)], rows), "",
-        "reference psnr: color against 50 steps of DDIM. ![time against error](sample.png)", "", "## Consistency", "",
-        table(["", "sampled", "true views"], fits), ""])
+    fits = [
+        [key.replace("_", " "), *(number(mean_of(agreement[side], key)) for side in ("sampled", "true"))]
+        for key in agreement["true"][0]
+    ]
+    return "\n".join(
+        [
+            "# Sampling: time against error",
+            "",
+            f"{len(agreement['true'])} held-out objects of `procedural:900000` and on, {record['image_size']} px, two threads, on {machine()}. {record['remark']}",
+            f"Start-up (imports, weights) {start['start_up_seconds']:.1f} s, the whole command on one picture {start['whole_seconds']:.1f} s and {start['peak_mb']:.0f} MB.",
+            "",
+            table(["sampler", *(name.replace("_", " ") for name in SHOWN)], rows),
+            "",
+            "reference psnr: color against 50 steps of DDIM. ![time against error](sample.png)",
+            "",
+            "## Consistency",
+            "",
+            table(["", "sampled", "true views"], fits),
+            "",
+        ]
+    )
 
 
 def draw(path: Path, record: dict) -> None:
@@ -121,9 +161,16 @@ def main() -> None:
     torch.set_num_threads(2)
     model = load_model(arguments.model)
     size = model.config.image_size
-    folders = views_folders(arguments.held_out or [held_out_data(arguments.cache / str(size), size, arguments.limit)])[: arguments.limit]
-    record: dict = {"image_size": size, "remark": busy(), "start_up": start_up(arguments.model, folders[0].path / "condition" / "000.png"), "rows": {},
-                    "consistency": {"sampled": [], "true": []}}
+    folders = views_folders(arguments.held_out or [held_out_data(arguments.cache / str(size), size, arguments.limit)])[
+        : arguments.limit
+    ]
+    record: dict = {
+        "image_size": size,
+        "remark": busy(),
+        "start_up": start_up(arguments.model, folders[0].path / "condition" / "000.png"),
+        "rows": {},
+        "consistency": {"sampled": [], "true": []},
+    }
     arguments.output.mkdir(parents=True, exist_ok=True)
     for seed, folder in enumerate(folders):
         truth = true_views(folder, size)

@@ -1,10 +1,11 @@
-"""Views by Blender's Cycles (the bpy module) for benchmarks/render.py and relight.py: prints its seconds, writes its images.
+"""Views by Blender's Cycles (the bpy module) for benchmarks/render.py and relight.py: prints its seconds, writes its
+images.
 
   PEERS_PYTHON benchmarks/shading_blender.py MODEL.glb LIGHT.exr OUT.npz --views front,right --size 512 --samples 16 --light
 
-Box filter, direct light only, no adaptive sampling. Buffers come as AOVs and the normal pass of the one picture, without light
-when --light is left out: the cheapest way there is. Cycles' depth is not antialiased, so it is not written.
-"""
+Box filter, direct light only, no adaptive sampling. Buffers come as AOVs and the normal pass of the one picture,
+without light when --light is left out: the cheapest way there is. Cycles' depth is not antialiased, so it is not
+written."""
 
 from __future__ import annotations
 
@@ -80,13 +81,16 @@ def add_buffers() -> None:
         for name, socket in INPUTS.items() if shader else ():
             out = tree.nodes.new("ShaderNodeOutputAOV")
             out.aov_name, source, target = name, shader.inputs[socket], out.inputs[0 if name == "albedo" else 1]
-            value = tree.nodes.new("ShaderNodeVectorMath")  # AOVs add up through cut-outs, so each surface gives its value times its alpha
+            # AOVs add up through cut-outs, so each surface gives its value times its alpha.
+            value = tree.nodes.new("ShaderNodeVectorMath")
             value.operation = "MULTIPLY"
             for given, factor in ((source, value.inputs[0]), (shader.inputs["Alpha"], value.inputs[1])):
                 if given.links:
                     tree.links.new(given.links[0].from_socket, factor)
                 else:
-                    factor.default_value = given.default_value[:3] if given.type == "RGBA" else (given.default_value,) * 3
+                    factor.default_value = (
+                        given.default_value[:3] if given.type == "RGBA" else (given.default_value,) * 3
+                    )
             tree.links.new(value.outputs[0], target)
 
 

@@ -1,7 +1,7 @@
 """Views by gdtool for benchmarks/render.py and relight.py: prints its seconds, writes its images.
 
-  python benchmarks/shading_gdtool.py MODEL ENV OUT.npz --views front,right --size 512 --samples 16 --light sampled --light-samples 4
-"""
+python benchmarks/shading_gdtool.py MODEL ENV OUT.npz --views front,right --size 512 --samples 16 --light sampled
+--light-samples 4"""
 
 from __future__ import annotations
 
@@ -32,13 +32,19 @@ def main() -> None:
     torch.set_num_threads(1)
     from gdtool.assets.load import load_scene
     from gdtool.cameras import rig
-    from gdtool.shading.render import render
     from gdtool.shading.bsdf.closed_form import closed_form_image
-    from gdtool.shading.render.direct import DirectLight
     from gdtool.shading.lights.studio import studio
+    from gdtool.shading.render import render
+    from gdtool.shading.render.direct import DirectLight
 
     # What the renderer imports when it first needs it: no renderer's seconds have its imports in them.
-    for module in ("embreex.mesh_construction", "gdtool.shading.bsdf.closed_form", "gdtool.shading.lights.prefilter", "gdtool.geometry.tangents", "torch.quasirandom"):
+    for module in (
+        "embreex.mesh_construction",
+        "gdtool.shading.bsdf.closed_form",
+        "gdtool.shading.lights.prefilter",
+        "gdtool.geometry.tangents",
+        "torch.quasirandom",
+    ):
         importlib.import_module(module)
     scene = normalised(load_scene(asked.model))
     if asked.converged:
@@ -61,7 +67,11 @@ def main() -> None:
 
     frames = list(renderer.each(view, [cameras[name] for name in asked.views.split(",")]))
     seconds = {"wall s": time.perf_counter() - wall, "cpu s": time.process_time() - processor}
-    np.savez(asked.out, names=np.array(asked.views.split(",")), **{key: np.stack([frame[key] for frame in frames]) for key in frames[0]})
+    np.savez(
+        asked.out,
+        names=np.array(asked.views.split(",")),
+        **{key: np.stack([frame[key] for frame in frames]) for key in frames[0]},
+    )
     print(json.dumps({**seconds, "rays": renderer.counts.samples + renderer.counts.shadow_rays}))
 
 

@@ -2,9 +2,8 @@
 
   PEERS_PYTHON benchmarks/shading_mitsuba.py SCENE.npz OUT.npz --views front,right --size 512 --samples 16
 
-SCENE.npz is what shading_scene.exported writes. Direct light, box filter, metallic-roughness as `principled` under `normalmap`; a
-first picture that is not timed loads the kernels. Emission and alpha are left out.
-"""
+SCENE.npz is what shading_scene.exported writes. Direct light, box filter, metallic-roughness as `principled` under
+`normalmap`; a first picture that is not timed loads the kernels. Emission and alpha are left out."""
 
 from __future__ import annotations
 
@@ -45,11 +44,22 @@ def mesh(scene: dict, key: str, place: str) -> dict:
     path = os.path.join(place, f"{key}.ply")
     made.write_ply(path)
     color = {"type": "mesh_attribute", "name": "vertex_color"} if len(colors) else value(scene, f"{key}_base_color")
-    bsdf = {"type": "principled", "base_color": color, "roughness": value(scene, f"{key}_roughness"),
-            "metallic": value(scene, f"{key}_metallic"), "specular": 0.5}
+    bsdf = {
+        "type": "principled",
+        "base_color": color,
+        "roughness": value(scene, f"{key}_roughness"),
+        "metallic": value(scene, f"{key}_metallic"),
+        "specular": 0.5,
+    }
     if scene[f"{key}_normal"].ndim == 3:
         bsdf = {"type": "normalmap", "normalmap": texture(scene[f"{key}_normal"], True), "bsdf": bsdf}
-    return {"type": "ply", "filename": path, "flip_tex_coords": False, "face_normals": not len(normals), "bsdf": {"type": "twosided", "bsdf": bsdf}}
+    return {
+        "type": "ply",
+        "filename": path,
+        "flip_tex_coords": False,
+        "face_normals": not len(normals),
+        "bsdf": {"type": "twosided", "bsdf": bsdf},
+    }
 
 
 def main() -> None:
@@ -70,18 +80,37 @@ def main() -> None:
         # Mitsuba's map begins a quarter turn before gdtool's.
         light = np.roll(stored["light"], -(stored["light"].shape[1] // 4), 1)
         keys = [name.removesuffix("_vertices") for name in stored if name.endswith("_vertices")]
-        scene = mi.load_dict({"type": "scene", "light": {"type": "envmap", "bitmap": mi.Bitmap(light.astype(np.float32))},
-                              **{key: mesh(stored, key, place) for key in keys}})
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "light": {"type": "envmap", "bitmap": mi.Bitmap(light.astype(np.float32))},
+                **{key: mesh(stored, key, place) for key in keys},
+            }
+        )
     integrator = mi.load_dict({"type": "direct", "hide_emitters": True})
 
     def picture(view: str, samples: int, seed: int) -> np.ndarray:
         angle = np.radians(stored[f"azimuth_{view}"])
         half = float(stored["half_width"])
-        sensor = mi.load_dict({
-            "type": "orthographic", "near_clip": 0.1, "far_clip": 10.0,
-            "to_world": Transform().look_at(origin=[3 * np.sin(angle), 0, 3 * np.cos(angle)], target=[0, 0, 0], up=[0, 1, 0]) @ Transform().scale([half, half, 1]),
-            "film": {"type": "hdrfilm", "width": asked.size, "height": asked.size, "pixel_format": "rgba", "rfilter": {"type": "box"}},
-            "sampler": {"type": "independent", "sample_count": samples}})
+        sensor = mi.load_dict(
+            {
+                "type": "orthographic",
+                "near_clip": 0.1,
+                "far_clip": 10.0,
+                "to_world": Transform().look_at(
+                    origin=[3 * np.sin(angle), 0, 3 * np.cos(angle)], target=[0, 0, 0], up=[0, 1, 0]
+                )
+                @ Transform().scale([half, half, 1]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": asked.size,
+                    "height": asked.size,
+                    "pixel_format": "rgba",
+                    "rfilter": {"type": "box"},
+                },
+                "sampler": {"type": "independent", "sample_count": samples},
+            }
+        )
         image = mi.render(scene, sensor=sensor, integrator=integrator, spp=samples, seed=seed)
         dr.eval(image)
         return np.array(image)
@@ -91,7 +120,10 @@ def main() -> None:
     parts = max(1, asked.samples // 256)
     picture(names[0], asked.samples // parts, 10_000)
     wall, processor = time.perf_counter(), time.process_time()
-    images = [np.mean([picture(name, asked.samples // parts, asked.seed + 100 * part) for part in range(parts)], 0) for name in names]
+    images = [
+        np.mean([picture(name, asked.samples // parts, asked.seed + 100 * part) for part in range(parts)], 0)
+        for name in names
+    ]
     seconds = {"wall s": time.perf_counter() - wall, "cpu s": time.process_time() - processor}
     frames = np.stack(images)
     np.savez(asked.out, names=np.array(names), color=frames[..., :3], mask=frames[..., 3])

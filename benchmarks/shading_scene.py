@@ -26,7 +26,8 @@ def normalised(scene: Scene) -> Scene:
 
 
 def times(texture: Texture | None, factor: np.ndarray, channels: slice) -> np.ndarray:
-    """(h, w, c) the texture's channels by a factor, 8-bit where the factor is 1, else float32; or the factor (c,) itself."""
+    """(h, w, c) the texture's channels by a factor, 8-bit where the factor is 1, else float32; or the factor (c,)
+    itself."""
     if texture is None:
         return factor
     from gdtool.images.color import linear_from_srgb
@@ -40,8 +41,8 @@ def times(texture: Texture | None, factor: np.ndarray, channels: slice) -> np.nd
 
 
 def for_mitsuba(scene: Scene) -> dict[str, np.ndarray]:
-    """Arrays of each material's mesh: vertices, faces, normals or none, uv, vertex colors or none, and its inputs, each an
-    image or a number. The UV set and transform are those of the base color, else of the normal map."""
+    """Arrays of each material's mesh: vertices, faces, normals or none, uv, vertex colors or none, and its inputs, each
+    an image or a number. The UV set and transform are those of the base color, else of the normal map."""
     from gdtool.shading.render.textures import transform_uv
 
     out = {}
@@ -50,19 +51,36 @@ def for_mitsuba(scene: Scene) -> dict[str, np.ndarray]:
         if not len(faces):
             continue
         used, flat = np.unique(faces, return_inverse=True)
-        one = next((t for t in (material.base_color_texture, material.normal_texture, material.metallic_roughness_texture) if t is not None), None)
+        one = next(
+            (
+                t
+                for t in (material.base_color_texture, material.normal_texture, material.metallic_roughness_texture)
+                if t is not None
+            ),
+            None,
+        )
         uv = None if one is None or one.uv_set >= len(scene.uvs) else scene.uvs[one.uv_set]
         uv = np.zeros((len(used), 2)) if uv is None else transform_uv(one, uv[used])
         factor = np.asarray(material.base_color[:3])
         surface = material.metallic_roughness_texture
         key = f"m{number}"
-        out |= {f"{key}_vertices": scene.vertices[used], f"{key}_faces": flat.reshape(-1, 3), f"{key}_normals": np.zeros((0, 3)) if scene.normals is None else scene.normals[used],
-                f"{key}_uv": uv,
-                f"{key}_colors": np.zeros((0, 3)) if scene.colors is None else scene.colors[used, :3] * factor,
-                f"{key}_base_color": times(material.base_color_texture, factor, slice(0, 3)),
-                f"{key}_roughness": np.float32(material.roughness) if surface is None else times(surface, np.full(1, material.roughness), slice(1, 2)),
-                f"{key}_metallic": np.float32(material.metallic) if surface is None else times(surface, np.full(1, material.metallic), slice(2, 3)),
-                f"{key}_normal": np.float32(0) if material.normal_texture is None else times(material.normal_texture, np.ones(3), slice(0, 3))}
+        out |= {
+            f"{key}_vertices": scene.vertices[used],
+            f"{key}_faces": flat.reshape(-1, 3),
+            f"{key}_normals": np.zeros((0, 3)) if scene.normals is None else scene.normals[used],
+            f"{key}_uv": uv,
+            f"{key}_colors": np.zeros((0, 3)) if scene.colors is None else scene.colors[used, :3] * factor,
+            f"{key}_base_color": times(material.base_color_texture, factor, slice(0, 3)),
+            f"{key}_roughness": np.float32(material.roughness)
+            if surface is None
+            else times(surface, np.full(1, material.roughness), slice(1, 2)),
+            f"{key}_metallic": np.float32(material.metallic)
+            if surface is None
+            else times(surface, np.full(1, material.metallic), slice(2, 3)),
+            f"{key}_normal": np.float32(0)
+            if material.normal_texture is None
+            else times(material.normal_texture, np.ones(3), slice(0, 3)),
+        }
     return out
 
 
@@ -83,11 +101,25 @@ def exported(model: str, env: str, folder: Path, seed: int = 0) -> dict[str, str
         place = str(folder / "model.glb")
         write_glb(place, scene)
     cameras = rig("six", 16)
-    azimuths = {camera.name: float(np.degrees(np.arctan2(camera.position[0], camera.position[2]))) for camera in cameras}
+    azimuths = {
+        camera.name: float(np.degrees(np.arctan2(camera.position[0], camera.position[2]))) for camera in cameras
+    }
     half = cameras[0].pixel_size * 8
-    np.savez(folder / "scene.npz", light=light, half_width=half, **{f"azimuth_{name}": angle for name, angle in azimuths.items()}, **for_mitsuba(scene))
-    found = {"model": place, "light": str(folder / "light.exr"), "scene": str(folder / "scene.npz"), "azimuths": azimuths, "half_width": half,
-             "faces": len(scene.faces)}
+    np.savez(
+        folder / "scene.npz",
+        light=light,
+        half_width=half,
+        **{f"azimuth_{name}": angle for name, angle in azimuths.items()},
+        **for_mitsuba(scene),
+    )
+    found = {
+        "model": place,
+        "light": str(folder / "light.exr"),
+        "scene": str(folder / "scene.npz"),
+        "azimuths": azimuths,
+        "half_width": half,
+        "faces": len(scene.faces),
+    }
     (folder / "scene.json").write_text(json.dumps(found))
     return found
 

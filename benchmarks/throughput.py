@@ -2,11 +2,10 @@
 
     python benchmarks/throughput.py [-o docs/benchmarks] [--objects 24] [--counts 10,100,1000] [--fresh]
 
-Writes throughput.md, throughput.json and throughput.png, after every row; begun again it goes on where it was. Cores are
-allowed by affinity (1, 2, 4, … all). Ways: one process with that many threads, as many processes by --shard of one thread
-each, and, where the package is installed and for all cores, --ray local. Start-up is in the times. About eight minutes of
-two quiet cores.
-"""
+Writes throughput.md, throughput.json and throughput.png, after every row; begun again it goes on where it was. Cores
+are allowed by affinity (1, 2, 4, … all). Ways: one process with that many threads, as many processes by --shard of one
+thread each, and, where the package is installed and for all cores, --ray local. Start-up is in the times. About eight
+minutes of two quiet cores."""
 
 from __future__ import annotations
 
@@ -29,13 +28,27 @@ COLUMNS = ("way", "cores", "objects", "seconds", "cpu", "per_core_minute", "per_
 
 def one_process(folder: Path, objects: int, cores: int, options: tuple[str, ...]) -> list[Cost]:
     """A process with a thread for every core."""
-    return [gdtool("render-dataset", f"procedural:0..{objects - 1}", *options, "--threads", str(cores), "-o", folder, "-q")]
+    return [
+        gdtool("render-dataset", f"procedural:0..{objects - 1}", *options, "--threads", str(cores), "-o", folder, "-q")
+    ]
 
 
 def shards(folder: Path, objects: int, cores: int, options: tuple[str, ...]) -> list[Cost]:
     """A process of one thread for every core, at once."""
+
     def run(part: int) -> Cost:
-        return gdtool("render-dataset", f"procedural:0..{objects - 1}", *options, "--threads", "1", "--shard", f"{part}/{cores}", "-o", folder, "-q")
+        return gdtool(
+            "render-dataset",
+            f"procedural:0..{objects - 1}",
+            *options,
+            "--threads",
+            "1",
+            "--shard",
+            f"{part}/{cores}",
+            "-o",
+            folder,
+            "-q",
+        )
 
     with ThreadPoolExecutor(cores) as pool:
         return list(pool.map(run, range(1, cores + 1)))
@@ -63,11 +76,20 @@ def measured(way: str, cores: int, objects: int, options: tuple[str, ...]) -> di
 
 
 def row_of(way: str, cores: int, objects: int, costs: list[Cost]) -> dict:
-    """Figures of runs that went on at once. Rates are objects a minute, by the clock and core, and by processor time."""
+    """Figures of runs that went on at once. Rates are objects a minute, by the clock and core, and by processor
+    time."""
     seconds, cpu = max(c.seconds for c in costs), sum(c.cpu_seconds for c in costs)
     known = way != "ray"
-    return {"way": way, "cores": cores, "objects": objects, "seconds": seconds, "cpu": cpu if known else None, "per_core_minute": 60 * objects / (seconds * cores),
-            "per_cpu_minute": 60 * objects / cpu if known else None, "peak_mb": max(c.peak_mb for c in costs) if known else None}
+    return {
+        "way": way,
+        "cores": cores,
+        "objects": objects,
+        "seconds": seconds,
+        "cpu": cpu if known else None,
+        "per_core_minute": 60 * objects / (seconds * cores),
+        "per_cpu_minute": 60 * objects / cpu if known else None,
+        "peak_mb": max(c.peak_mb for c in costs) if known else None,
+    }
 
 
 def plan(objects: int, counts: list[int], cores: int, ray: bool) -> list[tuple[str, str, int, int, tuple[str, ...]]]:
@@ -81,14 +103,32 @@ def plan(objects: int, counts: list[int], cores: int, ray: bool) -> list[tuple[s
 
 def report(state: dict) -> str:
     """The page."""
-    def rows(name: str) -> str:
-        return table(COLUMNS, [[number(row.get(column)) for column in COLUMNS] for row in state["rows"].values() if row["table"] == name])
 
-    parts = ["# Throughput of render-dataset", "", f"`make bench-throughput`: {state['machine']}. {state['busy']}".rstrip(), "",
-             "Start-up (about two seconds) is in every row. per_core_minute is by the clock, per_cpu_minute by the processor time taken.", "",
-             f"## More cores: procedural objects, `{' '.join(TYPICAL)}`", "", rows("cores"), "",
-             *([] if state["ray"] else ["No row by `--ray local`: the package ray is not installed.", ""]),
-             f"## More objects: `{' '.join(TINY)}`, one process", "", rows("objects"), "", "![growth](throughput.png)", ""]
+    def rows(name: str) -> str:
+        return table(
+            COLUMNS,
+            [[number(row.get(column)) for column in COLUMNS] for row in state["rows"].values() if row["table"] == name],
+        )
+
+    parts = [
+        "# Throughput of render-dataset",
+        "",
+        f"`make bench-throughput`: {state['machine']}. {state['busy']}".rstrip(),
+        "",
+        "Start-up (about two seconds) is in every row. per_core_minute is by the clock, per_cpu_minute by the processor time taken.",
+        "",
+        f"## More cores: procedural objects, `{' '.join(TYPICAL)}`",
+        "",
+        rows("cores"),
+        "",
+        *([] if state["ray"] else ["No row by `--ray local`: the package ray is not installed.", ""]),
+        f"## More objects: `{' '.join(TINY)}`, one process",
+        "",
+        rows("objects"),
+        "",
+        "![growth](throughput.png)",
+        "",
+    ]
     return "\n".join(parts)
 
 

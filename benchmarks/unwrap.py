@@ -2,12 +2,11 @@
 
     python benchmarks/unwrap.py [MODEL_OR_FOLDER ...] [-o docs/benchmarks] [--faces 20000] [--peers-python PYTHON]
 
-Writes unwrap.md, unwrap.json, unwrap.png and the layouts unwrap_sheet.png, row by row: killed, it goes on where it was. Models
-that are quads already are taken as they are; others as remesh.py left them, or are remeshed first. The knobs are swept and
-brute force is tried on the models of --sweep. All leave two texels between charts at 1024. Every run is a child process with
-a time limit, and what did not begin within --minutes is left for the next time; mirrored is a share of the area, overlap
-counts texels of 4096² with more than one owner.
-"""
+Writes unwrap.md, unwrap.json, unwrap.png and the layouts unwrap_sheet.png, row by row: killed, it goes on where it was.
+Models that are quads already are taken as they are; others as remesh.py left them, or are remeshed first. The knobs are
+swept and brute force is tried on the models of --sweep. All leave two texels between charts at 1024. Every run is a
+child process with a time limit, and what did not begin within --minutes is left for the next time; mirrored is a share
+of the area, overlap counts texels of 4096² with more than one owner."""
 
 from __future__ import annotations
 
@@ -26,13 +25,30 @@ from wireframe import file_name, sheet
 
 SIZE, PADDING = 1024, 2
 FINE = 4096  # where overlaps are looked for
-WAYS = {"ours": {}, "ours, stretch 1.001": {"good_stretch": 1.001}, "ours, stretch 1.005": {"good_stretch": 1.005},
-        "ours, cost 1": {"max_cost": 1.0}, "ours, cost 4": {"max_cost": 4.0}}
+WAYS = {
+    "ours": {},
+    "ours, stretch 1.001": {"good_stretch": 1.001},
+    "ours, stretch 1.005": {"good_stretch": 1.005},
+    "ours, cost 1": {"max_cost": 1.0},
+    "ours, cost 4": {"max_cost": 4.0},
+}
 BLENDER = "Blender Smart UV"
 BRUTE = "xatlas, brute force"
 PEERS = {"xatlas": False, "xatlas, brute force": True}
-COLUMNS = ("model", "way", "seconds", "processor", "charts", "coverage", "overlap", "stretch", "area_distortion", "angle_distortion", "mirrored",
-           "seam_length")
+COLUMNS = (
+    "model",
+    "way",
+    "seconds",
+    "processor",
+    "charts",
+    "coverage",
+    "overlap",
+    "stretch",
+    "area_distortion",
+    "angle_distortion",
+    "mirrored",
+    "seam_length",
+)
 
 
 def ours(vertices: np.ndarray, faces: np.ndarray, options: dict) -> tuple:
@@ -75,7 +91,9 @@ def overlapping(faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray) -> int:
     return int((owner_count(uv, corner_triangles(face_uvs, triangulated(faces)[1]), FINE) > 1).sum())
 
 
-def measure(name: str, vertices: np.ndarray, faces: np.ndarray, ways: list[str], asked: argparse.Namespace, rows: Rows) -> None:
+def measure(
+    name: str, vertices: np.ndarray, faces: np.ndarray, ways: list[str], asked: argparse.Namespace, rows: Rows
+) -> None:
     """A row for each way that has none yet; one that fails says why. faces (f, 4). Keeps pictures of the layouts."""
     from gdtool.core.child import ChildFailed, call
     from gdtool.geometry.topology import triangulated
@@ -97,14 +115,25 @@ def measure(name: str, vertices: np.ndarray, faces: np.ndarray, ways: list[str],
                 uv, face_uvs, cost = call(peer, vertices, triangles, PEERS[way], seconds=asked.limit, memory_mb=16000)
             else:
                 uv, face_uvs, cost = call(ours, vertices, faces, WAYS[way], seconds=asked.limit, memory_mb=16000)
-            row = {"model": name, "way": way, **cost, **figures(vertices, mine, uv, face_uvs, SIZE), "overlap": overlapping(mine, uv, face_uvs)}
+            row = {
+                "model": name,
+                "way": way,
+                **cost,
+                **figures(vertices, mine, uv, face_uvs, SIZE),
+                "overlap": overlapping(mine, uv, face_uvs),
+            }
             if way in ("ours", "xatlas", BLENDER):
                 chart = islands(vertices, mine, face_uvs)[0]
                 (asked.kept / "pictures").mkdir(parents=True, exist_ok=True)
-                write_png(asked.kept / "pictures" / file_name(name, f"{way} layout"), layout(mine, uv, face_uvs, chart, 420))
+                write_png(
+                    asked.kept / "pictures" / file_name(name, f"{way} layout"), layout(mine, uv, face_uvs, chart, 420)
+                )
                 if way == "ours":
                     board = checkerboard(vertices, mine, uv, face_uvs, chart)
-                    write_png(asked.kept / "pictures" / file_name(name, "ours checkerboard"), board[::2, :board.shape[1] // 2:2])
+                    write_png(
+                        asked.kept / "pictures" / file_name(name, "ours checkerboard"),
+                        board[::2, : board.shape[1] // 2 : 2],
+                    )
         except ChildFailed as failure:
             row = {"model": name, "way": way, "failed": str(failure)}
         rows.add(row)
@@ -112,8 +141,8 @@ def measure(name: str, vertices: np.ndarray, faces: np.ndarray, ways: list[str],
 
 def quads_of(source: str | Path, faces: int, triangles: int, kept: Path) -> tuple[str, np.ndarray, np.ndarray]:
     """Name, vertices and quads (f, 4) of a solid or a model file, remeshed unless it is quads."""
-    from gdtool.remesh.task import Request
     from gdtool.remesh.pipeline import remesh
+    from gdtool.remesh.task import Request
 
     if isinstance(source, Path) and source.suffix.lower() == ".obj":
         from gdtool.folders.mesh import read_obj
@@ -134,7 +163,9 @@ def quads_of(source: str | Path, faces: int, triangles: int, kept: Path) -> tupl
 
 
 def main() -> None:
-    parser = arguments(__doc__, "what is unwrapped besides the solids", "a Python that has bpy; without it Blender is left out")
+    parser = arguments(
+        __doc__, "what is unwrapped besides the solids", "a Python that has bpy; without it Blender is left out"
+    )
     parser.add_argument("--input", type=int, default=1_000_000, help="triangles that remesh gets")
     parser.add_argument("--sweep", default="part,spot", help="models that the knobs are swept on")
     asked = parser.parse_args()
@@ -151,21 +182,42 @@ def main() -> None:
     def ways(name: str) -> list[str]:
         swept = name in asked.sweep.split(",")
         out = [way for way in WAYS if way == "ours" or swept]
-        out += [way for way in PEERS if find_spec("xatlas") and (way != BRUTE or swept)] + ([BLENDER] if asked.peers_python else [])
+        out += [way for way in PEERS if find_spec("xatlas") and (way != BRUTE or swept)] + (
+            [BLENDER] if asked.peers_python else []
+        )
         return [way for way in out if not asked.only or way in asked.only.split(",")]
 
     def report(complete: bool) -> str:
         rows.write(complete)
-        text = table(COLUMNS, ([number(row.get(name, "failed" if name == "charts" and "failed" in row else None), 4) for name in COLUMNS]
-                               for row in rows.rows))
+        text = table(
+            COLUMNS,
+            (
+                [
+                    number(row.get(name, "failed" if name == "charts" and "failed" in row else None), 4)
+                    for name in COLUMNS
+                ]
+                for row in rows.rows
+            ),
+        )
         failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows.rows if "failed" in row)
         head = f"# Unwrap: about {asked.faces} quads\n\n`make bench-assets`, {machine()}. {note}\n\n"
-        (asked.out / "unwrap.md").write_text(head + beside(rows.rows, [*PEERS, BLENDER]) + "\n\n" + text + "\n" + (f"\nFailed:\n\n{failed}\n" if failed else "")
-                                             + "\n![time against coverage](unwrap.png)\n\n![layouts](unwrap_sheet.png)\n")
+        (asked.out / "unwrap.md").write_text(
+            head
+            + beside(rows.rows, [*PEERS, BLENDER])
+            + "\n\n"
+            + text
+            + "\n"
+            + (f"\nFailed:\n\n{failed}\n" if failed else "")
+            + "\n![time against coverage](unwrap.png)\n\n![layouts](unwrap_sheet.png)\n"
+        )
         shares = [row | {"uncovered": 1 - row["coverage"]} for row in rows.rows if "coverage" in row]
         plot(shares, asked.out / "unwrap.png", "uncovered", "share of the texture that no chart covers", False)
-        sheet(asked.kept / "pictures", list(dict.fromkeys(row["model"] for row in rows.rows)),
-              ["ours layout", "ours checkerboard", "xatlas layout", f"{BLENDER} layout"], asked.out / "unwrap_sheet.png")
+        sheet(
+            asked.kept / "pictures",
+            list(dict.fromkeys(row["model"] for row in rows.rows)),
+            ["ours layout", "ours checkerboard", "xatlas layout", f"{BLENDER} layout"],
+            asked.out / "unwrap_sheet.png",
+        )
         return text
 
     sources = [*filter(None, asked.solids.split(",")), *models_in(asked.models)]

@@ -26,7 +26,9 @@ def wireframe(vertices: np.ndarray, faces: np.ndarray, size: int = 420) -> np.nd
     line = ((np.arange(size) + 0.5) / size - 0.5) * scale
     origins = centre + back * diagonal + (line[None, :, None] * right - line[:, None, None] * up)
     triangles, face_idx = triangulated(faces)
-    hits = RayCaster(vertices, triangles.astype(np.int64)).first_hit(origins.reshape(-1, 3), np.broadcast_to(-back, (size * size, 3)).copy())
+    hits = RayCaster(vertices, triangles.astype(np.int64)).first_hit(
+        origins.reshape(-1, 3), np.broadcast_to(-back, (size * size, 3)).copy()
+    )
     found = np.flatnonzero(hits.face_idx >= 0)
     face = face_idx[hits.face_idx[found]]
     point = origins.reshape(-1, 3)[found] - back * hits.distance[found][:, None]

@@ -1,4 +1,5 @@
-"""The gdtool command line. Nothing but signals and the list of commands is imported before main() listens to signals."""
+"""The gdtool command line. Nothing but signals and the list of commands is imported before main() listens to
+signals."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ def _cli() -> object:
 
 
 def main(load: Callable[[], object] = _cli) -> None:
-    """Run the click command that load() gives, which may import what it likes, and exit with one of the documented codes."""
+    """Run the click command that load() gives, which may import what it likes, and exit with one of the documented
+    codes."""
     _open_streams()
     # Files that a umask would close to their own user could not be finished, nor removed.
     os.umask(os.umask(0o077) & 0o077)
@@ -56,7 +58,8 @@ def main(load: Callable[[], object] = _cli) -> None:
 
 
 def _open_streams() -> None:
-    """Open /dev/null in the place of standard streams that the caller closed: a file of the user's would get their numbers."""
+    """Open /dev/null in the place of standard streams that the caller closed: a file of the user's would get their
+    numbers."""
     for number, name in ((0, "stdin"), (1, "stdout"), (2, "stderr")):
         try:
             os.fstat(number)

@@ -77,7 +77,8 @@ def _usage(error: click.ClickException) -> int:
 
 
 def _close_stdout() -> None:
-    """Where stdout cannot be written (its reader has left, its disk is full), keep the interpreter from flushing it again."""
+    """Where stdout cannot be written (its reader has left, its disk is full), keep the interpreter from flushing it
+    again."""
     try:
         sys.stdout.flush()
     except (OSError, ValueError):
@@ -86,7 +87,8 @@ def _close_stdout() -> None:
 
 
 def tell(error: Exception, subject: object) -> GdtoolError:
-    """Report an exception that was raised while working on subject, with its traceback under --debug; what it counts as."""
+    """Report an exception that was raised while working on subject, with its traceback under --debug; what it counts
+    as."""
     problem = from_exception(error, subject)
     if debugging():
         import traceback
@@ -112,7 +114,8 @@ def report_text(text: str) -> None:
 
 
 def emit(content: bytes) -> None:
-    """Write a result to stdout at once. Raises OutputError where it cannot be written, BrokenPipeError where nobody reads it."""
+    """Write a result to stdout at once. Raises OutputError where it cannot be written, BrokenPipeError where nobody
+    reads it."""
     try:
         sys.stdout.flush()
         sys.stdout.buffer.write(content)
@@ -191,18 +194,32 @@ def option_from_field(field: Any, hint: Any) -> click.Option:
             inner, meta = typing.get_args(inner)[0], typing.get_args(inner)[1]
     name = field.name.replace("_", "-")
     text = meta.description or ""
-    common = {"default": None if optional and field.default is None else field.default, "show_default": not optional, "help": text}
+    common = {
+        "default": None if optional and field.default is None else field.default,
+        "show_default": not optional,
+        "help": text,
+    }
     if inner is bool:
         return click.Option([f"--{name}/--no-{name}"], **common)
     if typing.get_origin(inner) is Literal:
         return click.Option([f"--{name}"], type=click.Choice([str(a) for a in typing.get_args(inner)]), **common)
     if typing.get_origin(inner) is tuple:
         common["default"] = ",".join(field.default or ())
-        return click.Option([f"--{name}"], type=TEXT, metavar="A,B,…", callback=lambda _c, _p, v: tuple(x for x in v.split(",") if x), **common)
+        return click.Option(
+            [f"--{name}"],
+            type=TEXT,
+            metavar="A,B,…",
+            callback=lambda _c, _p, v: tuple(x for x in v.split(",") if x),
+            **common,
+        )
     if inner in (int, float):
         lowest, highest = (meta.ge, meta.gt), (meta.le, meta.lt)
-        bounds = {"min": next((x for x in lowest if x is not None), None), "max": next((x for x in highest if x is not None), None),
-                  "min_open": meta.gt is not None, "max_open": meta.lt is not None}
+        bounds = {
+            "min": next((x for x in lowest if x is not None), None),
+            "max": next((x for x in highest if x is not None), None),
+            "min_open": meta.gt is not None,
+            "max_open": meta.lt is not None,
+        }
         return click.Option([f"--{name}"], type=(IntegerRange if inner is int else FiniteRange)(**bounds), **common)
     return click.Option([f"--{name}"], type=TEXT, **common)
 
@@ -235,7 +252,8 @@ def shard_of(text: str | None) -> tuple[int, int]:
 
 
 def help_of(module: types.ModuleType) -> str:
-    """A module's docstring as click help: pasted examples keep their line breaks. Under python -OO it is read from the source."""
+    """A module's docstring as click help: pasted examples keep their line breaks. Under python -OO it is read from the
+    source."""
     text = module.__doc__
     if text is None:
         import ast
@@ -259,8 +277,14 @@ def stage_command(stage: Stage, help: str) -> click.Command:
         arguments = values["sources"]
         shard = shard_of(values.get("shard"))
         settings = Settings(
-            output=Path(values["output"]) if values["output"] else None, several=len(arguments) > 1 or shard[1] > 1, dry_run=values["dry_run"],
-            force=values["force"], threads=values["threads"], device=values["device"], shard=shard, ray=values.get("ray"),
+            output=Path(values["output"]) if values["output"] else None,
+            several=len(arguments) > 1 or shard[1] > 1,
+            dry_run=values["dry_run"],
+            force=values["force"],
+            threads=values["threads"],
+            device=values["device"],
+            shard=shard,
+            ray=values.get("ray"),
         )
         flags = {flag: values["second_" + flag] for flag in stage.second_inputs}
         options = build_options(stage.Options, values)
@@ -274,8 +298,13 @@ def stage_command(stage: Stage, help: str) -> click.Command:
                 continue
             done += 1
             if values["as_json"]:
-                record = {"folder": str(result.path), "kind": result.kind, "status": result.status,
-                          "seconds": round(result.seconds, 3), "skipped": list(result.skipped)}
+                record = {
+                    "folder": str(result.path),
+                    "kind": result.kind,
+                    "status": result.status,
+                    "seconds": round(result.seconds, 3),
+                    "skipped": list(result.skipped),
+                }
                 emit(json.dumps(record).encode() + b"\n")
             else:
                 emit(os.fsencode(result.path) + b"\n")
@@ -285,7 +314,9 @@ def stage_command(stage: Stage, help: str) -> click.Command:
     params += options_from(stage.Options)
     for flag in stage.second_inputs:
         second = stage.second(flag)
-        text = second.help or f"The {second.kind} to use" + ("; found along the provenance chain without it." if second.search else ".")
+        text = second.help or f"The {second.kind} to use" + (
+            "; found along the provenance chain without it." if second.search else "."
+        )
         params.append(click.Option([f"--{flag}", f"second_{flag}"], type=TEXT, metavar="PATH", help=text))
     if stage.dataset:
         text = "Only every Nth source from the Ith on, for job arrays that share -o: 1/N to N/N."
@@ -293,12 +324,23 @@ def stage_command(stage: Stage, help: str) -> click.Command:
         text = "Fan out on the Ray cluster at ADDRESS, a source a task; local: on this machine's cores. Nodes share the folders. Needs gdtool[ray]."
         params.append(click.Option(["--ray"], type=TEXT, metavar="ADDRESS", help=text))
     params += [
-        click.Option(["-o", "--output"], type=TEXT, metavar="DIR", help="Output folder; for several sources the parent of NAME.asset/KIND."),
+        click.Option(
+            ["-o", "--output"],
+            type=TEXT,
+            metavar="DIR",
+            help="Output folder; for several sources the parent of NAME.asset/KIND.",
+        ),
         click.Option(["-n", "--dry-run"], is_flag=True, help="Print what would be made."),
         click.Option(["-f", "--force"], is_flag=True, help="Run even when up to date."),
         click.Option(["--json", "as_json"], is_flag=True, help="Print one JSON object per source."),
         click.Option(["--threads"], type=IntegerRange(0, MOST_THREADS), default=0, help="Threads; 0: all cores."),
-        click.Option(["--device"], type=click.Choice(["cpu", "cuda"]), default="cpu", show_default=True, help="Where networks run."),
+        click.Option(
+            ["--device"],
+            type=click.Choice(["cpu", "cuda"]),
+            default="cpu",
+            show_default=True,
+            help="Where networks run.",
+        ),
     ]
     params += [click.Option(list(flags), is_flag=True, help=text) for flags, text in VERBOSITY.items()]
     return click.Command(stage.name, callback=invoke, params=params, help=help)

@@ -51,13 +51,17 @@ def _loaded(plugin) -> click.Command:
     try:
         command = plugin.load()
     except (Exception, SystemExit) as error:  # of a stranger's module
-        raise ResourceError(f"plugin {plugin.name}", f"cannot be loaded ({type(error).__name__}: {first_line(error)})", cure) from error
+        raise ResourceError(
+            f"plugin {plugin.name}", f"cannot be loaded ({type(error).__name__}: {first_line(error)})", cure
+        ) from error
     if not isinstance(command, click.Command):
         raise ResourceError(f"plugin {plugin.name}", f"{plugin.value} is no click command", cure)
     return command
 
 
-@click.group(cls=LazyGroup, help=HELP, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.group(
+    cls=LazyGroup, help=HELP, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}
+)
 @click.version_option(package_name="gdtool")
 def cli():
     pass

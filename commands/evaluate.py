@@ -21,8 +21,20 @@ def _one(text, reference, views, options):
 
 @click.command("evaluate", help=help_of(stage))
 @click.argument("results", metavar="[RESULTS]...", nargs=-1, type=TEXT)
-@click.option("--reference", type=TEXT, metavar="PATH", help="What to measure against: a folder, a model file or procedural:SEED; found along the provenance chain without it.")
-@click.option("--views", "--cameras", "views", type=TEXT, metavar="VIEWS", help="Views that the result was made from; found along the provenance chain without it.")
+@click.option(
+    "--reference",
+    type=TEXT,
+    metavar="PATH",
+    help="What to measure against: a folder, a model file or procedural:SEED; found along the provenance chain without it.",
+)
+@click.option(
+    "--views",
+    "--cameras",
+    "views",
+    type=TEXT,
+    metavar="VIEWS",
+    help="Views that the result was made from; found along the provenance chain without it.",
+)
 @verbosity_options
 def command(results, reference, views, as_json, quiet, verbose, debug, **values):
     set_verbosity(quiet, verbose)

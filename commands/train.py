@@ -9,7 +9,13 @@ from gdtool.stages import train as stage
 from ._common import build_options, help_of, stage_command
 
 command = stage_command(stage.STAGE, help=help_of(stage))
-command.params.append(click.Option(["--plan"], is_flag=True, help="Tell memory, FLOPs and time of the training, computed from its structure; no data."))
+command.params.append(
+    click.Option(
+        ["--plan"],
+        is_flag=True,
+        help="Tell memory, FLOPs and time of the training, computed from its structure; no data.",
+    )
+)
 _train = command.callback
 
 

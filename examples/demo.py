@@ -1,8 +1,8 @@
 """One image to a finished asset, with the time and the error of each stage (`make demo`).
 
-The image is examples/demo.png, a render of procedural object SEED that the bundled model never saw, so the truth is known:
-the same object is rendered by render-dataset, and every stage is measured against it, or against what it was given.
-"""
+The image is examples/demo.png, a render of procedural object SEED that the bundled model never saw, so the truth is
+known: the same object is rendered by render-dataset, and every stage is measured against it, or against what it was
+given."""
 
 from __future__ import annotations
 
@@ -23,7 +23,14 @@ STAGES = (
     ("bake", ("--size", "1024"), "views"),
     ("relight", ("--env", "mid", "--views", "4"), None),
 )
-SHOWN = ("color_psnr_masked", "albedo_psnr_masked", "normal_degrees", "seen_distance", "surface_distance", "surface_iou")
+SHOWN = (
+    "color_psnr_masked",
+    "albedo_psnr_masked",
+    "normal_degrees",
+    "seen_distance",
+    "surface_distance",
+    "surface_iou",
+)
 
 
 def gdtool(*arguments: str) -> str:
@@ -42,8 +49,11 @@ def error_of(folder: str, reference: str) -> str:
 
 def main() -> None:
     image = Path(__file__).with_name("demo.png")
-    references = {"truth": gdtool("render-dataset", f"procedural:{SEED}", "-o", str(ROOT / "truth")),
-                  "surface": str(ROOT / "surface"), "views": str(ROOT / "views")}
+    references = {
+        "truth": gdtool("render-dataset", f"procedural:{SEED}", "-o", str(ROOT / "truth")),
+        "surface": str(ROOT / "surface"),
+        "views": str(ROOT / "views"),
+    }
     rows, source = [], str(image)
     for name, options, reference in STAGES:
         start = time.perf_counter()
@@ -53,8 +63,10 @@ def main() -> None:
     print(f"\n{'stage':<14}{'seconds':>8}  error")
     for name, seconds, error in rows:
         print(f"{name:<14}{seconds:8.1f}  {error}")
-    print(f"{'in all':<14}{sum(row[1] for row in rows):8.1f}\n\nasset:  {ROOT / 'asset/asset.glb'}\nlook:   " +
-          "\n        ".join(str(ROOT / kind / "contact_sheet.png") for kind in ("views", "asset", "renders")))
+    print(
+        f"{'in all':<14}{sum(row[1] for row in rows):8.1f}\n\nasset:  {ROOT / 'asset/asset.glb'}\nlook:   "
+        + "\n        ".join(str(ROOT / kind / "contact_sheet.png") for kind in ("views", "asset", "renders"))
+    )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Render examples/demo.png: the demo's object as a camera sees it, from the front, a little above, in perspective.
 
-    python examples/make_demo_image.py [OUT.png]
+python examples/make_demo_image.py [OUT.png]
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ def main() -> None:
 
     out = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).with_name("demo.png")
     camera = camera_at(0.0, ELEVATION, name="photograph", size=SIZE, **LENS)
-    color, mask = render_color(load_scene(f"procedural:{SEED}"), camera, load_environment("mid"), samples=16, light_samples=32)
+    color, mask = render_color(
+        load_scene(f"procedural:{SEED}"), camera, load_environment("mid"), samples=16, light_samples=32
+    )
     exposure = 0.95 / np.percentile(color[mask > 0.5].max(axis=-1), 99)  # highlights may clip, as in a photograph
     write_png(out, np.dstack([srgb_from_linear(np.clip(color * exposure, 0, 1)), mask]).astype(np.float32))
     print(out)

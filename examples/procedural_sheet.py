@@ -1,6 +1,7 @@
 """A contact sheet of procedural objects, seen from half right and above: what training data looks like.
 
-    python examples/procedural_sheet.py FIRST_SEED [COUNT] [OUT.png]       python examples/procedural_sheet.py kinds 5 sheet.png
+python examples/procedural_sheet.py FIRST_SEED [COUNT] [OUT.png]       python examples/procedural_sheet.py kinds 5
+sheet.png
 """
 
 from __future__ import annotations
@@ -37,7 +38,10 @@ def main() -> None:
         rows, labels = [[picture(generate(seed, kind), light) for seed in range(count)] for kind in names], names
     else:
         images = [picture(generate(seed), light) for seed in range(int(first), int(first) + count)]
-        rows, labels = [images[i:i + COLUMNS] for i in range(0, count, COLUMNS)], [str(int(first) + i) for i in range(0, count, COLUMNS)]
+        rows, labels = (
+            [images[i : i + COLUMNS] for i in range(0, count, COLUMNS)],
+            [str(int(first) + i) for i in range(0, count, COLUMNS)],
+        )
     write_png(out, contact_sheet(rows, labels_left=labels))
     print(out)
 

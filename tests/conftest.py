@@ -28,8 +28,16 @@ def gdtool(tmp_path):
     """gdtool("remesh", "x.obj", stdin="…") -> CompletedProcess with text stdout and stderr, in the test's folder."""
 
     def run(*arguments, stdin="", timeout=300, env=None, **kwargs):
-        return subprocess.run([sys.executable, "-m", "gdtool", *map(str, arguments)], input=stdin, capture_output=True, text=True,
-                              timeout=timeout, cwd=tmp_path, env={**os.environ, "OMP_NUM_THREADS": "2", **(env or {})}, **kwargs)
+        return subprocess.run(
+            [sys.executable, "-m", "gdtool", *map(str, arguments)],
+            input=stdin,
+            capture_output=True,
+            text=True,
+            timeout=timeout,
+            cwd=tmp_path,
+            env={**os.environ, "OMP_NUM_THREADS": "2", **(env or {})},
+            **kwargs,
+        )
 
     return run
 
@@ -39,8 +47,8 @@ def gdtool_here(tmp_path, monkeypatch):
     """As gdtool, but within this process: no second import of torch, so a tenth of the time for small work."""
 
     def run(*arguments, stdin=""):
-        from gdtool.commands._group import cli
         from gdtool.commands._common import guarded
+        from gdtool.commands._group import cli
 
         out, err = io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True), io.StringIO()
         before = signal.getsignal(signal.SIGTERM)

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 _CURE = "export it again, or without Draco compression"
 
 
-def read_draco(file: GltfFile, packed: DracoPrimitive, primitive: Primitive, subject: str) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def read_draco(
+    file: GltfFile, packed: DracoPrimitive, primitive: Primitive, subject: str
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Attributes (count, ...) float64 by name and triangle indices (3f,) of a compressed primitive.
 
     Raises InputError for a stream that does not decode or lacks what the file promises; ResourceError without DracoPy.
@@ -24,23 +26,33 @@ def read_draco(file: GltfFile, packed: DracoPrimitive, primitive: Primitive, sub
     try:
         import DracoPy
     except ImportError:
-        raise ResourceError(file.path, "is compressed with Draco, which needs the package DracoPy", "pip install DracoPy") from None
+        raise ResourceError(
+            file.path, "is compressed with Draco, which needs the package DracoPy", "pip install DracoPy"
+        ) from None
     content = bytes(file.view(packed.buffer_view))
     for index in (primitive.attributes["POSITION"], *([primitive.indices] if primitive.indices is not None else [])):
-        file.check_memory(file.item(file.document.accessors, index, "accessor").count * 48, subject, "export it with fewer faces")
+        file.check_memory(
+            file.item(file.document.accessors, index, "accessor").count * 48, subject, "export it with fewer faces"
+        )
     try:
         mesh = DracoPy.decode(content)
         stored = {item["unique_id"]: np.asarray(item["data"]) for item in mesh.attributes}
         indices = np.asarray(mesh.faces).reshape(-1).astype(np.int64)
     except Exception as error:  # the binding raises types of its own and bare ones
-        raise file.refuse(f"{subject}: its Draco stream does not decode ({str(error)[:80] or type(error).__name__})", _CURE) from None
+        raise file.refuse(
+            f"{subject}: its Draco stream does not decode ({str(error)[:80] or type(error).__name__})", _CURE
+        ) from None
     out = {}
     for name, identity in packed.attributes.items():
         if name.startswith("_"):
             continue
         if identity not in stored:
             raise file.refuse(f"{subject}: its Draco stream holds no {name}", _CURE)
-        record = file.item(file.document.accessors, primitive.attributes[name], "accessor") if name in primitive.attributes else None
+        record = (
+            file.item(file.document.accessors, primitive.attributes[name], "accessor")
+            if name in primitive.attributes
+            else None
+        )
         array = stored[identity]
         array = array.reshape(len(array), -1)
         whole = array.dtype.kind in "iu" and (name.startswith("COLOR_") or (record is not None and record.normalized))

@@ -20,12 +20,21 @@ from gdtool.core.names import shown, uri_path
 from gdtool.core.reading import bytes_of, require_regular_file
 
 SUPPORTED = {
-    "EXT_meshopt_compression", "EXT_texture_webp", "KHR_draco_mesh_compression", "KHR_materials_emissive_strength", "KHR_materials_ior",
-    "KHR_materials_pbrSpecularGlossiness", "KHR_materials_specular", "KHR_materials_unlit", "KHR_mesh_quantization", "KHR_texture_transform",
+    "EXT_meshopt_compression",
+    "EXT_texture_webp",
+    "KHR_draco_mesh_compression",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_ior",
+    "KHR_materials_pbrSpecularGlossiness",
+    "KHR_materials_specular",
+    "KHR_materials_unlit",
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
 }
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _SHAPES = {"SCALAR": (), "VEC2": (2,), "VEC3": (3,), "VEC4": (4,), "MAT2": (2, 2), "MAT3": (3, 3), "MAT4": (4, 4)}
-# Bytes of one object of the JSON once it is decoded, with what is made of a node: a node of three characters takes this much.
+# Bytes of one object of the JSON once it is decoded, with what is made of a node: a node of three characters takes this
+# much.
 _OBJECT_BYTES = 600
 
 EXPORT = "export it again as glTF 2.0"
@@ -36,9 +45,8 @@ SIMPLIFY = "export it with fewer faces or fewer instances"
 class GltfFile:
     """An opened .glb or .gltf: its decoded document, and bytes and accessors on demand.
 
-    Buffers, buffer views and the chunks of a GLB are views of what was read, not copies. Raises InputError for whatever the
-    specification forbids and is looked at, ResourceError for what would take more memory than one input may.
-    """
+    Buffers, buffer views and the chunks of a GLB are views of what was read, not copies. Raises InputError for whatever
+    the specification forbids and is looked at, ResourceError for what would take more memory than one input may."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -54,7 +62,11 @@ class GltfFile:
         self._unpacked = 0  # bytes of decompressed buffer views
         for name in self.document.extensions_required:
             if name not in SUPPORTED:
-                raise InputError(path, f"requires the extension {printed(name)}, which gdtool does not know", "export it without that extension")
+                raise InputError(
+                    path,
+                    f"requires the extension {printed(name)}, which gdtool does not know",
+                    "export it without that extension",
+                )
         ignored = sorted(set(self.document.extensions_used) - SUPPORTED)
         self.notes += [f"extension {printed(name)} is ignored" for name in ignored]
 
@@ -85,7 +97,7 @@ class GltfFile:
             size, kind = struct.unpack_from("<I4s", content, at)
             if at + 8 + size > length:
                 raise self.refuse(f"has a chunk of {size} bytes that reaches past its end", COPY)
-            chunks.append((kind, memoryview(content)[at + 8:at + 8 + size]))
+            chunks.append((kind, memoryview(content)[at + 8 : at + 8 + size]))
             at += 8 + size
         if not chunks or chunks[0][0] != b"JSON":
             raise self.refuse("does not begin with a JSON chunk", EXPORT)
@@ -106,21 +118,29 @@ class GltfFile:
         return document
 
     def resolve(self, uri: str, what: str) -> bytes | Path:
-        """Bytes of a data: URI, or the path of the regular file that a relative one names, within the folder of this file.
+        """Bytes of a data: URI, or the path of the regular file that a relative one names, within the folder of this
+        file.
 
-        Percent-encoded characters are decoded first and links followed; what leads outside is refused. Raises InputError.
-        """
+        Percent-encoded characters are decoded first and links followed; what leads outside is refused. Raises
+        InputError."""
         if uri[:5].lower() == "data:":
             head, comma, body = uri[5:].partition(",")
             if not comma:
                 raise self.refuse(f"{what} has a data: URI without data", EXPORT)
             try:
-                return base64.b64decode(unquote(body), validate=True) if head.lower().endswith(";base64") else unquote_to_bytes(body)
+                return (
+                    base64.b64decode(unquote(body), validate=True)
+                    if head.lower().endswith(";base64")
+                    else unquote_to_bytes(body)
+                )
             except (binascii.Error, ValueError):
                 raise self.refuse(f"{what} has a data: URI that is not base64", EXPORT) from None
         path = uri_path(self.path.parent, uri, self.path, f"the URI of {what}")
         if not path.exists():
-            raise self.refuse(f"{what} is in {shown(uri)}, which does not exist", "put that file beside the model or embed it in a .glb")
+            raise self.refuse(
+                f"{what} is in {shown(uri)}, which does not exist",
+                "put that file beside the model or embed it in a .glb",
+            )
         require_regular_file(path)
         return path
 
@@ -137,8 +157,10 @@ class GltfFile:
             else:
                 raise self.refuse(f"buffer {index} has no URI and the file no binary chunk for it", EXPORT)
             if len(content) < record.byte_length:
-                raise self.refuse(f"buffer {index} has {len(content)} bytes, not the {record.byte_length} it says", COPY)
-            self._buffers[index] = memoryview(content)[:record.byte_length]
+                raise self.refuse(
+                    f"buffer {index} has {len(content)} bytes, not the {record.byte_length} it says", COPY
+                )
+            self._buffers[index] = memoryview(content)[: record.byte_length]
         return self._buffers[index]
 
     def _read_buffer(self, path: Path, length: int, index: int) -> bytes:
@@ -163,20 +185,26 @@ class GltfFile:
                 self.check_memory(self._unpacked, f"decompressing buffer view {index} and those before it", SIMPLIFY)
                 self._views[index] = memoryview(decode_view(bytes(source), packed, self.path))
             else:
-                self._views[index] = self._slice(self.buffer(record.buffer), record.byte_offset, record.byte_length, index)
+                self._views[index] = self._slice(
+                    self.buffer(record.buffer), record.byte_offset, record.byte_length, index
+                )
         return self._views[index]
 
     def _slice(self, content: memoryview, offset: int, length: int, index: int) -> memoryview:
         if offset + length > len(content):
-            raise self.refuse(f"buffer view {index} reaches past the end of its buffer ({offset + length} of {len(content)} bytes)", EXPORT)
-        return content[offset:offset + length]
+            raise self.refuse(
+                f"buffer view {index} reaches past the end of its buffer ({offset + length} of {len(content)} bytes)",
+                EXPORT,
+            )
+        return content[offset : offset + length]
 
     def check_memory(self, size: int, what: str, cure: str) -> None:
         """ResourceError when size bytes are more than one input may take."""
         require_memory(size, self.path, what, cure)
 
     def accessor(self, index: int) -> tuple[np.ndarray, Accessor]:
-        """The stored numbers of an accessor, (count, ...) in their own type with sparse values set in, and its record."""
+        """The stored numbers of an accessor, (count, ...) in their own type with sparse values set in, and its
+        record."""
         record: Accessor = self.item(self.document.accessors, index, "accessor")
         dtype, shape = np.dtype(_DTYPES[record.component_type]), _SHAPES[record.type]
         self.check_memory(record.count * dtype.itemsize * int(np.prod(shape)), f"accessor {index}", SIMPLIFY)
@@ -191,7 +219,16 @@ class GltfFile:
             out = self._overridden(out, record.sparse, index)
         return out, record
 
-    def _strided(self, view: int, offset: int, stride: int | None, count: int, dtype: np.dtype, shape: tuple[int, ...], index: int) -> np.ndarray:
+    def _strided(
+        self,
+        view: int,
+        offset: int,
+        stride: int | None,
+        count: int,
+        dtype: np.dtype,
+        shape: tuple[int, ...],
+        index: int,
+    ) -> np.ndarray:
         content = self.view(view)
         rows = shape[0] if len(shape) == 2 else 1
         # columns of matrices begin at multiples of four bytes (specification, section 3.6.2.4)
@@ -202,8 +239,11 @@ class GltfFile:
         if stride < size:
             raise self.refuse(f"accessor {index} has elements of {size} bytes, {stride} apart", EXPORT)
         if offset + stride * (count - 1) + size > len(content):
-            raise self.refuse(f"accessor {index} reaches past the end of its buffer view "
-                              f"({offset + stride * (count - 1) + size} of {len(content)} bytes)", EXPORT)
+            raise self.refuse(
+                f"accessor {index} reaches past the end of its buffer view "
+                f"({offset + stride * (count - 1) + size} of {len(content)} bytes)",
+                EXPORT,
+            )
         inner = (column_stride, dtype.itemsize) if rows > 1 else (dtype.itemsize,) * len(shape)
         return np.ndarray((count, *shape), dtype, content, offset, (stride, *inner))
 
@@ -211,8 +251,12 @@ class GltfFile:
         if sparse.count > len(base):
             raise self.refuse(f"accessor {index} overrides {sparse.count} of its {len(base)} elements", EXPORT)
         dtype = np.dtype(_DTYPES[sparse.indices.component_type])
-        where = self._strided(sparse.indices.buffer_view, sparse.indices.byte_offset, None, sparse.count, dtype, (), index).astype(np.int64)
-        values = self._strided(sparse.values.buffer_view, sparse.values.byte_offset, None, sparse.count, base.dtype, base.shape[1:], index)
+        where = self._strided(
+            sparse.indices.buffer_view, sparse.indices.byte_offset, None, sparse.count, dtype, (), index
+        ).astype(np.int64)
+        values = self._strided(
+            sparse.values.buffer_view, sparse.values.byte_offset, None, sparse.count, base.dtype, base.shape[1:], index
+        )
         if where.max() >= len(base) or (np.diff(where) <= 0).any():
             raise self.refuse(f"accessor {index} has sparse indices out of range or order", EXPORT)
         out = base.copy()

@@ -14,9 +14,11 @@ MAX_ELEMENTS = 2**31 - 1  # vertices or faces of a Scene, whose indices are int3
 _VERTEX_BYTES = {"POSITION": 24, "NORMAL": 24, "TANGENT": 32, "COLOR_0": 32}
 _UV_BYTES = 16
 _FACE_BYTES = 24  # of one face in its part: int64 corners
-_JOINED_FACE_BYTES = 24 + 24 + 12 + 12  # moved to the whole, put together and made int32, with the index of its material
+# Moved to the whole, put together and made int32, with the index of its material.
+_JOINED_FACE_BYTES = 24 + 24 + 12 + 12
 _PART_BYTES = 4096  # of one primitive under one node: its Python objects and array headers
-# While one primitive is read and placed: each component as stored and as float64, a delta of a morph target, and the results of the transform.
+# While one primitive is read and placed: each component as stored and as float64, a delta of a morph target, and the
+# results of the transform.
 _COMPONENT_BYTES = 32
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _SKIN_BYTES = 6 * 128  # of one vertex's (4, 4) float64 matrix and those it is blended, divided and applied through
@@ -25,7 +27,8 @@ _CORNER_BYTES = 64  # of one index: int64, and what np.unique sorts and returns
 
 @dataclass(frozen=True)
 class Geometry:
-    """vertices and faces of all instances together, and the bytes that read_gltf takes to make them, its copies included."""
+    """vertices and faces of all instances together, and the bytes that read_gltf takes to make them, its copies
+    included."""
 
     parts: int
     vertices: int
@@ -34,7 +37,8 @@ class Geometry:
 
 
 def check_geometry(file: GltfFile, visible: list[int]) -> None:
-    """Raise ResourceError, with the prediction, when the meshes of the visible nodes would take more memory than one input may.
+    """Raise ResourceError, with the prediction, when the meshes of the visible nodes would take more memory than one
+    input may.
 
     So do more than MAX_ELEMENTS vertices or faces.
     """
@@ -46,7 +50,8 @@ def check_geometry(file: GltfFile, visible: list[int]) -> None:
 
 
 def predicted_geometry(file: GltfFile, visible: list[int]) -> Geometry:
-    """What the meshes of the visible nodes expand to; no buffer is read. Raises InputError for references that lead nowhere."""
+    """What the meshes of the visible nodes expand to; no buffer is read. Raises InputError for references that lead
+    nowhere."""
     parts = vertices = faces = kept = most = 0
     flat_corners = 0
     names: set[str] = set()
@@ -77,7 +82,8 @@ def predicted_geometry(file: GltfFile, visible: list[int]) -> Geometry:
 
 @dataclass(frozen=True)
 class _Need:
-    """One primitive: its size, the attributes that are kept, the bytes held of it, and those that pass while it is read."""
+    """One primitive: its size, the attributes that are kept, the bytes held of it, and those that pass while it is
+    read."""
 
     vertices: int
     faces: int
@@ -91,15 +97,25 @@ def _need(file: GltfFile, primitive: Primitive) -> _Need | None:
     """None for points, lines and what has no positions."""
     if primitive.mode < 4 or "POSITION" not in primitive.attributes:
         return None
-    records = {name: file.item(file.document.accessors, index, "accessor") for name, index in primitive.attributes.items()}
+    records = {
+        name: file.item(file.document.accessors, index, "accessor") for name, index in primitive.attributes.items()
+    }
     count = records["POSITION"].count
-    corners = count if primitive.indices is None else file.item(file.document.accessors, primitive.indices, "accessor").count
+    corners = (
+        count if primitive.indices is None else file.item(file.document.accessors, primitive.indices, "accessor").count
+    )
     faces = corners // 3 if primitive.mode == 4 else max(corners - 2, 0)
     names = frozenset(name for name in records if _width(name))
     vertices = min(count, 3 * faces)
     components = sum(_COMPONENTS[record.type] for name, record in records.items() if not name.startswith("_"))
-    return _Need(vertices, faces, names, vertices * sum(_width(name) for name in names),
-                 count * components * _COMPONENT_BYTES + corners * _CORNER_BYTES, count * _SKIN_BYTES)
+    return _Need(
+        vertices,
+        faces,
+        names,
+        vertices * sum(_width(name) for name in names),
+        count * components * _COMPONENT_BYTES + corners * _CORNER_BYTES,
+        count * _SKIN_BYTES,
+    )
 
 
 def _width(name: str) -> int:

@@ -13,7 +13,8 @@ from gdtool.assets.scene import Material, Texture
 
 _WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _DIELECTRIC_F0 = 0.04
-# Of one pixel of a converted material: two maps of up to four 16-bit channels at the common size, each through a row copy, and 4 + 3 bytes out.
+# Of one pixel of a converted material: two maps of up to four 16-bit channels at the common size, each through a row
+# copy, and 4 + 3 bytes out.
 _CONVERTED_BYTES = 2 * 2 * 8 + 7
 
 
@@ -29,12 +30,20 @@ class MaterialReader:
         """Material `index` of the file, specular-glossiness converted to metallic-roughness."""
         record: MaterialRecord = self.file.item(self.file.document.materials, index, "material")
         extensions, surface = record.extensions, record.pbr_metallic_roughness
-        strength = extensions.KHR_materials_emissive_strength.emissive_strength if extensions.KHR_materials_emissive_strength else 1.0
+        strength = (
+            extensions.KHR_materials_emissive_strength.emissive_strength
+            if extensions.KHR_materials_emissive_strength
+            else 1.0
+        )
         emissive = tuple(max(0.0, x) * strength for x in record.emissive_factor)
         if not np.isfinite(emissive).all():
             raise self.file.refuse(f"material {index}: its emission is not finite", "lower its emissive strength")
         specular = extensions.KHR_materials_specular
-        if specular and (specular.specular_texture or specular.specular_color_texture or specular.specular_color_factor != (1.0, 1.0, 1.0)):
+        if specular and (
+            specular.specular_texture
+            or specular.specular_color_texture
+            or specular.specular_color_factor != (1.0, 1.0, 1.0)
+        ):
             self.file.notes.append(f"material {index}: specular colour and textures are ignored")
         out = Material(
             name=record.name or f"material_{index}",
@@ -69,17 +78,30 @@ class MaterialReader:
         if record.extensions.EXT_texture_webp is not None:
             source = record.extensions.EXT_texture_webp.source
         if source is None:
-            other = "KHR_texture_basisu, which gdtool does not read" if record.extensions.KHR_texture_basisu else "no image that gdtool knows"
+            other = (
+                "KHR_texture_basisu, which gdtool does not read"
+                if record.extensions.KHR_texture_basisu
+                else "no image that gdtool knows"
+            )
             raise self.file.refuse(f"texture {info.index} has {other}", "export it with PNG or JPEG textures")
         transform = info.extensions.KHR_texture_transform
         out = Texture(self._image(source), encoding, info.tex_coord)
         if transform is not None:
-            out = replace(out, offset=transform.offset, rotation=transform.rotation, scale=transform.scale,
-                          uv_set=info.tex_coord if transform.tex_coord is None else transform.tex_coord)
+            out = replace(
+                out,
+                offset=transform.offset,
+                rotation=transform.rotation,
+                scale=transform.scale,
+                uv_set=info.tex_coord if transform.tex_coord is None else transform.tex_coord,
+            )
         if record.sampler is not None:
             sampler = self.file.item(self.file.document.samplers, record.sampler, "sampler")
-            out = replace(out, wrap_u=_WRAPS[sampler.wrap_s], wrap_v=_WRAPS[sampler.wrap_t],
-                          filter="nearest" if sampler.mag_filter == 9728 else "linear")
+            out = replace(
+                out,
+                wrap_u=_WRAPS[sampler.wrap_s],
+                wrap_v=_WRAPS[sampler.wrap_t],
+                filter="nearest" if sampler.mag_filter == 9728 else "linear",
+            )
         return out
 
     def _image(self, index: int) -> np.ndarray:
@@ -110,26 +132,44 @@ class MaterialReader:
         diffuse_texture = self._texture(record.diffuse_texture, "srgb")
         specular_texture = self._texture(record.specular_glossiness_texture, "srgb")
         if specular_texture is None:
-            specular, metallic_of = np.array(record.specular_factor), _metallic(np.array(record.diffuse_factor[:3]), np.array(record.specular_factor))
+            specular, metallic_of = (
+                np.array(record.specular_factor),
+                _metallic(np.array(record.diffuse_factor[:3]), np.array(record.specular_factor)),
+            )
             if diffuse_texture is None or metallic_of == 0:
                 base = _base_color(np.array(record.diffuse_factor[:3]), specular, metallic_of)
-                return replace(material, base_color=_unit((*base, record.diffuse_factor[3])), metallic=float(metallic_of),
-                               roughness=_unit((1 - record.glossiness_factor,))[0], base_color_texture=diffuse_texture,
-                               metallic_roughness_texture=None)
+                return replace(
+                    material,
+                    base_color=_unit((*base, record.diffuse_factor[3])),
+                    metallic=float(metallic_of),
+                    roughness=_unit((1 - record.glossiness_factor,))[0],
+                    base_color_texture=diffuse_texture,
+                    metallic_roughness_texture=None,
+                )
         return self._converted_maps(material, record, diffuse_texture, specular_texture, index)
 
-    def _converted_maps(self, material: Material, record: SpecularGlossiness, diffuse_texture: Texture | None,
-                        specular_texture: Texture | None, index: int) -> Material:
+    def _converted_maps(
+        self,
+        material: Material,
+        record: SpecularGlossiness,
+        diffuse_texture: Texture | None,
+        specular_texture: Texture | None,
+        index: int,
+    ) -> Material:
         from gdtool.images.color import linear_from_srgb, rgba, srgb_from_linear
         from gdtool.images.io import quantized
 
         given = [t for t in (diffuse_texture, specular_texture) if t is not None]
         if len({_lookup(t) for t in given}) > 1:
-            raise self.file.refuse(f"material {index} is specular-glossiness with two different texture lookups, which gdtool cannot convert",
-                                   "export it as metallic-roughness")
+            raise self.file.refuse(
+                f"material {index} is specular-glossiness with two different texture lookups, which gdtool cannot convert",
+                "export it as metallic-roughness",
+            )
         height, width = max(t.image.shape[0] for t in given), max(t.image.shape[1] for t in given)
         size = height * width * _CONVERTED_BYTES
-        self.file.check_memory(size, f"converting material {index} at {width}x{height} pixels", "export it as metallic-roughness")
+        self.file.check_memory(
+            size, f"converting material {index} at {width}x{height} pixels", "export it as metallic-roughness"
+        )
 
         def pixels(texture: Texture | None) -> np.ndarray:
             image = np.full((1, 1, 4), 255, np.uint8) if texture is None else texture.image
@@ -151,9 +191,14 @@ class MaterialReader:
             base = np.clip(_base_color(d[..., :3], g[..., :3], metallic[..., None]), 0, 1)
             encoded[rows] = quantized(np.concatenate([srgb_from_linear(base), d[..., 3:]], -1))
             surface[rows] = quantized(np.stack([np.ones_like(metallic), 1 - g[..., 3], metallic], -1))
-        return replace(material, base_color=(1.0, 1.0, 1.0, 1.0), metallic=1.0, roughness=1.0,
-                       base_color_texture=replace(given[0], image=encoded, encoding="srgb"),
-                       metallic_roughness_texture=replace(given[0], image=surface, encoding="linear"))
+        return replace(
+            material,
+            base_color=(1.0, 1.0, 1.0, 1.0),
+            metallic=1.0,
+            roughness=1.0,
+            base_color_texture=replace(given[0], image=encoded, encoding="srgb"),
+            metallic_roughness_texture=replace(given[0], image=surface, encoding="linear"),
+        )
 
 
 def _lookup(texture: Texture) -> tuple:
@@ -172,8 +217,8 @@ def _brightness(color: np.ndarray) -> np.ndarray:
 def _metallic(diffuse: np.ndarray, specular: np.ndarray) -> np.ndarray:
     """Metallic (...) for which base color b satisfies both models' brightness.
 
-    Of d (1 - max s) = b (1 - m)(1 - 0.04) and s = 0.04 (1 - m) + b m, b eliminated: a quadratic in m, its root in [0, 1].
-    """
+    Of d (1 - max s) = b (1 - m)(1 - 0.04) and s = 0.04 (1 - m) + b m, b eliminated: a quadratic in m, its root in [0,
+    1]."""
     f0, d, s = _DIELECTRIC_F0, _brightness(diffuse), _brightness(specular)
     kept = d * (1 - specular.max(-1)) / (1 - f0)
     # f0 m² + (kept - 2 f0 + s) m + (f0 - s) = 0, from s (1 - m) = f0 (1 - m)² + kept m
@@ -189,5 +234,3 @@ def _base_color(diffuse: np.ndarray, specular: np.ndarray, metallic: np.ndarray)
     from_specular = (specular - _DIELECTRIC_F0 * (1 - metallic)) / np.maximum(metallic, 1e-4)
     weight = metallic * metallic
     return np.clip(from_diffuse, 0, 1) * (1 - weight) + np.clip(from_specular, 0, 1) * weight
-
-

@@ -34,7 +34,11 @@ class Part:
     @property
     def nbytes(self) -> int:
         """Bytes of all its arrays."""
-        return sum(a.nbytes for a in (self.vertices, self.faces, self.normals, self.tangents, self.colors, *self.uvs) if a is not None)
+        return sum(
+            a.nbytes
+            for a in (self.vertices, self.faces, self.normals, self.tangents, self.colors, *self.uvs)
+            if a is not None
+        )
 
 
 def read_gltf(path: str | Path) -> Scene:
@@ -42,9 +46,8 @@ def read_gltf(path: str | Path) -> Scene:
 
     Skins stand as their joints do without animation; morph targets at their default weights. Strips and fans become
     triangles, points and lines are left out (and noted). A primitive without a material gets DEFAULT_MATERIAL.
-    Raises InputError naming the file and the fault, required extensions that are not known by name; ResourceError with the
-    prediction, before any geometry is decoded, where all of it would take more memory than one input may.
-    """
+    Raises InputError naming the file and the fault, required extensions that are not known by name; ResourceError with
+    the prediction, before any geometry is decoded, where all of it would take more memory than one input may."""
     file = GltfFile(Path(path))
     parts: list[Part] = []
     held = 0
@@ -63,7 +66,8 @@ def read_gltf(path: str | Path) -> Scene:
                 matrices = _joint_matrices(file, node, worlds, primitive, len(part.vertices), subject)
                 parts.append(_compact(_placed(part, worlds[index] if matrices is None else matrices)))
                 held += parts[-1].nbytes
-                file.check_memory(held, f"{subject} and the geometry before it", SIMPLIFY)  # Draco streams may hold more than is said
+                # Draco streams may hold more than is said.
+                file.check_memory(held, f"{subject} and the geometry before it", SIMPLIFY)
     if not parts:
         raise file.refuse("has no faces", "export the model with its meshes")
     return _joined(file, parts)
@@ -81,7 +85,9 @@ def _visible(file: GltfFile) -> list[int]:
     while stack:
         index = stack.pop()
         if index in seen:
-            raise file.refuse(f"its scene shows node {index} twice", "name each root node once in the scene, and no child")
+            raise file.refuse(
+                f"its scene shows node {index} twice", "name each root node once in the scene, and no child"
+            )
         seen.add(index)
         out.append(index)
         stack += reversed(file.item(document.nodes, index, "node").children)
@@ -122,12 +128,17 @@ def _local_matrix(file: GltfFile, node: Node, index: int) -> np.ndarray:
     x, y, z, w = node.rotation
     length = np.sqrt(x * x + y * y + z * z + w * w)
     if not 0.9 < length < 1.1:
-        raise file.refuse(f"node {index} has a rotation that is not a unit quaternion (length {length:.3g})", "reset the rotation of that node")
+        raise file.refuse(
+            f"node {index} has a rotation that is not a unit quaternion (length {length:.3g})",
+            "reset the rotation of that node",
+        )
     x, y, z, w = x / length, y / length, z / length, w / length
     out = np.eye(4)
-    out[:3, :3] = [[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                   [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                   [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]
+    out[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
     out[:3, :3] *= node.scale
     out[:3, 3] = node.translation
     return out
@@ -147,8 +158,11 @@ def _read_primitive(file: GltfFile, primitive: Primitive, weights: tuple[float, 
 
         attributes, indices = read_draco(file, packed, primitive, subject)
     else:
-        attributes = {name: file.floats(index, always_normalized=name.startswith("COLOR_"))
-                      for name, index in primitive.attributes.items() if not name.startswith("_")}
+        attributes = {
+            name: file.floats(index, always_normalized=name.startswith("COLOR_"))
+            for name, index in primitive.attributes.items()
+            if not name.startswith("_")
+        }
         indices = None
         if primitive.indices is not None:
             stored, record = file.accessor(primitive.indices)
@@ -156,7 +170,12 @@ def _read_primitive(file: GltfFile, primitive: Primitive, weights: tuple[float, 
                 raise file.refuse(f"{subject}: its indices are not unsigned integers", EXPORT)
             indices = stored.astype(np.int64)
     count = len(attributes["POSITION"])
-    for name, width in (("POSITION", 3), ("NORMAL", 3), ("TANGENT", 4), *((n, 2) for n in attributes if n.startswith("TEXCOORD_"))):
+    for name, width in (
+        ("POSITION", 3),
+        ("NORMAL", 3),
+        ("TANGENT", 4),
+        *((n, 2) for n in attributes if n.startswith("TEXCOORD_")),
+    ):
         if name in attributes and attributes[name].shape[1:] != (width,):
             raise file.refuse(f"{subject}: {printed(name)} is not a vector of {width}", EXPORT)
     for name, array in attributes.items():
@@ -164,7 +183,10 @@ def _read_primitive(file: GltfFile, primitive: Primitive, weights: tuple[float, 
             raise file.refuse(f"{subject}: {printed(name)} has {len(array)} elements, POSITION {count}", EXPORT)
     _add_targets(file, primitive, weights, attributes, subject)
     if not np.isfinite(attributes["POSITION"]).all():
-        raise file.refuse(f"{subject}: vertex {int(np.argwhere(~np.isfinite(attributes['POSITION']))[0][0])} is not finite", "remove that vertex or move it to a finite place")
+        raise file.refuse(
+            f"{subject}: vertex {int(np.argwhere(~np.isfinite(attributes['POSITION']))[0][0])} is not finite",
+            "remove that vertex or move it to a finite place",
+        )
     if indices is None:
         indices = np.arange(count)
     if len(indices) and indices.max() >= count:
@@ -174,13 +196,19 @@ def _read_primitive(file: GltfFile, primitive: Primitive, weights: tuple[float, 
         file.notes.append(f"{subject}: has no faces")
         return None
     sets = [int(name[9:]) for name in attributes if _UV_SET.fullmatch(name)]
-    uvs = tuple(attributes.get(f"TEXCOORD_{i}") for i in range(max(sets, default=-1) + 1 if max(sets, default=0) < 32 else 0))
+    uvs = tuple(
+        attributes.get(f"TEXCOORD_{i}") for i in range(max(sets, default=-1) + 1 if max(sets, default=0) < 32 else 0)
+    )
     colors = attributes.get("COLOR_0")
     if colors is not None:
         if colors.shape[1:] not in ((3,), (4,)):
             raise file.refuse(f"{subject}: COLOR_0 is neither RGB nor RGBA", EXPORT)
         colors = np.concatenate([colors[:, :3], colors[:, 3:] if colors.shape[1] == 4 else np.ones((count, 1))], 1)
-    for name, arrays in (("a texture coordinate", uvs), ("a vertex color", (colors,)), ("a normal", (attributes.get("NORMAL"),))):
+    for name, arrays in (
+        ("a texture coordinate", uvs),
+        ("a vertex color", (colors,)),
+        ("a normal", (attributes.get("NORMAL"),)),
+    ):
         if any(a is not None and not np.isfinite(a).all() for a in arrays):
             raise file.refuse(f"{subject}: {name} is not finite", "export it without that attribute")
     tangents = attributes.get("TANGENT")
@@ -190,20 +218,24 @@ def _read_primitive(file: GltfFile, primitive: Primitive, weights: tuple[float, 
     return Part(attributes["POSITION"], faces, primitive.material, attributes.get("NORMAL"), tangents, uvs, colors)
 
 
-def _add_targets(file: GltfFile, primitive: Primitive, weights: tuple[float, ...], attributes: dict[str, np.ndarray], subject: str) -> None:
+def _add_targets(
+    file: GltfFile, primitive: Primitive, weights: tuple[float, ...], attributes: dict[str, np.ndarray], subject: str
+) -> None:
     for weight, target in zip(weights, primitive.targets, strict=False):
         for name in ("POSITION", "NORMAL"):
             if weight and name in target and name in attributes:
                 delta = file.floats(target[name])
                 if delta.shape != attributes[name].shape:
-                    raise file.refuse(f"{subject}: a morph target's {name} has another shape", "export it without morph targets")
+                    raise file.refuse(
+                        f"{subject}: a morph target's {name} has another shape", "export it without morph targets"
+                    )
                 attributes[name] = attributes[name] + weight * delta
 
 
 def _triangles(indices: np.ndarray, mode: int) -> np.ndarray:
     """(f, 3) from a list (4), strip (5) or fan (6); specification, section 3.7.2.1. Incomplete ends are dropped."""
     if mode == 4:
-        return indices[:len(indices) // 3 * 3].reshape(-1, 3)
+        return indices[: len(indices) // 3 * 3].reshape(-1, 3)
     if len(indices) < 3:
         return np.zeros((0, 3), np.int64)
     i = np.arange(len(indices) - 2)
@@ -212,7 +244,9 @@ def _triangles(indices: np.ndarray, mode: int) -> np.ndarray:
     return faces[~repeats(faces)]  # strips join by empty triangles
 
 
-def _joint_matrices(file: GltfFile, node: Node, worlds: list[np.ndarray], primitive: Primitive, count: int, subject: str) -> np.ndarray | None:
+def _joint_matrices(
+    file: GltfFile, node: Node, worlds: list[np.ndarray], primitive: Primitive, count: int, subject: str
+) -> np.ndarray | None:
     """(v, 4, 4) world_from_vertex of a skinned primitive, None for a rigid one (specification, section 3.7.3)."""
     if node.skin is None or "JOINTS_0" not in primitive.attributes or "WEIGHTS_0" not in primitive.attributes:
         return None
@@ -224,15 +258,22 @@ def _joint_matrices(file: GltfFile, node: Node, worlds: list[np.ndarray], primit
     if skin.inverse_bind_matrices is not None:
         inverse = file.floats(skin.inverse_bind_matrices)
         if inverse.shape[1:] != (4, 4) or len(inverse) < len(joints):
-            raise file.refuse(f"skin {node.skin} has {len(inverse)} inverse bind matrices for {len(joints)} joints", _UNSKINNED)
-        joints = joints @ inverse[:len(joints)].transpose(0, 2, 1)  # stored by columns
+            raise file.refuse(
+                f"skin {node.skin} has {len(inverse)} inverse bind matrices for {len(joints)} joints", _UNSKINNED
+            )
+        joints = joints @ inverse[: len(joints)].transpose(0, 2, 1)  # stored by columns
     out, total = np.zeros((count, 4, 4)), np.zeros(count)
     for k in range(8):
         if f"JOINTS_{k}" not in primitive.attributes or f"WEIGHTS_{k}" not in primitive.attributes:
             break
         index, _ = file.accessor(primitive.attributes[f"JOINTS_{k}"])
         weight = file.floats(primitive.attributes[f"WEIGHTS_{k}"], always_normalized=True)
-        if index.shape != (count, 4) or weight.shape != (count, 4) or index.dtype.kind != "u" or not np.isfinite(weight).all():
+        if (
+            index.shape != (count, 4)
+            or weight.shape != (count, 4)
+            or index.dtype.kind != "u"
+            or not np.isfinite(weight).all()
+        ):
             raise file.refuse(f"{subject}: its joints and weights are not four a vertex", _UNSKINNED)
         if (index[weight > 0] >= len(joints)).any():
             raise file.refuse(f"{subject}: refers to a joint out of range (its skin has {len(joints)})", _UNSKINNED)
@@ -240,12 +281,16 @@ def _joint_matrices(file: GltfFile, node: Node, worlds: list[np.ndarray], primit
             out += weight[:, j, None, None] * joints[np.where(weight[:, j] > 0, index[:, j], 0)]
         total += weight.sum(1)
     if not (total > 0).all():
-        raise file.refuse(f"{subject}: a vertex has no skin weight", "normalize the weights of all its vertices, or export it without the skin")
+        raise file.refuse(
+            f"{subject}: a vertex has no skin weight",
+            "normalize the weights of all its vertices, or export it without the skin",
+        )
     return out / total[:, None, None]
 
 
 def _placed(part: Part, matrix: np.ndarray) -> Part:
     """The part under matrix (4, 4), or (v, 4, 4) one per vertex. A mirroring matrix turns the faces' winding."""
+
     def apply(linear: np.ndarray, vectors: np.ndarray) -> np.ndarray:
         return np.einsum("...ij,...j->...i", linear, vectors)
 
@@ -275,8 +320,15 @@ def _compact(part: Part) -> Part:
     def pick(array: np.ndarray | None) -> np.ndarray | None:
         return None if array is None else array[used]
 
-    return Part(part.vertices[used], faces.reshape(-1, 3), part.material, pick(part.normals), pick(part.tangents),
-                tuple(pick(uv) for uv in part.uvs), pick(part.colors))
+    return Part(
+        part.vertices[used],
+        faces.reshape(-1, 3),
+        part.material,
+        pick(part.normals),
+        pick(part.tangents),
+        tuple(pick(uv) for uv in part.uvs),
+        pick(part.colors),
+    )
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -301,20 +353,30 @@ def _joined(file: GltfFile, parts: list[Part]) -> Scene:
     for material in materials:
         for texture in (material.base_color_texture, material.metallic_roughness_texture, material.normal_texture):
             if texture is not None and texture.uv_set >= set_count:
-                raise file.refuse(f"material {material.name!r} looks up texture coordinates {texture.uv_set}, which no mesh has", "export it with that UV map")
+                raise file.refuse(
+                    f"material {material.name!r} looks up texture coordinates {texture.uv_set}, which no mesh has",
+                    "export it with that UV map",
+                )
     uvs = []
     for k in range(set_count):
         given = [part.uvs[k] if k < len(part.uvs) else None for part in parts]
-        uvs.append(None if all(uv is None for uv in given) else
-                   np.concatenate([np.zeros((n, 2)) if uv is None else uv for uv, n in zip(given, counts, strict=True)]))
+        uvs.append(
+            None
+            if all(uv is None for uv in given)
+            else np.concatenate([np.zeros((n, 2)) if uv is None else uv for uv, n in zip(given, counts, strict=True)])
+        )
     colors = None
     if any(part.colors is not None for part in parts):
-        colors = np.concatenate([np.ones((n, 4)) if p.colors is None else p.colors for p, n in zip(parts, counts, strict=True)])
+        colors = np.concatenate(
+            [np.ones((n, 4)) if p.colors is None else p.colors for p, n in zip(parts, counts, strict=True)]
+        )
     return Scene(
         vertices=np.concatenate([part.vertices for part in parts]),
         faces=np.concatenate([part.faces + offset for part, offset in zip(parts, first, strict=True)]).astype(np.int32),
         materials=tuple(materials),
-        material_idx=np.repeat([place[part.material] for part in parts], [len(part.faces) for part in parts]).astype(np.int32),
+        material_idx=np.repeat([place[part.material] for part in parts], [len(part.faces) for part in parts]).astype(
+            np.int32
+        ),
         normals=None if parts[0].normals is None else np.concatenate([part.normals for part in parts]),
         tangents=tangents,
         uvs=tuple(uvs),
@@ -333,14 +395,19 @@ def _flat(part: Part) -> Part:
     faces = np.arange(len(corner)).reshape(-1, 3)
     normals = np.repeat(face_normals(vertices, faces)[0], 3, axis=0)
     uvs = tuple(None if uv is None else uv[corner] for uv in part.uvs)
-    return Part(vertices, faces, part.material, normals, None, uvs, None if part.colors is None else part.colors[corner])
+    return Part(
+        vertices, faces, part.material, normals, None, uvs, None if part.colors is None else part.colors[corner]
+    )
 
 
 def _common_tangents(file: GltfFile, parts: list[Part], materials: list[Material]) -> np.ndarray | None:
     """(v, 4), or None where a part that needs tangents has none (they are computed then, for all alike)."""
     if all(part.tangents is None for part in parts):
         return None
-    if any(part.tangents is None and material.normal_texture is not None for part, material in zip(parts, materials, strict=True)):
+    if any(
+        part.tangents is None and material.normal_texture is not None
+        for part, material in zip(parts, materials, strict=True)
+    ):
         file.notes.append("tangents are only on some parts and are computed anew")
         return None
     out = []

@@ -1,8 +1,7 @@
 """The parts of a glTF 2.0 document that gdtool reads, as types to decode the JSON with.
 
-Field names and defaults are those of the specification (https://registry.khronos.org/glTF/specs/2.0, section 5), written
-in snake case; fields that are not listed are passed over.
-"""
+Field names and defaults are those of the specification (https://registry.khronos.org/glTF/specs/2.0, section 5),
+written in snake case; fields that are not listed are passed over."""
 
 from __future__ import annotations
 

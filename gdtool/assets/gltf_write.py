@@ -19,16 +19,17 @@ _FILTERS = {"linear": (9729, 9987), "nearest": (9728, 9984)}  # magnification; m
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 
-def write_glb(path: str | Path, scene: Scene, extras: dict[str, Any] | None = None, made: dict[int, str | bytes] | None = None) -> None:
+def write_glb(
+    path: str | Path, scene: Scene, extras: dict[str, Any] | None = None, made: dict[int, str | bytes] | None = None
+) -> None:
     """Write a .glb: one node, one mesh, a primitive per material in use; the same scene gives the same bytes.
 
     Every metallicFactor and roughnessFactor is written out (the format's default metal is 1). Textures whose Texture
     shares one image array become one embedded PNG, so that occlusion and metallic-roughness can be one file. Colour
-    textures are stored as sRGB and the others as linear, as the format demands. extras goes to asset.extras.
-    made: by id of an image array, its PNG where there is one already: the bytes, or the name of the file beside the .glb that
-    holds it, which is then referred to.
-    Tangents are written where the material has a normal map, MikkTSpace's where the scene has none. Raises OutputError, ResourceError beyond 4 GiB.
-    """
+    textures are stored as sRGB and the others as linear, as the format demands. extras goes to asset.extras. made: by
+    id of an image array, its PNG where there is one already: the bytes, or the name of the file beside the .glb that
+    holds it, which is then referred to. Tangents are written where the material has a normal map, MikkTSpace's where
+    the scene has none. Raises OutputError, ResourceError beyond 4 GiB."""
     content = glb_bytes(scene, extras, made)
     path = Path(path)
     try:
@@ -38,7 +39,9 @@ def write_glb(path: str | Path, scene: Scene, extras: dict[str, Any] | None = No
     except OSError as error:
         raise from_os_error(error, path) from None
     if not whole:
-        raise OutputError(path, "was not written whole (it reads back otherwise)", "free some space or choose another -o")
+        raise OutputError(
+            path, "was not written whole (it reads back otherwise)", "free some space or choose another -o"
+        )
 
 
 def glb_bytes(scene: Scene, extras: dict[str, Any] | None = None, made: dict[int, str | bytes] | None = None) -> bytes:
@@ -51,11 +54,13 @@ def glb_bytes(scene: Scene, extras: dict[str, Any] | None = None, made: dict[int
         material = scene.materials[index]
         faces = scene.faces[scene.material_idx == index]
         used, local, tangents = _split(scene, material, faces, uv_slots)
-        primitives.append({
-            "attributes": _attributes(document, scene, used, tangents, uv_slots),
-            "indices": document.accessor(local.reshape(-1), "SCALAR", _ELEMENT_ARRAY_BUFFER),
-            "material": document.unique("materials", _material(document, material, uv_slots)),
-        })
+        primitives.append(
+            {
+                "attributes": _attributes(document, scene, used, tangents, uv_slots),
+                "indices": document.accessor(local.reshape(-1), "SCALAR", _ELEMENT_ARRAY_BUFFER),
+                "material": document.unique("materials", _material(document, material, uv_slots)),
+            }
+        )
     document.json["meshes"] = [{"name": scene.name, "primitives": primitives}]
     document.json["nodes"] = [{"name": scene.name, "mesh": 0}]
     document.json["scenes"] = [{"nodes": [0]}]
@@ -79,8 +84,11 @@ def _check(scene: Scene) -> None:
             raise ValueError("uvs of the scene to write are not finite")
 
 
-def _split(scene: Scene, material: Material, faces: np.ndarray, uv_slots: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Vertices (n,) that one primitive uses, its corners as positions among them, and tangents (n, 4) where it needs them.
+def _split(
+    scene: Scene, material: Material, faces: np.ndarray, uv_slots: list[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Vertices (n,) that one primitive uses, its corners as positions among them, and tangents (n, 4) where it needs
+    them.
 
     A vertex stands more than once where its faces' tangents differ.
     """
@@ -94,7 +102,9 @@ def _split(scene: Scene, material: Material, faces: np.ndarray, uv_slots: list[i
         return used, local, None
     from gdtool.geometry.tangents import corner_tangents, weld
 
-    tangents = corner_tangents(scene.vertices, faces, normals, scene.uvs[material.normal_texture.uv_set], faces).reshape(-1, 4)
+    tangents = corner_tangents(
+        scene.vertices, faces, normals, scene.uvs[material.normal_texture.uv_set], faces
+    ).reshape(-1, 4)
     corner = faces.reshape(-1, 1)
     split = weld(corner // 4096, corner % 4096, tangents)  # weld compares float32, which holds no large index
     first = np.unique(split, return_index=True)[1]
@@ -102,19 +112,27 @@ def _split(scene: Scene, material: Material, faces: np.ndarray, uv_slots: list[i
     return used, split, _unit_tangents(tangents[first], normals[used])
 
 
-def _attributes(document: _Document, scene: Scene, used: np.ndarray, tangents: np.ndarray | None, uv_slots: list[int]) -> dict[str, int]:
-    out = {"POSITION": document.accessor(np.asarray(scene.vertices, np.float32)[used], "VEC3", _ARRAY_BUFFER, bounds=True)}
+def _attributes(
+    document: _Document, scene: Scene, used: np.ndarray, tangents: np.ndarray | None, uv_slots: list[int]
+) -> dict[str, int]:
+    out = {
+        "POSITION": document.accessor(np.asarray(scene.vertices, np.float32)[used], "VEC3", _ARRAY_BUFFER, bounds=True)
+    }
     if scene.normals is not None:
         normals = _unit_normals(scene)[used]
         out["NORMAL"] = document.accessor(normals.astype(np.float32), "VEC3", _ARRAY_BUFFER)
         if tangents is not None:
             out["TANGENT"] = document.accessor(tangents, "VEC4", _ARRAY_BUFFER)
     for slot, index in enumerate(uv_slots):
-        out[f"TEXCOORD_{slot}"] = document.accessor(np.asarray(scene.uvs[index], np.float32)[used], "VEC2", _ARRAY_BUFFER)
+        out[f"TEXCOORD_{slot}"] = document.accessor(
+            np.asarray(scene.uvs[index], np.float32)[used], "VEC2", _ARRAY_BUFFER
+        )
     if scene.colors is not None:
         colors = np.clip(scene.colors, 0, 1).astype(np.float32)
         opaque = scene.colors.shape[1] == 3 or bool((colors[:, 3] == 1).all())
-        out["COLOR_0"] = document.accessor(colors[used][:, :3] if opaque else colors[used], "VEC3" if opaque else "VEC4", _ARRAY_BUFFER)
+        out["COLOR_0"] = document.accessor(
+            colors[used][:, :3] if opaque else colors[used], "VEC3" if opaque else "VEC4", _ARRAY_BUFFER
+        )
     return out
 
 
@@ -132,7 +150,8 @@ def _unit_normals(scene: Scene) -> np.ndarray:
 
 
 def _unit_tangents(tangents: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(v, 4) float32: unit directions and w exactly 1 or -1; any direction across the normal where one has no length."""
+    """(v, 4) float32: unit directions and w exactly 1 or -1; any direction across the normal where one has no
+    length."""
     direction = tangents[:, :3].astype(np.float64)
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     across = np.cross(normals, np.where(np.abs(normals[:, :1]) < 0.9, (1.0, 0, 0), (0, 1.0, 0)))
@@ -157,7 +176,9 @@ def _material(document: _Document, material: Material, uv_slots: list[int]) -> d
         "name": material.name,
         "pbrMetallicRoughness": {k: v for k, v in surface.items() if v is not None},
         "normalTexture": info(material.normal_texture, "linear", **_unless_one("scale", material.normal_scale)),
-        "occlusionTexture": info(material.occlusion_texture, "linear", **_unless_one("strength", material.occlusion_strength)),
+        "occlusionTexture": info(
+            material.occlusion_texture, "linear", **_unless_one("strength", material.occlusion_strength)
+        ),
         "emissiveTexture": info(material.emissive_texture, "srgb"),
         "emissiveFactor": [float(x) / strength for x in material.emissive] if max(material.emissive) > 0 else None,
         "alphaMode": material.alpha_mode if material.alpha_mode != "OPAQUE" else None,
@@ -213,8 +234,12 @@ class _Document:
         if target == _ELEMENT_ARRAY_BUFFER:
             array = array.astype(np.uint16 if array.max() < 65535 else np.uint32)
         array = np.ascontiguousarray(array)
-        item: dict[str, Any] = {"bufferView": self.view(array.astype(array.dtype.newbyteorder("<")).tobytes(), target),
-                                "componentType": _COMPONENT[array.dtype.name], "count": len(array), "type": kind}
+        item: dict[str, Any] = {
+            "bufferView": self.view(array.astype(array.dtype.newbyteorder("<")).tobytes(), target),
+            "componentType": _COMPONENT[array.dtype.name],
+            "count": len(array),
+            "type": kind,
+        }
         if bounds:
             item |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
         return self._append("accessors", item)
@@ -222,13 +247,21 @@ class _Document:
     def texture(self, texture: Texture, encoding: str, uv_slots: list[int]) -> dict[str, Any]:
         """The textureInfo of a texture."""
         magnify, minify = _FILTERS[texture.filter]
-        sampler = self.unique("samplers", {"magFilter": magnify, "minFilter": minify,
-                                           "wrapS": _WRAP[texture.wrap_u], "wrapT": _WRAP[texture.wrap_v]})
-        info: dict[str, Any] = {"index": self.unique("textures", {"sampler": sampler, "source": self._image(texture, encoding)})}
+        sampler = self.unique(
+            "samplers",
+            {"magFilter": magnify, "minFilter": minify, "wrapS": _WRAP[texture.wrap_u], "wrapT": _WRAP[texture.wrap_v]},
+        )
+        info: dict[str, Any] = {
+            "index": self.unique("textures", {"sampler": sampler, "source": self._image(texture, encoding)})
+        }
         uv_set = uv_slots.index(texture.uv_set) if texture.uv_set in uv_slots else 0
         if uv_set:
             info["texCoord"] = uv_set
-        transform = {"offset": [float(x) for x in texture.offset], "rotation": float(texture.rotation), "scale": [float(x) for x in texture.scale]}
+        transform = {
+            "offset": [float(x) for x in texture.offset],
+            "rotation": float(texture.rotation),
+            "scale": [float(x) for x in texture.scale],
+        }
         if transform != {"offset": [0.0, 0.0], "rotation": 0.0, "scale": [1.0, 1.0]}:
             info["extensions"] = {"KHR_texture_transform": transform}
             self.extensions.add("KHR_texture_transform")
@@ -263,9 +296,20 @@ class _Document:
         text += b" " * (-len(text) % 4)
         total = 12 + 8 + len(text) + 8 + len(self.binary)
         if total >= 1 << 32:
-            raise ResourceError("asset.glb", f"would have {total >> 30} GiB, more than the format's 4", "use fewer faces or smaller maps")
-        return b"".join([struct.pack("<4sII", b"glTF", 2, total), struct.pack("<I4s", len(text), b"JSON"), text,
-                         struct.pack("<I4s", len(self.binary), b"BIN\0"), bytes(self.binary)])
+            raise ResourceError(
+                "asset.glb",
+                f"would have {total >> 30} GiB, more than the format's 4",
+                "use fewer faces or smaller maps",
+            )
+        return b"".join(
+            [
+                struct.pack("<4sII", b"glTF", 2, total),
+                struct.pack("<I4s", len(text), b"JSON"),
+                text,
+                struct.pack("<I4s", len(self.binary), b"BIN\0"),
+                bytes(self.binary),
+            ]
+        )
 
 
 def _encoded(image: np.ndarray, from_encoding: str, to_encoding: str) -> np.ndarray:

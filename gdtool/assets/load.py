@@ -15,8 +15,8 @@ from gdtool.geometry.vectors import cross, dot
 
 _CHUNK = 2**14  # faces at a time: what they need in between stays in the cache
 _MAX_SEED_DIGITS = 19  # of a 64-bit integer
-# Bytes that a byte of the file takes while it is read, with its arrays: measured on grids of 90,000 vertices, as text where that is more.
-# glTF counts its geometry from its JSON, OBJ in obj_lines.
+# Bytes that a byte of the file takes while it is read, with its arrays: measured on grids of 90,000 vertices, as text
+# where that is more. glTF counts its geometry from its JSON, OBJ in obj_lines.
 _HELD_PER_BYTE = {".ply": 17, ".stl": 8}
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 
@@ -32,14 +32,23 @@ def load_scene(source: str | Path) -> Scene:
 
         seed = source.removeprefix("procedural:")
         if not (seed.isascii() and seed.isdigit() and len(seed) <= _MAX_SEED_DIGITS):
-            raise InputError(source, f"is not procedural:SEED, a number of at most {_MAX_SEED_DIGITS} digits", "name it like procedural:7")
+            raise InputError(
+                source,
+                f"is not procedural:SEED, a number of at most {_MAX_SEED_DIGITS} digits",
+                "name it like procedural:7",
+            )
         return replace(generate(int(seed)), name="procedural-" + seed.zfill(6))
     path = Path(source)
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES and not path.is_dir():
         raise InputError(path, f"is not a model that gdtool reads ({', '.join(SUFFIXES)})", "export it as .glb")
     require_regular_file(path)
-    require_memory(path.stat().st_size * _HELD_PER_BYTE.get(suffix, 1), path, "its content", "simplify it or split it into several files")
+    require_memory(
+        path.stat().st_size * _HELD_PER_BYTE.get(suffix, 1),
+        path,
+        "its content",
+        "simplify it or split it into several files",
+    )
     if suffix in (".glb", ".gltf"):
         from gdtool.assets.gltf_read import read_gltf as read
     elif suffix == ".obj":
@@ -50,29 +59,43 @@ def load_scene(source: str | Path) -> Scene:
 
 
 def _checked(scene: Scene, path: Path) -> Scene:
-    """The scene without faces of which two corners coincide; those whose three lie on a line stay, being seams that keep a
-    mesh closed. Raises InputError for what no stage can work on."""
+    """The scene without faces of which two corners coincide; those whose three lie on a line stay, being seams that
+    keep a mesh closed. Raises InputError for what no stage can work on."""
     if not len(scene.faces):
         raise InputError(path, "has no faces", "export the model with its faces")
     if scene.faces.min() < 0 or scene.faces.max() >= len(scene.vertices):
-        raise InputError(path, f"a face refers to a vertex out of range (there are {len(scene.vertices)})", "export it again with all its vertices")
+        raise InputError(
+            path,
+            f"a face refers to a vertex out of range (there are {len(scene.vertices)})",
+            "export it again with all its vertices",
+        )
     named = np.zeros(len(scene.vertices), bool)
     named[scene.faces] = True
     used = scene.vertices[named]
     if not np.isfinite(used).all():
-        raise InputError(path, f"vertex {int(np.argwhere(~np.isfinite(scene.vertices))[0][0])} is not finite", "remove that vertex or move it to a finite place")
+        raise InputError(
+            path,
+            f"vertex {int(np.argwhere(~np.isfinite(scene.vertices))[0][0])} is not finite",
+            "remove that vertex or move it to a finite place",
+        )
     low, high = used.min(0), used.max(0)
     extent = float((high - low).max())
     if not np.isfinite(extent) or extent > 1e100:
         raise InputError(path, f"is {extent:.3g} units large", "scale it down")
     if extent == 0:
-        raise InputError(path, "has all its vertices in one point", "export it at a scale that its file format can hold")
+        raise InputError(
+            path, "has all its vertices in one point", "export it at a scale that its file format can hold"
+        )
     empty, has_area = _degenerate((scene.vertices - low) / extent, scene.faces)
     if not has_area:
         raise InputError(path, "has only faces without area", "export it with faces that have an area")
     if empty.any():
-        scene = replace(scene, faces=scene.faces[~empty], material_idx=scene.material_idx[~empty],
-                        notes=(*scene.notes, f"{int(empty.sum())} faces with two corners in one place are left out"))
+        scene = replace(
+            scene,
+            faces=scene.faces[~empty],
+            material_idx=scene.material_idx[~empty],
+            notes=(*scene.notes, f"{int(empty.sum())} faces with two corners in one place are left out"),
+        )
     return _with_sound_normals(scene)
 
 
@@ -81,8 +104,8 @@ def _degenerate(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, bo
     rows = np.ascontiguousarray(vertices.T)  # several times faster than corners of (f, 3, 3)
     empty, has_area = np.empty(len(faces), bool), False
     for i in range(0, len(faces), _CHUNK):
-        a, b, c = (rows.take(corner, 1) for corner in np.ascontiguousarray(faces[i:i + _CHUNK].T))
-        empty[i:i + _CHUNK] = (a == b).all(0) | (b == c).all(0) | (c == a).all(0)
+        a, b, c = (rows.take(corner, 1) for corner in np.ascontiguousarray(faces[i : i + _CHUNK].T))
+        empty[i : i + _CHUNK] = (a == b).all(0) | (b == c).all(0) | (c == a).all(0)
         if not has_area:
             normal = cross(b - a, c - a)
             has_area = bool((dot(normal, normal) > 1e-32).any())
@@ -101,4 +124,8 @@ def _with_sound_normals(scene: Scene) -> Scene:
 
     normals = scene.normals.copy()
     normals[bad] = vertex_normals(scene.vertices, scene.faces)[bad]
-    return replace(scene, normals=normals, notes=(*scene.notes, f"{int(bad.sum())} normals without a direction are replaced by the faces'"))
+    return replace(
+        scene,
+        normals=normals,
+        notes=(*scene.notes, f"{int(bad.sum())} normals without a direction are replaced by the faces'"),
+    )

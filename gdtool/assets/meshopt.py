@@ -11,14 +11,21 @@ from gdtool.core.errors import InputError, ResourceError
 def decode_view(source: bytes, packed: MeshoptView, path: Path) -> bytes:
     """The bytes that a compressed buffer view stands for: count elements, byteStride apart.
 
-    path: the file that holds it, for messages. Raises InputError for a stream that does not decode, ResourceError without the package.
-    """
+    path: the file that holds it, for messages. Raises InputError for a stream that does not decode, ResourceError
+    without the package."""
     try:
         import meshopt
     except ImportError:
-        raise ResourceError(path, "is compressed with meshopt, which needs the package meshopt",
-                            "pip install meshopt, or unpack it with gltfpack or gltf-transform") from None
+        raise ResourceError(
+            path,
+            "is compressed with meshopt, which needs the package meshopt",
+            "pip install meshopt, or unpack it with gltfpack or gltf-transform",
+        ) from None
     try:
-        return meshopt.decode_gltf_buffer(source, packed.count, packed.byte_stride, packed.mode, packed.filter).tobytes()
+        return meshopt.decode_gltf_buffer(
+            source, packed.count, packed.byte_stride, packed.mode, packed.filter
+        ).tobytes()
     except (RuntimeError, ValueError) as error:
-        raise InputError(path, f"has a meshopt stream that does not decode ({str(error)[:80]})", "compress it again with gltfpack") from None
+        raise InputError(
+            path, f"has a meshopt stream that does not decode ({str(error)[:80]})", "compress it again with gltfpack"
+        ) from None

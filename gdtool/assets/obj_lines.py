@@ -1,4 +1,5 @@
-"""What the lines of a Wavefront OBJ say: all lines of a kind at once where they are alike, one by one where they are not."""
+"""What the lines of a Wavefront OBJ say: all lines of a kind at once where they are alike, one by one where they are
+not."""
 
 from __future__ import annotations
 
@@ -12,18 +13,20 @@ from gdtool.core.errors import InputError
 from gdtool.core.memory import require_memory
 from gdtool.core.reading import bytes_of, require_regular_file
 
-HELD_PER_BYTE = 11  # bytes that a byte of the file takes while it is read, with its arrays: measured on grids of 90,000 vertices
+# Bytes that a byte of the file takes while it is read, with its arrays: measured on grids of 90,000 vertices.
+HELD_PER_BYTE = 11
 _MOST = 2**31 - 1  # no file has as many vertices
 
 
 @dataclass(frozen=True)
 class ObjLines:
-    """v, vt, vn, f, usemtl and mtllib lines; nothing is checked against anything else but that indices count from where they stand.
+    """v, vt, vn, f, usemtl and mtllib lines; nothing is checked against anything else but that indices count from where
+    they stand.
 
-    vertices (v, 3), colors (k, 3) of those vertices that have one, uvs (t, 2) with v up, normals (n, 3), float64. corners
-    (c, 3) int64, polygon after polygon: vertex, texture coordinate and normal, from 0, -1 where absent. sizes (p,) corners
-    a polygon, at least 3; groups (p,) the material of each, into names, of which "" is the first; libraries as they come.
-    """
+    vertices (v, 3), colors (k, 3) of those vertices that have one, uvs (t, 2) with v up, normals (n, 3), float64.
+    corners (c, 3) int64, polygon after polygon: vertex, texture coordinate and normal, from 0, -1 where absent. sizes
+    (p,) corners a polygon, at least 3; groups (p,) the material of each, into names, of which "" is the first;
+    libraries as they come."""
 
     vertices: np.ndarray
     colors: np.ndarray
@@ -39,7 +42,9 @@ class ObjLines:
 def read_lines(path: Path) -> ObjLines:
     """Read an OBJ. Raises InputError, with the line that is wrong, and OutputError."""
     require_regular_file(path)
-    require_memory(path.stat().st_size * HELD_PER_BYTE, path, "its content", "simplify it or split it into several files")
+    require_memory(
+        path.stat().st_size * HELD_PER_BYTE, path, "its content", "simplify it or split it into several files"
+    )
     data = bytes_of(path)
     lines = _at_once(data)
     if lines is None:
@@ -101,10 +106,20 @@ def _one_by_one(text: str, path: Path) -> ObjLines:
             else:
                 names.take(words, line)
         except (ValueError, IndexError, OverflowError) as error:
-            raise InputError(path, f"line {number} is not what OBJ says ({str(error)[:120]})", "correct that line or export it again") from None
-    return ObjLines(np.array(vertices, np.float64).reshape(-1, 3), np.array(colors, np.float64).reshape(-1, 3), np.array(uvs, np.float64).reshape(-1, 2),
-                    np.array(normals, np.float64).reshape(-1, 3), np.array(corners, np.int64).reshape(-1, 3), np.array(sizes, np.int64),
-                    np.array(groups, np.int64), tuple(names.places), tuple(names.libraries))
+            raise InputError(
+                path, f"line {number} is not what OBJ says ({str(error)[:120]})", "correct that line or export it again"
+            ) from None
+    return ObjLines(
+        np.array(vertices, np.float64).reshape(-1, 3),
+        np.array(colors, np.float64).reshape(-1, 3),
+        np.array(uvs, np.float64).reshape(-1, 2),
+        np.array(normals, np.float64).reshape(-1, 3),
+        np.array(corners, np.int64).reshape(-1, 3),
+        np.array(sizes, np.int64),
+        np.array(groups, np.int64),
+        tuple(names.places),
+        tuple(names.libraries),
+    )
 
 
 def _corner(word: str, counts: tuple[int, int, int]) -> tuple[int, int, int]:
@@ -143,12 +158,14 @@ def _at_once(data: bytes) -> ObjLines | None:
     names, at, group = _Names(), [0], [0]
     try:
         for row in np.flatnonzero((first == ord("u")) | (first == ord("m"))).tolist():
-            line = data[starts[row]:ends[row]].decode("utf-8", "replace")
+            line = data[starts[row] : ends[row]].decode("utf-8", "replace")
             names.take(line.split(), line)
             at.append(row)
             group.append(names.current)
         payloads = {key: _payload(text, starts, ends, kinds[key], len(key)) for key in kinds}
-        (vertices, colors), (uvs, _), (normals, _) = (_numbers(*payloads[key], width) for key, width in (("v", 3), ("vt", 2), ("vn", 3)))
+        (vertices, colors), (uvs, _), (normals, _) = (
+            _numbers(*payloads[key], width) for key, width in (("v", 3), ("vt", 2), ("vn", 3))
+        )
         rows = np.flatnonzero(of_f)
         corners, sizes = _corners(*payloads["f"], [np.cumsum(kinds[key])[rows] for key in ("v", "vt", "vn")])
     except (_Unlike, IndexError):
@@ -157,14 +174,19 @@ def _at_once(data: bytes) -> ObjLines | None:
     return ObjLines(vertices, colors, uvs, normals, corners, sizes, groups, tuple(names.places), tuple(names.libraries))
 
 
-def _payload(text: np.ndarray, starts: np.ndarray, ends: np.ndarray, rows: np.ndarray, letters: int) -> tuple[np.ndarray, np.ndarray]:
+def _payload(
+    text: np.ndarray, starts: np.ndarray, ends: np.ndarray, rows: np.ndarray, letters: int
+) -> tuple[np.ndarray, np.ndarray]:
     """The bytes of some lines with their keys, of so many letters, blanked, and where each line begins there."""
     which = np.flatnonzero(rows)
     begin, length = starts[which], ends[which] - starts[which] + 1
     if len(which) and which[-1] - which[0] == len(which) - 1:  # one behind the other
-        own, begin = text[begin[0]:begin[0] + length.sum()].copy(), begin - begin[0]
+        own, begin = text[begin[0] : begin[0] + length.sum()].copy(), begin - begin[0]
     else:
-        own, begin = text[np.repeat(rows, ends - starts + 1)] if len(which) else text[:0].copy(), np.cumsum(length) - length
+        own, begin = (
+            text[np.repeat(rows, ends - starts + 1)] if len(which) else text[:0].copy(),
+            np.cumsum(length) - length,
+        )
     for i in range(letters):
         own[begin + i] = ord(" ")
     return own, begin
@@ -198,7 +220,8 @@ def _parsed(payload: np.ndarray, kind: type, count: int) -> np.ndarray:
 
 
 def _numbers(payload: np.ndarray, begin: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """The first `width` numbers of each line, and the fourth to sixth where there are so many, (lines, width) and (lines or 0, 3)."""
+    """The first `width` numbers of each line, and the fourth to sixth where there are so many, (lines, width) and
+    (lines or 0, 3)."""
     if not len(begin):
         return np.empty((0, width)), np.empty((0, 3))
     table = _alike(_words(payload), begin)
@@ -226,16 +249,20 @@ def _corners(payload: np.ndarray, begin: np.ndarray, counts: list[np.ndarray]) -
         payload[slash] = ord(" ")
         parts = _words(payload)
     each, odd = divmod(len(parts), len(words))
-    if odd or (parts[::each or 1] != words).any():
+    if odd or (parts[:: each or 1] != words).any():
         raise _Unlike
     # So many slashes as numbers need between them, or two in a row in each word.
-    columns = {(1, 0, 0): [0], (2, 1, 0): [0, 1], (2, 2, 1): [0, 2], (3, 2, 0): [0, 1, 2]}.get((each, *(n / len(words) for n in (slashes, double))))
+    columns = {(1, 0, 0): [0], (2, 1, 0): [0, 1], (2, 2, 1): [0, 2], (3, 2, 0): [0, 1, 2]}.get(
+        (each, *(n / len(words) for n in (slashes, double)))
+    )
     if columns is None:
         raise _Unlike
     found = _parsed(payload, np.int64, len(parts)).reshape(-1, each)
     out = np.full((len(words), 3), -1, np.int64)
     for column, given in zip(columns, found.T, strict=True):
-        out[:, column] = np.where(given > 0, given - 1, given + np.repeat(counts[column], sizes)) if (given < 0).any() else given - 1
+        out[:, column] = (
+            np.where(given > 0, given - 1, given + np.repeat(counts[column], sizes)) if (given < 0).any() else given - 1
+        )
         if (given == 0).any() or (out[:, column] < 0).any() or given.max() >= _MOST:
             raise _Unlike
     return out, sizes

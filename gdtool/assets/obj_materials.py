@@ -14,19 +14,22 @@ from gdtool.core.reading import bytes_of
 from gdtool.core.references import is_readable, library_folder, map_name, obj_libraries, obj_texture
 
 _CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}
-_MERGED_BYTES = 48  # of one pixel while two maps become one: four float32 channels, resized, clipped, scaled and rounded
+# Of one pixel while two maps become one: four float32 channels, resized, clipped, scaled and rounded.
+_MERGED_BYTES = 48
 
 
-def obj_materials(path: Path, libraries: list[str], names: list[str], has_colors: bool) -> tuple[tuple[Material, ...], list[str]]:
+def obj_materials(
+    path: Path, libraries: list[str], names: list[str], has_colors: bool
+) -> tuple[tuple[Material, ...], list[str]]:
     """The materials of an OBJ, one for each name in order, and notes about what was assumed.
 
     base color: map_Kd (then Kd is ignored, as Blender does), else Kd, linear. roughness: map_Pr, Pr, else from Ns where
     Ks reflects at all: (2 / (Ns + 2))^(1/4), the GGX width of that Blinn-Phong lobe; else 0.5. metallic: map_Pm, Pm,
     else 0. norm, or a map_Bump that is blue all over, is the normal map. Ke, map_Ke, d, Tr and map_d are read, Ni is
-    not (exporters fill it at will). Faces without a material are DEFAULT_MATERIAL; white where vertices have colours.
-    A missing library or texture is noted and its defaults taken; one that lies elsewhere than core/references.py allows, or is no
-    regular file, is an InputError. ResourceError for textures that together take more memory than one input may.
-    """
+    not (exporters fill it at will). Faces without a material are DEFAULT_MATERIAL; white where vertices have colours. A
+    missing library or texture is noted and its defaults taken; one that lies elsewhere than core/references.py allows,
+    or is no regular file, is an InputError. ResourceError for textures that together take more memory than one input
+    may."""
     notes: list[str] = []
     records: dict[str, dict[str, list[str]]] = {}
     textures = _Textures(path, notes)
@@ -45,8 +48,11 @@ def obj_materials(path: Path, libraries: list[str], names: list[str], has_colors
         if name in records:
             out.append(_material(name, records[name], places[name], textures, notes))
         else:
-            notes.append(f"material {name!r} is not defined: a dielectric of roughness 0.5" if name
-                         else "faces without a material are a dielectric of roughness 0.5")
+            notes.append(
+                f"material {name!r} is not defined: a dielectric of roughness 0.5"
+                if name
+                else "faces without a material are a dielectric of roughness 0.5"
+            )
             out.append(replace(default, name=name or default.name))
     return tuple(out), list(dict.fromkeys(notes))
 
@@ -66,7 +72,9 @@ def _read_library(path: Path) -> dict[str, dict[str, list[str]]]:
     return out
 
 
-def _material(name: str, record: dict[str, list[str]], place: tuple[Path, str], textures: _Textures, notes: list[str]) -> Material:
+def _material(
+    name: str, record: dict[str, list[str]], place: tuple[Path, str], textures: _Textures, notes: list[str]
+) -> Material:
     def numbers(key: str) -> list[float]:
         try:
             values = [float(word) for word in record.get(key, [])]
@@ -90,9 +98,21 @@ def _material(name: str, record: dict[str, list[str]], place: tuple[Path, str], 
         roughness = unit((2 / (max(ns[0], 0.0) + 2)) ** 0.25)
     metallic = unit(numbers("pm")[0]) if numbers("pm") else 0.0
     color_map, alpha_map = image("map_kd"), image("map_d")
-    color = (1.0, 1.0, 1.0) if color_map is not None else tuple(unit(x) for x in (kd * 3)[:3]) if kd else DEFAULT_MATERIAL.base_color[:3]
-    out = Material(name=name, base_color=(*color, alpha), roughness=roughness, metallic=metallic, alpha_mode="BLEND" if alpha < 1 else "OPAQUE",
-                   emissive=tuple(max(0.0, x) for x in (ke * 3)[:3]) if ke else (0.0, 0.0, 0.0))
+    color = (
+        (1.0, 1.0, 1.0)
+        if color_map is not None
+        else tuple(unit(x) for x in (kd * 3)[:3])
+        if kd
+        else DEFAULT_MATERIAL.base_color[:3]
+    )
+    out = Material(
+        name=name,
+        base_color=(*color, alpha),
+        roughness=roughness,
+        metallic=metallic,
+        alpha_mode="BLEND" if alpha < 1 else "OPAQUE",
+        emissive=tuple(max(0.0, x) for x in (ke * 3)[:3]) if ke else (0.0, 0.0, 0.0),
+    )
     if color_map is not None:
         color_map = _spread(color_map)
         if alpha_map is not None:
@@ -104,11 +124,19 @@ def _material(name: str, record: dict[str, list[str]], place: tuple[Path, str], 
     if roughness_map is not None or metallic_map is not None:
         _require_merged(textures.model, roughness_map, metallic_map)
         packed = _packed(roughness_map, metallic_map)
-        out = replace(out, metallic_roughness_texture=Texture(packed), roughness=1.0 if roughness_map is not None else roughness,
-                      metallic=1.0 if metallic_map is not None else metallic)
+        out = replace(
+            out,
+            metallic_roughness_texture=Texture(packed),
+            roughness=1.0 if roughness_map is not None else roughness,
+            metallic=1.0 if metallic_map is not None else metallic,
+        )
     emissive_map = image("map_ke")
     if emissive_map is not None:
-        out = replace(out, emissive_texture=Texture(_spread(emissive_map), "srgb"), emissive=out.emissive if max(out.emissive) > 0 else (1.0, 1.0, 1.0))
+        out = replace(
+            out,
+            emissive_texture=Texture(_spread(emissive_map), "srgb"),
+            emissive=out.emissive if max(out.emissive) > 0 else (1.0, 1.0, 1.0),
+        )
     for key in ("norm", "map_norm", "map_bump", "bump"):
         normal_map = image(key)
         if normal_map is None:
@@ -129,7 +157,8 @@ class _Textures:
         self._held = 0  # bytes
 
     def image(self, words: list[str], library: Path, folder: str) -> np.ndarray | None:
-        """The image of a texture statement, its one channel where -imfchan asks for it; None (and a note) when it cannot be read.
+        """The image of a texture statement, its one channel where -imfchan asks for it; None (and a note) when it
+        cannot be read.
 
         words: those behind the keyword; library: the .mtl, and folder: its place relative to the model's.
         """
@@ -142,7 +171,7 @@ class _Textures:
             self._images[path] = self._read(path, name)
         image, channel = self._images[path], _CHANNELS.get(letter or "")
         if image is not None and channel is not None and channel < image.shape[2]:
-            return image[..., channel:channel + 1]
+            return image[..., channel : channel + 1]
         return image
 
     def _read(self, path: Path, name: str) -> np.ndarray | None:
@@ -164,10 +193,16 @@ def _spread(image: np.ndarray) -> np.ndarray:
 
 
 def _require_merged(model: Path, *maps: np.ndarray | None) -> None:
-    """Raise ResourceError when maps that become one, as high as the highest and as wide as the widest, would take too much memory."""
+    """Raise ResourceError when maps that become one, as high as the highest and as wide as the widest, would take too
+    much memory."""
     given = [one for one in maps if one is not None]
     height, width = max(one.shape[0] for one in given), max(one.shape[1] for one in given)
-    require_memory(height * width * _MERGED_BYTES, model, f"merging two maps at {width}x{height} pixels", "make the maps of one material equally large")
+    require_memory(
+        height * width * _MERGED_BYTES,
+        model,
+        f"merging two maps at {width}x{height} pixels",
+        "make the maps of one material equally large",
+    )
 
 
 def _resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -202,7 +237,9 @@ def _with_alpha(color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
     source = alpha[..., -1:] if alpha.shape[2] in (2, 4) else alpha[..., :1]
     height, width = max(color.shape[0], source.shape[0]), max(color.shape[1], source.shape[1])
-    pixels = np.concatenate([_resized(unit_range(color[..., :3]), height, width), _resized(unit_range(source), height, width)], -1)
+    pixels = np.concatenate(
+        [_resized(unit_range(color[..., :3]), height, width), _resized(unit_range(source), height, width)], -1
+    )
     return quantized(pixels)
 
 

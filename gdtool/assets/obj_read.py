@@ -25,13 +25,27 @@ def read_obj(path: str | Path) -> Scene:
     """
     path = Path(path)
     lines = read_lines(path)
-    vertices, colors, uvs, normals, corners = lines.vertices, lines.colors, lines.uvs * (1, -1) + (0, 1), lines.normals, lines.corners
+    vertices, colors, uvs, normals, corners = (
+        lines.vertices,
+        lines.colors,
+        lines.uvs * (1, -1) + (0, 1),
+        lines.normals,
+        lines.corners,
+    )
     notes: list[str] = []
     for column, array, what in ((0, vertices, "vertex"), (1, uvs, "texture coordinate"), (2, normals, "normal")):
         if corners[:, column].max() >= len(array):
-            raise InputError(path, f"a face refers to {what} {int(corners[:, column].max()) + 1}, but there are {len(array)}", "export it again with all its elements")
+            raise InputError(
+                path,
+                f"a face refers to {what} {int(corners[:, column].max()) + 1}, but there are {len(array)}",
+                "export it again with all its elements",
+            )
         if not np.isfinite(array).all():
-            raise InputError(path, f"{what} {int(np.argwhere(~np.isfinite(array))[0][0]) + 1} is not finite", "replace it by finite numbers")
+            raise InputError(
+                path,
+                f"{what} {int(np.argwhere(~np.isfinite(array))[0][0]) + 1} is not finite",
+                "replace it by finite numbers",
+            )
     has_normals = (corners[:, 2] >= 0).all()
     if not has_normals:
         if (corners[:, 2] >= 0).any():
@@ -44,7 +58,9 @@ def read_obj(path: str | Path) -> Scene:
         unique, _, corner_idx = unique_rows(corners)
     faces, polygon_idx = triangulate(vertices, corners[:, 0], lines.sizes)
     used = np.unique(lines.groups).tolist()
-    materials, material_notes = obj_materials(path, list(lines.libraries), [lines.names[i] for i in used], len(colors) > 0)
+    materials, material_notes = obj_materials(
+        path, list(lines.libraries), [lines.names[i] for i in used], len(colors) > 0
+    )
     place = np.zeros(len(lines.names), np.int32)
     place[used] = np.arange(len(used))
     vertex_colors = None
@@ -62,8 +78,12 @@ def read_obj(path: str | Path) -> Scene:
         coordinates = (np.where(unique[:, 1:2] >= 0, uvs[unique[:, 1]], 0.0),)
     elif any(m.base_color_texture or m.metallic_roughness_texture or m.normal_texture for m in materials):
         notes.append("has textures but no texture coordinates: the textures are left out")
-        materials = tuple(replace(m, base_color_texture=None, metallic_roughness_texture=None, normal_texture=None, emissive_texture=None)
-                          for m in materials)
+        materials = tuple(
+            replace(
+                m, base_color_texture=None, metallic_roughness_texture=None, normal_texture=None, emissive_texture=None
+            )
+            for m in materials
+        )
     return Scene(
         vertices=vertices[unique[:, 0]],
         faces=corner_idx.astype(np.int32)[faces],

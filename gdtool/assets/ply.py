@@ -1,11 +1,28 @@
-"""Binary PLY of triangles, whose elements are arrays as they stand: gdtool's own surfaces and what most scanners write."""
+"""Binary PLY of triangles, whose elements are arrays as they stand: gdtool's own surfaces and what most scanners
+write."""
 
 from __future__ import annotations
 
 import numpy as np
 
-_TYPES = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-          "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
+_TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -16,7 +33,7 @@ def binary_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     triangles and nothing else, in binary.
     """
     end = data.find(b"end_header\n")
-    header = data[:max(end, 0)].decode("ascii", "replace").split("\n")
+    header = data[: max(end, 0)].decode("ascii", "replace").split("\n")
     kind = header[1].split() if len(header) > 1 and header[0].strip() == "ply" else []
     if len(kind) != 3 or kind[0] != "format" or kind[1] not in _ORDERS:
         raise ValueError("is not a binary PLY")

@@ -8,9 +8,8 @@ import numpy as np
 def triangulate(vertices: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Triangles (t, 3) as positions in `corners`, and the polygon (t,) each is part of.
 
-    vertices (v, 3); corners (c,) vertex of each polygon corner, polygon after polygon; sizes (p,) corners a polygon, ≥ 3.
-    A quad is cut along corners 0 and 2, unless it is concave there; larger polygons are cut by their ears.
-    """
+    vertices (v, 3); corners (c,) vertex of each polygon corner, polygon after polygon; sizes (p,) corners a polygon, ≥
+    3. A quad is cut along corners 0 and 2, unless it is concave there; larger polygons are cut by their ears."""
     first = np.cumsum(sizes) - sizes
     if (sizes == 3).all():
         return np.arange(3 * len(sizes)).reshape(-1, 3), np.arange(len(sizes))
@@ -59,7 +58,11 @@ def _cut_ears(points: np.ndarray) -> np.ndarray:
             if turn(flat[a], flat[b], flat[c]) <= 0:
                 continue
             others = flat[[i for i in left if i not in (a, b, c)]]
-            inside = (turn(flat[a], flat[b], others) >= 0) & (turn(flat[b], flat[c], others) >= 0) & (turn(flat[c], flat[a], others) >= 0)
+            inside = (
+                (turn(flat[a], flat[b], others) >= 0)
+                & (turn(flat[b], flat[c], others) >= 0)
+                & (turn(flat[c], flat[a], others) >= 0)
+            )
             if not inside.any():
                 break
         else:

@@ -43,7 +43,11 @@ def read_scan(path: str | Path) -> Scene:
     if not len(faces):
         raise InputError(path, "has no faces", "export the model with its faces")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(path, f"a face refers to a vertex out of range (there are {len(vertices)})", "export it again with all its vertices")
+        raise InputError(
+            path,
+            f"a face refers to a vertex out of range (there are {len(vertices)})",
+            "export it again with all its vertices",
+        )
     notes = ["has no material: a dielectric of roughness 0.5", *scan.notes]
     if kind == "stl":
         if not np.isfinite(vertices).all():
@@ -63,12 +67,23 @@ def read_scan(path: str | Path) -> Scene:
             normals = scan.normals / length
         else:
             notes.append("normals without a direction are ignored")
-    return Scene(vertices.astype(np.float64), faces.astype(np.int32), (material,), normals=normals, colors=colors, name=path.stem, notes=tuple(notes))
+    return Scene(
+        vertices.astype(np.float64),
+        faces.astype(np.int32),
+        (material,),
+        normals=normals,
+        colors=colors,
+        name=path.stem,
+        notes=tuple(notes),
+    )
 
 
 def _plain_stl(data: bytes) -> _Scan | None:
     """A binary STL; None for what is not as long as that says it is."""
-    if len(data) < _STL_HEADER or (len(data) - _STL_HEADER) != int.from_bytes(data[80:84], "little") * _STL_FACE.itemsize:
+    if (
+        len(data) < _STL_HEADER
+        or (len(data) - _STL_HEADER) != int.from_bytes(data[80:84], "little") * _STL_FACE.itemsize
+    ):
         return None
     corners = np.frombuffer(data, _STL_FACE, offset=_STL_HEADER)["corners"].reshape(-1, 3)
     return _Scan(corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
@@ -91,7 +106,12 @@ def _plain_ply(data: bytes) -> _Scan | None:
         colors = np.full((len(records), 4), 255, np.uint8)
         for i, name in enumerate(colored):
             colors[:, i] = records[name]
-    return _Scan(columns(records, "x y z"), faces, columns(records, "nx ny nz") if {"nx", "ny", "nz"} <= set(kinds) else None, colors)
+    return _Scan(
+        columns(records, "x y z"),
+        faces,
+        columns(records, "nx ny nz") if {"nx", "ny", "nz"} <= set(kinds) else None,
+        colors,
+    )
 
 
 def _by_trimesh(data: bytes, kind: str, path: Path) -> _Scan:
@@ -100,14 +120,26 @@ def _by_trimesh(data: bytes, kind: str, path: Path) -> _Scan:
     try:
         mesh = trimesh.load(io.BytesIO(data), file_type=kind, process=False, force="mesh")
     except Exception as error:  # the parsers raise whatever the malformed bytes lead to
-        raise InputError(path, f"is not a {kind.upper()} file that can be read ({type(error).__name__}: {str(error)[:60]!r})", f"export it again as binary {kind.upper()}") from None
+        raise InputError(
+            path,
+            f"is not a {kind.upper()} file that can be read ({type(error).__name__}: {str(error)[:60]!r})",
+            f"export it again as binary {kind.upper()}",
+        ) from None
     if not hasattr(mesh, "faces"):
         raise InputError(path, "has no faces", "export the model with its faces")
-    vertices, faces = np.asarray(mesh.vertices, np.float64).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3)
+    vertices, faces = (
+        np.asarray(mesh.vertices, np.float64).reshape(-1, 3),
+        np.asarray(mesh.faces, np.int64).reshape(-1, 3),
+    )
     stored = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
     names = getattr(getattr(stored, "dtype", None), "names", None) or (stored if isinstance(stored, dict) else ())
     normals = None
     if all(key in names for key in ("nx", "ny", "nz")):
         normals = np.stack([np.asarray(stored[key], np.float64).reshape(-1) for key in ("nx", "ny", "nz")], 1)
-    return _Scan(vertices, faces, normals, np.asarray(mesh.visual.vertex_colors) if mesh.visual.kind == "vertex" else None,
-                 ("colors of faces are ignored",) if mesh.visual.kind == "face" else ())
+    return _Scan(
+        vertices,
+        faces,
+        normals,
+        np.asarray(mesh.visual.vertex_colors) if mesh.visual.kind == "vertex" else None,
+        ("colors of faces are ignored",) if mesh.visual.kind == "face" else (),
+    )

@@ -9,10 +9,10 @@ from typing import Protocol
 import numpy as np
 
 from gdtool.assets.scene import Material, Scene, Texture
-from gdtool.folders.mesh import QuadMesh
-from gdtool.geometry.tangents import weld
 from gdtool.bake.maps import Maps
 from gdtool.bake.target import Target
+from gdtool.folders.mesh import QuadMesh
+from gdtool.geometry.tangents import weld
 
 
 class Drawn(Protocol):
@@ -23,19 +23,31 @@ class Drawn(Protocol):
     double_sided: bool
 
 
-def material_of(maps: Maps, name: str, alpha_mode: str = "OPAQUE", alpha_cutoff: float = 0.5, double_sided: bool = False) -> Material:
+def material_of(
+    maps: Maps, name: str, alpha_mode: str = "OPAQUE", alpha_cutoff: float = 0.5, double_sided: bool = False
+) -> Material:
     """The glTF material of maps; every factor is explicit."""
+
     # A texture repeats by default; clamped, a chart at the map's edge does not read the opposite edge.
     def texture(image: np.ndarray | None, encoding: str) -> Texture | None:
         return None if image is None else Texture(image, encoding, wrap_u="clamp", wrap_v="clamp")
 
     orm = texture(maps.orm, "linear")
     return Material(
-        name=name, base_color=maps.factors["base_color"], metallic=maps.factors["metallic"][0], roughness=maps.factors["roughness"][0],
-        alpha_mode=alpha_mode, alpha_cutoff=alpha_cutoff, double_sided=double_sided,
-        base_color_texture=texture(maps.base_color, "srgb"), metallic_roughness_texture=orm if maps.has_roughness_metallic else None,
-        normal_texture=texture(maps.normal, "linear"), occlusion_texture=orm if maps.has_occlusion else None,
-        emissive=maps.factors.get("emissive", (0.0, 0.0, 0.0)), emissive_texture=texture(maps.emissive, "srgb"))
+        name=name,
+        base_color=maps.factors["base_color"],
+        metallic=maps.factors["metallic"][0],
+        roughness=maps.factors["roughness"][0],
+        alpha_mode=alpha_mode,
+        alpha_cutoff=alpha_cutoff,
+        double_sided=double_sided,
+        base_color_texture=texture(maps.base_color, "srgb"),
+        metallic_roughness_texture=orm if maps.has_roughness_metallic else None,
+        normal_texture=texture(maps.normal, "linear"),
+        occlusion_texture=orm if maps.has_occlusion else None,
+        emissive=maps.factors.get("emissive", (0.0, 0.0, 0.0)),
+        emissive_texture=texture(maps.emissive, "srgb"),
+    )
 
 
 def scene_of(target: Target, maps: Maps, material: Material, name: str) -> Scene:
@@ -54,13 +66,26 @@ def scene_of(target: Target, maps: Maps, material: Material, name: str) -> Scene
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     kept = first[order]
-    return Scene(vertices=target.vertices[position_idx[kept]], faces=place[vertex].reshape(-1, 3).astype(np.int32),
-                 materials=(material,), normals=normals[kept], tangents=tangents[kept] if maps.normal is not None else None,
-                 uvs=(np.asarray(target.uv, np.float64)[uv_idx[kept]],), name=name)
+    return Scene(
+        vertices=target.vertices[position_idx[kept]],
+        faces=place[vertex].reshape(-1, 3).astype(np.int32),
+        materials=(material,),
+        normals=normals[kept],
+        tangents=tangents[kept] if maps.normal is not None else None,
+        uvs=(np.asarray(target.uv, np.float64)[uv_idx[kept]],),
+        name=name,
+    )
 
 
-def write_obj(path: Path, mesh: QuadMesh, face_normals_idx: np.ndarray, normals: np.ndarray, maps: Maps, files: dict[str, str],
-              name: str) -> None:
+def write_obj(
+    path: Path,
+    mesh: QuadMesh,
+    face_normals_idx: np.ndarray,
+    normals: np.ndarray,
+    maps: Maps,
+    files: dict[str, str],
+    name: str,
+) -> None:
     """Write path (.obj) with the quads as they are, and the .mtl beside it, named alike.
 
     face_normals_idx (f, 4) into normals (n, 3), -1 with a triangle's fourth corner. files: map name to file name.
@@ -72,7 +97,9 @@ def write_obj(path: Path, mesh: QuadMesh, face_normals_idx: np.ndarray, normals:
     lines += ["vn %.6g %.6g %.6g" % tuple(n) for n in normals.tolist()]
     lines.append("usemtl material")
     for face, uvs, ns in zip(mesh.faces.tolist(), mesh.face_uvs.tolist(), face_normals_idx.tolist(), strict=True):
-        lines.append("f " + " ".join(f"{v + 1}/{t + 1}/{n + 1}" for v, t, n in zip(face, uvs, ns, strict=True) if v >= 0))
+        lines.append(
+            "f " + " ".join(f"{v + 1}/{t + 1}/{n + 1}" for v, t, n in zip(face, uvs, ns, strict=True) if v >= 0)
+        )
     path.write_text("\n".join(lines) + "\n")
     library.write_text(material_library(maps, files))
 
@@ -84,13 +111,21 @@ def _word(name: str) -> str:
 def material_library(maps: Maps, files: dict[str, str]) -> str:
     """Text of the .mtl: the classic fields, and the physically based ones (Pr, Pm, norm) that newer readers know.
 
-    The normal map is named twice: Blender's importer leaves norm out, and takes map_Bump for a normal map of strength -bm.
+    The normal map is named twice: Blender's importer leaves norm out, and takes map_Bump for a normal map of strength
+    -bm.
 
     Scalar maps are channels of the packed map: -imfchan is the format's own way to say which (Wavefront MTL 4.2).
     """
     r, g, b, a = maps.factors["base_color"]
-    lines = ["newmtl material", f"Kd {r:.6g} {g:.6g} {b:.6g}", "Ks 0.04 0.04 0.04", f"d {a:.6g}", "illum 2",
-             f"Pr {maps.factors['roughness'][0]:.6g}", f"Pm {maps.factors['metallic'][0]:.6g}"]
+    lines = [
+        "newmtl material",
+        f"Kd {r:.6g} {g:.6g} {b:.6g}",
+        "Ks 0.04 0.04 0.04",
+        f"d {a:.6g}",
+        "illum 2",
+        f"Pr {maps.factors['roughness'][0]:.6g}",
+        f"Pm {maps.factors['metallic'][0]:.6g}",
+    ]
     if "base_color" in files:
         lines.append(f"map_Kd {files['base_color']}")
         if maps.base_color.shape[2] == 4:
@@ -121,22 +156,46 @@ def corner_normals_of_quads(mesh: QuadMesh, target: Target, face_idx: np.ndarray
     return np.where(mesh.is_quad[:, None] | (np.arange(4) < 3), idx.reshape(-1, 4), -1), normals
 
 
-def write_models(path: Callable[[str], Path], target: Target, mesh: QuadMesh, face_idx: np.ndarray, maps: Maps, surface: Drawn,
-                 name: str, convention: str, usd: str, levels: list[Target], threads: int = 1) -> dict[str, str]:
-    """Write asset.glb, asset.obj, the maps, OpenUSD where usd names a suffix, and asset_lod1.glb and on; the maps' files.
+def write_models(
+    path: Callable[[str], Path],
+    target: Target,
+    mesh: QuadMesh,
+    face_idx: np.ndarray,
+    maps: Maps,
+    surface: Drawn,
+    name: str,
+    convention: str,
+    usd: str,
+    levels: list[Target],
+    threads: int = 1,
+) -> dict[str, str]:
+    """Write asset.glb, asset.obj, the maps, OpenUSD where usd names a suffix, and asset_lod1.glb and on; the maps'
+    files.
 
     path(file name) says where. face_idx (t,) is the quad of each triangle. The coarser levels refer to the maps' files.
     """
     from gdtool.assets.gltf_write import write_glb
-    from gdtool.images.io import encode_pngs, write_png
     from gdtool.bake.maps import contact_sheet_of, directx
+    from gdtool.images.io import encode_pngs, write_png
 
     material = material_of(maps, name, surface.alpha_mode, surface.alpha_cutoff, surface.double_sided)
-    shown = {key: image for key, image in (("base_color", maps.base_color), ("orm", maps.orm), ("normal", maps.normal), ("emissive", maps.emissive))
-             if image is not None}
+    shown = {
+        key: image
+        for key, image in (
+            ("base_color", maps.base_color),
+            ("orm", maps.orm),
+            ("normal", maps.normal),
+            ("emissive", maps.emissive),
+        )
+        if image is not None
+    }
     # Encoding a large map takes as long as baking it: once, for the .glb and for the file beside it.
     encoded = dict(zip(shown, encode_pngs(list(shown.values()), threads=threads), strict=True))
-    write_glb(path("asset.glb"), scene_of(target, maps, material, name), made={id(shown[key]): content for key, content in encoded.items()})
+    write_glb(
+        path("asset.glb"),
+        scene_of(target, maps, material, name),
+        made={id(shown[key]): content for key, content in encoded.items()},
+    )
     files, beside = {key: f"{key}.png" for key in shown}, {id(image): f"{key}.png" for key, image in shown.items()}
     for key, content in encoded.items():
         if key == "normal" and convention == "directx":
@@ -155,6 +214,17 @@ def write_models(path: Callable[[str], Path], target: Target, mesh: QuadMesh, fa
     if usd:
         from gdtool.bake.usd import write_usd
 
-        write_usd(path(usd), mesh, normals_idx, normals, maps, files, convention, surface.alpha_mode, surface.alpha_cutoff, surface.double_sided)
+        write_usd(
+            path(usd),
+            mesh,
+            normals_idx,
+            normals,
+            maps,
+            files,
+            convention,
+            surface.alpha_mode,
+            surface.alpha_cutoff,
+            surface.double_sided,
+        )
     write_png(path("contact_sheet.png"), contact_sheet_of(maps))
     return files

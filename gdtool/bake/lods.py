@@ -10,19 +10,20 @@ from pathlib import Path
 
 import numpy as np
 
+from gdtool.bake.target import Target
 from gdtool.core.child import ChildFailed, call
 from gdtool.core.ending import temporary_folder
 from gdtool.core.native import imported
-from gdtool.bake.target import Target
 
 
-def collapse_textured(vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray, target_faces: int,
-                      folder: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the child runs: MeshLab's quadric collapse in position and texture space (Garland & Heckbert 1998), seams kept.
+def collapse_textured(
+    vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray, target_faces: int, folder: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the child runs: MeshLab's quadric collapse in position and texture space (Garland & Heckbert 1998), seams
+    kept.
 
-    vertices (v, 3), faces (t, 3), corner_uvs (t, 3, 2) of the corners. folder: where its files may be; whoever starts the child removes it,
-    since a child that is killed cannot. Returns the same of about target_faces triangles.
-    """
+    vertices (v, 3), faces (t, 3), corner_uvs (t, 3, 2) of the corners. folder: where its files may be; whoever starts
+    the child removes it, since a child that is killed cannot. Returns the same of about target_faces triangles."""
     from gdtool.images.io import write_png
 
     pymeshlab = imported("pymeshlab")
@@ -31,16 +32,26 @@ def collapse_textured(vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.nd
     Path(folder, "full.mtl").write_text("newmtl one\nmap_Kd blank.png\n")
     lines = ["mtllib full.mtl", "usemtl one", *("v %.9g %.9g %.9g" % tuple(p) for p in vertices.tolist())]
     lines += ["vt %.9g %.9g" % tuple(p) for p in corner_uvs.reshape(-1, 2).tolist()]
-    lines += ["f " + " ".join(f"{v + 1}/{3 * k + i + 1}" for i, v in enumerate(face)) for k, face in enumerate(faces.tolist())]
+    lines += [
+        "f " + " ".join(f"{v + 1}/{3 * k + i + 1}" for i, v in enumerate(face)) for k, face in enumerate(faces.tolist())
+    ]
     path = Path(folder, "full.obj")
     path.write_text("\n".join(lines) + "\n")
     meshes = pymeshlab.MeshSet()
     meshes.load_new_mesh(str(path))
-    meshes.meshing_decimation_quadric_edge_collapse_with_texture(targetfacenum=target_faces, preserveboundary=True, preservenormal=True,
-                                                                 optimalplacement=True, planarquadric=True)
+    meshes.meshing_decimation_quadric_edge_collapse_with_texture(
+        targetfacenum=target_faces,
+        preserveboundary=True,
+        preservenormal=True,
+        optimalplacement=True,
+        planarquadric=True,
+    )
     mesh = meshes.current_mesh()
-    return (np.asarray(mesh.vertex_matrix()), np.asarray(mesh.face_matrix(), np.int64),
-            np.asarray(mesh.wedge_tex_coord_matrix()).reshape(-1, 3, 2))
+    return (
+        np.asarray(mesh.vertex_matrix()),
+        np.asarray(mesh.face_matrix(), np.int64),
+        np.asarray(mesh.wedge_tex_coord_matrix()).reshape(-1, 3, 2),
+    )
 
 
 def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[Target | None, str]:
@@ -50,8 +61,16 @@ def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[
     """
     try:
         with temporary_folder() as folder:
-            vertices, faces, uv = call(collapse_textured, target.vertices, target.faces.astype(np.int64),
-                                       target.uv[target.face_uvs], target_faces, str(folder), seconds=seconds, memory_mb=8000)
+            vertices, faces, uv = call(
+                collapse_textured,
+                target.vertices,
+                target.faces.astype(np.int64),
+                target.uv[target.face_uvs],
+                target_faces,
+                str(folder),
+                seconds=seconds,
+                memory_mb=8000,
+            )
     except ChildFailed as failure:
         return None, str(failure)
     if not len(faces) or not np.isfinite(vertices).all() or not np.isfinite(uv).all():
@@ -81,4 +100,8 @@ def drift(level: Target, full: Target, size: int = 1024, count: int = 20_000) ->
     at = inside.at(face[known], uv[known, 0], uv[known, 1])
     there = np.einsum("nk,nkc->nc", np.clip(at, -1, 2), full.vertices[full.faces[face[known]]])
     apart = np.linalg.norm(there - points[known], axis=1) / float(np.ptp(full.vertices, axis=0).max())
-    return {"drift_mean": float(apart.mean()), "drift_p99": float(np.percentile(apart, 99)), "outside": float(1 - known.mean())}
+    return {
+        "drift_mean": float(apart.mean()),
+        "drift_p99": float(np.percentile(apart, 99)),
+        "outside": float(1 - known.mean()),
+    }

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gdtool.core.threads import mapped
 from gdtool.bake.padding import Gutters
 from gdtool.bake.target import Texels
+from gdtool.core.threads import mapped
 
 # Smaller differences than this, in stored units, are no detail: one step of 8 bits and rounding.
 CONSTANT_RANGE = 1.5 / 255
@@ -24,13 +24,12 @@ HEIGHT_BITS = 16  # a step of 8 bits is a visible terrace
 class Maps:
     """Maps as stored, uint8 or uint16, (s, s, c), None where a factor or nothing takes their place.
 
-    base_color RGB(A) sRGB; orm R occlusion, G roughness, B metallic; normal tangent space, +Y up; emissive RGB sRGB; extra:
-    grey maps that no material refers to, height and confidence. factors: base_color linear RGBA, roughness, metallic,
-    emissive linear RGB where anything shines, what the material's factors have to be; height, the distance that 0 and 1
-    of that map stand for below and above the surface. has_occlusion: orm's R means something. has_roughness_metallic: G
-    and B do. skipped: (what, why, seconds that gutters and storing would
-    have taken, those of one that is stored, or None).
-    """
+    base_color RGB(A) sRGB; orm R occlusion, G roughness, B metallic; normal tangent space, +Y up; emissive RGB sRGB;
+    extra: grey maps that no material refers to, height and confidence. factors: base_color linear RGBA, roughness,
+    metallic, emissive linear RGB where anything shines, what the material's factors have to be; height, the distance
+    that 0 and 1 of that map stand for below and above the surface. has_occlusion: orm's R means something.
+    has_roughness_metallic: G and B do. skipped: (what, why, seconds that gutters and storing would have taken, those of
+    one that is stored, or None)."""
 
     size: int
     base_color: np.ndarray | None
@@ -52,9 +51,11 @@ def quantise(image: np.ndarray, bits: int) -> np.ndarray:
     return np.rint(scaled, out=scaled).astype(kind)
 
 
-def constant_of(values: np.ndarray, tolerance: float = CONSTANT_RANGE, encoding: Callable = lambda x: x) -> np.ndarray | None:
-    """The middle of values (n,) or (n, c), float64, when no channel spans more than tolerance, else None; both as encoding,
-    which is monotonic, has them."""
+def constant_of(
+    values: np.ndarray, tolerance: float = CONSTANT_RANGE, encoding: Callable = lambda x: x
+) -> np.ndarray | None:
+    """The middle of values (n,) or (n, c), float64, when no channel spans more than tolerance, else None; both as
+    encoding, which is monotonic, has them."""
     if not len(values):
         return None
     low, high = (encoding(np.clip(end, 0, 1).astype(np.float64)) for end in (values.min(0), values.max(0)))
@@ -70,15 +71,23 @@ def flat_angle(tangent_normals: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(up, -1, 1))))
 
 
-def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.ndarray | None = None, bits: int = 8,
-              padding: int | None = None, normal_map: str = "auto", least_alpha: float = 0.5 / 255, threads: int = 1) -> Maps:
-    """Maps of what texels read (bake.Baked.values): albedo, roughness, metallic, tangent_normal, perhaps alpha, emissive
-    (n, 3) linear, height (n,) in the target's units, confidence (n,) in [0, 1].
+def make_maps(
+    texels: Texels,
+    values: dict[str, np.ndarray],
+    *,
+    occlusion: np.ndarray | None = None,
+    bits: int = 8,
+    padding: int | None = None,
+    normal_map: str = "auto",
+    least_alpha: float = 0.5 / 255,
+    threads: int = 1,
+) -> Maps:
+    """Maps of what texels read (bake.Baked.values): albedo, roughness, metallic, tangent_normal, perhaps alpha,
+    emissive (n, 3) linear, height (n,) in the target's units, confidence (n,) in [0, 1].
 
-    occlusion (n,) or None. normal_map "auto" leaves a flat map out. Gutters are filled over `padding` texels, everywhere
-    when None. Color of less alpha than least_alpha is never seen: it is filled like a gutter, or filtering would draw what
-    painters leave there, black mostly, around all that is seen.
-    """
+    occlusion (n,) or None. normal_map "auto" leaves a flat map out. Gutters are filled over `padding` texels,
+    everywhere when None. Color of less alpha than least_alpha is never seen: it is filled like a gutter, or filtering
+    would draw what painters leave there, black mostly, around all that is seen."""
     from gdtool.images.color import linear_from_srgb, srgb_from_linear
 
     inside = slice(0, texels.inside)
@@ -89,7 +98,9 @@ def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.nd
     if alpha is not None and alpha[inside].min() >= 1 - CONSTANT_RANGE:
         alpha = None
         skipped.append(("alpha", "opaque everywhere"))
-    constants = [constant_of(channel[inside], encoding=srgb_from_linear) for channel in color] if alpha is None else [None]
+    constants = (
+        [constant_of(channel[inside], encoding=srgb_from_linear) for channel in color] if alpha is None else [None]
+    )
     if any(constant is None for constant in constants):
         factors: dict[str, tuple[float, ...]] = {"base_color": (1.0, 1.0, 1.0, 1.0)}
         layers["base_color"] = color if alpha is None else [*color, alpha]
@@ -134,31 +145,55 @@ def make_maps(texels: Texels, values: dict[str, np.ndarray], *, occlusion: np.nd
     if "confidence" in values:
         layers["confidence"] = [values["confidence"]]
     gutters = Gutters(texels.mask(), padding)
-    planes = {name: [_Plane(channel, gutters, srgb_from_linear if name in ("base_color", "emissive") and k < 3 else None)
-                     for k, channel in enumerate(layer)] for name, layer in layers.items()}  # alpha, the fourth channel, is never sRGB
+    planes = {
+        name: [
+            _Plane(channel, gutters, srgb_from_linear if name in ("base_color", "emissive") and k < 3 else None)
+            # Alpha, the fourth channel, is never sRGB.
+            for k, channel in enumerate(layer)
+        ]
+        for name, layer in layers.items()
+    }
     if alpha is not None and (hidden := alpha < least_alpha).any() and not hidden.all():
         seen = Gutters(texels.image(~hidden), padding)
-        planes["base_color"][:3] = [_Plane(np.where(hidden, np.float32(0), channel), seen, srgb_from_linear) for channel in color]
+        planes["base_color"][:3] = [
+            _Plane(np.where(hidden, np.float32(0), channel), seen, srgb_from_linear) for channel in color
+        ]
     start = time.perf_counter()
     stored = _stored(texels, planes, {name: HEIGHT_BITS if name == "height" else bits for name in planes}, threads)
     one = (time.perf_counter() - start) / len(stored) if stored else None
-    return Maps(texels.size, stored.get("base_color"), stored.get("orm"), stored.get("normal"), factors, has_occlusion, varies,
-                stored.get("emissive"), {name: stored[name] for name in ("height", "confidence") if name in stored},
-                [(what, why, one if what.endswith("map") else None) for what, why in skipped])
+    return Maps(
+        texels.size,
+        stored.get("base_color"),
+        stored.get("orm"),
+        stored.get("normal"),
+        factors,
+        has_occlusion,
+        varies,
+        stored.get("emissive"),
+        {name: stored[name] for name in ("height", "confidence") if name in stored},
+        [(what, why, one if what.endswith("map") else None) for what, why in skipped],
+    )
 
 
 @dataclass(frozen=True)
 class _Plane:
-    """One channel of a map: values (n,) in [0, 1], or of a unit vector; None for 1 everywhere. encoding: what they are put through first."""
+    """One channel of a map: values (n,) in [0, 1], or of a unit vector; None for 1 everywhere. encoding: what they are
+    put through first."""
 
     values: np.ndarray | None
     gutters: Gutters
     encoding: Callable | None
 
 
-def _stored(texels: Texels, layers: dict[str, list[_Plane]], bits: dict[str, int], threads: int) -> dict[str, np.ndarray]:
-    """(s, s, c) uint8 or uint16 of each layer's channels, gutters filled; "normal" is stored as 0.5 n + 0.5 of unit vectors."""
-    out = {name: np.empty((texels.size, texels.size, len(layer)), np.uint8 if bits[name] == 8 else np.uint16) for name, layer in layers.items()}
+def _stored(
+    texels: Texels, layers: dict[str, list[_Plane]], bits: dict[str, int], threads: int
+) -> dict[str, np.ndarray]:
+    """(s, s, c) uint8 or uint16 of each layer's channels, gutters filled; "normal" is stored as 0.5 n + 0.5 of unit
+    vectors."""
+    out = {
+        name: np.empty((texels.size, texels.size, len(layer)), np.uint8 if bits[name] == 8 else np.uint16)
+        for name, layer in layers.items()
+    }
     normal: dict[int, np.ndarray] = {}
 
     def store(at: tuple[str, int]) -> None:
@@ -167,19 +202,23 @@ def _stored(texels: Texels, layers: dict[str, list[_Plane]], bits: dict[str, int
         if plane.values is None:
             out[name][..., k] = np.iinfo(out[name].dtype).max
             return
-        image = plane.gutters.fill(texels.image(plane.values if plane.encoding is None else plane.encoding(np.clip(plane.values, 0, 1))))
+        image = plane.gutters.fill(
+            texels.image(plane.values if plane.encoding is None else plane.encoding(np.clip(plane.values, 0, 1)))
+        )
         if name == "normal":
             normal[k] = image
             return
         for row in range(0, texels.size, _ROWS_AT_ONCE):
-            out[name][row:row + _ROWS_AT_ONCE, :, k] = quantise(image[row:row + _ROWS_AT_ONCE], bits[name])
+            out[name][row : row + _ROWS_AT_ONCE, :, k] = quantise(image[row : row + _ROWS_AT_ONCE], bits[name])
 
     def turn(row: int) -> None:
-        rows = [normal[k][row:row + _ROWS_AT_ONCE] for k in range(3)]
+        rows = [normal[k][row : row + _ROWS_AT_ONCE] for k in range(3)]
         length = np.sqrt(sum(component * component for component in rows))
         scale = np.float32(0.5) / np.where(length > 0, length, np.float32(1))
         for k, component in enumerate(rows):
-            out["normal"][row:row + _ROWS_AT_ONCE, :, k] = quantise(component * scale + np.float32(0.5), bits["normal"])
+            out["normal"][row : row + _ROWS_AT_ONCE, :, k] = quantise(
+                component * scale + np.float32(0.5), bits["normal"]
+            )
 
     for _ in mapped(store, [(name, k) for name, layer in layers.items() for k in range(len(layer))], threads):
         pass
@@ -211,11 +250,19 @@ def contact_sheet_of(maps: Maps, width: int = 384) -> np.ndarray:
         return np.broadcast_to(np.asarray(value, np.float32), (64, 64, 3))
 
     factors = maps.factors
-    tiles = {"base color": small(maps.base_color) if maps.base_color is not None else plain(srgb_from_linear(np.array(factors["base_color"][:3])))}
+    tiles = {
+        "base color": small(maps.base_color)
+        if maps.base_color is not None
+        else plain(srgb_from_linear(np.array(factors["base_color"][:3])))
+    }
     if maps.has_occlusion:
         tiles["occlusion"] = small(maps.orm[..., :1])
     for channel, name in ((1, "roughness"), (2, "metallic")):
-        tiles[name] = small(maps.orm[..., channel:channel + 1]) * factors[name][0] if maps.has_roughness_metallic else plain(factors[name][0])
+        tiles[name] = (
+            small(maps.orm[..., channel : channel + 1]) * factors[name][0]
+            if maps.has_roughness_metallic
+            else plain(factors[name][0])
+        )
     if maps.normal is not None:
         tiles["normal"] = small(maps.normal)
     if maps.emissive is not None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gdtool.bake.target import TEXELS_AT_ONCE, Target, Texels, surface_at, texels_of
 from gdtool.core.threads import mapped
 from gdtool.geometry.tangents import dot, unit
-from gdtool.bake.target import TEXELS_AT_ONCE, Target, Texels, surface_at, texels_of
 
 
 def cosine_directions(count: int) -> np.ndarray:
@@ -24,8 +24,15 @@ def _basis(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([1 + sign * x * x * a, sign * b, -sign * x], 1), np.stack([b, sign + y * y * a, -y], 1)
 
 
-def openness(points: np.ndarray, normals: np.ndarray, caster, ray_count: int, seed: int, reach: float = np.inf,
-             lift: float = 1e-4) -> np.ndarray:
+def openness(
+    points: np.ndarray,
+    normals: np.ndarray,
+    caster,
+    ray_count: int,
+    seed: int,
+    reach: float = np.inf,
+    lift: float = 1e-4,
+) -> np.ndarray:
     """(n,) float32 in [0, 1]: share of ray_count cosine-distributed rays from points (n, 3) that leave the surface.
 
     caster is a geometry.quick_rays.QuickCaster. Rays start `lift` above the surface and are blocked within reach only.
@@ -50,10 +57,9 @@ def openness(points: np.ndarray, normals: np.ndarray, caster, ray_count: int, se
 def bake_occlusion(target: Target, texels: Texels, trace, scale: int = 4, threads: int = 1) -> np.ndarray:
     """Occlusion (n,) float32 for texels, traced at 1/scale of the map's size and upsampled along the surface.
 
-    trace(face_idx, barycentric) -> (m,) gives the occlusion at places on the target. A coarse texel helps a fine one only
-    when it lies near it in space and its surface looks the same way, so nothing leaks from one chart, or one side of an
-    edge, to another. Fine texels that no coarse one helps are traced.
-    """
+    trace(face_idx, barycentric) -> (m,) gives the occlusion at places on the target. A coarse texel helps a fine one
+    only when it lies near it in space and its surface looks the same way, so nothing leaks from one chart, or one side
+    of an edge, to another. Fine texels that no coarse one helps are traced."""
     size = texels.size
     coarse = texels_of(target, max(1, -(-size // scale)), rings=0)
     slot = np.full(coarse.size * coarse.size, -1, np.int32)
@@ -88,7 +94,7 @@ def bake_occlusion(target: Target, texels: Texels, trace, scale: int = 4, thread
     parts = [slice(s, min(s + TEXELS_AT_ONCE, texels.inside)) for s in range(0, texels.inside, TEXELS_AT_ONCE)]
     for _ in mapped(run, parts, threads):
         pass
-    alone = np.flatnonzero(~helped[:texels.inside])
+    alone = np.flatnonzero(~helped[: texels.inside])
     if len(alone):
         out[alone] = trace(texels.face_idx[alone], texels.barycentric[alone])
     # Beyond a crease the surface goes on in another direction: around charts the inside is continued instead.
@@ -98,10 +104,10 @@ def bake_occlusion(target: Target, texels: Texels, trace, scale: int = 4, thread
 
 def continue_into_rings(texels: Texels, values: np.ndarray) -> None:
     """Give the texels around the charts the mean of their neighbours' values (n,), inner ones first; changes values."""
-    size, ring = texels.size, texels.texel[texels.inside:]
+    size, ring = texels.size, texels.texel[texels.inside :]
     slot = np.full((size + 2) * (size + 2), -1, np.int32)
     place = (texels.texel // size + 1) * (size + 2) + texels.texel % size + 1
-    slot[place[:texels.inside]] = np.arange(texels.inside, dtype=np.int32)
+    slot[place[: texels.inside]] = np.arange(texels.inside, dtype=np.int32)
     waiting = np.arange(texels.inside, texels.inside + len(ring))
     while len(waiting):
         near = slot[place[waiting][:, None] + [o + d for o in (-size - 2, 0, size + 2) for d in (-1, 0, 1)]]
@@ -117,7 +123,8 @@ def continue_into_rings(texels: Texels, values: np.ndarray) -> None:
 
 
 def _kinship(near: np.ndarray, own: np.ndarray, wider: float = 1.0, reach: float = 3.0) -> np.ndarray:
-    """(n,) in [0, 1]: how much a place says about another one; 0 beyond reach spacings, which are `wider` times as large.
+    """(n,) in [0, 1]: how much a place says about another one; 0 beyond reach spacings, which are `wider` times as
+    large.
 
     near and own (n, 6 or more): position in spacings, unit direction.
     """
@@ -138,8 +145,8 @@ def _smoothed(known: np.ndarray, slot: np.ndarray) -> np.ndarray:
     padded = np.pad(slot, 2, constant_values=-1)
     out = known[:, 6].copy()
     for start in range(0, len(own), TEXELS_AT_ONCE):
-        here = own[start:start + TEXELS_AT_ONCE]
-        r, c, mine = row[start:start + TEXELS_AT_ONCE], column[start:start + TEXELS_AT_ONCE], known[here]
+        here = own[start : start + TEXELS_AT_ONCE]
+        r, c, mine = row[start : start + TEXELS_AT_ONCE], column[start : start + TEXELS_AT_ONCE], known[here]
         total, value = np.ones(len(here), np.float32), mine[:, 6].copy()
         for dr in range(-2, 3):
             for dc in range(-2, 3):

@@ -9,24 +9,24 @@ from pathlib import Path
 import numpy as np
 
 from gdtool.assets.scene import Scene
+from gdtool.bake.picture import Picture
+from gdtool.bake.pipeline import Lookup, ViewsOfSource, vertex_lookup, with_views
+from gdtool.bake.project_views import pixel_footprint, sight_of
+from gdtool.bake.reproject import Places, Source
 from gdtool.folders.surface import Surface
 from gdtool.folders.views import Views
 from gdtool.geometry.frames import invert_similarity, transform_points
 from gdtool.geometry.normals import vertex_normals
 from gdtool.geometry.tangents import dot
-from gdtool.bake.pipeline import Lookup, ViewsOfSource, vertex_lookup, with_views
-from gdtool.bake.picture import Picture
-from gdtool.bake.project_views import pixel_footprint, sight_of
-from gdtool.bake.reproject import Places, Source
 
 
 @dataclass(frozen=True)
 class Origin:
     """A source in the normalised frame, its material lookup, its vertex normals (v, 3), and how its surface is drawn.
 
-    label says where materials come from, for the report. detail is the width of the finest detail that the source holds,
-    in the normalised frame: a texel of its textures, half a pixel of its views, a pixel of the picture they were made of or half an edge of its mesh.
-    """
+    label says where materials come from, for the report. detail is the width of the finest detail that the source
+    holds, in the normalised frame: a texel of its textures, half a pixel of its views, a pixel of the picture they were
+    made of or half an edge of its mesh."""
 
     source: Source
     lookup: Lookup
@@ -39,7 +39,8 @@ class Origin:
 
 
 def material_field(path: Path, device: str = "cpu") -> Callable[[np.ndarray], dict[str, np.ndarray]]:
-    """The material network of a surface's field.safetensors: points (n, 3) to albedo (n, 3), roughness (n,), metallic (n,).
+    """The material network of a surface's field.safetensors: points (n, 3) to albedo (n, 3), roughness (n,), metallic
+    (n,).
 
     Raises InputError for a file that is damaged or holds another network.
     """
@@ -53,9 +54,15 @@ def material_field(path: Path, device: str = "cpu") -> Callable[[np.ndarray], di
     network = MaterialNetwork()
     try:
         tensors = load_file(str(path))
-        network.load_state_dict({name.removeprefix("material."): value for name, value in tensors.items() if name.startswith("material.")})
+        network.load_state_dict(
+            {name.removeprefix("material."): value for name, value in tensors.items() if name.startswith("material.")}
+        )
     except (SafetensorError, RuntimeError, OSError) as error:
-        raise InputError(path, f"is not the material field that gdtool writes ({str(error).splitlines()[0]})", "run gdtool reconstruct again") from None
+        raise InputError(
+            path,
+            f"is not the material field that gdtool writes ({str(error).splitlines()[0]})",
+            "run gdtool reconstruct again",
+        ) from None
     network = network.to(device).eval()
 
     def at(points: np.ndarray) -> dict[str, np.ndarray]:
@@ -65,16 +72,24 @@ def material_field(path: Path, device: str = "cpu") -> Callable[[np.ndarray], di
     return at
 
 
-def from_surface(surface: Surface, views: Views | None, field: Callable[[np.ndarray], dict[str, np.ndarray]] | None = None,
-                 picture: Picture | None = None) -> Origin:
+def from_surface(
+    surface: Surface,
+    views: Views | None,
+    field: Callable[[np.ndarray], dict[str, np.ndarray]] | None = None,
+    picture: Picture | None = None,
+) -> Origin:
     """A surface; views give material and normals where they see it well, its vertices elsewhere.
 
-    field (material_field) takes the vertices' place for the materials that no view shows. picture: what one of the views
-    was made of, for its finer detail.
-    """
+    field (material_field) takes the vertices' place for the materials that no view shows. picture: what one of the
+    views was made of, for its finer detail."""
     source = Source(surface.vertices, surface.faces)
     normals = surface.normals if surface.normals is not None else vertex_normals(surface.vertices, surface.faces)
-    attributes = {"albedo": surface.albedo, "roughness": surface.roughness, "metallic": surface.metallic, "confidence": surface.confidence}
+    attributes = {
+        "albedo": surface.albedo,
+        "roughness": surface.roughness,
+        "metallic": surface.metallic,
+        "confidence": surface.confidence,
+    }
     lookup = vertex_lookup(source, attributes, normals.astype(np.float32))
     images = dict(views.images) if views is not None else {}
     label = "vertices"
@@ -96,7 +111,9 @@ def from_surface(surface: Surface, views: Views | None, field: Callable[[np.ndar
     return Origin(source, lookup, normals, label, detail=detail)
 
 
-def _with_field(lookup: Lookup, source: Source, field: Callable[[np.ndarray], dict[str, np.ndarray]], names: list[str]) -> Lookup:
+def _with_field(
+    lookup: Lookup, source: Source, field: Callable[[np.ndarray], dict[str, np.ndarray]], names: list[str]
+) -> Lookup:
     def looked(places: Places) -> dict[str, np.ndarray]:
         read = field(source.at(places.face_idx, places.barycentric, source.vertices))
         return {**lookup(places), **{name: read[name] for name in names}}
@@ -130,13 +147,22 @@ def texture_detail(scene: Scene) -> float | None:
     widths, weights = [], []
     for index in np.unique(scene.material_idx):
         material, faces = scene.materials[index], scene.material_idx == index
-        textures = (material.base_color_texture, material.metallic_roughness_texture, material.normal_texture, material.emissive_texture)
+        textures = (
+            material.base_color_texture,
+            material.metallic_roughness_texture,
+            material.normal_texture,
+            material.emissive_texture,
+        )
         found = [t for t in textures if t is not None and t.uv_set < len(scene.uvs) and scene.uvs[t.uv_set] is not None]
         if not found:
             continue
         density = np.zeros(int(faces.sum()))
         for texture in found:
-            u, v = (scene.uvs[texture.uv_set][scene.faces[faces][:, k]] - scene.uvs[texture.uv_set][scene.faces[faces][:, 0]] for k in (1, 2))
+            u, v = (
+                scene.uvs[texture.uv_set][scene.faces[faces][:, k]]
+                - scene.uvs[texture.uv_set][scene.faces[faces][:, 0]]
+                for k in (1, 2)
+            )
             height, width = texture.image.shape[:2]
             covered = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) * abs(texture.scale[0] * texture.scale[1])
             density = np.maximum(density, covered * height * width)
@@ -150,12 +176,13 @@ def texture_detail(scene: Scene) -> float | None:
     return float(spans[order][np.searchsorted(np.cumsum(weight[order]), weight.sum() / 2)])
 
 
-def from_scene(scene: Scene, source_from_world: np.ndarray, footprint: Callable[[float], float] = lambda detail: 0.0) -> Origin:
+def from_scene(
+    scene: Scene, source_from_world: np.ndarray, footprint: Callable[[float], float] = lambda detail: 0.0
+) -> Origin:
     """A model with its own textures, in its own frame; source_from_world (4, 4) takes the normalised frame there.
 
-    footprint(detail) is the width, in the normalised frame, that the model's textures are averaged over where they are read, when
-    the model's detail (see Origin) is known.
-    """
+    footprint(detail) is the width, in the normalised frame, that the model's textures are averaged over where they are
+    read, when the model's detail (see Origin) is known."""
     from gdtool.shading.render.surface_points import SurfaceLookup
 
     matrix = invert_similarity(source_from_world)
@@ -165,8 +192,13 @@ def from_scene(scene: Scene, source_from_world: np.ndarray, footprint: Callable[
     normals = scene.normals @ turn.T if scene.normals is not None else vertex_normals(source.vertices, source.faces)
 
     # Single precision places a texel of a 16384² texture within 1/1000 of itself, in half the time.
-    points = SurfaceLookup(replace(scene, normals=None if scene.normals is None else scene.normals.astype(np.float32),
-                                   uvs=tuple(None if uv is None else uv.astype(np.float32) for uv in scene.uvs)))
+    points = SurfaceLookup(
+        replace(
+            scene,
+            normals=None if scene.normals is None else scene.normals.astype(np.float32),
+            uvs=tuple(None if uv is None else uv.astype(np.float32) for uv in scene.uvs),
+        )
+    )
     own = texture_detail(scene)
     # Vertex colors, or nothing but factors: the mesh says how fine it is.
     detail = 0.5 * _edge(source) if own is None else own / float(np.sqrt((source_from_world[:3, 0] ** 2).sum()))
@@ -186,6 +218,21 @@ def from_scene(scene: Scene, source_from_world: np.ndarray, footprint: Callable[
     modes = {material.alpha_mode for material in scene.materials}
     mode = next((m for m in ("BLEND", "MASK") if m in modes), "OPAQUE")
     shines = any(max(material.emissive) > 0 for material in scene.materials)
-    kept = ["albedo", "roughness", "metallic", *(["alpha"] if mode != "OPAQUE" else []), *(["emissive"] if shines else [])]
+    kept = [
+        "albedo",
+        "roughness",
+        "metallic",
+        *(["alpha"] if mode != "OPAQUE" else []),
+        *(["emissive"] if shines else []),
+    ]
     cutoffs = [m.alpha_cutoff for m in scene.materials if m.alpha_mode == "MASK"]
-    return Origin(source, lookup, normals, "model", mode, cutoffs[0] if cutoffs else 0.5, any(m.double_sided for m in scene.materials), detail)
+    return Origin(
+        source,
+        lookup,
+        normals,
+        "model",
+        mode,
+        cutoffs[0] if cutoffs else 0.5,
+        any(m.double_sided for m in scene.materials),
+        detail,
+    )

@@ -13,8 +13,8 @@ class Gutters:
     """Fills the texels outside a mask (h, w) from those inside; the mask's levels are made once for all channels.
 
     Averages of what is known are pushed up a pyramid, and pulled down into what is not (Gortler et al. 1996, "The
-    Lumigraph", section 3.5). Beyond `padding` texels from the mask all become the channel's mean inside; None: no limit.
-    """
+    Lumigraph", section 3.5). Beyond `padding` texels from the mask all become the channel's mean inside; None: no
+    limit."""
 
     def __init__(self, mask: np.ndarray, padding: int | None = None):
         self.mask = np.asarray(mask, bool)
@@ -74,8 +74,8 @@ def _doubled(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _doubled_rows(image: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[slice, np.ndarray]]:
-    """_doubled's rows, some at a time. A texel's centre lies a quarter of a coarse texel from its parent's, so weights are three quarters
-    and one."""
+    """_doubled's rows, some at a time. A texel's centre lies a quarter of a coarse texel from its parent's, so weights
+    are three quarters and one."""
     height, width = image.shape
     for first in range(0, height, _ROWS_AT_ONCE):
         rows = np.arange(first, min(first + _ROWS_AT_ONCE, height))
@@ -88,16 +88,18 @@ def _doubled_rows(image: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[s
             np.add(column[:, :-1], other[:, 1:], out=line[:, 1:-1:2])
             line[:, 0], line[:, -1] = column[:, 0] + other[:, 0], column[:, -1] + other[:, -1]
         end = min(2 * first + len(out), shape[0])
-        yield slice(2 * first, end), out[:end - 2 * first, :shape[1]]
+        yield slice(2 * first, end), out[: end - 2 * first, : shape[1]]
 
 
 def push_pull(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """(h, w, c) or (h, w) float32: image with the texels outside mask (h, w) filled from those inside, which stay as they
-    are. An all-empty mask gives the image back."""
+    """(h, w, c) or (h, w) float32: image with the texels outside mask (h, w) filled from those inside, which stay as
+    they are. An all-empty mask gives the image back."""
     return fill_gutters(image, mask)
 
 
-def fill_gutters(image: np.ndarray, mask: np.ndarray, padding: int | None = None, background: float | None = None) -> np.ndarray:
+def fill_gutters(
+    image: np.ndarray, mask: np.ndarray, padding: int | None = None, background: float | None = None
+) -> np.ndarray:
     """Fill `padding` texels around the charts (all texels when None); farther ones get background (default: the mean).
 
     image (h, w, c) or (h, w) float, mask (h, w) bool of the texels that are known.

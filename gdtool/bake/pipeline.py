@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gdtool.core.threads import mapped
-from gdtool.geometry.tangents import dot, encode_tangent_space, unit
 from gdtool.bake.occlusion import openness
 from gdtool.bake.picture import Picture
 from gdtool.bake.project_views import Sight, observe, steadiness
 from gdtool.bake.reproject import Places, Source, reproject
 from gdtool.bake.supersample import supersample
 from gdtool.bake.target import TEXELS_AT_ONCE, Target, Texels, surface_at
+from gdtool.core.threads import mapped
+from gdtool.geometry.tangents import dot, encode_tangent_space, unit
 
 # Looks the material of places up: dict of albedo (n, 3) linear, roughness (n,), metallic (n,), normal (n, 3) unit in
 # world axes, and alpha (n,) where the source has one.
@@ -25,9 +25,8 @@ Lookup = Callable[[Places], dict[str, np.ndarray]]
 class ViewsOfSource:
     """Views of the source and what their cameras see of it.
 
-    images: domain (albedo linear, roughness, metallic, normal) to (k, h, w[, c]); mask (k, h, w); picture: what one of them was
-    made of.
-    """
+    images: domain (albedo linear, roughness, metallic, normal) to (k, h, w[, c]); mask (k, h, w); picture: what one of
+    them was made of."""
 
     sights: list[Sight]
     images: dict[str, np.ndarray]
@@ -82,9 +81,11 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
         points = source.at(places.face_idx, places.barycentric, source.vertices)
         prior = [srgb_from_linear(out[d]) if d == "albedo" else out[d] for d in domains]
         prior = np.concatenate([p if p.ndim == 2 else p[:, None] for p in prior], 1)
-        value, seen, shares = observe(points, out["normal"], views.sights, stack, views.mask, prior, known=pictured, colors=channel[1])
+        value, seen, shares = observe(
+            points, out["normal"], views.sights, stack, views.mask, prior, known=pictured, colors=channel[1]
+        )
         for k, domain in enumerate(domains):
-            own, read = prior[:, channel[k]:channel[k + 1]], value[:, channel[k]:channel[k + 1]]
+            own, read = prior[:, channel[k] : channel[k + 1]], value[:, channel[k] : channel[k + 1]]
             share = seen[:, None]
             if domain == "normal":
                 read = unit(read)
@@ -93,7 +94,9 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
             mixed = own + share * (read - own)
             if domain == "normal":
                 mixed = unit(mixed)
-            out[domain] = linear_from_srgb(mixed) if domain == "albedo" else mixed if out[domain].ndim == 2 else mixed[:, 0]
+            out[domain] = (
+                linear_from_srgb(mixed) if domain == "albedo" else mixed if out[domain].ndim == 2 else mixed[:, 0]
+            )
         if pictured is not None:
             _sharpen(out, points, views.picture, views.sights[pictured], seen * shares[pictured])
         out["seen"] = seen
@@ -105,7 +108,8 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
 
 
 def _sharpen(out: dict[str, np.ndarray], points: np.ndarray, picture: Picture, sight: Sight, share: np.ndarray) -> None:
-    """Multiply what the picture has in finer pixels into the albedo of points (n, 3), by the share (n,) that its view has in it.
+    """Multiply what the picture has in finer pixels into the albedo of points (n, 3), by the share (n,) that its view
+    has in it.
 
     What a metal shows is what it mirrors, and no detail of its own.
     """
@@ -115,8 +119,9 @@ def _sharpen(out: dict[str, np.ndarray], points: np.ndarray, picture: Picture, s
     out["albedo"][seen] = np.clip(out["albedo"][seen] * (1 + share[seen, None] * (picture.at(points[seen]) - 1)), 0, 1)
 
 
-def _read(target: Target, source: Source, lookup: Lookup, reach: np.ndarray, face_idx: np.ndarray,
-          barycentric: np.ndarray) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, ...], Places]:
+def _read(
+    target: Target, source: Source, lookup: Lookup, reach: np.ndarray, face_idx: np.ndarray, barycentric: np.ndarray
+) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, ...], Places]:
     """What lookup says of the places that stand for places on the target; what surface_at says; and the places."""
     frame = surface_at(target, face_idx, barycentric)
     places = reproject(frame[0], unit(frame[1]), reach[face_idx], source)
@@ -126,15 +131,25 @@ def _read(target: Target, source: Source, lookup: Lookup, reach: np.ndarray, fac
     return read, frame, places
 
 
-def bake(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: np.ndarray, samples: int = 1,
-         threads: int = 1, progress: Callable = lambda iterable, total, label: iterable, height: bool = False, confidence: bool = False) -> Baked:
+def bake(
+    target: Target,
+    texels: Texels,
+    source: Source,
+    lookup: Lookup,
+    reach: np.ndarray,
+    samples: int = 1,
+    threads: int = 1,
+    progress: Callable = lambda iterable, total, label: iterable,
+    height: bool = False,
+    confidence: bool = False,
+) -> Baked:
     """Bake what lookup says of the source into the texels.
 
     reach (t,) from reproject.vertex_reach. samples per texel (a square number) are taken where neighbouring texels
-    differ, one elsewhere (supersample.supersample). values has albedo, roughness, metallic, tangent_normal (n, 3) and whatever else lookup gives besides
-    normal; where they are asked for height (n,), how far above the target, along its normal, the source lies, and the
-    lookup's confidence (n,), 0 where the normal leads to nothing and the nearest point serves.
-    """
+    differ, one elsewhere (supersample.supersample). values has albedo, roughness, metallic, tangent_normal (n, 3) and
+    whatever else lookup gives besides normal; where they are asked for height (n,), how far above the target, along its
+    normal, the source lies, and the lookup's confidence (n,), 0 where the normal leads to nothing and the nearest point
+    serves."""
     reach = reach.astype(np.float32)
     values: dict[str, np.ndarray] = {}
     by_ray = np.empty(len(texels), bool)
@@ -143,7 +158,9 @@ def bake(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: 
         out, frame, places = _read(target, source, lookup, reach, face_idx, barycentric)
         out["tangent_normal"] = encode_tangent_space(*frame[1:], out.pop("normal"))
         if height:
-            out["height"] = dot(source.at(places.face_idx, places.barycentric, source.vertices) - frame[0], unit(frame[1]))
+            out["height"] = dot(
+                source.at(places.face_idx, places.barycentric, source.vertices) - frame[0], unit(frame[1])
+            )
         certain = out.pop("confidence", None)
         if confidence:
             out["confidence"] = np.where(places.by_ray, certain, 0)
@@ -161,16 +178,18 @@ def bake(target: Target, texels: Texels, source: Source, lookup: Lookup, reach: 
     parts = [slice(s, min(s + TEXELS_AT_ONCE, len(texels))) for s in range(0, len(texels), TEXELS_AT_ONCE)]
     for _ in progress(mapped(run, parts, threads), len(parts), "bake"):
         pass
-    report = {"texels": texels.inside, "nearest_point_share": float(1 - by_ray[:texels.inside].mean())}
+    report = {"texels": texels.inside, "nearest_point_share": float(1 - by_ray[: texels.inside].mean())}
     if samples > 1:
         report["supersampled_share"] = supersample(target, texels, values, lambda *at: read(*at)[0], samples, threads)
     seen = values.pop("seen", None)
     return Baked(values, seen, report)
 
 
-def occlusion_tracer(target: Target, source: Source, reach: np.ndarray, normals: np.ndarray, rays: int, seed: int,
-                     threads: int = 1) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """trace(face_idx, barycentric) -> openness (n,) of the source at places on the target; normals (v, 3) of the source."""
+def occlusion_tracer(
+    target: Target, source: Source, reach: np.ndarray, normals: np.ndarray, rays: int, seed: int, threads: int = 1
+) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """trace(face_idx, barycentric) -> openness (n,) of the source at places on the target; normals (v, 3) of the
+    source."""
     lift = 5e-4 * source.extent
 
     def trace(face_idx: np.ndarray, barycentric: np.ndarray) -> np.ndarray:

@@ -14,7 +14,8 @@ GRAZING = 0.12
 _SUPERSAMPLE = 2
 # Views that differ by less, in stored units, agree.
 TOLERANCE = 0.15
-# How much better a picture sees color than the views that were made of it, at the same angle; never more than one that faces the surface.
+# How much better a picture sees color than the views that were made of it, at the same angle; never more than one that
+# faces the surface.
 KNOWN = 4.0
 
 
@@ -33,7 +34,8 @@ class Sight:
 
 
 def sight_of(camera: Camera, caster, mask: np.ndarray) -> Sight:
-    """What a camera sees of a surface, by rays; mask (h, w) is the view's own coverage, whose border counts as silhouette."""
+    """What a camera sees of a surface, by rays; mask (h, w) is the view's own coverage, whose border counts as
+    silhouette."""
     from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter
 
     h, w, n = camera.height, camera.width, _SUPERSAMPLE
@@ -47,7 +49,9 @@ def sight_of(camera: Camera, caster, mask: np.ndarray) -> Sight:
     missed = np.isinf(samples)
     low, high = samples.min(-1), np.where(missed, -np.inf, samples).max(-1)
     # A step: neighbouring pixels whose depths differ by more than a surface at 80 degrees would make them.
-    span = maximum_filter(np.where(np.isinf(high), camera.far, high), 3) - minimum_filter(np.where(np.isinf(low), camera.far, low), 3)
+    span = maximum_filter(np.where(np.isinf(high), camera.far, high), 3) - minimum_filter(
+        np.where(np.isinf(low), camera.far, low), 3
+    )
     step = span > 2 * pixel_footprint(camera, np.where(np.isinf(low), camera.far, low)) * np.tan(np.radians(80))
     edge = step | missed.any(-1) | (mask < 0.999)
     edge = np.pad(edge, 1, constant_values=True)
@@ -66,8 +70,13 @@ def _toward(camera: Camera, points: np.ndarray) -> np.ndarray:
     return unit(camera.position - points)
 
 
-def _read(sight: Sight, stack: np.ndarray, mask: np.ndarray, points: np.ndarray, normals: np.ndarray,
-          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _read(
+    sight: Sight,
+    stack: np.ndarray,
+    mask: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One view at the points that face it: their indices (m,), values (m, c), quality (m,) in [0, 1].
 
     stack (h, w, c) straight values, mask (h, w). Bilinear over those of the four pixels that show this part of the
@@ -111,17 +120,25 @@ def steadiness(sight: Sight, points: np.ndarray) -> np.ndarray:
     return np.clip(sight.clear[np.clip(pixel[:, 1], 0, h - 1), np.clip(pixel[:, 0], 0, w - 1)] - 1, 0, 1)
 
 
-def observe(points: np.ndarray, normals: np.ndarray, sights: list[Sight], stack: np.ndarray, mask: np.ndarray,
-            prior: np.ndarray | None = None, sharpness: float = 6.0, known: int | None = None, colors: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def observe(
+    points: np.ndarray,
+    normals: np.ndarray,
+    sights: list[Sight],
+    stack: np.ndarray,
+    mask: np.ndarray,
+    prior: np.ndarray | None = None,
+    sharpness: float = 6.0,
+    known: int | None = None,
+    colors: int = 0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What the views say about points (n, 3) of the surface with unit normals (n, 3).
 
     stack (k, h, w, c) and mask (k, h, w) of the k sights. Views are weighted by facing, distance to silhouettes and
     coverage; the best one counts far more than the next (its power is sharpness), so detail is not averaged away, and
-    the change from one view to another is smooth. A view that differs from all others and from prior (n, c) fades
-    out, but not the known one, which the others were made of: of the first channels, its colors, it counts as if of KNOWN
-    times the quality, 1 at most. Returns values (n, c) float32, confidence (n,) float32 in [0, 1], 0 where no view sees the point, and each
-    view's share (k, n) of the values, of the colors where one is known.
-    """
+    the change from one view to another is smooth. A view that differs from all others and from prior (n, c) fades out,
+    but not the known one, which the others were made of: of the first channels, its colors, it counts as if of KNOWN
+    times the quality, 1 at most. Returns values (n, c) float32, confidence (n,) float32 in [0, 1], 0 where no view sees
+    the point, and each view's share (k, n) of the values, of the colors where one is known."""
     count, channels = len(points), stack.shape[-1]
     value = np.zeros((len(sights), count, channels), np.float32)
     quality = np.zeros((len(sights), count), np.float32)
@@ -152,7 +169,8 @@ def observe(points: np.ndarray, normals: np.ndarray, sights: list[Sight], stack:
 
 
 def _fade_outliers(value: np.ndarray, share: np.ndarray, prior: np.ndarray | None) -> np.ndarray:
-    """share (k, n), less where a view's value (k, n, c) is far from the median of all that see the point and prior (n, c).
+    """share (k, n), less where a view's value (k, n, c) is far from the median of all that see the point and prior (n,
+    c).
 
     Only where at least three opinions are there. The loss is gradual, from half the tolerance to twice it, so that a
     view on which the others gain does not end in an edge on the surface; a trace stays, so that one view always counts.

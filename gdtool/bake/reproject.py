@@ -13,10 +13,12 @@ from gdtool.geometry.distance import barycentric_of, bisected
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.tangents import dot, weld
 
-# A place on the source is on the right side when its face's normal agrees with the mesh's normal: dot product above this.
+# A place on the source is on the right side when its face's normal agrees with the mesh's normal: dot product above
+# this.
 AGREEMENT = 0.1
 _RETRIES = 4
-# Faces with an edge of more than this share of the source are cut for the search of closest points, while there are no more than so many.
+# Faces with an edge of more than this share of the source are cut for the search of closest points, while there are no
+# more than so many.
 _LONG, _MOST_CUT = 1 / 16, 100_000
 
 
@@ -29,20 +31,28 @@ class Nearest:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, chosen: np.ndarray | None = None):
         igl = imported("igl")
         some = faces if chosen is None else faces[chosen]
-        cut_vertices, cut, whole = bisected(vertices, some, _LONG * float(np.ptp(vertices, axis=0).max(initial=0)), _MOST_CUT)
-        self._vertices, self._faces = np.ascontiguousarray(cut_vertices, np.float64), np.ascontiguousarray(cut, np.int64)
+        cut_vertices, cut, whole = bisected(
+            vertices, some, _LONG * float(np.ptp(vertices, axis=0).max(initial=0)), _MOST_CUT
+        )
+        self._vertices, self._faces = (
+            np.ascontiguousarray(cut_vertices, np.float64),
+            np.ascontiguousarray(cut, np.int64),
+        )
         self._face_idx = (whole if chosen is None else chosen[whole]).astype(np.int32)
         self._tree = igl.AABB()
         self._tree.init(self._vertices, self._faces)
 
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """face_idx (n,) into all faces and the closest point (n, 3) to each of points (n, 3)."""
-        _, face, point = self._tree.squared_distance(self._vertices, self._faces, np.ascontiguousarray(points, np.float64))
+        _, face, point = self._tree.squared_distance(
+            self._vertices, self._faces, np.ascontiguousarray(points, np.float64)
+        )
         return self._face_idx[face.reshape(-1)], np.asarray(point).reshape(-1, 3).copy()
 
 
 class Source:
-    """Triangles to bake from: vertices (v, 3), faces (f, 3), face_normals (f, 3) unit, and what finds places on them."""
+    """Triangles to bake from: vertices (v, 3), faces (f, 3), face_normals (f, 3) unit, and what finds places on
+    them."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
         from gdtool.geometry.quick_rays import QuickCaster
@@ -81,8 +91,8 @@ class Source:
             return self._facing[axis, sign]
 
     def turn_to(self, points: np.ndarray, normals: np.ndarray) -> bool:
-        """Turn all faces round where the source is inside out: where nine in ten of those nearest to points (n, 3) look away
-        from normals (n, 3). Returns whether it was."""
+        """Turn all faces round where the source is inside out: where nine in ten of those nearest to points (n, 3) look
+        away from normals (n, 3). Returns whether it was."""
         face, _ = self.nearest.closest(points)
         if not len(face) or (dot(self.face_normals[face], normals) < 0).mean() < 0.9:
             return False
@@ -98,8 +108,8 @@ class Source:
 
 @dataclass(frozen=True)
 class Places:
-    """Places on a source: face_idx (n,), barycentric (n, 3) float32, by_ray (n,) bool, False where by nearest point, and from_behind
-    (n,) bool, where the back of the face is meant."""
+    """Places on a source: face_idx (n,), barycentric (n, 3) float32, by_ray (n,) bool, False where by nearest point,
+    and from_behind (n,) bool, where the back of the face is meant."""
 
     face_idx: np.ndarray
     barycentric: np.ndarray
@@ -110,9 +120,8 @@ class Places:
 def vertex_reach(vertices: np.ndarray, faces: np.ndarray, source: Source) -> np.ndarray:
     """How far from each triangle's points to look for the source, (t,): its cage.
 
-    Twice the largest distance of its corners to the source, and a share of its size for the bulge between them. A corner
-    that lies far out (a part that remeshing lost) does not count for more than the 99th percentile of all.
-    """
+    Twice the largest distance of its corners to the source, and a share of its size for the bulge between them. A
+    corner that lies far out (a part that remeshing lost) does not count for more than the 99th percentile of all."""
     distance = np.linalg.norm(source.nearest.closest(vertices)[1] - vertices, axis=1)
     distance = np.minimum(distance, np.percentile(distance, 99) + 1e-12)
     corners = vertices[faces]
@@ -121,13 +130,20 @@ def vertex_reach(vertices: np.ndarray, faces: np.ndarray, source: Source) -> np.
     return 2 * distance[faces].max(1) + 0.3 * np.minimum(longest, np.percentile(longest, 99)) + 1e-4 * extent
 
 
-def _march(points: np.ndarray, directions: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source, start: float,
-           through: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """First face on the right side along each ray within reach: face_idx (n,), -1 for none, distance (n,), barycentric (n, 3).
+def _march(
+    points: np.ndarray,
+    directions: np.ndarray,
+    normals: np.ndarray,
+    reach: np.ndarray,
+    source: Source,
+    start: float,
+    through: bool = True,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """First face on the right side along each ray within reach: face_idx (n,), -1 for none, distance (n,), barycentric
+    (n, 3).
 
-    Faces on the wrong side are stepped through, unless a ray that may not go through meets the first of them from behind: these rays
-    (k,) come last, with the place of that face and a distance of infinity.
-    """
+    Faces on the wrong side are stepped through, unless a ray that may not go through meets the first of them from
+    behind: these rays (k,) come last, with the place of that face and a distance of infinity."""
     face, t, barycentric = source.caster.quick_hits(points - directions * points.dtype.type(start), directions)
     t -= np.float32(start)
     near = (face >= 0) & (t <= reach)
@@ -142,7 +158,9 @@ def _march(points: np.ndarray, directions: np.ndarray, normals: np.ndarray, reac
     for _ in range(_RETRIES - 1):
         if not len(active):
             break
-        hit_face, t, hit_at = source.caster.quick_hits(points[active] + directions[active] * travelled[:, None], directions[active])
+        hit_face, t, hit_at = source.caster.quick_hits(
+            points[active] + directions[active] * travelled[:, None], directions[active]
+        )
         t += travelled
         near = (hit_face >= 0) & (t <= reach[active])
         active, hit_face, hit_at, t = active[near], hit_face[near], hit_at[near], t[near]
@@ -153,12 +171,13 @@ def _march(points: np.ndarray, directions: np.ndarray, normals: np.ndarray, reac
     return face, distance, barycentric, np.flatnonzero(back)
 
 
-def _nearest_agreeing(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source) -> tuple[np.ndarray, np.ndarray]:
+def _nearest_agreeing(
+    points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source
+) -> tuple[np.ndarray, np.ndarray]:
     """Nearest place whose face looks the same way as the normal: face_idx (n,), point (n, 3).
 
-    Plain nearest if none does; and where that lies within reach (n,) but none that looks the same way: the back of a sheet that has
-    but one side.
-    """
+    Plain nearest if none does; and where that lies within reach (n,) but none that looks the same way: the back of a
+    sheet that has but one side."""
     face, point = source.nearest.closest(points)
     wrong = np.flatnonzero(dot(source.face_normals[face], normals) <= AGREEMENT)
     if not len(wrong):
@@ -180,8 +199,11 @@ def _nearest_agreeing(points: np.ndarray, normals: np.ndarray, reach: np.ndarray
     return face, point
 
 
-def _slide_off_edges(points: np.ndarray, normals: np.ndarray, source: Source, met: np.ndarray, face: np.ndarray, barycentric: np.ndarray) -> None:
-    """Where a ray met (n,) bool a slanted face from afar, take the nearest place instead if it agrees; changes face, barycentric.
+def _slide_off_edges(
+    points: np.ndarray, normals: np.ndarray, source: Source, met: np.ndarray, face: np.ndarray, barycentric: np.ndarray
+) -> None:
+    """Where a ray met (n,) bool a slanted face from afar, take the nearest place instead if it agrees; changes face,
+    barycentric.
 
     At a crease that remeshing cut off, the normal leads past the edge to a place well away from the nearest one.
     """
@@ -214,16 +236,21 @@ def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source
     """Where points (n, 3) with unit normals (n, 3) of the baked mesh lie on the source.
 
     The nearest face along the normal, outward or inward within reach (n,), that looks the same way; the nearest such
-    place in any direction where the normal meets none. So nothing is read from the other side of a thin wall. A sheet without
-    another side is read from behind, and nothing through it.
-    """
+    place in any direction where the normal meets none. So nothing is read from the other side of a thin wall. A sheet
+    without another side is read from behind, and nothing through it."""
     start = 2e-5 * source.extent
     face, distance, barycentric, behind = _march(points, -normals, normals, reach, source, start, through=False)
     # Two sheets that look the same way have a third between them: outward cannot be nearer than what is this near.
     rest = np.flatnonzero(distance > 5e-4 * source.extent)
-    out_face, out_distance, out_at, _ = _march(points[rest], normals[rest], normals[rest], np.minimum(reach, distance)[rest], source, start)
+    out_face, out_distance, out_at, _ = _march(
+        points[rest], normals[rest], normals[rest], np.minimum(reach, distance)[rest], source, start
+    )
     outward = (out_face >= 0) & (out_distance < distance[rest])
-    face[rest[outward]], distance[rest[outward]], barycentric[rest[outward]] = out_face[outward], out_distance[outward], out_at[outward]
+    face[rest[outward]], distance[rest[outward]], barycentric[rest[outward]] = (
+        out_face[outward],
+        out_distance[outward],
+        out_at[outward],
+    )
     # Inside something whose front is not there: a sheet with one side, unless its other side lies on it.
     behind = behind[np.isinf(distance[behind])]
     _turn_over(source, behind, face, barycentric)

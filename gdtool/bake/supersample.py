@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
+from gdtool.bake.target import TEXELS_AT_ONCE, Target, Texels
 from gdtool.core.threads import mapped
 from gdtool.geometry.tangents import unit
 from gdtool.geometry.uv_raster import Barycentrics, owners_of
-from gdtool.bake.target import TEXELS_AT_ONCE, Target, Texels
 
 # Neighbouring texels that differ by no more than this, in stored units, are of one piece: eight steps of 8 bits.
 TOLERANCE = 0.03
@@ -17,8 +17,11 @@ _COMPARED = ("albedo", "roughness", "metallic", "tangent_normal", "alpha", "emis
 _ROWS_AT_ONCE = 64
 
 
-def varying(texels: Texels, values: dict[str, np.ndarray], threads: int = 1, tolerance: float = TOLERANCE) -> np.ndarray:
-    """(m,) indices of the texels that differ by more than tolerance, in anything as it is stored, from one of the eight beside them."""
+def varying(
+    texels: Texels, values: dict[str, np.ndarray], threads: int = 1, tolerance: float = TOLERANCE
+) -> np.ndarray:
+    """(m,) indices of the texels that differ by more than tolerance, in anything as it is stored, from one of the eight
+    beside them."""
     from gdtool.images.color import srgb_from_linear
 
     size, mask = texels.size, texels.mask()
@@ -27,13 +30,17 @@ def varying(texels: Texels, values: dict[str, np.ndarray], threads: int = 1, tol
         if name not in values:
             continue
         for channel in np.moveaxis(values[name].reshape(len(texels), -1), 1, 0):
-            image = texels.image(srgb_from_linear(np.clip(channel, 0, 1)) if name in ("albedo", "emissive") else channel)
+            image = texels.image(
+                srgb_from_linear(np.clip(channel, 0, 1)) if name in ("albedo", "emissive") else channel
+            )
 
             def compare(row: int, image: np.ndarray = image) -> None:
                 rows, first = slice(max(row - 1, 0), row + _ROWS_AT_ONCE + 1), min(row, 1)
-                low, high = (_extreme(np.where(mask[rows], image[rows], worst), pick)[first:first + _ROWS_AT_ONCE]
-                             for worst, pick in ((np.float32(np.inf), np.minimum), (np.float32(-np.inf), np.maximum)))
-                out[row:row + _ROWS_AT_ONCE] |= high - low > tolerance
+                low, high = (
+                    _extreme(np.where(mask[rows], image[rows], worst), pick)[first : first + _ROWS_AT_ONCE]
+                    for worst, pick in ((np.float32(np.inf), np.minimum), (np.float32(-np.inf), np.maximum))
+                )
+                out[row : row + _ROWS_AT_ONCE] |= high - low > tolerance
 
             for _ in mapped(compare, list(range(0, size, _ROWS_AT_ONCE)), threads):
                 pass
@@ -51,14 +58,21 @@ def _extreme(image: np.ndarray, pick: Callable) -> np.ndarray:
     return image
 
 
-def supersample(target: Target, texels: Texels, values: dict[str, np.ndarray], read: Callable[[np.ndarray, np.ndarray], dict[str, np.ndarray]],
-                samples: int, threads: int = 1) -> float:
-    """Change values (n, …) of the texels that vary to means over samples, a square number, of each; the share of texels that vary.
+def supersample(
+    target: Target,
+    texels: Texels,
+    values: dict[str, np.ndarray],
+    read: Callable[[np.ndarray, np.ndarray], dict[str, np.ndarray]],
+    samples: int,
+    threads: int = 1,
+) -> float:
+    """Change values (n, …) of the texels that vary to means over samples, a square number, of each; the share of texels
+    that vary.
 
-    read(face_idx, barycentric) says what values has of any places on the target. A sample is read in the triangle that owns its
-    place, and does not count where none does: so a texel has the mean of what its charts cover of it. Where they cover no sample
-    it keeps what it has. Color is averaged by how much of it is seen, tangent_normal made a unit vector again.
-    """
+    read(face_idx, barycentric) says what values has of any places on the target. A sample is read in the triangle that
+    owns its place, and does not count where none does: so a texel has the mean of what its charts cover of it. Where
+    they cover no sample it keeps what it has. Color is averaged by how much of it is seen, tangent_normal made a unit
+    vector again."""
     side, size, chosen = int(round(samples**0.5)), texels.size, varying(texels, values, threads)
     barycentrics, texel = Barycentrics(target.uv, target.face_uvs), texels.texel[chosen]
     offsets = [((k % side + 0.5) / side, (k // side + 0.5) / side) for k in range(side * side)]
@@ -86,7 +100,9 @@ def supersample(target: Target, texels: Texels, values: dict[str, np.ndarray], r
     return float((chosen < texels.inside).sum() / max(texels.inside, 1))
 
 
-def _means(taken: Iterable[tuple[np.ndarray, dict[str, np.ndarray]]], count: int, like: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _means(
+    taken: Iterable[tuple[np.ndarray, dict[str, np.ndarray]]], count: int, like: dict[str, np.ndarray]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Which of count texels have samples, known (m,), and the means (m, …) of those, of what like names.
 
     taken: for one sample of each texel after another, the texels (k,) that have it and what was read there."""

@@ -13,15 +13,16 @@ from gdtool.geometry.tangents import corner_tangents, edge_pairs, frames_of
 from gdtool.geometry.uv_raster import Barycentrics, between_centres, centres_in, extend_owners, owners_of
 
 CREASE_DEGREES = 45.0
-# Texels at a time: few enough that what is computed of them stays near the cache, enough that libigl, which looks for nearest points
-# while no other thread may run, does so on all cores: it begins at 10,000 points.
+# Texels at a time: few enough that what is computed of them stays near the cache, enough that libigl, which looks for
+# nearest points while no other thread may run, does so on all cores: it begins at 10,000 points.
 TEXELS_AT_ONCE = 65_536
 # A texel this many times as wide as the source's detail has too much in it for one sample (docs/numerics.md).
 COARSE_TEXEL = 3.0
 
 
 def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float = CREASE_DEGREES) -> np.ndarray:
-    """Shading normals (t, 3, 3) float64 of triangles' corners: smooth, but split along edges sharper than crease_degrees.
+    """Shading normals (t, 3, 3) float64 of triangles' corners: smooth, but split along edges sharper than
+    crease_degrees.
 
     Faces weighted by their angle at the vertex (Thürmer & Wüthrich 1998).
     """
@@ -56,9 +57,8 @@ def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_degrees: floa
 class Target:
     """Triangles with texture coordinates and the frames that a normal map is encoded in.
 
-    vertices (v, 3), faces (t, 3), uv (c, 2) with (0, 0) at the image's top left, face_uvs (t, 3), normals (t, 3, 3) unit
-    and tangents (t, 3, 4) of the corners.
-    """
+    vertices (v, 3), faces (t, 3), uv (c, 2) with (0, 0) at the image's top left, face_uvs (t, 3), normals (t, 3, 3)
+    unit and tangents (t, 3, 4) of the corners."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -68,8 +68,14 @@ class Target:
     tangents: np.ndarray
 
     @classmethod
-    def of(cls, vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray,
-           crease_degrees: float = CREASE_DEGREES) -> Target:
+    def of(
+        cls,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        uv: np.ndarray,
+        face_uvs: np.ndarray,
+        crease_degrees: float = CREASE_DEGREES,
+    ) -> Target:
         """Target of a triangle mesh, with smooth normals split at creases and MikkTSpace tangents."""
         normals = corner_normals(vertices, faces, crease_degrees)
         own = np.arange(len(faces) * 3).reshape(-1, 3)
@@ -103,7 +109,7 @@ class Texels:
     def mask(self, inside_only: bool = False) -> np.ndarray:
         """(size, size) bool: which texels these are."""
         out = np.zeros(self.size * self.size, bool)
-        out[self.texel[:self.inside] if inside_only else self.texel] = True
+        out[self.texel[: self.inside] if inside_only else self.texel] = True
         return out.reshape(self.size, self.size)
 
     def image(self, values: np.ndarray, fill: float = 0.0) -> np.ndarray:
@@ -118,9 +124,8 @@ class Texels:
 def texels_of(target: Target, size: int, rings: int = 2, threads: int = 1) -> Texels:
     """Texels of a map of size x size that the target's charts cover, and `rings` of them around the charts.
 
-    Where charts pass between texel centres, too far from any, the texels that they pass through are theirs; where none covers a
-    centre there are no texels.
-    """
+    Where charts pass between texel centres, too far from any, the texels that they pass through are theirs; where none
+    covers a centre there are no texels."""
     barycentrics = Barycentrics(target.uv, target.face_uvs)
     owner = owners_of(target.uv, target.face_uvs, size)
     if owner.max() >= 0:
@@ -134,15 +139,21 @@ def texels_of(target: Target, size: int, rings: int = 2, threads: int = 1) -> Te
     def place(part: slice) -> None:
         at[part] = centres_in(barycentrics, face_idx[part], inside[part], size)
 
-    for _ in mapped(place, [slice(s, min(s + 2 * TEXELS_AT_ONCE, len(inside))) for s in range(0, len(inside), 2 * TEXELS_AT_ONCE)], threads):
+    for _ in mapped(
+        place,
+        [slice(s, min(s + 2 * TEXELS_AT_ONCE, len(inside))) for s in range(0, len(inside), 2 * TEXELS_AT_ONCE)],
+        threads,
+    ):
         pass
-    at[len(inside):] = ring_at
+    at[len(inside) :] = ring_at
     return Texels(size, np.concatenate([inside, ring.astype(inside.dtype)]), face_idx, at, len(inside))
 
 
-def surface_at(target: Target, face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Positions (n, 3), normals (n, 3), tangents (n, 3) and handedness (n,) at places on the target, float32, component by component
-    in memory: sums over components then run over numbers that lie side by side.
+def surface_at(
+    target: Target, face_idx: np.ndarray, barycentric: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Positions (n, 3), normals (n, 3), tangents (n, 3) and handedness (n,) at places on the target, float32, component
+    by component in memory: sums over components then run over numbers that lie side by side.
 
     Normals and tangents as viewers interpolate them, not normalised (see tangents.frames_of)."""
     first, *others = target.packed
@@ -180,5 +191,6 @@ def size_for(target: Target, detail: float, least: int = 256, most: int = 4096) 
 
 
 def samples_for(width: float, detail: float) -> int:
-    """How many samples a texel that spans width needs where the source varies, whose detail is so wide (both in one unit)."""
+    """How many samples a texel that spans width needs where the source varies, whose detail is so wide (both in one
+    unit)."""
     return 4 if width > COARSE_TEXEL * detail else 1

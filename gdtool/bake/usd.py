@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gdtool.bake.maps import Maps
 from gdtool.core.errors import OutputError, ResourceError
 from gdtool.core.native import imported_if_installed
 from gdtool.folders.mesh import QuadMesh
-from gdtool.bake.maps import Maps
 
 YEAR_2000 = 946_684_800  # seconds
 MESH, MATERIAL = "/asset/mesh", "/asset/material"
@@ -25,8 +25,18 @@ def require() -> None:
         raise ResourceError("usd-core", "is not installed, and --usd needs it", "pip install 'gdtool[usd]'")
 
 
-def write_usd(path: Path, mesh: QuadMesh, normals_idx: np.ndarray, normals: np.ndarray, maps: Maps, files: dict[str, str],
-              convention: str = "opengl", alpha_mode: str = "OPAQUE", alpha_cutoff: float = 0.5, double_sided: bool = False) -> None:
+def write_usd(
+    path: Path,
+    mesh: QuadMesh,
+    normals_idx: np.ndarray,
+    normals: np.ndarray,
+    maps: Maps,
+    files: dict[str, str],
+    convention: str = "opengl",
+    alpha_mode: str = "OPAQUE",
+    alpha_cutoff: float = 0.5,
+    double_sided: bool = False,
+) -> None:
     """Write path, a .usda or a .usdz that packs it with its maps.
 
     normals_idx (f, 4) into normals (n, 3), -1 with a triangle's fourth corner; files: map name to the name of the file
@@ -108,8 +118,20 @@ def _material(stage, maps: Maps, files: dict[str, str], convention: str, alpha_m
     color = maps.factors["base_color"]
     roughness, metallic = maps.factors["roughness"][0], maps.factors["metallic"][0]
     base = texture("base_color", "sRGB", color) if "base_color" in files else None
-    orm = texture("orm", "raw", (1.0, roughness if maps.has_roughness_metallic else 1.0, metallic if maps.has_roughness_metallic else 1.0, 1.0)) \
-        if "orm" in files else None
+    orm = (
+        texture(
+            "orm",
+            "raw",
+            (
+                1.0,
+                roughness if maps.has_roughness_metallic else 1.0,
+                metallic if maps.has_roughness_metallic else 1.0,
+                1.0,
+            ),
+        )
+        if "orm" in files
+        else None
+    )
     feed("diffuseColor", types.Color3f, base, "rgb", Gf.Vec3f(*color[:3]))
     feed("roughness", types.Float, orm if maps.has_roughness_metallic else None, "g", roughness)
     feed("metallic", types.Float, orm if maps.has_roughness_metallic else None, "b", metallic)

@@ -12,7 +12,14 @@ from typing import Literal
 import numpy as np
 
 # Name and azimuth in degrees; 0 is in front (on +Z), positive toward +X.
-SIX_VIEWS = (("front", 0.0), ("front_right", 45.0), ("right", 90.0), ("back", 180.0), ("left", -90.0), ("front_left", -45.0))
+SIX_VIEWS = (
+    ("front", 0.0),
+    ("front_right", 45.0),
+    ("right", 90.0),
+    ("back", 180.0),
+    ("left", -90.0),
+    ("front_left", -45.0),
+)
 HALF_WIDTH = 0.72  # a unit cube turned by 45 degrees is 1.414 wide: 0.707 and a margin of two pixels in 256
 DISTANCE = 2.0
 
@@ -69,9 +76,18 @@ def look_at(position, target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0)) -> np.ndarray:
     return out
 
 
-def camera_at(azimuth: float, elevation: float = 0.0, *, name: str, size: int, distance: float = DISTANCE,
-              half_width: float = HALF_WIDTH, fov_degrees: float | None = None) -> Camera:
-    """A camera on a sphere around the origin, looking at it. Angles in degrees; with fov_degrees (across) perspective."""
+def camera_at(
+    azimuth: float,
+    elevation: float = 0.0,
+    *,
+    name: str,
+    size: int,
+    distance: float = DISTANCE,
+    half_width: float = HALF_WIDTH,
+    fov_degrees: float | None = None,
+) -> Camera:
+    """A camera on a sphere around the origin, looking at it. Angles in degrees; with fov_degrees (across)
+    perspective."""
     a, e = np.radians(azimuth), np.radians(elevation)
     position = distance * np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
     pose = look_at(position)
@@ -79,11 +95,14 @@ def camera_at(azimuth: float, elevation: float = 0.0, *, name: str, size: int, d
     if fov_degrees is None:
         return Camera(name, pose, size, size, half_width=half_width, near=near, far=far)
     focal = 0.5 * size / np.tan(np.radians(fov_degrees) / 2)
-    return Camera(name, pose, size, size, "perspective", fx=focal, fy=focal, cx=size / 2, cy=size / 2, near=near, far=far)
+    return Camera(
+        name, pose, size, size, "perspective", fx=focal, fy=focal, cx=size / 2, cy=size / 2, near=near, far=far
+    )
 
 
 def rig(name: str, size: int) -> list[Camera]:
-    """A named rig of square cameras: "six" (DESIGN's default) or "wonder3d" (same azimuths, orthographic width 1.35)."""
+    """A named rig of square cameras: "six" (DESIGN's default) or "wonder3d" (same azimuths, orthographic width
+    1.35)."""
     half_widths = {"six": HALF_WIDTH, "wonder3d": 1.35 / 2}
     if name not in half_widths:
         raise ValueError(f"unknown rig {name!r}; known: {', '.join(half_widths)}")

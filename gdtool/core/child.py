@@ -1,8 +1,7 @@
 """Run one function in a killable child process with a time and a memory limit.
 
-Native mesh libraries hang, crash or call exit() on hard input; in a child that costs one attempt, not the run. A child gets its
-arguments and gives its result by pickle over pipes, and dies with its parent, however the parent ends.
-"""
+Native mesh libraries hang, crash or call exit() on hard input; in a child that costs one attempt, not the run. A child
+gets its arguments and gives its result by pickle over pipes, and dies with its parent, however the parent ends."""
 
 from __future__ import annotations
 
@@ -23,10 +22,15 @@ from typing import Any
 from gdtool.core import errors
 from gdtool.core.errors import ChildFailed
 
-# The environment of a child. glibc gives large blocks back to the system at once, so that native vectors which grow fault their pages in
-# again and again: a sixth of the time of a quadric collapse. OpenBLAS starts a thread for each core as numpy is imported, a third
-# of a child's start-up, and no child multiplies dense matrices.
-_SETTINGS = {"OPENBLAS_NUM_THREADS": "1", "MALLOC_MMAP_THRESHOLD_": str(2**30), "MALLOC_TRIM_THRESHOLD_": str(2**32), "MALLOC_TOP_PAD_": str(2**26)}
+# The environment of a child. glibc gives large blocks back to the system at once, so that native vectors which grow
+# fault their pages in again and again: a sixth of the time of a quadric collapse. OpenBLAS starts a thread for each
+# core as numpy is imported, a third of a child's start-up, and no child multiplies dense matrices.
+_SETTINGS = {
+    "OPENBLAS_NUM_THREADS": "1",
+    "MALLOC_MMAP_THRESHOLD_": str(2**30),
+    "MALLOC_TRIM_THRESHOLD_": str(2**32),
+    "MALLOC_TOP_PAD_": str(2**26),
+}
 
 # Children that import a module meanwhile and wait for a request, by that module.
 _waiting: dict[str, list[subprocess.Popen]] = {}
@@ -36,7 +40,8 @@ if hasattr(os, "register_at_fork"):
 
 
 def prepare(function: Callable[..., Any], modules: Sequence[str] = (), count: int = 1) -> None:
-    """Have `count` children wait for begin() of `function`: they import its module, and `modules`, while this process goes on."""
+    """Have `count` children wait for begin() of `function`: they import its module, and `modules`, while this process
+    goes on."""
     module = _module_of(function)
     waiting = _waiting.setdefault(module, [])
     with contextlib.suppress(OSError):  # then begin() starts it, and tells what fails
@@ -44,13 +49,14 @@ def prepare(function: Callable[..., Any], modules: Sequence[str] = (), count: in
             waiting.append(_started((module, *modules)))
 
 
-def begin(function: Callable[..., Any], *args: Any, seconds: float, memory_mb: int | None = None, **kwargs: Any) -> Running:
+def begin(
+    function: Callable[..., Any], *args: Any, seconds: float, memory_mb: int | None = None, **kwargs: Any
+) -> Running:
     """Start function(*args, **kwargs) in a child process, which gets a copy of the arguments as they are now.
 
-    function: at the top level of a module. seconds: it is killed after so many. memory_mb: how much the child's address space may
-    grow beyond what it has after importing (Linux). The thread that calls this must outlive the child: the system ends a child with the
-    thread that started it.
-    """
+    function: at the top level of a module. seconds: it is killed after so many. memory_mb: how much the child's address
+    space may grow beyond what it has after importing (Linux). The thread that calls this must outlive the child: the
+    system ends a child with the thread that started it."""
     module = _module_of(function)
     waiting = _waiting.get(module)
     place = None
@@ -108,7 +114,8 @@ class Running:
         self._process.kill()
 
     def result(self) -> Any:
-        """Wait for what the function returns. Raises the GdtoolError that it raised, and ChildFailed for everything else."""
+        """Wait for what the function returns. Raises the GdtoolError that it raised, and ChildFailed for everything
+        else."""
         try:
             self._talk.join()
         except BaseException:
@@ -122,7 +129,9 @@ class Running:
             raise ChildFailed(f"{self._name} died of {signal.Signals(-code).name}")
         if not self._answer:
             last = self._printed.decode(errors="replace").strip().splitlines()[-1:]
-            raise ChildFailed(f"{self._name} ended with exit code {code} and no result" + "".join(f" ({line})" for line in last))
+            raise ChildFailed(
+                f"{self._name} ended with exit code {code} and no result" + "".join(f" ({line})" for line in last)
+            )
         status, value = pickle.loads(self._answer)
         if status == "done":
             return value
@@ -136,8 +145,13 @@ def _started(modules: tuple[str, ...]) -> subprocess.Popen:
     root = str(Path(__file__).resolve().parents[2])
     # The gdtool beside this file, and nothing of the folder that the child starts in.
     code = f"import sys; sys.path.insert(0, {root!r}); import gdtool; from {__name__} import serve; serve()"
-    process = subprocess.Popen([sys.executable, "-P", "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                               env=_SETTINGS | os.environ)
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=_SETTINGS | os.environ,
+    )
     with contextlib.suppress(BrokenPipeError):  # it is dead already: result() says of what
         process.stdin.write(pickle.dumps((sys.path, modules)))
         process.stdin.flush()
@@ -145,7 +159,8 @@ def _started(modules: tuple[str, ...]) -> subprocess.Popen:
 
 
 class _Pickler(pickle.Pickler):
-    """Pickle numpy's types by name: an array that is read would otherwise have a copy of its type, for which ufunc.at has no fast loops."""
+    """Pickle numpy's types by name: an array that is read would otherwise have a copy of its type, for which ufunc.at
+    has no fast loops."""
 
     def reducer_override(self, value: Any) -> Any:
         numpy = sys.modules.get("numpy")

@@ -16,10 +16,10 @@ AHEAD = 2
 def each(address: str, work: Callable[[str], Any], texts: Iterator[str], cores: int) -> Iterator[Any]:
     """work(text) for every text, on the cluster at address, results as they come (not in the order of texts).
 
-    address: "local" starts Ray on this machine; else what `ray start` printed, "auto", or ray://HOST:PORT. cores: of each
-    task. work is pickled; it runs in this process's working folder, which all nodes must see. It returns its errors; a
-    text whose worker dies (a native crash, no memory) gives a GdtoolError. Raises ResourceError without Ray or cluster.
-    """
+    address: "local" starts Ray on this machine; else what `ray start` printed, "auto", or ray://HOST:PORT. cores: of
+    each task. work is pickled; it runs in this process's working folder, which all nodes must see. It returns its
+    errors; a text whose worker dies (a native crash, no memory) gives a GdtoolError. Raises ResourceError without Ray
+    or cluster."""
     ray = _connected(address)
     try:
         task = ray.remote(num_cpus=cores, max_retries=1)(_within)
@@ -47,11 +47,19 @@ def _connected(address: str) -> Any:
         raise ResourceError("--ray", "needs the package ray", "pip install 'gdtool[ray]'") from None
     try:
         _knock(address)
-        ray.init(None if address == "local" else address, log_to_driver=False, logging_level="ERROR",
-                 **({"include_dashboard": False} if address == "local" else {}))
+        ray.init(
+            None if address == "local" else address,
+            log_to_driver=False,
+            logging_level="ERROR",
+            **({"include_dashboard": False} if address == "local" else {}),
+        )
     except (RuntimeError, ValueError, OverflowError, OSError) as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise ResourceError(f"--ray {address}", f"no cluster answers ({reason[:100]})", "start one with `ray start --head`, or use --ray local") from None
+        raise ResourceError(
+            f"--ray {address}",
+            f"no cluster answers ({reason[:100]})",
+            "start one with `ray start --head`, or use --ray local",
+        ) from None
     return ray
 
 

@@ -1,4 +1,5 @@
-"""End in order when a signal asks for it: an exception in the main thread, the clean-up, and the exit code 128 + signal.
+"""End in order when a signal asks for it: an exception in the main thread, the clean-up, and the exit code 128 +
+signal.
 
 The exception can only be raised between two steps of Python. Where a native call keeps the main thread for longer than
 GRACE, a second thread runs the clean-up and ends the process. It cannot do so inside a native call that holds the
@@ -20,7 +21,8 @@ from types import FrameType
 from gdtool.core import log
 from gdtool.core.errors import GdtoolError
 
-# Seconds that the main thread has to unwind. With the clean-up after it, an interrupted command ends within two seconds.
+# Seconds that the main thread has to unwind. With the clean-up after it, an interrupted command ends within two
+# seconds.
 GRACE = 1.2
 
 # SIGXCPU: the soft limit of processor time (ulimit -t) is reached.
@@ -80,7 +82,8 @@ def listen() -> Callable[[], None]:
 
 
 def ignore() -> None:
-    """Raise nothing from now on, where the process is about to end; the thread still ends it when that takes too long."""
+    """Raise nothing from now on, where the process is about to end; the thread still ends it when that takes too
+    long."""
     global _deaf
     _deaf = True
 
@@ -101,7 +104,8 @@ def certainly(clean_up: Callable[[], None]) -> Iterator[None]:
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """A folder of this process in the system's folder for temporary files, removed at the end of the block whatever ends it."""
+    """A folder of this process in the system's folder for temporary files, removed at the end of the block whatever
+    ends it."""
     import shutil
     import tempfile
 
@@ -111,12 +115,14 @@ def temporary_folder() -> Iterator[Path]:
 
 
 class TimeOver(BaseException):
-    """The time limit of the work under way is over. No Exception, so that no fallback takes it for a failure of its own."""
+    """The time limit of the work under way is over. No Exception, so that no fallback takes it for a failure of its
+    own."""
 
 
 @contextmanager
 def time_limit(seconds: float, late: GdtoolError) -> Iterator[None]:
-    """Raise `late` in a block that takes longer than so many seconds, and end the process with it where a native call goes on for GRACE more.
+    """Raise `late` in a block that takes longer than so many seconds, and end the process with it where a native call
+    goes on for GRACE more.
 
     Of the main thread; elsewhere, and where the system has no SIGALRM, there is no limit. It cannot be nested.
     """

@@ -1,4 +1,5 @@
-"""Errors that a user reads: one line that names the thing, the fact and the cure, and the exit code that goes with it."""
+"""Errors that a user reads: one line that names the thing, the fact and the cure, and the exit code that goes with
+it."""
 
 from __future__ import annotations
 
@@ -65,17 +66,24 @@ _CURES = {
     errno.EIO: "check the disk",
 }
 # Limits of the machine, as against the disk.
-_LIMITS = {errno.ENOMEM: "free memory or raise its limit (ulimit -v)", errno.EAGAIN: "raise the limit of processes (ulimit -u)",
-           errno.ENFILE: "close other programs"}
+_LIMITS = {
+    errno.ENOMEM: "free memory or raise its limit (ulimit -v)",
+    errno.EAGAIN: "raise the limit of processes (ulimit -u)",
+    errno.ENFILE: "close other programs",
+}
 # A name that no file can have is a fault of what was given, not of the disk.
-_BAD_NAMES = {errno.ENAMETOOLONG: "shorten the name", errno.ELOOP: "remove the loop of links", errno.EILSEQ: "rename it"}
+_BAD_NAMES = {
+    errno.ENAMETOOLONG: "shorten the name",
+    errno.ELOOP: "remove the loop of links",
+    errno.EILSEQ: "rename it",
+}
 
 
 def from_os_error(error: OSError, subject: object) -> GdtoolError:
     """The error to report for an OSError: what failed is in its file name, else in subject.
 
-    InputError for names that are too long or lead in a circle, ResourceError for the machine's limits, OutputError for all else.
-    """
+    InputError for names that are too long or lead in a circle, ResourceError for the machine's limits, OutputError for
+    all else."""
     fact = error.strerror or str(error) or type(error).__name__
     fact, place = fact[0].lower() + fact[1:], error.filename or subject
     if error.errno in _BAD_NAMES:
@@ -87,10 +95,24 @@ def from_os_error(error: OSError, subject: object) -> GdtoolError:
 
 # The Debian package that brings a shared library; these are what the packages that gdtool needs are linked with.
 _DEBIAN_PACKAGES = {
-    "libGL.so.1": "libgl1", "libGLU.so.1": "libglu1-mesa", "libOpenGL.so.0": "libopengl0", "libEGL.so.1": "libegl1", "libgomp.so.1": "libgomp1",
-    "libstdc++.so.6": "libstdc++6", "libX11.so.6": "libx11-6", "libXext.so.6": "libxext6", "libXrender.so.1": "libxrender1", "libSM.so.6": "libsm6",
-    "libICE.so.6": "libice6", "libxcb.so.1": "libxcb1", "libglib-2.0.so.0": "libglib2.0-0", "libgthread-2.0.so.0": "libglib2.0-0",
-    "libz.so.1": "zlib1g", "libfontconfig.so.1": "libfontconfig1", "libfreetype.so.6": "libfreetype6", "libdbus-1.so.3": "libdbus-1-3",
+    "libGL.so.1": "libgl1",
+    "libGLU.so.1": "libglu1-mesa",
+    "libOpenGL.so.0": "libopengl0",
+    "libEGL.so.1": "libegl1",
+    "libgomp.so.1": "libgomp1",
+    "libstdc++.so.6": "libstdc++6",
+    "libX11.so.6": "libx11-6",
+    "libXext.so.6": "libxext6",
+    "libXrender.so.1": "libxrender1",
+    "libSM.so.6": "libsm6",
+    "libICE.so.6": "libice6",
+    "libxcb.so.1": "libxcb1",
+    "libglib-2.0.so.0": "libglib2.0-0",
+    "libgthread-2.0.so.0": "libglib2.0-0",
+    "libz.so.1": "zlib1g",
+    "libfontconfig.so.1": "libfontconfig1",
+    "libfreetype.so.6": "libfreetype6",
+    "libdbus-1.so.3": "libdbus-1-3",
 }
 # What the loader says where the address space, not the library, is what is missing.
 _NOT_MAPPED = re.compile(r"failed to map segment|cannot allocate memory|cannot create shared object descriptor", re.I)
@@ -98,9 +120,14 @@ _NOT_MAPPED = re.compile(r"failed to map segment|cannot allocate memory|cannot c
 _ASKED = re.compile(r"(?:unable|tried) to allocate ([\d.]+) ?(bytes|[KMGT]i?B)", re.I)
 _NO_LIBRARY = re.compile(r"([\w+.-]+\.so[.\d]*): cannot open shared object file")
 # What torch, OpenCV and C++ say when memory runs out; numpy and Python raise MemoryError.
-_NO_MEMORY = re.compile(r"out of memory|bad_alloc|can't allocate memory|not enough memory|insufficient memory|failed to allocate|unable to allocate", re.I)
+_NO_MEMORY = re.compile(
+    r"out of memory|bad_alloc|can't allocate memory|not enough memory|insufficient memory|failed to allocate|unable to allocate",
+    re.I,
+)
 _NO_THREAD = re.compile(r"can't start new thread|resource temporarily unavailable", re.I)
-_NO_DEVICE = re.compile(r"found no nvidia driver|not compiled with cuda|no cuda gpus are available|cuda (driver )?error|cudnn", re.I)
+_NO_DEVICE = re.compile(
+    r"found no nvidia driver|not compiled with cuda|no cuda gpus are available|cuda (driver )?error|cudnn", re.I
+)
 _MOST_SHOWN = 200  # characters of another program's message
 
 
@@ -110,7 +137,8 @@ def first_line(error: BaseException) -> str:
 
 
 def missing_library(error: ImportError) -> GdtoolError | None:
-    """The error to report for an import that lacks a shared library of the system or a Python package; None for any other.
+    """The error to report for an import that lacks a shared library of the system or a Python package; None for any
+    other.
 
     A module of gdtool that cannot be imported is a fault of gdtool.
     """
@@ -118,8 +146,11 @@ def missing_library(error: ImportError) -> GdtoolError | None:
     if found:
         needed_by = (error.name or "").partition(".")[0]
         package = _DEBIAN_PACKAGES.get(found[1])
-        return ResourceError(found[1], "is not installed" + (f", and {needed_by} needs it" if needed_by else ""),
-                             f"apt install {package}" if package else f"install the system package that holds {found[1]}")
+        return ResourceError(
+            found[1],
+            "is not installed" + (f", and {needed_by} needs it" if needed_by else ""),
+            f"apt install {package}" if package else f"install the system package that holds {found[1]}",
+        )
     if isinstance(error, ModuleNotFoundError) and error.name and error.name.partition(".")[0] != "gdtool":
         return ResourceError(error.name, "is not installed", "pip install gdtool, which brings what it needs")
     return None
@@ -128,9 +159,8 @@ def missing_library(error: ImportError) -> GdtoolError | None:
 def from_exception(error: Exception, subject: object) -> GdtoolError:
     """The error to report for anything that was raised while working on subject.
 
-    GdtoolError: itself. OutputError, InputError or ResourceError for what the system, the memory, a device or a missing library
-    does. A GdtoolError with exit code 1, "internal error", for all else.
-    """
+    GdtoolError: itself. OutputError, InputError or ResourceError for what the system, the memory, a device or a missing
+    library does. A GdtoolError with exit code 1, "internal error", for all else."""
     if isinstance(error, GdtoolError):
         return error
     found: GdtoolError | None = None
@@ -141,13 +171,21 @@ def from_exception(error: Exception, subject: object) -> GdtoolError:
     elif isinstance(error, OSError):
         found = from_os_error(error, subject)
     elif isinstance(error, ImportError) and is_unmapped(error):
-        found = ResourceError(subject, f"ran out of memory while {error.name or 'a library'} was loaded", "free memory or raise its limit (ulimit -v)")
+        found = ResourceError(
+            subject,
+            f"ran out of memory while {error.name or 'a library'} was loaded",
+            "free memory or raise its limit (ulimit -v)",
+        )
     elif isinstance(error, ImportError):
         found = missing_library(error)
     elif isinstance(error, ChildFailed):
         found = ResourceError(subject, f"a step of it failed ({first})", "free memory, or give it a smaller input")
     elif native and _NO_THREAD.search(str(error)):
-        found = ResourceError(subject, f"cannot start a thread ({first})", "raise the limit of processes (ulimit -u) or of memory (ulimit -v)")
+        found = ResourceError(
+            subject,
+            f"cannot start a thread ({first})",
+            "raise the limit of processes (ulimit -u) or of memory (ulimit -v)",
+        )
     elif isinstance(error, (RuntimeError, AssertionError)) and _NO_DEVICE.search(str(error)):
         found = ResourceError(subject, f"the device failed ({first})", "run it on the cpu")
     return found or internal_error(error, subject)
@@ -169,4 +207,8 @@ def asked_for(error: BaseException) -> str:
 
 def internal_error(error: BaseException, subject: object) -> GdtoolError:
     """The error to report for a fault of gdtool itself."""
-    return GdtoolError(subject, f"internal error ({type(error).__name__}: {first_line(error)})", "run it again with --debug to see where, and report that")
+    return GdtoolError(
+        subject,
+        f"internal error ({type(error).__name__}: {first_line(error)})",
+        "run it again with --debug to see where, and report that",
+    )

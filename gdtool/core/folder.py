@@ -33,7 +33,8 @@ class Folder:
         return self.manifest.name
 
     def file(self, relative: str) -> Path:
-        """Path of a file of the folder, which lies below it, links followed. Raises InputError for a name or a link that leads elsewhere."""
+        """Path of a file of the folder, which lies below it, links followed. Raises InputError for a name or a link
+        that leads elsewhere."""
         return path_inside(self.path, relative, self.path / MANIFEST, "file")
 
 
@@ -52,8 +53,11 @@ def open_folder(path: Path | str, kinds: tuple[str, ...] = (), reader: str = "",
         path = path.parent
     manifest = read_manifest(path)
     if kinds and manifest.kind not in kinds:
-        raise InputError(path, f"holds {manifest.kind}, but {reader or 'this'} reads {' or '.join(kinds)}",
-                         f"run gdtool {MADE_BY[kinds[0]]} first" if kinds[0] in MADE_BY else f"name a file for {reader}")
+        raise InputError(
+            path,
+            f"holds {manifest.kind}, but {reader or 'this'} reads {' or '.join(kinds)}",
+            f"run gdtool {MADE_BY[kinds[0]]} first" if kinds[0] in MADE_BY else f"name a file for {reader}",
+        )
     if check:
         check_files(path, manifest)
     return Folder(path, manifest)
@@ -68,5 +72,9 @@ def dataset_objects(dataset: Folder) -> Iterator[Folder]:
         path = path_inside(dataset.path, entry.path, dataset.path / MANIFEST, "object")
         found = open_folder(path, ("views",), "a dataset", check=False)
         if found.manifest.digest != entry.digest:
-            raise InputError(path, "is not the folder that the dataset lists (other digest)", f"run gdtool render-dataset into {dataset.path} again")
+            raise InputError(
+                path,
+                "is not the folder that the dataset lists (other digest)",
+                f"run gdtool render-dataset into {dataset.path} again",
+            )
         yield found

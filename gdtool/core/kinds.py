@@ -36,7 +36,9 @@ class Content(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 class ViewsContent(Content, frozen=True, kw_only=True):
     """What a rig of cameras sees: cameras.json, <domain>/<view>.png or .exr, mask/<view>.png."""
 
-    views: Annotated[tuple[str, ...], Meta(min_length=1, description="names of the views, in the order of cameras.json")]
+    views: Annotated[
+        tuple[str, ...], Meta(min_length=1, description="names of the views, in the order of cameras.json")
+    ]
     domains: Annotated[tuple[Domain, ...], Meta(description="domains that every view has")]
     exposure: Annotated[float, Meta(gt=0, description="radiance was multiplied by this before sRGB encoding")] = 1.0
     clipped_share: Annotated[Share, Meta(description="share of foreground color values that clipped at 1")] = 0.0
@@ -44,7 +46,9 @@ class ViewsContent(Content, frozen=True, kw_only=True):
     environment: Annotated[str, Meta(description="name of the environment the color was lit by; empty: unknown")] = ""
     conditions: Annotated[int, Meta(ge=0, description="number of condition images, condition/000.png and on")] = 0
     model: Annotated[bool, Meta(description="source.glb holds the model the views show")] = False
-    picture: Annotated[str, Meta(description="name of the view that picture.png shows: what the views were made of; empty: none")] = ""
+    picture: Annotated[
+        str, Meta(description="name of the view that picture.png shows: what the views were made of; empty: none")
+    ] = ""
 
 
 class DatasetObject(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -113,7 +117,9 @@ class AssetContent(Content, frozen=True, kw_only=True):
     maps: Annotated[dict[str, str], Meta(description="map name to file; a map that is constant is a factor instead")]
     factors: Annotated[dict[str, tuple[float, ...]], Meta(description="factors written to the material, linear")]
     usd: Annotated[str, Meta(description="the OpenUSD file, if one was asked for")] = ""
-    lods: Annotated[tuple[str, ...], Meta(description="coarser levels on the same maps, finest first, if they were asked for")] = ()
+    lods: Annotated[
+        tuple[str, ...], Meta(description="coarser levels on the same maps, finest first, if they were asked for")
+    ] = ()
     normal_convention: Literal["opengl", "directx"] = "opengl"
     frame: Annotated[Literal["normalised", "source"], Meta(description="frame that the vertices are in")] = "normalised"
 

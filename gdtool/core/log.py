@@ -11,7 +11,8 @@ level = NORMAL
 
 
 def printable(text: str) -> str:
-    """text as one line: control characters and line breaks escaped, bytes of names that are not UTF-8 as replacement characters."""
+    """text as one line: control characters and line breaks escaped, bytes of names that are not UTF-8 as replacement
+    characters."""
     return "".join(_shown(c) for c in text)
 
 

@@ -67,7 +67,9 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     stage: Annotated[str, Meta(description="what made the folder; any name when it was not gdtool")]
     stage_version: Annotated[int, Meta(ge=0)] = 0
     tool_version: str = ""
-    key: Annotated[str, Meta(description="sha256 of stage, stage version, options and input digests; may be empty")] = ""
+    key: Annotated[str, Meta(description="sha256 of stage, stage version, options and input digests; may be empty")] = (
+        ""
+    )
     options: dict[str, Any] = {}
     inputs: tuple[InputEntry, ...] = ()
     content: Any
@@ -126,7 +128,9 @@ def decode(raw: Any, path: Path) -> Manifest:
         content = msgspec.convert(raw["content"], CONTENTS[manifest.kind])
     except msgspec.ValidationError as error:
         fact = str(error)
-        raise InputError(path, fact[0].lower() + fact[1:], _nearest(fact, nested) or "see docs/format.md for the fields") from None
+        raise InputError(
+            path, fact[0].lower() + fact[1:], _nearest(fact, nested) or "see docs/format.md for the fields"
+        ) from None
     checked_name(manifest.name, path, "name")
     for one in (*(entry.path for entry in manifest.files), *_files_named_in(content)):
         relative_parts(one, path, "file path")
@@ -150,8 +154,12 @@ def read_manifest(folder: Path) -> Manifest:
     """The manifest of a folder. Raises InputError when there is none or it is faulty."""
     path = folder / MANIFEST
     if not path.is_file():
-        fact = "has no manifest.json" if folder.is_dir() else ("is not a folder" if folder.exists() else "does not exist")
-        raise InputError(folder, fact, "name a folder that a gdtool command has written" if folder.exists() else "check the path")
+        fact = (
+            "has no manifest.json" if folder.is_dir() else ("is not a folder" if folder.exists() else "does not exist")
+        )
+        raise InputError(
+            folder, fact, "name a folder that a gdtool command has written" if folder.exists() else "check the path"
+        )
     return decode(read_json(path), path)
 
 
@@ -160,10 +168,15 @@ def check_files(folder: Path, manifest: Manifest) -> None:
     for entry in manifest.files:
         path = path_inside(folder, entry.path, folder / MANIFEST, "file")
         if not path.is_file():
-            raise InputError(path, "is listed in the manifest but missing", f"put it back, or run {_maker(manifest)} again")
+            raise InputError(
+                path, "is listed in the manifest but missing", f"put it back, or run {_maker(manifest)} again"
+            )
         if path.stat().st_size != entry.size or file_sha256(path) != entry.sha256:
-            raise InputError(path, "is not the file that the manifest lists (other size or hash)",
-                             f"put the file back, or move it away and run {_maker(manifest)} again")
+            raise InputError(
+                path,
+                "is not the file that the manifest lists (other size or hash)",
+                f"put the file back, or move it away and run {_maker(manifest)} again",
+            )
 
 
 def _maker(manifest: Manifest) -> str:

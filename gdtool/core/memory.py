@@ -15,7 +15,8 @@ SHARE = 0.5
 
 
 def most_held() -> int:
-    """Bytes that one input may take: SHARE of this machine's memory, or of the limit on the address space (RLIMIT_AS) where that is smaller."""
+    """Bytes that one input may take: SHARE of this machine's memory, or of the limit on the address space (RLIMIT_AS)
+    where that is smaller."""
     most = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     try:
         import resource
@@ -32,4 +33,8 @@ def require_memory(size: int, subject: object, what: str, cure: str, most: int |
     """
     limit = most_held() if most is None else min(most, most_held())
     if size > limit:
-        raise ResourceError(subject, f"{what} would take {size / 2**30:.1f} GiB of memory, more than the {limit / 2**30:.1f} GiB for one input", cure)
+        raise ResourceError(
+            subject,
+            f"{what} would take {size / 2**30:.1f} GiB of memory, more than the {limit / 2**30:.1f} GiB for one input",
+            cure,
+        )

@@ -1,8 +1,7 @@
 """Turn names that stand inside files into paths, and refuse those that lead elsewhere.
 
-A manifest, a dataset index, an archive, a glTF or an OBJ comes from a stranger. A name in it becomes a path only through
-path_inside(), so that no file outside the folder it belongs to is ever read or written.
-"""
+A manifest, a dataset index, an archive, a glTF or an OBJ comes from a stranger. A name in it becomes a path only
+through path_inside(), so that no file outside the folder it belongs to is ever read or written."""
 
 from __future__ import annotations
 
@@ -27,9 +26,8 @@ _BYTE_ESCAPES = range(0xDC80, 0xDD00)
 def text_fault(text: str, byte_escapes: bool = False) -> str | None:
     """What makes text unfit to be a name or a line of output; None where nothing does.
 
-    NUL, control characters (C0, DEL, C1) and lone surrogates. byte_escapes: accept U+DC80 to U+DCFF, which stand for the
-    bytes of a name on disk that is not UTF-8.
-    """
+    NUL, control characters (C0, DEL, C1) and lone surrogates. byte_escapes: accept U+DC80 to U+DCFF, which stand for
+    the bytes of a name on disk that is not UTF-8."""
     for character in text:
         code = ord(character)
         if code == 0:
@@ -68,27 +66,34 @@ def checked_name(text: str, subject: object, what: str) -> str:
     return text
 
 
-def path_inside(folder: Path, relative: str, subject: object, what: str, *, levels_up: int = 0, byte_escapes: bool = False) -> Path:
+def path_inside(
+    folder: Path, relative: str, subject: object, what: str, *, levels_up: int = 0, byte_escapes: bool = False
+) -> Path:
     """The path that a name inside a file stands for: folder / relative, below folder, links followed.
 
-    relative: components with forward slashes; an absolute one, a drive, a backslash, control characters, lone surrogates and over-long names
-    are refused. levels_up: how many folders above `folder` still belong to it. subject: the file that holds the name; what: what it names.
-    The path need not exist. Raises InputError.
-    """
+    relative: components with forward slashes; an absolute one, a drive, a backslash, control characters, lone
+    surrogates and over-long names are refused. levels_up: how many folders above `folder` still belong to it. subject:
+    the file that holds the name; what: what it names. The path need not exist. Raises InputError."""
     parts = relative_parts(relative, subject, what, levels_up=levels_up, byte_escapes=byte_escapes)
     path = folder.joinpath(*parts)
     try:
         root, target = folder.resolve(), path.resolve()
     except (OSError, RuntimeError):  # a loop of links
-        raise InputError(subject, f"{what} {shown(relative)} is a link that leads nowhere", "replace the link by the file itself") from None
+        raise InputError(
+            subject, f"{what} {shown(relative)} is a link that leads nowhere", "replace the link by the file itself"
+        ) from None
     for _ in range(levels_up):
         root = root.parent
     if not target.is_relative_to(root):
-        raise InputError(subject, f"{what} {shown(relative)} is a link that leaves {folder}", "replace the link by the file itself")
+        raise InputError(
+            subject, f"{what} {shown(relative)} is a link that leaves {folder}", "replace the link by the file itself"
+        )
     return path
 
 
-def relative_parts(relative: str, subject: object, what: str, *, levels_up: int | None = 0, byte_escapes: bool = False) -> tuple[str, ...]:
+def relative_parts(
+    relative: str, subject: object, what: str, *, levels_up: int | None = 0, byte_escapes: bool = False
+) -> tuple[str, ...]:
     """The components of a relative path in a file, "." left out and ".." kept. Raises InputError as path_inside() does.
 
     levels_up: how far ".." may lead above the start; None: as far as it likes.
@@ -114,7 +119,11 @@ def relative_parts(relative: str, subject: object, what: str, *, levels_up: int 
     if not fault and len(os.fsencode(relative)) > MAX_PATH_BYTES:
         fault = f"is longer than {MAX_PATH_BYTES} bytes"
     if fault:
-        cure = "put the file beside or below the one that names it" if fault in ("is absolute", "leaves its folder", "begins with a drive") else CURE
+        cure = (
+            "put the file beside or below the one that names it"
+            if fault in ("is absolute", "leaves its folder", "begins with a drive")
+            else CURE
+        )
         raise InputError(subject, f"{what} {shown(relative)} {fault}", cure)
     return tuple(parts)
 
@@ -122,13 +131,16 @@ def relative_parts(relative: str, subject: object, what: str, *, levels_up: int 
 def uri_path(folder: Path, uri: str, subject: object, what: str, *, levels_up: int = 0) -> Path:
     """The path of the file that a relative URI or a customary file name in a model stands for.
 
-    It is percent-decoded first and judged then. A file that is really called as the URI is written, percent signs and all,
-    goes before; backslashes are taken for slashes. A scheme (file:, http:, C:) is refused. Raises InputError.
-    """
+    It is percent-decoded first and judged then. A file that is really called as the URI is written, percent signs and
+    all, goes before; backslashes are taken for slashes. A scheme (file:, http:, C:) is refused. Raises InputError."""
     decoded = unquote(uri)
     for text in (uri, decoded):
         if _SCHEME.match(text):
-            raise InputError(subject, f"{what} {shown(uri)} names another place than a file", "put the file beside or below the one that names it")
+            raise InputError(
+                subject,
+                f"{what} {shown(uri)} names another place than a file",
+                "put the file beside or below the one that names it",
+            )
     literal, plain = uri.replace("\\", "/"), decoded.replace("\\", "/")
     path = path_inside(folder, plain, subject, what, levels_up=levels_up)
     if literal != plain and text_fault(literal) is None:
@@ -144,7 +156,8 @@ def shown(text: str, most: int = 80) -> str:
 
 
 def name_from_path(text: str) -> str:
-    """An object's name from a file's: bytes that are not UTF-8 are read as Latin-1, and what no name may hold becomes underscores."""
+    """An object's name from a file's: bytes that are not UTF-8 are read as Latin-1, and what no name may hold becomes
+    underscores."""
     plain = "".join(chr(ord(c) - 0xDC00) if ord(c) in _BYTE_ESCAPES else c for c in text)
     name = "".join("_" if c in "/\\" or text_fault(c) else c for c in plain)
     if _DRIVE.match(name):

@@ -1,4 +1,5 @@
-"""Packages that bring native code: import them, or say what is missing, and ask for the memory that they cannot do without."""
+"""Packages that bring native code: import them, or say what is missing, and ask for the memory that they cannot do
+without."""
 
 from __future__ import annotations
 
@@ -9,15 +10,21 @@ from types import ModuleType
 from gdtool.core.errors import GdtoolError, ResourceError, first_line, is_unmapped, missing_library
 
 # What pip installs, where that is not the module's name.
-_DISTRIBUTIONS = {"cv2": "opencv-python-headless", "fast_simplification": "fast-simplification", "igl": "libigl", "pxr": "gdtool[usd]",
-                  "pyQuadriFlow": "gdtool[quadriflow]", "onnxruntime": "gdtool[matting]"}
+_DISTRIBUTIONS = {
+    "cv2": "opencv-python-headless",
+    "fast_simplification": "fast-simplification",
+    "igl": "libigl",
+    "pxr": "gdtool[usd]",
+    "pyQuadriFlow": "gdtool[quadriflow]",
+    "onnxruntime": "gdtool[matting]",
+}
 
 
 def imported(module: str) -> ModuleType:
     """Import a module of a native package, such as "pymeshlab" or "embreex.rtcore_scene".
 
-    Raises ResourceError where the package is not installed, a shared library that it needs is missing, or it cannot be loaded.
-    """
+    Raises ResourceError where the package is not installed, a shared library that it needs is missing, or it cannot be
+    loaded."""
     try:
         return importlib.import_module(module)
     except (ImportError, OSError) as error:  # OSError: packages that load their library by ctypes
@@ -39,8 +46,8 @@ def imported_if_installed(module: str) -> ModuleType | None:
 def import_error(error: ImportError | OSError, module: str) -> GdtoolError | MemoryError:
     """The error to report for a failed import of `module`.
 
-    MemoryError where there was no room for it: in a child with a memory limit that is a reason to fall back, elsewhere exit code 5.
-    """
+    MemoryError where there was no room for it: in a child with a memory limit that is a reason to fall back, elsewhere
+    exit code 5."""
     if is_unmapped(error):
         return MemoryError(f"no memory to load {module}")
     package = module.partition(".")[0]
@@ -57,7 +64,8 @@ def import_error(error: ImportError | OSError, module: str) -> GdtoolError | Mem
 
 
 def require_address_space(size: int, what: str) -> None:
-    """Raise MemoryError when the limit on this process's address space (RLIMIT_AS) leaves less than size bytes; without a limit do nothing.
+    """Raise MemoryError when the limit on this process's address space (RLIMIT_AS) leaves less than size bytes; without
+    a limit do nothing.
 
     For libraries that crash where an allocation fails. what: names the memory in the message.
     """
@@ -72,7 +80,9 @@ def require_address_space(size: int, what: str) -> None:
     except (ImportError, OSError):  # Windows, or no /proc to tell what is used
         return
     if size > left:
-        raise MemoryError(f"unable to allocate {size / 2**30:.2f} GiB for {what}: {max(left, 0) / 2**30:.2f} GiB of the limit are left")
+        raise MemoryError(
+            f"unable to allocate {size / 2**30:.2f} GiB for {what}: {max(left, 0) / 2**30:.2f} GiB of the limit are left"
+        )
 
 
 def _is_of(missing: str | None, module: str) -> bool:

@@ -1,8 +1,9 @@
-"""Decide whether a folder at the place of an output may be replaced: only what gdtool wrote there, and nobody changed since.
+"""Decide whether a folder at the place of an output may be replaced: only what gdtool wrote there, and nobody changed
+since.
 
-What stands at an output's place may be somebody's work. It is replaced only if it is empty, or a folder of the same kind that a stage
-wrote, with no file beside those that its manifest lists and each of those as it was written. `--force` does not change that.
-"""
+What stands at an output's place may be somebody's work. It is replaced only if it is empty, or a folder of the same
+kind that a stage wrote, with no file beside those that its manifest lists and each of those as it was written.
+`--force` does not change that."""
 
 from __future__ import annotations
 
@@ -20,9 +21,8 @@ CURE = "name another output with -o"
 def output_place(path: Path) -> Path:
     """Where an output really lies: path, or what the link at path points to. A link is followed once, and stays.
 
-    Raises UsageError for a link to a link, a name that holds a line break, another control character or NUL, and for anything at the place
-    that is no folder.
-    """
+    Raises UsageError for a link to a link, a name that holds a line break, another control character or NUL, and for
+    anything at the place that is no folder."""
     fault = text_fault(str(path), byte_escapes=True)
     if fault:
         raise UsageError(ascii(str(path)), fault, CURE)
@@ -37,7 +37,8 @@ def output_place(path: Path) -> Path:
 
 
 def refuse_overlap(place: Path, sources: Iterable[Path]) -> None:
-    """Raise UsageError where the output is one of the sources, holds one, or lies inside one: it would erase or change what it is made from."""
+    """Raise UsageError where the output is one of the sources, holds one, or lies inside one: it would erase or change
+    what it is made from."""
     here = place.resolve()
     for source in sources:
         there = source.resolve()
@@ -50,7 +51,8 @@ def refuse_overlap(place: Path, sources: Iterable[Path]) -> None:
 
 
 def refuse_loss(place: Path, kind: str) -> None:
-    """Raise UsageError, naming the file, where replacing the folder at place by a result of this kind would lose something of the user's.
+    """Raise UsageError, naming the file, where replacing the folder at place by a result of this kind would lose
+    something of the user's.
 
     Reads every listed file, to compare its digest.
     """
@@ -71,12 +73,17 @@ def refuse_loss(place: Path, kind: str) -> None:
         path = place / relative
         if relative not in listed:
             raise UsageError(path, "is not a file that gdtool wrote there", f"move it away, or {CURE}")
-        if path.is_symlink() or path.stat().st_size != listed[relative].size or file_sha256(path) != listed[relative].sha256:
+        if (
+            path.is_symlink()
+            or path.stat().st_size != listed[relative].size
+            or file_sha256(path) != listed[relative].sha256
+        ):
             raise UsageError(path, "was changed after gdtool wrote it", f"move it away, or {CURE}")
 
 
 def refuse_index(root: Path) -> None:
-    """Raise UsageError where root has a manifest.json that is no dataset index of gdtool's: writing the index would lose it."""
+    """Raise UsageError where root has a manifest.json that is no dataset index of gdtool's: writing the index would
+    lose it."""
     if not (root / MANIFEST).exists():
         return
     manifest = _own_manifest(root, [MANIFEST])

@@ -1,8 +1,7 @@
 """Walk back along what a folder was made from, by path and by digest.
 
-A manifest says where each input lay and what it was. An input that lies there still but is another one by now is told and refused: what
-a stage would take from it does not belong to the folder at hand.
-"""
+A manifest says where each input lay and what it was. An input that lies there still but is another one by now is told
+and refused: what a stage would take from it does not belong to the folder at hand."""
 
 from __future__ import annotations
 
@@ -44,7 +43,8 @@ class Origin:
 
 
 def origins(folder: Folder) -> Iterator[Origin]:
-    """What a folder was made from, generated objects left out; paths in manifests are relative to where the folder really lies."""
+    """What a folder was made from, generated objects left out; paths in manifests are relative to where the folder
+    really lies."""
     for entry in folder.manifest.inputs:
         if not entry.path.startswith("procedural:"):
             parts = relative_parts(entry.path, folder.path / MANIFEST, "input", levels_up=None, byte_escapes=True)
@@ -52,7 +52,8 @@ def origins(folder: Folder) -> Iterator[Origin]:
 
 
 def ancestors(folder: Folder, cure: str) -> Iterator[Folder]:
-    """The folders that this one was made from, nearest first, as far as they still lie where the manifests say; a model's network is none.
+    """The folders that this one was made from, nearest first, as far as they still lie where the manifests say; a
+    model's network is none.
 
     cure: what to do about a folder that was replaced since, for the message.
     Raises InputError for one that was replaced since.
@@ -74,14 +75,16 @@ def ancestors(folder: Folder, cure: str) -> Iterator[Folder]:
 
 
 def find_ancestor(folder: Folder, kind: str, cure: str) -> Folder | None:
-    """The nearest folder of a kind along the provenance chain (the folder itself included), or None. Raises as ancestors() does."""
+    """The nearest folder of a kind along the provenance chain (the folder itself included), or None. Raises as
+    ancestors() does."""
     if folder.kind == kind:
         return folder
     return next((found for found in ancestors(folder, cure) if found.kind == kind), None)
 
 
 def missing_origin(folder: Folder, cure: str) -> Origin | None:
-    """The first thing along the provenance chain that lies no more where the manifests say; None where all is there. Raises as ancestors() does."""
+    """The first thing along the provenance chain that lies no more where the manifests say; None where all is there.
+    Raises as ancestors() does."""
     for one in (folder, *ancestors(folder, cure)):
         for origin in origins(one):
             if origin.is_gone:

@@ -1,9 +1,8 @@
 """Atomic publishing: a folder appears whole or not at all, whatever kills the run.
 
 Beside the target `surface` live, while a run works on it: `.surface.lock`, `.surface.<key>.partial` (what is being
-written), `.surface.<key>.old` (what it replaces, for a moment, where the system cannot swap two folders) and, for stages that resume,
-`.surface.<key>.work`; <key> is the first twelve hexadecimal digits of the run's key.
-"""
+written), `.surface.<key>.old` (what it replaces, for a moment, where the system cannot swap two folders) and, for
+stages that resume, `.surface.<key>.work`; <key> is the first twelve hexadecimal digits of the run's key."""
 
 from __future__ import annotations
 
@@ -36,7 +35,11 @@ def locked(target: Path, wait_seconds: float = 3600.0) -> Iterator[None]:
         handle = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o666)
         if os.fstat(handle).st_size:  # a lock of ours is empty, and is removed in the end
             os.close(handle)
-            raise OutputError(path, "is in the way of the output's lock, and gdtool did not write it", "move it away, or choose another -o")
+            raise OutputError(
+                path,
+                "is in the way of the output's lock, and gdtool did not write it",
+                "move it away, or choose another -o",
+            )
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             # The holder before us removes the file when it is done: a lock on a removed file guards nothing.
@@ -80,14 +83,19 @@ def _beside(target: Path, key: str, use: str) -> Path:
 def _left_beside(target: Path, *uses: str) -> list[Path]:
     """Folders that runs of this output, and of no other, have left beside it."""
     pattern = re.compile(re.escape(f".{target.name}.") + f"[0-9a-f]{{{KEY_DIGITS}}}" + r"\.(" + "|".join(uses) + ")")
-    return sorted(path for path in target.parent.iterdir() if pattern.fullmatch(path.name) and path.is_dir() and not path.is_symlink())
+    return sorted(
+        path
+        for path in target.parent.iterdir()
+        if pattern.fullmatch(path.name) and path.is_dir() and not path.is_symlink()
+    )
 
 
 def clear_stale(target: Path) -> None:
-    """Remove what killed runs left half written beside the target. The lock must be held: so no run that is left of is alive.
+    """Remove what killed runs left half written beside the target. The lock must be held: so no run that is left of is
+    alive.
 
-    Workspaces stay, those of other options too: they may hold hours of a training. clear_workspaces() removes them after a publication.
-    """
+    Workspaces stay, those of other options too: they may hold hours of a training. clear_workspaces() removes them
+    after a publication."""
     for old in _left_beside(target, "old"):
         if target.exists():
             remove_tree(old)
@@ -104,7 +112,8 @@ def clear_workspaces(target: Path) -> None:
 
 
 def remove_tree(folder: Path) -> None:
-    """Remove a folder of our own as far as the system lets us, also where a umask has left it without permissions. A link is not followed."""
+    """Remove a folder of our own as far as the system lets us, also where a umask has left it without permissions. A
+    link is not followed."""
     if folder.is_symlink() or not folder.is_dir():
         return
 
@@ -118,10 +127,13 @@ def remove_tree(folder: Path) -> None:
 
 
 def require_replaceable(target: Path) -> None:
-    """Raise OutputError where the folder at target could not be removed once it is replaced: it, or a folder in it, is closed to this user."""
+    """Raise OutputError where the folder at target could not be removed once it is replaced: it, or a folder in it, is
+    closed to this user."""
     for root, _, _ in os.walk(target):
         if not os.access(root, os.W_OK | os.X_OK):
-            raise OutputError(root, "cannot be replaced: it is closed to writing", "check its permissions or choose another -o")
+            raise OutputError(
+                root, "cannot be replaced: it is closed to writing", "check its permissions or choose another -o"
+            )
 
 
 def publish(partial: Path, target: Path) -> None:

@@ -16,7 +16,12 @@ from gdtool.core.names import shown, text_fault
 
 MAX_INTEGER_DIGITS = 19  # of a 64-bit integer
 
-_SPECIAL = ((stat.S_ISFIFO, "a FIFO"), (stat.S_ISSOCK, "a socket"), (stat.S_ISCHR, "a device"), (stat.S_ISBLK, "a device"))
+_SPECIAL = (
+    (stat.S_ISFIFO, "a FIFO"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
 
 
 def require_regular_file(path: Path) -> None:
@@ -32,7 +37,9 @@ def require_regular_file(path: Path) -> None:
         raise InputError(shown(str(path)), "is no name of a file", "check the path") from None
     except OSError as error:
         if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
-            raise InputError(shown(str(path)), error.strerror.lower() if error.strerror else "is no name of a file", "check the path") from None
+            raise InputError(
+                shown(str(path)), error.strerror.lower() if error.strerror else "is no name of a file", "check the path"
+            ) from None
         raise from_os_error(error, path) from None
     kind = next((name for test, name in _SPECIAL if test(mode)), None)
     if kind:
@@ -44,8 +51,8 @@ def require_regular_file(path: Path) -> None:
 def bytes_of(path: Path) -> bytes:
     """The bytes of a file that the user named.
 
-    Raises InputError where it is no regular file, ResourceError where it is larger than one input may be, OutputError where it cannot be read.
-    """
+    Raises InputError where it is no regular file, ResourceError where it is larger than one input may be, OutputError
+    where it cannot be read."""
     require_regular_file(path)
     require_memory(path.stat().st_size, path, "its content", "give a smaller file")
     try:
@@ -62,12 +69,14 @@ def read_json(path: Path) -> Any:
 def parse_json(content: bytes | str, subject: object) -> Any:
     """Parse JSON strictly: lists, dicts, strings, finite floats, 64-bit integers, booleans and None.
 
-    Raises InputError that names subject and the place: for text that is not JSON, a key that appears twice, NaN and infinities, numbers
-    beyond float64 or 64 bits, nesting deeper than Python's parser goes (some 1000 levels), and strings with lone surrogates that stand for no byte of a file name.
-    """
+    Raises InputError that names subject and the place: for text that is not JSON, a key that appears twice, NaN and
+    infinities, numbers beyond float64 or 64 bits, nesting deeper than Python's parser goes (some 1000 levels), and
+    strings with lone surrogates that stand for no byte of a file name."""
     try:
         text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
-        value = json.loads(text, object_pairs_hook=_unique, parse_int=_integer, parse_float=_float, parse_constant=_constant)
+        value = json.loads(
+            text, object_pairs_hook=_unique, parse_int=_integer, parse_float=_float, parse_constant=_constant
+        )
     except _Refused as fault:
         raise InputError(subject, str(fault), "correct that entry") from None
     except RecursionError:

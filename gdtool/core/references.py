@@ -15,22 +15,36 @@ from gdtool.core.errors import InputError
 from gdtool.core.names import path_inside, relative_parts, uri_path
 from gdtool.core.reading import require_regular_file
 
-# Where a texture of an .mtl is looked for: beside the library, or as in Google Scanned Objects' layout, which is the last.
+# Where a texture of an .mtl is looked for: beside the library, or as in Google Scanned Objects' layout, which is the
+# last.
 TEXTURE_PLACES = ("", "textures", "../textures", "../materials/textures")
 OBJ_LEVELS_UP = 1  # folders above an .obj's own that its names may lead to
 
 # Options of a texture statement in an .mtl and how many words follow each; -o, -s and -t take one to three numbers.
-_OPTION_WORDS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-bm": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-mm": 2, "-texres": 1, "-type": 1,
-                 "-o": 3, "-s": 3, "-t": 3}
+_OPTION_WORDS = {
+    "-blendu": 1,
+    "-blendv": 1,
+    "-boost": 1,
+    "-bm": 1,
+    "-cc": 1,
+    "-clamp": 1,
+    "-imfchan": 1,
+    "-mm": 2,
+    "-texres": 1,
+    "-type": 1,
+    "-o": 3,
+    "-s": 3,
+    "-t": 3,
+}
 
 
 def obj_file(model: Path, name: str, subject: Path, what: str, folder: str = "") -> Path | None:
-    """The path that a name in an .obj or .mtl stands for; None for an empty name or ".", which exporters write for no file.
+    """The path that a name in an .obj or .mtl stands for; None for an empty name or ".", which exporters write for no
+    file.
 
-    model: the .obj. folder: what the name is relative to, itself relative to the model's folder. Backslashes are taken for
-    slashes, and of an absolute name only the last part counts. subject, what: as in path_inside(). Raises InputError for a name
-    that leads more than one folder above the model's, links followed.
-    """
+    model: the .obj. folder: what the name is relative to, itself relative to the model's folder. Backslashes are taken
+    for slashes, and of an absolute name only the last part counts. subject, what: as in path_inside(). Raises
+    InputError for a name that leads more than one folder above the model's, links followed."""
     plain = _plain(name)
     if plain in ("", "."):
         return None
@@ -38,7 +52,8 @@ def obj_file(model: Path, name: str, subject: Path, what: str, folder: str = "")
 
 
 def obj_texture(model: Path, name: str, subject: Path, what: str, folder: str = "") -> Path | None:
-    """The texture that a name in an .mtl stands for, as obj_file(); looked for in TEXTURE_PLACES, the first where none holds it.
+    """The texture that a name in an .mtl stands for, as obj_file(); looked for in TEXTURE_PLACES, the first where none
+    holds it.
 
     Raises InputError also for a FIFO, a device or a socket.
     """
@@ -58,7 +73,8 @@ def obj_texture(model: Path, name: str, subject: Path, what: str, folder: str = 
 
 
 def obj_libraries(model: Path, line: str) -> Iterator[tuple[str, Path]]:
-    """The name and path of each library of an mtllib line: one name that holds spaces, or several names. Raises InputError."""
+    """The name and path of each library of an mtllib line: one name that holds spaces, or several names. Raises
+    InputError."""
     try:
         whole = obj_file(model, line, model, "the material library")
     except InputError:
@@ -91,7 +107,8 @@ def map_name(words: list[str]) -> tuple[str, str | None]:
 
 
 def is_readable(path: Path) -> bool:
-    """Whether path is a regular file; False for a folder and for nothing. Raises InputError for a FIFO, a device or a socket."""
+    """Whether path is a regular file; False for a folder and for nothing. Raises InputError for a FIFO, a device or a
+    socket."""
     if not path.is_file():
         if path.exists() and not path.is_dir():
             require_regular_file(path)
@@ -100,7 +117,8 @@ def is_readable(path: Path) -> bool:
 
 
 def referred_files(path: Path) -> list[Path]:
-    """The regular files that a .gltf or .obj names, of those that its reader would open. Never raises: the reader tells what is wrong."""
+    """The regular files that a .gltf or .obj names, of those that its reader would open. Never raises: the reader tells
+    what is wrong."""
     try:
         if not path.is_file():
             return []
@@ -140,7 +158,9 @@ def _obj_files(path: Path) -> list[Path]:
         for line in file:
             if "mtllib" in line and len(words := line.split(None, 1)) == 2 and words[0] == "mtllib":
                 try:
-                    libraries |= {name: library for name, library in obj_libraries(path, words[1].strip()) if is_readable(library)}
+                    libraries |= {
+                        name: library for name, library in obj_libraries(path, words[1].strip()) if is_readable(library)
+                    }
                 except InputError:
                     continue
     out = list(libraries.values())

@@ -20,12 +20,39 @@ import msgspec
 import gdtool
 from gdtool import __version__
 from gdtool.core import ending, log, sources
-from gdtool.core.errors import GdtoolError, InputError, ResourceError, UsageError, asked_for, from_exception, from_os_error
+from gdtool.core.errors import (
+    GdtoolError,
+    InputError,
+    ResourceError,
+    UsageError,
+    asked_for,
+    from_exception,
+    from_os_error,
+)
 from gdtool.core.folder import Folder, is_folder, open_folder
-from gdtool.core.manifest import MANIFEST, InputEntry, Manifest, RunRecord, check_files, digest_of, encode, list_files, read_manifest
+from gdtool.core.manifest import (
+    MANIFEST,
+    InputEntry,
+    Manifest,
+    RunRecord,
+    check_files,
+    digest_of,
+    encode,
+    list_files,
+    read_manifest,
+)
 from gdtool.core.ownership import output_place, refuse_index, refuse_loss, refuse_overlap
 from gdtool.core.provenance import find_ancestor, missing_origin
-from gdtool.core.publish import clear_stale, clear_workspaces, locked, partial_path, publish, remove_tree, require_replaceable, workspace_path
+from gdtool.core.publish import (
+    clear_stale,
+    clear_workspaces,
+    locked,
+    partial_path,
+    publish,
+    remove_tree,
+    require_replaceable,
+    workspace_path,
+)
 from gdtool.core.sources import Source
 from gdtool.core.stage import Inputs, Output, Stage
 
@@ -104,7 +131,11 @@ def second_inputs(stage: Stage, source: Source, given: dict[str, str | None]) ->
             out[flag] = None
         moved = f"{gone.path}, which {gone.of.kind} {gone.of.path} was made from, is gone" if gone else ""
         if out[flag] is None and wanted.required:
-            raise UsageError(sources.name_of(source), moved or f"has no {wanted.kind} along its provenance chain", f"name one with --{flag}")
+            raise UsageError(
+                sources.name_of(source),
+                moved or f"has no {wanted.kind} along its provenance chain",
+                f"name one with --{flag}",
+            )
         if moved:
             warnings.append(f"no {wanted.kind} found: {moved}; name one with --{flag} where there is one")
     return SecondInputs(out, tuple(warnings))
@@ -116,7 +147,9 @@ def option_record(options: Any, folder: Path | None) -> dict[str, Any]:
     for field in msgspec.structs.fields(options):
         value = record.get(field.name)
         if names_file(field) and isinstance(value, str) and Path(value).is_file():
-            record[field.name] = sources.digest(Path(value)) if folder is None else sources.relative_to(Path(value), folder)
+            record[field.name] = (
+                sources.digest(Path(value)) if folder is None else sources.relative_to(Path(value), folder)
+            )
     return record
 
 
@@ -127,11 +160,14 @@ def names_file(field: Any) -> bool:
 
 
 def key_of(stage: str, version: int, options: dict[str, Any], inputs: list[tuple[str, str]]) -> str:
-    """What tells one result of a stage from another: sha256 of its name, version, options (files by digest), and (role, digest) of its inputs."""
+    """What tells one result of a stage from another: sha256 of its name, version, options (files by digest), and (role,
+    digest) of its inputs."""
     return digest_of([stage, version, options, inputs])
 
 
-def stale_reason(target: Path, stage: Stage, key: str, options: dict[str, Any], inputs: list[tuple[str, str]]) -> str | None:
+def stale_reason(
+    target: Path, stage: Stage, key: str, options: dict[str, Any], inputs: list[tuple[str, str]]
+) -> str | None:
     """Why the folder at target is not the result of this key, cheapest check first; None when it is."""
     if not is_folder(target):
         return "not made yet"
@@ -167,7 +203,9 @@ def _refuse_other_source(target: Path, stage: Stage, source: Source, chosen: boo
         raise UsageError(target, f"was made from another source ({before})", "name an output folder with -o")
 
 
-def run_one(stage: Stage, given: list[Source], options: Any, flags: dict[str, str | None], settings: Settings) -> Result:
+def run_one(
+    stage: Stage, given: list[Source], options: Any, flags: dict[str, str | None], settings: Settings
+) -> Result:
     """Run a stage on one source (or, when it gathers, on all of them) and publish the result."""
     source = given[0]
     named = default_output(stage, source, settings.output, settings.several and not stage.gathers)
@@ -208,7 +246,11 @@ def run_one(stage: Stage, given: list[Source], options: Any, flags: dict[str, st
             try:
                 stage.run(inputs, options, out)
             except MemoryError as error:
-                raise ResourceError(inputs.name, f"{stage.name} ran out of memory{asked_for(error)}", "lower the resolution or free memory") from None
+                raise ResourceError(
+                    inputs.name,
+                    f"{stage.name} ran out of memory{asked_for(error)}",
+                    "lower the resolution or free memory",
+                ) from None
             if out.content is None:
                 raise RuntimeError(f"{stage.name} gave no content")
             entries = [
@@ -216,9 +258,19 @@ def run_one(stage: Stage, given: list[Source], options: Any, flags: dict[str, st
                 for (role, one), (_, digest) in zip(roles, digests, strict=True)
             ]
             manifest = Manifest(
-                kind=stage.writes, name=inputs.name, stage=stage.name, stage_version=stage.version, tool_version=__version__,
-                key=key, options=recorded, inputs=tuple(entries), content=out.content, skipped=tuple(out.skipped),
-                warnings=tuple(out.warnings), files=list_files(partial), run=_record(out, start),
+                kind=stage.writes,
+                name=inputs.name,
+                stage=stage.name,
+                stage_version=stage.version,
+                tool_version=__version__,
+                key=key,
+                options=recorded,
+                inputs=tuple(entries),
+                content=out.content,
+                skipped=tuple(out.skipped),
+                warnings=tuple(out.warnings),
+                files=list_files(partial),
+                run=_record(out, start),
             )
             (partial / MANIFEST).write_bytes(encode(manifest))
             refuse_loss(target, stage.writes)  # again: the run may have taken hours
@@ -226,7 +278,9 @@ def run_one(stage: Stage, given: list[Source], options: Any, flags: dict[str, st
             clear_workspaces(target)
         except BaseException as error:
             if _is_resumable(stage, out.place_of_workspace):
-                log.say(f"{named}: what is done so far is kept in {out.place_of_workspace}; the same command goes on from it")
+                log.say(
+                    f"{named}: what is done so far is kept in {out.place_of_workspace}; the same command goes on from it"
+                )
             if isinstance(error, OSError):
                 raise from_os_error(error, target) from error
             raise
@@ -296,14 +350,23 @@ def write_dataset_index(root: Path, results: list[Result]) -> Path:
     for result in results:
         objects[result.path.relative_to(root).as_posix()] = read_manifest(result.path).digest
     content = DatasetContent(objects=tuple(DatasetObject(path, objects[path]) for path in sorted(objects)))
-    manifest = Manifest(kind="dataset", name=root.absolute().name, stage="render-dataset", tool_version=__version__, content=content, files=())
+    manifest = Manifest(
+        kind="dataset",
+        name=root.absolute().name,
+        stage="render-dataset",
+        tool_version=__version__,
+        content=content,
+        files=(),
+    )
     temporary = root / f".{MANIFEST}.partial"
     temporary.write_bytes(encode(manifest))
     os.replace(temporary, root / MANIFEST)
     return root
 
 
-def _attempt(stage: Stage, text: str, *, options: Any, flags: dict[str, str | None], settings: Settings) -> Result | GdtoolError:
+def _attempt(
+    stage: Stage, text: str, *, options: Any, flags: dict[str, str | None], settings: Settings
+) -> Result | GdtoolError:
     """The result of one source, or what was wrong with it."""
     try:
         source = sources.resolve(text, stage.reads, stage.name, allow_missing=settings.dry_run)
@@ -325,12 +388,15 @@ def _on_cluster(work: functools.partial, stream: Iterator[str], settings: Settin
     work.keywords["settings"] = dataclasses.replace(settings, threads=threads, ray=None)
     for result in cluster.each(settings.ray, work, stream, threads):
         if isinstance(result, Result):
-            log.say(f"{result.path}: {result.status}" + (f" in {result.seconds:.1f} s" if result.status == "done" else ""))
+            log.say(
+                f"{result.path}: {result.status}" + (f" in {result.seconds:.1f} s" if result.status == "done" else "")
+            )
         yield result
 
 
-def run_all(stage: Stage, arguments: tuple[str, ...], options: Any, flags: dict[str, str | None],
-            settings: Settings) -> Iterator[Result | GdtoolError]:
+def run_all(
+    stage: Stage, arguments: tuple[str, ...], options: Any, flags: dict[str, str | None], settings: Settings
+) -> Iterator[Result | GdtoolError]:
     """Run a stage on every source, as they arrive; a source that fails yields its error and the rest go on."""
     stream = sources.incoming(arguments)
     part, parts = settings.shard

@@ -24,13 +24,16 @@ PICTURES = "pictures"  # a kind of source: a folder of another program, without 
 
 
 def expand(text: str) -> Iterator[str]:
-    """procedural:A..B becomes its seeds, one by one; anything else is itself. Raises UsageError for anything else after procedural:."""
+    """procedural:A..B becomes its seeds, one by one; anything else is itself. Raises UsageError for anything else after
+    procedural:."""
     if not text.startswith("procedural:"):
         yield text
         return
     match = PROCEDURAL.fullmatch(text)
     if not match:
-        raise UsageError(shown(text), "is not procedural:SEED or procedural:FIRST..LAST", "give whole numbers, as in procedural:0..9")
+        raise UsageError(
+            shown(text), "is not procedural:SEED or procedural:FIRST..LAST", "give whole numbers, as in procedural:0..9"
+        )
     if any(len(digits) > MAX_INTEGER_DIGITS or int(digits) >= 2**63 for digits in (match[1], match[2] or "0")):
         raise UsageError(shown(text), "has a seed beyond 64 bits", f"give seeds up to {2**63 - 1}")
     first = int(match[1])
@@ -44,9 +47,8 @@ def expand(text: str) -> Iterator[str]:
 def incoming(arguments: tuple[str, ...]) -> Iterator[str]:
     """Sources in order: the arguments, or without any the lines of stdin, each as soon as it arrives.
 
-    Raises UsageError when both are empty: a pipe whose first stage failed fails as a whole. Also for what can be no source, before any of
-    the arguments is worked on.
-    """
+    Raises UsageError when both are empty: a pipe whose first stage failed fails as a whole. Also for what can be no
+    source, before any of the arguments is worked on."""
     empty = True
     for text in arguments:
         next(expand(_checked(text)))
@@ -82,10 +84,16 @@ def _folder_of(raw: bytes, line: str) -> str | None:
     try:
         record = parse_json(raw, "stdin")
     except InputError as error:
-        raise UsageError("stdin", f"line {shown(line, 60)} {error.fact}", "pipe in paths, or what --json prints") from None
+        raise UsageError(
+            "stdin", f"line {shown(line, 60)} {error.fact}", "pipe in paths, or what --json prints"
+        ) from None
     if isinstance(record, dict) and "folder" in record and isinstance(record["folder"], str | None):
         return record["folder"]
-    raise UsageError("stdin", f"line {shown(line, 60)} is neither a path nor an object of --json", "pipe in paths, or what --json prints")
+    raise UsageError(
+        "stdin",
+        f"line {shown(line, 60)} is neither a path nor an object of --json",
+        "pipe in paths, or what --json prints",
+    )
 
 
 def _checked(text: str) -> str:
@@ -100,7 +108,9 @@ def resolve(text: str, kinds: tuple[str, ...], reader: str, allow_missing: bool 
     """Open what a source names. Raises InputError when it is missing or of the wrong kind."""
     if text.startswith("procedural:"):
         if "model-file" not in kinds and "mesh-file" not in kinds:
-            raise InputError(text, f"names a model, but {reader} reads {_words(kinds)}", "run gdtool render-dataset first")
+            raise InputError(
+                text, f"names a model, but {reader} reads {_words(kinds)}", "run gdtool render-dataset first"
+            )
         return text
     path = Path(text)
     folder_kinds = tuple(kind for kind in kinds if not kind.endswith("-file"))
@@ -113,8 +123,13 @@ def resolve(text: str, kinds: tuple[str, ...], reader: str, allow_missing: bool 
     if not (allow_missing and not os.path.lexists(path)):
         require_regular_file(path)
     if path.exists() and len(folder_kinds) == len(kinds):
-        raise InputError(path, f"is a file, but {reader} reads a {_words(kinds)} folder",
-                         f"name a folder that gdtool {MADE_BY[folder_kinds[0]]} has written" if folder_kinds[0] in MADE_BY else "name the folder that it lies in")
+        raise InputError(
+            path,
+            f"is a file, but {reader} reads a {_words(kinds)} folder",
+            f"name a folder that gdtool {MADE_BY[folder_kinds[0]]} has written"
+            if folder_kinds[0] in MADE_BY
+            else "name the folder that it lies in",
+        )
     return path
 
 
@@ -137,13 +152,19 @@ def hub_folder(text: str, revision: str = "") -> str:
     try:
         from huggingface_hub import snapshot_download
     except ImportError:
-        raise ResourceError(text, "does not exist here, and huggingface_hub is not installed to ask the hub for it",
-                            "pip install 'gdtool[hub]', or give a local folder") from None
+        raise ResourceError(
+            text,
+            "does not exist here, and huggingface_hub is not installed to ask the hub for it",
+            "pip install 'gdtool[hub]', or give a local folder",
+        ) from None
     try:
         return snapshot_download(text, revision=revision or None, allow_patterns=["*.json", "*.safetensors"])
     except Exception as error:  # of several libraries: no network, no such id, no permission
-        raise InputError(text, f"is no folder here, and the hub does not give it ({type(error).__name__})",
-                         "check the id and the network, or give a local folder") from None
+        raise InputError(
+            text,
+            f"is no folder here, and the hub does not give it ({type(error).__name__})",
+            "check the id and the network, or give a local folder",
+        ) from None
 
 
 def name_of(source: Source) -> str:
@@ -173,7 +194,8 @@ def relative_to(path: Path | str, folder: Path) -> str:
     """path as seen from where folder really lies, forward slashes; procedural:SEED stays as it is."""
     if isinstance(path, str):
         return path
-    # Where both really lie, but for a link that the path itself is: ".." from a folder reached by a link does not lead back along the link.
+    # Where both really lie, but for a link that the path itself is: ".." from a folder reached by a link does not lead
+    # back along the link.
     real = Path(os.path.realpath(path.parent), path.name) if path.name not in ("", "..") else path.resolve()
     return Path(os.path.relpath(real, os.path.realpath(folder))).as_posix()
 

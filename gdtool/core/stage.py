@@ -35,9 +35,8 @@ def file_option(description: str) -> Any:
 class SecondInput:
     """An input beside the source: a flag, and when search is set found along the provenance chain without it.
 
-    default: a folder that ships with gdtool, as "package/folder", taken when neither gives one. foreign: a folder of another
-    program, or an id of the Hugging Face hub, will do as well, and arrives as a Path.
-    """
+    default: a folder that ships with gdtool, as "package/folder", taken when neither gives one. foreign: a folder of
+    another program, or an id of the Hugging Face hub, will do as well, and arrives as a Path."""
 
     kind: str
     required: bool = False
@@ -62,18 +61,17 @@ class Stage:
     """A stage and all that its command line, its manifest and its schema are derived from.
 
     reads: folder kinds, and "image-file", "model-file", "mesh-file" for files. version rises when results change.
-    gathers: all sources go into one run (train). dataset: several results share a root with an index.
-    check(inputs, options) is called before any work: it raises a GdtoolError for what the run would find out only later (a file that an
-    option names, a package that it needs), and takes no time. checkpoint: the file of the workspace that a later run goes on
-    from; without it a failed run leaves no workspace.
-    """
+    gathers: all sources go into one run (train). dataset: several results share a root with an index. check(inputs,
+    options) is called before any work: it raises a GdtoolError for what the run would find out only later (a file that
+    an option names, a package that it needs), and takes no time. checkpoint: the file of the workspace that a later run
+    goes on from; without it a failed run leaves no workspace."""
 
     name: str
     version: int
     reads: tuple[str, ...]
     writes: str
     Options: type[msgspec.Struct]
-    run: Callable[[Inputs, Any, "Output"], None]
+    run: Callable[[Inputs, Any, Output], None]
     second_inputs: dict[str, SecondInput | str] = field(default_factory=dict)
     gathers: bool = False
     dataset: bool = False

@@ -1,4 +1,5 @@
-"""One readable configuration of the diffusion model and of its training: `paper` and `tiny` are the same code as `small`.
+"""One readable configuration of the diffusion model and of its training: `paper` and `tiny` are the same code as
+`small`.
 
 Everything a model folder needs to be rebuilt is ModelConfig (its config.json); everything a run needs is TrainConfig.
 """
@@ -13,14 +14,15 @@ from msgspec import Meta
 from gdtool.cameras.camera import SIX_VIEWS
 from gdtool.core.names import text_fault
 
-# The order of the domains is the order of the one-hot switcher and of every (…, domain, view, …) axis; color is primary.
+# The order of the domains is the order of the one-hot switcher and of every (…, domain, view, …) axis; color is
+# primary.
 DOMAINS = ("color", "normal", "depth", "albedo", "roughness", "metallic")
 # Wonder3D's [elevation of the condition, view's elevation, view's azimuth] and our six labels, as sin and cos each.
 CLASS_WIDTH = 2 * (3 + len(DOMAINS))
 
 
-# Bounds of what a configuration file may ask for: far above any model that was trained, low enough that a network's structure
-# is known in a second and its memory can be predicted before it is made.
+# Bounds of what a configuration file may ask for: far above any model that was trained, low enough that a network's
+# structure is known in a second and its memory can be predicted before it is made.
 Pixels = Annotated[int, Meta(ge=1, le=4096)]
 Width = Annotated[int, Meta(ge=1, le=16384)]  # channels
 Layers = Annotated[int, Meta(ge=1, le=64)]
@@ -35,7 +37,14 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """Shape of the network, of its inputs and of its noise. Sizes in pixels unless said otherwise."""
 
     image_size: Pixels = 64
-    views: Annotated[tuple[str, ...], Meta(min_length=1)] = ("front", "front_right", "right", "back", "left", "front_left")
+    views: Annotated[tuple[str, ...], Meta(min_length=1)] = (
+        "front",
+        "front_right",
+        "right",
+        "back",
+        "left",
+        "front_left",
+    )
     domains: Annotated[tuple[str, ...], Meta(min_length=1)] = DOMAINS
     # codec: "vae" is Stable Diffusion's (factor 8, 4 channels), "patch" is space-to-depth of the pixels.
     codec: Literal["vae", "patch"] = "patch"
@@ -61,20 +70,23 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     cross_domain: Literal["none", "one_way", "two_way", "joint", "joint_last"] = "two_way"
     # what tells an image its view and domain, and the cameras: ours, or Wonder3D's numbers verbatim
     convention: Literal["gdtool", "wonder3d"] = "gdtool"
-    # image encoder: "clip" is one projected embedding as one token, "patch" a small transformer over the image's patches
+    # image encoder: "clip" is one projected embedding as one token, "patch" a small transformer over the image's
+    # patches
     encoder: Literal["clip", "patch"] = "patch"
     encoder_width: Width = 192
     encoder_layers: Annotated[int, Meta(ge=0, le=64)] = 4
     encoder_patch: Pixels = 8
     # noise
     prediction: Literal["epsilon", "v", "x"] = "x"
-    # scale of the network's noisy input: "unit" is variance preserving; "shrunk" is the linear estimate of x_0 from it, so
-    # that pure noise, which says nothing, comes in as nothing (x-prediction only)
+    # scale of the network's noisy input: "unit" is variance preserving; "shrunk" is the linear estimate of x_0 from it,
+    # so that pure noise, which says nothing, comes in as nothing (x-prediction only)
     noisy_input: Literal["unit", "shrunk"] = "unit"
     timesteps: Annotated[int, Meta(ge=2, le=100_000)] = 1000
     noise_schedule: Literal["scaled_linear", "cosine"] = "cosine"
-    sampling_steps: Annotated[int, Meta(ge=1, le=1000)] = 50  # denoising steps of sample-views when none are asked for: what measured best for this model
-    # the mean of what is made of the picture and of its mirror image; twice the time. Patch codec and own convention only.
+    # Denoising steps of sample-views when none are asked for: what measured best for this model.
+    sampling_steps: Annotated[int, Meta(ge=1, le=1000)] = 50
+    # the mean of what is made of the picture and of its mirror image; twice the time. Patch codec and own convention
+    # only.
     sampling_mirrored: bool = False
     # encoded background of color and albedo while training; sampling uses the first
     backgrounds: Annotated[tuple[Literal["white", "grey", "black"], ...], Meta(min_length=1)] = ("grey",)
@@ -116,7 +128,7 @@ def _fault(config: ModelConfig) -> str | None:
     for i, width in enumerate(config.channels):
         if width % config.norm_groups:
             return f"channels[{i}] is {width}, not a multiple of norm_groups {config.norm_groups}"
-        attends = config.attention_levels[i] or any(config.row_attention[i:i + 1]) or i == levels - 1
+        attends = config.attention_levels[i] or any(config.row_attention[i : i + 1]) or i == levels - 1
         heads = config.heads or max(width // config.head_width, 1)
         if attends and width % heads:
             return f"channels[{i}] is {width}, not a multiple of its {heads} heads (heads, head_width)"
@@ -146,8 +158,11 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     accumulate: Annotated[int, Meta(ge=1, le=1_000_000)] = 1
     steps: Annotated[int, Meta(ge=1, le=10**9)] = 4000
     # The last phase sees all images at once, as sampling does; few objects then, so that a step costs about the same.
-    phases: Annotated[tuple[Phase, ...], Meta(min_length=1, max_length=100)] = (Phase(share=0.6, domains=3, views=3), Phase(share=0.8, domains=6, views=3, batch=4),
-                                                                               Phase(share=1.0, domains=6, views=6, batch=2))
+    phases: Annotated[tuple[Phase, ...], Meta(min_length=1, max_length=100)] = (
+        Phase(share=0.6, domains=3, views=3),
+        Phase(share=0.8, domains=6, views=3, batch=4),
+        Phase(share=1.0, domains=6, views=6, batch=2),
+    )
     optimizer: Literal["adamw", "muon"] = "adamw"  # muon: for the matrices inside the network
     warmup: Annotated[int, Meta(ge=1, le=10**9)] = 50
     decay: bool = True  # cosine to a twentieth of the learning rate over the run
@@ -158,17 +173,18 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     ema: Share = 0.999
     snr_gamma: Weight = 5.0  # min-SNR: a clean image's error is weighted by min(SNR, gamma) …
     snr_floor: Weight = 1.0  # … and at least by this, or a model that samples in few steps never learns the first one
-    # of each domain's values in the error, in the order of DOMAINS; the coverage beside the scalars' always weighs 1. Depth's
-    # spread inside an object is a tenth of the others', so at 1 it is not learned. Patch codec only.
+    # of each domain's values in the error, in the order of DOMAINS; the coverage beside the scalars' always weighs 1.
+    # Depth's spread inside an object is a tenth of the others', so at 1 it is not learned. Patch codec only.
     domain_weights: tuple[Weight, Weight, Weight, Weight, Weight, Weight] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
-    # whose values are compared by distance instead of its square: one step of sampling then gives their median, which is
-    # sharper than their mean and nearer on average. Patch codec only.
+    # whose values are compared by distance instead of its square: one step of sampling then gives their median, which
+    # is sharper than their mean and nearer on average. Patch codec only.
     absolute_domains: tuple[Literal[DOMAINS], ...] = ()
     pure_noise: Share = 0.6  # share of samples at the last timestep
     drop_embedding: Share = 0.05
     drop_both: Share = 0.05
     drop_latent: Share = 0.05
-    tilted: Share = 0.5  # share of condition images from a random elevation, or in perspective, where the data have them
+    # Share of condition images from a random elevation, or in perspective, where the data have them.
+    tilted: Share = 0.5
     mirror: bool = True
     hue: bool = True
     pbr_weight: Weight = 0.1
@@ -180,27 +196,77 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 PRESETS: dict[str, tuple[ModelConfig, TrainConfig]] = {
     # a few thousand weights: what the tests train
     "tiny": (
-        ModelConfig(sampling_steps=2, image_size=32, patch=4, channels=(16, 32), attention_levels=(False, True), head_width=16,
-                    norm_groups=4, encoder_width=32, encoder_layers=1, row_attention=(True, False), noisy_input="shrunk"),
-        TrainConfig(batch=2, steps=20, warmup=2, pbr_pixels=64, ema=0.9,
-                    phases=(Phase(share=0.5, domains=2, views=2), Phase(share=1.0))),
+        ModelConfig(
+            sampling_steps=2,
+            image_size=32,
+            patch=4,
+            channels=(16, 32),
+            attention_levels=(False, True),
+            head_width=16,
+            norm_groups=4,
+            encoder_width=32,
+            encoder_layers=1,
+            row_attention=(True, False),
+            noisy_input="shrunk",
+        ),
+        TrainConfig(
+            batch=2,
+            steps=20,
+            warmup=2,
+            pbr_pixels=64,
+            ema=0.9,
+            phases=(Phase(share=0.5, domains=2, views=2), Phase(share=1.0)),
+        ),
     ),
-    # what a laptop trains over lunch, and what the bundled model is
-    # While it is trained for minutes and not for days, its first prediction is its best (docs/benchmarks/model_quality.md).
-    "small": (ModelConfig(sampling_steps=1, sampling_mirrored=True, row_attention=(True, False, False), noisy_input="shrunk"), TrainConfig()),
+    # what a laptop trains over lunch, and what the bundled model is While it is trained for minutes and not for days,
+    # its first prediction is its best (docs/benchmarks/model_quality.md).
+    "small": (
+        ModelConfig(sampling_steps=1, sampling_mirrored=True, row_attention=(True, False, False), noisy_input="shrunk"),
+        TrainConfig(),
+    ),
     # METHOD section 1: Stable Diffusion Image Variations grown to six domains; 30,000 multi-view steps, then 20,000
     # with attention across the domains, batch 512
     "paper": (
-        ModelConfig(image_size=256, codec="vae", condition_alpha=False, mirror_back=False,
-                    channels=(320, 640, 1280, 1280), attention_levels=(True, True, True, False), layers_per_block=2,
-                    heads=8, norm_groups=32, feed_forward=4, time_scale_shift=False, position_embedding=False,
-                    condition_skip=False, gradient_checkpointing=True, encoder="clip", encoder_width=768,
-                    prediction="epsilon", noise_schedule="scaled_linear", backgrounds=("white", "black", "grey"),
-                    pretrained="lambdalabs/sd-image-variations-diffusers", revision="v2.0"),
-        TrainConfig(batch=512, accumulate=64, steps=50_000, warmup=100, decay=False, class_rate=10.0, ema=0.9999, snr_floor=0.0,
-                    pure_noise=0.0, hue=False, mirror=False,
-                    phases=(Phase(share=0.6, domains=1, views=6, learning_rate=1e-4),
-                            Phase(share=1.0, domains=6, views=6, learning_rate=5e-5))),
+        ModelConfig(
+            image_size=256,
+            codec="vae",
+            condition_alpha=False,
+            mirror_back=False,
+            channels=(320, 640, 1280, 1280),
+            attention_levels=(True, True, True, False),
+            layers_per_block=2,
+            heads=8,
+            norm_groups=32,
+            feed_forward=4,
+            time_scale_shift=False,
+            position_embedding=False,
+            condition_skip=False,
+            gradient_checkpointing=True,
+            encoder="clip",
+            encoder_width=768,
+            prediction="epsilon",
+            noise_schedule="scaled_linear",
+            backgrounds=("white", "black", "grey"),
+            pretrained="lambdalabs/sd-image-variations-diffusers",
+            revision="v2.0",
+        ),
+        TrainConfig(
+            batch=512,
+            accumulate=64,
+            steps=50_000,
+            warmup=100,
+            decay=False,
+            class_rate=10.0,
+            ema=0.9999,
+            snr_floor=0.0,
+            pure_noise=0.0,
+            hue=False,
+            mirror=False,
+            phases=(
+                Phase(share=0.6, domains=1, views=6, learning_rate=1e-4),
+                Phase(share=1.0, domains=6, views=6, learning_rate=5e-5),
+            ),
+        ),
     ),
 }
 

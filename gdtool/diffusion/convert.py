@@ -38,7 +38,12 @@ def partial_of(target: str | Path) -> Path:
 def main(arguments: list[str]) -> int:
     from gdtool.core.child import ChildFailed, call
 
-    paths = [p for a in arguments for p in (sorted(Path(a).rglob("*")) if Path(a).is_dir() else [Path(a)]) if p.suffix in PICKLES]
+    paths = [
+        p
+        for a in arguments
+        for p in (sorted(Path(a).rglob("*")) if Path(a).is_dir() else [Path(a)])
+        if p.suffix in PICKLES
+    ]
     if not paths:
         print("convert: names no .bin, .pt, .pth or .ckpt file", file=sys.stderr)
         return 2
@@ -47,7 +52,10 @@ def main(arguments: list[str]) -> int:
         try:
             count = call(convert, str(path), str(target), seconds=600, memory_mb=20000)
         except ChildFailed as error:
-            print(f"convert: {path}: is not a pickle of tensors alone ({str(error).splitlines()[-1][:200]})", file=sys.stderr)
+            print(
+                f"convert: {path}: is not a pickle of tensors alone ({str(error).splitlines()[-1][:200]})",
+                file=sys.stderr,
+            )
             return 3
         finally:
             partial_of(target).unlink(missing_ok=True)  # of a child that was killed

@@ -59,24 +59,37 @@ def read_obj(path: Path) -> QuadMesh:
     place = _cut(lines.sizes)
     quads, corners = (np.where(place >= 0, lines.corners[:, column].astype(np.int32)[place], -1) for column in (0, 1))
     if quads.max() >= len(points):
-        raise InputError(path, f"a face refers to a vertex out of range (there are {len(points)})", "export the mesh again with all its vertices")
+        raise InputError(
+            path,
+            f"a face refers to a vertex out of range (there are {len(points)})",
+            "export the mesh again with all its vertices",
+        )
     if not np.isfinite(points).all():
-        raise InputError(path, f"vertex {int(np.argwhere(~np.isfinite(points))[0][0]) + 1} is not finite", "remove that vertex or move it to a finite place")
+        raise InputError(
+            path,
+            f"vertex {int(np.argwhere(~np.isfinite(points))[0][0]) + 1} is not finite",
+            "remove that vertex or move it to a finite place",
+        )
     if (corners[quads >= 0] < 0).any():
         return QuadMesh(points, quads)
     if corners.max() >= len(coordinates):
-        raise InputError(path, f"a face refers to a texture coordinate out of range (there are {len(coordinates)})", _UNWRAP)
+        raise InputError(
+            path, f"a face refers to a texture coordinate out of range (there are {len(coordinates)})", _UNWRAP
+        )
     if not np.isfinite(coordinates).all():
         raise InputError(path, "has a texture coordinate that is not finite", _UNWRAP)
     return QuadMesh(points, quads, coordinates, corners)
 
 
 def _cut(sizes: np.ndarray) -> np.ndarray:
-    """Quads (q, 4), and triangles with a fourth of -1, that polygons of sizes (p,) corners are cut into, as places among all corners."""
+    """Quads (q, 4), and triangles with a fourth of -1, that polygons of sizes (p,) corners are cut into, as places
+    among all corners."""
     first = np.cumsum(sizes) - sizes
     pieces = (sizes - 1) // 2
     polygon = np.repeat(np.arange(len(sizes)), pieces)
-    step = 2 * (np.arange(len(polygon)) - np.repeat(np.cumsum(pieces) - pieces, pieces))[:, None] + np.array([0, 1, 2, 3])
+    step = 2 * (np.arange(len(polygon)) - np.repeat(np.cumsum(pieces) - pieces, pieces))[:, None] + np.array(
+        [0, 1, 2, 3]
+    )
     step[:, 0] = 0
     return np.where(step < sizes[polygon, None], first[polygon, None] + step, -1)
 

@@ -59,7 +59,9 @@ def _convert(path: Path, kind: type) -> Any:
         return msgspec.convert(read_json(path), kind)
     except msgspec.ValidationError as error:
         fact = str(error)
-        raise InputError(path, fact[0].lower() + fact[1:], f"write it as schemas/{kind.__name__.lower()}.schema.json says") from None
+        raise InputError(
+            path, fact[0].lower() + fact[1:], f"write it as schemas/{kind.__name__.lower()}.schema.json says"
+        ) from None
 
 
 def _write(path: Path, record: Any) -> None:
@@ -75,9 +77,17 @@ def read_cameras(path: Path) -> list[Camera]:
         rotation = pose[:3, :3]
         rigid = np.abs(rotation).max() < 2 and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
         if not (rigid and np.linalg.det(rotation) > 0 and np.allclose(pose[3], (0, 0, 0, 1))):
-            raise InputError(path, f"camera {record.name!r}: world_from_camera is not rigid (rotation and translation)", "remove scale and shear from it")
+            raise InputError(
+                path,
+                f"camera {record.name!r}: world_from_camera is not rigid (rotation and translation)",
+                "remove scale and shear from it",
+            )
         if record.near >= record.far:
-            raise InputError(path, f"camera {record.name!r}: near {record.near:g} is not below far {record.far:g}", "write near < far")
+            raise InputError(
+                path,
+                f"camera {record.name!r}: near {record.near:g} is not below far {record.far:g}",
+                "write near < far",
+            )
         needed = ("half_width",) if record.projection == "orthographic" else ("fx", "fy")
         for key in needed:
             if getattr(record, key) <= 0:
@@ -95,9 +105,23 @@ def write_cameras(path: Path, cameras: list[Camera]) -> None:
     records = []
     for c in cameras:
         pose = tuple(float(x) for x in c.world_from_camera.ravel())
-        own = {"half_width": float(c.half_width)} if c.projection == "orthographic" else {k: float(getattr(c, k)) for k in ("fx", "fy", "cx", "cy")}
-        records.append(CameraRecord(name=c.name, projection=c.projection, width=c.width, height=c.height,
-                                    world_from_camera=pose, near=float(c.near), far=float(c.far), **own))
+        own = (
+            {"half_width": float(c.half_width)}
+            if c.projection == "orthographic"
+            else {k: float(getattr(c, k)) for k in ("fx", "fy", "cx", "cy")}
+        )
+        records.append(
+            CameraRecord(
+                name=c.name,
+                projection=c.projection,
+                width=c.width,
+                height=c.height,
+                world_from_camera=pose,
+                near=float(c.near),
+                far=float(c.far),
+                **own,
+            )
+        )
     _write(path, Cameras(tuple(records)))
 
 
@@ -106,12 +130,22 @@ def read_record(path: Path) -> dict[str, Any]:
     light = _convert(path, Light)
     if not len(light.axes) == len(light.sharpness) == len(light.amplitudes):
         raise InputError(path, "axes, sharpness and amplitudes differ in number", "write one of each for every lobe")
-    return {"kind": light.kind, "axes": np.array(light.axes, np.float64).reshape(-1, 3), "sharpness": np.array(light.sharpness, np.float64),
-            "amplitudes": np.array(light.amplitudes, np.float64).reshape(-1, 3), "environment": light.environment, "fit_error": light.fit_error}
+    return {
+        "kind": light.kind,
+        "axes": np.array(light.axes, np.float64).reshape(-1, 3),
+        "sharpness": np.array(light.sharpness, np.float64),
+        "amplitudes": np.array(light.amplitudes, np.float64).reshape(-1, 3),
+        "environment": light.environment,
+        "fit_error": light.fit_error,
+    }
 
 
 def write_record(path: Path, light: dict[str, Any]) -> None:
     """Write light.json from arrays axes, sharpness and amplitudes (and environment, fit_error where known)."""
-    plain = json.loads(json.dumps({k: np.asarray(v).tolist() if isinstance(v, (np.ndarray, list, tuple)) else v for k, v in light.items()},
-                                  default=float))
+    plain = json.loads(
+        json.dumps(
+            {k: np.asarray(v).tolist() if isinstance(v, (np.ndarray, list, tuple)) else v for k, v in light.items()},
+            default=float,
+        )
+    )
     _write(path, msgspec.convert(plain, Light))

@@ -25,7 +25,9 @@ def schemas() -> dict[str, dict[str, Any]]:
         root["properties"]["content"] = body
         root["properties"]["kind"] = {"const": kind}
         root["properties"]["format"] = {"const": FORMAT}
-        out[f"{kind}.schema.json"] = _document(f"manifest.json of a {kind} folder", root, {k: v for k, v in components.items() if k != "Manifest"})
+        out[f"{kind}.schema.json"] = _document(
+            f"manifest.json of a {kind} folder", root, {k: v for k, v in components.items() if k != "Manifest"}
+        )
     for name, record in (("cameras", Cameras), ("light", Light)):
         _, components = msgspec.json.schema_components((record,), ref_template="#/$defs/{name}")
         root = components.pop(record.__name__)

@@ -17,8 +17,22 @@ from gdtool.core.stage import Output
 from gdtool.folders.records import read_record, write_record
 
 # albedo is 8-bit sRGB under the names that viewers show.
-_VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"), ("red", "u1"),
-                    ("green", "u1"), ("blue", "u1"), ("roughness", "<f4"), ("metallic", "<f4"), ("confidence", "<f4")])
+_VERTEX = np.dtype(
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("nx", "<f4"),
+        ("ny", "<f4"),
+        ("nz", "<f4"),
+        ("red", "u1"),
+        ("green", "u1"),
+        ("blue", "u1"),
+        ("roughness", "<f4"),
+        ("metallic", "<f4"),
+        ("confidence", "<f4"),
+    ]
+)
 # What the confidence was made of, where it is known.
 _EVIDENCE = [("views", "u1"), ("residual", "<f4")]
 _AGAIN = "run gdtool reconstruct on the views again"
@@ -46,14 +60,23 @@ class Surface:
     residual: np.ndarray | None = None
 
 
-def write_surface(out: Output, surface: Surface, *, watertight: bool, method: str = "", source_from_world=None, **extra: Any) -> None:
+def write_surface(
+    out: Output, surface: Surface, *, watertight: bool, method: str = "", source_from_world=None, **extra: Any
+) -> None:
     """Write surface.ply (and light.json) and set out.content; extra goes to SurfaceContent (report, field)."""
     write_surface_ply(out.path("surface.ply"), surface)
     if surface.light is not None:
         write_record(out.path("light.json"), surface.light)
     matrix = IDENTITY if source_from_world is None else tuple(float(x) for x in np.asarray(source_from_world).ravel())
-    out.content = SurfaceContent(vertices=len(surface.vertices), faces=len(surface.faces), watertight=bool(watertight),
-                                 light=surface.light is not None, method=method, source_from_world=matrix, **extra)
+    out.content = SurfaceContent(
+        vertices=len(surface.vertices),
+        faces=len(surface.faces),
+        watertight=bool(watertight),
+        light=surface.light is not None,
+        method=method,
+        source_from_world=matrix,
+        **extra,
+    )
 
 
 def write_surface_ply(path: Path, surface: Surface) -> None:
@@ -110,7 +133,11 @@ def read_surface(folder: Folder) -> Surface:
         raise InputError(path, f"vertex {int(np.argwhere(~np.isfinite(vertices))[0][0])} is not finite", _AGAIN)
 
     def column(name: str, default: float) -> np.ndarray:
-        return np.clip(vertex[name], 0, 1).astype(np.float32) if name in names else np.full(len(vertex), default, np.float32)
+        return (
+            np.clip(vertex[name], 0, 1).astype(np.float32)
+            if name in names
+            else np.full(len(vertex), default, np.float32)
+        )
 
     if {"red", "green", "blue"} <= set(names):
         albedo = linear_from_srgb(np.stack([vertex[k] for k in ("red", "green", "blue")], -1).astype(np.float32) / 255)
@@ -118,5 +145,14 @@ def read_surface(folder: Folder) -> Surface:
         albedo = np.full((len(vertex), 3), 0.8, np.float32)
     normals = columns(vertex, "nx ny nz").astype(np.float32) if {"nx", "ny", "nz"} <= set(names) else None
     light = read_record(folder.file("light.json")) if folder.content.light else None
-    return Surface(vertices, faces.astype(np.int32), albedo.astype(np.float32), column("roughness", 0.5), column("metallic", 0.0),
-                   column("confidence", 0.0), normals, light, *(np.asarray(vertex[name]) if name in names else None for name, _ in _EVIDENCE))
+    return Surface(
+        vertices,
+        faces.astype(np.int32),
+        albedo.astype(np.float32),
+        column("roughness", 0.5),
+        column("metallic", 0.0),
+        column("confidence", 0.0),
+        normals,
+        light,
+        *(np.asarray(vertex[name]) if name in names else None for name, _ in _EVIDENCE),
+    )

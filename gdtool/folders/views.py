@@ -46,20 +46,28 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
     cameras = read_cameras(folder.file("cameras.json"))
     content: ViewsContent = folder.content
     if tuple(camera.name for camera in cameras) != tuple(content.views):
-        raise InputError(folder.file("cameras.json"), "does not hold the views that the manifest lists, in that order",
-                         "list the same views in both")
+        raise InputError(
+            folder.file("cameras.json"),
+            "does not hold the views that the manifest lists, in that order",
+            "list the same views in both",
+        )
     wanted = [d for d in content.domains if domains is None or d in domains]
 
     def load(domain: str, view: str, camera: Camera) -> np.ndarray:
         path = folder.file(f"{domain}/{view}.{'exr' if domain == 'depth' else 'png'}")
         image = read_image(path)
         if image.shape[:2] != (camera.height, camera.width):
-            raise InputError(path, f"is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}",
-                             "scale the picture, or write its size into cameras.json")
+            raise InputError(
+                path,
+                f"is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}",
+                "scale the picture, or write its size into cameras.json",
+            )
         channels = CHANNELS.get(domain, 1)
         image = image.reshape(camera.height, camera.width, -1)
         if image.shape[2] < channels:
-            raise InputError(path, f"has {image.shape[2]} channels, {domain} has {channels}", f"save it with {channels} channels")
+            raise InputError(
+                path, f"has {image.shape[2]} channels, {domain} has {channels}", f"save it with {channels} channels"
+            )
         image = image[..., :channels]
         if image.dtype.kind == "u":
             image = image.astype(np.float32) / np.iinfo(image.dtype).max
@@ -71,8 +79,19 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
     if len({(camera.height, camera.width) for camera in cameras}) > 1:
         raise InputError(folder.file("cameras.json"), "has cameras of different sizes", "render all views at one size")
     channels = sum(CHANNELS.get(domain, 1) for domain in wanted)
-    size = len(cameras) * cameras[0].height * cameras[0].width * (channels + 1 + _PASSING * max((CHANNELS.get(domain, 1) for domain in wanted), default=1)) * 4
-    require_memory(size, folder.path, f"{len(cameras)} views of {cameras[0].width}x{cameras[0].height} pixels", "render fewer or smaller views")
+    size = (
+        len(cameras)
+        * cameras[0].height
+        * cameras[0].width
+        * (channels + 1 + _PASSING * max((CHANNELS.get(domain, 1) for domain in wanted), default=1))
+        * 4
+    )
+    require_memory(
+        size,
+        folder.path,
+        f"{len(cameras)} views of {cameras[0].width}x{cameras[0].height} pixels",
+        "render fewer or smaller views",
+    )
     mask = np.stack([load("mask", c.name, c) for c in cameras]).astype(np.float32)
     images = {}
     for domain in wanted:
@@ -88,7 +107,8 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
 
 
 def read_picture(folder: Folder, cameras: list[Camera]) -> tuple[np.ndarray, Camera] | None:
-    """The picture (h, w, 4), linear color and straight alpha, that a views folder was made of, and the camera it looks through.
+    """The picture (h, w, 4), linear color and straight alpha, that a views folder was made of, and the camera it looks
+    through.
 
     None where the folder holds none. Raises InputError for one that is not a whole number of times as fine as its view.
     """
@@ -100,14 +120,26 @@ def read_picture(folder: Folder, cameras: list[Camera]) -> tuple[np.ndarray, Cam
         return None
     camera = next((camera for camera in cameras if camera.name == content.picture), None)
     if camera is None:
-        raise InputError(folder.path, f"the manifest says that picture.png shows the view {content.picture!r}, which it does not hold",
-                         "name one of its views, or none")
+        raise InputError(
+            folder.path,
+            f"the manifest says that picture.png shows the view {content.picture!r}, which it does not hold",
+            "name one of its views, or none",
+        )
     path = folder.file("picture.png")
     image = unit_range(read_image(path))
     h, w = image.shape[:2]
-    if image.ndim != 3 or image.shape[2] != 4 or h % camera.height or w % camera.width or h // camera.height != w // camera.width:
-        raise InputError(path, f"is {w}x{h}, not RGBA of a multiple of its view's {camera.width}x{camera.height}",
-                         "scale it to a whole multiple of the view")
+    if (
+        image.ndim != 3
+        or image.shape[2] != 4
+        or h % camera.height
+        or w % camera.width
+        or h // camera.height != w // camera.width
+    ):
+        raise InputError(
+            path,
+            f"is {w}x{h}, not RGBA of a multiple of its view's {camera.width}x{camera.height}",
+            "scale it to a whole multiple of the view",
+        )
     return np.concatenate([linear_from_srgb(image[..., :3]), image[..., 3:]], -1).astype(np.float32), camera
 
 
@@ -150,4 +182,6 @@ def write_views(out: Output, views: Views, *, source_from_world: np.ndarray | No
         write_png(out.path("contact_sheet.png"), picture)
     matrix = IDENTITY if source_from_world is None else tuple(float(x) for x in np.asarray(source_from_world).ravel())
     present = tuple(d for d in (*DOMAINS, "closed_form") if d in views.images)
-    out.content = ViewsContent(views=views.names, domains=present, source_from_world=matrix, light=views.light is not None, **extra)
+    out.content = ViewsContent(
+        views=views.names, domains=present, source_from_world=matrix, light=views.light is not None, **extra
+    )

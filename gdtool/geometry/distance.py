@@ -1,4 +1,5 @@
-"""Distances to triangle meshes, inside and outside, and points on surfaces (libigl; fcpw for search trees of large meshes)."""
+"""Distances to triangle meshes, inside and outside, and points on surfaces (libigl; fcpw for search trees of large
+meshes)."""
 
 from __future__ import annotations
 
@@ -17,13 +18,15 @@ _LARGE = 200_000  # triangles from which fcpw's tree is built in a quarter of th
 class SearchTree:
     """Closest points on one triangle mesh, asked again and again: vertices (v, 3), faces (f, 3), at least one of them.
 
-    Of a large mesh fcpw (Sawhney 2021) finds the triangle, in single precision: one that is farther than the nearest by some
-    1e-7 of the mesh's size, or of the distance, can be taken for it. The point on that triangle is found in double precision.
-    """
+    Of a large mesh fcpw (Sawhney 2021) finds the triangle, in single precision: one that is farther than the nearest by
+    some 1e-7 of the mesh's size, or of the distance, can be taken for it. The point on that triangle is found in double
+    precision."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
         self.vertices, self.faces = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64)
-        self._search = (_fcpw_search(self.vertices, self.faces) if len(faces) >= _LARGE else None) or _igl_search(self.vertices, self.faces)
+        self._search = (_fcpw_search(self.vertices, self.faces) if len(faces) >= _LARGE else None) or _igl_search(
+            self.vertices, self.faces
+        )
 
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Distance (n,), face_idx (n,) and closest point (n, 3) for points (n, 3)."""
@@ -33,7 +36,8 @@ class SearchTree:
         return np.sqrt(np.maximum(squared, 0)), face_idx, point
 
 
-_Search = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]  # points (n, 3): squared distance (n,), face_idx (n,), point (n, 3)
+# Points (n, 3): squared distance (n,), face_idx (n,), point (n, 3).
+_Search = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 def _igl_search(vertices: np.ndarray, faces: np.ndarray) -> _Search:
@@ -42,7 +46,10 @@ def _igl_search(vertices: np.ndarray, faces: np.ndarray) -> _Search:
     tree.init(vertices, faces)
 
     def search(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        found = [tree.squared_distance(vertices, faces, points[start:start + _AT_ONCE]) for start in range(0, len(points), _AT_ONCE)]
+        found = [
+            tree.squared_distance(vertices, faces, points[start : start + _AT_ONCE])
+            for start in range(0, len(points), _AT_ONCE)
+        ]
         return tuple(np.concatenate([np.asarray(part) for part in parts]) for parts in zip(*found, strict=True))
 
     return search
@@ -63,7 +70,8 @@ def _fcpw_search(vertices: np.ndarray, faces: np.ndarray) -> _Search | None:
     scene.set_object_count(1)
     scene.set_object_vertices(single(vertices), 0)
     scene.set_object_triangles(faces.astype(np.int32), 0)
-    scene.build(fcpw.aggregate_type.bvh_longest_axis_center, True, False, True)  # searched as quickly as the others, built in half their time
+    # Searched as quickly as the others, built in half their time.
+    scene.build(fcpw.aggregate_type.bvh_longest_axis_center, True, False, True)
 
     def search(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         found, face_idx = fcpw.interaction_3D_list(), np.empty(len(points), np.int64)
@@ -78,10 +86,12 @@ def _fcpw_search(vertices: np.ndarray, faces: np.ndarray) -> _Search | None:
 
 
 def by_place(points: np.ndarray) -> np.ndarray:
-    """An order (n,) of points (n, 3) in which those near to one another follow one another: what is read for one is still in the cache for the next."""
+    """An order (n,) of points (n, 3) in which those near to one another follow one another: what is read for one is
+    still in the cache for the next."""
     low, high = points.min(0), points.max(0)
     cell = ((points - low) * (_CELLS / (float((high - low).max()) or 1.0))).astype(np.uint16)
-    return np.argsort((cell[:, 0] * (_CELLS + 1) + cell[:, 1]) * (_CELLS + 1) + cell[:, 2], kind="stable")  # of 16 bits: in linear time
+    # Of 16 bits: in linear time.
+    return np.argsort((cell[:, 0] * (_CELLS + 1) + cell[:, 1]) * (_CELLS + 1) + cell[:, 2], kind="stable")
 
 
 def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -103,13 +113,16 @@ def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> np.ndarra
     return out
 
 
-def bisected(vertices: np.ndarray, faces: np.ndarray, longest: float, most: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (w, 3), faces (g, 3) and the face (g,) that each is of: the same surface, in faces without an edge of more than longest.
+def bisected(
+    vertices: np.ndarray, faces: np.ndarray, longest: float, most: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (w, 3), faces (g, 3) and the face (g,) that each is of: the same surface, in faces without an edge of
+    more than longest.
 
-    Their longest edges are cut in the middle, again and again while there are no more than `most` faces; neighbours do not share the new
-    vertices. A search tree finds closest points on them sooner: the boxes of long faces are mostly air.
-    As trimesh.remesh.subdivide_to_size, but with a limit, which a mesh of many long faces needs, and without an import of .3 s.
-    """
+    Their longest edges are cut in the middle, again and again while there are no more than `most` faces; neighbours do
+    not share the new vertices. A search tree finds closest points on them sooner: the boxes of long faces are mostly
+    air. As trimesh.remesh.subdivide_to_size, but with a limit, which a mesh of many long faces needs, and without an
+    import of .3 s."""
     whole, corners = np.arange(len(faces)), vertices[faces]
     done: list[tuple[np.ndarray, np.ndarray]] = []
     while len(whole):
@@ -129,7 +142,9 @@ def bisected(vertices: np.ndarray, faces: np.ndarray, longest: float, most: int)
     return corners.reshape(-1, 3), np.arange(len(corners) * 3).reshape(-1, 3), whole
 
 
-def closest_points(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def closest_points(
+    points: np.ndarray, vertices: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For points (n, 3): distance (n,) to the surface, face_idx (n,) int32 and the closest point (n, 3).
 
     Vertices that no face uses are no surface. Zero-area faces count as the segment or point that they are. Raises
@@ -156,8 +171,9 @@ def winding_number(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) 
     return np.asarray(igl.fast_winding_number(vertices, np.ascontiguousarray(faces, np.int64), points))
 
 
-def sample_surface(vertices: np.ndarray, faces: np.ndarray, count: int,
-                   rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sample_surface(
+    vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """count area-weighted uniform samples: points (n, 3), face_idx (n,) int32, barycentric (n, 3).
 
     Zero-area faces get none. Raises ValueError when the whole mesh has no area.
@@ -177,7 +193,8 @@ def sample_surface(vertices: np.ndarray, faces: np.ndarray, count: int,
 
 
 def barycentric_of(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """(n, 3) barycentric coordinates of points (n, 3) in the planes of triangles (n, 3, 3); zero-area ones give (1, 0, 0)."""
+    """(n, 3) barycentric coordinates of points (n, 3) in the planes of triangles (n, 3, 3); zero-area ones give (1, 0,
+    0)."""
     a, b, c = np.ascontiguousarray(triangles.transpose(1, 2, 0))
     e0, e1, e2 = b - a, c - a, points.T - a
     normal = cross(e0, e1)

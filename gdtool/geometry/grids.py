@@ -56,7 +56,7 @@ def band_cells(inside: np.ndarray, touched: np.ndarray) -> np.ndarray:
     for i in (0, 1):
         for j in (0, 1):
             for k in (0, 1):
-                count += inside[i:i + count.shape[0], j:j + count.shape[1], k:k + count.shape[2]]
+                count += inside[i : i + count.shape[0], j : j + count.shape[1], k : k + count.shape[2]]
     return dilate(((count > 0) & (count < 8)) | touched, 1)
 
 
@@ -70,7 +70,7 @@ def fine_points(cells: np.ndarray, factor: int) -> np.ndarray:
     for i in (0, 1):
         for j in (0, 1):
             for k in (0, 1):
-                fine[i:i + n[0], j:j + n[1], k:k + n[2]] |= grown
+                fine[i : i + n[0], j : j + n[1], k : k + n[2]] |= grown
     return fine
 
 

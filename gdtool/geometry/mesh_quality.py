@@ -9,7 +9,8 @@ from gdtool.geometry.vectors import cross, dot
 
 
 def columns_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(3, c, f) coordinates of the corners of faces (f, c): whole rows to compute with, several times faster than (f, c, 3)."""
+    """(3, c, f) coordinates of the corners of faces (f, c): whole rows to compute with, several times faster than (f,
+    c, 3)."""
     return np.ascontiguousarray(vertices.T).take(np.ascontiguousarray(faces.T), axis=1)
 
 
@@ -46,7 +47,8 @@ def _corner_sines(p: np.ndarray, *normals: np.ndarray) -> list[np.ndarray]:
 
 
 def worst_jacobian(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(q,) smallest scaled Jacobian of each quad with corners (3, 4, q), about its own normal and about `normals` (3, q): the worse of both."""
+    """(q,) smallest scaled Jacobian of each quad with corners (3, 4, q), about its own normal and about `normals` (3,
+    q): the worse of both."""
     own, other = _corner_sines(p, _normal_of(p)[0], normals)
     return np.minimum(own, other).min(0)
 
@@ -69,7 +71,8 @@ def valences(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def topology_figures(vertices: np.ndarray, faces: np.ndarray) -> dict[str, float | int | bool]:
-    """Quads, triangles, pieces, watertight, boundary edges, irregular share (inner vertices of other than four edges)."""
+    """Quads, triangles, pieces, watertight, boundary edges, irregular share (inner vertices of other than four
+    edges)."""
     edges = edges_of(faces)
     valence, inner = valences(faces, len(vertices))
     return {
@@ -82,7 +85,8 @@ def topology_figures(vertices: np.ndarray, faces: np.ndarray) -> dict[str, float
 
 
 def shape_figures(vertices: np.ndarray, faces: np.ndarray) -> dict[str, float]:
-    """Scaled Jacobian (mean, least, share that is folded) and mean deviation of corners from 90 degrees, of the quads."""
+    """Scaled Jacobian (mean, least, share that is folded) and mean deviation of corners from 90 degrees, of the
+    quads."""
     quads = faces[faces[:, 3] >= 0]
     if not len(quads):
         return {}
@@ -92,13 +96,25 @@ def shape_figures(vertices: np.ndarray, faces: np.ndarray) -> dict[str, float]:
     after, before = np.roll(p, -1, 1) - p, np.roll(p, 1, 1) - p
     length = np.linalg.norm(after, axis=-1) * np.linalg.norm(before, axis=-1)
     angle = np.degrees(np.arccos(np.clip((after * before).sum(-1) / np.maximum(length, 1e-300), -1, 1)))
-    return {"jacobian_mean": float(least.mean()), "jacobian_min": float(least.min()), "folded_share": float((least <= 0).mean()),
-            "angle_deviation_deg": float(np.abs(angle - 90).mean())}
+    return {
+        "jacobian_mean": float(least.mean()),
+        "jacobian_min": float(least.min()),
+        "folded_share": float((least <= 0).mean()),
+        "angle_deviation_deg": float(np.abs(angle - 90).mean()),
+    }
 
 
-def distance_figures(vertices: np.ndarray, triangles: np.ndarray, source_vertices: np.ndarray, source_faces: np.ndarray,
-                     count: int, seed: int = 0, source=None) -> dict[str, float]:
-    """Sampled distances between two surfaces in their unit: mean of both directions, largest of both, mean normal angle.
+def distance_figures(
+    vertices: np.ndarray,
+    triangles: np.ndarray,
+    source_vertices: np.ndarray,
+    source_faces: np.ndarray,
+    count: int,
+    seed: int = 0,
+    source=None,
+) -> dict[str, float]:
+    """Sampled distances between two surfaces in their unit: mean of both directions, largest of both, mean normal
+    angle.
 
     source: quad_shape.Surface of the source, where its search tree is there already.
     """
@@ -110,10 +126,15 @@ def distance_figures(vertices: np.ndarray, triangles: np.ndarray, source_vertice
     distances, angles = [], []
     for one, other in ((mine, theirs), (theirs, mine)):
         points, face_idx, _ = sample_surface(*one, count, rng)
-        distance, other_idx, _ = source.closest(points) if source is not None and other is theirs else closest_points(points, *other)
+        distance, other_idx, _ = (
+            source.closest(points) if source is not None and other is theirs else closest_points(points, *other)
+        )
         distances.append(distance)
         here, there = (face_normals(v, f[index])[0] for (v, f), index in ((one, face_idx), (other, other_idx)))
         cosine = (here * there).sum(1)
         angles.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-    return {"distance_mean": float((distances[0].mean() + distances[1].mean()) / 2), "hausdorff": float(max(d.max() for d in distances)),
-            "normal_deg": float(np.concatenate(angles).mean())}
+    return {
+        "distance_mean": float((distances[0].mean() + distances[1].mean()) / 2),
+        "hausdorff": float(max(d.max() for d in distances)),
+        "normal_deg": float(np.concatenate(angles).mean()),
+    }

@@ -46,7 +46,9 @@ def is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
     return not np.bincount(index.reshape(-1), np.sign(end - start)).any()
 
 
-def seen(points: np.ndarray, normals: np.ndarray, caster: RayCaster, cameras: Sequence[Camera], tolerance: float) -> np.ndarray:
+def seen(
+    points: np.ndarray, normals: np.ndarray, caster: RayCaster, cameras: Sequence[Camera], tolerance: float
+) -> np.ndarray:
     """(n,) bool: whether points (n, 3) on the caster's mesh are in the picture of any camera and nothing hides them.
 
     Faces are seen from both sides, but not edge-on: normals (n, 3).
@@ -66,9 +68,18 @@ def seen(points: np.ndarray, normals: np.ndarray, caster: RayCaster, cameras: Se
     return out
 
 
-def surface_protocol(vertices: np.ndarray, faces: np.ndarray, true_vertices: np.ndarray, true_faces: np.ndarray, *,
-                     cameras: Sequence[Camera] | None = None, samples: int = 100_000, seed: int = 0,
-                     threshold: float = 0.01, cells: int = IOU_CELLS) -> dict[str, float]:
+def surface_protocol(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    true_vertices: np.ndarray,
+    true_faces: np.ndarray,
+    *,
+    cameras: Sequence[Camera] | None = None,
+    samples: int = 100_000,
+    seed: int = 0,
+    threshold: float = 0.01,
+    cells: int = IOU_CELLS,
+) -> dict[str, float]:
     """The "surface" protocol: distances from area-weighted samples of each surface to the other *surface*.
 
     Unit: the truth's largest extent. distance is the mean of accuracy (result to truth) and completeness (truth to
@@ -131,15 +142,23 @@ def inside(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.nd
     return np.abs(winding_number(points, vertices, faces)) > 0.5
 
 
-def volume_iou(vertices: np.ndarray, faces: np.ndarray, true_vertices: np.ndarray, true_faces: np.ndarray,
-               cells: int = IOU_CELLS, pad: float = IOU_PAD) -> float:
+def volume_iou(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    true_vertices: np.ndarray,
+    true_faces: np.ndarray,
+    cells: int = IOU_CELLS,
+    pad: float = IOU_PAD,
+) -> float:
     """Intersection over union of the two volumes on cells^3 cell centres of the cube around the truth.
 
     The cube has the truth's largest extent times pad as its side and the truth's centre. 0 when both are empty there.
     """
     used = true_vertices[np.unique(true_faces)]
     low, high = used.min(0), used.max(0)
-    return _grid_iou(vertices, faces, true_vertices, true_faces, (low + high) / 2, float((high - low).max()) * pad, cells)
+    return _grid_iou(
+        vertices, faces, true_vertices, true_faces, (low + high) / 2, float((high - low).max()) * pad, cells
+    )
 
 
 def _grid_iou(vertices, faces, true_vertices, true_faces, center, side: float, cells: int) -> float:
@@ -176,8 +195,9 @@ def _cell_centers(cells: int, side: float) -> np.ndarray:
     return np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
 
 
-def syncdreamer_protocol(vertices: np.ndarray, faces: np.ndarray, true_vertices: np.ndarray,
-                         true_faces: np.ndarray) -> dict[str, float]:
+def syncdreamer_protocol(
+    vertices: np.ndarray, faces: np.ndarray, true_vertices: np.ndarray, true_faces: np.ndarray
+) -> dict[str, float]:
     """The "syncdreamer" protocol, which published tables of single-image methods use (Liu et al. 2023).
 
     Both are moved alike so that the truth is centred with largest extent 1. Sixteen fixed 256^2 depth views of each are
@@ -209,8 +229,17 @@ def syncdreamer_protocol(vertices: np.ndarray, faces: np.ndarray, true_vertices:
 
 def sync_cameras() -> list[Camera]:
     """The sixteen fixed cameras of the protocol."""
-    return [camera_at(360 * i / SYNC_VIEWS, SYNC_ELEVATION, name=f"{i:02d}", size=SYNC_SIZE, distance=SYNC_DISTANCE, fov_degrees=SYNC_FOV)
-            for i in range(SYNC_VIEWS)]
+    return [
+        camera_at(
+            360 * i / SYNC_VIEWS,
+            SYNC_ELEVATION,
+            name=f"{i:02d}",
+            size=SYNC_SIZE,
+            distance=SYNC_DISTANCE,
+            fov_degrees=SYNC_FOV,
+        )
+        for i in range(SYNC_VIEWS)
+    ]
 
 
 def depth_cloud(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -257,14 +286,18 @@ def align(points: np.ndarray, others: np.ndarray, steps: int = 60, count: int = 
         if error >= last * (1 - 1e-5):
             break
         last = error
-        step = similarity(np.concatenate([moved, moved[a_idx]]), np.concatenate([b[b_idx], b]),
-                          np.concatenate([np.full(len(a), 1 / len(a)), np.full(len(b), 1 / len(b))]))
+        step = similarity(
+            np.concatenate([moved, moved[a_idx]]),
+            np.concatenate([b[b_idx], b]),
+            np.concatenate([np.full(len(a), 1 / len(a)), np.full(len(b), 1 / len(b))]),
+        )
         total = step @ total
     return total
 
 
 def similarity(points: np.ndarray, others: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(4, 4) rotation, uniform scale and translation that take points (n, 3) to others in least squares (Umeyama 1991)."""
+    """(4, 4) rotation, uniform scale and translation that take points (n, 3) to others in least squares (Umeyama
+    1991)."""
     weights = weights / weights.sum()
     center, other_center = weights @ points, weights @ others
     a, b = points - center, others - other_center

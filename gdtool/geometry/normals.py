@@ -16,12 +16,15 @@ def face_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, n
     kind = np.result_type(vertices, np.float32)
     normals, area = np.empty((len(faces), 3), kind), np.empty(len(faces), kind)
     for i in range(0, len(faces), CHUNK):
-        normals[i:i + CHUNK].T[:], area[i:i + CHUNK] = normals_of(rows, np.ascontiguousarray(faces[i:i + CHUNK].T, np.intp))
+        normals[i : i + CHUNK].T[:], area[i : i + CHUNK] = normals_of(
+            rows, np.ascontiguousarray(faces[i : i + CHUNK].T, np.intp)
+        )
     return normals, area
 
 
 def normals_of(position: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals (3, f) and areas (f,) of triangles: position (3, v), corners (3, f). Quickest of some CHUNK at a time."""
+    """Unit normals (3, f) and areas (f,) of triangles: position (3, v), corners (3, f). Quickest of some CHUNK at a
+    time."""
     a, b, c = (position.take(corner, 1) for corner in corners)
     normal = cross(b - a, c - a)
     length = np.sqrt(dot(normal, normal))

@@ -15,8 +15,8 @@ from gdtool.geometry.vectors import cross, dot
 CHUNK = 1 << 16
 # Corners above which a mesh is not tested for being convex: a second of work.
 MAX_CONVEX = 200_000
-# Address space that Embree reserves while it builds a tree, and crashes without: 200 MB whatever the mesh is, and for each face twice
-# what was measured for 20 to 500 thousand of them on two cores.
+# Address space that Embree reserves while it builds a tree, and crashes without: 200 MB whatever the mesh is, and for
+# each face twice what was measured for 20 to 500 thousand of them on two cores.
 _TREE_BYTES, _FACE_BYTES = 200_000_000, 400
 _MOST_BY_PAIRS = 20_000_000  # faces times corners; of more the hull is quicker
 
@@ -37,7 +37,9 @@ class Hits:
         return self.face_idx >= 0
 
 
-def intersect_planes(origins: np.ndarray, directions: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def intersect_planes(
+    origins: np.ndarray, directions: np.ndarray, triangles: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Distances (n,) and barycentric weights (n, 3) where rays meet the planes of their triangles (n, 3, 3).
 
     Möller & Trumbore 1997 in double precision; weights are clamped to the triangle, since Embree's watertight edges
@@ -48,8 +50,8 @@ def intersect_planes(origins: np.ndarray, directions: np.ndarray, triangles: np.
 
 
 def _meet(origins: np.ndarray, directions: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """intersect_planes for triangles (9, n): a corner and two edges. Component by component, so that every sum runs over
-    numbers that lie side by side."""
+    """intersect_planes for triangles (9, n): a corner and two edges. Component by component, so that every sum runs
+    over numbers that lie side by side."""
     o, d, a, e1, e2 = origins.T, directions.T, triangles[:3], triangles[3:6], triangles[6:]
     p = cross(d, e2)
     determinant = dot(e1, p)
@@ -113,7 +115,12 @@ class RayCaster:
             part = slice(start, start + CHUNK)
             local = np.empty((len(origins[part]), 3), np.float32)
             for i in range(3):
-                np.multiply(origins[part, i] - origins.dtype.type(self.center[i]), origins.dtype.type(self.scale), out=local[:, i], casting="same_kind")
+                np.multiply(
+                    origins[part, i] - origins.dtype.type(self.center[i]),
+                    origins.dtype.type(self.scale),
+                    out=local[:, i],
+                    casting="same_kind",
+                )
             along = np.ascontiguousarray(directions[part], np.float32)
             limit = None if limits is None else np.ascontiguousarray(limits[part] * self.scale, np.float32)
             out[part] = self._scene.run(local, along, query=query, dists=limit)
@@ -137,14 +144,20 @@ class RayCaster:
             distance, barycentric = _meet(origins, directions, np.take(self._edges, face_idx, axis=1))
         elif len(hit):
             found = np.take(self._edges, face_idx[hit], axis=1)
-            distance[hit], barycentric[hit] = _meet(origins.T.take(hit, axis=1).T, directions.T.take(hit, axis=1).T, found)
+            distance[hit], barycentric[hit] = _meet(
+                origins.T.take(hit, axis=1).T, directions.T.take(hit, axis=1).T, found
+            )
         return Hits(face_idx, distance, barycentric)
 
-    def occluded(self, origins: np.ndarray, directions: np.ndarray, max_distance: float | np.ndarray = np.inf) -> np.ndarray:
+    def occluded(
+        self, origins: np.ndarray, directions: np.ndarray, max_distance: float | np.ndarray = np.inf
+    ) -> np.ndarray:
         """(n,) bool: whether anything lies on each ray before max_distance (in units of the direction's length)."""
         limits = None
         if np.ndim(max_distance) or np.isfinite(max_distance):
-            limits = np.minimum(np.broadcast_to(np.asarray(max_distance, np.float64), (len(origins),)), 1e30 / self.scale)
+            limits = np.minimum(
+                np.broadcast_to(np.asarray(max_distance, np.float64), (len(origins),)), 1e30 / self.scale
+            )
         return self._run(origins, directions, "OCCLUDED", limits) >= 0
 
 
@@ -172,10 +185,12 @@ def is_convex(vertices: np.ndarray, faces: np.ndarray, tolerance: float = 1e-6) 
     return _all_before(vertices, faces, normals, solid, points, tolerance * extent)
 
 
-def _all_before(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, chosen: np.ndarray, points: np.ndarray, height: float) -> bool:
+def _all_before(
+    vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, chosen: np.ndarray, points: np.ndarray, height: float
+) -> bool:
     """Whether the planes of the chosen faces have all points on one side, but for that height."""
     for start in range(0, len(chosen), 512):
-        part = chosen[start:start + 512]
+        part = chosen[start : start + 512]
         over = normals[part] @ points.T - np.einsum("ij,ij->i", normals[part], vertices[faces[part, 0]])[:, None]
         if (np.minimum(over.max(1), -over.min(1)) > height).any():
             return False

@@ -10,7 +10,17 @@ from gdtool.core.errors import InputError
 from gdtool.core.native import imported
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.rows import first_equal, first_rows
-from gdtool.geometry.topology import compact, components, corner_fans, edges_of, even, is_watertight, one_fan_each, repeats, twins_of
+from gdtool.geometry.topology import (
+    compact,
+    components,
+    corner_fans,
+    edges_of,
+    even,
+    is_watertight,
+    one_fan_each,
+    repeats,
+    twins_of,
+)
 
 # Welding joins vertices closer than this share of the longest side: far below any detail, far above rounding.
 WELD_SHARE = 1e-7
@@ -22,14 +32,25 @@ def check(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
     if not len(faces):
         raise InputError(subject, "has no faces", NO_AREA)
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(subject, f"a face refers to vertex {int(faces.max() if faces.min() >= 0 else faces.min())} of {len(vertices)}", "remove that face, or export the mesh again")
+        raise InputError(
+            subject,
+            f"a face refers to vertex {int(faces.max() if faces.min() >= 0 else faces.min())} of {len(vertices)}",
+            "remove that face, or export the mesh again",
+        )
     bad = ~np.isfinite(vertices).all(1)
     if bad.any():
-        raise InputError(subject, f"vertex {int(np.argmax(bad))} is not finite ({int(bad.sum())} such)", "remove such vertices with their faces")
+        raise InputError(
+            subject,
+            f"vertex {int(np.argmax(bad))} is not finite ({int(bad.sum())} such)",
+            "remove such vertices with their faces",
+        )
 
 
-def clean(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> tuple[np.ndarray, np.ndarray, dict[str, int | bool], bool]:
-    """A manifold, consistently oriented mesh of the same shape, what had to be done to it, and whether it is watertight.
+def clean(
+    vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh"
+) -> tuple[np.ndarray, np.ndarray, dict[str, int | bool], bool]:
+    """A manifold, consistently oriented mesh of the same shape, what had to be done to it, and whether it is
+    watertight.
 
     vertices (v, 3) float, faces (f, 3). A closed, manifold mesh passes unchanged except for unused vertices. Raises
     InputError (see check), also when all faces have no area.
@@ -109,7 +130,8 @@ def _used(faces: np.ndarray, count: int) -> int:
 
 
 def _one_fan(faces: np.ndarray, doubled: bool = True) -> bool | None:
-    """Whether the faces around each vertex of a closed mesh form one fan; None of an open one. doubled: also where two have the same corners."""
+    """Whether the faces around each vertex of a closed mesh form one fan; None of an open one. doubled: also where two
+    have the same corners."""
     if not even(faces) or (twins := twins_of(faces)) is None:
         return None
     return (doubled or not _twice(twins)) and one_fan_each(faces, twins)
@@ -133,7 +155,9 @@ def without_crumbs(vertices: np.ndarray, faces: np.ndarray, pieces: int) -> tupl
     return compact(vertices, faces[np.isin(piece, keep)])
 
 
-def one_vertex_per_fan(vertices: np.ndarray, faces: np.ndarray, fans: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def one_vertex_per_fan(
+    vertices: np.ndarray, faces: np.ndarray, fans: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Bow-tie vertices doubled, so that each fan of faces (f, 3) or (f, 4) has its own; compact."""
     fans = corner_fans(faces)[0] if fans is None else fans
     used = faces >= 0
@@ -169,7 +193,10 @@ def _oriented(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     faces = np.asarray(igl.bfs_orient(np.ascontiguousarray(faces))[0]).copy()
     count, piece = components(faces)
     a, b, c = (vertices[faces[:, i]] for i in range(3))
-    centre = np.stack([np.bincount(piece, a[:, i], count) for i in range(3)], -1) / np.bincount(piece, minlength=count)[:, None]
+    centre = (
+        np.stack([np.bincount(piece, a[:, i], count) for i in range(3)], -1)
+        / np.bincount(piece, minlength=count)[:, None]
+    )
     volume = np.bincount(piece, np.einsum("ij,ij->i", a - centre[piece], np.cross(b - a, c - a)), count)
     inward = (volume < 0)[piece]
     faces[inward] = faces[inward][:, ::-1]

@@ -8,7 +8,8 @@ _MIX = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9)
 
 
 def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What np.unique finds along axis 0: the rows that differ (u, k) in rising order, where each is first (u,), and which each row is (n,).
+    """What np.unique finds along axis 0: the rows that differ (u, k) in rising order, where each is first (u,), and
+    which each row is (n,).
 
     rows (n, k), integers or floating point without NaN; 0 and -0 are one number.
     """
@@ -22,20 +23,23 @@ def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def first_equal(rows: np.ndarray) -> np.ndarray:
-    """Which of the rows (n, k) each is equal to, the first of them (n,): unique_rows' second at its third, in half the time."""
+    """Which of the rows (n, k) each is equal to, the first of them (n,): unique_rows' second at its third, in half the
+    time."""
     first, group = _grouped(_words(np.asarray(rows)))
     return first.take(group)
 
 
 def first_rows(rows: np.ndarray) -> np.ndarray:
-    """Where each of the rows (n, k) that differ is first (u,), in rising order: unique_rows' second, sooner where all differ."""
+    """Where each of the rows (n, k) that differ is first (u,), in rising order: unique_rows' second, sooner where all
+    differ."""
     words = _words(rows)
     key = np.sort(_hashes(words))
     return np.sort(_grouped(words)[0]) if (key[1:] == key[:-1]).any() else np.arange(len(rows))
 
 
 def _grouped(words: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of rows (n, k) of 64 bits each where those that differ are first (u,), in no order, and which of these each is (n,)."""
+    """Of rows (n, k) of 64 bits each where those that differ are first (u,), in no order, and which of these each is
+    (n,)."""
     key = _hashes(words)
     order = np.argsort(key)
     sorted_key = key.take(order)
@@ -51,7 +55,8 @@ def _grouped(words: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _words(rows: np.ndarray) -> np.ndarray:
     """Rows of 64 bits each, the same for equal ones."""
-    return rows.astype(np.int64) if np.issubdtype(rows.dtype, np.integer) else rows.astype(np.float64) + 0.0  # + 0.0: -0 is 0
+    # + 0.0: -0 is 0.
+    return rows.astype(np.int64) if np.issubdtype(rows.dtype, np.integer) else rows.astype(np.float64) + 0.0
 
 
 def _hashes(words: np.ndarray) -> np.ndarray:

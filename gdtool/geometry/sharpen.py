@@ -26,9 +26,11 @@ _SLIVERS_IN_A_ROW = 2
 _LARGEST_SHARE = 0.25  # more bevel vertices than this: a rough surface, not a mechanical part
 
 
-def dihedral_degrees(vertices: np.ndarray, faces: np.ndarray, thinnest: float = 0.0,
-                     edges: Edges | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges (k, 2) with two faces, those faces (k, 2), and the angle (k,) between their normals in degrees; 0 beside zero-area faces.
+def dihedral_degrees(
+    vertices: np.ndarray, faces: np.ndarray, thinnest: float = 0.0, edges: Edges | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Edges (k, 2) with two faces, those faces (k, 2), and the angle (k,) between their normals in degrees; 0 beside
+    zero-area faces.
 
     thinnest: a triangle whose height is a smaller share of its longest side has no direction of its own: it counts with
     the face across that side. edges: those of the faces, where they are known.
@@ -38,7 +40,9 @@ def dihedral_degrees(vertices: np.ndarray, faces: np.ndarray, thinnest: float = 
     ends = edges.ends[edge_idx]
     normals, area = face_normals(vertices, faces)
     if thinnest:
-        across = _across_slivers(np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1), pairs, area, thinnest)
+        across = _across_slivers(
+            np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1), pairs, area, thinnest
+        )
         normals, area = normals[across], area[across]
     cosine = np.einsum("ki,ki->k", normals[pairs[:, 0]], normals[pairs[:, 1]])
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
@@ -47,8 +51,8 @@ def dihedral_degrees(vertices: np.ndarray, faces: np.ndarray, thinnest: float = 
 
 
 def _across_slivers(length: np.ndarray, pairs: np.ndarray, area: np.ndarray, thinnest: float) -> np.ndarray:
-    """For faces of areas (f,) with edges of `length` (k,) between pairs (k, 2) of them: the face (f,) across the longest of a
-    sliver's edges, and across that one's where it is a sliver too; all others themselves."""
+    """For faces of areas (f,) with edges of `length` (k,) between pairs (k, 2) of them: the face (f,) across the
+    longest of a sliver's edges, and across that one's where it is a sliver too; all others themselves."""
     longest = np.zeros(len(area))
     for one in pairs.T:
         np.maximum.at(longest, one, length)
@@ -62,8 +66,12 @@ def _across_slivers(length: np.ndarray, pairs: np.ndarray, area: np.ndarray, thi
     return across
 
 
-def restore_creases(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float = 30.0,
-                    accept: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray, dict[str, float | int]]:
+def restore_creases(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    crease_degrees: float = 30.0,
+    accept: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray, dict[str, float | int]]:
     """Bevels drawn out to the creases they cut off: vertices, faces and a report (moved, largest_move, bevel_share).
 
     vertices (v, 3), faces (f, 3) fine enough for a bevel to be one cell wide. Creases that are sharp already, smooth
@@ -80,9 +88,14 @@ def restore_creases(vertices: np.ndarray, faces: np.ndarray, crease_degrees: flo
     return *collapse_bevels(out, faces, moved, _JOIN_EDGES * edge), report
 
 
-def _drawn_out(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float,
-               accept: Callable[[np.ndarray, np.ndarray], np.ndarray] | None) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Which vertices (n,) of restore_creases move, where to (n, 3), about how long edges are, and the share of bevel vertices."""
+def _drawn_out(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    crease_degrees: float,
+    accept: Callable[[np.ndarray, np.ndarray], np.ndarray] | None,
+) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Which vertices (n,) of restore_creases move, where to (n, 3), about how long edges are, and the share of bevel
+    vertices."""
     from scipy.spatial import cKDTree
 
     maybe, used = _maybe_bent(vertices, faces, crease_degrees / 2)
@@ -109,19 +122,25 @@ def _drawn_out(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float,
     side, normals = side[area > 0], normals[area > 0]
     if len(side) < _NEIGHBOURS:
         return at[:0], vertices[:0], 0.0, bevel_share
-    sampled = vertices[faces[::max(len(faces) // 20000, 1)]]
-    edge = np.median(np.linalg.norm(sampled - np.roll(sampled, 1, 1), axis=-1))  # of a grid's mesh all edges are about a cell
+    sampled = vertices[faces[:: max(len(faces) // 20000, 1)]]
+    # Of a grid's mesh all edges are about a cell.
+    edge = np.median(np.linalg.norm(sampled - np.roll(sampled, 1, 1), axis=-1))
     centroid = sum(vertices.take(corner, 0) for corner in side.T) / 3
     distance, near = cKDTree(centroid).query(vertices[at], k=_NEIGHBOURS, workers=2)
     own_places, own_faces = renumbered(faces.take(around, 0), len(vertices))
     own = vertex_normals(vertices[own_places], own_faces)[bevel[own_places]]
     # A row per coordinate (3, k, p) from here on.
     n, c = (np.ascontiguousarray(rows.T).take(np.ascontiguousarray(near.T), 1) for rows in (normals, centroid))
-    valid = (distance.T < _FARTHEST_EDGES * edge) & (dot(n, own.T) > 0.1)
+    valid = (_FARTHEST_EDGES * edge > distance.T) & (dot(n, own.T) > 0.1)
     cluster, sides, spread = _sides(n, valid, crease_degrees * 0.8)
     point, residual = _meeting_point(vertices[at], n, c, cluster, sides)
     move = np.linalg.norm(point - vertices[at], axis=1)
-    good = (sides >= 2) & (spread > crease_degrees * 0.8) & (move < _LARGEST_MOVE_EDGES * edge) & (residual < _LARGEST_RESIDUAL_EDGES * edge)
+    good = (
+        (sides >= 2)
+        & (spread > crease_degrees * 0.8)
+        & (move < _LARGEST_MOVE_EDGES * edge)
+        & (residual < _LARGEST_RESIDUAL_EDGES * edge)
+    )
     if accept is not None and good.any():
         good[good] = accept(at[good], point[good])
     return at[good], point[good], edge, bevel_share
@@ -131,22 +150,21 @@ def corners_in(faces: np.ndarray, marked: np.ndarray) -> np.ndarray:
     """(f,) int8: how many corners of each of faces (f, 3) are marked (v,) bool."""
     out = np.empty(len(faces), np.int8)
     for i in range(0, len(faces), CHUNK):
-        a, b, c = marked.view(np.int8).take(faces[i:i + CHUNK]).T
-        out[i:i + CHUNK] = a + b + c
+        a, b, c = marked.view(np.int8).take(faces[i : i + CHUNK]).T
+        out[i : i + CHUNK] = a + b + c
     return out
 
 
 def _maybe_bent(vertices: np.ndarray, faces: np.ndarray, degrees: float) -> tuple[np.ndarray, int]:
-    """(v,) bool: vertices that may have two faces whose normals differ by more than `degrees`, none that has is left out; and how many
-    vertices have faces.
+    """(v,) bool: vertices that may have two faces whose normals differ by more than `degrees`, none that has is left
+    out; and how many vertices have faces.
 
-    Of d unit normals two of which are a chord c apart the mean is no longer than sqrt(1 - c^2 / (2 d)): the variance is the mean
-    squared distance of the pairs, and each other normal is at least c / 2 from one of the two.
-    """
+    Of d unit normals two of which are a chord c apart the mean is no longer than sqrt(1 - c^2 / (2 d)): the variance is
+    the mean squared distance of the pairs, and each other normal is at least c / 2 from one of the two."""
     total, number = np.zeros((3, len(vertices))), np.zeros(len(vertices))
     rows = np.ascontiguousarray(vertices.T)
     for i in range(0, len(faces), CHUNK):
-        corners = np.ascontiguousarray(faces[i:i + CHUNK].T, np.intp)
+        corners = np.ascontiguousarray(faces[i : i + CHUNK].T, np.intp)
         normals = normals_of(rows, corners)[0]
         for corner in corners:
             np.add.at(number, corner, 1.0)
@@ -159,8 +177,8 @@ def _maybe_bent(vertices: np.ndarray, faces: np.ndarray, degrees: float) -> tupl
 def _sides(normals: np.ndarray, valid: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Group k normals (3, k, p) at each of p points into up to three sides.
 
-    Returns the side (k, p) of each, -1 where not valid (k, p); the number of sides (p,); the largest angle (p,) between two.
-    """
+    Returns the side (k, p) of each, -1 where not valid (k, p); the number of sides (p,); the largest angle (p,) between
+    two."""
     point = np.arange(valid.shape[1])
     cosine_limit = np.cos(np.radians(degrees))
 
@@ -184,8 +202,9 @@ def _sides(normals: np.ndarray, valid: np.ndarray, degrees: float) -> tuple[np.n
     return cluster, np.where(enough, 1 + has_second + has_third, 0), np.where(enough, spread, 0.0)
 
 
-def _meeting_point(points: np.ndarray, normals: np.ndarray, centroids: np.ndarray, cluster: np.ndarray,
-                   sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _meeting_point(
+    points: np.ndarray, normals: np.ndarray, centroids: np.ndarray, cluster: np.ndarray, sides: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The point nearest to points (p, 3) where the planes of their k faces' normals and centroids (3, k, p), grouped by
     cluster (k, p) into sides (p,), meet, and the rms distance (p,) to those planes."""
     weight = np.zeros(cluster.shape)
@@ -197,7 +216,14 @@ def _meeting_point(points: np.ndarray, normals: np.ndarray, centroids: np.ndarra
     matrix = np.stack([(one * normals).sum(1) for one in weighted]).transpose(2, 0, 1)
     value, vector = np.linalg.eigh(matrix)
     # Rank = number of sides, unless three planes share a line.
-    rank_ok = np.stack([(sides == 3) & (value[:, 0] > 0.03 * value[:, 2]), (sides >= 2) & (value[:, 1] > 0.02 * value[:, 2]), sides >= 1], -1)
+    rank_ok = np.stack(
+        [
+            (sides == 3) & (value[:, 0] > 0.03 * value[:, 2]),
+            (sides >= 2) & (value[:, 1] > 0.02 * value[:, 2]),
+            sides >= 1,
+        ],
+        -1,
+    )
     inverse = np.where(rank_ok, 1 / np.where(rank_ok, value, 1), 0)
     right = np.einsum("ikp,kp->pi", weighted, offset)
     move = np.einsum("pij,pj,pkj,pk->pi", vector, inverse, vector, right)
@@ -205,12 +231,14 @@ def _meeting_point(points: np.ndarray, normals: np.ndarray, centroids: np.ndarra
     return points + move, residual
 
 
-def collapse_bevels(vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
+def collapse_bevels(
+    vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, longest: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Collapse edges shorter than `longest` between moved vertices: both rims of a bevel that became one crease.
 
-    vertices (v, 3), faces (f, 3), moved (v,) bool. An edge collapses only where the mesh stays manifold (link condition,
-    Dey et al. 1999) and no face with an area turns over; shorter ones first. Returns compact vertices and faces.
-    """
+    vertices (v, 3), faces (f, 3), moved (v,) bool. An edge collapses only where the mesh stays manifold (link
+    condition, Dey et al. 1999) and no face with an area turns over; shorter ones first. Returns compact vertices and
+    faces."""
     touches = corners_in(faces, moved)
     rims = faces[np.flatnonzero(touches > 1)].astype(np.int64)
     half = np.concatenate([rims[:, [i, (i + 1) % 3]] for i in range(3)])
@@ -237,7 +265,8 @@ def collapse_bevels(vertices: np.ndarray, faces: np.ndarray, moved: np.ndarray, 
 
 
 class _Rims:
-    """Vertices (v, 3) and faces (f, 3) about bevels whose short edges are collapsed; which faces stay (f,) bool, what each vertex became (v,)."""
+    """Vertices (v, 3) and faces (f, 3) about bevels whose short edges are collapsed; which faces stay (f,) bool, what
+    each vertex became (v,)."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, longest: float):
         self._position, self._corners = np.ascontiguousarray(vertices.T), np.ascontiguousarray(faces.T)
@@ -271,8 +300,8 @@ class _Rims:
             self.became = self.became[self.became]
 
     def _joined(self, a: np.ndarray, b: np.ndarray, near: np.ndarray, corners: np.ndarray) -> None:
-        """Edges from a (n,) to b (n,) collapsed where they can be, no two of which have a face around them in common; near (m,): all faces
-        around them, with their corners (3, m)."""
+        """Edges from a (n,) to b (n,) collapsed where they can be, no two of which have a face around them in common;
+        near (m,): all faces around them, with their corners (3, m)."""
         way = self._position[:, a] - self._position[:, b]
         few = (a != b) & (dot(way, way) <= self._longest**2)
         a, b = a[few], b[few]

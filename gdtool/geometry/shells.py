@@ -10,16 +10,16 @@ from gdtool.geometry.topology import components, edges_of, even
 
 _POINTS = 8  # vertices of a body that are asked for: all of them are inside, or the body sticks out
 _INSIDE = 0.5  # least winding number of a point inside a closed body: 1 inside, 0 outside
-_MOST_OUTER = 200  # bodies that are looked into, those of the largest boxes first: the cost of a scene of thousands of bodies
+# Bodies that are looked into, those of the largest boxes first: the cost of a scene of thousands of bodies.
+_MOST_OUTER = 200
 
 
 def internal_shells(vertices: np.ndarray, faces: np.ndarray, welded: bool = True) -> tuple[int, float]:
     """How many closed bodies lie inside another closed body, and the share of all faces that are theirs.
 
-    vertices (v, 3), faces (f, 3). Bodies are connected by edges; open ones neither enclose nor count. A body counts where
-    _POINTS of its vertices have a winding number of about 1 in one other body, whichever way that faces. welded: False where
-    vertices at one place have several indices, as along seams of texture coordinates.
-    """
+    vertices (v, 3), faces (f, 3). Bodies are connected by edges; open ones neither enclose nor count. A body counts
+    where _POINTS of its vertices have a winding number of about 1 in one other body, whichever way that faces. welded:
+    False where vertices at one place have several indices, as along seams of texture coordinates."""
     if not welded:
         faces = first_equal(vertices).take(faces)
     count, body = components(faces)
@@ -40,7 +40,7 @@ def internal_shells(vertices: np.ndarray, faces: np.ndarray, welded: bool = True
             continue
         chosen = np.stack([start[inner] + (sizes[inner] - 1) * k // (_POINTS - 1) for k in range(_POINTS)], 1)
         points = vertices[faces[order[chosen]].reshape(-1, 3)[:, 0]]
-        winding = winding_number(points, vertices, faces[order[start[outer]:start[outer + 1]]])
+        winding = winding_number(points, vertices, faces[order[start[outer] : start[outer + 1]]])
         inside[inner] = (np.abs(winding).reshape(len(inner), _POINTS) > _INSIDE).all(1)
     return int(inside.sum()), float(sizes[inside].sum() / len(faces))
 
@@ -65,9 +65,12 @@ def _closed(faces: np.ndarray, body: np.ndarray, count: int) -> np.ndarray:
 
 
 def told(vertices: np.ndarray, faces: np.ndarray, welded: bool = True) -> str | None:
-    """A line for the user where there are internal shells; None where there are none. Arguments as of internal_shells()."""
+    """A line for the user where there are internal shells; None where there are none. Arguments as of
+    internal_shells()."""
     count, share = internal_shells(vertices, faces, welded)
     if not count:
         return None
     bodies = "1 closed body lies" if count == 1 else f"{count} closed bodies lie"
-    return f"{bodies} inside another, with {share:.1%} of the faces, seen from nowhere outside; remove what is not wanted"
+    return (
+        f"{bodies} inside another, with {share:.1%} of the faces, seen from nowhere outside; remove what is not wanted"
+    )

@@ -19,40 +19,45 @@ from gdtool.geometry.sharpen import corners_in, restore_creases
 from gdtool.geometry.unpinch import unpinched
 
 CHILD_MODULES = ("scipy.sparse.csgraph", "scipy.spatial")  # that a child imports while it waits (core.child.prepare)
-_PACES, _UNIT = (4.0, 3.0, 8.0), 0.5  # how steeply the collapse's bound rises, tried in turn; the unit of lengths, in sizes of the mesh
+# How steeply the collapse's bound rises, tried in turn; the unit of lengths, in sizes of the mesh.
+_PACES, _UNIT = (4.0, 3.0, 8.0), 0.5
 _BY_WAY = 6  # times the triangles asked for, to which the quicker collapse still goes well
-_UNEVEN, _FLAT = 1e-3, 1e-14  # edge lengths that what is flat is moved by; determinant of the mean of its normals' squares
+# Edge lengths that what is flat is moved by; determinant of the mean of its normals' squares.
+_UNEVEN, _FLAT = 1e-3, 1e-14
 SHAKEN = 0.03  # edge lengths that all is moved by where the triangles are to be even
 _FEW_FLAT, _SAMPLE = 0.01, 20000  # of the vertices: so few stop no collapse; how many of them tell
 _STUCK, _FEW = 1.25, 32  # triangles in units of those asked for, and so many more, that a collapse may leave
 
 
 def shaken(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Vertices (v, 3) moved by noise of SHAKEN times the shortest edge of their faces (f, 3), for a collapse that leaves triangles of one size.
+    """Vertices (v, 3) moved by noise of SHAKEN times the shortest edge of their faces (f, 3), for a collapse that
+    leaves triangles of one size.
 
-    With it every vertex that is taken in adds about the same to an edge's error, where the surface is flat as where it is
-    curved less than the noise; without it what is flat comes out in a few large triangles, and slivers around it.
+    With it every vertex that is taken in adds about the same to an edge's error, where the surface is flat as where it
+    is curved less than the noise; without it what is flat comes out in a few large triangles, and slivers around it.
     """
     position = np.ascontiguousarray(vertices, np.float32)
     far = np.full(len(vertices), median_edge(vertices, faces) ** 2, np.float32)
     for i in range(0, len(faces), CHUNK):
-        corners = np.ascontiguousarray(faces[i:i + CHUNK].T, np.intp)
+        corners = np.ascontiguousarray(faces[i : i + CHUNK].T, np.intp)
         shortest = np.full(corners.shape[1], np.inf, np.float32)
         for one, other in combinations(corners, 2):
             side = position.take(one, 0) - position.take(other, 0)
             np.minimum(shortest, np.einsum("fi,fi->f", side, side), out=shortest)
         for corner in corners:
             np.minimum.at(far, corner, shortest)
-    return vertices + SHAKEN * np.sqrt(far)[:, None] * np.random.default_rng(0).standard_normal(vertices.shape, np.float32)
+    return vertices + SHAKEN * np.sqrt(far)[:, None] * np.random.default_rng(0).standard_normal(
+        vertices.shape, np.float32
+    )
 
 
 def uneven(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Vertices (v, 3), those that lie in a plane but for rounding, where there are more than a few, moved by up to _UNEVEN edge lengths.
+    """Vertices (v, 3), those that lie in a plane but for rounding, where there are more than a few, moved by up to
+    _UNEVEN edge lengths.
 
-    The quadric of an edge in a plane has its least value all over. Where its determinant is exactly zero the collapse takes an end or
-    the middle; where rounding makes it a little more it takes a point somewhere far, has to pass the edge over, and what is curved is
-    taken down to its last triangles instead.
-    """
+    The quadric of an edge in a plane has its least value all over. Where its determinant is exactly zero the collapse
+    takes an end or the middle; where rounding makes it a little more it takes a point somewhere far, has to pass the
+    edge over, and what is curved is taken down to its last triangles instead."""
     some = np.arange(len(vertices)) % max(len(vertices) // _SAMPLE, 1) == 0
     around, few = topology.renumbered(faces[np.flatnonzero(corners_in(faces, some))], len(vertices))
     if _flat(vertices[around], few)[some[around]].sum() / some.sum() < _FEW_FLAT:
@@ -65,7 +70,10 @@ def uneven(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def _flat(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(v,) bool: vertices all of whose faces lie in a plane that rounding bends."""
-    normals, corners = face_normals(vertices.astype(np.float32).astype(np.float64), faces)[0].T, np.ascontiguousarray(faces.T, np.intp)
+    normals, corners = (
+        face_normals(vertices.astype(np.float32).astype(np.float64), faces)[0].T,
+        np.ascontiguousarray(faces.T, np.intp),
+    )
     sums = np.zeros((6, len(vertices)))
     for total, (one, other) in zip(sums, combinations_with_replacement(normals, 2), strict=True):
         product = one * other
@@ -74,19 +82,25 @@ def _flat(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     sums /= np.maximum(np.bincount(corners.ravel(), minlength=len(vertices)), 1)
     xx, xy, xz, yy, yz, zz = sums
     determinant = abs(xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz))
-    return (0 < determinant) & (determinant < _FLAT)
+    return (determinant > 0) & (determinant < _FLAT)
 
 
-def collapse(vertices: np.ndarray, faces: np.ndarray, target_faces: int, aggressiveness: float, unit: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """What the child runs: fast-simplification's quadric collapse (Garland & Heckbert 1997), with lengths in units of `unit`.
+def collapse(
+    vertices: np.ndarray, faces: np.ndarray, target_faces: int, aggressiveness: float, unit: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """What the child runs: fast-simplification's quadric collapse (Garland & Heckbert 1997), with lengths in units of
+    `unit`.
 
-    It takes all edges whose error is below a bound that rises from round to round, from the same number whatever the size of the
-    mesh: in a large unit the first rounds take what they meet, which leaves even triangles; in a small one it takes the flattest
-    first, which leaves a fifth of the error.
-    """
+    It takes all edges whose error is below a bound that rises from round to round, from the same number whatever the
+    size of the mesh: in a large unit the first rounds take what they meet, which leaves even triangles; in a small one
+    it takes the flattest first, which leaves a fifth of the error."""
     fast_simplification = imported("fast_simplification")
     out_vertices, out_faces = fast_simplification.simplify(
-        np.ascontiguousarray(vertices / unit, np.float32), np.ascontiguousarray(faces, np.int32), target_count=target_faces, agg=aggressiveness)
+        np.ascontiguousarray(vertices / unit, np.float32),
+        np.ascontiguousarray(faces, np.int32),
+        target_count=target_faces,
+        agg=aggressiveness,
+    )
     return np.asarray(out_vertices, np.float64) * unit, np.asarray(out_faces, np.int64)
 
 
@@ -103,25 +117,28 @@ def median_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 def _few(faces: np.ndarray) -> np.ndarray:
     """Some 20,000 of the faces, enough to tell their size."""
-    return faces[::max(len(faces) // 20000, 1)]
+    return faces[:: max(len(faces) // 20000, 1)]
 
 
 def collapse_topology(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """What the child runs where the quicker collapse tears the mesh: MeshLab's, which refuses what changes the topology.
+    """What the child runs where the quicker collapse tears the mesh: MeshLab's, which refuses what changes the
+    topology.
 
     Without its cleaning afterwards, which joins what coincides.
     """
     pymeshlab = imported("pymeshlab")
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int32)))
-    meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=target_faces, preservetopology=True, preservenormal=True, planarquadric=True,
-                                                      autoclean=False)
+    meshes.meshing_decimation_quadric_edge_collapse(
+        targetfacenum=target_faces, preservetopology=True, preservenormal=True, planarquadric=True, autoclean=False
+    )
     mesh = meshes.current_mesh()
     return np.asarray(mesh.vertex_matrix()), np.asarray(mesh.face_matrix(), np.int64)
 
 
 def collapse_by_way(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """What the child runs where the quicker collapse does not come to its end: that one as far as it goes well, MeshLab's from there.
+    """What the child runs where the quicker collapse does not come to its end: that one as far as it goes well,
+    MeshLab's from there.
 
     A third of the time of MeshLab's alone. No triangles at all where the quicker one does not come so far either.
     """
@@ -132,7 +149,8 @@ def collapse_by_way(vertices: np.ndarray, faces: np.ndarray, target_faces: int) 
 
 
 def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Fallback that cannot fail: vertices of one grid cell become their mean (Rossignac & Borrel 1993). May join sheets."""
+    """Fallback that cannot fail: vertices of one grid cell become their mean (Rossignac & Borrel 1993). May join
+    sheets."""
     low, extent = vertices.min(0), float(np.ptp(vertices, 0).max())
     cells = int(np.clip((target_faces / 2) ** 0.5 / 2, 4, 2000))
     while True:
@@ -147,10 +165,11 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
         cells *= 2
 
 
-def reduced(vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple, even: bool,
-            crease_degrees: float = 0.0) -> tuple[np.ndarray, np.ndarray, int]:
-    """What the child runs: one of the collapses above of what is shaken, or uneven, first, and before that drawn out to creases that turn
-    by more than crease_degrees, if any; and how many vertices were."""
+def reduced(
+    vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple, even: bool, crease_degrees: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """What the child runs: one of the collapses above of what is shaken, or uneven, first, and before that drawn out to
+    creases that turn by more than crease_degrees, if any; and how many vertices were."""
     moved = 0
     if crease_degrees:
         vertices, faces, creases = restore_creases(vertices, faces, crease_degrees)
@@ -159,22 +178,33 @@ def reduced(vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple,
     return *globals()[way](vertices, faces.astype(np.int32, copy=False), *arguments), moved
 
 
-def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attributes: np.ndarray | None = None, *,
-             seconds: float = 120.0, closed: Callable[[], bool] | None = None, crease_degrees: float = 0.0, careful: bool = False,
-             near: bool = False, even: bool = False, measured: bool = True,
-             meanwhile: Callable[[], object] = lambda: None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, dict[str, float | int | str]]:
+def simplify(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    target_faces: int,
+    attributes: np.ndarray | None = None,
+    *,
+    seconds: float = 120.0,
+    closed: Callable[[], bool] | None = None,
+    crease_degrees: float = 0.0,
+    careful: bool = False,
+    near: bool = False,
+    even: bool = False,
+    measured: bool = True,
+    meanwhile: Callable[[], object] = lambda: None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, dict[str, float | int | str]]:
     """A mesh of about target_faces triangles of the same shape and topology.
 
     vertices (v, 3), faces (f, 3), attributes (v, a) or None. Returns vertices, faces, attributes (read at the closest
     point of the input) and a report: faces, method, and error, the largest distance of the result's vertices and of the
-    input's vertices (at most 20,000 of them) to the other surface, in units of the input. A closed, manifold
-    input stays so (closed says whether it is, soon). With crease_degrees, bevels are drawn out first to
-    creases that turn by more, unless what comes of it cannot be collapsed; the report says how many vertices moved (creases).
-    `careful` takes the slow way first, for meshes with more small parts than triangles to
-    spare: the quick one reaches any number, even by tearing down what is large. With `near` the quick one keeps nearer to the surface, its
-    triangles less even; with `even` the triangles are of one size, and off the surface by some hundredths of the input's edges (SHAKEN).
-    Without `measured` the error is left out; with it, a quick result that is as far off as its edges are long is
-    compared with the slow one's. `meanwhile` is called while each child works.
+    input's vertices (at most 20,000 of them) to the other surface, in units of the input. A closed, manifold input
+    stays so (closed says whether it is, soon). With crease_degrees, bevels are drawn out first to creases that turn by
+    more, unless what comes of it cannot be collapsed; the report says how many vertices moved (creases). `careful`
+    takes the slow way first, for meshes with more small parts than triangles to spare: the quick one reaches any
+    number, even by tearing down what is large. With `near` the quick one keeps nearer to the surface, its triangles
+    less even; with `even` the triangles are of one size, and off the surface by some hundredths of the input's edges
+    (SHAKEN). Without `measured` the error is left out; with it, a quick result that is as far off as its edges are long
+    is compared with the slow one's. `meanwhile` is called while each child works.
     Raises InputError as repair.check does.
     """
     repair.check(vertices, faces)
@@ -192,7 +222,10 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
         raise InputError("mesh", "all its faces lie in one point", repair.NO_AREA)
     unit = (vertices - centre) / extent
     edge = _edge(unit, faces, target_faces)
-    is_closed, pieces = cache(closed or (lambda: topology.is_watertight(faces))), cache(lambda: topology.components(faces)[0])
+    is_closed, pieces = (
+        cache(closed or (lambda: topology.is_watertight(faces))),
+        cache(lambda: topology.components(faces)[0]),
+    )
 
     def beside() -> None:
         if closed is not None and cores() > 1 and is_closed():
@@ -200,7 +233,18 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
         meanwhile()
 
     def collapsed(crease_degrees: float) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str], int | None]:
-        return _collapsed(unit, faces, target_faces, edge if near else _UNIT, even, crease_degrees, careful, seconds, is_closed, beside)
+        return _collapsed(
+            unit,
+            faces,
+            target_faces,
+            edge if near else _UNIT,
+            even,
+            crease_degrees,
+            careful,
+            seconds,
+            is_closed,
+            beside,
+        )
 
     found, method, reasons, moved = collapsed(crease_degrees)
     if found is None and moved != 0:
@@ -212,7 +256,12 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
         if not len(found[1]):
             found = None
     if found is None:
-        return vertices, faces, attributes, {"faces": len(faces), "method": "none", "error": 0.0, "creases": 0, "failed": "; ".join(reasons)}
+        return (
+            vertices,
+            faces,
+            attributes,
+            {"faces": len(faces), "method": "none", "error": 0.0, "creases": 0, "failed": "; ".join(reasons)},
+        )
     out_vertices, out_faces = topology.compact(*found)
     if topology.components(out_faces)[0] > 1 and is_closed():
         out_vertices, out_faces = repair.without_crumbs(out_vertices, out_faces, pieces())
@@ -230,16 +279,35 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, target_faces: int, attribu
         report["failed"] = "; ".join(reasons)
     out = out_vertices * extent + centre, out_faces, out_attributes, report
     if measured and not careful and method == "quadric collapse" and report["error"] > edge * extent:
-        other = simplify(vertices, faces, target_faces, attributes, seconds=seconds, closed=is_closed, careful=True, near=near, even=even)
+        other = simplify(
+            vertices,
+            faces,
+            target_faces,
+            attributes,
+            seconds=seconds,
+            closed=is_closed,
+            careful=True,
+            near=near,
+            even=even,
+        )
         return min(out, other, key=lambda one: one[3]["error"] if one[3]["method"] != "none" else np.inf)
     return out
 
 
-def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit: float, even: bool, crease_degrees: float, careful: bool,
-               seconds: float, is_closed: Callable[[], bool], meanwhile: Callable[[], object]
-               ) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str], int | None]:
-    """What the first way leaves that keeps the mesh as closed as it is, or None; its name, what failed, and how many vertices were drawn
-    out to creases, None where no child came to tell."""
+def _collapsed(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    target_faces: int,
+    unit: float,
+    even: bool,
+    crease_degrees: float,
+    careful: bool,
+    seconds: float,
+    is_closed: Callable[[], bool],
+    meanwhile: Callable[[], object],
+) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str], int | None]:
+    """What the first way leaves that keeps the mesh as closed as it is, or None; its name, what failed, and how many
+    vertices were drawn out to creases, None where no child came to tell."""
     # The quick collapse tears a closed mesh now and then (a handful of edges with four faces), at one pace and not at
     # another, and of parts made of slivers it collapses nothing, at any; MeshLab's takes ten times as long.
     quick = [("collapse", (target_faces, pace, unit)) for pace in _PACES]
@@ -253,8 +321,17 @@ def _collapsed(vertices: np.ndarray, faces: np.ndarray, target_faces: int, unit:
         if moved != 0 and way != "collapse" and not careful:
             break  # what cannot be collapsed are folds, of bevels that were drawn out where there is no crease
         try:
-            running = begin(reduced, vertices, faces.astype(np.int32), way, arguments, even, crease_degrees,
-                            seconds=seconds, memory_mb=16000)
+            running = begin(
+                reduced,
+                vertices,
+                faces.astype(np.int32),
+                way,
+                arguments,
+                even,
+                crease_degrees,
+                seconds=seconds,
+                memory_mb=16000,
+            )
             meanwhile()
             *out, moved = running.result()
         except ChildFailed as failure:
@@ -282,12 +359,18 @@ def _sound(vertices: np.ndarray, faces: np.ndarray, closed: bool, target_faces: 
     return not closed or (topology.is_watertight(faces) and topology.is_manifold(faces))
 
 
-def deviation(vertices_a: np.ndarray, faces_a: np.ndarray, vertices_b: np.ndarray, faces_b: np.ndarray, limit: int = 20000) -> float:
-    """Largest distance of the vertices of one mesh to the surface of the other, both ways, at most `limit` vertices each."""
+def deviation(
+    vertices_a: np.ndarray, faces_a: np.ndarray, vertices_b: np.ndarray, faces_b: np.ndarray, limit: int = 20000
+) -> float:
+    """Largest distance of the vertices of one mesh to the surface of the other, both ways, at most `limit` vertices
+    each."""
     from gdtool.geometry.distance import closest_points
 
     out = 0.0
-    for (points, faces), surface in (((vertices_a, faces_a), (vertices_b, faces_b)), ((vertices_b, faces_b), (vertices_a, faces_a))):
+    for (points, faces), surface in (
+        ((vertices_a, faces_a), (vertices_b, faces_b)),
+        ((vertices_b, faces_b), (vertices_a, faces_a)),
+    ):
         used = np.unique(faces)
         step = max(len(used) // limit, 1)
         out = max(out, float(closest_points(points[used[::step]], *surface)[0].max()))

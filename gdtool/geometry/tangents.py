@@ -1,4 +1,5 @@
-"""Tangent frames by the MikkTSpace algorithm (Mikkelsen 2008, "Simulation of Wrinkled Surfaces Revisited", section 3.7).
+"""Tangent frames by the MikkTSpace algorithm (Mikkelsen 2008, "Simulation of Wrinkled Surfaces Revisited", section
+3.7).
 
 glTF viewers decode normal maps in this basis whether a file carries tangents or not, so a baker has to encode in it.
 The steps follow the algorithm's reference description: corners with identical position, normal and texture coordinate
@@ -81,8 +82,14 @@ def connected(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (np.cumsum(root) - 1)[label]
 
 
-def corner_tangents(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray,
-                    face_normals_idx: np.ndarray | None = None) -> np.ndarray:
+def corner_tangents(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray,
+    uv: np.ndarray,
+    face_uvs: np.ndarray,
+    face_normals_idx: np.ndarray | None = None,
+) -> np.ndarray:
     """Tangents (t, 3, 4) float32 of the corners of triangles, glTF's form.
 
     vertices (v, 3), faces (t, 3); normals (n, 3) unit, indexed by face_normals_idx (t, 3) or like vertices; uv (c, 2)
@@ -131,7 +138,8 @@ def corner_tangents(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray
 
 
 def frames_of(normal: np.ndarray, tangent: np.ndarray, sign: np.ndarray) -> np.ndarray:
-    """Tangent frames (n, 3, 3), columns tangent, bitangent, normal, of interpolated normals and tangents (n, 3), sign (n,).
+    """Tangent frames (n, 3, 3), columns tangent, bitangent, normal, of interpolated normals and tangents (n, 3), sign
+    (n,).
 
     Nothing is normalised after interpolation, as MikkTSpace asks: encoder and decoder then use the same basis.
     """

@@ -1,4 +1,5 @@
-"""What the indices of a mesh tell: its edges, the fans around its vertices, its pieces, whether it is closed and manifold."""
+"""What the indices of a mesh tell: its edges, the fans around its vertices, its pieces, whether it is closed and
+manifold."""
 
 from __future__ import annotations
 
@@ -67,7 +68,8 @@ def edges_of(faces: np.ndarray) -> Edges:
 
 
 def twins_of(faces: np.ndarray) -> np.ndarray | None:
-    """(3 f,) the half edge the other way round for each half edge of triangles (f, 3); None where one has none or several, and for other faces.
+    """(3 f,) the half edge the other way round for each half edge of triangles (f, 3); None where one has none or
+    several, and for other faces.
 
     In linear time: half edges are the entries of a sparse matrix, whose transpose has the same entries elsewhere.
     """
@@ -92,13 +94,14 @@ def twins_of(faces: np.ndarray) -> np.ndarray | None:
 
 
 def even(faces: np.ndarray) -> bool:
-    """Whether each edge of faces (f, 3) is one of an even number of them, by the exclusive or of hashes (splitmix64's): wrong once in 2^64.
+    """Whether each edge of faces (f, 3) is one of an even number of them, by the exclusive or of hashes (splitmix64's):
+    wrong once in 2^64.
 
-    A manifold whose faces all look out is watertight where it is so; that is told in a tenth of the time that is_watertight takes.
-    """
+    A manifold whose faces all look out is watertight where it is so; that is told in a tenth of the time that
+    is_watertight takes."""
     together = np.uint64(0)
     for i in range(0, len(faces), _CHUNK):
-        start = np.ascontiguousarray(faces[i:i + _CHUNK].T, np.uint64)
+        start = np.ascontiguousarray(faces[i : i + _CHUNK].T, np.uint64)
         end = start[[1, 2, 0]]
         key = np.minimum(start, end) << np.uint64(32) | np.maximum(start, end)
         key = (key ^ key >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
@@ -132,12 +135,13 @@ def split_vertices(faces: np.ndarray) -> np.ndarray:
     return np.flatnonzero(corner_fans(faces)[1] > 1)
 
 
-def corner_fans(faces: np.ndarray, mates: np.ndarray | None = None, edges: Edges | None = None) -> tuple[np.ndarray, np.ndarray]:
+def corner_fans(
+    faces: np.ndarray, mates: np.ndarray | None = None, edges: Edges | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """The fan (f, c) each face corner belongs to (numbered over the mesh), and the number of fans at each vertex.
 
-    Fans go on across edges of exactly two faces, and across mates (k, 2), pairs of half edges that belong together. edges: those of the
-    faces, where they are known.
-    """
+    Fans go on across edges of exactly two faces, and across mates (k, 2), pairs of half edges that belong together.
+    edges: those of the faces, where they are known."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -181,7 +185,8 @@ def components(faces: np.ndarray) -> tuple[int, np.ndarray]:
     if (twins := twins_of(faces)) is not None:
         return _pieces(twins)
     edges = edges_of(faces)
-    # The faces of an edge in a row, each tied to the next: linear in the number of corners, whatever the edges' valence.
+    # The faces of an edge in a row, each tied to the next: linear in the number of corners, whatever the edges'
+    # valence.
     edge, face = edges.half_edge_idx[edges.order], edges.half_face[edges.order]
     tied = edge[1:] == edge[:-1]
     rows, columns = face[:-1][tied], face[1:][tied]
@@ -205,7 +210,8 @@ def euler_number(faces: np.ndarray) -> int:
 
 
 def handles(faces: np.ndarray, pieces: int, edges: Edges | None = None) -> int:
-    """How many handles a manifold of so many pieces has, by Euler's formula, from the loops of its rim; edges: its own, where they are known."""
+    """How many handles a manifold of so many pieces has, by Euler's formula, from the loops of its rim; edges: its own,
+    where they are known."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -213,7 +219,11 @@ def handles(faces: np.ndarray, pieces: int, edges: Edges | None = None) -> int:
     rim = edges.ends[edges.count == 1]
     corners, local = np.unique(rim, return_inverse=True)
     one, two = local.reshape(-1, 2).T
-    loops = connected_components(coo_matrix((np.ones(len(one)), (one, two)), (len(corners),) * 2), False)[0] if len(rim) else 0
+    loops = (
+        connected_components(coo_matrix((np.ones(len(one)), (one, two)), (len(corners),) * 2), False)[0]
+        if len(rim)
+        else 0
+    )
     return pieces - (loops + len(np.unique(faces[faces >= 0])) - len(edges.ends) + len(faces)) // 2
 
 
@@ -265,7 +275,8 @@ def _plain(faces: np.ndarray) -> bool:
 
 
 def _counting_order(keys: np.ndarray, width: int) -> np.ndarray:
-    """What np.argsort(keys, kind="stable") gives for keys (n,) below width, in linear time: as a sparse matrix' rows."""
+    """What np.argsort(keys, kind="stable") gives for keys (n,) below width, in linear time: as a sparse matrix'
+    rows."""
     from scipy.sparse import csr_array
 
     if len(keys) < _FEW or width > 2**31 - 1 or len(keys) > 2**31 - 1:
@@ -280,12 +291,14 @@ def _pieces(twins: np.ndarray) -> tuple[int, np.ndarray]:
     from scipy.sparse.csgraph import connected_components
 
     f = len(twins) // 3
-    return connected_components(csr_array((np.ones(3 * f, np.int8), twins // 3, np.arange(0, 3 * f + 1, 3)), (f, f)), True, "weak")
+    return connected_components(
+        csr_array((np.ones(3 * f, np.int8), twins // 3, np.arange(0, 3 * f + 1, 3)), (f, f)), True, "weak"
+    )
 
 
 def one_fan_each(faces: np.ndarray, twins: np.ndarray) -> bool:
-    """Whether the faces around each vertex of triangles (f, 3) that have twins (3 f,) form one fan: who walks around it, from an edge that leaves it
-    to the next one, meets all that do."""
+    """Whether the faces around each vertex of triangles (f, 3) that have twins (3 f,) form one fan: who walks around
+    it, from an edge that leaves it to the next one, meets all that do."""
     n, start = len(twins), faces.ravel()
     turn = twins.take(np.arange(n, dtype=np.int32).reshape(-1, 3)[:, [2, 0, 1]].ravel())
     number = np.bincount(start)

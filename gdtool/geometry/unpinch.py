@@ -11,9 +11,8 @@ from gdtool.geometry.topology import Edges, corner_fans, edges_of
 def unpinched(vertices: np.ndarray, faces: np.ndarray, rounds: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """A closed triangle mesh two sheets of which share an edge, with a copy of the edge and its ends for each sheet.
 
-    faces (f, 3). Faces on both sides of one wedge of the inside stay together; what comes off is a piece of its own. Edges of
-    an odd number of faces, or of more one way than the other, are left.
-    """
+    faces (f, 3). Faces on both sides of one wedge of the inside stay together; what comes off is a piece of its own.
+    Edges of an odd number of faces, or of more one way than the other, are left."""
     edges = edges_of(faces)
     pinched = np.flatnonzero((edges.count > 2) & (edges.count % 2 == 0))
     if not len(pinched):
@@ -28,7 +27,7 @@ def unpinched(vertices: np.ndarray, faces: np.ndarray, rounds: int = 3) -> tuple
     first = np.cumsum(edges.count) - edges.count
     mates = []
     for edge in pinched.tolist():
-        half = edges.order[first[edge]:first[edge] + edges.count[edge]]
+        half = edges.order[first[edge] : first[edge] + edges.count[edge]]
         a, b = vertices[edges.ends[edge]]
         along = b - a
         x = np.cross(along, [1.0, 0.0, 0.0] if abs(along[0]) < 0.9 * np.linalg.norm(along) else [0.0, 1.0, 0.0])
@@ -61,8 +60,11 @@ def unpinched(vertices: np.ndarray, faces: np.ndarray, rounds: int = 3) -> tuple
     return unpinched(out, found, rounds - 1)
 
 
-def _halved(vertices: np.ndarray, faces: np.ndarray, near: np.ndarray, edges: Edges, mates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each pair of half edges (k, 2) of the faces `near` with a vertex of its own in the middle, its two triangles cut in two."""
+def _halved(
+    vertices: np.ndarray, faces: np.ndarray, near: np.ndarray, edges: Edges, mates: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Each pair of half edges (k, 2) of the faces `near` with a vertex of its own in the middle, its two triangles cut
+    in two."""
     touched, more, points = set(), [], []
     faces = faces.copy()
     for pair in mates.tolist():

@@ -1,8 +1,8 @@
 """Exact rasterising of texture coordinates: which triangle owns which texel.
 
 Texture coordinates are snapped to 1/4096 of a texel and everything after that is integer arithmetic, with the top-left
-rule of the graphics interfaces (Direct3D 11 functional specification, section 3.4.1.2): triangles that share an edge
-or a vertex share no texel and leave none between them. Rays through texel centres, the usual other way, can miss an edge.
+rule of the graphics interfaces (Direct3D 11 functional specification, section 3.4.1.2): triangles that share an edge or
+a vertex share no texel and leave none between them. Rays through texel centres, the usual other way, can miss an edge.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ def _expand(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def owned_texels(uv: np.ndarray, faces: np.ndarray, size: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Batches of (face_idx (n,), row (n,), column (n,)): every texel whose centre a triangle owns, in order of triangles.
+    """Batches of (face_idx (n,), row (n,), column (n,)): every texel whose centre a triangle owns, in order of
+    triangles.
 
     uv (v, 2), (0, 0) at the image's top left; faces (t, 3) into uv. Triangles may turn either way; those without area
     own nothing. A texel comes up once per triangle that covers it: more than once only where triangles overlap.
@@ -98,7 +99,9 @@ class Barycentrics:
         e1, e2 = b - a, c - a
         det = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
         inverse = np.where(det == 0, 0.0, 1.0 / np.where(det == 0, 1.0, det))
-        self._of_face = np.stack([a[:, 0], a[:, 1], e2[:, 1] * inverse, -e2[:, 0] * inverse, -e1[:, 1] * inverse, e1[:, 0] * inverse], 1)
+        self._of_face = np.stack(
+            [a[:, 0], a[:, 1], e2[:, 1] * inverse, -e2[:, 0] * inverse, -e1[:, 1] * inverse, e1[:, 0] * inverse], 1
+        )
 
     def at(self, face_idx: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """(n, 3) float64 of texture points u, v (n,) in triangles face_idx (n,); linear beyond them."""
@@ -117,11 +120,11 @@ class Barycentrics:
 
 
 def owners_of(uv: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
-    """(size * size,) int32: the triangle that owns each texel, -1 where none covers its centre; the first where several do.
+    """(size * size,) int32: the triangle that owns each texel, -1 where none covers its centre; the first where several
+    do.
 
-    uv (v, 2) with (0, 0) at the image's top left, faces (t, 3). Raises ValueError for coordinates that are not finite or
-    beyond ±64.
-    """
+    uv (v, 2) with (0, 0) at the image's top left, faces (t, 3). Raises ValueError for coordinates that are not finite
+    or beyond ±64."""
     owner = np.full(size * size, -1, np.int32)
     for face, row, column in owned_texels(uv, faces, size):
         texel = row.astype(np.int64) * size + column
@@ -163,11 +166,12 @@ def owner_count(uv: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
 
 
 def between_centres(uv: np.ndarray, faces: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Texels that charts pass through too far from any texel they own: texel (n,) flat indices, and the triangle (n,) there.
+    """Texels that charts pass through too far from any texel they own: texel (n,) flat indices, and the triangle (n,)
+    there.
 
-    owner (size, size) as from owners_of. Charts smaller than a texel, and slivers' ends, cover no texel's centre; lookups on
-    them would read what the charts around them are continued with. Texels beside owned ones are left to extend_owners.
-    """
+    owner (size, size) as from owners_of. Charts smaller than a texel, and slivers' ends, cover no texel's centre;
+    lookups on them would read what the charts around them are continued with. Texels beside owned ones are left to
+    extend_owners."""
     from gdtool.geometry.topology import edges_of
 
     size, wide = owner.shape[0], owner.shape[0] + 2
@@ -187,14 +191,15 @@ def between_centres(uv: np.ndarray, faces: np.ndarray, owner: np.ndarray) -> tup
     return texel, edges.half_face[rim[edge[inside][lone][first]]].astype(np.int32)
 
 
-def extend_owners(barycentrics: Barycentrics, face_idx: np.ndarray, rings: int,
-                  farthest: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def extend_owners(
+    barycentrics: Barycentrics, face_idx: np.ndarray, rings: int, farthest: float = 1.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Texels just outside the charts and where they would lie if the triangle beside them went on.
 
     face_idx (size, size) as from rasterize_uv. Returns texel (n,) flat indices of up to `rings` texels around all
     charts, owner (n,) the face of the nearest covered texel (of a smaller ring), barycentric (n, 3) float64, linearly
-    extrapolated and held within `farthest` outside [0, 1]. Lookups between texel centres at a chart's border read these.
-    """
+    extrapolated and held within `farthest` outside [0, 1]. Lookups between texel centres at a chart's border read
+    these."""
     size = face_idx.shape[0]
     owner = np.pad(face_idx, 1, constant_values=-1)
     flat, wide = owner.ravel(), size + 2

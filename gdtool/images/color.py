@@ -36,7 +36,7 @@ def _by_blocks(curve: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.n
     flat = x.ravel()
     out = np.empty_like(flat)
     for start in range(0, flat.size, _AT_ONCE):
-        out[start:start + _AT_ONCE] = curve(flat[start:start + _AT_ONCE])
+        out[start : start + _AT_ONCE] = curve(flat[start : start + _AT_ONCE])
     return out.reshape(x.shape)
 
 
@@ -54,7 +54,8 @@ def encode_normal(normal: np.ndarray) -> np.ndarray:
 
 
 def decode_normal(encoded: np.ndarray) -> np.ndarray:
-    """0.5 n + 0.5 (..., 3) in [0, 1] (or uint8, uint16) -> unit normals; (0, 0, 0) where the stored value is the middle.
+    """0.5 n + 0.5 (..., 3) in [0, 1] (or uint8, uint16) -> unit normals; (0, 0, 0) where the stored value is the
+    middle.
 
     Shorter than 0.02 is the middle: 8-bit storage has no exact 0.5 (128 / 255 is 0.004 off it).
     """

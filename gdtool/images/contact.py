@@ -11,7 +11,9 @@ from gdtool.images.color import unit_range
 _MARGIN = 4  # pixels between cells
 
 
-def contact_sheet(rows: Sequence[Sequence[np.ndarray | None]], labels_top: Sequence[str] = (), labels_left: Sequence[str] = ()) -> np.ndarray:
+def contact_sheet(
+    rows: Sequence[Sequence[np.ndarray | None]], labels_top: Sequence[str] = (), labels_left: Sequence[str] = ()
+) -> np.ndarray:
     """Lay images out in a table -> (h, w, 3) uint8.
 
     rows: images (h, w) or (h, w, 1..4), encoded as they are to be shown, float [0, 1] or integer; None leaves its cell
@@ -33,9 +35,11 @@ def contact_sheet(rows: Sequence[Sequence[np.ndarray | None]], labels_top: Seque
             if image is not None:
                 y = top + i * (height + _MARGIN) + (height - image.shape[0]) // 2
                 x = left + j * (width + _MARGIN) + (width - image.shape[1]) // 2
-                sheet[y:y + image.shape[0], x:x + image.shape[1]] = image
+                sheet[y : y + image.shape[0], x : x + image.shape[1]] = image
     labels = [(left + j * (width + _MARGIN), text // 3, label) for j, label in enumerate(labels_top)]
-    labels += [(_MARGIN, top + i * (height + _MARGIN) + (height - text) // 2, label) for i, label in enumerate(labels_left)]
+    labels += [
+        (_MARGIN, top + i * (height + _MARGIN) + (height - text) // 2, label) for i, label in enumerate(labels_left)
+    ]
     return _with_text(sheet, labels, text)
 
 

@@ -20,7 +20,8 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def check_container(path: Path, head: bytes, file: BinaryIO) -> None:
-    """Raise InputError for an empty, cut or animated file, ResourceError for a huge PNG or a file beyond MAX_FILE_BYTES; head is its first 64 bytes, file is open for reading.
+    """Raise InputError for an empty, cut or animated file, ResourceError for a huge PNG or a file beyond
+    MAX_FILE_BYTES; head is its first 64 bytes, file is open for reading.
 
     Decoders print to stderr or fill with grey where a file ends early, so this looks first.
     """
@@ -28,7 +29,11 @@ def check_container(path: Path, head: bytes, file: BinaryIO) -> None:
         raise InputError(path, "is empty", COPY)
     size = os.fstat(file.fileno()).st_size
     if size > MAX_FILE_BYTES:
-        raise ResourceError(path, f"is a file of {size / 2**30:.1f} GiB, more than {MAX_FILE_BYTES >> 30} for a picture", "scale it down")
+        raise ResourceError(
+            path,
+            f"is a file of {size / 2**30:.1f} GiB, more than {MAX_FILE_BYTES >> 30} for a picture",
+            "scale it down",
+        )
     if head.startswith(PNG):
         _check_png(path, file)
     elif head.startswith(b"\xff\xd8\xff"):
@@ -40,10 +45,19 @@ def check_container(path: Path, head: bytes, file: BinaryIO) -> None:
 
 
 def suffix_of(head: bytes) -> str:
-    """The suffix that the first bytes of an image call for: OpenImageIO tries the suffix's format first, and only then tells why it fails."""
+    """The suffix that the first bytes of an image call for: OpenImageIO tries the suffix's format first, and only then
+    tells why it fails."""
     if head[:4] == b"RIFF":
         return ".webp" if head[8:12] == b"WEBP" else ""
-    signatures = {PNG: ".png", b"\xff\xd8\xff": ".jpg", b"II*\0": ".tif", b"MM\0*": ".tif", b"v/1\x01": ".exr", b"#?": ".hdr", b"BM": ".bmp"}
+    signatures = {
+        PNG: ".png",
+        b"\xff\xd8\xff": ".jpg",
+        b"II*\0": ".tif",
+        b"MM\0*": ".tif",
+        b"v/1\x01": ".exr",
+        b"#?": ".hdr",
+        b"BM": ".bmp",
+    }
     return next((suffix for signature, suffix in signatures.items() if head.startswith(signature)), "")
 
 
@@ -65,9 +79,17 @@ def _check_png(path: Path, file: BinaryIO) -> None:
         if left or len(crc) < 4:
             raise InputError(path, "is cut short (no end of the PNG)", COPY)
         if checksum != struct.unpack(">I", crc)[0]:
-            raise InputError(path, f"is damaged (bad checksum in the PNG's {kind.decode() if kind.isalpha() and kind.isascii() else 'chunks'})", COPY)
+            raise InputError(
+                path,
+                f"is damaged (bad checksum in the PNG's {kind.decode() if kind.isalpha() and kind.isascii() else 'chunks'})",
+                COPY,
+            )
         if kind == b"IHDR" and length >= 8 and max(struct.unpack_from(">II", body)) > MAX_SIDE:
-            raise ResourceError(path, "is {}x{} pixels, more than {} a side".format(*struct.unpack_from(">II", body), MAX_SIDE), "scale it down")
+            raise ResourceError(
+                path,
+                "is {}x{} pixels, more than {} a side".format(*struct.unpack_from(">II", body), MAX_SIDE),
+                "scale it down",
+            )
         if kind == b"acTL" and length >= 4 and struct.unpack(">I", body[:4])[0] > 1:
             raise InputError(path, "is an animation", "save one frame as a still")
         if kind == b"IEND":

@@ -1,4 +1,5 @@
-"""A subject on a background that is not plain, by GrabCut (Rother et al. 2004, OpenCV), and whether that can be trusted."""
+"""A subject on a background that is not plain, by GrabCut (Rother et al. 2004, OpenCV), and whether that can be
+trusted."""
 
 from __future__ import annotations
 
@@ -19,7 +20,9 @@ def cut_out(color: np.ndarray, subject: object, cure: str) -> np.ndarray:
     """
     _, wide, agreement = both_frames(color)
     if agreement < AGREEMENT or not 0.005 < float(wide.mean()) < 0.8:
-        raise InputError(subject, "has a background that is not plain, and its colors do not tell the subject from it", cure)
+        raise InputError(
+            subject, "has a background that is not plain, and its colors do not tell the subject from it", cure
+        )
     return wide
 
 

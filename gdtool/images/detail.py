@@ -10,7 +10,8 @@ FLOOR = 1e-3  # squared logarithms: less than this says nothing of a gain
 
 
 def masked_mean(values: np.ndarray, mask: np.ndarray, width: float) -> np.ndarray:
-    """Gaussian mean of values (h, w[, ...]) over the covered pixels around each; mask (h, w) in [0, 1], width in pixels."""
+    """Gaussian mean of values (h, w[, ...]) over the covered pixels around each; mask (h, w) in [0, 1], width in
+    pixels."""
     from scipy.ndimage import gaussian_filter
 
     weight = np.asarray(mask, np.float64)
@@ -31,12 +32,15 @@ def detail_gain(one: np.ndarray, other: np.ndarray, mask: np.ndarray) -> np.ndar
 def guided(values: np.ndarray, guide: np.ndarray, mask: np.ndarray, width: float, least: float) -> np.ndarray:
     """values (h, w, c) as far as they are linear in guide (h, w, g), around each pixel of mask (h, w).
 
-    The guided filter (He, Sun and Tang, "Guided Image Filtering", 2010) with Gaussian windows of width pixels. least: added
-    to the guide's variances, so that a guide that hardly varies explains little.
-    """
+    The guided filter (He, Sun and Tang, "Guided Image Filtering", 2010) with Gaussian windows of width pixels. least:
+    added to the guide's variances, so that a guide that hardly varies explains little."""
     mean, level = masked_mean(guide, mask, width), masked_mean(values, mask, width)
-    variance = masked_mean(guide[..., :, None] * guide[..., None, :], mask, width) - mean[..., :, None] * mean[..., None, :]
-    common = masked_mean(guide[..., :, None] * values[..., None, :], mask, width) - mean[..., :, None] * level[..., None, :]
+    variance = (
+        masked_mean(guide[..., :, None] * guide[..., None, :], mask, width) - mean[..., :, None] * mean[..., None, :]
+    )
+    common = (
+        masked_mean(guide[..., :, None] * values[..., None, :], mask, width) - mean[..., :, None] * level[..., None, :]
+    )
     slope = np.linalg.solve(variance + least * np.eye(guide.shape[-1]), common)
     start = level - np.einsum("...g,...gc->...c", mean, slope)
     return np.einsum("...g,...gc->...c", guide, masked_mean(slope, mask, width)) + masked_mean(start, mask, width)

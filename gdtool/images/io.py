@@ -21,11 +21,17 @@ from gdtool.core.threads import mapped
 from gdtool.images.containers import COPY, MAX_SIDE, check_container, suffix_of
 
 MAX_BYTES = 1 << 30  # of the pixels as stored, all channels of the file: OpenImageIO's own limit is set to it
-MAX_HELD = 4 << 30  # bytes while one picture is read: the pixels as stored, as decoded, and one copy where they are turned or put in order
+# Bytes while one picture is read: the pixels as stored, as decoded, and one copy where they are turned or put in order.
+MAX_HELD = 4 << 30
 _ROWS = 256  # rows at a time where pixels are checked and changed in place
 
-_TYPES = {"uint8": ("uint8", np.uint8), "uint16": ("uint16", np.uint16), "half": ("float", np.float32),
-          "float": ("float", np.float32), "double": ("float", np.float32)}
+_TYPES = {
+    "uint8": ("uint8", np.uint8),
+    "uint16": ("uint16", np.uint16),
+    "half": ("float", np.float32),
+    "float": ("float", np.float32),
+    "double": ("float", np.float32),
+}
 
 
 def read_image(path: str | Path) -> np.ndarray:
@@ -33,9 +39,8 @@ def read_image(path: str | Path) -> np.ndarray:
 
     1 channel is grey, 2 grey and alpha, 3 RGB, 4 RGBA; alpha is straight (EXR's premultiplied colours are divided).
     Palettes are expanded, EXIF rotation is applied. Raises InputError for what is not one whole still image in grey or
-    RGB, is no regular file, or holds values that are not finite; ResourceError beyond 16384 pixels a side, 1 GiB as stored, or
-    MAX_HELD or half of the memory while it is read; OutputError when the file cannot be read.
-    """
+    RGB, is no regular file, or holds values that are not finite; ResourceError beyond 16384 pixels a side, 1 GiB as
+    stored, or MAX_HELD or half of the memory while it is read; OutputError when the file cannot be read."""
     path = Path(path)
     require_regular_file(path)
     try:
@@ -73,8 +78,14 @@ def _read(path: Path, name: str) -> np.ndarray:
     if source is None:
         fact = oiio.geterror().replace(name, "").strip().split("\n")[0]
         if "exceeds" in fact or "limit" in fact:
-            raise ResourceError(path, f"is larger than gdtool reads ({MAX_SIDE} pixels a side, {MAX_BYTES >> 30} GiB)", "scale it down")
-        raise InputError(path, f"is not an image that can be read ({_lower(fact) or 'unknown format'})", "save it as PNG, JPEG or EXR")
+            raise ResourceError(
+                path, f"is larger than gdtool reads ({MAX_SIDE} pixels a side, {MAX_BYTES >> 30} GiB)", "scale it down"
+            )
+        raise InputError(
+            path,
+            f"is not an image that can be read ({_lower(fact) or 'unknown format'})",
+            "save it as PNG, JPEG or EXR",
+        )
     try:
         spec = source.spec()
         _check_spec(path, spec)
@@ -83,8 +94,12 @@ def _read(path: Path, name: str) -> np.ndarray:
         kind, dtype = _TYPES[str(spec.format)]
         channels, orientation = _channels(path, list(spec.channelnames)), spec.get_int_attribute("Orientation", 1)
         first, last = min(channels), max(channels) + 1
-        _check_held(path, spec, last - first, np.dtype(dtype).itemsize, orientation != 1 or channels != list(range(first, last)))
-        pixels = source.read_image(kind) if last - first == spec.nchannels else source.read_image(0, 0, first, last, kind)
+        _check_held(
+            path, spec, last - first, np.dtype(dtype).itemsize, orientation != 1 or channels != list(range(first, last))
+        )
+        pixels = (
+            source.read_image(kind) if last - first == spec.nchannels else source.read_image(0, 0, first, last, kind)
+        )
         # A truncated file can come back as zeros with success: only the error flag tells.
         if pixels is None or source.has_error:
             fact = source.geterror().replace(name, "").strip().split("\n")[0]
@@ -111,11 +126,18 @@ def _lower(text: str) -> str:
 
 def _check_spec(path: Path, spec) -> None:
     if spec.width > MAX_SIDE or spec.height > MAX_SIDE or spec.image_bytes() > MAX_BYTES:
-        raise ResourceError(path, f"is {spec.width}x{spec.height} pixels in {spec.nchannels} channels ({spec.image_bytes() / 2**30:.1f} GiB), more than "
-                            f"{MAX_SIDE} a side or {MAX_BYTES >> 30} GiB", "scale it down")
+        raise ResourceError(
+            path,
+            f"is {spec.width}x{spec.height} pixels in {spec.nchannels} channels ({spec.image_bytes() / 2**30:.1f} GiB), more than "
+            f"{MAX_SIDE} a side or {MAX_BYTES >> 30} GiB",
+            "scale it down",
+        )
     if spec.depth > 1 or spec.deep:
         raise InputError(path, "is a volume or a deep image", "flatten it")
-    spaces = {spec.get_string_attribute(key).lower() for key in ("jpeg:ColorSpace", "tiff:ColorSpace", "psd:ColorMode", "oiio:ColorSpace")}
+    spaces = {
+        spec.get_string_attribute(key).lower()
+        for key in ("jpeg:ColorSpace", "tiff:ColorSpace", "psd:ColorMode", "oiio:ColorSpace")
+    }
     if any("cmyk" in space or "ycck" in space or "ycbcrk" in space for space in spaces) or "C" in spec.channelnames[:1]:
         raise InputError(path, "is in CMYK", "convert it to RGB")
     if spec.get_int_attribute("oiio:Movie", 0):
@@ -123,14 +145,18 @@ def _check_spec(path: Path, spec) -> None:
 
 
 def _check_held(path: Path, spec, channels: int, itemsize: int, copied: bool) -> None:
-    """Raise ResourceError when reading so many channels, of itemsize bytes as decoded, takes more than MAX_HELD or half of the memory."""
+    """Raise ResourceError when reading so many channels, of itemsize bytes as decoded, takes more than MAX_HELD or half
+    of the memory."""
     pixels = spec.width * spec.height * channels
     size = pixels * spec.format.size() + pixels * itemsize * (2 if copied else 1)
-    require_memory(size, path, f"reading {spec.width}x{spec.height} pixels in {channels} channels", "scale it down", MAX_HELD)
+    require_memory(
+        size, path, f"reading {spec.width}x{spec.height} pixels in {channels} channels", "scale it down", MAX_HELD
+    )
 
 
 def _channels(path: Path, names: list[str]) -> list[int]:
-    """Which channels make grey, grey and alpha, RGB or RGBA, in that order, of whatever a multi-channel file holds besides."""
+    """Which channels make grey, grey and alpha, RGB or RGBA, in that order, of whatever a multi-channel file holds
+    besides."""
     if {"R", "G", "B"} <= set(names):
         wanted = ["R", "G", "B", *(["A"] if "A" in names else [])]
         return [names.index(name) for name in wanted]
@@ -143,17 +169,19 @@ def _channels(path: Path, names: list[str]) -> list[int]:
 
 def _check_finite(path: Path, pixels: np.ndarray) -> None:
     for start in range(0, len(pixels), _ROWS):
-        bad = ~np.isfinite(pixels[start:start + _ROWS])
+        bad = ~np.isfinite(pixels[start : start + _ROWS])
         if bad.any():
             row, column, channel = np.argwhere(bad)[0]
             value = pixels[start + row, column, channel]
-            raise InputError(path, f"is not finite at row {start + row}, column {column} ({value})", "give that pixel a finite value")
+            raise InputError(
+                path, f"is not finite at row {start + row}, column {column} ({value})", "give that pixel a finite value"
+            )
 
 
 def _divide_by_alpha(pixels: np.ndarray) -> None:
     """Turn premultiplied colors (h, w, 2 or 4) into straight ones where alpha is above 0, in place."""
     for start in range(0, len(pixels), _ROWS):
-        rows = pixels[start:start + _ROWS]
+        rows = pixels[start : start + _ROWS]
         alpha = rows[..., -1:]
         rows[..., :-1] = np.where(alpha > 0, rows[..., :-1] / np.where(alpha > 0, alpha, 1), rows[..., :-1])
 
@@ -162,7 +190,8 @@ def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Undo an EXIF orientation 1..8: the stored rows and columns, as the camera was held."""
     flips = {2: (1,), 3: (0, 1), 4: (0,), 6: (0,), 7: (0, 1), 8: (1,)}
     if orientation in (5, 6, 7, 8):
-        # 5 is a transpose; 6 turns clockwise: flip the rows, then transpose; 8 the other way; 7 over the other diagonal.
+        # 5 is a transpose; 6 turns clockwise: flip the rows, then transpose; 8 the other way; 7 over the other
+        # diagonal.
         return np.flip(pixels, flips[orientation]).swapaxes(0, 1) if orientation != 5 else pixels.swapaxes(0, 1)
     return np.flip(pixels, flips[orientation]) if orientation in flips else pixels
 
@@ -184,17 +213,24 @@ def write_png(path: str | Path, image: np.ndarray, bits: int = 8) -> None:
     No colour-space chunk is written: what the numbers mean is the folder format's business. The file is read again and
     compared; raises OutputError when it cannot be written whole.
     """
-    _write(Path(path), quantized(image, bits), "uint8" if quantized(image[:1, :1], bits).dtype == np.uint8 else "uint16")
+    _write(
+        Path(path), quantized(image, bits), "uint8" if quantized(image[:1, :1], bits).dtype == np.uint8 else "uint16"
+    )
 
 
 def write_exr(path: str | Path, image: np.ndarray) -> None:
-    """Write (h, w) or (h, w, 1, 3 or 4) as 32-bit float EXR, zip-compressed; alpha given straight, stored premultiplied.
+    """Write (h, w) or (h, w, 1, 3 or 4) as 32-bit float EXR, zip-compressed; alpha given straight, stored
+    premultiplied.
 
     Read again and compared; raises OutputError, also for NaN and infinity, which readers take in many ways.
     """
     image = np.asarray(image, np.float32)
     if not np.isfinite(image).all():
-        raise OutputError(path, f"would hold {int((~np.isfinite(image)).sum())} numbers that are not finite", "this is a fault of gdtool: please report it")
+        raise OutputError(
+            path,
+            f"would hold {int((~np.isfinite(image)).sum())} numbers that are not finite",
+            "this is a fault of gdtool: please report it",
+        )
     _write(Path(path), image, "float")
 
 
@@ -245,8 +281,11 @@ def _write(path: Path, image: np.ndarray, kind: str) -> None:
     if not same:
         with contextlib.suppress(OSError):
             path.unlink()
-        raise OutputError(path, f"was not written whole ({_lower(fact.strip().splitlines()[0]) if fact.strip() else 'it reads back otherwise'})",
-                          "free some space or choose another -o")
+        raise OutputError(
+            path,
+            f"was not written whole ({_lower(fact.strip().splitlines()[0]) if fact.strip() else 'it reads back otherwise'})",
+            "free some space or choose another -o",
+        )
 
 
 def _again(path: Path) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""Where the subject of a picture is: its alpha, a mask given with it, what a network says, or its difference from the background."""
+"""Where the subject of a picture is: its alpha, a mask given with it, what a network says, or its difference from the
+background."""
 
 from __future__ import annotations
 
@@ -15,21 +16,31 @@ WORKING_SIDE = 384  # pixels; larger pictures are segmented at this size
 _CURE = "give a mask with --mask, a network with --matting, or cut the subject out (RGBA)"
 
 
-def foreground(image: np.ndarray, mask: np.ndarray | None = None, subject: object = "image",
-               tell: Callable[[str], None] = lambda text: None, network: str | Path | None = None) -> np.ndarray:
+def foreground(
+    image: np.ndarray,
+    mask: np.ndarray | None = None,
+    subject: object = "image",
+    tell: Callable[[str], None] = lambda text: None,
+    network: str | Path | None = None,
+) -> np.ndarray:
     """Coverage (h, w) float32 in [0, 1] of a picture's subject.
 
-    image (h, w, c) as read_image gives it; mask (h, w[, c]) of the same size, brighter or more opaque is subject.
-    In this order: the mask; the picture's own alpha, unless it is opaque everywhere; the network (matting.py), where one is
-    given; segmentation against a background that is plain (a smooth gradient and soft shadows are); GrabCut against one that
-    is not. That is a guess (one in four that it does not refuse lacks or has too much: docs/benchmarks/cutout.md), and `tell` is told.
+    image (h, w, c) as read_image gives it; mask (h, w[, c]) of the same size, brighter or more opaque is subject. In
+    this order: the mask; the picture's own alpha, unless it is opaque everywhere; the network (matting.py), where one
+    is given; segmentation against a background that is plain (a smooth gradient and soft shadows are); GrabCut against
+    one that is not. That is a guess (one in four that it does not refuse lacks or has too much:
+    docs/benchmarks/cutout.md), and `tell` is told.
     Raises InputError, naming `subject`, for a picture or mask without a subject, or a background that it blends into.
     """
     image = image.reshape(*image.shape[:2], -1)
     if mask is not None:
         coverage = _mask_coverage(mask)
         if coverage.shape != image.shape[:2]:
-            raise InputError(subject, f"is {image.shape[1]}x{image.shape[0]}, its mask {coverage.shape[1]}x{coverage.shape[0]}", "scale the mask to the size of the picture")
+            raise InputError(
+                subject,
+                f"is {image.shape[1]}x{image.shape[0]}, its mask {coverage.shape[1]}x{coverage.shape[0]}",
+                "scale the mask to the size of the picture",
+            )
         if not (coverage > 0.5).any():
             raise InputError(subject, "has an empty mask", "paint the subject white in it")
         return coverage
@@ -48,7 +59,7 @@ def _mask_coverage(mask: np.ndarray) -> np.ndarray:
     pixels = np.clip(unit_range(mask), 0, 1).astype(np.float32).reshape(*mask.shape[:2], -1)
     if pixels.shape[2] in (2, 4) and pixels[..., -1].min() < 0.5:
         return pixels[..., -1]
-    return pixels[..., :1 if pixels.shape[2] < 3 else 3].mean(-1)
+    return pixels[..., : 1 if pixels.shape[2] < 3 else 3].mean(-1)
 
 
 def _encoded(image: np.ndarray) -> np.ndarray:
@@ -68,7 +79,8 @@ def _salient(image: np.ndarray, subject: object, network: str | Path) -> np.ndar
 
 
 def _segmented(image: np.ndarray, subject: object, tell: Callable[[str], None]) -> np.ndarray:
-    """Coverage by the difference from a background model fitted to the border, its edge by random walks (Grady 2006)."""
+    """Coverage by the difference from a background model fitted to the border, its edge by random walks (Grady
+    2006)."""
     from skimage.color import rgb2lab
     from skimage.segmentation import random_walker
     from skimage.transform import resize
@@ -86,7 +98,9 @@ def _segmented(image: np.ndarray, subject: object, tell: Callable[[str], None]) 
         with warnings.catch_warnings():
             # the solver's last digits leave [0, 1]; the result is clipped below
             warnings.filterwarnings("ignore", message="The probability range", category=UserWarning)
-            coverage = random_walker(lab / 20, labels, beta=200, mode="cg_j", tol=1e-3, return_full_prob=True, channel_axis=-1)[0]
+            coverage = random_walker(
+                lab / 20, labels, beta=200, mode="cg_j", tol=1e-3, return_full_prob=True, channel_axis=-1
+            )[0]
     coverage = np.clip(_without_specks(coverage), 0, 1)
     if (coverage > 0.5).mean() < 0.002:
         raise InputError(subject, "shows no subject that stands off its background", _CURE)
@@ -96,11 +110,14 @@ def _segmented(image: np.ndarray, subject: object, tell: Callable[[str], None]) 
 
 
 def _labels(lab: np.ndarray, color: np.ndarray, subject: object, tell: Callable[[str], None]) -> np.ndarray:
-    """Labels (h, w) as of _trimap, by the difference from a plain background, else by GrabCut. lab and color (h, w, 3) are one picture."""
+    """Labels (h, w) as of _trimap, by the difference from a plain background, else by GrabCut. lab and color (h, w, 3)
+    are one picture."""
     fitted = _background(lab)
     if fitted is None:
         labels = _labels_without_plain_background(color, subject)
-        tell(f"{subject}: the background is not plain; the subject was cut out by its colors and may lack parts: look at it, or give a mask")
+        tell(
+            f"{subject}: the background is not plain; the subject was cut out by its colors and may lack parts: look at it, or give a mask"
+        )
         return labels
     background, spread = fitted
     difference = lab - background
@@ -160,7 +177,8 @@ def _background(lab: np.ndarray) -> tuple[np.ndarray, float] | None:
 
 
 def _trimap(distance: np.ndarray, sure: float, spread: float) -> np.ndarray:
-    """Labels (h, w): 1 subject, 2 background, 0 to be decided. distance (h, w) is the colour difference from the background."""
+    """Labels (h, w): 1 subject, 2 background, 0 to be decided. distance (h, w) is the colour difference from the
+    background."""
     from scipy import ndimage
 
     near = distance < sure
@@ -179,7 +197,11 @@ def _trimap(distance: np.ndarray, sure: float, spread: float) -> np.ndarray:
     inside = ndimage.binary_opening(~background, iterations=1)
     labels = np.zeros(distance.shape, np.int32)
     labels[ndimage.binary_erosion(background, iterations=2, border_value=1)] = 2
-    labels[ndimage.binary_erosion(inside & (distance > sure) | ndimage.binary_erosion(inside, iterations=3), iterations=1, border_value=1)] = 1
+    labels[
+        ndimage.binary_erosion(
+            inside & (distance > sure) | ndimage.binary_erosion(inside, iterations=3), iterations=1, border_value=1
+        )
+    ] = 1
     return labels
 
 
@@ -194,4 +216,6 @@ def _without_specks(coverage: np.ndarray) -> np.ndarray:
     area[0] = 0
     small = area < 0.01 * area.max()
     small[0] = False
-    return np.where(ndimage.binary_dilation(small[pieces], iterations=2) & ~(area >= 0.01 * area.max())[pieces], 0, coverage)
+    return np.where(
+        ndimage.binary_dilation(small[pieces], iterations=2) & ~(area >= 0.01 * area.max())[pieces], 0, coverage
+    )

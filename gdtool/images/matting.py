@@ -1,4 +1,5 @@
-"""A subject cut out by a network that was trained to: U²-Net (Qin et al. 2020) as an ONNX file, run by onnxruntime (gdtool[matting])."""
+"""A subject cut out by a network that was trained to: U²-Net (Qin et al. 2020) as an ONNX file, run by onnxruntime
+(gdtool[matting])."""
 
 from __future__ import annotations
 
@@ -16,15 +17,16 @@ MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's 
 def saliency(color: np.ndarray, network: str | Path) -> np.ndarray:
     """Coverage (h, w) float32 in [0, 1] of what stands out in a picture, color (h, w, 3) sRGB in [0, 1].
 
-    network: an .onnx file of U²-Net's structure: one picture (1, 3, s, s), normalised as ImageNet's, to maps (1, 1, s, s) of which
-    the first counts, stretched to [0, 1] as the authors do. Raises ResourceError without onnxruntime, InputError for a file
-    that is no such network or gives nothing finite.
-    """
+    network: an .onnx file of U²-Net's structure: one picture (1, 3, s, s), normalised as ImageNet's, to maps (1, 1, s,
+    s) of which the first counts, stretched to [0, 1] as the authors do. Raises ResourceError without onnxruntime,
+    InputError for a file that is no such network or gives nothing finite."""
     from skimage.transform import resize
 
     onnxruntime = imported_if_installed("onnxruntime")
     if onnxruntime is None:
-        raise ResourceError("--matting", "needs the package onnxruntime", "pip install 'gdtool[matting]', or give a mask with --mask")
+        raise ResourceError(
+            "--matting", "needs the package onnxruntime", "pip install 'gdtool[matting]', or give a mask with --mask"
+        )
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = 4  # what is wrong with a file is said below, in one line
     try:
@@ -33,9 +35,15 @@ def saliency(color: np.ndarray, network: str | Path) -> np.ndarray:
         side = entry.shape[-1] if isinstance(entry.shape[-1], int) else SIDE
         picture = resize(color, (side, side), order=1, anti_aliasing=True)
         picture = (picture / max(float(picture.max()), 1e-6) - MEAN) / DEVIATION
-        found = np.asarray(session.run(None, {entry.name: np.moveaxis(picture, -1, 0)[None].astype(np.float32)})[0][0, 0])
+        found = np.asarray(
+            session.run(None, {entry.name: np.moveaxis(picture, -1, 0)[None].astype(np.float32)})[0][0, 0]
+        )
     except Exception as failure:  # onnxruntime's own errors have no common class
-        raise InputError(network, f"is no network of U²-Net's structure: {str(failure).strip().splitlines()[0]}", "take u2net.onnx, u2netp.onnx or silueta.onnx") from None
+        raise InputError(
+            network,
+            f"is no network of U²-Net's structure: {str(failure).strip().splitlines()[0]}",
+            "take u2net.onnx, u2netp.onnx or silueta.onnx",
+        ) from None
     low, high = float(found.min()), float(found.max())
     if not (np.isfinite(low) and np.isfinite(high) and high > low):
         raise InputError(network, "finds nothing in the picture", "give a mask with --mask")

@@ -20,15 +20,25 @@ def psnr(image: np.ndarray, reference: np.ndarray, where: np.ndarray | None = No
 
 
 def ssim(image: np.ndarray, reference: np.ndarray, where: np.ndarray | None = None) -> float:
-    """Structural similarity for a range of 1 (Wang et al. 2004: Gaussian window of 1.5 pixels), mean over pixels and channels.
+    """Structural similarity for a range of 1 (Wang et al. 2004: Gaussian window of 1.5 pixels), mean over pixels and
+    channels.
 
     where (h, w) bool: mean over these pixels; their windows still reach outside.
     """
     from skimage.metrics import structural_similarity
 
-    _, values = structural_similarity(np.asarray(image, np.float64), np.asarray(reference, np.float64), data_range=1.0, gaussian_weights=True,
-                                      sigma=1.5, use_sample_covariance=False, K1=_C1, K2=_C2, full=True,
-                                      channel_axis=-1 if np.ndim(image) == 3 else None)
+    _, values = structural_similarity(
+        np.asarray(image, np.float64),
+        np.asarray(reference, np.float64),
+        data_range=1.0,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        K1=_C1,
+        K2=_C2,
+        full=True,
+        channel_axis=-1 if np.ndim(image) == 3 else None,
+    )
     if where is not None:
         return float(values[where].mean())
     edge = 5  # half the window: there it would see beyond the picture
@@ -47,8 +57,11 @@ def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
     return resize(np.asarray(image, np.float64), (height, width), order=1, anti_aliasing=True, mode="edge")
 
 
-def resized_views(images: dict[str, np.ndarray], mask: np.ndarray, height: int, width: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Views.images and Views.mask at another size: averages over the covered part of each new pixel; normals unit again."""
+def resized_views(
+    images: dict[str, np.ndarray], mask: np.ndarray, height: int, width: int
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Views.images and Views.mask at another size: averages over the covered part of each new pixel; normals unit
+    again."""
     if mask.shape[1:] == (height, width):
         return images, mask
     small = np.stack([resized(one, height, width) for one in mask])
@@ -63,17 +76,22 @@ def resized_views(images: dict[str, np.ndarray], mask: np.ndarray, height: int, 
 
 
 def over_white(linear: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """(h, w, 3) sRGB-encoded over white, of linear straight color (h, w, 3) and coverage (h, w): as viewers composite."""
+    """(h, w, 3) sRGB-encoded over white, of linear straight color (h, w, 3) and coverage (h, w): as viewers
+    composite."""
     return np.clip(srgb_from_linear(linear), 0, 1) * mask[..., None] + (1 - mask[..., None])
 
 
-def color_metrics(color: np.ndarray, mask: np.ndarray, true_color: np.ndarray, true_mask: np.ndarray) -> dict[str, float]:
+def color_metrics(
+    color: np.ndarray, mask: np.ndarray, true_color: np.ndarray, true_mask: np.ndarray
+) -> dict[str, float]:
     """PSNR and SSIM of k pictures, each one's figure and then the mean; (k, h, w, 3) linear and (k, h, w) coverage.
 
     *_published: over white, full frame, at 256^2. *_masked: in the stored encoding over the pixels that lie wholly on
     the reference's object, at the pictures' size; where the result has nothing it is black.
     """
-    out: dict[str, list[float]] = {name: [] for name in ("psnr_published", "ssim_published", "psnr_masked", "ssim_masked")}
+    out: dict[str, list[float]] = {
+        name: [] for name in ("psnr_published", "ssim_published", "psnr_masked", "ssim_masked")
+    }
     for a, m, b, n in zip(color, mask, true_color, true_mask, strict=True):
         small, true_small = (resized(over_white(x, y), PUBLISHED_SIZE, PUBLISHED_SIZE) for x, y in ((a, m), (b, n)))
         out["psnr_published"].append(psnr(small, true_small))
@@ -108,7 +126,8 @@ def normal_degrees(normal: np.ndarray, mask: np.ndarray, true_normal: np.ndarray
 
 
 def depth_error(depth: np.ndarray, mask: np.ndarray, true_depth: np.ndarray, true_mask: np.ndarray) -> float:
-    """Mean absolute difference over the pixels that lie on the object in both, in world units (the object's size is 1)."""
+    """Mean absolute difference over the pixels that lie on the object in both, in world units (the object's size is
+    1)."""
     where = common(mask, true_mask)
     return float(np.abs(np.asarray(depth, np.float64) - true_depth)[where].mean()) if where.any() else float("nan")
 
@@ -119,8 +138,9 @@ def mask_iou(mask: np.ndarray, true_mask: np.ndarray) -> float:
     return float(both / either) if either > 0 else 1.0
 
 
-def views_metrics(images: dict[str, np.ndarray], mask: np.ndarray, true_images: dict[str, np.ndarray],
-                  true_mask: np.ndarray) -> dict[str, float]:
+def views_metrics(
+    images: dict[str, np.ndarray], mask: np.ndarray, true_images: dict[str, np.ndarray], true_mask: np.ndarray
+) -> dict[str, float]:
     """All figures of k views against k reference views, over the domains that both have (Views.images, Views.mask).
 
     Of albedo only the masked protocol is told: there is no published one.

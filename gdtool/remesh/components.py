@@ -1,4 +1,5 @@
-"""A mesh of several pieces: the small ones apart from the large, and where all fail together, those that fail one by one."""
+"""A mesh of several pieces: the small ones apart from the large, and where all fail together, those that fail one by
+one."""
 
 from __future__ import annotations
 
@@ -7,21 +8,24 @@ import numpy as np
 from gdtool.geometry import topology
 from gdtool.geometry.distance import closest_points
 from gdtool.remesh.engines.candidate import Candidate, judged
-from gdtool.remesh.fit.shaping import CUT_OFF, drawn, fault_of, outlined, settled
-from gdtool.remesh.fallback.pair_and_split import split_count
-from gdtool.remesh.task import COUNT_TOLERANCE, Part
 from gdtool.remesh.engines.search import Found
+from gdtool.remesh.fallback.pair_and_split import split_count
+from gdtool.remesh.fit.shaping import CUT_OFF, drawn, fault_of, outlined, settled
+from gdtool.remesh.task import COUNT_TOLERANCE, Part
 
 SMALL_PIECE_QUADS = 48
 _MOST_ALONE, _ALONE, _FEWEST = 16, 300, 6  # pieces that are remeshed one by one; quads of one that is, and of any
-# Of the quads of a piece, that there may be more or fewer in any case, and at most; the rest of the tolerance goes by the root of their number.
+# Of the quads of a piece, that there may be more or fewer in any case, and at most; the rest of the tolerance goes by
+# the root of their number.
 _SURELY, _MOST_OFF = 0.02, 0.15
 _MADE_UP = 0.5  # of the quads of the other pieces, that these may have more or fewer of than their share
-_ON_ONE, _MOST_APART = 0.9, 1.5  # of a component's quads lie on the piece that they stand for; edge lengths that a piece strays
+# Of a component's quads lie on the piece that they stand for; edge lengths that a piece strays.
+_ON_ONE, _MOST_APART = 0.9, 1.5
 
 
 def by_size(part: Part) -> tuple[Part | None, Part]:
-    """The small pieces as one mesh, None where there are none, and the large ones as another, each with its share of the quads by area."""
+    """The small pieces as one mesh, None where there are none, and the large ones as another, each with its share of
+    the quads by area."""
     (count, piece), quads = part.pieces, part.quads
     share = part.piece_areas / part.piece_areas.sum()
     small = share * quads < SMALL_PIECE_QUADS
@@ -35,23 +39,35 @@ def by_size(part: Part) -> tuple[Part | None, Part]:
 
 
 def well_made(part: Part, whole: Candidate | None) -> tuple[Found | None, np.ndarray]:
-    """Of an engine's quads of all pieces those of the pieces on which they stand up to judgement, finished; which these are (pieces,) bool."""
+    """Of an engine's quads of all pieces those of the pieces on which they stand up to judgement, finished; which these
+    are (pieces,) bool."""
     (count, piece), good = part.pieces, np.zeros(part.pieces[0], bool)
     if whole is None or count > part.quads / SMALL_PIECE_QUADS:
         return None, good
     parts = [part.of(piece == k, 0) for k in range(count)]
-    quads = [judged(*quads, topology.invariants(own.faces)) for own, quads in zip(parts, quads_by_piece(whole.vertices, whole.quads, part), strict=True)]
+    quads = [
+        judged(*quads, topology.invariants(own.faces))
+        for own, quads in zip(parts, quads_by_piece(whole.vertices, whole.quads, part), strict=True)
+    ]
     good[:] = [fault is None for fault, _, _ in quads]
     if not good.any():
         return None, good
     of_these = whole.drawn
     if of_these is None or not good.all():
         these = part.of(good[piece], part.quads)
-        outline = outlined(*joined([own[1:] for own, fits in zip(quads, good, strict=True) if fits]), these.surface, these.features, 0, part.request)
+        outline = outlined(
+            *joined([own[1:] for own, fits in zip(quads, good, strict=True) if fits]),
+            these.surface,
+            these.features,
+            0,
+            part.request,
+        )
         of_these = drawn(outline, these.surface, these.features, part.request)
     made = quads_by_piece(*settled(*of_these, part.fine(), part.request), part)
     for k in np.flatnonzero(good):
-        good[k] = len(made[k][1]) > 0 and fault_of(*made[k], parts[k].surface, part.edge, _MOST_APART, CUT_OFF)[0] is None
+        good[k] = (
+            len(made[k][1]) > 0 and fault_of(*made[k], parts[k].surface, part.edge, _MOST_APART, CUT_OFF)[0] is None
+        )
     if not good.any():
         return None, good
     found = *joined([made[k] for k in np.flatnonzero(good)]), whole.way.label
@@ -62,11 +78,12 @@ def well_made(part: Part, whole: Candidate | None) -> tuple[Found | None, np.nda
 
 
 def apart(part: Part, done: np.ndarray, quads: int) -> list[Part]:
-    """What is left to do of the pieces that are not done (pieces,) bool, in so many quads: each large one, and, given up, all others together.
+    """What is left to do of the pieces that are not done (pieces,) bool, in so many quads: each large one, and, given
+    up, all others together.
 
-    What lies close together an engine may join, and what is thin it may lose beside the rest, so that it may do better on one piece alone.
-    It comes less near to a count of few; what their counts may be off is shared such that the sum of all pieces still holds.
-    """
+    What lies close together an engine may join, and what is thin it may lose beside the rest, so that it may do better
+    on one piece alone. It comes less near to a count of few; what their counts may be off is shared such that the sum
+    of all pieces still holds."""
     if done.all():
         return []
     count, piece = part.pieces
@@ -84,11 +101,15 @@ def apart(part: Part, done: np.ndarray, quads: int) -> list[Part]:
     own = np.maximum((own * (quads / max(own.sum(), 1))).round().astype(int), _FEWEST)
     spare = max(COUNT_TOLERANCE * part.quads - _SURELY * own.sum(), 0)
     tolerance = np.minimum(_SURELY + spare * np.sqrt(own) / np.sqrt(own).sum() / own, _MOST_OFF)
-    return out + [part.of(piece == k, int(number), tolerance=float(off)) for k, number, off in zip(alone, own, tolerance, strict=True)]
+    return out + [
+        part.of(piece == k, int(number), tolerance=float(off))
+        for k, number, off in zip(alone, own, tolerance, strict=True)
+    ]
 
 
 def quads_by_piece(vertices: np.ndarray, quads: np.ndarray, part: Part) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Vertices and quads of each piece: of the components of a quad mesh those that lie on it; what lies on two is nobody's."""
+    """Vertices and quads of each piece: of the components of a quad mesh those that lie on it; what lies on two is
+    nobody's."""
     (count, piece), (components, label) = part.pieces, topology.components(quads)
     on = piece[closest_points(vertices[quads].mean(1), part.vertices, part.faces)[1]]
     share = np.zeros((components, count))
@@ -100,4 +121,6 @@ def quads_by_piece(vertices: np.ndarray, quads: np.ndarray, part: Part) -> list[
 def joined(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Meshes as one."""
     offset = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
-    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate([faces + o for (_, faces), o in zip(parts, offset, strict=False)])
+    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(
+        [faces + o for (_, faces), o in zip(parts, offset, strict=False)]
+    )

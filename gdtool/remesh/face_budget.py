@@ -7,23 +7,24 @@ from dataclasses import replace
 
 import numpy as np
 
-from gdtool.remesh.task import Record, Request
-from gdtool.remesh.pipeline import remesh
 from gdtool.geometry.simplify import deviation
 from gdtool.geometry.topology import triangulated
+from gdtool.remesh.pipeline import remesh
+from gdtool.remesh.task import Record, Request
 
 _FEWEST = 64
 _CLOSE_ENOUGH = 1.15  # counts nearer than this to each other are not told apart
 _MOST_RUNS = 6
 
 
-def coarsest(vertices: np.ndarray, faces: np.ndarray, request: Request, limit: float,
-             way: Callable[..., tuple] | None = None) -> tuple[np.ndarray, np.ndarray, Record, float]:
+def coarsest(
+    vertices: np.ndarray, faces: np.ndarray, request: Request, limit: float, way: Callable[..., tuple] | None = None
+) -> tuple[np.ndarray, np.ndarray, Record, float]:
     """The fewest quads, at most request.quads, that stay within `limit` of the surface, and the distance they reach.
 
     The distance is of vertices of both meshes to the other surface (simplify.deviation). It falls about as one over the
-    number of quads, which tells the next number to try; when even request.quads are too few they are returned. way: what makes quads, called as remesh is.
-    """
+    number of quads, which tells the next number to try; when even request.quads are too few they are returned. way:
+    what makes quads, called as remesh is."""
     too_few, enough = min(_FEWEST, request.quads) / _CLOSE_ENOUGH, None
     quads = request.quads
     for _ in range(_MOST_RUNS):

@@ -1,4 +1,5 @@
-"""Triangles to quads: simplified to what the quads can show, an engine's quads of the whole or of its pieces, and the fallback."""
+"""Triangles to quads: simplified to what the quads can show, an engine's quads of the whole or of its pieces, and the
+fallback."""
 
 from __future__ import annotations
 
@@ -11,16 +12,16 @@ import numpy as np
 
 from gdtool.core.child import prepare
 from gdtool.geometry.normals import face_normals
-from gdtool.remesh.fallback.smoothed import split
-from gdtool.remesh.fit.shaping import farthest
-from gdtool.remesh.components import SMALL_PIECE_QUADS, apart, by_size, joined, well_made
-from gdtool.remesh.fit.surface_projection import Surface
-from gdtool.remesh.fallback.pair_and_split import of_own, split_count
-from gdtool.remesh.spacing import spread
-from gdtool.remesh.task import Part, Record, Request
-from gdtool.remesh.engines.search import Found, Trial, prepare_engines
 from gdtool.geometry.simplify import CHILD_MODULES, SHAKEN, median_edge, reduced, simplify
 from gdtool.geometry.topology import even
+from gdtool.remesh.components import SMALL_PIECE_QUADS, apart, by_size, joined, well_made
+from gdtool.remesh.engines.search import Found, Trial, prepare_engines
+from gdtool.remesh.fallback.pair_and_split import of_own, split_count
+from gdtool.remesh.fallback.smoothed import split
+from gdtool.remesh.fit.shaping import farthest
+from gdtool.remesh.fit.surface_projection import Surface
+from gdtool.remesh.spacing import spread
+from gdtool.remesh.task import Part, Record, Request
 
 _GAP = 8.0  # edge lengths between pieces: none of what is asked of a surface reaches so far
 _FOR_A_HANDLE = 100  # quads: with fewer engines lose some (benchmarks/remesh_nets.py)
@@ -30,9 +31,8 @@ _SHAKEN_OFF = 3.0  # of the noise that keeps triangles even, which moves few of 
 def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[np.ndarray, np.ndarray, Record]:
     """Quads (q, 4) on the surface of a clean triangle mesh (repair.clean), and the record of how.
 
-    vertices (v, 3) in a unit box, faces (f, 3). All faces are quads; closed and manifold where the input is. Pieces that nearly touch
-    are laid apart meanwhile, so that none is drawn onto another.
-    """
+    vertices (v, 3) in a unit box, faces (f, 3). All faces are quads; closed and manifold where the input is. Pieces
+    that nearly touch are laid apart meanwhile, so that none is drawn onto another."""
     if len(faces) > _needed(request):
         prepare(reduced, CHILD_MODULES)
     edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
@@ -43,7 +43,9 @@ def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[n
     return _remeshed(vertices, faces, edge, request)
 
 
-def _remeshed(vertices: np.ndarray, faces: np.ndarray, edge: float, request: Request) -> tuple[np.ndarray, np.ndarray, Record]:
+def _remeshed(
+    vertices: np.ndarray, faces: np.ndarray, edge: float, request: Request
+) -> tuple[np.ndarray, np.ndarray, Record]:
     """remesh() of what is one piece, or of pieces none of which is near another, or that are too many to lay apart."""
     record, fine = Record(), cache(lambda: Surface(vertices, faces))
     whole = _coarse(vertices, faces, edge, request, record, fine)
@@ -66,8 +68,11 @@ def _remeshed(vertices: np.ndarray, faces: np.ndarray, edge: float, request: Req
     return *joined([found[:2] for found in done]), record
 
 
-def _coarse(vertices: np.ndarray, faces: np.ndarray, edge: float, request: Request, record: Record, fine: Callable[[], Surface]) -> Part:
-    """What quads of that edge need of the mesh, its creases restored: collapsed quickly, with care where that strays by more than an edge.
+def _coarse(
+    vertices: np.ndarray, faces: np.ndarray, edge: float, request: Request, record: Record, fine: Callable[[], Surface]
+) -> Part:
+    """What quads of that edge need of the mesh, its creases restored: collapsed quickly, with care where that strays by
+    more than an edge.
 
     What the noise that keeps its triangles even moved is on the surface again.
     """
@@ -77,7 +82,8 @@ def _coarse(vertices: np.ndarray, faces: np.ndarray, edge: float, request: Reque
         error = 0.0
         if len(found) < len(faces):
             away, _, point = fine().closest(out)
-            near = away < _SHAKEN_OFF * SHAKEN * median_edge(vertices, faces)  # what is farther was drawn out to a crease
+            # What is farther was drawn out to a crease.
+            near = away < _SHAKEN_OFF * SHAKEN * median_edge(vertices, faces)
             out[near] = point[near]
             error = float(away.max())
         part = Part(out, found, request.quads, edge, request, fine)
@@ -129,25 +135,47 @@ def _needed(request: Request) -> int:
     return max(3 * request.quads, 20000)
 
 
-def _simplified(vertices: np.ndarray, faces: np.ndarray, edge: float, request: Request, record: Record, careful: bool,
-                fine: Callable[[], Surface]) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh with its creases restored as coarse as quads of that edge need, or the mesh as it was where that cannot be done."""
+def _simplified(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    edge: float,
+    request: Request,
+    record: Record,
+    careful: bool,
+    fine: Callable[[], Surface],
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with its creases restored as coarse as quads of that edge need, or the mesh as it was where that cannot
+    be done."""
 
     def meanwhile() -> None:
-        # Not before: the engines' start would slow what this process does alone, the tree's building holds the interpreter's lock.
+        # Not before: the engines' start would slow what this process does alone, the tree's building holds the
+        # interpreter's lock.
         prepare_engines(request.quads, request)
         fine()
-        for module in ("scipy.spatial", "embreex.mesh_construction", "embreex.rtcore_scene"):  # what comes next would wait for them
+        # What comes next would wait for them.
+        for module in ("scipy.spatial", "embreex.mesh_construction", "embreex.rtcore_scene"):
             import_module(module)
 
     if len(faces) <= _needed(request):
         prepare_engines(request.quads, request)
     # Bevels as wide as the quads are drawn as they are.
     restored = request.restore_creases and median_edge(vertices, faces) < 0.75 * edge
-    found = simplify(vertices, faces, _needed(request), seconds=request.for_the_rest, crease_degrees=request.crease_degrees if restored else 0.0,
-                     closed=lambda: even(faces), careful=careful, even=True, measured=False, meanwhile=meanwhile)
+    found = simplify(
+        vertices,
+        faces,
+        _needed(request),
+        seconds=request.for_the_rest,
+        crease_degrees=request.crease_degrees if restored else 0.0,
+        closed=lambda: even(faces),
+        careful=careful,
+        even=True,
+        measured=False,
+        meanwhile=meanwhile,
+    )
     report = found[3]
-    record.figures |= {"simplified_to": report["faces"]} | ({"crease_vertices_restored": report["creases"]} if restored else {})
+    record.figures |= {"simplified_to": report["faces"]} | (
+        {"crease_vertices_restored": report["creases"]} if restored else {}
+    )
     if "failed" in report:
         record.failed.append(f"simplify: {report['failed']}")
     return found[:2]

@@ -1,4 +1,5 @@
-"""Pieces of a mesh laid out beside one another, so that nothing made of one is drawn onto another that it nearly touches."""
+"""Pieces of a mesh laid out beside one another, so that nothing made of one is drawn onto another that it nearly
+touches."""
 
 from __future__ import annotations
 
@@ -7,7 +8,8 @@ import numpy as np
 from gdtool.geometry import topology
 from gdtool.geometry.distance import closest_points
 
-_MOST_FACES, _MOST_PIECES = 200_000, 1000  # of larger meshes pieces are not looked for; more pieces are left where they are
+# Of larger meshes pieces are not looked for; more pieces are left where they are.
+_MOST_FACES, _MOST_PIECES = 200_000, 1000
 
 
 class Spread:
@@ -25,7 +27,8 @@ class Spread:
 
 
 def spread(vertices: np.ndarray, faces: np.ndarray, gap: float) -> Spread | None:
-    """The pieces in rows, their bounding boxes `gap` apart at least; None where they are so already, or are too many to tell.
+    """The pieces in rows, their bounding boxes `gap` apart at least; None where they are so already, or are too many to
+    tell.
 
     vertices (v, 3), faces (f, 3).
     """

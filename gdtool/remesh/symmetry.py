@@ -1,4 +1,5 @@
-"""Quads that are mirror images of each other: one half remeshed, the other reflected, the seam on the plane between them."""
+"""Quads that are mirror images of each other: one half remeshed, the other reflected, the seam on the plane between
+them."""
 
 from __future__ import annotations
 
@@ -7,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from gdtool.geometry import topology
-from gdtool.remesh.fit.feature_curves import Constraints, Features
 from gdtool.geometry.mesh_quality import scaled_jacobian
 from gdtool.geometry.normals import face_normals
+from gdtool.geometry.sharpen import restore_creases
+from gdtool.remesh.fit.feature_curves import Constraints, Features
 from gdtool.remesh.fit.surface_projection import Surface, fill_holes, remove_doublets
-from gdtool.remesh.task import Record, Request
 from gdtool.remesh.fit.untangle import unfold
 from gdtool.remesh.pipeline import remesh
-from gdtool.geometry.sharpen import restore_creases
+from gdtool.remesh.task import Record, Request
 
 _TOLERANCE_EDGES, _TOLERANCE_SIDE = 0.25, 0.004  # of the quads' side, of the longest side: halves farther apart differ
 _SNAP_EDGES = 1e-3  # vertices of the input nearer to the plane, in its own edge lengths, are on it
@@ -24,18 +25,23 @@ _INSIDE_EDGES = 0.05  # other vertices keep this far from the plane
 AXES = "xyz"
 
 
-def mirror_plane(vertices: np.ndarray, faces: np.ndarray, quads: int, axes: str = AXES,
-                 limit: int = 8000) -> tuple[int | None, dict[str, float]]:
-    """The axis (0, 1, 2) about whose plane through the origin the mesh is its own mirror image, the best of `axes`, or None;
-    and for each the largest distance of reflected vertices to the surface.
+def mirror_plane(
+    vertices: np.ndarray, faces: np.ndarray, quads: int, axes: str = AXES, limit: int = 8000
+) -> tuple[int | None, dict[str, float]]:
+    """The axis (0, 1, 2) about whose plane through the origin the mesh is its own mirror image, the best of `axes`, or
+    None; and for each the largest distance of reflected vertices to the surface.
 
-    vertices (v, 3) in a unit box about the origin. What would be finer than a quarter of one of the quads does not count.
-    """
+    vertices (v, 3) in a unit box about the origin. What would be finer than a quarter of one of the quads does not
+    count."""
     edge = (face_normals(vertices, faces)[1].sum() / quads) ** 0.5
     surface = Surface(vertices, faces)
     points = vertices[np.unique(faces)]
-    points = points[::max(len(points) // limit, 1)]
-    far = {AXES[i]: float(surface.closest(points * np.where(np.arange(3) == i, -1.0, 1.0))[0].max()) for i in range(3) if AXES[i] in axes}
+    points = points[:: max(len(points) // limit, 1)]
+    far = {
+        AXES[i]: float(surface.closest(points * np.where(np.arange(3) == i, -1.0, 1.0))[0].max())
+        for i in range(3)
+        if AXES[i] in axes
+    }
     best = min(far, key=far.__getitem__)
     return (AXES.index(best) if far[best] <= min(_TOLERANCE_EDGES * edge, _TOLERANCE_SIDE) else None), far
 
@@ -64,11 +70,14 @@ def half_of(vertices: np.ndarray, faces: np.ndarray, axis: int) -> tuple[np.ndar
     ring = np.stack([np.where(sign[split] >= 0, split, -1), crossing], -1).reshape(-1, 6)
     ring = np.take_along_axis(ring, np.argsort(ring < 0, 1, kind="stable"), 1)
     more = ring[:, 3] >= 0
-    return topology.compact(np.concatenate([vertices, added]), np.concatenate([whole, ring[:, :3], ring[more][:, [0, 2, 3]]]))
+    return topology.compact(
+        np.concatenate([vertices, added]), np.concatenate([whole, ring[:, :3], ring[more][:, [0, 2, 3]]])
+    )
 
 
-def joined_with_mirror(vertices: np.ndarray, quads: np.ndarray, axis: int, edge: float,
-                       surface: Surface | None = None) -> tuple[np.ndarray, np.ndarray]:
+def joined_with_mirror(
+    vertices: np.ndarray, quads: np.ndarray, axis: int, edge: float, surface: Surface | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """A half of quads (q, 4) and its reflection as one mesh; rim vertices near the plane are drawn onto it and shared.
 
     Quads that this folds are unfolded on `surface`.
@@ -97,7 +106,9 @@ def joined_with_mirror(vertices: np.ndarray, quads: np.ndarray, axis: int, edge:
     return remove_doublets(np.concatenate([vertices, reflected]), np.concatenate([quads, turned]))
 
 
-def remesh_mirrored(vertices: np.ndarray, faces: np.ndarray, request: Request, axis: int) -> tuple[np.ndarray, np.ndarray, Record]:
+def remesh_mirrored(
+    vertices: np.ndarray, faces: np.ndarray, request: Request, axis: int
+) -> tuple[np.ndarray, np.ndarray, Record]:
     """As quads.remesh, the quads being their own mirror image about the plane through the origin across `axis`.
 
     Where the halves do not close, the whole is remeshed as it is, and the record says so (figure "symmetry" is "none").
@@ -108,7 +119,10 @@ def remesh_mirrored(vertices: np.ndarray, faces: np.ndarray, request: Request, a
         fine_vertices, fine_faces, report = restore_creases(vertices, faces, request.crease_degrees)
         moved = report["moved"]
     half = half_of(fine_vertices, fine_faces, axis)
-    out, quads, record = remesh(*half, replace(request, quads=max(request.quads // 2, 8), restore_creases=False, least_jacobian=_LEAST_JACOBIAN / 2))
+    out, quads, record = remesh(
+        *half,
+        replace(request, quads=max(request.quads // 2, 8), restore_creases=False, least_jacobian=_LEAST_JACOBIAN / 2),
+    )
     out, quads = joined_with_mirror(out, quads, axis, edge, record.source or Surface(*half))
     if moved is not None:
         record.figures["crease_vertices_restored"] = moved
@@ -116,7 +130,9 @@ def remesh_mirrored(vertices: np.ndarray, faces: np.ndarray, request: Request, a
     if topology.is_watertight(faces):
         out, quads = fill_holes(out, quads)
         fault = None if topology.is_watertight(quads) else "it does not close along the plane"
-        fault = fault or (None if topology.components(quads)[0] == topology.components(faces)[0] else "pieces are lost or joined")
+        fault = fault or (
+            None if topology.components(quads)[0] == topology.components(faces)[0] else "pieces are lost or joined"
+        )
     if fault is None and not topology.is_manifold(quads):
         fault = "it is not manifold"
     if fault is None and scaled_jacobian(out, quads).min() <= 0 and request.smooth_iterations:

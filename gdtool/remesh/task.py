@@ -11,11 +11,11 @@ import numpy as np
 
 from gdtool.geometry import topology
 from gdtool.geometry.distance import sample_surface
-from gdtool.remesh.fit.feature_curves import Features, find_features
 from gdtool.geometry.normals import face_normals
-from gdtool.remesh.fit.surface_projection import Surface
 from gdtool.geometry.rays import RayCaster
 from gdtool.geometry.vectors import dot
+from gdtool.remesh.fit.feature_curves import Features, find_features
+from gdtool.remesh.fit.surface_projection import Surface
 
 COUNT_TOLERANCE = 0.03
 QUADS_OF_A_PIECE = 12  # at least
@@ -25,19 +25,22 @@ _NARROW_EDGES, _FEW_NARROW = 1.5, 0.05  # share of the creases' length
 _WALL_EDGES, _PARALLEL, _FEW_THIN = 2.0, 0.9, 7e-4  # cosine between the two sides of a wall; share of the surface
 _RAYS, _OFF = 20_000, 1e-4  # edge lengths under the surface that they start
 _FEATURE_EDGES = 3  # quads long: shorter creases are noise
-_FACES_OF_A_HANDLE = 40  # about as few as were found to keep one: 40 of a torus of one handle, 21 a handle of a lattice of 28
+# About as few as were found to keep one: 40 of a torus of one handle, 21 a handle of a lattice of 28.
+_FACES_OF_A_HANDLE = 40
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for: about `quads` faces; creases sharper than crease_degrees followed; time limit of the whole, memory limit of a child."""
+    """What is asked for: about `quads` faces; creases sharper than crease_degrees followed; time limit of the whole,
+    memory limit of a child."""
 
     quads: int = 20000
     crease_degrees: float = 30.0
     engine: str = "auto"
     smooth_iterations: int = 5
     restore_creases: bool = True
-    seconds: float = 120.0  # from when the request is made; engines have a share of them, the rest is for what needs none
+    # From when the request is made; engines have a share of them, the rest is for what needs none.
+    seconds: float = 120.0
     memory_mb: int = 16000
     least_jacobian: float = 0.0  # a coarser mesh subdivided is passed over where its worst quad is worse
     begun: float = field(default_factory=time.monotonic)
@@ -81,8 +84,8 @@ class Record:
 def count_reason(faces: np.ndarray, made: int, asked: int, tried: list[str], of_a_piece: int = QUADS_OF_A_PIECE) -> str:
     """Why a mesh got `made` faces and not those asked for, as far as that is known.
 
-    faces (f, 3): the manifold that they were made from; tried: what failed on the way; of_a_piece: the fewest faces of a piece.
-    """
+    faces (f, 3): the manifold that they were made from; tried: what failed on the way; of_a_piece: the fewest faces of
+    a piece."""
     pieces = topology.components(faces)[0]
     if made < asked:
         reason = "no way that was tried came nearer to the count"
@@ -111,7 +114,15 @@ class Part:
 
     def of(self, faces: np.ndarray, quads: int, given_up: bool = False, tolerance: float = COUNT_TOLERANCE) -> Part:
         """Some of the triangles: faces (f,) bool."""
-        return Part(*topology.compact(self.vertices, self.faces[faces]), quads, self.edge, self.request, self.fine, given_up, tolerance)
+        return Part(
+            *topology.compact(self.vertices, self.faces[faces]),
+            quads,
+            self.edge,
+            self.request,
+            self.fine,
+            given_up,
+            tolerance,
+        )
 
     def counted(self, count: int, wanted: float) -> bool:
         """Whether so many quads are about as many as wanted."""
@@ -142,14 +153,15 @@ class Part:
 
     @cached_property
     def narrow(self) -> bool:
-        """Whether more than a few creases lie in pairs closer together than _NARROW_EDGES, as on thin plates and small bevels; not asked of
-        what has more triangles than quads."""
+        """Whether more than a few creases lie in pairs closer together than _NARROW_EDGES, as on thin plates and small
+        bevels; not asked of what has more triangles than quads."""
         return len(self.faces) < self.quads and self.features.in_strips(_NARROW_EDGES * self.edge) > _FEW_NARROW
 
     @cached_property
     def thin(self) -> bool:
-        """Whether more than a little of the surface bounds walls thinner than two quads are wide, as rays into it tell. Wedges are none;
-        not asked of what has fewer triangles than quads, as a coarser mesh may do there all the same."""
+        """Whether more than a little of the surface bounds walls thinner than two quads are wide, as rays into it tell.
+        Wedges are none; not asked of what has fewer triangles than quads, as a coarser mesh may do there all the
+        same."""
         if len(self.faces) < self.quads:
             return False
         points, face_idx = sample_surface(self.vertices, self.faces, _RAYS, np.random.default_rng(0))[:2]
@@ -161,4 +173,6 @@ class Part:
 
     @cached_property
     def features(self) -> Features:
-        return find_features(self.vertices, self.faces, self.request.crease_degrees or 181.0, _FEATURE_EDGES * self.edge)
+        return find_features(
+            self.vertices, self.faces, self.request.crease_degrees or 181.0, _FEATURE_EDGES * self.edge
+        )

@@ -1,10 +1,10 @@
 """Mesh with texture coordinates to an engine-ready asset: maps from the surface it came from, .glb, quad .obj, OpenUSD.
 
 Use it after unwrap. Base color, occlusion-roughness-metallic and tangent-space normals are read texel by texel from the
-surface: from its confident views where there are any (found along the provenance chain), else from its vertices, or from
-the textures of the model that was remeshed. The picture that sample-views made the views of adds what it shows finer than
-they. Maps that would be constant become factors, a flat normal map is left out. Without --size a texel is as fine as the
-source's detail: a texel of its textures, half a pixel of its views, a pixel of the picture.
+surface: from its confident views where there are any (found along the provenance chain), else from its vertices, or
+from the textures of the model that was remeshed. The picture that sample-views made the views of adds what it shows
+finer than they. Maps that would be constant become factors, a flat normal map is left out. Without --size a texel is as
+fine as the source's detail: a texel of its textures, half a pixel of its views, a pixel of the picture.
 
 Example:
   gdtool bake cat.asset/atlas --size 2048 --lods 4
@@ -25,20 +25,60 @@ from gdtool.core.stage import MOST_SEED, Inputs, Output, SecondInput, Stage, fil
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of bake."""
 
-    size: Annotated[int, Meta(ge=16, le=16384, description="width and height of the maps in texels; without it what the source's detail needs, 256 to 4096")] | None = None
-    samples: Annotated[int, Meta(ge=1, le=64, description="samples per texel where neighbouring texels differ: 1, 4, 9, …; without it 4 where a texel is much wider than the source's detail, else 1")] | None = None
+    size: (
+        Annotated[
+            int,
+            Meta(
+                ge=16,
+                le=16384,
+                description="width and height of the maps in texels; without it what the source's detail needs, 256 to 4096",
+            ),
+        ]
+        | None
+    ) = None
+    samples: (
+        Annotated[
+            int,
+            Meta(
+                ge=1,
+                le=64,
+                description="samples per texel where neighbouring texels differ: 1, 4, 9, …; without it 4 where a texel is much wider than the source's detail, else 1",
+            ),
+        ]
+        | None
+    ) = None
     ao: Annotated[bool, Meta(description="trace ambient occlusion")] = True
     ao_rays: Annotated[int, Meta(ge=1, le=65536, description="rays per traced point of ambient occlusion")] = 64
     padding: Annotated[int, Meta(ge=0, le=16384, description="texels of gutter around charts; 0: all that is free")] = 0
     bits: Annotated[int, Meta(ge=8, le=16, multiple_of=8, description="bits per channel of the maps, 8 or 16")] = 8
-    normal_map: Annotated[Literal["auto", "on", "off"], Meta(description="auto leaves it out where it would be flat")] = "auto"
-    normal_convention: Annotated[Literal["opengl", "directx"], Meta(description="green channel of normal.png; .glb is always opengl")] = "opengl"
-    project_views: Annotated[bool, Meta(description="read materials from the views where they see the surface well")] = True
-    height: Annotated[bool, Meta(description="write height.png as well: where the source lies above the mesh, 16 bits")] = False
+    normal_map: Annotated[
+        Literal["auto", "on", "off"], Meta(description="auto leaves it out where it would be flat")
+    ] = "auto"
+    normal_convention: Annotated[
+        Literal["opengl", "directx"], Meta(description="green channel of normal.png; .glb is always opengl")
+    ] = "opengl"
+    project_views: Annotated[
+        bool, Meta(description="read materials from the views where they see the surface well")
+    ] = True
+    height: Annotated[
+        bool, Meta(description="write height.png as well: where the source lies above the mesh, 16 bits")
+    ] = False
     confidence: Annotated[bool, Meta(description="write confidence.png as well: how sure each texel is")] = False
-    lods: Annotated[int, Meta(ge=1, le=8, description="levels of detail, the full one counted; each has half the triangles of the one before, all share the maps")] = 1
-    usd: Annotated[Literal["none", "usda", "usdz"], Meta(description="write OpenUSD with UsdPreviewSurface as well (needs usd-core)")] = "none"
-    source_frame: Annotated[bool, Meta(description="write vertices in the source's own frame instead of the normalised one")] = False
+    lods: Annotated[
+        int,
+        Meta(
+            ge=1,
+            le=8,
+            description="levels of detail, the full one counted; each has half the triangles of the one before, all share the maps",
+        ),
+    ] = 1
+    usd: Annotated[
+        Literal["none", "usda", "usdz"],
+        Meta(description="write OpenUSD with UsdPreviewSurface as well (needs usd-core)"),
+    ] = "none"
+    source_frame: Annotated[
+        bool, Meta(description="write vertices in the source's own frame instead of the normalised one")
+    ] = False
     model: file_option("model or mesh file, with its textures, to bake from instead of the surface") = None
     seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="seed of the occlusion rays")] = 0
 
@@ -57,9 +97,9 @@ def check(inputs: Inputs, options: Options) -> None:
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Bake one atlas."""
-    from gdtool.bake.pipeline import bake, occlusion_tracer
     from gdtool.bake.maps import make_maps
     from gdtool.bake.occlusion import bake_occlusion
+    from gdtool.bake.pipeline import bake, occlusion_tracer
     from gdtool.bake.reproject import vertex_reach
     from gdtool.bake.target import texel_width, texels_of
 
@@ -72,10 +112,15 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         origin = _read_origin(inputs, options, matrix, target, out)
         few = slice(None, None, max(1, len(target.faces) // 5000))
         if origin.source.turn_to(target.vertices[target.faces[few]].mean(1), target.normals[few].mean(1)):
-            out.warn(f"{inputs.name}: what it is baked from is inside out beside it; the faces are taken the other way round")
+            out.warn(
+                f"{inputs.name}: what it is baked from is inside out beside it; the faces are taken the other way round"
+            )
     size, samples = _fineness(options, target, origin.detail)
     if options.samples is None and samples == 1:
-        out.skip("more samples", f"a texel is {texel_width(target, size) / max(origin.detail, 1e-12):.2g} times as wide as the source's detail: one stands for it")
+        out.skip(
+            "more samples",
+            f"a texel is {texel_width(target, size) / max(origin.detail, 1e-12):.2g} times as wide as the source's detail: one stands for it",
+        )
     _check_memory(inputs, size)
     with out.step("rasterise"):
         texels = texels_of(target, size, threads=out.threads)
@@ -83,24 +128,49 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             raise InputError(_path(inputs), "its texture coordinates cover no texel", "run gdtool unwrap")
     with out.step("bake"):
         reach = vertex_reach(target.vertices, target.faces, origin.source)
-        baked = bake(target, texels, origin.source, origin.lookup, reach, samples=samples, threads=out.threads, progress=out.progress,
-                     height=options.height, confidence=options.confidence)
+        baked = bake(
+            target,
+            texels,
+            origin.source,
+            origin.lookup,
+            reach,
+            samples=samples,
+            threads=out.threads,
+            progress=out.progress,
+            height=options.height,
+            confidence=options.confidence,
+        )
     occlusion = None
     if options.ao:
         with out.step("occlusion"):
-            trace = occlusion_tracer(target, origin.source, reach, origin.normals, options.ao_rays, options.seed, out.threads)
+            trace = occlusion_tracer(
+                target, origin.source, reach, origin.normals, options.ao_rays, options.seed, out.threads
+            )
             occlusion = bake_occlusion(target, texels, trace, threads=out.threads)
     else:
         out.skip("occlusion", "left out by --no-ao")
     with out.step("maps"):
-        maps = make_maps(texels, baked.values, occlusion=occlusion, bits=options.bits, padding=options.padding or None, normal_map=options.normal_map,
-                         threads=out.threads, **({"least_alpha": origin.alpha_cutoff} if origin.alpha_mode == "MASK" else {}))
+        maps = make_maps(
+            texels,
+            baked.values,
+            occlusion=occlusion,
+            bits=options.bits,
+            padding=options.padding or None,
+            normal_map=options.normal_map,
+            threads=out.threads,
+            **({"least_alpha": origin.alpha_cutoff} if origin.alpha_mode == "MASK" else {}),
+        )
     for what, reason, seconds in maps.skipped:
         out.skip(what, reason, seconds)
     if options.normal_map == "off":
         out.skip("normal map", "left out by --normal-map off")
-    report = {**baked.report, "seen_share": 0.0 if baked.seen is None else float((baked.seen[:texels.inside] > 0.5).mean()),
-              "materials_from": origin.label, "detail": origin.detail, "samples": samples}
+    report = {
+        **baked.report,
+        "seen_share": 0.0 if baked.seen is None else float((baked.seen[: texels.inside] > 0.5).mean()),
+        "materials_from": origin.label,
+        "detail": origin.detail,
+        "samples": samples,
+    }
     levels = []
     if options.lods > 1:
         with out.step("levels of detail"):
@@ -115,8 +185,8 @@ _FEWER = 0.9  # of the level before: what cannot come down to what is asked is w
 
 def _levels(target, count: int, out: Output, report: dict) -> list:
     """The coarser targets, finest first; what they cost in place goes to report."""
-    from gdtool.core.threads import mapped
     from gdtool.bake.lods import coarser, drift
+    from gdtool.core.threads import mapped
 
     counts = [max(len(target.faces) >> k, 4) for k in range(1, count)]
     levels, most = [], len(target.faces)
@@ -129,7 +199,10 @@ def _levels(target, count: int, out: Output, report: dict) -> list:
             continue
         slid = drift(level, target)
         if slid["drift_mean"] > _MOST_DRIFT:
-            out.skip(f"level of {wanted} triangles", f"it would slide {100 * slid['drift_mean']:.1f} % of the extent on the maps")
+            out.skip(
+                f"level of {wanted} triangles",
+                f"it would slide {100 * slid['drift_mean']:.1f} % of the extent on the maps",
+            )
             continue
         most = len(level.faces)
         if most > 1.5 * wanted:
@@ -148,17 +221,27 @@ def _check_memory(inputs: Inputs, size: int) -> None:
     """Raise ResourceError when the maps will not fit into memory, rather than be killed half-way."""
     from pathlib import Path
 
-    needed = 130 * size * size  # bytes per texel, measured by benchmarks/bake.py at 2048 and 4096 on an atlas that is 72 % covered
+    # Bytes per texel, measured by benchmarks/bake.py at 2048 and 4096 on an atlas that is 72 % covered.
+    needed = 130 * size * size
     try:
-        free = next(int(line.split()[1]) * 1024 for line in Path("/proc/meminfo").read_text().splitlines() if line.startswith("MemAvailable"))
+        free = next(
+            int(line.split()[1]) * 1024
+            for line in Path("/proc/meminfo").read_text().splitlines()
+            if line.startswith("MemAvailable")
+        )
     except (OSError, StopIteration):
         return
     if needed > free:
-        raise ResourceError(inputs.name, f"maps of {size} texels need about {needed / 2**30:.0f} GB of memory, {free / 2**30:.0f} GB are free", "lower --size")
+        raise ResourceError(
+            inputs.name,
+            f"maps of {size} texels need about {needed / 2**30:.0f} GB of memory, {free / 2**30:.0f} GB are free",
+            "lower --size",
+        )
 
 
 def _read_mesh(inputs: Inputs, options: Options):
-    """The mesh to bake for, in the normalised frame and with texture coordinates, and the (4, 4) matrix to its source's frame.
+    """The mesh to bake for, in the normalised frame and with texture coordinates, and the (4, 4) matrix to its source's
+    frame.
 
     A file may be in either frame: one that fills the unit box is taken to be normalised, like the surface it is baked
     from; another one to be in the source's frame.
@@ -174,7 +257,9 @@ def _read_mesh(inputs: Inputs, options: Options):
     if hasattr(main, "content"):
         mesh, matrix = read_mesh(main), np.array(main.content.source_from_world).reshape(4, 4)
     elif isinstance(main, str):
-        raise InputError(main, "has no texture coordinates of its own to bake into", "run gdtool remesh and gdtool unwrap first")
+        raise InputError(
+            main, "has no texture coordinates of its own to bake into", "run gdtool remesh and gdtool unwrap first"
+        )
     else:
         if main.suffix.lower() == ".obj":
             mesh = read_obj(main)
@@ -195,7 +280,9 @@ def _read_mesh(inputs: Inputs, options: Options):
         if surface is None or not normalised:
             mesh = dataclasses.replace(mesh, vertices=transform_points(invert_similarity(matrix), mesh.vertices))
     if np.abs(mesh.uv).max() > 64:
-        raise InputError(_path(inputs), f"has texture coordinates as large as {np.abs(mesh.uv).max():g}", "run gdtool unwrap")
+        raise InputError(
+            _path(inputs), f"has texture coordinates as large as {np.abs(mesh.uv).max():g}", "run gdtool unwrap"
+        )
     return mesh, matrix
 
 
@@ -205,9 +292,9 @@ def _read_origin(inputs: Inputs, options: Options, matrix, target, out: Output):
 
     surface, views = inputs.second["surface"], inputs.second["views"]
     if options.model is None and surface is not None:
+        from gdtool.bake.origin import material_field
         from gdtool.folders.surface import read_surface
         from gdtool.folders.views import read_views
-        from gdtool.bake.origin import material_field
 
         read = None
         if not options.project_views:
@@ -222,7 +309,9 @@ def _read_origin(inputs: Inputs, options: Options, matrix, target, out: Output):
         known = surface.content.field and not (read and {"albedo", "roughness", "metallic"} <= set(read.images))
         field = material_field(surface.file("field.safetensors"), out.device) if known else None
         read = read if read is not None and read.images else None
-        return from_surface(read_surface(surface), read, field, None if read is None else _read_picture(views, read, out))
+        return from_surface(
+            read_surface(surface), read, field, None if read is None else _read_picture(views, read, out)
+        )
     named = _named_model(inputs, options)
     from gdtool.assets.load import load_scene
     from gdtool.bake.target import texel_width
@@ -248,7 +337,11 @@ def _named_model(inputs: Inputs, options: Options) -> str:
         if named is not None and not named.startswith("procedural:") and Path(named).suffix.lower() not in SUFFIXES:
             named = None
     if named is None:
-        raise InputError(_path(inputs), "has no surface to bake from along its provenance chain", "name one with --surface or --model")
+        raise InputError(
+            _path(inputs),
+            "has no surface to bake from along its provenance chain",
+            "name one with --surface or --model",
+        )
     return named
 
 
@@ -257,17 +350,22 @@ def _fineness(options: Options, target, detail: float) -> tuple[int, int]:
     from gdtool.bake.target import samples_for, size_for, texel_width
 
     size = options.size or size_for(target, detail)
-    return size, samples_for(texel_width(target, size), detail) if options.samples is None else round(options.samples**0.5) ** 2
+    return size, samples_for(texel_width(target, size), detail) if options.samples is None else round(
+        options.samples**0.5
+    ) ** 2
 
 
 def _read_picture(folder, views, out: Output):
-    """The picture that the views were made of, where the folder holds it and they hold an albedo to put its detail on."""
-    from gdtool.folders.views import read_picture
+    """The picture that the views were made of, where the folder holds it and they hold an albedo to put its detail
+    on."""
     from gdtool.bake.picture import picture_of
+    from gdtool.folders.views import read_picture
 
     found = read_picture(folder, views.cameras)
     if found is None or "albedo" not in views.images:
-        out.skip("picture", "the views' folder holds none" if found is None else "the views hold no albedo for its detail")
+        out.skip(
+            "picture", "the views' folder holds none" if found is None else "the views hold no albedo for its detail"
+        )
         return None
     image, camera = found
     return picture_of(image, camera, views.images["albedo"][views.names.index(camera.name)])
@@ -277,8 +375,8 @@ def target_of(mesh):
     """The triangles to bake into, and the quad (t,) each comes from."""
     import numpy as np
 
-    from gdtool.geometry.topology import triangulated
     from gdtool.bake.target import Target
+    from gdtool.geometry.topology import triangulated
 
     faces, face_idx = triangulated(mesh.faces)
     # The same cut for the texture corners: cut a mesh whose faces are the corners' numbers.
@@ -295,17 +393,21 @@ def _check_overlap(target, inputs: Inputs, out: Output) -> None:
     count = owner_count(target.uv, target.face_uvs, 512)
     share = float((count > 1).sum() / max((count > 0).sum(), 1))
     if share > 0.001:
-        out.warn(f"{inputs.name}: texture coordinates overlap on {100 * share:.1f} % of what they cover; the first face there is baked")
+        out.warn(
+            f"{inputs.name}: texture coordinates overlap on {100 * share:.1f} % of what they cover; the first face there is baked"
+        )
     if target.uv.min() < -1e-6 or target.uv.max() > 1 + 1e-6:
         out.warn(f"{inputs.name}: texture coordinates leave the unit square; what lies outside is not baked")
 
 
-def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx, maps, origin, matrix, report, levels) -> None:
+def _write(
+    out: Output, options: Options, inputs: Inputs, mesh, target, face_idx, maps, origin, matrix, report, levels
+) -> None:
     """Write the folder's files and set out.content."""
     import dataclasses
 
-    from gdtool.geometry.frames import transform_points
     from gdtool.bake.asset import write_models
+    from gdtool.geometry.frames import transform_points
 
     if options.source_frame:
         turn = matrix[:3, :3] / (matrix[:3, 0] ** 2).sum() ** 0.5
@@ -313,19 +415,41 @@ def _write(out: Output, options: Options, inputs: Inputs, mesh, target, face_idx
         def moved(one):
             tangents = one.tangents.copy()
             tangents[..., :3] = tangents[..., :3] @ turn.T
-            return dataclasses.replace(one, vertices=transform_points(matrix, one.vertices), normals=one.normals @ turn.T, tangents=tangents)
+            return dataclasses.replace(
+                one, vertices=transform_points(matrix, one.vertices), normals=one.normals @ turn.T, tangents=tangents
+            )
 
         target, levels = moved(target), [moved(level) for level in levels]
         mesh = dataclasses.replace(mesh, vertices=target.vertices)
     usd = f"asset.{options.usd}" if options.usd != "none" else ""
-    files = write_models(out.path, target, mesh, face_idx, maps, origin, inputs.name, options.normal_convention, usd, levels, out.threads)
+    files = write_models(
+        out.path, target, mesh, face_idx, maps, origin, inputs.name, options.normal_convention, usd, levels, out.threads
+    )
     out.content = AssetContent(
-        size=maps.size, maps=files, usd=usd, factors=maps.factors, normal_convention=options.normal_convention,
+        size=maps.size,
+        maps=files,
+        usd=usd,
+        factors=maps.factors,
+        normal_convention=options.normal_convention,
         lods=tuple(f"asset_lod{k}.glb" for k in range(1, len(levels) + 1)),
-        frame="source" if options.source_frame else "normalised", source_from_world=tuple(float(x) for x in matrix.ravel()), report=report)
+        frame="source" if options.source_frame else "normalised",
+        source_from_world=tuple(float(x) for x in matrix.ravel()),
+        report=report,
+    )
 
 
 STAGE = Stage(
-    name="bake", version=13, reads=("atlas", "mesh-file"), writes="asset", Options=Options, run=run, check=check,
-    second_inputs={"surface": SecondInput("surface", help="The surface to bake from; found along the provenance chain without it."),
-                   "views": SecondInput("views", help="Views of it; found along the provenance chain without it.")})
+    name="bake",
+    version=13,
+    reads=("atlas", "mesh-file"),
+    writes="asset",
+    Options=Options,
+    run=run,
+    check=check,
+    second_inputs={
+        "surface": SecondInput(
+            "surface", help="The surface to bake from; found along the provenance chain without it."
+        ),
+        "views": SecondInput("views", help="Views of it; found along the provenance chain without it."),
+    },
+)

@@ -59,11 +59,16 @@ def require_model(option: str, value: str) -> None:
 
     require_file(option, value)
     if Path(value).suffix.lower() not in SUFFIXES:
-        raise InputError(value, "is no model file by its ending", f"name a {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]} file with {option}")
+        raise InputError(
+            value,
+            "is no model file by its ending",
+            f"name a {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]} file with {option}",
+        )
 
 
 def require_picture(option: str, value: str) -> tuple[int, int]:
-    """Width and height of the picture that an option names, from its header. Raises what reading it would where it has none."""
+    """Width and height of the picture that an option names, from its header. Raises what reading it would where it has
+    none."""
     require_file(option, value)
     header = _header(value)
     if header is None:
@@ -75,7 +80,8 @@ def require_picture(option: str, value: str) -> tuple[int, int]:
 
 
 def require_environment(option: str, value: str, names: tuple[str, ...]) -> None:
-    """Raise InputError unless an option names a light: one of names, random:NUMBER, or a lat-long picture of float pixels."""
+    """Raise InputError unless an option names a light: one of names, random:NUMBER, or a lat-long picture of float
+    pixels."""
     if value in names:
         return
     cure = f"use {', '.join(names)}, random:NUMBER, or an .hdr or .exr file with {option}"
@@ -98,7 +104,9 @@ def require_environment(option: str, value: str, names: tuple[str, ...]) -> None
 def require_fov(degrees: float) -> None:
     """Raise UsageError for a field of view that is neither orthographic (0) nor wide enough to compute with."""
     if 0 < degrees < LEAST_FOV:
-        raise UsageError(f"--fov {degrees:g}", f"is narrower than {LEAST_FOV:g} degrees", "use --fov 0, which is orthographic")
+        raise UsageError(
+            f"--fov {degrees:g}", f"is narrower than {LEAST_FOV:g} degrees", "use --fov 0, which is orthographic"
+        )
 
 
 def _header(path: str) -> tuple[int, int, bool] | None:

@@ -1,9 +1,10 @@
 """Measure a result against a reference, and print the figures.
 
-Use it at the end of a pipe, or on any two of: folders of views, surface, mesh, atlas, asset or renders, and model files.
-Geometry is measured against geometry in two protocols, pictures against pictures, whatever both hold. Without --reference
-the model that the result came from is found along its provenance, and the views it came from say what part of the truth
-was seen. An asset is also rendered through the cameras of those views. docs/metrics.md says what each figure is.
+Use it at the end of a pipe, or on any two of: folders of views, surface, mesh, atlas, asset or renders, and model
+files. Geometry is measured against geometry in two protocols, pictures against pictures, whatever both hold. Without
+--reference the model that the result came from is found along its provenance, and the views it came from say what part
+of the truth was seen. An asset is also rendered through the cameras of those views. docs/metrics.md says what each
+figure is.
 
 Example:
   gdtool render-dataset procedural:7 | gdtool reconstruct | gdtool evaluate
@@ -44,13 +45,20 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     frame: Annotated[
         Literal["auto", "source", "box", "same"],
-        Meta(description="how a model file gets into the result's frame: source = by the result's source_from_world, box = centred with longest "
-                         "side 1, same = it is there already; auto: same for two files, source where the result has one, else box"),
+        Meta(
+            description="how a model file gets into the result's frame: source = by the result's source_from_world, box = centred with longest "
+            "side 1, same = it is there already; auto: same for two files, source where the result has one, else box"
+        ),
     ] = "auto"
     samples: Annotated[int, Meta(ge=100, le=10_000_000, description="points drawn on each surface")] = 100_000
-    threshold: Annotated[float, Meta(gt=0, le=1, description="distance that counts as a match in the F-score, largest extent of the truth 1")] = 0.01
+    threshold: Annotated[
+        float,
+        Meta(gt=0, le=1, description="distance that counts as a match in the F-score, largest extent of the truth 1"),
+    ] = 0.01
     syncdreamer: Annotated[bool, Meta(description="measure by the protocol of the published tables too")] = True
-    render: Annotated[bool, Meta(description="render an asset or a model through the cameras of the views and compare the pictures")] = True
+    render: Annotated[
+        bool, Meta(description="render an asset or a model through the cameras of the views and compare the pictures")
+    ] = True
     seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="of the drawn points")] = 0
 
 
@@ -83,7 +91,9 @@ def evaluate(result: Source, reference: Source | None, options: Options, views: 
         views = reference
     truth = reference if reference is not None else _truth_along(result)
     if truth is None and views is None:
-        raise UsageError(name_of(result), "has neither model nor views along its provenance chain", "name one with --reference")
+        raise UsageError(
+            name_of(result), "has neither model nor views along its provenance chain", "name one with --reference"
+        )
 
     geometry = read_geometry(result)
     report |= _shape(geometry)
@@ -92,7 +102,11 @@ def evaluate(result: Source, reference: Source | None, options: Options, views: 
         report["reference"] = name_of(truth)
         report |= _surfaces(geometry, against, options, views)
     elif reference is not None and not (options.render and _has_material(result)):
-        raise InputError(_place(reference), "holds no model to measure the geometry against", "name the model itself with --reference")
+        raise InputError(
+            _place(reference),
+            "holds no model to measure the geometry against",
+            "name the model itself with --reference",
+        )
     # Views named as the reference are the truth of the pictures; those along the provenance may have been generated.
     pictures = reference if _kind(reference) == "views" else views
     if options.render and pictures is not None and _has_material(result):
@@ -117,7 +131,8 @@ def _has_material(source: Source) -> bool:
 
 
 def _truth_along(result: Source) -> Source | None:
-    """The model that a result was made from: a file or procedural:SEED, or the views that carry their model; or None."""
+    """The model that a result was made from: a file or procedural:SEED, or the views that carry their model; or
+    None."""
     if not isinstance(result, Folder):
         return None
     cure = "name what to measure against with --reference"
@@ -183,8 +198,12 @@ def _shape(geometry: Geometry) -> Report:
 
     from gdtool.geometry.metrics import is_closed, weld
 
-    return {"vertices": len(np.unique(weld(geometry.vertices, geometry.faces))), "faces": len(geometry.faces) - geometry.quads,
-            "quads": geometry.quads, "watertight": is_closed(geometry.vertices, geometry.faces)}
+    return {
+        "vertices": len(np.unique(weld(geometry.vertices, geometry.faces))),
+        "faces": len(geometry.faces) - geometry.quads,
+        "quads": geometry.quads,
+        "watertight": is_closed(geometry.vertices, geometry.faces),
+    }
 
 
 def _in_world(geometry: Geometry) -> np.ndarray:
@@ -208,9 +227,19 @@ def _surfaces(geometry: Geometry, truth: Source, options: Options, views: Folder
     cameras = read_cameras(views.file("cameras.json")) if views is not None else None
     # The cameras are in the normalised frame: of two files nothing says where that is.
     known = geometry.source_from_world is not None or options.frame == "box"
-    found = metrics.surface_protocol(vertices, geometry.faces, true_vertices, true_geometry.faces, samples=options.samples, seed=options.seed,
-                                     threshold=options.threshold, cameras=cameras if known else None)
-    report: Report = {f"surface_{name}" if not name.startswith("seen_") else name: value for name, value in found.items()}
+    found = metrics.surface_protocol(
+        vertices,
+        geometry.faces,
+        true_vertices,
+        true_geometry.faces,
+        samples=options.samples,
+        seed=options.seed,
+        threshold=options.threshold,
+        cameras=cameras if known else None,
+    )
+    report: Report = {
+        f"surface_{name}" if not name.startswith("seen_") else name: value for name, value in found.items()
+    }
     report["reference_watertight"] = "iou" in found
     if options.syncdreamer:
         found = metrics.syncdreamer_protocol(vertices, geometry.faces, true_vertices, true_geometry.faces)
@@ -242,26 +271,45 @@ def _pictures(result: Folder, reference: Source | None) -> Report:
     from gdtool.images.metrics import resized_views, views_metrics
 
     if reference is None:
-        reference = next((folder for folder in ancestors(result, "name one with --reference") if folder.kind == result.kind), None)
+        reference = next(
+            (folder for folder in ancestors(result, "name one with --reference") if folder.kind == result.kind), None
+        )
         if reference is None:
-            raise UsageError(result.path, f"has no other {result.kind} along its provenance chain", "name one with --reference")
+            raise UsageError(
+                result.path, f"has no other {result.kind} along its provenance chain", "name one with --reference"
+            )
         reference = open_folder(reference.path)
     if _kind(reference) != result.kind:
-        cure = f"run gdtool render-dataset {_place(reference)} --cameras {result.path} first" if result.kind == "views" else "name a renders folder with --reference"
+        cure = (
+            f"run gdtool render-dataset {_place(reference)} --cameras {result.path} first"
+            if result.kind == "views"
+            else "name a renders folder with --reference"
+        )
         raise InputError(_place(reference), f"holds {_kind(reference)}, but the result holds {result.kind}", cure)
     read = _read_renders if result.kind == "renders" else _read_views
     (images, mask, names), (true_images, true_mask, true_names) = read(result), read(reference)
     shared = [name for name in true_names if name in names]
     if not shared:
-        raise InputError(result.path, f"has no view in common with {reference.path} ({', '.join(true_names)})",
-                         f"run gdtool render-dataset with --cameras {reference.path}" if result.kind == "views" else "render both with the same --views")
+        raise InputError(
+            result.path,
+            f"has no view in common with {reference.path} ({', '.join(true_names)})",
+            f"run gdtool render-dataset with --cameras {reference.path}"
+            if result.kind == "views"
+            else "render both with the same --views",
+        )
     if result.kind == "views":
         _check_cameras(result, reference, shared)
     pick, true_pick = [names.index(name) for name in shared], [true_names.index(name) for name in shared]
     height, width = min(mask.shape[1:], true_mask.shape[1:])
     small, small_mask = resized_views({d: x[pick] for d, x in images.items()}, mask[pick], height, width)
-    true_small, true_small_mask = resized_views({d: x[true_pick] for d, x in true_images.items()}, true_mask[true_pick], height, width)
-    return {"reference": reference.name, "views": len(shared), **views_metrics(small, small_mask, true_small, true_small_mask)}
+    true_small, true_small_mask = resized_views(
+        {d: x[true_pick] for d, x in true_images.items()}, true_mask[true_pick], height, width
+    )
+    return {
+        "reference": reference.name,
+        "views": len(shared),
+        **views_metrics(small, small_mask, true_small, true_small_mask),
+    }
 
 
 def _read_views(folder: Folder) -> tuple[dict[str, np.ndarray], np.ndarray, list[str]]:
@@ -291,7 +339,9 @@ def _check_cameras(result: Folder, reference: Folder, names: list[str]) -> None:
 
     from gdtool.folders.records import read_cameras
 
-    mine, other = ({camera.name: camera for camera in read_cameras(folder.file("cameras.json"))} for folder in (result, reference))
+    mine, other = (
+        {camera.name: camera for camera in read_cameras(folder.file("cameras.json"))} for folder in (result, reference)
+    )
     for name in names:
         a, b = mine[name], other[name]
         same = a.projection == b.projection and np.allclose(a.world_from_camera, b.world_from_camera, atol=SAME_POSE)
@@ -300,8 +350,11 @@ def _check_cameras(result: Folder, reference: Folder, names: list[str]) -> None:
         else:
             same = same and np.isclose(a.fx / a.width, b.fx / b.width, rtol=SAME_POSE)
         if not same or a.width * b.height != a.height * b.width:
-            raise InputError(result.path, f"sees {name} from another camera than {reference.path}",
-                             f"run gdtool render-dataset with --cameras {reference.path}")
+            raise InputError(
+                result.path,
+                f"sees {name} from another camera than {reference.path}",
+                f"run gdtool render-dataset with --cameras {reference.path}",
+            )
 
 
 def _rendered(result: Source, views: Folder) -> Report:
@@ -318,7 +371,11 @@ def _rendered(result: Source, views: Folder) -> Report:
     for scene, names in scenes:
         renderer = Renderer(scene)
         buffers = [renderer.buffers(camera) for camera in truth.cameras]
-        images |= {name: np.stack([channel(one) for one in buffers]) for name, channel in names.items() if name in (*truth.images, "mask")}
+        images |= {
+            name: np.stack([channel(one) for one in buffers])
+            for name, channel in names.items()
+            if name in (*truth.images, "mask")
+        }
     mask = images.pop("mask")
     return {"views": len(truth.cameras), **views_metrics(images, mask, truth.images, truth.mask)}
 
@@ -338,13 +395,29 @@ def _scenes(source: Source) -> list[tuple[Scene, dict[str, Callable[[dict[str, n
     every = {name: (lambda buffers, name=name: buffers[name]) for name in (*RENDERED, "mask")}
     if _kind(source) != "surface":
         scene = _load(source.file("asset.glb") if isinstance(source, Folder) else source)
-        return [(_normalised(scene, source) if isinstance(source, Folder) and source.content.frame == "source" else scene, every)]
+        return [
+            (
+                _normalised(scene, source)
+                if isinstance(source, Folder) and source.content.frame == "source"
+                else scene,
+                every,
+            )
+        ]
     from gdtool.folders.surface import read_surface
 
     surface = read_surface(source)
-    scene = Scene(surface.vertices, surface.faces, (Material("surface", metallic=0.0),), normals=surface.normals, colors=_rgba(surface.albedo))
+    scene = Scene(
+        surface.vertices,
+        surface.faces,
+        (Material("surface", metallic=0.0),),
+        normals=surface.normals,
+        colors=_rgba(surface.albedo),
+    )
     rough = replace(scene, colors=_rgba(np.stack([surface.roughness, surface.metallic, surface.metallic], -1)))
-    parts = {"roughness": lambda buffers: buffers["albedo"][..., 0], "metallic": lambda buffers: buffers["albedo"][..., 1]}
+    parts = {
+        "roughness": lambda buffers: buffers["albedo"][..., 0],
+        "metallic": lambda buffers: buffers["albedo"][..., 1],
+    }
     return [(scene, {name: every[name] for name in ("normal", "depth", "albedo", "mask")}), (rough, parts)]
 
 
@@ -365,13 +438,17 @@ def _normalised(scene: Scene, folder: Folder) -> Scene:
     matrix = invert_similarity(np.array(folder.content.source_from_world).reshape(4, 4))
     turn = matrix[:3, :3] / np.linalg.norm(matrix[:3, 0])
     normals = None if scene.normals is None else scene.normals @ turn.T
-    tangents = None if scene.tangents is None else np.concatenate([scene.tangents[:, :3] @ turn.T, scene.tangents[:, 3:]], 1)
+    tangents = (
+        None if scene.tangents is None else np.concatenate([scene.tangents[:, :3] @ turn.T, scene.tangents[:, 3:]], 1)
+    )
     return replace(scene, vertices=transform_points(matrix, scene.vertices), normals=normals, tangents=tangents)
 
 
 # What the figures are called on a terminal, and how they are grouped there; docs/metrics.md explains each.
 GROUPS = (
-    ("surface protocol", "surface_"), ("surface protocol, the part that the views see", "seen_"), ("syncdreamer protocol", "syncdreamer_"),
+    ("surface protocol", "surface_"),
+    ("surface protocol, the part that the views see", "seen_"),
+    ("syncdreamer protocol", "syncdreamer_"),
     ("pictures", ("mask_", "color_", "albedo_", "closed_form_", "normal_", "depth_", "roughness_", "metallic_")),
 )
 UNITS = {"degrees": "°", "psnr": " dB"}
@@ -383,7 +460,13 @@ def table(report: Report) -> str:
 
     def add(name: str, label: str) -> None:
         value = report[name]
-        text = ("yes" if value else "no") if isinstance(value, bool) else f"{value:.5g}" if isinstance(value, float) else str(value)
+        text = (
+            ("yes" if value else "no")
+            if isinstance(value, bool)
+            else f"{value:.5g}"
+            if isinstance(value, float)
+            else str(value)
+        )
         unit = next((unit for word, unit in UNITS.items() if word in name), "")
         lines.append(f"  {label.replace('_', ' '):<24}{text}{unit}")
 

@@ -1,8 +1,9 @@
 """Pictures made by another program to a views folder that reconstruct reads.
 
 Use it on a Wonder3D output folder (colors and normals of six views), on a folder with NeRF's transforms.json, or on a
-plain folder with a cameras.json (docs/format.md's) and pictures as DOMAIN/VIEW.png or VIEW.png. The mask is the picture's
-alpha or a mask/VIEW.png, else the subject is told from a plain background. The object is moved into the normalised frame.
+plain folder with a cameras.json (docs/format.md's) and pictures as DOMAIN/VIEW.png or VIEW.png. The mask is the
+picture's alpha or a mask/VIEW.png, else the subject is told from a plain background. The object is moved into the
+normalised frame.
 
 Example:
   gdtool import-views outputs/cropsize-192-cfg1.0/owl | gdtool reconstruct
@@ -30,9 +31,15 @@ SAMPLES = 64  # across the cube in which the silhouettes' common cone is looked 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of import-views."""
 
-    format: Annotated[Literal["auto", "wonder3d", "nerf", "plain"], Meta(description="what the folder is; auto: by what it holds")] = "auto"
-    up: Annotated[Literal["auto", "y", "z"], Meta(description="axis of its world that points up; auto: z for nerf, y for plain")] = "auto"
-    normalize: Annotated[bool, Meta(description="centre what the silhouettes have in common and scale its longest side to 1")] = True
+    format: Annotated[
+        Literal["auto", "wonder3d", "nerf", "plain"], Meta(description="what the folder is; auto: by what it holds")
+    ] = "auto"
+    up: Annotated[
+        Literal["auto", "y", "z"], Meta(description="axis of its world that points up; auto: z for nerf, y for plain")
+    ] = "auto"
+    normalize: Annotated[
+        bool, Meta(description="centre what the silhouettes have in common and scale its longest side to 1")
+    ] = True
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
@@ -45,9 +52,15 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     with out.step("read"):
         module = adapter(inputs.main, options.format)
         pictures = module.read(inputs.main)
-    cameras, images, mask = pictures.cameras, dict(pictures.images), np.where(pictures.mask > 1 / 512, pictures.mask, 0).astype(np.float32)
+    cameras, images, mask = (
+        pictures.cameras,
+        dict(pictures.images),
+        np.where(pictures.mask > 1 / 512, pictures.mask, 0).astype(np.float32),
+    )
     if not (mask > 0.5).any():
-        raise InputError(inputs.main, "every mask is empty", "give pictures with an alpha, or white masks as mask/VIEW.png")
+        raise InputError(
+            inputs.main, "every mask is empty", "give pictures with an alpha, or white masks as mask/VIEW.png"
+        )
     matrix = np.eye(4)  # of this world into ours
     if (pictures.up if options.up == "auto" else options.up) == "z":
         matrix[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
@@ -69,7 +82,12 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         inside = mask > 0
         images[name] = np.where(inside[..., None] if stack.ndim == 4 else inside, stack, 0).astype(np.float32)
     with out.step("write"):
-        write_views(out, Views(cameras, images, mask), source_from_world=np.linalg.inv(matrix), report={"format": module.__name__.rpartition(".")[2]})
+        write_views(
+            out,
+            Views(cameras, images, mask),
+            source_from_world=np.linalg.inv(matrix),
+            report={"format": module.__name__.rpartition(".")[2]},
+        )
 
 
 def moved(camera: Camera, matrix: np.ndarray) -> Camera:
@@ -80,7 +98,13 @@ def moved(camera: Camera, matrix: np.ndarray) -> Camera:
     pose = np.eye(4)
     pose[:3, :3] = matrix[:3, :3] / scale @ camera.world_from_camera[:3, :3]
     pose[:3, 3] = matrix[:3, :3] @ camera.position + matrix[:3, 3]
-    return replace(camera, world_from_camera=pose, half_width=camera.half_width * scale, near=camera.near * scale, far=camera.far * scale)
+    return replace(
+        camera,
+        world_from_camera=pose,
+        half_width=camera.half_width * scale,
+        near=camera.near * scale,
+        far=camera.far * scale,
+    )
 
 
 def bounded(camera: Camera) -> Camera:
@@ -109,7 +133,9 @@ def normalisation(cameras: list[Camera], mask: np.ndarray) -> np.ndarray | None:
     positions = np.stack([camera.position for camera in cameras])
     center = np.linalg.lstsq(across.sum(0), np.einsum("kij,kj->i", across, positions), rcond=None)[0]
     distance = np.abs(((positions - center) * axes).sum(1))
-    reach = max(float(pixel_footprint(c, d)) * max(c.width, c.height) / 2 for c, d in zip(cameras, distance, strict=True))
+    reach = max(
+        float(pixel_footprint(c, d)) * max(c.width, c.height) / 2 for c, d in zip(cameras, distance, strict=True)
+    )
     total = np.eye(4)
     for _ in range(2):
         step = np.eye(4)

@@ -9,10 +9,12 @@ from contextlib import contextmanager
 from gdtool.core.ending import GRACE, time_limit
 from gdtool.core.errors import ResourceError
 
-# A run ends within OVER x its time limit + MORE seconds: what it is asked for takes its time, reading, checking and writing come on top.
+# A run ends within OVER x its time limit + MORE seconds: what it is asked for takes its time, reading, checking and
+# writing come on top.
 OVER, MORE = 2.0, 5.0
 _UNWIND = GRACE + 0.3  # seconds of MORE that are left for the end
-# A quick machine takes half the time of the one that the rates were measured on: what takes longer even so is refused at once.
+# A quick machine takes half the time of the one that the rates were measured on: what takes longer even so is refused
+# at once.
 _QUICK = 0.5
 
 
@@ -20,7 +22,9 @@ _QUICK = 0.5
 def held_to(seconds: float, option: str, name: str, cure: str) -> Iterator[None]:
     """Raise ResourceError in a block that takes longer than OVER x seconds + MORE."""
     most = OVER * seconds + MORE - _UNWIND
-    with time_limit(most, ResourceError(name, f"is not done after {most:g} s, and {option} {seconds:g} allows no more", cure)):
+    with time_limit(
+        most, ResourceError(name, f"is not done after {most:g} s, and {option} {seconds:g} allows no more", cure)
+    ):
         yield
 
 
@@ -30,5 +34,8 @@ def require_time(needed: float, seconds: float, option: str, name: str, cure: st
     needed: seconds of the quickest way on the machine that it was measured on.
     """
     if _QUICK * needed > OVER * seconds + MORE - _UNWIND:
-        raise ResourceError(name, f"needs about {math.ceil(needed)} s in the quickest way, and {option} {seconds:g} allows less",
-                            f"raise {option} to {math.ceil(needed)}, or {cure}")
+        raise ResourceError(
+            name,
+            f"needs about {math.ceil(needed)} s in the quickest way, and {option} {seconds:g} allows less",
+            f"raise {option} to {math.ceil(needed)}, or {cure}",
+        )

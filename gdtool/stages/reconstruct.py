@@ -21,7 +21,8 @@ from gdtool.core.errors import InputError, UsageError
 from gdtool.core.kinds import DOMAINS
 from gdtool.core.stage import MOST_SECONDS, MOST_SEED, Inputs, Output, Stage
 
-# Below this share of points that another view confirms, depth and normals say less of the shape than the silhouettes do.
+# Below this share of points that another view confirms, depth and normals say less of the shape than the silhouettes
+# do.
 LEAST_AGREEMENT = 0.25
 # Below this share of normals that fit the slope of the depth they describe another surface (a broken normal map, say).
 LEAST_FITTING_NORMALS = 0.5
@@ -31,13 +32,32 @@ AROUND = 0.5  # seconds of --budget for start-up and publication
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of reconstruct."""
 
-    method: Annotated[Literal["grid", "paper"], Meta(description="grid: carve and refine; paper: SDF and material networks")] = "grid"
-    resolution: Annotated[int, Meta(ge=0, le=512, description="grid samples along a unit of length; 0: a little finer than the views' pixels")] = 0
+    method: Annotated[
+        Literal["grid", "paper"], Meta(description="grid: carve and refine; paper: SDF and material networks")
+    ] = "grid"
+    resolution: Annotated[
+        int,
+        Meta(ge=0, le=512, description="grid samples along a unit of length; 0: a little finer than the views' pixels"),
+    ] = 0
     steps: Annotated[int, Meta(ge=1, le=100_000, description="paper: the most optimisation steps of each phase")] = 1000
-    precision: Annotated[Literal["float32", "bfloat16"], Meta(description="paper: of the networks' layers while the first shape is fitted; the end is always float32")] = "float32"
-    root: Annotated[Literal["secant", "median"], Meta(description="paper: surface point between two samples of a ray")] = "secant"
-    brdf: Annotated[Literal["gltf", "paper"], Meta(description="paper: reflection model that color is fitted with")] = "gltf"
-    budget: Annotated[float, Meta(ge=0, le=MOST_SECONDS, description="seconds to be done in: grid takes a coarser grid, paper shortens its schedule; 0: as long as it helps")] = 0.0
+    precision: Annotated[
+        Literal["float32", "bfloat16"],
+        Meta(description="paper: of the networks' layers while the first shape is fitted; the end is always float32"),
+    ] = "float32"
+    root: Annotated[
+        Literal["secant", "median"], Meta(description="paper: surface point between two samples of a ray")
+    ] = "secant"
+    brdf: Annotated[Literal["gltf", "paper"], Meta(description="paper: reflection model that color is fitted with")] = (
+        "gltf"
+    )
+    budget: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=MOST_SECONDS,
+            description="seconds to be done in: grid takes a coarser grid, paper shortens its schedule; 0: as long as it helps",
+        ),
+    ] = 0.0
     ignore: Annotated[tuple[str, ...], Meta(description="domains to leave out, for example depth,normal")] = ()
     seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="seed of everything random")] = 0
 
@@ -50,7 +70,8 @@ def check(inputs: Inputs, options: Options) -> None:
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
-    """Reconstruct one views folder. Raises ResourceError where it takes longer than --budget by far (stages/limits.py)."""
+    """Reconstruct one views folder. Raises ResourceError where it takes longer than --budget by far
+    (stages/limits.py)."""
     from gdtool.stages.limits import held_to
 
     cure = f"raise --budget to {max(round(2 * options.budget), 1)}, or leave it out"
@@ -59,9 +80,19 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
 
 def _run(inputs: Inputs, options: Options, out: Output) -> None:
-    from gdtool.fields.views.depth_alignment import agreement
     from gdtool.fields.appearance.appearance import appearance
-    from gdtool.fields.grid.fusion import BUMPY, SMALL, align_depth, finest_pixel, fuse_within, grid_step, is_closed_manifold, prepare_all, silhouettes_outvoted
+    from gdtool.fields.grid.fusion import (
+        BUMPY,
+        SMALL,
+        align_depth,
+        finest_pixel,
+        fuse_within,
+        grid_step,
+        is_closed_manifold,
+        prepare_all,
+        silhouettes_outvoted,
+    )
+    from gdtool.fields.views.depth_alignment import agreement
     from gdtool.folders.surface import Surface, write_surface
     from gdtool.folders.views import read_views
     from gdtool.geometry.normals import vertex_normals
@@ -83,28 +114,47 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         sights, before, noise = align_depth(views.cameras, views.mask, depth, normal, step, clock, log.status, colors)
         agreed = agreement(sights)
         if agreed < LEAST_AGREEMENT:
-            out.warn(f"depth and normals do not fit together (a view confirms {agreed:.0%} of another's points); the silhouettes alone give the shape")
+            out.warn(
+                f"depth and normals do not fit together (a view confirms {agreed:.0%} of another's points); the silhouettes alone give the shape"
+            )
             sights, noise = prepare_all(views.cameras, views.mask, None, None), 0.0
         outvoted = silhouettes_outvoted(sights)
         if noise == before and depth is not None:
             out.skip("alignment of depth", f"the views agree to {noise / step:.3f} of a grid step")
         if outvoted:
-            out.warn(f"the silhouettes contradict one another: up to {outvoted} of {len(sights)} are outvoted at a point")
+            out.warn(
+                f"the silhouettes contradict one another: up to {outvoted} of {len(sights)} are outvoted at a point"
+            )
     grow = SMALL * finest_pixel(views.cameras) if folder.content.picture else 0.0
     if not grow:
         out.skip("growth of the surface", "no model made the views of a picture")
     with out.step("fuse"):
         try:
-            shape, coarser = fuse_within(sights, step, noise, outvoted, clock, normal is not None, grow, folder.content.picture)
+            shape, coarser = fuse_within(
+                sights, step, noise, outvoted, clock, normal is not None, grow, folder.content.picture
+            )
         except ValueError as error:
             raise InputError(folder.path, str(error), "give masks and cameras of one object") from None
     if shape.bumps is None or shape.bumps <= BUMPY:
-        out.skip("surface by normals", f"it is within {shape.bumps:.1f} degrees of them" if shape.bumps is not None
-                 else "there are none" if normal is None
-                 else "the silhouettes alone give the shape" if all(sight.planes is None for sight in sights) else "the views agree")
+        out.skip(
+            "surface by normals",
+            f"it is within {shape.bumps:.1f} degrees of them"
+            if shape.bumps is not None
+            else "there are none"
+            if normal is None
+            else "the silhouettes alone give the shape"
+            if all(sight.planes is None for sight in sights)
+            else "the views agree",
+        )
     if not shape.restored:
-        out.skip("parts that the picture alone shows", "the views together have something behind each of its pixels" if grow and noise
-                 else "the views agree" if grow else "no model made the views of a picture")
+        out.skip(
+            "parts that the picture alone shows",
+            "the views together have something behind each of its pixels"
+            if grow and noise
+            else "the views agree"
+            if grow
+            else "no model made the views of a picture",
+        )
     if coarser:
         out.skip("the whole grid", f"--budget has no time for it: the surface is taken {coarser}")
     _check_cameras(folder, views.cameras, shape.vertices)
@@ -113,18 +163,49 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         vertices, faces, figures, fit = _fit(views, sights, shape, options, out)
     with out.step("materials"):
         normals = vertex_normals(vertices, faces)
-        look = appearance(views.cameras, views.mask, views.images, vertices, faces, normals, shape.step, views.light, options.seed)
+        look = appearance(
+            views.cameras, views.mask, views.images, vertices, faces, normals, shape.step, views.light, options.seed
+        )
         for what, reason in look.skipped:
             out.skip(what, reason)
     if fit is not None:
         _use_fit(fit, vertices, views, look, options, out)
-    surface = Surface(vertices, faces, look.albedo, look.roughness, look.metallic, look.confidence, normals, look.light, look.views, look.residual)
-    report = {"seen_share": float((shape.support > 0.02).mean()), "pieces_dropped": shape.dropped, "grid_step": shape.step,
-              "disagreement_before": before, "disagreement": noise, "grown": grow, "restored_share": shape.restored, "agreement": agreed, "silhouettes_outvoted": outvoted,
-              "mean_confidence": float(look.confidence.mean()), **look.figures, **figures}
+    surface = Surface(
+        vertices,
+        faces,
+        look.albedo,
+        look.roughness,
+        look.metallic,
+        look.confidence,
+        normals,
+        look.light,
+        look.views,
+        look.residual,
+    )
+    report = {
+        "seen_share": float((shape.support > 0.02).mean()),
+        "pieces_dropped": shape.dropped,
+        "grid_step": shape.step,
+        "disagreement_before": before,
+        "disagreement": noise,
+        "grown": grow,
+        "restored_share": shape.restored,
+        "agreement": agreed,
+        "silhouettes_outvoted": outvoted,
+        "mean_confidence": float(look.confidence.mean()),
+        **look.figures,
+        **figures,
+    }
     with out.step("write"):
-        write_surface(out, surface, watertight=is_closed_manifold(faces), method=options.method, field=fit is not None,
-                      source_from_world=folder.content.source_from_world, report=report)
+        write_surface(
+            out,
+            surface,
+            watertight=is_closed_manifold(faces),
+            method=options.method,
+            field=fit is not None,
+            source_from_world=folder.content.source_from_world,
+            report=report,
+        )
 
 
 def _clock(options: Options):
@@ -137,22 +218,37 @@ def _clock(options: Options):
 def _fit(views, sights, shape, options: Options, out: Output):
     """The paper's networks, started from the grid's shape, and the mesh of their surface.
 
-    sights: the aligned views. Where there are normals and no depth, theirs is what holds the surface in its place: normals
-    alone let it drift.
-    """
+    sights: the aligned views. Where there are normals and no depth, theirs is what holds the surface in its place:
+    normals alone let it drift."""
     from gdtool.fields.grid.fusion import is_closed_manifold
-    from gdtool.fields.neural.paper import PaperOptions, extract_network, fit_networks
     from gdtool.fields.grid.refine import keep_pieces
+    from gdtool.fields.neural.paper import PaperOptions, extract_network, fit_networks
 
     images = _with_depth(views, sights)
     volume = 0 if "depth" in images else options.steps // 3
     if not volume:
         out.skip("volume start", f"{'depth' if 'depth' in views.images else 'normal'} views say where the surface is")
-    settings = PaperOptions(options.steps, volume, options.steps, rule=options.root, brdf=options.brdf, seed=options.seed,
-                            budget=options.budget, device=out.device, precision=options.precision)
+    settings = PaperOptions(
+        options.steps,
+        volume,
+        options.steps,
+        rule=options.root,
+        brdf=options.brdf,
+        seed=options.seed,
+        budget=options.budget,
+        device=out.device,
+        precision=options.precision,
+    )
     with out.step("networks"):
-        fit, figures = fit_networks(views.cameras, views.mask, images, shape.vertices, shape.faces, settings,
-                                    lambda count, label: out.progress(range(count), count, label))
+        fit, figures = fit_networks(
+            views.cameras,
+            views.mask,
+            images,
+            shape.vertices,
+            shape.faces,
+            settings,
+            lambda count, label: out.progress(range(count), count, label),
+        )
     with out.step("extract"):
         vertices, faces = extract_network(fit.sdf, shape.step, out.device)
         if len(faces):
@@ -167,15 +263,23 @@ def _with_depth(views, sights) -> dict:
     """The views' images, with the depth that the aligned views came to where there was none and normals gave it."""
     import numpy as np
 
-    found = {id(sight.camera): (sight.points - sight.camera.position) @ -sight.camera.backward for sight in sights if sight.points is not None}
+    found = {
+        id(sight.camera): (sight.points - sight.camera.position) @ -sight.camera.backward
+        for sight in sights
+        if sight.points is not None
+    }
     if "depth" in views.images or not found:
         return views.images
-    return views.images | {"depth": np.stack([found.get(id(camera), np.zeros_like(mask)) for camera, mask in
-                                              zip(views.cameras, views.mask, strict=True)]).astype(np.float32)}
+    return views.images | {
+        "depth": np.stack(
+            [found.get(id(camera), np.zeros_like(mask)) for camera, mask in zip(views.cameras, views.mask, strict=True)]
+        ).astype(np.float32)
+    }
 
 
 def _use_fit(fit, vertices, views, look, options: Options, out: Output) -> None:
-    """Put the material network's values, where views supervised it, and the fitted light into look; save the networks."""
+    """Put the material network's values, where views supervised it, and the fitted light into look; save the
+    networks."""
     from gdtool.fields.neural.paper import light_record, network_materials, save_field
 
     values = network_materials(fit.material, vertices, out.device)
@@ -206,7 +310,10 @@ def _depth(views, out: Output):
     from gdtool.fields.grid.fusion import depth_for
 
     if "depth" in views.images or "normal" not in views.images:
-        out.skip("matching of views", "depth views say where the surface is" if "depth" in views.images else "there are no normals to match")
+        out.skip(
+            "matching of views",
+            "depth views say where the surface is" if "depth" in views.images else "there are no normals to match",
+        )
         return views.images.get("depth")
     alike = {domain: views.images[domain] for domain in ("albedo", "roughness", "metallic") if domain in views.images}
     with out.step("match views"):
@@ -219,7 +326,11 @@ def _check_cameras(folder, cameras, vertices) -> None:
 
     for camera in cameras:
         if project(camera, vertices)[1].min() <= 0:
-            raise InputError(folder.file("cameras.json"), f"camera {camera.name!r} is inside the object or looks away from it", "give it a world_from_camera outside the object, -z towards it")
+            raise InputError(
+                folder.file("cameras.json"),
+                f"camera {camera.name!r} is inside the object or looks away from it",
+                "give it a world_from_camera outside the object, -z towards it",
+            )
 
 
 def _check_masks(path, views, out: Output) -> None:

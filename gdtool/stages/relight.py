@@ -33,12 +33,54 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     elevation: Annotated[float, Meta(ge=-89, le=89, description="of the cameras, degrees")] = 10.0
     fov: Annotated[float, Meta(ge=0, le=120, description="across, degrees; 0: orthographic")] = 30.0
     size: Annotated[int, Meta(ge=16, le=8192, description="width and height in pixels")] = 512
-    light: Annotated[Literal["sampled", "prefiltered", "sg"], Meta(description="how --env lights: sampled, exact direct light with shadows; prefiltered, the light averaged over reflection lobes, shadows from a few rays; sg, closed form of sixteen spherical Gaussians, no shadows")] = "sampled"
-    samples: Annotated[int, Meta(ge=1, le=4096, description="the most samples per pixel; pixels whose mean is known get fewer, at least 4")] = 64
-    light_samples: Annotated[int, Meta(ge=0, le=1024, description="directions per sample, from the light and from the reflection each; 0, prefiltered only: no shadows")] = 4
-    budget: Annotated[float, Meta(gt=0, le=MOST_SECONDS, description="seconds for the rendering of all views, up to 4096 samples per pixel; the pictures then depend on the machine")] | None = None
-    target_psnr: Annotated[float, Meta(ge=10, le=60, description="dB, estimated while rendering, at which a view is done, up to 4096 samples per pixel")] | None = None
-    exposure: Annotated[float, Meta(ge=LEAST_EXPOSURE, le=MOST_EXPOSURE, description="factor on the color; 1: a white card in the light's brightest direction has radiance 0.8")] = 1.0
+    light: Annotated[
+        Literal["sampled", "prefiltered", "sg"],
+        Meta(
+            description="how --env lights: sampled, exact direct light with shadows; prefiltered, the light averaged over reflection lobes, shadows from a few rays; sg, closed form of sixteen spherical Gaussians, no shadows"
+        ),
+    ] = "sampled"
+    samples: Annotated[
+        int,
+        Meta(ge=1, le=4096, description="the most samples per pixel; pixels whose mean is known get fewer, at least 4"),
+    ] = 64
+    light_samples: Annotated[
+        int,
+        Meta(
+            ge=0,
+            le=1024,
+            description="directions per sample, from the light and from the reflection each; 0, prefiltered only: no shadows",
+        ),
+    ] = 4
+    budget: (
+        Annotated[
+            float,
+            Meta(
+                gt=0,
+                le=MOST_SECONDS,
+                description="seconds for the rendering of all views, up to 4096 samples per pixel; the pictures then depend on the machine",
+            ),
+        ]
+        | None
+    ) = None
+    target_psnr: (
+        Annotated[
+            float,
+            Meta(
+                ge=10,
+                le=60,
+                description="dB, estimated while rendering, at which a view is done, up to 4096 samples per pixel",
+            ),
+        ]
+        | None
+    ) = None
+    exposure: Annotated[
+        float,
+        Meta(
+            ge=LEAST_EXPOSURE,
+            le=MOST_EXPOSURE,
+            description="factor on the color; 1: a white card in the light's brightest direction has radiance 0.8",
+        ),
+    ] = 1.0
     brdf: Annotated[Literal["gltf", "paper"], Meta(description="reflection model; gltf is what engines use")] = "gltf"
     seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="seed of everything random")] = 0
 
@@ -74,11 +116,11 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.images.contact import contact_sheet
     from gdtool.images.io import write_png
     from gdtool.shading.bsdf.closed_form import closed_form_image
+    from gdtool.shading.lights.studio import studio
     from gdtool.shading.render.direct import DirectLight
     from gdtool.shading.render.render import Goal, Renderer
     from gdtool.shading.render.rigs import turntable
     from gdtool.shading.render.skipped_work import savings
-    from gdtool.shading.lights.studio import studio
     from gdtool.stages.limits import held_to
 
     torch.set_num_threads(1)  # shading runs in threads of its own
@@ -93,32 +135,42 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     cameras = turntable(options.views, options.size, options.elevation, options.fov)
     frames, clipped = [], []
     cure = "raise --budget, or lower --size or --views"
-    held = contextlib.nullcontext() if options.budget is None else held_to(options.budget, "--budget", inputs.name, cure)
+    held = (
+        contextlib.nullcontext() if options.budget is None else held_to(options.budget, "--budget", inputs.name, cure)
+    )
     with held, out.step("render"):
         renderer = Renderer(scene, out.threads)
         direct = color = None
         if options.light != "sg":
-            direct = DirectLight(renderer, environment, options.light_samples, options.seed, options.brdf, mode=options.light)
+            direct = DirectLight(
+                renderer, environment, options.light_samples, options.seed, options.brdf, mode=options.light
+            )
             color = direct.color(options.exposure)
         open_ended = options.budget is not None or options.target_psnr is not None
         samples = OPEN_ENDED if open_ended else options.samples
         reached, begun = [], time.perf_counter()
         for number, camera in enumerate(out.progress(cameras, len(cameras), "frames")):
             # Each view gets an even part of what is left of the budget.
-            left = None if options.budget is None else max(0.0, options.budget - (time.perf_counter() - begun)) / (len(cameras) - number)
+            left = (
+                None
+                if options.budget is None
+                else max(0.0, options.budget - (time.perf_counter() - begun)) / (len(cameras) - number)
+            )
             frame = renderer.buffers(camera, samples, color, Goal(left, options.target_psnr))
             reached.append(renderer.counts.estimated_psnr)
             if color is None:
                 frame["color"] = closed_form_image(frame, camera, lobes, options.brdf) * options.exposure
             seen = frame["color"][frame["mask"] > 0]
             clipped.append(float((seen > 1).mean()) if len(seen) else 0.0)
-            frames.append(np.concatenate([srgb_from_linear(np.clip(frame["color"], 0, 1)), frame["mask"][..., None]], -1))
+            frames.append(
+                np.concatenate([srgb_from_linear(np.clip(frame["color"], 0, 1)), frame["mask"][..., None]], -1)
+            )
     with out.step("write"):
         for camera, frame in zip(cameras, frames, strict=True):
             write_png(out.path(f"{camera.name}.png"), frame)
         write_cameras(out.path("cameras.json"), cameras)
         columns = int(np.ceil(np.sqrt(len(frames))))
-        rows = [frames[i:i + columns] for i in range(0, len(frames), columns)]
+        rows = [frames[i : i + columns] for i in range(0, len(frames), columns)]
         write_png(out.path("contact_sheet.png"), contact_sheet(rows))
     if options.light == "sg":
         out.skip("shadows", "the closed form has none")
@@ -130,11 +182,24 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     if options.target_psnr is not None and (not known or min(known) < options.target_psnr):
         out.warn(f"--target-psnr {options.target_psnr:g} was not reached by {samples} samples per pixel")
     counts = renderer.counts
-    report = {"clipped_share": float(np.mean(clipped)), "environment_scale": environment.scale, "samples": counts.samples,
-              "shadow_rays": counts.shadow_rays, **({"estimated_psnr": min(known)} if known else {}),
-              **{f"light_fit_{k}": v for k, v in record["fit_error"].items()}}
-    out.content = RendersContent(frames=len(frames), environment=environment.name, light=options.light, exposure=options.exposure,
-                                 source_from_world=tuple(float(x) for x in matrix.ravel()), report=report)
+    report = {
+        "clipped_share": float(np.mean(clipped)),
+        "environment_scale": environment.scale,
+        "samples": counts.samples,
+        "shadow_rays": counts.shadow_rays,
+        **({"estimated_psnr": min(known)} if known else {}),
+        **{f"light_fit_{k}": v for k, v in record["fit_error"].items()},
+    }
+    out.content = RendersContent(
+        frames=len(frames),
+        environment=environment.name,
+        light=options.light,
+        exposure=options.exposure,
+        source_from_world=tuple(float(x) for x in matrix.ravel()),
+        report=report,
+    )
 
 
-STAGE = Stage(name="relight", version=6, reads=("asset", "model-file"), writes="renders", Options=Options, run=run, check=check)
+STAGE = Stage(
+    name="relight", version=6, reads=("asset", "model-file"), writes="renders", Options=Options, run=run, check=check
+)

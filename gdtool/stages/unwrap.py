@@ -25,15 +25,29 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Options of unwrap."""
 
     size: Annotated[int, Meta(ge=16, le=65536, description="texture size in texels that the padding is for")] = 2048
-    mip_safe: Annotated[int, Meta(ge=1, le=65536, description="charts stay a texel apart down to the mip level of this size")] = 256
-    padding: Annotated[int, Meta(ge=0, le=1024, description="texels between charts at --size; 0: what --mip-safe needs")] = 0
+    mip_safe: Annotated[
+        int, Meta(ge=1, le=65536, description="charts stay a texel apart down to the mip level of this size")
+    ] = 256
+    padding: Annotated[
+        int, Meta(ge=0, le=1024, description="texels between charts at --size; 0: what --mip-safe needs")
+    ] = 0
     max_stretch: Annotated[float, Meta(gt=1, le=100, description="a chart with more L2 stretch is cut")] = 1.1
-    symmetry: Annotated[Literal["none", "x", "y", "z"], Meta(description="faces that mirror others along this axis share their texels")] = "none"
+    symmetry: Annotated[
+        Literal["none", "x", "y", "z"], Meta(description="faces that mirror others along this axis share their texels")
+    ] = "none"
     redo: Annotated[bool, Meta(description="make new texture coordinates even where the mesh has valid ones")] = False
-    seconds: Annotated[float, Meta(gt=0, le=MOST_SECONDS, description="time limit; charts are shaped in the first 60 % of it, what is left then goes in simpler ways; after twice the limit and 5 s the run fails")] = 120.0
+    seconds: Annotated[
+        float,
+        Meta(
+            gt=0,
+            le=MOST_SECONDS,
+            description="time limit; charts are shaped in the first 60 % of it, what is left then goes in simpler ways; after twice the limit and 5 s the run fails",
+        ),
+    ] = 120.0
 
 
-# Of the quickest way, charts by the side that faces look at, with what comes before and after (400,000 quads, two cores of 2.5 GHz).
+# Of the quickest way, charts by the side that faces look at, with what comes before and after (400,000 quads, two cores
+# of 2.5 GHz).
 SECONDS_PER_FACE = 1.2e-4
 
 
@@ -73,7 +87,13 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         else:
             out.warn(f"{inputs.name}: its texture coordinates are not kept: {reason}")
     if not kept:
-        require_time(SECONDS_PER_FACE * len(mesh.faces), options.seconds, "--seconds", inputs.name, "run gdtool remesh with fewer --faces before")
+        require_time(
+            SECONDS_PER_FACE * len(mesh.faces),
+            options.seconds,
+            "--seconds",
+            inputs.name,
+            "run gdtool remesh with fewer --faces before",
+        )
         request = Request(size=options.size, padding=padding, max_stretch=options.max_stretch, seconds=options.seconds)
         with out.step("unwrap"):
             twin, corner = _twins(mesh, options, inputs, out)
@@ -92,22 +112,34 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         report["shared"] = float((twin >= 0).mean())
         report["texels_per_unit"] = _density(mesh, options.size)
         if kept and report["mirrored"] > 0:
-            out.warn(f"{inputs.name}: {report['mirrored']:.0%} of the surface is mirrored in its texture coordinates; tangent-space "
-                     "normal maps hold there in MikkTSpace alone, and --redo makes coordinates without mirrored charts")
+            out.warn(
+                f"{inputs.name}: {report['mirrored']:.0%} of the surface is mirrored in its texture coordinates; tangent-space "
+                "normal maps hold there in MikkTSpace alone, and --redo makes coordinates without mirrored charts"
+            )
         if report["overlap"] > 0 and not kept:
             out.warn(f"{inputs.name}: charts overlap on {100 * report['overlap']:.2g} % of what they cover")
     with out.step("preview"):
         chart = islands(mesh.vertices, faces, face_uvs)[0]
         write_png(out.path("layout.png"), unwrap_preview.layout(faces, mesh.uv, face_uvs, chart))
-        write_png(out.path("checkerboard.png"), unwrap_preview.checkerboard(mesh.vertices, faces, mesh.uv, face_uvs, chart))
+        write_png(
+            out.path("checkerboard.png"), unwrap_preview.checkerboard(mesh.vertices, faces, mesh.uv, face_uvs, chart)
+        )
     with out.step("write"):
         write_mesh(out, mesh)
     quads = int(mesh.is_quad.sum())
     out.content = AtlasContent(
-        vertices=len(mesh.vertices), quads=quads, triangles=len(mesh.faces) - quads, charts=report["charts"], size=options.size,
-        padding=padding, coverage=report["coverage"], watertight=topology.is_watertight(mesh.faces), report=report | {"kept": kept},
+        vertices=len(mesh.vertices),
+        quads=quads,
+        triangles=len(mesh.faces) - quads,
+        charts=report["charts"],
+        size=options.size,
+        padding=padding,
+        coverage=report["coverage"],
+        watertight=topology.is_watertight(mesh.faces),
+        report=report | {"kept": kept},
         tried=tuple(tried),
-        source_from_world=tuple(float(x) for x in matrix.ravel()))
+        source_from_world=tuple(float(x) for x in matrix.ravel()),
+    )
 
 
 def _twins(mesh, options: Options, inputs: Inputs, out: Output):
@@ -120,8 +152,10 @@ def _twins(mesh, options: Options, inputs: Inputs, out: Output):
         return np.full(len(mesh.faces), -1), np.full(mesh.faces.shape, -1)
     twin, corner = mirror_twins(mesh.vertices, mesh.faces.astype(np.int64), "xyz".index(options.symmetry))
     if not (twin >= 0).any():
-        out.warn(f"{inputs.name}: no face mirrors another along {options.symmetry}, so that none share texels; "
-                 f"gdtool remesh --symmetry {options.symmetry} makes faces that do")
+        out.warn(
+            f"{inputs.name}: no face mirrors another along {options.symmetry}, so that none share texels; "
+            f"gdtool remesh --symmetry {options.symmetry} makes faces that do"
+        )
     return twin, corner
 
 
@@ -130,7 +164,8 @@ def _path(inputs: Inputs):
 
 
 def _read(inputs: Inputs, out: Output):
-    """The mesh in the normalised frame, faces without an area or a repeated corner left out, and the (4, 4) matrix back."""
+    """The mesh in the normalised frame, faces without an area or a repeated corner left out, and the (4, 4) matrix
+    back."""
     import numpy as np
 
     from gdtool.folders.mesh import QuadMesh, read_mesh, read_obj
@@ -146,11 +181,17 @@ def _read(inputs: Inputs, out: Output):
             mesh = _from_scene(main, inputs, out)
         matrix = None
     if not np.isfinite(mesh.vertices).all():
-        raise InputError(_path(inputs), f"vertex {int(np.argmin(np.isfinite(mesh.vertices).all(1)))} is not finite", "run gdtool remesh on the model it was made from")
+        raise InputError(
+            _path(inputs),
+            f"vertex {int(np.argmin(np.isfinite(mesh.vertices).all(1)))} is not finite",
+            "run gdtool remesh on the model it was made from",
+        )
     used = np.unique(mesh.faces[mesh.faces >= 0])
     extent = float(np.ptp(mesh.vertices[used], 0).max()) if len(used) else 0.0
     if not 1e-150 < extent < 1e150:
-        raise InputError(_path(inputs), f"its longest side is {extent:g}, which cannot be computed with", "scale it to about 1")
+        raise InputError(
+            _path(inputs), f"its longest side is {extent:g}, which cannot be computed with", "scale it to about 1"
+        )
     if matrix is None:
         matrix = unit_box(mesh.vertices[used])
         mesh = QuadMesh(transform_points(invert_similarity(matrix), mesh.vertices), mesh.faces, mesh.uv, mesh.face_uvs)
@@ -174,7 +215,9 @@ def _from_scene(main, inputs: Inputs, out: Output):
     filler = np.full((len(scene.faces), 1), -1, np.int32)
     corners = np.concatenate([scene.faces, filler], 1).astype(np.int32)
     uv = scene.uvs[0] if scene.uvs else None
-    return QuadMesh(vertices, np.concatenate([joined[scene.faces], filler], 1).astype(np.int32), uv, None if uv is None else corners)
+    return QuadMesh(
+        vertices, np.concatenate([joined[scene.faces], filler], 1).astype(np.int32), uv, None if uv is None else corners
+    )
 
 
 def _without_degenerate(mesh, inputs: Inputs, out: Output):

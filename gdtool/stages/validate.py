@@ -22,7 +22,17 @@ from gdtool.core.manifest import MANIFEST, check_files
 from gdtool.core.runner import key_of, names_file
 from gdtool.core.sources import digest
 
-STAGES = ("render-dataset", "train", "sample-views", "import-views", "reconstruct", "remesh", "unwrap", "bake", "relight")
+STAGES = (
+    "render-dataset",
+    "train",
+    "sample-views",
+    "import-views",
+    "reconstruct",
+    "remesh",
+    "unwrap",
+    "bake",
+    "relight",
+)
 
 
 def faults(path: Path) -> Iterator[str]:
@@ -55,8 +65,8 @@ def _read(check: Callable[[], Iterator[str]]) -> Iterator[str]:
 def _check_key(folder: Folder) -> Iterator[str]:
     """That the key is the one that the stage, its version, the options and the inputs give.
 
-    Nothing is said of a manifest without a key or of another program's stage, nor where an option names a file that lies elsewhere by now: its digest is part of the key.
-    """
+    Nothing is said of a manifest without a key or of another program's stage, nor where an option names a file that
+    lies elsewhere by now: its digest is part of the key."""
     manifest = folder.manifest
     if not manifest.key or manifest.stage not in STAGES:
         return
@@ -90,7 +100,11 @@ def _needed(folder: Folder) -> set[str]:
     if folder.kind in ("mesh", "atlas"):
         return {"mesh.obj"}
     if folder.kind == "asset":
-        return {"asset.glb", "asset.obj", "asset.mtl"} | set(content.maps.values()) | ({content.usd} if content.usd else set())
+        return (
+            {"asset.glb", "asset.obj", "asset.mtl"}
+            | set(content.maps.values())
+            | ({content.usd} if content.usd else set())
+        )
     if folder.kind == "renders":
         return {f"{i:03d}.png" for i in range(content.frames)}
     if folder.kind == "model":

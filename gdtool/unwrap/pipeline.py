@@ -14,14 +14,16 @@ from gdtool.core.child import ChildFailed, begin, prepare
 from gdtool.geometry.simplify import CHILD_MODULES, reduced
 from gdtool.geometry.topology import triangulated
 from gdtool.geometry.uv_raster import owner_count
-from gdtool.unwrap.segment.charts import Adjacency, find_charts, run_xatlas
-from gdtool.unwrap.segment.straight_cuts import cut_to_pack
+from gdtool.unwrap.pack.search import WELL_PACKED, best_packed, pack
 from gdtool.unwrap.parameterize.flatten import singular_values, stretch
 from gdtool.unwrap.parameterize.schedule import flatten_all
-from gdtool.unwrap.pack.search import WELL_PACKED, best_packed, pack
+from gdtool.unwrap.segment.charts import Adjacency, find_charts, run_xatlas
+from gdtool.unwrap.segment.straight_cuts import cut_to_pack
 
-_MORE_CHARTS, _MOST_CUT = (5, 9, 13, 18, 23, 27), 43  # charts that cutting for packing adds, about, and ends with, at most
-# Shares of the time by which charts are found, shaped, projected, a child that has not ended is given up, and charts are packed.
+# Charts that cutting for packing adds, about, and ends with, at most.
+_MORE_CHARTS, _MOST_CUT = (5, 9, 13, 18, 23, 27), 43
+# Shares of the time by which charts are found, shaped, projected, a child that has not ended is given up, and charts
+# are packed.
 _SHARES = 0.2, 0.6, 0.7, 0.8, 0.9
 _SHORTEST = 0.05  # seconds of a child
 
@@ -41,7 +43,8 @@ class Request:
 @dataclass
 class Unwrapped:
     """uv (c, 2) in [0, 1], (0, 0) at the image's top left; face_uvs (f, 4) into it, -1 with a triangle's fourth corner;
-    chart (f,); what was tried and failed on the way; what was skipped, why, and the seconds that it would have taken."""
+    chart (f,); what was tried and failed on the way; what was skipped, why, and the seconds that it would have
+    taken."""
 
     uv: np.ndarray
     face_uvs: np.ndarray
@@ -53,9 +56,9 @@ class Unwrapped:
 def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapped:
     """Texture coordinates of quads and triangles faces (f, 4); a quad lies in one chart, its corners flat together.
 
-    vertices (v, 3) finite. Charts are never mirrored and do not overlap; all have one texel density. As the time runs out the
-    rest goes in simpler ways: charts by the side of a box that they look at, laid flat by projection, at last face by face, in rows.
-    """
+    vertices (v, 3) finite. Charts are never mirrored and do not overlap; all have one texel density. As the time runs
+    out the rest goes in simpler ways: charts by the side of a box that they look at, laid flat by projection, at last
+    face by face, in rows."""
     begun = time.monotonic()
     found_by, shaped_by, projected_by, hung_by, packed_by = (begun + share * request.seconds for share in _SHARES)
     prepare(reduced, CHILD_MODULES)
@@ -70,8 +73,19 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
 
     label, part, proxy, failed = find_charts(adjacency, unit, faces, until=found_by, max_cost=request.max_cost)
     try:
-        child = begin(flatten_all, unit, faces, label, request.good_stretch, request.max_stretch, proxy,
-                      (shaped_by, projected_by), part, seconds=max(hung_by - time.monotonic(), _SHORTEST), memory_mb=8000)
+        child = begin(
+            flatten_all,
+            unit,
+            faces,
+            label,
+            request.good_stretch,
+            request.max_stretch,
+            proxy,
+            (shaped_by, projected_by),
+            part,
+            seconds=max(hung_by - time.monotonic(), _SHORTEST),
+            memory_mb=8000,
+        )
         import_module("scipy.spatial")  # packing would wait for it
         flat, more = child.result()
     except ChildFailed as failure:
@@ -91,11 +105,16 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapp
         chart[faces_idx] = i
         offset += len(uv)
     uv = np.concatenate(places)
-    return Unwrapped(np.clip(np.stack([uv[:, 0], 1 - uv[:, 1]], -1), 0, 1), face_uvs.astype(np.int32), chart, failed, skipped)
+    return Unwrapped(
+        np.clip(np.stack([uv[:, 0], 1 - uv[:, 1]], -1), 0, 1), face_uvs.astype(np.int32), chart, failed, skipped
+    )
 
 
-def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float, until: float) -> tuple[list, list, list[tuple[str, str, float]]]:
-    """The charts, cut further where that fills the square better; orders to pack them in that were found on the way; what was skipped."""
+def _cut_to_pack(
+    adjacency: Adjacency, flat: list, gap: float, until: float
+) -> tuple[list, list, list[tuple[str, str, float]]]:
+    """The charts, cut further where that fills the square better; orders to pack them in that were found on the way;
+    what was skipped."""
     counts = [len(flat) + more for more in _MORE_CHARTS if len(flat) + more <= _MOST_CUT]
     tried, start = [flat], time.monotonic()
 
@@ -110,14 +129,23 @@ def _cut_to_pack(adjacency: Adjacency, flat: list, gap: float, until: float) -> 
     chosen, share, ways, leapt = best_packed(variants(), gap)
     skipped, took = [], time.monotonic() - start
     if leapt:
-        skipped.append((f"packing {leapt} ways to cut", "the charts before filled too little of the square", leapt * took / (len(tried) - leapt)))
+        skipped.append(
+            (
+                f"packing {leapt} ways to cut",
+                "the charts before filled too little of the square",
+                leapt * took / (len(tried) - leapt),
+            )
+        )
     if share > WELL_PACKED and len(tried) <= len(counts):
         skipped.append(("cutting further for packing", f"the charts fill {share:.0%} of the square", took))
     return tried[chosen], ways, skipped
 
 
-def figures(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, size: int = 1024) -> dict[str, float | int]:
-    """Charts, coverage and overlap of the unit square, L2 stretch, angle and area distortion, mirrored share, seam length.
+def figures(
+    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, size: int = 1024
+) -> dict[str, float | int]:
+    """Charts, coverage and overlap of the unit square, L2 stretch, angle and area distortion, mirrored share, seam
+    length.
 
     Mirrored and overlap are shares of area; seam length is in diagonals of the bounding box, each seam counted once.
     """
@@ -136,10 +164,14 @@ def figures(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: n
     count = owner_count(uv, corners, size)
     label, seam = islands(vertices, faces, face_uvs)
     return {
-        "charts": int(label.max()) + 1, "coverage": float((count > 0).mean()), "overlap": float((count > 1).sum() / max((count > 0).sum(), 1)),
-        "stretch": stretch(points, corners, upward), "area_distortion": float((weight * np.maximum(ratio, 1 / ratio)).sum()),
+        "charts": int(label.max()) + 1,
+        "coverage": float((count > 0).mean()),
+        "overlap": float((count > 1).sum() / max((count > 0).sum(), 1)),
+        "stretch": stretch(points, corners, upward),
+        "area_distortion": float((weight * np.maximum(ratio, 1 / ratio)).sum()),
         "angle_distortion": float((weight * np.minimum(values[use, 0] / np.maximum(values[use, 1], 1e-12), 100)).sum()),
-        "mirrored": float(area[flat < 0].sum() / area.sum()), "degenerate": float(1 - use.mean()),
+        "mirrored": float(area[flat < 0].sum() / area.sum()),
+        "degenerate": float(1 - use.mean()),
         "seam_length": seam / float(np.linalg.norm(np.ptp(vertices, 0))),
     }
 
@@ -152,8 +184,8 @@ def corner_triangles(face_uvs: np.ndarray, face_idx: np.ndarray) -> np.ndarray:
 
 
 def islands(vertices: np.ndarray, faces: np.ndarray, face_uvs: np.ndarray) -> tuple[np.ndarray, float]:
-    """The chart (f,) of each face, joined wherever an edge has the same texture corners on both sides, and the length of
-    the edges that have not."""
+    """The chart (f,) of each face, joined wherever an edge has the same texture corners on both sides, and the length
+    of the edges that have not."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -165,9 +197,11 @@ def islands(vertices: np.ndarray, faces: np.ndarray, face_uvs: np.ndarray) -> tu
     first = (np.cumsum(edges.count) - edges.count)[edge_idx]
     ends_uv = edges_of(face_uvs).half_ends  # in the same order of corners
     one, two = ends_uv[order[first]], ends_uv[order[first + 1]]
-    backward = (edges.half_ends[order[first]][:, 0] != edges.half_ends[order[first + 1]][:, 0])
+    backward = edges.half_ends[order[first]][:, 0] != edges.half_ends[order[first + 1]][:, 0]
     two = np.where(backward[:, None], two[:, ::-1], two)
     joined = (one == two).all(1)
     graph = coo_matrix((np.ones(int(joined.sum())), (pairs[joined, 0], pairs[joined, 1])), (len(faces), len(faces)))
     ends = edges.ends[edge_idx[~joined]]
-    return connected_components(graph, False)[1], float(np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1).sum())
+    return connected_components(graph, False)[1], float(
+        np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1).sum()
+    )

@@ -34,8 +34,9 @@ def layout(faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, chart: np.nd
     return out
 
 
-def checkerboard(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, chart: np.ndarray,
-                 size: int = 512) -> np.ndarray:
+def checkerboard(
+    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, chart: np.ndarray, size: int = 512
+) -> np.ndarray:
     """(size, 2 size, 3) in [0, 1]: the mesh from front right and back left under a checkerboard, charts tinted."""
     from gdtool.cameras import rays, rig
     from gdtool.geometry.normals import face_normals

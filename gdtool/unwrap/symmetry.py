@@ -1,4 +1,5 @@
-"""Both halves of a symmetric mesh on the same texels: half of it is unwrapped, the other half takes its twins' corners."""
+"""Both halves of a symmetric mesh on the same texels: half of it is unwrapped, the other half takes its twins'
+corners."""
 
 from __future__ import annotations
 
@@ -11,9 +12,8 @@ def mirror_twins(vertices: np.ndarray, faces: np.ndarray, axis: int) -> tuple[np
     """For faces (f, 4), -1 as a triangle's fourth corner, mirrored in the middle of vertices (v, 3) along axis.
 
     Returns twin (f,): for a face of the lower half the face of the upper half that mirrors it, -1 for all others (upper
-    faces, faces across the middle, and those without a twin); and corner (f, 4): which of its twin's corners each of its
-    corners is, -1 where there is none.
-    """
+    faces, faces across the middle, and those without a twin); and corner (f, 4): which of its twin's corners each of
+    its corners is, -1 where there is none."""
     from scipy.spatial import cKDTree
 
     used = np.unique(faces[faces >= 0])

@@ -23,27 +23,44 @@ class Builder:
     """A document and its one buffer; add() returns accessor indices."""
 
     def __init__(self) -> None:
-        self.document: dict[str, Any] = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
-                                         "meshes": [{"primitives": []}], "accessors": [], "bufferViews": []}
+        self.document: dict[str, Any] = {
+            "asset": {"version": "2.0"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0}],
+            "meshes": [{"primitives": []}],
+            "accessors": [],
+            "bufferViews": [],
+        }
         self.binary = b""
 
     def view(self, content: bytes, **extra: Any) -> int:
         self.binary += b"\0" * (-len(self.binary) % 4)
-        self.document["bufferViews"].append({"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(content), **extra})
+        self.document["bufferViews"].append(
+            {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(content), **extra}
+        )
         self.binary += content
         return len(self.document["bufferViews"]) - 1
 
     def add(self, array: np.ndarray, **extra: Any) -> int:
         stride = {}
         stored = array
-        if array.ndim == 2 and (array.itemsize * array.shape[1]) % 4:  # rows of vertex attributes begin at multiples of four
+        # Rows of vertex attributes begin at multiples of four.
+        if array.ndim == 2 and (array.itemsize * array.shape[1]) % 4:
             size = array.itemsize * array.shape[1]
             stored = np.zeros((len(array), -(-size // 4) * 4), np.uint8)
             stored[:, :size] = np.ascontiguousarray(array).view(np.uint8).reshape(len(array), size)
             stride = {"byteStride": stored.shape[1]}
         view = self.view(np.ascontiguousarray(stored).tobytes(), **stride)
-        self.document["accessors"].append({"bufferView": view, "componentType": _COMPONENT[array.dtype.name], "count": len(array),
-                                           "type": _KIND[array.shape[1:]], **extra})
+        self.document["accessors"].append(
+            {
+                "bufferView": view,
+                "componentType": _COMPONENT[array.dtype.name],
+                "count": len(array),
+                "type": _KIND[array.shape[1:]],
+                **extra,
+            }
+        )
         return len(self.document["accessors"]) - 1
 
     def primitive(self, attributes: dict[str, int], indices: int | None = None, **extra: Any) -> None:
@@ -75,8 +92,11 @@ def pack(text: bytes, binary: bytes) -> bytes:
 def quad(**material: Any) -> Builder:
     """A unit square facing +Z with normals and texture coordinates, and a material where one is given."""
     builder = Builder()
-    attributes = {"POSITION": builder.add(QUAD), "NORMAL": builder.add(np.tile(np.float32([0, 0, 1]), (4, 1))),
-                  "TEXCOORD_0": builder.add(QUAD[:, :2] * np.float32([1, -1]) + np.float32([0, 1]))}
+    attributes = {
+        "POSITION": builder.add(QUAD),
+        "NORMAL": builder.add(np.tile(np.float32([0, 0, 1]), (4, 1))),
+        "TEXCOORD_0": builder.add(QUAD[:, :2] * np.float32([1, -1]) + np.float32([0, 1])),
+    }
     extra = {}
     if material:
         builder.document["materials"] = [material]

@@ -39,7 +39,7 @@ def damaged(whole: bytes, rng: random.Random) -> bytes:
         elif kind < 0.6:
             out[i] = rng.choice(b'0123456789-.[]{}",\x00\xff')
         elif kind < 0.75:
-            del out[i:i + rng.randrange(1, 9)]
+            del out[i : i + rng.randrange(1, 9)]
         elif kind < 0.9:
             out[i:i] = rng.choice([b"1e999", b"-1", b"99999999999", b"null", b"\n", b'"x"', b"[]"])
         else:
@@ -56,8 +56,14 @@ def damaged(whole: bytes, rng: random.Random) -> bytes:
 
 @pytest.mark.parametrize("kind", ["glb", "obj", "ply", "stl", "png", "exr"])
 def test_a_damaged_file_is_read_or_refused(tmp_path, kind, capfd):
-    whole = {"glb": textured_quad, "obj": lambda: OBJ, "ply": lambda: ply().encode(), "stl": lambda: stl(FACES),
-             "png": lambda: encode_png(np.random.default_rng(0).random((16, 16, 4))), "exr": lambda: exr(tmp_path)}[kind]()
+    whole = {
+        "glb": textured_quad,
+        "obj": lambda: OBJ,
+        "ply": lambda: ply().encode(),
+        "stl": lambda: stl(FACES),
+        "png": lambda: encode_png(np.random.default_rng(0).random((16, 16, 4))),
+        "exr": lambda: exr(tmp_path),
+    }[kind]()
     rng, path, read = random.Random(kind), tmp_path / f"x.{kind}", read_image if kind in ("png", "exr") else load_scene
     refused = 0
     for _ in range(150):

@@ -24,13 +24,21 @@ def test_quad(tmp_path):
     np.testing.assert_array_equal(scene.faces.ravel(), QUAD_FACES)
     np.testing.assert_allclose(scene.normals, [[0, 0, 1]] * 4)
     np.testing.assert_allclose(scene.uvs[0], [[0, 1], [1, 1], [1, 0], [0, 0]])
-    assert scene.materials == (DEFAULT_MATERIAL,) and scene.name == "quad" and scene.colors is None and scene.tangents is None
+    assert (
+        scene.materials == (DEFAULT_MATERIAL,)
+        and scene.name == "quad"
+        and scene.colors is None
+        and scene.tangents is None
+    )
 
 
 def test_external_and_data_uris_equal_the_binary_chunk(tmp_path):
     builder = quad()
     truth = read_gltf(builder.write(tmp_path / "a.glb"))
-    for uri in ("its%20buffer.bin", "data:application/octet-stream;base64," + base64.b64encode(builder.binary).decode()):
+    for uri in (
+        "its%20buffer.bin",
+        "data:application/octet-stream;base64," + base64.b64encode(builder.binary).decode(),
+    ):
         (tmp_path / "its buffer.bin").write_bytes(builder.binary)
         document = {**builder.document, "buffers": [{"byteLength": len(builder.binary), "uri": uri}]}
         (tmp_path / "a.gltf").write_text(json.dumps(document))
@@ -39,8 +47,18 @@ def test_external_and_data_uris_equal_the_binary_chunk(tmp_path):
         np.testing.assert_array_equal(scene.faces, truth.faces)
 
 
-@pytest.mark.parametrize("uri", ["/etc/passwd", "file:///etc/passwd", "http://example.com/x.bin", "C:/x.bin", "\\\\host\\x.bin", "missing.bin",
-                                 "data:application/octet-stream;base64,***"])
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "/etc/passwd",
+        "file:///etc/passwd",
+        "http://example.com/x.bin",
+        "C:/x.bin",
+        "\\\\host\\x.bin",
+        "missing.bin",
+        "data:application/octet-stream;base64,***",
+    ],
+)
 def test_uris_that_are_not_relative_are_refused(tmp_path, uri):
     builder = quad()
     document = {**builder.document, "buffers": [{"byteLength": len(builder.binary), "uri": uri}]}
@@ -51,8 +69,15 @@ def test_uris_that_are_not_relative_are_refused(tmp_path, uri):
 
 def test_sparse_overrides(tmp_path):
     builder = quad()
-    where, values = builder.view(np.uint16([1, 3]).tobytes()), builder.view(np.float32([[5, 0, 0], [0, 7, 0]]).tobytes())
-    builder.document["accessors"][0]["sparse"] = {"count": 2, "indices": {"bufferView": where, "componentType": 5123}, "values": {"bufferView": values}}
+    where, values = (
+        builder.view(np.uint16([1, 3]).tobytes()),
+        builder.view(np.float32([[5, 0, 0], [0, 7, 0]]).tobytes()),
+    )
+    builder.document["accessors"][0]["sparse"] = {
+        "count": 2,
+        "indices": {"bufferView": where, "componentType": 5123},
+        "values": {"bufferView": values},
+    }
     scene = read_gltf(builder.write(tmp_path / "a.glb"))
     np.testing.assert_array_equal(scene.vertices, [[0, 0, 0], [5, 0, 0], [1, 1, 0], [0, 7, 0]])
     builder.document["accessors"][0]["sparse"]["count"] = 9
@@ -65,7 +90,11 @@ def test_sparse_over_nothing_starts_from_zeros(tmp_path):
     where, values = builder.view(np.uint8([1, 2]).tobytes()), builder.view(np.float32([[1, 0, 0], [1, 1, 0]]).tobytes())
     record = builder.document["accessors"][0]
     del record["bufferView"]
-    record["sparse"] = {"count": 2, "indices": {"bufferView": where, "componentType": 5121}, "values": {"bufferView": values}}
+    record["sparse"] = {
+        "count": 2,
+        "indices": {"bufferView": where, "componentType": 5121},
+        "values": {"bufferView": values},
+    }
     np.testing.assert_array_equal(read_gltf(builder.write(tmp_path / "a.glb")).vertices[:3], QUAD[:3])
 
 
@@ -73,8 +102,11 @@ def test_quantised_positions_are_numbers_and_normalised_are_fractions(tmp_path):
     builder = Builder()
     builder.document |= {"extensionsRequired": ["KHR_mesh_quantization"], "extensionsUsed": ["KHR_mesh_quantization"]}
     builder.document["nodes"][0]["scale"] = [0.001, 0.001, 0.001]
-    attributes = {"POSITION": builder.add((QUAD * 1000).astype(np.int16)), "NORMAL": builder.add(np.int8([[0, 0, 127]] * 4), normalized=True),
-                  "TEXCOORD_0": builder.add((QUAD[:, :2] * 65535).astype(np.uint16), normalized=True)}
+    attributes = {
+        "POSITION": builder.add((QUAD * 1000).astype(np.int16)),
+        "NORMAL": builder.add(np.int8([[0, 0, 127]] * 4), normalized=True),
+        "TEXCOORD_0": builder.add((QUAD[:, :2] * 65535).astype(np.uint16), normalized=True),
+    }
     builder.primitive(attributes, builder.add(QUAD_FACES))
     scene = read_gltf(builder.write(tmp_path / "a.glb"))
     np.testing.assert_allclose(scene.vertices, QUAD, atol=1e-12)
@@ -85,7 +117,9 @@ def test_quantised_positions_are_numbers_and_normalised_are_fractions(tmp_path):
 def test_the_lowest_signed_byte_is_minus_one(tmp_path):
     builder = Builder()
     builder.primitive({"POSITION": builder.add(np.int8([[-128, 0, 0], [127, 0, 0], [0, 127, 0]]), normalized=True)})
-    np.testing.assert_allclose(read_gltf(builder.write(tmp_path / "a.glb")).vertices, [[-1, 0, 0], [1, 0, 0], [0, 1, 0]])
+    np.testing.assert_allclose(
+        read_gltf(builder.write(tmp_path / "a.glb")).vertices, [[-1, 0, 0], [1, 0, 0], [0, 1, 0]]
+    )
 
 
 def test_interleaved_attributes(tmp_path):
@@ -93,14 +127,18 @@ def test_interleaved_attributes(tmp_path):
     rows = np.concatenate([QUAD, np.tile(np.float32([0, 0, 1]), (4, 1)), QUAD[:, :2]], 1)
     view = builder.view(rows.tobytes(), byteStride=32)
     for offset, kind in ((0, "VEC3"), (12, "VEC3"), (24, "VEC2")):
-        builder.document["accessors"].append({"bufferView": view, "byteOffset": offset, "componentType": 5126, "count": 4, "type": kind})
+        builder.document["accessors"].append(
+            {"bufferView": view, "byteOffset": offset, "componentType": 5126, "count": 4, "type": kind}
+        )
     builder.primitive({"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2}, builder.add(QUAD_FACES))
     scene = read_gltf(builder.write(tmp_path / "a.glb"))
     np.testing.assert_array_equal(scene.vertices, QUAD)
     np.testing.assert_array_equal(scene.uvs[0], QUAD[:, :2])
 
 
-@pytest.mark.parametrize(("mode", "indices"), [(4, [0, 1, 2, 0, 2, 3]), (5, [0, 1, 3, 2]), (6, [0, 1, 2, 3]), (5, [0, 1, 3, 2, 2])])
+@pytest.mark.parametrize(
+    ("mode", "indices"), [(4, [0, 1, 2, 0, 2, 3]), (5, [0, 1, 3, 2]), (6, [0, 1, 2, 3]), (5, [0, 1, 3, 2, 2])]
+)
 def test_lists_strips_and_fans_face_one_way(tmp_path, mode, indices):
     builder = Builder()
     builder.primitive({"POSITION": builder.add(QUAD)}, builder.add(np.array(indices, np.uint8)), mode=mode)
@@ -125,7 +163,10 @@ def test_points_and_lines_are_left_out_and_noted(tmp_path):
 def test_node_hierarchy(tmp_path):
     builder = quad()
     half = np.sqrt(0.5)
-    builder.document["nodes"] = [{"children": [1], "translation": [10, 0, 0]}, {"mesh": 0, "rotation": [0, half, 0, half], "scale": [2, 2, 2]}]
+    builder.document["nodes"] = [
+        {"children": [1], "translation": [10, 0, 0]},
+        {"mesh": 0, "rotation": [0, half, 0, half], "scale": [2, 2, 2]},
+    ]
     scene = read_gltf(builder.write(tmp_path / "a.glb"))
     # a quarter turn about +Y takes +X to -Z and +Z to +X
     np.testing.assert_allclose(scene.vertices, [[10, 0, 0], [10, 0, -2], [10, 2, -2], [10, 2, 0]], atol=1e-12)
@@ -140,7 +181,9 @@ def test_a_mirroring_node_turns_the_winding_and_keeps_the_bitangent(tmp_path):
     builder = quad(normalTexture={"index": 0})
     builder.document["images"] = [{"bufferView": builder.view(encode_png(np.full((2, 2, 3), 0.5)))}]
     builder.document["textures"] = [{"source": 0}]
-    builder.document["meshes"][0]["primitives"][0]["attributes"]["TANGENT"] = builder.add(np.tile(np.float32([1, 0, 0, 1]), (4, 1)))
+    builder.document["meshes"][0]["primitives"][0]["attributes"]["TANGENT"] = builder.add(
+        np.tile(np.float32([1, 0, 0, 1]), (4, 1))
+    )
     builder.document["nodes"][0]["scale"] = [-1, 1, 1]
     scene = read_gltf(builder.write(tmp_path / "a.glb"))
     np.testing.assert_allclose(area_vector(scene), [0, 0, 1])
@@ -171,7 +214,11 @@ def test_skins_stand_as_their_joints_do(tmp_path):
     inverse = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
     inverse[1, 3, 1] = -1  # stored by columns: the second joint was bound at y = 1
     builder.document["skins"] = [{"joints": [1, 2], "inverseBindMatrices": builder.add(inverse)}]
-    builder.document["nodes"] = [{"mesh": 0, "skin": 0, "translation": [100, 0, 0]}, {"children": [2]}, {"translation": [0, 3, 0]}]
+    builder.document["nodes"] = [
+        {"mesh": 0, "skin": 0, "translation": [100, 0, 0]},
+        {"children": [2]},
+        {"translation": [0, 3, 0]},
+    ]
     builder.document["scenes"] = [{"nodes": [0, 1]}]
     scene = read_gltf(builder.write(tmp_path / "a.glb"))
     # the mesh's own node does not move a skinned mesh
@@ -183,7 +230,9 @@ def test_skins_stand_as_their_joints_do(tmp_path):
 
 def test_morph_targets_at_their_default_weight(tmp_path):
     builder = quad()
-    builder.document["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": builder.add(np.tile(np.float32([0, 0, 4]), (4, 1)))}]
+    builder.document["meshes"][0]["primitives"][0]["targets"] = [
+        {"POSITION": builder.add(np.tile(np.float32([0, 0, 4]), (4, 1)))}
+    ]
     builder.document["meshes"][0]["weights"] = [0.25]
     np.testing.assert_allclose(read_gltf(builder.write(tmp_path / "a.glb")).vertices[:, 2], 1)
     builder.document["nodes"][0]["weights"] = [0.5]
@@ -193,8 +242,15 @@ def test_morph_targets_at_their_default_weight(tmp_path):
 def test_primitives_with_and_without(tmp_path):
     builder = quad(name="red", pbrMetallicRoughness={"baseColorFactor": [1, 0, 0, 1]})
     colors = np.uint8([[255, 0, 0], [0, 255, 0], [0, 0, 255], [51, 51, 51]])
-    builder.primitive({"POSITION": builder.add(QUAD + np.float32([2, 0, 0])), "COLOR_0": builder.add(colors, normalized=True),
-                       "TEXCOORD_1": builder.add(QUAD[:, :2])}, builder.add(QUAD_FACES), material=0)
+    builder.primitive(
+        {
+            "POSITION": builder.add(QUAD + np.float32([2, 0, 0])),
+            "COLOR_0": builder.add(colors, normalized=True),
+            "TEXCOORD_1": builder.add(QUAD[:, :2]),
+        },
+        builder.add(QUAD_FACES),
+        material=0,
+    )
     builder.primitive({"POSITION": builder.add(QUAD + np.float32([4, 0, 0]))}, builder.add(QUAD_FACES))
     scene = load_scene(builder.write(tmp_path / "a.glb"))
     assert [m.name for m in scene.materials] == ["red", "default"]
@@ -218,10 +274,16 @@ def test_shared_buffers_bring_only_their_vertices(tmp_path):
 def test_draco(tmp_path):
     codec = pytest.importorskip("DracoPy")
     builder = Builder()
-    builder.document |= {"extensionsRequired": ["KHR_draco_mesh_compression"], "extensionsUsed": ["KHR_draco_mesh_compression"]}
+    builder.document |= {
+        "extensionsRequired": ["KHR_draco_mesh_compression"],
+        "extensionsUsed": ["KHR_draco_mesh_compression"],
+    }
     packed = codec.encode(QUAD, QUAD_FACES.reshape(-1, 3).astype(np.uint32), quantization_bits=14)
     view = builder.view(packed)
-    builder.document["accessors"] = [{"componentType": 5126, "count": 4, "type": "VEC3"}, {"componentType": 5125, "count": 6, "type": "SCALAR"}]
+    builder.document["accessors"] = [
+        {"componentType": 5126, "count": 4, "type": "VEC3"},
+        {"componentType": 5125, "count": 6, "type": "SCALAR"},
+    ]
     identity = codec.decode(packed).attributes[0]["unique_id"]
     extension = {"KHR_draco_mesh_compression": {"bufferView": view, "attributes": {"POSITION": identity}}}
     builder.primitive({"POSITION": 0}, 1, extensions=extension)
@@ -235,7 +297,12 @@ def test_draco_without_its_package(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "DracoPy", None)
     builder = Builder()
     builder.document["accessors"] = [{"componentType": 5126, "count": 4, "type": "VEC3"}]
-    builder.primitive({"POSITION": 0}, extensions={"KHR_draco_mesh_compression": {"bufferView": builder.view(b"DRACO"), "attributes": {"POSITION": 0}}})
+    builder.primitive(
+        {"POSITION": 0},
+        extensions={
+            "KHR_draco_mesh_compression": {"bufferView": builder.view(b"DRACO"), "attributes": {"POSITION": 0}}
+        },
+    )
     with pytest.raises(ResourceError, match="DracoPy"):
         read_gltf(builder.write(tmp_path / "a.glb"))
 
@@ -243,7 +310,8 @@ def test_draco_without_its_package(tmp_path, monkeypatch):
 def test_meshopt_without_its_package(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "meshopt", None)
     builder = quad()
-    builder.document["bufferViews"][0]["extensions"] = {"EXT_meshopt_compression": {
-        "buffer": 0, "byteLength": 16, "byteStride": 12, "count": 4, "mode": "ATTRIBUTES"}}
+    builder.document["bufferViews"][0]["extensions"] = {
+        "EXT_meshopt_compression": {"buffer": 0, "byteLength": 16, "byteStride": 12, "count": 4, "mode": "ATTRIBUTES"}
+    }
     with pytest.raises(ResourceError, match="pip install meshopt"):
         read_gltf(builder.write(tmp_path / "a.glb"))

@@ -1,4 +1,5 @@
-"""What glTF's fields mean once a file is looked up: transforms, second UV set, vertex colours, both sides, ior and specular."""
+"""What glTF's fields mean once a file is looked up: transforms, second UV set, vertex colours, both sides, ior and
+specular."""
 
 from __future__ import annotations
 
@@ -8,8 +9,8 @@ import pytest
 from gdtool.assets.gltf_read import read_gltf
 from gdtool.cameras import camera_at
 from gdtool.core.errors import InputError
-from gdtool.shading.render.direct import DirectLight
 from gdtool.shading.lights.environment import Environment
+from gdtool.shading.render.direct import DirectLight
 from gdtool.shading.render.render import Renderer, render_buffers
 from gdtool.shading.render.surface_points import surface_attributes
 from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad, with_textures
@@ -38,11 +39,17 @@ def texel(row: int, column: int) -> np.ndarray:
     return linear_from_srgb(PIXELS[row, column])
 
 
-@pytest.mark.parametrize("transform, at", [
-    ({"offset": [0.25, 0.5]}, (2, 1)), ({"scale": [3, 1]}, (0, 1)),
-    # The specification's matrix: u' = u cos + v sin, v' = v cos − u sin; (1/8, 1/8) turned by 90° is (1/8, −1/8), the last row.
-    ({"rotation": np.pi / 2}, (3, 0)), ({"offset": [0.5, 0], "rotation": -np.pi / 2, "scale": [1, 3]}, (0, 0)),
-])
+@pytest.mark.parametrize(
+    "transform, at",
+    [
+        ({"offset": [0.25, 0.5]}, (2, 1)),
+        ({"scale": [3, 1]}, (0, 1)),
+        # The specification's matrix: u' = u cos + v sin, v' = v cos − u sin; (1/8, 1/8) turned by 90° is (1/8, −1/8),
+        # the last row.
+        ({"rotation": np.pi / 2}, (3, 0)),
+        ({"offset": [0.5, 0], "rotation": -np.pi / 2, "scale": [1, 3]}, (0, 0)),
+    ],
+)
 def test_texture_transforms_place_the_lookup(tmp_path, transform, at):
     got = textured(tmp_path, [(0.125, 0.125)], {"extensions": {"KHR_texture_transform": transform}})
     np.testing.assert_allclose(got, texel(*at), atol=1e-6)
@@ -85,7 +92,9 @@ def test_ior_and_specular_set_the_reflectance_at_normal_incidence(tmp_path):
 def seen(scene, *, azimuth=0.0, elevation=0.0, size=32, light=1.0, samples=16) -> dict[str, np.ndarray]:
     """A view of the scene under a uniform light, without shadows."""
     renderer = Renderer(scene, 1)
-    direct = DirectLight(renderer, Environment(np.full((8, 16, 3), light, np.float32), "uniform"), samples, 0, shadows=False)
+    direct = DirectLight(
+        renderer, Environment(np.full((8, 16, 3), light, np.float32), "uniform"), samples, 0, shadows=False
+    )
     return renderer.buffers(camera_at(azimuth, elevation, name="v", size=size), 4, direct.color())
 
 
@@ -97,7 +106,8 @@ def centred(builder) -> object:
 
 @pytest.mark.parametrize("azimuth", [0.0, 80.0])
 def test_specular_zero_reflects_nothing_also_at_grazing_angles(tmp_path, azimuth):
-    """KHR_materials_specular scales f90 too: a white one is then a plain Lambert surface, 1 in a furnace at every angle."""
+    """KHR_materials_specular scales f90 too: a white one is then a plain Lambert surface, 1 in a furnace at every
+    angle."""
     material = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 0.3}}
     got = []
     for specular in (0.0, 1.0):
@@ -111,32 +121,52 @@ def test_specular_zero_reflects_nothing_also_at_grazing_angles(tmp_path, azimuth
 
 
 def test_unlit_shows_its_base_color_whatever_the_light(tmp_path):
-    builder = centred(quad(pbrMetallicRoughness={"baseColorFactor": [0.25, 0.5, 1, 1]}, extensions={"KHR_materials_unlit": {}}))
+    builder = centred(
+        quad(pbrMetallicRoughness={"baseColorFactor": [0.25, 0.5, 1, 1]}, extensions={"KHR_materials_unlit": {}})
+    )
     builder.document["extensionsUsed"] = ["KHR_materials_unlit"]
     scene = read_gltf(builder.write(tmp_path / "a.glb"))
     for light in (0.0, 7.0):
         images = seen(scene, light=light)
-        np.testing.assert_allclose(images["color"][images["mask"] == 1], np.broadcast_to([0.25, 0.5, 1], ((images["mask"] == 1).sum(), 3)), atol=1e-6)
+        np.testing.assert_allclose(
+            images["color"][images["mask"] == 1],
+            np.broadcast_to([0.25, 0.5, 1], ((images["mask"] == 1).sum(), 3)),
+            atol=1e-6,
+        )
 
 
 def test_emission_is_factor_times_texture_times_strength(tmp_path):
     builder = with_textures(glow=np.full((2, 2, 3), 188, np.uint8))  # sRGB 188 is 0.503 linear
     builder.document["extensionsUsed"] = ["KHR_materials_emissive_strength"]
-    builder.document["materials"] = [{"emissiveFactor": [1, 0.5, 0], "emissiveTexture": {"index": 0}, "extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": 4}},
-                                      "pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1]}}]
+    builder.document["materials"] = [
+        {
+            "emissiveFactor": [1, 0.5, 0],
+            "emissiveTexture": {"index": 0},
+            "extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": 4}},
+            "pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1]},
+        }
+    ]
     images = seen(read_gltf(centred(builder).write(tmp_path / "a.glb")), light=0.0)
     linear = ((188 / 255 + 0.055) / 1.055) ** 2.4
     np.testing.assert_allclose(images["color"][images["mask"] == 1].mean(0), [4 * linear, 2 * linear, 0], rtol=1e-4)
 
 
-@pytest.mark.parametrize("mode, alpha, visible", [("OPAQUE", 0.1, 1), ("MASK", 0.3, 1), ("MASK", 0.2, 0), ("BLEND", 0.6, 1), ("BLEND", 0.4, 0)])
+@pytest.mark.parametrize(
+    "mode, alpha, visible",
+    [("OPAQUE", 0.1, 1), ("MASK", 0.3, 1), ("MASK", 0.2, 0), ("BLEND", 0.6, 1), ("BLEND", 0.4, 0)],
+)
 def test_alpha_of_factor_texture_and_vertices_multiplies(tmp_path, mode, alpha, visible):
     """Cutoff 0.25 for MASK; BLEND is seen from one half on; alpha is never sRGB."""
     pixels = np.full((2, 2, 4), 255, np.uint8)
     pixels[..., 3] = 204  # 0.8
     builder = with_textures(color=pixels)
-    builder.document["materials"] = [{"alphaMode": mode, **({"alphaCutoff": 0.25} if mode == "MASK" else {}),
-                                      "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, alpha / 0.4], "baseColorTexture": {"index": 0}}}]
+    builder.document["materials"] = [
+        {
+            "alphaMode": mode,
+            **({"alphaCutoff": 0.25} if mode == "MASK" else {}),
+            "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, alpha / 0.4], "baseColorTexture": {"index": 0}},
+        }
+    ]
     if alpha / 0.4 > 1:
         builder.document["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"][3] = 1
     vertex = np.tile(np.float32([1, 1, 1, 0.5 if alpha / 0.4 <= 1 else alpha / 0.8]), (4, 1))
@@ -157,13 +187,16 @@ def test_samplers_wrap_each_axis(tmp_path, wrap, at, axis):
     builder.document["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
     place = [0.125, 0.125]
     place[axis] = 1.375
-    builder.document["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = builder.add(np.tile(np.float32(place), (4, 1)))
+    builder.document["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = builder.add(
+        np.tile(np.float32(place), (4, 1))
+    )
     got = surface_attributes(read_gltf(builder.write(tmp_path / "a.glb")), *CORNER)["albedo"][0]
     np.testing.assert_allclose(got, texel(*((0, at) if axis == 0 else (at, 0))), atol=1e-6)
 
 
 def test_filters_blend_linear_values_or_take_the_nearest(tmp_path):
-    """Between the texels 0 and 255, a quarter of the way: nearest gives black, linear a quarter of white, in linear light."""
+    """Between the texels 0 and 255, a quarter of the way: nearest gives black, linear a quarter of white, in linear
+    light."""
     pixels = np.zeros((1, 2, 3), np.uint8)
     pixels[0, 1] = 255
     got = {}
@@ -172,30 +205,42 @@ def test_filters_blend_linear_values_or_take_the_nearest(tmp_path):
         builder.document["samplers"] = [{"magFilter": code, "wrapS": 33071}]
         builder.document["textures"][0]["sampler"] = 0
         builder.document["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
-        builder.document["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = builder.add(np.tile(np.float32([0.375, 0.5]), (4, 1)))
+        builder.document["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = builder.add(
+            np.tile(np.float32([0.375, 0.5]), (4, 1))
+        )
         got[name] = float(surface_attributes(read_gltf(builder.write(tmp_path / "a.glb")), *CORNER)["albedo"][0, 0])
     assert got == {"nearest": 0.0, "linear": pytest.approx(0.25, abs=1e-6)}
 
 
 def test_small_pictures_read_coarser_levels_of_any_size(tmp_path):
-    """A fine checker of odd size, a sample to dozens of texels: grey by its levels, where the finest alone would be black or white."""
+    """A fine checker of odd size, a sample to dozens of texels: grey by its levels, where the finest alone would be
+    black or white."""
     checker = (np.indices((301, 299)).sum(0) % 2 * 255).astype(np.uint8)[..., None].repeat(3, 2)
     builder = with_textures(color=checker)
     builder.document["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
-    images = render_buffers(read_gltf(centred(builder).write(tmp_path / "a.glb")), camera_at(0.0, 0.0, name="v", size=16), 4)
+    images = render_buffers(
+        read_gltf(centred(builder).write(tmp_path / "a.glb")), camera_at(0.0, 0.0, name="v", size=16), 4
+    )
     inside = images["albedo"][images["mask"] == 1]
     assert len(inside) > 80 and np.abs(inside - 0.5).max() < 0.02
 
 
 def test_quantised_attributes_by_their_extension(tmp_path):
-    """KHR_mesh_quantization: bytes and shorts for every attribute, normalised or not, and a node that undoes the scale."""
+    """KHR_mesh_quantization: bytes and shorts for every attribute, normalised or not, and a node that undoes the
+    scale."""
     plain = read_gltf(quad(name="m").write(tmp_path / "a.glb"))
     builder = Builder()
-    builder.document |= {"extensionsUsed": ["KHR_mesh_quantization", "KHR_texture_transform"], "extensionsRequired": ["KHR_mesh_quantization"]}
-    attributes = {"POSITION": builder.add((QUAD * 1000).astype(np.uint16)), "NORMAL": builder.add(np.tile(np.int8([0, 0, 127]), (4, 1)), normalized=True),
-                  "TANGENT": builder.add(np.tile(np.int16([32767, 0, 0, -32767]), (4, 1)), normalized=True),
-                  "TEXCOORD_0": builder.add(np.rint((QUAD[:, :2] * (1, -1) + (0, 1)) * 65535).astype(np.uint16), normalized=True),
-                  "TEXCOORD_1": builder.add((QUAD[:, :2] * 100).astype(np.int8))}
+    builder.document |= {
+        "extensionsUsed": ["KHR_mesh_quantization", "KHR_texture_transform"],
+        "extensionsRequired": ["KHR_mesh_quantization"],
+    }
+    attributes = {
+        "POSITION": builder.add((QUAD * 1000).astype(np.uint16)),
+        "NORMAL": builder.add(np.tile(np.int8([0, 0, 127]), (4, 1)), normalized=True),
+        "TANGENT": builder.add(np.tile(np.int16([32767, 0, 0, -32767]), (4, 1)), normalized=True),
+        "TEXCOORD_0": builder.add(np.rint((QUAD[:, :2] * (1, -1) + (0, 1)) * 65535).astype(np.uint16), normalized=True),
+        "TEXCOORD_1": builder.add((QUAD[:, :2] * 100).astype(np.int8)),
+    }
     builder.primitive(attributes, builder.add(QUAD_FACES.astype(np.uint8)))
     builder.document["nodes"] = [{"mesh": 0, "scale": [1e-3, 1e-3, 1e-3]}]
     scene = read_gltf(builder.write(tmp_path / "b.glb"))

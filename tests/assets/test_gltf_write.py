@@ -28,21 +28,50 @@ def full_scene() -> Scene:
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
     orm = pixels(3, 1)
     painted = Material(
-        name="painted", base_color=(0.5, 0.25, 1, 0.75), metallic=0.125, roughness=0.5, emissive=(3, 1.5, 0), alpha_mode="MASK", alpha_cutoff=0.25,
-        double_sided=True, ior=1.25, specular=0.5, normal_scale=0.5, occlusion_strength=0.25,
-        base_color_texture=Texture(pixels(4), "srgb", offset=(0.5, 0), rotation=0.25, scale=(2, 1), wrap_u="mirror", wrap_v="clamp", filter="nearest"),
-        metallic_roughness_texture=Texture(orm), occlusion_texture=Texture(orm), normal_texture=Texture(pixels(3, 2)),
-        emissive_texture=Texture(pixels(3, 3), "srgb", uv_set=2))
+        name="painted",
+        base_color=(0.5, 0.25, 1, 0.75),
+        metallic=0.125,
+        roughness=0.5,
+        emissive=(3, 1.5, 0),
+        alpha_mode="MASK",
+        alpha_cutoff=0.25,
+        double_sided=True,
+        ior=1.25,
+        specular=0.5,
+        normal_scale=0.5,
+        occlusion_strength=0.25,
+        base_color_texture=Texture(
+            pixels(4),
+            "srgb",
+            offset=(0.5, 0),
+            rotation=0.25,
+            scale=(2, 1),
+            wrap_u="mirror",
+            wrap_v="clamp",
+            filter="nearest",
+        ),
+        metallic_roughness_texture=Texture(orm),
+        occlusion_texture=Texture(orm),
+        normal_texture=Texture(pixels(3, 2)),
+        emissive_texture=Texture(pixels(3, 3), "srgb", uv_set=2),
+    )
     plain = Material(name="plain", base_color=(0.25, 0.5, 0.75, 1), metallic=0.0, roughness=1.0)
     return Scene(
-        vertices, faces, (painted, Material(name="never used"), plain), np.array([0, 0, 2, 2], np.int32), normals=np.tile([0, 0, 1.0], (8, 1)),
-        tangents=np.tile([1, 0, 0, -1.0], (8, 1)), uvs=(vertices[:, :2] / 3, None, vertices[:, 1::-1] / 3),
-        colors=np.random.default_rng(4).random((8, 4)), name="both")
+        vertices,
+        faces,
+        (painted, Material(name="never used"), plain),
+        np.array([0, 0, 2, 2], np.int32),
+        normals=np.tile([0, 0, 1.0], (8, 1)),
+        tangents=np.tile([1, 0, 0, -1.0], (8, 1)),
+        uvs=(vertices[:, :2] / 3, None, vertices[:, 1::-1] / 3),
+        colors=np.random.default_rng(4).random((8, 4)),
+        name="both",
+    )
 
 
 def document_of(content: bytes) -> dict:
     length = struct.unpack_from("<I", content, 12)[0]
-    return json.loads(content[20:20 + length])
+    return json.loads(content[20 : 20 + length])
 
 
 def test_what_is_written_is_read_again(tmp_path):
@@ -52,16 +81,35 @@ def test_what_is_written_is_read_again(tmp_path):
     corner, again = scene.faces.ravel(), back.faces.ravel()
     np.testing.assert_allclose(back.vertices[again], scene.vertices[corner])
     np.testing.assert_allclose(back.normals[again], scene.normals[corner])
-    np.testing.assert_allclose(back.tangents[back.faces[:2]].reshape(-1, 4), scene.tangents[scene.faces[:2]].reshape(-1, 4))
+    np.testing.assert_allclose(
+        back.tangents[back.faces[:2]].reshape(-1, 4), scene.tangents[scene.faces[:2]].reshape(-1, 4)
+    )
     np.testing.assert_allclose(back.colors[again], scene.colors[corner], atol=1e-7)
     np.testing.assert_allclose(back.uvs[0][again], scene.uvs[0][corner], atol=1e-7)
     np.testing.assert_allclose(back.uvs[1][again], scene.uvs[2][corner], atol=1e-7)  # sets are numbered without gaps
     painted, plain = back.materials
     assert plain == scene.materials[2]
-    for name in ("base_color", "metallic", "roughness", "emissive", "alpha_mode", "alpha_cutoff", "double_sided", "ior", "specular", "normal_scale",
-                 "occlusion_strength"):
+    for name in (
+        "base_color",
+        "metallic",
+        "roughness",
+        "emissive",
+        "alpha_mode",
+        "alpha_cutoff",
+        "double_sided",
+        "ior",
+        "specular",
+        "normal_scale",
+        "occlusion_strength",
+    ):
         assert getattr(painted, name) == getattr(scene.materials[0], name), name
-    for name in ("base_color_texture", "metallic_roughness_texture", "occlusion_texture", "normal_texture", "emissive_texture"):
+    for name in (
+        "base_color_texture",
+        "metallic_roughness_texture",
+        "occlusion_texture",
+        "normal_texture",
+        "emissive_texture",
+    ):
         written, read = getattr(scene.materials[0], name), getattr(painted, name)
         np.testing.assert_array_equal(read.image, written.image)
         assert replace(read, image=0, uv_set=0) == replace(written, image=0, uv_set=0)
@@ -80,7 +128,12 @@ def test_factors_are_explicit_and_shared_maps_are_one_image():
     first = document["materials"][0]
     assert first["occlusionTexture"]["index"] == first["pbrMetallicRoughness"]["metallicRoughnessTexture"]["index"]
     assert document["asset"]["extras"] == {"by": "a test"}
-    assert set(document["extensionsUsed"]) == {"KHR_materials_emissive_strength", "KHR_materials_ior", "KHR_materials_specular", "KHR_texture_transform"}
+    assert set(document["extensionsUsed"]) == {
+        "KHR_materials_emissive_strength",
+        "KHR_materials_ior",
+        "KHR_materials_specular",
+        "KHR_texture_transform",
+    }
 
 
 def test_colours_are_stored_as_the_format_says():
@@ -93,7 +146,9 @@ def test_colours_are_stored_as_the_format_says():
     content = glb_bytes(scene)
     view = back["bufferViews"][back["images"][0]["bufferView"]]
     start = 12 + 8 + struct.unpack_from("<I", content, 12)[0] + 8 + view["byteOffset"]
-    np.testing.assert_array_equal(decode_image(content[start:start + view["byteLength"]], "map")[0, 0], [188, 188, 188, 128])
+    np.testing.assert_array_equal(
+        decode_image(content[start : start + view["byteLength"]], "map")[0, 0], [188, 188, 188, 128]
+    )
 
 
 def test_tangents_are_made_where_a_normal_map_needs_them(tmp_path):
@@ -125,8 +180,15 @@ def test_many_vertices_take_wide_indices(tmp_path):
     np.testing.assert_allclose(back.vertices[back.faces], vertices[faces])
 
 
-@pytest.mark.parametrize("broken", [{"vertices": np.full((8, 3), np.nan)}, {"faces": np.array([[0, 1, 8]], np.int32)}, {"faces": np.zeros((0, 3), np.int32)},
-                                    {"colors": np.full((8, 4), np.inf)}])
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"vertices": np.full((8, 3), np.nan)},
+        {"faces": np.array([[0, 1, 8]], np.int32)},
+        {"faces": np.zeros((0, 3), np.int32)},
+        {"colors": np.full((8, 4), np.inf)},
+    ],
+)
 def test_broken_scenes_are_not_written(tmp_path, broken):
     with pytest.raises(ValueError):
         write_glb(tmp_path / "a.glb", replace(full_scene(), **broken))
@@ -141,17 +203,28 @@ def test_a_place_that_cannot_be_written(tmp_path):
 
 def validator_path() -> str | None:
     """NODE_PATH under which gltf-validator is installed, or None."""
-    places = [TOOLS / "node_modules", TOOLS.parents[1] / "node_modules", *(Path(p) for p in os.environ.get("NODE_PATH", "").split(":") if p)]
+    places = [
+        TOOLS / "node_modules",
+        TOOLS.parents[1] / "node_modules",
+        *(Path(p) for p in os.environ.get("NODE_PATH", "").split(":") if p),
+    ]
     return next((str(place) for place in places if (place / "gltf-validator").is_dir()), None)
 
 
-@pytest.mark.skipif(shutil.which("node") is None or validator_path() is None, reason="needs node and the npm package gltf-validator (npm install in tests/tools)")
+@pytest.mark.skipif(
+    shutil.which("node") is None or validator_path() is None,
+    reason="needs node and the npm package gltf-validator (npm install in tests/tools)",
+)
 @pytest.mark.parametrize("tangents", [True, False])
 def test_the_khronos_validator_finds_nothing(tmp_path, tangents):
     scene = full_scene() if tangents else replace(full_scene(), tangents=None)
     write_glb(tmp_path / "a.glb", scene)
-    done = subprocess.run(["node", TOOLS / "validate_gltf.mjs", tmp_path / "a.glb"], capture_output=True, text=True,
-                          env={**os.environ, "NODE_PATH": validator_path()})
+    done = subprocess.run(
+        ["node", TOOLS / "validate_gltf.mjs", tmp_path / "a.glb"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "NODE_PATH": validator_path()},
+    )
     report = json.loads(done.stdout)
     serious = [m for m in report["messages"] if m["severity"] < 2]
     assert done.returncode == 0 and serious == []

@@ -24,8 +24,14 @@ def stl(faces: np.ndarray) -> bytes:
 def ply(extra: str = "", rows: list[str] | None = None) -> str:
     rows = rows or [" ".join(map(str, p)) for p in CORNERS]
     faces = "\n".join("3 " + " ".join(map(str, face)) for face in FACES)
-    return (f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\nproperty float x\nproperty float y\nproperty float z\n{extra}"
-            f"element face {len(FACES)}\nproperty list uchar int vertex_indices\nend_header\n" + "\n".join(rows) + "\n" + faces + "\n")
+    return (
+        f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\nproperty float x\nproperty float y\nproperty float z\n{extra}"
+        f"element face {len(FACES)}\nproperty list uchar int vertex_indices\nend_header\n"
+        + "\n".join(rows)
+        + "\n"
+        + faces
+        + "\n"
+    )
 
 
 def test_stl_is_welded(tmp_path):
@@ -56,21 +62,39 @@ def binary(order: str = "<", colors: bool = False, wide: bool = False, faces: np
     """A binary PLY; normals of no unit length."""
     kind, place = ("double", order + "f8") if wide else ("float", order + "f4")
     names = ["x", "y", "z", "nx", "ny", "nz"]
-    vertex = np.empty(len(CORNERS), [(name, place) for name in names] + [(name, "u1") for name in ("red", "green", "blue") if colors])
+    vertex = np.empty(
+        len(CORNERS), [(name, place) for name in names] + [(name, "u1") for name in ("red", "green", "blue") if colors]
+    )
     for i, name in enumerate(names):
         vertex[name] = np.concatenate([CORNERS / 3, CORNERS + 0.5], 1)[:, i]
     for name in vertex.dtype.names[6:]:
         vertex[name] = np.arange(len(CORNERS)) * 60
     face = np.empty(len(faces), [("count", "u1"), ("idx", order + "i4", 3)])
     face["count"], face["idx"] = 3, faces
-    lines = ["ply", f"format binary_{'little' if order == '<' else 'big'}_endian 1.0", "comment made here", f"element vertex {len(vertex)}"]
-    lines += [f"property {kind} {name}" for name in names] + [f"property uchar {name}" for name in vertex.dtype.names[6:]]
+    lines = [
+        "ply",
+        f"format binary_{'little' if order == '<' else 'big'}_endian 1.0",
+        "comment made here",
+        f"element vertex {len(vertex)}",
+    ]
+    lines += [f"property {kind} {name}" for name in names] + [
+        f"property uchar {name}" for name in vertex.dtype.names[6:]
+    ]
     lines += [f"element face {len(face)}", "property list uchar int vertex_index", "end_header", ""]
     return "\n".join(lines).encode() + vertex.tobytes() + face.tobytes()
 
 
-@pytest.mark.parametrize(("name", "content"), [("x.ply", binary()), ("x.ply", binary(">")), ("x.ply", binary(colors=True)), ("x.ply", binary(wide=True)),
-                                               ("x.stl", stl(FACES))], ids=["little", "big", "colors", "double", "stl"])
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("x.ply", binary()),
+        ("x.ply", binary(">")),
+        ("x.ply", binary(colors=True)),
+        ("x.ply", binary(wide=True)),
+        ("x.stl", stl(FACES)),
+    ],
+    ids=["little", "big", "colors", "double", "stl"],
+)
 def test_plain_binary_files_are_read_as_trimesh_reads_them(tmp_path, monkeypatch, name, content):
     (tmp_path / name).write_bytes(content)
     with monkeypatch.context() as patch:
@@ -79,30 +103,39 @@ def test_plain_binary_files_are_read_as_trimesh_reads_them(tmp_path, monkeypatch
     for plain in ("_plain_ply", "_plain_stl"):
         monkeypatch.setattr(scan_read, plain, lambda data: None)
     true = load_scene(tmp_path / name)
-    assert ours.notes == true.notes and ours.materials == true.materials and (name == "x.stl" or true.normals is not None)
+    assert (
+        ours.notes == true.notes and ours.materials == true.materials and (name == "x.stl" or true.normals is not None)
+    )
     for key in ("vertices", "faces", "normals", "colors"):
         one, two = getattr(ours, key), getattr(true, key)
         assert one is two is None or one.dtype == two.dtype and np.array_equal(one, two)
 
 
-@pytest.mark.parametrize(("content", "fact"), [(binary()[:-1], "PLY"), (binary() + b"x", "PLY"), (binary(faces=FACES + 1), "out of range")],
-                         ids=["cut", "more", "index"])
+@pytest.mark.parametrize(
+    ("content", "fact"),
+    [(binary()[:-1], "PLY"), (binary() + b"x", "PLY"), (binary(faces=FACES + 1), "out of range")],
+    ids=["cut", "more", "index"],
+)
 def test_binary_files_that_are_not_what_they_say_are_refused(tmp_path, content, fact):
     (tmp_path / "x.ply").write_bytes(content)
     with pytest.raises(InputError, match=fact):
         load_scene(tmp_path / "x.ply")
 
 
-@pytest.mark.parametrize(("name", "content", "fact"), [
-    ("x.stl", b"", "has no faces"),
-    ("x.stl", stl(FACES)[:100], "STL|has no faces"),
-    ("x.stl", stl(FACES[:0]), "has no faces"),
-    ("x.ply", b"ply\nformat nonsense\n", "PLY"),
-    ("x.ply", b"not a ply at all", "PLY"),
-    ("x.ply", ply().replace("3 0 2 1", "3 0 2 9").encode(), "out of range"),
-    ("x.ply", ply().replace("1.0 0.0 0.0", "nan 0.0 0.0").encode(), "not finite"),
-    ("x.fbx", b"Kaydara", "not a model that gdtool reads"),
-], ids=["empty", "cut", "no triangles", "header", "no ply", "index", "nan", "unknown"])
+@pytest.mark.parametrize(
+    ("name", "content", "fact"),
+    [
+        ("x.stl", b"", "has no faces"),
+        ("x.stl", stl(FACES)[:100], "STL|has no faces"),
+        ("x.stl", stl(FACES[:0]), "has no faces"),
+        ("x.ply", b"ply\nformat nonsense\n", "PLY"),
+        ("x.ply", b"not a ply at all", "PLY"),
+        ("x.ply", ply().replace("3 0 2 1", "3 0 2 9").encode(), "out of range"),
+        ("x.ply", ply().replace("1.0 0.0 0.0", "nan 0.0 0.0").encode(), "not finite"),
+        ("x.fbx", b"Kaydara", "not a model that gdtool reads"),
+    ],
+    ids=["empty", "cut", "no triangles", "header", "no ply", "index", "nan", "unknown"],
+)
 def test_what_is_wrong_is_named(tmp_path, name, content, fact):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=fact) as caught:
@@ -125,7 +158,9 @@ def test_faces_with_coinciding_corners_are_left_out_and_flat_seams_keep_a_body_c
     vertices = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nv .5 0 0\nv 1 0 0\n"
     (tmp_path / "x.obj").write_text(vertices + "".join(f"f {face}\n" for face in [*faces, "2 6 4"]))
     scene = load_scene(tmp_path / "x.obj")
-    assert len(scene.faces) == len(scene.material_idx) == 6 and any("two corners in one place" in note for note in scene.notes)
+    assert len(scene.faces) == len(scene.material_idx) == 6 and any(
+        "two corners in one place" in note for note in scene.notes
+    )
     assert is_closed(scene.vertices, scene.faces) and not is_closed(scene.vertices, scene.faces[:-1])
 
 
@@ -143,7 +178,9 @@ def test_textures_without_coordinates_are_left_out(tmp_path):
     (tmp_path / "x.mtl").write_text("newmtl a\nmap_Kd c.png\n")
     (tmp_path / "x.obj").write_text("mtllib x.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     scene = load_scene(tmp_path / "x.obj")
-    assert scene.materials[0].base_color_texture is None and any("no texture coordinates" in note for note in scene.notes)
+    assert scene.materials[0].base_color_texture is None and any(
+        "no texture coordinates" in note for note in scene.notes
+    )
 
 
 def test_procedural_objects_by_their_seed():

@@ -16,22 +16,56 @@ def packed(builder: Builder, content: bytes, count: int, stride: int, mode: str,
     """An accessor over a compressed view."""
     source = builder.view(content)
     where = builder.document["bufferViews"][source]
-    extension = {"buffer": 0, "byteOffset": where["byteOffset"], "byteLength": len(content), "byteStride": stride, "count": count, "mode": mode, **extra}
-    builder.document["bufferViews"][source] = {"buffer": 0, "byteLength": count * stride, "extensions": {"EXT_meshopt_compression": extension}}
+    extension = {
+        "buffer": 0,
+        "byteOffset": where["byteOffset"],
+        "byteLength": len(content),
+        "byteStride": stride,
+        "count": count,
+        "mode": mode,
+        **extra,
+    }
+    builder.document["bufferViews"][source] = {
+        "buffer": 0,
+        "byteLength": count * stride,
+        "extensions": {"EXT_meshopt_compression": extension},
+    }
     builder.document["accessors"].append({"bufferView": source, "count": count, **accessor})
     return len(builder.document["accessors"]) - 1
 
 
 def scene_of(tmp_path, index_type=np.uint32, mode="TRIANGLES", normals=None):
     builder = Builder()
-    builder.document |= {"extensionsUsed": ["EXT_meshopt_compression"], "extensionsRequired": ["EXT_meshopt_compression"]}
-    attributes = {"POSITION": packed(builder, meshopt.encode_vertex_buffer_level(QUAD, 2, 0), 4, 12, "ATTRIBUTES", {"componentType": 5126, "type": "VEC3"})}
+    builder.document |= {
+        "extensionsUsed": ["EXT_meshopt_compression"],
+        "extensionsRequired": ["EXT_meshopt_compression"],
+    }
+    attributes = {
+        "POSITION": packed(
+            builder,
+            meshopt.encode_vertex_buffer_level(QUAD, 2, 0),
+            4,
+            12,
+            "ATTRIBUTES",
+            {"componentType": 5126, "type": "VEC3"},
+        )
+    }
     if normals is not None:
         content = meshopt.encode_vertex_buffer_level(normals, 2, 0)
-        attributes["NORMAL"] = packed(builder, content, 4, 4, "ATTRIBUTES", {"componentType": 5120, "type": "VEC3", "normalized": True}, filter="OCTAHEDRAL")
+        attributes["NORMAL"] = packed(
+            builder,
+            content,
+            4,
+            4,
+            "ATTRIBUTES",
+            {"componentType": 5120, "type": "VEC3", "normalized": True},
+            filter="OCTAHEDRAL",
+        )
     content = meshopt.encode_gltf_buffer(QUAD_FACES.astype(np.uint32), mode)
     size = np.dtype(index_type).itemsize
-    indices = packed(builder, content, len(QUAD_FACES), size, mode, {"componentType": {2: 5123, 4: 5125}[size], "type": "SCALAR"})
+    indices = packed(
+        builder, content, len(QUAD_FACES), size, mode, {"componentType": {2: 5123, 4: 5125}[size], "type": "SCALAR"}
+    )
     builder.primitive(attributes, indices)
     return read_gltf(builder.write(tmp_path / "a.glb"))
 
@@ -58,8 +92,14 @@ def test_exponents(tmp_path):
     stored = ((QUAD * 4).astype(np.int64) | (0x100 - 2) << 24).astype(np.uint32)
     builder = Builder()
     content = meshopt.encode_vertex_buffer_level(stored, 2, 0)
-    builder.primitive({"POSITION": packed(builder, content, 4, 12, "ATTRIBUTES", {"componentType": 5126, "type": "VEC3"}, filter="EXPONENTIAL")},
-                      builder.add(QUAD_FACES))
+    builder.primitive(
+        {
+            "POSITION": packed(
+                builder, content, 4, 12, "ATTRIBUTES", {"componentType": 5126, "type": "VEC3"}, filter="EXPONENTIAL"
+            )
+        },
+        builder.add(QUAD_FACES),
+    )
     np.testing.assert_array_equal(read_gltf(builder.write(tmp_path / "a.glb")).vertices, QUAD)
 
 

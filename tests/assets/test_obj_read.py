@@ -30,7 +30,9 @@ def test_one_square_in_many_spellings(tmp_path, face):
 
 
 def test_texture_coordinates_turn_downward_and_corners_split(tmp_path):
-    scene = read(tmp_path, SQUARE + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvn 0 0 2\nf 1/1/1 2/2/1 3/3/1\nf 1/4/1 3/3/1 4/4/1\n")
+    scene = read(
+        tmp_path, SQUARE + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvn 0 0 2\nf 1/1/1 2/2/1 3/3/1\nf 1/4/1 3/3/1 4/4/1\n"
+    )
     np.testing.assert_allclose(scene.uvs[0][scene.faces[0]], [[0, 1], [1, 1], [1, 0]])
     np.testing.assert_allclose(scene.normals, [[0, 0, 1]] * len(scene.vertices))
     assert len(scene.vertices) == 5  # vertex 1 has two texture coordinates
@@ -70,9 +72,15 @@ MATERIALS = SQUARE + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nmtllib x.mtl\nusemtl a\nf 
 
 def test_material_numbers_and_their_defaults(tmp_path):
     one = read(tmp_path, MATERIALS, "newmtl a\nKd 0.1 0.2 0.3\nd 0.5\nPr 0.7\nPm 0.9\nKe 2 1 0\n").materials[0]
-    assert (one.base_color, one.roughness, one.metallic, one.alpha_mode, one.emissive) == ((0.1, 0.2, 0.3, 0.5), 0.7, 0.9, "BLEND", (2, 1, 0))
+    assert (one.base_color, one.roughness, one.metallic, one.alpha_mode, one.emissive) == (
+        (0.1, 0.2, 0.3, 0.5),
+        0.7,
+        0.9,
+        "BLEND",
+        (2, 1, 0),
+    )
     shiny = read(tmp_path, MATERIALS, "newmtl a\nKd 1 1 1\nKs 0.5 0.5 0.5\nNs 198\n").materials[0]
-    assert shiny.roughness == pytest.approx(0.01 ** 0.25) and shiny.metallic == 0 and shiny.alpha_mode == "OPAQUE"
+    assert shiny.roughness == pytest.approx(0.01**0.25) and shiny.metallic == 0 and shiny.alpha_mode == "OPAQUE"
     dull = read(tmp_path, MATERIALS, "newmtl a\nKd 1 1 1\nKs 0 0 0\nNs 198\n").materials[0]
     assert dull.roughness == 0.5
 
@@ -84,9 +92,15 @@ def test_maps(tmp_path):
     flat = np.full((4, 4, 3), (128, 128, 255), np.uint8)
     for name, image in (("my color.png", color), ("orm.png", orm), ("rough.png", rough), ("flat.png", flat)):
         write_png(tmp_path / name, image)
-    m = read(tmp_path, MATERIALS, "newmtl a\nKd 0 0 0\nmap_Kd -s 1 1 1 -clamp on my color.png\nmap_Pr rough.png\nmap_Pm -imfchan b orm.png\nmap_Bump -bm 1 flat.png\n").materials[0]
+    m = read(
+        tmp_path,
+        MATERIALS,
+        "newmtl a\nKd 0 0 0\nmap_Kd -s 1 1 1 -clamp on my color.png\nmap_Pr rough.png\nmap_Pm -imfchan b orm.png\nmap_Bump -bm 1 flat.png\n",
+    ).materials[0]
     np.testing.assert_array_equal(m.base_color_texture.image, color)
-    assert m.base_color_texture.encoding == "srgb" and m.base_color == (1, 1, 1, 1) and (m.roughness, m.metallic) == (1, 1)
+    assert (
+        m.base_color_texture.encoding == "srgb" and m.base_color == (1, 1, 1, 1) and (m.roughness, m.metallic) == (1, 1)
+    )
     packed = m.metallic_roughness_texture.image
     np.testing.assert_array_equal(packed[..., 1], rough[..., 0])
     np.testing.assert_array_equal(packed[..., 2], np.repeat(np.repeat(orm[..., 2], 2, 0), 2, 1))
@@ -108,20 +122,23 @@ def test_faces_keep_their_materials(tmp_path):
     assert [scene.materials[i].roughness for i in scene.material_idx] == [0.2, 0.2, 0.1] and len(scene.materials) == 2
 
 
-@pytest.mark.parametrize(("text", "fact"), [
-    ("v 0 0 0\n", "has no faces"),
-    ("", "has no faces"),
-    (SQUARE + "f 1 2 9\n", "refers to vertex 9"),
-    (SQUARE + "f 1 2 -5\n", "line 5"),
-    (SQUARE + "f 1 2 0\n", "line 5"),
-    (SQUARE + "f 1 2\n", "line 5"),
-    (SQUARE + "f 1/1 2/2 3/3\n", "texture coordinate 3"),
-    (SQUARE.replace("v 1 1 0", "v nan 1 0") + "f 1 2 3\n", "vertex 3 is not finite"),
-    (SQUARE.replace("v 1 1 0", "v inf 1 0") + "f 1 2 3\n", "vertex 3 is not finite"),
-    (SQUARE.replace("v 1 1 0", "v 1 one 0") + "f 1 2 3\n", "line 3"),
-    ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "without area"),
-    ("v 5 5 5\nv 5 5 5\nv 5 5 5\nf 1 2 3\n", "one point"),
-])
+@pytest.mark.parametrize(
+    ("text", "fact"),
+    [
+        ("v 0 0 0\n", "has no faces"),
+        ("", "has no faces"),
+        (SQUARE + "f 1 2 9\n", "refers to vertex 9"),
+        (SQUARE + "f 1 2 -5\n", "line 5"),
+        (SQUARE + "f 1 2 0\n", "line 5"),
+        (SQUARE + "f 1 2\n", "line 5"),
+        (SQUARE + "f 1/1 2/2 3/3\n", "texture coordinate 3"),
+        (SQUARE.replace("v 1 1 0", "v nan 1 0") + "f 1 2 3\n", "vertex 3 is not finite"),
+        (SQUARE.replace("v 1 1 0", "v inf 1 0") + "f 1 2 3\n", "vertex 3 is not finite"),
+        (SQUARE.replace("v 1 1 0", "v 1 one 0") + "f 1 2 3\n", "line 3"),
+        ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "without area"),
+        ("v 5 5 5\nv 5 5 5\nv 5 5 5\nf 1 2 3\n", "one point"),
+    ],
+)
 def test_what_is_wrong_is_named(tmp_path, text, fact):
     with pytest.raises(InputError, match=fact):
         read(tmp_path, text)

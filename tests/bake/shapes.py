@@ -6,12 +6,15 @@ import numpy as np
 
 
 def torus(around: int, across: int, major: float = 0.35, minor: float = 0.14):
-    """Quads (f, 4) of a torus about +Y, vertices (v, 3), outward normals (v, 3); seen from outside counter-clockwise."""
+    """Quads (f, 4) of a torus about +Y, vertices (v, 3), outward normals (v, 3); seen from outside
+    counter-clockwise."""
     a, b = np.meshgrid(np.arange(around) * 2 * np.pi / around, np.arange(across) * 2 * np.pi / across, indexing="ij")
     normals = np.stack([np.cos(b) * np.sin(a), np.sin(b), np.cos(b) * np.cos(a)], -1).reshape(-1, 3)
     centre = major * np.stack([np.sin(a), 0 * a, np.cos(a)], -1).reshape(-1, 3)
     idx = np.arange(around * across).reshape(around, across)
-    quads = np.stack([idx, np.roll(idx, -1, 0), np.roll(np.roll(idx, -1, 0), -1, 1), np.roll(idx, -1, 1)], -1).reshape(-1, 4)
+    quads = np.stack([idx, np.roll(idx, -1, 0), np.roll(np.roll(idx, -1, 0), -1, 1), np.roll(idx, -1, 1)], -1).reshape(
+        -1, 4
+    )
     return centre + minor * normals, quads, normals
 
 
@@ -52,7 +55,9 @@ def unwrapped(vertices: np.ndarray, faces: np.ndarray, size: int = 512, padding:
 def albedo_of(points: np.ndarray) -> np.ndarray:
     """A smooth, colourful function of position: (n, 3) linear in [0.05, 0.95]."""
     x, y, z = points.T
-    return np.stack([0.5 + 0.4 * np.sin(9 * x + 2 * y), 0.5 + 0.4 * np.sin(8 * z - 3 * x), 0.45 + 0.35 * np.cos(11 * y + 4 * z)], -1)
+    return np.stack(
+        [0.5 + 0.4 * np.sin(9 * x + 2 * y), 0.5 + 0.4 * np.sin(8 * z - 3 * x), 0.45 + 0.35 * np.cos(11 * y + 4 * z)], -1
+    )
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:

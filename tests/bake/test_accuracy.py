@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gdtool.images.color import srgb_from_linear
-from gdtool.bake.pipeline import bake, vertex_lookup
 from gdtool.bake.maps import make_maps
+from gdtool.bake.pipeline import bake, vertex_lookup
 from gdtool.bake.reproject import Source, vertex_reach
 from gdtool.bake.target import Target, points_at, texels_of
+from gdtool.images.color import srgb_from_linear
 from tests.bake.shapes import albedo_of, psnr, torus, triangles_of, unwrapped
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
@@ -43,16 +43,28 @@ def stored():
     texels = texels_of(target, SIZE)
     source = Source(fine, triangles_of(fine_quads))
     attributes = {"albedo": albedo_of(fine), "roughness": 0.5 + 0.8 * fine[:, 0], "metallic": np.full(len(fine), 0.25)}
-    baked = bake(target, texels, source, vertex_lookup(source, attributes, fine_normals), vertex_reach(coarse, faces, source), threads=2)
+    baked = bake(
+        target,
+        texels,
+        source,
+        vertex_lookup(source, attributes, fine_normals),
+        vertex_reach(coarse, faces, source),
+        threads=2,
+    )
     maps = make_maps(texels, baked.values)
     return target, texels, {"albedo": maps.base_color / 255, "roughness": maps.orm[..., 1:2] / 255}
 
 
 def test_stored_maps_are_the_material_to_55_db(stored):
     target, texels, maps = stored
-    true = material(points_at(target, texels.face_idx, texels.barycentric)[0][:texels.inside])
+    true = material(points_at(target, texels.face_idx, texels.barycentric)[0][: texels.inside])
     for name, image in maps.items():
-        assert psnr(image.reshape(-1, image.shape[2])[texels.texel[:texels.inside]], true[name].reshape(texels.inside, -1)) >= 55
+        assert (
+            psnr(
+                image.reshape(-1, image.shape[2])[texels.texel[: texels.inside]], true[name].reshape(texels.inside, -1)
+            )
+            >= 55
+        )
 
 
 def test_no_seam_shows(stored):
@@ -62,6 +74,6 @@ def test_no_seam_shows(stored):
     for name, image in maps.items():
         assert seams.ratio(name, image) <= 1.2
         bare = np.zeros_like(image)
-        inside = texels.texel[:texels.inside]
+        inside = texels.texel[: texels.inside]
         bare.reshape(-1, image.shape[2])[inside] = image.reshape(-1, image.shape[2])[inside]
         assert seams.ratio(name, bare) > 1.2

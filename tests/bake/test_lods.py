@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 
-from gdtool.stages import bake
 from gdtool.bake import lods
 from gdtool.bake.lods import coarser, drift
 from gdtool.bake.target import Target, size_for
+from gdtool.stages import bake
 from tests.bake.shapes import torus, triangles_of, unwrapped
 
 
@@ -27,7 +27,10 @@ def test_a_level_has_the_triangles_asked_for_and_stays_on_its_texels():
     # Every chart turns the way it did: a mirrored one would turn its normal map round.
     u, v = (level.uv[level.face_uvs[:, k]] - level.uv[level.face_uvs[:, 0]] for k in (1, 2))
     whole_u, whole_v = (full.uv[full.face_uvs[:, k]] - full.uv[full.face_uvs[:, 0]] for k in (1, 2))
-    turned, whole = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] > 0, whole_u[:, 0] * whole_v[:, 1] - whole_u[:, 1] * whole_v[:, 0] > 0
+    turned, whole = (
+        u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] > 0,
+        whole_u[:, 0] * whole_v[:, 1] - whole_u[:, 1] * whole_v[:, 0] > 0,
+    )
     assert abs(turned.mean() - whole.mean()) < 0.05
 
 
@@ -75,7 +78,11 @@ def test_a_level_that_slides_on_its_maps_is_left_out_and_named(monkeypatch):
 def test_a_level_that_seams_keep_from_its_count_stays_where_it_is_coarser_than_the_last(monkeypatch):
     full, told = target(), Told()
     count = len(full.faces)
-    levels = {count // 2: coarser(full, count // 2)[0], count // 4: coarser(full, int(0.4 * count))[0], count // 8: coarser(full, int(0.38 * count))[0]}
+    levels = {
+        count // 2: coarser(full, count // 2)[0],
+        count // 4: coarser(full, int(0.4 * count))[0],
+        count // 8: coarser(full, int(0.38 * count))[0],
+    }
     monkeypatch.setattr(lods, "coarser", lambda target, n: (levels[n], ""))
     assert bake._levels(full, 4, told, {}) == [levels[count // 2], levels[count // 4]]
     assert len(told.warned) == 1 and "fewer would tear a seam" in told.warned[0]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gdtool.bake.maps import constant_of, contact_sheet_of, directx, flat_angle, make_maps, quantise
-from gdtool.geometry.uv_raster import rasterize_uv
 from gdtool.bake.target import Target, texels_of
+from gdtool.geometry.uv_raster import rasterize_uv
 
 
 @pytest.fixture
@@ -20,7 +20,12 @@ def texels():
 def values(texels, albedo=(0.5, 0.2, 0.1), roughness=0.4, metallic=0.0, normal=(0.0, 0.0, 1.0)):
     n = len(texels)
     fill = lambda v: np.ascontiguousarray(np.broadcast_to(np.asarray(v, np.float32), (n, *np.shape(v))))  # noqa: E731
-    return {"albedo": fill(albedo), "roughness": fill(roughness), "metallic": fill(metallic), "tangent_normal": fill(normal)}
+    return {
+        "albedo": fill(albedo),
+        "roughness": fill(roughness),
+        "metallic": fill(metallic),
+        "tangent_normal": fill(normal),
+    }
 
 
 def test_constants_become_factors(texels):
@@ -28,7 +33,12 @@ def test_constants_become_factors(texels):
     assert maps.base_color is None and maps.orm is None and maps.normal is None
     np.testing.assert_allclose(maps.factors["base_color"], (0.5, 0.2, 0.1, 1.0), atol=1e-5)
     assert maps.factors["roughness"] == (pytest.approx(0.4),) and maps.factors["metallic"] == (0.0,)
-    assert {what for what, _, _ in maps.skipped} == {"base_color map", "roughness and metallic map", "occlusion map", "normal map"}
+    assert {what for what, _, _ in maps.skipped} == {
+        "base_color map",
+        "roughness and metallic map",
+        "occlusion map",
+        "normal map",
+    }
     assert contact_sheet_of(maps).dtype == np.uint8
 
 

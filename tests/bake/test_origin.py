@@ -3,25 +3,38 @@
 import numpy as np
 import pytest
 
+from gdtool.bake.origin import from_surface, material_field
+from gdtool.bake.reproject import Places
 from gdtool.core.errors import InputError
 from gdtool.folders.surface import Surface
 from gdtool.folders.views import Views
-from gdtool.bake.origin import from_surface, material_field
-from gdtool.bake.reproject import Places
-from tests.stages.bake_folders import torus_views
 from tests.bake.shapes import albedo_of, psnr, torus, triangles_of
+from tests.stages.bake_folders import torus_views
 
 
 @pytest.fixture(scope="module")
 def surface():
     vertices, quads, normals = torus(160, 90)
     count = len(vertices)
-    return Surface(vertices, triangles_of(quads), np.full((count, 3), 0.5), np.full(count, 0.2), np.full(count, 0.1), np.ones(count), normals)
+    return Surface(
+        vertices,
+        triangles_of(quads),
+        np.full((count, 3), 0.5),
+        np.full(count, 0.2),
+        np.full(count, 0.1),
+        np.ones(count),
+        normals,
+    )
 
 
 def places_on(surface, count=4000):
     rng = np.random.default_rng(0)
-    return Places(rng.integers(0, len(surface.faces), count).astype(np.int32), rng.dirichlet((1, 1, 1), count).astype(np.float32), np.ones(count, bool), np.zeros(count, bool))
+    return Places(
+        rng.integers(0, len(surface.faces), count).astype(np.int32),
+        rng.dirichlet((1, 1, 1), count).astype(np.float32),
+        np.ones(count, bool),
+        np.zeros(count, bool),
+    )
 
 
 def at(origin, places):
@@ -46,7 +59,9 @@ def test_views_give_what_they_see_and_vertices_the_rest(surface):
 def test_a_part_in_front_does_not_colour_what_it_hides(surface):
     # A plate between the ring and the front camera, painted red in that view only.
     views = torus_views(192)
-    vertices = np.concatenate([surface.vertices, [[-0.3, -0.1, 0.6], [0.3, -0.1, 0.6], [0.3, 0.1, 0.6], [-0.3, 0.1, 0.6]]])
+    vertices = np.concatenate(
+        [surface.vertices, [[-0.3, -0.1, 0.6], [0.3, -0.1, 0.6], [0.3, 0.1, 0.6], [-0.3, 0.1, 0.6]]]
+    )
     n = len(surface.vertices)
     faces = np.concatenate([surface.faces, [[n, n + 1, n + 2], [n, n + 2, n + 3]]])
     albedo = views.images["albedo"].copy()
@@ -56,11 +71,20 @@ def test_a_part_in_front_does_not_colour_what_it_hides(surface):
     mask = views.mask.copy()
     mask[0][plate] = 1
     extend = lambda a, value: np.concatenate([a, np.full((4, *a.shape[1:]), value)])  # noqa: E731
-    whole = Surface(vertices, faces, extend(surface.albedo, 0.5), extend(surface.roughness, 0.2), extend(surface.metallic, 0), extend(surface.confidence, 1))
+    whole = Surface(
+        vertices,
+        faces,
+        extend(surface.albedo, 0.5),
+        extend(surface.roughness, 0.2),
+        extend(surface.metallic, 0),
+        extend(surface.confidence, 1),
+    )
     origin = from_surface(whole, Views(views.cameras[:1], {"albedo": albedo[:1]}, mask[:1]))
     read = origin.lookup(places_on(surface))
     assert read["albedo"][:, 1].min() > 0.04  # the plate's green is 0; the ring's is above 0.1
-    on_plate = Places(np.array([len(faces) - 2], np.int32), np.full((1, 3), 1 / 3, np.float32), np.ones(1, bool), np.zeros(1, bool))
+    on_plate = Places(
+        np.array([len(faces) - 2], np.int32), np.full((1, 3), 1 / 3, np.float32), np.ones(1, bool), np.zeros(1, bool)
+    )
     np.testing.assert_allclose(origin.lookup(on_plate)["albedo"], [[1, 0, 0]], atol=1e-3)
 
 
@@ -68,7 +92,15 @@ def test_one_view_that_disagrees_with_the_others_is_left_out(surface):
     views = torus_views(192)
     albedo = views.images["albedo"].copy()
     albedo[1] = (0.0, 1.0, 0.0)  # front right, between front and right
-    truth = Surface(surface.vertices, surface.faces, albedo_of(surface.vertices), surface.roughness, surface.metallic, surface.confidence, surface.normals)
+    truth = Surface(
+        surface.vertices,
+        surface.faces,
+        albedo_of(surface.vertices),
+        surface.roughness,
+        surface.metallic,
+        surface.confidence,
+        surface.normals,
+    )
     origin = from_surface(truth, Views(views.cameras, {"albedo": albedo}, views.mask))
     places = places_on(surface)
     points = at(origin, places)
@@ -105,11 +137,21 @@ def test_detail_is_a_texel_of_the_finest_texture():
     from gdtool.assets.scene import Material, Scene, Texture
     from gdtool.bake.origin import texture_detail
 
-    vertices, faces = np.array([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    vertices, faces = (
+        np.array([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]),
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+    )
     uv = np.array([[0.0, 1], [1, 1], [1, 0], [0, 0]])
     image = lambda size: Texture(np.zeros((size, size, 3), np.uint8))  # noqa: E731
-    for material, expected in ((Material(base_color_texture=image(64)), 2 / 64), (Material(base_color_texture=image(64), normal_texture=image(256)), 2 / 256),
-                               (Material(), None)):
-        assert texture_detail(Scene(vertices, faces, (material,), uvs=(uv,))) == (None if expected is None else pytest.approx(expected))
+    for material, expected in (
+        (Material(base_color_texture=image(64)), 2 / 64),
+        (Material(base_color_texture=image(64), normal_texture=image(256)), 2 / 256),
+        (Material(), None),
+    ):
+        assert texture_detail(Scene(vertices, faces, (material,), uvs=(uv,))) == (
+            None if expected is None else pytest.approx(expected)
+        )
     # Repeated four times along each side, it is four times as fine.
-    assert texture_detail(Scene(vertices, faces, (Material(base_color_texture=image(64)),), uvs=(4 * uv,))) == pytest.approx(2 / 256)
+    assert texture_detail(
+        Scene(vertices, faces, (Material(base_color_texture=image(64)),), uvs=(4 * uv,))
+    ) == pytest.approx(2 / 256)

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gdtool.bake.origin import from_surface
+from gdtool.bake.picture import picture_of
 from gdtool.cameras import project, rig
 from gdtool.folders.surface import Surface
 from gdtool.folders.views import Views
 from gdtool.images.metrics import resized
-from gdtool.bake.origin import from_surface
-from gdtool.bake.picture import picture_of
-from tests.stages.bake_folders import torus_views
 from tests.bake.shapes import albedo_of, psnr, torus, triangles_of
+from tests.stages.bake_folders import torus_views
 
 FINE, COARSE = 256, 64
 
@@ -22,7 +22,11 @@ def shown(painted: np.ndarray, light: np.ndarray):
     y, x = np.mgrid[:FINE, :FINE] + 0.5
     disc = (((x - FINE / 2) ** 2 + (y - FINE / 2) ** 2) < (0.4 * FINE) ** 2).astype(float)[..., None]
     view = resized(np.concatenate([painted * disc, disc], -1), COARSE, COARSE)
-    return view[..., :3] / np.maximum(view[..., 3:], 1e-3), np.concatenate([painted * light[..., None], disc], -1).astype(np.float32), disc[..., 0] > 0
+    return (
+        view[..., :3] / np.maximum(view[..., 3:], 1e-3),
+        np.concatenate([painted * light[..., None], disc], -1).astype(np.float32),
+        disc[..., 0] > 0,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +71,9 @@ def test_the_view_that_the_others_were_made_of_is_not_outvoted():
     vertices, quads, normals = torus(160, 90)
     count, views = len(vertices), torus_views(96)
     other = np.full((count, 3), 0.5)
-    surface = Surface(vertices, triangles_of(quads), other, np.full(count, 0.5), np.zeros(count), np.ones(count), normals)
+    surface = Surface(
+        vertices, triangles_of(quads), other, np.full(count, 0.5), np.zeros(count), np.ones(count), normals
+    )
     albedo = np.where(views.mask[..., None] > 0, np.full(3, 0.5), 0).astype(np.float32)
     albedo[0] = views.images["albedo"][0]
     given = Views(views.cameras, {"albedo": albedo}, views.mask)
@@ -85,13 +91,18 @@ def _front_places(vertices, faces, normals):
 
     facing = np.flatnonzero(normals[faces].mean(1)[:, 2] > 0.95)
     facing = facing[vertices[faces[facing]].mean(1)[:, 2] > 0.3]
-    return Places(facing.astype(np.int32), np.full((len(facing), 3), 1 / 3, np.float32), np.ones(len(facing), bool), np.zeros(len(facing), bool))
+    return Places(
+        facing.astype(np.int32),
+        np.full((len(facing), 3), 1 / 3, np.float32),
+        np.ones(len(facing), bool),
+        np.zeros(len(facing), bool),
+    )
 
 
 def test_a_picture_tells_color_where_other_views_face_the_surface_better_and_nothing_else():
     """A plane at 40 degrees to the front camera and 5 to the next; only colors follow the picture's view."""
-    from gdtool.geometry.rays import RayCaster
     from gdtool.bake.project_views import observe, sight_of
+    from gdtool.geometry.rays import RayCaster
 
     cameras = [camera for camera in rig("six", 64) if camera.name in ("front", "front_right")]
     turned = np.radians(40)

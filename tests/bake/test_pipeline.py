@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from gdtool.geometry.tangents import decode_tangent_space
-from gdtool.bake.pipeline import bake, occlusion_tracer, vertex_lookup
 from gdtool.bake.maps import make_maps
 from gdtool.bake.occlusion import bake_occlusion, openness
-from gdtool.geometry.uv_raster import rasterize_uv
+from gdtool.bake.pipeline import bake, occlusion_tracer, vertex_lookup
 from gdtool.bake.reproject import Source, vertex_reach
 from gdtool.bake.target import Target, corner_normals, points_at, texels_of
+from gdtool.geometry.tangents import decode_tangent_space
+from gdtool.geometry.uv_raster import rasterize_uv
 from tests.bake.shapes import albedo_of, psnr, sphere, torus, triangles_of, unwrapped
 
 
@@ -42,9 +42,9 @@ def torus_bake():
 
 def test_analytic_albedo_within_psnr_bound(torus_bake):
     target, texels, _, _, _, baked = torus_bake
-    at, _ = nearest_on_torus(positions(target, texels)[:texels.inside])
-    assert psnr(baked.values["albedo"][:texels.inside], albedo_of(at)) > 50
-    assert np.abs(baked.values["roughness"][:texels.inside] - (0.5 + 0.3 * at[:, 0])).max() < 0.01
+    at, _ = nearest_on_torus(positions(target, texels)[: texels.inside])
+    assert psnr(baked.values["albedo"][: texels.inside], albedo_of(at)) > 50
+    assert np.abs(baked.values["roughness"][: texels.inside] - (0.5 + 0.3 * at[:, 0])).max() < 0.01
     assert baked.report["nearest_point_share"] < 0.001
 
 
@@ -57,7 +57,7 @@ def test_normal_map_decodes_to_the_fine_normals(torus_bake):
     points, frames = points_at(target, texels.face_idx, texels.barycentric)
     decoded = decode_tangent_space(frames, np.rint((baked.values["tangent_normal"] * 0.5 + 0.5) * 255) / 255 * 2 - 1)
     _, truth = nearest_on_torus(points)
-    angle = np.degrees(np.arccos(np.clip((decoded * truth).sum(1), -1, 1)))[:texels.inside]
+    angle = np.degrees(np.arccos(np.clip((decoded * truth).sum(1), -1, 1)))[: texels.inside]
     assert angle.mean() < 0.5 and angle.max() < 4
     flat = frames[..., 2] / np.linalg.norm(frames[..., 2], axis=1, keepdims=True)
     unbaked = np.degrees(np.arccos(np.clip((flat * truth).sum(1), -1, 1)))
@@ -67,16 +67,21 @@ def test_normal_map_decodes_to_the_fine_normals(torus_bake):
 
 def test_supersampling_only_where_it_varies_and_nearer_the_texel_mean(torus_bake):
     target, texels, source, _, reach, _ = torus_bake
+
     # Above the middle stripes finer than a texel, whose mean is one half; below it one half everywhere.
     def stripes(places):
         y = source.at(places.face_idx, places.barycentric, source.vertices)[:, 1:2]
         count = len(places.face_idx)
-        return {"albedo": np.repeat(np.where(y > 0, (np.sin(900 * y) > 0) * 1.0, 0.5), 3, 1), "roughness": np.full(count, 0.5),
-                "metallic": np.zeros(count), "normal": source.face_normals[places.face_idx]}
+        return {
+            "albedo": np.repeat(np.where(y > 0, (np.sin(900 * y) > 0) * 1.0, 0.5), 3, 1),
+            "roughness": np.full(count, 0.5),
+            "metallic": np.zeros(count),
+            "normal": source.face_normals[places.face_idx],
+        }
 
-    one = bake(target, texels, source, stripes, reach).values["albedo"][:texels.inside]
+    one = bake(target, texels, source, stripes, reach).values["albedo"][: texels.inside]
     many = bake(target, texels, source, stripes, reach, samples=16)
-    assert np.abs(many.values["albedo"][:texels.inside] - 0.5).mean() < 0.7 * np.abs(one - 0.5).mean()
+    assert np.abs(many.values["albedo"][: texels.inside] - 0.5).mean() < 0.7 * np.abs(one - 0.5).mean()
     assert 0.4 < many.report["supersampled_share"] < 0.9
 
 
@@ -87,10 +92,16 @@ def test_thin_wall_does_not_bleed_through():
     up, down = np.array([[0, 2, 1], [0, 3, 2]]), np.array([[4, 5, 6], [4, 6, 7]])
     source = Source(np.concatenate([top, bottom]), np.concatenate([up, down]))
     albedo = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], 4, 0)
-    lookup = vertex_lookup(source, {"albedo": albedo, "roughness": np.ones(8), "metallic": np.zeros(8)}, np.repeat([[0, 1.0, 0], [0, -1.0, 0]], 4, 0))
+    lookup = vertex_lookup(
+        source,
+        {"albedo": albedo, "roughness": np.ones(8), "metallic": np.zeros(8)},
+        np.repeat([[0, 1.0, 0], [0, -1.0, 0]], 4, 0),
+    )
     for off in (-0.008, 0.008):
         low = np.concatenate([top + (0, off, 0), bottom - (0, off, 0)])
-        uv = np.array([[0.05, 0.1], [0.45, 0.1], [0.45, 0.9], [0.05, 0.9], [0.55, 0.1], [0.95, 0.1], [0.95, 0.9], [0.55, 0.9]])
+        uv = np.array(
+            [[0.05, 0.1], [0.45, 0.1], [0.45, 0.9], [0.05, 0.9], [0.55, 0.1], [0.95, 0.1], [0.95, 0.9], [0.55, 0.9]]
+        )
         faces = np.concatenate([up, down])
         target = Target.of(low, faces, uv, faces)
         texels = texels_of(target, 64)
@@ -101,12 +112,26 @@ def test_thin_wall_does_not_bleed_through():
 
 def test_a_chart_smaller_than_a_texel_has_its_own_color():
     """A blue triangle that covers no texel's centre, beside the chart of a red square: its lookups are blue."""
-    vertices = np.array([[-0.5, 0, -0.5], [0.5, 0, -0.5], [0.5, 0, 0.5], [-0.5, 0, 0.5], [-0.01, 0.3, 0], [0, 0.3, 0.01], [0.01, 0.3, 0]])
+    vertices = np.array(
+        [
+            [-0.5, 0, -0.5],
+            [0.5, 0, -0.5],
+            [0.5, 0, 0.5],
+            [-0.5, 0, 0.5],
+            [-0.01, 0.3, 0],
+            [0, 0.3, 0.01],
+            [0.01, 0.3, 0],
+        ]
+    )
     faces = np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6]])
-    uv = np.array([[0.1, 0.1], [0.5, 0.1], [0.5, 0.5], [0.1, 0.5], *((np.array([[40.1, 20.7], [40.4, 20.7], [40.1, 20.9]])) / 64)])
+    uv = np.array(
+        [[0.1, 0.1], [0.5, 0.1], [0.5, 0.5], [0.1, 0.5], *((np.array([[40.1, 20.7], [40.4, 20.7], [40.1, 20.9]])) / 64)]
+    )
     target, source = Target.of(vertices, faces, uv, faces), Source(vertices, faces)
     albedo = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], [4, 3], 0)
-    lookup = vertex_lookup(source, {"albedo": albedo, "roughness": np.ones(7), "metallic": np.zeros(7)}, np.repeat([[0, 1.0, 0]], 7, 0))
+    lookup = vertex_lookup(
+        source, {"albedo": albedo, "roughness": np.ones(7), "metallic": np.zeros(7)}, np.repeat([[0, 1.0, 0]], 7, 0)
+    )
     texels = texels_of(target, 64)
     baked = bake(target, texels, source, lookup, vertex_reach(vertices, faces, source))
     image = make_maps(texels, baked.values).base_color
@@ -120,8 +145,8 @@ def test_every_covered_texel_is_read_and_ring_texels_continue_it(torus_bake):
     owner, _ = rasterize_uv(target.uv, target.face_uvs, 256)
     np.testing.assert_array_equal(texels.mask(inside_only=True), owner >= 0)
     assert all(np.isfinite(v).all() for v in baked.values.values())
-    at, _ = nearest_on_torus(positions(target, texels)[texels.inside:])
-    assert psnr(baked.values["albedo"][texels.inside:], albedo_of(at)) > 35
+    at, _ = nearest_on_torus(positions(target, texels)[texels.inside :])
+    assert psnr(baked.values["albedo"][texels.inside :], albedo_of(at)) > 35
 
 
 def test_corner_normals_are_smooth_on_a_sphere_and_split_on_a_cube():
@@ -154,11 +179,12 @@ def test_occlusion_of_a_torus_agrees_with_many_rays_and_repeats(torus_bake):
     target, texels, source, _, reach, _ = torus_bake
     normals = torus(240, 140)[2]
     run = lambda rays, seed, scale: bake_occlusion(  # noqa: E731
-        target, texels, occlusion_tracer(target, source, reach, normals, rays, seed), scale)
+        target, texels, occlusion_tracer(target, source, reach, normals, rays, seed), scale
+    )
     first, again = run(64, 3, 4), run(64, 3, 4)
     np.testing.assert_array_equal(first, again)
     truth = run(256, 9, 1)
-    difference = (first - truth)[:texels.inside]
+    difference = (first - truth)[: texels.inside]
     assert np.sqrt((difference**2).mean()) < 0.03
     at = positions(target, texels)
     around = np.linalg.norm(at[:, [0, 2]], axis=1)

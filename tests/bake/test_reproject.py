@@ -41,7 +41,8 @@ def test_thin_wall_is_never_crossed():
         for offset in (-0.004, -0.0005, 0.0, 0.0005, 0.004):
             points = np.column_stack([xy, np.full(3000, side * (0.0005 + offset))])
             places = reproject(points, normals, np.full(3000, 0.01), source)
-            np.testing.assert_allclose(at(source, places)[:, 2], side * 0.0005, atol=3e-7)  # weights of the corners are float32
+            # Weights of the corners are float32.
+            np.testing.assert_allclose(at(source, places)[:, 2], side * 0.0005, atol=3e-7)
             np.testing.assert_allclose(at(source, places)[:, :2], xy, atol=3e-7)  # weights of the corners are float32
 
 
@@ -53,7 +54,9 @@ def test_nearest_point_serves_where_the_normal_misses_and_stays_on_its_side():
     normals = np.array([[0.0, 0, 1], [0, 0, -1], [0, 0, 1]])
     places = reproject(points, normals, np.full(3, 0.01), source)
     assert not places.by_ray.any()
-    np.testing.assert_allclose(at(source, places), [[0.5, 0.1, 0.0005], [0.5, 0.1, -0.0005], [0.5, 0.1, 0.0005]], atol=1e-9)
+    np.testing.assert_allclose(
+        at(source, places), [[0.5, 0.1, 0.0005], [0.5, 0.1, -0.0005], [0.5, 0.1, 0.0005]], atol=1e-9
+    )
 
 
 def test_reach_covers_the_distance_but_not_the_object():
@@ -81,7 +84,8 @@ def test_a_sheet_without_another_side_is_read_from_behind():
 
 
 def test_a_sheet_is_not_looked_through():
-    # What lies behind a sheet without another side, and looks the same way as the mesh, is not what the mesh stands for.
+    # What lies behind a sheet without another side, and looks the same way as the mesh, is not what the mesh stands
+    # for.
     square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
     faces = np.array([[0, 2, 1], [0, 3, 2]])
     source = Source(np.concatenate([square, square * 0.9 - (0, 0, 0.01)]), np.concatenate([faces, faces[:, ::-1] + 4]))

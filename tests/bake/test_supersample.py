@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from gdtool.images.color import srgb_from_linear
 from gdtool.bake import supersample
 from gdtool.bake.pipeline import bake, vertex_lookup
 from gdtool.bake.reproject import Source, vertex_reach
 from gdtool.bake.target import COARSE_TEXEL, Target, samples_for, texels_of
+from gdtool.images.color import srgb_from_linear
 from tests.bake.shapes import albedo_of, torus, triangles_of, unwrapped
 
 SIZE = 32
@@ -19,18 +19,26 @@ def test_as_many_samples_as_the_source_has_detail():
 
 
 def plate(material, left=4.0, right=28.0, samples=16, threads=1):
-    """Values by texel (SIZE, SIZE, …) of a plate whose chart spans [left, right] x [4, 28] texels, one unit a texel; material(x (n,))."""
+    """Values by texel (SIZE, SIZE, …) of a plate whose chart spans [left, right] x [4, 28] texels, one unit a texel;
+    material(x (n,))."""
     vertices = np.array([[left, 0, 4], [right, 0, 4], [right, 0, 28], [left, 0, 28.0]])
     faces = np.array([[0, 2, 1], [0, 3, 2]])
     target, source = Target.of(vertices, faces, vertices[:, [0, 2]] / SIZE, faces), Source(vertices, faces)
 
     def lookup(places):
         x = source.at(places.face_idx, places.barycentric, source.vertices)[:, 0]
-        plain = {"albedo": np.full((len(x), 3), 0.5), "roughness": np.full(len(x), 0.5), "metallic": np.zeros(len(x)), "normal": np.tile([0.0, 1, 0], (len(x), 1))}
+        plain = {
+            "albedo": np.full((len(x), 3), 0.5),
+            "roughness": np.full(len(x), 0.5),
+            "metallic": np.zeros(len(x)),
+            "normal": np.tile([0.0, 1, 0], (len(x), 1)),
+        }
         return {name: value.astype(np.float32) for name, value in (plain | material(x)).items()}
 
     texels = texels_of(target, SIZE)
-    baked = bake(target, texels, source, lookup, vertex_reach(vertices, faces, source), samples=samples, threads=threads)
+    baked = bake(
+        target, texels, source, lookup, vertex_reach(vertices, faces, source), samples=samples, threads=threads
+    )
     return {name: texels.image(value) for name, value in baked.values.items()}
 
 
@@ -54,7 +62,12 @@ def test_samples_beside_the_chart_do_not_count():
 
 
 def test_color_that_is_not_seen_does_not_count():
-    values = plate(lambda x: {"alpha": np.where(x < 10.5, 1.0, 0.0), "albedo": np.where(x[:, None] < 10.5, [0.8, 0.2, 0.1], [0, 0, 0])})
+    values = plate(
+        lambda x: {
+            "alpha": np.where(x < 10.5, 1.0, 0.0),
+            "albedo": np.where(x[:, None] < 10.5, [0.8, 0.2, 0.1], [0, 0, 0]),
+        }
+    )
     assert values["alpha"][15, 10] == pytest.approx(0.5, abs=1e-6)
     np.testing.assert_allclose(values["albedo"][15, 10], [0.8, 0.2, 0.1], atol=1e-3)
 
@@ -67,7 +80,13 @@ def ring():
     target = Target.of(coarse, faces, *unwrapped(coarse, faces, 128))
     source = Source(fine, triangles_of(quads))
     attributes = {"albedo": albedo_of(fine), "roughness": (fine[:, 1] > 0.05) * 1.0, "metallic": np.zeros(len(fine))}
-    return target, texels_of(target, 128), source, vertex_lookup(source, attributes, normals), vertex_reach(coarse, faces, source)
+    return (
+        target,
+        texels_of(target, 128),
+        source,
+        vertex_lookup(source, attributes, normals),
+        vertex_reach(coarse, faces, source),
+    )
 
 
 def test_any_number_of_threads_gives_the_same(ring):
@@ -84,7 +103,9 @@ def test_texels_left_with_one_sample_are_within_the_tolerance(ring, monkeypatch)
     monkeypatch.setattr(supersample, "varying", lambda texels, values, threads: np.arange(len(texels)))
     every = bake(*ring, samples=4).values
     assert len(left) > 100
-    assert np.abs(srgb_from_linear(some["albedo"]) - srgb_from_linear(every["albedo"]))[left].max() < supersample.TOLERANCE
+    assert (
+        np.abs(srgb_from_linear(some["albedo"]) - srgb_from_linear(every["albedo"]))[left].max() < supersample.TOLERANCE
+    )
     for name in ("roughness", "tangent_normal"):
         assert np.abs(some[name] - every[name])[left].max() < supersample.TOLERANCE
     assert np.abs(some["roughness"] - bake(*ring).values["roughness"]).max() > 0.2

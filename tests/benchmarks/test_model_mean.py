@@ -23,7 +23,23 @@ def trained(gdtool, tmp_path):
     def train(name, seed, start=None, **changes):
         (tmp_path / f"{name}.json").write_text(json.dumps({"model": SMALLER | changes}))
         begun = ["--start", start] if start else []
-        result = gdtool("train", spheres, "--preset", "tiny", "--threads", 1, "--config", f"{name}.json", *begun, "--steps", 2, "--seed", seed, "-o", name)
+        result = gdtool(
+            "train",
+            spheres,
+            "--preset",
+            "tiny",
+            "--threads",
+            1,
+            "--config",
+            f"{name}.json",
+            *begun,
+            "--steps",
+            2,
+            "--seed",
+            seed,
+            "-o",
+            name,
+        )
         assert result.returncode == 0, result.stderr
         return tmp_path / name
 

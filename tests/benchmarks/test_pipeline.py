@@ -51,23 +51,39 @@ def test_what_fails_says_why(stand_in):
 
 
 def test_evaluate_asks_for_json(stand_in):
-    assert measure.evaluate(Path("a"), "--samples", "9")["arguments"] == ["evaluate", "a", "--json", "--quiet", "--samples", "9"]
+    assert measure.evaluate(Path("a"), "--samples", "9")["arguments"] == [
+        "evaluate",
+        "a",
+        "--json",
+        "--quiet",
+        "--samples",
+        "9",
+    ]
 
 
 def record(way, quality, seconds, distance, **more):
-    stages = {"reconstruct": {"seconds": seconds, "peak_mb": 100.0, "surface_distance": distance},
-              "whole": {"seconds": 2 * seconds, "peak_mb": 200.0, "surface_distance": distance, "albedo_psnr_masked": 25.0}}
+    stages = {
+        "reconstruct": {"seconds": seconds, "peak_mb": 100.0, "surface_distance": distance},
+        "whole": {"seconds": 2 * seconds, "peak_mb": 200.0, "surface_distance": distance, "albedo_psnr_masked": 25.0},
+    }
     return {"way": way, "quality": quality, "source": f"procedural:{seconds}", "stages": stages, **more}
 
 
-RECORDS = [record("model", "fast", 1.0, 0.004), record("model", "fast", 3.0, 0.002), record("model", "fast", 2.0, 0.010),
-           record("model", "fine", 9.0, 0.001), {"way": "image", "quality": "fast", "source": "x", "stages": {}, "failed": "bake exited with 1: no"}]
+RECORDS = [
+    record("model", "fast", 1.0, 0.004),
+    record("model", "fast", 3.0, 0.002),
+    record("model", "fast", 2.0, 0.010),
+    record("model", "fine", 9.0, 0.001),
+    {"way": "image", "quality": "fast", "source": "x", "stages": {}, "failed": "bake exited with 1: no"},
+]
 
 
 def test_summary_is_the_median_over_sources():
     rows = {(row["way"], row["quality"], row["stage"]): row for row in pipeline.summary(RECORDS)}
     assert rows["model", "fast", "reconstruct"]["seconds"] == 2.0
-    assert rows["model", "fast", "whole"]["surface_distance"] == 0.004 and rows["model", "fast", "whole"]["sources"] == 3
+    assert (
+        rows["model", "fast", "whole"]["surface_distance"] == 0.004 and rows["model", "fast", "whole"]["sources"] == 3
+    )
     assert ("image", "fast", "whole") not in rows
 
 
@@ -86,19 +102,33 @@ def test_the_plot_is_drawn(tmp_path):
 
 def test_roundtrip_counts_what_passes():
     good = {"seen_distance": 0.003, "surface_distance": 0.01, "albedo_psnr_masked": 23.0, "watertight": True}
-    records = [{"model": name, "seconds": 1.0, "peak_mb": 2.0, "asset": asset} for name, asset in
-               (("a", good), ("b", good | {"seen_distance": 0.005}), ("c", good | {"albedo_psnr_masked": 21.0}), ("d", good | {"watertight": False}))]
+    records = [
+        {"model": name, "seconds": 1.0, "peak_mb": 2.0, "asset": asset}
+        for name, asset in (
+            ("a", good),
+            ("b", good | {"seen_distance": 0.005}),
+            ("c", good | {"albedo_psnr_masked": 21.0}),
+            ("d", good | {"watertight": False}),
+        )
+    ]
     records.append({"model": "e", "seconds": 0.0, "peak_mb": 0.0, "failed": "remesh exited with 1"})
     assert [roundtrip.passes(r) for r in records] == [True, False, False, False, False]
-    assert "Of 5 models: 3 within 0.004 seen and 0.015 whole, 3 closed, 3 with albedo ≥ 22 dB, 1 all of it." in roundtrip.report(records)
+    assert (
+        "Of 5 models: 3 within 0.004 seen and 0.015 whole, 3 closed, 3 with albedo ≥ 22 dB, 1 all of it."
+        in roundtrip.report(records)
+    )
 
 
 def test_roundtrip_takes_models_with_metallic_roughness_textures(tmp_path):
     from gdtool.assets.gltf_write import write_glb
     from gdtool.assets.procedural import generate
 
-    textured = next(scene for scene in map(generate, range(50)) if any(m.metallic_roughness_texture for m in scene.materials))
-    plain = next(scene for scene in map(generate, range(200)) if not any(m.metallic_roughness_texture for m in scene.materials))
+    textured = next(
+        scene for scene in map(generate, range(50)) if any(m.metallic_roughness_texture for m in scene.materials)
+    )
+    plain = next(
+        scene for scene in map(generate, range(200)) if not any(m.metallic_roughness_texture for m in scene.materials)
+    )
     write_glb(tmp_path / "a.glb", textured)
     write_glb(tmp_path / "b.glb", plain)
     (tmp_path / "c.glb").write_bytes(b"no model")
@@ -106,9 +136,14 @@ def test_roundtrip_takes_models_with_metallic_roughness_textures(tmp_path):
     assert len(roundtrip.models_under([tmp_path], True)) == 3
 
 
-@pytest.mark.parametrize("stage", sorted({name for options in pipeline.QUALITIES.values() for name in options} | {s for s, _ in roundtrip.STAGES}))
+@pytest.mark.parametrize(
+    "stage",
+    sorted({name for options in pipeline.QUALITIES.values() for name in options} | {s for s, _ in roundtrip.STAGES}),
+)
 def test_the_options_exist(stage):
     command = importlib.import_module("gdtool.commands." + stage.replace("-", "_")).command
     known = {flag for param in command.params for flag in param.opts}
-    used = [options.get(stage, []) for options in pipeline.QUALITIES.values()] + [options for name, options in roundtrip.STAGES if name == stage]
+    used = [options.get(stage, []) for options in pipeline.QUALITIES.values()] + [
+        options for name, options in roundtrip.STAGES if name == stage
+    ]
     assert {flag for options in used for flag in options if flag.startswith("--")} <= known

@@ -34,7 +34,9 @@ def test_the_disturbance_has_the_size_it_says(ball):
     angle = np.degrees(np.arccos(np.clip((found.images["normal"] * ball.images["normal"]).sum(-1)[inner], -1, 1)))
     assert 3 < np.sqrt((angle**2).mean()) < 7
     assert np.allclose(np.linalg.norm(found.images["normal"][inner], axis=-1), 1, atol=1e-4)
-    assert (found.images["depth"] == again.images["depth"]).all() and (found.images["depth"] != other.images["depth"]).any()
+    assert (found.images["depth"] == again.images["depth"]).all() and (
+        found.images["depth"] != other.images["depth"]
+    ).any()
     for k in range(6):  # a pixel more or less on both sides
         assert abs((found.mask[k, 32] > 0.5).sum() - (ball.mask[k, 32] > 0.5).sum()) == 2
     assert (found.images["depth"][found.mask > 0.5] > 0.5).all()  # a grown mask's new pixels have values
@@ -53,9 +55,24 @@ def test_peers_find_a_ball(ball, name):
 
 
 def test_report_names_what_is_missed_and_who_is_better(tmp_path):
-    records = [{"model": "cat", "source": "cat.glb", "method": m, "case": c, "distance": d, "iou": 0.99, "seconds": 3.0, "watertight": True}
-               for m, c, d in ((reconstruct.OURS, "clean", 5e-4), (reconstruct.OURS, "perturbed 0 0.125", 9e-3), ("carved hull", "clean", 6e-4),
-                               ("carved hull", "perturbed 0 0.125", 4e-3))]
+    records = [
+        {
+            "model": "cat",
+            "source": "cat.glb",
+            "method": m,
+            "case": c,
+            "distance": d,
+            "iou": 0.99,
+            "seconds": 3.0,
+            "watertight": True,
+        }
+        for m, c, d in (
+            (reconstruct.OURS, "clean", 5e-4),
+            (reconstruct.OURS, "perturbed 0 0.125", 9e-3),
+            ("carved hull", "clean", 6e-4),
+            ("carved hull", "perturbed 0 0.125", 4e-3),
+        )
+    ]
     text = reconstruct.markdown(records, Namespace(size=64, seeds=1, wavelengths=[0.125]), "")
     assert "clean: median distance 0.0005, wanted ≤ 0.0007: holds" in text
     assert "perturbed: median distance 0.009, wanted ≤ 0.0022: **missed**" in text
@@ -65,13 +82,22 @@ def test_report_names_what_is_missed_and_who_is_better(tmp_path):
 
 
 def rows_of(**figures):
-    return [{"model": "cat", "source": "cat.glb", "case": "clean", "watertight": True, "iou": 0.99, **row} for row in figures["rows"]]
+    return [
+        {"model": "cat", "source": "cat.glb", "case": "clean", "watertight": True, "iou": 0.99, **row}
+        for row in figures["rows"]
+    ]
 
 
 def test_a_budget_is_held_against_the_peers_that_were_done_by_then():
-    rows = rows_of(rows=[{"method": "gdtool", "distance": 1e-3, "seconds": 6.0}, {"method": "gdtool 5 s", "distance": 2e-3, "seconds": 4.0},
-                         {"method": "gdtool 10 s", "distance": 2e-3, "seconds": 8.0}, {"method": "carved hull", "distance": 3e-3, "seconds": 1.0},
-                         {"method": "slow peer", "distance": 1.5e-3, "seconds": 9.0}])
+    rows = rows_of(
+        rows=[
+            {"method": "gdtool", "distance": 1e-3, "seconds": 6.0},
+            {"method": "gdtool 5 s", "distance": 2e-3, "seconds": 4.0},
+            {"method": "gdtool 10 s", "distance": 2e-3, "seconds": 8.0},
+            {"method": "carved hull", "distance": 3e-3, "seconds": 1.0},
+            {"method": "slow peer", "distance": 1.5e-3, "seconds": 9.0},
+        ]
+    )
     text = reconstruct_report.by_budget(rows)
     first, second = (next(line for line in text.splitlines() if f"clean, {b} s" in line) for b in (5, 10))
     assert "carved hull" in first and "| yes |" in first
@@ -79,7 +105,15 @@ def test_a_budget_is_held_against_the_peers_that_were_done_by_then():
 
 
 def test_skips_say_what_they_save():
-    rows = rows_of(rows=[{"method": "gdtool", "distance": 1e-3, "skips": [{"what": "band", "done": 3.0, "skipped": 1.0, "change": 0.0}]}])
+    rows = rows_of(
+        rows=[
+            {
+                "method": "gdtool",
+                "distance": 1e-3,
+                "skips": [{"what": "band", "done": 3.0, "skipped": 1.0, "change": 0.0}],
+            }
+        ]
+    )
     assert "| band | 3 | 1 | 2 | 0 | 1 |" in reconstruct_report.by_skip(rows)
 
 
@@ -92,7 +126,8 @@ def test_rows_that_were_measured_are_not_measured_again(tmp_path):
     again = reconstruct.Bench(given)
     assert not again.has("dog", "clean", "gdtool")
     assert again.has("cat", "clean", "gdtool") and not again.has("cat", "clean", "carved hull")
-    assert not reconstruct.Bench(Namespace(output=tmp_path, size=128, options=[], fresh=False)).records  # of other views
+    # Of other views.
+    assert not reconstruct.Bench(Namespace(output=tmp_path, size=128, options=[], fresh=False)).records
     again.save(complete=True)
     assert not reconstruct.Bench(given).records
 

@@ -1,4 +1,5 @@
-"""`make bench-assets` where the folder of models is absent: remesh_models.py says so, leaves what was measured and does not stop the rest."""
+"""`make bench-assets` where the folder of models is absent: remesh_models.py says so, leaves what was measured and does
+not stop the rest."""
 
 import sys
 from pathlib import Path

@@ -30,7 +30,11 @@ def test_cores_grow_by_doubling_up_to_all(cores, steps):
 
 def test_the_page_has_a_row_for_every_run():
     costs = [Cost(30.0, 400.0, "", 20.0)]
-    rows = {f"{i}": {"table": name, **throughput.row_of(way, 1, count, costs)} for i, (name, way, count) in
-            enumerate([("cores", "threads", 24), ("cores", "ray", 24), ("objects", "threads", 1000)])}
+    rows = {
+        f"{i}": {"table": name, **throughput.row_of(way, 1, count, costs)}
+        for i, (name, way, count) in enumerate(
+            [("cores", "threads", 24), ("cores", "ray", 24), ("objects", "threads", 1000)]
+        )
+    }
     page = throughput.report({"machine": "m", "busy": "", "ray": True, "rows": rows})
     assert page.count("\n| threads") == 2 and page.count("\n| ray") == 1 and "1000" in page

@@ -80,11 +80,17 @@ def test_arrays_go_there_and_back_whatever_the_function_prints():
 
 def test_numbers_there_and_back_are_of_numpys_own_types():
     """ufunc.at takes ten times as long with types that are equal to these only; others come as they are."""
-    numbers = [np.arange(2).astype(kind) for kind in (bool, np.int8, np.int32, np.uint64, np.float32, float, complex) for _ in range(2)]
+    numbers = [
+        np.arange(2).astype(kind)
+        for kind in (bool, np.int8, np.int32, np.uint64, np.float32, float, complex)
+        for _ in range(2)
+    ]
     others = [np.arange(5, dtype=">f8"), np.array(["a", "bc"]), np.array([(1, 2.0)], [("one", int), ("two", float)])]
     there, arrays = child.call(of_own_type, numbers + others, seconds=30)
-    assert all(there[:len(numbers)]) and all(of_own_type(arrays[:len(numbers)])[0])
-    assert all(one.dtype == other.dtype and (one == other).all() for one, other in zip(arrays, numbers + others, strict=True))
+    assert all(there[: len(numbers)]) and all(of_own_type(arrays[: len(numbers)])[0])
+    assert all(
+        one.dtype == other.dtype and (one == other).all() for one, other in zip(arrays, numbers + others, strict=True)
+    )
 
 
 def test_a_prepared_child_is_used_and_has_imported_the_module():
@@ -136,7 +142,8 @@ def test_a_copy_of_this_process_does_not_use_its_waiting_children():
 def test_children_that_were_begun_work_at_once_and_keep_their_limits():
     running = [child.begin(large, seconds=30) for _ in range(2)] + [child.begin(hang, seconds=1)]
     deadline = time.monotonic() + 30
-    while any(one._process.returncode is None for one in running) and time.monotonic() < deadline:  # nobody has asked for a result yet
+    # Nobody has asked for a result yet.
+    while any(one._process.returncode is None for one in running) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert all(one._process.returncode is not None for one in running)
     assert [len(one.result()) for one in running[:2]] == [2**20] * 2
@@ -150,12 +157,15 @@ def test_our_errors_come_back_as_themselves():
     assert caught.value.cure == "cut it"
 
 
-@pytest.mark.parametrize("name, words, limits", [
-    ("crash", "SIGABRT", {"seconds": 30}),
-    ("leave", "no result", {"seconds": 30}),
-    ("hang", "longer than 1 s", {"seconds": 1}),
-    ("grow", "more than 500 MB", {"seconds": 30, "memory_mb": 500}),
-])
+@pytest.mark.parametrize(
+    "name, words, limits",
+    [
+        ("crash", "SIGABRT", {"seconds": 30}),
+        ("leave", "no result", {"seconds": 30}),
+        ("hang", "longer than 1 s", {"seconds": 1}),
+        ("grow", "more than 500 MB", {"seconds": 30, "memory_mb": 500}),
+    ],
+)
 def test_everything_else_is_a_failure_with_its_reason(name, words, limits):
     with pytest.raises(child.ChildFailed, match=words):
         child.call(globals()[name], **limits)

@@ -32,7 +32,8 @@ def imports(path, top_level_only=False):
 
 
 def may_import():
-    """Room to the rooms that docs/architecture.md lets it import, itself among them; what stands in parentheses there is a reason."""
+    """Room to the rooms that docs/architecture.md lets it import, itself among them; what stands in parentheses there
+    is a reason."""
     rows = re.findall(r"^\| `gdtool/(\w+)/` \|[^|]*\|([^|]*)\|$", (ROOT / "docs/architecture.md").read_text(), re.M)
     return {room: {room, *re.findall(r"\w+", re.sub(r"\(.*?\)", "", others))} for room, others in rows}
 
@@ -55,11 +56,18 @@ def test_arrows_point_one_way(path):
                 assert name.split(".")[1] in may_import()[room], f"{room} imports {name}"
 
 
-@pytest.mark.parametrize("path", modules("gdtool/stages") + modules("gdtool/core") + modules("commands"), ids=lambda p: p.name)
+@pytest.mark.parametrize(
+    "path", modules("gdtool/stages") + modules("gdtool/core") + modules("commands"), ids=lambda p: p.name
+)
 def test_heavy_packages_load_inside_functions(path):
     for name in imports(path, top_level_only=True):
         assert name.split(".")[0] not in HEAVY, name
-        assert not name.startswith(tuple(f"gdtool.{room}" for room in ("geometry", "images", "shading", "fields", "diffusion", "remesh", "unwrap", "bake"))), name
+        assert not name.startswith(
+            tuple(
+                f"gdtool.{room}"
+                for room in ("geometry", "images", "shading", "fields", "diffusion", "remesh", "unwrap", "bake")
+            )
+        ), name
 
 
 def test_package_list_is_the_tree():

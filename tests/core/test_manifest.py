@@ -28,21 +28,24 @@ def edited(folder, change):
     return folder
 
 
-@pytest.mark.parametrize("change, words", [
-    (lambda m: m.update(format=2), "upgrade gdtool"),
-    (lambda m: m.update(kind="picture"), "unknown kind"),
-    (lambda m: m.update(conten=1), "did you mean 'content'?"),
-    (lambda m: m["content"].update(frame=1), "did you mean 'frames'?"),
-    (lambda m: m["content"].pop("frames"), "frames"),
-    (lambda m: m["files"].append({"path": "../x", "size": 1, "sha256": "0" * 64}), "leaves its folder"),
-    (lambda m: m["files"].append({"path": "/x", "size": 1, "sha256": "0" * 64}), "is absolute"),
-    (lambda m: m.update(name="../../x"), "separator"),
-    (lambda m: m.update(name="a\nb"), "control character"),
-    (lambda m: m.update(name="x" * 300), "longer than 255 bytes"),
-    (lambda m: m["inputs"][0].update(path="/etc/passwd"), "is absolute"),
-    (lambda m: m["files"].append({"path": "x", "size": 1, "sha256": "0" * 64}), "missing"),
-    (lambda m: m["files"][0].update(sha256="0" * 64), "hash"),
-])
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda m: m.update(format=2), "upgrade gdtool"),
+        (lambda m: m.update(kind="picture"), "unknown kind"),
+        (lambda m: m.update(conten=1), "did you mean 'content'?"),
+        (lambda m: m["content"].update(frame=1), "did you mean 'frames'?"),
+        (lambda m: m["content"].pop("frames"), "frames"),
+        (lambda m: m["files"].append({"path": "../x", "size": 1, "sha256": "0" * 64}), "leaves its folder"),
+        (lambda m: m["files"].append({"path": "/x", "size": 1, "sha256": "0" * 64}), "is absolute"),
+        (lambda m: m.update(name="../../x"), "separator"),
+        (lambda m: m.update(name="a\nb"), "control character"),
+        (lambda m: m.update(name="x" * 300), "longer than 255 bytes"),
+        (lambda m: m["inputs"][0].update(path="/etc/passwd"), "is absolute"),
+        (lambda m: m["files"].append({"path": "x", "size": 1, "sha256": "0" * 64}), "missing"),
+        (lambda m: m["files"][0].update(sha256="0" * 64), "hash"),
+    ],
+)
 def test_faulty_manifests_are_refused(folder, change, words):
     with pytest.raises(InputError, match=words.replace("?", r"\?")):
         open_folder(edited(folder, change))

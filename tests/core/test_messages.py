@@ -1,7 +1,8 @@
-"""Every error says what removes it, by an option that the command has: read from the source, so that no message is left out.
+"""Every error says what removes it, by an option that the command has: read from the source, so that no message is left
+out.
 
-Checked are all calls that construct an error of core/errors.py, and all calls of functions that take a `cure` and build one.
-"""
+Checked are all calls that construct an error of core/errors.py, and all calls of functions that take a `cure` and build
+one."""
 
 import ast
 import importlib
@@ -15,13 +16,17 @@ import pytest
 from gdtool.commands import COMMANDS
 from tests.conftest import ROOT
 
-ERRORS = {"GdtoolError": 2, "InputError": 2, "UsageError": 2, "OutputError": 2, "ResourceError": 2}  # the place of the cure among the arguments
+# The place of the cure among the arguments.
+ERRORS = {"GdtoolError": 2, "InputError": 2, "UsageError": 2, "OutputError": 2, "ResourceError": 2}
 # A cure that says no more than this names no option, command or value.
-GENERIC = re.compile(r"(please )?((check|fix|correct|repair|change|see|look at|verify|use|give|provide|choose|try) (it|that|the|your|a|an|another|other|valid|right|correct"
-                     r"|the right|the correct|a valid|a correct|a different|another valid)?( )?(input|file|files|folder|data|value|values|arguments?|options?|configuration"
-                     r"|documentation|docs|manual|message|format|name|setting|settings|again|once more)?|try again|retry|run it again|contact .*|report it|unknown|none|n/?a)\W*",
-                     re.IGNORECASE)
-FOREIGN = re.compile(r"\b(?:apt|conda|hf|pip|python|ray|torchrun) [^;,]*")  # another program's command, with its own options
+GENERIC = re.compile(
+    r"(please )?((check|fix|correct|repair|change|see|look at|verify|use|give|provide|choose|try) (it|that|the|your|a|an|another|other|valid|right|correct"
+    r"|the right|the correct|a valid|a correct|a different|another valid)?( )?(input|file|files|folder|data|value|values|arguments?|options?|configuration"
+    r"|documentation|docs|manual|message|format|name|setting|settings|again|once more)?|try again|retry|run it again|contact .*|report it|unknown|none|n/?a)\W*",
+    re.IGNORECASE,
+)
+# Another program's command, with its own options.
+FOREIGN = re.compile(r"\b(?:apt|conda|hf|pip|python|ray|torchrun) [^;,]*")
 OTHER = re.compile(r"\bgdtool ([a-z][a-z-]*)([^;,]*)")  # another command of gdtool, with that one's options
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9]*(?:-[a-z0-9]+)*")
 # Options that a message may name though not every command that reaches its module has them: by file and function.
@@ -31,7 +36,11 @@ EXCEPTIONS: dict[tuple[str, str], tuple[set[str], str]] = {
     ("commands/_common.py", "shard_of"): ({"--shard"}, "called where --shard was given, by the commands that have it"),
 }
 
-FILES = {str(path.relative_to(ROOT)): ast.parse(path.read_text()) for folder in ("gdtool", "commands") for path in sorted((ROOT / folder).rglob("*.py"))}
+FILES = {
+    str(path.relative_to(ROOT)): ast.parse(path.read_text())
+    for folder in ("gdtool", "commands")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+}
 
 
 def module_of(file):
@@ -50,19 +59,26 @@ def options_of(command):
     found = importlib.import_module("gdtool.commands." + command.replace("-", "_")).command
     with click.Context(found) as context:
         params = [*found.get_params(context), *cli.params]
-    return {"--help", "--version"} | {name for param in params if isinstance(param, click.Option) for name in (*param.opts, *param.secondary_opts)}
+    return {"--help", "--version"} | {
+        name for param in params if isinstance(param, click.Option) for name in (*param.opts, *param.secondary_opts)
+    }
 
 
 @cache
 def mentioned(module):
-    """Modules of gdtool that a module imports, wherever in it, or names in a string "module:function" for a child process."""
+    """Modules of gdtool that a module imports, wherever in it, or names in a string "module:function" for a child
+    process."""
     found = set()
     for node in ast.walk(FILES[MODULES[module]]):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.level == 0:
             found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and re.fullmatch(r"gdtool(\.\w+)+(:\w+)?", node.value):
+        elif (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and re.fullmatch(r"gdtool(\.\w+)+(:\w+)?", node.value)
+        ):
             found.add(node.value.partition(":")[0])
     return found & MODULES.keys()
 
@@ -101,24 +117,46 @@ def place_of_cure(function):
 def default_cure(function):
     """The default of a function's `cure`; None where it has none."""
     arguments = [*function.args.posonlyargs, *function.args.args]
-    given = zip(arguments[len(arguments) - len(function.args.defaults):], function.args.defaults, strict=True)
-    return next((value for argument, value in (*given, *zip(function.args.kwonlyargs, function.args.kw_defaults, strict=True)) if argument.arg == "cure"), None)
+    given = zip(arguments[len(arguments) - len(function.args.defaults) :], function.args.defaults, strict=True)
+    return next(
+        (
+            value
+            for argument, value in (*given, *zip(function.args.kwonlyargs, function.args.kw_defaults, strict=True))
+            if argument.arg == "cure"
+        ),
+        None,
+    )
 
 
 # Functions that build errors of a `cure` that they are given, and those that can do without.
-TAKING = [(file, function) for file, tree in FILES.items() for function in functions(tree) if function.name != "__init__"
-          and any(argument.arg == "cure" for argument in (*function.args.args, *function.args.kwonlyargs))]
+TAKING = [
+    (file, function)
+    for file, tree in FILES.items()
+    for function in functions(tree)
+    if function.name != "__init__"
+    and any(argument.arg == "cure" for argument in (*function.args.args, *function.args.kwonlyargs))
+]
 HELPERS = {function.name: place_of_cure(function) for _, function in TAKING}
 OPTIONAL = {function.name for _, function in TAKING if default_cure(function) is not None}
 
 
 def name_called(call):
-    return call.func.id if isinstance(call.func, ast.Name) else call.func.attr if isinstance(call.func, ast.Attribute) else ""
+    return (
+        call.func.id
+        if isinstance(call.func, ast.Name)
+        else call.func.attr
+        if isinstance(call.func, ast.Attribute)
+        else ""
+    )
 
 
 def constants_of(tree):
     """Strings that have a name at the top of a module."""
-    return {node.targets[0].id: node.value for node in tree.body if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)}
+    return {
+        node.targets[0].id: node.value
+        for node in tree.body
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
+    }
 
 
 def constants(file):
@@ -161,7 +199,9 @@ class Message:
         self.file, self.function, self.call, self.name = file, function, call, name_called(call)
         place = ERRORS.get(self.name, HELPERS.get(self.name))
         named = next((keyword.value for keyword in call.keywords if keyword.arg == "cure"), None)
-        self.cure = named if named is not None else call.args[place] if place is not None and len(call.args) > place else None
+        self.cure = (
+            named if named is not None else call.args[place] if place is not None and len(call.args) > place else None
+        )
         self.where = f"{file}:{call.lineno}"
 
     def cures(self):
@@ -169,7 +209,11 @@ class Message:
 
     def words(self):
         known = constants(self.file)
-        return [text for node in (*self.call.args, *(keyword.value for keyword in self.call.keywords)) for text in texts(node, known)]
+        return [
+            text
+            for node in (*self.call.args, *(keyword.value for keyword in self.call.keywords))
+            for text in texts(node, known)
+        ]
 
 
 def messages_of(file):
@@ -190,18 +234,32 @@ MESSAGES = [message for file in FILES for message in messages_of(file)]
 
 
 def test_the_messages_are_found():
-    assert len(MESSAGES) > 150 and {"geometry", "bake", "diffusion", "images", "stages", "core"} <= {m.file.split("/")[1] for m in MESSAGES}
+    assert len(MESSAGES) > 150 and {"geometry", "bake", "diffusion", "images", "stages", "core"} <= {
+        m.file.split("/")[1] for m in MESSAGES
+    }
 
 
 def test_every_error_has_a_cure():
-    lacking = [m.where for m in MESSAGES if m.cure is None and m.name not in OPTIONAL or "" in m.cures() or isinstance(m.cure, ast.Constant) and not m.cure.value]
+    lacking = [
+        m.where
+        for m in MESSAGES
+        if m.cure is None
+        and m.name not in OPTIONAL
+        or "" in m.cures()
+        or isinstance(m.cure, ast.Constant)
+        and not m.cure.value
+    ]
     assert not lacking, f"say what removes the fault: {lacking}"
 
 
 def test_no_function_has_a_cure_of_nothing():
-    """A parameter `cure` has to be given, or has a default that says something; None stands for what the function says itself."""
-    lacking = [f"{file}:{function.lineno} {function.name}" for file, function in TAKING
-               if "" in texts(default_cure(function), constants(file))]
+    """A parameter `cure` has to be given, or has a default that says something; None stands for what the function says
+    itself."""
+    lacking = [
+        f"{file}:{function.lineno} {function.name}"
+        for file, function in TAKING
+        if "" in texts(default_cure(function), constants(file))
+    ]
     assert not lacking, f"let those who call say what removes the fault: {lacking}"
 
 
@@ -210,12 +268,32 @@ def test_no_cure_is_generic():
     assert not generic, f"name an option, a command or a value: {generic}"
 
 
-@pytest.mark.parametrize("cure", ["check the input", "Check your file.", "try again", "fix the file", "fix it", "use a valid value", "see the documentation"])
+@pytest.mark.parametrize(
+    "cure",
+    [
+        "check the input",
+        "Check your file.",
+        "try again",
+        "fix the file",
+        "fix it",
+        "use a valid value",
+        "see the documentation",
+    ],
+)
 def test_generic_phrases_are_known(cure):
     assert GENERIC.fullmatch(cure)
 
 
-@pytest.mark.parametrize("cure", ["run gdtool unwrap", "lower --size", "export it as glTF 2.0", "use --device cpu", "scale the mask to the size of the picture"])
+@pytest.mark.parametrize(
+    "cure",
+    [
+        "run gdtool unwrap",
+        "lower --size",
+        "export it as glTF 2.0",
+        "use --device cpu",
+        "scale the mask to the size of the picture",
+    ],
+)
 def test_cures_that_say_something_are_not_taken_for_generic(cure):
     assert not GENERIC.fullmatch(cure)
 
@@ -226,7 +304,9 @@ def faults_of_options(text, commands):
     wrong = []
     for name, rest in OTHER.findall(text):
         if name in COMMANDS:
-            wrong += [f"gdtool {name} has no {option}" for option in OPTION.findall(rest) if option not in options_of(name)]
+            wrong += [
+                f"gdtool {name} has no {option}" for option in OPTION.findall(rest) if option not in options_of(name)
+            ]
     for option in OPTION.findall(OTHER.sub("", text)):
         wrong += [f"{command} has no {option}" for command in sorted(commands) if option not in options_of(command)]
     return wrong
@@ -256,4 +336,6 @@ def test_rooms_are_reached_through_imports_and_child_functions():
     assert "unwrap" in commands_of("gdtool/unwrap/parameterize/schedule.py")
     assert commands_of("gdtool/core/errors.py") == set(COMMANDS)
     for (file, function), (allowed, reason) in EXCEPTIONS.items():
-        assert allowed and reason and any(one.name == function for one in functions(FILES[file])), f"{file}: {function} is gone"
+        assert allowed and reason and any(one.name == function for one in functions(FILES[file])), (
+            f"{file}: {function} is gone"
+        )

@@ -45,7 +45,15 @@ def test_one_level_up_is_not_two(tmp_path):
     folder = tmp_path / "a" / "b"
     folder.mkdir(parents=True)
     assert uri_path(folder, "../textures/x.png", "m.obj", "map_Kd", levels_up=1) == folder / "../textures/x.png"
-    for uri in ("../../x.png", "%2e%2e/%2e%2e/x.png", "%2Fetc%2Fpasswd", "file:///etc/passwd", "http://host/x", "%66ile:/etc/passwd", "..%5C..%5Cx"):
+    for uri in (
+        "../../x.png",
+        "%2e%2e/%2e%2e/x.png",
+        "%2Fetc%2Fpasswd",
+        "file:///etc/passwd",
+        "http://host/x",
+        "%66ile:/etc/passwd",
+        "..%5C..%5Cx",
+    ):
         with pytest.raises(InputError):
             uri_path(folder, uri, "m.obj", "map_Kd", levels_up=1)
 

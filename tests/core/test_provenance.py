@@ -23,7 +23,9 @@ def copy(inputs, options, out):
     out.content = RendersContent(frames=1, environment="none", light="none")
 
 
-NEXT = dataclasses.replace(STAGE, name="next", reads=("renders",), run=copy, second_inputs={"views": SecondInput("views", required=False)})
+NEXT = dataclasses.replace(
+    STAGE, name="next", reads=("renders",), run=copy, second_inputs={"views": SecondInput("views", required=False)}
+)
 
 
 def run(stage, source, output):
@@ -81,7 +83,9 @@ def test_a_path_through_a_linked_folder_records_where_things_really_lie():
     moved = Path("b/c/d")
     moved.mkdir(parents=True)
     os.rename("disk", "b/c/d/disk")  # a chain that moves as a whole is whole
-    assert [one.manifest.digest for one in ancestors(open_folder(moved / "disk/deep/second"), CURE)] == [folder.manifest.digest]
+    assert [one.manifest.digest for one in ancestors(open_folder(moved / "disk/deep/second"), CURE)] == [
+        folder.manifest.digest
+    ]
 
 
 def test_an_absolute_input_in_a_manifest_is_refused(chain):

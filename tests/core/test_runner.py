@@ -22,8 +22,15 @@ from tests.core.toy import STAGE, Options
 
 def toy(*arguments, stdin=None, **kwargs):
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.run([sys.executable, "-m", "tests.core.toy", *map(str, arguments)], input=stdin, capture_output=True, text=True,
-                          env=env, timeout=60, **kwargs)
+    return subprocess.run(
+        [sys.executable, "-m", "tests.core.toy", *map(str, arguments)],
+        input=stdin,
+        capture_output=True,
+        text=True,
+        env=env,
+        timeout=60,
+        **kwargs,
+    )
 
 
 def run(*arguments, options=None, **settings):
@@ -62,10 +69,13 @@ def test_second_run_does_nothing_and_says_so(capsys):
     assert Path("cat.asset/renders/manifest.json").stat().st_mtime > 1  # make must be content as well
 
 
-@pytest.mark.parametrize("change, reason", [
-    (lambda: Path("cat.png").write_bytes(b"dog"), "source changed"),
-    (lambda: Path("cat.asset/renders/000.png").unlink(), "damaged"),
-])
+@pytest.mark.parametrize(
+    "change, reason",
+    [
+        (lambda: Path("cat.png").write_bytes(b"dog"), "source changed"),
+        (lambda: Path("cat.asset/renders/000.png").unlink(), "damaged"),
+    ],
+)
 def test_stale_results_are_made_again_with_the_reason(change, reason, capsys):
     Path("cat.png").write_bytes(b"cat")
     run("cat.png")
@@ -112,7 +122,10 @@ def test_o_is_the_folder_for_one_and_the_parent_for_several():
     for name in "ab":
         Path(f"{name}.png").write_bytes(name.encode())
     assert run("a.png", output=Path("x"))[0].path == Path("x")
-    assert [r.path for r in run("a.png", "b.png", output=Path("y"), several=True)] == [Path("y/a.asset/renders"), Path("y/b.asset/renders")]
+    assert [r.path for r in run("a.png", "b.png", output=Path("y"), several=True)] == [
+        Path("y/a.asset/renders"),
+        Path("y/b.asset/renders"),
+    ]
 
 
 def test_one_bad_source_among_many():
@@ -154,7 +167,9 @@ def test_read_only_place_exits_4_and_missing_reader_141():
     for name in names:
         Path(name).write_bytes(b"x")
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    pipe = subprocess.Popen([sys.executable, "-m", "tests.core.toy", *names], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=env)
+    pipe = subprocess.Popen(
+        [sys.executable, "-m", "tests.core.toy", *names], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=env
+    )
     pipe.stdout.readline()
     pipe.stdout.close()
     errors = pipe.stderr.read().decode()
@@ -165,7 +180,9 @@ def test_streams_a_source_as_soon_as_its_line_arrives():
     for name in "ab":
         Path(f"{name}.png").write_bytes(b"x")
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    process = subprocess.Popen([sys.executable, "-m", "tests.core.toy"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=env, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tests.core.toy"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=env, text=True
+    )
     for name in "ab":
         process.stdin.write(f"{name}.png\n")
         process.stdin.flush()
@@ -178,9 +195,13 @@ def test_streams_a_source_as_soon_as_its_line_arrives():
 def test_interrupted_leaves_nothing(sign, code):
     Path("cat.png").write_bytes(b"cat")
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    process = subprocess.Popen([sys.executable, "-m", "tests.core.toy", "cat.png", "--repeat", "500", "--pause", "0.02"], env=env,
-                               stderr=subprocess.PIPE, preexec_fn=listen_to_interrupts)
-    while not list(Path(".").glob("cat.asset/.renders.*.partial/000.png")):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tests.core.toy", "cat.png", "--repeat", "500", "--pause", "0.02"],
+        env=env,
+        stderr=subprocess.PIPE,
+        preexec_fn=listen_to_interrupts,
+    )
+    while not list(Path().glob("cat.asset/.renders.*.partial/000.png")):
         time.sleep(0.01)
     process.send_signal(sign)
     assert process.wait() == code
@@ -195,8 +216,12 @@ def test_killed_at_random_moments_the_old_or_the_new_is_there():
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     rng = random.Random(0)
     for _ in range(8):
-        process = subprocess.Popen([sys.executable, "-m", "tests.core.toy", "cat.png", "--repeat", "20", "--pause", "0.01", "--force"],
-                                   env=env, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "tests.core.toy", "cat.png", "--repeat", "20", "--pause", "0.01", "--force"],
+            env=env,
+            stderr=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+        )
         time.sleep(0.25 + 0.5 * rng.random())
         process.kill()
         process.wait()
@@ -209,8 +234,15 @@ def test_killed_at_random_moments_the_old_or_the_new_is_there():
 def test_two_processes_on_one_output_do_not_mix():
     Path("cat.png").write_bytes(b"cat")
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    both = [subprocess.Popen([sys.executable, "-m", "tests.core.toy", "cat.png", "--repeat", "20", "--pause", "0.01"], env=env,
-                             stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    both = [
+        subprocess.Popen(
+            [sys.executable, "-m", "tests.core.toy", "cat.png", "--repeat", "20", "--pause", "0.01"],
+            env=env,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for _ in range(2)
+    ]
     errors = [process.communicate()[1] for process in both]
     assert [process.returncode for process in both] == [0, 0]
     assert sum("up to date" in text for text in errors) == 1

@@ -7,11 +7,17 @@ import numpy as np
 from gdtool.cameras import rays, rig
 from gdtool.folders.views import Views
 
-LIGHT = {"kind": "spherical_gaussians", "axes": [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], "sharpness": [1.0, 4.0],
-         "amplitudes": [[0.5, 0.5, 0.5], [0.3, 0.2, 0.1]]}
+LIGHT = {
+    "kind": "spherical_gaussians",
+    "axes": [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]],
+    "sharpness": [1.0, 4.0],
+    "amplitudes": [[0.5, 0.5, 0.5], [0.3, 0.2, 0.1]],
+}
 
 
-def sphere_views(seed: int, size: int = 32, domains=("color", "normal", "depth", "albedo", "roughness", "metallic")) -> Views:
+def sphere_views(
+    seed: int, size: int = 32, domains=("color", "normal", "depth", "albedo", "roughness", "metallic")
+) -> Views:
     """A sphere of radius 0.5 at the origin: red where x > 0, green elsewhere, darkened by the seed; depth is exact."""
     cameras = rig("six", size)
     rng = np.random.default_rng(seed)
@@ -26,8 +32,15 @@ def sphere_views(seed: int, size: int = 32, domains=("color", "normal", "depth",
         normal = np.where(mask[..., None], (origins + depth[..., None] * directions) / 0.5, 0)
         albedo = np.where(normal[..., :1] > 0, [0.8, 0.2, 0.1], [0.1, 0.7, 0.2]) * tint * mask[..., None]
         lit = albedo * np.clip(normal[..., 2:] * 0.5 + 0.5, 0, 1)
-        every = {"color": lit, "normal": normal, "depth": depth, "albedo": albedo, "roughness": roughness * mask,
-                 "metallic": metallic * mask, "mask": mask}
+        every = {
+            "color": lit,
+            "normal": normal,
+            "depth": depth,
+            "albedo": albedo,
+            "roughness": roughness * mask,
+            "metallic": metallic * mask,
+            "mask": mask,
+        }
         for name, stack in stacks.items():
             stack.append(np.asarray(every[name], np.float32))
     images = {name: np.stack(stack) for name, stack in stacks.items()}

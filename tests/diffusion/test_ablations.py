@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.config import ABLATIONS, DOMAINS
-from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.inference.sampling import sample_images
+from gdtool.diffusion.network.attention import Layout
+from gdtool.diffusion.network.model import Model
 from gdtool.stages.train import Options, configured
 
 SMALL = {"channels": (8, 16), "head_width": 8, "encoder_width": 16, "image_size": 16, "row_attention": ()}

@@ -17,7 +17,12 @@ def pack(spheres, archive, webdataset):
             for path in sorted(p for p in folder.rglob("*") if p.is_file()):
                 relative = path.relative_to(folder).as_posix()
                 key = folder.parent.stem
-                tar.add(path, f"train/{key}.{relative.replace('/', '.')}" if webdataset else f"{folder.parent.name}/views/{relative}")
+                tar.add(
+                    path,
+                    f"train/{key}.{relative.replace('/', '.')}"
+                    if webdataset
+                    else f"{folder.parent.name}/views/{relative}",
+                )
 
 
 @pytest.mark.parametrize("webdataset", [False, True])
@@ -26,7 +31,9 @@ def test_an_archive_gives_the_folders_it_was_made_of(tmp_path, webdataset):
     pack(spheres, tmp_path / "a.tar", webdataset)
     (tmp_path / "work").mkdir()
     assert object_count(tmp_path / "a.tar") == 3
-    for folder, original in zip(views_of(tmp_path / "a.tar", tmp_path / "work"), sorted(spheres.glob("*.asset/views")), strict=True):
+    for folder, original in zip(
+        views_of(tmp_path / "a.tar", tmp_path / "work"), sorted(spheres.glob("*.asset/views")), strict=True
+    ):
         from gdtool.core.folder import open_folder
 
         a, b = read_views(folder), read_views(open_folder(original))
@@ -38,7 +45,9 @@ def test_an_archive_gives_the_folders_it_was_made_of(tmp_path, webdataset):
 def test_training_on_an_archive_is_training_on_its_folders(gdtool, tmp_path):
     spheres = write_spheres(tmp_path / "spheres", size=16)
     pack(spheres, tmp_path / "a.tar", True)
-    (tmp_path / "c.json").write_text('{"model": {"channels": [8, 16], "head_width": 8, "encoder_width": 16, "image_size": 16}}')
+    (tmp_path / "c.json").write_text(
+        '{"model": {"channels": [8, 16], "head_width": 8, "encoder_width": 16, "image_size": 16}}'
+    )
     line = ("--preset", "tiny", "--config", "c.json", "--steps", 2, "--held-out", 0, "--threads", 1)
     for source, name in (("spheres", "x"), ("a.tar", "y")):
         result = gdtool("train", source, *line, "-o", name)

@@ -56,7 +56,10 @@ def test_star_formula_for_color():
             found.append(torch.zeros(2, 4, 16, dtype=torch.float64))
             continue
         q, k, v = star.to_q(x[0]), star.to_k(x[place]), star.to_v(x[place])
-        heads = [torch.softmax(q[..., p] @ k[..., p].transpose(-1, -2) / 8**0.5, -1) @ v[..., p] for p in (slice(0, 8), slice(8, 16))]
+        heads = [
+            torch.softmax(q[..., p] @ k[..., p].transpose(-1, -2) / 8**0.5, -1) @ v[..., p]
+            for p in (slice(0, 8), slice(8, 16))
+        ]
         found.append(torch.cat(heads, -1))
     expected = star.to_out[0](star.fuse(torch.cat(found, -1)))
     torch.testing.assert_close(star(x.flatten(0, 1), layout).view(3, 2, 4, 16)[0], expected)

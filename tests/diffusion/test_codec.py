@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from gdtool.diffusion.network import codec as codecs
-from gdtool.diffusion.network.codec import CHUNK, PatchCodec, VaeCodec
 from gdtool.diffusion.config import PRESETS
 from gdtool.diffusion.data.objects import draw
+from gdtool.diffusion.network import codec as codecs
+from gdtool.diffusion.network.codec import CHUNK, PatchCodec, VaeCodec
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.training.loop import choose, losses, phase_at
 from tests.diffusion.test_training import MODEL, TRAIN, spheres
@@ -33,7 +33,9 @@ class StandInVae(torch.nn.Module):
 
     def decode(self, latents):
         self.given.append(len(latents))
-        return SimpleNamespace(sample=torch.tanh(torch.nn.functional.interpolate(latents[:, :3], scale_factor=8) * self.weight))
+        return SimpleNamespace(
+            sample=torch.tanh(torch.nn.functional.interpolate(latents[:, :3], scale_factor=8) * self.weight)
+        )
 
 
 def vae_codec():

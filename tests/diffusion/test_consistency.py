@@ -23,16 +23,26 @@ def test_a_sphere_agrees_with_itself():
 
 
 def test_lit_maps_are_their_color():
-    """Color made of the maps by the closed form under a known light comes back; against a constant color it does not."""
+    """Color made of the maps by the closed form under a known light comes back; against a constant color it does
+    not."""
     import torch
 
     from gdtool.shading.bsdf.closed_form import shade
     from gdtool.shading.bsdf.sg import SphericalGaussians
 
-    light = SphericalGaussians(torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]), torch.tensor([2.0, 4.0]), torch.tensor([[0.6, 0.6, 0.6], [0.3, 0.2, 0.1]]))
+    light = SphericalGaussians(
+        torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]),
+        torch.tensor([2.0, 4.0]),
+        torch.tensor([[0.6, 0.6, 0.6], [0.3, 0.2, 0.1]]),
+    )
     maps = {d: torch.from_numpy(VIEWS.images[d]) for d in ("normal", "albedo", "roughness", "metallic")}
-    view = torch.tensor(np.stack([c.backward for c in rig("six", 64)]), dtype=torch.float32)[:, None, None].expand(-1, 64, 64, -1)
-    color = shade(maps["normal"], view, maps["albedo"], maps["roughness"], maps["metallic"], light).numpy() * (VIEWS.mask > 0)[..., None]
+    view = torch.tensor(np.stack([c.backward for c in rig("six", 64)]), dtype=torch.float32)[:, None, None].expand(
+        -1, 64, 64, -1
+    )
+    color = (
+        shade(maps["normal"], view, maps["albedo"], maps["roughness"], maps["metallic"], light).numpy()
+        * (VIEWS.mask > 0)[..., None]
+    )
     exact = rerendered_psnr(with_image("color", color))
     swapped = rerendered_psnr(with_image("color", color[::-1]))
     assert exact > 28 and exact > swapped + 6
@@ -41,8 +51,14 @@ def test_lit_maps_are_their_color():
 def test_slopes_see_turned_normals():
     turn = np.radians(20)
     normal = VIEWS.images["normal"]
-    turned = np.stack([normal[..., 0], np.cos(turn) * normal[..., 1] - np.sin(turn) * normal[..., 2],
-                       np.sin(turn) * normal[..., 1] + np.cos(turn) * normal[..., 2]], -1)
+    turned = np.stack(
+        [
+            normal[..., 0],
+            np.cos(turn) * normal[..., 1] - np.sin(turn) * normal[..., 2],
+            np.sin(turn) * normal[..., 1] + np.cos(turn) * normal[..., 2],
+        ],
+        -1,
+    )
     assert slope_degrees(with_image("normal", turned)) == pytest.approx(15, abs=5)
 
 

@@ -53,13 +53,29 @@ distributed.leave()
 def run(tmp_path, name, processes, accumulate=1, shard=False, steps=99):
     script = tmp_path / "run.py"
     script.write_text(SCRIPT)
-    start = [sys.executable] if processes == 1 else [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", str(processes)]
+    start = (
+        [sys.executable]
+        if processes == 1
+        else [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", str(processes)]
+    )
     root = str(Path(__file__).parents[2])
-    done = subprocess.run([*start, str(script), str(tmp_path / name), str(accumulate), str(steps)], capture_output=True, text=True, timeout=300,
-                          env={**__import__("os").environ, "PYTHONPATH": root, "OMP_NUM_THREADS": "1", "GDTOOL_SHARD": "1" if shard else "0"})
+    done = subprocess.run(
+        [*start, str(script), str(tmp_path / name), str(accumulate), str(steps)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={
+            **__import__("os").environ,
+            "PYTHONPATH": root,
+            "OMP_NUM_THREADS": "1",
+            "GDTOOL_SHARD": "1" if shard else "0",
+        },
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     rows = list(csv.DictReader(open(tmp_path / name / "loss.csv")))
-    return np.array([[float(row[c] or 0) for c in ("loss", "norm", "color")] for row in rows]), load_file(tmp_path / name / "checkpoint.safetensors")
+    return np.array([[float(row[c] or 0) for c in ("loss", "norm", "color")] for row in rows]), load_file(
+        tmp_path / name / "checkpoint.safetensors"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -68,12 +84,17 @@ def single(tmp_path_factory):
     return *run(folder, "one", 1), folder / "one" / "validation.csv"
 
 
-@pytest.mark.parametrize("processes, accumulate, shard", [(1, 2, False), (2, 1, False), pytest.param(2, 2, True, marks=pytest.mark.slow)],
-                         ids=["accumulated", "ddp", "fsdp"])
+@pytest.mark.parametrize(
+    "processes, accumulate, shard",
+    [(1, 2, False), (2, 1, False), pytest.param(2, 2, True, marks=pytest.mark.slow)],
+    ids=["accumulated", "ddp", "fsdp"],
+)
 def test_the_curve_is_that_of_one_process(single, tmp_path, processes, accumulate, shard):
     """Same global batch of four: in two parts one after the other, in two processes, and with the weights split too."""
     curve, tensors = run(tmp_path, "many", processes, accumulate, shard)
-    one, many = (np.genfromtxt(path, delimiter=",", skip_header=1) for path in (single[2], tmp_path / "many" / "validation.csv"))
+    one, many = (
+        np.genfromtxt(path, delimiter=",", skip_header=1) for path in (single[2], tmp_path / "many" / "validation.csv")
+    )
     assert many[:, 0].tolist() == [3, 6]
     np.testing.assert_allclose(many, one, atol=0.05)
     assert len(curve) == 6

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from gdtool.diffusion.config import DOMAINS
-from gdtool.diffusion.network.encoding import coverage, decode, encode, mirrored, planes_from_images
 from gdtool.diffusion.data.framing import FRONT_EXTENT, frame, whole_frame
+from gdtool.diffusion.network.encoding import coverage, decode, encode, mirrored, planes_from_images
 from tests.diffusion.spheres import sphere_views
 
 
@@ -30,7 +30,9 @@ def test_encode_then_decode_is_the_identity(sphere, background):
     for domain in ("color", "albedo"):
         expected = srgb_from_linear(views.images[domain])
         np.testing.assert_allclose(np.moveaxis(values[domain].numpy(), 1, -1)[inside], expected[inside], atol=1e-5)
-    np.testing.assert_allclose(np.moveaxis(values["normal"].numpy(), 1, -1)[inside], views.images["normal"][inside], atol=1e-5)
+    np.testing.assert_allclose(
+        np.moveaxis(values["normal"].numpy(), 1, -1)[inside], views.images["normal"][inside], atol=1e-5
+    )
     for domain in ("depth", "roughness", "metallic"):
         np.testing.assert_allclose(values[domain].numpy()[inside], views.images[domain][inside], atol=1e-5)
 
@@ -43,7 +45,9 @@ def test_half_covered_pixels_keep_their_values(sphere):
     mask = coverage(images, 1.0)
     np.testing.assert_allclose(mask, 0.5 * views.mask, atol=1e-6)
     inside = views.mask > 0
-    np.testing.assert_allclose(decode(images, mask, 1.0)["depth"].numpy()[inside], views.images["depth"][inside], atol=1e-5)
+    np.testing.assert_allclose(
+        decode(images, mask, 1.0)["depth"].numpy()[inside], views.images["depth"][inside], atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("domains", [("normal",), ("color",), ("depth", "albedo")])
@@ -65,7 +69,9 @@ def test_framing_centres_and_scales():
     rows, columns = np.nonzero(out[..., 3] > 0.5)
     assert abs(rows.mean() - 31.5) < 0.3 and abs(columns.mean() - 31.5) < 0.3
     assert abs((np.ptp(rows) + 1) - FRONT_EXTENT * 64) <= 1.5
-    np.testing.assert_allclose(out[out[..., 3] > 0.1][:, :3], np.broadcast_to([0.2, 0.4, 0.6], (int((out[..., 3] > 0.1).sum()), 3)), atol=1e-4)
+    np.testing.assert_allclose(
+        out[out[..., 3] > 0.1][:, :3], np.broadcast_to([0.2, 0.4, 0.6], (int((out[..., 3] > 0.1).sum()), 3)), atol=1e-4
+    )
 
 
 def test_framing_a_framed_front_view_changes_nothing():
@@ -97,7 +103,12 @@ def test_the_pictures_silhouette_is_the_front_views_and_mirrored_the_backs(spher
     # The slanted shape is taller than the sphere: the others show what goes beyond it, and are as they were elsewhere.
     right, guessed = out.mask[names.index("right")], views.mask[names.index("right")]
     changed = np.abs(right - guessed) > 1e-6
-    assert report["drawn_share"] > 0.1 and (right[changed] == 1).all() and changed[guessed.max(1) == 0].any() and changed[guessed > 0.5].sum() == 0
+    assert (
+        report["drawn_share"] > 0.1
+        and (right[changed] == 1).all()
+        and changed[guessed.max(1) == 0].any()
+        and changed[guessed > 0.5].sum() == 0
+    )
     assert all(np.isfinite(image).all() for image in out.images.values())
     assert (out.images["depth"][names.index("front")][alpha == 0] == 0).all()
 
@@ -163,7 +174,8 @@ def test_depth_stays_within_the_outlines_that_other_views_show():
     cameras, images, mask = views_of(lambda points: sphere(points, 0.4), 64)
     pixel = cameras[0].pixel_size
     moved = np.abs(within_silhouettes(images["depth"], mask, cameras) - images["depth"])[mask > 0.99]
-    assert moved.max() < 3 * pixel and moved.mean() < 0.2 * pixel  # at the poles rows are as wide as the square root of their height
+    # At the poles rows are as wide as the square root of their height.
+    assert moved.max() < 3 * pixel and moved.mean() < 0.2 * pixel
     names = [camera.name for camera in cameras]
     wrong = images["depth"].copy()
     wrong[names.index("right")] -= 0.1 * (mask[names.index("right")] > 0.5)
@@ -177,7 +189,9 @@ def test_depth_stays_within_the_outlines_that_other_views_show():
         reach = np.hypot(points[:, 0], points[:, 2]) - np.sqrt(np.maximum(0.4**2 - points[:, 1] ** 2, 0))
         assert reach.max() < 0.1 * 0.4 + 2 * pixel and (np.hypot(before[:, 0], before[:, 2]) > 0.45).any()
     others = [k for k, name in enumerate(names) if name not in ("right", "front")]
-    np.testing.assert_allclose(found[others][mask[others] > 0.99], images["depth"][others][mask[others] > 0.99], atol=3 * pixel)
+    np.testing.assert_allclose(
+        found[others][mask[others] > 0.99], images["depth"][others][mask[others] > 0.99], atol=3 * pixel
+    )
     flat = mask * 0
     assert (within_silhouettes(wrong, flat, cameras) == wrong).all()
     # Outlines of another object, at the very border of their pictures.
@@ -190,7 +204,8 @@ def test_depth_stays_within_the_outlines_that_other_views_show():
 
 
 def test_an_outline_between_pixels_keeps_depth_to_a_fraction_of_one():
-    """Of a wall that leans by a fifth of a pixel a row: no steps of whole pixels in the depth of the view that faces it."""
+    """Of a wall that leans by a fifth of a pixel a row: no steps of whole pixels in the depth of the view that faces
+    it."""
     from gdtool.cameras import rig
     from gdtool.diffusion.inference.result import within_silhouettes
 

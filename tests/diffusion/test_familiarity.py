@@ -1,4 +1,5 @@
-"""Pictures unlike the training's are told, and results that a model was unsure of, with the figure that is outside; training's own are not."""
+"""Pictures unlike the training's are told, and results that a model was unsure of, with the figure that is outside;
+training's own are not."""
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ def box(width, height, brightness, noise=0.02, size=32, seed=0):
     """A framed box of so many pixels: a condition (4, size, size)."""
     alpha = np.zeros((size, size), np.float32)
     top, left = (size - height) // 2, (size - width) // 2
-    alpha[top: top + height, left: left + width] = 1
+    alpha[top : top + height, left : left + width] = 1
     grey = brightness + np.random.default_rng(seed).normal(0, noise, (size, size))
     return np.concatenate([np.repeat(((2 * grey - 1) * alpha)[None], 3, 0), 2 * alpha[None] - 1]).astype(np.float32)
 
@@ -70,7 +71,9 @@ def test_the_blur_of_outlines_is_the_width_of_their_ramps(width):
 def test_the_picture_s_own_view_is_no_doubt():
     views = np.stack([ramped(12), ramped(2), ramped(2)])
     shown = result_figures(views, 0, ramped(1))
-    assert shown["outline_blur"] == pytest.approx(result_figures(views[1:])["outline_blur"]) and shown["row_mismatch"] == pytest.approx(0, abs=1e-6)
+    assert shown["outline_blur"] == pytest.approx(result_figures(views[1:])["outline_blur"]) and shown[
+        "row_mismatch"
+    ] == pytest.approx(0, abs=1e-6)
 
 
 def test_rows_that_the_other_views_leave_empty_are_counted():
@@ -80,7 +83,10 @@ def test_rows_that_the_other_views_leave_empty_are_counted():
 
 
 def test_an_empty_result_has_figures():
-    assert result_figures(np.zeros((6, 8, 8), np.float32), 0, ramped(1, 8)) == {"outline_blur": 0.0, "row_mismatch": 1.0}
+    assert result_figures(np.zeros((6, 8, 8), np.float32), 0, ramped(1, 8)) == {
+        "outline_blur": 0.0,
+        "row_mismatch": 1.0,
+    }
 
 
 def test_limits_let_the_asked_share_through():
@@ -89,11 +95,14 @@ def test_limits_let_the_asked_share_through():
     known = limits(results, 0.05)
     told = [doubts(one, known) for one in results]
     assert 0.045 < np.mean([bool(words) for words in told]) <= 0.05
-    assert min(np.mean([one[name] > known[name].high for one in results]) for name in DOUBTS) > 0.02  # each has its part
+    # Each has its part.
+    assert min(np.mean([one[name] > known[name].high for one in results]) for name in DOUBTS) > 0.02
 
 
 def test_a_doubt_is_told_with_its_figure_and_the_usual():
     known = {"outline_blur": PictureRange(0.0, 9.0), "row_mismatch": PictureRange(0.0, 0.05)}
     assert doubts({"outline_blur": 9.0, "row_mismatch": 0.05}, known) == []
-    assert doubts({"outline_blur": 12.34, "row_mismatch": 0.01}, known) == ["their outlines are blurred over 12.3 pixels, 9.0 at most is usual"]
+    assert doubts({"outline_blur": 12.34, "row_mismatch": 0.01}, known) == [
+        "their outlines are blurred over 12.3 pixels, 9.0 at most is usual"
+    ]
     assert doubts({"outline_blur": 12.34, "row_mismatch": 0.5}, {}) == []  # a model that does not say what is usual

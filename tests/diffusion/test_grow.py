@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.config import PRESETS
+from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.grow import grown, resized
 from gdtool.diffusion.network.model import Model
 
@@ -35,7 +35,9 @@ def test_a_grown_model_predicts_what_the_small_one_did(factor):
 
     def predicted(model, rgba, pixels):
         condition = model.condition_latents(rgba, layout, views)
-        latents = model.predict_clean(model.codec.encode(pixels), condition, torch.tensor([500]), model.encoder(rgba), layout, views)
+        latents = model.predict_clean(
+            model.codec.encode(pixels), condition, torch.tensor([500]), model.encoder(rgba), layout, views
+        )
         return model.codec.decode(latents)
 
     def squares(image):

@@ -38,8 +38,11 @@ def test_the_second_version_is_asked_for(hub, tmp_path):
 def test_a_repository_of_pickles_is_refused_with_the_line_that_converts_it(hub, tmp_path):
     (tmp_path / "vae").mkdir()
     (tmp_path / "vae" / "config.json").write_text("{}")
-    with pytest.raises(InputError, match=r"no safetensors in vae/ .* hf download lambdalabs/sd-image-variations-diffusers "
-                                         r"--revision v2\.0 --local-dir DIR && python -m gdtool\.diffusion\.convert DIR"):
+    with pytest.raises(
+        InputError,
+        match=r"no safetensors in vae/ .* hf download lambdalabs/sd-image-variations-diffusers "
+        r"--revision v2\.0 --local-dir DIR && python -m gdtool\.diffusion\.convert DIR",
+    ):
         pretrained_part(PAPER, "vae")
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from gdtool.diffusion.network.codec import make_codec
 from gdtool.diffusion.config import PRESETS, TrainConfig
+from gdtool.diffusion.network.codec import make_codec
 from gdtool.diffusion.network.encoding import encode, planes_from_images
 from gdtool.diffusion.training.losses import image_error, linear, rendering_error, view_directions
 from gdtool.images.color import linear_from_srgb
@@ -23,7 +23,9 @@ def setting():
 
 
 def error(predicted, truth, planes, light, pixels=64):
-    return rendering_error(predicted, truth, ORDER, planes, light, view_directions(CONFIG), pixels, 0.0, torch.Generator().manual_seed(0))
+    return rendering_error(
+        predicted, truth, ORDER, planes, light, view_directions(CONFIG), pixels, 0.0, torch.Generator().manual_seed(0)
+    )
 
 
 def test_the_true_maps_have_no_error_and_changed_ones_have():
@@ -83,7 +85,7 @@ def test_a_weighted_domain_counts_more_and_its_coverage_does_not():
 
     def both(channel, domain):
         changed = truth.clone()
-        changed[domain * 6: domain * 6 + 6, channel] += 0.3
+        changed[domain * 6 : domain * 6 + 6, channel] += 0.3
         return (x[0, domain] for x in image_error(codec.encode(changed), clean, 1, tuple(range(6)), CONFIG, train))
 
     for domain, channel, factor in ((0, 0, 1), (1, 2, 2), (2, 0, 8), (2, 1, 8), (2, 2, 1), (5, 0, 0.5), (5, 2, 1)):
@@ -93,17 +95,20 @@ def test_a_weighted_domain_counts_more_and_its_coverage_does_not():
 
 
 def test_in_a_domain_compared_by_distance_a_median_is_best_and_coverage_stays_squared():
-    """Of three truths 0, 0 and 0.9, one estimate: the squared error is least at their mean, the distance at their median."""
+    """Of three truths 0, 0 and 0.9, one estimate: the squared error is least at their mean, the distance at their
+    median."""
     codec, base = make_codec(CONFIG), torch.zeros(36, 3, CONFIG.image_size, CONFIG.image_size)
     train = TrainConfig(absolute_domains=("normal", "depth"))
 
     def cost(domain, channels, estimate):
         guess, total = base.clone(), 0.0
-        guess[domain * 6: domain * 6 + 6, channels] = estimate
+        guess[domain * 6 : domain * 6 + 6, channels] = estimate
         for one in (0.0, 0.0, 0.9):
             target = base.clone()
-            target[domain * 6: domain * 6 + 6, channels] = one
-            total += float(image_error(codec.encode(guess), codec.encode(target), 1, tuple(range(6)), CONFIG, train)[0][0, domain])
+            target[domain * 6 : domain * 6 + 6, channels] = one
+            total += float(
+                image_error(codec.encode(guess), codec.encode(target), 1, tuple(range(6)), CONFIG, train)[0][0, domain]
+            )
         return total
 
     for domain, channels in ((1, [0, 1, 2]), (2, [0, 1])):
@@ -117,6 +122,8 @@ def test_the_distance_of_a_normal_does_not_depend_on_the_axes():
     zero = torch.zeros(6, 3, CONFIG.image_size, CONFIG.image_size)
 
     def cost(vector):
-        return image_error(codec.encode(zero + torch.tensor(vector)[:, None, None]), codec.encode(zero), 1, (1,), CONFIG, train)[0]
+        return image_error(
+            codec.encode(zero + torch.tensor(vector)[:, None, None]), codec.encode(zero), 1, (1,), CONFIG, train
+        )[0]
 
     torch.testing.assert_close(cost([0.3, 0.0, 0.0]), cost([0.3 / 3**0.5] * 3))

@@ -12,7 +12,9 @@ FORWARD = 0.15  # the post stands this far in front of the ball's middle
 
 
 def ball_with_post(points):
-    post = np.maximum(np.hypot(points[..., 0] + 0.1, points[..., 2] - FORWARD) - 0.04, np.abs(points[..., 1] - 0.35) - 0.2)
+    post = np.maximum(
+        np.hypot(points[..., 0] + 0.1, points[..., 2] - FORWARD) - 0.04, np.abs(points[..., 1] - 0.35) - 0.2
+    )
     return np.minimum(sphere(points, 0.3), post)
 
 
@@ -21,8 +23,12 @@ def seen():
     """The views, and their masks with the post faded out of all but the front and the back one."""
     cameras, images, mask = views_of(ball_with_post, SIZE)
     ball = views_of(lambda points: sphere(points, 0.3), SIZE)[2]
-    guessed = np.array([own if camera.name in ("front", "back") else np.minimum(own, np.maximum(without, 0.2))
-                        for camera, own, without in zip(cameras, mask, ball, strict=True)])
+    guessed = np.array(
+        [
+            own if camera.name in ("front", "back") else np.minimum(own, np.maximum(without, 0.2))
+            for camera, own, without in zip(cameras, mask, ball, strict=True)
+        ]
+    )
     return cameras, images, mask, guessed
 
 
@@ -49,7 +55,9 @@ def test_every_view_shows_the_part_as_the_known_one_has_it(seen):
     names = [camera.name for camera in cameras]
     front, right = names.index("front"), names.index("right")
     known = np.where(guessed >= 0.5, guessed, 0)
-    wrong = {domain: np.where((known > 0.5).reshape(known.shape + (1,) * (x.ndim - 3)), x, 0) for domain, x in images.items()}
+    wrong = {
+        domain: np.where((known > 0.5).reshape(known.shape + (1,) * (x.ndim - 3)), x, 0) for domain, x in images.items()
+    }
     part = lost_part(guessed, known, cameras, front, images["depth"][front])
     before = {domain: x.copy() for domain, x in wrong.items()}
     draw_part(part, wrong, known, cameras, front)

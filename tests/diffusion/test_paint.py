@@ -10,7 +10,8 @@ SIZE = 64
 
 @pytest.fixture(scope="module")
 def ball():
-    """Coverage (SIZE, SIZE) and unit normals of a ball, and the light on it: linear in the normal, and an edge of shadow none."""
+    """Coverage (SIZE, SIZE) and unit normals of a ball, and the light on it: linear in the normal, and an edge of
+    shadow none."""
     y, x = (np.mgrid[:SIZE, :SIZE] + 0.5) / SIZE * 2 - 1
     z = np.sqrt(np.clip(0.8**2 - x**2 - y**2, 0, None))
     normal = np.stack([x, -y, z], -1) / np.maximum(np.sqrt(x**2 + y**2 + z**2), 1e-6)[..., None]
@@ -80,5 +81,5 @@ def test_black_white_and_empty_pictures_stay_finite(ball):
     mask, normal, _ = ball
     for color in (0.0, 1.0, 50.0):
         found, _ = repainted(np.full((SIZE, SIZE, 3), 0.5), np.full((SIZE, SIZE, 3), color), mask, normal)
-        assert np.isfinite(found).all() and (0 <= found).all() and (found <= 1).all()
+        assert np.isfinite(found).all() and (found >= 0).all() and (found <= 1).all()
     assert repainted(painted(), painted(), np.zeros_like(mask), normal)[1].max() == 0

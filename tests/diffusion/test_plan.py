@@ -6,8 +6,8 @@ import torch
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
-from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.config import PRESETS, Phase
+from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.model import Model, parameter_count
 from gdtool.diffusion.reports.plan import frozen_cost, phase_cost, plan_of, rendering_share, step_cost
 from gdtool.diffusion.training.loop import new_state, train_step
@@ -51,7 +51,9 @@ def test_memory_is_what_the_profiler_sees(checkpointing):
 
 def peak_of(profiler) -> int:
     live = peak = 0
-    for event in sorted((e for e in profiler.profiler.kineto_results.events() if e.name() == "[memory]"), key=lambda e: e.start_ns()):
+    for event in sorted(
+        (e for e in profiler.profiler.kineto_results.events() if e.name() == "[memory]"), key=lambda e: e.start_ns()
+    ):
         live += event.nbytes()
         peak = max(peak, live)
     return peak
@@ -62,15 +64,31 @@ def with_vae(tmp_path):
     """A configuration with a VAE of Stable Diffusion's structure and a few thousand weights."""
     diffusers = pytest.importorskip("diffusers", reason="needs pip install 'gdtool[hub]'")
     blocks = {"block_out_channels": (8, 8, 8, 8), "norm_num_groups": 4, "latent_channels": 4}
-    diffusers.AutoencoderKL(down_block_types=("DownEncoderBlock2D",) * 4, up_block_types=("UpDecoderBlock2D",) * 4, **blocks).save_pretrained(tmp_path / "vae")
-    return msgspec.structs.replace(CONFIG, codec="vae", condition_alpha=False, condition_skip=False, image_size=64, pretrained=str(tmp_path))
+    diffusers.AutoencoderKL(
+        down_block_types=("DownEncoderBlock2D",) * 4, up_block_types=("UpDecoderBlock2D",) * 4, **blocks
+    ).save_pretrained(tmp_path / "vae")
+    return msgspec.structs.replace(
+        CONFIG, codec="vae", condition_alpha=False, condition_skip=False, image_size=64, pretrained=str(tmp_path)
+    )
 
 
 def real_and_planned(config, rendering):
-    """(FLOPs, peak bytes less gradients) of a train_step of two objects, all six domains, and what is planned for it."""
+    """(FLOPs, peak bytes less gradients) of a train_step of two objects, all six domains, and what is planned for
+    it."""
     phase = Phase(domains=6, views=2)
-    train = msgspec.structs.replace(PRESETS["tiny"][1], batch=2, precision="float32", pure_noise=0.0, phases=(phase,), tilted=0.0, hue=False, mirror=False,
-                                    pbr_weight=0.1 if rendering else 0.0, pbr_snr=-1.0)  # every object has less noise than that
+    train = msgspec.structs.replace(
+        PRESETS["tiny"][1],
+        batch=2,
+        precision="float32",
+        pure_noise=0.0,
+        phases=(phase,),
+        tilted=0.0,
+        hue=False,
+        mirror=False,
+        # Every object has less noise than that.
+        pbr_weight=0.1 if rendering else 0.0,
+        pbr_snr=-1.0,
+    )
     torch.manual_seed(0)
     state, objects = new_state(Model(config).train(), train), spheres(2, config.image_size)
     train_step(state, objects, train, 0, None, "cpu")  # the optimiser's moments are there from now on
@@ -81,7 +99,10 @@ def real_and_planned(config, rendering):
         train_step(state, objects, train, 0, None, "cpu")
     weights = parameter_count(state.model)
     planned = phase_cost(config, train, phase, frozen_cost(config), weights, fused=False)
-    return (counter.get_total_flops(), peak_of(profiler) - 4 * weights), (planned["flops_per_step"], planned["activation_bytes"])
+    return (counter.get_total_flops(), peak_of(profiler) - 4 * weights), (
+        planned["flops_per_step"],
+        planned["activation_bytes"],
+    )
 
 
 @pytest.mark.parametrize("rendering", [False, True])
@@ -100,14 +121,25 @@ def test_a_real_training_step_with_a_vae_costs_what_is_planned(with_vae, renderi
 
 def test_objects_with_much_noise_are_not_rendered():
     train = PRESETS["tiny"][1]
-    assert rendering_share(CONFIG, train, 3) == 0.0 == rendering_share(CONFIG, msgspec.structs.replace(train, pbr_weight=0.0), 6)
+    assert (
+        rendering_share(CONFIG, train, 3)
+        == 0.0
+        == rendering_share(CONFIG, msgspec.structs.replace(train, pbr_weight=0.0), 6)
+    )
     # the cosine schedule's SNR is 1 half-way
-    assert rendering_share(CONFIG, msgspec.structs.replace(train, pbr_snr=1.0, pure_noise=0.6), 6) == pytest.approx(0.2, abs=0.01)
+    assert rendering_share(CONFIG, msgspec.structs.replace(train, pbr_snr=1.0, pure_noise=0.6), 6) == pytest.approx(
+        0.2, abs=0.01
+    )
 
 
 def test_a_plan_adds_up():
-    train = msgspec.structs.replace(PRESETS["tiny"][1], batch=4, accumulate=2, steps=10,
-                                    phases=(Phase(share=0.5, domains=1, views=2), Phase(domains=6, views=6)))
+    train = msgspec.structs.replace(
+        PRESETS["tiny"][1],
+        batch=4,
+        accumulate=2,
+        steps=10,
+        phases=(Phase(share=0.5, domains=1, views=2), Phase(domains=6, views=6)),
+    )
     plan = plan_of(CONFIG, train)
     assert plan["weights"] == parameter_count(Model(CONFIG)) and plan["weights_bytes"] == 20 * plan["weights"]
     assert [p["steps"] for p in plan["phases"]] == [5, 5] and plan["phases"][1]["objects_at_once"] == 2

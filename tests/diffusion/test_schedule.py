@@ -7,7 +7,15 @@ import pytest
 import torch
 
 from gdtool.diffusion.config import ModelConfig
-from gdtool.diffusion.network.schedule import DATA_VARIANCE, clean_from_prediction, input_scale, loss_weight, sample, signal_and_noise, timesteps
+from gdtool.diffusion.network.schedule import (
+    DATA_VARIANCE,
+    clean_from_prediction,
+    input_scale,
+    loss_weight,
+    sample,
+    signal_and_noise,
+    timesteps,
+)
 
 CONFIG = ModelConfig()
 SD = msgspec.structs.replace(CONFIG, noise_schedule="scaled_linear")

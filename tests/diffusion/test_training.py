@@ -8,12 +8,22 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.training import loop as training, optimizer
 from gdtool.diffusion.config import DOMAINS, PRESETS, Phase
-from gdtool.diffusion.data.objects import LIGHTS, Objects, draw, from_bytes, mirror, object_order, permute_colors, to_bytes
+from gdtool.diffusion.data.objects import (
+    LIGHTS,
+    Objects,
+    draw,
+    from_bytes,
+    mirror,
+    object_order,
+    permute_colors,
+    to_bytes,
+)
 from gdtool.diffusion.network.encoding import PLANES, planes_from_images
 from gdtool.diffusion.network.labels import class_labels
 from gdtool.diffusion.network.model import Model
+from gdtool.diffusion.training import loop as training
+from gdtool.diffusion.training import optimizer
 from gdtool.diffusion.training.loop import CHECKPOINT, choose, learning_rate, new_state, phase_at, run_training
 from tests.diffusion.spheres import LIGHT, sphere_views
 
@@ -30,8 +40,12 @@ def spheres(count=4, size=16) -> Objects:
     light = np.zeros((LIGHTS, 7), np.float32)
     light[:, 2] = 1
     light[:2] = np.concatenate([LIGHT["axes"], np.array(LIGHT["sharpness"])[:, None], LIGHT["amplitudes"]], 1)
-    return Objects(to_bytes(np.stack(planes)), to_bytes(np.stack(conditions))[:, None], np.stack([light] * count),
-                   tuple(f"sphere{i}" for i in range(count)))
+    return Objects(
+        to_bytes(np.stack(planes)),
+        to_bytes(np.stack(conditions))[:, None],
+        np.stack([light] * count),
+        tuple(f"sphere{i}" for i in range(count)),
+    )
 
 
 def test_bytes_keep_zero_exactly():
@@ -58,7 +72,11 @@ def test_mirroring_swaps_sides_and_is_its_own_inverse():
 
 def test_permuted_colors_permute_the_light_as_well():
     objects = spheres(1)
-    planes, rgba, light = from_bytes(objects.planes[0]), from_bytes(objects.conditions[0, 0]), torch.from_numpy(objects.lights[0])
+    planes, rgba, light = (
+        from_bytes(objects.planes[0]),
+        from_bytes(objects.conditions[0, 0]),
+        torch.from_numpy(objects.lights[0]),
+    )
     new = permute_colors(planes, rgba, light, [2, 0, 1])
     torch.testing.assert_close(new[0][:, 0], planes[:, 2])
     torch.testing.assert_close(new[0][:, PLANES["albedo"].start], planes[:, PLANES["albedo"].start + 2])
@@ -83,15 +101,23 @@ def test_steps_see_color_and_as_many_domains_and_views_as_the_phase_says():
 
 def test_a_phase_may_have_a_batch_of_its_own(monkeypatch):
     drawn = []
-    monkeypatch.setattr(training, "draw", lambda objects, idx, *rest: drawn.append(len(idx)) or draw(objects, idx, *rest))
+    monkeypatch.setattr(
+        training, "draw", lambda objects, idx, *rest: drawn.append(len(idx)) or draw(objects, idx, *rest)
+    )
     train = msgspec.structs.replace(TRAIN, phases=(Phase(share=1.0, domains=1, views=1, batch=3),))
     training.train_step(new_state(Model(MODEL), train), spheres(), train, 0, None, "cpu")
     assert sum(drawn) == 3 != TRAIN.batch
 
 
 def test_phases_and_rate_follow_progress():
-    train = msgspec.structs.replace(TRAIN, phases=(Phase(share=0.5, learning_rate=1.0), Phase(share=1.0, learning_rate=0.1)), warmup=10)
-    assert phase_at(0.49, train).learning_rate == 1.0 and phase_at(0.5, train).learning_rate == 0.1 and phase_at(1.0, train).learning_rate == 0.1
+    train = msgspec.structs.replace(
+        TRAIN, phases=(Phase(share=0.5, learning_rate=1.0), Phase(share=1.0, learning_rate=0.1)), warmup=10
+    )
+    assert (
+        phase_at(0.49, train).learning_rate == 1.0
+        and phase_at(0.5, train).learning_rate == 0.1
+        and phase_at(1.0, train).learning_rate == 0.1
+    )
     state = new_state(Model(MODEL), train)
     assert learning_rate(state, 0.0, train) == pytest.approx(0.1)
     state.step = 100
@@ -119,7 +145,9 @@ def train(workspace, steps, **changes):
             raise Stop
 
     try:
-        return run_training(Model(MODEL), spheres(), options, workspace, seed=3, checkpoint_every=4, validate_every=1, validate=stop)
+        return run_training(
+            Model(MODEL), spheres(), options, workspace, seed=3, checkpoint_every=4, validate_every=1, validate=stop
+        )
     except Stop:
         return stopped["state"]
 
@@ -133,7 +161,10 @@ def test_a_killed_run_resumes_bit_for_bit(tmp_path, precision):
     for (name, p), (_, q) in zip(whole.model.named_parameters(), resumed.model.named_parameters(), strict=True):
         assert torch.equal(p, q), name
         assert torch.equal(whole.average[name], resumed.average[name]), name
-    without_time = [[{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(open(tmp_path / w / "loss.csv"))] for w in "ab"]
+    without_time = [
+        [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(open(tmp_path / w / "loss.csv"))]
+        for w in "ab"
+    ]
     assert without_time[0] == without_time[1] and len(without_time[0]) == 12
 
 
@@ -160,7 +191,9 @@ def test_muon_moves_a_matrix_alike_in_all_its_directions(monkeypatch):
     before = p.detach().clone()
     generator = torch.Generator().manual_seed(0)
     # a gradient that is nearly of rank one: AdamW would move the same way everywhere
-    p.grad = torch.outer(torch.randn(p.shape[0], generator=generator), torch.randn(p[0].numel(), generator=generator)).view(p.shape)
+    p.grad = torch.outer(
+        torch.randn(p.shape[0], generator=generator), torch.randn(p[0].numel(), generator=generator)
+    ).view(p.shape)
     p.grad += 0.05 * torch.randn(p.shape, generator=generator)
     own.step()
     given, moved = (torch.linalg.svdvals(x.flatten(1)) for x in (p.grad, p.detach() - before))
@@ -184,8 +217,15 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
 
 def test_training_lowers_the_error(tmp_path):
     torch.manual_seed(0)
-    options = msgspec.structs.replace(TRAIN, steps=60, batch=2, pbr_weight=0.0, pure_noise=1.0, phases=(Phase(learning_rate=3e-3),),
-                                    precision="float32")
+    options = msgspec.structs.replace(
+        TRAIN,
+        steps=60,
+        batch=2,
+        pbr_weight=0.0,
+        pure_noise=1.0,
+        phases=(Phase(learning_rate=3e-3),),
+        precision="float32",
+    )
     state = run_training(Model(MODEL), spheres(), options, tmp_path, seed=0)
     rows = list(csv.DictReader(open(tmp_path / "loss.csv")))
     first, last = (np.mean([float(r["loss"]) for r in part]) for part in (rows[:5], rows[-5:]))
@@ -207,8 +247,12 @@ def poisoned(monkeypatch, bad):
 def test_steps_that_are_not_finite_are_left_out_counted_and_told(tmp_path, monkeypatch):
     poisoned(monkeypatch, lambda number: number in (1, 2, 5))
     said = []
-    state = run_training(Model(MODEL), spheres(), msgspec.structs.replace(TRAIN, steps=7), tmp_path, seed=0, warn=said.append)
-    assert [line.split(" is left out")[0] for line in said] == ["step 2", "step 3", "step 6"] and "2 in a row" in said[1]
+    state = run_training(
+        Model(MODEL), spheres(), msgspec.structs.replace(TRAIN, steps=7), tmp_path, seed=0, warn=said.append
+    )
+    assert [line.split(" is left out")[0] for line in said] == ["step 2", "step 3", "step 6"] and "2 in a row" in said[
+        1
+    ]
     assert [row["skipped"] for row in csv.DictReader(open(tmp_path / "loss.csv"))] == list("0110010")
     assert all(torch.isfinite(p).all() for p in state.model.parameters())
 
@@ -216,7 +260,9 @@ def test_steps_that_are_not_finite_are_left_out_counted_and_told(tmp_path, monke
 def test_a_lost_run_ends_with_finite_weights_in_its_checkpoint(tmp_path, monkeypatch):
     poisoned(monkeypatch, lambda number: number >= 4)
     with pytest.raises(InputError, match="not finite in 10 steps up to 14"):
-        run_training(Model(MODEL), spheres(), msgspec.structs.replace(TRAIN, steps=40), tmp_path, seed=0, checkpoint_every=4)
+        run_training(
+            Model(MODEL), spheres(), msgspec.structs.replace(TRAIN, steps=40), tmp_path, seed=0, checkpoint_every=4
+        )
     assert all(torch.isfinite(x).all() for x in training.read_tensors(tmp_path / CHECKPOINT)[0].values())
 
 

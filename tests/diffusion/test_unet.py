@@ -5,13 +5,13 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.network.attention import Layout
+from gdtool.diffusion.checkpoint.weights import load_stable_diffusion
 from gdtool.diffusion.config import PRESETS
+from gdtool.diffusion.inference.sampling import sample_images
+from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.encoding import mirrored
 from gdtool.diffusion.network.model import Model
-from gdtool.diffusion.inference.sampling import sample_images
 from gdtool.diffusion.network.unet import UNet
-from gdtool.diffusion.checkpoint.weights import load_stable_diffusion
 
 TINY = msgspec.structs.replace(PRESETS["tiny"][0], channels=(8, 16), head_width=8, encoder_width=16, image_size=16)
 PAPER = PRESETS["paper"][0]
@@ -47,7 +47,9 @@ def test_the_paper_preset_has_stable_diffusions_keys_and_size():
 
 def small_stable_diffusion():
     """A UNet as Stable Diffusion has it (4 input channels, no classes, no star), small, with its weights."""
-    config = msgspec.structs.replace(PAPER, channels=(8, 16, 16, 16), heads=2, norm_groups=4, encoder_width=12, gradient_checkpointing=False)
+    config = msgspec.structs.replace(
+        PAPER, channels=(8, 16, 16, 16), heads=2, norm_groups=4, encoder_width=12, gradient_checkpointing=False
+    )
     torch.manual_seed(0)
     grown = UNet(config, 4, 4, 8)
     plain = UNet(msgspec.structs.replace(config, cross_domain="none", multi_view=False), 4, 0, 8)
@@ -66,8 +68,12 @@ def test_pretrained_weights_start_unchanged():
             torch.nn.init.zeros_(p)
     layout, context, t = Layout(1, (0, 1, 2), 1), torch.randn(1, 1, 12), torch.tensor([500])
     noisy, condition, label = torch.randn(3, 4, 8, 8), torch.randn(3, 4, 8, 8), torch.zeros(3, 18)
-    torch.testing.assert_close(grown(noisy, condition, t, label, context, layout),
-                               plain(noisy, torch.zeros(3, 0, 8, 8), t, label, context, layout), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        grown(noisy, condition, t, label, context, layout),
+        plain(noisy, torch.zeros(3, 0, 8, 8), t, label, context, layout),
+        rtol=1e-5,
+        atol=1e-5,
+    )
 
 
 def test_pretrained_weights_that_do_not_fit_are_named():
@@ -94,7 +100,9 @@ def test_checkpointing_changes_no_gradient():
         layout, views = Layout(1, (0, 1), 2), torch.tensor([0, 3])
         rgba = torch.randn(1, 4, 16, 16, generator=torch.Generator().manual_seed(1))
         noisy = torch.randn(model.latent_shape(layout), generator=torch.Generator().manual_seed(2))
-        out = model.predict_clean(noisy, model.condition_latents(rgba, layout, views), torch.tensor([300]), model.encoder(rgba), layout, views)
+        out = model.predict_clean(
+            noisy, model.condition_latents(rgba, layout, views), torch.tensor([300]), model.encoder(rgba), layout, views
+        )
         out.square().sum().backward()
         grads.append({n: p.grad for n, p in model.named_parameters() if p.grad is not None})
     assert grads[0].keys() == grads[1].keys()
@@ -105,7 +113,9 @@ def test_checkpointing_changes_no_gradient():
 def test_the_view_from_behind_gets_the_mirrored_condition():
     model = tiny()
     rgba = torch.randn(1, 4, 16, 16)
-    latent = model.condition_latents(rgba, Layout(1, (0, 2), 2), torch.tensor([0, 3])).view(2, 2, *model.codec.encode_condition(rgba).shape[1:])
+    latent = model.condition_latents(rgba, Layout(1, (0, 2), 2), torch.tensor([0, 3])).view(
+        2, 2, *model.codec.encode_condition(rgba).shape[1:]
+    )
     torch.testing.assert_close(latent[1, 0], model.codec.encode_condition(rgba)[0])
     torch.testing.assert_close(latent[1, 1], model.codec.encode_condition(rgba.flip(-1))[0])
     torch.testing.assert_close(model.codec.decode(latent[:, 0, :48]), rgba[:, :3].expand(2, -1, -1, -1))
@@ -145,12 +155,15 @@ def test_guidance_costs_and_acts_between_its_timesteps_alone(monkeypatch):
     never = sample_images(model, rgba, steps=4, seed=4, guidance=2.5, guided_to=0.0, guided_from=1.0)
     for domain in plain:
         assert torch.equal(never[domain], plain[domain])
-    assert not torch.allclose(early["color"][0, 1:], plain["color"][0, 1:]) and not torch.allclose(early["color"][0, 1:], all_over["color"][0, 1:])
+    assert not torch.allclose(early["color"][0, 1:], plain["color"][0, 1:]) and not torch.allclose(
+        early["color"][0, 1:], all_over["color"][0, 1:]
+    )
 
 
 @pytest.mark.parametrize("guidance", [1.0, 2.5])
 def test_sampled_with_its_mirror_image_a_picture_gives_the_mirrored_views_of_the_turned_picture(guidance):
-    """At one step, where noise of no weight says nothing; at two both sides of the mean have mirrored noise, so each object is whole."""
+    """At one step, where noise of no weight says nothing; at two both sides of the mean have mirrored noise, so each
+    object is whole."""
     model = tiny(noisy_input="shrunk")
     rgba = torch.rand(2, 4, 16, 16) * 2 - 1
     plain = sample_images(model, rgba, steps=1, guidance=guidance)
@@ -170,7 +183,8 @@ def test_only_a_model_of_pixels_is_sampled_with_the_mirror_image():
     half = tiny(sampling_mirrored=True, views=("front", "right"))
     with pytest.raises(InputError, match="both sides"):
         sample_images(half, torch.rand(1, 4, 16, 16), steps=1, mirror=True)
-    assert sample_images(half, torch.rand(1, 4, 16, 16), steps=1)["color"].shape[1] == 2  # the preset asks, the model cannot
+    # The preset asks, the model cannot.
+    assert sample_images(half, torch.rand(1, 4, 16, 16), steps=1)["color"].shape[1] == 2
 
 
 def test_domains_that_are_not_asked_for_are_not_computed():

@@ -11,17 +11,27 @@ import torch
 
 from gdtool.core.errors import InputError
 from gdtool.diffusion.checkpoint import wonder3d
-from gdtool.diffusion.network.labels import class_labels
-from gdtool.diffusion.network.attention import Layout, TransformerBlock
 from gdtool.diffusion.config import DOMAINS, ModelConfig
+from gdtool.diffusion.network.attention import Layout, TransformerBlock
+from gdtool.diffusion.network.labels import class_labels
 from gdtool.diffusion.network.tensors import read_tensors
 
-SMALL = {"block_out_channels": (8, 16, 16, 16), "norm_num_groups": 4, "attention_head_dim": 2, "cross_attention_dim": 24, "layers_per_block": 2}
+SMALL = {
+    "block_out_channels": (8, 16, 16, 16),
+    "norm_num_groups": 4,
+    "attention_head_dim": 2,
+    "cross_attention_dim": 24,
+    "layers_per_block": 2,
+}
 
 
 def heads_attend(weights, name, queries, keys, heads=2):
     """Multi-head attention of (t, c) to (s, e), head by head."""
-    q, k, v = queries @ weights[f"{name}.to_q.weight"].T, keys @ weights[f"{name}.to_k.weight"].T, keys @ weights[f"{name}.to_v.weight"].T
+    q, k, v = (
+        queries @ weights[f"{name}.to_q.weight"].T,
+        keys @ weights[f"{name}.to_k.weight"].T,
+        keys @ weights[f"{name}.to_v.weight"].T,
+    )
     width = q.shape[1] // heads
     out = []
     for h in range(heads):
@@ -33,17 +43,27 @@ def heads_attend(weights, name, queries, keys, heads=2):
 
 def normed(weights, name, x):
     centred = x - x.mean(-1, keepdim=True)
-    return centred / (centred.square().mean(-1, keepdim=True) + 1e-5).sqrt() * weights[f"{name}.weight"] + weights[f"{name}.bias"]
+    return (
+        centred / (centred.square().mean(-1, keepdim=True) + 1e-5).sqrt() * weights[f"{name}.weight"]
+        + weights[f"{name}.bias"]
+    )
 
 
 def plain_block(weights, normal, color, context, last=False):
-    """normal, color: a list of views (t, c) each. Image by image: all views of the own domain; then, of the own view, both
-    domains; then the picture's embedding; then the gated feed-forward (and with `last`, both domains only here)."""
+    """normal, color: a list of views (t, c) each. Image by image: all views of the own domain; then, of the own view,
+    both domains; then the picture's embedding; then the gated feed-forward (and with `last`, both domains only
+    here)."""
+
     def joined(domains, place):
         name = f"attn_joint_{place}"
         ready = [[normed(weights, f"norm_joint_{place}", x) for x in views] for views in domains]
-        return [[x + heads_attend(weights, name, ready[d][k], torch.cat([ready[0][k], ready[1][k]])) for k, x in enumerate(views)]
-                for d, views in enumerate(domains)]
+        return [
+            [
+                x + heads_attend(weights, name, ready[d][k], torch.cat([ready[0][k], ready[1][k]]))
+                for k, x in enumerate(views)
+            ]
+            for d, views in enumerate(domains)
+        ]
 
     domains = []
     for views in (normal, color):
@@ -51,12 +71,16 @@ def plain_block(weights, normal, color, context, last=False):
         domains.append([x + heads_attend(weights, "attn1", normed(weights, "norm1", x), every) for x in views])
     if not last:
         domains = joined(domains, "mid")
-    domains = [[x + heads_attend(weights, "attn2", normed(weights, "norm2", x), context) for x in views] for views in domains]
+    domains = [
+        [x + heads_attend(weights, "attn2", normed(weights, "norm2", x), context) for x in views] for views in domains
+    ]
     out = []
     for views in domains:
         out.append([])
         for x in views:
-            value, gate = (normed(weights, "norm3", x) @ weights["ff.net.0.proj.weight"].T + weights["ff.net.0.proj.bias"]).chunk(2, -1)
+            value, gate = (
+                normed(weights, "norm3", x) @ weights["ff.net.0.proj.weight"].T + weights["ff.net.0.proj.bias"]
+            ).chunk(2, -1)
             gate = 0.5 * gate * (1 + torch.erf(gate / 2**0.5))
             out[-1].append(x + (value * gate) @ weights["ff.net.2.weight"].T + weights["ff.net.2.bias"])
     return joined(out, "last") if last else out
@@ -74,7 +98,9 @@ def test_the_block_is_wonder3ds(place):
     own = block(x, context, layout).view(2, 2, 3, 4, 16)
     parts = x.view(2, 2, 3, 4, 16)
     for b in range(2):
-        normal, color = plain_block(block.state_dict(), list(parts[b, 1]), list(parts[b, 0]), context[b], place == "joint_last")
+        normal, color = plain_block(
+            block.state_dict(), list(parts[b, 1]), list(parts[b, 0]), context[b], place == "joint_last"
+        )
         torch.testing.assert_close(own[b, 1], torch.stack(normal))
         torch.testing.assert_close(own[b, 0], torch.stack(color))
 
@@ -105,7 +131,9 @@ def test_older_names_are_read():
 
 
 def test_white_background_of_normals_becomes_coverage():
-    n = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1)[..., None, None]
+    n = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1)[
+        ..., None, None
+    ]
     torch.testing.assert_close(wonder3d.premultiplied_normals(n), n)
     assert float(wonder3d.premultiplied_normals(torch.ones(3, 2, 2)).abs().max()) == 0.0
 
@@ -120,7 +148,9 @@ def test_a_pickle_is_refused_and_the_line_it_names_converts_it(tmp_path):
     done = subprocess.run([sys.executable, *command[1:]], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     read, _ = read_tensors(tmp_path / "diffusion_pytorch_model.safetensors")
-    assert read.keys() == tensors.keys() and all(torch.equal(read[k], tensors[k]) and read[k].dtype == tensors[k].dtype for k in read)
+    assert read.keys() == tensors.keys() and all(
+        torch.equal(read[k], tensors[k]) and read[k].dtype == tensors[k].dtype for k in read
+    )
 
 
 class Evil:
@@ -132,29 +162,54 @@ def test_a_pickle_that_runs_code_is_not_run(tmp_path):
     (tmp_path / "x.bin").write_bytes(pickle.dumps({"w": Evil()}))
     torch.save({"w": Evil()}, tmp_path / "y.bin")
     for name in ("x", "y"):
-        done = subprocess.run([sys.executable, "-m", "gdtool.diffusion.convert", f"{name}.bin"], capture_output=True, text=True, cwd=tmp_path)
+        done = subprocess.run(
+            [sys.executable, "-m", "gdtool.diffusion.convert", f"{name}.bin"],
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+        )
         assert done.returncode == 3 and "Traceback" not in done.stderr
         assert not (tmp_path / "was_here").exists() and not (tmp_path / f"{name}.safetensors").exists()
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The published layout, small and random; its UNet's keys are diffusers' own and the attention that Wonder3D adds."""
+    """The published layout, small and random; its UNet's keys are diffusers' own and the attention that Wonder3D
+    adds."""
     diffusers = pytest.importorskip("diffusers", reason="needs pip install 'gdtool[hub]'")
     transformers = pytest.importorskip("transformers", reason="needs pip install 'gdtool[hub]'")
     from safetensors.torch import save_file
 
     path = tmp_path_factory.mktemp("wonder3d")
     torch.manual_seed(0)
-    diffusers.AutoencoderKL(down_block_types=("DownEncoderBlock2D",) * 4, up_block_types=("UpDecoderBlock2D",) * 4,
-                            block_out_channels=(8, 8, 8, 8), norm_num_groups=4, latent_channels=4).save_pretrained(path / "vae")
-    vision = transformers.CLIPVisionConfig(hidden_size=16, intermediate_size=32, projection_dim=24, num_hidden_layers=1, num_attention_heads=2,
-                                           image_size=224, patch_size=32)
+    diffusers.AutoencoderKL(
+        down_block_types=("DownEncoderBlock2D",) * 4,
+        up_block_types=("UpDecoderBlock2D",) * 4,
+        block_out_channels=(8, 8, 8, 8),
+        norm_num_groups=4,
+        latent_channels=4,
+    ).save_pretrained(path / "vae")
+    vision = transformers.CLIPVisionConfig(
+        hidden_size=16,
+        intermediate_size=32,
+        projection_dim=24,
+        num_hidden_layers=1,
+        num_attention_heads=2,
+        image_size=224,
+        patch_size=32,
+    )
     transformers.CLIPVisionModelWithProjection(vision).save_pretrained(path / "image_encoder")
-    diffusers.DDIMScheduler(beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", clip_sample=False,
-                            steps_offset=1).save_pretrained(path / "scheduler")
-    unet = diffusers.UNet2DConditionModel(sample_size=8, in_channels=8, out_channels=4, class_embed_type="projection",
-                                          projection_class_embeddings_input_dim=10, **SMALL)
+    diffusers.DDIMScheduler(
+        beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", clip_sample=False, steps_offset=1
+    ).save_pretrained(path / "scheduler")
+    unet = diffusers.UNet2DConditionModel(
+        sample_size=8,
+        in_channels=8,
+        out_channels=4,
+        class_embed_type="projection",
+        projection_class_embeddings_input_dim=10,
+        **SMALL,
+    )
     tensors = dict(unet.state_dict())
     for name in list(tensors):
         if ".attn1." in name:
@@ -190,15 +245,17 @@ def test_without_joint_attention_an_image_gets_what_diffusers_gives_it(folder):
     label = model.labels[[0, 1], 2]
     with torch.no_grad():
         given = model.unet(noisy, condition, torch.tensor([400]), label, context, Layout(1, (0, 1), 1))
-        expected = reference.eval()(torch.cat([noisy, condition], 1), 400, context.expand(2, -1, -1), class_labels=label).sample
+        expected = reference.eval()(
+            torch.cat([noisy, condition], 1), 400, context.expand(2, -1, -1), class_labels=label
+        ).sample
     torch.testing.assert_close(given, expected, atol=2e-5, rtol=1e-4)
     assert own.prediction == "epsilon"
 
 
 def test_guidance_is_the_step_from_nothing_to_the_condition(folder):
     """One step at guidance 3, restated: without = zero embedding, zero latent, the same camera labels."""
-    from gdtool.diffusion.network.encoding import encode_condition
     from gdtool.diffusion.inference.sampling import sample_images
+    from gdtool.diffusion.network.encoding import encode_condition
 
     model = wonder3d.load(folder)
     rgba = torch.rand(1, 4, 64, 64) * 2 - 1
@@ -243,4 +300,8 @@ def test_a_folder_with_pickles_is_refused_by_command(folder, gdtool, tmp_path):
 
     write_png(tmp_path / "x.png", image)
     result = gdtool("sample-views", "x.png", "--model", "w", "-o", "views")
-    assert result.returncode == 3 and "python -m gdtool.diffusion.convert" in result.stderr and "Traceback" not in result.stderr
+    assert (
+        result.returncode == 3
+        and "python -m gdtool.diffusion.convert" in result.stderr
+        and "Traceback" not in result.stderr
+    )

@@ -34,8 +34,14 @@ def folder(tmp_path):
         log = tmp_path / "log"
         log.write_text("")
         environment = {**os.environ, "LOG": str(log), "FAIL": fail}
-        result = subprocess.run(["make", "-f", str(MAKEFILE), f"GDTOOL={gdtool}", *arguments], cwd=cwd, env=environment,
-                                capture_output=True, text=True, timeout=60)
+        result = subprocess.run(
+            ["make", "-f", str(MAKEFILE), f"GDTOOL={gdtool}", *arguments],
+            cwd=cwd,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
         return result, log.read_text().splitlines()
 
     return work, run
@@ -80,9 +86,14 @@ def test_a_failed_stage_is_resumed_where_it_stopped(folder):
     assert result.returncode == 0 and stages(calls, "owl.") == FROM_IMAGE[2:] and stages(calls, "cat.") == []
 
 
-@pytest.mark.parametrize(("changed", "again"), [
-    ("cat.asset/mesh/manifest.json", ["unwrap", "bake"]), ("cat.png", FROM_IMAGE), ("chair.glb", FROM_MODEL),
-])
+@pytest.mark.parametrize(
+    ("changed", "again"),
+    [
+        ("cat.asset/mesh/manifest.json", ["unwrap", "bake"]),
+        ("cat.png", FROM_IMAGE),
+        ("chair.glb", FROM_MODEL),
+    ],
+)
 def test_what_follows_from_a_new_source_or_result_runs_again(folder, changed, again):
     work, run = folder
     run()

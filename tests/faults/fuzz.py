@@ -36,11 +36,13 @@ def mutated(content: bytes, rng: np.random.Generator) -> bytes:
         elif kind == 1:
             out[at] = int(rng.choice([0, 1, 34, 44, 45, 58, 91, 123, 127, 128, 255]))
         elif kind == 2:
-            out[at:at + 4] = rng.choice([b"\0\0\0\0", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\0\0\xc0\x7f"])
+            out[at : at + 4] = rng.choice(
+                [b"\0\0\0\0", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\0\0\xc0\x7f"]
+            )
         elif kind == 3:
-            del out[at:at + int(rng.integers(1, 40))]
+            del out[at : at + int(rng.integers(1, 40))]
         elif kind == 4:
-            out[at:at] = out[at:at + int(rng.integers(1, 40))]
+            out[at:at] = out[at : at + int(rng.integers(1, 40))]
         else:
             del out[at:]
     return bytes(out)
@@ -108,8 +110,14 @@ def glb_seed() -> bytes:
     from gdtool.assets.scene import Material, Scene, Texture
 
     image = np.full((4, 4, 3), 200, np.uint8)
-    return glb_bytes(Scene(np.eye(3), np.array([[0, 1, 2]], np.int32), (Material(base_color_texture=Texture(image, "srgb")),),
-                           uvs=(np.array([[0, 0], [1, 0], [0, 1.0]]),)))
+    return glb_bytes(
+        Scene(
+            np.eye(3),
+            np.array([[0, 1, 2]], np.int32),
+            (Material(base_color_texture=Texture(image, "srgb")),),
+            uvs=(np.array([[0, 0], [1, 0], [0, 1.0]]),),
+        )
+    )
 
 
 def text_seed(kind: str) -> bytes:
@@ -122,8 +130,16 @@ def text_seed(kind: str) -> bytes:
         return b"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nf 1/1 2/2 3/3 4/1\nf -1/1 -2/2 -3/3\n"
     if kind == "json":
         content = MeshContent(vertices=8, quads=6, triangles=0, watertight=True)
-        return encode(Manifest(kind="mesh", name="x", stage="remesh", content=content, inputs=(InputEntry("source", "../a.obj", "0" * 64),),
-                               files=(FileEntry("mesh.obj", 3, "1" * 64),)))
+        return encode(
+            Manifest(
+                kind="mesh",
+                name="x",
+                stage="remesh",
+                content=content,
+                inputs=(InputEntry("source", "../a.obj", "0" * 64),),
+                files=(FileEntry("mesh.obj", 3, "1" * 64),),
+            )
+        )
     with tempfile.TemporaryDirectory() as folder:
         write_cameras(Path(folder, "c.json"), rig("six", 8)[:2])
         return Path(folder, "c.json").read_bytes()
@@ -132,7 +148,9 @@ def text_seed(kind: str) -> bytes:
 def ply_seed() -> bytes:
     vertex = np.eye(3, dtype="<f4").tobytes()
     face = b"\3" + np.array([0, 1, 2], "<i4").tobytes()
-    header = "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    header = (
+        "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    )
     return (header + "element face 1\nproperty list uchar int vertex_indices\nend_header\n").encode() + vertex + face
 
 
@@ -193,9 +211,21 @@ def child(name: str, seed: int, seconds: float, rounds: int, folder: str) -> Non
 def fuzz(name: str, seed: int, seconds: float, rounds: int = 10**9) -> tuple[str, bytes | None]:
     """What became of one child, and the file that broke it or None."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "tests.faults.fuzz", "--child", name, str(seed), str(seconds), str(rounds), folder]
+        command = [
+            sys.executable,
+            "-m",
+            "tests.faults.fuzz",
+            "--child",
+            name,
+            str(seed),
+            str(seconds),
+            str(rounds),
+            folder,
+        ]
         try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=seconds + 120, cwd=Path(__file__).parents[2])
+            done = subprocess.run(
+                command, capture_output=True, text=True, timeout=seconds + 120, cwd=Path(__file__).parents[2]
+            )
             said, code = (done.stdout + done.stderr[-400:]).strip(), done.returncode
         except subprocess.TimeoutExpired:
             said, code = "hangs", -1

@@ -2,11 +2,11 @@
 
     python -m tests.faults.fuzz_commands [MINUTES] [SEED]
 
-Each case is a copy of a small working folder (models, pictures, a result of every stage), damaged in up to three places, on which one
-command runs with random sources, options and outputs. It must end in time, with a documented exit code, one line an error and no
-traceback; print nothing but paths; publish only folders that validate; leave nothing behind; and change nothing that it did not make.
-A case that breaks a rule is printed with its seed, which makes it again: `python -m tests.faults.fuzz_commands 0 SEED`.
-"""
+Each case is a copy of a small working folder (models, pictures, a result of every stage), damaged in up to three
+places, on which one command runs with random sources, options and outputs. It must end in time, with a documented exit
+code, one line an error and no traceback; print nothing but paths; publish only folders that validate; leave nothing
+behind; and change nothing that it did not make. A case that breaks a rule is printed with its seed, which makes it
+again: `python -m tests.faults.fuzz_commands 0 SEED`."""
 
 from __future__ import annotations
 
@@ -33,28 +33,116 @@ from tests.faults.fuzz import mutated
 
 SECONDS = 60.0  # a case works on a few hundred triangles and pictures of 32 pixels; what takes longer hangs
 CODES = {0, 1, 2, 3, 4, 5}
-ODD_TEXTS = ["", " ", "nan", "inf", "-inf", "-1", "0", "1e-300", "1e308", "9" * 30, "-" + "9" * 5000, "0x10", "1,5", "é", "a\nb", "x" * 300, "../..", "/", ".",
-             "/dev/zero", "/dev/null", "/proc/self/mem", "~", "%s", "--", "-", "true", "none", "auto", "[", "procedural:1", "procedural:3..1", "procedural:-1",
-             "procedural:" + "9" * 30, "{}", '{"folder": 3}', '{"folder": null}', "[" * 2000, "\udcff", "1/0", "2/1", "1/2"]
-ODD_VALUES: list[Any] = [None, True, 0, -1, 1.5, 2**31, 2**63 - 1, 2**70, 10**400, 1e308, -1e308, "", "x", "../../x", "/etc/passwd", "%2Fetc%2Fpasswd", "a\0b",
-                         "\ud800", "x" * 5000, [], {}, [[]], {"a": {}}, [1, "a", None]]
+ODD_TEXTS = [
+    "",
+    " ",
+    "nan",
+    "inf",
+    "-inf",
+    "-1",
+    "0",
+    "1e-300",
+    "1e308",
+    "9" * 30,
+    "-" + "9" * 5000,
+    "0x10",
+    "1,5",
+    "é",
+    "a\nb",
+    "x" * 300,
+    "../..",
+    "/",
+    ".",
+    "/dev/zero",
+    "/dev/null",
+    "/proc/self/mem",
+    "~",
+    "%s",
+    "--",
+    "-",
+    "true",
+    "none",
+    "auto",
+    "[",
+    "procedural:1",
+    "procedural:3..1",
+    "procedural:-1",
+    "procedural:" + "9" * 30,
+    "{}",
+    '{"folder": 3}',
+    '{"folder": null}',
+    "[" * 2000,
+    "\udcff",
+    "1/0",
+    "2/1",
+    "1/2",
+]
+ODD_VALUES: list[Any] = [
+    None,
+    True,
+    0,
+    -1,
+    1.5,
+    2**31,
+    2**63 - 1,
+    2**70,
+    10**400,
+    1e308,
+    -1e308,
+    "",
+    "x",
+    "../../x",
+    "/etc/passwd",
+    "%2Fetc%2Fpasswd",
+    "a\0b",
+    "\ud800",
+    "x" * 5000,
+    [],
+    {},
+    [[]],
+    {"a": {}},
+    [1, "a", None],
+]
 # What keeps a good run short; random options come after, and win.
 QUICK = {
-    "render-dataset": ["--size", "32", "--samples", "1", "--light-samples", "1"], "sample-views": ["--steps", "1"], "import-views": [],
-    "reconstruct": ["--resolution", "24"], "remesh": ["--faces", "200", "--seconds", "20"], "unwrap": ["--size", "128", "--seconds", "20"],
-    "bake": ["--size", "64", "--samples", "1", "--ao-rays", "4"], "relight": ["--size", "32", "--samples", "1", "--views", "1"],
-    "train": ["--preset", "tiny", "--steps", "1", "--batch", "1", "--held-out", "1"], "evaluate": ["--samples", "100", "--no-syncdreamer", "--no-render"], "validate": [],
+    "render-dataset": ["--size", "32", "--samples", "1", "--light-samples", "1"],
+    "sample-views": ["--steps", "1"],
+    "import-views": [],
+    "reconstruct": ["--resolution", "24"],
+    "remesh": ["--faces", "200", "--seconds", "20"],
+    "unwrap": ["--size", "128", "--seconds", "20"],
+    "bake": ["--size", "64", "--samples", "1", "--ao-rays", "4"],
+    "relight": ["--size", "32", "--samples", "1", "--views", "1"],
+    "train": ["--preset", "tiny", "--steps", "1", "--batch", "1", "--held-out", "1"],
+    "evaluate": ["--samples", "100", "--no-syncdreamer", "--no-render"],
+    "validate": [],
 }
 # The lines of stderr: errors, warnings, what a run tells of itself.
 KNOWN_LINE = re.compile(r"gdtool( [a-z-]+)?: |warning: |  |.*: (running|done|up to date|what is done so far)")
 # What each command reads.
 FITTING = {
-    "render-dataset": ["painted.obj", "cube.obj", "box.glb", "box.gltf", "procedural:1"], "sample-views": ["cat.png", "paint.png"], "import-views": ["pictures"],
-    "reconstruct": ["box.asset/views"], "remesh": ["box.asset/surface", "cube.obj", "box.glb"], "unwrap": ["box.asset/mesh", "cube.obj"],
-    "bake": ["box.asset/atlas"], "relight": ["box.asset/asset", "box.glb"], "train": ["box.asset/views", "box.tar"],
+    "render-dataset": ["painted.obj", "cube.obj", "box.glb", "box.gltf", "procedural:1"],
+    "sample-views": ["cat.png", "paint.png"],
+    "import-views": ["pictures"],
+    "reconstruct": ["box.asset/views"],
+    "remesh": ["box.asset/surface", "cube.obj", "box.glb"],
+    "unwrap": ["box.asset/mesh", "cube.obj"],
+    "bake": ["box.asset/atlas"],
+    "relight": ["box.asset/asset", "box.glb"],
+    "train": ["box.asset/views", "box.tar"],
 }
 # Options that ask for more work than a fuzz has time for.
-LEFT_OUT = {"--compile", "--ray", "--help", "--debug", "--minutes", "--preset", "--tensorboard", "--method", "--target-psnr"}
+LEFT_OUT = {
+    "--compile",
+    "--ray",
+    "--help",
+    "--debug",
+    "--minutes",
+    "--preset",
+    "--tensorboard",
+    "--method",
+    "--target-psnr",
+}
 
 
 def make_pool(pool: Path) -> None:
@@ -70,15 +158,21 @@ def make_pool(pool: Path) -> None:
     write_png(pool / "paint.png", rng.random((8, 8, 3)))
     (pool / "paint.mtl").write_text("newmtl paint\nKd 1 1 1\nmap_Kd paint.png\nNs 20\n")
     corners = "".join(f"v {x} {y} {z}\n" for x, y, z in CUBE)
-    (pool / "painted.obj").write_text("mtllib paint.mtl\n" + corners + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl paint\n"
-                                      + "".join("f " + " ".join(f"{v + 1}/{k + 1}" for k, v in enumerate(quad)) + "\n" for quad in QUADS))
+    (pool / "painted.obj").write_text(
+        "mtllib paint.mtl\n"
+        + corners
+        + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl paint\n"
+        + "".join("f " + " ".join(f"{v + 1}/{k + 1}" for k, v in enumerate(quad)) + "\n" for quad in QUADS)
+    )
     triangles = np.concatenate([QUADS[:, [0, 1, 2]], QUADS[:, [0, 2, 3]]]).astype(np.int32)
     texture = Texture(rng.integers(0, 255, (8, 8, 3), np.uint8), "srgb")
-    glb = glb_bytes(Scene(CUBE, triangles, (Material(base_color_texture=texture),), uvs=(rng.random((len(triangles), 3, 2)),)))
+    glb = glb_bytes(
+        Scene(CUBE, triangles, (Material(base_color_texture=texture),), uvs=(rng.random((len(triangles), 3, 2)),))
+    )
     (pool / "box.glb").write_bytes(glb)
     size = int.from_bytes(glb[12:16], "little")
-    document = json.loads(glb[20:20 + size])
-    (pool / "box.bin").write_bytes(glb[28 + size:])
+    document = json.loads(glb[20 : 20 + size])
+    (pool / "box.bin").write_bytes(glb[28 + size :])
     document["buffers"][0]["uri"] = "box.bin"
     (pool / "box.gltf").write_text(json.dumps(document, indent=1))
     y, x = np.mgrid[:48, :48]
@@ -92,7 +186,12 @@ def make_pool(pool: Path) -> None:
     source: list[str] = []
     for step in chain.split("|"):
         name, *words = step.split()
-        done = subprocess.run([sys.executable, "-m", "gdtool", name, *words, *source, *QUICK[name], "-q"], cwd=pool, capture_output=True, text=True)
+        done = subprocess.run(
+            [sys.executable, "-m", "gdtool", name, *words, *source, *QUICK[name], "-q"],
+            cwd=pool,
+            capture_output=True,
+            text=True,
+        )
         if done.returncode:
             raise RuntimeError(f"the working folder could not be made: {done.stderr}")
         source = [done.stdout.strip()]
@@ -148,7 +247,9 @@ def damage(folder: Path, rng: np.random.Generator) -> None:
 
 def options_of(command: click.Command, rng: np.random.Generator, places: list[str]) -> list[str]:
     """Up to three random options with good, bounding or odd values."""
-    known = [option for option in command.params if isinstance(option, click.Option) and not set(option.opts) & LEFT_OUT]
+    known = [
+        option for option in command.params if isinstance(option, click.Option) and not set(option.opts) & LEFT_OUT
+    ]
     out: list[str] = []
     for option in rng.permutation(np.array(known, object))[: int(rng.choice([0, 0, 0, 1, 1, 2, 3]))]:
         out.append(option.opts[-1])
@@ -179,19 +280,64 @@ def case(rng: np.random.Generator, folder: Path) -> tuple[list[str], bytes]:
     context = click.Context(cli)
     name = str(rng.choice(list(COMMANDS)))
     places = sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
-    likely = ["cube.obj", "painted.obj", "box.glb", "box.gltf", "cat.png", "pictures", "box.tar", *(f"box.asset/{k}" for k in
-              ("views", "surface", "mesh", "atlas", "asset", "renders"))]
+    likely = [
+        "cube.obj",
+        "painted.obj",
+        "box.glb",
+        "box.gltf",
+        "cat.png",
+        "pictures",
+        "box.tar",
+        *(f"box.asset/{k}" for k in ("views", "surface", "mesh", "atlas", "asset", "renders")),
+    ]
     sources = []
     for _ in range(1 if rng.integers(6) else int(rng.choice([0, 2]))):
         kind = rng.integers(12)
         fitting = np.array(FITTING.get(name, likely), object)
-        sources.append(str(rng.choice(fitting)) if kind < 7 else str(rng.choice(np.array(likely, object))) if kind < 10 else str(rng.choice(np.array(places, object))) if kind == 10
-                       else ODD_TEXTS[int(rng.integers(len(ODD_TEXTS)))])
-    outputs = ["out", "mine", "link", ".", "..", "box.asset", "box.asset/mesh", "cat.png", "mine/new", "a/b/c", "out\nx", "/proc/x", "x" * 300]
-    output = ["-o", str(rng.choice(np.array(outputs, object)))] if name not in ("evaluate", "validate") and rng.integers(2) else []
-    flags = [flag for flag in ("--force", "--dry-run", "--json") if rng.integers(6) == 0] if name not in ("evaluate", "validate") else []
+        sources.append(
+            str(rng.choice(fitting))
+            if kind < 7
+            else str(rng.choice(np.array(likely, object)))
+            if kind < 10
+            else str(rng.choice(np.array(places, object)))
+            if kind == 10
+            else ODD_TEXTS[int(rng.integers(len(ODD_TEXTS)))]
+        )
+    outputs = [
+        "out",
+        "mine",
+        "link",
+        ".",
+        "..",
+        "box.asset",
+        "box.asset/mesh",
+        "cat.png",
+        "mine/new",
+        "a/b/c",
+        "out\nx",
+        "/proc/x",
+        "x" * 300,
+    ]
+    output = (
+        ["-o", str(rng.choice(np.array(outputs, object)))]
+        if name not in ("evaluate", "validate") and rng.integers(2)
+        else []
+    )
+    flags = (
+        [flag for flag in ("--force", "--dry-run", "--json") if rng.integers(6) == 0]
+        if name not in ("evaluate", "validate")
+        else []
+    )
     through_stdin = rng.integers(4) == 0
-    words = [name, *QUICK[name], *options_of(cli.get_command(context, name), rng, places), *output, *flags, "--threads", "1"]
+    words = [
+        name,
+        *QUICK[name],
+        *options_of(cli.get_command(context, name), rng, places),
+        *output,
+        *flags,
+        "--threads",
+        "1",
+    ]
     if name in ("evaluate", "validate"):
         words = words[:-2]
     given = b"".join(os.fsencode(source) + b"\n" for source in sources) if through_stdin else b""
@@ -211,7 +357,8 @@ def state(folder: Path) -> dict[str, str]:
 
 
 def run_case(words: list[str], given: bytes, folder: Path) -> tuple[int, str, str]:
-    """Exit code (124: it did not end in time), stdout and stderr of the command, in a copy of this process: it has imported what commands need."""
+    """Exit code (124: it did not end in time), stdout and stderr of the command, in a copy of this process: it has
+    imported what commands need."""
     files = [tempfile.TemporaryFile() for _ in range(3)]
     files[0].write(given)
     files[0].seek(0)
@@ -223,7 +370,11 @@ def run_case(words: list[str], given: bytes, folder: Path) -> tuple[int, str, st
             os.chdir(folder)
             for number, file in enumerate(files):
                 os.dup2(file.fileno(), number)
-            sys.stdin, sys.stdout, sys.stderr = open(0), open(1, "w", errors="surrogateescape"), open(2, "w", errors="backslashreplace")
+            sys.stdin, sys.stdout, sys.stderr = (
+                open(0),
+                open(1, "w", errors="surrogateescape"),
+                open(2, "w", errors="backslashreplace"),
+            )
             sys.argv = ["gdtool", *words]
             from gdtool.commands import main
 
@@ -280,7 +431,9 @@ def broken_rules(words: list[str], code: int, out: str, err: str, folder: Path, 
             place = json.loads(line)["folder"] if "--json" in words else line
             paths.append(folder / place)
         if "--dry-run" not in words:
-            rules += [f"printed {path}, which is no whole folder" for path in paths if not (path / "manifest.json").is_file()]
+            rules += [
+                f"printed {path}, which is no whole folder" for path in paths if not (path / "manifest.json").is_file()
+            ]
             from gdtool.core.errors import GdtoolError
             from gdtool.core.folder import open_folder
 
@@ -293,8 +446,14 @@ def broken_rules(words: list[str], code: int, out: str, err: str, folder: Path, 
     if "leftovers" not in before and leftovers(folder):
         rules.append(f"left {leftovers(folder)}")
     after = state(folder.parent)
-    replaced = [str(path.resolve()) + "/" for path in paths] + ([str(folder / "out" / "manifest.json")] if paths else [])
-    lost = [name for name, digest in before.items() if after.get(name) != digest and not any(os.path.realpath(name).startswith(top) for top in replaced)]
+    replaced = [str(path.resolve()) + "/" for path in paths] + (
+        [str(folder / "out" / "manifest.json")] if paths else []
+    )
+    lost = [
+        name
+        for name, digest in before.items()
+        if after.get(name) != digest and not any(os.path.realpath(name).startswith(top) for top in replaced)
+    ]
     mine = [name for name in before if "/mine/" in name and after.get(name) != before[name]]
     rules += [f"changed or removed {name}" for name in {*lost, *mine}]
     return rules
@@ -312,7 +471,9 @@ def main(arguments: list[str]) -> int:
     with tempfile.TemporaryDirectory(prefix="gdtool-fuzz-") as top:
         top_path = Path(top).resolve()
         # By another process: the thread pools of OpenImageIO and torch do not live on in a copy of this one.
-        subprocess.run([sys.executable, "-m", "tests.faults.fuzz_commands", "--pool", str(top_path / "pool")], check=True)
+        subprocess.run(
+            [sys.executable, "-m", "tests.faults.fuzz_commands", "--pool", str(top_path / "pool")], check=True
+        )
         for module in ("torch", "trimesh", "scipy.spatial", "skimage.measure", "OpenImageIO"):
             importlib.import_module(module)
         end, seed = time.monotonic() + 60 * minutes, first
@@ -334,7 +495,10 @@ def main(arguments: list[str]) -> int:
                 print("".join(f"  {rule}\n" for rule in rules) + f"  exit {code}, said: {err[-600:]!r}", flush=True)
             shutil.rmtree(top_path / "outside")
             count, seed = count + 1, seed + 1
-    print(f"{count} runs from seed {first}: {broken} broke a rule; exit codes " + ", ".join(f"{code}: {n}" for code, n in sorted(codes.items())))
+    print(
+        f"{count} runs from seed {first}: {broken} broke a rule; exit codes "
+        + ", ".join(f"{code}: {n}" for code, n in sorted(codes.items()))
+    )
     return 1 if broken else 0
 
 

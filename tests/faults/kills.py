@@ -1,11 +1,12 @@
-"""Kill a run at sixty-one moments; whatever the moment, the output is the old result or the new one, whole (part of `make fuzz`).
+"""Kill a run at sixty-one moments; whatever the moment, the output is the old result or the new one, whole (part of
+`make fuzz`).
 
     python -m tests.faults.kills [RANDOM] [EXACT] [SEED]
 
-RANDOM kills come at random times of a run, EXACT ones just before a chosen operation on the file system: the run's first and last, and
-others spread over what it does to the output's folder (making, writing, renaming, removing), the manifest and the swap among them.
-After each kill the output opens, nothing beside it has changed, and at the end an undisturbed run gives the same files as one that was never killed.
-"""
+RANDOM kills come at random times of a run, EXACT ones just before a chosen operation on the file system: the run's
+first and last, and others spread over what it does to the output's folder (making, writing, renaming, removing), the
+manifest and the swap among them. After each kill the output opens, nothing beside it has changed, and at the end an
+undisturbed run gives the same files as one that was never killed."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ EVENTS = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.chmod", "os.utim
 
 
 def watched(act) -> None:
-    """Call act(what) before each operation on the file system that touches an output in the working folder, and before the swap."""
+    """Call act(what) before each operation on the file system that touches an output in the working folder, and before
+    the swap."""
     here = os.getcwd()
 
     def hook(event: str, arguments: tuple) -> None:
@@ -56,7 +58,8 @@ def watched(act) -> None:
 
 
 def inside(stop_before: int) -> None:
-    """What the killed process runs: gdtool, until operation number stop_before (counted from 0); -1: to its end, telling the operations."""
+    """What the killed process runs: gdtool, until operation number stop_before (counted from 0); -1: to its end,
+    telling the operations."""
     count = 0
 
     def act(what: str) -> None:
@@ -75,15 +78,28 @@ def inside(stop_before: int) -> None:
 
 
 def start(folder: Path, stop_before: int | None = None) -> subprocess.Popen:
-    words = ["-m", "gdtool", *COMMAND] if stop_before is None else ["-m", "tests.faults.kills", "--inside", str(stop_before)]
+    words = (
+        ["-m", "gdtool", *COMMAND]
+        if stop_before is None
+        else ["-m", "tests.faults.kills", "--inside", str(stop_before)]
+    )
     root = str(Path(__file__).resolve().parents[2])
-    return subprocess.Popen([sys.executable, *words], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-                            env={**os.environ, "PYTHONPATH": root, "OMP_NUM_THREADS": "1"})
+    return subprocess.Popen(
+        [sys.executable, *words],
+        cwd=folder,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": root, "OMP_NUM_THREADS": "1"},
+    )
 
 
 def spread(operations: list[str], count: int) -> list[int]:
-    """`count` operations to stop before: the first, the last, all around the manifest and the swap, and others evenly between them."""
-    important = [i for i, what in enumerate(operations) if "manifest.json" in what or what.startswith(("swap", "os.rename"))]
+    """`count` operations to stop before: the first, the last, all around the manifest and the swap, and others evenly
+    between them."""
+    important = [
+        i for i, what in enumerate(operations) if "manifest.json" in what or what.startswith(("swap", "os.rename"))
+    ]
     chosen = list(dict.fromkeys([0, len(operations) - 1, *important]))[:count]
     even = (round(k * (len(operations) - 1) / max(count - 1, 1)) for k in range(count))
     for one in even:
@@ -99,7 +115,11 @@ def main(random_kills: int = 50, exact_kills: int = 11, seed: int = 0) -> int:
     with tempfile.TemporaryDirectory(prefix="gdtool-kills-") as top:
         folder = Path(top)
         quad_cube(folder / "cube.obj", 4)
-        done = subprocess.run([sys.executable, "-m", "gdtool", "remesh", "cube.obj", "--faces", "96", "-o", "out", "-q"], cwd=folder, stdout=subprocess.DEVNULL)
+        done = subprocess.run(
+            [sys.executable, "-m", "gdtool", "remesh", "cube.obj", "--faces", "96", "-o", "out", "-q"],
+            cwd=folder,
+            stdout=subprocess.DEVNULL,
+        )
         assert done.returncode == 0
         old = open_folder(folder / "out").manifest.digest
         quad_cube(folder / "cube.obj", CELLS)
@@ -114,8 +134,13 @@ def main(random_kills: int = 50, exact_kills: int = 11, seed: int = 0) -> int:
         new = open_folder(folder / "out").manifest.digest
         assert old != new
         rng = random.Random(seed)
-        moments: list[tuple[str, int | None, float]] = [(f"before {operations[i]}", i, 0.0) for i in spread(operations, exact_kills)]
-        moments += [(f"after {share:.2f} of a run", None, share * usual) for share in (rng.uniform(0.1, 1.1) for _ in range(random_kills))]
+        moments: list[tuple[str, int | None, float]] = [
+            (f"before {operations[i]}", i, 0.0) for i in spread(operations, exact_kills)
+        ]
+        moments += [
+            (f"after {share:.2f} of a run", None, share * usual)
+            for share in (rng.uniform(0.1, 1.1) for _ in range(random_kills))
+        ]
         for name, stop, seconds in moments:
             if stop is not None:  # or the sweep of what the kill before has left would be counted with the operations
                 start(folder).communicate()

@@ -27,7 +27,8 @@ from gdtool.images.io import read_image, write_exr, write_png
 from gdtool.shading.lights.load import load_environment
 from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad
 from tests.conftest import ROOT
-from tests.fields.shapes import torus, views_folder, views_of as seen
+from tests.fields.shapes import torus, views_folder
+from tests.fields.shapes import views_of as seen
 
 
 @pytest.fixture
@@ -47,7 +48,9 @@ def grid(side):
     x, y = np.meshgrid(*[np.linspace(0, 1, side, dtype=np.float32)] * 2)
     index = np.arange(side * side, dtype=np.uint32).reshape(side, side)
     corners = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
-    return np.stack([x, y, x * y], -1).reshape(-1, 3), np.stack([corners[i] for i in (0, 1, 2, 0, 2, 3)], -1).reshape(-1)
+    return np.stack([x, y, x * y], -1).reshape(-1, 3), np.stack([corners[i] for i in (0, 1, 2, 0, 2, 3)], -1).reshape(
+        -1
+    )
 
 
 def instances(side, count, normals="all", skin=False):
@@ -56,18 +59,33 @@ def instances(side, count, normals="all", skin=False):
     positions, indices = grid(side)
     attributes = {"POSITION": builder.add(positions), "TEXCOORD_0": builder.add(positions[:, :2].copy())}
     if skin:
-        attributes |= {"JOINTS_0": builder.add(np.zeros((len(positions), 4), np.uint8)), "WEIGHTS_0": builder.add(np.tile(np.float32([1, 0, 0, 0]), (len(positions), 1)))}
+        attributes |= {
+            "JOINTS_0": builder.add(np.zeros((len(positions), 4), np.uint8)),
+            "WEIGHTS_0": builder.add(np.tile(np.float32([1, 0, 0, 0]), (len(positions), 1))),
+        }
         builder.document["skins"] = [{"joints": [0]}]
     normal = {} if normals == "none" else {"NORMAL": builder.add(np.tile(np.float32([0, 0, 1]), (len(positions), 1)))}
     builder.primitive(attributes | normal, faces := builder.add(indices))
     builder.document["meshes"].append({"primitives": [{"attributes": attributes, "indices": faces}]})
-    builder.document["nodes"] = [{"mesh": int(normals == "half" and i % 2), "translation": [i, 0, 0], **({"skin": 0} if skin else {})} for i in range(count)]
+    builder.document["nodes"] = [
+        {"mesh": int(normals == "half" and i % 2), "translation": [i, 0, 0], **({"skin": 0} if skin else {})}
+        for i in range(count)
+    ]
     builder.document["scenes"] = [{"nodes": list(range(count))}]
     return builder
 
 
-@pytest.mark.parametrize(("side", "count", "normals", "skin"), [(150, 16, "all", False), (150, 16, "none", False), (150, 16, "half", False), (300, 1, "all", False),
-                                                              (300, 1, "all", True), (4, 500, "all", False)])
+@pytest.mark.parametrize(
+    ("side", "count", "normals", "skin"),
+    [
+        (150, 16, "all", False),
+        (150, 16, "none", False),
+        (150, 16, "half", False),
+        (300, 1, "all", False),
+        (300, 1, "all", True),
+        (4, 500, "all", False),
+    ],
+)
 def test_the_geometry_of_a_gltf_takes_what_is_predicted(tmp_path, side, count, normals, skin):
     path = instances(side, count, normals, skin).write(tmp_path / "x.glb")
     file = GltfFile(path)
@@ -92,7 +110,9 @@ def test_many_instances_are_refused_before_a_buffer_is_read(tmp_path, little_mem
         builder.document["buffers"] = [{"byteLength": len(builder.binary), "uri": "absent.bin"}]
         path.write_text(json.dumps(builder.document))
     start = time.monotonic()
-    with pytest.raises(ResourceError, match=r"8,192,000 vertices, 15,876,000 faces in 2,000 instances\) would take \d+\.\d GiB") as caught:
+    with pytest.raises(
+        ResourceError, match=r"8,192,000 vertices, 15,876,000 faces in 2,000 instances\) would take \d+\.\d GiB"
+    ) as caught:
         load_scene(path)
     assert caught.value.cure and time.monotonic() - start < 2
 
@@ -113,7 +133,9 @@ def test_the_objects_of_a_json_are_counted(tmp_path, little_memory):
         load_scene(path)
 
 
-@pytest.mark.parametrize("roots", [[0] * 100_000, list(range(20_000))], ids=["one root again and again", "each node of a chain"])
+@pytest.mark.parametrize(
+    "roots", [[0] * 100_000, list(range(20_000))], ids=["one root again and again", "each node of a chain"]
+)
 def test_a_scene_shows_a_node_once(tmp_path, roots):
     """Otherwise 20,000 nodes are walked 200 million times."""
     builder = quad()
@@ -130,8 +152,10 @@ def test_views_of_one_buffer_are_no_copies(tmp_path):
     length = builder.document["bufferViews"][whole]["byteLength"]
     for i in range(100):
         builder.document["bufferViews"].append({"buffer": 0, "byteOffset": 0, "byteLength": length})
-        builder.document["accessors"] += [{"bufferView": i, "componentType": 5126, "count": 4, "type": "VEC3"},
-                                          {"bufferView": i, "byteOffset": QUAD.nbytes, "componentType": 5123, "count": 6, "type": "SCALAR"}]
+        builder.document["accessors"] += [
+            {"bufferView": i, "componentType": 5126, "count": 4, "type": "VEC3"},
+            {"bufferView": i, "byteOffset": QUAD.nbytes, "componentType": 5123, "count": 6, "type": "SCALAR"},
+        ]
         builder.primitive({"POSITION": 2 * i}, 2 * i + 1)
     path = builder.write(tmp_path / "x.glb")
     tracemalloc.start()
@@ -150,7 +174,9 @@ def test_a_large_sparse_file_is_not_read(tmp_path, little_memory, name):
 
 
 def test_the_textures_of_a_model_are_counted_together(tmp_path, little_memory):
-    (tmp_path / "x.obj").write_text("mtllib x.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n" + "".join(f"usemtl m{i}\nf 1/1 2/1 3/1\n" for i in range(8)))
+    (tmp_path / "x.obj").write_text(
+        "mtllib x.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n" + "".join(f"usemtl m{i}\nf 1/1 2/1 3/1\n" for i in range(8))
+    )
     (tmp_path / "x.mtl").write_text("".join(f"newmtl m{i}\nmap_Kd {i}.png\n" for i in range(8)))
     for i in range(8):
         write_png(tmp_path / f"{i}.png", np.full((2048, 2048, 3), i, np.uint8))
@@ -175,18 +201,34 @@ def exr(path, width, height, names, kind="float", value=0.5):
     spec["compression"] = "zip"
     out = oiio.ImageOutput.create(str(path))
     rows = np.full((256, width, len(names)), value, np.float32)
-    assert out.open(str(path), spec) and all(out.write_scanlines(y, min(y + 256, height), 0, rows[:height - y]) for y in range(0, height, 256)) and out.close()
+    assert (
+        out.open(str(path), spec)
+        and all(out.write_scanlines(y, min(y + 256, height), 0, rows[: height - y]) for y in range(0, height, 256))
+        and out.close()
+    )
 
 
-@pytest.mark.parametrize(("names", "kind", "most"), [("RGBA", "float", 1.5), ("RGBA", "half", 1.5), ("Y", "float", 1.5), (["R", "G", "B", *(f"layer.{i}" for i in range(20))], "float", 1.8)],
-                         ids=["RGBA", "half", "grey", "layers"])
+@pytest.mark.parametrize(
+    ("names", "kind", "most"),
+    [
+        ("RGBA", "float", 1.5),
+        ("RGBA", "half", 1.5),
+        ("Y", "float", 1.5),
+        (["R", "G", "B", *(f"layer.{i}" for i in range(20))], "float", 1.8),
+    ],
+    ids=["RGBA", "half", "grey", "layers"],
+)
 def test_reading_an_exr_takes_little_more_than_what_it_gives(tmp_path, names, kind, most):
     """In a child, whose greatest size is its own: most is the peak over the bytes of the picture."""
     width = 2048 if len(names) > 4 else 4096
     exr(tmp_path / "x.exr", width, width // 2, list(names), kind)
-    code = ("import resource, sys, numpy, OpenImageIO; from gdtool.images.io import read_image; size = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024\n"
-            "before = size(); image = read_image(sys.argv[1]); print((size() - before) / image.nbytes)")
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "x.exr")], capture_output=True, text=True, cwd=ROOT)
+    code = (
+        "import resource, sys, numpy, OpenImageIO; from gdtool.images.io import read_image; size = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024\n"
+        "before = size(); image = read_image(sys.argv[1]); print((size() - before) / image.nbytes)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "x.exr")], capture_output=True, text=True, cwd=ROOT
+    )
     extra = 30e6 / (width * width // 2 * min(len(names), 4 if "A" in names else 3) * 4)  # what the library itself takes
     assert float(done.stdout) < most + extra, done.stderr
 
@@ -194,7 +236,9 @@ def test_reading_an_exr_takes_little_more_than_what_it_gives(tmp_path, names, ki
 def test_of_many_channels_the_picture_is_read(tmp_path):
     exr(tmp_path / "x.exr", 64, 32, ["Z.depth", "B", "G", "R", "A", "extra"])
     exr(tmp_path / "y.exr", 64, 32, "RGBA")
-    assert np.array_equal(read_image(tmp_path / "x.exr"), read_image(tmp_path / "y.exr")) and read_image(tmp_path / "x.exr").shape == (32, 64, 4)
+    assert np.array_equal(read_image(tmp_path / "x.exr"), read_image(tmp_path / "y.exr")) and read_image(
+        tmp_path / "x.exr"
+    ).shape == (32, 64, 4)
 
 
 def test_what_reading_a_picture_takes_is_predicted(tmp_path, little_memory, monkeypatch):
@@ -304,12 +348,23 @@ def test_a_large_extended_header_is_not_read(tmp_path, work):
 
 
 MALFORMED = {
-    "empty": b"", "text": b"no tar at all" * 100, "zeros then text": bytes(700) + b"x" * 900, "half a header": header("a", tarfile.REGTYPE, 5)[:300],
-    "cut content": header("a/views/manifest.json", tarfile.REGTYPE, 5000) + b"x" * 700, "bad checksum": header("a", tarfile.REGTYPE, 5).replace(b"a", b"b", 1),
-    "negative size": header("a", tarfile.REGTYPE, 5).replace(b"00000000005", b"-0000000005"), "chain of headers": header("a", tarfile.XHDTYPE, 0) * 3000,
-    "cut gzip": gzip.compress(header("a/views/manifest.json", tarfile.REGTYPE, 5000) + bytes(6000))[:60], "bad gzip": b"\x1f\x8b\x08\x00" + b"x" * 900,
-    "bad xz": b"\xfd7zXZ\x00" + b"x" * 900, "bad bzip2": b"BZh9" + b"x" * 900,
-    "PAX words": header("p", tarfile.XHDTYPE, 20) + b"99999999 path=x\n    " + bytes(492), "PAX size": header("p", tarfile.XHDTYPE, 20) + b"20 size=notanumber\n\0" + bytes(492) + header("a", tarfile.REGTYPE, 5),
+    "empty": b"",
+    "text": b"no tar at all" * 100,
+    "zeros then text": bytes(700) + b"x" * 900,
+    "half a header": header("a", tarfile.REGTYPE, 5)[:300],
+    "cut content": header("a/views/manifest.json", tarfile.REGTYPE, 5000) + b"x" * 700,
+    "bad checksum": header("a", tarfile.REGTYPE, 5).replace(b"a", b"b", 1),
+    "negative size": header("a", tarfile.REGTYPE, 5).replace(b"00000000005", b"-0000000005"),
+    "chain of headers": header("a", tarfile.XHDTYPE, 0) * 3000,
+    "cut gzip": gzip.compress(header("a/views/manifest.json", tarfile.REGTYPE, 5000) + bytes(6000))[:60],
+    "bad gzip": b"\x1f\x8b\x08\x00" + b"x" * 900,
+    "bad xz": b"\xfd7zXZ\x00" + b"x" * 900,
+    "bad bzip2": b"BZh9" + b"x" * 900,
+    "PAX words": header("p", tarfile.XHDTYPE, 20) + b"99999999 path=x\n    " + bytes(492),
+    "PAX size": header("p", tarfile.XHDTYPE, 20)
+    + b"20 size=notanumber\n\0"
+    + bytes(492)
+    + header("a", tarfile.REGTYPE, 5),
 }
 
 

@@ -43,12 +43,12 @@ def overlapping(folder):
     path = weights(folder)
     content = path.read_bytes()
     size = struct.unpack("<Q", content[:8])[0]
-    header = json.loads(content[8:8 + size])
+    header = json.loads(content[8 : 8 + size])
     names = [name for name in header if name != "__metadata__"]
     first, second = sorted(names, key=lambda n: header[n]["data_offsets"])[:2]
     header[second]["data_offsets"][0] -= 4
     text = json.dumps(header).encode()
-    path.write_bytes(struct.pack("<Q", len(text)) + text + content[8 + size:])
+    path.write_bytes(struct.pack("<Q", len(text)) + text + content[8 + size :])
 
 
 def changed(change):
@@ -57,13 +57,22 @@ def changed(change):
         name = sorted(tensors)[0]
         tensors[name] = change(tensors[name])
         save_file(tensors, weights(folder))
+
     return damage
 
 
-@pytest.mark.parametrize("damage, word", [
-    (as_pickle, "safetensors"), (only_pickle, "safetensors"), (truncated, ""), (overlapping, ""),
-    (changed(lambda x: x * float("nan")), "finite"), (changed(lambda x: x.reshape(-1)[:1]), "shape"),
-], ids=["pickle", "only pickle", "truncated", "overlapping", "nan", "shape"])
+@pytest.mark.parametrize(
+    "damage, word",
+    [
+        (as_pickle, "safetensors"),
+        (only_pickle, "safetensors"),
+        (truncated, ""),
+        (overlapping, ""),
+        (changed(lambda x: x * float("nan")), "finite"),
+        (changed(lambda x: x.reshape(-1)[:1]), "shape"),
+    ],
+    ids=["pickle", "only pickle", "truncated", "overlapping", "nan", "shape"],
+)
 def test_refused_in_one_line(gdtool, tmp_path, tiny_model, damage, word):  # noqa: F811
     shutil.copytree(tiny_model, tmp_path / "model")
     damage(tmp_path / "model")

@@ -19,11 +19,19 @@ def scattered(count):
     return joined(*[(0.05 * vertices + rng.uniform(-1, 1, 3), faces) for _ in range(count)])
 
 
-@pytest.mark.parametrize("mesh, options, reason", [
-    (scattered(20), ["--faces", 60], "it has 20 separate pieces, and each takes at least 12 faces or so (engines: not tried, 20 pieces of so few quads)"),
-    (torus(24), ["--faces", 16, "--engine", "split"], "fewer would close some of its 1 handles"),
-    (scattered(40), ["--triangles", 100], "it has 40 separate pieces, and each takes at least 4 faces or so"),
-], ids=["pieces", "handle", "triangles"])
+@pytest.mark.parametrize(
+    "mesh, options, reason",
+    [
+        (
+            scattered(20),
+            ["--faces", 60],
+            "it has 20 separate pieces, and each takes at least 12 faces or so (engines: not tried, 20 pieces of so few quads)",
+        ),
+        (torus(24), ["--faces", 16, "--engine", "split"], "fewer would close some of its 1 handles"),
+        (scattered(40), ["--triangles", 100], "it has 40 separate pieces, and each takes at least 4 faces or so"),
+    ],
+    ids=["pieces", "handle", "triangles"],
+)
 def test_a_count_that_is_missed_says_why(gdtool_here, tmp_path, mesh, options, reason):
     write_obj(tmp_path / "x.obj", *mesh)
     done = gdtool_here("remesh", "x.obj", *options, "-o", "out")
@@ -35,11 +43,18 @@ def test_a_count_that_is_missed_says_why(gdtool_here, tmp_path, mesh, options, r
 def test_a_reason_follows_from_what_the_mesh_is():
     assert "40 separate pieces" in count_reason(scattered(40)[1], 480, 100, [])
     assert "28 handles" in count_reason(lattice()[1], 588, 200, [])
-    assert count_reason(cube()[1], 40, 16, ["simplify: it died"]) == "fewer would change its shape, or its topology (simplify: it died)"
+    assert (
+        count_reason(cube()[1], 40, 16, ["simplify: it died"])
+        == "fewer would change its shape, or its topology (simplify: it died)"
+    )
     assert count_reason(cube()[1], 12, 16, []) == "no way that was tried came nearer to the count"
 
 
-@pytest.mark.parametrize("arguments", [["remesh", "x.obj", "--triangles", 200], ["render-dataset", "x.obj", "--size", 16, "--domains", "normal"]], ids=["remesh", "render-dataset"])
+@pytest.mark.parametrize(
+    "arguments",
+    [["remesh", "x.obj", "--triangles", 200], ["render-dataset", "x.obj", "--size", 16, "--domains", "normal"]],
+    ids=["remesh", "render-dataset"],
+)
 def test_internal_shells_are_told_with_their_share(gdtool_here, tmp_path, arguments):
     (outer, faces), (inner, others) = sphere(16), sphere(16)
     write_obj(tmp_path / "x.obj", *joined((outer, faces), (0.4 * inner, others)))

@@ -21,11 +21,17 @@ from tests.faults.files import leftovers, lines_of, quad_cube
 def no_work(monkeypatch):
     """No stage may begin to work."""
     for stage in (bake, relight, remesh, render_dataset, sample_views, train):
+
         def run(*_):
             pytest.fail("the run has begun")
 
-        monkeypatch.setattr(importlib.import_module("gdtool.commands." + stage.__name__.rpartition(".")[2]), "command",
-                            importlib.import_module("gdtool.commands._common").stage_command(dataclasses.replace(stage.STAGE, run=run), "x"))
+        monkeypatch.setattr(
+            importlib.import_module("gdtool.commands." + stage.__name__.rpartition(".")[2]),
+            "command",
+            importlib.import_module("gdtool.commands._common").stage_command(
+                dataclasses.replace(stage.STAGE, run=run), "x"
+            ),
+        )
 
 
 @pytest.fixture
@@ -43,31 +49,43 @@ def files(tmp_path):
     return tmp_path
 
 
-@pytest.mark.parametrize("line, code, words", [
-    ("relight cube.obj --env nothing.exr", 3, "nothing.exr: does not exist; use dark, mid, bright"),
-    ("relight cube.obj --env square.exr", 3, "square.exr: is 8x8"),
-    ("relight cube.obj --env text.exr", 3, "text.exr"),
-    ("relight cube.obj --env ball.png", 3, "ball.png: is not a high dynamic range image"),
-    ("relight cube.obj --env pipe.exr", 3, "pipe.exr: is a FIFO"),
-    ("relight cube.obj --env .", 3, "is a folder"),
-    ("relight cube.obj --env random:x", 2, "--env random:x: is not random:NUMBER"),
-    (f"relight cube.obj --env random:{2**64}", 2, "64-bit number"),
-    ("relight cube.obj --fov 1e-9", 2, "use --fov 0, which is orthographic"),
-    ("relight cube.obj --budget 1 --target-psnr 30", 2, "leave one of them out"),
-    ("render-dataset cube.obj --light nothing.exr", 3, "nothing.exr: does not exist"),
-    ("render-dataset cube.obj --domains colour", 2, "choose from color"),
-    ("remesh cube.obj --quad-size 1e-300", 2, "is smaller than 1e-05"),
-    ("remesh cube.obj --device cuda", 5, "gdtool: --device cuda: is not there; use --device cpu"),
-    ("bake cube.obj --model nothing.glb", 3, "nothing.glb: does not exist; check the path that --model gives"),
-    ("bake cube.obj --model notes.txt", 3, "notes.txt: is no model file by its ending"),
-    ("bake cube.obj", 3, "name one with --surface or --model"),
-    ("bake cube.obj --surface nothing", 3, "nothing: does not exist"),
-    ("sample-views ball.png --mask nothing.png", 3, "nothing.png: does not exist; check the path that --mask gives"),
-    ("sample-views ball.png --mask small.png", 3, "small.png: is 40x32, the image 64x64; scale it to 64x64"),
-    ("sample-views ball.png --mask text.exr", 3, "text.exr"),
-    ("sample-views ball.png --matting nothing.onnx", 3, "nothing.onnx: does not exist; check the path that --matting gives"),
-    ("sample-views ball.png --model nothing", 3, "nothing: does not exist"),
-], ids=lambda value: value if isinstance(value, str) and " " in value and ":" not in value else "")
+@pytest.mark.parametrize(
+    "line, code, words",
+    [
+        ("relight cube.obj --env nothing.exr", 3, "nothing.exr: does not exist; use dark, mid, bright"),
+        ("relight cube.obj --env square.exr", 3, "square.exr: is 8x8"),
+        ("relight cube.obj --env text.exr", 3, "text.exr"),
+        ("relight cube.obj --env ball.png", 3, "ball.png: is not a high dynamic range image"),
+        ("relight cube.obj --env pipe.exr", 3, "pipe.exr: is a FIFO"),
+        ("relight cube.obj --env .", 3, "is a folder"),
+        ("relight cube.obj --env random:x", 2, "--env random:x: is not random:NUMBER"),
+        (f"relight cube.obj --env random:{2**64}", 2, "64-bit number"),
+        ("relight cube.obj --fov 1e-9", 2, "use --fov 0, which is orthographic"),
+        ("relight cube.obj --budget 1 --target-psnr 30", 2, "leave one of them out"),
+        ("render-dataset cube.obj --light nothing.exr", 3, "nothing.exr: does not exist"),
+        ("render-dataset cube.obj --domains colour", 2, "choose from color"),
+        ("remesh cube.obj --quad-size 1e-300", 2, "is smaller than 1e-05"),
+        ("remesh cube.obj --device cuda", 5, "gdtool: --device cuda: is not there; use --device cpu"),
+        ("bake cube.obj --model nothing.glb", 3, "nothing.glb: does not exist; check the path that --model gives"),
+        ("bake cube.obj --model notes.txt", 3, "notes.txt: is no model file by its ending"),
+        ("bake cube.obj", 3, "name one with --surface or --model"),
+        ("bake cube.obj --surface nothing", 3, "nothing: does not exist"),
+        (
+            "sample-views ball.png --mask nothing.png",
+            3,
+            "nothing.png: does not exist; check the path that --mask gives",
+        ),
+        ("sample-views ball.png --mask small.png", 3, "small.png: is 40x32, the image 64x64; scale it to 64x64"),
+        ("sample-views ball.png --mask text.exr", 3, "text.exr"),
+        (
+            "sample-views ball.png --matting nothing.onnx",
+            3,
+            "nothing.onnx: does not exist; check the path that --matting gives",
+        ),
+        ("sample-views ball.png --model nothing", 3, "nothing: does not exist"),
+    ],
+    ids=lambda value: value if isinstance(value, str) and " " in value and ":" not in value else "",
+)
 def test_what_lies_only_at_the_end(gdtool_here, no_work, files, monkeypatch, line, code, words):
     import torch
 
@@ -90,16 +108,29 @@ def test_lights_that_are_there_pass(files):
     early.require_environment("--env", name, ())
 
 
-@pytest.mark.parametrize("line, module, cure", [
-    ("remesh cube.obj --engine quadriflow", "pyQuadriFlow", "pip install 'gdtool[quadriflow]', or use --engine auto"),
-    ("bake cube.obj --usd usda", "pxr.Usd", "pip install 'gdtool[usd]', or leave out --usd"),
-    ("sample-views ball.png --matting notes.txt", "onnxruntime", "pip install 'gdtool[matting]', or give a mask with --mask"),
-])
+@pytest.mark.parametrize(
+    "line, module, cure",
+    [
+        (
+            "remesh cube.obj --engine quadriflow",
+            "pyQuadriFlow",
+            "pip install 'gdtool[quadriflow]', or use --engine auto",
+        ),
+        ("bake cube.obj --usd usda", "pxr.Usd", "pip install 'gdtool[usd]', or leave out --usd"),
+        (
+            "sample-views ball.png --matting notes.txt",
+            "onnxruntime",
+            "pip install 'gdtool[matting]', or give a mask with --mask",
+        ),
+    ],
+)
 def test_packages_that_an_option_needs(gdtool_here, no_work, files, monkeypatch, line, module, cure):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     monkeypatch.setitem(sys.modules, module, None)
     done = gdtool_here(*line.split(), "-o", "out")
-    assert done.returncode == 5 and cure in done.stderr and len(lines_of(done.stderr)) == 1 and leftovers(files) == [], done.stderr
+    assert (
+        done.returncode == 5 and cure in done.stderr and len(lines_of(done.stderr)) == 1 and leftovers(files) == []
+    ), done.stderr
 
 
 def test_a_package_whose_library_is_missing_names_the_library(monkeypatch):
@@ -115,22 +146,40 @@ def dataset(count):
     return types.SimpleNamespace(kind="dataset", content=types.SimpleNamespace(objects=[None] * count))
 
 
-@pytest.mark.parametrize("count, options, fine", [(5, {"held_out": 4}, True), (5, {"held_out": 5}, False), (5, {"held_out": 900}, False), (2, {}, True),
-                                                  (1, {"held_out": 0}, True)])
+@pytest.mark.parametrize(
+    "count, options, fine",
+    [
+        (5, {"held_out": 4}, True),
+        (5, {"held_out": 5}, False),
+        (5, {"held_out": 900}, False),
+        (2, {}, True),
+        (1, {"held_out": 0}, True),
+    ],
+)
 def test_holding_out_all_objects_is_refused(count, options, fine):
     given = dataset(count)
     inputs = Inputs(given, "x", {"start": None}, (given,))
     if fine:
         train.check(inputs, train.Options(**options))
     else:
-        with pytest.raises(Exception, match=f"leaves none of the {count} objects to train on; hold out at most {count - 1}") as caught:
+        with pytest.raises(
+            Exception, match=f"leaves none of the {count} objects to train on; hold out at most {count - 1}"
+        ) as caught:
             train.check(inputs, train.Options(**options))
         assert caught.value.exit_code == 2
 
 
-@pytest.mark.parametrize("content, fact", [('{"model": {"patch": "four"}}', "patch"), ('{"model": {"patch": 1e999}}', "beyond double precision"),
-                                           ('{"models": {}}', "models"), ('{"model": {}, "model": {}}', "appears twice"), ("[", "is not JSON"),
-                                           ('{"model": {"no_such": 1}}', "no_such")])
+@pytest.mark.parametrize(
+    "content, fact",
+    [
+        ('{"model": {"patch": "four"}}', "patch"),
+        ('{"model": {"patch": 1e999}}', "beyond double precision"),
+        ('{"models": {}}', "models"),
+        ('{"model": {}, "model": {}}', "appears twice"),
+        ("[", "is not JSON"),
+        ('{"model": {"no_such": 1}}', "no_such"),
+    ],
+)
 def test_a_wrong_training_configuration_is_refused(tmp_path, content, fact):
     (tmp_path / "c.json").write_text(content)
     given = dataset(9)

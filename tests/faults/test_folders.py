@@ -31,6 +31,7 @@ def camera(change):
     def damage(folder):
         edit(folder / "cameras.json", lambda c: change(c["cameras"]))
         resealed(folder)
+
     return damage
 
 
@@ -43,6 +44,7 @@ def text(old, new):
         path = folder / MANIFEST
         assert old in path.read_text()
         path.write_text(path.read_text().replace(old, new, 1))
+
     return damage
 
 
@@ -71,7 +73,10 @@ DAMAGE = {
     "missing": (lambda f: (f / "mask/back.png").unlink(), "missing"),
     "changed": (lambda f: (f / "mask/back.png").write_bytes((f / "mask/front.png").read_bytes()[::-1]), "hash"),
     "parent": (manifest(lambda m: m["files"].append({"path": "../../x", "size": 1, "sha256": "0" * 64})), "leaves"),
-    "absolute": (manifest(lambda m: m["files"].append({"path": "/etc/hostname", "size": 1, "sha256": "0" * 64})), "is absolute"),
+    "absolute": (
+        manifest(lambda m: m["files"].append({"path": "/etc/hostname", "size": 1, "sha256": "0" * 64})),
+        "is absolute",
+    ),
     "link": (outside, "leaves"),
     "fewer_cameras": (camera(lambda c: c.pop()), "views that the manifest lists"),
     "no_camera": (camera(lambda c: c.clear()), "cameras.json"),
@@ -104,7 +109,12 @@ def test_each_is_refused_in_one_line(gdtool, good, damaged, tmp_path, command):
 
 
 def test_the_wrong_kind_names_the_stage_that_makes_the_right_one(gdtool, good):
-    for command, cure in (("remesh", "gdtool reconstruct"), ("unwrap", "gdtool remesh"), ("bake", "gdtool unwrap"), ("relight", "gdtool bake")):
+    for command, cure in (
+        ("remesh", "gdtool reconstruct"),
+        ("unwrap", "gdtool remesh"),
+        ("bake", "gdtool unwrap"),
+        ("relight", "gdtool bake"),
+    ):
         done = gdtool(command, good)
         (told,) = lines_of(done.stderr)
         assert done.returncode == 3 and "holds views" in told and cure in told, told
@@ -118,6 +128,7 @@ def test_a_camera_inside_the_object(gdtool, good, tmp_path):
         for one in cameras:
             for i in (3, 7, 11):
                 one["world_from_camera"][i] = 0.0
+
     camera(move)(tmp_path / "in.asset/views")
     done = gdtool("reconstruct", "in.asset/views")
     (told,) = lines_of(done.stderr)

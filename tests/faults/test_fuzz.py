@@ -1,4 +1,5 @@
-"""A few hundred damaged files for every reader, the same each time, and all that once broke one (`make fuzz` looks for more)."""
+"""A few hundred damaged files for every reader, the same each time, and all that once broke one (`make fuzz` looks for
+more)."""
 
 import pytest
 

@@ -21,7 +21,9 @@ def ball() -> np.ndarray:
     """(48, 48, 4) uint8: a shaded disc, away from the border, on nothing."""
     y, x = np.mgrid[:SIZE, :SIZE]
     inside = (x - 22) ** 2 + (y - 25) ** 2 < 15**2
-    return (np.stack([60 + 3 * x, 200 - 2 * y, 90 + 0 * x, np.full_like(x, 255)], -1) * inside[..., None]).astype(np.uint8)
+    return (np.stack([60 + 3 * x, 200 - 2 * y, 90 + 0 * x, np.full_like(x, 255)], -1) * inside[..., None]).astype(
+        np.uint8
+    )
 
 
 def write(path, content: bytes):
@@ -34,17 +36,33 @@ def refused(folder) -> dict[str, tuple[int, str]]:
     whole = png(SIZE, SIZE, RGBA, 8, scanlines(ball()))
     write(folder / "empty.png", b"")
     write(folder / "text.png", b"a text")
-    write(folder / "cut.png", whole[:len(whole) * 2 // 3])
+    write(folder / "cut.png", whole[: len(whole) * 2 // 3])
     write(folder / "crc.png", whole[:60] + bytes([whole[60] ^ 255]) + whole[61:])
-    write(folder / "wide.png", b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 200_000, 200_000, 8, RGB, 0, 0, 0)) + whole[33:])
+    write(
+        folder / "wide.png",
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 200_000, 200_000, 8, RGB, 0, 0, 0)) + whole[33:],
+    )
     write(folder / "bomb.png", png(16_000, 16_000, RGBA, 16, b"\0" * 30_000_000))
-    write(folder / "animated.png", png(SIZE, SIZE, RGBA, 8, scanlines(ball()), before=chunk(b"acTL", struct.pack(">II", 2, 0))))
+    write(
+        folder / "animated.png",
+        png(SIZE, SIZE, RGBA, 8, scanlines(ball()), before=chunk(b"acTL", struct.pack(">II", 2, 0))),
+    )
     write_png(folder / "small.png", np.full((16, 16, 4), 0.5))
     write_png(folder / "clear.png", np.zeros((SIZE, SIZE, 4)))
     write_png(folder / "noise.png", np.random.default_rng(0).random((SIZE, SIZE, 3)))
-    return {"empty.png": (3, "empty"), "text.png": (3, "not an image"), "cut.png": (3, "cut"), "crc.png": (3, "checksum"), "wide.png": (5, "16384"),
-            "bomb.png": (5, "bomb"), "animated.png": (3, "animation"), "small.png": (3, "small"), "clear.png": (3, "transparent"),
-            "noise.png": (3, "--mask"), "none.png": (3, "does not exist")}
+    return {
+        "empty.png": (3, "empty"),
+        "text.png": (3, "not an image"),
+        "cut.png": (3, "cut"),
+        "crc.png": (3, "checksum"),
+        "wide.png": (5, "16384"),
+        "bomb.png": (5, "bomb"),
+        "animated.png": (3, "animation"),
+        "small.png": (3, "small"),
+        "clear.png": (3, "transparent"),
+        "noise.png": (3, "--mask"),
+        "none.png": (3, "does not exist"),
+    }
 
 
 def test_each_is_refused_in_one_line(gdtool, tmp_path, tiny_model):  # noqa: F811
@@ -69,8 +87,17 @@ def test_each_spelling_of_one_picture_is_the_same_picture(gdtool, tmp_path, tiny
     colors, index = np.unique(picture.reshape(-1, 4), axis=0, return_inverse=True)
     few = colors[:256][np.minimum(index.reshape(SIZE, SIZE), 255)]
     write(tmp_path / "few.png", png(SIZE, SIZE, RGBA, 8, scanlines(few)))
-    write(tmp_path / "palette.png", png(SIZE, SIZE, PALETTE, 8, scanlines(np.minimum(index, 255).reshape(SIZE, SIZE, 1).astype(np.uint8)),
-                                        before=chunk(b"PLTE", colors[:256, :3].tobytes()) + chunk(b"tRNS", colors[:256, 3].tobytes())))
+    write(
+        tmp_path / "palette.png",
+        png(
+            SIZE,
+            SIZE,
+            PALETTE,
+            8,
+            scanlines(np.minimum(index, 255).reshape(SIZE, SIZE, 1).astype(np.uint8)),
+            before=chunk(b"PLTE", colors[:256, :3].tobytes()) + chunk(b"tRNS", colors[:256, 3].tobytes()),
+        ),
+    )
     grey = picture[..., [0, 3]]
     write(tmp_path / "grey.png", png(SIZE, SIZE, GREY_ALPHA, 8, scanlines(grey)))
     write(tmp_path / "grey_rgba.png", png(SIZE, SIZE, RGBA, 8, scanlines(grey[..., [0, 0, 0, 1]])))
@@ -97,11 +124,25 @@ def test_names_of_every_kind(tmp_path, tiny_model, name):  # noqa: F811
     path = os.fsencode(tmp_path) + b"/" + name
     with open(path, "wb") as file:
         file.write(png(SIZE, SIZE, RGBA, 8, scanlines(ball())))
-    command = [sys.executable, "-m", "gdtool", "sample-views", "--model", str(tiny_model), "--steps", "1", "-q", "--", name]
+    command = [
+        sys.executable,
+        "-m",
+        "gdtool",
+        "sample-views",
+        "--model",
+        str(tiny_model),
+        "--steps",
+        "1",
+        "-q",
+        "--",
+        name,
+    ]
     done = subprocess.run(command, capture_output=True, cwd=tmp_path, env={**os.environ, "OMP_NUM_THREADS": "2"})
     assert done.returncode == 0, done.stderr
     out = done.stdout.removesuffix(b"\n")
     # The object's name is text: bytes that are not UTF-8 are read as Latin-1.
     assert out == os.fsencode(name_from_path(os.fsdecode(name.removesuffix(b".png")))) + b".asset/views"
-    check = subprocess.run([sys.executable, "-m", "gdtool", "validate", "-q"], input=done.stdout, capture_output=True, cwd=tmp_path)
+    check = subprocess.run(
+        [sys.executable, "-m", "gdtool", "validate", "-q"], input=done.stdout, capture_output=True, cwd=tmp_path
+    )
     assert check.returncode == 0, check.stderr

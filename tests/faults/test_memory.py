@@ -1,4 +1,5 @@
-"""Memory that runs out, in this process and in children: exit code 5 with what was asked for, and nothing left behind."""
+"""Memory that runs out, in this process and in children: exit code 5 with what was asked for, and nothing left
+behind."""
 
 import os
 import resource
@@ -10,11 +11,11 @@ import time
 import numpy as np
 import pytest
 
+from gdtool.bake import lods
 from gdtool.core import child
 from gdtool.core.child import ChildFailed, call
 from gdtool.core.errors import ResourceError, from_exception
 from gdtool.core.native import import_error, require_address_space
-from gdtool.bake import lods
 from tests.bake.test_lods import target
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits on the address space are Linux's")
@@ -32,28 +33,48 @@ def test_a_failed_allocation_of_torch_says_how_much_it_asked_for():
     with pytest.raises(RuntimeError) as refused:
         torch.empty(2**44)
     told = from_exception(refused.value, "x")
-    assert isinstance(told, ResourceError) and str(told).startswith("x: ran out of memory (it asked for 65536.00 GiB); ")
+    assert isinstance(told, ResourceError) and str(told).startswith(
+        "x: ran out of memory (it asked for 65536.00 GiB); "
+    )
 
 
 def test_a_library_that_finds_no_room_is_not_taken_for_one_that_is_missing():
     fault = ImportError("libembree4.so.4: failed to map segment from shared object", name="embreex")
-    assert str(from_exception(fault, "x")) == "x: ran out of memory while embreex was loaded; free memory or raise its limit (ulimit -v)"
-    assert isinstance(import_error(fault, "embreex"), MemoryError)  # with a fallback in a child that has a limit of its own
+    assert (
+        str(from_exception(fault, "x"))
+        == "x: ran out of memory while embreex was loaded; free memory or raise its limit (ulimit -v)"
+    )
+    # With a fallback in a child that has a limit of its own.
+    assert isinstance(import_error(fault, "embreex"), MemoryError)
 
 
 def limited(code, megabytes):
     """Run code in a Python of its own whose address space grows by no more than that."""
-    before = "import resource; used = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize();" \
-             f"resource.setrlimit(resource.RLIMIT_AS, (used + {megabytes} * 2**20,) * 2)\n"
-    return subprocess.run([sys.executable, "-c", "import numpy; import gdtool.geometry.rays; import embreex.rtcore_scene, embreex.mesh_construction\n" + before + code],
-                          capture_output=True, text=True, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)})
+    before = (
+        "import resource; used = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize();"
+        f"resource.setrlimit(resource.RLIMIT_AS, (used + {megabytes} * 2**20,) * 2)\n"
+    )
+    return subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "import numpy; import gdtool.geometry.rays; import embreex.rtcore_scene, embreex.mesh_construction\n"
+            + before
+            + code,
+        ],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
 
 
 def test_embree_is_not_started_where_it_would_crash():
     """Without the question in front of it this is a segmentation fault."""
     code = "from gdtool.geometry.rays import RayCaster\nRayCaster(numpy.eye(3), numpy.array([[0, 1, 2]]))"
     done = limited(code, 60)
-    assert done.returncode == 1 and "MemoryError: unable to allocate 0.19 GiB for rays at 1 faces" in done.stderr, done.stderr
+    assert done.returncode == 1 and "MemoryError: unable to allocate 0.19 GiB for rays at 1 faces" in done.stderr, (
+        done.stderr
+    )
     assert limited(code, 1000).returncode == 0
 
 
@@ -84,8 +105,14 @@ def whole():
     return target()
 
 
-@pytest.mark.parametrize("fault, told", [(dict(seconds=0.01, memory_mb=8000), "took longer than 0.01 s"), (dict(seconds=60, memory_mb=1), "needs more than 1 MB")],
-                         ids=["time", "memory"])
+@pytest.mark.parametrize(
+    "fault, told",
+    [
+        (dict(seconds=0.01, memory_mb=8000), "took longer than 0.01 s"),
+        (dict(seconds=60, memory_mb=1), "needs more than 1 MB"),
+    ],
+    ids=["time", "memory"],
+)
 def test_a_failed_collapse_leaves_no_temporary_folder(monkeypatch, tmp_path, whole, fault, told):
     """The child that makes coarser levels works on files; one that is killed cannot remove them itself."""
     (tmp_path / "temporary").mkdir()

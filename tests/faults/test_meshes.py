@@ -1,4 +1,5 @@
-"""Meshes and glTF files as they come: refused in one line that names the file and the fact, or repaired with a warning."""
+"""Meshes and glTF files as they come: refused in one line that names the file and the fact, or repaired with a
+warning."""
 
 import json
 
@@ -14,7 +15,9 @@ TRIANGLES = np.concatenate([QUADS[:, :3], QUADS[:, [0, 2, 3]]])
 
 
 def obj(vertices, faces) -> str:
-    return "".join("v %r %r %r\n" % tuple(map(float, p)) for p in vertices) + "".join("f " + " ".join(str(i + 1) for i in f) + "\n" for f in faces)
+    return "".join("v %r %r %r\n" % tuple(map(float, p)) for p in vertices) + "".join(
+        "f " + " ".join(str(i + 1) for i in f) + "\n" for f in faces
+    )
 
 
 def glb(**document) -> bytes:
@@ -38,15 +41,31 @@ REFUSED = {
     "length.glb": (glb()[:-8], "says it has"),
     "extension.glb": (glb(extensionsRequired=["VENDOR_unknown"]), "VENDOR_unknown"),
     "cycle.glb": (glb(nodes=[{"mesh": 0, "children": [1]}, {"children": [0]}]), "cycle"),
-    "http.glb": (glb(images=[{"uri": "http://example.com/a.png"}], textures=[{"source": 0}],
-                     materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
-                     meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}]), "http"),
+    "http.glb": (
+        glb(
+            images=[{"uri": "http://example.com/a.png"}],
+            textures=[{"source": 0}],
+            materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+            meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}],
+        ),
+        "http",
+    ),
     "json.gltf": ('{"asset": {"version": "2.0"},,}', "json.gltf"),
-    "outside.gltf": (json.dumps({"asset": {"version": "2.0"}, "buffers": [{"uri": "/etc/hostname", "byteLength": 4}],
-                                 "bufferViews": [{"buffer": 0, "byteLength": 4}],
-                                 "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
-                                 "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}], "nodes": [{"mesh": 0}],
-                                 "scenes": [{"nodes": [0]}], "scene": 0}), "hostname"),
+    "outside.gltf": (
+        json.dumps(
+            {
+                "asset": {"version": "2.0"},
+                "buffers": [{"uri": "/etc/hostname", "byteLength": 4}],
+                "bufferViews": [{"buffer": 0, "byteLength": 4}],
+                "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+                "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+                "nodes": [{"mesh": 0}],
+                "scenes": [{"nodes": [0]}],
+                "scene": 0,
+            }
+        ),
+        "hostname",
+    ),
     "what.xyz": ("1 2 3\n", "what.xyz"),
 }
 
@@ -58,7 +77,9 @@ def faulty(tmp_path):
     return list(REFUSED)
 
 
-@pytest.mark.parametrize("command", [("remesh", "--faces", 100), ("render-dataset", "--size", 16, "--domains", "normal")], ids=lambda c: c[0])
+@pytest.mark.parametrize(
+    "command", [("remesh", "--faces", 100), ("render-dataset", "--size", 16, "--domains", "normal")], ids=lambda c: c[0]
+)
 def test_each_is_refused_in_one_line(gdtool, faulty, tmp_path, command):
     done = gdtool(*command, *faulty, "missing.obj", "-q")
     told = lines_of(done.stderr)

@@ -1,4 +1,5 @@
-"""Model folders whose configuration no network can be made of, or whose files are not what they have to be: one line, nothing allocated."""
+"""Model folders whose configuration no network can be made of, or whose files are not what they have to be: one line,
+nothing allocated."""
 
 import json
 import os
@@ -11,13 +12,13 @@ from safetensors.torch import save_file
 from gdtool.core import memory
 from gdtool.core.errors import InputError, ResourceError
 from gdtool.diffusion.checkpoint import wonder3d
+from gdtool.diffusion.checkpoint.weights import load_model, read_config, save_model
 from gdtool.diffusion.config import PRESETS
 from gdtool.diffusion.inference.familiarity import read_ranges
 from gdtool.diffusion.network.grow import resized
 from gdtool.diffusion.network.model import Model
-from gdtool.diffusion.training.loop import CHECKPOINT, load_checkpoint
-from gdtool.diffusion.checkpoint.weights import load_model, read_config, save_model
 from gdtool.diffusion.network.tensors import read_tensors
+from gdtool.diffusion.training.loop import CHECKPOINT, load_checkpoint
 from gdtool.stages.train import Options, configured
 from tests.faults.test_checkpoints import changed
 
@@ -38,21 +39,38 @@ def write(path, **changes):
 
 
 BAD_FIELDS = [
-    ({"patch": 0}, r"`int` >= 1 - at `\$.patch`"), ({"patch": -4}, r"`int` >= 1 - at `\$.patch`"), ({"patch": 2**40}, r"`int` <= 4096 - at `\$.patch`"),
-    ({"patch": "4"}, r"got `str` - at `\$.patch`"), ({"patch": 5}, "image_size is 32, not a multiple of patch 5"),
-    ({"image_size": 36}, "is 9, which cannot be halved 1 times for 2 levels"), ({"image_size": 10**9}, r"`int` <= 4096 - at `\$.image_size`"),
-    ({"channels": [16, -32]}, r"`int` >= 1 - at `\$.channels\[1\]`"), ({"channels": [16, 10**8]}, r"`int` <= 16384 - at `\$.channels\[1\]`"),
-    ({"channels": []}, r"length >= 1 - at `\$.channels`"), ({"channels": [16] * 9}, r"length <= 8 - at `\$.channels`"),
-    ({"channels": [15, 32]}, r"channels\[0\] is 15, which has to be even"), ({"channels": [16, 30]}, r"channels\[1\] is 30, not a multiple of norm_groups 4"),
-    ({"heads": 5}, r"not a multiple of its 5 heads"), ({"head_width": 0}, r"`int` >= 1 - at `\$.head_width`"),
-    ({"attention_levels": [True]}, "attention_levels has 1 entries, channels has 2"), ({"row_attention": [True]}, "row_attention has 1 entries"),
-    ({"encoder_patch": 0}, r"`int` >= 1 - at `\$.encoder_patch`"), ({"encoder_patch": 7}, "not a multiple of encoder_patch 7"),
-    ({"encoder_width": 200}, "encoder_width is 200, not a multiple of its 3 heads"), ({"encoder_layers": -1}, r"`int` >= 0 - at `\$.encoder_layers`"),
-    ({"layers_per_block": 10**6}, r"`int` <= 64 - at `\$.layers_per_block`"), ({"timesteps": 10**12}, r"`int` <= 100000 - at `\$.timesteps`"),
-    ({"timesteps": 1}, r"`int` >= 2 - at `\$.timesteps`"), ({"sampling_steps": 0}, r"`int` >= 1 - at `\$.sampling_steps`"),
-    ({"views": ["front", "top"]}, "views names 'top', which is none of"), ({"views": ["front", "front"]}, "views names one twice"),
-    ({"views": []}, r"length >= 1 - at `\$.views`"), ({"domains": ["color", "smell"]}, "domains names 'smell'"), ({"domains": []}, r"length >= 1 - at `\$.domains`"),
-    ({"backgrounds": []}, r"length >= 1 - at `\$.backgrounds`"), ({"pretrained": "a\0b"}, "pretrained holds a NUL character"),
+    ({"patch": 0}, r"`int` >= 1 - at `\$.patch`"),
+    ({"patch": -4}, r"`int` >= 1 - at `\$.patch`"),
+    ({"patch": 2**40}, r"`int` <= 4096 - at `\$.patch`"),
+    ({"patch": "4"}, r"got `str` - at `\$.patch`"),
+    ({"patch": 5}, "image_size is 32, not a multiple of patch 5"),
+    ({"image_size": 36}, "is 9, which cannot be halved 1 times for 2 levels"),
+    ({"image_size": 10**9}, r"`int` <= 4096 - at `\$.image_size`"),
+    ({"channels": [16, -32]}, r"`int` >= 1 - at `\$.channels\[1\]`"),
+    ({"channels": [16, 10**8]}, r"`int` <= 16384 - at `\$.channels\[1\]`"),
+    ({"channels": []}, r"length >= 1 - at `\$.channels`"),
+    ({"channels": [16] * 9}, r"length <= 8 - at `\$.channels`"),
+    ({"channels": [15, 32]}, r"channels\[0\] is 15, which has to be even"),
+    ({"channels": [16, 30]}, r"channels\[1\] is 30, not a multiple of norm_groups 4"),
+    ({"heads": 5}, r"not a multiple of its 5 heads"),
+    ({"head_width": 0}, r"`int` >= 1 - at `\$.head_width`"),
+    ({"attention_levels": [True]}, "attention_levels has 1 entries, channels has 2"),
+    ({"row_attention": [True]}, "row_attention has 1 entries"),
+    ({"encoder_patch": 0}, r"`int` >= 1 - at `\$.encoder_patch`"),
+    ({"encoder_patch": 7}, "not a multiple of encoder_patch 7"),
+    ({"encoder_width": 200}, "encoder_width is 200, not a multiple of its 3 heads"),
+    ({"encoder_layers": -1}, r"`int` >= 0 - at `\$.encoder_layers`"),
+    ({"layers_per_block": 10**6}, r"`int` <= 64 - at `\$.layers_per_block`"),
+    ({"timesteps": 10**12}, r"`int` <= 100000 - at `\$.timesteps`"),
+    ({"timesteps": 1}, r"`int` >= 2 - at `\$.timesteps`"),
+    ({"sampling_steps": 0}, r"`int` >= 1 - at `\$.sampling_steps`"),
+    ({"views": ["front", "top"]}, "views names 'top', which is none of"),
+    ({"views": ["front", "front"]}, "views names one twice"),
+    ({"views": []}, r"length >= 1 - at `\$.views`"),
+    ({"domains": ["color", "smell"]}, "domains names 'smell'"),
+    ({"domains": []}, r"length >= 1 - at `\$.domains`"),
+    ({"backgrounds": []}, r"length >= 1 - at `\$.backgrounds`"),
+    ({"pretrained": "a\0b"}, "pretrained holds a NUL character"),
     ({"unknown": 1}, "unknown field `unknown`"),
 ]
 
@@ -64,8 +82,17 @@ def test_a_field_that_no_network_can_be_made_of_is_named_with_its_bound(tmp_path
     assert refused.value.subject == str(tmp_path / "config.json") and refused.value.cure
 
 
-@pytest.mark.parametrize("text, told", [("[]", "Expected `object`"), ("{", "is not JSON"), ('{"patch": ' + "9" * 5000 + "}", "beyond 64 bits"),
-                                        ("[" * 100_000, "nested too deeply"), ('{"patch": 4, "patch": 4}', "appears twice"), ('{"patch": NaN}', "NaN")])
+@pytest.mark.parametrize(
+    "text, told",
+    [
+        ("[]", "Expected `object`"),
+        ("{", "is not JSON"),
+        ('{"patch": ' + "9" * 5000 + "}", "beyond 64 bits"),
+        ("[" * 100_000, "nested too deeply"),
+        ('{"patch": 4, "patch": 4}', "appears twice"),
+        ('{"patch": NaN}', "NaN"),
+    ],
+)
 def test_a_configuration_that_is_no_object_of_bounded_values_is_refused(tmp_path, text, told):
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(InputError, match=told):
@@ -77,8 +104,18 @@ def test_every_preset_is_within_the_bounds(config):
     assert msgspec.json.decode(msgspec.json.encode(config), type=type(config)) == config
 
 
-@pytest.mark.parametrize("changes", [{"train": {"batch": 0}}, {"train": {"betas": [0.9, 1.0]}}, {"train": {"phases": []}}, {"train": {"warmup": 0}},
-                                     {"train": {"phases": [{"domains": 0}]}}, {"train": {"pbr_pixels": -1}}, {"model": {"patch": 3}}])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"train": {"batch": 0}},
+        {"train": {"betas": [0.9, 1.0]}},
+        {"train": {"phases": []}},
+        {"train": {"warmup": 0}},
+        {"train": {"phases": [{"domains": 0}]}},
+        {"train": {"pbr_pixels": -1}},
+        {"model": {"patch": 3}},
+    ],
+)
 def test_train_refuses_such_a_configuration_of_its_own(tmp_path, changes):
     (tmp_path / "changes.json").write_text(json.dumps(changes))
     with pytest.raises(InputError, match="changes.json"):
@@ -92,7 +129,9 @@ def test_a_size_that_leaves_no_network_is_refused():
 
 def test_a_network_larger_than_the_memory_is_refused_with_the_prediction(folder):
     write(folder / "config.json", channels=[16384] * 2, layers_per_block=64)
-    with pytest.raises(ResourceError, match=r"its network of [\d,.]+ million weights would take [\d.]+ GiB of memory, more than"):
+    with pytest.raises(
+        ResourceError, match=r"its network of [\d,.]+ million weights would take [\d.]+ GiB of memory, more than"
+    ):
         load_model(folder)
 
 
@@ -106,7 +145,10 @@ def test_the_memory_that_is_left_decides(folder, monkeypatch):
 def test_weights_of_another_network_are_told_before_it_is_made(folder, monkeypatch):
     write(folder / "config.json", channels=[16, 256])
     monkeypatch.setattr(torch.nn.Module, "load_state_dict", None)
-    with pytest.raises(InputError, match="has shape .*, the configuration needs .*; give the config.json that these weights were trained with"):
+    with pytest.raises(
+        InputError,
+        match="has shape .*, the configuration needs .*; give the config.json that these weights were trained with",
+    ):
         load_model(folder)
 
 
@@ -123,7 +165,11 @@ def test_nan_is_found_in_eight_bits_as_well(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["model.safetensors", "config.json", "pictures.json"])
-@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero"), lambda path: path.mkdir()], ids=["fifo", "device", "folder"])
+@pytest.mark.parametrize(
+    "make",
+    [os.mkfifo, lambda path: path.symlink_to("/dev/zero"), lambda path: path.mkdir()],
+    ids=["fifo", "device", "folder"],
+)
 def test_what_is_no_regular_file_is_refused_at_once(folder, name, make):
     (folder / name).unlink(missing_ok=True)
     make(folder / name)
@@ -138,16 +184,42 @@ def test_ranges_of_another_type_are_refused(folder, content):
         read_ranges(folder)
 
 
-UNET = {"in_channels": 8, "class_embed_type": "projection", "projection_class_embeddings_input_dim": 10, "block_out_channels": [32, 64],
-        "down_block_types": ["CrossAttnDownBlock2D", "DownBlock2D"], "cross_attention_dim": 32, "attention_head_dim": 2, "sample_size": 8, "norm_num_groups": 8}
+UNET = {
+    "in_channels": 8,
+    "class_embed_type": "projection",
+    "projection_class_embeddings_input_dim": 10,
+    "block_out_channels": [32, 64],
+    "down_block_types": ["CrossAttnDownBlock2D", "DownBlock2D"],
+    "cross_attention_dim": 32,
+    "attention_head_dim": 2,
+    "sample_size": 8,
+    "norm_num_groups": 8,
+}
 
 
-@pytest.mark.parametrize("change", [{"block_out_channels": 5}, {"block_out_channels": []}, {"block_out_channels": [-4, 8]}, {"down_block_types": [1, 2]},
-                                    {"down_block_types": ["DownBlock2D"]}, {"sample_size": 10**9}, {"sample_size": 0}, {"layers_per_block": -1},
-                                    {"attention_head_dim": "x"}, {"norm_num_groups": 0}, {"cross_attention_dim": None}, {"in_channels": [8]}],
-                         ids=lambda x: json.dumps(x))
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"block_out_channels": 5},
+        {"block_out_channels": []},
+        {"block_out_channels": [-4, 8]},
+        {"down_block_types": [1, 2]},
+        {"down_block_types": ["DownBlock2D"]},
+        {"sample_size": 10**9},
+        {"sample_size": 0},
+        {"layers_per_block": -1},
+        {"attention_head_dim": "x"},
+        {"norm_num_groups": 0},
+        {"cross_attention_dim": None},
+        {"in_channels": [8]},
+    ],
+    ids=lambda x: json.dumps(x),
+)
 def test_a_field_of_wonder3d_is_named(tmp_path, change):
-    for name, content in (("unet/config.json", UNET | change), ("scheduler/scheduler_config.json", {"beta_schedule": "scaled_linear"})):
+    for name, content in (
+        ("unet/config.json", UNET | change),
+        ("scheduler/scheduler_config.json", {"beta_schedule": "scaled_linear"}),
+    ):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(json.dumps(content))
     with pytest.raises(InputError, match="unet/config.json"):
@@ -155,9 +227,12 @@ def test_a_field_of_wonder3d_is_named(tmp_path, change):
 
 
 def test_a_checkpoint_without_its_record_is_refused(tmp_path):
-    for metadata in ({}, {"state": "{}"}, {"state": '{"step": -1, "seconds": 0, "identity": ""}'}, {"state": "nonsense"}):
+    for metadata in (
+        {},
+        {"state": "{}"},
+        {"state": '{"step": -1, "seconds": 0, "identity": ""}'},
+        {"state": "nonsense"},
+    ):
         save_file({"x": torch.zeros(1)}, tmp_path / CHECKPOINT, metadata=metadata)
         with pytest.raises(InputError, match=CHECKPOINT):
             load_checkpoint(None, tmp_path, "")
-
-

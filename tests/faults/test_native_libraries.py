@@ -5,21 +5,21 @@ import sys
 import numpy as np
 import pytest
 
+from gdtool.bake import lods
+from gdtool.bake.reproject import Nearest
 from gdtool.core import child
 from gdtool.core.errors import ResourceError
 from gdtool.core.native import imported, imported_if_installed
 from gdtool.geometry import repair, simplify
-from gdtool.remesh.fallback import pair_and_split
 from gdtool.geometry.distance import _fcpw_search, closest_points, winding_number
-from gdtool.remesh.engines.adapters import run_instant_meshes, run_quadriflow
-from gdtool.remesh.task import Request
-from gdtool.remesh.pipeline import remesh
 from gdtool.geometry.rays import RayCaster
 from gdtool.images.cutout import both_frames
-from gdtool.bake import lods
+from gdtool.remesh.engines.adapters import run_instant_meshes, run_quadriflow
+from gdtool.remesh.fallback import pair_and_split
+from gdtool.remesh.pipeline import remesh
+from gdtool.remesh.task import Request
 from gdtool.unwrap.parameterize import flatten
 from gdtool.unwrap.segment import charts
-from gdtool.bake.reproject import Nearest
 from tests.faults.files import quad_cube
 from tests.geometry.solids import sphere
 
@@ -44,14 +44,22 @@ def broken(tmp_path, monkeypatch):
 
 
 USES = {
-    "igl": [lambda: closest_points(np.zeros((1, 3)), *TRIANGLE), lambda: winding_number(np.zeros((1, 3)), *TRIANGLE), lambda: Nearest(*TRIANGLE),
-            lambda: repair._split(*TRIANGLE), lambda: pair_and_split.of_own(*TRIANGLE, 16, 1.0),
-            lambda: flatten._conformal(*TRIANGLE, np.array([0, 1, 2]))],
+    "igl": [
+        lambda: closest_points(np.zeros((1, 3)), *TRIANGLE),
+        lambda: winding_number(np.zeros((1, 3)), *TRIANGLE),
+        lambda: Nearest(*TRIANGLE),
+        lambda: repair._split(*TRIANGLE),
+        lambda: pair_and_split.of_own(*TRIANGLE, 16, 1.0),
+        lambda: flatten._conformal(*TRIANGLE, np.array([0, 1, 2])),
+    ],
     "fcpw": [lambda: _fcpw_search(*TRIANGLE)],
     "embreex": [lambda: RayCaster(*TRIANGLE)],
     "fast_simplification": [lambda: simplify.collapse(*TRIANGLE, 1, 5.0)],
-    "pymeshlab": [lambda: simplify.collapse_topology(*TRIANGLE, 1), lambda: pair_and_split.even_triangles(*TRIANGLE, 10, 30.0),
-                  lambda: lods.collapse_textured(*TRIANGLE, np.zeros((1, 3, 2)), 1, ".")],
+    "pymeshlab": [
+        lambda: simplify.collapse_topology(*TRIANGLE, 1),
+        lambda: pair_and_split.even_triangles(*TRIANGLE, 10, 30.0),
+        lambda: lods.collapse_textured(*TRIANGLE, np.zeros((1, 3, 2)), 1, "."),
+    ],
     "pynanoinstantmeshes": [lambda: run_instant_meshes(*TRIANGLE, 100, 30.0)],
     "xatlas": [lambda: charts.run_xatlas(*TRIANGLE, 2.0)],
     "cv2": [lambda: both_frames(np.zeros((40, 40, 3)))],
@@ -62,13 +70,18 @@ USES = {
 def test_a_missing_shared_library_is_told_with_the_package_that_brings_it(broken, module):
     broken(module)
     for use in USES[module]:
-        with pytest.raises(ResourceError, match=f"^libGL.so.1: is not installed, and {module} needs it; apt install libgl1$"):
+        with pytest.raises(
+            ResourceError, match=f"^libGL.so.1: is not installed, and {module} needs it; apt install libgl1$"
+        ):
             use()
 
 
 def test_a_library_of_unknown_origin_is_named(broken):
     broken("igl", "libodd.so.7: cannot open shared object file: No such file or directory")
-    with pytest.raises(ResourceError, match="^libodd.so.7: is not installed, and igl needs it; install the system package that holds libodd.so.7$"):
+    with pytest.raises(
+        ResourceError,
+        match="^libodd.so.7: is not installed, and igl needs it; install the system package that holds libodd.so.7$",
+    ):
         imported("igl")
 
 
@@ -80,7 +93,10 @@ def test_a_package_that_is_not_installed_is_told_with_the_line_that_installs_it(
 
 def test_a_package_that_cannot_be_loaded_is_not_taken_for_one_that_is_not_installed(broken):
     broken("fcpw", "numpy.core.multiarray failed to import\nmore lines")
-    with pytest.raises(ResourceError, match=r"^fcpw: cannot be loaded \(numpy.core.multiarray failed to import\); pip install --force-reinstall fcpw$"):
+    with pytest.raises(
+        ResourceError,
+        match=r"^fcpw: cannot be loaded \(numpy.core.multiarray failed to import\); pip install --force-reinstall fcpw$",
+    ):
         imported_if_installed("fcpw")
 
 
@@ -90,7 +106,9 @@ def test_quadriflow_without_its_package_is_an_error(monkeypatch):
         run_quadriflow(*TRIANGLE, 100, 30.0)
 
 
-@pytest.mark.parametrize("module, engine", [("pymeshlab", "split"), ("pynanoinstantmeshes", "auto"), ("fast_simplification", "auto")])
+@pytest.mark.parametrize(
+    "module, engine", [("pymeshlab", "split"), ("pynanoinstantmeshes", "auto"), ("fast_simplification", "auto")]
+)
 def test_remesh_falls_back_from_no_missing_library(broken, module, engine):
     broken(module)
     with pytest.raises(ResourceError, match=f"libGL.so.1: is not installed, and {module} needs it"):

@@ -14,10 +14,19 @@ from gdtool.core import sources
 from gdtool.core.errors import UsageError
 
 MODULES = {name: importlib.import_module("gdtool.commands." + name.replace("-", "_")) for name in COMMANDS}
-NUMBERS = [(name, param) for name, module in MODULES.items() for param in module.command.params
-           if isinstance(param.type, (click.types.IntParamType, click.types.FloatParamType))]
-STRINGS = [(name, param) for name, module in MODULES.items() for param in module.command.params
-           if not getattr(param, "is_flag", False) and not isinstance(param.type, (click.Choice, click.types.IntParamType, click.types.FloatParamType))]
+NUMBERS = [
+    (name, param)
+    for name, module in MODULES.items()
+    for param in module.command.params
+    if isinstance(param.type, (click.types.IntParamType, click.types.FloatParamType))
+]
+STRINGS = [
+    (name, param)
+    for name, module in MODULES.items()
+    for param in module.command.params
+    if not getattr(param, "is_flag", False)
+    and not isinstance(param.type, (click.Choice, click.types.IntParamType, click.types.FloatParamType))
+]
 
 
 def by_option(pairs):
@@ -63,24 +72,52 @@ def test_no_string_holds_a_control_character(name, param):
     assert "caf\udce9" in converted(name, param, "caf\udce9")  # a name that is not UTF-8
 
 
-@pytest.mark.parametrize("text, fact", [
-    ("procedural:5..2", "ends before it begins"), (f"procedural:{2**63}", "beyond 64 bits"), (f"procedural:0..{2**64}", "beyond 64 bits"),
-    ("procedural:" + "9" * 5000, "beyond 64 bits"), ("procedural:-1", "is not procedural:SEED"), ("procedural:٣", "is not procedural:SEED"),
-    ("procedural:1\n", "control character"), ("procedural:", "is not procedural:SEED"),
-])
+@pytest.mark.parametrize(
+    "text, fact",
+    [
+        ("procedural:5..2", "ends before it begins"),
+        (f"procedural:{2**63}", "beyond 64 bits"),
+        (f"procedural:0..{2**64}", "beyond 64 bits"),
+        ("procedural:" + "9" * 5000, "beyond 64 bits"),
+        ("procedural:-1", "is not procedural:SEED"),
+        ("procedural:٣", "is not procedural:SEED"),
+        ("procedural:1\n", "control character"),
+        ("procedural:", "is not procedural:SEED"),
+    ],
+)
 def test_generated_objects_have_64_bit_seeds_in_order(text, fact):
     with pytest.raises(UsageError, match=fact) as caught:
         next(sources.incoming(("procedural:1", text)))  # told before the first one is worked on
     assert caught.value.cure and len(str(caught.value)) < 400
     assert list(sources.incoming(("procedural:2..4", f"procedural:{2**63 - 1}"))) == [
-        "procedural:2", "procedural:3", "procedural:4", f"procedural:{2**63 - 1}"]
+        "procedural:2",
+        "procedural:3",
+        "procedural:4",
+        f"procedural:{2**63 - 1}",
+    ]
 
 
-@pytest.mark.parametrize("line", [
-    b'{"folder": 5}', b'{"folder": ["a"]}', b'{"path": "a"}', b'{"folder": "\\ud800"}', b'{"folder": "a\\u0000b"}', b'{"folder": "a\\nb"}', b'{"folder": "a"',
-    b'{"folder": ' + b"9" * 5000 + b"}", b'{"folder": ' + b"[" * 100_000, b'{"folder": "a", "folder": "b"}', b"a\0b", b"a\x1b[2Jb", b"a\rb",
-    b"x" * (sources.MAX_LINE_BYTES + 1), b'{"folder": "\xff"}',
-], ids=lambda line: line[:24])
+@pytest.mark.parametrize(
+    "line",
+    [
+        b'{"folder": 5}',
+        b'{"folder": ["a"]}',
+        b'{"path": "a"}',
+        b'{"folder": "\\ud800"}',
+        b'{"folder": "a\\u0000b"}',
+        b'{"folder": "a\\nb"}',
+        b'{"folder": "a"',
+        b'{"folder": ' + b"9" * 5000 + b"}",
+        b'{"folder": ' + b"[" * 100_000,
+        b'{"folder": "a", "folder": "b"}',
+        b"a\0b",
+        b"a\x1b[2Jb",
+        b"a\rb",
+        b"x" * (sources.MAX_LINE_BYTES + 1),
+        b'{"folder": "\xff"}',
+    ],
+    ids=lambda line: line[:24],
+)
 def test_lines_of_stdin_that_name_no_source(monkeypatch, line):
     feed(monkeypatch, b"first\n" + line + b"\n")
     stream = sources.incoming(())
@@ -91,24 +128,40 @@ def test_lines_of_stdin_that_name_no_source(monkeypatch, line):
 
 
 def test_lines_of_stdin_that_name_one(monkeypatch):
-    feed(monkeypatch, b'caf\xe9.obj\r\n{"folder": "a/b", "seconds": 1.5}\n{"folder": null}\n\n{"folder": "\\udce9"}\nlast')
+    feed(
+        monkeypatch,
+        b'caf\xe9.obj\r\n{"folder": "a/b", "seconds": 1.5}\n{"folder": null}\n\n{"folder": "\\udce9"}\nlast',
+    )
     assert list(sources.incoming(())) == ["caf\udce9.obj", "a/b", "\udce9", "last"]
 
 
 def test_nothing_from_a_pipe_points_at_the_command_before_it(monkeypatch):
     feed(monkeypatch, b"")
-    with pytest.raises(UsageError, match="gave no sources; the command before the pipe has failed or printed nothing: see its message"):
+    with pytest.raises(
+        UsageError, match="gave no sources; the command before the pipe has failed or printed nothing: see its message"
+    ):
         next(sources.incoming(()))
     monkeypatch.setattr(sys, "stdin", None)
     with pytest.raises(UsageError, match="gave no sources; name files or folders, or pipe their paths in"):
         next(sources.incoming(()))
 
 
-@pytest.mark.parametrize("arguments", [
-    ["remesh", "x.obj", "-o", "a\nb"], ["remesh", "a\nb"], ["relight", "x.obj", "--exposure", "inf"], ["relight", "x.obj", "--seed", str(2**70)],
-    ["remesh", "x.obj", "--seconds", "inf"], ["remesh", "x.obj", "--threads", str(10**9)], ["render-dataset", "x.obj", "--shard", "1/" + "9" * 5000],
-    ["render-dataset", "x.obj", "--shard", "٣/٣"], ["remesh", "x.obj", "--no-such-option"], ["nothing"],
-], ids=lambda a: " ".join(a)[:40])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["remesh", "x.obj", "-o", "a\nb"],
+        ["remesh", "a\nb"],
+        ["relight", "x.obj", "--exposure", "inf"],
+        ["relight", "x.obj", "--seed", str(2**70)],
+        ["remesh", "x.obj", "--seconds", "inf"],
+        ["remesh", "x.obj", "--threads", str(10**9)],
+        ["render-dataset", "x.obj", "--shard", "1/" + "9" * 5000],
+        ["render-dataset", "x.obj", "--shard", "٣/٣"],
+        ["remesh", "x.obj", "--no-such-option"],
+        ["nothing"],
+    ],
+    ids=lambda a: " ".join(a)[:40],
+)
 def test_a_wrong_command_line_is_one_line_and_exits_2(gdtool_here, arguments, tmp_path):
     done = gdtool_here(*arguments)
     assert done.returncode == 2 and done.stdout == "" and len(done.stderr.splitlines()) == 1, done.stderr

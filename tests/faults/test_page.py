@@ -23,7 +23,11 @@ def test_each_test_exists():
     missing = []
     for file, name in NAMED.findall(PAGE.read_text()):
         path = ROOT / file
-        names = {node.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)} if path.is_file() else set()
+        names = (
+            {node.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)}
+            if path.is_file()
+            else set()
+        )
         if name not in names:
             missing.append(f"{file}::{name}")
     assert missing == []

@@ -16,7 +16,8 @@ from gdtool.folders.adapters import nerf, plain
 from gdtool.folders.views import read_views
 from gdtool.images.io import encode_png, write_png
 from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, with_textures
-from tests.fields.shapes import torus, views_folder, views_of as seen
+from tests.fields.shapes import torus, views_folder
+from tests.fields.shapes import views_of as seen
 
 FACE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
 RED, BLUE = (np.full((2, 2, 3), color, np.uint8) for color in ((255, 0, 0), (0, 0, 255)))
@@ -24,7 +25,8 @@ RED, BLUE = (np.full((2, 2, 3), color, np.uint8) for color in ((255, 0, 0), (0, 
 
 @pytest.fixture
 def model_folder(tmp_path):
-    """deep/inside/model, with a picture, a buffer and a library in tmp_path, two folders above any place a model may name."""
+    """deep/inside/model, with a picture, a buffer and a library in tmp_path, two folders above any place a model may
+    name."""
     write_png(tmp_path / "secret.png", RED)
     (tmp_path / "secret.bin").write_bytes(QUAD.tobytes() + QUAD_FACES.tobytes())
     (tmp_path / "secret.mtl").write_text("newmtl m\nKd 1 0 0\n")
@@ -38,9 +40,15 @@ def gltf(folder, buffer="m.bin", image=None):
     builder = Builder()
     extra = {}
     if image is not None:
-        builder.document |= {"materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}], "textures": [{"source": 0}], "images": [{"uri": image}]}
+        builder.document |= {
+            "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+            "textures": [{"source": 0}],
+            "images": [{"uri": image}],
+        }
         extra = {"material": 0}
-    builder.primitive({"POSITION": builder.add(QUAD), "TEXCOORD_0": builder.add(QUAD[:, :2].copy())}, builder.add(QUAD_FACES), **extra)
+    builder.primitive(
+        {"POSITION": builder.add(QUAD), "TEXCOORD_0": builder.add(QUAD[:, :2].copy())}, builder.add(QUAD_FACES), **extra
+    )
     (folder / "m.bin").write_bytes(builder.binary)
     builder.document["buffers"] = [{"byteLength": len(builder.binary), "uri": buffer}]
     (folder / "model.gltf").write_text(json.dumps(builder.document))
@@ -49,8 +57,20 @@ def gltf(folder, buffer="m.bin", image=None):
 
 def outside_uris(target):
     path = str(target)
-    return [path, path.replace("/", "%2F"), "%2e%2e/" * 3 + target.name, "../" * 3 + target.name, "..%5C" * 3 + target.name, "file://" + path,
-            "x/../../" + target.name, "%66ile:" + path, "http://example.com/" + target.name, "\\" + path, "a\0b", "%00"]
+    return [
+        path,
+        path.replace("/", "%2F"),
+        "%2e%2e/" * 3 + target.name,
+        "../" * 3 + target.name,
+        "..%5C" * 3 + target.name,
+        "file://" + path,
+        "x/../../" + target.name,
+        "%66ile:" + path,
+        "http://example.com/" + target.name,
+        "\\" + path,
+        "a\0b",
+        "%00",
+    ]
 
 
 @pytest.mark.parametrize("number", range(12))
@@ -72,7 +92,9 @@ def test_a_gltf_reads_no_link_that_leaves_its_folder(model_folder, tmp_path):
         load_scene(gltf(model_folder, image="textures/secret.png"))
 
 
-@pytest.mark.parametrize("uri", ["maps/a b.png", "maps/a%20b.png", "./maps/a%20b.png", "maps/../maps/a%20b.png", "maps%5Ca%20b.png"])
+@pytest.mark.parametrize(
+    "uri", ["maps/a b.png", "maps/a%20b.png", "./maps/a%20b.png", "maps/../maps/a%20b.png", "maps%5Ca%20b.png"]
+)
 def test_a_gltf_reads_what_lies_in_its_folder(model_folder, uri):
     write_png(model_folder / "maps" / "a b.png", BLUE)
     scene = load_scene(gltf(model_folder, image=uri))
@@ -85,7 +107,16 @@ def obj(folder, library="m.mtl", texture=None):
     return folder / "model.obj"
 
 
-@pytest.mark.parametrize("texture", ["../../../secret.png", "..\\..\\..\\secret.png", "a/../../../../secret.png", "-s 1 1 1 ../../../secret.png", "x\0y.png"])
+@pytest.mark.parametrize(
+    "texture",
+    [
+        "../../../secret.png",
+        "..\\..\\..\\secret.png",
+        "a/../../../../secret.png",
+        "-s 1 1 1 ../../../secret.png",
+        "x\0y.png",
+    ],
+)
 def test_an_mtl_reads_nothing_two_folders_above_the_model(model_folder, texture):
     with pytest.raises(InputError) as caught:
         load_scene(obj(model_folder, texture=texture))
@@ -110,7 +141,15 @@ def test_an_absolute_name_of_an_mtl_stands_for_its_last_part_beside_the_model(mo
     assert np.array_equal(load_scene(path).materials[0].base_color_texture.image, BLUE)
 
 
-@pytest.mark.parametrize(("texture", "place"), [("../textures/t.png", "../textures"), ("t.png", "../materials/textures"), ("..\\t.png", ".."), ("a/../t.png", ".")])
+@pytest.mark.parametrize(
+    ("texture", "place"),
+    [
+        ("../textures/t.png", "../textures"),
+        ("t.png", "../materials/textures"),
+        ("..\\t.png", ".."),
+        ("a/../t.png", "."),
+    ],
+)
 def test_textures_one_folder_above_an_obj_are_read(model_folder, texture, place):
     (model_folder / "a").mkdir()
     write_png((model_folder / place / "t.png").resolve(), BLUE)
@@ -124,8 +163,13 @@ def test_a_texture_without_a_name_is_noted(model_folder, texture):
 
 
 def test_a_digest_follows_the_files_that_are_read_and_no_others(model_folder, tmp_path):
-    for make, names in ((gltf, {"image": "../../../secret.png"}), (obj, {"texture": tmp_path / "secret.png"}), (obj, {"texture": "../../../secret.png"}),
-                        (obj, {"library": "../../../secret.mtl"}), (gltf, {"image": "%2e%2e/" * 3 + "secret.png"})):
+    for make, names in (
+        (gltf, {"image": "../../../secret.png"}),
+        (obj, {"texture": tmp_path / "secret.png"}),
+        (obj, {"texture": "../../../secret.png"}),
+        (obj, {"library": "../../../secret.mtl"}),
+        (gltf, {"image": "%2e%2e/" * 3 + "secret.png"}),
+    ):
         path = make(model_folder, **names)
         before = digest(path)
         write_png(tmp_path / "secret.png", np.random.default_rng(0).integers(0, 255, (2, 2, 3), np.uint8))
@@ -141,7 +185,9 @@ def test_a_digest_follows_the_files_that_are_read_and_no_others(model_folder, tm
 
 @pytest.mark.parametrize("name", ["../../../secret", "%2e%2e/" * 3 + "secret", "/etc/hostname", "a\0b"])
 def test_transforms_json_names_no_picture_outside_its_folder(model_folder, name):
-    (model_folder / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": [{"file_path": name, "transform_matrix": np.eye(4).tolist()}]}))
+    (model_folder / "transforms.json").write_text(
+        json.dumps({"camera_angle_x": 1.0, "frames": [{"file_path": name, "transform_matrix": np.eye(4).tolist()}]})
+    )
     with pytest.raises(InputError) as caught:
         nerf.read(model_folder)
     assert caught.value.subject.endswith("transforms.json") and "exist" not in caught.value.fact
@@ -149,8 +195,16 @@ def test_transforms_json_names_no_picture_outside_its_folder(model_folder, name)
 
 @pytest.mark.parametrize("name", ["..", "../../secret", "a/b", "x" * 300])
 def test_cameras_json_names_no_picture_outside_its_folder(model_folder, name):
-    camera = {"name": name, "projection": "orthographic", "width": 2, "height": 2, "world_from_camera": np.eye(4).ravel().tolist(), "half_width": 1.0,
-              "near": 1.0, "far": 3.0}
+    camera = {
+        "name": name,
+        "projection": "orthographic",
+        "width": 2,
+        "height": 2,
+        "world_from_camera": np.eye(4).ravel().tolist(),
+        "half_width": 1.0,
+        "near": 1.0,
+        "far": 3.0,
+    }
     (model_folder / "cameras.json").write_text(json.dumps({"cameras": [camera]}))
     with pytest.raises(InputError, match="cameras.json"):
         plain.read(model_folder)
@@ -165,8 +219,17 @@ def test_a_picture_of_a_views_folder_is_no_link_that_leaves_it(tmp_path):
         read_views(open_folder(path, check=False))
 
 
-@pytest.mark.parametrize("name", ["../../../out.png", "/tmp/out.png", "a.asset/views/../../../../out.png", "a.asset/views/color/a\\b.png", "a.asset/views/color/\x07.png",
-                                  "a.asset/views/" + "x" * 300 + ".png"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../../../out.png",
+        "/tmp/out.png",
+        "a.asset/views/../../../../out.png",
+        "a.asset/views/color/a\\b.png",
+        "a.asset/views/color/\x07.png",
+        "a.asset/views/" + "x" * 300 + ".png",
+    ],
+)
 def test_an_archive_writes_nothing_outside_the_workspace(tmp_path, name):
     archive, work = tmp_path / "a.tar", tmp_path / "deep" / "work"
     work.mkdir(parents=True)

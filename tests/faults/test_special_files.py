@@ -21,8 +21,8 @@ from gdtool.folders.records import write_cameras
 from gdtool.folders.views import read_views
 from gdtool.images.io import read_image
 from gdtool.shading.lights.load import load_environment
-from tests.fields.shapes import torus, views_folder, views_of
 from tests.faults.test_paths_in_files import gltf, obj
+from tests.fields.shapes import torus, views_folder, views_of
 
 SECONDS = 10  # a reader that has opened a FIFO waits for ever
 
@@ -30,6 +30,7 @@ SECONDS = 10  # a reader that has opened a FIFO waits for ever
 @pytest.fixture(autouse=True)
 def ends():
     """A test that hangs fails."""
+
     def late(*_):
         raise TimeoutError(f"still reading after {SECONDS} s")
 
@@ -56,8 +57,18 @@ def special(path, kind):
 
 
 KINDS = ["a FIFO", "a device", "a socket"]
-READERS = {"m.glb": load_scene, "m.gltf": load_scene, "m.obj": load_scene, "m.ply": load_scene, "m.stl": load_scene, "quads.obj": read_obj,
-           "x.png": read_image, "x.exr": load_environment, "x.hdr": load_environment, "x.tar": object_count}
+READERS = {
+    "m.glb": load_scene,
+    "m.gltf": load_scene,
+    "m.obj": load_scene,
+    "m.ply": load_scene,
+    "m.stl": load_scene,
+    "quads.obj": read_obj,
+    "x.png": read_image,
+    "x.exr": load_environment,
+    "x.hdr": load_environment,
+    "x.tar": object_count,
+}
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,4 +1,5 @@
-"""What the system does to a run: a full disk, a place that cannot be written, signals, a second process, a lost reader."""
+"""What the system does to a run: a full disk, a place that cannot be written, signals, a second process, a lost
+reader."""
 
 import os
 import resource
@@ -25,7 +26,9 @@ def listen_to_interrupts():
 
 def start(*arguments, **kwargs):
     kwargs.setdefault("preexec_fn", listen_to_interrupts)
-    return subprocess.Popen([*REMESH, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **kwargs)
+    return subprocess.Popen(
+        [*REMESH, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **kwargs
+    )
 
 
 @pytest.fixture
@@ -55,14 +58,23 @@ def test_a_full_disk_exits_4_and_keeps_the_old_result(tmp_path, cube):
     assert tree(tmp_path / "out") == before and leftovers(tmp_path) == []
 
 
-@pytest.mark.parametrize("command", [
-    ["render-dataset", "cube.obj", "--size", "64", "--samples", "1", "--domains", "normal,depth"],
-    ["evaluate", "cube.obj", "--reference", "cube.obj", "--samples", "200", "--no-syncdreamer"],
-])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["render-dataset", "cube.obj", "--size", "64", "--samples", "1", "--domains", "normal,depth"],
+        ["evaluate", "cube.obj", "--reference", "cube.obj", "--samples", "200", "--no-syncdreamer"],
+    ],
+)
 def test_a_full_disk_of_every_writer(tmp_path, cube, command):
     """Pictures fail to be written as meshes do; a command that writes nothing does not care."""
-    done = subprocess.run([sys.executable, "-m", "gdtool", *command, "-q"], capture_output=True, text=True, preexec_fn=lambda: resource.setrlimit(
-        resource.RLIMIT_FSIZE, (600, 600)) or signal.signal(signal.SIGXFSZ, signal.SIG_IGN))
+    done = subprocess.run(
+        [sys.executable, "-m", "gdtool", *command, "-q"],
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: (
+            resource.setrlimit(resource.RLIMIT_FSIZE, (600, 600)) or signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        ),
+    )
     if command[0] == "evaluate":
         assert done.returncode == 0, done.stderr
     else:
@@ -128,7 +140,18 @@ def test_two_processes_on_one_output(tmp_path, cube):
 
 
 def test_empty_stdin_fails_the_pipe(gdtool):
-    for command in ("render-dataset", "sample-views", "import-views", "reconstruct", "remesh", "unwrap", "bake", "relight", "evaluate", "validate"):
+    for command in (
+        "render-dataset",
+        "sample-views",
+        "import-views",
+        "reconstruct",
+        "remesh",
+        "unwrap",
+        "bake",
+        "relight",
+        "evaluate",
+        "validate",
+    ):
         done = gdtool(command)
         assert done.returncode == 2 and len(lines_of(done.stderr)) == 1 and done.stdout == "", command
     pipe = f"{sys.executable} -m gdtool reconstruct nothing | {sys.executable} -m gdtool remesh | {sys.executable} -m gdtool unwrap"
@@ -156,15 +179,36 @@ def test_no_home_no_tmp_no_user(tmp_path, cube):
     bare = {"PATH": os.environ.get("PATH", ""), "OMP_NUM_THREADS": "1"}
     done = subprocess.run([*REMESH, cube], capture_output=True, text=True, env=bare)
     assert done.returncode == 0 and done.stdout == "cube.asset/mesh\n", done.stderr
-    done = subprocess.run([sys.executable, "-m", "gdtool", "render-dataset", cube, "--size", "32", "--domains", "normal", "-o", "views"],
-                          capture_output=True, text=True, env={**bare, "HOME": "/nowhere", "TMPDIR": "/nowhere"})
+    done = subprocess.run(
+        [sys.executable, "-m", "gdtool", "render-dataset", cube, "--size", "32", "--domains", "normal", "-o", "views"],
+        capture_output=True,
+        text=True,
+        env={**bare, "HOME": "/nowhere", "TMPDIR": "/nowhere"},
+    )
     assert done.returncode == 0, done.stderr
 
 
 def test_too_little_memory_exits_5(tmp_path, cube):
     """A limit that Python and numpy fit in, but not a picture of 4096² in doubles."""
     limit = 1_500 * 2**20
-    command = [sys.executable, "-m", "gdtool", "evaluate", cube, "--reference", cube, "--samples", "10000000", "--no-syncdreamer", "-q"]
-    done = subprocess.run(command, capture_output=True, text=True, preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
-                          env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
+    command = [
+        sys.executable,
+        "-m",
+        "gdtool",
+        "evaluate",
+        cube,
+        "--reference",
+        cube,
+        "--samples",
+        "10000000",
+        "--no-syncdreamer",
+        "-q",
+    ]
+    done = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
+        env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+    )
     assert done.returncode == 5 and "Traceback" not in done.stderr and "memory" in done.stderr, done.stderr

@@ -1,4 +1,5 @@
-"""Views of analytic solids, sphere-traced, and views folders made of arrays: what the reconstruction tests start from."""
+"""Views of analytic solids, sphere-traced, and views folders made of arrays: what the reconstruction tests start
+from."""
 
 from __future__ import annotations
 
@@ -60,8 +61,9 @@ def views_of(distance, size=96, samples=2, cameras=None):
                 normal = gradient(distance, points)
                 albedo, roughness, metallic = material(points)
                 color = albedo * (0.25 + 0.75 * np.clip(normal @ LIGHT, 0, 1))[..., None]
-                for name, value in dict(color=color, normal=normal, depth=depth, albedo=albedo, roughness=roughness,
-                                        metallic=metallic).items():
+                for name, value in dict(
+                    color=color, normal=normal, depth=depth, albedo=albedo, roughness=roughness, metallic=metallic
+                ).items():
                     total[name] = total.get(name, 0) + np.where(hit if value.ndim == 2 else hit[..., None], value, 0)
                 cover += hit
         for name, value in total.items():
@@ -69,7 +71,7 @@ def views_of(distance, size=96, samples=2, cameras=None):
             if name == "normal":
                 value = value / np.maximum(np.linalg.norm(value, axis=-1, keepdims=True), 1e-9)
             images.setdefault(name, []).append(value)
-        masks.append(cover / samples ** 2)
+        masks.append(cover / samples**2)
     return cameras, {n: np.stack(v).astype(np.float32) for n, v in images.items()}, np.stack(masks).astype(np.float32)
 
 

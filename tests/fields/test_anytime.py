@@ -3,9 +3,17 @@
 import numpy as np
 import pytest
 
-from gdtool.fields.grid import fusion
 from gdtool.fields.clock import Clock
-from gdtool.fields.grid.fusion import align_depth, bring_together, fuse_views, fuse_within, grid_step, is_closed_manifold, prepare_all
+from gdtool.fields.grid import fusion
+from gdtool.fields.grid.fusion import (
+    align_depth,
+    bring_together,
+    fuse_views,
+    fuse_within,
+    grid_step,
+    is_closed_manifold,
+    prepare_all,
+)
 
 from .shapes import torus, views_of
 

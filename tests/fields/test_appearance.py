@@ -4,11 +4,18 @@ import numpy as np
 import pytest
 import torch
 
-from gdtool.fields.appearance.light import Visibility, fit_amplitudes, materials_from_color, recover_light, unoccluded, visibility
+from gdtool.fields.appearance.light import (
+    Visibility,
+    fit_amplitudes,
+    materials_from_color,
+    recover_light,
+    unoccluded,
+    visibility,
+)
 from gdtool.fields.appearance.materials import Observations, confidence, fuse, spread
 from gdtool.shading.bsdf.closed_form import shade
-from gdtool.shading.sampling import fibonacci
 from gdtool.shading.bsdf.sg import SphericalGaussians
+from gdtool.shading.sampling import fibonacci
 
 
 def directions(count, seed=0):
@@ -21,8 +28,12 @@ def lit(normals, view, albedo, roughness, metallic, light):
     return shade(*tensors, SphericalGaussians.from_record(light)).numpy()
 
 
-LIGHT = {"kind": "spherical_gaussians", "axes": fibonacci(16).tolist(), "sharpness": [12.0] * 16,
-         "amplitudes": np.random.default_rng(3).uniform(0, 1.5, (16, 3)).tolist()}
+LIGHT = {
+    "kind": "spherical_gaussians",
+    "axes": fibonacci(16).tolist(),
+    "sharpness": [12.0] * 16,
+    "amplitudes": np.random.default_rng(3).uniform(0, 1.5, (16, 3)).tolist(),
+}
 
 
 def test_light_of_known_materials_is_recovered():
@@ -49,7 +60,9 @@ def test_albedo_from_color_under_a_known_light():
     albedo = 0.2 + 0.5 * (normals[:, :1] > 0) * np.array([[1.0, 0.6, 0.3]])
     color = lit(normals, normals, albedo, np.full(2000, 0.5), np.zeros(2000), LIGHT)
     samples = (np.arange(2000), normals, color)
-    found, roughness, metallic, _, _ = materials_from_color(normals, color, np.ones(2000), unoccluded(normals), samples, LIGHT | {"fit_error": {"rms": 0.1}})
+    found, roughness, metallic, _, _ = materials_from_color(
+        normals, color, np.ones(2000), unoccluded(normals), samples, LIGHT | {"fit_error": {"rms": 0.1}}
+    )
     assert metallic == 0.0
     assert np.abs(found - albedo).mean() < 0.03
 
@@ -82,7 +95,8 @@ def test_confidence_grows_with_views_and_falls_with_their_quarrel():
 
 
 def test_a_wall_hides_the_light_behind_it_alone():
-    """Points on a floor beside a high wall at x = 0: light from beyond the wall does not arrive, light from this side does."""
+    """Points on a floor beside a high wall at x = 0: light from beyond the wall does not arrive, light from this side
+    does."""
     floor = np.array([[0.0, 0, -9], [9, 0, -9], [9, 0, 9], [0, 0, 9]])
     wall = np.array([[0.0, 0, -9], [0, 9, -9], [0, 9, 9], [0, 0, 9]])
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
@@ -98,7 +112,8 @@ def test_a_wall_hides_the_light_behind_it_alone():
 
 
 def test_shadow_stays_out_of_the_albedo():
-    """One albedo, half the points in the shadow of one lobe: with visibility it comes back even, without it does not."""
+    """One albedo, half the points in the shadow of one lobe: with visibility it comes back even, without it does
+    not."""
     normals = directions(2000)
     rng = np.random.default_rng(4)
     rays = directions(2000 * 64, 5).reshape(2000, 64, 3)
@@ -106,10 +121,22 @@ def test_shadow_stays_out_of_the_albedo():
     dark = rng.random(2000) < 0.5
     seen = Visibility(rays, ~(dark[:, None] & (rays[..., 0] > 0.2)))
     arrives = seen.of_lobes(np.array(LIGHT["axes"]), np.array(LIGHT["sharpness"]))
-    color = sum(lit(normals, normals, np.full((2000, 3), 0.5), np.full(2000, 0.8), np.zeros(2000),
-                    {n: v if n == "kind" else v[k:k + 1] for n, v in LIGHT.items()}) * arrives[:, k:k + 1] for k in range(16))
+    color = sum(
+        lit(
+            normals,
+            normals,
+            np.full((2000, 3), 0.5),
+            np.full(2000, 0.8),
+            np.zeros(2000),
+            {n: v if n == "kind" else v[k : k + 1] for n, v in LIGHT.items()},
+        )
+        * arrives[:, k : k + 1]
+        for k in range(16)
+    )
     uneven = []
     for visible in (seen, unoccluded(normals)):
-        albedo = materials_from_color(normals, color, np.ones(2000), visible, (np.arange(2000), normals, color), LIGHT)[0]
+        albedo = materials_from_color(normals, color, np.ones(2000), visible, (np.arange(2000), normals, color), LIGHT)[
+            0
+        ]
         uneven.append(float(albedo.std() / albedo.mean()))
     assert uneven[0] < 0.1 and uneven[1] > 2 * uneven[0]

@@ -5,10 +5,26 @@ import pytest
 import trimesh
 
 from gdtool.cameras import rig
-from gdtool.fields.views.depth_alignment import Corrections, agreement, corrections, disagreement, normals_fit_depth, slope_rows
 from gdtool.fields.grid.carve import silhouettes_outvoted
-from gdtool.fields.grid.fusion import BUMPY, align_depth, depth_for, folds, fuse_views, grid_step, is_closed_manifold, prepare_all
+from gdtool.fields.grid.fusion import (
+    BUMPY,
+    align_depth,
+    depth_for,
+    folds,
+    fuse_views,
+    grid_step,
+    is_closed_manifold,
+    prepare_all,
+)
 from gdtool.fields.grid.refine import _inside_silhouettes, bumpiness, drop_debris, follow_normals, refine
+from gdtool.fields.views.depth_alignment import (
+    Corrections,
+    agreement,
+    corrections,
+    disagreement,
+    normals_fit_depth,
+    slope_rows,
+)
 from gdtool.fields.views.prepared_view import free_distance, hull_distance, prepare, silhouette_distance, with_edge
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import components, signed_volume
@@ -34,7 +50,7 @@ def reconstruct(cameras, images, mask, depth=True, normal=True):
 
 
 # Pixels are 0.02 wide here: the bounds are a tenth of one on average, two at the worst.
-@pytest.mark.parametrize("solid, volume", [(sphere, np.pi / 6), (cube, 1.0), (torus, 2 * np.pi ** 2 * 0.35 * 0.15 ** 2)])
+@pytest.mark.parametrize("solid, volume", [(sphere, np.pi / 6), (cube, 1.0), (torus, 2 * np.pi**2 * 0.35 * 0.15**2)])
 def test_all_domains_meet_the_analytic_surface(seen, solid, volume):
     shape = reconstruct(*seen[solid.__name__])
     error = np.abs(solid(shape.vertices))
@@ -58,7 +74,12 @@ def test_edges_are_drawn_out(monkeypatch):
     cameras, images, mask = views_of(lambda points: cube(points @ turn, 0.3), SIZE)
     sights, step = prepare_all(cameras, mask, images["depth"], images["normal"]), grid_step(cameras, 0)
     along = np.linspace(-0.25, 0.25, 41)
-    edges = [np.insert(np.full((41, 2), (a, b)), axis, along, 1) @ turn.T for axis in range(3) for a in (0.3, -0.3) for b in (0.3, -0.3)]
+    edges = [
+        np.insert(np.full((41, 2), (a, b)), axis, along, 1) @ turn.T
+        for axis in range(3)
+        for a in (0.3, -0.3)
+        for b in (0.3, -0.3)
+    ]
 
     def missed():
         shape = fuse_views(sights, step)
@@ -77,7 +98,9 @@ def box(points, centre, half):
 
 
 def test_a_narrow_gap_stays_open():
-    """Two handles before a head: only a pixel or two of one view shows, beside jumps in depth, that they do not touch."""
+    """Two handles before a head: only a pixel or two of one view shows, beside jumps in depth, that they do not
+    touch."""
+
     def opener(points):
         handles = np.minimum(*(box(points, [0.12, 0, side * 0.125], [0.3, 0.12, 0.1]) for side in (1, -1)))
         return np.minimum(handles, box(points, [-0.3, 0, 0], [0.12, 0.2, 0.2]))
@@ -94,7 +117,7 @@ def test_what_leaves_a_silhouette_goes_back_as_far_as_it_must():
     """Also where it began beyond a picture that cuts the object, of which nothing is known."""
     camera = rig("six", SIZE)[0]
     mask = np.zeros((SIZE, SIZE), np.float32)
-    mask[:, :SIZE // 2] = 1
+    mask[:, : SIZE // 2] = 1
     sight = prepare(camera, mask)
     at = np.array([1.0, 0.0, 0.0])  # to the right of the front view
     start, end = np.array([-0.2, 0.1, 3.0])[:, None] * at, np.array([0.3, 0.1, 0.3])[:, None] * at
@@ -200,14 +223,24 @@ def test_a_surface_that_fits_its_normals_hardly_follows_them(seen, solid):
     shape = reconstruct(cameras, images, mask)
     sights = prepare_all(cameras, mask, images["depth"], images["normal"])
     assert bumpiness(shape.vertices, shape.faces, sights, 2 * step) < BUMPY
-    moved = np.linalg.norm(follow_normals(shape.vertices, shape.faces, sights, step, reach=2 * step) - shape.vertices, axis=1) / step
+    moved = (
+        np.linalg.norm(
+            follow_normals(shape.vertices, shape.faces, sights, step, reach=2 * step) - shape.vertices, axis=1
+        )
+        / step
+    )
     assert moved.mean() < 0.05 and np.quantile(moved, 0.9) < 0.1
 
 
 def test_a_thin_wall_that_two_views_turn_inside_out_has_no_hole():
-    """A dish that opens to the front; from the front its floor, 0.02 thick, lies 0.04 too deep in the middle, and so it does from the back."""
+    """A dish that opens to the front; from the front its floor, 0.02 thick, lies 0.04 too deep in the middle, and so it
+    does from the back."""
+
     def dish(points):
-        return np.maximum(box(points, np.zeros(3), np.array([0.4, 0.4, 0.15])), -box(points, np.array([0, 0, 0.02]), np.array([0.34, 0.34, 0.15])))
+        return np.maximum(
+            box(points, np.zeros(3), np.array([0.4, 0.4, 0.15])),
+            -box(points, np.array([0, 0, 0.02]), np.array([0.34, 0.34, 0.15])),
+        )
 
     cameras, images, mask = views_of(dish)
     names, depth = [camera.name for camera in cameras], images["depth"].copy()
@@ -227,12 +260,16 @@ def test_what_a_grown_silhouette_gains_is_free_as_far_as_beside_it(seen):
     cameras, images, mask = seen["cube"]
     pixel, edge = cameras[0].pixel_size, 2 * cameras[0].pixel_size
     small = np.zeros_like(mask[0])
-    small[4:-4, 4:-4] = mask[0][4:-4, 4:-4] * (np.hypot(*(np.indices(small.shape[:2])[:, 4:-4, 4:-4] - SIZE / 2 + 0.5)) < 0.3 / pixel)
+    small[4:-4, 4:-4] = mask[0][4:-4, 4:-4] * (
+        np.hypot(*(np.indices(small.shape[:2])[:, 4:-4, 4:-4] - SIZE / 2 + 0.5)) < 0.3 / pixel
+    )
     sight = prepare(cameras[0], small, np.where(small > 0, images["depth"][0], 0), images["normal"][0])
     grown = with_edge(sight, edge)
     rim, beyond = np.array([[0.3 + pixel, 0, 0.6]]), np.array([[0.3 + 6 * pixel, 0, 0.6]])
     assert hull_distance(grown, rim) < 0 < hull_distance(sight, rim)
-    assert not np.isfinite(free_distance(sight, rim)[0]) and free_distance(grown, rim)[0] == pytest.approx([0.1], abs=2e-3)
+    assert not np.isfinite(free_distance(sight, rim)[0]) and free_distance(grown, rim)[0] == pytest.approx(
+        [0.1], abs=2e-3
+    )
     assert free_distance(grown, rim)[1] < 1e-3  # a bound: no surface of its own
     assert not np.isfinite(free_distance(grown, beyond)[0])
     # Nothing is gained by one that shrinks, and what was seen is seen as before.
@@ -276,10 +313,16 @@ def test_silhouettes_that_were_grown_or_shrunk_are_found_out(seen):
 def test_slopes_say_how_the_depth_bends(seen):
     cameras, images, mask = seen["sphere"]
     ramp = 0.02 * np.linspace(-1, 1, SIZE)[None, :]
-    sight = prepare_all(cameras[:1], mask[:1], np.where(mask[:1] > 0, images["depth"][:1] + ramp, 0).astype(np.float32), images["normal"][:1])[0]
+    sight = prepare_all(
+        cameras[:1],
+        mask[:1],
+        np.where(mask[:1] > 0, images["depth"][:1] + ramp, 0).astype(np.float32),
+        images["normal"][:1],
+    )[0]
     _, _, slope, weight = slope_rows(sight)
-    across = np.average(slope[: len(slope) // 2], weights=weight[: len(slope) // 2])  # down the rows first, then along them
-    along = np.average(slope[len(slope) // 2:], weights=weight[len(slope) // 2:])
+    # Down the rows first, then along them.
+    across = np.average(slope[: len(slope) // 2], weights=weight[: len(slope) // 2])
+    along = np.average(slope[len(slope) // 2 :], weights=weight[len(slope) // 2 :])
     assert abs(across) < 0.004 and along == pytest.approx(-0.04 / (SIZE * cameras[0].pixel_size), abs=0.006)
 
 
@@ -328,5 +371,7 @@ def test_what_no_view_sees_stays_where_the_carving_put_it():
     cube, cell = trimesh.creation.box((1, 1, 1)), 1 / 32
     for _ in range(5):
         cube = cube.subdivide()
-    move = np.linalg.norm(refine(np.asarray(cube.vertices), np.asarray(cube.faces), [], cell, reach=0.1) - cube.vertices, axis=1)
+    move = np.linalg.norm(
+        refine(np.asarray(cube.vertices), np.asarray(cube.faces), [], cell, reach=0.1) - cube.vertices, axis=1
+    )
     assert 0 < move.max() < 0.8 * cell and move.mean() < 0.08 * cell

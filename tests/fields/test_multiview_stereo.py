@@ -5,9 +5,9 @@ import pytest
 
 from gdtool.cameras import camera_at, rays, rig
 from gdtool.cameras.camera import SIX_VIEWS
-from gdtool.fields.views import multiview_stereo
 from gdtool.fields.grid.carve import hull_bounds
 from gdtool.fields.grid.fusion import depth_for, prepare_all
+from gdtool.fields.views import multiview_stereo
 from gdtool.fields.views.multiview_stereo import LITTLE, _passed, match_views, pixel_steps, slopes, stretched
 
 from .shapes import sphere, torus, two_balls, views_of
@@ -41,6 +41,7 @@ def test_depth_is_found_from_normals_and_albedo(solid, bound, cameras):
 
 def test_what_looks_alike_helps_where_normals_do_not():
     """A box' side has one normal: its texture says where it is."""
+
     def box(points):
         q = np.abs(points - [0, 0, 0.1]) - [0.35, 0.3, 0.2]
         hole = np.abs(points - [0, 0, 0.3]) - [0.25, 0.2, 0.1]  # a recess that no silhouette shows
@@ -80,7 +81,8 @@ def test_trust_is_in_what_another_view_shows_too():
 
 
 def test_costs_are_passed_along_planes():
-    """Against the recurrence of Hirschmüller 2008, eq. 13, with depths that grow by whole candidates from pixel to pixel."""
+    """Against the recurrence of Hirschmüller 2008, eq. 13, with depths that grow by whole candidates from pixel to
+    pixel."""
     rng = np.random.default_rng(0)
     cost, slope = rng.uniform(0, 1, (1, 6, 9)).astype(np.float32), np.full((1, 6), 2.0)
     jump = rng.uniform(0.2, 1, (1, 6)).astype(np.float32)
@@ -114,8 +116,11 @@ def test_views_that_show_nothing_have_no_depth():
 @pytest.mark.parametrize("lie", ["other sides", "noise", "nothing"])
 def test_normals_that_lie_still_leave_depths_within_the_silhouettes(lie):
     cameras, images, mask = views_of(torus, SIZE)
-    normal = {"other sides": images["normal"][[0, 5, 4, 3, 2, 1]], "nothing": np.zeros_like(images["normal"]),
-              "noise": np.random.default_rng(0).standard_normal(images["normal"].shape).astype(np.float32)}[lie]
+    normal = {
+        "other sides": images["normal"][[0, 5, 4, 3, 2, 1]],
+        "nothing": np.zeros_like(images["normal"]),
+        "noise": np.random.default_rng(0).standard_normal(images["normal"].shape).astype(np.float32),
+    }[lie]
     depth = depth_for(cameras, mask, normal)
     inside = mask > 0.5
     assert np.isfinite(depth).all() and (depth[~inside] == 0).all()

@@ -1,11 +1,12 @@
-"""The paper's networks: a fitted sphere, a field that starts inside out, bfloat16 beside float32, and the end of a budget."""
+"""The paper's networks: a fitted sphere, a field that starts inside out, bfloat16 beside float32, and the end of a
+budget."""
 
 import numpy as np
 import pytest
 import torch
 
-from gdtool.fields.neural.networks import FREQUENCIES, SdfNetwork
 from gdtool.fields.neural.fit import Pixels, fit_distances, one_cycle, start, train
+from gdtool.fields.neural.networks import FREQUENCIES, SdfNetwork
 from gdtool.fields.neural.paper import closest_approach
 
 RADIUS = 0.3
@@ -94,11 +95,21 @@ def test_volume_start_and_surface_steps_follow_one_another_without_depth():
     points = on_sphere(200) * torch.tensor([1.5, 1.5, 0.0])
     origins, directions = points + torch.tensor([0.0, 0, 2]), torch.tensor([[0.0, 0, -1]]).expand(200, 3)
     inside = points.norm(dim=-1) < RADIUS
-    normal = torch.cat([points[:, :2], (RADIUS ** 2 - (points ** 2).sum(-1, keepdim=True)).clamp_min(0).sqrt()], 1) / RADIUS
+    normal = torch.cat([points[:, :2], (RADIUS**2 - (points**2).sum(-1, keepdim=True)).clamp_min(0).sqrt()], 1) / RADIUS
     pixels = Pixels(origins, directions, inside, torch.full((200,), 1.4), torch.full((200,), 2.6), {"normal": normal})
     fit, _ = fitted()
-    done = train(fit, pixels, volume_steps=3, surface_steps=4, batch=64, seed=0, rule="secant", brdf="gltf",
-                 track=lambda n, _: range(n), spent=lambda: 0.0)
+    done = train(
+        fit,
+        pixels,
+        volume_steps=3,
+        surface_steps=4,
+        batch=64,
+        seed=0,
+        rule="secant",
+        brdf="gltf",
+        track=lambda n, _: range(n),
+        spent=lambda: 0.0,
+    )
     assert done == 7 and {"mask", "normal", "eikonal"} <= set(fit.history[0])
     with torch.no_grad():
         assert fit.sdf(on_sphere()).abs().mean() < 0.03

@@ -29,7 +29,15 @@ def rows(ball, error, gain=1.0, offset=0.0):
     cameras, images, mask = ball
     names = [camera.name for camera in cameras]
     first, second = names.index("front"), names.index("front_right")
-    pictures = [Picture.of(cameras[k], images["albedo"][k] * (gain if k == second else 1) + (offset if k == second else 0), mask[k], REACH) for k in (first, second)]
+    pictures = [
+        Picture.of(
+            cameras[k],
+            images["albedo"][k] * (gain if k == second else 1) + (offset if k == second else 0),
+            mask[k],
+            REACH,
+        )
+        for k in (first, second)
+    ]
     normal = images["normal"][first]
     seen = (mask[first] > 0.99) & (normal @ cameras[first].backward > 0.5) & (normal @ cameras[second].backward > 0.5)
     points = (0.45 * normal - error * cameras[first].backward)[seen].astype(np.float64)

@@ -73,7 +73,8 @@ def test_without_a_view_from_behind_a_part_is_as_thick_as_wide(seen):
     alone, share = restore_shown(values, grid, [front], front)
     assert share == pytest.approx(lost.sum() / (front.mask > 0.5).sum())
     wing = grid.points(index[(alone < 0).ravel() & (np.abs(grid.points(index)[:, 0]) > 0.2)])
-    assert np.ptp(wing[:, 2]) < 0.08 and wing[:, 2].max() == pytest.approx(CHORD, abs=0.03)  # thin, where its front edge is seen
+    # Thin, where its front edge is seen.
+    assert np.ptp(wing[:, 2]) < 0.08 and wing[:, 2].max() == pytest.approx(CHORD, abs=0.03)
     assert (alone <= values).all()
     # What is there needs nothing, and a view without depth says nothing of where.
     whole = plane(grid.points(index)).reshape(grid.shape).astype(np.float32)

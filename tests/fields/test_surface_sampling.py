@@ -20,7 +20,17 @@ def exact_alpha(f0, f1, s):
 
 @pytest.mark.parametrize("sharpness", [1.0, 20.0, 1e3, 1e4, 1e6])
 def test_neus_alpha_against_mpmath(sharpness):
-    pairs = [(0.1, 0.05), (0.02, -0.02), (0.0, 0.0), (0.0, -0.01), (-0.01, -0.02), (-0.3, -0.4), (-0.4, -0.3), (0.3, 0.3), (1e-4, -1e-4)]
+    pairs = [
+        (0.1, 0.05),
+        (0.02, -0.02),
+        (0.0, 0.0),
+        (0.0, -0.01),
+        (-0.01, -0.02),
+        (-0.3, -0.4),
+        (-0.4, -0.3),
+        (0.3, 0.3),
+        (1e-4, -1e-4),
+    ]
     f0, f1 = (torch.tensor(x, dtype=torch.float32) for x in zip(*pairs, strict=True))
     alpha = ss.neus_alpha(f0, f1, sharpness)
     expected = torch.tensor([exact_alpha(a, b, sharpness) for a, b in zip(f0, f1, strict=True)])
@@ -31,7 +41,7 @@ def test_neus_alpha_against_mpmath(sharpness):
 def test_alpha_gradient_is_finite_everywhere():
     f = torch.tensor([0.0, 1e-9, -1e-9, 1.0, -1.0], requires_grad=True)
     for s in (1.0, 1e3, 1e6):
-        grad, = torch.autograd.grad(ss.neus_alpha(f[:, None], f[None, :], s).sum(), f)
+        (grad,) = torch.autograd.grad(ss.neus_alpha(f[:, None], f[None, :], s).sum(), f)
         assert torch.isfinite(grad).all()
 
 
@@ -50,7 +60,16 @@ def test_weights_sum_to_one_through_a_wall():
 
 def test_first_crossing_equals_brute_force_on_adversaries():
     nan = math.nan
-    rows = [[1, 0, -1, 1], [0, -1, 0, -1], [1, 1, 1, 1], [-1, -1, -1, -1], [-1, 1, 1, -1], [-1, 0, 0, 0], [1, nan, -1, -1], [0, 0, 0, -0.1]]
+    rows = [
+        [1, 0, -1, 1],
+        [0, -1, 0, -1],
+        [1, 1, 1, 1],
+        [-1, -1, -1, -1],
+        [-1, 1, 1, -1],
+        [-1, 0, 0, 0],
+        [1, nan, -1, -1],
+        [0, 0, 0, -0.1],
+    ]
     found, idx = ss.first_crossing(torch.tensor(rows, dtype=torch.float32))
     for row, hit, k in zip(rows, found, idx, strict=True):
         expected = next((i for i in range(3) if row[i] >= 0 > row[i + 1]), None)
@@ -65,7 +84,10 @@ def test_secant_is_exact_on_a_plane_and_second_order_on_a_sphere():
     for width in (0.08, 0.04):
         # A ray past a sphere's centre at distance 0.3, radius 0.5: it enters at t = 0.6 (0.4 before the middle, at 1).
         f = lambda t: torch.sqrt((t - 1) ** 2 + 0.09) - 0.5
-        a, b = torch.tensor([0.6 - 0.3 * width], dtype=torch.float64), torch.tensor([0.6 + 0.7 * width], dtype=torch.float64)
+        a, b = (
+            torch.tensor([0.6 - 0.3 * width], dtype=torch.float64),
+            torch.tensor([0.6 + 0.7 * width], dtype=torch.float64),
+        )
         errors.append(abs(float(ss.secant_root(a, b, f(a), f(b))) - 0.6))
     assert errors[1] < 0.3 * errors[0]
 
@@ -92,13 +114,13 @@ def test_implicit_points_move_with_the_field():
     value, gradient = point.norm(dim=-1) - radius, point / point.norm(dim=-1, keepdim=True)
     moved = ss.implicit_points(point, direction, value, gradient)
     assert torch.allclose(moved, point)
-    slope, = torch.autograd.grad(moved[0, 2], radius)
+    (slope,) = torch.autograd.grad(moved[0, 2], radius)
     assert float(slope) == pytest.approx(0.5 / 0.4)  # z = sqrt(r^2 - 0.09), dz/dr = r / z
 
 
 def test_unit_of_zero_has_a_finite_gradient():
     v = torch.zeros(2, 3, requires_grad=True)
-    grad, = torch.autograd.grad(ss.unit(v).sum(), v)
+    (grad,) = torch.autograd.grad(ss.unit(v).sum(), v)
     assert torch.isfinite(grad).all()
 
 

@@ -35,8 +35,14 @@ def random_views(size=16):
     mask = (rng.random((6, size, size)) > 0.3).astype(np.float32)
     normal = rng.standard_normal((6, size, size, 3))
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    images = {"color": rng.random((6, size, size, 3)), "normal": normal, "depth": rng.uniform(1.2, 2.8, (6, size, size)),
-              "albedo": rng.random((6, size, size, 3)), "roughness": rng.random((6, size, size)), "metallic": rng.random((6, size, size))}
+    images = {
+        "color": rng.random((6, size, size, 3)),
+        "normal": normal,
+        "depth": rng.uniform(1.2, 2.8, (6, size, size)),
+        "albedo": rng.random((6, size, size, 3)),
+        "roughness": rng.random((6, size, size)),
+        "metallic": rng.random((6, size, size)),
+    }
     images = {k: (v * (mask[..., None] if v.ndim == 4 else mask)).astype(np.float32) for k, v in images.items()}
     light = {"axes": np.eye(3), "sharpness": [1.0, 10.0, 100.0], "amplitudes": np.ones((3, 3)), "environment": "mid"}
     return Views(cameras, images, mask, light)
@@ -45,7 +51,10 @@ def random_views(size=16):
 def test_views_come_back_within_their_quantisation():
     views = random_views()
     folder = written("views", lambda out: write_views(out, views, exposure=2.0))
-    assert folder.content.domains == ("color", "normal", "depth", "albedo", "roughness", "metallic") and folder.content.exposure == 2
+    assert (
+        folder.content.domains == ("color", "normal", "depth", "albedo", "roughness", "metallic")
+        and folder.content.exposure == 2
+    )
     back = read_views(folder)
     inside = views.mask > 0
     assert np.array_equal(back.mask, views.mask) and np.array_equal(back.images["depth"], views.images["depth"])
@@ -68,40 +77,74 @@ def test_cameras_come_back_and_bad_ones_are_refused():
     cameras = [camera_at(20, 10, name="a", size=8, fov_degrees=40), *rig("wonder3d", 8)]
     write_cameras(Path("c.json"), cameras)
     for before, after in zip(cameras, read_cameras(Path("c.json")), strict=True):
-        assert np.allclose(before.world_from_camera, after.world_from_camera, atol=1e-15) and before.fx == after.fx and before.name == after.name
+        assert (
+            np.allclose(before.world_from_camera, after.world_from_camera, atol=1e-15)
+            and before.fx == after.fx
+            and before.name == after.name
+        )
     text = Path("c.json").read_text()
-    for old, new, words in (('"near": 1.0', '"near": 9.0', "near 9 is not below far"), ('"half_width": 0.675', '"half_width": 0.0', "half_width"),
-                            ('"name": "left"', '"name": "right"', "one name"), ('"projection": "ortho', '"projection": "fish', "projection")):
+    for old, new, words in (
+        ('"near": 1.0', '"near": 9.0', "near 9 is not below far"),
+        ('"half_width": 0.675', '"half_width": 0.0', "half_width"),
+        ('"name": "left"', '"name": "right"', "one name"),
+        ('"projection": "ortho', '"projection": "fish', "projection"),
+    ):
         Path("bad.json").write_text(text.replace(old, new, 1))
         with pytest.raises(InputError, match=words):
             read_cameras(Path("bad.json"))
 
 
 def test_light_comes_back():
-    light = {"axes": np.eye(3)[:2], "sharpness": np.array([0.0, 5.0]), "amplitudes": np.ones((2, 3)), "fit_error": {"rms": 0.1}}
+    light = {
+        "axes": np.eye(3)[:2],
+        "sharpness": np.array([0.0, 5.0]),
+        "amplitudes": np.ones((2, 3)),
+        "fit_error": {"rms": 0.1},
+    }
     write_record(Path("l.json"), light)
-    assert np.array_equal(read_record(Path("l.json"))["axes"], light["axes"]) and read_record(Path("l.json"))["fit_error"] == {"rms": 0.1}
+    assert np.array_equal(read_record(Path("l.json"))["axes"], light["axes"]) and read_record(Path("l.json"))[
+        "fit_error"
+    ] == {"rms": 0.1}
 
 
 def test_surface_comes_back_and_missing_properties_have_their_defaults():
     triangles = triangulated(QUADS)[0]
     n = len(CUBE)
-    surface = Surface(CUBE, triangles, np.linspace(0, 1, n * 3).reshape(n, 3), np.linspace(0, 1, n), np.linspace(1, 0, n), np.full(n, 0.5))
+    surface = Surface(
+        CUBE,
+        triangles,
+        np.linspace(0, 1, n * 3).reshape(n, 3),
+        np.linspace(0, 1, n),
+        np.linspace(1, 0, n),
+        np.full(n, 0.5),
+    )
     folder = written("surface", lambda out: write_surface(out, surface, watertight=True))
     back = read_surface(folder)
     assert np.allclose(back.vertices, CUBE) and np.array_equal(back.faces, triangles)
     assert np.abs(back.albedo - surface.albedo).max() < 0.005 and np.allclose(back.roughness, surface.roughness)
-    assert np.allclose(back.normals, CUBE / np.linalg.norm(CUBE, axis=1, keepdims=True), atol=1e-6)  # a cube's corners point outward
+    # A cube's corners point outward.
+    assert np.allclose(back.normals, CUBE / np.linalg.norm(CUBE, axis=1, keepdims=True), atol=1e-6)
     assert back.views is None and back.residual is None
     seen = replace(surface, views=np.arange(n), residual=np.linspace(0, 0.7, n, dtype=np.float32))
     write_surface_ply(folder.file("surface.ply"), seen)
     back = read_surface(folder)
-    assert np.array_equal(back.views, seen.views) and np.array_equal(back.residual, seen.residual) and np.allclose(back.confidence, 0.5)
-    bare = b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n" \
-        b"element face 1\nproperty list uchar uint vertex_indices\nend_header\n" + CUBE[:3].astype("<f4").tobytes() + b"\x03" + np.arange(3, dtype="<u4").tobytes()
+    assert (
+        np.array_equal(back.views, seen.views)
+        and np.array_equal(back.residual, seen.residual)
+        and np.allclose(back.confidence, 0.5)
+    )
+    bare = (
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        b"element face 1\nproperty list uchar uint vertex_indices\nend_header\n"
+        + CUBE[:3].astype("<f4").tobytes()
+        + b"\x03"
+        + np.arange(3, dtype="<u4").tobytes()
+    )
     folder.file("surface.ply").write_bytes(bare)
     back = read_surface(folder)
-    assert back.normals is None and np.allclose(back.albedo, 0.8) and back.roughness[0] == 0.5 and back.confidence[0] == 0
+    assert (
+        back.normals is None and np.allclose(back.albedo, 0.8) and back.roughness[0] == 0.5 and back.confidence[0] == 0
+    )
     folder.file("surface.ply").write_bytes(bare[:-2])
     with pytest.raises(InputError, match="length"):
         read_surface(folder)
@@ -113,14 +156,23 @@ def test_quads_come_back_with_their_texture_coordinates():
     write_obj(Path("m.obj"), mesh)
     assert "vt 0 1" in Path("m.obj").read_text()  # the image's top left is OBJ's (0, 1)
     back = read_obj(Path("m.obj"))
-    assert np.array_equal(back.faces, QUADS) and np.array_equal(back.face_uvs, mesh.face_uvs) and np.allclose(back.uv, uv)
+    assert (
+        np.array_equal(back.faces, QUADS) and np.array_equal(back.face_uvs, mesh.face_uvs) and np.allclose(back.uv, uv)
+    )
     mixed = QuadMesh(CUBE, np.concatenate([QUADS[:5], [[1, 3, 7, -1], [1, 7, 5, -1]]]).astype(np.int32))
     write_obj(Path("m.obj"), mixed)
     assert np.array_equal(read_obj(Path("m.obj")).faces, mixed.faces)
 
 
-@pytest.mark.parametrize("text, words", [("v 0 0 0\nf 1 2 3\n", "out of range"), ("v 0 0\n", "line 1"), ("v 0 0 0\n", "no faces"),
-                                         ("v 0 0 nan\nv 0 0 0\nv 1 0 0\nf 1 2 3\n", "not finite")])
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("v 0 0 0\nf 1 2 3\n", "out of range"),
+        ("v 0 0\n", "line 1"),
+        ("v 0 0 0\n", "no faces"),
+        ("v 0 0 nan\nv 0 0 0\nv 1 0 0\nf 1 2 3\n", "not finite"),
+    ],
+)
 def test_faulty_obj_is_refused(text, words):
     Path("m.obj").write_text(text)
     with pytest.raises(InputError, match=words):

@@ -16,7 +16,10 @@ def quad_cube(rounds: int) -> tuple[np.ndarray, np.ndarray]:
     """A cube of 6 * 4**rounds quads."""
     from gdtool.remesh.fit.surface_projection import subdivide
 
-    vertices, faces = cube()[0], np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    vertices, faces = (
+        cube()[0],
+        np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]),
+    )
     for _ in range(rounds):
         vertices, faces, _ = subdivide(vertices, faces)
     return vertices, faces
@@ -42,7 +45,9 @@ def marching(field, n: int, half: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sphere(n: int = 32, radius: float = 0.8, centre=(0.0, 0.0, 0.0)) -> tuple[np.ndarray, np.ndarray]:
-    return marching(lambda x, y, z: np.sqrt((x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2) - radius, n, 1.03)
+    return marching(
+        lambda x, y, z: np.sqrt((x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2) - radius, n, 1.03
+    )
 
 
 def torus(n: int = 40) -> tuple[np.ndarray, np.ndarray]:
@@ -51,6 +56,7 @@ def torus(n: int = 40) -> tuple[np.ndarray, np.ndarray]:
 
 def lattice(cells: int = 3, n: int = 40) -> tuple[np.ndarray, np.ndarray]:
     """A cube of what Schwarz' P surface bounds, of so many periods along an edge: of three, 28 handles."""
+
     def field(x, y, z):
         waves = sum(np.cos(np.pi * cells * (axis / 0.9 + 1)) for axis in (x, y, z))
         return np.maximum(waves, 20 * (np.maximum(np.maximum(abs(x), abs(y)), abs(z)) - 0.9))
@@ -60,6 +66,7 @@ def lattice(cells: int = 3, n: int = 40) -> tuple[np.ndarray, np.ndarray]:
 
 def bored_box(n: int = 56) -> tuple[np.ndarray, np.ndarray]:
     """A box of half sides 0.8, 0.6, 0.5 with a bore of radius 0.3 along z: twelve straight creases and two circles."""
+
     def field(x, y, z):
         return np.maximum(np.maximum(np.maximum(abs(x) - 0.8, abs(y) - 0.6), abs(z) - 0.5), 0.3 - np.hypot(x, y))
 
@@ -70,11 +77,21 @@ def rod(sections: int, radius: float = 0.03, height: float = 0.5) -> tuple[np.nd
     """A cylinder of slivers along z: two fans and a wall of two triangles a section."""
     angle = 2 * np.pi * np.arange(sections) / sections
     ring = radius * np.stack([np.cos(angle), np.sin(angle)], -1)
-    vertices = np.concatenate([np.c_[ring, np.full(sections, -height / 2)], np.c_[ring, np.full(sections, height / 2)], [[0, 0, -height / 2], [0, 0, height / 2]]])
+    vertices = np.concatenate(
+        [
+            np.c_[ring, np.full(sections, -height / 2)],
+            np.c_[ring, np.full(sections, height / 2)],
+            [[0, 0, -height / 2], [0, 0, height / 2]],
+        ]
+    )
     one = np.arange(sections)
     two = (one + 1) % sections
-    faces = [(one, two, two + sections), (one, two + sections, one + sections), (two, one, 0 * one + 2 * sections),
-             (one + sections, two + sections, 0 * one + 2 * sections + 1)]
+    faces = [
+        (one, two, two + sections),
+        (one, two + sections, one + sections),
+        (two, one, 0 * one + 2 * sections),
+        (one + sections, two + sections, 0 * one + 2 * sections + 1),
+    ]
     return vertices, np.concatenate([np.stack(face, -1) for face in faces])
 
 
@@ -82,7 +99,9 @@ def assembly(pins: int, sections: int) -> tuple[np.ndarray, np.ndarray]:
     """A disk of radius 1 in a circle of so many pins, in a box of side 1."""
     around = 2 * np.pi * np.arange(pins) / pins
     pin = rod(sections)
-    vertices, faces = joined(rod(64, 1.0, 0.3), *((pin[0] + (1.3 * np.cos(a), 1.3 * np.sin(a), 0), pin[1]) for a in around))
+    vertices, faces = joined(
+        rod(64, 1.0, 0.3), *((pin[0] + (1.3 * np.cos(a), 1.3 * np.sin(a), 0), pin[1]) for a in around)
+    )
     return vertices / 2.66, faces
 
 
@@ -97,7 +116,9 @@ def plane(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
 
 def joined(*meshes) -> tuple[np.ndarray, np.ndarray]:
     offset = np.cumsum([0] + [len(v) for v, _ in meshes])
-    return np.concatenate([v for v, _ in meshes]), np.concatenate([f + o for (_, f), o in zip(meshes, offset, strict=False)])
+    return np.concatenate([v for v, _ in meshes]), np.concatenate(
+        [f + o for (_, f), o in zip(meshes, offset, strict=False)]
+    )
 
 
 def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
@@ -108,5 +129,7 @@ def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 
 def write_obj(path, vertices, faces) -> None:
-    lines = ["v %.17g %.17g %.17g" % tuple(p) for p in vertices] + ["f " + " ".join(str(i + 1) for i in face) for face in faces.tolist()]
+    lines = ["v %.17g %.17g %.17g" % tuple(p) for p in vertices] + [
+        "f " + " ".join(str(i + 1) for i in face) for face in faces.tolist()
+    ]
     path.write_text("\n".join(lines) + "\n")

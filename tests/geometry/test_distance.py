@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from gdtool.geometry import distance
-from gdtool.geometry.distance import SearchTree, barycentric_of, bisected, closest_on_triangles, closest_points, sample_surface, winding_number
+from gdtool.geometry.distance import (
+    SearchTree,
+    barycentric_of,
+    bisected,
+    closest_on_triangles,
+    closest_points,
+    sample_surface,
+    winding_number,
+)
 from tests.geometry.solids import sphere
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
@@ -22,7 +30,9 @@ def test_distance_to_a_square():
     points = np.array([[0.5, 0.25, 2], [0.5, 0.25, -2], [2, 0.5, 0], [2, 2, 1], [0.1, 0.2, 0]])
     distance, face_idx, closest = closest_points(points, SQUARE, HALVES)
     np.testing.assert_allclose(distance, [2, 2, 1, np.sqrt(3), 0], atol=1e-12)
-    np.testing.assert_allclose(closest, [[0.5, 0.25, 0], [0.5, 0.25, 0], [1, 0.5, 0], [1, 1, 0], [0.1, 0.2, 0]], atol=1e-12)
+    np.testing.assert_allclose(
+        closest, [[0.5, 0.25, 0], [0.5, 0.25, 0], [1, 0.5, 0], [1, 1, 0], [0.1, 0.2, 0]], atol=1e-12
+    )
     assert face_idx.tolist()[:2] == [0, 0] and face_idx[4] == 1
 
 
@@ -54,7 +64,9 @@ def test_the_closest_point_of_a_triangle_by_its_own_side_or_corner():
     points = rng.normal(size=(400, 3)) * 2
     found = closest_on_triangles(points, triangles)
     for point, triangle, closest in zip(points, triangles, found, strict=True):
-        np.testing.assert_allclose(closest, closest_points(point[None], triangle, np.array([[0, 1, 2]]))[2][0], atol=1e-9)
+        np.testing.assert_allclose(
+            closest, closest_points(point[None], triangle, np.array([[0, 1, 2]]))[2][0], atol=1e-9
+        )
 
 
 @pytest.mark.parametrize("place", [(0, 0, 0), (1e6, -3e5, 20)], ids=["at the origin", "far from it"])
@@ -81,11 +93,15 @@ def test_points_in_the_order_of_place_follow_those_near_to_them():
     assert np.array_equal(np.sort(order), np.arange(4000))
     steps = [np.linalg.norm(np.diff(some, axis=0), axis=1).mean() for some in (points, points[order])]
     assert steps[1] < 0.5 * steps[0]
-    assert np.array_equal(distance.by_place(np.repeat(points[:1], 5, 0)), np.arange(5))  # all in one place: as they come
+    # All in one place: as they come.
+    assert np.array_equal(distance.by_place(np.repeat(points[:1], 5, 0)), np.arange(5))
 
 
 def test_cut_faces_are_the_same_surface_with_the_same_sides():
-    vertices, faces = np.array([[0, 0, 0], [8, 0.01, 0], [0, 0.1, 0], [0.5, 0.5, 1.0]]), np.array([[0, 1, 2], [0, 2, 3], [2, 1, 3], [1, 1, 1]])
+    vertices, faces = (
+        np.array([[0, 0, 0], [8, 0.01, 0], [0, 0.1, 0], [0.5, 0.5, 1.0]]),
+        np.array([[0, 1, 2], [0, 2, 3], [2, 1, 3], [1, 1, 1]]),
+    )
     cut_vertices, cut, whole = bisected(vertices, faces, 0.5, 1000)
     corners = cut_vertices[cut]
     assert len(cut) > 40 and np.linalg.norm(np.roll(corners, -1, 1) - corners, axis=-1).max() <= 0.5
@@ -95,7 +111,9 @@ def test_cut_faces_are_the_same_surface_with_the_same_sides():
         np.testing.assert_allclose(np.bincount(whole, area[:, k], len(faces)), theirs[:, k], atol=1e-12)
     assert np.linalg.norm(area, axis=1).sum() == pytest.approx(np.linalg.norm(theirs, axis=1).sum())
     points = np.random.default_rng(0).uniform(-1, 9, (500, 3))
-    np.testing.assert_allclose(closest_points(points, cut_vertices, cut)[2], closest_points(points, vertices, faces)[2], atol=1e-12)
+    np.testing.assert_allclose(
+        closest_points(points, cut_vertices, cut)[2], closest_points(points, vertices, faces)[2], atol=1e-12
+    )
 
 
 def test_faces_are_cut_no_further_than_the_most_and_short_ones_not_at_all():

@@ -17,7 +17,7 @@ def test_sphere_has_its_volume_and_radius():
     vertices, faces = extract(values_of(lambda p: np.linalg.norm(p, axis=1) - 0.4, grid), grid)
     assert is_closed_manifold(faces)
     assert np.abs(np.linalg.norm(vertices, axis=1) - 0.4).max() < 3e-4
-    assert signed_volume(vertices, faces) == pytest.approx(4 / 3 * np.pi * 0.4 ** 3, rel=0.01)
+    assert signed_volume(vertices, faces) == pytest.approx(4 / 3 * np.pi * 0.4**3, rel=0.01)
 
 
 def test_surface_that_reaches_the_border_is_closed():

@@ -24,7 +24,9 @@ def cube(side=1.0, center=(0, 0, 0)):
 
 
 def plane(height):
-    return np.array([[0, 0, height], [1, 0, height], [1, 1, height], [0, 1, height]], float), np.array([[0, 1, 2], [0, 2, 3]])
+    return np.array([[0, 0, height], [1, 0, height], [1, 1, height], [0, 1, height]], float), np.array(
+        [[0, 1, 2], [0, 2, 3]]
+    )
 
 
 def measure(a, b, **options):
@@ -69,7 +71,9 @@ def test_one_way_distances_of_half_a_square():
 def test_flipped_faces_are_told_apart_from_wrong_normals():
     vertices, faces = cube()
     found = measure((vertices, faces[:, ::-1]), (vertices, faces))
-    assert found["flipped_share"] == pytest.approx(1, abs=0.01) and found["normal_degrees"] == pytest.approx(0, abs=1e-4)
+    assert found["flipped_share"] == pytest.approx(1, abs=0.01) and found["normal_degrees"] == pytest.approx(
+        0, abs=1e-4
+    )
     assert found["iou"] == 1  # the volume is the same
 
 
@@ -121,7 +125,8 @@ def test_closed():
 
 
 def test_six_views_see_a_sphere_up_to_its_caps():
-    """Cameras on the equator see what faces at least one of them: from below by its azimuths, 45 or 90 degrees apart."""
+    """Cameras on the equator see what faces at least one of them: from below by its azimuths, 45 or 90 degrees
+    apart."""
     radius, cameras = 0.5, rig("six", 64)
     vertices, faces = sphere(radius, subdivisions=4)
     rng = np.random.default_rng(0)
@@ -131,7 +136,8 @@ def test_six_views_see_a_sphere_up_to_its_caps():
     hits = caster.first_hit(direction * 2, -direction)
     points, normals = direction * (2 - hits.distance)[:, None], direction
     found = metrics.seen(points, normals, caster, cameras, metrics.SEEN_TOLERANCE)
-    # Every direction off the poles has a camera within 45 degrees of azimuth: all of the sphere but the poles faces one.
+    # Every direction off the poles has a camera within 45 degrees of azimuth: all of the sphere but the poles faces
+    # one.
     facing = np.max(direction @ np.stack([c.backward for c in cameras], 1), axis=1)
     assert found[facing > 0.06].all() and not found[facing < 0.04].any()
     one = metrics.seen(points, normals, caster, cameras[:1], metrics.SEEN_TOLERANCE)
@@ -163,7 +169,8 @@ def test_the_seen_part_leaves_the_hidden_error_out():
 
 
 def test_the_seen_part_leaves_out_how_a_result_closes_what_no_view_sees():
-    """A cup against its closed hull: the lid is wrong, and none of the six horizontal views looks at it or into the cup."""
+    """A cup against its closed hull: the lid is wrong, and none of the six horizontal views looks at it or into the
+    cup."""
     outer = trimesh.creation.cylinder(0.4, 1.0, sections=64)
     outer.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
     vertices, faces = arrays(outer)
@@ -180,7 +187,9 @@ def test_syncdreamer_identical_and_scaled():
     found = metrics.syncdreamer_protocol(*sphere(0.4), *sphere(0.5))
     assert found["chamfer"] == pytest.approx(0.1, rel=0.03)
     assert found["iou"] == pytest.approx(0.8**3, rel=0.03)
-    assert found["icp_scale"] == pytest.approx(1.25, rel=0.02) and found["icp_chamfer"] < 0.006 and found["icp_iou"] > 0.95
+    assert (
+        found["icp_scale"] == pytest.approx(1.25, rel=0.02) and found["icp_chamfer"] < 0.006 and found["icp_iou"] > 0.95
+    )
 
 
 def test_syncdreamer_scales_with_the_truth(monkeypatch):

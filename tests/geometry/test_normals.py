@@ -22,6 +22,8 @@ def test_normals_are_the_same_however_many_faces_are_taken_at_a_time(monkeypatch
     whole = face_normals(vertices, faces)
     monkeypatch.setattr(normals_module, "CHUNK", 100)
     assert all(np.array_equal(one, other) for one, other in zip(whole, face_normals(vertices, faces), strict=True))
-    assert (whole[0] * vertices[faces].mean(1)).sum(1).min() > 0.7 and abs(np.linalg.norm(whole[0], axis=1) - 1).max() < 1e-6
+    assert (whole[0] * vertices[faces].mean(1)).sum(1).min() > 0.7 and abs(
+        np.linalg.norm(whole[0], axis=1) - 1
+    ).max() < 1e-6
     assert (vertex_normals(vertices, faces) * vertices).sum(1).min() > 0.79
     assert [len(part) for part in face_normals(vertices, faces[:0])] == [0, 0]

@@ -53,7 +53,9 @@ def test_two_cubes_at_one_edge_become_two_manifolds():
     assert not topology.is_manifold(shared)
     out_vertices, out_faces, report, closed = repair.clean(vertices, shared)
     assert closed and report["nonmanifold_edges"] == 1
-    assert topology.is_watertight(out_faces) and topology.is_manifold(out_faces) and topology.components(out_faces)[0] == 2
+    assert (
+        topology.is_watertight(out_faces) and topology.is_manifold(out_faces) and topology.components(out_faces)[0] == 2
+    )
     assert volume(out_vertices, out_faces) == pytest.approx(2)
 
 
@@ -62,16 +64,27 @@ def test_bow_tie_is_parted():
     vertices, faces = joined(one, (two[0] + 1, two[1]))
     _, first, inverse = np.unique(vertices.round(6), axis=0, return_index=True, return_inverse=True)
     shared = first[inverse.ravel()][faces]
-    assert topology.is_watertight(shared) and not topology.is_manifold(shared) and len(topology.split_vertices(shared)) == 1
+    assert (
+        topology.is_watertight(shared)
+        and not topology.is_manifold(shared)
+        and len(topology.split_vertices(shared)) == 1
+    )
     out_vertices, out_faces, report, closed = repair.clean(vertices, shared)
-    assert closed and report == {"nonmanifold_vertices": 1} and topology.is_manifold(out_faces) and len(out_vertices) == 16
+    assert (
+        closed and report == {"nonmanifold_vertices": 1} and topology.is_manifold(out_faces) and len(out_vertices) == 16
+    )
 
 
 def test_turned_faces_are_turned_back():
     vertices, faces = cube()
     faces[3] = faces[3][::-1]
     out_vertices, out_faces, report, closed = repair.clean(vertices, faces)
-    assert closed and report["turned_edges"] == 3 and topology.is_watertight(out_faces) and volume(out_vertices, out_faces) == pytest.approx(1)
+    assert (
+        closed
+        and report["turned_edges"] == 3
+        and topology.is_watertight(out_faces)
+        and volume(out_vertices, out_faces) == pytest.approx(1)
+    )
 
 
 def test_inside_out_is_turned():
@@ -86,18 +99,27 @@ def test_duplicate_and_flat_faces_go():
     n = len(vertices)
     more = np.concatenate([faces, faces[:2], [[n - 3, n - 2, n - 1], [0, 0, 1]]])
     _, out, report, closed = repair.clean(vertices, more)
-    assert not closed and len(out) == 8 and report["duplicate_faces"] == 2 and report["zero_area_faces"] == 1 and report["degenerate_faces"] == 1
+    assert (
+        not closed
+        and len(out) == 8
+        and report["duplicate_faces"] == 2
+        and report["zero_area_faces"] == 1
+        and report["degenerate_faces"] == 1
+    )
 
 
-@pytest.mark.parametrize("vertices, faces, fact", [
-    (np.zeros((3, 3)), np.zeros((0, 3), int), "no faces"),
-    (np.eye(3), np.array([[0, 1, 3]]), "refers to vertex 3 of 3"),
-    (np.eye(3), np.array([[0, 1, -1]]), "refers to vertex -1"),
-    (np.array([[0, 0, 0], [1, 0, 0], [0, np.nan, 0.0]]), np.array([[0, 1, 2]]), "vertex 2 is not finite"),
-    (np.ones((3, 3)), np.array([[0, 1, 2]]), "one point"),
-    (np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]]), np.array([[0, 1, 2]]), "no face has an area"),
-    (np.eye(3), np.array([[0, 0, 1], [1, 2, 2]]), "no face has an area"),
-])
+@pytest.mark.parametrize(
+    "vertices, faces, fact",
+    [
+        (np.zeros((3, 3)), np.zeros((0, 3), int), "no faces"),
+        (np.eye(3), np.array([[0, 1, 3]]), "refers to vertex 3 of 3"),
+        (np.eye(3), np.array([[0, 1, -1]]), "refers to vertex -1"),
+        (np.array([[0, 0, 0], [1, 0, 0], [0, np.nan, 0.0]]), np.array([[0, 1, 2]]), "vertex 2 is not finite"),
+        (np.ones((3, 3)), np.array([[0, 1, 2]]), "one point"),
+        (np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]]), np.array([[0, 1, 2]]), "no face has an area"),
+        (np.eye(3), np.array([[0, 0, 1], [1, 2, 2]]), "no face has an area"),
+    ],
+)
 def test_refused(vertices, faces, fact):
     with pytest.raises(InputError, match=fact):
         repair.clean(vertices, faces, "x.obj")

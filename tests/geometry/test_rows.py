@@ -11,7 +11,9 @@ from gdtool.geometry import rows
 @pytest.mark.parametrize("mix", [rows._MIX, (np.uint64(0), np.uint64(0))], ids=["hashed", "all of one hash"])
 def test_unique_rows_are_those_of_numpy(kind, count, width, mix, monkeypatch):
     monkeypatch.setattr(rows, "_MIX", mix)
-    given = (np.random.default_rng(count).integers(-6, 6, (count, width)) / (3 if np.issubdtype(kind, np.floating) else 1)).astype(kind)
+    given = (
+        np.random.default_rng(count).integers(-6, 6, (count, width)) / (3 if np.issubdtype(kind, np.floating) else 1)
+    ).astype(kind)
     given[given == 0] *= -1  # -0 where there is one
     given[: count // 3] = abs(given[: count // 3])
     distinct, first, which = rows.unique_rows(given)

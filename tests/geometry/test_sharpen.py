@@ -51,7 +51,11 @@ def test_edges_collapsed_at_once_are_those_collapsed_one_by_one():
     together.collapse(edges)
     for edge in edges:
         alone.collapse(alone.became[edge][None])
-    assert (together.became == alone.became).all() and (together.stays == alone.stays).all() and together.stays.mean() < 0.8
+    assert (
+        (together.became == alone.became).all()
+        and (together.stays == alone.stays).all()
+        and together.stays.mean() < 0.8
+    )
 
 
 def test_bevels_of_marching_cubes_become_creases():
@@ -62,7 +66,9 @@ def test_bevels_of_marching_cubes_become_creases():
     before, after = (np.linalg.norm(v - corner, axis=1).min() for v in (vertices, sharp))
     assert after < 0.2 * before
     features = find_features(sharp, sharp_faces, 30.0, 0.15)
-    length = np.linalg.norm(features.points[features.segments[:, 0]] - features.points[features.segments[:, 1]], axis=1).sum()
+    length = np.linalg.norm(
+        features.points[features.segments[:, 0]] - features.points[features.segments[:, 1]], axis=1
+    ).sum()
     assert length == pytest.approx(4 * (1.6 + 1.2 + 1.0) + 2 * 2 * np.pi * 0.3, rel=0.05)
 
 

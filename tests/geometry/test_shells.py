@@ -12,16 +12,19 @@ def ball(radius, centre=(0.0, 0.0, 0.0)):
     return vertices * (radius / 0.8) + centre, faces
 
 
-@pytest.mark.parametrize("name, bodies, inside", [
-    ("one", [ball(0.8)], []),
-    ("apart", [ball(0.3, (-0.5, 0, 0)), ball(0.3, (0.5, 0, 0))], []),
-    ("inside", [ball(0.9), ball(0.3)], [1]),
-    ("nested", [ball(0.9), ball(0.5), ball(0.2)], [1, 2]),
-    ("two in one", [ball(0.9), ball(0.2, (0.4, 0, 0)), ball(0.2, (-0.4, 0, 0))], [1, 2]),
-    ("through the wall", [ball(0.6), ball(0.3, (0.6, 0, 0))], []),
-    ("in the hole of a ring", [torus(40), ball(0.1)], []),
-    ("in the ring itself", [torus(40), ball(0.1, (0.65, 0.0, 0.0))], [1]),
-])
+@pytest.mark.parametrize(
+    "name, bodies, inside",
+    [
+        ("one", [ball(0.8)], []),
+        ("apart", [ball(0.3, (-0.5, 0, 0)), ball(0.3, (0.5, 0, 0))], []),
+        ("inside", [ball(0.9), ball(0.3)], [1]),
+        ("nested", [ball(0.9), ball(0.5), ball(0.2)], [1, 2]),
+        ("two in one", [ball(0.9), ball(0.2, (0.4, 0, 0)), ball(0.2, (-0.4, 0, 0))], [1, 2]),
+        ("through the wall", [ball(0.6), ball(0.3, (0.6, 0, 0))], []),
+        ("in the hole of a ring", [torus(40), ball(0.1)], []),
+        ("in the ring itself", [torus(40), ball(0.1, (0.65, 0.0, 0.0))], [1]),
+    ],
+)
 def test_bodies_inside_a_closed_one_are_counted_with_their_share(name, bodies, inside):
     vertices, faces = joined(*bodies)
     count, share = internal_shells(vertices, faces)

@@ -77,7 +77,8 @@ def test_slivers_that_the_quick_collapse_does_not_touch():
 
 
 def test_flat_parts_go_first_however_they_lie():
-    """Sides cut finely, turned so that rounding bends them: the quick collapse comes to its end, and the cube stays one."""
+    """Sides cut finely, turned so that rounding bends them: the quick collapse comes to its end, and the cube stays
+    one."""
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
     vertices, quads = quad_cube(6)
     vertices, faces = vertices @ (turn * np.linalg.det(turn)), np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])
@@ -85,8 +86,11 @@ def test_flat_parts_go_first_however_they_lie():
     assert len(found) == 200 and topology.is_watertight(found) and topology.is_manifold(found)
     assert simplify.deviation(vertices, faces, out, found) < 1e-3 and volume(out, found) == pytest.approx(1, abs=1e-4)
     assert len(simplify.collapse(vertices, faces, 200, 5.0)[1]) > 5000
-    # Only what lies in a side moves: at an edge of the cube the middle of the normals' squares has a determinant of nought too.
-    by = np.linalg.norm(simplify.uneven(vertices, faces) - vertices, axis=1) / np.linalg.norm(vertices[quads[0, 0]] - vertices[quads[0, 1]])
+    # Only what lies in a side moves: at an edge of the cube the middle of the normals' squares has a determinant of
+    # nought too.
+    by = np.linalg.norm(simplify.uneven(vertices, faces) - vertices, axis=1) / np.linalg.norm(
+        vertices[quads[0, 0]] - vertices[quads[0, 1]]
+    )
     assert 0.5 < (by > 0).mean() <= 1 and by.max() < 3 * simplify._UNEVEN
     # What is not flat stays where it is, and what is flat along an axis, which rounding does not bend.
     for vertices, faces in (sphere(40), bored_box(40)):
@@ -101,7 +105,12 @@ def test_creases_are_drawn_out_unless_that_cannot_be_collapsed(monkeypatch):
         return np.linalg.norm(vertices - corner, axis=1).min()
 
     out, found, _, report = simplify.simplify(vertices, faces, 2000, crease_degrees=30.0)
-    assert report["creases"] > 300 and len(found) <= 2000 and topology.is_watertight(found) and off(out) < 0.2 * off(vertices)
+    assert (
+        report["creases"] > 300
+        and len(found) <= 2000
+        and topology.is_watertight(found)
+        and off(out) < 0.2 * off(vertices)
+    )
     begin = simplify.begin
 
     class Torn:
@@ -121,8 +130,14 @@ def test_creases_are_drawn_out_unless_that_cannot_be_collapsed(monkeypatch):
         return begin(*given, **limits)
 
     monkeypatch.setattr(simplify, "begin", dying)
-    assert (found := simplify.simplify(vertices, faces, 2000, crease_degrees=30.0)[3])["faces"] <= 2000 and found["creases"] == 0
-    monkeypatch.setattr(simplify, "begin", lambda *given, **limits: Torn(begin(*given, **limits)) if restored(given) else begin(*given, **limits))
+    assert (found := simplify.simplify(vertices, faces, 2000, crease_degrees=30.0)[3])["faces"] <= 2000 and found[
+        "creases"
+    ] == 0
+    monkeypatch.setattr(
+        simplify,
+        "begin",
+        lambda *given, **limits: Torn(begin(*given, **limits)) if restored(given) else begin(*given, **limits),
+    )
     out, found, _, report = simplify.simplify(vertices, faces, 2000, crease_degrees=30.0)
     assert report["creases"] == 0 and "creases restored" in report["failed"] and topology.is_watertight(found)
     assert off(out) > 0.5 * off(vertices)
@@ -148,8 +163,10 @@ def test_the_noise_of_even_is_as_fine_as_the_detail():
     ball = ball_vertices * 1e-3 + (2.0, 0.0, 0.0), ball_faces
     vertices, faces = joined((cube_vertices, np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])), ball)
     out = simplify.shaken(vertices, faces)
-    assert np.abs(out - vertices)[:len(cube_vertices)].max() > 0.01 * np.linalg.norm(cube_vertices[quads[0, 0]] - cube_vertices[quads[0, 1]])
-    radius = np.linalg.norm(out[len(cube_vertices):] - (2.0, 0.0, 0.0), axis=1)
+    assert np.abs(out - vertices)[: len(cube_vertices)].max() > 0.01 * np.linalg.norm(
+        cube_vertices[quads[0, 0]] - cube_vertices[quads[0, 1]]
+    )
+    radius = np.linalg.norm(out[len(cube_vertices) :] - (2.0, 0.0, 0.0), axis=1)
     assert 1e-6 < np.abs(radius - 0.8e-3).max() < 1e-5
 
 

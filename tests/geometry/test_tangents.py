@@ -93,4 +93,5 @@ def test_encoding_decodes_to_the_same_normal_in_skewed_and_mirrored_frames():
     np.testing.assert_allclose(decode_tangent_space(frames, local), world, atol=1e-9)
     flat = encode_tangent_space(normal, tangent, sign, normal / np.linalg.norm(normal, axis=1, keepdims=True))
     np.testing.assert_allclose(flat, np.tile([0, 0, 1.0], (count, 1)), atol=1e-9)
-    np.testing.assert_array_equal(encode_tangent_space(normal[:1], normal[:1], sign[:1], world[:1]), [[0, 0, 1]])  # no frame at all
+    # No frame at all.
+    np.testing.assert_array_equal(encode_tangent_space(normal[:1], normal[:1], sign[:1], world[:1]), [[0, 0, 1]])

@@ -28,8 +28,18 @@ def test_triangulation_cuts_between_first_and_third_corner_and_keeps_volume():
     assert np.isclose((a * np.cross(b, c)).sum() / 6, 1)  # outward: positive volume
 
 
-@pytest.mark.parametrize("mesh, cut, handles", [(sphere(12), 0, 0), (torus(20), 0, 1), (torus(20), 40, 1), (plane(4), 0, 0), (lattice(), 0, 28),
-                                                (joined(torus(20), sphere(12), plane(4)), 0, 1)], ids=["ball", "ring", "open ring", "sheet", "net", "several"])
+@pytest.mark.parametrize(
+    "mesh, cut, handles",
+    [
+        (sphere(12), 0, 0),
+        (torus(20), 0, 1),
+        (torus(20), 40, 1),
+        (plane(4), 0, 0),
+        (lattice(), 0, 28),
+        (joined(torus(20), sphere(12), plane(4)), 0, 1),
+    ],
+    ids=["ball", "ring", "open ring", "sheet", "net", "several"],
+)
 def test_handles(mesh, cut, handles):
     """As many as there are however many loops the rim has."""
     vertices, faces = mesh
@@ -52,21 +62,34 @@ def test_edges_count_as_sorting_does():
     edges = topology.edges_of(faces)
     half = np.sort(edges.half_ends, 1)
     ends, inverse, count = np.unique(half, axis=0, return_inverse=True, return_counts=True)
-    assert (edges.ends == ends).all() and (edges.count == count).all() and (edges.half_edge_idx == inverse.ravel()).all()
+    assert (
+        (edges.ends == ends).all() and (edges.count == count).all() and (edges.half_edge_idx == inverse.ravel()).all()
+    )
     assert (edges.order == np.argsort(inverse.ravel(), kind="stable")).all()
 
 
 @pytest.mark.parametrize("change", ["none", "turned", "opened", "doubled", "wedge"])
 def test_watertight_as_the_edges_say(change):
     _, faces = torus(20)
-    faces = {"none": faces, "turned": np.concatenate([faces[:1, ::-1], faces[1:]]), "opened": faces[1:],
-             "doubled": np.concatenate([faces, faces[:1]]), "wedge": np.concatenate([faces, faces[:1], faces[:1, ::-1]])}[change]
+    faces = {
+        "none": faces,
+        "turned": np.concatenate([faces[:1, ::-1], faces[1:]]),
+        "opened": faces[1:],
+        "doubled": np.concatenate([faces, faces[:1]]),
+        "wedge": np.concatenate([faces, faces[:1], faces[:1, ::-1]]),
+    }[change]
     edges = topology.edges_of(faces)
-    assert topology.is_watertight(faces) == bool((edges.count == 2).all() and not edges.turned.any()) == (change == "none")
+    assert (
+        topology.is_watertight(faces) == bool((edges.count == 2).all() and not edges.turned.any()) == (change == "none")
+    )
 
 
 def test_unused_vertices_go_and_triangles_among_quads_stay():
     vertices = np.arange(21.0).reshape(7, 3)
     out, faces = topology.compact(vertices, np.array([[1, 2, 4, 5], [1, 5, 6, -1]], np.int32))
-    assert (out == vertices[[1, 2, 4, 5, 6]]).all() and (faces == [[0, 1, 2, 3], [0, 3, 4, -1]]).all() and faces.dtype == np.int64
+    assert (
+        (out == vertices[[1, 2, 4, 5, 6]]).all()
+        and (faces == [[0, 1, 2, 3], [0, 3, 4, -1]]).all()
+        and faces.dtype == np.int64
+    )
     assert topology.compact(out, faces)[0] is out

@@ -5,7 +5,15 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from gdtool.geometry.uv_raster import SUBTEXEL_BITS, Barycentrics, between_centres, extend_owners, owner_count, owners_of, rasterize_uv
+from gdtool.geometry.uv_raster import (
+    SUBTEXEL_BITS,
+    Barycentrics,
+    between_centres,
+    extend_owners,
+    owner_count,
+    owners_of,
+    rasterize_uv,
+)
 
 
 def grid(n: int, low: float, high: float, jitter: float = 0.0, seed: int = 0):
@@ -51,8 +59,11 @@ def test_agrees_with_rational_arithmetic_on_adversaries():
     centres = (np.array([[0, 0], [5, 0], [5, 7], [11, 11], [3, 9]]) + 0.5) / size  # vertices on texel centres
     others = rng.uniform(-0.3, 1.3, (9, 2))
     uv = np.concatenate([centres, others, [[0.25, 0.25], [0.25 + 1e-5, 0.25], [0.25, 0.25 + 1e-5]]])
-    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [2, 1, 0], [1, 1, 2], [0, 2, 2]]  # mirrored and degenerate ones
-                     + [[14, 15, 16]] + rng.integers(0, len(uv), (12, 3)).tolist())
+    faces = np.array(
+        [[0, 1, 2], [0, 2, 3], [0, 3, 4], [2, 1, 0], [1, 1, 2], [0, 2, 2]]  # mirrored and degenerate ones
+        + [[14, 15, 16]]
+        + rng.integers(0, len(uv), (12, 3)).tolist()
+    )
     owner, _ = rasterize_uv(uv, faces, size)
     np.testing.assert_array_equal(owner, exact_owner(uv, faces, size))
 
@@ -124,7 +135,8 @@ def test_extended_owners_go_on_linearly():
 
 
 def test_charts_between_texel_centres_get_what_they_pass_through():
-    """A square, a triangle a third of a texel wide and a sliver of nine texels' length and a tenth's width, apart from one another."""
+    """A square, a triangle a third of a texel wide and a sliver of nine texels' length and a tenth's width, apart from
+    one another."""
     square = [[4, 4], [12, 4], [12, 12], [4, 12]]
     tiny = [[20.6, 6.6], [20.9, 6.6], [20.6, 6.9]]
     sliver = [[4.1, 20.05], [13.3, 20.05], [13.3, 20.15]]

@@ -14,17 +14,25 @@ def chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
-def png(width: int, height: int, color: int, bits: int, scanlines: bytes, *, before: bytes = b"", interlaced: bool = False) -> bytes:
+def png(
+    width: int, height: int, color: int, bits: int, scanlines: bytes, *, before: bytes = b"", interlaced: bool = False
+) -> bytes:
     """A PNG of filtered scanlines (each with its filter byte); `before` holds chunks between IHDR and IDAT."""
     header = struct.pack(">IIBBBBB", width, height, bits, color, 0, 0, int(interlaced))
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + before + chunk(b"IDAT", zlib.compress(scanlines)) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + before
+        + chunk(b"IDAT", zlib.compress(scanlines))
+        + chunk(b"IEND", b"")
+    )
 
 
 def scanlines(image: np.ndarray) -> bytes:
     """Unfiltered scanlines of (h, w, c) uint8 or uint16."""
     rows = image.astype(image.dtype.newbyteorder(">")).tobytes()
     stride = len(rows) // len(image)
-    return b"".join(b"\0" + rows[i * stride:(i + 1) * stride] for i in range(len(image)))
+    return b"".join(b"\0" + rows[i * stride : (i + 1) * stride] for i in range(len(image)))
 
 
 def adam7(image: np.ndarray) -> bytes:

@@ -6,7 +6,9 @@ from gdtool.images.color import decode_normal, encode_normal, linear_from_srgb, 
 
 def test_srgb_known_values():
     # IEC 61966-2-1: mid grey, the knee, the ends
-    np.testing.assert_allclose(srgb_from_linear(np.array([0, 0.0031308, 0.18, 1.0])), [0, 0.04045, 0.4613561, 1], atol=1e-6)
+    np.testing.assert_allclose(
+        srgb_from_linear(np.array([0, 0.0031308, 0.18, 1.0])), [0, 0.04045, 0.4613561, 1], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

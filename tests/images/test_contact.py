@@ -12,7 +12,7 @@ def test_cells_stand_where_their_row_and_column_say():
     isolated = np.flatnonzero((sheet == (255, 0, 0)).all(-1).any(1))
     assert len(isolated) == 40 and ((sheet == (255, 0, 0)).all(-1).sum() == 1600)
     assert (sheet == 128).all(-1).sum() == 800
-    assert (sheet[isolated[-1] + 5:, :44] == 255).all()  # transparent is white
+    assert (sheet[isolated[-1] + 5 :, :44] == 255).all()  # transparent is white
 
 
 def test_labels_leave_ink():

@@ -41,4 +41,6 @@ def test_what_is_linear_in_the_guide_comes_back_and_what_is_not_is_smoothed(disc
 def test_a_flat_guide_leaves_the_mean(disc):
     rng = np.random.default_rng(2)
     values, guide = rng.normal(0, 1, (SIZE, SIZE, 2)), np.ones((SIZE, SIZE, 3))
-    np.testing.assert_allclose(guided(values, guide, disc, 4.0, 1e-3), masked_mean(masked_mean(values, disc, 4.0), disc, 4.0), atol=1e-6)
+    np.testing.assert_allclose(
+        guided(values, guide, disc, 4.0, 1e-3), masked_mean(masked_mean(values, disc, 4.0), disc, 4.0), atol=1e-6
+    )

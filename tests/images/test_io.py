@@ -116,8 +116,16 @@ def test_grey_and_alpha_in_sixteen_bits():
 def test_exif_rotation_is_applied(tmp_path, orientation):
     upright = np.random.default_rng(7).integers(0, 256, (34, 40, 3), np.uint8)
     # what a camera held so would store: the inverse of the turn that the EXIF table names
-    stored = {1: upright, 2: upright[:, ::-1], 3: upright[::-1, ::-1], 4: upright[::-1], 5: upright.transpose(1, 0, 2),
-              6: np.rot90(upright, 1), 7: upright[::-1, ::-1].transpose(1, 0, 2), 8: np.rot90(upright, -1)}[orientation]
+    stored = {
+        1: upright,
+        2: upright[:, ::-1],
+        3: upright[::-1, ::-1],
+        4: upright[::-1],
+        5: upright.transpose(1, 0, 2),
+        6: np.rot90(upright, 1),
+        7: upright[::-1, ::-1].transpose(1, 0, 2),
+        8: np.rot90(upright, -1),
+    }[orientation]
     save(tmp_path / "x.tif", stored, Orientation=orientation)
     np.testing.assert_array_equal(read_image(tmp_path / "x.tif"), upright)
 
@@ -129,7 +137,7 @@ def faulty(kind: str, picture: np.ndarray) -> bytes:
     if kind == "text":
         return b"these are words, not pixels"
     if kind == "truncated":
-        return whole[:len(whole) // 2]
+        return whole[: len(whole) // 2]
     if kind == "checksum":
         return whole[:200] + bytes([whole[200] ^ 255]) + whole[201:]
     if kind == "no end":
@@ -141,9 +149,18 @@ def faulty(kind: str, picture: np.ndarray) -> bytes:
     raise KeyError(kind)
 
 
-@pytest.mark.parametrize(("kind", "fact"), [
-    ("empty", "is empty"), ("text", "is not an image"), ("truncated", "cut short"), ("checksum", "bad checksum"), ("no end", "cut short"),
-    ("animated", "animation"), ("gif", "GIF")])
+@pytest.mark.parametrize(
+    ("kind", "fact"),
+    [
+        ("empty", "is empty"),
+        ("text", "is not an image"),
+        ("truncated", "cut short"),
+        ("checksum", "bad checksum"),
+        ("no end", "cut short"),
+        ("animated", "animation"),
+        ("gif", "GIF"),
+    ],
+)
 def test_faulty_files_are_named(tmp_path, picture, kind, fact, capfd):
     path = tmp_path / "x.png"
     path.write_bytes(faulty(kind, picture))
@@ -158,7 +175,7 @@ def test_truncated_jpeg(tmp_path, picture, cut):
     save(tmp_path / "x.jpg", picture)
     content = (tmp_path / "x.jpg").read_bytes()
     assert read_image(tmp_path / "x.jpg").shape == picture.shape
-    (tmp_path / "x.jpg").write_bytes(content[:int(len(content) * cut)])
+    (tmp_path / "x.jpg").write_bytes(content[: int(len(content) * cut)])
     with pytest.raises(InputError):
         read_image(tmp_path / "x.jpg")
 
@@ -174,10 +191,29 @@ def test_huge_headers_are_refused_before_decoding(side):
 
 def test_cmyk_is_refused(tmp_path):
     # a baseline TIFF by hand (TIFF 6.0, section 16): photometric interpretation 5 is separated inks
-    entries = [(256, 3, 1, 40), (257, 3, 1, 40), (258, 3, 4, 8 + 6400), (259, 3, 1, 1), (262, 3, 1, 5), (273, 4, 1, 8), (277, 3, 1, 4), (278, 3, 1, 40),
-               (279, 4, 1, 6400), (332, 3, 1, 1)]
-    directory = struct.pack("<H", len(entries)) + b"".join(struct.pack("<HHII", *entry) for entry in entries) + struct.pack("<I", 0)
-    (tmp_path / "x.tif").write_bytes(struct.pack("<2sHI", b"II", 42, 8 + 6400 + 8) + bytes(range(256)) * 25 + struct.pack("<4H", 8, 8, 8, 8) + directory)
+    entries = [
+        (256, 3, 1, 40),
+        (257, 3, 1, 40),
+        (258, 3, 4, 8 + 6400),
+        (259, 3, 1, 1),
+        (262, 3, 1, 5),
+        (273, 4, 1, 8),
+        (277, 3, 1, 4),
+        (278, 3, 1, 40),
+        (279, 4, 1, 6400),
+        (332, 3, 1, 1),
+    ]
+    directory = (
+        struct.pack("<H", len(entries))
+        + b"".join(struct.pack("<HHII", *entry) for entry in entries)
+        + struct.pack("<I", 0)
+    )
+    (tmp_path / "x.tif").write_bytes(
+        struct.pack("<2sHI", b"II", 42, 8 + 6400 + 8)
+        + bytes(range(256)) * 25
+        + struct.pack("<4H", 8, 8, 8, 8)
+        + directory
+    )
     with pytest.raises(InputError, match="CMYK"):
         read_image(tmp_path / "x.tif")
 
@@ -194,7 +230,7 @@ def test_exr_with_nan_names_the_pixel(tmp_path):
 def test_truncated_exr_says_one_thing(tmp_path, cut, capfd):
     write_exr(tmp_path / "x.exr", np.random.default_rng(9).random((64, 64, 3)))
     content = (tmp_path / "x.exr").read_bytes()
-    (tmp_path / "x.exr").write_bytes(content[:int(len(content) * cut)])
+    (tmp_path / "x.exr").write_bytes(content[: int(len(content) * cut)])
     with pytest.raises(InputError, match="damaged or cut short|cannot be read|can be read"):
         read_image(tmp_path / "x.exr")
     assert capfd.readouterr().err == ""

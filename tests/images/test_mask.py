@@ -5,8 +5,16 @@ from gdtool.core.errors import InputError
 from gdtool.images.mask import foreground
 
 
-def scene(size: int = 160, background=(0.9, 0.9, 0.9), subject=(0.7, 0.2, 0.1), center=(0.0, 0.0), gradient: float = 0.0, noise: float = 0.01):
-    """A disc of radius 0.5 with a hole of radius 0.2 on a background that darkens downward: (picture uint8, coverage)."""
+def scene(
+    size: int = 160,
+    background=(0.9, 0.9, 0.9),
+    subject=(0.7, 0.2, 0.1),
+    center=(0.0, 0.0),
+    gradient: float = 0.0,
+    noise: float = 0.01,
+):
+    """A disc of radius 0.5 with a hole of radius 0.2 on a background that darkens downward: (picture uint8,
+    coverage)."""
     y, x = np.meshgrid(np.linspace(-1, 1, size), np.linspace(-1, 1, size), indexing="ij")
     r = np.hypot(x - center[0], y - center[1])
     coverage = np.clip((0.5 - r) * size / 2 + 0.5, 0, 1) * np.clip((r - 0.2) * size / 2 + 0.5, 0, 1)
@@ -67,13 +75,16 @@ def test_a_given_mask_comes_before_everything():
     np.testing.assert_array_equal(foreground(image, np.dstack([mask] * 3)), mask / 255)
 
 
-@pytest.mark.parametrize(("image", "mask", "fact"), [
-    (np.dstack([scene()[0], np.zeros((160, 160), np.uint8)]), None, "transparent everywhere"),
-    (np.random.default_rng(0).integers(0, 256, (100, 100, 3), np.uint8), None, "--mask"),
-    (np.full((100, 100, 3), 200, np.uint8), None, "--mask"),
-    (scene()[0], np.zeros((160, 160), np.uint8), "empty mask"),
-    (scene()[0], np.ones((80, 160), np.uint8), "its mask"),
-])
+@pytest.mark.parametrize(
+    ("image", "mask", "fact"),
+    [
+        (np.dstack([scene()[0], np.zeros((160, 160), np.uint8)]), None, "transparent everywhere"),
+        (np.random.default_rng(0).integers(0, 256, (100, 100, 3), np.uint8), None, "--mask"),
+        (np.full((100, 100, 3), 200, np.uint8), None, "--mask"),
+        (scene()[0], np.zeros((160, 160), np.uint8), "empty mask"),
+        (scene()[0], np.ones((80, 160), np.uint8), "its mask"),
+    ],
+)
 def test_what_has_no_subject_is_refused(image, mask, fact):
     with pytest.raises(InputError, match=fact) as caught:
         foreground(image, mask, "cat.png")

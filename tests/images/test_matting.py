@@ -19,10 +19,15 @@ def network(tmp_path):
     weight = (np.array([1.0, -0.5, -0.5]) * DEVIATION).astype(np.float32).reshape(1, 3, 1, 1)
     bias = np.array([np.dot([1.0, -0.5, -0.5], MEAN)], np.float32)
     graph = helper.make_graph(
-        [helper.make_node("Conv", ["input.1", "weight", "bias"], ["redness"]), helper.make_node("Sigmoid", ["redness"], ["found"])],
-        "red", [helper.make_tensor_value_info("input.1", TensorProto.FLOAT, [1, 3, 320, 320])],
+        [
+            helper.make_node("Conv", ["input.1", "weight", "bias"], ["redness"]),
+            helper.make_node("Sigmoid", ["redness"], ["found"]),
+        ],
+        "red",
+        [helper.make_tensor_value_info("input.1", TensorProto.FLOAT, [1, 3, 320, 320])],
         [helper.make_tensor_value_info("found", TensorProto.FLOAT, [1, 1, 320, 320])],
-        [numpy_helper.from_array(weight, "weight"), numpy_helper.from_array(bias, "bias")])
+        [numpy_helper.from_array(weight, "weight"), numpy_helper.from_array(bias, "bias")],
+    )
     path = tmp_path / "red.onnx"
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), path)
     return path

@@ -38,7 +38,9 @@ def test_ssim_of_equal_and_of_constant_pictures():
 
 def test_ssim_does_not_depend_on_the_range_that_a_picture_happens_to_have():
     dim = noise((64, 64)) * 0.1
-    assert metrics.ssim(dim, dim + 0.05) == pytest.approx(metrics.ssim(np.pad(dim, 20), np.pad(dim + 0.05, 20), np.pad(np.ones((64, 64), bool), 20)), abs=0.1)
+    assert metrics.ssim(dim, dim + 0.05) == pytest.approx(
+        metrics.ssim(np.pad(dim, 20), np.pad(dim + 0.05, 20), np.pad(np.ones((64, 64), bool), 20)), abs=0.1
+    )
 
 
 def test_resized_is_the_average_over_area():
@@ -106,10 +108,25 @@ def test_depth_and_masks():
 
 def test_views_metrics_take_the_domains_that_both_have():
     mask = np.ones((1, 256, 256), np.float32)
-    images = {"color": noise((1, 256, 256, 3)), "albedo": noise((1, 256, 256, 3)), "roughness": noise((1, 256, 256)), "depth": noise((1, 256, 256))}
+    images = {
+        "color": noise((1, 256, 256, 3)),
+        "albedo": noise((1, 256, 256, 3)),
+        "roughness": noise((1, 256, 256)),
+        "depth": noise((1, 256, 256)),
+    }
     found = metrics.views_metrics(images, mask, {k: v for k, v in images.items() if k != "depth"}, mask)
-    assert found == pytest.approx({"mask_iou": 1, "color_psnr_published": 100, "color_ssim_published": 1, "color_psnr_masked": 100, "color_ssim_masked": 1,
-                                   "albedo_psnr_masked": 100, "albedo_ssim_masked": 1, "roughness_error": 0})
+    assert found == pytest.approx(
+        {
+            "mask_iou": 1,
+            "color_psnr_published": 100,
+            "color_ssim_published": 1,
+            "color_psnr_masked": 100,
+            "color_ssim_masked": 1,
+            "albedo_psnr_masked": 100,
+            "albedo_ssim_masked": 1,
+            "roughness_error": 0,
+        }
+    )
 
 
 def test_nothing_in_common_gives_no_figure():

@@ -6,7 +6,8 @@ import numpy as np
 
 from gdtool.core.child import ChildFailed
 from gdtool.geometry import topology
-from gdtool.remesh.engines import candidate as quad_candidate, search
+from gdtool.remesh.engines import candidate as quad_candidate
+from gdtool.remesh.engines import search
 
 
 def whole(faces) -> bool:
@@ -30,7 +31,8 @@ class Ended:
 
 
 def in_this_process(monkeypatch, engine=None) -> list:
-    """Candidates are made here, by `engine` in the place of every engine where one is given; the calls, as they come."""
+    """Candidates are made here, by `engine` in the place of every engine where one is given; the calls, as they
+    come."""
     calls = []
 
     def begin(_, *given, **limits):

@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 
 from gdtool.geometry import topology
-from gdtool.remesh import components as quad_pieces, pipeline
+from gdtool.geometry.mesh_quality import distance_figures, topology_figures
+from gdtool.geometry.topology import triangulated
+from gdtool.remesh import components as quad_pieces
+from gdtool.remesh import pipeline
 from gdtool.remesh.engines import candidate, search
 from gdtool.remesh.fit.feature_curves import Constraints
-from gdtool.geometry.mesh_quality import distance_figures, topology_figures
 from gdtool.remesh.task import Part, Request
-from gdtool.geometry.topology import triangulated
-from tests.remesh.engines import in_this_process, whole
 from tests.geometry.solids import cube, joined, sphere
+from tests.remesh.engines import in_this_process, whole
 
 
 def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
@@ -24,7 +25,11 @@ def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
     assert sum(part.quads for part in parts) == 4000 and min(part.quads for part in parts) >= 4000 * 0.02
     assert sum(part.tolerance * part.quads for part in parts) == pytest.approx(0.03 * 4000)
     few = quad_pieces.apart(both, np.array([True, False]), 1000)[0]
-    assert few.tolerance * few.quads == pytest.approx(0.03 * 4000) and few.counted(1000 + 119, 1000) and not few.counted(1000 - 121, 1000)
+    assert (
+        few.tolerance * few.quads == pytest.approx(0.03 * 4000)
+        and few.counted(1000 + 119, 1000)
+        and not few.counted(1000 - 121, 1000)
+    )
     assert quad_pieces.apart(both, np.array([True, False]), 400)[0].tolerance == 0.15
     tried = []
     real = search.Trial.run
@@ -59,13 +64,15 @@ def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless)
     assert record.engine == ("instant-meshes; pair and split" if hopeless else "instant-meshes")
     assert topology.components(found)[0] == 21 and whole(found) and abs(len(found) / 4000 - 1) <= 0.03
     small = found[(out[found][..., 2] < 0.15).all(1)]
-    assert topology_figures(*topology.compact(out, small))["irregular_share"] < 0.1  # eight of a ball's hundred; of paired triangles a fifth and more
+    # Eight of a ball's hundred; of paired triangles a fifth and more.
+    assert topology_figures(*topology.compact(out, small))["irregular_share"] < 0.1
     assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.02
 
 
 @pytest.mark.parametrize("wanted, kept", [(1.0, True), (1.2, False)])
 def test_pieces_are_kept_as_they_were_drawn_where_the_others_can_make_up_for_their_count(monkeypatch, wanted, kept):
-    """Two balls of which an engine's quads are those of both: all are kept, or none where there are a sixth too few; none is drawn again."""
+    """Two balls of which an engine's quads are those of both: all are kept, or none where there are a sixth too few;
+    none is drawn again."""
     meshes = [sphere(24, 0.3, (x, 0, 0)) for x in (-0.4, 0.4)]
     out, found = quad_pieces.joined([pipeline.remesh(*mesh, Request(quads=500, engine="split"))[:2] for mesh in meshes])
     part = Part(*joined(*meshes), round(wanted * len(found)), 0.05, Request(), None)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from gdtool.geometry import topology
-from gdtool.remesh.fit.feature_curves import Constraints
 from gdtool.geometry.mesh_quality import scaled_jacobian
 from gdtool.remesh.connectivity.diagonal_collapse import without_folded
+from gdtool.remesh.fit.feature_curves import Constraints
 from gdtool.remesh.fit.shaping import surface_of
 from tests.geometry.solids import quad_torus
 
@@ -39,7 +39,12 @@ def test_a_folded_quad_goes_and_its_surroundings_stay(apart):
     torn, quads, _ = opened(vertices, faces, 17, apart)
     assert topology.is_watertight(quads) and len(quads) == len(faces) + 1 and scaled_jacobian(torn, quads).min() < 0.05
     out, found, _ = without_folded(torn, quads, surface_of(vertices, faces), Constraints.none(len(torn)))
-    assert len(found) == len(faces) and len(out) == len(vertices) and topology.is_watertight(found) and topology.is_manifold(found)
+    assert (
+        len(found) == len(faces)
+        and len(out) == len(vertices)
+        and topology.is_watertight(found)
+        and topology.is_manifold(found)
+    )
     assert topology.euler_number(found) == topology.euler_number(faces)
     assert scaled_jacobian(out, found).min() > 0.8 * scaled_jacobian(vertices, faces).min()
     assert len(np.unique(np.concatenate([out, vertices]).round(9), axis=0)) <= len(vertices) + 1
@@ -50,7 +55,9 @@ def test_what_is_held_stays():
     torn, quads, new = opened(vertices, faces, 17, 0.1)
     constraints = Constraints.none(len(torn))
     constraints.curve[[new[0], new[2]]] = 0
-    out, found, _ = without_folded(torn, quads, surface_of(vertices, faces), replace(constraints, fixed=np.ones(len(torn), bool)))
+    out, found, _ = without_folded(
+        torn, quads, surface_of(vertices, faces), replace(constraints, fixed=np.ones(len(torn), bool))
+    )
     assert out is torn and found is quads
     # One of the two is held: it is the one that stays, where it was.
     constraints.curve[new[2]] = -1

@@ -1,19 +1,21 @@
-"""Pairs of irregular vertices that are led together: what was pulled apart closes, creases stay, the mesh stays whole."""
+"""Pairs of irregular vertices that are led together: what was pulled apart closes, creases stay, the mesh stays
+whole."""
 
 import numpy as np
 import pytest
 
 from gdtool.geometry import topology
-from gdtool.remesh.engines import candidate as quad_candidate
 from gdtool.geometry.mesh_quality import valences
-from gdtool.remesh.engines.candidate import Way, candidate
-from gdtool.remesh.connectivity.edge_rotation import cancel_pairs
 from gdtool.geometry.sharpen import dihedral_degrees
+from gdtool.remesh.connectivity.edge_rotation import cancel_pairs
+from gdtool.remesh.engines import candidate as quad_candidate
+from gdtool.remesh.engines.candidate import Way, candidate
 from tests.geometry.solids import marching, plane, quad_cube, quad_torus
 
 
 def rotated(quads: np.ndarray, p: int, q: int) -> np.ndarray:
-    """The edge from p to q turned within the hexagon around it: it ends now at the corner before p in its first face."""
+    """The edge from p to q turned within the hexagon around it: it ends now at the corner before p in its first
+    face."""
     one = next(f for f in quads.tolist() if p in f and f[(f.index(p) + 1) % 4] == q)
     two = next(f for f in quads.tolist() if q in f and f[(f.index(q) + 1) % 4] == p)
     r, s = (one[(one.index(q) + i) % 4] for i in (1, 2))
@@ -91,7 +93,11 @@ def test_creases_stay():
     found = cancel_pairs(points, torn)
     kept = {tuple(sorted(edge)) for edge in topology.edges_of(found).ends.tolist()}
     assert crease <= kept
-    assert topology.is_watertight(found) and topology.is_manifold(found) and irregular(points, found) < irregular(points, torn) / 2
+    assert (
+        topology.is_watertight(found)
+        and topology.is_manifold(found)
+        and irregular(points, found) < irregular(points, torn) / 2
+    )
 
 
 def test_an_engine_s_quads_have_fewer(monkeypatch):

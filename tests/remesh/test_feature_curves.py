@@ -3,15 +3,16 @@
 import numpy as np
 import pytest
 
-from gdtool.remesh.fit.feature_curves import Features, _tidy, find_features, trace
 from gdtool.geometry.sharpen import dihedral_degrees
+from gdtool.remesh.fit.feature_curves import Features, _tidy, find_features, trace
 from tests.geometry.solids import cube
 
 FACES = np.array([(0, 1, 4), (1, 2, 4), (0, 4, 2), (0, 2, 3)])
 
 
 def square(turned_degrees: float) -> np.ndarray:
-    """A square of two halves that turn about the diagonal 0-2, and vertex 4 past the diagonal, so that (0, 4, 2) is a folded sliver."""
+    """A square of two halves that turn about the diagonal 0-2, and vertex 4 past the diagonal, so that (0, 4, 2) is a
+    folded sliver."""
     angle = np.radians(turned_degrees)
     along, side = np.array([1, 1, 0]) / 2**0.5, np.array([-1, 1, 0]) / 2**0.5
     tip = along / 2**0.5 + (side * np.cos(angle) + np.array([0, 0, 1]) * np.sin(angle)) / 2**0.5
@@ -39,12 +40,16 @@ def test_corners_in_a_row_are_not_all_drawn_into_one():
     teeth, length, short = 21, 10, 1.5
     points = np.array([(x, y, 0.0) for x in range(teeth) for y in range(length)])
     root = length * np.arange(teeth)
-    segments = np.concatenate([np.stack([root[:-1], root[1:]], -1)] + [np.stack([root + y, root + y + 1], -1) for y in range(length - 1)])
+    segments = np.concatenate(
+        [np.stack([root[:-1], root[1:]], -1)] + [np.stack([root + y, root + y + 1], -1) for y in range(length - 1)]
+    )
     found = _tidy(points, segments, short)
     ends = found.points[found.segments]
     assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() <= 1 + short
     # No tooth is lost, and the corners that are left stand on the spine.
-    assert (found.points[:, 1] == length - 1).sum() == teeth and 1 < len(np.unique(ends[ends[..., 1] == 0], axis=0)) < teeth
+    assert (found.points[:, 1] == length - 1).sum() == teeth and 1 < len(
+        np.unique(ends[ends[..., 1] == 0], axis=0)
+    ) < teeth
 
 
 def plate(thickness: float) -> tuple[np.ndarray, np.ndarray]:
@@ -54,16 +59,20 @@ def plate(thickness: float) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("thickness", [0.005, 0.014])
 def test_both_rims_of_a_thin_plate_are_kept(thickness):
-    """Its short edges are half a quad or more than one long; drawn together they would bend the rims by their whole length."""
+    """Its short edges are half a quad or more than one long; drawn together they would bend the rims by their whole
+    length."""
     vertices, faces = plate(thickness)
     found = find_features(vertices, faces, 30.0, 0.03)
     length = np.linalg.norm(found.points[found.segments[:, 0]] - found.points[found.segments[:, 1]], axis=1)
     assert len(found.corners) == 8 and length.sum() == pytest.approx(8 + 4 * thickness)
-    assert found.in_strips(2 * thickness) == pytest.approx(8 / (8 + 4 * thickness)) and found.in_strips(thickness / 2) == 0
+    assert (
+        found.in_strips(2 * thickness) == pytest.approx(8 / (8 + 4 * thickness)) and found.in_strips(thickness / 2) == 0
+    )
 
 
 def test_a_curve_whose_corner_has_no_vertex_of_its_own_is_followed_all_the_same():
-    """Two corners nearer to each other than to any other vertex of the grid: both curves are held, one from the vertex beside."""
+    """Two corners nearer to each other than to any other vertex of the grid: both curves are held, one from the vertex
+    beside."""
     side = 21
     x, y = np.meshgrid(np.arange(side), np.arange(side), indexing="ij")
     vertices = np.stack([x, y, 0 * x], -1).reshape(-1, 3).astype(float)

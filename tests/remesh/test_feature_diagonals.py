@@ -9,7 +9,7 @@ from gdtool.remesh.fit.surface_projection import Surface, subdivide
 
 def grid(n: int = 4):
     """A flat grid of n x n unit quads."""
-    y, x = np.mgrid[:n + 1, :n + 1]
+    y, x = np.mgrid[: n + 1, : n + 1]
     vertices = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1).astype(float)
     corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
     return vertices, np.stack([corner, corner + 1, corner + n + 2, corner + n + 1], -1)
@@ -35,7 +35,8 @@ def test_a_path_round_a_corner_crosses_its_quad():
 
 
 def test_bent_quads_are_cut_along_the_ridge():
-    ridge = np.array([[0, 0, 0], [2, 0, -1], [2, 2, 0], [0, 2, -1.0]])  # the ridge runs from the first corner to the third
+    # The ridge runs from the first corner to the third.
+    ridge = np.array([[0, 0, 0], [2, 0, -1], [2, 2, 0], [0, 2, -1.0]])
     surface = Surface(ridge, np.array([[0, 1, 2], [0, 2, 3]]))
     for turn in range(4):
         quad = np.roll([0, 1, 2, 3], turn)[None]

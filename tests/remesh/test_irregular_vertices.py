@@ -21,7 +21,7 @@ def opened(points: np.ndarray, quads: np.ndarray, v: int) -> tuple[np.ndarray, n
         quads[i][quads[i] == v] = len(points)
     start = quads[fan[0]][(quads[fan[0]].tolist().index(len(points)) + 1) % 4]
     end = before[fan[1]]
-    return np.concatenate([points, points[v:v + 1] * 1.01]), np.concatenate([quads, [[v, start, len(points), end]]])
+    return np.concatenate([points, points[v : v + 1] * 1.01]), np.concatenate([quads, [[v, start, len(points), end]]])
 
 
 def test_an_opened_vertex_closes_again():

@@ -4,17 +4,18 @@ import numpy as np
 import pytest
 
 from gdtool.geometry import simplify, topology
+from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, shape_figures
+from gdtool.geometry.topology import triangulated
 from gdtool.remesh import pipeline as quads
-from gdtool.remesh.fallback import pair_and_split as quad_split, smoothed
+from gdtool.remesh.fallback import pair_and_split as quad_split
+from gdtool.remesh.fallback import smoothed
+from gdtool.remesh.fallback.pair_and_split import pair_and_split
 from gdtool.remesh.fit import shaping
 from gdtool.remesh.fit.feature_curves import NO_FEATURES
-from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, shape_figures
 from gdtool.remesh.fit.surface_projection import Surface
-from gdtool.remesh.fallback.pair_and_split import pair_and_split
 from gdtool.remesh.task import Part, Request
-from gdtool.geometry.topology import triangulated
-from tests.remesh.engines import whole
 from tests.geometry.solids import cube, joined, rod, sphere, torus, volume
+from tests.remesh.engines import whole
 
 
 def test_pairing_gives_the_asked_count_exactly():
@@ -54,8 +55,17 @@ def test_even_triangles_are_sought_no_longer_than_they_come_nearer_to_their_numb
     assert abs(len(quad_split.even_triangles(*sphere(24), 500, 30.0)[1]) / 500 - 1) < 0.05 and 1 <= len(runs) <= 4
 
 
-@pytest.mark.parametrize("mesh, quads, few", [(sphere(24), 100, False), (sphere(24), 20, True), (torus(24), 200, False), (torus(24), 120, True),
-                                              (joined(*[sphere(8)] * 9), 260, False), (joined(*[sphere(8)] * 9), 240, True)])
+@pytest.mark.parametrize(
+    "mesh, quads, few",
+    [
+        (sphere(24), 100, False),
+        (sphere(24), 20, True),
+        (torus(24), 200, False),
+        (torus(24), 120, True),
+        (joined(*[sphere(8)] * 9), 260, False),
+        (joined(*[sphere(8)] * 9), 240, True),
+    ],
+)
 def test_even_triangles_that_would_be_too_few_are_not_sought(monkeypatch, mesh, quads, few):
     """Twelve for a piece, and eighty for a handle."""
     sought = []
@@ -103,7 +113,9 @@ def test_quads_without_area_are_evened_out_where_their_neighbours_stay(monkeypat
     assert polygon_normals(split, quad_faces)[1][100] < 1e-12
     monkeypatch.setattr(shaping, "_let_go", lambda *given: np.arange(len(quad_faces)))
     surface, request = Surface(vertices, faces), Request(quads=600)
-    out = shaping.better(split, quad_faces, *shaping.evened(split, quad_faces, surface, NO_FEATURES, request), surface, request, surface)
+    out = shaping.better(
+        split, quad_faces, *shaping.evened(split, quad_faces, surface, NO_FEATURES, request), surface, request, surface
+    )
     edge = (polygon_normals(out, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
     assert polygon_normals(out, quad_faces)[1].min() > 1e-4 * edge**2
     touched = np.isin(quad_faces, quad_faces[100]).any(1)

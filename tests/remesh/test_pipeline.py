@@ -4,21 +4,24 @@ import numpy as np
 import pytest
 
 from gdtool.geometry import simplify, topology
-from gdtool.remesh import pipeline
 from gdtool.geometry.mesh_quality import distance_figures, shape_figures
+from gdtool.geometry.topology import triangulated
+from gdtool.remesh import pipeline
 from gdtool.remesh.engines.adapters import ENGINES
 from gdtool.remesh.task import Request
-from gdtool.geometry.topology import triangulated
-from tests.remesh.engines import in_this_process, whole
 from tests.geometry.solids import assembly, bored_box, cube, lattice, plane, sphere, torus, volume
+from tests.remesh.engines import in_this_process, whole
 
 
 @pytest.mark.slow
 def test_large_parts_are_not_torn_down_for_small_ones():
-    """An assembly with more pins than the count has quads to spare, all of slivers, which the quick collapse does not touch."""
+    """An assembly with more pins than the count has quads to spare, all of slivers, which the quick collapse does not
+    touch."""
     vertices, faces = assembly(60, 128)
     out, found, record = pipeline.remesh(vertices, faces, Request(quads=3000))
-    assert any("the quick collapse stopped" in line for line in record.failed) and record.figures["simplified_to"] == 20000
+    assert (
+        any("the quick collapse stopped" in line for line in record.failed) and record.figures["simplified_to"] == 20000
+    )
     assert abs(len(found) / 3000 - 1) < 0.1 and whole(found) and topology.components(found)[0] == 61
     assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.015
 
@@ -34,7 +37,9 @@ def test_what_the_quick_collapse_ruins_is_made_again_with_care(monkeypatch):
     monkeypatch.setattr(simplify, "begin", shrinking)
     out, _, record = pipeline.remesh(vertices, faces, Request(quads=2000))
     assert begun == ["collapse", "collapse_topology"] and abs(np.linalg.norm(out, axis=1) - 0.5).max() < 0.01
-    assert any(line.startswith("simplify: strays") for line in record.failed) and record.figures["simplify_error"] < 0.01
+    assert (
+        any(line.startswith("simplify: strays") for line in record.failed) and record.figures["simplify_error"] < 0.01
+    )
 
 
 def test_sphere():
@@ -55,7 +60,8 @@ def test_torus_keeps_its_hole():
 
 @pytest.mark.parametrize("each, ways", [(70, {"engines"}), (220, {"instant-meshes, 1 subdivision"})])
 def test_a_net_of_so_many_handles_that_engines_lose_some_keeps_all(each, ways):
-    """With few quads for each handle what would fail is not tried: no engine, or only none that starts from fewer still."""
+    """With few quads for each handle what would fail is not tried: no engine, or only none that starts from fewer
+    still."""
     vertices, faces = lattice()
     out, found, record = pipeline.remesh(vertices / 2, faces, Request(quads=28 * each))
     assert whole(found) and topology.handles(found, 1) == 28 and abs(len(found) / (28 * each) - 1) <= 0.03
@@ -78,7 +84,9 @@ def test_creases_lie_on_quad_edges():
     line = np.linspace(-0.37, 0.37, 50)
     from gdtool.geometry.distance import closest_points
 
-    truth = np.concatenate([np.stack([line, 0 * line + 0.3 * s, 0 * line + 0.25 * t], -1) for s in (-1, 1) for t in (-1, 1)])
+    truth = np.concatenate(
+        [np.stack([line, 0 * line + 0.3 * s, 0 * line + 0.25 * t], -1) for s in (-1, 1) for t in (-1, 1)]
+    )
     assert np.median(closest_points(truth, out, triangles)[0]) < 1e-3  # marching cubes cuts these edges off by 8e-3
 
 

@@ -8,17 +8,18 @@ import pytest
 
 from gdtool.core.child import ChildFailed
 from gdtool.geometry import topology
-from gdtool.remesh import pipeline as quads
-from gdtool.remesh.engines import candidate as quad_candidate, search
-from gdtool.remesh.fit.feature_curves import Constraints
 from gdtool.geometry.normals import face_normals
+from gdtool.geometry.topology import triangulated
+from gdtool.remesh import pipeline as quads
+from gdtool.remesh.engines import candidate as quad_candidate
+from gdtool.remesh.engines import search
 from gdtool.remesh.engines.candidate import Candidate
+from gdtool.remesh.fit.feature_curves import Constraints
 from gdtool.remesh.fit.shaping import Outline, fault_of, left_out, surface_of
 from gdtool.remesh.fit.surface_projection import Surface
 from gdtool.remesh.task import Part, Record, Request
-from gdtool.geometry.topology import triangulated
-from tests.remesh.engines import Ended, around, in_this_process, inner_face, whole
 from tests.geometry.solids import cube, marching, quad_cube, sphere, torus, volume
+from tests.remesh.engines import Ended, around, in_this_process, inner_face, whole
 
 
 @pytest.mark.parametrize("failure", ["died of SIGSEGV", "ended with exit code 0 and no result"])
@@ -43,33 +44,55 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
 
     calls = in_this_process(monkeypatch, engine)
     # Drawn onto the large sphere the small one would become it.
-    monkeypatch.setattr(quad_candidate, "outlined", lambda vertices, faces, *_: Outline(
-        vertices, faces, Constraints.none(len(vertices)), tips=np.zeros(0, int), edge=1.0, far=0.0, limit=1.0, hopeless=True))
+    monkeypatch.setattr(
+        quad_candidate,
+        "outlined",
+        lambda vertices, faces, *_: Outline(
+            vertices,
+            faces,
+            Constraints.none(len(vertices)),
+            tips=np.zeros(0, int),
+            edge=1.0,
+            far=0.0,
+            limit=1.0,
+            hopeless=True,
+        ),
+    )
     _, found, record = quads.remesh(vertices / 2, faces, Request(quads=1000))
     assert len(calls) == runs and record.engine == "pair and split" and whole(found)
     assert outcome == "a crash" or "strays" in record.failed[0]
 
 
-@pytest.mark.parametrize("tops, wanted, order", [((0.3, 1.0), 1000, [1, 0]), ((0.3, 1.0), 1100, [0, 1]), ((0.39, 1.0), 1000, [0, 1]),
-                                                  ((0.3, 0.3), 875, [0, 1])], ids=["far", "of another count", "in no doubt", "both far"])
+@pytest.mark.parametrize(
+    "tops, wanted, order",
+    [((0.3, 1.0), 1000, [1, 0]), ((0.3, 1.0), 1100, [0, 1]), ((0.39, 1.0), 1000, [0, 1]), ((0.3, 0.3), 875, [0, 1])],
+    ids=["far", "of another count", "in no doubt", "both far"],
+)
 def test_of_two_the_one_much_nearer_to_the_surface_comes_first_where_the_other_is_in_doubt(tops, wanted, order):
     """Balls without a cap, and whole ones."""
     vertices, faces = sphere(24, 0.4)
     out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
     part = Part(vertices, faces, 1000, 0.045, Request(), None)
     way = search.Way("instant-meshes", 0, (1.0,), 30.0)
-    two = [Candidate(way, 1000, None, *topology.compact(out, found[out[found].mean(1)[:, 2] < height])) for height in tops]
+    two = [
+        Candidate(way, 1000, None, *topology.compact(out, found[out[found].mean(1)[:, 2] < height])) for height in tops
+    ]
     assert [id(one) for one in search.Trial(part, Record())._nearer_first(two, wanted)] == [id(two[k]) for k in order]
 
 
 def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(monkeypatch):
-    """Half a ball, a tenth too few quads; a whole one lacks nothing, nor one without a cap that its tip can be drawn over."""
+    """Half a ball, a tenth too few quads; a whole one lacks nothing, nor one without a cap that its tip can be drawn
+    over."""
     vertices, faces = sphere(24, 0.4)
     out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
     part = Part(vertices, faces, 1000, 0.045, Request(), None)
     height = out[found].mean(1)[:, 2]
-    left = [Candidate(search.Way("instant-meshes", 0, (1.0,), 30.0), 1000, None, *topology.compact(out, found[height < most])).leaves_out(part)
-            for most in (1.0, 0.37, 0.0)]
+    left = [
+        Candidate(
+            search.Way("instant-meshes", 0, (1.0,), 30.0), 1000, None, *topology.compact(out, found[height < most])
+        ).leaves_out(part)
+        for most in (1.0, 0.37, 0.0)
+    ]
     assert left[:2] == [None, None] and "leaves out 3" in left[2]
     calls = in_this_process(monkeypatch, lambda *_: topology.compact(out, found[height < 0.0]))
     monkeypatch.setattr(quad_candidate, "judged", lambda vertices, found, *_: (None, vertices, found))
@@ -88,13 +111,19 @@ def test_a_coarser_mesh_is_given_up_where_walls_are_thinner_than_quads(thickness
     wedge[:, 2] *= 0.01 + (wedge[:, 0] + 0.45) / 0.9 * 0.7 / thickness
     assert not Part(wedge, faces, 4000, 0.02, Request(), None).thin
     # One side of a sheet is no wall, nor is what lies outside, before it.
-    assert not Part(vertices, faces[face_normals(vertices, faces)[0][:, 2] > 0.5], 2000, part.edge, Request(), None).thin
+    assert not Part(
+        vertices, faces[face_normals(vertices, faces)[0][:, 2] > 0.5], 2000, part.edge, Request(), None
+    ).thin
     # A coarse mesh is not asked.
     assert not Part(cube()[0] * (0.9, 0.9, thickness), cube()[1], 4000, part.edge, Request(), None).thin
     assert not Part(vertices, faces[:, ::-1], 4000, part.edge, Request(), None).thin
     # Without creases, or its narrow sides tell.
     _, found, record = quads.remesh(vertices, faces, Request(quads=4000, crease_degrees=0.0))
-    assert whole(found) and any("walls" in text for text in record.failed) == thin and not (thin and "1 subdivision" in record.engine)
+    assert (
+        whole(found)
+        and any("walls" in text for text in record.failed) == thin
+        and not (thin and "1 subdivision" in record.engine)
+    )
 
 
 def with_tunnel(vertices, faces, length):
@@ -130,7 +159,9 @@ def test_torn_output_is_not_believed(monkeypatch):
     in_this_process(monkeypatch, lambda *_: (np.random.default_rng(0).random((8, 3)), book))
     vertices, faces = sphere(24)
     _, found, record = quads.remesh(vertices / 2, faces, Request(quads=300))
-    assert whole(found) and record.engine == "pair and split" and any("pieces are lost" in text for text in record.failed)
+    assert (
+        whole(found) and record.engine == "pair and split" and any("pieces are lost" in text for text in record.failed)
+    )
 
 
 def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
@@ -150,8 +181,12 @@ def test_candidates_are_in_the_order_of_place(monkeypatch):
     rng = np.random.default_rng(1)
     mixed, number = rng.permutation(len(vertices)), np.empty(len(vertices), np.int64)
     number[mixed] = np.arange(len(vertices))
-    monkeypatch.setitem(quad_candidate.ENGINES, "quadriflow", lambda *_: (vertices[mixed], rng.permutation(number[faces])))
-    one = quad_candidate.candidate(vertices, triangulated(faces)[0], quad_candidate.Way("quadriflow", 0, (1.0,), 30.0), len(faces))
+    monkeypatch.setitem(
+        quad_candidate.ENGINES, "quadriflow", lambda *_: (vertices[mixed], rng.permutation(number[faces]))
+    )
+    one = quad_candidate.candidate(
+        vertices, triangulated(faces)[0], quad_candidate.Way("quadriflow", 0, (1.0,), 30.0), len(faces)
+    )
     assert one.fault is None and len(one.quads) == len(faces)
 
     def places(v, q):
@@ -159,7 +194,8 @@ def test_candidates_are_in_the_order_of_place(monkeypatch):
 
     assert places(one.vertices, one.quads) == places(vertices, faces)
     ends = topology.edges_of(one.quads).ends
-    assert np.abs(np.diff(ends, axis=1)).mean() < 0.3 * len(vertices) / 3  # a third of them, on average, where it is by chance
+    # A third of them, on average, where it is by chance.
+    assert np.abs(np.diff(ends, axis=1)).mean() < 0.3 * len(vertices) / 3
 
 
 def test_output_without_area_is_no_quads():
@@ -185,11 +221,13 @@ def test_surface_that_the_quads_do_without_is_measured():
     surface = Surface(vertices, faces)
     closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, rest))
     assert left_out(surface_of(vertices, closed), surface, (0.1,)) == [0]
-    assert left_out(surface_of(vertices, opened), surface, (0.1, 2.0)) == pytest.approx([0.8**2 / 6, 0], abs=0.02)  # the lid but its rim
+    # The lid but its rim.
+    assert left_out(surface_of(vertices, opened), surface, (0.1, 2.0)) == pytest.approx([0.8**2 / 6, 0], abs=0.02)
 
 
 def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_finer_one_comes(monkeypatch):
-    """Of a coarser mesh subdivided less is put up with than of a finer one, for the finer one comes after it; where it does not, it is better than none."""
+    """Of a coarser mesh subdivided less is put up with than of a finer one, for the finer one comes after it; where it
+    does not, it is better than none."""
 
     engine = quad_candidate.ENGINES["instant-meshes"]
 
@@ -200,7 +238,9 @@ def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_fine
 
     calls = in_this_process(monkeypatch)
     monkeypatch.setitem(quad_candidate.ENGINES, "instant-meshes", torn)
-    monkeypatch.setattr(quad_candidate, "fault_of", lambda *given: ("cuts off 0.7% of the surface" if given[-1] < 0.007 else None, 0.5))
+    monkeypatch.setattr(
+        quad_candidate, "fault_of", lambda *given: ("cuts off 0.7% of the surface" if given[-1] < 0.007 else None, 0.5)
+    )
     vertices, faces = sphere(96, 0.45)
     _, found, record = quads.remesh(vertices, faces, Request(quads=4000))
     assert record.engine == "instant-meshes, 1 subdivision" and whole(found) and abs(len(found) / 4000 - 1) <= 0.03
@@ -220,7 +260,9 @@ def test_when_the_time_is_over_no_engine_is_begun():
     vertices, faces = sphere(96, 0.45)
     start = time.monotonic()
     out, found, record = quads.remesh(vertices, faces, Request(quads=4000, seconds=0.0))
-    assert record.engine == "pair and split" and record.failed == ["instant-meshes, 1 subdivision: not tried, the time is over"]
+    assert record.engine == "pair and split" and record.failed == [
+        "instant-meshes, 1 subdivision: not tried, the time is over"
+    ]
     assert whole(found) and abs(len(found) / 4000 - 1) <= 0.03 and time.monotonic() - start < 30
 
 
@@ -231,7 +273,8 @@ def test_every_round_asks_for_two_densities():
 
 
 def test_what_is_asked_next_lies_between_what_gave_too_few_and_what_gave_too_many():
-    """An engine's count may jump by a twentieth: in proportion to the last answer what gave too many would be asked for again."""
+    """An engine's count may jump by a twentieth: in proportion to the last answer what gave too many would be asked for
+    again."""
     gave = [(19700.0, 20868), (20100.0, 21164)]
     assert search._between(gave, 20000) is None and search._between(gave, 22000) is None
     gave += [(18691.0, 19164), (19070.0, 18844)]
@@ -239,8 +282,8 @@ def test_what_is_asked_next_lies_between_what_gave_too_few_and_what_gave_too_man
 
 
 def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypatch):
-    """The first in rank where it will do, without a look at the other, and the other first where the first's outline leaves out more;
-    where none does, what comes nearest to it."""
+    """The first in rank where it will do, without a look at the other, and the other first where the first's outline
+    leaves out more; where none does, what comes nearest to it."""
     way = search._ways(20000, Request())[0]
     drawn = []
 
@@ -269,13 +312,16 @@ def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypa
 
 
 def test_the_quads_of_tips_count_before_any_are_drawn(monkeypatch):
-    """What has too many quads with those of its tips is not drawn; another that has as many tips but fewer quads is, and only then a new one asked for."""
+    """What has too many quads with those of its tips is not drawn; another that has as many tips but fewer quads is,
+    and only then a new one asked for."""
     way = search._ways(20000, Request())[0]
     trial = search.Trial(Part(*cube(), 4000, 0.1, Request(), None), Record())
 
     def candidate(count, tips, hopeless=False):
         found = Candidate(way, count, None, np.zeros((0, 3)), np.zeros((count // 4, 4), int))
-        found.traced = Outline(np.zeros((0, 3)), np.zeros((count + tips, 4), int), None, np.zeros(0, int), 0.1, 0.0, 1.0, hopeless)
+        found.traced = Outline(
+            np.zeros((0, 3)), np.zeros((count + tips, 4), int), None, np.zeros(0, int), 0.1, 0.0, 1.0, hopeless
+        )
         return found
 
     monkeypatch.setattr(Candidate, "trace", lambda one, part: setattr(one, "outline", one.traced))
@@ -287,7 +333,8 @@ def test_the_quads_of_tips_count_before_any_are_drawn(monkeypatch):
 
 
 def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypatch):
-    """A plate hardly thicker than a quad: the engine is asked at full density alone, both rims are met, and the record says so."""
+    """A plate hardly thicker than a quad: the engine is asked at full density alone, both rims are met, and the record
+    says so."""
     calls = in_this_process(monkeypatch)
     vertices, faces = cube()
     vertices = vertices * (1, 0.8, 0.02)
@@ -311,4 +358,9 @@ def test_an_engine_has_a_memory_limit_of_its_own_within_the_request(monkeypatch,
     monkeypatch.setattr(search, "begin", begin)
     vertices, faces = sphere(48, 0.45)
     _, found, record = quads.remesh(vertices, faces, Request(quads=4000, memory_mb=given))
-    assert limits and all(least <= limit <= most for limit in limits) and record.engine == "pair and split" and whole(found)
+    assert (
+        limits
+        and all(least <= limit <= most for limit in limits)
+        and record.engine == "pair and split"
+        and whole(found)
+    )

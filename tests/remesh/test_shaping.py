@@ -20,15 +20,27 @@ def test_tips_stay_where_folded_quads_before_them_are_taken_out(monkeypatch):
         """A vertex becomes another, a quad is gone."""
         number = np.arange(len(vertices)) - (np.arange(len(vertices)) > gone)
         kept = np.delete(np.arange(len(vertices)), gone)
-        return vertices[kept], number[np.where(faces == gone, 0, faces)][1:], Constraints(constraints.curve[kept], constraints.fixed[kept], *held[2:])
+        return (
+            vertices[kept],
+            number[np.where(faces == gone, 0, faces)][1:],
+            Constraints(constraints.curve[kept], constraints.fixed[kept], *held[2:]),
+        )
 
     held = constraints.curve, constraints.fixed, constraints.path, constraints.path_curve
-    monkeypatch.setattr(shaping, "_squared", lambda vertices, faces, surface, features, constraints, request: (vertices, constraints))
-    monkeypatch.setattr(shaping, "_unfolded", lambda vertices, faces, surface, features, constraints, tips: (vertices, constraints))
+    monkeypatch.setattr(
+        shaping, "_squared", lambda vertices, faces, surface, features, constraints, request: (vertices, constraints)
+    )
+    monkeypatch.setattr(
+        shaping, "_unfolded", lambda vertices, faces, surface, features, constraints, tips: (vertices, constraints)
+    )
     monkeypatch.setattr(shaping, "without_folded", without_one)
     monkeypatch.setattr(shaping, "unfold", lambda vertices, *_: vertices)
-    monkeypatch.setattr(shaping, "ease", lambda vertices, *given, tips, **_: eased.append(vertices[tips]) or (vertices, given[3]))
+    monkeypatch.setattr(
+        shaping, "ease", lambda vertices, *given, tips, **_: eased.append(vertices[tips]) or (vertices, given[3])
+    )
     for jacobian in (0.1, -0.1):
-        monkeypatch.setattr(shaping, "scaled_jacobian", lambda vertices, faces, jacobian=jacobian: np.full(len(faces), jacobian))
+        monkeypatch.setattr(
+            shaping, "scaled_jacobian", lambda vertices, faces, jacobian=jacobian: np.full(len(faces), jacobian)
+        )
         shaping.drawn(Outline(vertices, quads, constraints, tips, 0.1, 0.0, 1.0, False), None, None, Request())
     assert len(eased) == 1 and np.array_equal(eased[0], vertices[tips])  # of the folded ones alone

@@ -3,8 +3,8 @@
 import numpy as np
 
 from gdtool.geometry import topology
-from gdtool.remesh import pipeline
 from gdtool.geometry.mesh_quality import scaled_jacobian
+from gdtool.remesh import pipeline
 from gdtool.remesh.spacing import spread
 from gdtool.remesh.task import Request
 from tests.geometry.solids import cube, joined, sphere
@@ -17,10 +17,17 @@ def boxes(*sizes_and_centres):
 
 def test_pieces_are_laid_apart_and_brought_back():
     """Side by side, one inside the other, and of unlike size."""
-    vertices, faces = boxes(((0.4, 0.3, 0.5), (0, 0, 0)), ((0.4, 0.3, 0.5), (0, 0.301, 0)), ((0.1, 0.1, 0.1), (0, 0, 0)), ((0.9, 0.05, 0.05), (0, 0, 0.4)))
+    vertices, faces = boxes(
+        ((0.4, 0.3, 0.5), (0, 0, 0)),
+        ((0.4, 0.3, 0.5), (0, 0.301, 0)),
+        ((0.1, 0.1, 0.1), (0, 0, 0)),
+        ((0.9, 0.05, 0.05), (0, 0, 0.4)),
+    )
     found = spread(vertices, faces, 0.1)
     _, piece = topology.components(faces)
-    boxes_of = [(found.vertices[faces[piece == k]].min((0, 1)), found.vertices[faces[piece == k]].max((0, 1))) for k in range(4)]
+    boxes_of = [
+        (found.vertices[faces[piece == k]].min((0, 1)), found.vertices[faces[piece == k]].max((0, 1))) for k in range(4)
+    ]
     for i, (low, high) in enumerate(boxes_of):
         for other_low, other_high in boxes_of[:i]:
             assert (np.maximum(low - other_high, other_low - high)).max() >= 0.1 - 1e-9
@@ -36,10 +43,13 @@ def test_what_is_one_piece_or_apart_as_it_is_stays():
 
 
 def test_quads_of_one_piece_are_not_drawn_onto_another():
-    """Two balls, one in the other, a tenth of a quad apart: each keeps its radius. Not laid apart both come to lie between the two."""
+    """Two balls, one in the other, a tenth of a quad apart: each keeps its radius. Not laid apart both come to lie
+    between the two."""
     vertices, faces = joined(sphere(48, 0.4), sphere(48, 0.397))
     out, found, record = pipeline.remesh(vertices, faces, Request(quads=3000))
-    assert "instant-meshes" in record.engine and scaled_jacobian(out, found).min() > 0.2 and topology.is_watertight(found)
+    assert (
+        "instant-meshes" in record.engine and scaled_jacobian(out, found).min() > 0.2 and topology.is_watertight(found)
+    )
     count, piece = topology.components(found)
     assert count == 2
     inner, outer = sorted((np.linalg.norm(out[np.unique(found[piece == k])], axis=1) for k in range(2)), key=np.mean)

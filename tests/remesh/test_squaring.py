@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from gdtool.geometry.distance import closest_points
-from gdtool.remesh.fit.feature_curves import Constraints, Features, untied
 from gdtool.geometry.mesh_quality import scaled_jacobian
+from gdtool.geometry.topology import triangulated
+from gdtool.remesh.fit.feature_curves import Constraints, Features, untied
 from gdtool.remesh.fit.squaring import balance, ease, square_up
 from gdtool.remesh.fit.surface_projection import Surface
-from gdtool.geometry.topology import triangulated
 from tests.geometry.solids import plane, sphere
 
 NO_FEATURES = Features(np.zeros((0, 3)), np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))

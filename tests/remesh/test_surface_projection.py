@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from gdtool.geometry.mesh_quality import scaled_jacobian, shape_figures, topology_figures
-from gdtool.remesh.fit.surface_projection import fill_holes, remove_doublets, subdivide
 from gdtool.geometry.topology import triangulated
-from tests.remesh.engines import around, inner_face, whole
+from gdtool.remesh.fit.surface_projection import fill_holes, remove_doublets, subdivide
 from tests.geometry.solids import cube, quad_cube, volume
+from tests.remesh.engines import around, inner_face, whole
 
 
 def test_grid_figures():
@@ -17,7 +17,11 @@ def test_grid_figures():
     faces = np.stack([i, i + 1, i + 6, i + 5], -1)
     vertices = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1)
     figures = topology_figures(vertices, faces) | shape_figures(vertices, faces)
-    assert figures["irregular_share"] == 0 and figures["boundary_edges"] == 16 and figures["jacobian_min"] == pytest.approx(1)
+    assert (
+        figures["irregular_share"] == 0
+        and figures["boundary_edges"] == 16
+        and figures["jacobian_min"] == pytest.approx(1)
+    )
     vertices[6] += [1.5, 1.5, 0]  # past the opposite corner: folded
     assert scaled_jacobian(vertices, faces).min() < 0
 

@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 
 from gdtool.geometry import topology
+from gdtool.geometry.mesh_quality import distance_figures, scaled_jacobian
+from gdtool.geometry.normals import face_normals
+from gdtool.geometry.topology import triangulated
 from gdtool.remesh import pipeline
 from gdtool.remesh.fit import shaping
 from gdtool.remesh.fit.feature_curves import Constraints
-from gdtool.geometry.mesh_quality import distance_figures, scaled_jacobian
-from gdtool.geometry.normals import face_normals
 from gdtool.remesh.fit.shaping import farthest, surface_of
 from gdtool.remesh.fit.surface_projection import Surface
-from gdtool.remesh.task import Request
 from gdtool.remesh.fit.tip_extrusion import draw_out
-from gdtool.geometry.topology import triangulated
-from tests.remesh.engines import in_this_process
+from gdtool.remesh.task import Request
 from tests.geometry.solids import quad_cube, sphere
+from tests.remesh.engines import in_this_process
 
 
 def horned(length, width=0.05, bend=0.0):
@@ -42,7 +42,9 @@ def test_a_horn_is_drawn_out(length, bend):
     vertices, faces, edge = ball()
     surface = Surface(*horned(length, bend=bend))
     assert farthest(surface_of(vertices, faces), surface) > 1.4 * edge
-    out, found, constraints, tips, _, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge, most_added=0.3)
+    out, found, constraints, tips, _, _ = draw_out(
+        vertices, faces, Constraints.none(len(vertices)), surface, edge, most_added=0.3
+    )
     assert farthest(surface_of(out, found), surface) < 0.8 * edge
     assert topology.is_watertight(found) and topology.is_manifold(found) and topology.euler_number(found) == 2
     assert len(faces) < len(found) < 1.2 * len(faces)
@@ -50,7 +52,7 @@ def test_a_horn_is_drawn_out(length, bend):
     apex = surface.vertices[surface.vertices[:, 0].argmax()]
     assert np.linalg.norm(out[tips] - apex, axis=1).min() < 0.9 * edge
     # The quads away from the horn are those that were there.
-    same = (vertices == out[:len(vertices)]).all(1)
+    same = (vertices == out[: len(vertices)]).all(1)
     assert same.sum() > 0.97 * len(vertices) and (vertices[~same, 0] > 0.3).all()
 
 
@@ -68,7 +70,8 @@ def test_what_is_near_enough_is_left_alone():
 
 
 def test_what_is_bare_is_told_by_area_and_not_by_how_many_vertices_are_there():
-    """Creases have most of a simplified mesh's vertices: what is cut off along them is little of the surface all the same."""
+    """Creases have most of a simplified mesh's vertices: what is cut off along them is little of the surface all the
+    same."""
     vertices, faces, edge = ball()
     fine, triangles = sphere(160, 0.4)
     narrow = fine[:, 0] > 0.39
@@ -78,7 +81,9 @@ def test_what_is_bare_is_told_by_area_and_not_by_how_many_vertices_are_there():
     far, away = draw_out(vertices, faces, Constraints.none(len(vertices)), many, edge)[4:]
     share = face_normals(many.vertices, many.faces)[1] * (many.vertices[many.faces].mean(1)[:, 0] > 0.39)
     assert far == pytest.approx(0.4 * edge, rel=0.2)
-    assert (away > 0.25 * edge).mean() == pytest.approx(share.sum() / face_normals(many.vertices, many.faces)[1].sum(), abs=0.01)
+    assert (away > 0.25 * edge).mean() == pytest.approx(
+        share.sum() / face_normals(many.vertices, many.faces)[1].sum(), abs=0.01
+    )
 
 
 def _cut_in_four(vertices, faces, which, rounds):
@@ -89,7 +94,9 @@ def _cut_in_four(vertices, faces, which, rounds):
         n, k = len(vertices), np.arange(len(own))
         ab, bc, ca = n + k, n + len(own) + k, n + 2 * len(own) + k
         vertices = np.concatenate([vertices, (a + b) / 2, (b + c) / 2, (c + a) / 2])
-        own = np.concatenate([np.stack(x, -1) for x in ((own[:, 0], ab, ca), (ab, own[:, 1], bc), (ca, bc, own[:, 2]), (ab, bc, ca))])
+        own = np.concatenate(
+            [np.stack(x, -1) for x in ((own[:, 0], ab, ca), (ab, own[:, 1], bc), (ca, bc, own[:, 2]), (ab, bc, ca))]
+        )
     return vertices, np.concatenate([own, rest])
 
 
@@ -105,7 +112,7 @@ def test_one_vertex_reaches_a_tip_that_is_less_than_an_edge_away():
 def test_paths_along_creases_end_where_a_tip_is_drawn_out():
     """A path over the tip is no path of edges any more; the rest of it holds."""
     vertices, faces, edge = ball()
-    around = np.flatnonzero((np.abs(vertices[:, 2]) < 1e-9))
+    around = np.flatnonzero(np.abs(vertices[:, 2]) < 1e-9)
     around = around[np.argsort(np.arctan2(vertices[around, 1], vertices[around, 0]))]
     path = np.stack([around, np.roll(around, -1)], -1)
     curve = np.full(len(vertices), -1)
@@ -114,7 +121,9 @@ def test_paths_along_creases_end_where_a_tip_is_drawn_out():
     _, found, constraints, tips, _, _ = draw_out(vertices, faces, held, Surface(*horned(0.2)), edge)
     edges = set(map(tuple, topology.edges_of(found).ends.tolist()))
     assert 0.8 * len(path) < len(constraints.path) < len(path)
-    assert all(tuple(sorted(ends)) in edges for ends in constraints.path.tolist()) and (constraints.curve[tips] < 0).all()
+    assert (
+        all(tuple(sorted(ends)) in edges for ends in constraints.path.tolist()) and (constraints.curve[tips] < 0).all()
+    )
 
 
 def test_an_engine_that_cuts_a_horn_short_is_still_taken(monkeypatch):
@@ -137,6 +146,8 @@ def test_what_is_held_on_a_blunt_tip_leaves_room_for_quads():
     # A ridge some edges wide and a tenth of that thick: all vertices of its cap are drawn about as far.
     blunt = (fine[:, 0] > 0) & (abs(fine[:, 1]) < 2.2 * edge) & (abs(fine[:, 2]) < 0.4 * edge)
     fine[blunt, 0] += 1.4 * edge
-    out, _, _, tips, _, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), Surface(fine, triangles), edge, most_added=0.3)
+    out, _, _, tips, _, _ = draw_out(
+        vertices, faces, Constraints.none(len(vertices)), Surface(fine, triangles), edge, most_added=0.3
+    )
     apart = np.linalg.norm(out[tips][:, None] - out[tips], axis=-1)[np.triu_indices(len(tips), 1)]
     assert len(tips) > 2 and apart.min() > 0.7 * edge

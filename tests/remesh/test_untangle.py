@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from gdtool.remesh.fit.feature_curves import Constraints, find_features
 from gdtool.geometry.mesh_quality import scaled_jacobian
+from gdtool.remesh.fit.feature_curves import Constraints, find_features
 from gdtool.remesh.fit.surface_projection import Surface, incidence
 from gdtool.remesh.fit.untangle import _apart, unfold
 from tests.geometry.solids import cube, plane, quad_cube
@@ -29,7 +29,9 @@ def folded(n, step=0.25):
 def test_many_folds_are_mended_at_once_and_the_rest_stays():
     vertices, faces, pulled = folded(12)
     assert (scaled_jacobian(vertices, faces) <= 0).sum() >= len(pulled)
-    out = unfold(vertices, faces, Surface(*plane()), find_features(*plane(), 181.0, 1.0), Constraints.none(len(vertices)))
+    out = unfold(
+        vertices, faces, Surface(*plane()), find_features(*plane(), 181.0, 1.0), Constraints.none(len(vertices))
+    )
     assert scaled_jacobian(out, faces).min() > 0.2 and np.abs(out[:, 2]).max() < 1e-12
     touched = np.unique(faces[scaled_jacobian(vertices, faces) < 0.3])
     around = np.unique(faces[np.isin(faces, touched).any(1)])
@@ -62,7 +64,13 @@ def test_vertices_on_a_crease_slide_along_it():
     moved = vertices.copy()
     moved[on[1], 0] = vertices[on[2], 0] + 0.3 * (vertices[on[3], 0] - vertices[on[2], 0])  # past the next one
     assert scaled_jacobian(moved, faces).min() <= 0
-    out = unfold(moved, faces, surface, features, Constraints(held, np.zeros(len(vertices), bool), np.zeros((0, 2), np.int64), np.zeros(0, np.int64)))
+    out = unfold(
+        moved,
+        faces,
+        surface,
+        features,
+        Constraints(held, np.zeros(len(vertices), bool), np.zeros((0, 2), np.int64), np.zeros(0, np.int64)),
+    )
     assert scaled_jacobian(out, faces).min() > 0.2
     assert np.abs(out[on, 1:] - vertices[on, 1:]).max() < 1e-9
 
@@ -82,6 +90,9 @@ def test_vertices_of_a_batch_move_as_each_would_alone(monkeypatch):
     vertices[[12, 38, 56], 1] += 0.2
     how = faces, Surface(*plane()), find_features(*plane(), 181.0, 1.0), Constraints.none(len(vertices))
     together, whole = unfold(vertices, *how), _apart
-    monkeypatch.setattr("gdtool.remesh.fit.untangle._apart", lambda *given: [batch[k:k + 1] for batch in whole(*given) for k in range(len(batch))])
+    monkeypatch.setattr(
+        "gdtool.remesh.fit.untangle._apart",
+        lambda *given: [batch[k : k + 1] for batch in whole(*given) for k in range(len(batch))],
+    )
     np.testing.assert_array_equal(unfold(vertices, *how), together)
     assert (together != vertices).any(1).sum() > 10

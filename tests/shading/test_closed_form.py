@@ -20,7 +20,9 @@ def direction(degrees: float, azimuth: float = 0.0) -> torch.Tensor:
 
 
 def light(axis: torch.Tensor, sharpness: float, amplitude: float = 1.0) -> SphericalGaussians:
-    return SphericalGaussians(axis[None], torch.tensor([sharpness], dtype=axis.dtype), torch.full((1, 3), amplitude, dtype=axis.dtype))
+    return SphericalGaussians(
+        axis[None], torch.tensor([sharpness], dtype=axis.dtype), torch.full((1, 3), amplitude, dtype=axis.dtype)
+    )
 
 
 def quadrature(view, albedo, roughness, metallic, lights, kind="gltf", rings=240, spokes=160, around=None):
@@ -32,7 +34,9 @@ def quadrature(view, albedo, roughness, metallic, lights, kind="gltf", rings=240
     weight = 8 * u**3 / rings * (2 * math.pi / spokes)
     phi = (torch.arange(spokes, dtype=dtype) + 0.5) * 2 * math.pi / spokes
     mu, ring = 1 - drop, torch.sqrt(drop * (2 - drop))
-    local = torch.stack([ring[:, None] * phi.cos(), ring[:, None] * phi.sin(), mu[:, None].expand(-1, spokes)], -1).reshape(-1, 3)
+    local = torch.stack(
+        [ring[:, None] * phi.cos(), ring[:, None] * phi.sin(), mu[:, None].expand(-1, spokes)], -1
+    ).reshape(-1, 3)
     pole = normalize(around.to(dtype))
     helper = torch.tensor([0.0, 1.0, 0.0], dtype=dtype)
     x = normalize(torch.linalg.cross(helper, pole))
@@ -44,7 +48,9 @@ def quadrature(view, albedo, roughness, metallic, lights, kind="gltf", rings=240
     n_l = l[:, 2].clamp_min(0)
     a, r, m = (torch.as_tensor(t, dtype=dtype) for t in (albedo, roughness, metallic))
     f0 = models.f0_of(a, m, 0.04)
-    diffuse, specular = models.reflectance(kind, a, r, m, f0, n_l, v[2].expand_as(n_l), h[:, 2], (h * v).sum(-1).clamp(0, 1))
+    diffuse, specular = models.reflectance(
+        kind, a, r, m, f0, n_l, v[2].expand_as(n_l), h[:, 2], (h * v).sum(-1).clamp(0, 1)
+    )
     radiance = evaluate(lights.to(dtype), l) * (n_l * w)[:, None]
     return (diffuse * radiance).sum(0), (specular * radiance).sum(0)
 
@@ -61,9 +67,18 @@ def test_diffuse_against_quadrature(kind, sharpness, angle):
     assert torch.allclose(got.double(), exact, rtol=0.12 if kind == "paper" else 0.03)
 
 
-# Relative L1 error of the specular lobe over lamps around the mirror direction, worst of three sharpnesses, by (roughness,
-# view angle): measured, frozen with 5 % slack.
-FROZEN = {(0.1, 0): 0.095, (0.3, 0): 0.2, (0.5, 0): 0.113, (1.0, 0): 0.109, (0.1, 60): 0.077, (0.3, 60): 0.143, (0.5, 60): 0.156, (1.0, 60): 0.272}
+# Relative L1 error of the specular lobe over lamps around the mirror direction, worst of three sharpnesses, by
+# (roughness, view angle): measured, frozen with 5 % slack.
+FROZEN = {
+    (0.1, 0): 0.095,
+    (0.3, 0): 0.2,
+    (0.5, 0): 0.113,
+    (1.0, 0): 0.109,
+    (0.1, 60): 0.077,
+    (0.3, 60): 0.143,
+    (0.5, 60): 0.156,
+    (1.0, 60): 0.272,
+}
 
 
 def specular_error(roughness: float, angle: float, sharpness: float) -> float:
@@ -103,16 +118,28 @@ def test_white_lambert_under_uniform_light_is_white():
 def test_linear_in_the_light_and_in_no_frame():
     generator = torch.Generator().manual_seed(0)
     axes = normalize(torch.randn(5, 3, generator=generator))
-    lights = SphericalGaussians(axes, torch.tensor([0.5, 3.0, 20.0, 90.0, 300.0]), torch.rand(5, 3, generator=generator))
+    lights = SphericalGaussians(
+        axes, torch.tensor([0.5, 3.0, 20.0, 90.0, 300.0]), torch.rand(5, 3, generator=generator)
+    )
     view = direction(35.0)
     maps = (torch.tensor([0.7, 0.3, 0.2]), torch.tensor(0.4), torch.tensor(0.6))
     whole = shade(N, view, *maps, lights)
-    parts = sum(shade(N, view, *maps, SphericalGaussians(lights.axes[i:i + 1], lights.sharpness[i:i + 1], lights.amplitudes[i:i + 1])) for i in range(5))
+    parts = sum(
+        shade(
+            N,
+            view,
+            *maps,
+            SphericalGaussians(lights.axes[i : i + 1], lights.sharpness[i : i + 1], lights.amplitudes[i : i + 1]),
+        )
+        for i in range(5)
+    )
     assert torch.allclose(whole, parts, rtol=1e-5)
     turn, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator))
     turned = shade(turn @ N, turn @ view, *maps, SphericalGaussians(axes @ turn.T, lights.sharpness, lights.amplitudes))
     assert torch.allclose(whole, turned, rtol=1e-4)
-    swapped = shade(N, view, maps[0].flip(0), *maps[1:], SphericalGaussians(axes, lights.sharpness, lights.amplitudes.flip(1)))
+    swapped = shade(
+        N, view, maps[0].flip(0), *maps[1:], SphericalGaussians(axes, lights.sharpness, lights.amplitudes.flip(1))
+    )
     assert torch.allclose(whole.flip(0), swapped, rtol=1e-6)
 
 
@@ -121,12 +148,23 @@ def test_finite_and_never_negative_at_every_adversary(kind):
     normals = torch.stack([N, torch.zeros(3), -N, direction(89.9999)])
     views = torch.stack([N, direction(90.0), direction(120.0), -N])
     axes = torch.stack([N, -N, direction(90.0), -direction(120.0)])
-    normal, view, roughness, sharpness, axis = (t.reshape(-1) for t in torch.meshgrid(
-        *(torch.arange(n) for n in (4, 4, 4, 6, 4)), indexing="ij"))
-    roughness, sharpness = torch.tensor([0.0, 1e-12, 0.045, 1.0])[roughness], torch.tensor([0.0, 1e-30, 1e-8, 1.0, 1e4, 1e10])[sharpness]
+    normal, view, roughness, sharpness, axis = (
+        t.reshape(-1) for t in torch.meshgrid(*(torch.arange(n) for n in (4, 4, 4, 6, 4)), indexing="ij")
+    )
+    roughness, sharpness = (
+        torch.tensor([0.0, 1e-12, 0.045, 1.0])[roughness],
+        torch.tensor([0.0, 1e-30, 1e-8, 1.0, 1e4, 1e10])[sharpness],
+    )
     count = len(normal)
-    tensors = [normals[normal], torch.tensor([0.0, 0.5, 1.0]).expand(count, 3).clone(), roughness.clone(), torch.full((count,), 0.5),
-               axes[axis][:, None], sharpness[:, None].clone(), torch.ones(count, 1, 3)]
+    tensors = [
+        normals[normal],
+        torch.tensor([0.0, 0.5, 1.0]).expand(count, 3).clone(),
+        roughness.clone(),
+        torch.full((count,), 0.5),
+        axes[axis][:, None],
+        sharpness[:, None].clone(),
+        torch.ones(count, 1, 3),
+    ]
     tensors = [t.detach().requires_grad_() for t in tensors]
     # One light a point: lights broadcast like everything else.
     lights = SphericalGaussians(tensors[4], tensors[5], tensors[6])
@@ -135,7 +173,13 @@ def test_finite_and_never_negative_at_every_adversary(kind):
     value.sum().backward()
     for t in tensors:
         bad = ~torch.isfinite(t.grad).reshape(count, -1).all(1)
-        assert not bad.any(), (normals[normal[bad]][0], views[view[bad]][0], roughness[bad][0], sharpness[bad][0], axes[axis[bad]][0])
+        assert not bad.any(), (
+            normals[normal[bad]][0],
+            views[view[bad]][0],
+            roughness[bad][0],
+            sharpness[bad][0],
+            axes[axis[bad]][0],
+        )
 
 
 def test_a_zero_normal_is_black():
@@ -151,7 +195,11 @@ def test_gradcheck_in_float64():
     axes = normalize(random(2, 3) - 0.3).requires_grad_()
     sharpness, amplitudes = (1 + 20 * random(2)).requires_grad_(), random(2, 3).requires_grad_()
     normal, view = normalize(random(3)).requires_grad_(), normalize(random(3))
-    albedo, roughness, metallic = random(3).requires_grad_(), (0.2 + 0.6 * random(1)[0]).requires_grad_(), random(1)[0].requires_grad_()
+    albedo, roughness, metallic = (
+        random(3).requires_grad_(),
+        (0.2 + 0.6 * random(1)[0]).requires_grad_(),
+        random(1)[0].requires_grad_(),
+    )
 
     def function(n, a, r, m, p, s, mu):
         return shade(n, view, a, r, m, SphericalGaussians(p, s, mu))
@@ -163,7 +211,9 @@ def test_visibility_and_fresnel_at_their_ends():
     one = torch.tensor(1.0)
     for kind in ("gltf", "paper"):
         for r in (0.0, 0.5, 1.0):
-            values = models.visibility(kind, torch.tensor(r), torch.tensor([0.0, 1.0, 1.0 + 1e-7, 0.0]), torch.tensor([0.0, 1.0, 1.0, 1.0]))
+            values = models.visibility(
+                kind, torch.tensor(r), torch.tensor([0.0, 1.0, 1.0 + 1e-7, 0.0]), torch.tensor([0.0, 1.0, 1.0, 1.0])
+            )
             assert torch.isfinite(values).all() and (values > 0).all()
             # Both cosines 1: no masking at all leaves 1/4.
             assert float(values[1]) == pytest.approx(0.25, rel=1e-6)

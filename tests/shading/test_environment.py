@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.shading.lights.bundled import BUNDLED
+from gdtool.shading.lights.bundled import BUNDLED, direction, paint, random_lobes
 from gdtool.shading.lights.environment import METERED_WHITE, Environment
 from gdtool.shading.lights.load import load_environment
-from gdtool.shading.lights.bundled import direction, paint, random_lobes
 from gdtool.shading.lights.prefilter import IrradianceMap
 from gdtool.shading.lights.sg_fit import fit_sg
 from gdtool.shading.lights.studio import studio
@@ -68,7 +67,9 @@ def test_a_light_made_of_lobes_is_found_again():
 
 def test_random_studios_differ_and_repeat():
     one, two = (random_lobes(np.random.default_rng(k)) for k in (1, 2))
-    assert not np.allclose(one[2], two[2]) and all(np.array_equal(a, b) for a, b in zip(one, random_lobes(np.random.default_rng(1)), strict=True))
+    assert not np.allclose(one[2], two[2]) and all(
+        np.array_equal(a, b) for a, b in zip(one, random_lobes(np.random.default_rng(1)), strict=True)
+    )
     for seed in range(20):
         _, lobes, record = studio(f"random:{seed}")
         assert (lobes.amplitudes >= 0).all() and record["fit_error"]["irradiance_rms"] < 0.01
@@ -101,8 +102,11 @@ def test_irradiance_does_not_depend_on_how_coarse_the_image_is(size):
     for up in (False, True):
         if up and size[0] % 2:
             continue
-        image[size[0] // 2:] = 0 if up else 1
+        image[size[0] // 2 :] = 0 if up else 1
         light = Environment(image.copy())
         wanted = np.pi * (0.5 * (1 + normals[:, 1]) if up else np.ones(200))
-        for got in (light.irradiance(normals), IrradianceMap(light).lookup(torch.as_tensor(normals.T, dtype=torch.float32)).numpy().T):
+        for got in (
+            light.irradiance(normals),
+            IrradianceMap(light).lookup(torch.as_tensor(normals.T, dtype=torch.float32)).numpy().T,
+        ):
             np.testing.assert_allclose(got, np.broadcast_to(wanted[:, None], (200, 3)), atol=0.008 * np.pi)

@@ -26,7 +26,12 @@ def test_the_expected_error_is_that_of_straight_edges(count):
     normal = np.stack([np.cos(angle), np.sin(angle)])
 
     def covered(points):
-        return np.concatenate([((points - 0.5) @ part < o).mean(0) for part, o in zip(np.split(normal, 40, 1), np.split(offset, 40), strict=True)])
+        return np.concatenate(
+            [
+                ((points - 0.5) @ part < o).mean(0)
+                for part, o in zip(np.split(normal, 40, 1), np.split(offset, 40), strict=True)
+            ]
+        )
 
     fine = (np.stack(np.meshgrid(*[np.arange(48)] * 2), -1).reshape(-1, 2) + 0.5) / 48
     mean = covered(pixel_pattern(count))

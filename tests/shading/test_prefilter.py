@@ -7,11 +7,18 @@ import pytest
 import torch
 
 from gdtool.cameras import rig
-from gdtool.shading.render.direct import DirectLight
 from gdtool.shading.lights.environment import Environment
-from gdtool.shading.lights.prefilter import LightPyramid, Prefiltered, filtered_light, octahedral, octahedral_directions, read_octahedral
-from gdtool.shading.render.render import Goal, Renderer
+from gdtool.shading.lights.prefilter import (
+    LightPyramid,
+    Prefiltered,
+    filtered_light,
+    octahedral,
+    octahedral_directions,
+    read_octahedral,
+)
 from gdtool.shading.lights.studio import studio
+from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.render.render import Goal, Renderer
 from tests.shading.test_render import GREY, sphere, uniform
 
 
@@ -19,7 +26,10 @@ def test_octahedral_map_is_its_own_inverse_and_keeps_areas():
     d = octahedral_directions(32)
     s, t = octahedral(*(torch.tensor(c) for c in d.T))
     centres = (np.arange(32) + 0.5) / 32
-    assert np.abs(s.numpy().reshape(32, 32) - centres).max() < 1e-12 and np.abs(t.numpy().reshape(32, 32) - centres[:, None]).max() < 1e-12
+    assert (
+        np.abs(s.numpy().reshape(32, 32) - centres).max() < 1e-12
+        and np.abs(t.numpy().reshape(32, 32) - centres[:, None]).max() < 1e-12
+    )
     # Texels of equal area: the plain mean of x² is a third.
     assert np.allclose((d**2).mean(0), 1 / 3, atol=2e-3) and np.allclose(d.mean(0), 0, atol=1e-12)
 
@@ -32,12 +42,17 @@ def test_pyramid_keeps_the_mean():
     canvas = Environment(np.zeros((64, 128, 3)))
     smooth = LightPyramid(Environment((canvas.directions + 1).astype(np.float32)))
     d = octahedral_directions(16)
-    found = smooth.mean(*(torch.tensor(c, dtype=torch.float32)[None] for c in d.T), torch.full((1, 1), smooth.texel_angle * 1.01))[:, 0].T
+    found = smooth.mean(
+        *(torch.tensor(c, dtype=torch.float32)[None] for c in d.T), torch.full((1, 1), smooth.texel_angle * 1.01)
+    )[:, 0].T
     assert np.abs(found.numpy() - 1 - d).mean() < 0.05
 
 
 # The sharp one is drawn by samples that overlap, which widens it: measured 7 %.
-@pytest.mark.parametrize("roughness, side, dense, tolerance", [(0.2, 128, 0, 0.08), (0.3, 64, 64, 0.06), (0.5, 32, 32, 0.06), (1.0, 32, 32, 0.06)])
+@pytest.mark.parametrize(
+    "roughness, side, dense, tolerance",
+    [(0.2, 128, 0, 0.08), (0.3, 64, 64, 0.06), (0.5, 32, 32, 0.06), (1.0, 32, 32, 0.06)],
+)
 def test_filtered_light_is_the_lobes_average(roughness, side, dense, tolerance):
     env = studio("mid", fit=False)[0].shrunk(64)
     light = (env.image * env.solid_angles[:, None, None]).reshape(-1, 3)
@@ -46,7 +61,14 @@ def test_filtered_light_is_the_lobes_average(roughness, side, dense, tolerance):
     cosine, a2 = normal @ toward.T, roughness**4
     lobe = np.maximum(cosine, 0) / (0.5 * (1 + a2) - 0.5 * (1 - a2) * cosine) ** 2
     truth = lobe @ light / (lobe @ weight)[:, None]
-    found = read_octahedral(filtered_light(LightPyramid(env), roughness, side, dense), *(torch.tensor(c, dtype=torch.float32) for c in normal.T)).numpy().T
+    found = (
+        read_octahedral(
+            filtered_light(LightPyramid(env), roughness, side, dense),
+            *(torch.tensor(c, dtype=torch.float32) for c in normal.T),
+        )
+        .numpy()
+        .T
+    )
     assert np.abs(found - truth).mean() < tolerance * truth.mean()
 
 

@@ -10,8 +10,8 @@ import pytest
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.cameras import camera_at, rays, rig
 from gdtool.shading.lights.environment import Environment
-from gdtool.shading.render.pattern import pixel_pattern
 from gdtool.shading.render.color import render_color
+from gdtool.shading.render.pattern import pixel_pattern
 from gdtool.shading.render.render import Renderer, render_buffers
 from gdtool.shading.render.surface_points import surface_attributes
 
@@ -19,11 +19,18 @@ GREY = Material(base_color=(0.5, 0.25, 0.125, 1.0), metallic=0.0, roughness=0.5)
 
 
 def sphere(radius: float = 0.5, rings: int = 96, material: Material = GREY) -> Scene:
-    theta, phi = np.meshgrid(np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings, endpoint=False), indexing="ij")
+    theta, phi = np.meshgrid(
+        np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings, endpoint=False), indexing="ij"
+    )
     unit = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)], -1).reshape(-1, 3)
     row, column = np.meshgrid(np.arange(rings), np.arange(2 * rings), indexing="ij")
     a, b = row * 2 * rings + column, row * 2 * rings + (column + 1) % (2 * rings)
-    faces = np.concatenate([np.stack([a, a + 2 * rings, b + 2 * rings], -1).reshape(-1, 3), np.stack([a, b + 2 * rings, b], -1).reshape(-1, 3)])
+    faces = np.concatenate(
+        [
+            np.stack([a, a + 2 * rings, b + 2 * rings], -1).reshape(-1, 3),
+            np.stack([a, b + 2 * rings, b], -1).reshape(-1, 3),
+        ]
+    )
     return Scene(vertices=unit * radius, faces=faces.astype(np.int32), materials=(material,), normals=unit)
 
 
@@ -101,13 +108,19 @@ def test_pictures_are_not_mirrored_in_any_view():
     one = sphere(0.1, 16)
     parts = [one.vertices + np.array(p) for p in balls]
     colors = np.repeat(np.eye(3), len(one.vertices), 0)
-    scene = Scene(vertices=np.concatenate(parts), faces=np.concatenate([one.faces + k * len(one.vertices) for k in range(3)]),
-                  materials=(dataclasses.replace(GREY, base_color=(1, 1, 1, 1)),), normals=np.concatenate([one.normals] * 3),
-                  colors=np.concatenate([colors, np.ones((len(colors), 1))], 1))
+    scene = Scene(
+        vertices=np.concatenate(parts),
+        faces=np.concatenate([one.faces + k * len(one.vertices) for k in range(3)]),
+        materials=(dataclasses.replace(GREY, base_color=(1, 1, 1, 1)),),
+        normals=np.concatenate([one.normals] * 3),
+        colors=np.concatenate([colors, np.ones((len(colors), 1))], 1),
+    )
     expected = {"front": "right", "back": "left", "right": None, "left": None}
     for camera in rig("six", 64):
         albedo = render_buffers(scene, camera, samples=4)["albedo"]
-        rows = {c: np.argwhere(albedo[..., k] > 0.5).mean(0) for k, c in enumerate("rgb") if (albedo[..., k] > 0.5).any()}
+        rows = {
+            c: np.argwhere(albedo[..., k] > 0.5).mean(0) for k, c in enumerate("rgb") if (albedo[..., k] > 0.5).any()
+        }
         assert rows["g"][0] < 25, "up is up"
         if camera.name in ("front", "back"):
             assert (rows["r"][1] > 40) == (expected[camera.name] == "right")
@@ -137,7 +150,9 @@ def test_bilinear_filter_blends_linear_values():
 
 def test_a_fine_checker_averages_and_second_uv_set_is_used():
     checker = (np.indices((64, 64)).sum(0) % 2 * 255).astype(np.uint8)[..., None].repeat(3, 2)
-    material = dataclasses.replace(GREY, base_color=(1, 1, 1, 1), base_color_texture=Texture(checker, "linear", uv_set=1))
+    material = dataclasses.replace(
+        GREY, base_color=(1, 1, 1, 1), base_color_texture=Texture(checker, "linear", uv_set=1)
+    )
     scene = quad(material, uv_scale=0.0)
     scene = dataclasses.replace(scene, uvs=(scene.uvs[0], quad(material, uv_scale=4.0).uvs[0]))
     out = render_buffers(scene, rig("six", 32)[0], samples=16)
@@ -150,7 +165,11 @@ def test_normal_map_tilts_toward_the_tangents():
     for local in tilted:
         texel = np.rint((0.5 * local + 0.5) * 65535).astype(np.uint16)
         material = dataclasses.replace(GREY, normal_texture=Texture(np.broadcast_to(texel, (4, 4, 3)).copy()))
-        views = {c.name: render_buffers(quad(material), c, samples=4)["normal"][32, 32] for c in rig("six", 64) if c.name in ("front", "back")}
+        views = {
+            c.name: render_buffers(quad(material), c, samples=4)["normal"][32, 32]
+            for c in rig("six", 64)
+            if c.name in ("front", "back")
+        }
         assert np.allclose(views["front"], local, atol=1e-3)
         assert np.allclose(views["back"], -local, atol=1e-3)
 
@@ -160,12 +179,18 @@ def test_alpha_mask_lets_rays_through_and_blend_counts_from_one_half():
     for mode, cutoff in (("MASK", 0.5), ("BLEND", 0.0)):
         near = quad(Material(base_color_texture=front, alpha_mode=mode, alpha_cutoff=cutoff, metallic=0.0), z=0.2)
         far = quad(dataclasses.replace(GREY, base_color=(0, 0, 1, 1)), z=-0.2)
-        scene = Scene(vertices=np.concatenate([near.vertices, far.vertices]), faces=np.concatenate([near.faces, far.faces + 4]),
-                      materials=(near.materials[0], far.materials[0]), material_idx=np.array([0, 0, 1, 1], np.int32),
-                      uvs=(np.concatenate([near.uvs[0], far.uvs[0]]),))
+        scene = Scene(
+            vertices=np.concatenate([near.vertices, far.vertices]),
+            faces=np.concatenate([near.faces, far.faces + 4]),
+            materials=(near.materials[0], far.materials[0]),
+            material_idx=np.array([0, 0, 1, 1], np.int32),
+            uvs=(np.concatenate([near.uvs[0], far.uvs[0]]),),
+        )
         out = render_buffers(scene, rig("six", 64)[0], samples=4)
         assert np.allclose(out["albedo"][32, 20], 1) and np.allclose(out["albedo"][32, 44], (0, 0, 1))
-        assert out["depth"][32, 20] == pytest.approx(1.8, abs=1e-5) and out["depth"][32, 44] == pytest.approx(2.2, abs=1e-5)
+        assert out["depth"][32, 20] == pytest.approx(1.8, abs=1e-5) and out["depth"][32, 44] == pytest.approx(
+            2.2, abs=1e-5
+        )
         renderer = Renderer(scene)
         # From behind the hole the sky is open, behind the solid half it is not.
         origins = np.array([[-0.25, 0, -0.1], [0.25, 0, -0.1]])
@@ -188,11 +213,16 @@ def test_lambert_quad_under_a_hemisphere_and_its_shadow():
     open_sky, mask = render_color(floor, camera, uniform(), samples=4, light_samples=64)
     lit = open_sky[mask == 1].mean()
     assert 0.47 < lit < 0.54 and MIN_ROUGHNESS < 0.1
-    # A long wall of height 0.5 at x = 0.5: at distance d it hides (1 - d / sqrt(d² + 0.25)) / 2 of the cosine-weighted sky.
+    # A long wall of height 0.5 at x = 0.5: at distance d it hides (1 - d / sqrt(d² + 0.25)) / 2 of the cosine-weighted
+    # sky.
     wall = quad(GREY, half=4.0)
     turned = wall.vertices[:, [2, 1, 0]] * (1, 1, -0.125) + (0.5, 0, 0)
-    scene = Scene(vertices=np.concatenate([floor.vertices, turned]), faces=np.concatenate([floor.faces, wall.faces + 4]),
-                  materials=(floor.materials[0], Material(base_color=(0, 0, 0, 1), metallic=0.0)), material_idx=np.array([0, 0, 1, 1], np.int32))
+    scene = Scene(
+        vertices=np.concatenate([floor.vertices, turned]),
+        faces=np.concatenate([floor.faces, wall.faces + 4]),
+        materials=(floor.materials[0], Material(base_color=(0, 0, 0, 1), metallic=0.0)),
+        material_idx=np.array([0, 0, 1, 1], np.int32),
+    )
     shadowed, mask = render_color(scene, camera, uniform(), samples=4, light_samples=64)
     for column in (6, 16, 26):
         d = 0.5 - (column + 0.5 - 16) * camera.pixel_size
@@ -219,8 +249,12 @@ def test_light_is_unbiased_at_few_directions():
     """The mean of many cheap renderings is the expensive one, in the open, in half shadow and on refined pixels."""
     light = Environment((np.random.default_rng(5).random((16, 32, 3)) ** 8).astype(np.float32) * 5)
     one = sphere(0.25, 24)
-    scene = Scene(vertices=np.concatenate([one.vertices + (0.2, 0, 0.1), one.vertices - (0.2, 0, 0.1)]), materials=one.materials,
-                  faces=np.concatenate([one.faces, one.faces + len(one.vertices)]), normals=np.concatenate([one.normals] * 2))
+    scene = Scene(
+        vertices=np.concatenate([one.vertices + (0.2, 0, 0.1), one.vertices - (0.2, 0, 0.1)]),
+        materials=one.materials,
+        faces=np.concatenate([one.faces, one.faces + len(one.vertices)]),
+        normals=np.concatenate([one.normals] * 2),
+    )
     camera = rig("six", 24)[1]
     best, mask = render_color(scene, camera, light, samples=16, light_samples=256, seed=50)
     cheap = np.mean([render_color(scene, camera, light, samples=16, light_samples=8, seed=s)[0] for s in range(12)], 0)

@@ -47,7 +47,10 @@ def test_product_against_mpmath(gap):
             with mpmath.workdps(50):
                 t1, t2 = mpmath.mpf(float(np.float32(s1))), mpmath.mpf(float(np.float32(s2)))
                 norm1, norm2 = (mpmath.sqrt(sum(mpmath.mpf(float(x)) ** 2 for x in v)) for v in (a, b))
-                total = [t1 * mpmath.mpf(float(x)) / norm1 + t2 * mpmath.mpf(float(y)) / norm2 for x, y in zip(a, b, strict=True)]
+                total = [
+                    t1 * mpmath.mpf(float(x)) / norm1 + t2 * mpmath.mpf(float(y)) / norm2
+                    for x, y in zip(a, b, strict=True)
+                ]
                 length = mpmath.sqrt(sum(x * x for x in total))
                 drop = length - t1 - t2
             scale = float(t1 + t2)
@@ -118,7 +121,14 @@ def test_gradients_are_finite_everywhere(value):
         s = torch.tensor(value, dtype=torch.float32, requires_grad=True)
         axis, sharpness, exponent = sg.product(p, s, q, s)
         c = (p * q).sum()
-        total = sg.cosine_integral(s, c) + sg.hemisphere_integral(s, c) + sg.integral(s) + sg.lobe(p, s, q) + axis.sum() + exponent.exp()
+        total = (
+            sg.cosine_integral(s, c)
+            + sg.hemisphere_integral(s, c)
+            + sg.integral(s)
+            + sg.lobe(p, s, q)
+            + axis.sum()
+            + exponent.exp()
+        )
         (total + sg.cosine_integral(sharpness, axis[2])).backward()
         for tensor in (p, q, s):
             assert torch.isfinite(tensor.grad).all(), (value, angle)

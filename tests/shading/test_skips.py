@@ -1,4 +1,5 @@
-"""Every skip of the renderer on and off: what is left out changes nothing, or no more than the tolerance stated here."""
+"""Every skip of the renderer on and off: what is left out changes nothing, or no more than the tolerance stated
+here."""
 
 from __future__ import annotations
 
@@ -14,11 +15,11 @@ from gdtool.assets.scene import Scene, Texture
 from gdtool.cameras import rig
 from gdtool.geometry import rays
 from gdtool.geometry.rays import is_convex
-from gdtool.shading.render.direct import DirectLight
-from gdtool.shading.lights.prefilter import LADDER
 from gdtool.shading.bsdf.reflection import Surface
-from gdtool.shading.render.render import Renderer
+from gdtool.shading.lights.prefilter import LADDER
 from gdtool.shading.lights.studio import studio
+from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.render.render import Renderer
 from tests.geometry.solids import cube
 from tests.shading.test_render import GREY, four_colors, quad, sphere
 
@@ -28,8 +29,13 @@ def test_convex_is_what_lies_on_its_hull(most, monkeypatch):
     monkeypatch.setattr(rays, "_MOST_BY_PAIRS", most)
     ball = sphere(rings=24)
     turned = ball.vertices @ np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    assert is_convex(ball.vertices, ball.faces) and is_convex(turned * [1, 2, 3], ball.faces) and is_convex(ball.vertices, ball.faces[:, ::-1])
-    assert is_convex(ball.vertices, ball.faces[:500]) and is_convex(ball.vertices * [1, 0, 1], ball.faces[:60])  # open; in a plane
+    assert (
+        is_convex(ball.vertices, ball.faces)
+        and is_convex(turned * [1, 2, 3], ball.faces)
+        and is_convex(ball.vertices, ball.faces[:, ::-1])
+    )
+    # Open; in a plane.
+    assert is_convex(ball.vertices, ball.faces[:500]) and is_convex(ball.vertices * [1, 0, 1], ball.faces[:60])
     for corner in (0, 300, 1199):
         dented = ball.vertices.copy()
         dented[corner] *= 0.98
@@ -85,7 +91,10 @@ def test_a_texture_of_one_value_is_a_factor():
     from gdtool.shading.render.skipped_work import savings
 
     flat = Texture(np.full((8, 8, 3), (200, 100, 50), np.uint8), "srgb")
-    scene = quad(dataclasses.replace(GREY, base_color_texture=flat, metallic_roughness_texture=Texture(four_colors().image)), uv_scale=1.7)
+    scene = quad(
+        dataclasses.replace(GREY, base_color_texture=flat, metallic_roughness_texture=Texture(four_colors().image)),
+        uv_scale=1.7,
+    )
     renderers = [Renderer(scene), Renderer(scene)]
     renderers[1].lookup.skip_constant = False
     few, all_ = (renderer.buffers(rig("six", 48)[1], 8) for renderer in renderers)
@@ -99,11 +108,14 @@ def two_balls() -> Scene:
     large, small = sphere(0.3, 24), sphere(0.15, 16)
     vertices = np.concatenate([large.vertices, small.vertices + (0.28, 0.25, 0.2)])
     faces = np.concatenate([large.faces, small.faces + len(large.vertices)])
-    return Scene(vertices=vertices, faces=faces, materials=(GREY,), normals=np.concatenate([large.normals, small.normals]))
+    return Scene(
+        vertices=vertices, faces=faces, materials=(GREY,), normals=np.concatenate([large.normals, small.normals])
+    )
 
 
 def test_leaving_out_rays_toward_little_light_keeps_the_mean(monkeypatch):
-    """Russian roulette: over many seeds the same picture (to 0.5 % in the mean, 3 % at a pixel), with fewer rays and hardly more noise."""
+    """Russian roulette: over many seeds the same picture (to 0.5 % in the mean, 3 % at a pixel), with fewer rays and
+    hardly more noise."""
     scene, camera, light = two_balls(), rig("six", 24)[1], studio("mid", fit=False)[0]
     means, noises, rays = [], [], []
     for share in (0.0, direct.RARE):
@@ -123,7 +135,8 @@ def test_leaving_out_rays_toward_little_light_keeps_the_mean(monkeypatch):
 
 
 def test_directions_below_the_horizon_bring_nothing(monkeypatch):
-    """Followed all the same, they meet the surface that they start from, but for a few that leave over an edge (1 in 1000)."""
+    """Followed all the same, they meet the surface that they start from, but for a few that leave over an edge (1 in
+    1000)."""
     monkeypatch.setattr(direct, "RARE", 0.0)
     scene, camera, light = two_balls(), rig("six", 24)[1], studio("mid", fit=False)[0]
     evaluate, frames, rays = Surface.evaluate, [], []
@@ -144,15 +157,22 @@ def test_directions_below_the_horizon_bring_nothing(monkeypatch):
 def test_absent_textures_are_as_white_ones():
     white = Texture(np.full((4, 4, 3), 255, np.uint8), "linear")
     flat = Texture(np.tile(np.array([128, 128, 255], np.uint8), (4, 4, 1)), "linear")
-    given = dataclasses.replace(GREY, base_color_texture=dataclasses.replace(white, encoding="srgb"), metallic_roughness_texture=white, normal_texture=flat,
-                                emissive_texture=dataclasses.replace(white, encoding="srgb"))
+    given = dataclasses.replace(
+        GREY,
+        base_color_texture=dataclasses.replace(white, encoding="srgb"),
+        metallic_roughness_texture=white,
+        normal_texture=flat,
+        emissive_texture=dataclasses.replace(white, encoding="srgb"),
+    )
     frames = []
     for material in (GREY, given):
         renderer = Renderer(quad(material))
         renderer.lookup.skip_constant = False
         frames.append(renderer.buffers(rig("six", 32)[1], 8))
     # 128 of 255 is not quite a flat normal.
-    assert all(np.abs(frames[0][name] - frames[1][name]).max() < (5e-3 if name == "normal" else 1e-6) for name in frames[0])
+    assert all(
+        np.abs(frames[0][name] - frames[1][name]).max() < (5e-3 if name == "normal" else 1e-6) for name in frames[0]
+    )
 
 
 def test_opaque_materials_need_no_alpha_test():

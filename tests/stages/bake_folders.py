@@ -23,8 +23,17 @@ from tests.bake.shapes import albedo_of, torus, triangles_of, unwrapped
 def finish(path: Path, kind: str, content, inputs: dict[str, Path]) -> Path:
     """Write the manifest of a folder made from inputs (role to folder or file)."""
     sources = {role: open_folder(p) if p.is_dir() else p for role, p in inputs.items()}
-    entries = tuple(InputEntry(role, os.path.relpath(inputs[role], path), digest(source)) for role, source in sources.items())
-    manifest = Manifest(kind=kind, name=path.parent.name.removesuffix(".asset"), stage="test", content=content, inputs=entries, files=list_files(path))
+    entries = tuple(
+        InputEntry(role, os.path.relpath(inputs[role], path), digest(source)) for role, source in sources.items()
+    )
+    manifest = Manifest(
+        kind=kind,
+        name=path.parent.name.removesuffix(".asset"),
+        stage="test",
+        content=content,
+        inputs=entries,
+        files=list_files(path),
+    )
     (path / MANIFEST).write_bytes(encode(manifest))
     return path
 
@@ -50,14 +59,20 @@ def torus_views(size: int = 96) -> Views:
         at = np.einsum("nk,nkc->nc", hits.barycentric, vertices[faces[hits.face_idx]])
         normal = np.einsum("nk,nkc->nc", hits.barycentric, normals[faces[hits.face_idx]])
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-        for name, value in (("albedo", albedo_of(at)), ("roughness", 0.5 + 0.4 * at[:, 0]), ("metallic", 0 * at[:, 0]), ("normal", normal)):
+        for name, value in (
+            ("albedo", albedo_of(at)),
+            ("roughness", 0.5 + 0.4 * at[:, 0]),
+            ("metallic", 0 * at[:, 0]),
+            ("normal", normal),
+        ):
             stacks[name].append(np.where(seen[..., None], value.reshape(size, size, -1), 0).squeeze())
         masks.append(seen)
     return Views(cameras, {k: np.array(v, np.float32) for k, v in stacks.items()}, np.array(masks, np.float32))
 
 
 def make_chain(root: Path, *, with_views: bool = True, gray_vertices: bool = False) -> Path:
-    """root/views, surface, atlas, each made from the one before; the atlas folder. gray_vertices: colour only in views."""
+    """root/views, surface, atlas, each made from the one before; the atlas folder. gray_vertices: colour only in
+    views."""
     made_from: dict[str, Path] = {}
     if with_views:
         out = fresh(root / "views")
@@ -67,7 +82,11 @@ def make_chain(root: Path, *, with_views: bool = True, gray_vertices: bool = Fal
     albedo = np.full((len(vertices), 3), 0.5) if gray_vertices else albedo_of(vertices)
     fill = lambda value: np.full(len(vertices), value, np.float32)  # noqa: E731
     out = fresh(root / "surface")
-    write_surface(out, Surface(vertices, triangles_of(quads), albedo, 0.5 + 0.4 * vertices[:, 0], fill(0), fill(1), normals), watertight=True)
+    write_surface(
+        out,
+        Surface(vertices, triangles_of(quads), albedo, 0.5 + 0.4 * vertices[:, 0], fill(0), fill(1), normals),
+        watertight=True,
+    )
     finish(root / "surface", "surface", out.content, made_from)
     write_atlas(root / "atlas", {"source": root / "surface"})
     return root / "atlas"
@@ -82,7 +101,12 @@ def torus_atlas() -> QuadMesh:
     whole = (corners[:, 0, 0] == corners[:, 1, 0]) & (corners[:, 0, 2] == corners[:, 1, 1])
     none = np.full((2 * (~whole).sum(), 1), -1)
     faces = np.concatenate([quads[whole], np.concatenate([triangles_of(quads[~whole]), none], 1)])
-    uvs = np.concatenate([np.concatenate([corners[whole, 0], corners[whole, 1, 2:]], 1), np.concatenate([corners[~whole].reshape(-1, 3), none], 1)])
+    uvs = np.concatenate(
+        [
+            np.concatenate([corners[whole, 0], corners[whole, 1, 2:]], 1),
+            np.concatenate([corners[~whole].reshape(-1, 3), none], 1),
+        ]
+    )
     return QuadMesh(vertices, faces.astype(np.int32), uv, uvs.astype(np.int32))
 
 
@@ -92,8 +116,14 @@ def write_atlas(path: Path, inputs: dict[str, Path], mesh: QuadMesh | None = Non
     out = fresh(path)
     write_mesh(out, mesh)
     quads = int(mesh.is_quad.sum())
-    content = AtlasContent(vertices=len(mesh.vertices), quads=quads, triangles=len(mesh.faces) - quads, charts=1, size=256, padding=4,
-                           coverage=0.5, watertight=True)
+    content = AtlasContent(
+        vertices=len(mesh.vertices),
+        quads=quads,
+        triangles=len(mesh.faces) - quads,
+        charts=1,
+        size=256,
+        padding=4,
+        coverage=0.5,
+        watertight=True,
+    )
     return finish(path, "atlas", content, inputs)
-
-

@@ -21,11 +21,15 @@ def run(inputs, options, out):
     write_views(out, sphere_views(int(inputs.main.split(":")[1]), options.size, options.domains))
 
 
-SPHERES = Stage(name="render-dataset", version=1, reads=("model-file",), writes="views", Options=Options, run=run, dataset=True)
+SPHERES = Stage(
+    name="render-dataset", version=1, reads=("model-file",), writes="views", Options=Options, run=run, dataset=True
+)
 
 
 def write_spheres(root: Path, count: int = 3, **options) -> Path:
     """root/procedural-*.asset/views and root/manifest.json of count spheres."""
-    results = list(run_all(SPHERES, (f"procedural:0..{count - 1}",), Options(**options), {}, Settings(output=root, several=True)))
+    results = list(
+        run_all(SPHERES, (f"procedural:0..{count - 1}",), Options(**options), {}, Settings(output=root, several=True))
+    )
     assert len(results) == count and all(result.status == "done" for result in results)
     return root

@@ -11,8 +11,8 @@ from gdtool.core.folder import open_folder
 from gdtool.folders.mesh import QuadMesh, write_obj
 from gdtool.folders.views import Views, write_views
 from gdtool.images.io import read_image, write_png
-from tests.stages.bake_folders import finish, fresh, make_chain, torus_atlas, torus_views, write_atlas
 from tests.bake.shapes import psnr
+from tests.stages.bake_folders import finish, fresh, make_chain, torus_atlas, torus_views, write_atlas
 
 FAST = ("--size", 128, "--ao-rays", 16)
 
@@ -37,7 +37,11 @@ def rendered_albedo(asset: Path, views: Views | None = None, facing: float = 0.0
     for k, camera in enumerate(views.cameras):
         origins, directions = rays(camera)
         hits = caster.first_hit(origins.reshape(-1, 3), directions.reshape(-1, 3))
-        both = hits.found & (views.mask[k].ravel() > 0) & (views.images["normal"][k].reshape(-1, 3) @ camera.backward >= facing)
+        both = (
+            hits.found
+            & (views.mask[k].ravel() > 0)
+            & (views.images["normal"][k].reshape(-1, 3) @ camera.backward >= facing)
+        )
         ours.append(lookup.attributes(hits.face_idx[both], hits.barycentric[both])["albedo"])
         theirs.append(views.images["albedo"][k].reshape(-1, 3)[both])
     return psnr(srgb_from_linear(np.concatenate(ours)), srgb_from_linear(np.concatenate(theirs)))
@@ -71,19 +75,26 @@ def test_views_serve_where_vertices_know_nothing(gdtool, tmp_path):
 
 
 def test_a_picture_finer_than_its_view_is_baked(gdtool, tmp_path):
-    """Blurred views of the torus, and the picture that they were made of, sharp: the asset has it where the front sees it."""
+    """Blurred views of the torus, and the picture that they were made of, sharp: the asset has it where the front sees
+    it."""
     from gdtool.images.color import srgb_from_linear
     from gdtool.images.metrics import resized_views
 
     atlas = make_chain(tmp_path / "gray.asset", gray_vertices=True)
     fine = torus_views(384)
-    striped = np.where(np.arange(384) // 6 % 2, 0.9, 0.15).astype(np.float32)[None, None, :, None] * fine.mask[..., None] * np.float32([1, 0.8, 0.6])
+    striped = (
+        np.where(np.arange(384) // 6 % 2, 0.9, 0.15).astype(np.float32)[None, None, :, None]
+        * fine.mask[..., None]
+        * np.float32([1, 0.8, 0.6])
+    )
     images, mask = resized_views({**fine.images, "albedo": striped}, fine.mask, 96, 96)
     for way in ("plain", "pictured"):
         folder = tmp_path / way
         out = fresh(folder)
         if way == "pictured":
-            write_png(out.path("picture.png"), np.concatenate([srgb_from_linear(striped[0]), fine.mask[0][..., None]], -1))
+            write_png(
+                out.path("picture.png"), np.concatenate([srgb_from_linear(striped[0]), fine.mask[0][..., None]], -1)
+            )
         write_views(out, Views(rig("six", 96), images, mask), picture="front" if way == "pictured" else "")
         finish(folder, "views", out.content, {})
         done = gdtool("bake", atlas, "--size", 512, "--no-ao", "--views", folder, "-o", f"from_{way}")
@@ -205,13 +216,16 @@ def test_broken_faces_do_not_stop_it(gdtool, chain, tmp_path):
     assert rendered_albedo(tmp_path / "out") > 25
 
 
-@pytest.mark.parametrize("fault, code, message", [
-    ("no uv", 3, "has no texture coordinates; run gdtool unwrap"),
-    ("no surface", 3, "has no surface to bake from along its provenance chain; name one with --surface or --model"),
-    ("no texel", 3, "cover no texel; run gdtool unwrap"),
-    ("not there", 3, "does not exist"),
-    ("size", 2, "--size"),
-])
+@pytest.mark.parametrize(
+    "fault, code, message",
+    [
+        ("no uv", 3, "has no texture coordinates; run gdtool unwrap"),
+        ("no surface", 3, "has no surface to bake from along its provenance chain; name one with --surface or --model"),
+        ("no texel", 3, "cover no texel; run gdtool unwrap"),
+        ("not there", 3, "does not exist"),
+        ("size", 2, "--size"),
+    ],
+)
 def test_bad_input_exits_with_one_line(gdtool, chain, tmp_path, fault, code, message):
     mesh, surface, options = torus_atlas(), ("--surface", chain.parent / "surface"), ()
     if fault == "no uv":
@@ -236,8 +250,12 @@ def test_overlapping_texture_coordinates_are_told(gdtool, chain, tmp_path):
     mesh = torus_atlas()
     half = len(mesh.faces) // 2
     folded = mesh.face_uvs.copy()
-    folded[half:half * 2] = folded[:half]
-    write_atlas(tmp_path / "atlas", {"source": chain.parent / "surface"}, QuadMesh(mesh.vertices, mesh.faces[mesh.is_quad], mesh.uv, folded[mesh.is_quad]))
+    folded[half : half * 2] = folded[:half]
+    write_atlas(
+        tmp_path / "atlas",
+        {"source": chain.parent / "surface"},
+        QuadMesh(mesh.vertices, mesh.faces[mesh.is_quad], mesh.uv, folded[mesh.is_quad]),
+    )
     done = gdtool("bake", "atlas", *FAST, "--no-ao", "-o", "out")
     assert done.returncode == 0 and "texture coordinates overlap on" in done.stderr
 
@@ -256,8 +274,10 @@ def test_levels_of_detail_share_the_maps(gdtool, chain, tmp_path):
         assert abs(len(level.faces) - len(full.faces) / 2**k) < 0.02 * len(full.faces)
         assert (tmp_path / "out" / name).stat().st_size < 0.7 * (tmp_path / "out" / "asset.glb").stat().st_size
         # The same picture, and the normal map the way glTF has it, whatever lies beside it for others.
-        for one, other in ((level.materials[0].base_color_texture, full.materials[0].base_color_texture),
-                           (level.materials[0].normal_texture, full.materials[0].normal_texture)):
+        for one, other in (
+            (level.materials[0].base_color_texture, full.materials[0].base_color_texture),
+            (level.materials[0].normal_texture, full.materials[0].normal_texture),
+        ):
             np.testing.assert_array_equal(one.image, other.image)
         assert content.report[f"lod{k}_drift_mean"] < 0.008 * k and content.report[f"lod{k}_outside"] < 0.01
     assert gdtool("bake", chain, *FAST, "--no-ao", "-o", "one").returncode == 0
@@ -315,5 +335,7 @@ def test_emission_comes_along(gdtool, chain, tmp_path):
         assert {key: file for key, file in content.maps.items() if key == "emissive"} == expected
         assert content.factors["emissive"] == pytest.approx((3, 3, 3), rel=1e-3)
         material = load_scene(tmp_path / name / "asset.glb").materials[0]
-        assert material.emissive == pytest.approx((3, 3, 3), rel=1e-3) and (material.emissive_texture is None) == (texture is None)
+        assert material.emissive == pytest.approx((3, 3, 3), rel=1e-3) and (material.emissive_texture is None) == (
+            texture is None
+        )
         assert "Ke 3 3 3" in (tmp_path / name / "asset.mtl").read_text()

@@ -1,4 +1,5 @@
-"""bake on meshes that break others: thin walls, mirrored and missing texture area, one face, tiny and huge coordinates."""
+"""bake on meshes that break others: thin walls, mirrored and missing texture area, one face, tiny and huge
+coordinates."""
 
 import json
 from pathlib import Path
@@ -19,7 +20,8 @@ def slab(thickness=0.001):
     """A closed plate, 1 x 1 x thickness: vertices (8, 3), quads (6, 4), a texture rectangle of its own for each."""
     x = np.array([-0.5, 0.5])
     vertices = np.array([[a, b, c] for a in x for b in x for c in x * thickness])
-    quads = np.array([[1, 5, 7, 3], [0, 2, 6, 4], [4, 6, 7, 5], [0, 1, 3, 2], [2, 3, 7, 6], [0, 4, 5, 1]])  # front and back first
+    # Front and back first.
+    quads = np.array([[1, 5, 7, 3], [0, 2, 6, 4], [4, 6, 7, 5], [0, 1, 3, 2], [2, 3, 7, 6], [0, 4, 5, 1]])
     corner = np.array([[0.0, 1], [1, 1], [1, 0], [0, 0]])
     uv = np.concatenate([(corner * 0.8 + 0.1 + (k % 3, k // 3)) / 3 for k in range(6)])
     return vertices, quads, uv, np.arange(24).reshape(6, 4)
@@ -29,10 +31,12 @@ def colored(vertices, quads, uv, corners, colors):
     """A Scene whose quads have the texture colors (6, 3), 8 bits, in their rectangles."""
     image = np.zeros((48, 48, 3), np.uint8)
     for k, color in enumerate(colors):
-        image[k // 3 * 16:k // 3 * 16 + 16, k % 3 * 16:k % 3 * 16 + 16] = color
+        image[k // 3 * 16 : k // 3 * 16 + 16, k % 3 * 16 : k % 3 * 16 + 16] = color
     flat = vertices[quads].reshape(-1, 3)
     faces = np.stack([corners[:, :3], corners[:, [0, 2, 3]]], 1).reshape(-1, 3)
-    return Scene(flat, faces.astype(np.int32), (Material(base_color_texture=Texture(image, "srgb"), metallic=0.0),), uvs=(uv,))
+    return Scene(
+        flat, faces.astype(np.int32), (Material(base_color_texture=Texture(image, "srgb"), metallic=0.0),), uvs=(uv,)
+    )
 
 
 RED, BLUE, GRAY = (200, 30, 30), (30, 30, 200), (90, 90, 90)
@@ -65,7 +69,11 @@ def here(tmp_path, monkeypatch):
 def test_thin_walls_keep_their_sides_at_any_scale(gdtool, scale):
     vertices, quads, uv, corners = slab()
     far = np.array([3.0, -2.0, 7.0]) * scale  # not about the origin
-    image, _, _ = bake(gdtool, QuadMesh(vertices * scale + far, quads, uv, corners), colored(vertices * scale + far, quads, uv, corners, COLORS))
+    image, _, _ = bake(
+        gdtool,
+        QuadMesh(vertices * scale + far, quads, uv, corners),
+        colored(vertices * scale + far, quads, uv, corners, COLORS),
+    )
     np.testing.assert_allclose(middle(image, 0), RED, atol=1)
     np.testing.assert_allclose(middle(image, 1), BLUE, atol=1)
 
@@ -74,7 +82,9 @@ def test_mirrored_texture_coordinates_bake_the_same_picture_the_other_way_round(
     vertices, quads, uv, corners = slab(0.3)
     scene = colored(vertices, quads, uv, corners, COLORS)
     plain, _, _ = bake(gdtool, QuadMesh(vertices, quads, uv, corners), scene, *FAST, "--no-ao")
-    mirrored, folder, _ = bake(gdtool, QuadMesh(vertices, quads, uv * (-1, 1) + (1, 0), corners), scene, *FAST, "--no-ao")
+    mirrored, folder, _ = bake(
+        gdtool, QuadMesh(vertices, quads, uv * (-1, 1) + (1, 0), corners), scene, *FAST, "--no-ao"
+    )
     np.testing.assert_allclose(mirrored[:, ::-1].astype(int), plain, atol=1)
     assert folder.manifest.warnings == ()
 
@@ -94,7 +104,9 @@ def test_one_face_is_enough(gdtool):
     faces = np.array([[0, 1, 2, -1]])
     image = np.zeros((8, 8, 3), np.uint8)
     image[:, :4], image[:, 4:] = RED, BLUE
-    scene = Scene(vertices, faces[:, :3].astype(np.int32), (Material(base_color_texture=Texture(image, "srgb")),), uvs=(uv,))
+    scene = Scene(
+        vertices, faces[:, :3].astype(np.int32), (Material(base_color_texture=Texture(image, "srgb")),), uvs=(uv,)
+    )
     baked, folder, _ = bake(gdtool, QuadMesh(vertices, faces, uv, faces), scene, *FAST, "--lods", 3)
     np.testing.assert_allclose(baked[50, 10], RED, atol=1)
     np.testing.assert_allclose(baked[55, 45], BLUE, atol=1)

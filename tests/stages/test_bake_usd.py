@@ -57,14 +57,25 @@ def test_geometry_and_material_are_the_assets(gdtool, chain, tmp_path, conventio
         shader, output, _ = surface.GetInput(name).GetConnectedSource()
         return UsdShade.Shader(shader), output
 
-    for name, map_name, output, space in [("diffuseColor", "base_color", "rgb", "sRGB"), ("roughness", "orm", "g", "raw"),
-                                          ("occlusion", "orm", "r", "raw"), ("normal", "normal", "rgb", "raw")]:
+    for name, map_name, output, space in [
+        ("diffuseColor", "base_color", "rgb", "sRGB"),
+        ("roughness", "orm", "g", "raw"),
+        ("occlusion", "orm", "r", "raw"),
+        ("normal", "normal", "rgb", "raw"),
+    ]:
         shader, channel = source(name)
         assert channel == output and shader.GetInput("sourceColorSpace").Get() == space
-        assert shader.GetInput("file").Get().path == f"./{map_name}.png" and (tmp_path / "out" / f"{map_name}.png").is_file()
+        assert (
+            shader.GetInput("file").Get().path == f"./{map_name}.png"
+            and (tmp_path / "out" / f"{map_name}.png").is_file()
+        )
     normal = source("normal")[0]
     up = 1 if convention == "opengl" else -1
-    np.testing.assert_allclose(np.array(normal.GetInput("scale").Get()) * 0.5 + np.array(normal.GetInput("bias").Get()), [0, 0, 0, 0.5], atol=1e-6)
+    np.testing.assert_allclose(
+        np.array(normal.GetInput("scale").Get()) * 0.5 + np.array(normal.GetInput("bias").Get()),
+        [0, 0, 0, 0.5],
+        atol=1e-6,
+    )
     assert normal.GetInput("scale").Get()[1] == 2 * up
     factors = json.loads((tmp_path / "out" / "manifest.json").read_text())["content"]["factors"]
     roughness = source("roughness")[0].GetInput("scale").Get()
@@ -76,7 +87,12 @@ def test_a_package_holds_its_maps_and_repeats_exactly(gdtool, chain, tmp_path):
         done = gdtool("bake", chain, *FAST, "--usd", "usdz", "-o", name)
         assert done.returncode == 0, done.stderr
     with zipfile.ZipFile(tmp_path / "a" / "asset.usdz") as package:
-        assert {name.rsplit("/")[-1] for name in package.namelist()} == {"asset.usda", "base_color.png", "orm.png", "normal.png"}
+        assert {name.rsplit("/")[-1] for name in package.namelist()} == {
+            "asset.usda",
+            "base_color.png",
+            "orm.png",
+            "normal.png",
+        }
     assert not (tmp_path / "a" / "asset.usda").exists()
     assert (tmp_path / "a" / "asset.usdz").read_bytes() == (tmp_path / "b" / "asset.usdz").read_bytes()
     moved = shutil.copy(tmp_path / "a" / "asset.usdz", tmp_path / "alone.usdz")

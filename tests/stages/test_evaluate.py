@@ -39,7 +39,10 @@ def egg_views(vertices, faces, size=48):
     scene = Scene(vertices, faces, (Material("egg", base_color=(0.5, 0.25, 0.1, 1), metallic=0.25, roughness=0.75),))
     renderer, cameras = Renderer(scene), rig("six", size)
     buffers = [renderer.buffers(camera) for camera in cameras]
-    images = {name: np.stack([one[name] for one in buffers]) for name in ("normal", "depth", "albedo", "roughness", "metallic")}
+    images = {
+        name: np.stack([one[name] for one in buffers])
+        for name in ("normal", "depth", "albedo", "roughness", "metallic")
+    }
     mask = np.stack([one["mask"] for one in buffers])
     return Views(cameras, {"color": images["albedo"], **images}, mask)
 
@@ -48,7 +51,14 @@ def write_egg_surface(path, inputs, scale=1.0, matrix=MATRIX):
     vertices, faces = egg()
     fill = lambda value: np.full(len(vertices), value, np.float32)  # noqa: E731
     out = fresh(path)
-    surface = Surface(vertices * scale, faces, np.tile(np.float32((0.5, 0.25, 0.1)), (len(vertices), 1)), fill(0.65), fill(0.25), fill(1))
+    surface = Surface(
+        vertices * scale,
+        faces,
+        np.tile(np.float32((0.5, 0.25, 0.1)), (len(vertices), 1)),
+        fill(0.65),
+        fill(0.25),
+        fill(1),
+    )
     write_surface(out, surface, watertight=True, source_from_world=matrix)
     return finish(path, "surface", out.content, inputs)
 
@@ -64,27 +74,38 @@ def chain(tmp_path):
     finish(root / "views", "views", out.content, {})
     manifest = read_manifest(root / "views")
     source = InputEntry("source", "../../egg.obj", sources.digest(tmp_path / "egg.obj"))
-    (root / "views" / MANIFEST).write_bytes(encode(type(manifest)(**{**{f: getattr(manifest, f) for f in manifest.__struct_fields__}, "inputs": (source,)})))
+    (root / "views" / MANIFEST).write_bytes(
+        encode(type(manifest)(**{**{f: getattr(manifest, f) for f in manifest.__struct_fields__}, "inputs": (source,)}))
+    )
     write_egg_surface(root / "surface", {"source": root / "views"}, 0.95)
     return root
 
 
 def measured(result, reference=None, **options):
     """The stage itself, in this process: a command takes seconds to start, and test_the_command runs it."""
-    found, against = (None if x is None else sources.resolve(str(x), evaluate.READS, "test") for x in (result, reference))
+    found, against = (
+        None if x is None else sources.resolve(str(x), evaluate.READS, "test") for x in (result, reference)
+    )
     return evaluate.evaluate(found, against, evaluate.Options(**{"samples": 2000, "syncdreamer": False, **options}))
 
 
 def test_the_truth_and_the_views_are_found_along_the_provenance(chain):
     found = measured(chain / "surface")
     assert all(isinstance(value, (bool, int, float, str)) for value in found.values())  # flat
-    assert found["result"] == "egg" and found["kind"] == "surface" and found["watertight"] and found["reference_watertight"]
+    assert (
+        found["result"] == "egg"
+        and found["kind"] == "surface"
+        and found["watertight"]
+        and found["reference_watertight"]
+    )
     assert found["vertices"] == len(egg()[0]) and found["faces"] == len(egg()[1]) and found["quads"] == 0
     # 5 % of a radius of 0.3 to 0.5, some less along the normal: the frame of the model was undone.
     assert 0.014 < found["surface_distance"] < 0.025
     assert found["surface_iou"] == pytest.approx(0.95**3, abs=0.01)
     assert found["surface_normal_degrees"] < 3 and found["surface_flipped_share"] == 0
-    assert found["seen_distance"] == pytest.approx(found["surface_distance"], rel=0.1) and 0.8 < found["seen_share"] <= 1
+    assert (
+        found["seen_distance"] == pytest.approx(found["surface_distance"], rel=0.1) and 0.8 < found["seen_share"] <= 1
+    )
 
 
 def test_a_surface_is_rendered_through_the_cameras_of_its_views(chain):
@@ -102,7 +123,11 @@ def test_a_surface_is_rendered_through_the_cameras_of_its_views(chain):
 
 def test_views_named_as_the_reference_come_before_those_along_the_provenance(chain, tmp_path):
     truth = read_views(open_folder(chain / "views"))
-    rougher = shifted(truth, tmp_path / "rougher", images={**truth.images, "roughness": truth.images["roughness"] + 0.15 * (truth.mask > 0)})
+    rougher = shifted(
+        truth,
+        tmp_path / "rougher",
+        images={**truth.images, "roughness": truth.images["roughness"] + 0.15 * (truth.mask > 0)},
+    )
     exact = write_egg_surface(chain / "exact", {"source": chain / "views"})
     assert measured(exact)["roughness_error"] == pytest.approx(0.1, abs=0.005)
     assert measured(exact, rougher)["roughness_error"] == pytest.approx(0.25, abs=0.005)
@@ -154,7 +179,9 @@ def test_quads_and_their_seen_part(chain):
         row[:] = row[np.argsort(s * np.arctan2(corners[row, c], corners[row, b]))]
     out = fresh(chain / "mesh")
     write_mesh(out, QuadMesh(corners, quads.astype(np.int32)))
-    content = MeshContent(vertices=8, quads=6, triangles=0, watertight=True, source_from_world=tuple(map(float, MATRIX.ravel())))
+    content = MeshContent(
+        vertices=8, quads=6, triangles=0, watertight=True, source_from_world=tuple(map(float, MATRIX.ravel()))
+    )
     finish(chain / "mesh", "mesh", content, {"source": chain / "surface"})
     found = measured(chain / "mesh")
     assert (found["vertices"], found["quads"], found["faces"]) == (8, 6, 6) and found["watertight"]
@@ -194,7 +221,9 @@ def test_views_against_views(chain, tmp_path):
     for name in ("color_psnr_published", "color_psnr_masked", "albedo_psnr_masked"):
         assert found[name] == 100, name
     assert found["color_ssim_published"] == pytest.approx(1) and found["normal_degrees"] < 0.01
-    assert found["roughness_error"] == pytest.approx(0.2, abs=0.003) and found["depth_error"] == pytest.approx(0.01, abs=1e-5)
+    assert found["roughness_error"] == pytest.approx(0.2, abs=0.003) and found["depth_error"] == pytest.approx(
+        0.01, abs=1e-5
+    )
     assert "metallic_error" not in found and "surface_distance" not in found
 
 
@@ -203,7 +232,10 @@ def test_views_of_another_size_and_of_other_cameras(chain, tmp_path):
     large = shifted(egg_views(vertices, faces, 96), tmp_path / "large")
     found = measured(large, chain / "views")
     assert found["mask_iou"] > 0.99 and found["normal_degrees"] < 1 and found["color_psnr_masked"] > 45
-    turned = shifted(replace(egg_views(vertices, faces), cameras=[replace(c, half_width=0.5) for c in rig("six", 48)]), tmp_path / "turned")
+    turned = shifted(
+        replace(egg_views(vertices, faces), cameras=[replace(c, half_width=0.5) for c in rig("six", 48)]),
+        tmp_path / "turned",
+    )
     with pytest.raises(InputError, match="another camera"):
         measured(turned, chain / "views")
 
@@ -233,7 +265,9 @@ def test_the_command(gdtool, chain):
     one, two = (gdtool("evaluate", chain / "surface", "--json", "--samples", 500) for _ in range(2))
     assert one.returncode == 0 and one.stdout == two.stdout and one.stderr == ""
     found = json.loads(one.stdout)
-    assert found["syncdreamer_chamfer"] > 0 and found["surface_distance"] > 0 and found["path"] == str(chain / "surface")
+    assert (
+        found["syncdreamer_chamfer"] > 0 and found["surface_distance"] > 0 and found["path"] == str(chain / "surface")
+    )
     assert all(isinstance(value, (bool, int, float, str)) for value in found.values())
 
     done = gdtool("evaluate", "--samples", 500, "--no-syncdreamer", stdin=f"{chain / 'surface'}\n{chain / 'nothing'}\n")

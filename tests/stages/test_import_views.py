@@ -45,7 +45,10 @@ def wonder3d(tmp_path, wonder3d_pictures):
     cameras, images, mask = wonder3d_pictures
     for k, camera in enumerate(cameras):
         # The front camera's axes, which are this world's.
-        write_png(folder / f"normals_000_{camera.name}.png", np.concatenate([encode_normal(images["normal"][k]), mask[k][..., None]], -1))
+        write_png(
+            folder / f"normals_000_{camera.name}.png",
+            np.concatenate([encode_normal(images["normal"][k]), mask[k][..., None]], -1),
+        )
         write_png(folder / f"rgb_000_{camera.name}.png", rgba(images, mask, k))
     return folder
 
@@ -97,7 +100,11 @@ def reconstructed(gdtool, folder):
 
 def test_wonder3d_is_neither_mirrored_nor_turned(gdtool, wonder3d):
     views, surface, back = reconstructed(gdtool, wonder3d)
-    assert views.path.name == "views" and views.path.parent.name == "owl.asset" and views.content.domains == ("color", "normal")
+    assert (
+        views.path.name == "views"
+        and views.path.parent.name == "owl.asset"
+        and views.content.domains == ("color", "normal")
+    )
     assert error(surface.vertices, back) < 0.013  # normals and silhouettes alone; a mirrored one is off by far more
     assert all(error(surface.vertices * flip, back) > 0.02 for flip in ((-1, 1, 1), (1, -1, 1), (1, 1, -1)))
     assert np.ptp(surface.vertices, axis=0).max() == pytest.approx(1, abs=0.04)
@@ -148,8 +155,13 @@ def test_bad_input_is_one_line_and_leaves_nothing(gdtool, wonder3d, nerf, plain,
     record = json.loads((nerf / "transforms.json").read_text())
     (nerf / "transforms.json").write_text(json.dumps(record | {"k1": 0.3}))
     (plain / "cameras.json").write_text("{}")
-    for folder, word in ((tmp_path / "nothing", "transforms.json"), (wonder3d, "back"), (nerf, "distorted"), (plain, "cameras.json"),
-                         (tmp_path / "missing", "does not exist")):
+    for folder, word in (
+        (tmp_path / "nothing", "transforms.json"),
+        (wonder3d, "back"),
+        (nerf, "distorted"),
+        (plain, "cameras.json"),
+        (tmp_path / "missing", "does not exist"),
+    ):
         done = gdtool("import-views", folder, "--quiet")
         assert done.returncode == 3 and word in done.stderr and done.stdout == "", done.stderr
         assert len(done.stderr.strip().splitlines()) == 1 and "Traceback" not in done.stderr

@@ -22,7 +22,10 @@ def address():
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     from ray.cluster_utils import Cluster
 
-    nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "object_store_memory": 100 * 2**20, "include_dashboard": False})
+    nodes = Cluster(
+        initialize_head=True,
+        head_node_args={"num_cpus": 1, "object_store_memory": 100 * 2**20, "include_dashboard": False},
+    )
     nodes.add_node(num_cpus=1, object_store_memory=100 * 2**20)
     yield nodes.address
     nodes.shutdown()
@@ -37,18 +40,24 @@ def test_sources_fan_out_and_bad_ones_are_reported(gdtool_here, address, tmp_pat
     assert done.returncode == 1 and "c.obj" in done.stderr and "Traceback" not in done.stderr, done.stderr
     wanted = [f"data/{name}.asset/views" for name in "abdef"]
     assert sorted(done.stdout.splitlines()) == wanted
-    assert [one["path"] for one in json.loads((tmp_path / "data/manifest.json").read_text())["content"]["objects"]] == [p[5:] for p in wanted]
+    assert [one["path"] for one in json.loads((tmp_path / "data/manifest.json").read_text())["content"]["objects"]] == [
+        p[5:] for p in wanted
+    ]
     # The same as without: the folders' digests do not know who made them.
     again = gdtool_here("render-dataset", *sources, *fast)
     assert again.returncode == 1 and again.stderr.count("up to date") == 5
     assert gdtool_here("render-dataset", "a.obj", *FAST, "--domains", "normal", "-o", "alone").returncode == 0
-    alone, there = (json.loads((tmp_path / p / "manifest.json").read_text())["files"] for p in ("alone", "data/a.asset/views"))
+    alone, there = (
+        json.loads((tmp_path / p / "manifest.json").read_text())["files"] for p in ("alone", "data/a.asset/views")
+    )
     assert alone == there
 
 
 @pytest.fixture
 def where():
-    """The node a text is worked on; "crash" kills its worker, "fault" raises. Local, so that workers need not import this file."""
+    """The node a text is worked on; "crash" kills its worker, "fault" raises. Local, so that workers need not import
+    this file."""
+
     def work(text: str) -> str:
         import os
         import time

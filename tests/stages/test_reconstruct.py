@@ -37,8 +37,13 @@ def test_writes_a_valid_surface_once(gdtool, folder, tmp_path):
     assert content["watertight"] and content["light"] and is_closed_manifold(surface.faces)
     skipped = {s["what"]: s["reason"] for s in manifest(out)["skipped"]}
     assert skipped["surface by normals"] == "the views agree"
-    assert skipped["growth of the surface"] == "no model made the views of a picture" and content["report"]["grown"] == 0
-    assert skipped["parts that the picture alone shows"] == "no model made the views of a picture" and content["report"]["restored_share"] == 0
+    assert (
+        skipped["growth of the surface"] == "no model made the views of a picture" and content["report"]["grown"] == 0
+    )
+    assert (
+        skipped["parts that the picture alone shows"] == "no model made the views of a picture"
+        and content["report"]["restored_share"] == 0
+    )
     assert np.abs(torus(surface.vertices)).mean() < 0.002
     albedo, roughness, metallic = material(surface.vertices)
     sure = surface.confidence > 0.5
@@ -47,7 +52,11 @@ def test_writes_a_valid_surface_once(gdtool, folder, tmp_path):
     assert np.abs(surface.roughness - roughness)[sure].mean() < 0.02
     # Six views around: none sees what the ring hides, none all of it; exact views agree.
     assert surface.views.min() == 0 and 2 <= surface.views.max() <= 5
-    assert (surface.views[sure] > 0).all() and surface.residual[surface.views == 0].max() == 0 and surface.residual.mean() < 0.02
+    assert (
+        (surface.views[sure] > 0).all()
+        and surface.residual[surface.views == 0].max() == 0
+        and surface.residual.mean() < 0.02
+    )
     far = sure & (np.abs(surface.vertices[:, 0]) > 0.05)
     assert np.abs(surface.metallic - metallic)[far].mean() < 0.03
     assert gdtool("validate", out).returncode == 0
@@ -74,7 +83,7 @@ def test_color_alone_gives_an_honest_hull(gdtool, folder, tmp_path):
     assert manifest(out)["content"]["watertight"]
     # The hull holds the object, and is not much larger.
     assert np.abs(torus(surface.vertices)).mean() < 0.03
-    assert 0.02 <= surface.albedo.min() and surface.albedo.max() <= 0.96
+    assert surface.albedo.min() >= 0.02 and surface.albedo.max() <= 0.96
     # Color alone cannot be sure.
     assert surface.confidence.max() <= 0.5
 
@@ -93,7 +102,9 @@ def test_paper_method_writes_its_networks(gdtool, folder, tmp_path):
 
 def test_paper_method_without_depth_goes_by_what_the_normals_gave(gdtool, folder, tmp_path):
     out = tmp_path / "paper"
-    done = gdtool("reconstruct", folder, "--method", "paper", "--steps", 30, "--resolution", 32, "--ignore", "depth", "-o", out)
+    done = gdtool(
+        "reconstruct", folder, "--method", "paper", "--steps", 30, "--resolution", 32, "--ignore", "depth", "-o", out
+    )
     assert done.returncode == 0, done.stderr
     skipped = {one["what"]: one["reason"] for one in manifest(out)["skipped"]}
     assert skipped["volume start"] == "normal views say where the surface is" and "matching of views" not in skipped
@@ -114,7 +125,9 @@ def test_normals_that_contradict_one_another_leave_the_silhouettes(gdtool, tmp_p
     record = manifest(out)
     assert record["content"]["watertight"]
     assert any("do not fit together" in warning for warning in record["warnings"])
-    assert {s["what"]: s["reason"] for s in record["skipped"]}["surface by normals"] == "the silhouettes alone give the shape"
+    assert {s["what"]: s["reason"] for s in record["skipped"]}[
+        "surface by normals"
+    ] == "the silhouettes alone give the shape"
     assert method == "grid" or "volume start" not in {one["what"] for one in record["skipped"]}
     assert np.abs(read_surface(open_folder(out)).vertices).max() < 0.6
 

@@ -37,7 +37,9 @@ def test_writes_frames_that_validate_and_skips_when_up_to_date(gdtool, square, t
     content = json.loads((path / "manifest.json").read_text())["content"]
     assert (content["frames"], content["environment"], content["light"]) == (3, "mid", light)
     frame = read_image(path / "000.png")
-    assert frame.shape == (32, 32, 4) and frame[16, 16, 3] == 255 and frame[0, 0, 3] == 0 and frame[16, 16, :3].min() > 0
+    assert (
+        frame.shape == (32, 32, 4) and frame[16, 16, 3] == 255 and frame[0, 0, 3] == 0 and frame[16, 16, :3].min() > 0
+    )
     assert "up to date" in gdtool("relight", square, *FAST, "--views", "3", "--light", light).stderr
 
 
@@ -57,7 +59,10 @@ def test_either_reflection_model(gdtool, square, tmp_path, light):
     """A rough dielectric seen from the front differs by Disney's diffuse; both are finite, and recorded."""
     frames = {}
     for brdf in ("gltf", "paper"):
-        assert gdtool("relight", square, *FAST, "--views", "1", "--light", light, "--brdf", brdf, "-o", brdf).returncode == 0
+        assert (
+            gdtool("relight", square, *FAST, "--views", "1", "--light", light, "--brdf", brdf, "-o", brdf).returncode
+            == 0
+        )
         assert json.loads((tmp_path / brdf / "manifest.json").read_text())["options"]["brdf"] == brdf
         frames[brdf] = read_image(tmp_path / brdf / "000.png").astype(int)
     assert (frames["gltf"] != frames["paper"]).any() and np.abs(frames["gltf"] - frames["paper"]).max() < 60
@@ -65,7 +70,12 @@ def test_either_reflection_model(gdtool, square, tmp_path, light):
 
 def test_works_in_a_pipe_and_bad_input_exits_3(gdtool, square, tmp_path):
     # The command itself, with a true pipe.
-    done = subprocess.run([sys.executable, "-m", "gdtool", "relight", *FAST, "--light", "sg"], input=f"{square}\n", capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "gdtool", "relight", *FAST, "--light", "sg"],
+        input=f"{square}\n",
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0 and done.stdout == "square.asset/renders\n"
     (tmp_path / "bad.glb").write_bytes(b"glTF")
     bad = gdtool("relight", "bad.glb", *FAST)

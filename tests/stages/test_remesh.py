@@ -76,12 +76,15 @@ def test_huge_and_tiny_coordinates_are_normalised(gdtool, tmp_path, scale):
     assert content(tmp_path / "cube.asset/mesh")["watertight"]
 
 
-@pytest.mark.parametrize("text, fact", [
-    ("v 0 0 0\n", "no faces"),
-    ("v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "not finite"),
-    ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "out of range"),
-    ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no face has an area"),
-])
+@pytest.mark.parametrize(
+    "text, fact",
+    [
+        ("v 0 0 0\n", "no faces"),
+        ("v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "not finite"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "out of range"),
+        ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no face has an area"),
+    ],
+)
 def test_bad_mesh_is_refused(gdtool, tmp_path, text, fact):
     (tmp_path / "bad.obj").write_text(text)
     run = gdtool("remesh", "bad.obj")
@@ -93,7 +96,8 @@ def test_count_by_the_size_of_quads_or_by_their_distance(gdtool, tmp_path):
     write_obj(tmp_path / "ball.obj", *sphere(32))
     run = gdtool("remesh", "ball.obj", "--quad-size", 0.06, "-o", "sized")
     assert run.returncode == 0, run.stderr
-    assert abs(content(tmp_path / "sized")["quads"] * 0.06**2 / np.pi - 1) < 0.06  # the sphere of diameter 1 has area pi
+    # The sphere of diameter 1 has area pi.
+    assert abs(content(tmp_path / "sized")["quads"] * 0.06**2 / np.pi - 1) < 0.06
     run = gdtool("remesh", "ball.obj", "--faces", 3000, "--max-deviation", 0.008, "-o", "near")
     assert run.returncode == 0 and "farther" not in run.stderr, run.stderr
     near = content(tmp_path / "near")

@@ -14,9 +14,9 @@ from safetensors.numpy import load_file, save_file
 from gdtool.core.errors import InputError
 from gdtool.core.kinds import ModelContent
 from gdtool.core.manifest import MANIFEST, Manifest, encode, list_files
+from gdtool.diffusion.checkpoint.weights import load_model, save_model
 from gdtool.diffusion.config import PRESETS
 from gdtool.diffusion.network.model import Model
-from gdtool.diffusion.checkpoint.weights import load_model, save_model
 from gdtool.images.io import read_image, write_png
 
 CONFIG = msgspec.structs.replace(PRESETS["tiny"][0], channels=(8, 16), head_width=8, encoder_width=16, image_size=16)
@@ -25,7 +25,9 @@ CONFIG = msgspec.structs.replace(PRESETS["tiny"][0], channels=(8, 16), head_widt
 def write_manifest(folder):
     content = ModelContent(preset="tiny", image_size=16, domains=CONFIG.domains, parameters=1, steps=1)
     (folder / MANIFEST).unlink(missing_ok=True)
-    manifest = Manifest(kind="model", name="tiny", stage="train", tool_version="0", content=content, files=list_files(folder))
+    manifest = Manifest(
+        kind="model", name="tiny", stage="train", tool_version="0", content=content, files=list_files(folder)
+    )
     (folder / MANIFEST).write_bytes(encode(manifest))
 
 
@@ -72,8 +74,12 @@ def test_a_picture_becomes_six_views_in_six_domains(gdtool, picture, tiny_model,
     made = gdtool("reconstruct", views)
     assert made.returncode == 0, made.stderr
     surface = json.loads((tmp_path / "ball.asset/surface" / MANIFEST).read_text())
-    assert surface["content"]["report"]["grown"] > 0 and "growth of the surface" not in {one["what"] for one in surface["skipped"]}
-    assert (surface["content"]["report"]["restored_share"] > 0) != ("parts that the picture alone shows" in {one["what"] for one in surface["skipped"]})
+    assert surface["content"]["report"]["grown"] > 0 and "growth of the surface" not in {
+        one["what"] for one in surface["skipped"]
+    }
+    assert (surface["content"]["report"]["restored_share"] > 0) != (
+        "parts that the picture alone shows" in {one["what"] for one in surface["skipped"]}
+    )
     kept, shown = read_image(views / "picture.png"), read_image(views / "condition/000.png")
     assert kept.shape == (64, 64, 4)
     assert np.abs(kept[..., 3].reshape(16, 4, 16, 4).mean((1, 3)) - shown[..., 3]).mean() < 8
@@ -83,7 +89,9 @@ def test_a_picture_becomes_six_views_in_six_domains(gdtool, picture, tiny_model,
 
 
 def bytes_of(folder):
-    return {p.relative_to(folder): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file() and p.name != MANIFEST}
+    return {
+        p.relative_to(folder): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file() and p.name != MANIFEST
+    }
 
 
 def test_an_object_does_not_depend_on_its_company(gdtool, picture, tiny_model, tmp_path):
@@ -96,7 +104,9 @@ def test_an_object_does_not_depend_on_its_company(gdtool, picture, tiny_model, t
 
 
 def test_a_subset_of_the_domains(gdtool, picture, tiny_model, tmp_path):
-    result = sample(gdtool, "ball.png", "--model", tiny_model, "--domains", "normal,depth", "--scheduler", "dpm", "--guidance", 2)
+    result = sample(
+        gdtool, "ball.png", "--model", tiny_model, "--domains", "normal,depth", "--scheduler", "dpm", "--guidance", 2
+    )
     assert result.returncode == 0, result.stderr
     content = json.loads((tmp_path / "ball.asset/views" / MANIFEST).read_text())["content"]
     assert content["domains"] == ["normal", "depth"]
@@ -119,7 +129,11 @@ def test_without_a_compiler_that_is_said(gdtool, picture, tiny_model, monkeypatc
     monkeypatch.setenv("CXX", "/bin/false")
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
     result = sample(gdtool, "ball.png", "--model", tiny_model, "--compile", "-o", "out")
-    assert result.returncode == 5 and "--compile: PyTorch cannot compile" in result.stderr and not (tmp_path / "out").exists()
+    assert (
+        result.returncode == 5
+        and "--compile: PyTorch cannot compile" in result.stderr
+        and not (tmp_path / "out").exists()
+    )
 
 
 def test_a_mask_file_says_what_the_subject_is(gdtool, tiny_model, tmp_path):
@@ -145,7 +159,9 @@ def test_bad_pictures_are_bad_input(gdtool, tiny_model, tmp_path):
     write_png(tmp_path / "clear.png", np.zeros((64, 64, 4)))
     for name in ("text.png", "small.png", "clear.png"):
         result = sample(gdtool, name, "--model", tiny_model)
-        assert result.returncode == 3 and name.split(".")[0] in result.stderr and "Traceback" not in result.stderr, result.stderr
+        assert result.returncode == 3 and name.split(".")[0] in result.stderr and "Traceback" not in result.stderr, (
+            result.stderr
+        )
 
 
 def test_it_works_in_a_pipe(gdtool, picture, tiny_model):
@@ -170,9 +186,11 @@ def test_weights_of_the_wrong_shape_are_named(damaged):
 
 def test_weights_that_are_missing_unknown_or_nan_are_named(damaged):
     whole = load_file(damaged / "model.safetensors")
-    for change, words in (({"unet.conv_out.bias": None}, "lacks tensor unet.conv_out.bias"),
-                          ({"surplus": np.zeros(3, np.float16)}, "surplus"),
-                          ({"unet.conv_out.bias": np.full_like(whole["unet.conv_out.bias"], np.nan)}, "unet.conv_out.bias holds NaN")):
+    for change, words in (
+        ({"unet.conv_out.bias": None}, "lacks tensor unet.conv_out.bias"),
+        ({"surplus": np.zeros(3, np.float16)}, "surplus"),
+        ({"unet.conv_out.bias": np.full_like(whole["unet.conv_out.bias"], np.nan)}, "unet.conv_out.bias holds NaN"),
+    ):
         save_file({k: v for k, v in (whole | change).items() if v is not None}, damaged / "model.safetensors")
         with pytest.raises(InputError, match=words):
             load_model(damaged)
@@ -217,11 +235,15 @@ def test_a_result_that_the_model_is_unsure_of_is_told(gdtool, picture, tiny_mode
     # What is usual is known of one way of sampling.
     result = sample(gdtool, "ball.png", "--model", model, "--domains", "normal,depth", "-o", "other")
     record = json.loads((tmp_path / "other" / MANIFEST).read_text())
-    assert not any("unsure" in text for text in record["warnings"]) and "the model's doubt of its result" in {one["what"] for one in record["skipped"]}
+    assert not any("unsure" in text for text in record["warnings"]) and "the model's doubt of its result" in {
+        one["what"] for one in record["skipped"]
+    }
 
 
 def test_loading_a_model_leaves_pytorchs_compiler_out():
     # It takes a second to import, and one operation on the meta device, where shapes are checked, can do that.
-    code = ("import sys; from pathlib import Path; import gdtool.models; from gdtool.diffusion.checkpoint.weights import load_model; "
-            "load_model(Path(gdtool.models.__file__).parent / 'default'); print([m for m in ('torch._dynamo', 'sympy') if m in sys.modules])")
+    code = (
+        "import sys; from pathlib import Path; import gdtool.models; from gdtool.diffusion.checkpoint.weights import load_model; "
+        "load_model(Path(gdtool.models.__file__).parent / 'default'); print([m for m in ('torch._dynamo', 'sympy') if m in sys.modules])"
+    )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

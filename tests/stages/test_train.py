@@ -30,7 +30,11 @@ def test_train_writes_a_model_that_validates_and_then_skips(gdtool, spheres, tmp
     assert first.stdout == "model\n"
     model = tmp_path / "model"
     manifest = json.loads((model / "manifest.json").read_text())
-    assert manifest["kind"] == "model" and manifest["content"]["steps"] == 4 and manifest["content"]["report"]["objects"] == 2
+    assert (
+        manifest["kind"] == "model"
+        and manifest["content"]["steps"] == 4
+        and manifest["content"]["report"]["objects"] == 2
+    )
     rows = list(csv.DictReader(open(model / "loss.csv")))
     assert [int(row["step"]) for row in rows] == [1, 2, 3, 4] and all(float(row["loss"]) > 0 for row in rows)
     assert (model / "validation" / "step_000004.png").stat().st_size > 1000
@@ -50,7 +54,9 @@ def test_tensorboard_has_every_row_of_the_log(gdtool, spheres, tmp_path):
     found = loader.EventAccumulator(str(tmp_path / "model/tensorboard"))
     found.Reload()
     rows = list(csv.DictReader(open(tmp_path / "model/loss.csv")))
-    assert [(event.step, pytest.approx(event.value, rel=1e-4)) for event in found.Scalars("loss")] == [(int(row["step"]), float(row["loss"])) for row in rows]
+    assert [(event.step, pytest.approx(event.value, rel=1e-4)) for event in found.Scalars("loss")] == [
+        (int(row["step"]), float(row["loss"])) for row in rows
+    ]
     assert [event.step for event in found.Images("validation")] == [4]
 
 
@@ -59,7 +65,9 @@ def test_without_the_package_tensorboard_is_refused(gdtool, spheres, tmp_path, m
     (tmp_path / "hidden/tensorboard/__init__.py").write_text("raise ImportError('hidden')\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "hidden"))
     run = gdtool("train", spheres, *TINY, "--steps", 2, "--tensorboard", "-o", "model")
-    assert run.returncode == 5 and "pip install 'gdtool[tensorboard]'" in run.stderr and not (tmp_path / "model").exists()
+    assert (
+        run.returncode == 5 and "pip install 'gdtool[tensorboard]'" in run.stderr and not (tmp_path / "model").exists()
+    )
 
 
 def test_same_seed_same_weights(gdtool, spheres, tmp_path):
@@ -71,8 +79,12 @@ def test_same_seed_same_weights(gdtool, spheres, tmp_path):
 def test_a_killed_training_goes_on_where_it_was(gdtool, spheres, tmp_path):
     line = [str(x) for x in ("train", spheres, *TINY, "--steps", 40, "--checkpoint-every", 2, "--held-out", 0)]
     assert gdtool(*line, "-o", "whole").returncode == 0
-    process = subprocess.Popen([sys.executable, "-m", "gdtool", *line, "-o", "killed"], cwd=tmp_path, stderr=subprocess.DEVNULL,
-                               env={**os.environ, "OMP_NUM_THREADS": "1"})
+    process = subprocess.Popen(
+        [sys.executable, "-m", "gdtool", *line, "-o", "killed"],
+        cwd=tmp_path,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
     deadline = time.monotonic() + 240  # the machine may be busy
     while not list(tmp_path.glob(".*/checkpoint.safetensors")) + list(tmp_path.glob("*/checkpoint.safetensors")):
         assert process.poll() is None and time.monotonic() < deadline, "no checkpoint was written"
@@ -87,21 +99,29 @@ def test_a_killed_training_goes_on_where_it_was(gdtool, spheres, tmp_path):
 
 def test_training_goes_on_from_a_model(gdtool, spheres, tmp_path):
     assert gdtool("train", spheres, *TINY, "--steps", 2, "--held-out", 0, "-o", "first").returncode == 0
-    after = gdtool("train", spheres, *TINY, "--steps", 1, "--seed", 1, "--held-out", 0, "--start", "first", "-o", "second")
+    after = gdtool(
+        "train", spheres, *TINY, "--steps", 1, "--seed", 1, "--held-out", 0, "--start", "first", "-o", "second"
+    )
     assert after.returncode == 0, after.stderr
     first, second = load_file(tmp_path / "first/model.safetensors"), load_file(tmp_path / "second/model.safetensors")
     fresh = gdtool("train", spheres, *TINY, "--steps", 1, "--seed", 1, "--held-out", 0, "-o", "fresh")
     assert fresh.returncode == 0
     name = "unet.conv_in.weight"
-    distance = [np.abs(first[name].astype(float) - x[name]).max() for x in (second, load_file(tmp_path / "fresh/model.safetensors"))]
+    distance = [
+        np.abs(first[name].astype(float) - x[name]).max()
+        for x in (second, load_file(tmp_path / "fresh/model.safetensors"))
+    ]
     assert distance[0] < distance[1]
 
 
-@pytest.mark.parametrize("changes, words", [
-    ({"model": {"chanels": [8]}}, "chanels"),
-    ({"train": {"batch": "many"}}, "batch"),
-    ({"weights": {}}, "weights"),
-])
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"model": {"chanels": [8]}}, "chanels"),
+        ({"train": {"batch": "many"}}, "batch"),
+        ({"weights": {}}, "weights"),
+    ],
+)
 def test_a_wrong_configuration_is_named(gdtool, spheres, tmp_path, changes, words):
     (tmp_path / "config.json").write_text(json.dumps(changes))
     result = gdtool("train", spheres, *TINY, "-o", "model")
@@ -136,6 +156,7 @@ def test_a_small_model_is_grown_to_a_larger_size(gdtool, spheres, tmp_path):
     assert (config["image_size"], config["patch"], config["encoder_patch"]) == (32, 8, 16)
     weights = load_file(tmp_path / "grown/model.safetensors")["unet.conv_in.weight"]
     pixels = weights.astype(np.float32).reshape(8, 7, 8, 8, 3, 3)
-    assert np.abs(pixels[:, :, 0::2] - pixels[:, :, 1::2]).max() < 0.01 * np.abs(pixels).max() + 0.01  # one small step away
+    # One small step away.
+    assert np.abs(pixels[:, :, 0::2] - pixels[:, :, 1::2]).max() < 0.01 * np.abs(pixels).max() + 0.01
     bad = gdtool("train", large, *TINY, "--size", 24, "--steps", 1, "-o", "bad")
     assert bad.returncode == 3 and "neither a multiple" in bad.stderr

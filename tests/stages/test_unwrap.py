@@ -78,11 +78,14 @@ def test_overlapping_coordinates_are_replaced(gdtool, tmp_path):
     assert content(tmp_path / "twice.asset/atlas")["report"]["overlap"] == 0
 
 
-@pytest.mark.parametrize("text, fact", [
-    ("v 0 0 0\n", "no faces"),
-    ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no face has an area"),
-    ("v 0 0 0\nv 1 0 0\nv 0 inf 0\nf 1 2 3\n", "not finite"),
-])
+@pytest.mark.parametrize(
+    "text, fact",
+    [
+        ("v 0 0 0\n", "no faces"),
+        ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no face has an area"),
+        ("v 0 0 0\nv 1 0 0\nv 0 inf 0\nf 1 2 3\n", "not finite"),
+    ],
+)
 def test_bad_mesh_is_refused(gdtool, tmp_path, text, fact):
     (tmp_path / "bad.obj").write_text(text)
     run = gdtool("unwrap", "bad.obj")
@@ -102,6 +105,7 @@ def test_symmetric_halves_share_their_texels(gdtool, tmp_path, ring):
     folder = open_folder(tmp_path / "ring.asset/atlas")
     report, mesh = folder.content.report, read_mesh(folder)
     assert report["shared"] == 0.5 and report["overlap"] == 0 and report["mirrored"] == 0
+
     # Each vertex' corners lie where those of its mirror image do.
     def corners_of(vertices):
         found = {}

@@ -30,13 +30,32 @@ def large(path):
     Image.new("RGB", (16_400, 1)).save(path.with_suffix(".png"))
     points = struct.pack("<9f", 1, 0, 0, 0, 1, 0, 0, 0, 1)
     material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
-    path.write_text(json.dumps({
-        "asset": {"version": "2.0"}, "buffers": [{"byteLength": 36, "uri": "data:;base64," + base64.b64encode(points).decode()}],
-        "bufferViews": [{"buffer": 0, "byteLength": 36}], "images": [{"uri": path.with_suffix(".png").name}], "textures": [{"source": 0}],
-        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3", "min": [0, 0, 0], "max": [1, 1, 1]},
-                      {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC2"}],
-        "materials": [material], "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}],
-        "nodes": [{"mesh": 0}], "scenes": [{"nodes": [0]}]}))
+    path.write_text(
+        json.dumps(
+            {
+                "asset": {"version": "2.0"},
+                "buffers": [{"byteLength": 36, "uri": "data:;base64," + base64.b64encode(points).decode()}],
+                "bufferViews": [{"buffer": 0, "byteLength": 36}],
+                "images": [{"uri": path.with_suffix(".png").name}],
+                "textures": [{"source": 0}],
+                "accessors": [
+                    {
+                        "bufferView": 0,
+                        "componentType": 5126,
+                        "count": 3,
+                        "type": "VEC3",
+                        "min": [0, 0, 0],
+                        "max": [1, 1, 1],
+                    },
+                    {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC2"},
+                ],
+                "materials": [material],
+                "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}],
+                "nodes": [{"mesh": 0}],
+                "scenes": [{"nodes": [0]}],
+            }
+        )
+    )
     return path
 
 
@@ -102,7 +121,9 @@ def dataset(tmp_path, good, entry):
     shutil.copytree(good, root / "ring.asset/views")
     shutil.copytree(good, tmp_path / "outside/views")
     content = {"objects": [entry]}
-    (root / "manifest.json").write_text(json.dumps({"kind": "dataset", "name": "data", "stage": "mine", "content": content, "files": []}))
+    (root / "manifest.json").write_text(
+        json.dumps({"kind": "dataset", "name": "data", "stage": "mine", "content": content, "files": []})
+    )
     return root
 
 

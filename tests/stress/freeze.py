@@ -21,10 +21,26 @@ def measure(rings: int = 512) -> dict:
     from tests.stress.test_reflection import KINDS, LIGHTS, ROUGHNESS, VIEWS, furnace, specular_error
 
     return {
-        "specular": {kind: {f"{r:g}/{v}/{s:g}": round(specular_error(kind, r, v, s, rings), 4) for r in ROUGHNESS for v in VIEWS for s in LIGHTS}
-                     for kind in KINDS},
-        "furnace": {kind: {f"{r:g}/{v}": [round(furnace(kind, r, float(v), 1.0)[1], 4), round(sum(furnace(kind, r, float(v), 0.0)), 4)]
-                           for r in ROUGHNESS for v in VIEWS} for kind in KINDS},
+        "specular": {
+            kind: {
+                f"{r:g}/{v}/{s:g}": round(specular_error(kind, r, v, s, rings), 4)
+                for r in ROUGHNESS
+                for v in VIEWS
+                for s in LIGHTS
+            }
+            for kind in KINDS
+        },
+        "furnace": {
+            kind: {
+                f"{r:g}/{v}": [
+                    round(furnace(kind, r, float(v), 1.0)[1], 4),
+                    round(sum(furnace(kind, r, float(v), 0.0)), 4),
+                ]
+                for r in ROUGHNESS
+                for v in VIEWS
+            }
+            for kind in KINDS
+        },
     }
 
 

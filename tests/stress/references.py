@@ -16,7 +16,21 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(300)
 N = torch.tensor([0.0, 0.0, 1.0])
 
 # λ of METHOD.md's sweep, with the ends of the formats and the places where the code changes its form.
-SHARPNESS = (0.0, 1e-45, 1e-38, 1e-30, *(10.0 ** k for k in range(-8, 11)), 9.9e-5, 1.01e-4, 9.9e-4, 1.01e-3, 0.499, 0.501, 1e12, 3e38)
+SHARPNESS = (
+    0.0,
+    1e-45,
+    1e-38,
+    1e-30,
+    *(10.0**k for k in range(-8, 11)),
+    9.9e-5,
+    1.01e-4,
+    9.9e-4,
+    1.01e-3,
+    0.499,
+    0.501,
+    1e12,
+    3e38,
+)
 # 181 angles, and those where the clamped cosine's edge is.
 ANGLES = np.concatenate([np.linspace(0, np.pi, 181), np.pi / 2 + np.array([-1e-3, -1e-6, 1e-6, 1e-3])])
 
@@ -29,7 +43,9 @@ def direction(degrees: float, azimuth: float = 0.0, dtype: torch.dtype = torch.f
 
 def light(axis: torch.Tensor, sharpness: float, amplitude: float = 1.0) -> SphericalGaussians:
     """One grey lobe."""
-    return SphericalGaussians(axis[None], torch.tensor([sharpness], dtype=axis.dtype), torch.full((1, 3), amplitude, dtype=axis.dtype))
+    return SphericalGaussians(
+        axis[None], torch.tensor([sharpness], dtype=axis.dtype), torch.full((1, 3), amplitude, dtype=axis.dtype)
+    )
 
 
 def sphere_integral(sharpness: float) -> float:
@@ -67,6 +83,7 @@ def ring_integrals(sharpness: float, cosines: np.ndarray) -> tuple[np.ndarray, n
 def product_of_lobes(axis1, sharpness1, axis2, sharpness2) -> tuple[list, object, object]:
     """Axis, sharpness and log amplitude of a product, axes normalised first, in 60 digits."""
     with mpmath.workdps(60):
+
         def unit(v):
             v = [mpmath.mpf(float(x)) for x in v]
             length = mpmath.sqrt(sum(x * x for x in v))
@@ -78,7 +95,9 @@ def product_of_lobes(axis1, sharpness1, axis2, sharpness2) -> tuple[list, object
         return [x / length if length else mpmath.mpf(0) for x in total], length, length - t1 - t2
 
 
-def reflected(view, albedo, roughness, metallic, lights, kind="gltf", f0=0.04, rings=512, spokes=512) -> tuple[torch.Tensor, torch.Tensor]:
+def reflected(
+    view, albedo, roughness, metallic, lights, kind="gltf", f0=0.04, rings=512, spokes=512
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Diffuse and specular radiance (3,) of the true BRDF under SG light about N, by quadrature in float64.
 
     The grid is a polar one about the sharper of the reflection lobe and the first light, finer toward its pole.
@@ -88,10 +107,16 @@ def reflected(view, albedo, roughness, metallic, lights, kind="gltf", f0=0.04, r
     drop, weight = 2 * u**4, 8 * u**3 / rings * (2 * math.pi / spokes)
     phi = (torch.arange(spokes, dtype=dtype) + 0.5) * 2 * math.pi / spokes
     mu, ring = 1 - drop, torch.sqrt(drop * (2 - drop))
-    local = torch.stack([ring[:, None] * phi.cos(), ring[:, None] * phi.sin(), mu[:, None].expand(-1, spokes)], -1).reshape(-1, 3)
+    local = torch.stack(
+        [ring[:, None] * phi.cos(), ring[:, None] * phi.sin(), mu[:, None].expand(-1, spokes)], -1
+    ).reshape(-1, 3)
     v = view.to(dtype)
     mirror = torch.stack([-v[0], -v[1], v[2]])
-    pole = mirror if 2 / max(roughness, models.MIN_ROUGHNESS) ** 4 > float(lights.sharpness[0]) else lights.axes[0].to(dtype)
+    pole = (
+        mirror
+        if 2 / max(roughness, models.MIN_ROUGHNESS) ** 4 > float(lights.sharpness[0])
+        else lights.axes[0].to(dtype)
+    )
     helper = torch.eye(3, dtype=dtype)[int(pole.abs().argmin())]
     x = normalize(torch.linalg.cross(helper, pole))
     y = torch.linalg.cross(pole, x)
@@ -100,7 +125,16 @@ def reflected(view, albedo, roughness, metallic, lights, kind="gltf", f0=0.04, r
     h = normalize(l + v)
     n_l = l[:, 2].clamp_min(0)
     a, r, m = (torch.as_tensor(t, dtype=dtype) for t in (albedo, roughness, metallic))
-    diffuse, specular = models.reflectance(kind, a, r, m, models.f0_of(a, m, f0), n_l, v[2].expand_as(n_l), h[:, 2].clamp(0, 1),
-                                           (h * v).sum(-1).clamp(0, 1))
+    diffuse, specular = models.reflectance(
+        kind,
+        a,
+        r,
+        m,
+        models.f0_of(a, m, f0),
+        n_l,
+        v[2].expand_as(n_l),
+        h[:, 2].clamp(0, 1),
+        (h * v).sum(-1).clamp(0, 1),
+    )
     radiance = evaluate(lights.to(dtype), l) * (n_l * w)[:, None]
     return (diffuse * radiance).sum(0), (specular * radiance).sum(0)

@@ -33,10 +33,17 @@ def test_neus_alpha(sharpness):
     """Every pair: zeros, equal values, entering, leaving, and starts inside."""
     f0, f1 = (x.reshape(-1) for x in torch.meshgrid(torch.tensor(VALUES), torch.tensor(VALUES), indexing="ij"))
     alpha = ss.neus_alpha(f0, f1, sharpness).double()
-    exact = torch.tensor([exact_alpha(float(a), float(b), sharpness) for a, b in zip(f0, f1, strict=True)], dtype=torch.float64)
+    exact = torch.tensor(
+        [exact_alpha(float(a), float(b), sharpness) for a, b in zip(f0, f1, strict=True)], dtype=torch.float64
+    )
     assert ((alpha >= 0) & (alpha <= 1)).all()
     worst = int((alpha - exact).abs().argmax())
-    assert float((alpha - exact).abs().max()) <= 1e-5, (float(f0[worst]), float(f1[worst]), float(alpha[worst]), float(exact[worst]))
+    assert float((alpha - exact).abs().max()) <= 1e-5, (
+        float(f0[worst]),
+        float(f1[worst]),
+        float(alpha[worst]),
+        float(exact[worst]),
+    )
     x, y = f0.clone().requires_grad_(), f1.clone().requires_grad_()
     for gradient in torch.autograd.grad(ss.neus_alpha(x, y, sharpness).sum(), (x, y)):
         assert torch.isfinite(gradient).all()
@@ -60,8 +67,18 @@ def brute_force_crossing(values: list[float]) -> int | None:
 
 
 @settings(max_examples=150)
-@given(st.integers(2, 64).flatmap(lambda n: st.lists(
-    st.one_of(st.sampled_from([0.0, -0.0, 1.0, -1.0, 1e-45, -1e-45, math.nan, math.inf, -math.inf]), st.floats(-1, 1, width=32)), min_size=n, max_size=n)))
+@given(
+    st.integers(2, 64).flatmap(
+        lambda n: st.lists(
+            st.one_of(
+                st.sampled_from([0.0, -0.0, 1.0, -1.0, 1e-45, -1e-45, math.nan, math.inf, -math.inf]),
+                st.floats(-1, 1, width=32),
+            ),
+            min_size=n,
+            max_size=n,
+        )
+    )
+)
 def test_first_crossing(values):
     found, idx = ss.first_crossing(torch.tensor([values], dtype=torch.float32))
     expected = brute_force_crossing(values)
@@ -73,7 +90,12 @@ DISTANCES = {
     "sphere": lambda p: p.norm(dim=-1) - 0.4,
     "plane": lambda p: p @ torch.tensor([0.36, 0.48, 0.8], dtype=p.dtype) - 0.1,
     "torus": lambda p: torch.sqrt((p[..., [0, 2]].norm(dim=-1) - 0.3) ** 2 + p[..., 1] ** 2) - 0.1,
-    "capsule": lambda p: (p - torch.stack([p[..., 0].clamp(-0.3, 0.3), torch.zeros_like(p[..., 0]), torch.zeros_like(p[..., 0])], -1)).norm(dim=-1) - 0.2,
+    "capsule": lambda p: (
+        (
+            p - torch.stack([p[..., 0].clamp(-0.3, 0.3), torch.zeros_like(p[..., 0]), torch.zeros_like(p[..., 0])], -1)
+        ).norm(dim=-1)
+        - 0.2
+    ),
 }
 
 
@@ -112,7 +134,7 @@ def check_encoding(values: np.ndarray) -> None:
     """Against sin and cos of π 2^k x in 40 digits, of the float32 that is encoded."""
     points = torch.tensor(values, dtype=torch.float32)[:, None].expand(-1, 3)
     got = encode(points).double().numpy()
-    assert got.shape[1] == ENCODED and not got[:, 3 + 6 * FREQUENCIES:].any()
+    assert got.shape[1] == ENCODED and not got[:, 3 + 6 * FREQUENCIES :].any()
     with mpmath.workdps(40):
         for row, x in zip(got, points[:, 0].double().numpy(), strict=True):
             for k in range(FREQUENCIES):
@@ -122,7 +144,14 @@ def check_encoding(values: np.ndarray) -> None:
 
 
 def test_encoding_at_both_ends_and_between():
-    check_encoding(np.concatenate([[1.0, -1.0, 0.0, 0.5, -0.5, 1e-30, np.nextafter(np.float32(1), 0), np.nextafter(np.float32(-1), 0)], np.linspace(-1, 1, 101)]))
+    check_encoding(
+        np.concatenate(
+            [
+                [1.0, -1.0, 0.0, 0.5, -0.5, 1e-30, np.nextafter(np.float32(1), 0), np.nextafter(np.float32(-1), 0)],
+                np.linspace(-1, 1, 101),
+            ]
+        )
+    )
 
 
 @pytest.mark.slow
@@ -161,12 +190,14 @@ def test_a_row_with_nan_spoils_no_other_row():
 
 
 def test_diffusion_network_in_bfloat16():
-    from gdtool.diffusion.network.attention import Layout
     from gdtool.diffusion.config import PRESETS
+    from gdtool.diffusion.network.attention import Layout
     from gdtool.diffusion.network.model import Model
 
     torch.manual_seed(0)
-    model = Model(msgspec.structs.replace(PRESETS["tiny"][0], channels=(16, 32), head_width=8, encoder_width=16, image_size=16)).eval()
+    model = Model(
+        msgspec.structs.replace(PRESETS["tiny"][0], channels=(16, 32), head_width=8, encoder_width=16, image_size=16)
+    ).eval()
     for p in model.parameters():  # nothing at zero, so that every path shows
         if p.ndim >= 2 and not p.any():
             torch.nn.init.normal_(p, std=0.05)
@@ -174,7 +205,9 @@ def test_diffusion_network_in_bfloat16():
     noisy = torch.randn(model.latent_shape(layout))
 
     def clean():
-        return model.predict_clean(noisy, model.condition_latents(rgba, layout, views), torch.tensor([300]), model.encoder(rgba), layout, views)
+        return model.predict_clean(
+            noisy, model.condition_latents(rgba, layout, views), torch.tensor([300]), model.encoder(rgba), layout, views
+        )
 
     with torch.no_grad():
         exact = clean()

@@ -1,4 +1,5 @@
-"""METHOD.md's sweep of spherical Gaussians: integral, product, hemisphere, cosine. λ from 0 and 1e-45 to float32's largest."""
+"""METHOD.md's sweep of spherical Gaussians: integral, product, hemisphere, cosine. λ from 0 and 1e-45 to float32's
+largest."""
 
 from __future__ import annotations
 
@@ -17,7 +18,24 @@ from tests.stress.references import ANGLES, SHARPNESS, ULP, product_of_lobes, ri
 settings.register_profile("stress", derandomize=True, deadline=None, print_blob=True)
 settings.load_profile("stress")
 
-GAPS = (0.0, 1e-8, 1e-6, 1e-4, 1e-3, 0.01, 0.1, 0.5, 1.0, 1.5, math.pi / 2, 2.0, 3.0, math.pi - 1e-3, math.pi - 1e-6, math.pi)
+GAPS = (
+    0.0,
+    1e-8,
+    1e-6,
+    1e-4,
+    1e-3,
+    0.01,
+    0.1,
+    0.5,
+    1.0,
+    1.5,
+    math.pi / 2,
+    2.0,
+    3.0,
+    math.pi - 1e-3,
+    math.pi - 1e-6,
+    math.pi,
+)
 
 
 def test_integral_over_the_sphere_is_within_four_ulp():
@@ -25,7 +43,7 @@ def test_integral_over_the_sphere_is_within_four_ulp():
     exact = np.array([sphere_integral(float(x)) for x in values])
     got = sg.integral(values).double().numpy()
     # A denormal result has fewer digits than four units of the last place of a normal one.
-    assert (np.abs(got - exact) <= np.maximum(4 * ULP * exact, 2.0 ** -149)).all()
+    assert (np.abs(got - exact) <= np.maximum(4 * ULP * exact, 2.0**-149)).all()
     assert float(sg.integral(torch.tensor(math.inf))) == 0.0
 
 
@@ -42,7 +60,8 @@ def check_product(p1: torch.Tensor, s1: float, p2: torch.Tensor, s2: float) -> N
     total, length, drop = float(a) + float(b), float(length), float(drop)
     assert np.isfinite(axis).all() and math.isfinite(sharpness) and exponent <= 0 and np.linalg.norm(axis) < 1 + 1e-6
     assert abs(sharpness - length) <= 2e-6 * max(total, 1e-20), (s1, s2)
-    # The amplitude exp(exponent), relative while float32 can hold it, as METHOD.md asks where its logarithm is moderate.
+    # The amplitude exp(exponent), relative while float32 can hold it, as METHOD.md asks where its logarithm is
+    # moderate.
     if drop > -80:
         assert abs(exponent - drop) <= 2e-6 * max(1.0, abs(drop)), (s1, s2)
     if length > 1e-2 * total > 1e-20:
@@ -124,7 +143,8 @@ def test_cosine_integral_grows_with_the_cosine(value, one, two):
 
 @pytest.mark.parametrize("value", [1.0, 1e2, 1e4, 1e6, 1e7, 1e10])
 def test_lobes_keep_their_digits_when_sharp(value):
-    """Evaluated where exp is between 1 and e⁻⁸: the direction is stored in float32, and its rounding is the caller's."""
+    """Evaluated where exp is between 1 and e⁻⁸: the direction is stored in float32, and its rounding is the
+    caller's."""
     p, s = torch.tensor([0.0, 0.0, 1.0]), torch.tensor(value)
     angles = np.minimum(np.linspace(0, 4, 33) / math.sqrt(value), np.pi)
     v = torch.tensor(np.stack([np.sin(angles), 0 * angles, np.cos(angles)], 1), dtype=torch.float32)
@@ -132,7 +152,11 @@ def test_lobes_keep_their_digits_when_sharp(value):
     assert float(((sg.lobe(p, s, v).double() - exact) / exact).abs().max()) <= 2e-6
 
 
-ADVERSARIES = [(value, angle) for value in SHARPNESS for angle in (0.0, 1e-4, np.pi / 2 - 1e-6, np.pi / 2, np.pi / 2 + 1e-6, 3.0, np.pi)]
+ADVERSARIES = [
+    (value, angle)
+    for value in SHARPNESS
+    for angle in (0.0, 1e-4, np.pi / 2 - 1e-6, np.pi / 2, np.pi / 2 + 1e-6, 3.0, np.pi)
+]
 
 
 def test_gradients_are_finite_at_every_adversary():
@@ -141,10 +165,14 @@ def test_gradients_are_finite_at_every_adversary():
     p = torch.tensor(np.stack([np.sin(angle), 0 * angle, np.cos(angle)], 1), dtype=torch.float32, requires_grad=True)
     q = torch.tensor([0.0, 0.0, 1.0]).expand(len(s), 3).clone().requires_grad_()
     for name, function in {
-        "product axis": lambda: sg.product(p, s, q, s)[0].sum(-1), "product sharpness": lambda: sg.product(p, s, q, s)[1],
-        "product amplitude": lambda: sg.product(p, s, q, s)[2].exp(), "unequal product": lambda: sg.product(p, s, q, 2 * s.clamp_max(1e12))[2].exp(),
-        "lobe": lambda: sg.lobe(p, s, q), "integral": lambda: sg.integral(s),
-        "hemisphere": lambda: sg.hemisphere_integral(s, (p * q).sum(-1)), "cosine": lambda: sg.cosine_integral(s, (p * q).sum(-1)),
+        "product axis": lambda: sg.product(p, s, q, s)[0].sum(-1),
+        "product sharpness": lambda: sg.product(p, s, q, s)[1],
+        "product amplitude": lambda: sg.product(p, s, q, s)[2].exp(),
+        "unequal product": lambda: sg.product(p, s, q, 2 * s.clamp_max(1e12))[2].exp(),
+        "lobe": lambda: sg.lobe(p, s, q),
+        "integral": lambda: sg.integral(s),
+        "hemisphere": lambda: sg.hemisphere_integral(s, (p * q).sum(-1)),
+        "cosine": lambda: sg.cosine_integral(s, (p * q).sum(-1)),
     }.items():
         value = function()
         assert torch.isfinite(value).all(), name
@@ -162,5 +190,10 @@ def test_gradcheck(low, high):
         # Steps smaller than the stretches between the places where the form changes.
         assert torch.autograd.gradcheck(function, (s, c), eps=low * 1e-4, atol=1e-4, rtol=1e-3)
     assert torch.autograd.gradcheck(sg.integral, (s,), eps=low * 1e-4, atol=1e-4, rtol=1e-3)
-    p, q = (sg.normalize(torch.tensor(v, dtype=torch.float64)).requires_grad_() for v in ([0.3, -0.5, 0.8], [-0.2, 0.9, 0.1]))
-    assert torch.autograd.gradcheck(lambda a, b, t: sg.product(a, t, b, 2 * t), (p, q, s[0].detach().requires_grad_()), atol=1e-4, rtol=1e-3)
+    p, q = (
+        sg.normalize(torch.tensor(v, dtype=torch.float64)).requires_grad_()
+        for v in ([0.3, -0.5, 0.8], [-0.2, 0.9, 0.1])
+    )
+    assert torch.autograd.gradcheck(
+        lambda a, b, t: sg.product(a, t, b, 2 * t), (p, q, s[0].detach().requires_grad_()), atol=1e-4, rtol=1e-3
+    )

@@ -1,7 +1,8 @@
-"""Meshes that break things: each is remeshed and unwrapped, or refused in one line; nothing hangs, crashes or loses what was there.
+"""Meshes that break things: each is remeshed and unwrapped, or refused in one line; nothing hangs, crashes or loses
+what was there.
 
-The public meshes of SHARED (../shared/assets/mesh unless GDTOOL_MESHES names another folder) run where they are present.
-"""
+The public meshes of SHARED (../shared/assets/mesh unless GDTOOL_MESHES names another folder) run where they are
+present."""
 
 import os
 from pathlib import Path
@@ -66,15 +67,26 @@ def moved(mesh, x: float, y: float):
 
 
 CASES = {
-    "one face": lambda: (np.eye(3), np.array([[0, 1, 2]])), "slivers": slivers,
+    "one face": lambda: (np.eye(3), np.array([[0, 1, 2]])),
+    "slivers": slivers,
 }
 SLOW_CASES = {
     "wall of a thousandth": lambda: slab(1e-3),
-    "fan": lambda: fan(7), "size 1e-6": lambda: scaled(sphere(16), 1e-6), "size 1e6, far off": lambda: scaled(sphere(16), 1e6, 3e6),
-    "crossing": crossing, "open": opened, "soup": soup, "wall of a hundred-thousandth": lambda: slab(1e-5), "fan of 200": lambda: fan(200),
-    "size 1e-6 with creases": lambda: scaled(bored_box(40), 1e-6), "size 1e6 with creases": lambda: scaled(bored_box(40), 1e6),
-    "many pieces": lambda: joined(*(moved(scaled(sphere(8), 0.06), 0.15 * i, 0.15 * j) for i in range(-5, 6) for j in range(-5, 6))),
-    "two faces": lambda: (cube()[0], cube()[1][:2]), "a thousand slabs thin": lambda: joined(*(scaled(slab(1e-3), 1.0, 0.01 * i) for i in range(20))),
+    "fan": lambda: fan(7),
+    "size 1e-6": lambda: scaled(sphere(16), 1e-6),
+    "size 1e6, far off": lambda: scaled(sphere(16), 1e6, 3e6),
+    "crossing": crossing,
+    "open": opened,
+    "soup": soup,
+    "wall of a hundred-thousandth": lambda: slab(1e-5),
+    "fan of 200": lambda: fan(200),
+    "size 1e-6 with creases": lambda: scaled(bored_box(40), 1e-6),
+    "size 1e6 with creases": lambda: scaled(bored_box(40), 1e6),
+    "many pieces": lambda: joined(
+        *(moved(scaled(sphere(8), 0.06), 0.15 * i, 0.15 * j) for i in range(-5, 6) for j in range(-5, 6))
+    ),
+    "two faces": lambda: (cube()[0], cube()[1][:2]),
+    "a thousand slabs thin": lambda: joined(*(scaled(slab(1e-3), 1.0, 0.01 * i) for i in range(20))),
 }
 
 

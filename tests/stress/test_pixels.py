@@ -14,8 +14,8 @@ from scipy.stats import t as student
 
 from gdtool.assets.scene import Material, Scene
 from gdtool.cameras import camera_at
-from gdtool.shading.render.direct import DirectLight
 from gdtool.shading.lights.bundled import bundled
+from gdtool.shading.render.direct import DirectLight
 from gdtool.shading.render.render import Renderer
 from tests.stress.test_scenes import ball
 
@@ -29,12 +29,17 @@ def stage(material: Material) -> Scene:
     """A ball over a floor: light, shadow, and pixels that edges cut."""
     vertices, faces = ball(10)
     floor = np.array([[-0.6, -0.3, -0.6], [0.6, -0.3, -0.6], [0.6, -0.3, 0.6], [-0.6, -0.3, 0.6]])
-    return Scene(vertices=np.concatenate([vertices * 0.5, floor]), faces=np.concatenate([faces, len(vertices) + np.array([[0, 2, 1], [0, 3, 2]])]).astype(np.int32),
-                 materials=(material,))
+    return Scene(
+        vertices=np.concatenate([vertices * 0.5, floor]),
+        faces=np.concatenate([faces, len(vertices) + np.array([[0, 2, 1], [0, 3, 2]])]).astype(np.int32),
+        materials=(material,),
+    )
 
 
 def picture(renderer: Renderer, environment, seed: int, directions: int, brdf: str = "gltf", **options) -> np.ndarray:
-    return renderer.buffers(CAMERA, SAMPLES, DirectLight(renderer, environment, directions, seed, brdf, **options).color())["color"].astype(np.float64)
+    return renderer.buffers(
+        CAMERA, SAMPLES, DirectLight(renderer, environment, directions, seed, brdf, **options).color()
+    )["color"].astype(np.float64)
 
 
 def z_test(draws: np.ndarray, reference: np.ndarray, reference_error: np.ndarray, bias: float = 0.0) -> float:
@@ -52,17 +57,22 @@ def z_test(draws: np.ndarray, reference: np.ndarray, reference_error: np.ndarray
     return 1 - (1 - float(p.min())) ** int(seen.sum())
 
 
-MATERIALS = {"plaster": Material(base_color=(0.7, 0.5, 0.3, 1), metallic=0.0, roughness=1.0), "plastic": Material(base_color=(0.2, 0.5, 0.8, 1), metallic=0.0, roughness=0.3),
-             "metal": Material(base_color=(0.9, 0.7, 0.4, 1), metallic=1.0, roughness=0.4)}
+MATERIALS = {
+    "plaster": Material(base_color=(0.7, 0.5, 0.3, 1), metallic=0.0, roughness=1.0),
+    "plastic": Material(base_color=(0.2, 0.5, 0.8, 1), metallic=0.0, roughness=0.3),
+    "metal": Material(base_color=(0.9, 0.7, 0.4, 1), metallic=1.0, roughness=0.4),
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("brdf, known", [("gltf", False), ("gltf", True), ("paper", False)], ids=["gltf", "gltf known irradiance", "paper"])
+@pytest.mark.parametrize(
+    "brdf, known", [("gltf", False), ("gltf", True), ("paper", False)], ids=["gltf", "gltf known irradiance", "paper"]
+)
 @pytest.mark.parametrize("material", MATERIALS)
 @pytest.mark.parametrize("light", ["mid", "bright"])
 def test_sampled_light_agrees_with_the_converged(material, light, brdf, known):
-    """The plain estimate is unbiased; the one that is used for glTF's Lambert, the known irradiance times the visible share,
-    is a ratio of two estimates, off by up to 0.1 % where a pixel is half in shadow."""
+    """The plain estimate is unbiased; the one that is used for glTF's Lambert, the known irradiance times the visible
+    share, is a ratio of two estimates, off by up to 0.1 % where a pixel is half in shadow."""
     renderer, environment = Renderer(stage(MATERIALS[material]), 1), bundled(light).shrunk(64)
     reference = [picture(renderer, environment, 1000 + k, 1024, brdf, known=False) for k in range(4)]
     error = np.std(reference, 0, ddof=1) / 2

@@ -1,4 +1,5 @@
-"""The grid method where views are small, large, missing, doubled, mirrored, contradictory or of awkward solids: whole and near."""
+"""The grid method where views are small, large, missing, doubled, mirrored, contradictory or of awkward solids: whole
+and near."""
 
 from __future__ import annotations
 
@@ -65,7 +66,9 @@ def picked(views, keep):
 
 
 # What no view sees may be closed otherwise; these solids are seen all around but for their tops and bottoms.
-@pytest.mark.parametrize("name, pieces", [("sphere", 1), ("cube", 1), ("torus", 1), ("two_balls", 2), ("card", 1), ("wire", 1)])
+@pytest.mark.parametrize(
+    "name, pieces", [("sphere", 1), ("cube", 1), ("torus", 1), ("two_balls", 2), ("card", 1), ("wire", 1)]
+)
 def test_awkward_solids(seen, name, pieces):
     shape = reconstruct(*seen[name])
     check_whole(shape)
@@ -100,7 +103,8 @@ def test_a_doubled_view_changes_little(seen):
 
 @pytest.mark.parametrize("view", [1, 3])
 def test_a_mirrored_view(seen, view):
-    """A picture the wrong way round contradicts the others; what comes out is still whole and of about the object's size."""
+    """A picture the wrong way round contradicts the others; what comes out is still whole and of about the object's
+    size."""
     solid = lambda p: np.minimum(sphere(p - [0.25, 0.1, 0.0], 0.2), sphere(p + [0.2, 0.1, 0.1], 0.28))  # noqa: E731
     cameras, images, mask = views_of(solid, SIZE, 1)
     true = reconstruct(cameras, images, mask)
@@ -156,7 +160,8 @@ def test_the_largest_views_fit_into_memory(tmp_path):
 
 
 def check_disturbed(seen, seeds, most=0.015):
-    """By seeds: no NaN, hole or blow-up, and nearer than the disturbance itself would leave a surface (1 % warp, 2 % scale).
+    """By seeds: no NaN, hole or blow-up, and nearer than the disturbance itself would leave a surface (1 % warp, 2 %
+    scale).
 
     A card is as thick as the grid can hold it.
     """
@@ -183,12 +188,19 @@ def test_a_card_whose_edges_no_mask_shows_stays_thin(seen):
     check_disturbed(seen, [29], 0.025)
 
 
-@pytest.mark.parametrize("albedo, roughness, metallic", [(0.0, 0.5, 0.0), (0.8, 0.2, 1.0), (0.6, 1.0, 0.0)], ids=["black", "metal", "rough"])
+@pytest.mark.parametrize(
+    "albedo, roughness, metallic", [(0.0, 0.5, 0.0), (0.8, 0.2, 1.0), (0.6, 1.0, 0.0)], ids=["black", "metal", "rough"]
+)
 def test_materials_at_their_ends(gdtool, tmp_path, seen, albedo, roughness, metallic):
     cameras, images, mask = seen["two_balls"]
     inside = (mask > 0).astype(np.float32)
-    given = {**images, "albedo": albedo * inside[..., None] * np.ones(3, np.float32), "roughness": roughness * inside, "metallic": metallic * inside,
-             "color": albedo * images["color"]}
+    given = {
+        **images,
+        "albedo": albedo * inside[..., None] * np.ones(3, np.float32),
+        "roughness": roughness * inside,
+        "metallic": metallic * inside,
+        "color": albedo * images["color"],
+    }
     folder = views_folder(tmp_path / "balls.asset" / "views", cameras, given, mask)
     done = gdtool("reconstruct", folder)
     assert done.returncode == 0, done.stderr

@@ -12,32 +12,48 @@ from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.cameras import camera_at
 from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
 from gdtool.shading.bsdf.closed_form import closed_form_image, shade
-from gdtool.shading.render.direct import DirectLight
-from gdtool.shading.lights.environment import Environment
-from gdtool.shading.lights.bundled import bundled
-from gdtool.shading.render.render import Renderer
 from gdtool.shading.bsdf.sg import SphericalGaussians
+from gdtool.shading.lights.bundled import bundled
+from gdtool.shading.lights.environment import Environment
+from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.render.render import Renderer
 
 SHINY = Material(base_color=(1, 1, 1, 1), metallic=1.0, roughness=0.0)
 MATERIALS = {
-    "mirror": SHINY, "black": Material(base_color=(0, 0, 0, 1), metallic=0.0, roughness=0.0), "rough": dataclasses.replace(SHINY, roughness=1.0),
+    "mirror": SHINY,
+    "black": Material(base_color=(0, 0, 0, 1), metallic=0.0, roughness=0.0),
+    "rough": dataclasses.replace(SHINY, roughness=1.0),
     "dense glass": Material(base_color=(1, 1, 1, 1), metallic=0.0, roughness=0.0, ior=1e6, specular=1e6),
     "air": Material(base_color=(0.5, 0.5, 0.5, 1), metallic=0.0, roughness=0.5, ior=1.0, specular=0.0),
-    "glowing": Material(base_color=(1, 0, 0, 1), metallic=0.0, emissive=(1e6, 0, 1e-6)), "unlit": dataclasses.replace(SHINY, unlit=True),
-    "one texel": Material(base_color_texture=Texture(np.full((1, 1, 4), 255, np.uint8), "srgb"), metallic_roughness_texture=Texture(np.zeros((1, 1, 3), np.uint8)),
-                          normal_texture=Texture(np.array([[[128, 128, 128]]], np.uint8)), alpha_mode="MASK"),
-    "normal map from behind": Material(normal_texture=Texture(np.array([[[0, 128, 0], [255, 0, 0]]], np.uint8)), normal_scale=100.0, roughness=0.0),
+    "glowing": Material(base_color=(1, 0, 0, 1), metallic=0.0, emissive=(1e6, 0, 1e-6)),
+    "unlit": dataclasses.replace(SHINY, unlit=True),
+    "one texel": Material(
+        base_color_texture=Texture(np.full((1, 1, 4), 255, np.uint8), "srgb"),
+        metallic_roughness_texture=Texture(np.zeros((1, 1, 3), np.uint8)),
+        normal_texture=Texture(np.array([[[128, 128, 128]]], np.uint8)),
+        alpha_mode="MASK",
+    ),
+    "normal map from behind": Material(
+        normal_texture=Texture(np.array([[[0, 128, 0], [255, 0, 0]]], np.uint8)), normal_scale=100.0, roughness=0.0
+    ),
     "float texels": Material(base_color_texture=Texture(np.array([[[-1.0, 2.0, 1e30]]], np.float32))),
 }
 
 
 def ball(rings: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    theta, phi = np.meshgrid(np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings, endpoint=False), indexing="ij")
+    theta, phi = np.meshgrid(
+        np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings, endpoint=False), indexing="ij"
+    )
     unit = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)], -1).reshape(-1, 3)
     row, column = np.meshgrid(np.arange(rings), np.arange(2 * rings), indexing="ij")
     a, b = row * 2 * rings + column, row * 2 * rings + (column + 1) % (2 * rings)
     # At the poles one of the two triangles of a place has no area; they stay.
-    faces = np.concatenate([np.stack([a, a + 2 * rings, b + 2 * rings], -1).reshape(-1, 3), np.stack([a, b + 2 * rings, b], -1).reshape(-1, 3)])
+    faces = np.concatenate(
+        [
+            np.stack([a, a + 2 * rings, b + 2 * rings], -1).reshape(-1, 3),
+            np.stack([a, b + 2 * rings, b], -1).reshape(-1, 3),
+        ]
+    )
     return unit * 0.5, faces.astype(np.int32)
 
 
@@ -64,7 +80,14 @@ def sun() -> Environment:
     return Environment(image, "sun")
 
 
-LIGHTS = {"black": constant(0.0), "one texel": constant(1.0, (1, 1)), "huge": constant(1e9), "tiny": constant(1e-30), "sun": sun(), "studio": bundled("mid")}
+LIGHTS = {
+    "black": constant(0.0),
+    "one texel": constant(1.0, (1, 1)),
+    "huge": constant(1e9),
+    "tiny": constant(1e-30),
+    "sun": sun(),
+    "studio": bundled("mid"),
+}
 
 
 def check(images: dict[str, np.ndarray], lit: bool = True) -> None:
@@ -77,7 +100,9 @@ def check(images: dict[str, np.ndarray], lit: bool = True) -> None:
             assert image.max() <= 1 + 1e-6, name
 
 
-def rendered(scene: Scene, environment: Environment, *, fov: float | None = 30.0, brdf: str = "gltf", size: int = 16, **options) -> dict[str, np.ndarray]:
+def rendered(
+    scene: Scene, environment: Environment, *, fov: float | None = 30.0, brdf: str = "gltf", size: int = 16, **options
+) -> dict[str, np.ndarray]:
     renderer = Renderer(scene, 1)
     light = DirectLight(renderer, environment, options.pop("samples", 4), 0, brdf, **options)
     return renderer.buffers(camera_at(20.0, 10.0, name="v", size=size, fov_degrees=fov), 4, light.color())
@@ -140,8 +165,15 @@ def test_random_triangles_and_materials(seed):
     vertices = transform_points(invert_similarity(unit_box(vertices)), vertices)
     faces = rng.integers(0, count, (int(rng.integers(8, 80)), 3)).astype(np.int32)
     names = list(MATERIALS)
-    scene = Scene(vertices=vertices, faces=faces, materials=tuple(MATERIALS.values()), material_idx=rng.integers(0, len(names), len(faces)).astype(np.int32),
-                  normals=rng.normal(size=(count, 3)) * rng.integers(0, 2, (count, 1)), uvs=(rng.normal(size=(count, 2)) * 1e3,), colors=rng.random((count, 4)))
+    scene = Scene(
+        vertices=vertices,
+        faces=faces,
+        materials=tuple(MATERIALS.values()),
+        material_idx=rng.integers(0, len(names), len(faces)).astype(np.int32),
+        normals=rng.normal(size=(count, 3)) * rng.integers(0, 2, (count, 1)),
+        uvs=(rng.normal(size=(count, 2)) * 1e3,),
+        colors=rng.random((count, 4)),
+    )
     for light in LIGHTS.values():
         images = rendered(scene, light, brdf=("gltf", "paper")[seed % 2], size=32)
         for name, image in images.items():
@@ -149,6 +181,12 @@ def test_random_triangles_and_materials(seed):
 
 
 def test_shade_does_not_leave_float32_between_a_white_metal_and_the_brightest_light():
-    value = shade(torch.tensor([0.0, 0, 1]), torch.tensor([0.0, 0, 1]), torch.ones(3), torch.tensor(0.0), torch.tensor(1.0),
-                  SphericalGaussians(torch.tensor([[0.0, 0, 1]]), torch.tensor([250.0]), torch.full((1, 3), 1e30)))
+    value = shade(
+        torch.tensor([0.0, 0, 1]),
+        torch.tensor([0.0, 0, 1]),
+        torch.ones(3),
+        torch.tensor(0.0),
+        torch.tensor(1.0),
+        SphericalGaussians(torch.tensor([[0.0, 0, 1]]), torch.tensor([250.0]), torch.full((1, 3), 1e30)),
+    )
     assert torch.isfinite(value).all()

@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gdtool.assets.scene import Texture
+from gdtool.bake.maps import quantise
 from gdtool.geometry.tangents import corner_tangents
+from gdtool.geometry.uv_raster import owner_count
 from gdtool.images.color import decode_normal, encode_normal, linear_from_srgb, srgb_from_linear
 from gdtool.images.io import read_image, write_png
 from gdtool.shading.bsdf.reflection import frame
 from gdtool.shading.render.textures import TextureReader
-from gdtool.bake.maps import quantise
-from gdtool.geometry.uv_raster import owner_count
 from tests.geometry.test_uv_raster import exact_owner
 
 settings.register_profile("stress", derandomize=True, deadline=None, print_blob=True)
@@ -69,19 +69,61 @@ def by_area(values: np.ndarray, count: int) -> np.ndarray:
 def test_lookups_stay_within_the_texture_whatever_the_coordinates(wrap, filtering):
     image = np.random.default_rng(0).integers(40, 200, (5, 7, 3), np.uint8)
     reader = TextureReader(Texture(image, wrap_u=wrap, wrap_v=wrap, filter=filtering))
-    u, v = (x.ravel() for x in np.meshgrid(*[[-1e30, -1e9, -2.0, -1.0, -1e-17, 0.0, 0.5, 1 - 1e-17, 1.0, 1.5, 1e9, 1e30, math.nan, math.inf, -math.inf]] * 2))
+    u, v = (
+        x.ravel()
+        for x in np.meshgrid(
+            *[
+                [
+                    -1e30,
+                    -1e9,
+                    -2.0,
+                    -1.0,
+                    -1e-17,
+                    0.0,
+                    0.5,
+                    1 - 1e-17,
+                    1.0,
+                    1.5,
+                    1e9,
+                    1e30,
+                    math.nan,
+                    math.inf,
+                    -math.inf,
+                ]
+            ]
+            * 2
+        )
+    )
     value = reader.read(np.stack([u, v], 1))
     assert np.isfinite(value).all() and value.min() >= 40 / 255 - 1e-6 and value.max() <= 200 / 255 + 1e-6
 
 
 def test_frames_are_unit_square_and_handed():
     directions = np.random.default_rng(0).normal(size=(20_000, 3))
-    directions[:12] = [[0, 0, 1], [0, 0, -1], [1e-8, 0, -1], [0, -1e-8, -1], [1e-4, 1e-4, -1], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [1, 0, -1e-30],
-                       [1, 0, -0.0], [0.7, 0.7, -1e-12]]
+    directions[:12] = [
+        [0, 0, 1],
+        [0, 0, -1],
+        [1e-8, 0, -1],
+        [0, -1e-8, -1],
+        [1e-4, 1e-4, -1],
+        [1, 0, 0],
+        [0, 1, 0],
+        [-1, 0, 0],
+        [0, -1, 0],
+        [1, 0, -1e-30],
+        [1, 0, -0.0],
+        [0.7, 0.7, -1e-12],
+    ]
     n = torch.tensor(directions / np.linalg.norm(directions, axis=1, keepdims=True), dtype=torch.float32)
     tangent, bitangent = (torch.stack([c.expand(len(n)) for c in v], 1).double() for v in frame(*n.unbind(1)))
     normal = n.double()
-    for a, b, wanted in ((tangent, tangent, 1), (bitangent, bitangent, 1), (tangent, bitangent, 0), (tangent, normal, 0), (bitangent, normal, 0)):
+    for a, b, wanted in (
+        (tangent, tangent, 1),
+        (bitangent, bitangent, 1),
+        (tangent, bitangent, 0),
+        (tangent, normal, 0),
+        (bitangent, normal, 0),
+    ):
         assert float(((a * b).sum(1) - wanted).abs().max()) <= 1e-6
     assert float((torch.linalg.cross(tangent, bitangent) - normal).abs().max()) <= 1e-6
 
@@ -109,7 +151,8 @@ CORNERS = st.tuples(st.integers(0, 48), st.integers(0, 48))
 @settings(max_examples=25)
 @given(CORNERS)
 def test_texels_around_a_shared_vertex_have_one_owner(place):
-    """Four triangles about a point of the map, wherever it is, cover each texel once; and as rational arithmetic says."""
+    """Four triangles about a point of the map, wherever it is, cover each texel once; and as rational arithmetic
+    says."""
     uv = np.array([[0, 0], [48, 0], [48, 48], [0, 48], place]) / 48
     faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
     assert (owner_count(uv, faces, 12) == 1).all()
@@ -129,7 +172,9 @@ def test_what_is_not_finite_is_not_stored(tmp_path):
 def test_quantisation_is_within_half_a_step(bits, tmp_path):
     top = 2**bits - 1
     steps = np.arange(top + 1) / top
-    x = np.concatenate([np.random.default_rng(0).random(20_000), steps, [-1.0, 2.0, -np.inf, np.inf]]).astype(np.float32)
+    x = np.concatenate([np.random.default_rng(0).random(20_000), steps, [-1.0, 2.0, -np.inf, np.inf]]).astype(
+        np.float32
+    )
     stored = quantise(x, bits).astype(np.float64) / top
     assert np.abs(stored - np.clip(x.astype(np.float64), 0, 1)).max() <= 0.5 / top + 6e-8
     np.testing.assert_array_equal(quantise(steps.astype(np.float32), bits), np.arange(top + 1))
@@ -150,9 +195,21 @@ def test_sixteen_bit_normals_and_depths():
 
 
 def test_srgb_against_forty_digits():
-    values = np.concatenate([np.linspace(0, 1, 401), [0.0031308, 0.0031309, 0.04045, 0.04046, 1e-30]]).astype(np.float32)
+    values = np.concatenate([np.linspace(0, 1, 401), [0.0031308, 0.0031309, 0.04045, 0.04046, 1e-30]]).astype(
+        np.float32
+    )
     with mpmath.workdps(40):
-        encoded = [12.92 * mpmath.mpf(float(x)) if x <= 0.0031308 else 1.055 * mpmath.mpf(float(x)) ** (mpmath.mpf(1) / mpmath.mpf("2.4")) - 0.055 for x in values]
-        linear = [mpmath.mpf(float(x)) / 12.92 if x <= 0.04045 else ((mpmath.mpf(float(x)) + 0.055) / 1.055) ** mpmath.mpf("2.4") for x in values]
+        encoded = [
+            12.92 * mpmath.mpf(float(x))
+            if x <= 0.0031308
+            else 1.055 * mpmath.mpf(float(x)) ** (mpmath.mpf(1) / mpmath.mpf("2.4")) - 0.055
+            for x in values
+        ]
+        linear = [
+            mpmath.mpf(float(x)) / 12.92
+            if x <= 0.04045
+            else ((mpmath.mpf(float(x)) + 0.055) / 1.055) ** mpmath.mpf("2.4")
+            for x in values
+        ]
     assert np.abs(srgb_from_linear(values).astype(np.float64) - np.array(encoded, float)).max() <= 3e-7
     assert np.abs(linear_from_srgb(values).astype(np.float64) - np.array(linear, float)).max() <= 3e-7

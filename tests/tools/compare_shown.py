@@ -1,9 +1,8 @@
 """An asset as three.js and Blender show it, against gdtool: python compare_shown.py ASSET.glb [--peers-python PATH]
 
-Runs the show_in_* scripts of this folder and prints the PSNR in dB over the pixels that both pictures cover in full: of the
-base color without light, and in three.js of the asset lit by an environment (benchmarks/asset.py has Blender's). three.js needs
-what show_in_three.mjs says; Blender a Python that has bpy. What is not there is named and left out.
-"""
+Runs the show_in_* scripts of this folder and prints the PSNR in dB over the pixels that both pictures cover in full: of
+the base color without light, and in three.js of the asset lit by an environment (benchmarks/asset.py has Blender's).
+three.js needs what show_in_three.mjs says; Blender a Python that has bpy. What is not there is named and left out."""
 
 from __future__ import annotations
 
@@ -25,7 +24,9 @@ def picture(command: list, out: Path, mode: str | Path) -> np.ndarray | str:
     from gdtool.images.io import read_image
 
     try:
-        done = subprocess.run([*map(str, command), str(out), str(mode)], capture_output=True, text=True, timeout=300, check=False)
+        done = subprocess.run(
+            [*map(str, command), str(out), str(mode)], capture_output=True, text=True, timeout=300, check=False
+        )
     except (OSError, subprocess.TimeoutExpired) as error:
         return str(error)
     if done.returncode or not out.exists():
@@ -41,7 +42,11 @@ def averaged(image: np.ndarray) -> np.ndarray:
     if step == 1:
         return image
     alpha = image[..., 3:]
-    sums = np.concatenate([linear_from_srgb(image[..., :3]) * alpha, alpha], -1).reshape(SIZE, step, SIZE, step, 4).mean((1, 3))
+    sums = (
+        np.concatenate([linear_from_srgb(image[..., :3]) * alpha, alpha], -1)
+        .reshape(SIZE, step, SIZE, step, 4)
+        .mean((1, 3))
+    )
     return np.concatenate([srgb_from_linear(sums[..., :3] / np.maximum(sums[..., 3:], 1e-9)), sums[..., 3:]], -1)
 
 
@@ -76,7 +81,10 @@ def main() -> None:
             pairs["Blender, base color"] = ([asked.peers_python, HERE / "show_in_blender.py", asset], "unlit", "unlit")
         found: dict[str, float | str] = {}
         for name, (command, mode, own_mode) in pairs.items():
-            ours, theirs = picture(own, place / f"gdtool_{own_mode}.png", own_mode), picture(command, place / f"{name}.png", mode)
+            ours, theirs = (
+                picture(own, place / f"gdtool_{own_mode}.png", own_mode),
+                picture(command, place / f"{name}.png", mode),
+            )
             if isinstance(ours, str) or isinstance(theirs, str):
                 found[name] = ours if isinstance(ours, str) else theirs
                 continue

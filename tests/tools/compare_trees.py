@@ -2,13 +2,12 @@
 
     python -m tests.tools.compare_trees BASE [--tree PATH] [--assets ASSETS] [--work DIR] [--only NAME ...]
 
-BASE is a commit, or the root of a checkout; PATH the checkout to compare with it (default: this one). Both run under this
-interpreter. ASSETS is a folder of real models (its mesh/ and glb/ are read); without it their cases are left out, and the last
-line says so. DIR keeps the results of BASE for the next comparison. Exits with 1 when anything differs.
+BASE is a commit, or the root of a checkout; PATH the checkout to compare with it (default: this one). Both run under
+this interpreter. ASSETS is a folder of real models (its mesh/ and glb/ are read); without it their cases are left out,
+and the last line says so. DIR keeps the results of BASE for the next comparison. Exits with 1 when anything differs.
 
-What may differ: how a run went (`run` and `saved_seconds` in a manifest, seconds in reports), the version of gdtool, and sentences, as far as
-compare_trees.tsv says which sentence replaces which.
-"""
+What may differ: how a run went (`run` and `saved_seconds` in a manifest, seconds in reports), the version of gdtool,
+and sentences, as far as compare_trees.tsv says which sentence replaces which."""
 
 from __future__ import annotations
 
@@ -30,8 +29,8 @@ SENTENCES = Path(__file__).with_suffix(".tsv")
 SECONDS = 900  # for one command, on a busy machine
 # Fields of a manifest or a report that tell how a run went.
 TIMES = re.compile(r"seconds|finished|peak_memory|_mb$|per_second")
-# Fields that follow from others: the files themselves are compared, and a sentence in a source's manifest enters the digests of all that
-# is made from it.
+# Fields that follow from others: the files themselves are compared, and a sentence in a source's manifest enters the
+# digests of all that is made from it.
 NOT_COMPARED = ("run", "tool_version", "stage_version", "key", "digest", "sha256")
 BUNDLED_MODEL = re.compile(r"^.*gdtool/models/")  # each tree has its own
 
@@ -43,7 +42,8 @@ class Case:
     name: str
     words: tuple[str, ...]
     needs: str = ""  # a path below ASSETS
-    varies: bool = False  # two runs of one version differ: only the figures in the manifest are compared, within VARIATION
+    # Two runs of one version differ: only the figures in the manifest are compared, within VARIATION.
+    varies: bool = False
 
 
 # Of the figures of a case that varies. Four runs of the base spread over 8 %.
@@ -59,13 +59,22 @@ def cases() -> list[Case]:
 
     # render-dataset: generated objects, a solid without materials, an open mesh, a broken one, real models
     add("views", "render-dataset procedural:3 --size 128")
-    add("views_turned", "render-dataset procedural:12 --size 96 --rig turntable --views 3 --fov 40 --elevation 20 --light mid --turn 45")
-    add("views_solid", "render-dataset sources/torus.obj --size 96 --domains color,normal,depth,closed_form --brdf paper")
+    add(
+        "views_turned",
+        "render-dataset procedural:12 --size 96 --rig turntable --views 3 --fov 40 --elevation 20 --light mid --turn 45",
+    )
+    add(
+        "views_solid",
+        "render-dataset sources/torus.obj --size 96 --domains color,normal,depth,closed_form --brdf paper",
+    )
     add("views_open", "render-dataset sources/bowl.ply --size 64 --rig sphere --views 2 --no-normalize")
     add("views_broken", "render-dataset sources/broken.obj --size 64 --rig wonder3d")
     add("views_textured", "render-dataset assets/glb/BoxTextured.glb --size 96", "glb/BoxTextured.glb")
     add("views_real", "render-dataset assets/mesh/odedstein/spot/spot.obj --size 128", "mesh/odedstein/spot/spot.obj")
-    add("objects", "render-dataset procedural:20..22 --size 64 --samples 4 --condition-views 2 --domains color,normal,depth,albedo,roughness,metallic")
+    add(
+        "objects",
+        "render-dataset procedural:20..22 --size 64 --samples 4 --condition-views 2 --domains color,normal,depth,albedo,roughness,metallic",
+    )
     # import-views: a plain folder, one of Wonder3D's, NeRF's
     add("views_plain", "import-views sources/plain --format plain")
     add("views_wonder3d", "import-views sources/wonder3d")
@@ -76,18 +85,31 @@ def cases() -> list[Case]:
     add("model_ablated", "train objects --preset tiny --steps 2 --held-out 1 --size 32 --ablation one_way")
     add("sampled_tiny", "sample-views sources/picture.png --model model --steps 2 --seed 1")
     add("sampled", "sample-views sources/picture.png")
-    add("sampled_masked", "sample-views sources/opaque.png --mask sources/mask.png --steps 2 --guidance 2 --scheduler dpm --no-mirror")
-    add("sampled_cut", "sample-views sources/opaque.png --no-crop --steps 1 --precision bfloat16 --domains color,normal")
+    add(
+        "sampled_masked",
+        "sample-views sources/opaque.png --mask sources/mask.png --steps 2 --guidance 2 --scheduler dpm --no-mirror",
+    )
+    add(
+        "sampled_cut", "sample-views sources/opaque.png --no-crop --steps 1 --precision bfloat16 --domains color,normal"
+    )
     # reconstruct: whole views, disturbed ones, silhouettes alone, the paper's method
     add("surface", "reconstruct views --resolution 64")
     add("surface_sampled", "reconstruct sampled --resolution 64")
     add("surface_plain", "reconstruct views_plain --resolution 64")
-    add("surface_silhouette", "reconstruct views_turned --resolution 48 --ignore depth,normal,albedo,roughness,metallic")
+    add(
+        "surface_silhouette", "reconstruct views_turned --resolution 48 --ignore depth,normal,albedo,roughness,metallic"
+    )
     add("surface_color", "reconstruct views --resolution 64 --ignore albedo,roughness,metallic")
     add("surface_paper", "reconstruct views --method paper --steps 40", varies=True)
     # remesh: solids, an open mesh, a broken one, a reconstructed surface, real models
-    for name, options in {"cube.obj": "", "torus.obj": "--symmetry auto", "bowl.ply": "", "broken.obj": "", "gear.obj": "--max-deviation 0.005",
-                          "blob.stl": "--triangles 1500"}.items():
+    for name, options in {
+        "cube.obj": "",
+        "torus.obj": "--symmetry auto",
+        "bowl.ply": "",
+        "broken.obj": "",
+        "gear.obj": "--max-deviation 0.005",
+        "blob.stl": "--triangles 1500",
+    }.items():
         add(f"mesh_{name.split('.')[0]}", f"remesh sources/{name} --faces 2000 {options}")
     add("mesh", "remesh surface --faces 4000")
     add("mesh_split", "remesh sources/gear.obj --faces 1500 --engine split --no-restore-creases")
@@ -113,14 +135,21 @@ def cases() -> list[Case]:
     add("renders_model", "relight sources/bowl.ply --size 96 --target-psnr 30")
     add("renders_glb", "relight assets/glb/BoxTextured.glb --size 96 --samples 8", "glb/BoxTextured.glb")
     # evaluate and validate
-    for name, reference in {"surface": "procedural:3", "mesh": "surface", "asset": "procedural:3", "sampled": "views", "mesh_gear": "sources/gear.obj"}.items():
+    for name, reference in {
+        "surface": "procedural:3",
+        "mesh": "surface",
+        "asset": "procedural:3",
+        "sampled": "views",
+        "mesh_gear": "sources/gear.obj",
+    }.items():
         add(f"figures_of_{name}", f"evaluate {name} --reference {reference} --samples 20000 --json")
     add("checked", "validate views objects model sampled surface mesh atlas asset asset/asset.glb renders")
     add("checked_broken", "validate sources/plain sources/broken.obj")
     return found
 
 
-# --------------------------------------------------------------------------------------------------------------- sources
+# ---------------------------------------------------------------------------------------------------------------
+# sources
 
 
 def write_sources(folder: Path, site: Path) -> None:
@@ -140,7 +169,11 @@ def write_sources(folder: Path, site: Path) -> None:
     torus = trimesh.creation.torus(0.5, 0.2, 48, 24)
     write("torus.obj", torus.vertices, torus.faces)
     ball = trimesh.creation.icosphere(4)
-    write("blob.stl", ball.vertices * (1 + 0.2 * np.sin(4 * ball.vertices) + 0.01 * rng.standard_normal(ball.vertices.shape)), ball.faces)
+    write(
+        "blob.stl",
+        ball.vertices * (1 + 0.2 * np.sin(4 * ball.vertices) + 0.01 * rng.standard_normal(ball.vertices.shape)),
+        ball.faces,
+    )
     bowl = ball.faces[ball.vertices[ball.faces][:, :, 1].max(1) < 0.3]
     colored = trimesh.Trimesh(ball.vertices, bowl, process=False)
     colored.visual.vertex_colors = (np.clip(ball.vertices * 0.5 + 0.5, 0, 1) * 255).astype(np.uint8)
@@ -150,19 +183,36 @@ def write_sources(folder: Path, site: Path) -> None:
     around = np.arange(96)
     rim = np.concatenate([np.insert(outline, 2, height, 1) for height in (-0.2, 0.2)] + [[[0, 0, -0.2], [0, 0, 0.2]]])
     further = (around + 1) % 96
-    sides = np.concatenate([np.stack([around, further, further + 96], 1), np.stack([around, further + 96, around + 96], 1)])
-    caps = np.concatenate([np.stack([np.full(96, 192), further, around], 1), np.stack([np.full(96, 193), around + 96, further + 96], 1)])
+    sides = np.concatenate(
+        [np.stack([around, further, further + 96], 1), np.stack([around, further + 96, around + 96], 1)]
+    )
+    caps = np.concatenate(
+        [np.stack([np.full(96, 192), further, around], 1), np.stack([np.full(96, 193), around + 96, further + 96], 1)]
+    )
     write("gear.obj", rim, np.concatenate([sides, caps]))
-    # Broken: doubled and turned faces, a hole, three faces at one edge, a loose vertex, a sliver, two solids through each other.
+    # Broken: doubled and turned faces, a hole, three faces at one edge, a loose vertex, a sliver, two solids through
+    # each other.
     other = ball.vertices * 0.4 + (0.5, 0.1, 0.0)
     vertices = np.concatenate([cube.vertices, other, [[3, 3, 3], [0, 0, 2], [0, 0, 2 + 1e-9]]])
-    faces = np.concatenate([cube.faces[5:], cube.faces[:20][:, ::-1], ball.faces + len(cube.vertices), [[0, 1, len(vertices) - 2]],
-                            [[len(vertices) - 2, len(vertices) - 1, 4]]])
+    faces = np.concatenate(
+        [
+            cube.faces[5:],
+            cube.faces[:20][:, ::-1],
+            ball.faces + len(cube.vertices),
+            [[0, 1, len(vertices) - 2]],
+            [[len(vertices) - 2, len(vertices) - 1, 4]],
+        ]
+    )
     write("broken.obj", vertices, faces)
-    (folder / "textured.obj").write_text("".join(f"v {x} {y} 0\n" for y in range(5) for x in range(5)) +
-                                         "".join(f"vt {x / 4} {y / 4}\n" for y in range(5) for x in range(5)) +
-                                         "".join("f " + " ".join(f"{k}/{k}" for k in (i, i + 1, i + 6, i + 5)) + "\n"
-                                                 for y in range(4) for i in range(5 * y + 1, 5 * y + 5)))
+    (folder / "textured.obj").write_text(
+        "".join(f"v {x} {y} 0\n" for y in range(5) for x in range(5))
+        + "".join(f"vt {x / 4} {y / 4}\n" for y in range(5) for x in range(5))
+        + "".join(
+            "f " + " ".join(f"{k}/{k}" for k in (i, i + 1, i + 6, i + 5)) + "\n"
+            for y in range(4)
+            for i in range(5 * y + 1, 5 * y + 5)
+        )
+    )
 
     shutil.copy(ROOT / "examples" / "demo.png", folder / "picture.png")
     picture = oiio.ImageBuf(str(folder / "picture.png")).get_pixels(oiio.FLOAT)
@@ -180,7 +230,10 @@ def write_sources(folder: Path, site: Path) -> None:
             color = oiio.ImageBuf(str(views / "color" / f"{name}.png")).get_pixels(oiio.FLOAT)
             write_picture(folder / "wonder3d" / f"rgb_000_{name}.png", color)
             normal = oiio.ImageBuf(str(next(views.glob(f"normal/{name}.*")))).get_pixels(oiio.FLOAT)[..., :3]
-            write_picture(folder / "wonder3d" / f"normals_000_{name}.png", np.concatenate([normal * 0.5 + 0.5, color[..., 3:]], -1))
+            write_picture(
+                folder / "wonder3d" / f"normals_000_{name}.png",
+                np.concatenate([normal * 0.5 + 0.5, color[..., 3:]], -1),
+            )
         nerf(views, folder / "nerf", names)
 
 
@@ -211,7 +264,9 @@ def disturbed(views: Path, folder: Path, rng) -> None:
                 shutil.copy(path, folder / domain)
                 continue
             pixels = oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT)
-            pixels[..., :3] = pixels[..., :3] * rng.uniform(0.95, 1.05, 3) + 0.02 * rng.standard_normal(pixels[..., :3].shape)
+            pixels[..., :3] = pixels[..., :3] * rng.uniform(0.95, 1.05, 3) + 0.02 * rng.standard_normal(
+                pixels[..., :3].shape
+            )
             write_picture(folder / domain / path.name, pixels)
     shutil.copytree(views / "mask", folder / "mask")
 
@@ -232,11 +287,13 @@ def nerf(views: Path, folder: Path, names: list[str]) -> None:
     (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.4, "frames": frames}))
 
 
-# --------------------------------------------------------------------------------------------------------------- running
+# ---------------------------------------------------------------------------------------------------------------
+# running
 
 
 def importable(tree: Path, folder: Path) -> Path:
-    """A folder from which Python imports the gdtool of a checkout, as it is installed: with commands/ and schemas/ inside."""
+    """A folder from which Python imports the gdtool of a checkout, as it is installed: with commands/ and schemas/
+    inside."""
     package = folder / "gdtool"
     shutil.rmtree(folder, ignore_errors=True)
     package.mkdir(parents=True)
@@ -249,7 +306,9 @@ def importable(tree: Path, folder: Path) -> Path:
 def gdtool(site: Path, folder: Path, words: tuple[str, ...]) -> subprocess.CompletedProcess:
     """Run the gdtool that is imported from a folder, in another."""
     env = {**os.environ, "PYTHONPATH": str(site), "COLUMNS": "80"}
-    return subprocess.run([sys.executable, "-m", "gdtool", *words], cwd=folder, env=env, capture_output=True, text=True, timeout=SECONDS)
+    return subprocess.run(
+        [sys.executable, "-m", "gdtool", *words], cwd=folder, env=env, capture_output=True, text=True, timeout=SECONDS
+    )
 
 
 def run_all(site: Path, folder: Path, chosen: list[Case]) -> None:
@@ -262,10 +321,15 @@ def run_all(site: Path, folder: Path, chosen: list[Case]) -> None:
         done = gdtool(site, folder, words)
         (folder / f"{case.name}.stderr").write_text(done.stderr)
         told.write_text(f"exit code {done.returncode}\n{done.stdout}")
-        print(f"{folder.name} {number + 1}/{len(chosen)} {case.name}: exit code {done.returncode}", file=sys.stderr, flush=True)
+        print(
+            f"{folder.name} {number + 1}/{len(chosen)} {case.name}: exit code {done.returncode}",
+            file=sys.stderr,
+            flush=True,
+        )
 
 
-# ------------------------------------------------------------------------------------------------------------- comparing
+# -------------------------------------------------------------------------------------------------------------
+# comparing
 
 
 class Sentences:
@@ -282,6 +346,7 @@ class Sentences:
     def translated(self, text: str) -> str:
         """The text with every old sentence replaced."""
         for old, new in self._rules:
+
             def filled(match: re.Match[str], new: str = new) -> str:
                 self.used += 1
                 parts = iter(match.groups())
@@ -301,11 +366,15 @@ class Comparison:
     def case(self, case: Case) -> None:
         """Compare what one case wrote."""
         name = case.name
-        files = sorted({path.relative_to(root) for root in (self.base, self.tree) for path in self._files(root, name)}, key=str)
+        files = sorted(
+            {path.relative_to(root) for root in (self.base, self.tree) for path in self._files(root, name)}, key=str
+        )
         for relative in files:
             before, after = self.base / relative, self.tree / relative
             if case.varies and relative.name == "manifest.json" and before.exists() and after.exists():
-                self._figures(str(relative), *(json.loads(path.read_text())["content"]["report"] for path in (before, after)))
+                self._figures(
+                    str(relative), *(json.loads(path.read_text())["content"]["report"] for path in (before, after))
+                )
             elif case.varies and before.exists() and after.exists():
                 continue
             elif not before.exists() or not after.exists():
@@ -341,11 +410,14 @@ class Comparison:
     def _plain(self, value):
         """A parsed JSON without what tells how a run went or which version ran, its sentences replaced."""
         if isinstance(value, dict):
-            return {key: self._plain(one) for key, one in value.items()
-                    if key not in NOT_COMPARED and not TIMES.search(key)}
+            return {
+                key: self._plain(one) for key, one in value.items() if key not in NOT_COMPARED and not TIMES.search(key)
+            }
         if isinstance(value, list):
             return [self._plain(one) for one in value]
-        return BUNDLED_MODEL.sub("gdtool/models/", self.sentences.translated(value)) if isinstance(value, str) else value
+        return (
+            BUNDLED_MODEL.sub("gdtool/models/", self.sentences.translated(value)) if isinstance(value, str) else value
+        )
 
     def _fields(self, place: str, old, new) -> None:
         if isinstance(old, dict) and isinstance(new, dict):
@@ -391,7 +463,9 @@ def checkout(base: str, folder: Path) -> Path:
     """The root of the base: itself where it is a folder, else the commit's files below folder."""
     if Path(base).is_dir():
         return Path(base).resolve()
-    commit = subprocess.run(["git", "rev-parse", base], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+    commit = subprocess.run(
+        ["git", "rev-parse", base], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.strip()
     root = folder / f"base-{commit[:12]}"
     if not root.exists():
         partial = root.with_suffix(".partial")
@@ -408,7 +482,9 @@ def main() -> int:
     parser.add_argument("--tree", type=Path, default=ROOT)
     parser.add_argument("--assets", type=Path)
     parser.add_argument("--work", type=Path)
-    parser.add_argument("--only", nargs="+", help="beginnings of names of cases to compare; what they read is run as well")
+    parser.add_argument(
+        "--only", nargs="+", help="beginnings of names of cases to compare; what they read is run as well"
+    )
     options = parser.parse_args()
     work = options.work or Path(tempfile.mkdtemp(prefix="compare-"))
     work.mkdir(parents=True, exist_ok=True)
@@ -429,7 +505,9 @@ def main() -> int:
         if options.assets and not (folder / "assets").exists():
             copied = [case.needs for case in chosen if case.needs]
             for needed in copied:
-                for path in sorted((options.assets / needed).parent.iterdir() if "mesh/" in needed else [options.assets / needed]):
+                for path in sorted(
+                    (options.assets / needed).parent.iterdir() if "mesh/" in needed else [options.assets / needed]
+                ):
                     if path.is_file():
                         (folder / "assets" / needed).parent.mkdir(parents=True, exist_ok=True)
                         shutil.copy(path, (folder / "assets" / needed).parent)
@@ -451,7 +529,10 @@ def _with_what_they_read(all_cases: list[Case], beginnings: list[str]) -> list[C
     """The cases whose names begin so, and those whose results they read, in order."""
     by_name = {case.name: case for case in all_cases}
     wanted = {name for name in by_name if name.startswith(tuple(beginnings))}
-    while more := {word.split("/")[0] for name in wanted for word in by_name[name].words if word.split("/")[0] in by_name} - wanted:
+    while (
+        more := {word.split("/")[0] for name in wanted for word in by_name[name].words if word.split("/")[0] in by_name}
+        - wanted
+    ):
         wanted |= more
     return [case for case in all_cases if case.name in wanted]
 

@@ -32,7 +32,9 @@ def run(script: str) -> tuple[bool, float, str]:
         shutil.copytree(ROOT / "examples", Path(folder, "examples"))
         start = time.perf_counter()
         try:
-            done = subprocess.run(["bash", "-euo", "pipefail", "-c", script], cwd=folder, capture_output=True, text=True, timeout=SECONDS)
+            done = subprocess.run(
+                ["bash", "-euo", "pipefail", "-c", script], cwd=folder, capture_output=True, text=True, timeout=SECONDS
+            )
         except subprocess.TimeoutExpired:
             return False, SECONDS, f"took longer than {SECONDS} s"
         return done.returncode == 0, time.perf_counter() - start, done.stderr

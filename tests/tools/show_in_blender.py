@@ -35,7 +35,9 @@ def main(model: str, out: str, mode: str = "lit") -> None:
     if mode == "unlit":
         unlit()
     scene = bpy.context.scene
-    corners = [obj.matrix_world @ Vector(corner) for obj in scene.objects if obj.type == "MESH" for corner in obj.bound_box]
+    corners = [
+        obj.matrix_world @ Vector(corner) for obj in scene.objects if obj.type == "MESH" for corner in obj.bound_box
+    ]
     low = Vector(tuple(min(c[i] for c in corners) for i in range(3)))
     high = Vector(tuple(max(c[i] for c in corners) for i in range(3)))
     middle, extent = (low + high) / 2, max(high - low)
@@ -63,8 +65,14 @@ def main(model: str, out: str, mode: str = "lit") -> None:
     scene.render.resolution_x = scene.render.resolution_y = SIZE
     scene.render.filepath = out
     bpy.ops.render.render(write_still=True)
-    print({"meshes": sum(o.type == "MESH" for o in scene.objects), "faces": sum(len(m.polygons) for m in bpy.data.meshes),
-           "low": tuple(round(x, 4) for x in low), "high": tuple(round(x, 4) for x in high)})
+    print(
+        {
+            "meshes": sum(o.type == "MESH" for o in scene.objects),
+            "faces": sum(len(m.polygons) for m in bpy.data.meshes),
+            "low": tuple(round(x, 4) for x in low),
+            "high": tuple(round(x, 4) for x in high),
+        }
+    )
 
 
 if __name__ == "__main__":

@@ -16,9 +16,9 @@ from gdtool.cameras import rig
 from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
 from gdtool.images.color import srgb_from_linear
 from gdtool.images.io import write_png
+from gdtool.shading.lights.studio import studio
 from gdtool.shading.render.direct import DirectLight
 from gdtool.shading.render.render import Renderer, render_buffers
-from gdtool.shading.lights.studio import studio
 
 
 def main(model: str, out: str, mode: str = "lit") -> None:
@@ -31,7 +31,9 @@ def main(model: str, out: str, mode: str = "lit") -> None:
         color, mask = images["albedo"] * (1.0 if mode == "unlit" else 0.3 + sun[..., None]), images["mask"]
     else:
         renderer = Renderer(scene)
-        images = renderer.buffers(front, 16, DirectLight(renderer, studio(mode, 0, fit=False)[0], 16, shadows=False).color())
+        images = renderer.buffers(
+            front, 16, DirectLight(renderer, studio(mode, 0, fit=False)[0], 16, shadows=False).color()
+        )
         color, mask = images["color"], images["mask"]
     write_png(out, np.concatenate([srgb_from_linear(np.clip(color, 0, 1)), mask[..., None]], -1))
 

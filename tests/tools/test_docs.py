@@ -19,7 +19,7 @@ def lines_with_gdtool(text):
         for part in re.split(r"\n|\||;|&&", script.replace("\\\n", " ")):
             words = shlex.split(part, comments=True) if "gdtool " in part else []
             if "gdtool" in words[:2]:  # "do gdtool …" of a loop
-                yield words[words.index("gdtool") + 1:]
+                yield words[words.index("gdtool") + 1 :]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
@@ -29,7 +29,10 @@ def test_commands_and_options_exist(page):
             continue
         assert name in COMMANDS, f"{page.name}: gdtool {name}"
         command = importlib.import_module("gdtool.commands." + name.replace("-", "_")).command
-        known = {option for param in command.params for option in (*param.opts, *param.secondary_opts)} | {"--help", "-h"}
+        known = {option for param in command.params for option in (*param.opts, *param.secondary_opts)} | {
+            "--help",
+            "-h",
+        }
         for word in words:
             if re.match(r"--?[a-z]", word):
                 assert word.split("=")[0] in known, f"{page.name}: gdtool {name} {word}"

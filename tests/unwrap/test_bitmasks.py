@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gdtool.geometry.uv_raster import owner_count
-from gdtool.unwrap.pack.compact import Fine
 from gdtool.unwrap.pack.bitmasks import Shapes, rim_of, turned, upright_box
+from gdtool.unwrap.pack.compact import Fine
 
 RING = np.array([[0, 0], [9, 0], [9, 7], [0, 7], [2, 2], [7, 2], [7, 5], [2, 5.0]])
 RING_TRIANGLES = np.array([[0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]])
@@ -18,7 +18,7 @@ def test_a_mask_holds_all_that_the_chart_covers_and_the_gap_but_not_its_hole(gap
     masks, at = turned(rim, RING, 4.0, gap)
     for mask, uv in zip(masks, at, strict=True):
         size = max(mask.shape)
-        covered = owner_count(uv / size, RING_TRIANGLES, size)[:mask.shape[0], :mask.shape[1]] > 0
+        covered = owner_count(uv / size, RING_TRIANGLES, size)[: mask.shape[0], : mask.shape[1]] > 0
         assert (mask | ~covered).all()
         # Half a gap around it, and at most a cell and a half more.
         assert mask.sum() <= (4 * 9 + gap + 3) * (4 * 7 + gap + 3) - (4 * 5 - gap - 3) * (4 * 3 - gap - 3)
@@ -60,10 +60,18 @@ def test_what_charts_leave_free_of_each_other_is_what_is_not_taken():
     for i in range(8):
         place = shapes.placed(i, taken, border, 40, 0.5)
         assert shapes.placed(i, taken, border, 40, 0.5, others) == place is not None
-        free = [not shapes.cells(i, (turn, x, y)) & taken for turn in range(4) for x in range(41 - shapes.shapes[i][turn][1])
-                for y in range(41 - shapes.shapes[i][turn][0])]
-        hit = [not shapes._hit(i, turn, others) >> y * shapes.stride + x & 1 for turn in range(4) for x in range(41 - shapes.shapes[i][turn][1])
-               for y in range(41 - shapes.shapes[i][turn][0])]
+        free = [
+            not shapes.cells(i, (turn, x, y)) & taken
+            for turn in range(4)
+            for x in range(41 - shapes.shapes[i][turn][1])
+            for y in range(41 - shapes.shapes[i][turn][0])
+        ]
+        hit = [
+            not shapes._hit(i, turn, others) >> y * shapes.stride + x & 1
+            for turn in range(4)
+            for x in range(41 - shapes.shapes[i][turn][1])
+            for y in range(41 - shapes.shapes[i][turn][0])
+        ]
         assert hit == free
         others.append((i, place))
         taken |= shapes.cells(i, place)
@@ -77,7 +85,9 @@ def test_a_layout_whose_charts_touch_is_moved_apart():
     shapes = Shapes(boxed, cells, 0.0, 40, 0.5)
     places, scale = Fine(boxed, shapes, cells, [22], gap).settled([[(0, 0, 0), (0, 10, 0), (0, 0, 10), (0, 10, 10)]])
     low, high = np.array([uv.min(0) for uv in places]), np.array([uv.max(0) for uv in places])
-    assert low.min() >= 0.4 * gap and high.max() <= 1 - 0.4 * gap and high - low == pytest.approx(np.full((4, 2), scale))
+    assert (
+        low.min() >= 0.4 * gap and high.max() <= 1 - 0.4 * gap and high - low == pytest.approx(np.full((4, 2), scale))
+    )
     apart = np.maximum(low[:, None] - high[None], low[None] - high[:, None]).max(-1)
     assert apart[~np.eye(4, dtype=bool)].min() >= 0.99 * gap
     assert 4 * scale**2 > 0.85
@@ -101,4 +111,6 @@ def test_no_orders_are_sought_for_a_grid_on_which_charts_do_not_come_apart(monke
     places, _ = search.pack(charts, 0.002)
     shares = [given[0].shapes for given in sought]
     assert len(sought) == 2 and shares[0] != shares[1]
-    assert (owner_count(np.concatenate(places), np.concatenate([triangles + 4 * i for i in range(14)]), 2048) <= 1).all()
+    assert (
+        owner_count(np.concatenate(places), np.concatenate([triangles + 4 * i for i in range(14)]), 2048) <= 1
+    ).all()

@@ -5,14 +5,15 @@ import pytest
 
 from gdtool.geometry.topology import edges_of, triangulated
 from gdtool.unwrap.parameterize import schedule
-from gdtool.unwrap.segment.charts import Adjacency, own_corners
 from gdtool.unwrap.parameterize.flatten import lies_on_itself, overlapping, stretch
+from gdtool.unwrap.segment.charts import Adjacency, own_corners
 from gdtool.unwrap.segment.overlaps import onto_neighbours, peel
 from tests.unwrap.test_merge import GOOD, sheet
 
 
 def spiral(turns, around=120, across=6):
-    """A band of quads that winds around, each turn as high above the last as it is wide: flat, it lies on itself past one."""
+    """A band of quads that winds around, each turn as high above the last as it is wide: flat, it lies on itself past
+    one."""
     angle, radius = np.meshgrid(np.linspace(0, 2 * np.pi * turns, around + 1), np.linspace(0.5, 0.6, across + 1))
     uv = np.stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()], -1)
     row, column = (x.ravel() for x in np.mgrid[:across, :around])
@@ -35,14 +36,19 @@ def test_a_disk_whose_rim_does_not_cross_itself_lies_on_nothing():
     for turns in (0.9, 1.05, 1.6):
         _, faces, uv = spiral(turns)
         triangles = triangulated(faces)[0].astype(np.int64)
-        assert lies_on_itself(uv, triangles, edges_of(triangles), True) == overlapping(uv, triangles).any() == (turns > 1)
+        assert (
+            lies_on_itself(uv, triangles, edges_of(triangles), True) == overlapping(uv, triangles).any() == (turns > 1)
+        )
 
 
 @pytest.mark.parametrize("past", [0.0, 20.0])
 def test_a_rim_that_crosses_itself_where_two_of_its_corners_coincide(past):
-    """A fan around a corner of the rim, once around; and with an end past either side of where it meets itself, all in one place."""
+    """A fan around a corner of the rim, once around; and with an end past either side of where it meets itself, all in
+    one place."""
     degrees, length = np.array([-past, *range(0, 361, 30), 360 + past]), np.array([0.6, *[1.0] * 13, 0.6])
-    uv = np.concatenate([[[0, 0]], length[:, None] * np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))], -1)])
+    uv = np.concatenate(
+        [[[0, 0]], length[:, None] * np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))], -1)]
+    )
     uv[14] = uv[2]
     if not past:
         uv = np.delete(uv, [1, 15], 0)
@@ -59,7 +65,9 @@ def test_what_lies_on_itself_by_half_is_not_peeled():
 
 def test_a_peeled_band_is_two_charts_and_not_many_halves():
     vertices, faces, _ = spiral(1.05)
-    charts, cut = schedule.flatten_all(vertices, faces, np.zeros(len(faces), int), GOOD, 1.5, (vertices, triangulated(faces)[0].astype(np.int64)))
+    charts, cut = schedule.flatten_all(
+        vertices, faces, np.zeros(len(faces), int), GOOD, 1.5, (vertices, triangulated(faces)[0].astype(np.int64))
+    )
     assert len(charts) == 2 and cut == ["1 charts were cut: a chart overlaps itself"]
     assert sorted(np.concatenate([chart[0] for chart in charts])) == list(range(len(faces)))
     for _, _, uv, triangles in charts:
@@ -75,16 +83,27 @@ def test_a_piece_goes_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
     piece, dome, flat = (np.flatnonzero(mask) for mask in ((column >= 4) & (column < 6), column < 4, column >= 6))
 
     def chart(faces_idx):
-        return schedule.flatten_all(vertices, faces[faces_idx], np.zeros(len(faces_idx), int), GOOD, 1.5,
-                                  (vertices, triangulated(faces[faces_idx])[0].astype(np.int64)))[0][0]
+        return schedule.flatten_all(
+            vertices,
+            faces[faces_idx],
+            np.zeros(len(faces_idx), int),
+            GOOD,
+            1.5,
+            (vertices, triangulated(faces[faces_idx])[0].astype(np.int64)),
+        )[0][0]
 
     def left(home, beside=(dome, flat), good=GOOD):
         charts = [(own, *chart(own)[1:]) for own in beside]
-        return len(onto_neighbours(Adjacency(vertices, faces), vertices, faces, charts, [(int(home[0]), piece)], good)), charts
+        return len(
+            onto_neighbours(Adjacency(vertices, faces), vertices, faces, charts, [(int(home[0]), piece)], good)
+        ), charts
 
     count, charts = left(piece)
-    assert not count and len(charts[0][0]) == len(dome) and sorted(charts[1][0]) == sorted(np.concatenate([flat, piece]))
-    # What it came off does not get it back; with nothing flat beside it, it is left; so are all once enough has been tried.
+    assert (
+        not count and len(charts[0][0]) == len(dome) and sorted(charts[1][0]) == sorted(np.concatenate([flat, piece]))
+    )
+    # What it came off does not get it back; with nothing flat beside it, it is left; so are all once enough has been
+    # tried.
     assert left(flat, [flat])[0] == 1 and left(dome, [flat])[0] == 0
     assert left(piece, [dome], 1 + 1e-9)[0] == 1
     monkeypatch.setattr("gdtool.unwrap.segment.overlaps._WORK", -1)
@@ -103,5 +122,5 @@ def test_a_chart_much_larger_than_a_piece_stays_as_it_lies(columns, stays):
     assert not onto_neighbours(Adjacency(vertices, faces), vertices, faces, charts, [(int(piece[0]), piece)], 1.01)
     faces_idx, corners, uv, triangles = charts[0]
     assert sorted(faces_idx) == list(range(144)) and not overlapping(uv, triangles).any()
-    assert (uv[:len(lies)] == lies).all() == stays
+    assert (uv[: len(lies)] == lies).all() == stays
     assert stretch(own_corners(vertices, faces[faces_idx])[0], triangles, uv) < 1.02

@@ -7,16 +7,16 @@ import pytest
 
 from gdtool.core.child import ChildFailed
 from gdtool.geometry.topology import triangulated
+from gdtool.geometry.uv_raster import owner_count
 from gdtool.unwrap import pipeline
 from gdtool.unwrap.pack import search
-from gdtool.unwrap.segment import charts as unwrap_charts
-from gdtool.geometry.uv_raster import owner_count
+from gdtool.unwrap.pack.bitmasks import upright_box
+from gdtool.unwrap.pack.search import pack
 from gdtool.unwrap.parameterize.flatten import Flat, flatten, stretch
 from gdtool.unwrap.parameterize.schedule import flatten_all
-from gdtool.unwrap.pack.search import pack
-from gdtool.unwrap.pack.bitmasks import upright_box
-from tests.geometry.solids import cube
+from gdtool.unwrap.segment import charts as unwrap_charts
 from tests.bake.shapes import torus
+from tests.geometry.solids import cube
 from tests.unwrap.test_merge import sheet
 
 CUBE_QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
@@ -91,7 +91,9 @@ def test_degenerate_and_turned_faces_survive():
     vertices = vertices.copy()
     vertices[faces[7, 1]] = vertices[faces[7, 0]]
     result = pipeline.unwrap(vertices, faces, SMALL)
-    assert np.isfinite(result.uv).all() and pipeline.figures(vertices, faces, result.uv, result.face_uvs)["overlap"] == 0
+    assert (
+        np.isfinite(result.uv).all() and pipeline.figures(vertices, faces, result.uv, result.face_uvs)["overlap"] == 0
+    )
 
 
 def test_dead_xatlas_leaves_box_projection(monkeypatch):
@@ -155,7 +157,11 @@ def test_charts_stay_whole_where_they_fill_the_square(monkeypatch):
     monkeypatch.setattr(search, "_NEXT_GAINS", 1.0)
     other = pipeline.unwrap(vertices, faces, SMALL)
     few, many = checked(vertices, faces, found), checked(vertices, faces, other)
-    assert not other.skipped and many["coverage"] < 1.1 * few["coverage"] and many["stretch"] == pytest.approx(few["stretch"], abs=1e-3)
+    assert (
+        not other.skipped
+        and many["coverage"] < 1.1 * few["coverage"]
+        and many["stretch"] == pytest.approx(few["stretch"], abs=1e-3)
+    )
 
 
 def test_cylinder_side_is_developable():
@@ -183,7 +189,9 @@ def test_closed_mesh_cannot_lie_flat():
 @pytest.mark.parametrize("holes", [1, 2, 5])
 def test_a_torus_with_holes_has_a_handle_and_a_bent_sheet_with_holes_lies_flat(holes):
     vertices, faces, _ = torus(24, 12)
-    assert flatten(vertices, np.delete(triangulated(faces)[0], 40 * np.arange(holes), 0), 1.001, 1.1) == Flat(None, "has a handle")
+    assert flatten(vertices, np.delete(triangulated(faces)[0], 40 * np.arange(holes), 0), 1.001, 1.1) == Flat(
+        None, "has a handle"
+    )
     vertices, faces = sheet(20, bend=1.0)
     triangles = triangulated(np.delete(faces, 42 + 42 * np.arange(holes), 0))[0]
     flat = flatten(vertices, triangles, 1.001, 1.1)
@@ -206,7 +214,9 @@ def test_four_squares_pack_tight_and_turned_ones_are_set_upright():
 
 def test_the_tips_of_slivers_stay_clear_of_the_others():
     """Where a triangle is narrower than the packer's cells it takes its place all the same."""
-    shapes = [np.array([[0, 0], [1, 0], [1, height]]) for height in (1.0, 0.055, 0.012)] + [np.array([[0, 0], [2.2, 0], [2.2, 0.055]])]
+    shapes = [np.array([[0, 0], [1, 0], [1, height]]) for height in (1.0, 0.055, 0.012)] + [
+        np.array([[0, 0], [2.2, 0], [2.2, 0.055]])
+    ]
     charts = [(shape, np.array([[0, 1, 2]])) for shape in shapes for _ in range(12)]
     places, _ = pack(charts, 1 / 256)
     assert (owner_count(np.concatenate(places), np.arange(3 * len(charts)).reshape(-1, 3), 4096) <= 1).all()
@@ -223,7 +233,9 @@ def test_hundreds_of_charts_fill_the_square_better_than_shelves_do():
     from gdtool.unwrap.pack.search import _shelves
 
     rng = np.random.default_rng(0)
-    charts = [(corners * rng.uniform(0.2, 1), np.array([[0, 1, 2]])) for corners in rng.uniform(0, 1, (200, 1, 3, 2))[:, 0]]
+    charts = [
+        (corners * rng.uniform(0.2, 1), np.array([[0, 1, 2]])) for corners in rng.uniform(0, 1, (200, 1, 3, 2))[:, 0]
+    ]
     charts = [(uv if np.linalg.det([uv[1] - uv[0], uv[2] - uv[0]]) > 0 else uv[::-1], t) for uv, t in charts]
     places, scale = pack(charts, 1 / 512)
     assert min(uv.min() for uv in places) >= 0 and max(uv.max() for uv in places) <= 1
@@ -253,7 +265,9 @@ def ring_of_quads(around=96, across=10):
     uv = np.stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()], -1)
     row, column = (x.ravel() for x in np.mgrid[:across, :around])
     after = (column + 1) % around
-    quads = np.stack([row * around + column, (row + 1) * around + column, (row + 1) * around + after, row * around + after], -1)
+    quads = np.stack(
+        [row * around + column, (row + 1) * around + column, (row + 1) * around + after, row * around + after], -1
+    )
     return np.concatenate([uv, np.zeros((len(uv), 1))], 1), quads, uv
 
 
@@ -276,7 +290,9 @@ def test_a_ring_is_cut_into_arcs_that_keep_their_coordinates():
     i = (np.arange(10)[:, None] * 11 + np.arange(10)).ravel()
     faces = np.stack([i, i + 1, i + 12, i + 11], -1)
     flat = np.concatenate([square, np.zeros((121, 1))], 1)
-    assert not list(cut_to_pack(Adjacency(flat, faces), [(np.arange(100), faces, square, triangulated(faces)[0])], [40]))
+    assert not list(
+        cut_to_pack(Adjacency(flat, faces), [(np.arange(100), faces, square, triangulated(faces)[0])], [40])
+    )
 
 
 def test_two_rings_fill_the_square_better_once_cut():
@@ -284,7 +300,8 @@ def test_two_rings_fill_the_square_better_once_cut():
     both = np.concatenate([vertices, vertices + (2, 0, 0)])
     faces = np.concatenate([quads, quads + len(vertices)])
     found = checked(both, faces, pipeline.unwrap(both, faces, SMALL))
-    # Two whole rings cannot cover more than 2 * 0.75 pi / 4 of the square around the two of them, which is 1.707 of their width.
+    # Two whole rings cannot cover more than 2 * 0.75 pi / 4 of the square around the two of them, which is 1.707 of
+    # their width.
     assert found["coverage"] > 0.45 > 2 * 0.75 * np.pi / 4 / 1.707**2
 
 
@@ -302,7 +319,10 @@ def test_orders_are_not_searched_for_more_charts_where_few_fill_the_square():
     assert best_packed([narrow, many], 1 / 512)[0] == 1
     # Where it fills much less, the next ones are leapt over, though never the last.
     strips = grid(2, (3.0, 0.3))
-    assert best_packed([strips, few, many], 1 / 512)[::3] == (2, 1) and best_packed([strips, many], 1 / 512)[::3] == (1, 0)
+    assert best_packed([strips, few, many], 1 / 512)[::3] == (2, 1) and best_packed([strips, many], 1 / 512)[::3] == (
+        1,
+        0,
+    )
 
 
 @pytest.mark.parametrize(("around", "across", "minor"), [(96, 20, 0.08), (80, 28, 0.12), (96, 12, 0.035)])
@@ -317,4 +337,8 @@ def test_ways_leapt_over_cost_no_coverage_and_a_seam_or_two(monkeypatch, around,
         assert len(leapt) == (gains < np.inf) and not laid.failed
         found.append(pipeline.figures(vertices, faces, laid.uv, laid.face_uvs))
     quick, whole = found
-    assert quick["coverage"] > whole["coverage"] - 0.02 and quick["charts"] <= whole["charts"] + 8 and quick["overlap"] == 0
+    assert (
+        quick["coverage"] > whole["coverage"] - 0.02
+        and quick["charts"] <= whole["charts"] + 8
+        and quick["overlap"] == 0
+    )

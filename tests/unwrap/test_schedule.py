@@ -4,8 +4,8 @@ import numpy as np
 import trimesh
 
 from gdtool.unwrap.parameterize import schedule
-from gdtool.unwrap.pipeline import Request, figures, unwrap
 from gdtool.unwrap.parameterize.flatten import overlapping, stretch
+from gdtool.unwrap.pipeline import Request, figures, unwrap
 
 
 def ball(level=4):
@@ -71,5 +71,7 @@ def test_a_chart_is_cut_between_its_parts_and_without_any_through_the_middle():
     adjacency, column = Adjacency(vertices, faces), np.arange(400) % 20
     for part, first in ((column >= 6, 6), (np.where(column < 12, 7, np.where(column < 15, 3, 5)), 12)):
         one, other = schedule._halves(adjacency, part, np.arange(400))
-        assert {len(one), len(other)} == {20 * first, 400 - 20 * first} and (column[one] < first).all() != (column[other] < first).all()
+        assert {len(one), len(other)} == {20 * first, 400 - 20 * first} and (column[one] < first).all() != (
+            column[other] < first
+        ).all()
     assert min(map(len, schedule._halves(adjacency, np.zeros(400, int), np.arange(400)))) > 150

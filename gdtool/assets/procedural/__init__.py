@@ -3,9 +3,8 @@
     from gdtool.assets.procedural import generate
     scene = generate(7)
 
-Every part is a closed surface wound outward; the front (a face, an entrance, a bonnet) looks toward +Z and most objects are
-mirror-symmetric in x, as what people photograph is. The two UV sets are explained in finishes.py.
-"""
+Every part is a closed surface wound outward; the front (a face, an entrance, a bonnet) looks toward +Z and most objects
+are mirror-symmetric in x, as what people photograph is. The two UV sets are explained in finishes.py."""
 
 from __future__ import annotations
 
@@ -16,7 +15,15 @@ if TYPE_CHECKING:
 
 VERSION = 1  # rises when any seed's object changes: the version is part of every random stream
 
-FAMILY_WEIGHTS = {"creatures": 0.24, "vessels": 0.17, "nature": 0.17, "household": 0.16, "buildings": 0.09, "vehicles": 0.09, "abstract": 0.08}
+FAMILY_WEIGHTS = {
+    "creatures": 0.24,
+    "vessels": 0.17,
+    "nature": 0.17,
+    "household": 0.16,
+    "buildings": 0.09,
+    "vehicles": 0.09,
+    "abstract": 0.08,
+}
 
 
 def kinds() -> dict[str, list[str]]:
@@ -46,7 +53,9 @@ def generate(seed: int, kind: str | None = None) -> Scene:
     if kind is not None:
         family = next((name for name in names if kind in _family(name)), None)
         if family is None:
-            raise ValueError(f"no procedural kind {kind!r}; there are {', '.join(k for name in names for k in _family(name))}")
+            raise ValueError(
+                f"no procedural kind {kind!r}; there are {', '.join(k for name in names for k in _family(name))}"
+            )
         chosen = kind
     assembly = _family(family)[chosen](rng)
     return assembly.scene(f"procedural-{seed}-{chosen}")

@@ -6,7 +6,19 @@ import numpy as np
 
 from gdtool.assets.procedural import patterns, solids, tiles
 from gdtool.assets.procedural.assembly import Assembly
-from gdtool.assets.procedural.parts import ball, box, circle, cone, cylinder, extrusion, grid_part, loft, refined, subdivided, tube
+from gdtool.assets.procedural.parts import (
+    ball,
+    box,
+    circle,
+    cone,
+    cylinder,
+    extrusion,
+    grid_part,
+    loft,
+    refined,
+    subdivided,
+    tube,
+)
 
 
 def csg(rng) -> Assembly:
@@ -24,7 +36,13 @@ def csg(rng) -> Assembly:
         return solids.ring(c, rng.uniform(0.3, 0.5), rng.uniform(0.08, 0.18), "xyz"[rng.integers(3)])
 
     a, width = Assembly(), rng.choice([0.02, 0.02, 0.1, 0.2])
-    core = solids.blended([solids.block((0, 0, 0), rng.uniform(0.3, 0.6, 3), 0.05), *[solids.both_sides(primitive(0.5)) for _ in range(rng.integers(1, 4))]], width)
+    core = solids.blended(
+        [
+            solids.block((0, 0, 0), rng.uniform(0.3, 0.6, 3), 0.05),
+            *[solids.both_sides(primitive(0.5)) for _ in range(rng.integers(1, 4))],
+        ],
+        width,
+    )
     body = core
     for _ in range(int(rng.integers(1, 4))):
         body = solids.carved(body, solids.both_sides(primitive(0.7)), rng.choice([0.02, 0.06]))
@@ -51,7 +69,14 @@ def supershape(rng) -> Assembly:
     r1, r2 = r1 / r1.max(), r2 / r2.max()
     flat = np.cos(phi) * r2
     flat[[0, -1]] = 0
-    points = np.stack([flat[:, None] * r1 * np.cos(theta), np.broadcast_to((r2 * np.sin(phi))[:, None], (64, 120)), flat[:, None] * r1 * np.sin(theta)], -1)
+    points = np.stack(
+        [
+            flat[:, None] * r1 * np.cos(theta),
+            np.broadcast_to((r2 * np.sin(phi))[:, None], (64, 120)),
+            flat[:, None] * r1 * np.sin(theta),
+        ],
+        -1,
+    )
     a.add(grid_part(points * rng.uniform(0.6, 1.0, 3), crease_degrees=60), tiles.pick(rng))
     if rng.uniform() < 0.4:
         a.add(cylinder(0.4, 0.12).moved(y=-0.9), tiles.pick(rng))
@@ -65,7 +90,10 @@ def knot(rng) -> Assembly:
     r = 0.45 + rng.uniform(0.12, 0.25) * np.cos(q * t)
     path = np.stack([r * np.cos(p * t), r * np.sin(p * t), 0.25 * np.sin(q * t)], -1)
     outline = circle(20) if rng.uniform() < 0.6 else subdivided(circle(int(rng.integers(3, 6))), 5)
-    a.add(tube(path, rng.uniform(0.07, 0.14), closed=True, outline=outline).turned("x", rng.choice([0, 90, 20])), tiles.pick(rng))
+    a.add(
+        tube(path, rng.uniform(0.07, 0.14), closed=True, outline=outline).turned("x", rng.choice([0, 90, 20])),
+        tiles.pick(rng),
+    )
     if rng.uniform() < 0.4:
         a.add(ball(rng.uniform(0.15, 0.3), count=30), tiles.pick(rng))
     return a
@@ -75,7 +103,11 @@ def gear(rng) -> Assembly:
     """Gears, stars and cogs standing up, with hub and pins."""
     a, teeth, depth = Assembly(), int(rng.integers(5, 18)), rng.uniform(0.1, 0.4)
     k = np.arange(teeth * 8) % 8
-    step = np.array([0, 0, 0.5, 1, 1, 1, 0.5, 0])[k] if rng.uniform() < 0.7 else np.array([0, 0.25, 0.5, 0.75, 1, 0.75, 0.5, 0.25])[k]
+    step = (
+        np.array([0, 0, 0.5, 1, 1, 1, 0.5, 0])[k]
+        if rng.uniform() < 0.7
+        else np.array([0, 0.25, 0.5, 0.75, 1, 0.75, 0.5, 0.25])[k]
+    )
     outline = circle(teeth * 8) * (0.8 * (1 - depth + depth * step))[:, None]
     thick, finish = rng.uniform(0.15, 0.5), tiles.pick(rng, "metal" if rng.uniform() < 0.5 else "any")
     a.add(extrusion(outline, thick, 0.02).moved(y=-thick / 2).turned("x", 90), finish)
@@ -97,7 +129,10 @@ def prism(rng) -> Assembly:
         outline = subdivided(circle(sides * 2) * radii[:, None] * rng.uniform(0.3, 0.6), 4)
         tall, top = rng.uniform(0.3, 1.0), rng.uniform(0.3, 1.0)
         profile = refined([(0, 0), (0.95, 0), (1, 0.03), (top, tall - 0.02), (top * 0.95, tall), (0, tall)], 0.07)
-        a.add(loft(profile, outline, 30, twist_degrees=rng.choice([0, 0, rng.uniform(-120, 120)])).moved(y=y), tiles.pick(rng))
+        a.add(
+            loft(profile, outline, 30, twist_degrees=rng.choice([0, 0, rng.uniform(-120, 120)])).moved(y=y),
+            tiles.pick(rng),
+        )
         y += tall
     return a
 
@@ -108,9 +143,21 @@ def stack(rng) -> Assembly:
     for _ in range(int(rng.integers(2, 6))):
         s, finish = rng.uniform(0.2, 0.5), tiles.pick(rng)
         kind, turn = rng.integers(5), rng.choice([0, 0, 45])
-        part, tall = [(lambda: box(1.4 * s, 1.1 * s, 1.4 * s, 0.03, 10), 1.1 * s), (lambda: ball(s, count=36), 2 * s),
-                      (lambda: cylinder(s, s, count=44), s), (lambda: cone(s, 1.6 * s, 40).moved(y=-0.8 * s), 1.6 * s),
-                      (lambda: tube(s * np.stack([np.cos(w := 2 * np.pi * np.arange(48) / 48), 0 * w, np.sin(w)], -1), 0.3 * s, closed=True, outline=circle(20)), 0.6 * s)][kind]
+        part, tall = [
+            (lambda: box(1.4 * s, 1.1 * s, 1.4 * s, 0.03, 10), 1.1 * s),
+            (lambda: ball(s, count=36), 2 * s),
+            (lambda: cylinder(s, s, count=44), s),
+            (lambda: cone(s, 1.6 * s, 40).moved(y=-0.8 * s), 1.6 * s),
+            (
+                lambda: tube(
+                    s * np.stack([np.cos(w := 2 * np.pi * np.arange(48) / 48), 0 * w, np.sin(w)], -1),
+                    0.3 * s,
+                    closed=True,
+                    outline=circle(20),
+                ),
+                0.6 * s,
+            ),
+        ][kind]
         part = part().turned("y", turn).moved(y=y + tall / 2)
         if rng.uniform() < 0.35:
             a.add_pair(part.moved(s * rng.uniform(1.0, 1.5)), finish)
@@ -127,10 +174,24 @@ def blob(rng) -> Assembly:
     for _ in range(int(rng.integers(2, 7))):
         d = rng.normal(size=3)
         end = d / np.linalg.norm(d) * rng.uniform(0.4, 0.95)
-        shapes.append(solids.both_sides(solids.limb((0, 0, 0), np.abs(end) * np.array([1, np.sign(end[1]), np.sign(end[2])]), rng.uniform(0.1, 0.2), rng.uniform(0.06, 0.25))))
+        shapes.append(
+            solids.both_sides(
+                solids.limb(
+                    (0, 0, 0),
+                    np.abs(end) * np.array([1, np.sign(end[1]), np.sign(end[2])]),
+                    rng.uniform(0.1, 0.2),
+                    rng.uniform(0.06, 0.25),
+                )
+            )
+        )
     body, bump = solids.blended(shapes, rng.uniform(0.08, 0.25)), patterns.noise_field(rng, 1.5, 1.0)
     amount = np.float32(rng.choice([0.0, 0.02, 0.05]))
-    a.add(solids.polygonised(lambda p: body(p) + amount * bump(np.abs(p) * np.array([1, 0, 0]) + p * np.array([0, 1, 1])), 56, 1.5), tiles.pick(rng))
+    a.add(
+        solids.polygonised(
+            lambda p: body(p) + amount * bump(np.abs(p) * np.array([1, 0, 0]) + p * np.array([0, 1, 1])), 56, 1.5
+        ),
+        tiles.pick(rng),
+    )
     return a
 
 

@@ -42,7 +42,9 @@ class Assembly:
             directions = np.concatenate([part.normals for part in parts])
             starts = np.cumsum([0, *[len(part.vertices) for part in parts]])
             triangles = np.concatenate([part.faces + start for part, start in zip(parts, starts)])
-            look = self.finishes[members[0]](Shape(points, directions, lambda p=points, n=directions, f=triangles: convexity(p, n, f)))
+            look = self.finishes[members[0]](
+                Shape(points, directions, lambda p=points, n=directions, f=triangles: convexity(p, n, f))
+            )
             vertices.append(points)
             normals.append(directions)
             faces.append(triangles + offset)
@@ -51,9 +53,15 @@ class Assembly:
             field_uv.append(np.zeros((len(points), 2)) if look.field_uv is None else look.field_uv)
             materials.append(look.material)
             offset += len(points)
-        return Scene(vertices=np.concatenate(vertices), faces=np.concatenate(faces).astype(np.int32), materials=tuple(materials),
-                     material_idx=np.concatenate(material_idx), normals=np.concatenate(normals),
-                     uvs=(np.concatenate(surface_uv), np.concatenate(field_uv)), name=name)
+        return Scene(
+            vertices=np.concatenate(vertices),
+            faces=np.concatenate(faces).astype(np.int32),
+            materials=tuple(materials),
+            material_idx=np.concatenate(material_idx),
+            normals=np.concatenate(normals),
+            uvs=(np.concatenate(surface_uv), np.concatenate(field_uv)),
+            name=name,
+        )
 
 
 def _tiled_uv(part: Part, scale: float, tiles_per_unit: float) -> np.ndarray:
@@ -65,8 +73,11 @@ def _tiled_uv(part: Part, scale: float, tiles_per_unit: float) -> np.ndarray:
 
 
 def convexity(points: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Smoothed mean curvature per vertex (v,) of the welded mesh, scaled to about 1 on a sharp convex edge, < 0 in hollows."""
-    _, weld = np.unique(np.round(points * 1e6).astype(np.int64) @ np.array([1, 2_097_143, 4_398_016_094_209]), return_inverse=True)
+    """Smoothed mean curvature per vertex (v,) of the welded mesh, scaled to about 1 on a sharp convex edge, < 0 in
+    hollows."""
+    _, weld = np.unique(
+        np.round(points * 1e6).astype(np.int64) @ np.array([1, 2_097_143, 4_398_016_094_209]), return_inverse=True
+    )
     count = weld.max() + 1
     share = np.bincount(weld, minlength=count)
     position = np.stack([np.bincount(weld, points[:, k], count) / share for k in range(3)], -1)

@@ -14,7 +14,11 @@ BLACK = np.array([0.012, 0.011, 0.011])
 
 def fur_color(rng) -> np.ndarray:
     """Animal coats mostly, sometimes a toy's colour."""
-    return finishes.any_color(rng) if rng.uniform() < 0.35 else hsv(rng.uniform(0.02, 0.12), rng.uniform(0.05, 0.75), rng.uniform(0.2, 1.0) ** 0.7)
+    return (
+        finishes.any_color(rng)
+        if rng.uniform() < 0.35
+        else hsv(rng.uniform(0.02, 0.12), rng.uniform(0.05, 0.75), rng.uniform(0.2, 1.0) ** 0.7)
+    )
 
 
 def eyes(a: Assembly, rng, x: float, y: float, z: float, size: float, outward: float = 0.25) -> None:
@@ -35,21 +39,35 @@ def face(a: Assembly, rng, center, r: float, coat, snout: float) -> None:
     if snout > 0.05:
         a.add(ball(r * 0.42, r * 0.34, r * (0.3 + snout), 24).moved(x, y - 0.22 * r, z + 0.75 * r), muzzle)
     tip = z + r * (1.02 + snout if snout > 0.05 else 0.98)
-    a.add(ball(r * 0.13, r * 0.1, r * 0.1, 16).moved(x, y - 0.12 * r, tip), finishes.glossy(rng, BLACK if rng.uniform() < 0.7 else hsv(0.97, 0.5, 0.7)))
+    a.add(
+        ball(r * 0.13, r * 0.1, r * 0.1, 16).moved(x, y - 0.12 * r, tip),
+        finishes.glossy(rng, BLACK if rng.uniform() < 0.7 else hsv(0.97, 0.5, 0.7)),
+    )
 
 
 def ears(a: Assembly, rng, center, r: float, coat) -> None:
     x, y, z = center
     kind = rng.integers(5)
     if kind == 0:  # pointed
-        part = cone(r * rng.uniform(0.28, 0.42), r * rng.uniform(0.6, 1.0), 20).scaled(1, 1, 0.55).turned("z", -22).moved(x + 0.5 * r, y + 0.62 * r, z)
+        part = (
+            cone(r * rng.uniform(0.28, 0.42), r * rng.uniform(0.6, 1.0), 20)
+            .scaled(1, 1, 0.55)
+            .turned("z", -22)
+            .moved(x + 0.5 * r, y + 0.62 * r, z)
+        )
     elif kind == 1:  # round
         size = r * rng.uniform(0.28, 0.42)
         part = ball(size, size, size * 0.45, 22).moved(x + 0.68 * r, y + 0.68 * r, z)
     elif kind == 2:  # long upright
-        part = ball(r * 0.2, r * rng.uniform(0.7, 1.2), r * 0.12, 22).turned("z", -rng.uniform(5, 25)).moved(x + 0.4 * r, y + 1.5 * r, z)
+        part = (
+            ball(r * 0.2, r * rng.uniform(0.7, 1.2), r * 0.12, 22)
+            .turned("z", -rng.uniform(5, 25))
+            .moved(x + 0.4 * r, y + 1.5 * r, z)
+        )
     elif kind == 3:  # hanging
-        part = ball(r * 0.16, r * rng.uniform(0.45, 0.7), r * 0.3, 22).turned("z", 12).moved(x + 0.98 * r, y - 0.02 * r, z)
+        part = (
+            ball(r * 0.16, r * rng.uniform(0.45, 0.7), r * 0.3, 22).turned("z", 12).moved(x + 0.98 * r, y - 0.02 * r, z)
+        )
     else:  # wide, elephant
         part = ball(r * 0.75, r * 0.85, r * 0.12, 26).turned("y", 25).moved(x + 1.25 * r, y + 0.1 * r, z - 0.15 * r)
     a.add_pair(part, coat)
@@ -57,7 +75,11 @@ def ears(a: Assembly, rng, center, r: float, coat) -> None:
 
 def horns(a: Assembly, rng, center, r: float) -> None:
     x, y, z = center
-    finish = finishes.matte(rng, hsv(0.11, rng.uniform(0.1, 0.4), rng.uniform(0.3, 0.9))) if rng.uniform() < 0.7 else tiles.pick(rng, "metal")
+    finish = (
+        finishes.matte(rng, hsv(0.11, rng.uniform(0.1, 0.4), rng.uniform(0.3, 0.9)))
+        if rng.uniform() < 0.7
+        else tiles.pick(rng, "metal")
+    )
     if rng.uniform() < 0.25:
         a.add(cone(r * 0.12, r * 0.9, 20).turned("x", 25).moved(x, y + 0.8 * r, z + 0.4 * r), finish)
         return
@@ -76,14 +98,26 @@ def quadruped(rng) -> Assembly:
     neck_y, neck_z = rng.uniform(0.0, 0.6), rng.uniform(0.1, 0.4)
     head = (0.0, girth * 0.5 + neck_y + 0.1, length + neck_z)
     spread = girth * rng.uniform(0.5, 0.75)
-    body = [solids.ellipsoid((0, 0, -length * 0.4), (girth * rng.uniform(0.8, 1.05), girth * rng.uniform(0.85, 1.1), length * 0.75)),
-            solids.ellipsoid((0, 0.02, length * 0.45), (girth * 0.95, girth * rng.uniform(0.85, 1.1), length * 0.65)),
-            solids.limb((0, girth * 0.3, length * 0.7), (0, head[1] - 0.1 * r, head[2] - 0.1 * r), girth * 0.6, r * 0.6),
-            solids.ellipsoid(head, (r, r * rng.uniform(0.85, 1.05), r * rng.uniform(0.9, 1.05)))]
+    body = [
+        solids.ellipsoid(
+            (0, 0, -length * 0.4), (girth * rng.uniform(0.8, 1.05), girth * rng.uniform(0.85, 1.1), length * 0.75)
+        ),
+        solids.ellipsoid((0, 0.02, length * 0.45), (girth * 0.95, girth * rng.uniform(0.85, 1.1), length * 0.65)),
+        solids.limb((0, girth * 0.3, length * 0.7), (0, head[1] - 0.1 * r, head[2] - 0.1 * r), girth * 0.6, r * 0.6),
+        solids.ellipsoid(head, (r, r * rng.uniform(0.85, 1.05), r * rng.uniform(0.9, 1.05))),
+    ]
     bottom = -girth * 0.6 - leg
-    knees = [solids.chain([(spread, -0.1, z), (spread * 1.05, bottom * 0.6, z + bend), (spread * 1.05, bottom, z + 0.02)],
-                          [foot * 1.6, foot, foot * 1.05]) for z, bend in ((length * 0.65, 0.03), (-length * 0.75, -0.05))]
-    paws = [solids.ellipsoid((spread * 1.05, bottom, z + 0.08), (foot * 1.2, foot * 0.75, foot * 1.7)) for z in (length * 0.65, -length * 0.75)]
+    knees = [
+        solids.chain(
+            [(spread, -0.1, z), (spread * 1.05, bottom * 0.6, z + bend), (spread * 1.05, bottom, z + 0.02)],
+            [foot * 1.6, foot, foot * 1.05],
+        )
+        for z, bend in ((length * 0.65, 0.03), (-length * 0.75, -0.05))
+    ]
+    paws = [
+        solids.ellipsoid((spread * 1.05, bottom, z + 0.08), (foot * 1.2, foot * 0.75, foot * 1.7))
+        for z in (length * 0.65, -length * 0.75)
+    ]
     body.append(solids.both_sides(solids.blended(knees + paws, 0.04)))
     t = np.linspace(0, 1, 6)
     lift, thick = rng.uniform(-0.5, 0.8), max(foot * rng.uniform(0.3, 0.8), 0.045)  # thinner falls between the cells
@@ -92,17 +126,30 @@ def quadruped(rng) -> Assembly:
     trunk = rng.uniform() < 0.18
     if trunk:
         t = np.linspace(0, 1, 7)
-        path = np.stack([0 * t, head[1] - 0.15 * r - (0.9 + 0.4 * r) * t, head[2] + r * (0.8 + 0.35 * np.sin(2.5 * t))], -1)
+        path = np.stack(
+            [0 * t, head[1] - 0.15 * r - (0.9 + 0.4 * r) * t, head[2] + r * (0.8 + 0.35 * np.sin(2.5 * t))], -1
+        )
         path[:, 1] = np.maximum(path[:, 1], bottom)
         body.append(solids.chain(path, r * 0.38 * (1 - 0.55 * t)))
     coat = tiles.pick(rng, "fur", hsv(0.6, 0.05, rng.uniform(0.3, 0.7)) if trunk else fur_color(rng))
     a.add(solids.polygonised(solids.blended(body, rng.uniform(0.05, 0.12)), 60), coat)
     if trunk:
-        a.add_pair(ball(r * 0.75, r * 0.9, r * 0.13, 26).turned("y", 30).moved(r * 1.2, head[1] + 0.1 * r, head[2] - 0.25 * r), coat)
+        a.add_pair(
+            ball(r * 0.75, r * 0.9, r * 0.13, 26).turned("y", 30).moved(r * 1.2, head[1] + 0.1 * r, head[2] - 0.25 * r),
+            coat,
+        )
         eyes(a, rng, 0.6 * r, head[1] + 0.25 * r, head[2] + 0.72 * r, 0.1 * r, 0.8)
         t = np.linspace(0, 1, 10)
-        a.add_pair(tube(np.stack([0.4 * r + 0.1 * t, head[1] - 0.4 * r - 0.3 * r * np.sin(2 * t), head[2] + 0.7 * r + 0.7 * r * t], -1), 0.1 * r * (1 - 0.8 * t)),
-                   finishes.plastic(rng, hsv(0.12, 0.15, 0.9)))
+        a.add_pair(
+            tube(
+                np.stack(
+                    [0.4 * r + 0.1 * t, head[1] - 0.4 * r - 0.3 * r * np.sin(2 * t), head[2] + 0.7 * r + 0.7 * r * t],
+                    -1,
+                ),
+                0.1 * r * (1 - 0.8 * t),
+            ),
+            finishes.plastic(rng, hsv(0.12, 0.15, 0.9)),
+        )
     else:
         face(a, rng, head, r, coat, rng.choice([0.0, 0.15, 0.35, 0.6]))
         ears(a, rng, head, r, coat)
@@ -110,9 +157,14 @@ def quadruped(rng) -> Assembly:
             horns(a, rng, head, r)
     if rng.uniform() < 0.3:  # a collar
         n = np.linspace(0, 2 * np.pi, 36, endpoint=False)
-        mid = np.array([0, girth * 0.3 + 0.55 * (head[1] - girth * 0.3), length * 0.7 + 0.55 * (head[2] - length * 0.7)])
+        mid = np.array(
+            [0, girth * 0.3 + 0.55 * (head[1] - girth * 0.3), length * 0.7 + 0.55 * (head[2] - length * 0.7)]
+        )
         radius = (girth * 0.6 + r * 0.6) / 2 + 0.03
-        a.add(tube(mid + radius * np.stack([np.cos(n), 0 * n, np.sin(n)], -1), 0.03, closed=True), tiles.pick(rng, "paint"))
+        a.add(
+            tube(mid + radius * np.stack([np.cos(n), 0 * n, np.sin(n)], -1), 0.03, closed=True),
+            tiles.pick(rng, "paint"),
+        )
     return a
 
 
@@ -121,19 +173,38 @@ def sitting(rng) -> Assembly:
     a = Assembly()
     coat, r, girth = tiles.pick(rng, "fur", fur_color(rng)), rng.uniform(0.3, 0.45), rng.uniform(0.32, 0.5)
     head = (0.0, 0.42 + r * 0.75, 0.08)
-    body = [solids.ellipsoid((0, -0.1, 0), (girth, 0.45, girth * 0.9)), solids.ellipsoid((0, 0.2, 0.02), (girth * 0.75, 0.35, girth * 0.7)),
-            solids.ellipsoid(head, (r * rng.uniform(1, 1.15), r, r * 0.95))]
-    arm = solids.chain([(girth * 0.6, 0.22, 0.1), (girth * 0.75, -0.1, 0.3), (girth * 0.45, -0.48, 0.42)], [0.13, 0.11, 0.1])
-    leg = solids.blended([solids.ellipsoid((girth * 0.85, -0.38, 0.05), (0.2, 0.2, 0.3)), solids.ellipsoid((girth * 0.8, -0.5, 0.36), (0.12, 0.09, 0.18))], 0.05)
+    body = [
+        solids.ellipsoid((0, -0.1, 0), (girth, 0.45, girth * 0.9)),
+        solids.ellipsoid((0, 0.2, 0.02), (girth * 0.75, 0.35, girth * 0.7)),
+        solids.ellipsoid(head, (r * rng.uniform(1, 1.15), r, r * 0.95)),
+    ]
+    arm = solids.chain(
+        [(girth * 0.6, 0.22, 0.1), (girth * 0.75, -0.1, 0.3), (girth * 0.45, -0.48, 0.42)], [0.13, 0.11, 0.1]
+    )
+    leg = solids.blended(
+        [
+            solids.ellipsoid((girth * 0.85, -0.38, 0.05), (0.2, 0.2, 0.3)),
+            solids.ellipsoid((girth * 0.8, -0.5, 0.36), (0.12, 0.09, 0.18)),
+        ],
+        0.05,
+    )
     body.append(solids.both_sides(solids.blended([arm, leg], 0.03)))
     if rng.uniform() < 0.6:
         t = np.linspace(0, 1, 6)
-        body.append(solids.chain(np.stack([girth * (0.4 + 0.9 * np.sin(2 * t)), -0.45 + 0.25 * t**2, -girth * 0.9 + 0.5 * t], -1), 0.09 - 0.03 * t))
+        body.append(
+            solids.chain(
+                np.stack([girth * (0.4 + 0.9 * np.sin(2 * t)), -0.45 + 0.25 * t**2, -girth * 0.9 + 0.5 * t], -1),
+                0.09 - 0.03 * t,
+            )
+        )
     a.add(solids.polygonised(solids.blended(body, 0.07), 56), coat)
     face(a, rng, head, r, coat, rng.choice([0.0, 0.1, 0.2, 0.35]))
     ears(a, rng, head, r, coat)
     if rng.uniform() < 0.5:
-        a.add(ball(girth * 0.55, 0.3, 0.2, 26).moved(0, 0.02, girth * 0.62), tiles.pick(rng, "fur", finishes.near_color(rng, fur_color(rng), 0.4)))
+        a.add(
+            ball(girth * 0.55, 0.3, 0.2, 26).moved(0, 0.02, girth * 0.62),
+            tiles.pick(rng, "fur", finishes.near_color(rng, fur_color(rng), 0.4)),
+        )
     dress_head(a, rng, head, r, 0.3)
     return a
 
@@ -145,18 +216,38 @@ def bird(rng) -> Assembly:
     separate = rng.uniform() < 0.5
     r = girth * rng.uniform(0.65, 0.9)
     y = tall * (0.95 if separate else 0.55)
-    body = [solids.ellipsoid((0, 0, 0), (girth, tall, girth * 0.9)), solids.ellipsoid((0, y, 0.04), (r, r * 0.95, r * 0.95)),
-            solids.limb((0, -tall * 0.6, -girth * 0.5), (0, -tall * rng.uniform(0.9, 1.2), -girth * rng.uniform(0.9, 1.5)), 0.12, 0.07)]
+    body = [
+        solids.ellipsoid((0, 0, 0), (girth, tall, girth * 0.9)),
+        solids.ellipsoid((0, y, 0.04), (r, r * 0.95, r * 0.95)),
+        solids.limb(
+            (0, -tall * 0.6, -girth * 0.5),
+            (0, -tall * rng.uniform(0.9, 1.2), -girth * rng.uniform(0.9, 1.5)),
+            0.12,
+            0.07,
+        ),
+    ]
     a.add(solids.polygonised(solids.blended(body, 0.1), 52), coat)
-    a.add(ball(girth * 0.72, tall * 0.72, girth * 0.5, 30).moved(0, -tall * 0.1, girth * 0.47), tiles.pick(rng, "fur", finishes.near_color(rng, hsv(0.1, 0.2, 0.9), 0.3)))
+    a.add(
+        ball(girth * 0.72, tall * 0.72, girth * 0.5, 30).moved(0, -tall * 0.1, girth * 0.47),
+        tiles.pick(rng, "fur", finishes.near_color(rng, hsv(0.1, 0.2, 0.9), 0.3)),
+    )
     wing = coat if rng.uniform() < 0.4 else tiles.pick(rng, "fur", fur_color(rng))
-    a.add_pair(ball(0.09, tall * 0.75, girth * 0.55, 26).turned("z", rng.uniform(5, 40)).moved(girth * 1.02, -0.02, -0.05), wing)
+    a.add_pair(
+        ball(0.09, tall * 0.75, girth * 0.55, 26).turned("z", rng.uniform(5, 40)).moved(girth * 1.02, -0.02, -0.05),
+        wing,
+    )
     size = r * rng.uniform(0.22, 0.38)
     if size > r * 0.3:
-        a.add_pair(ball(size * 1.35, size * 1.35, size * 0.6, 26).moved(r * 0.42, y + r * 0.2, r * 0.78), finishes.matte(rng, hsv(0.1, 0.2, 0.9)))
+        a.add_pair(
+            ball(size * 1.35, size * 1.35, size * 0.6, 26).moved(r * 0.42, y + r * 0.2, r * 0.78),
+            finishes.matte(rng, hsv(0.1, 0.2, 0.9)),
+        )
     eyes(a, rng, r * 0.42, y + r * 0.2, r * 0.92, size * 0.8, 0.15)
     orange = finishes.plastic(rng, hsv(rng.uniform(0.06, 0.14), 0.85, rng.uniform(0.5, 0.95)))
-    a.add(cone(r * 0.2, r * rng.uniform(0.3, 0.7), 20).turned("x", rng.uniform(90, 120)).moved(0, y - r * 0.08, r * 0.92), orange)
+    a.add(
+        cone(r * 0.2, r * rng.uniform(0.3, 0.7), 20).turned("x", rng.uniform(90, 120)).moved(0, y - r * 0.08, r * 0.92),
+        orange,
+    )
     for toe in (-0.07, 0.0, 0.07):
         a.add_pair(ball(0.04, 0.035, 0.11, 14).moved(girth * 0.45 + toe, -tall * 0.97, girth * 0.45), orange)
     if rng.uniform() < 0.4:
@@ -182,13 +273,23 @@ def dress_head(a: Assembly, rng, head, r: float, chance: float) -> None:
         a.add(cylinder(r * 0.6, r * 0.3, top_radius=r * 0.66).moved(x, y + r * 0.95, z), gold)
         for k in range(6):
             w = 2 * np.pi * k / 6 + np.pi / 6
-            a.add(cone(r * 0.16, r * 0.4, 12).moved(x + r * 0.52 * np.cos(w), y + r * 1.05, z + r * 0.52 * np.sin(w)), gold)
+            a.add(
+                cone(r * 0.16, r * 0.4, 12).moved(x + r * 0.52 * np.cos(w), y + r * 1.05, z + r * 0.52 * np.sin(w)),
+                gold,
+            )
     elif kind == 3:
         half = refined([(0, 0), (1.04, 0), (1.0, 0.35), (0.75, 0.75), (0.4, 0.95), (0, 1.0)], 0.1)
         a.add(loft(half, circle(40)).scaled(r, r * 0.85, r).moved(x, y + 0.32 * r, z), finish)
     else:
         w = 2 * np.pi * np.arange(40) / 40
-        a.add(tube(np.stack([x + r * 0.85 * np.cos(w), np.full(40, y - r * 0.85), z + r * 0.85 * np.sin(w)], -1), r * 0.2, closed=True), finish)
+        a.add(
+            tube(
+                np.stack([x + r * 0.85 * np.cos(w), np.full(40, y - r * 0.85), z + r * 0.85 * np.sin(w)], -1),
+                r * 0.2,
+                closed=True,
+            ),
+            finish,
+        )
 
 
 def figure(rng) -> Assembly:
@@ -196,7 +297,12 @@ def figure(rng) -> Assembly:
     a = Assembly()
     r, hips, shoulder = rng.uniform(0.16, 0.34), rng.uniform(0.14, 0.26), rng.uniform(0.2, 0.34)
     leg, torso = rng.uniform(0.25, 0.6), rng.uniform(0.35, 0.6)
-    skin = finishes.plastic(rng, hsv(rng.uniform(0.04, 0.09), rng.uniform(0.25, 0.6), rng.uniform(0.35, 0.95)) if rng.uniform() < 0.75 else finishes.any_color(rng))
+    skin = finishes.plastic(
+        rng,
+        hsv(rng.uniform(0.04, 0.09), rng.uniform(0.25, 0.6), rng.uniform(0.35, 0.95))
+        if rng.uniform() < 0.75
+        else finishes.any_color(rng),
+    )
     shirt, trousers, shoe = tiles.pick(rng, "cloth"), tiles.pick(rng, "cloth"), tiles.pick(rng, "paint")
     head = (0.0, leg + torso + r * 0.95, 0.0)
     depth = shoulder * rng.uniform(0.5, 0.75)
@@ -204,23 +310,44 @@ def figure(rng) -> Assembly:
         skin, shirt, trousers = (tiles.pick(rng, "paint") for _ in range(3))
         chest = solids.block((0, leg + torso / 2, 0), (shoulder, torso / 2 + 0.02, depth), 0.05)
     else:
-        chest = solids.blended([solids.ellipsoid((0, leg + torso * 0.25, 0), (hips * 1.2, torso * 0.35, depth)),
-                                solids.ellipsoid((0, leg + torso * 0.7, 0), (shoulder, torso * 0.36, depth))], 0.1)
+        chest = solids.blended(
+            [
+                solids.ellipsoid((0, leg + torso * 0.25, 0), (hips * 1.2, torso * 0.35, depth)),
+                solids.ellipsoid((0, leg + torso * 0.7, 0), (shoulder, torso * 0.36, depth)),
+            ],
+            0.1,
+        )
     a.add(solids.polygonised(chest, 40), shirt)
     pose, bend = rng.uniform(-15, 75) * (1 if rng.uniform() < 0.6 else 0.3), rng.uniform(-0.15, 0.3)
     reach = leg * 0.5 + torso * 0.6
     sx, sy = shoulder * 0.95, leg + torso * 0.85
     w = np.radians(pose)
     elbow = (sx + reach * 0.5 * np.cos(np.radians(70) - w), sy - reach * 0.5 * np.sin(np.radians(70) - w), 0.02)
-    hand = (elbow[0] + reach * 0.4 * np.cos(np.radians(75) - w), elbow[1] - reach * 0.4 * np.sin(np.radians(75) - w), bend)
-    a.add_pair(tube(np.array([(sx * 0.9, sy, 0), elbow, hand]), np.array([0.085, 0.075, 0.065]), outline=circle(20)), shirt)
+    hand = (
+        elbow[0] + reach * 0.4 * np.cos(np.radians(75) - w),
+        elbow[1] - reach * 0.4 * np.sin(np.radians(75) - w),
+        bend,
+    )
+    a.add_pair(
+        tube(np.array([(sx * 0.9, sy, 0), elbow, hand]), np.array([0.085, 0.075, 0.065]), outline=circle(20)), shirt
+    )
     a.add_pair(ball(0.085, count=20).moved(*hand), skin)
-    a.add_pair(tube(np.array([(hips * 0.6, leg * 1.1, 0), (hips * 0.7, leg * 0.5, 0.02), (hips * 0.75, 0.06, 0)]), np.array([0.12, 0.1, 0.09]), outline=circle(20)), trousers)
+    a.add_pair(
+        tube(
+            np.array([(hips * 0.6, leg * 1.1, 0), (hips * 0.7, leg * 0.5, 0.02), (hips * 0.75, 0.06, 0)]),
+            np.array([0.12, 0.1, 0.09]),
+            outline=circle(20),
+        ),
+        trousers,
+    )
     a.add_pair(ball(0.11, 0.075, 0.17, 22).moved(hips * 0.78, 0.03, 0.06), shoe)
     if robot:
         a.add(solids.polygonised(solids.block(head, (r * 1.05, r * 0.85, r * 0.9), 0.05), 32), skin)
         eyes(a, rng, r * 0.45, head[1] + r * 0.1, r * 0.85, r * 0.22, 0.0)
-        a.add(cylinder(r * 0.5, r * 0.1).turned("x", 90).scaled(1, 0.4, 1).moved(0, head[1] - r * 0.4, r * 0.88), finishes.metal(rng))
+        a.add(
+            cylinder(r * 0.5, r * 0.1).turned("x", 90).scaled(1, 0.4, 1).moved(0, head[1] - r * 0.4, r * 0.88),
+            finishes.metal(rng),
+        )
         a.add(cylinder(0.02, r * 0.6).moved(0, head[1] + r * 1.1, 0), finishes.metal(rng))
         a.add(ball(0.05, count=16).moved(0, head[1] + r * 1.4, 0), finishes.glossy(rng))
         return a
@@ -228,8 +355,21 @@ def figure(rng) -> Assembly:
     eyes(a, rng, r * 0.36, head[1] + r * 0.12, r * 0.85, r * rng.uniform(0.1, 0.18), 0.1)
     a.add(ball(r * 0.12, r * 0.14, r * 0.18, 16).moved(0, head[1] - r * 0.1, r * 0.95), skin)
     t = np.linspace(-0.8, 0.8, 12)
-    a.add(tube(np.stack([r * 0.4 * t, head[1] - r * (0.5 - 0.12 * t**2), r * np.sqrt(np.maximum(0.86 - 0.45 * t**2, 0.3)) * 0.93], -1), r * 0.045, outline=circle(8)),
-          finishes.plastic(rng, hsv(0.98, 0.7, 0.5)))
+    a.add(
+        tube(
+            np.stack(
+                [
+                    r * 0.4 * t,
+                    head[1] - r * (0.5 - 0.12 * t**2),
+                    r * np.sqrt(np.maximum(0.86 - 0.45 * t**2, 0.3)) * 0.93,
+                ],
+                -1,
+            ),
+            r * 0.045,
+            outline=circle(8),
+        ),
+        finishes.plastic(rng, hsv(0.98, 0.7, 0.5)),
+    )
     hair = tiles.pick(rng, "fur", hsv(rng.uniform(0.03, 0.12), rng.uniform(0.2, 0.8), rng.uniform(0.08, 0.8)))
     if rng.uniform() < 0.75:
         a.add(ball(r * 1.06, r * 1.0, r * 0.95, 30).moved(0, head[1] + r * 0.2, -r * 0.18), hair)
@@ -243,7 +383,10 @@ def fish(rng) -> Assembly:
     a = Assembly()
     tall, wide = rng.uniform(0.25, 0.5), rng.uniform(0.14, 0.3)
     coat, fin = tiles.pick(rng, "fur", finishes.any_color(rng)), tiles.pick(rng, "skin")
-    body = solids.blended([solids.ellipsoid((0, 0, 0.1), (wide, tall, 0.6)), solids.limb((0, 0, -0.2), (0, 0, -0.75), tall * 0.45, 0.06)], 0.15)
+    body = solids.blended(
+        [solids.ellipsoid((0, 0, 0.1), (wide, tall, 0.6)), solids.limb((0, 0, -0.2), (0, 0, -0.75), tall * 0.45, 0.06)],
+        0.15,
+    )
     a.add(solids.polygonised(body, 52), coat)
     a.add(ball(0.035, tall * rng.uniform(0.8, 1.2), 0.25, 26).moved(0, 0, -0.9), fin)
     a.add(ball(0.03, tall * 0.5, 0.3, 24).moved(0, tall * 0.9, -0.05), fin)
@@ -257,17 +400,30 @@ def turtle(rng) -> Assembly:
     """Turtle, beetle or crab: a domed shell on a flat body with six or four limbs."""
     a = Assembly()
     dome, wide = rng.uniform(0.25, 0.5), rng.uniform(0.4, 0.55)
-    shell = finishes.crackled(np.random.default_rng(rng.integers(2**32))) if rng.uniform() < 0.5 else tiles.pick(rng, "any")
+    shell = (
+        finishes.crackled(np.random.default_rng(rng.integers(2**32))) if rng.uniform() < 0.5 else tiles.pick(rng, "any")
+    )
     half = np.stack([np.cos(np.linspace(0, np.pi / 2, 16)), np.sin(np.linspace(0, np.pi / 2, 16))], -1)
     half[-1, 0] = 0
     a.add(loft(np.vstack([(0, -0.1), (0.6, -0.1), (0.98, -0.04), half]), circle(48)).scaled(wide, dome, 0.6), shell)
     coat, r = tiles.pick(rng, "skin"), rng.uniform(0.16, 0.24)
     head = (0.0, 0.08, 0.62 + r)
-    limbs = [solids.limb((0, 0, 0.4), head, 0.12, r * 0.7), solids.ellipsoid(head, r), solids.ellipsoid((0, -0.05, 0), (wide * 0.85, 0.1, 0.5))]
+    limbs = [
+        solids.limb((0, 0, 0.4), head, 0.12, r * 0.7),
+        solids.ellipsoid(head, r),
+        solids.ellipsoid((0, -0.05, 0), (wide * 0.85, 0.1, 0.5)),
+    ]
     count = int(rng.integers(2, 4))
     for z in np.linspace(0.4, -0.4, count):
         reach = wide + rng.uniform(0.1, 0.3)
-        limbs.append(solids.both_sides(solids.chain([(wide * 0.6, -0.02, z), (reach, -0.02, z * 1.15), (reach + 0.06, -0.2, z * 1.25)], [0.1, 0.085, 0.07])))
+        limbs.append(
+            solids.both_sides(
+                solids.chain(
+                    [(wide * 0.6, -0.02, z), (reach, -0.02, z * 1.15), (reach + 0.06, -0.2, z * 1.25)],
+                    [0.1, 0.085, 0.07],
+                )
+            )
+        )
     limbs.append(solids.limb((0, -0.05, -0.5), (0, -0.08, -0.8), 0.07, 0.02))
     a.add(solids.polygonised(solids.blended(limbs, 0.06), 56), coat)
     eyes(a, rng, r * 0.55, head[1] + r * 0.4, head[2] + r * 0.6, r * 0.25, 0.4)
@@ -280,21 +436,48 @@ def dragon(rng) -> Assembly:
     coat = tiles.pick(rng, "fur", finishes.any_color(rng))
     r, lift = rng.uniform(0.17, 0.26), rng.uniform(0.25, 0.6)
     head = (0.0, 0.45 + lift, 0.5)
-    spine = np.array([(0, head[1], head[2]), (0, 0.3 + lift, 0.3), (0, 0.3, 0.25), (0, 0.0, 0.0), (0, -0.15, -0.35), (0, -0.35, -0.75),
-                      (0, -0.38 + rng.uniform(0, 0.5), -1.2)])
-    body = [solids.chain(spine, [0.12, 0.12, 0.2, 0.3, 0.24, 0.12, 0.04], 0.1), solids.ellipsoid(head, (r, r * 0.85, r)),
-            solids.ellipsoid((0, head[1] - 0.08 * r, head[2] + r), (r * 0.6, r * 0.45, r * 0.8))]
-    body.append(solids.both_sides(solids.blended([
-        solids.chain([(0.22, 0.1, 0.2), (0.34, -0.15, 0.35), (0.3, -0.42, 0.35)], [0.1, 0.08, 0.07]),
-        solids.chain([(0.2, -0.1, -0.25), (0.38, -0.15, -0.1), (0.34, -0.45, -0.25)], [0.15, 0.12, 0.08]),
-        solids.ellipsoid((0.3, -0.45, 0.42), (0.09, 0.05, 0.13)), solids.ellipsoid((0.35, -0.46, -0.18), (0.1, 0.05, 0.14))], 0.05)))
+    spine = np.array(
+        [
+            (0, head[1], head[2]),
+            (0, 0.3 + lift, 0.3),
+            (0, 0.3, 0.25),
+            (0, 0.0, 0.0),
+            (0, -0.15, -0.35),
+            (0, -0.35, -0.75),
+            (0, -0.38 + rng.uniform(0, 0.5), -1.2),
+        ]
+    )
+    body = [
+        solids.chain(spine, [0.12, 0.12, 0.2, 0.3, 0.24, 0.12, 0.04], 0.1),
+        solids.ellipsoid(head, (r, r * 0.85, r)),
+        solids.ellipsoid((0, head[1] - 0.08 * r, head[2] + r), (r * 0.6, r * 0.45, r * 0.8)),
+    ]
+    body.append(
+        solids.both_sides(
+            solids.blended(
+                [
+                    solids.chain([(0.22, 0.1, 0.2), (0.34, -0.15, 0.35), (0.3, -0.42, 0.35)], [0.1, 0.08, 0.07]),
+                    solids.chain([(0.2, -0.1, -0.25), (0.38, -0.15, -0.1), (0.34, -0.45, -0.25)], [0.15, 0.12, 0.08]),
+                    solids.ellipsoid((0.3, -0.45, 0.42), (0.09, 0.05, 0.13)),
+                    solids.ellipsoid((0.35, -0.46, -0.18), (0.1, 0.05, 0.14)),
+                ],
+                0.05,
+            )
+        )
+    )
     a.add(solids.polygonised(solids.blended(body, 0.06), 64), coat)
     spike = tiles.pick(rng, "paint")
     for t in np.linspace(0.08, 0.9, int(rng.integers(6, 12))):
         at = np.array([np.interp(t, np.linspace(0, 1, len(spine)), spine[:, k]) for k in range(3)])
         thick = np.interp(t, np.linspace(0, 1, 7), [0.12, 0.12, 0.2, 0.3, 0.24, 0.12, 0.04])
         back = np.array([0, 1, 0]) if t > 0.45 else np.array([0, 0.5, -0.85])
-        a.add(cone(0.06, 0.16, 12).scaled(0.5, 1, 1).turned("x", 0 if t > 0.45 else -60).moved(*(at + 0.85 * thick * back)), spike)
+        a.add(
+            cone(0.06, 0.16, 12)
+            .scaled(0.5, 1, 1)
+            .turned("x", 0 if t > 0.45 else -60)
+            .moved(*(at + 0.85 * thick * back)),
+            spike,
+        )
     wing, span, rise = tiles.pick(rng, "skin"), rng.uniform(0.6, 0.95), rng.uniform(0.3, 0.6)
     fingers = np.array([(0.45, 1.0), (1.0, 0.62), (0.9, 0.0), (0.5, -0.18)]) * np.array([span, rise])
     rim = [(0.0, 0.1), tuple(fingers[0])]
@@ -306,7 +489,9 @@ def dragon(rng) -> Assembly:
     def unfolded(part):
         return part.turned("x", lean).turned("y", fold).moved(0.16, 0.2, -0.05)
 
-    skin = extrusion(subdivided(np.array(rim + [(0.0, -0.05)]) - middle, 4), 0.03, 0.004).moved(y=-0.015).turned("x", -90)
+    skin = (
+        extrusion(subdivided(np.array(rim + [(0.0, -0.05)]) - middle, 4), 0.03, 0.004).moved(y=-0.015).turned("x", -90)
+    )
     a.add_pair(unfolded(skin.moved(*middle)), wing)
     wrist = np.array([0.45 * span, 0.97 * rise])
     for start, end, thick in (((0.0, 0.08), wrist, 0.05), *((wrist, tip, 0.032) for tip in fingers[1:])):
@@ -317,4 +502,12 @@ def dragon(rng) -> Assembly:
     return a
 
 
-KINDS = {"quadruped": quadruped, "sitting": sitting, "bird": bird, "figure": figure, "fish": fish, "turtle": turtle, "dragon": dragon}
+KINDS = {
+    "quadruped": quadruped,
+    "sitting": sitting,
+    "bird": bird,
+    "figure": figure,
+    "fish": fish,
+    "turtle": turtle,
+    "dragon": dragon,
+}

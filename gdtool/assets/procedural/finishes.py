@@ -1,9 +1,8 @@
 """What a part is made of: factors only, lookup tables over a solid field, or tiled images with a normal map.
 
 A finish is chosen first, with its random parameters, and applied when the object's shape is known: it is a function of
-`Shape` that returns a `Look`. A field finish stores its pattern as texture coordinates into a small lookup image (second
-UV set), so a threshold in the image is a crisp line on the surface however coarse the mesh is.
-"""
+`Shape` that returns a `Look`. A field finish stores its pattern as texture coordinates into a small lookup image
+(second UV set), so a threshold in the image is a crisp line on the surface however coarse the mesh is."""
 
 from __future__ import annotations
 
@@ -19,15 +18,24 @@ from gdtool.assets.scene import Material, Texture
 
 # Normal-incidence reflectance of metals, linear: measured optical constants as tabulated at physicallybased.info
 METALS = {
-    "gold": (1.0, 0.77, 0.31), "silver": (0.96, 0.95, 0.92), "copper": (0.93, 0.61, 0.49), "brass": (0.89, 0.74, 0.42),
-    "bronze": (0.71, 0.53, 0.34), "aluminium": (0.91, 0.91, 0.92), "iron": (0.53, 0.51, 0.49), "chrome": (0.64, 0.65, 0.66),
-    "titanium": (0.54, 0.50, 0.45), "nickel": (0.70, 0.64, 0.56), "steel": (0.60, 0.60, 0.62),
+    "gold": (1.0, 0.77, 0.31),
+    "silver": (0.96, 0.95, 0.92),
+    "copper": (0.93, 0.61, 0.49),
+    "brass": (0.89, 0.74, 0.42),
+    "bronze": (0.71, 0.53, 0.34),
+    "aluminium": (0.91, 0.91, 0.92),
+    "iron": (0.53, 0.51, 0.49),
+    "chrome": (0.64, 0.65, 0.66),
+    "titanium": (0.54, 0.50, 0.45),
+    "nickel": (0.70, 0.64, 0.56),
+    "steel": (0.60, 0.60, 0.62),
 }
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Where a finish goes, in the normalised object: points (v, 3), normals (v, 3), convexity (v,): > 0 on outer edges."""
+    """Where a finish goes, in the normalised object: points (v, 3), normals (v, 3), convexity (v,): > 0 on outer
+    edges."""
 
     points: np.ndarray
     normals: np.ndarray
@@ -36,7 +44,8 @@ class Shape:
 
 @dataclass(frozen=True)
 class Look:
-    """A material, texture coordinates (v, 2) of its second UV set (None: unused) and tiles per unit length of the first."""
+    """A material, texture coordinates (v, 2) of its second UV set (None: unused) and tiles per unit length of the
+    first."""
 
     material: Material
     field_uv: np.ndarray | None = None
@@ -57,7 +66,8 @@ def any_color(rng: np.random.Generator) -> np.ndarray:
     kind = rng.choice(7, p=[0.26, 0.2, 0.13, 0.18, 0.08, 0.07, 0.08])
     hue = rng.uniform()
     if kind == 0:
-        return hsv(hue, rng.uniform(0.65, 0.92), rng.uniform(0.6, 0.95) * (0.75 if 0.2 < hue < 0.48 else 1.0))  # no neon greens
+        # No neon greens.
+        return hsv(hue, rng.uniform(0.65, 0.92), rng.uniform(0.6, 0.95) * (0.75 if 0.2 < hue < 0.48 else 1.0))
     if kind == 1:
         return hsv(hue, rng.uniform(0.3, 0.6), rng.uniform(0.4, 0.8))
     if kind == 2:
@@ -87,9 +97,17 @@ def _srgb8(color: np.ndarray) -> np.ndarray:
     return np.round(srgb * 255).astype(np.uint8)
 
 
-def _material(name: str, color: np.ndarray, metallic: np.ndarray, roughness: np.ndarray, uv_set: int, wrap: str,
-              normal: np.ndarray | None = None) -> Material:
-    """Textured material from linear colour (h, w, 3), metallic and roughness (h, w) in [0, 1]; base_color may be a constant."""
+def _material(
+    name: str,
+    color: np.ndarray,
+    metallic: np.ndarray,
+    roughness: np.ndarray,
+    uv_set: int,
+    wrap: str,
+    normal: np.ndarray | None = None,
+) -> Material:
+    """Textured material from linear colour (h, w, 3), metallic and roughness (h, w) in [0, 1]; base_color may be a
+    constant."""
     shape = roughness.shape
     orm = np.stack([np.ones(shape), roughness, np.broadcast_to(metallic, shape)], -1)
     orm = np.round(np.clip(orm, 0, 1) * 255).astype(np.uint8)
@@ -97,13 +115,19 @@ def _material(name: str, color: np.ndarray, metallic: np.ndarray, roughness: np.
     def texture(image, encoding):
         return Texture(image, encoding, uv_set=uv_set, wrap_u=wrap, wrap_v=wrap)
 
-    return Material(name=name, base_color=(1.0, 1.0, 1.0, 1.0), metallic=1.0, roughness=1.0,
-                    base_color_texture=texture(_srgb8(np.broadcast_to(color, (*shape, 3))), "srgb"),
-                    metallic_roughness_texture=texture(orm, "linear"),
-                    normal_texture=None if normal is None else texture(normal, "linear"))
+    return Material(
+        name=name,
+        base_color=(1.0, 1.0, 1.0, 1.0),
+        metallic=1.0,
+        roughness=1.0,
+        base_color_texture=texture(_srgb8(np.broadcast_to(color, (*shape, 3))), "srgb"),
+        metallic_roughness_texture=texture(orm, "linear"),
+        normal_texture=None if normal is None else texture(normal, "linear"),
+    )
 
 
 # --- factors only -----------------------------------------------------------------------------------------------------
+
 
 def plain(color: np.ndarray, roughness: float, metallic: float = 0.0, name: str = "plain") -> Finish:
     """One linear colour, roughness and metallic."""
@@ -130,8 +154,14 @@ def glossy(rng, color=None) -> Finish:
 
 # --- lookup tables over solid fields ----------------------------------------------------------------------------------
 
-def _table(name: str, layers: list[tuple[float, np.ndarray, float, float]], softness: float = 0.01, speckle: float = 0.25,
-           wrap: str = "clamp") -> Material:
+
+def _table(
+    name: str,
+    layers: list[tuple[float, np.ndarray, float, float]],
+    softness: float = 0.01,
+    speckle: float = 0.25,
+    wrap: str = "clamp",
+) -> Material:
     """A lookup image over (pattern, dirt): layers (start in [0, 1], linear colour, roughness, metallic) along u.
 
     v darkens and roughens from 0 to 1 by `speckle`.
@@ -152,7 +182,9 @@ def _dirt(rng: np.random.Generator) -> Callable:
     return lambda points: np.clip(0.5 + 0.22 * field(points), 0.01, 0.99)
 
 
-def _field(name: str, material: Material, pattern: Callable[[Shape], np.ndarray], dirt: Callable, clip: bool = True) -> Finish:
+def _field(
+    name: str, material: Material, pattern: Callable[[Shape], np.ndarray], dirt: Callable, clip: bool = True
+) -> Finish:
     def apply(shape: Shape) -> Look:
         u = np.asarray(pattern(shape), float)
         u = np.clip(u, 0.004, 0.996) if clip else np.clip(u, -30, 30)
@@ -181,8 +213,13 @@ def banded(rng, color=None, axis=None, frequency=None) -> Finish:
         layers.append((rng.uniform(0.8, 0.92), third[2], third[0], third[1]))
     wobble, size = patterns.noise_field(rng, 2.0, 1.0), rng.choice([0.0, 0.08, 0.3])
     shift = rng.uniform()
-    return _field("stripes", _table("stripes", layers, 0.012, wrap="mirror"),
-                  lambda s: 2 * frequency * (product(s.points, direction)) + size * wobble(s.points) + shift, _dirt(rng), clip=False)
+    return _field(
+        "stripes",
+        _table("stripes", layers, 0.012, wrap="mirror"),
+        lambda s: 2 * frequency * (product(s.points, direction)) + size * wobble(s.points) + shift,
+        _dirt(rng),
+        clip=False,
+    )
 
 
 def gradient(rng, color=None, direction=None) -> Finish:
@@ -191,7 +228,9 @@ def gradient(rng, color=None, direction=None) -> Finish:
     other = near_color(rng, any_color(rng) if rng.uniform() < 0.5 else color, 0.6)
     axis = np.array([0.0, 1.0, 0.0]) if direction is None else np.asarray(direction, float)
     roughness = rng.uniform(0.15, 0.8)
-    material = _table("gradient", [(0, color, roughness, 0.0), (rng.uniform(0.3, 0.7), other, roughness, 0.0)], rng.uniform(0.2, 0.6))
+    material = _table(
+        "gradient", [(0, color, roughness, 0.0), (rng.uniform(0.3, 0.7), other, roughness, 0.0)], rng.uniform(0.2, 0.6)
+    )
     wobble = patterns.noise_field(rng, 2.0, 1.0)
     return _field("gradient", material, lambda s: 0.5 + product(s.points, axis) + 0.04 * wobble(s.points), _dirt(rng))
 
@@ -201,8 +240,11 @@ def marble(rng, color=None) -> Finish:
     color = any_color(rng) if color is None else color
     vein = any_metal(rng) if (gilded := rng.uniform() < 0.25) else near_color(rng, color, 1.0)
     roughness = rng.uniform(0.08, 0.35)
-    layers = [(0, vein, rng.uniform(0.15, 0.4), float(gilded)), (rng.uniform(0.05, 0.15), near_color(rng, color, 0.3), roughness, 0.0),
-              (0.55, color, roughness, 0.0)]
+    layers = [
+        (0, vein, rng.uniform(0.15, 0.4), float(gilded)),
+        (rng.uniform(0.05, 0.15), near_color(rng, color, 0.3), roughness, 0.0),
+        (0.55, color, roughness, 0.0),
+    ]
     field = patterns.noise_field(rng, rng.uniform(1.2, 2.5), 2.0)
     return _field("marble", _table("marble", layers, 0.04), lambda s: np.abs(field(s.points)) * 0.8, _dirt(rng))
 
@@ -280,9 +322,17 @@ def worn_paint(rng, color=None) -> Finish:
     color, bare = any_color(rng) if color is None else color, any_metal(rng)
     roughness = rng.uniform(0.2, 0.6)
     layers = [(0, color, roughness, 0.0), (0.58, color * 0.5, 0.8, 0.0), (0.63, bare, rng.uniform(0.25, 0.5), 1.0)]
-    chips, fine, amount = patterns.noise_field(rng, 3.0, 3.0), patterns.noise_field(rng, 14.0, 1.0), rng.uniform(0.6, 1.5)
-    return _field("worn paint", _table("worn paint", layers, 0.012),
-                  lambda s: 0.32 + amount * 0.3 * s.convexity() + 0.09 * chips(s.points) + 0.04 * fine(s.points), _dirt(rng))
+    chips, fine, amount = (
+        patterns.noise_field(rng, 3.0, 3.0),
+        patterns.noise_field(rng, 14.0, 1.0),
+        rng.uniform(0.6, 1.5),
+    )
+    return _field(
+        "worn paint",
+        _table("worn paint", layers, 0.012),
+        lambda s: 0.32 + amount * 0.3 * s.convexity() + 0.09 * chips(s.points) + 0.04 * fine(s.points),
+        _dirt(rng),
+    )
 
 
 def rusty(rng, color=None) -> Finish:
@@ -293,20 +343,28 @@ def rusty(rng, color=None) -> Finish:
         bare, rust = np.array(METALS["copper"]), hsv(rng.uniform(0.4, 0.47), 0.4, rng.uniform(0.5, 0.7))
     layers = [(0, bare, rng.uniform(0.2, 0.45), 1.0), (0.5, rust * 0.6, 0.8, 0.3), (0.6, rust, 0.92, 0.0)]
     field, amount = patterns.noise_field(rng, 2.0, 3.0), rng.uniform(0.25, 0.6)
-    return _field("rust", _table("rust", layers, 0.03), lambda s: amount + 0.2 * field(s.points) - 0.25 * s.points[:, 1], _dirt(rng))
+    return _field(
+        "rust",
+        _table("rust", layers, 0.03),
+        lambda s: amount + 0.2 * field(s.points) - 0.25 * s.points[:, 1],
+        _dirt(rng),
+    )
 
 
 def topped(rng, color=None, top=None) -> Finish:
     """Something on all that faces up: snow, moss, icing, dust."""
     color = any_color(rng) if color is None else color
-    top = (hsv(0.6, 0.03, 0.95) if rng.uniform() < 0.4 else hsv(rng.uniform(0.2, 0.35), 0.6, 0.5)) if top is None else top
+    top = (
+        (hsv(0.6, 0.03, 0.95) if rng.uniform() < 0.4 else hsv(rng.uniform(0.2, 0.35), 0.6, 0.5)) if top is None else top
+    )
     field = patterns.noise_field(rng, 4.0, 1.5)
     material = _table("topped", [(0, color, rng.uniform(0.4, 0.9), 0.0), (0.7, top, rng.uniform(0.7, 0.95), 0.0)], 0.04)
     return _field("topped", material, lambda s: 0.4 + 0.4 * s.normals[:, 1] + 0.06 * field(s.points), _dirt(rng))
 
 
 def gazing(rng, direction: np.ndarray, iris=None, white=None) -> Finish:
-    """An eyeball: black pupil, coloured iris, white, by the angle between the normal and `direction` (right eye's, x >= 0)."""
+    """An eyeball: black pupil, coloured iris, white, by the angle between the normal and `direction` (right eye's, x >=
+    0)."""
     iris = any_color(rng) if iris is None else iris
     white = np.array([0.9, 0.9, 0.87]) if white is None else white
     black = np.array([0.01, 0.01, 0.012])

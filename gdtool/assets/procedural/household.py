@@ -1,4 +1,5 @@
-"""Furniture, containers and tools: chairs, tables, sofas, beds, shelves, chests, cartons, books, clocks, extinguishers."""
+"""Furniture, containers and tools: chairs, tables, sofas, beds, shelves, chests, cartons, books, clocks,
+extinguishers."""
 
 from __future__ import annotations
 
@@ -7,7 +8,18 @@ import numpy as np
 from gdtool.assets.procedural import finishes, solids, tiles
 from gdtool.assets.procedural.assembly import Assembly
 from gdtool.assets.procedural.buildings import gable
-from gdtool.assets.procedural.parts import ball, box, circle, cone, cylinder, loft, refined, smooth_curve, subdivided, tube
+from gdtool.assets.procedural.parts import (
+    ball,
+    box,
+    circle,
+    cone,
+    cylinder,
+    loft,
+    refined,
+    smooth_curve,
+    subdivided,
+    tube,
+)
 
 
 def _leg(rng, height: float, size: float):
@@ -23,7 +35,10 @@ def _leg(rng, height: float, size: float):
 
 def chair(rng) -> Assembly:
     a = Assembly()
-    wood, seat = tiles.pick(rng, ["wood", "paint", "metal"][rng.integers(3)]), tiles.pick(rng, "cloth" if rng.uniform() < 0.5 else "wood")
+    wood, seat = (
+        tiles.pick(rng, ["wood", "paint", "metal"][rng.integers(3)]),
+        tiles.pick(rng, "cloth" if rng.uniform() < 0.5 else "wood"),
+    )
     w, d, leg, size = rng.uniform(0.5, 0.65), rng.uniform(0.48, 0.6), rng.uniform(0.4, 0.6), rng.uniform(0.045, 0.08)
     part = _leg(rng, leg, size)
     for z in (d / 2 - size, -d / 2 + size):
@@ -68,9 +83,13 @@ def table(rng) -> Assembly:
     for _ in range(int(rng.integers(0, 3))):  # something on it
         x, z = rng.uniform(-0.22, 0.22, 2)
         if rng.uniform() < 0.5:
-            a.add(ball(rng.uniform(0.05, 0.1), count=22).moved(x, height + thick / 2 + 0.06, z), tiles.pick(rng, "skin"))
+            a.add(
+                ball(rng.uniform(0.05, 0.1), count=22).moved(x, height + thick / 2 + 0.06, z), tiles.pick(rng, "skin")
+            )
         else:
-            a.add(cylinder(0.06, 0.2, top_radius=0.08).moved(x, height + thick / 2 + 0.1, z), tiles.pick(rng, "ceramic"))
+            a.add(
+                cylinder(0.06, 0.2, top_radius=0.08).moved(x, height + thick / 2 + 0.1, z), tiles.pick(rng, "ceramic")
+            )
     return a
 
 
@@ -81,7 +100,12 @@ def sofa(rng) -> Assembly:
     rounding = rng.uniform(0.04, 0.1)
 
     def soft(width, height, depth, x, y, z, finish, pair=False):
-        part = solids.polygonised(solids.block((0, 0, 0), (width / 2, height / 2, depth / 2), min(rounding, 0.45 * min(width, height, depth))), 30)
+        part = solids.polygonised(
+            solids.block(
+                (0, 0, 0), (width / 2, height / 2, depth / 2), min(rounding, 0.45 * min(width, height, depth))
+            ),
+            30,
+        )
         (a.add_pair if pair else a.add)(part.moved(x, y, z), finish)
 
     soft(w, 0.22, d, 0, 0.2, 0, cloth)
@@ -104,9 +128,12 @@ def bed(rng) -> Assembly:
     a.add(box(w, 0.16, d, 0.02).moved(y=0.2), wood)
     a.add(box(w, rng.uniform(0.5, 0.7), 0.07, 0.02).moved(0, 0.35, -d / 2), wood)
     a.add(box(w, rng.uniform(0.25, 0.4), 0.07, 0.02).moved(0, 0.2, d / 2), wood)
-    a.add(solids.polygonised(solids.block((0, 0.32, 0), (w * 0.47, 0.09, d * 0.48), 0.05), 40), finishes.matte(rng, finishes.hsv(0.1, 0.05, 0.9)))
+    a.add(
+        solids.polygonised(solids.block((0, 0.32, 0), (w * 0.47, 0.09, d * 0.48), 0.05), 40),
+        finishes.matte(rng, finishes.hsv(0.1, 0.05, 0.9)),
+    )
     a.add(solids.polygonised(solids.block((0, 0.34, d * 0.14), (w * 0.5, 0.1, d * 0.34), 0.06), 40), sheet)
-    for x in ([-0.22, 0.22] if w > 0.75 else [0]):
+    for x in [-0.22, 0.22] if w > 0.75 else [0]:
         a.add(ball(0.17, 0.06, 0.12, 26).moved(x, 0.44, -d * 0.34), tiles.pick(rng, "cloth"))
     return a
 
@@ -132,7 +159,10 @@ def shelf(rng) -> Assembly:
         while x < w / 2 - 0.12:
             thick, high = rng.uniform(0.04, 0.09), tall * rng.uniform(0.55, 0.85)
             if rng.uniform() < 0.85:
-                a.add(box(thick, high, d * 0.7, 0.006, 2).moved(x + thick / 2, h * k / rows + 0.02 + high / 2, 0.03), spines[rng.integers(4)])
+                a.add(
+                    box(thick, high, d * 0.7, 0.006, 2).moved(x + thick / 2, h * k / rows + 0.02 + high / 2, 0.03),
+                    spines[rng.integers(4)],
+                )
             x += thick + 0.005
     return a
 
@@ -152,20 +182,42 @@ def chest(rng) -> Assembly:
             for y in (0.04, h - 0.04):
                 a.add(box(side, 0.08, 0.05, 0.008).moved(0, y, half / 2).turned("y", turn), trim)
             if rng.uniform() < 0.7:
-                a.add(box(np.hypot(side, h) * 0.86, 0.07, 0.03, 0.006).turned("z", np.degrees(np.arctan2(h, side))).moved(0, h / 2, half / 2).turned("y", turn), trim)
+                a.add(
+                    box(np.hypot(side, h) * 0.86, 0.07, 0.03, 0.006)
+                    .turned("z", np.degrees(np.arctan2(h, side)))
+                    .moved(0, h / 2, half / 2)
+                    .turned("y", turn),
+                    trim,
+                )
     elif kind == 1:  # treasure chest
-        lid = loft(refined([(0, 0), (1, 0), (1, 1), (0, 1)], 0.12), circle(40), boxed=True).scaled(d / 2, w, d / 2).turned("z", 90).moved(w / 2, h, 0)
+        lid = (
+            loft(refined([(0, 0), (1, 0), (1, 1), (0, 1)], 0.12), circle(40), boxed=True)
+            .scaled(d / 2, w, d / 2)
+            .turned("z", 90)
+            .moved(w / 2, h, 0)
+        )
         a.add(lid, finish)
         for x in (-w * 0.35, 0, w * 0.35):
-            a.add(loft(refined([(0, 0), (1, 0), (1, 1), (0, 1)], 0.3), circle(40), boxed=True).scaled(d / 2 + 0.015, 0.07, d / 2 + 0.015).turned("z", 90).moved(x + 0.035, h, 0), trim)
+            a.add(
+                loft(refined([(0, 0), (1, 0), (1, 1), (0, 1)], 0.3), circle(40), boxed=True)
+                .scaled(d / 2 + 0.015, 0.07, d / 2 + 0.015)
+                .turned("z", 90)
+                .moved(x + 0.035, h, 0),
+                trim,
+            )
             a.add(box(0.07, h, d + 0.03, 0.006).moved(x, h / 2 + 0.01, 0), trim)
         a.add(box(0.16, 0.18, 0.07, 0.02).moved(0, h, d / 2 + 0.02), finishes.metal(rng))
     elif kind == 2:  # gift with ribbon and bow
         a.add(box(w + 0.02, h + 0.02, 0.12, 0.01).moved(y=h / 2), trim)
         a.add(box(0.12, h + 0.02, d + 0.02, 0.01).moved(y=h / 2), trim)
         t = np.linspace(0, 2 * np.pi, 30, endpoint=False)
-        for turn in ((0, 180) if rng.uniform() < 0.5 else (0, 90, 180, 270)):
-            a.add(tube(np.stack([0.14 + 0.14 * np.cos(t), h + 0.08 + 0.09 * np.sin(t), 0 * t], -1), 0.035, closed=True).turned("y", turn), trim)
+        for turn in (0, 180) if rng.uniform() < 0.5 else (0, 90, 180, 270):
+            a.add(
+                tube(
+                    np.stack([0.14 + 0.14 * np.cos(t), h + 0.08 + 0.09 * np.sin(t), 0 * t], -1), 0.035, closed=True
+                ).turned("y", turn),
+                trim,
+            )
     elif kind == 3:  # suitcase, radio or toaster: handle, corners, a dial or two
         a.add(tube(np.array([(-0.15, h, 0), (-0.14, h + 0.1, 0), (0.14, h + 0.1, 0), (0.15, h, 0)]), 0.03), trim)
         for x in (-1, 1):
@@ -176,7 +228,14 @@ def chest(rng) -> Assembly:
             a.add(box(w + 0.05, h * 0.25, d + 0.05, 0.02, 10).moved(y=h), trim)
         else:
             for turn, half, side in ((0, d, w), (180, d, w), (90, w, d), (270, w, d)):
-                a.add(box(side * 0.95, half * 0.4, 0.02, 0.004).moved(y=half * 0.2).turned("x", rng.uniform(25, 70)).moved(0, h, half / 2).turned("y", turn), finish)
+                a.add(
+                    box(side * 0.95, half * 0.4, 0.02, 0.004)
+                    .moved(y=half * 0.2)
+                    .turned("x", rng.uniform(25, 70))
+                    .moved(0, h, half / 2)
+                    .turned("y", turn),
+                    finish,
+                )
     return a
 
 
@@ -203,9 +262,13 @@ def books(rng) -> Assembly:
     for _ in range(int(rng.integers(1, 6))):
         w, d, thick, turn = rng.uniform(0.6, 0.9), rng.uniform(0.8, 1.1), rng.uniform(0.09, 0.25), rng.normal(0, 12)
         cover, page = tiles.pick(rng, "cloth"), finishes.matte(rng, finishes.hsv(0.12, 0.12, 0.92))
-        for part, finish in ((box(w, 0.03, d, 0.008).moved(y=thick), cover), (box(w, 0.03, d, 0.008), cover),
-                             (box(0.03, thick + 0.03, d, 0.01).moved(-w / 2, thick / 2), cover), (box(w * 0.95, thick, d * 0.95, 0.005).moved(y=thick / 2), page),
-                             (box(w * 0.5, 0.01, d * 0.25, 0.003).moved(0, thick + 0.016, 0), finishes.metal(rng))):
+        for part, finish in (
+            (box(w, 0.03, d, 0.008).moved(y=thick), cover),
+            (box(w, 0.03, d, 0.008), cover),
+            (box(0.03, thick + 0.03, d, 0.01).moved(-w / 2, thick / 2), cover),
+            (box(w * 0.95, thick, d * 0.95, 0.005).moved(y=thick / 2), page),
+            (box(w * 0.5, 0.01, d * 0.25, 0.003).moved(0, thick + 0.016, 0), finishes.metal(rng)),
+        ):
             a.add(part.moved(y=y + 0.015).turned("y", turn), finish)
         y += thick + 0.03
     return a
@@ -216,7 +279,17 @@ def extinguisher(rng) -> Assembly:
     a, h, r = Assembly(), rng.uniform(1.0, 1.4), rng.uniform(0.24, 0.34)
     body = tiles.pick(rng, "paint", finishes.hsv(rng.choice([0.0, 0.0, 0.1, 0.35, 0.6]), 0.85, 0.75))
     t = np.linspace(0, np.pi / 2, 10)
-    curve = np.vstack([(0, 0.02), (r * 0.9, 0), (r, 0.05), (r, h * 0.75), np.stack([0.08 + (r - 0.08) * np.cos(t), h * 0.75 + 0.2 * np.sin(t)], -1), (0.08, h), (0, h)])
+    curve = np.vstack(
+        [
+            (0, 0.02),
+            (r * 0.9, 0),
+            (r, 0.05),
+            (r, h * 0.75),
+            np.stack([0.08 + (r - 0.08) * np.cos(t), h * 0.75 + 0.2 * np.sin(t)], -1),
+            (0.08, h),
+            (0, h),
+        ]
+    )
     a.add(loft(refined(curve, 0.08), circle(48)), body)
     black, chrome = finishes.plastic(rng, np.full(3, 0.02)), finishes.metal(rng)
     a.add(cylinder(0.07, 0.16).moved(y=h + 0.05), chrome)
@@ -239,14 +312,37 @@ def clock(rng) -> Assembly:
         a.add(cylinder(r, depth, 0.04, 56).turned("x", 90).moved(y=r), case)
     else:
         a.add(box(2.3 * r, 2.3 * r, depth, 0.06).moved(y=r), case)
-    a.add(cylinder(r * 0.88, 0.06, 0.01, 56).turned("x", 90).moved(0, r, depth / 2), finishes.matte(rng, finishes.hsv(0.12, rng.uniform(0, 0.2), rng.uniform(0.75, 0.97))))
+    a.add(
+        cylinder(r * 0.88, 0.06, 0.01, 56).turned("x", 90).moved(0, r, depth / 2),
+        finishes.matte(rng, finishes.hsv(0.12, rng.uniform(0, 0.2), rng.uniform(0.75, 0.97))),
+    )
     w = 2 * np.pi * np.arange(56) / 56
-    a.add(tube(np.stack([r * 0.92 * np.cos(w), r + r * 0.92 * np.sin(w), np.full(56, depth / 2 + 0.03)], -1), 0.05, closed=True, outline=circle(12)), rim)
+    a.add(
+        tube(
+            np.stack([r * 0.92 * np.cos(w), r + r * 0.92 * np.sin(w), np.full(56, depth / 2 + 0.03)], -1),
+            0.05,
+            closed=True,
+            outline=circle(12),
+        ),
+        rim,
+    )
     dark = finishes.plastic(rng, np.full(3, 0.02))
     for k in range(12):
-        a.add(box(0.035, 0.09 if k % 3 == 0 else 0.05, 0.03, 0.006, 2).moved(y=r * 0.72).turned("z", 30 * k).moved(0, r, depth / 2 + 0.025), dark)
+        a.add(
+            box(0.035, 0.09 if k % 3 == 0 else 0.05, 0.03, 0.006, 2)
+            .moved(y=r * 0.72)
+            .turned("z", 30 * k)
+            .moved(0, r, depth / 2 + 0.025),
+            dark,
+        )
     for length, turn in ((0.5, rng.uniform(0, 360)), (0.7, rng.uniform(0, 360))):
-        a.add(box(0.04, r * length, 0.025, 0.008, 3).moved(y=r * length * 0.45).turned("z", turn).moved(0, r, depth / 2 + 0.045), dark)
+        a.add(
+            box(0.04, r * length, 0.025, 0.008, 3)
+            .moved(y=r * length * 0.45)
+            .turned("z", turn)
+            .moved(0, r, depth / 2 + 0.045),
+            dark,
+        )
     if rng.uniform() < 0.6:
         a.add_pair(ball(0.16, 0.12, 0.16, 24).turned("z", -30).moved(r * 0.55, r * 2.02, 0), rim)
         a.add_pair(cylinder(0.035, 0.3).turned("z", 25).moved(r * 0.6, 0.0, 0), rim)
@@ -258,7 +354,13 @@ def tool(rng) -> Assembly:
     a, handle, head = Assembly(), tiles.pick(rng, "wood"), tiles.pick(rng, "metal")
     length, kind = rng.uniform(0.9, 1.3), rng.integers(4)
     t = np.linspace(0, 1, 14)
-    a.add(loft(np.vstack([(0, 0), np.stack([0.05 * (1 + 0.25 * np.sin(7 * t)), t * length], -1), (0, length)]), circle(28) * np.array([1.0, 1.3])), handle)
+    a.add(
+        loft(
+            np.vstack([(0, 0), np.stack([0.05 * (1 + 0.25 * np.sin(7 * t)), t * length], -1), (0, length)]),
+            circle(28) * np.array([1.0, 1.3]),
+        ),
+        handle,
+    )
     if kind == 0:
         a.add(box(0.28, 0.2, 0.22, 0.03).moved(y=length), head)
         a.add(cylinder(0.13, 0.22).turned("z", 90).moved(0.24, length, 0), head)
@@ -270,7 +372,13 @@ def tool(rng) -> Assembly:
         a.add(box(0.5, 0.07, 0.1, 0.02).moved(y=length * 0.36), finishes.metal(rng))
         a.add(ball(0.08, count=24), finishes.metal(rng))
     elif kind == 2:
-        wedge = solids.common([solids.block((0.22, length - 0.12, 0), (0.22, 0.24, 0.07), 0.01), solids.ellipsoid((0.3, length - 0.12, 0), (0.34, 0.26, 0.075))], 0.02)
+        wedge = solids.common(
+            [
+                solids.block((0.22, length - 0.12, 0), (0.22, 0.24, 0.07), 0.01),
+                solids.ellipsoid((0.3, length - 0.12, 0), (0.34, 0.26, 0.075)),
+            ],
+            0.02,
+        )
         a.add(solids.polygonised(wedge, 46), head)
         a.add(box(0.16, 0.2, 0.15, 0.02).moved(y=length - 0.12), head)
     else:
@@ -278,5 +386,16 @@ def tool(rng) -> Assembly:
     return a
 
 
-KINDS = {"chair": chair, "table": table, "sofa": sofa, "bed": bed, "shelf": shelf, "chest": chest, "carton": carton, "books": books,
-         "extinguisher": extinguisher, "clock": clock, "tool": tool}
+KINDS = {
+    "chair": chair,
+    "table": table,
+    "sofa": sofa,
+    "bed": bed,
+    "shelf": shelf,
+    "chest": chest,
+    "carton": carton,
+    "books": books,
+    "extinguisher": extinguisher,
+    "clock": clock,
+    "tool": tool,
+}

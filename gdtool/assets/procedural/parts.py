@@ -9,7 +9,8 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Part:
-    """One closed surface. vertices (v, 3) and unit normals (v, 3), outward; faces (f, 3) counter-clockwise from outside.
+    """One closed surface. vertices (v, 3) and unit normals (v, 3), outward; faces (f, 3) counter-clockwise from
+    outside.
 
     Vertices are doubled along creases and texture seams; welded by position, every edge has exactly two faces.
     uv (v, 2): along the grid in [0, 1] when `extent` is given (the length of one unit of u and of v), otherwise a box
@@ -32,8 +33,14 @@ class Part:
         mean = float(np.abs(factors).mean())
         extent = None if self.extent is None else (self.extent[0] * mean, self.extent[1] * mean)
         uv = self.uv * mean if self.extent is None else self.uv
-        return replace(self, vertices=self.vertices * factors, normals=unit(self.normals / factors),
-                       faces=np.ascontiguousarray(faces), uv=uv, extent=extent)
+        return replace(
+            self,
+            vertices=self.vertices * factors,
+            normals=unit(self.normals / factors),
+            faces=np.ascontiguousarray(faces),
+            uv=uv,
+            extent=extent,
+        )
 
     def turned(self, axis: str, degrees: float) -> Part:
         """Rotated about the origin, right-handed, axis "x", "y" or "z"."""
@@ -76,7 +83,8 @@ def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 
 def _crease_flags(quads: np.ndarray, axis: int, wraps: bool, cosine: float) -> np.ndarray:
-    """Which grid lines across `axis` are sharp: the median angle of the quads on both sides; open ends count as sharp."""
+    """Which grid lines across `axis` are sharp: the median angle of the quads on both sides; open ends count as
+    sharp."""
     normals = unit(quads)
     cosines = np.einsum("...i,...i->...", normals, np.roll(normals, 1, axis))
     area = np.linalg.norm(quads, axis=-1)
@@ -171,8 +179,12 @@ def box_projected(part: Part) -> Part:
     x, y, z = part.vertices[source].T
     u = np.choose(side, [-z, z, x, x, x, -x])
     v = np.choose(side, [-y, -y, z, -z, -y, -y])
-    return Part(part.vertices[source], part.normals[source], inverse.reshape(part.faces.shape).astype(np.int32),
-                np.stack([u, v], -1))
+    return Part(
+        part.vertices[source],
+        part.normals[source],
+        inverse.reshape(part.faces.shape).astype(np.int32),
+        np.stack([u, v], -1),
+    )
 
 
 def circle(count: int = 40) -> np.ndarray:
@@ -182,7 +194,8 @@ def circle(count: int = 40) -> np.ndarray:
 
 
 def rectangle(width: float, depth: float, subdivisions: int = 6) -> np.ndarray:
-    """Outline (n, 2) of a rectangle about the origin; its sides are subdivided so that patterns have vertices to live on."""
+    """Outline (n, 2) of a rectangle about the origin; its sides are subdivided so that patterns have vertices to live
+    on."""
     corners = 0.5 * np.array([[width, -depth], [width, depth], [-width, depth], [-width, -depth]])
     return subdivided(corners, subdivisions)
 
@@ -212,8 +225,13 @@ def _miter(outline: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(along[:-1], knots, values[:, k]) for k in range(2)], -1)
 
 
-def loft(profile: np.ndarray, outline: np.ndarray, crease_degrees: float = 38.0, boxed: bool = False,
-         twist_degrees: float = 0.0) -> Part:
+def loft(
+    profile: np.ndarray,
+    outline: np.ndarray,
+    crease_degrees: float = 38.0,
+    boxed: bool = False,
+    twist_degrees: float = 0.0,
+) -> Part:
     """An outline (n, 2) in x and z carried up a profile of rows (scale, height) or (scale, height, inset).
 
     The first and the last row must have scale 0. inset moves the outline's sides inward by a length (bevels).
@@ -265,13 +283,17 @@ def box(width: float, height: float, depth: float, bevel: float = 0.02, subdivis
     return part.moved(y=-height / 2)
 
 
-def cylinder(radius: float, height: float, bevel: float = 0.02, count: int = 36, top_radius: float | None = None) -> Part:
+def cylinder(
+    radius: float, height: float, bevel: float = 0.02, count: int = 36, top_radius: float | None = None
+) -> Part:
     """A bevelled cylinder or truncated cone about the origin, along y."""
     top = radius if top_radius is None else top_radius
     bevel = min(bevel, 0.3 * min(radius, max(top, 1e-3)), 0.3 * height)
     h = height / 2
-    profile = refined([(0, -h), (radius - bevel, -h), (radius, -h + bevel), (top, h - bevel), (max(top - bevel, 0), h), (0, h)],
-                      max(height, radius) / 8)
+    profile = refined(
+        [(0, -h), (radius - bevel, -h), (radius, -h + bevel), (top, h - bevel), (max(top - bevel, 0), h), (0, h)],
+        max(height, radius) / 8,
+    )
     return loft(profile, circle(count))
 
 
@@ -290,7 +312,8 @@ def cone(radius: float, height: float, count: int = 32) -> Part:
 
 
 def tube(path: np.ndarray, radius: float | np.ndarray, closed: bool = False, outline: np.ndarray | None = None) -> Part:
-    """A tube of radius (k,) or one number along points (k, 3); open ends are rounded off. Parallel-transported frame."""
+    """A tube of radius (k,) or one number along points (k, 3); open ends are rounded off. Parallel-transported
+    frame."""
     path = np.asarray(path, float)
     outline = circle(16) if outline is None else outline
     radius = np.broadcast_to(np.asarray(radius, float), len(path)).copy()

@@ -25,7 +25,8 @@ def noise_field(rng: np.random.Generator, frequency: float, octaves: float = 2.0
 
 
 def cell_field(rng: np.random.Generator, count: int) -> Callable:
-    """Distances (n, 2) from points in the unit box about the origin to the nearest and second nearest of random sites."""
+    """Distances (n, 2) from points in the unit box about the origin to the nearest and second nearest of random
+    sites."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(rng.uniform(-0.55, 0.55, (count, 3)))
@@ -38,9 +39,11 @@ def tile_grid(size: int) -> tuple[np.ndarray, np.ndarray]:
     return np.meshgrid(axis, axis)
 
 
-def tile_noise(rng: np.random.Generator, size: int, low: float = 2, high: float = 64, slope: float = 1.5,
-               stretch: float = 1.0) -> np.ndarray:
-    """Tiling noise (size, size), unit variance, power between `low` and `high` cycles per tile; stretch > 1: streaks along u."""
+def tile_noise(
+    rng: np.random.Generator, size: int, low: float = 2, high: float = 64, slope: float = 1.5, stretch: float = 1.0
+) -> np.ndarray:
+    """Tiling noise (size, size), unit variance, power between `low` and `high` cycles per tile; stretch > 1: streaks
+    along u."""
     fy, fx = np.fft.fftfreq(size, 1 / size)[:, None], np.fft.rfftfreq(size, 1 / size)[None]
     frequency = np.hypot(fx * stretch, fy)
     gain = np.where((frequency >= low) & (frequency <= high), np.maximum(frequency, 1e-9) ** -slope, 0)
@@ -50,7 +53,8 @@ def tile_noise(rng: np.random.Generator, size: int, low: float = 2, high: float 
 
 
 def tile_cells(rng: np.random.Generator, size: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tiling Voronoi cells: distance to the nearest and to the second nearest site, index of the nearest (size, size)."""
+    """Tiling Voronoi cells: distance to the nearest and to the second nearest site, index of the nearest (size,
+    size)."""
     from scipy.spatial import cKDTree
 
     u, v = tile_grid(size)
@@ -65,8 +69,9 @@ def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
     return t * t * (3 - 2 * t)
 
 
-def brick_cells(rng: np.random.Generator, size: int, rows: int, columns: int, gap: float, shift: float = 0.5,
-                bevel: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
+def brick_cells(
+    rng: np.random.Generator, size: int, rows: int, columns: int, gap: float, shift: float = 0.5, bevel: float = 0.06
+) -> tuple[np.ndarray, np.ndarray]:
     """Running-bond bricks: height (size, size) in [0, 1] (0 in the joints) and a random shade per brick in [-1, 1]."""
     u, v = tile_grid(size)
     row = np.floor(v * rows).astype(int)

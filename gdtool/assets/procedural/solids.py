@@ -1,7 +1,7 @@
 """Signed distance functions, negative inside, and their closed triangle surface by marching cubes.
 
-A distance is a function of points (n, 3) float32 that returns (n,) float32; smooth blends after Quilez, "Smooth minimum".
-"""
+A distance is a function of points (n, 3) float32 that returns (n,) float32; smooth blends after Quilez, "Smooth
+minimum"."""
 
 from __future__ import annotations
 
@@ -60,7 +60,9 @@ def block(center: Sequence[float], half: Sequence[float], rounding: float = 0.02
     return distance
 
 
-def rod(center: Sequence[float], radius: float, half_length: float, axis: str = "y", rounding: float = 0.01) -> Distance:
+def rod(
+    center: Sequence[float], radius: float, half_length: float, axis: str = "y", rounding: float = 0.01
+) -> Distance:
     """A cylinder along a coordinate axis with rounded rims."""
     center, k = np.asarray(center, np.float32), "xyz".index(axis)
     others = [i for i in range(3) if i != k]
@@ -162,5 +164,6 @@ def polygonised(shape: Distance, resolution: int = 52, reach: float = 1.6) -> Pa
     normals = unit(np.stack([shape(queries + o) - shape(queries - o) for o in offsets], -1).astype(float))
     if signed_volume(vertices, faces) < 0:
         faces = faces[:, ::-1]
-    return box_projected(Part(vertices.astype(float), normals, np.ascontiguousarray(faces, dtype=np.int32),
-                              np.zeros((len(vertices), 2))))
+    return box_projected(
+        Part(vertices.astype(float), normals, np.ascontiguousarray(faces, dtype=np.int32), np.zeros((len(vertices), 2)))
+    )

@@ -32,7 +32,9 @@ def bricks(rng, color=None) -> Finish:
     joint = hsv(0.1, 0.1, rng.uniform(0.3, 0.85))
     glazed = rng.uniform() < 0.3
     roughness = 0.9 - height * (rng.uniform(0.5, 0.75) if glazed else 0.15)
-    return _tiled("bricks", _mix(joint, brick, height), 0.0, roughness, height + 0.03 * grain, 0.02, rng.uniform(1.2, 2.5))
+    return _tiled(
+        "bricks", _mix(joint, brick, height), 0.0, roughness, height + 0.03 * grain, 0.02, rng.uniform(1.2, 2.5)
+    )
 
 
 def planks(rng, color=None) -> Finish:
@@ -65,7 +67,9 @@ def shingles(rng, color=None) -> Finish:
         height = np.where(inside, 0.25 + 0.5 * fv - 0.5 * fu**2, height)
         shade = np.where(inside, shades[row % rows, column], shade)
     image = color * np.exp(0.3 * shade + 0.9 * (height - 0.5))[..., None]
-    return _tiled("shingles", image, 0.0, np.full((SIZE, SIZE), rng.uniform(0.3, 0.85)), height, 0.03, rng.uniform(1.5, 3))
+    return _tiled(
+        "shingles", image, 0.0, np.full((SIZE, SIZE), rng.uniform(0.3, 0.85)), height, 0.03, rng.uniform(1.5, 3)
+    )
 
 
 def woven(rng, color=None) -> Finish:
@@ -76,9 +80,13 @@ def woven(rng, color=None) -> Finish:
     u, v = patterns.tile_grid(SIZE)
     over = ((np.floor(u * count) + np.floor(v * count)) % 2) == 0
     warp, weft = np.abs(np.sin(np.pi * u * count)), np.abs(np.sin(np.pi * v * count))
-    height = np.where(over, weft * (0.6 + 0.4 * np.sin(np.pi * (u * count % 1))), warp * (0.6 + 0.4 * np.sin(np.pi * (v * count % 1))))
+    height = np.where(
+        over, weft * (0.6 + 0.4 * np.sin(np.pi * (u * count % 1))), warp * (0.6 + 0.4 * np.sin(np.pi * (v * count % 1)))
+    )
     image = np.where(over[..., None], color, other) * (0.45 + 0.55 * height)[..., None]
-    return _tiled("weave", image, 0.0, np.full((SIZE, SIZE), rng.uniform(0.45, 0.95)), height, 0.3 / count, rng.uniform(1.5, 3))
+    return _tiled(
+        "weave", image, 0.0, np.full((SIZE, SIZE), rng.uniform(0.45, 0.95)), height, 0.3 / count, rng.uniform(1.5, 3)
+    )
 
 
 def tartan(rng, color=None) -> Finish:
@@ -91,7 +99,9 @@ def tartan(rng, color=None) -> Finish:
         for axis in (u, v):
             image = _mix(image, band, 0.5 * (np.abs((axis - center + 0.5) % 1 - 0.5) < half))
     grain = patterns.tile_noise(rng, SIZE, 30, 120, 0.5)
-    return _tiled("tartan", image, 0.0, np.full((SIZE, SIZE), rng.uniform(0.6, 0.95)), grain, 0.002, rng.uniform(1.2, 3))
+    return _tiled(
+        "tartan", image, 0.0, np.full((SIZE, SIZE), rng.uniform(0.6, 0.95)), grain, 0.002, rng.uniform(1.2, 3)
+    )
 
 
 def hammered(rng, color=None) -> Finish:
@@ -99,7 +109,15 @@ def hammered(rng, color=None) -> Finish:
     color = any_metal(rng) if color is None else color
     near, _, _ = patterns.tile_cells(rng, SIZE, int(rng.integers(40, 160)))
     roughness = rng.uniform(0.15, 0.4) + 0.04 * patterns.tile_noise(rng, SIZE, 4, 60)
-    return _tiled("hammered", np.broadcast_to(color, (SIZE, SIZE, 3)), 1.0, roughness, near**2 / near.max() ** 2, 0.012, rng.uniform(1, 2))
+    return _tiled(
+        "hammered",
+        np.broadcast_to(color, (SIZE, SIZE, 3)),
+        1.0,
+        roughness,
+        near**2 / near.max() ** 2,
+        0.012,
+        rng.uniform(1, 2),
+    )
 
 
 def brushed(rng, color=None) -> Finish:
@@ -149,20 +167,77 @@ def dotted(rng, color=None) -> Finish:
 
 DIELECTRIC = (finishes.plastic, finishes.matte, finishes.glossy)
 THEMES = {
-    "any": (*DIELECTRIC, finishes.metal, finishes.banded, finishes.gradient, finishes.marble, finishes.blotched, finishes.spotted,
-            finishes.crackled, finishes.chequered, finishes.wooden, finishes.worn_paint, finishes.rusty, finishes.topped, bricks,
-            planks, shingles, woven, tartan, hammered, brushed, grained, dotted),
-    "ceramic": (finishes.glossy, finishes.glossy, finishes.plastic, finishes.banded, finishes.gradient, finishes.marble,
-                finishes.crackled, finishes.spotted, dotted, finishes.blotched, finishes.chequered),
-    "metal": (finishes.metal, finishes.metal, hammered, brushed, finishes.rusty, finishes.worn_paint, finishes.worn_paint),
+    "any": (
+        *DIELECTRIC,
+        finishes.metal,
+        finishes.banded,
+        finishes.gradient,
+        finishes.marble,
+        finishes.blotched,
+        finishes.spotted,
+        finishes.crackled,
+        finishes.chequered,
+        finishes.wooden,
+        finishes.worn_paint,
+        finishes.rusty,
+        finishes.topped,
+        bricks,
+        planks,
+        shingles,
+        woven,
+        tartan,
+        hammered,
+        brushed,
+        grained,
+        dotted,
+    ),
+    "ceramic": (
+        finishes.glossy,
+        finishes.glossy,
+        finishes.plastic,
+        finishes.banded,
+        finishes.gradient,
+        finishes.marble,
+        finishes.crackled,
+        finishes.spotted,
+        dotted,
+        finishes.blotched,
+        finishes.chequered,
+    ),
+    "metal": (
+        finishes.metal,
+        finishes.metal,
+        hammered,
+        brushed,
+        finishes.rusty,
+        finishes.worn_paint,
+        finishes.worn_paint,
+    ),
     "wood": (finishes.wooden, finishes.wooden, planks, finishes.matte, finishes.worn_paint),
-    "fur": (finishes.matte, finishes.blotched, finishes.spotted, finishes.banded, finishes.gradient, grained, finishes.crackled,
-            finishes.plastic, shingles),
+    "fur": (
+        finishes.matte,
+        finishes.blotched,
+        finishes.spotted,
+        finishes.banded,
+        finishes.gradient,
+        grained,
+        finishes.crackled,
+        finishes.plastic,
+        shingles,
+    ),
     "skin": (finishes.matte, finishes.plastic, finishes.gradient, finishes.spotted, grained, finishes.blotched),
     "cloth": (woven, tartan, finishes.matte, grained, dotted, finishes.banded, finishes.matte),
     "wall": (bricks, bricks, finishes.matte, planks, grained, finishes.topped, finishes.crackled),
     "roof": (shingles, shingles, planks, bricks, finishes.topped, finishes.matte, finishes.metal),
-    "paint": (finishes.plastic, finishes.glossy, finishes.worn_paint, finishes.worn_paint, finishes.gradient, brushed, finishes.metal),
+    "paint": (
+        finishes.plastic,
+        finishes.glossy,
+        finishes.worn_paint,
+        finishes.worn_paint,
+        finishes.gradient,
+        brushed,
+        finishes.metal,
+    ),
     "stone": (grained, finishes.marble, finishes.matte, bricks, finishes.topped, finishes.crackled),
 }
 

@@ -12,7 +12,13 @@ from gdtool.assets.procedural.parts import ball, box, circle, cone, cylinder, lo
 def wheels(a: Assembly, rng, x: float, y: float, zs, r: float, width: float) -> None:
     tire, hub = finishes.matte(rng, np.full(3, rng.uniform(0.01, 0.06))), finishes.metal(rng)
     t = np.linspace(-np.pi / 2, np.pi / 2, 9)
-    profile = np.vstack([(0, -width / 2), np.stack([r - 0.25 * width + 0.25 * width * np.cos(t), width / 2 * np.sin(t)], -1), (0, width / 2)])
+    profile = np.vstack(
+        [
+            (0, -width / 2),
+            np.stack([r - 0.25 * width + 0.25 * width * np.cos(t), width / 2 * np.sin(t)], -1),
+            (0, width / 2),
+        ]
+    )
     part = loft(profile, circle(36)).turned("z", 90)
     disc = cylinder(r * 0.6, width * 0.2, 0.02, 28).turned("z", 90)
     for z in zs:
@@ -28,7 +34,9 @@ def car(rng) -> Assembly:
     glass = finishes.glossy(rng, finishes.hsv(0.58, 0.3, rng.uniform(0.1, 0.4)))
     shift = rng.uniform(-0.2, 0.05)
     body = solids.block((0, 0, 0), (w, low, length), rng.uniform(0.06, 0.14))
-    roof = solids.block((0, low + cab * 0.6, shift), (w * rng.uniform(0.75, 0.92), cab, length * rng.uniform(0.35, 0.6)), 0.11)
+    roof = solids.block(
+        (0, low + cab * 0.6, shift), (w * rng.uniform(0.75, 0.92), cab, length * rng.uniform(0.35, 0.6)), 0.11
+    )
     shell = solids.blended([body, roof], rng.uniform(0.03, 0.15))
     for z in (length * 0.6, -length * 0.6):
         shell = solids.carved(shell, solids.rod((0, -low, z), r * 1.15, 2.0, "x"), 0.02)
@@ -39,10 +47,14 @@ def car(rng) -> Assembly:
     wheels(a, rng, w * 0.95, -low, (length * 0.6, -length * 0.6), r, rng.uniform(0.1, 0.15))
     lamp = finishes.glossy(rng, finishes.hsv(0.15, 0.2, 1.0))
     a.add_pair(ball(0.07, 0.06, 0.05, 20).moved(w * 0.62, 0.04, length * 0.97), lamp)
-    a.add_pair(box(0.12, 0.06, 0.05).moved(w * 0.62, 0.04, -length * 0.99), finishes.glossy(rng, finishes.hsv(0.0, 0.9, 0.7)))
+    a.add_pair(
+        box(0.12, 0.06, 0.05).moved(w * 0.62, 0.04, -length * 0.99), finishes.glossy(rng, finishes.hsv(0.0, 0.9, 0.7))
+    )
     a.add(box(w * 0.8, low * 0.5, 0.05).moved(0, -0.05, length), tiles.pick(rng, "metal"))
     for z in (length, -length):
-        a.add(box(w * 1.9, 0.07, 0.1, 0.02).moved(0, -low * 0.75, z), finishes.metal(rng) if rng.uniform() < 0.5 else dark)
+        a.add(
+            box(w * 1.9, 0.07, 0.1, 0.02).moved(0, -low * 0.75, z), finishes.metal(rng) if rng.uniform() < 0.5 else dark
+        )
     return a
 
 
@@ -59,9 +71,14 @@ def truck(rng) -> Assembly:
     a.add(box(w * 2.03, tall * 0.3, cab * 0.45).moved(0, tall * 0.68, front + 0.03), glass)
     kind = rng.integers(3)
     if kind == 0:
-        a.add(box(w * 2.1, tall * rng.uniform(0.9, 1.4), bed, 0.03, 10).moved(0, tall * 0.6, -0.08), tiles.pick(rng, "any"))
+        a.add(
+            box(w * 2.1, tall * rng.uniform(0.9, 1.4), bed, 0.03, 10).moved(0, tall * 0.6, -0.08),
+            tiles.pick(rng, "any"),
+        )
     elif kind == 1:
-        a.add(cylinder(w * 0.95, bed, 0.08, 44).turned("x", 90).moved(0, w * 0.95 + 0.05, -0.08), tiles.pick(rng, "paint"))
+        a.add(
+            cylinder(w * 0.95, bed, 0.08, 44).turned("x", 90).moved(0, w * 0.95 + 0.05, -0.08), tiles.pick(rng, "paint")
+        )
     else:
         side = tiles.pick(rng, "paint")
         a.add_pair(box(0.05, 0.28, bed).moved(w, 0.18, -0.08), side)
@@ -69,9 +86,17 @@ def truck(rng) -> Assembly:
             a.add(box(2 * w, 0.28, 0.05).moved(0, 0.18, z), side)
         load = tiles.pick(rng, "any")
         for _ in range(int(rng.integers(3, 9))):
-            a.add(ball(rng.uniform(0.1, 0.16), count=20).moved(rng.uniform(-0.6, 0.6) * w, rng.uniform(0.15, 0.35), rng.uniform(-0.35, 0.25) * bed), load)
+            a.add(
+                ball(rng.uniform(0.1, 0.16), count=20).moved(
+                    rng.uniform(-0.6, 0.6) * w, rng.uniform(0.15, 0.35), rng.uniform(-0.35, 0.25) * bed
+                ),
+                load,
+            )
     wheels(a, rng, w * 0.95, -0.05, (front, -bed * 0.2, -bed * 0.45), r, 0.12)
-    a.add_pair(ball(0.06, 0.05, 0.04, 16).moved(w * 0.65, 0.15, front + cab / 2), finishes.glossy(rng, finishes.hsv(0.15, 0.2, 1.0)))
+    a.add_pair(
+        ball(0.06, 0.05, 0.04, 16).moved(w * 0.65, 0.15, front + cab / 2),
+        finishes.glossy(rng, finishes.hsv(0.15, 0.2, 1.0)),
+    )
     a.add(box(w * 1.0, 0.14, 0.05).moved(0, 0.15, front + cab / 2), finishes.metal(rng))
     return a
 
@@ -88,7 +113,12 @@ def train(rng) -> Assembly:
     a.add(box(0.66, 0.06, 0.54, 0.02).moved(0, 0.75, -length * 0.55), paint)
     a.add(box(0.56, 0.2, 0.22).moved(0, 0.55, -length * 0.55), finishes.glossy(rng, finishes.hsv(0.58, 0.3, 0.15)))
     front = 0.15 + length / 2
-    a.add(loft(refined([(0, 0), (0.07, 0), (0.07, 0.2), (0.13, 0.3), (0.13, 0.34), (0, 0.34)], 0.05), circle(32)).moved(0, 0.3 + r * 0.8, front - 0.15), metal)
+    a.add(
+        loft(refined([(0, 0), (0.07, 0), (0.07, 0.2), (0.13, 0.3), (0.13, 0.34), (0, 0.34)], 0.05), circle(32)).moved(
+            0, 0.3 + r * 0.8, front - 0.15
+        ),
+        metal,
+    )
     a.add(ball(0.1, 0.13, None, 24).moved(0, 0.32 + r, 0.1), metal)
     a.add(cylinder(r * 0.75, 0.06, 0.02, 36).turned("x", 90).moved(0, 0.32, front), finishes.metal(rng))
     a.add(ball(0.07, count=20).moved(0, 0.32 + r * 0.9, front), finishes.glossy(rng, finishes.hsv(0.14, 0.3, 1)))
@@ -100,14 +130,28 @@ def train(rng) -> Assembly:
 def boat(rng) -> Assembly:
     a, hull = Assembly(), tiles.pick(rng, "paint" if rng.uniform() < 0.6 else "wood")
     w, length, tall = rng.uniform(0.25, 0.38), rng.uniform(0.7, 0.9), rng.uniform(0.25, 0.35)
-    body = solids.common([solids.ellipsoid((0, tall * 0.4, -0.1), (w, tall * 1.4, length)), lambda p: p[:, 1] - tall * 0.4, solids.block((0, 0, 0.12), (1, 1, length), 0.02)], 0.03)
+    body = solids.common(
+        [
+            solids.ellipsoid((0, tall * 0.4, -0.1), (w, tall * 1.4, length)),
+            lambda p: p[:, 1] - tall * 0.4,
+            solids.block((0, 0, 0.12), (1, 1, length), 0.02),
+        ],
+        0.03,
+    )
     deck = solids.ellipsoid((0, tall * 0.95, -0.1), (w * 0.85, tall, length * 0.88))
     a.add(solids.polygonised(solids.carved(body, deck, 0.02), 64), hull)
     kind = rng.integers(2)
     if kind == 0:
         mast = tiles.pick(rng, "wood")
         a.add(cylinder(0.025, 1.3).moved(0, tall * 0.4 + 0.5, 0), mast)
-        sail = solids.common([solids.ellipsoid((0.0, 0.0, 0.0), (0.62, 0.75, 0.09)), lambda p: np.abs(p[:, 1]) - 0.45, lambda p: np.abs(p[:, 0]) - 0.42], 0.03)
+        sail = solids.common(
+            [
+                solids.ellipsoid((0.0, 0.0, 0.0), (0.62, 0.75, 0.09)),
+                lambda p: np.abs(p[:, 1]) - 0.45,
+                lambda p: np.abs(p[:, 0]) - 0.42,
+            ],
+            0.03,
+        )
         cloth = tiles.pick(rng, "cloth")
         a.add(solids.polygonised(sail, 44).turned("y", rng.uniform(-60, 60)).moved(0.0, tall * 0.4 + 0.62, 0.06), cloth)
         a.add(box(0.2, 0.1, 0.01, 0.003).moved(0.1, tall * 0.4 + 1.15, 0), tiles.pick(rng, "cloth"))
@@ -115,7 +159,10 @@ def boat(rng) -> Assembly:
         y = tall * 0.3
         a.add(box(w * 1.0, 0.4, length * 0.7, 0.03).moved(0, y + 0.1, -0.15), tiles.pick(rng, "paint"))
         a.add(box(w * 0.7, 0.24, length * 0.4, 0.03).moved(0, y + 0.4, -0.1), tiles.pick(rng, "paint"))
-        a.add(box(w * 0.74, 0.08, length * 0.35, 0.01).moved(0, y + 0.44, -0.09), finishes.glossy(rng, finishes.hsv(0.58, 0.3, 0.15)))
+        a.add(
+            box(w * 0.74, 0.08, length * 0.35, 0.01).moved(0, y + 0.44, -0.09),
+            finishes.glossy(rng, finishes.hsv(0.58, 0.3, 0.15)),
+        )
         for z in (-0.15, -0.4)[: int(rng.integers(1, 3))]:
             a.add(cylinder(0.08, 0.36, top_radius=0.07).moved(0, y + 0.6, z), tiles.pick(rng, "paint"))
     return a
@@ -156,12 +203,24 @@ def rocket(rng) -> Assembly:
     a.add(loft(np.vstack([(0, nose[0, 1]), nose, (0, tall * 1.012)]), circle(48)), fin)
     count = int(rng.choice([3, 4]))
     for k in range(count):
-        a.add(ball(0.025, 0.34, 0.26, 26).turned("x", 30).moved(0, 0.12, r * 0.95).turned("y", 360 * k / count + 180 / count * (count == 4)), fin)
+        a.add(
+            ball(0.025, 0.34, 0.26, 26)
+            .turned("x", 30)
+            .moved(0, 0.12, r * 0.95)
+            .turned("y", 360 * k / count + 180 / count * (count == 4)),
+            fin,
+        )
     y = tall * 0.55
     at = np.interp(y, curve[:, 1], curve[:, 0])
     a.add(cylinder(0.13, 0.08, 0.02, 32).turned("x", 90).moved(0, y, at - 0.01), finishes.metal(rng))
-    a.add(cylinder(0.095, 0.08, 0.02, 32).turned("x", 90).moved(0, y, at + 0.01), finishes.glossy(rng, finishes.hsv(0.56, 0.5, 0.3)))
-    a.add(loft(refined([(0, -0.16), (r * 0.55, -0.16), (r * 0.4, 0.02), (0, 0.02)], 0.05), circle(36)), tiles.pick(rng, "metal"))
+    a.add(
+        cylinder(0.095, 0.08, 0.02, 32).turned("x", 90).moved(0, y, at + 0.01),
+        finishes.glossy(rng, finishes.hsv(0.56, 0.5, 0.3)),
+    )
+    a.add(
+        loft(refined([(0, -0.16), (r * 0.55, -0.16), (r * 0.4, 0.02), (0, 0.02)], 0.05), circle(36)),
+        tiles.pick(rng, "metal"),
+    )
     return a
 
 

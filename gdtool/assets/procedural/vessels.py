@@ -10,7 +10,8 @@ from gdtool.assets.procedural.parts import Part, ball, circle, cylinder, loft, r
 
 
 def walled(outer: np.ndarray, thickness: float, segments: int = 48, outline: np.ndarray | None = None) -> Part:
-    """An open vessel: outer profile rows (radius, height) from the foot's axis to the rim, returned inside at `thickness`."""
+    """An open vessel: outer profile rows (radius, height) from the foot's axis to the rim, returned inside at
+    `thickness`."""
     outer = np.asarray(outer, float)
     inner = outer[outer[:, 1] > outer[0, 1] + 1.5 * thickness]
     inner = np.stack([np.maximum(inner[:, 0] - thickness, 0.01), inner[:, 1]], -1)
@@ -32,7 +33,9 @@ def _outline(rng, plain_share: float = 0.6) -> np.ndarray:
 def body_curve(rng, height: float, foot: float, belly: float, neck: float, rim: float, count: int = 28) -> np.ndarray:
     """A random vessel contour (count, 2) through foot, belly, neck and rim radii."""
     where = np.sort(rng.uniform([0.2, 0.65], [0.5, 0.88]))
-    curve = smooth_curve([(foot, 0.02 * height), (belly, where[0] * height), (neck, where[1] * height), (rim, height)], count)
+    curve = smooth_curve(
+        [(foot, 0.02 * height), (belly, where[0] * height), (neck, where[1] * height), (rim, height)], count
+    )
     return np.vstack([(0, 0), (foot * 0.92, 0), curve])
 
 
@@ -47,7 +50,9 @@ def _handle(rng, start, end, bulge: float, radius: float) -> Part:
 
 def vase(rng) -> Assembly:
     a, height = Assembly(), rng.uniform(0.9, 1.8)
-    curve = body_curve(rng, height, rng.uniform(0.15, 0.35), rng.uniform(0.3, 0.6), rng.uniform(0.1, 0.3), rng.uniform(0.15, 0.42))
+    curve = body_curve(
+        rng, height, rng.uniform(0.15, 0.35), rng.uniform(0.3, 0.6), rng.uniform(0.1, 0.3), rng.uniform(0.15, 0.42)
+    )
     finish = tiles.pick(rng, "ceramic" if rng.uniform() < 0.7 else "any")
     part = walled(curve, 0.035, outline=_outline(rng))
     a.add(part, finish)
@@ -57,17 +62,31 @@ def vase(rng) -> Assembly:
         a.add_pair(_handle(rng, (r0, y0, 0), (r1, y1, 0), rng.uniform(0.1, 0.25), 0.035), finish)
     if rng.uniform() < 0.4:
         trim = tiles.pick(rng, "metal")
-        for y in ([height * 0.02, height] if rng.uniform() < 0.5 else [height]):
+        for y in [height * 0.02, height] if rng.uniform() < 0.5 else [height]:
             r = np.interp(y, curve[2:, 1], curve[2:, 0]) + 0.005
             angle = 2 * np.pi * np.arange(48) / 48
-            a.add(tube(np.stack([r * np.cos(angle), np.full(48, y), r * np.sin(angle)], -1), 0.028, closed=True, outline=circle(10)), trim)
+            a.add(
+                tube(
+                    np.stack([r * np.cos(angle), np.full(48, y), r * np.sin(angle)], -1),
+                    0.028,
+                    closed=True,
+                    outline=circle(10),
+                ),
+                trim,
+            )
     return a
 
 
 def bottle(rng) -> Assembly:
     a, height, r = Assembly(), rng.uniform(1.2, 1.9), rng.uniform(0.22, 0.42)
     neck, shoulder = r * rng.uniform(0.25, 0.5), rng.uniform(0.5, 0.7)
-    knots = [(r, 0.04), (r, height * shoulder * 0.8), (r * 0.95, height * shoulder), (neck, height * (shoulder + 0.16)), (neck * 0.95, height)]
+    knots = [
+        (r, 0.04),
+        (r, height * shoulder * 0.8),
+        (r * 0.95, height * shoulder),
+        (neck, height * (shoulder + 0.16)),
+        (neck * 0.95, height),
+    ]
     curve = np.vstack([(0, 0), (r * 0.9, 0), smooth_curve(knots, 36), (0, height)])
     square = rng.uniform() < 0.3
     outline = np.sign(circle(48)) * np.abs(circle(48)) ** 0.45 if square else circle(48)
@@ -85,17 +104,41 @@ def cup(rng) -> Assembly:
     a, height = Assembly(), rng.uniform(0.7, 1.2)
     rim = rng.uniform(0.35, 0.5)
     foot = rim * rng.uniform(0.55, 1.0)
-    curve = np.vstack([(0, 0), (foot * 0.93, 0), smooth_curve([(foot, 0.03), ((foot + rim) / 2 * rng.uniform(0.95, 1.12), height * 0.5), (rim, height)], 20)])
+    curve = np.vstack(
+        [
+            (0, 0),
+            (foot * 0.93, 0),
+            smooth_curve([(foot, 0.03), ((foot + rim) / 2 * rng.uniform(0.95, 1.12), height * 0.5), (rim, height)], 20),
+        ]
+    )
     finish = tiles.pick(rng, "ceramic" if rng.uniform() < 0.75 else "any")
     a.add(walled(curve, 0.04), finish)
     handle = finish if rng.uniform() < 0.7 else tiles.pick(rng, "ceramic")
-    a.add(_handle(rng, (foot * 0.98, height * 0.2, 0), (rim * 0.95, height * 0.82, 0), rng.uniform(0.18, 0.3), rng.uniform(0.035, 0.05)), handle)
+    a.add(
+        _handle(
+            rng,
+            (foot * 0.98, height * 0.2, 0),
+            (rim * 0.95, height * 0.82, 0),
+            rng.uniform(0.18, 0.3),
+            rng.uniform(0.035, 0.05),
+        ),
+        handle,
+    )
     if rng.uniform() < 0.6:
         inner = np.interp(height * 0.85, curve[2:, 1], curve[2:, 0]) - 0.03
-        a.add(cylinder(inner, 0.03, count=48).moved(y=height * 0.85), finishes.glossy(rng, finishes.hsv(rng.uniform(0.03, 0.12), 0.7, rng.uniform(0.15, 0.8))))
+        a.add(
+            cylinder(inner, 0.03, count=48).moved(y=height * 0.85),
+            finishes.glossy(rng, finishes.hsv(rng.uniform(0.03, 0.12), 0.7, rng.uniform(0.15, 0.8))),
+        )
     if rng.uniform() < 0.3:
         r = rim * 1.7
-        a.add(loft(refined([(0, -0.06), (r * 0.5, -0.06), (r, 0.03), (r, 0.06), (r * 0.5, -0.02), (0, -0.02)], 0.06), circle(48)), finish)
+        a.add(
+            loft(
+                refined([(0, -0.06), (r * 0.5, -0.06), (r, 0.03), (r, 0.06), (r * 0.5, -0.02), (0, -0.02)], 0.06),
+                circle(48),
+            ),
+            finish,
+        )
     return a
 
 
@@ -110,8 +153,26 @@ def teapot(rng) -> Assembly:
     a.add(loft(refined(np.vstack([(0, 0), (curve[0, 0] * 0.95, 0), curve, (0, height)]), 0.07), circle(56)), finish)
     lid = finish if rng.uniform() < 0.6 else tiles.pick(rng, "ceramic")
     dome = rng.uniform(0.08, 0.22)
-    a.add(loft(refined([(0, height - 0.02), (top * 1.04, height - 0.02), (top * 1.04, height + 0.02), (top * 0.75, height + dome * 0.7), (0, height + dome)], 0.05), circle(40)), lid)
-    a.add(ball(rng.uniform(0.06, 0.1), rng.uniform(0.06, 0.12), None, 20).moved(y=height + dome + 0.05), lid if rng.uniform() < 0.5 else tiles.pick(rng, "wood"))
+    a.add(
+        loft(
+            refined(
+                [
+                    (0, height - 0.02),
+                    (top * 1.04, height - 0.02),
+                    (top * 1.04, height + 0.02),
+                    (top * 0.75, height + dome * 0.7),
+                    (0, height + dome),
+                ],
+                0.05,
+            ),
+            circle(40),
+        ),
+        lid,
+    )
+    a.add(
+        ball(rng.uniform(0.06, 0.1), rng.uniform(0.06, 0.12), None, 20).moved(y=height + dome + 0.05),
+        lid if rng.uniform() < 0.5 else tiles.pick(rng, "wood"),
+    )
     side = 1 if rng.uniform() < 0.5 else -1
     t = np.linspace(0, 1, 18)
     y0, y1 = height * rng.uniform(0.25, 0.45), height * rng.uniform(0.85, 1.1)
@@ -121,22 +182,41 @@ def teapot(rng) -> Assembly:
     if kettle:
         bow = np.linspace(-0.1, np.pi + 0.1, 26)
         rise = height + rng.uniform(0.25, 0.5)
-        a.add(tube(np.stack([r * 0.75 * np.cos(bow), height * 0.8 + (rise - height * 0.8) * np.sin(bow), 0 * bow], -1), 0.045), handle)
+        a.add(
+            tube(
+                np.stack([r * 0.75 * np.cos(bow), height * 0.8 + (rise - height * 0.8) * np.sin(bow), 0 * bow], -1),
+                0.045,
+            ),
+            handle,
+        )
     else:
-        a.add(_handle(rng, (r * 0.9, height * 0.2, 0), (r * 0.8, height * 0.8, 0), rng.uniform(0.25, 0.4), 0.05).scaled(-side, 1, 1), handle)
+        a.add(
+            _handle(rng, (r * 0.9, height * 0.2, 0), (r * 0.8, height * 0.8, 0), rng.uniform(0.25, 0.4), 0.05).scaled(
+                -side, 1, 1
+            ),
+            handle,
+        )
     return a
 
 
 def bowl(rng) -> Assembly:
     a, height, rim = Assembly(), rng.uniform(0.25, 0.6), rng.uniform(0.5, 0.7)
     foot = rim * rng.uniform(0.3, 0.6)
-    curve = np.vstack([(0, 0), (foot, 0), smooth_curve([(foot * 1.02, 0.03), (rim * 0.85, height * 0.5), (rim, height)], 20)])
+    curve = np.vstack(
+        [(0, 0), (foot, 0), smooth_curve([(foot * 1.02, 0.03), (rim * 0.85, height * 0.5), (rim, height)], 20)]
+    )
     a.add(walled(curve, 0.04, outline=_outline(rng)), tiles.pick(rng, "ceramic" if rng.uniform() < 0.6 else "any"))
-    fruit = [tiles.pick(rng, "skin", finishes.hsv(h, 0.85, 0.85)) for h in rng.choice([0.0, 0.02, 0.09, 0.15, 0.25, 0.3, 0.8], 3)]
+    fruit = [
+        tiles.pick(rng, "skin", finishes.hsv(h, 0.85, 0.85))
+        for h in rng.choice([0.0, 0.02, 0.09, 0.15, 0.25, 0.3, 0.8], 3)
+    ]
     for _ in range(int(rng.integers(0, 8))):
         size, angle, reach = rng.uniform(0.12, 0.2), rng.uniform(0, 2 * np.pi), rng.uniform(0, rim * 0.55)
         y = height * (0.75 + 0.5 * (1 - reach / rim))
-        a.add(ball(size, size * rng.uniform(0.85, 1.1), None, 24).moved(reach * np.cos(angle), y, reach * np.sin(angle)), fruit[rng.integers(3)])
+        a.add(
+            ball(size, size * rng.uniform(0.85, 1.1), None, 24).moved(reach * np.cos(angle), y, reach * np.sin(angle)),
+            fruit[rng.integers(3)],
+        )
     return a
 
 
@@ -144,12 +224,24 @@ def goblet(rng) -> Assembly:
     a, height = Assembly(), rng.uniform(1.2, 1.8)
     base, stem, rim = rng.uniform(0.3, 0.42), rng.uniform(0.04, 0.09), rng.uniform(0.28, 0.45)
     knot = rng.uniform(0.35, 0.5) * height
-    curve = smooth_curve([(base, 0.04), (stem * 1.6, 0.12 * height), (stem, 0.25 * height), (stem * rng.uniform(1, 2.6), 0.32 * height),
-                          (stem * 1.2, knot), (rim * rng.uniform(0.9, 1.2), knot + 0.25 * height), (rim, height)], 48)
+    curve = smooth_curve(
+        [
+            (base, 0.04),
+            (stem * 1.6, 0.12 * height),
+            (stem, 0.25 * height),
+            (stem * rng.uniform(1, 2.6), 0.32 * height),
+            (stem * 1.2, knot),
+            (rim * rng.uniform(0.9, 1.2), knot + 0.25 * height),
+            (rim, height),
+        ],
+        48,
+    )
     outer = np.vstack([(0, 0), (base, 0), curve])
     inside = curve[curve[:, 1] > knot + 0.08 * height][::-1] - np.array([0.035, 0])
     profile = np.vstack([outer, inside[inside[:, 0] > 0.02], (0, knot + 0.1 * height)])
-    a.add(loft(refined(profile, 0.08), _outline(rng, 0.8)), tiles.pick(rng, "metal" if rng.uniform() < 0.6 else "ceramic"))
+    a.add(
+        loft(refined(profile, 0.08), _outline(rng, 0.8)), tiles.pick(rng, "metal" if rng.uniform() < 0.6 else "ceramic")
+    )
     return a
 
 
@@ -177,10 +269,32 @@ def candle(rng) -> Assembly:
         r, tall = rng.uniform(0.08, 0.13), rng.uniform(0.4, 0.8)
         a.add(cylinder(r, tall).moved(x, y + tall / 2 + 0.05, 0), wax)
         a.add(ball(0.04, 0.09, 0.04, 16).moved(x, y + tall + 0.13, 0), flame)
-        a.add(loft(refined([(0, y), (r * 1.3, y), (r * 1.7, y + 0.08), (r * 1.6, y + 0.1), (0, y + 0.05)], 0.05), circle(32)), stand)
+        a.add(
+            loft(
+                refined([(0, y), (r * 1.3, y), (r * 1.7, y + 0.08), (r * 1.6, y + 0.1), (0, y + 0.05)], 0.05),
+                circle(32),
+            ),
+            stand,
+        )
         if x:
             a.add(tube(np.array([(0, 0.25, 0), (x * 0.6, 0.3, 0), (x, 0.38, 0), (x, 0.52, 0)]), 0.035), stand)
-    a.add(loft(refined(np.vstack([(0, 0), (0.32, 0), smooth_curve([(0.32, 0.04), (0.08, 0.12), (0.05, 0.3), (0.07, 0.5)], 20), (0, 0.52)]), 0.07), circle(40)), stand)
+    a.add(
+        loft(
+            refined(
+                np.vstack(
+                    [
+                        (0, 0),
+                        (0.32, 0),
+                        smooth_curve([(0.32, 0.04), (0.08, 0.12), (0.05, 0.3), (0.07, 0.5)], 20),
+                        (0, 0.52),
+                    ]
+                ),
+                0.07,
+            ),
+            circle(40),
+        ),
+        stand,
+    )
     if count == 3:
         a.add(cylinder(0.045, 0.25).moved(y=0.58), stand)
     return a
@@ -192,18 +306,50 @@ def barrel(rng) -> Assembly:
     bulge = r * rng.uniform(1.0, 1.25)
     theme = ["wood", "paint", "ceramic", "metal"][rng.integers(4)]
     curve = smooth_curve([(r, 0.02), (bulge, height / 2), (r, height - 0.02)], 22)
-    a.add(loft(refined(np.vstack([(0, 0.04), (r * 0.9, 0.04), (r * 0.93, 0), curve, (r * 0.93, height), (r * 0.9, height - 0.04), (0, height - 0.04)]), 0.07), circle(48)),
-          tiles.pick(rng, theme))
+    a.add(
+        loft(
+            refined(
+                np.vstack(
+                    [
+                        (0, 0.04),
+                        (r * 0.9, 0.04),
+                        (r * 0.93, 0),
+                        curve,
+                        (r * 0.93, height),
+                        (r * 0.9, height - 0.04),
+                        (0, height - 0.04),
+                    ]
+                ),
+                0.07,
+            ),
+            circle(48),
+        ),
+        tiles.pick(rng, theme),
+    )
     hoop = tiles.pick(rng, "metal")
     for share in ([0.12, 0.3, 0.7, 0.88], [0.2, 0.8], [0.33, 0.66], [])[rng.integers(4)]:
         at = np.interp(share * height, curve[:, 1], curve[:, 0]) + 0.012
         profile = [(0, -0.035), (at, -0.035), (at, 0.035), (0, 0.035)]
         a.add(loft(refined(profile, 0.08), circle(48)).moved(y=share * height), hoop)
     if rng.uniform() < 0.4:
-        a.add(loft(refined([(0, 0), (r * 1.08, 0), (r * 1.08, 0.06), (r * 0.5, 0.12), (0, 0.13)], 0.06), circle(48)).moved(y=height - 0.01), tiles.pick(rng, theme))
+        a.add(
+            loft(
+                refined([(0, 0), (r * 1.08, 0), (r * 1.08, 0.06), (r * 0.5, 0.12), (0, 0.13)], 0.06), circle(48)
+            ).moved(y=height - 0.01),
+            tiles.pick(rng, theme),
+        )
         a.add(ball(0.08, 0.07, None, 20).moved(y=height + 0.16), hoop)
     return a
 
 
-KINDS = {"vase": vase, "bottle": bottle, "cup": cup, "teapot": teapot, "bowl": bowl, "goblet": goblet, "lamp": lamp,
-         "candle": candle, "barrel": barrel}
+KINDS = {
+    "vase": vase,
+    "bottle": bottle,
+    "cup": cup,
+    "teapot": teapot,
+    "bowl": bowl,
+    "goblet": goblet,
+    "lamp": lamp,
+    "candle": candle,
+    "barrel": barrel,
+}

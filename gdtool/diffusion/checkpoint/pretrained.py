@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.checkpoint.weights import load_stable_diffusion
+from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.network.tensors import pretrained_part, read_tensors
 
 

@@ -16,25 +16,37 @@ from gdtool.diffusion.network.tensors import NO_MODEL, read_tensors, require_wei
 WEIGHTS = "model.safetensors"
 BYTES_TO_LOAD = 10  # held for each weight while a model is read: 2 in the file, 4 of the float32 copy, 4 of the network
 OTHER_WEIGHTS = "give the config.json that these weights were trained with"
-OTHER_START = 'set "pretrained" to a Stable Diffusion 1 of that structure, such as lambdalabs/sd-image-variations-diffusers'
+OTHER_START = (
+    'set "pretrained" to a Stable Diffusion 1 of that structure, such as lambdalabs/sd-image-variations-diffusers'
+)
 
 
 def check_shapes(path: Path, tensors: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> None:
-    """Raise InputError that names the first tensor that is missing, unknown, of another shape or not of floating-point numbers."""
+    """Raise InputError that names the first tensor that is missing, unknown, of another shape or not of floating-point
+    numbers."""
     for name, tensor in wanted.items():
         if name not in tensors:
             raise InputError(path, f"lacks tensor {name}", OTHER_WEIGHTS)
         if tensors[name].shape != tensor.shape:
-            raise InputError(path, f"tensor {name} has shape {tuple(tensors[name].shape)}, the configuration needs {tuple(tensor.shape)}", OTHER_WEIGHTS)
+            raise InputError(
+                path,
+                f"tensor {name} has shape {tuple(tensors[name].shape)}, the configuration needs {tuple(tensor.shape)}",
+                OTHER_WEIGHTS,
+            )
         if not tensors[name].is_floating_point():
-            raise InputError(path, f"tensor {name} holds {str(tensors[name].dtype).removeprefix('torch.')}, no floating-point numbers", "save it as float16 or float32")
+            raise InputError(
+                path,
+                f"tensor {name} holds {str(tensors[name].dtype).removeprefix('torch.')}, no floating-point numbers",
+                "save it as float16 or float32",
+            )
     unknown = sorted(set(tensors) - set(wanted))
     if unknown:
         raise InputError(path, f"holds a tensor {unknown[0]} that the configuration does not know", OTHER_WEIGHTS)
 
 
 def read_config(path: Path) -> ModelConfig:
-    """The configuration in a model folder's config.json. Raises InputError that names the field, and what it has to be."""
+    """The configuration in a model folder's config.json. Raises InputError that names the field, and what it has to
+    be."""
     if not path.exists():
         raise InputError(path, "does not exist", NO_MODEL)
     return configured(read_json(path), path)
@@ -45,11 +57,14 @@ def configured(fields: object, subject: object) -> ModelConfig:
     try:
         return msgspec.convert(fields, ModelConfig)
     except msgspec.ValidationError as error:
-        raise InputError(subject, str(error), "correct that field, or copy the file again from where the model came") from None
+        raise InputError(
+            subject, str(error), "correct that field, or copy the file again from where the model came"
+        ) from None
 
 
 def require_room(config: ModelConfig, bytes_per_weight: int, subject: object) -> Model:
-    """The network's structure without numbers. Raises ResourceError where its weights would take more memory than there is.
+    """The network's structure without numbers. Raises ResourceError where its weights would take more memory than there
+    is.
 
     bytes_per_weight: what is held for each weight, for example BYTES_TO_LOAD.
     """
@@ -62,9 +77,8 @@ def require_room(config: ModelConfig, bytes_per_weight: int, subject: object) ->
 def load_model(folder: Path) -> Model:
     """The Model of a folder, in evaluation mode, float32.
 
-    Raises InputError for what is wrong with its files, ResourceError where it does not fit in memory. Nothing of the size of
-    its weights is allocated before the configuration and the weights are known to fit one another.
-    """
+    Raises InputError for what is wrong with its files, ResourceError where it does not fit in memory. Nothing of the
+    size of its weights is allocated before the configuration and the weights are known to fit one another."""
     config = read_config(folder / "config.json")
     wanted = require_room(config, BYTES_TO_LOAD, folder).state_dict()
     tensors, _ = read_tensors(folder / WEIGHTS)
@@ -99,8 +113,11 @@ def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
             grown[:, : tensor.shape[1]] = tensor
             tensor = grown
         if tensor.shape != target.shape:
-            raise InputError("pretrained weights", f"tensor {name} has shape {tuple(tensor.shape)}, needed is {tuple(target.shape)}", OTHER_START)
+            raise InputError(
+                "pretrained weights",
+                f"tensor {name} has shape {tuple(tensor.shape)}, needed is {tuple(target.shape)}",
+                OTHER_START,
+            )
         own[name] = tensor
     unet.load_state_dict(own)
     return sorted(set(own) - set(tensors))
-

@@ -25,8 +25,12 @@ from gdtool.diffusion.network.tensors import read_tensors
 EXTENT = 192 / 256
 UNET = "unet/diffusion_pytorch_model.safetensors"
 NEAREST_NORMAL = 3**0.5 - 1  # from white (1, 1, 1), encoded, to the nearest unit normal
-LEGACY = ((".attn_joint_twice.", ".attn_joint_mid."), (".norm_joint_twice.", ".norm_joint_mid."),
-          (".attn_joint.", ".attn_joint_last."), (".norm_joint.", ".norm_joint_last."))
+LEGACY = (
+    (".attn_joint_twice.", ".attn_joint_mid."),
+    (".norm_joint_twice.", ".norm_joint_mid."),
+    (".attn_joint.", ".attn_joint_last."),
+    (".norm_joint.", ".norm_joint_last."),
+)
 
 
 OTHER_FOLDER = "give a Wonder3D v1 folder, or a model folder of gdtool train"
@@ -71,35 +75,68 @@ def read_config(folder: Path, tensors: dict[str, torch.Tensor]) -> ModelConfig:
     path = folder / "unet" / "config.json"
     own = _read(path, _UNet)
     scheduler = _read(folder / "scheduler" / "scheduler_config.json", _Scheduler)
-    facts = {"in_channels": (own.in_channels, 8), "class_embed_type": (own.class_embed_type, "projection"),
-             "projection_class_embeddings_input_dim": (own.projection_class_embeddings_input_dim, WONDER3D_LABEL_WIDTH),
-             "beta_schedule": (scheduler.beta_schedule, "scaled_linear"), "prediction_type": (scheduler.prediction_type, "epsilon")}
+    facts = {
+        "in_channels": (own.in_channels, 8),
+        "class_embed_type": (own.class_embed_type, "projection"),
+        "projection_class_embeddings_input_dim": (own.projection_class_embeddings_input_dim, WONDER3D_LABEL_WIDTH),
+        "beta_schedule": (scheduler.beta_schedule, "scaled_linear"),
+        "prediction_type": (scheduler.prediction_type, "epsilon"),
+    }
     for name, (found, wanted) in facts.items():
         if found != wanted:
             raise InputError(path, f"has {name} {found!r}, Wonder3D {wanted!r}", OTHER_FOLDER)
     if not isinstance(own.attention_head_dim, int):
         raise InputError(path, "has another number of heads at each level", OTHER_FOLDER)
-    return configured({
-        "image_size": 8 * own.sample_size, "domains": ("color", "normal"), "codec": "vae", "condition_alpha": False, "mirror_back": False,
-        "channels": own.block_out_channels, "attention_levels": ["CrossAttn" in kind for kind in own.down_block_types],
-        "layers_per_block": own.layers_per_block, "heads": own.attention_head_dim, "norm_groups": own.norm_num_groups, "feed_forward": 4,
-        "time_scale_shift": False, "position_embedding": False, "condition_skip": False, "multi_view": own.multiview_attention,
-        "cross_domain": "joint_last" if any(".attn_joint_last." in name for name in tensors) else "joint", "convention": "wonder3d",
-        "encoder": "clip", "encoder_width": own.cross_attention_dim, "prediction": "epsilon", "noise_schedule": "scaled_linear",
-        "backgrounds": ("white",), "pretrained": str(folder)}, path)
+    return configured(
+        {
+            "image_size": 8 * own.sample_size,
+            "domains": ("color", "normal"),
+            "codec": "vae",
+            "condition_alpha": False,
+            "mirror_back": False,
+            "channels": own.block_out_channels,
+            "attention_levels": ["CrossAttn" in kind for kind in own.down_block_types],
+            "layers_per_block": own.layers_per_block,
+            "heads": own.attention_head_dim,
+            "norm_groups": own.norm_num_groups,
+            "feed_forward": 4,
+            "time_scale_shift": False,
+            "position_embedding": False,
+            "condition_skip": False,
+            "multi_view": own.multiview_attention,
+            "cross_domain": "joint_last" if any(".attn_joint_last." in name for name in tensors) else "joint",
+            "convention": "wonder3d",
+            "encoder": "clip",
+            "encoder_width": own.cross_attention_dim,
+            "prediction": "epsilon",
+            "noise_schedule": "scaled_linear",
+            "backgrounds": ("white",),
+            "pretrained": str(folder),
+        },
+        path,
+    )
 
 
 def load(folder: Path):
-    """The Model of a published folder, in evaluation mode, float32. Every tensor is used, and none is missing, else InputError."""
+    """The Model of a published folder, in evaluation mode, float32. Every tensor is used, and none is missing, else
+    InputError."""
     if _read(folder / "unet" / "config.json", _UNet).in_channels == 4:
-        raise InputError(folder, "is a Stable Diffusion that makes single pictures, such as Image Variations: a training starts from it, it has no views",
-                         "give a model folder of gdtool train, or Wonder3D's; gdtool train --preset paper trains one from it")
+        raise InputError(
+            folder,
+            "is a Stable Diffusion that makes single pictures, such as Image Variations: a training starts from it, it has no views",
+            "give a model folder of gdtool train, or Wonder3D's; gdtool train --preset paper trains one from it",
+        )
     if not (folder / UNET).is_file() and not list((folder / "unet").glob("*.bin")):
-        raise InputError(folder / UNET, "does not exist", "where the hub has pickles alone: hf download ID --local-dir DIR && "
-                         "python -m gdtool.diffusion.convert DIR, then give DIR as the model")
+        raise InputError(
+            folder / UNET,
+            "does not exist",
+            "where the hub has pickles alone: hf download ID --local-dir DIR && "
+            "python -m gdtool.diffusion.convert DIR, then give DIR as the model",
+        )
     tensors, _ = read_tensors(folder / UNET)
     for part, name in (("vae", "diffusion_pytorch_model"), ("image_encoder", "model")):
-        read_tensors(folder / part / f"{name}.safetensors")  # a pickle or a damaged file is named before a library opens it
+        # A pickle or a damaged file is named before a library opens it.
+        read_tensors(folder / part / f"{name}.safetensors")
     tensors = {renamed(name): tensor.float() for name, tensor in tensors.items()}
     config = read_config(folder, tensors)
     check_shapes(folder / UNET, tensors, require_room(config, BYTES_TO_LOAD, folder).unet.state_dict())
@@ -111,8 +148,8 @@ def load(folder: Path):
 def premultiplied_normals(x: torch.Tensor) -> torch.Tensor:
     """Normals (…, 3, h, w) in [-1, 1] over white -> times coverage, as our models give them.
 
-    Coverage m leaves m |n - 1| of the distance to white, at least 0.73 m for a unit normal n: what is nearer is an edge.
-    """
+    Coverage m leaves m |n - 1| of the distance to white, at least 0.73 m for a unit normal n: what is nearer is an
+    edge."""
     m = ((x - 1).norm(dim=-3, keepdim=True) / NEAREST_NORMAL).clamp(0, 1)
     n = (x - (1 - m)) / m.clamp_min(1e-3)
     return m * n / n.norm(dim=-3, keepdim=True).clamp_min(1e-6)

@@ -27,13 +27,20 @@ MANIFEST = "manifest.json"
 MAX_MEMBERS = 1 << 24  # of an archive: some 300,000 objects of 50 files
 MAX_OBJECT_MEMBERS = 20_000  # of one views folder: 1000 views of seven pictures each fit twice
 MAX_OBJECT_BYTES = 16 << 30  # unpacked, of one views folder: what lies on the disk at a time
-# Of a compressed archive, unpacked over packed: PNG and EXR are packed already, and padding with zeros gives some 20 for the smallest pictures.
+# Of a compressed archive, unpacked over packed: PNG and EXR are packed already, and padding with zeros gives some 20
+# for the smallest pictures.
 MAX_RATIO = 200
 MIN_JUDGED_BYTES = 64 << 20  # unpacked; below it a ratio says nothing and harms nothing
 MAX_HEADER_BYTES = 1 << 20  # of an extended header (long names, PAX records), which is read whole
 
 _PACK = "pack it again with tar, plain or compressed"
-_EXTENDED = (tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE)
+_EXTENDED = (
+    tarfile.GNUTYPE_LONGNAME,
+    tarfile.GNUTYPE_LONGLINK,
+    tarfile.XHDTYPE,
+    tarfile.XGLTYPE,
+    tarfile.SOLARIS_XHDTYPE,
+)
 _BLOCK = 1 << 20  # bytes copied at a time
 
 
@@ -51,9 +58,8 @@ def placed(member: str) -> tuple[str, str]:
 def object_count(archive: Path) -> int:
     """How many views folders a .tar holds; reads its headers only.
 
-    Raises InputError for what is no whole tar of regular files with names that stay inside, ResourceError for more members or
-    bytes than the limits above.
-    """
+    Raises InputError for what is no whole tar of regular files with names that stay inside, ResourceError for more
+    members or bytes than the limits above."""
     with _opened_tar(archive) as tar:
         count = sum(placed(member.name)[1] == MANIFEST for member in _members(archive, tar))
     if not count:
@@ -64,8 +70,8 @@ def object_count(archive: Path) -> int:
 def views_of(archive: Path, workspace: Path) -> Iterator[Folder]:
     """The views folders of a .tar in their order, each unpacked under workspace and removed again.
 
-    An object's members must stand together, as tar and WebDataset write them. Each header is judged before its content is
-    unpacked. Raises InputError and ResourceError as object_count(), OutputError where workspace cannot be written.
+    An object's members must stand together, as tar and WebDataset write them. Each header is judged before its content
+    is unpacked. Raises InputError and ResourceError as object_count(), OutputError where workspace cannot be written.
     """
     root = Path(tempfile.mkdtemp(dir=workspace, prefix="unpacked-"))
     try:
@@ -81,8 +87,11 @@ def views_of(archive: Path, workspace: Path) -> Iterator[Folder]:
                     current, count, size = name, 0, 0
                 count, size = count + 1, size + member.size
                 if count > MAX_OBJECT_MEMBERS or size > MAX_OBJECT_BYTES:
-                    raise ResourceError(archive, f"would unpack more than {MAX_OBJECT_MEMBERS:,} files or {MAX_OBJECT_BYTES >> 30} GiB for {shown(name)}",
-                                        "render fewer or smaller views of one object")
+                    raise ResourceError(
+                        archive,
+                        f"would unpack more than {MAX_OBJECT_MEMBERS:,} files or {MAX_OBJECT_BYTES >> 30} GiB for {shown(name)}",
+                        "render fewer or smaller views of one object",
+                    )
                 target = path_inside(_place(root, name, archive), relative, archive, "member", byte_escapes=True)
                 _unpack(archive, tar, member, target)
             if current is not None:
@@ -92,7 +101,8 @@ def views_of(archive: Path, workspace: Path) -> Iterator[Folder]:
 
 
 class _LongHeader(Exception):
-    """An extended header claims more than MAX_HEADER_BYTES; no error of tarfile's, which it would take for another format."""
+    """An extended header claims more than MAX_HEADER_BYTES; no error of tarfile's, which it would take for another
+    format."""
 
 
 class _BoundedHeader(tarfile.TarInfo):
@@ -125,7 +135,16 @@ def _malformed(archive: Path) -> Iterator[None]:
         yield
     except _LongHeader as error:
         raise InputError(archive, str(error), _PACK) from None
-    except (tarfile.TarError, EOFError, OSError, zlib.error, lzma.LZMAError, RecursionError, ValueError, OverflowError) as error:
+    except (
+        tarfile.TarError,
+        EOFError,
+        OSError,
+        zlib.error,
+        lzma.LZMAError,
+        RecursionError,
+        ValueError,
+        OverflowError,
+    ) as error:
         fact = " ".join(str(error).split())[:80] or type(error).__name__
         if "could not be opened successfully" in fact:  # tarfile goes on with each format's reason
             fact = "it is in no format that tarfile knows"
@@ -133,7 +152,8 @@ def _malformed(archive: Path) -> Iterator[None]:
 
 
 def _members(archive: Path, tar: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
-    """The regular files of an archive, each judged by its header: its name, its kind, and what it adds to the limits."""
+    """The regular files of an archive, each judged by its header: its name, its kind, and what it adds to the
+    limits."""
     packed, count, size = max(os.stat(archive).st_size, 1), 0, 0
     while True:
         with _malformed(archive):
@@ -142,12 +162,18 @@ def _members(archive: Path, tar: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
             return
         tar.members.clear()  # tarfile keeps each header otherwise
         if member.issparse():
-            raise InputError(archive, f"holds the sparse file {shown(member.name)}", "pack it again without sparse files")
+            raise InputError(
+                archive, f"holds the sparse file {shown(member.name)}", "pack it again without sparse files"
+            )
         count, size = count + 1, size + member.size + tarfile.BLOCKSIZE
         if count > MAX_MEMBERS:
             raise ResourceError(archive, f"holds more than {MAX_MEMBERS:,} members", "split it into several archives")
         if size > MIN_JUDGED_BYTES and size > MAX_RATIO * packed:
-            raise ResourceError(archive, f"would unpack to more than {size / 2**30:.1f} GiB, {size // packed} times its own size", "pack it uncompressed")
+            raise ResourceError(
+                archive,
+                f"would unpack to more than {size / 2**30:.1f} GiB, {size // packed} times its own size",
+                "pack it uncompressed",
+            )
         if not member.isfile():
             continue
         relative_parts(member.name, archive, "member", byte_escapes=True)
@@ -179,7 +205,8 @@ def _unpack(archive: Path, tar: tarfile.TarFile, member: tarfile.TarInfo, target
 
 
 def _place(root: Path, name: str, archive: Path) -> Path:
-    """The folder under root that an object is unpacked into: called by its name, which data.py takes for the object's."""
+    """The folder under root that an object is unpacked into: called by its name, which data.py takes for the
+    object's."""
     safe = archive.stem if name == "." else name.replace("/", "_").replace("..", "_")
     fault = name_fault(safe, byte_escapes=True)
     if fault:
@@ -190,5 +217,7 @@ def _place(root: Path, name: str, archive: Path) -> Path:
 def _opened(archive: Path, root: Path, name: str) -> Folder:
     folder = _place(root, name, archive)
     if not (folder / MANIFEST).is_file():
-        raise InputError(archive, f"has {shown(name)} in pieces, or without its manifest", "pack each views folder as one")
+        raise InputError(
+            archive, f"has {shown(name)} in pieces, or without its manifest", "pack each views folder as one"
+        )
     return open_folder(folder, ("views",), "train", check=False)

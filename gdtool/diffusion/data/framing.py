@@ -35,12 +35,13 @@ def whole_frame(image: np.ndarray, size: int) -> np.ndarray:
     side = max(h, w)
     square = np.zeros((side, side, 4), np.float32)
     top, left = (side - h) // 2, (side - w) // 2
-    square[top: top + h, left: left + w] = image
+    square[top : top + h, left : left + w] = image
     return _resample(square, 0.0, 0.0, float(side), size)
 
 
 def _resample(image: np.ndarray, x0: float, y0: float, side: float, size: int) -> np.ndarray:
-    """The square of the picture with corner (x0, y0) and the given side, in pixels, at (size, size); outside: transparent."""
+    """The square of the picture with corner (x0, y0) and the given side, in pixels, at (size, size); outside:
+    transparent."""
     import torch
     import torch.nn.functional as F
 

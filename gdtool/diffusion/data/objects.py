@@ -76,17 +76,27 @@ def decode_object(folder: Folder, config: ModelConfig) -> tuple[np.ndarray, np.n
     missing = [name for name in config.views if name not in views.names]
     lacking = [domain for domain in config.domains if domain not in views.images]
     if missing or lacking:
-        raise InputError(folder.path, f"lacks {', '.join(missing + lacking)}", "render it again with the default rig and all domains")
+        raise InputError(
+            folder.path, f"lacks {', '.join(missing + lacking)}", "render it again with the default rig and all domains"
+        )
     order = [views.names.index(name) for name in config.views]
     size, own = config.image_size, views.mask.shape[-1]
     if views.mask.shape[-2] != own or own % size:
-        raise InputError(folder.path, f"has views of {own} px, not a multiple of the model's {size}", f"run gdtool render-dataset --size {size}")
+        raise InputError(
+            folder.path,
+            f"has views of {own} px, not a multiple of the model's {size}",
+            f"run gdtool render-dataset --size {size}",
+        )
     planes = planes_from_images({d: x[order] for d, x in views.images.items()}, views.mask[order])
     front = np.concatenate([views.images["color"][order[0]], views.mask[order[0]][..., None]], -1)
     extent = bounding_side(front[..., 3]) / own
     conditions = [condition_plane(front)]
     for path in sorted(folder.path.glob("condition/*.png")):
-        image = read_image(path_inside(folder.path, f"condition/{path.name}", folder.path / MANIFEST, "condition image", byte_escapes=True))
+        image = read_image(
+            path_inside(
+                folder.path, f"condition/{path.name}", folder.path / MANIFEST, "condition image", byte_escapes=True
+            )
+        )
         image = image.astype(np.float32) / np.iinfo(image.dtype).max
         if image.ndim == 3 and image.shape[2] == 4 and image[..., 3].max() > 0.5:
             image = np.concatenate([linear_from_srgb(image[..., :3]), image[..., 3:]], -1)
@@ -107,8 +117,9 @@ def bounding_side(alpha: np.ndarray) -> float:
     return float(max(np.ptp(rows), np.ptp(columns)) + 1) if len(rows) else float(alpha.shape[0])
 
 
-def decode_dataset(folders: Iterable[Folder], count: int, config: ModelConfig, cache: Path, conditions: int = 5,
-                   warn=lambda text: None) -> Objects:
+def decode_dataset(
+    folders: Iterable[Folder], count: int, config: ModelConfig, cache: Path, conditions: int = 5, warn=lambda text: None
+) -> Objects:
     """Decode views folders into cache (kept between runs) and map the arrays.
 
     An object that cannot be used is left out with a warning. conditions: most condition images kept per object; objects
@@ -116,10 +127,16 @@ def decode_dataset(folders: Iterable[Folder], count: int, config: ModelConfig, c
     """
     h, k = config.image_size, len(config.views)
     names_file = cache / "objects.json"
-    files = {"planes": ((k, PLANE_COUNT, h, h), np.uint8), "conditions": ((conditions, 4, h, h), np.uint8), "lights": ((LIGHTS, 7), np.float32)}
+    files = {
+        "planes": ((k, PLANE_COUNT, h, h), np.uint8),
+        "conditions": ((conditions, 4, h, h), np.uint8),
+        "lights": ((LIGHTS, 7), np.float32),
+    }
     if not names_file.is_file():
-        arrays = {name: np.lib.format.open_memmap(cache / f"{name}.npy", "w+", dtype, (count, *shape))
-                  for name, (shape, dtype) in files.items()}
+        arrays = {
+            name: np.lib.format.open_memmap(cache / f"{name}.npy", "w+", dtype, (count, *shape))
+            for name, (shape, dtype) in files.items()
+        }
         names: list[str] = []
         for folder in folders:
             try:
@@ -161,13 +178,24 @@ def object_order(count: int, step: int, batch: int, seed: int) -> np.ndarray:
     return np.array([orders[epoch][position % count] for epoch, position in zip(epochs, positions, strict=True)])
 
 
-def draw(objects: Objects, idx: np.ndarray, config: ModelConfig, train: TrainConfig, generators: Sequence[np.random.Generator]) -> Batch:
-    """Batch of the objects idx with random condition images, mirrored and with permuted color channels; a generator each."""
+def draw(
+    objects: Objects,
+    idx: np.ndarray,
+    config: ModelConfig,
+    train: TrainConfig,
+    generators: Sequence[np.random.Generator],
+) -> Batch:
+    """Batch of the objects idx with random condition images, mirrored and with permuted color channels; a generator
+    each."""
     planes, rgba, lights = [], [], []
     for i, generator in zip(idx, generators, strict=True):
         tilted = generator.random() < train.tilted and objects.conditions.shape[1] > 1
         pick = int(generator.integers(1, objects.conditions.shape[1])) if tilted else 0
-        one = (from_bytes(objects.planes[i]), from_bytes(objects.conditions[i, pick]), torch.from_numpy(np.array(objects.lights[i])))
+        one = (
+            from_bytes(objects.planes[i]),
+            from_bytes(objects.conditions[i, pick]),
+            torch.from_numpy(np.array(objects.lights[i])),
+        )
         if train.mirror and generator.random() < 0.5:
             one = mirror(*one, config.views)
         if train.hue:
@@ -189,11 +217,12 @@ def mirror(planes, rgba, light, views: tuple[str, ...]):
 
 
 def permute_colors(planes, rgba, light, order):
-    """Permute red, green and blue of color, albedo, condition and light: light transport is the same for each channel."""
+    """Permute red, green and blue of color, albedo, condition and light: light transport is the same for each
+    channel."""
     planes, rgba, light = planes.clone(), rgba.clone(), light.clone()
     for domain in ("color", "albedo"):
         start = PLANES[domain].start
-        planes[:, start: start + 3] = planes[:, [start + int(j) for j in order]]
+        planes[:, start : start + 3] = planes[:, [start + int(j) for j in order]]
     rgba[:3] = rgba[[int(j) for j in order]]
     light[:, 4:] = light[:, [4 + int(j) for j in order]]
     return planes, rgba, light

@@ -1,11 +1,11 @@
 """Whether a model knows what a framed picture shows: plain figures of the picture against their range over the training
 pictures, and figures of what the model made of it against what is usual.
 
-The image encoder's own features do not tell (photographs of anything lie among the training objects, whose own tail reaches
-far further), so the picture's figures are ones that a user can read and act upon. They seldom tell either: how unsure a model
-is shows in its result (docs/benchmarks/model_doubt.md). One step of sampling answers with the middle of all outlines it holds
-possible, and that is a blur; and it may lose parts, whose rows the picture fills and the other views do not.
-"""
+The image encoder's own features do not tell (photographs of anything lie among the training objects, whose own tail
+reaches far further), so the picture's figures are ones that a user can read and act upon. They seldom tell either: how
+unsure a model is shows in its result (docs/benchmarks/model_doubt.md). One step of sampling answers with the middle of
+all outlines it holds possible, and that is a blur; and it may lose parts, whose rows the picture fills and the other
+views do not."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ FILE = "pictures.json"  # in a model folder
 TAIL = 0.005  # share of the training pictures left out at each end
 MARGIN = 0.1  # of the range, added at each end
 # Figures of a result (result_figures) and what one of them, and the usual most of it, says to the user.
-DOUBTS = {"outline_blur": "their outlines are blurred over {:.1f} pixels, {:.1f} at most is usual",
-          "row_mismatch": "they begin or end at another height than the picture, in {:.1%} of the frame, {:.1%} at most is usual"}
+DOUBTS = {
+    "outline_blur": "their outlines are blurred over {:.1f} pixels, {:.1f} at most is usual",
+    "row_mismatch": "they begin or end at another height than the picture, in {:.1%} of the frame, {:.1%} at most is usual",
+}
 
 
 class PictureRange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -40,13 +42,26 @@ def picture_figures(rgba: np.ndarray) -> dict[str, float]:
     color = 0.5 + 0.5 * rgba[:3] / np.maximum(alpha, 1e-3)
     grey = color.mean(0)
     # neighbours that are both inside: texture, and how much of the box's outline the subject has
-    steps = [(np.abs(np.diff(grey, axis=a)), np.take(inside, range(1, inside.shape[a]), a) & np.take(inside, range(inside.shape[a] - 1), a)) for a in (0, 1)]
-    texture = np.concatenate([step[both] for step, both in steps]) if any(both.any() for _, both in steps) else np.zeros(1)
+    steps = [
+        (
+            np.abs(np.diff(grey, axis=a)),
+            np.take(inside, range(1, inside.shape[a]), a) & np.take(inside, range(inside.shape[a] - 1), a),
+        )
+        for a in (0, 1)
+    ]
+    texture = (
+        np.concatenate([step[both] for step, both in steps]) if any(both.any() for _, both in steps) else np.zeros(1)
+    )
     outline = sum(int(np.diff(inside, axis=a).sum()) for a in (0, 1))
-    return {"share of the frame that the subject fills": float(inside.mean()), "share of its bounding box that the subject fills": float(inside.sum() / (height * width)),
-            "width over height of the subject": float(width / height), "length of the outline over that of the bounding box": float(outline / (2 * (height + width))),
-            "mean brightness": float(grey[inside].mean()), "spread of the brightness": float(grey[inside].std()),
-            "difference between neighbouring pixels": float(texture.mean())}
+    return {
+        "share of the frame that the subject fills": float(inside.mean()),
+        "share of its bounding box that the subject fills": float(inside.sum() / (height * width)),
+        "width over height of the subject": float(width / height),
+        "length of the outline over that of the bounding box": float(outline / (2 * (height + width))),
+        "mean brightness": float(grey[inside].mean()),
+        "spread of the brightness": float(grey[inside].std()),
+        "difference between neighbouring pixels": float(texture.mean()),
+    }
 
 
 def ranges(conditions) -> dict[str, PictureRange]:
@@ -73,12 +88,11 @@ def unfamiliar(rgba: np.ndarray, known: dict[str, PictureRange]) -> list[str]:
 def result_figures(coverage: np.ndarray, front: int | None = None, alpha: np.ndarray | None = None) -> dict[str, float]:
     """How unsure a model was of the views that the picture does not show: the figures in DOUBTS.
 
-    coverage (k, h, w) in [0, 1], as the model made it; front: the view whose silhouette the picture's coverage alpha (h, w) is,
-    without it all views count, and only outline_blur is told. outline_blur: width in pixels of the ramp from 0 to 1 across the
-    outlines, over which m (1 - m) adds up to a sixth of the width; their length is counted along rows and columns.
-    row_mismatch: views side by side, upright and orthographic, fill the same rows; how far each row's greatest coverage is
-    from that of the picture's row, mean over all rows of the frame.
-    """
+    coverage (k, h, w) in [0, 1], as the model made it; front: the view whose silhouette the picture's coverage alpha
+    (h, w) is, without it all views count, and only outline_blur is told. outline_blur: width in pixels of the ramp from
+    0 to 1 across the outlines, over which m (1 - m) adds up to a sixth of the width; their length is counted along rows
+    and columns. row_mismatch: views side by side, upright and orthographic, fill the same rows; how far each row's
+    greatest coverage is from that of the picture's row, mean over all rows of the frame."""
     unseen = np.asarray([view for k, view in enumerate(coverage) if k != front], np.float64)
     inside = unseen > 0.5
     length = sum(int(np.diff(inside, axis=a).sum()) for a in (1, 2))
@@ -89,8 +103,8 @@ def result_figures(coverage: np.ndarray, front: int | None = None, alpha: np.nda
 
 
 def limits(results: list[dict[str, float]], alarms: float) -> dict[str, PictureRange]:
-    """Ranges of a result's figures, all up to one quantile: the lowest at which at most the share `alarms` of these results
-    leaves one of them."""
+    """Ranges of a result's figures, all up to one quantile: the lowest at which at most the share `alarms` of these
+    results leaves one of them."""
     columns = np.array([[one[name] for name in DOUBTS] for one in results])  # (n, figures)
     for quantile in np.linspace(1 - alarms, 1, 101):
         high = np.quantile(columns, quantile, axis=0)
@@ -101,8 +115,11 @@ def limits(results: list[dict[str, float]], alarms: float) -> dict[str, PictureR
 
 def doubts(result: dict[str, float], known: dict[str, PictureRange]) -> list[str]:
     """What of a result's figures lies above the usual, in words; empty where nothing does."""
-    return [words.format(result[name], known[name].high) for name, words in DOUBTS.items()
-            if name in result and name in known and result[name] > known[name].high]
+    return [
+        words.format(result[name], known[name].high)
+        for name, words in DOUBTS.items()
+        if name in result and name in known and result[name] > known[name].high
+    ]
 
 
 def write_ranges(path: Path, known: dict[str, PictureRange]) -> None:
@@ -110,7 +127,8 @@ def write_ranges(path: Path, known: dict[str, PictureRange]) -> None:
 
 
 def read_ranges(folder: Path) -> dict[str, PictureRange]:
-    """What a model folder says of its training pictures; nothing for one that does not. Raises InputError when damaged."""
+    """What a model folder says of its training pictures; nothing for one that does not. Raises InputError when
+    damaged."""
     from gdtool.core.errors import InputError
     from gdtool.core.reading import read_json
 

@@ -1,10 +1,10 @@
-"""The picture's outline in the guessed views: what the picture shows and another view leaves no room for is drawn into it.
+"""The picture's outline in the guessed views: what the picture shows and another view leaves no room for is drawn into
+it.
 
 Of the object's outline from the front everything is known; of the others a model makes a guess, from which thin parts
-(ribbons, arms, spires) fade first. A part of the picture behind which the other outlines have no common point is put where
-they come nearest to having one and where the front view's depth has it, as thick as it is wide up to a bound, and every
-view shows it there.
-"""
+(ribbons, arms, spires) fade first. A part of the picture behind which the other outlines have no common point is put
+where they come nearest to having one and where the front view's depth has it, as thick as it is wide up to a bound, and
+every view shows it there."""
 
 from __future__ import annotations
 
@@ -28,8 +28,9 @@ LEAST_FACING = 0.2  # cosine: what a view shows faces it
 
 @dataclass(frozen=True)
 class Part:
-    """Pixels (row, column) of the known view, each (n,), the depth of the part's middle behind them and half its thickness
-    there, world units; outward (n, 3): unit, to the nearest outline; lost (n,): where no other outline leaves room."""
+    """Pixels (row, column) of the known view, each (n,), the depth of the part's middle behind them and half its
+    thickness there, world units; outward (n, 3): unit, to the nearest outline; lost (n,): where no other outline leaves
+    room."""
 
     row: np.ndarray
     column: np.ndarray
@@ -39,7 +40,9 @@ class Part:
     lost: np.ndarray
 
 
-def lost_part(soft: np.ndarray, mask: np.ndarray, cameras: list[Camera], known: int, depth: np.ndarray | None) -> Part | None:
+def lost_part(
+    soft: np.ndarray, mask: np.ndarray, cameras: list[Camera], known: int, depth: np.ndarray | None
+) -> Part | None:
     """What the mask of the known view shows and the other masks (k, h, w) leave no room for; None for nothing.
 
     soft (k, h, w): coverage as the model guessed it. depth (h, w): of the known view, where there is one.
@@ -79,7 +82,9 @@ def lost_part(soft: np.ndarray, mask: np.ndarray, cameras: list[Camera], known: 
     at = np.nonzero(zone)
     down, right = np.gradient(gaussian_filter(within, 1.0))
     outward = down[at][:, None] * camera.world_from_camera[:3, 1] - right[at][:, None] * camera.world_from_camera[:3, 0]
-    return Part(*at, middle[at], half[at], outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9), lost[at])
+    return Part(
+        *at, middle[at], half[at], outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9), lost[at]
+    )
 
 
 def grown_masks(part: Part, mask: np.ndarray, cameras: list[Camera], known: int) -> np.ndarray:
@@ -93,8 +98,8 @@ def grown_masks(part: Part, mask: np.ndarray, cameras: list[Camera], known: int)
 
 
 def draw_part(part: Part, images: dict[str, np.ndarray], mask: np.ndarray, cameras: list[Camera], known: int) -> None:
-    """Put the part into the images (k, h, w[, c]) of all domains, in place: the known view's own values, at the depth at
-    which each view sees it, with the normals of a rod along the part.
+    """Put the part into the images (k, h, w[, c]) of all domains, in place: the known view's own values, at the depth
+    at which each view sees it, with the normals of a rod along the part.
 
     mask (k, h, w): before the part was drawn.
     """
@@ -115,8 +120,8 @@ def draw_part(part: Part, images: dict[str, np.ndarray], mask: np.ndarray, camer
 
 
 def _shown(part: Part, shape: tuple[int, int], cameras: list[Camera], known: int, k: int) -> tuple[np.ndarray, ...]:
-    """Pixels (row, column) of view k in which the part is nearest to it; its depth there, its normal (n, 3), and which of
-    the part's pixels it is."""
+    """Pixels (row, column) of view k in which the part is nearest to it; its depth there, its normal (n, 3), and which
+    of the part's pixels it is."""
     camera = cameras[known]
     steps = np.linspace(-1.0, 1.0, 2 * int(np.ceil(part.half.max() / camera.pixel_size)) * PER_PIXEL + 1)
     start = backproject(camera, np.zeros(shape))[part.row, part.column]
@@ -132,4 +137,10 @@ def _shown(part: Part, shape: tuple[int, int], cameras: list[Camera], known: int
     source, across = chosen // len(steps), steps[chosen % len(steps)][:, None]
     normal = part.outward[source] * np.sqrt(1 - across**2) - across * camera.backward
     normal += cameras[k].backward * np.maximum(LEAST_FACING - normal @ cameras[k].backward, 0.0)[:, None]
-    return flat // shape[1], flat % shape[1], depth[chosen], normal / np.linalg.norm(normal, axis=1, keepdims=True), source
+    return (
+        flat // shape[1],
+        flat % shape[1],
+        depth[chosen],
+        normal / np.linalg.norm(normal, axis=1, keepdims=True),
+        source,
+    )

@@ -1,10 +1,10 @@
 """The picture's paint in the albedo of the view that shows it.
 
-A model gives that view's color, which is the picture, whole, and of the albedo's contrast about half. What color there is
-over albedo is light, and light on a distant-lit surface depends on the normal, smoothly: so the albedo is the color times a
-factor that is, around each pixel, as linear in the normal as the model's own. That would make paint of highlights and
-shadows too. How far the color's detail is paint is told by the model: where its albedo has none of it, nothing is changed.
-"""
+A model gives that view's color, which is the picture, whole, and of the albedo's contrast about half. What color there
+is over albedo is light, and light on a distant-lit surface depends on the normal, smoothly: so the albedo is the color
+times a factor that is, around each pixel, as linear in the normal as the model's own. That would make paint of
+highlights and shadows too. How far the color's detail is paint is told by the model: where its albedo has none of it,
+nothing is changed."""
 
 from __future__ import annotations
 
@@ -12,23 +12,34 @@ import numpy as np
 
 from gdtool.images.detail import DARK, detail_gain, guided, masked_mean
 
-# On held-out and real models: of detail whose gain is less in the model's albedo the true one has next to none, of what has more, all.
+# On held-out and real models: of detail whose gain is less in the model's albedo the true one has next to none, of what
+# has more, all.
 LIGHT, PAINT = 0.3, 0.5
-WIDTH, LEAST = 6.0, 0.005  # pixels and squared normals: over which light is linear in the normal, and what says nothing of it
+# Pixels and squared normals: over which light is linear in the normal, and what says nothing of it.
+WIDTH, LEAST = 6.0, 0.005
 
 
-def repainted(albedo: np.ndarray, color: np.ndarray, mask: np.ndarray, normal: np.ndarray | None = None,
-              metallic: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The albedo (h, w, 3), linear, with the paint that color (h, w, 3), linear, shows; and how far it was changed (h, w), 0 to 1.
+def repainted(
+    albedo: np.ndarray,
+    color: np.ndarray,
+    mask: np.ndarray,
+    normal: np.ndarray | None = None,
+    metallic: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The albedo (h, w, 3), linear, with the paint that color (h, w, 3), linear, shows; and how far it was changed (h,
+    w), 0 to 1.
 
-    mask (h, w) coverage, normal (h, w, 3) unit, metallic (h, w): what a metal shows is what it mirrors. Without normals light
-    is taken to be as smooth as the detail is not.
-    """
+    mask (h, w) coverage, normal (h, w, 3) unit, metallic (h, w): what a metal shows is what it mirrors. Without normals
+    light is taken to be as smooth as the detail is not."""
     seen, own = (np.log(np.clip(image, 0, None) + DARK, dtype=np.float64) for image in (color, albedo))
     gain = np.clip((detail_gain(seen, own, mask) - LIGHT) / (PAINT - LIGHT), 0, 1)
     share = np.where(mask > 0, gain * gain * (3 - 2 * gain), 0) * (1 if metallic is None else 1 - metallic)
     if not share.any():
         return albedo, share
     factor = own - seen
-    factor = masked_mean(factor, mask, WIDTH / 2) if normal is None else guided(factor, normal.astype(np.float64), mask, WIDTH, LEAST)
+    factor = (
+        masked_mean(factor, mask, WIDTH / 2)
+        if normal is None
+        else guided(factor, normal.astype(np.float64), mask, WIDTH, LEAST)
+    )
     return np.clip(np.exp(own + share[..., None] * (seen + factor - own)) - DARK, 0, 1).astype(np.float32), share

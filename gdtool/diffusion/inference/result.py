@@ -6,59 +6,72 @@ import numpy as np
 import torch
 
 from gdtool.cameras import Camera, project
-from gdtool.diffusion.network.encoding import coverage, decode
 from gdtool.diffusion.inference.familiarity import result_figures
 from gdtool.diffusion.inference.outline import draw_part, grown_masks, lost_part
 from gdtool.diffusion.inference.paint import repainted
+from gdtool.diffusion.network.encoding import coverage, decode
 from gdtool.fields.views.prepared_view import backproject
 from gdtool.folders.views import Views
 
-# The model's coverage at which outlines overlap the true ones most, at no cost in color; at one half they hold 4 % too little.
+# The model's coverage at which outlines overlap the true ones most, at no cost in color; at one half they hold 4 % too
+# little.
 OUTLINE = 0.45
-# Metal or not: the power by which a model's leaning is taken for its answer. From 3 on nothing is gained on held-out objects; edges stay soft.
+# Metal or not: the power by which a model's leaning is taken for its answer. From 3 on nothing is gained on held-out
+# objects; edges stay soft.
 DECIDED = 4
 
 
 def sharpen(mask: torch.Tensor) -> torch.Tensor:
-    """A model's coverage is soft where it is unsure of the outline; a real outline is a pixel wide: twice the slope there."""
+    """A model's coverage is soft where it is unsure of the outline; a real outline is a pixel wide: twice the slope
+    there."""
     return ((mask - OUTLINE) * 2 + 0.5).clamp(0, 1)
 
 
 def decided(metallic: torch.Tensor) -> torch.Tensor:
     """Metallic in [0, 1] nearer to 0 or 1, whichever it was nearer to: the odds to the power DECIDED.
 
-    A material is a metal or is none; what a model puts between says how sure it is, and is nearest on average at neither.
-    """
+    A material is a metal or is none; what a model puts between says how sure it is, and is nearest on average at
+    neither."""
     yes, no = metallic**DECIDED, (1 - metallic) ** DECIDED
     return yes / (yes + no)
 
 
 def tied(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
-    """Coverage (k, h, w), where two orthographic cameras face one another the mean of both: they see one outline, mirrored."""
+    """Coverage (k, h, w), where two orthographic cameras face one another the mean of both: they see one outline,
+    mirrored."""
     out, facing = soft.clone(), np.diag([-1.0, 1.0, -1.0])  # the other's axes, as seen from a camera
     for k, camera in enumerate(cameras):
         for other, opposite in enumerate(cameras):
             if camera.projection == opposite.projection == "orthographic" and np.allclose(
-                    camera.world_from_camera[:3, :3] @ facing, opposite.world_from_camera[:3, :3], atol=1e-6):
+                camera.world_from_camera[:3, :3] @ facing, opposite.world_from_camera[:3, :3], atol=1e-6
+            ):
                 out[k] = (soft[k] + soft[other].flip(-1)) / 2
     return out
 
 
 def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera]) -> np.ndarray:
-    """Depth (k, h, w) with no point farther out than the outline of any other view, coverage (k, h, w), in that point's row.
+    """Depth (k, h, w) with no point farther out than the outline of any other view, coverage (k, h, w), in that point's
+    row.
 
-    A point is moved along its ray, within the camera's range. Of orthographic cameras of one size that stand upright side
-    by side, whose rows are at one height: one view's rays run along another's rows.
-    """
+    A point is moved along its ray, within the camera's range. Of orthographic cameras of one size that stand upright
+    side by side, whose rows are at one height: one view's rays run along another's rows."""
     out, (height, width) = depth.astype(np.float64), mask.shape[1:]
     for k, camera in enumerate(cameras):
         inside = mask[k] > 0.5
         for j, other in enumerate(cameras):
             right, up = other.world_from_camera[:3, :2].T
-            per_depth = -float(camera.backward @ right) / other.pixel_size if other.projection == "orthographic" else 0.0
-            upright = camera.projection == "orthographic" and np.allclose(camera.world_from_camera[:3, 1], up, atol=1e-6)
-            if abs(per_depth) * other.pixel_size < 0.3 or not upright or abs((camera.position - other.position) @ up) > 1e-6 \
-                    or camera.pixel_size != other.pixel_size:
+            per_depth = (
+                -float(camera.backward @ right) / other.pixel_size if other.projection == "orthographic" else 0.0
+            )
+            upright = camera.projection == "orthographic" and np.allclose(
+                camera.world_from_camera[:3, 1], up, atol=1e-6
+            )
+            if (
+                abs(per_depth) * other.pixel_size < 0.3
+                or not upright
+                or abs((camera.position - other.position) @ up) > 1e-6
+                or camera.pixel_size != other.pixel_size
+            ):
                 continue
             shown = (mask[j] > 0.5).any(1)
             first, last = _begin(mask[j]), width - _begin(mask[j][:, ::-1])
@@ -71,18 +84,24 @@ def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera
 
 
 def _begin(mask: np.ndarray) -> np.ndarray:
-    """Column (h,) at which each row's coverage (h, w) first passes one half, between the centres of two pixels; 0 where it never does."""
+    """Column (h,) at which each row's coverage (h, w) first passes one half, between the centres of two pixels; 0 where
+    it never does."""
     row, first = np.arange(len(mask)), (mask > 0.5).argmax(1)
     inner, outer = mask[row, first], np.where(first > 0, mask[row, first - 1], 0.0)
     return np.where(inner > 0.5, first + 0.5 - (inner - 0.5) / np.maximum(inner - outer, 1e-6), 0.0)
 
 
-def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], background: float, domains: tuple[str, ...],
-                      picture_alpha: np.ndarray | None = None) -> tuple[Views, dict[str, float]]:
-    """Encoded images (k, 3, h, w) of one object -> Views of the asked domains with one mask per view, shared by all, and a
-    report: drawn_share of the picture that the other views left no room for (outline.py), and they show now;
-    painted_share of it whose albedo was given the picture's contrast (paint.py); and how unsure the model was of the other
-    views, outline_blur in pixels and row_mismatch (familiarity.result_figures).
+def views_from_images(
+    images: dict[str, torch.Tensor],
+    cameras: list[Camera],
+    background: float,
+    domains: tuple[str, ...],
+    picture_alpha: np.ndarray | None = None,
+) -> tuple[Views, dict[str, float]]:
+    """Encoded images (k, 3, h, w) of one object -> Views of the asked domains with one mask per view, shared by all,
+    and a report: drawn_share of the picture that the other views left no room for (outline.py), and they show now;
+    painted_share of it whose albedo was given the picture's contrast (paint.py); and how unsure the model was of the
+    other views, outline_blur in pixels and row_mismatch (familiarity.result_figures).
 
     picture_alpha (h, w): coverage of the framed picture. It is the front view's silhouette, and mirrored the back's
     (both orthographic), so neither is guessed; the front color, nearly the picture itself, is divided by it.
@@ -100,11 +119,15 @@ def views_from_images(images: dict[str, torch.Tensor], cameras: list[Camera], ba
             elif camera.name == "front":
                 mask[k] = known
                 if "color" in images:
-                    values["color"][k] = decode({"color": images["color"][k]}, torch.from_numpy(known), background)["color"]
+                    values["color"][k] = decode({"color": images["color"][k]}, torch.from_numpy(known), background)[
+                        "color"
+                    ]
     part, before, names = None, mask, [camera.name for camera in cameras]
     front = names.index("front") if picture_alpha is not None and "front" in names else None
     if front is not None:
-        part = lost_part(soft.numpy(), mask, cameras, front, values["depth"][front].numpy() if "depth" in images else None)
+        part = lost_part(
+            soft.numpy(), mask, cameras, front, values["depth"][front].numpy() if "depth" in images else None
+        )
     if part is not None:
         mask = grown_masks(part, mask, cameras, front)
     out = {}

@@ -8,8 +8,8 @@ from contextlib import nullcontext
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.config import DOMAINS
+from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.encoding import BACKGROUND, MIRRORED_VIEW, encode_condition, mirrored
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.network.schedule import sample
@@ -22,22 +22,42 @@ def precision_context(device: torch.device | str, precision: str):
 
 
 @torch.no_grad()
-def sample_images(model: Model, rgba: torch.Tensor, *, domains: tuple[str, ...] = DOMAINS, steps: int = 8, guidance: float = 1.0,
-                  guided_from: float = 0.0, guided_to: float = 1.0, seed: int = 0, scheduler: str = "ddim", precision: str = "float32", mirror: bool | None = None,
-                  progress: Callable = lambda iterable, total, label: iterable) -> dict[str, torch.Tensor]:
+def sample_images(
+    model: Model,
+    rgba: torch.Tensor,
+    *,
+    domains: tuple[str, ...] = DOMAINS,
+    steps: int = 8,
+    guidance: float = 1.0,
+    guided_from: float = 0.0,
+    guided_to: float = 1.0,
+    seed: int = 0,
+    scheduler: str = "ddim",
+    precision: str = "float32",
+    mirror: bool | None = None,
+    progress: Callable = lambda iterable, total, label: iterable,
+) -> dict[str, torch.Tensor]:
     """Sample every view of the domains for a batch of objects.
 
     rgba (b, 4, h, w): framed condition, premultiplied and encoded (data.condition_plane). Returns domain to encoded
-    images (b, k, 3, h, w) over the first of the configuration's backgrounds. Noise depends on seed alone: neither on the
-    batch nor on which domains are asked for. Where color is primary it is sampled even when it is not asked for.
-    guided_from, guided_to: timesteps, as shares of all, between which guidance acts; elsewhere there is none and half the work
-    (Kynkäänniemi et al. 2024). mirror: take at each step the mean of what the picture and its mirror image give; None: as the configuration says, where it can.
-    """
+    images (b, k, 3, h, w) over the first of the configuration's backgrounds. Noise depends on seed alone: neither on
+    the batch nor on which domains are asked for. Where color is primary it is sampled even when it is not asked for.
+    guided_from, guided_to: timesteps, as shares of all, between which guidance acts; elsewhere there is none and half
+    the work (Kynkäänniemi et al. 2024). mirror: take at each step the mean of what the picture and its mirror image
+    give; None: as the configuration says, where it can."""
     config, device = model.config, rgba.device
-    can = config.codec == "patch" and config.convention == "gdtool" and all(MIRRORED_VIEW.get(name, name) in config.views for name in config.views)
+    can = (
+        config.codec == "patch"
+        and config.convention == "gdtool"
+        and all(MIRRORED_VIEW.get(name, name) in config.views for name in config.views)
+    )
     mirror = config.sampling_mirrored and can if mirror is None else mirror
     if mirror and not can:
-        raise InputError("mirror", "only a model of the patch codec, in gdtool's convention, with views on both sides is sampled with the mirrored picture", "pass mirror=None")
+        raise InputError(
+            "mirror",
+            "only a model of the patch codec, in gdtool's convention, with views on both sides is sampled with the mirrored picture",
+            "pass mirror=None",
+        )
     rgba = torch.cat([rgba, rgba.flip(-1)]) if mirror else rgba
     b = len(rgba)
     wanted = [d for d in config.domains if d in domains]
@@ -68,7 +88,11 @@ def sample_images(model: Model, rgba: torch.Tensor, *, domains: tuple[str, ...] 
     single = Layout(b, indices, len(views))
     condition = model.condition_latents(rgba, single, views)
     if guided:  # second half of the batch: no embedding, no latent
-        double = torch.cat([condition, torch.zeros_like(condition)]), torch.cat([context, torch.zeros_like(context)]), Layout(2 * b, indices, len(views))
+        double = (
+            torch.cat([condition, torch.zeros_like(condition)]),
+            torch.cat([context, torch.zeros_like(context)]),
+            Layout(2 * b, indices, len(views)),
+        )
     bar = iter(progress(range(steps), steps, "sampling"))
 
     def denoise(x, t, i):

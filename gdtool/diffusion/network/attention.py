@@ -16,7 +16,8 @@ from gdtool.diffusion.config import DOMAINS
 
 
 def learned_position(count: int, width: int) -> nn.Parameter:
-    """(count, width), to begin with noise. Not drawn on the meta device: that alone would load PyTorch's compiler, a second."""
+    """(count, width), to begin with noise. Not drawn on the meta device: that alone would load PyTorch's compiler, a
+    second."""
     shape = torch.empty(count, width)
     return nn.Parameter(shape if shape.is_meta else 0.1 * torch.randn(count, width))
 
@@ -98,14 +99,18 @@ class CrossDomainAttention(Attention):
         answers = attend(queries, self.split(self.to_k(rest)), self.split(self.to_v(rest)))  # (b, n, k, heads, t, ·)
         answers = self.join(answers)
         fused = self.fuse.bias + sum(
-            F.linear(answers[:, j], self.fuse.weight[:, (layout.domains[i] - 1) * c: layout.domains[i] * c])
-            for j, i in enumerate(others))
+            F.linear(answers[:, j], self.fuse.weight[:, (layout.domains[i] - 1) * c : layout.domains[i] * c])
+            for j, i in enumerate(others)
+        )
         out: list = [None] * len(layout.domains)
         out[color] = self.to_out[0](fused)
         if self.two_way:
             keys, values = self.split(self.to_k(color_tokens)), self.split(self.to_v(color_tokens))
-            heard = attend(self.split(self.to_q(rest)), keys.unsqueeze(1).expand(-1, n, -1, -1, -1, -1),
-                           values.unsqueeze(1).expand(-1, n, -1, -1, -1, -1))
+            heard = attend(
+                self.split(self.to_q(rest)),
+                keys.unsqueeze(1).expand(-1, n, -1, -1, -1, -1),
+                values.unsqueeze(1).expand(-1, n, -1, -1, -1, -1),
+            )
             heard = self.to_out[0](self.join(heard))
         else:
             heard = torch.zeros(*shape, t, c, dtype=out[color].dtype, device=x.device)
@@ -115,7 +120,8 @@ class CrossDomainAttention(Attention):
 
 
 class JointAttention(Attention):
-    """Wonder3D's: the tokens of all domains of a view are one sequence. Starts as (nearly) nothing: no weights in to_out."""
+    """Wonder3D's: the tokens of all domains of a view are one sequence. Starts as (nearly) nothing: no weights in
+    to_out."""
 
     def __init__(self, width: int, heads: int):
         super().__init__(width, heads)
@@ -151,9 +157,12 @@ class FeedForward(nn.Module):
 
 
 class TransformerBlock(nn.Module):
-    """Self-attention over all views of a domain, the star across domains, attention to the image's embedding, feed-forward."""
+    """Self-attention over all views of a domain, the star across domains, attention to the image's embedding,
+    feed-forward."""
 
-    def __init__(self, width: int, heads: int, context_width: int, feed_forward: int, multi_view: bool, cross_domain: str):
+    def __init__(
+        self, width: int, heads: int, context_width: int, feed_forward: int, multi_view: bool, cross_domain: str
+    ):
         super().__init__()
         self.multi_view = multi_view
         self.norm1 = nn.LayerNorm(width)
@@ -199,8 +208,9 @@ class Transformer(nn.Module):
         self.norm = nn.GroupNorm(groups, width, eps=1e-6)
         self.proj_in = nn.Conv2d(width, width, 1)
         self.position = learned_position(side * side, width) if side else None
-        self.transformer_blocks = nn.ModuleList([
-            TransformerBlock(width, heads, context_width, config.feed_forward, config.multi_view, config.cross_domain)])
+        self.transformer_blocks = nn.ModuleList(
+            [TransformerBlock(width, heads, context_width, config.feed_forward, config.multi_view, config.cross_domain)]
+        )
         self.proj_out = nn.Conv2d(width, width, 1)
 
     def forward(self, x: torch.Tensor, context: torch.Tensor, layout: Layout) -> torch.Tensor:

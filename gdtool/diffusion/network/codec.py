@@ -41,9 +41,8 @@ class PatchCodec:
 class VaeCodec:
     """Stable Diffusion's autoencoder (diffusers), frozen: factor 8, 4 channels, the mode times the scaling factor.
 
-    It follows its input's device and takes CHUNK images at a time; where a gradient goes through decode(), each chunk is
-    computed again for it, so that only one chunk's activations are held.
-    """
+    It follows its input's device and takes CHUNK images at a time; where a gradient goes through decode(), each chunk
+    is computed again for it, so that only one chunk's activations are held."""
 
     latent_channels = condition_channels = 4
 
@@ -51,7 +50,9 @@ class VaeCodec:
         self.side = config.image_size // 8
         if vae is None:
             if imported_if_installed("diffusers") is None:
-                raise ResourceError("diffusers", "is not installed, and the vae codec needs it", "pip install 'gdtool[hub]'")
+                raise ResourceError(
+                    "diffusers", "is not installed, and the vae codec needs it", "pip install 'gdtool[hub]'"
+                )
             from diffusers import AutoencoderKL
 
             vae = AutoencoderKL.from_pretrained(pretrained_part(config, "vae"), use_safetensors=True)

@@ -8,8 +8,8 @@ from torch import nn
 
 from gdtool.core.errors import ResourceError
 from gdtool.core.native import imported_if_installed
-from gdtool.diffusion.network.attention import Attention, FeedForward, learned_position
 from gdtool.diffusion.config import ENCODER_HEAD_WIDTH, ModelConfig
+from gdtool.diffusion.network.attention import Attention, FeedForward, learned_position
 from gdtool.diffusion.network.tensors import pretrained_part
 
 
@@ -37,7 +37,9 @@ class PatchEncoder(nn.Module):
         self.patch = p
         self.embed = nn.Linear(4 * p * p, width)
         self.position = learned_position((config.image_size // p) ** 2, width)
-        self.layers = nn.ModuleList(EncoderLayer(width, max(width // ENCODER_HEAD_WIDTH, 1)) for _ in range(config.encoder_layers))
+        self.layers = nn.ModuleList(
+            EncoderLayer(width, max(width // ENCODER_HEAD_WIDTH, 1)) for _ in range(config.encoder_layers)
+        )
         self.norm = nn.LayerNorm(width)
 
     def forward(self, rgba):
@@ -60,10 +62,14 @@ class ClipEncoder(nn.Module):
         super().__init__()
         if clip is None:
             if imported_if_installed("transformers") is None:
-                raise ResourceError("transformers", "is not installed, and the clip encoder needs it", "pip install 'gdtool[hub]'")
+                raise ResourceError(
+                    "transformers", "is not installed, and the clip encoder needs it", "pip install 'gdtool[hub]'"
+                )
             from transformers import CLIPVisionModelWithProjection
 
-            clip = CLIPVisionModelWithProjection.from_pretrained(pretrained_part(config, "image_encoder"), use_safetensors=True)
+            clip = CLIPVisionModelWithProjection.from_pretrained(
+                pretrained_part(config, "image_encoder"), use_safetensors=True
+            )
         self.antialias = config.convention == "wonder3d"
         # in a list, so that its weights are neither trained nor saved with ours
         self.frozen = [clip.requires_grad_(False).eval()]

@@ -20,14 +20,22 @@ SLAB = 0.75  # half the depth range that is encoded: a unit box turned about its
 BACKGROUND = {"white": 1.0, "grey": 0.0, "black": -1.0}
 SCALARS = ("depth", "roughness", "metallic")
 # The thirteen planes a view is stored in: premultiplied values of each domain, then coverage.
-PLANES = {"color": slice(0, 3), "normal": slice(3, 6), "depth": slice(6, 7), "albedo": slice(7, 10),
-          "roughness": slice(10, 11), "metallic": slice(11, 12), "mask": slice(12, 13)}
+PLANES = {
+    "color": slice(0, 3),
+    "normal": slice(3, 6),
+    "depth": slice(6, 7),
+    "albedo": slice(7, 10),
+    "roughness": slice(10, 11),
+    "metallic": slice(11, 12),
+    "mask": slice(12, 13),
+}
 PLANE_COUNT = 13
 MIRRORED_VIEW = {"front_right": "front_left", "front_left": "front_right", "right": "left", "left": "right"}
 
 
 def planes_from_images(images: dict[str, np.ndarray], mask: np.ndarray) -> np.ndarray:
-    """Domain images (k, h, w[, 3]) of a views folder and mask (k, h, w) -> premultiplied planes (k, 13, h, w) in [-1, 1].
+    """Domain images (k, h, w[, 3]) of a views folder and mask (k, h, w) -> premultiplied planes (k, 13, h, w) in [-1,
+    1].
 
     color and albedo linear, normal unit, depth in world units. Coverage m is stored as 2m - 1.
     """
@@ -83,7 +91,8 @@ def mirrored(images: torch.Tensor, domains: tuple[int, ...], views: tuple[str, .
 
 
 def encode_condition(rgba: torch.Tensor, background: torch.Tensor) -> torch.Tensor:
-    """rgba (b, 4, h, w): premultiplied encoded color and coverage as 2m - 1 -> the same with color over the background."""
+    """rgba (b, 4, h, w): premultiplied encoded color and coverage as 2m - 1 -> the same with color over the
+    background."""
     behind = (0.5 - 0.5 * rgba[:, 3:]) * background[:, None, None, None]
     return torch.cat([rgba[:, :3] + behind, rgba[:, 3:]], 1)
 
@@ -106,9 +115,8 @@ def coverage(images: dict[str, torch.Tensor], background: float) -> torch.Tensor
 def decode(images: dict[str, torch.Tensor], mask: torch.Tensor, background: float) -> dict[str, torch.Tensor]:
     """Encoded images (…, 3, h, w) -> values inside the mask, whose coverage (…, h, w) they are divided by.
 
-    color, albedo sRGB (…, 3, h, w) in [0, 1]; normal unit; depth in world units (…, h, w); roughness, metallic (…, h, w).
-    Differentiable in images.
-    """
+    color, albedo sRGB (…, 3, h, w) in [0, 1]; normal unit; depth in world units (…, h, w); roughness, metallic (…, h,
+    w). Differentiable in images."""
     m = mask.clamp_min(0.1)
     out = {}
     for domain, x in images.items():

@@ -1,10 +1,9 @@
 """A larger model from a smaller one: the same network over patches of as many more pixels.
 
-A model with the patch codec sees image_size / patch tokens a side. Twice the size with twice the patch is as many tokens,
-so the same network at the same cost a step; only the layers that touch pixels have other shapes. They are made so that
-the grown model, shown the small one's inputs with each pixel as a square of equal ones, predicts what the small one
-predicts, each pixel a square.
-"""
+A model with the patch codec sees image_size / patch tokens a side. Twice the size with twice the patch is as many
+tokens, so the same network at the same cost a step; only the layers that touch pixels have other shapes. They are made
+so that the grown model, shown the small one's inputs with each pixel as a square of equal ones, predicts what the small
+one predicts, each pixel a square."""
 
 from __future__ import annotations
 
@@ -18,36 +17,48 @@ from gdtool.diffusion.config import ModelConfig
 
 
 def resized(config: ModelConfig, size: int) -> ModelConfig:
-    """The configuration at another image size (pixels), with patches that keep the number of tokens. Raises InputError."""
+    """The configuration at another image size (pixels), with patches that keep the number of tokens. Raises
+    InputError."""
     if size % config.image_size and config.image_size % size:
-        raise InputError("size", f"{size} is neither a multiple nor a divisor of the configuration's {config.image_size}",
-                         f"give {config.image_size} times a whole number, or a part of it, such as {config.image_size // 2}")
+        raise InputError(
+            "size",
+            f"{size} is neither a multiple nor a divisor of the configuration's {config.image_size}",
+            f"give {config.image_size} times a whole number, or a part of it, such as {config.image_size // 2}",
+        )
     patches = {}
     for name in ("patch", "encoder_patch"):
         if (name == "patch" and config.codec != "patch") or (name == "encoder_patch" and config.encoder != "patch"):
             continue
         value = getattr(config, name) * size
         if value % config.image_size:
-            raise InputError("size", f"{size} leaves no whole pixel in a patch of {getattr(config, name)}",
-                             f"give a multiple of {config.image_size // math.gcd(config.image_size, getattr(config, name))}")
+            raise InputError(
+                "size",
+                f"{size} leaves no whole pixel in a patch of {getattr(config, name)}",
+                f"give a multiple of {config.image_size // math.gcd(config.image_size, getattr(config, name))}",
+            )
         patches[name] = value // config.image_size
     try:
         return msgspec.structs.replace(config, image_size=size, **patches)
     except ValueError as fault:
-        raise InputError("size", f"{size} does not fit the configuration: {fault}", f"give a multiple of {config.image_size}") from None
+        raise InputError(
+            "size", f"{size} does not fit the configuration: {fault}", f"give a multiple of {config.image_size}"
+        ) from None
 
 
 def grown(tensors: dict[str, torch.Tensor], small: ModelConfig, large: ModelConfig) -> dict[str, torch.Tensor]:
-    """Weights of `large` from those of `small`, whose configuration it is at a multiple of its size; both unchanged if equal.
+    """Weights of `large` from those of `small`, whose configuration it is at a multiple of its size; both unchanged if
+    equal.
 
-    What reads pixels is shared out among the pixels of each square, what writes them is repeated. Raises InputError when
-    the two are not the same network.
-    """
+    What reads pixels is shared out among the pixels of each square, what writes them is repeated. Raises InputError
+    when the two are not the same network."""
     if small.image_size == large.image_size:
         return tensors
     if small.codec != "patch" or large.image_size % small.image_size or resized(small, large.image_size) != large:
-        raise InputError("start", f"is a model of {small.image_size} px that cannot be grown to {large.image_size} px",
-                         "start from a model of the patch codec that differs in nothing but a size which is a whole number of times smaller")
+        raise InputError(
+            "start",
+            f"is a model of {small.image_size} px that cannot be grown to {large.image_size} px",
+            "start from a model of the patch codec that differs in nothing but a size which is a whole number of times smaller",
+        )
     factor = large.image_size // small.image_size
     out = dict(tensors)
     out["unet.conv_in.weight"] = _squares(tensors["unet.conv_in.weight"], 1, small.patch, factor) / factor**2
@@ -60,6 +71,7 @@ def grown(tensors: dict[str, torch.Tensor], small: ModelConfig, large: ModelConf
 
 
 def _squares(weight: torch.Tensor, dim: int, patch: int, factor: int) -> torch.Tensor:
-    """Repeat each pixel of the patches that lie folded in weight's dimension dim (c p², as pixel_unshuffle folds) to a square."""
+    """Repeat each pixel of the patches that lie folded in weight's dimension dim (c p², as pixel_unshuffle folds) to a
+    square."""
     pixels = weight.unflatten(dim, (-1, patch, patch))
     return pixels.repeat_interleave(factor, dim + 1).repeat_interleave(factor, dim + 2).flatten(dim, dim + 2)

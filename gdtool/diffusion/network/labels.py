@@ -9,16 +9,24 @@ import torch
 from gdtool.cameras.camera import SIX_VIEWS
 from gdtool.diffusion.config import DOMAINS, ModelConfig
 
-# Wonder3D's elevation and azimuth (radians) of each view relative to the picture's, as its pipeline has them, in half precision.
-ELEVATION = {"front": 0.0, "front_right": -0.2362, "right": -0.1686, "back": 0.5220, "left": 0.6904, "front_left": 0.3733}
+# Wonder3D's elevation and azimuth (radians) of each view relative to the picture's, as its pipeline has them, in half
+# precision.
+ELEVATION = {
+    "front": 0.0,
+    "front_right": -0.2362,
+    "right": -0.1686,
+    "back": 0.5220,
+    "left": 0.6904,
+    "front_left": 0.3733,
+}
 AZIMUTH = {"front": 0.0, "front_right": 0.8125, "right": 1.6934, "back": 3.1406, "left": 4.8359, "front_left": 5.5859}
 SWITCH = {"normal": (1.0, 0.0), "color": (0.0, 1.0)}
 WONDER3D_LABEL_WIDTH = 10  # sin and cos of [elevation of the condition, elevation, azimuth, switch]
 
 
 def class_labels(config: ModelConfig) -> torch.Tensor:
-    """(domains, views, CLASS_WIDTH): sines, then cosines of [elevation of the condition, elevation and azimuth of the view
-    relative to it (radians), one-hot domain].
+    """(domains, views, CLASS_WIDTH): sines, then cosines of [elevation of the condition, elevation and azimuth of the
+    view relative to it (radians), one-hot domain].
 
     The elevation of a photograph is not known when sampling, so it is 0 in training as well and the network infers it.
     """
@@ -35,5 +43,11 @@ def class_labels(config: ModelConfig) -> torch.Tensor:
 
 def _wonder3d_labels(config: ModelConfig) -> torch.Tensor:
     """(domains, views, 10): sines, then cosines. Domains that it has not get the switch (0, 0)."""
-    raw = torch.tensor([[[0.0, ELEVATION[view], AZIMUTH[view], *SWITCH.get(domain, (0.0, 0.0))] for view in config.views] for domain in DOMAINS], device="cpu")
+    raw = torch.tensor(
+        [
+            [[0.0, ELEVATION[view], AZIMUTH[view], *SWITCH.get(domain, (0.0, 0.0))] for view in config.views]
+            for domain in DOMAINS
+        ],
+        device="cpu",
+    )
     return torch.cat([raw.sin(), raw.cos()], -1)

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import torch
 from torch import nn
 
+from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.codec import PatchCodec, make_codec
-from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.network.encoder import PatchEncoder, make_encoder
 from gdtool.diffusion.network.labels import class_labels
 from gdtool.diffusion.network.schedule import clean_from_prediction, input_scale, signal_and_noise
@@ -17,7 +17,8 @@ from gdtool.diffusion.network.unet import UNet
 
 
 class Model(nn.Module):
-    """Everything with weights that a model folder holds (a VAE and CLIP are loaded from where the configuration says)."""
+    """Everything with weights that a model folder holds (a VAE and CLIP are loaded from where the configuration
+    says)."""
 
     def __init__(self, config: ModelConfig, codec=None, encoder=None):
         super().__init__()
@@ -51,7 +52,10 @@ class Model(nn.Module):
     def levels(self, t: torch.Tensor, layout: Layout) -> tuple[torch.Tensor, torch.Tensor]:
         """Signal and noise of each image, (n, 1, 1, 1)."""
         n = len(layout.domains) * layout.views
-        return (self.signal[t].repeat_interleave(n).view(-1, 1, 1, 1), self.deviation[t].repeat_interleave(n).view(-1, 1, 1, 1))
+        return (
+            self.signal[t].repeat_interleave(n).view(-1, 1, 1, 1),
+            self.deviation[t].repeat_interleave(n).view(-1, 1, 1, 1),
+        )
 
 
 def parameter_count(model: nn.Module) -> int:

@@ -11,7 +11,8 @@ from gdtool.diffusion.config import ModelConfig
 
 
 def signal_and_noise(config: ModelConfig) -> tuple[torch.Tensor, torch.Tensor]:
-    """a and s for every timestep, (timesteps,) float32 each; on the processor, also where a model is built on the meta device."""
+    """a and s for every timestep, (timesteps,) float32 each; on the processor, also where a model is built on the meta
+    device."""
     n = config.timesteps
     if config.noise_schedule == "scaled_linear":  # Stable Diffusion 1
         beta = torch.linspace(0.00085**0.5, 0.012**0.5, n, dtype=torch.float64, device="cpu") ** 2
@@ -50,13 +51,17 @@ def timesteps(config: ModelConfig, steps: int) -> list[int]:
     return [max(round(config.timesteps * (1 - i / steps)) - 1, 0) for i in range(steps)]
 
 
-def sample(denoise: Callable[[torch.Tensor, int, int], torch.Tensor], noise: torch.Tensor, config: ModelConfig, steps: int,
-           scheduler: str) -> torch.Tensor:
+def sample(
+    denoise: Callable[[torch.Tensor, int, int], torch.Tensor],
+    noise: torch.Tensor,
+    config: ModelConfig,
+    steps: int,
+    scheduler: str,
+) -> torch.Tensor:
     """Integrate from noise to x_0.
 
-    denoise(x, timestep, step index) -> predicted x_0. scheduler: "ddim" (Song et al. 2021, deterministic) or "dpm", DPM-Solver++(2M)
-    (Lu et al. 2022, algorithm 2).
-    """
+    denoise(x, timestep, step index) -> predicted x_0. scheduler: "ddim" (Song et al. 2021, deterministic) or "dpm",
+    DPM-Solver++(2M) (Lu et al. 2022, algorithm 2)."""
     signal, deviation = signal_and_noise(config)
     steps_at = timesteps(config, steps)
     x, before, last_width = noise, None, math.inf

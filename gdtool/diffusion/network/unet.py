@@ -13,8 +13,8 @@ import torch.nn.functional as F
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
-from gdtool.diffusion.network.attention import Layout, RowAttention, Transformer
 from gdtool.diffusion.config import CLASS_WIDTH, DOMAINS, ModelConfig
+from gdtool.diffusion.network.attention import Layout, RowAttention, Transformer
 from gdtool.diffusion.network.labels import WONDER3D_LABEL_WIDTH
 
 
@@ -78,18 +78,45 @@ class Upsample(nn.Module):
 
 
 class Block(nn.Module):
-    """Residual blocks with attention along rows and a transformer after each (or neither), then a change of resolution (or none)."""
+    """Residual blocks with attention along rows and a transformer after each (or neither), then a change of resolution
+    (or none)."""
 
-    def __init__(self, inputs: list[int], width: int, side: int, config: ModelConfig, *, attention: bool, embedding: int,
-                 rows: bool = False, down: bool = False, up: bool = False):
+    def __init__(
+        self,
+        inputs: list[int],
+        width: int,
+        side: int,
+        config: ModelConfig,
+        *,
+        attention: bool,
+        embedding: int,
+        rows: bool = False,
+        down: bool = False,
+        up: bool = False,
+    ):
         super().__init__()
         heads = config.heads or max(width // config.head_width, 1)
         self.resnets = nn.ModuleList(
-            Resnet(n, width, embedding, config.norm_groups, config.time_scale_shift) for n in inputs)
-        self.row_attentions = nn.ModuleList(RowAttention(width, heads, side, config.norm_groups) for _ in inputs) if rows else None
-        self.attentions = nn.ModuleList(
-            Transformer(width, heads, config.encoder_width, side if config.position_embedding else None,
-                        config.norm_groups, config) for _ in inputs) if attention else None
+            Resnet(n, width, embedding, config.norm_groups, config.time_scale_shift) for n in inputs
+        )
+        self.row_attentions = (
+            nn.ModuleList(RowAttention(width, heads, side, config.norm_groups) for _ in inputs) if rows else None
+        )
+        self.attentions = (
+            nn.ModuleList(
+                Transformer(
+                    width,
+                    heads,
+                    config.encoder_width,
+                    side if config.position_embedding else None,
+                    config.norm_groups,
+                    config,
+                )
+                for _ in inputs
+            )
+            if attention
+            else None
+        )
         self.downsamplers = nn.ModuleList([Downsample(width)]) if down else None
         self.upsamplers = nn.ModuleList([Upsample(width)]) if up else None
 
@@ -108,7 +135,9 @@ class UNet(nn.Module):
         embedding = 4 * width0
         self.conv_in = nn.Conv2d(latent_channels + condition_channels, width0, 3, padding=1)
         self.time_embedding = Embedding(width0, embedding)
-        self.class_embedding = Embedding(WONDER3D_LABEL_WIDTH if config.convention == "wonder3d" else CLASS_WIDTH, embedding)
+        self.class_embedding = Embedding(
+            WONDER3D_LABEL_WIDTH if config.convention == "wonder3d" else CLASS_WIDTH, embedding
+        )
         common = dict(config=config, embedding=embedding)
         last = len(widths) - 1
         self.down_blocks, skips, previous = nn.ModuleList(), [width0], width0
@@ -117,7 +146,10 @@ class UNet(nn.Module):
         for i, width in enumerate(widths):
             inputs = [previous] + [width] * (config.layers_per_block - 1)
             self.down_blocks.append(
-                Block(inputs, width, sides[i], attention=config.attention_levels[i], rows=rows[i], down=i < last, **common))
+                Block(
+                    inputs, width, sides[i], attention=config.attention_levels[i], rows=rows[i], down=i < last, **common
+                )
+            )
             skips += [width] * (config.layers_per_block + (i < last))
             previous = width
         self.mid_block = Block([previous, previous], previous, sides[-1], attention=True, **common)
@@ -129,7 +161,8 @@ class UNet(nn.Module):
                 inputs.append(previous + skips.pop())
                 previous = width
             self.up_blocks.append(
-                Block(inputs, width, sides[i], attention=config.attention_levels[i], rows=rows[i], up=i > 0, **common))
+                Block(inputs, width, sides[i], attention=config.attention_levels[i], rows=rows[i], up=i > 0, **common)
+            )
         self.conv_norm_out = nn.GroupNorm(config.norm_groups, width0)
         self.conv_out = nn.Conv2d(width0, latent_channels, 3, padding=1)
         self.latent_channels = latent_channels

@@ -17,18 +17,22 @@ SEEN = 0.1  # a point this far behind what another view sees is hidden from it, 
 
 
 def consistency(views: Views) -> dict[str, float]:
-    """rerendered_psnr (dB), slope_degrees (median), reprojection_depth (median, world units), reprojection_share (of points within 0.02)."""
+    """rerendered_psnr (dB), slope_degrees (median), reprojection_depth (median, world units), reprojection_share (of
+    points within 0.02)."""
     distance, share = reprojection(views)
-    return {"rerendered_psnr": rerendered_psnr(views), "slope_degrees": slope_degrees(views),
-            "reprojection_depth": distance, "reprojection_share": share}
+    return {
+        "rerendered_psnr": rerendered_psnr(views),
+        "slope_degrees": slope_degrees(views),
+        "reprojection_depth": distance,
+        "reprojection_share": share,
+    }
 
 
 def rerendered_psnr(views: Views, count: int = 4000, seed: int = 0) -> float:
     """PSNR in dB (sRGB, foreground) of the normal, albedo, roughness and metallic views under one light against color.
 
-    The light is the spherical Gaussians that explain the color best (least squares at some pixels of all views); the figure
-    is taken at other pixels. Closed form: shadows and reflections of the object in itself count as error.
-    """
+    The light is the spherical Gaussians that explain the color best (least squares at some pixels of all views); the
+    figure is taken at other pixels. Closed form: shadows and reflections of the object in itself count as error."""
     import torch
 
     from gdtool.fields.appearance.light import recover_light, unoccluded
@@ -38,21 +42,31 @@ def rerendered_psnr(views: Views, count: int = 4000, seed: int = 0) -> float:
     from gdtool.shading.bsdf.sg import SphericalGaussians
 
     inside = views.mask > INSIDE
-    toward = np.stack([c.backward for c in views.cameras])[:, None, None].repeat(inside.shape[1], 1).repeat(inside.shape[2], 2)
+    toward = (
+        np.stack([c.backward for c in views.cameras])[:, None, None]
+        .repeat(inside.shape[1], 1)
+        .repeat(inside.shape[2], 2)
+    )
     rows = np.random.default_rng(seed).permutation(int(inside.sum()))[: 2 * count]
-    pick = {d: views.images[d][inside][rows].astype(np.float32) for d in ("color", "normal", "albedo", "roughness", "metallic")}
+    pick = {
+        d: views.images[d][inside][rows].astype(np.float32)
+        for d in ("color", "normal", "albedo", "roughness", "metallic")
+    }
     toward = toward[inside][rows].astype(np.float32)
     fit, test = slice(0, len(rows) // 2), slice(len(rows) // 2, None)
     args = [pick["normal"], toward, pick["color"], pick["albedo"], pick["roughness"], pick["metallic"]]
     light, _ = recover_light(*(x[fit] for x in args), unoccluded(pick["normal"][fit]))
-    lobes = SphericalGaussians(*(torch.tensor(np.array(light[name]), dtype=torch.float32) for name in ("axes", "sharpness", "amplitudes")))
+    lobes = SphericalGaussians(
+        *(torch.tensor(np.array(light[name]), dtype=torch.float32) for name in ("axes", "sharpness", "amplitudes"))
+    )
     n, v, c, a, r, m = (torch.from_numpy(x[test]) for x in args)
     rendered = shade(n, v, a, r, m, lobes).clamp(0, 1).numpy()
     return psnr(srgb_from_linear(rendered)[None], srgb_from_linear(np.clip(c.numpy(), 0, 1))[None])
 
 
 def slope_degrees(views: Views) -> float:
-    """Median angle in degrees between the normal and what depth's central differences make it, away from depth's edges."""
+    """Median angle in degrees between the normal and what depth's central differences make it, away from depth's
+    edges."""
     angles = []
     for k, camera in enumerate(views.cameras):
         points = _points(camera, views.images["depth"][k])
@@ -61,7 +75,9 @@ def slope_degrees(views: Views) -> float:
         normal = np.cross(along, across)
         normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
         good = inside[1:-1, 1:-1] & inside[1:-1, 2:] & inside[1:-1, :-2] & inside[2:, 1:-1] & inside[:-2, 1:-1]
-        good &= (np.abs(depth[1:-1, 2:] - depth[1:-1, :-2]) < EDGE) & (np.abs(depth[2:, 1:-1] - depth[:-2, 1:-1]) < EDGE)
+        good &= (np.abs(depth[1:-1, 2:] - depth[1:-1, :-2]) < EDGE) & (
+            np.abs(depth[2:, 1:-1] - depth[:-2, 1:-1]) < EDGE
+        )
         cosine = (normal * views.images["normal"][k][1:-1, 1:-1]).sum(-1)[good]
         angles.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
     every = np.concatenate(angles)
@@ -69,11 +85,12 @@ def slope_degrees(views: Views) -> float:
 
 
 def reprojection(views: Views) -> tuple[float, float]:
-    """Points of each view seen by another: median distance along its axis to what it sees there, and the share within 0.02.
+    """Points of each view seen by another: median distance along its axis to what it sees there, and the share within
+    0.02.
 
-    A point is left out where it lies behind the other view's surface by more than SEEN: hidden. One that falls on the other
-    view's background, or in front of its surface, is a contradiction: it counts with its distance, background as SEEN.
-    """
+    A point is left out where it lies behind the other view's surface by more than SEEN: hidden. One that falls on the
+    other view's background, or in front of its surface, is a contradiction: it counts with its distance, background as
+    SEEN."""
     distances = []
     for i, camera in enumerate(views.cameras):
         inside = views.mask[i] > INSIDE
@@ -82,7 +99,9 @@ def reprojection(views: Views) -> tuple[float, float]:
             if i == j:
                 continue
             xy, depth = project(other, points)
-            column, row = (np.clip(xy[:, a].astype(int), 0, size - 1) for a, size in ((0, other.width), (1, other.height)))
+            column, row = (
+                np.clip(xy[:, a].astype(int), 0, size - 1) for a, size in ((0, other.width), (1, other.height))
+            )
             there = views.mask[j][row, column] > INSIDE
             outside = views.mask[j][row, column] < 1 - INSIDE
             behind = depth - views.images["depth"][j][row, column]

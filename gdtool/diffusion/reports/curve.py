@@ -37,5 +37,5 @@ def draw_curve(csv_path: Path, column: str = "loss", width: int = 640, height: i
         rows_at = row_of(np.interp(at, np.arange(len(line)), line))
         for x in columns:
             a, b = sorted((rows_at[x], rows_at[max(x - 1, 0)]))
-            picture[a: b + 2, x] = shade
+            picture[a : b + 2, x] = shade
     return picture

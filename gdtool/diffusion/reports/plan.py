@@ -15,18 +15,19 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
+from gdtool.diffusion.config import DOMAINS, ModelConfig, Phase, TrainConfig
 from gdtool.diffusion.network import attention
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.codec import CHUNK, VaeCodec
-from gdtool.diffusion.config import DOMAINS, ModelConfig, Phase, TrainConfig
 from gdtool.diffusion.network.encoding import PLANES
-from gdtool.diffusion.training.losses import LIT, rendering_error, view_directions
 from gdtool.diffusion.network.model import Model, parameter_count, structure
 from gdtool.diffusion.network.schedule import signal_and_noise
+from gdtool.diffusion.training.losses import LIT, rendering_error, view_directions
 
 # Dense bfloat16 peak in FLOP/s, memory in bytes, NVLink in bytes/s in one direction (NVIDIA's data sheets, SXM parts).
 GPUS = {"A100 80 GB": (312e12, 80e9, 300e9), "H100 80 GB": (989e12, 80e9, 450e9), "H200 141 GB": (989e12, 141e9, 450e9)}
-UTILISATION = 0.35  # of the peak: what training a UNet of this size in bfloat16 commonly reaches; the one assumption here
+# Of the peak: what training a UNet of this size in bfloat16 commonly reaches; the one assumption here.
+UTILISATION = 0.35
 # Held for each weight: itself, its gradient, two moments and the average in float32, and autocast's copy in bfloat16.
 BYTES_PER_WEIGHT = 4 + 4 + 8 + 4
 GB = 1e9
@@ -82,7 +83,16 @@ def fused_attention():
         attention.attend = before
 
 
-def step_cost(config: ModelConfig, domains: int, views: int, objects: int, *, fused: bool, dtype=torch.bfloat16, device: str = "meta") -> dict[str, float]:
+def step_cost(
+    config: ModelConfig,
+    domains: int,
+    views: int,
+    objects: int,
+    *,
+    fused: bool,
+    dtype=torch.bfloat16,
+    device: str = "meta",
+) -> dict[str, float]:
     """FLOPs and peak bytes beyond the weights of one forward and backward pass over so many objects.
 
     fused: attention as on a GPU, else as attend() does it on this device. dtype: of what is computed.
@@ -95,7 +105,9 @@ def step_cost(config: ModelConfig, domains: int, views: int, objects: int, *, fu
     return {"flops": float(counter.get_total_flops()), "bytes": float(memory.peak - gradients)}
 
 
-def _one_step(config: ModelConfig, domains: int, views: int, objects: int, fused: bool, dtype, device: str, watch) -> Model:
+def _one_step(
+    config: ModelConfig, domains: int, views: int, objects: int, fused: bool, dtype, device: str, watch
+) -> Model:
     """A forward and backward pass under `watch`; the model with its gradients."""
     model = structure(config, device).to(dtype).train()
     layout = Layout(objects, tuple(range(len(DOMAINS)))[:domains], views)
@@ -133,7 +145,8 @@ def frozen_cost(config: ModelConfig) -> dict[str, float] | None:
             images = torch.zeros(CHUNK, 3, config.image_size, config.image_size, device="meta")
             cost["encode"], cost["encode_bytes"] = _counted(lambda: codec.encode(images))
             cost["decode"], cost["decode_bytes"] = _counted(
-                lambda: codec.decode(torch.zeros(shape, device="meta", requires_grad=True)).sum().backward())
+                lambda: codec.decode(torch.zeros(shape, device="meta", requires_grad=True)).sum().backward()
+            )
             cost["encode"], cost["decode"] = cost["encode"] / CHUNK, cost["decode"] / CHUNK
             cost["weights_bytes"] += 4.0 * parameter_count(codec.vae)
         if config.encoder == "clip":
@@ -146,19 +159,36 @@ def frozen_cost(config: ModelConfig) -> dict[str, float] | None:
 
 
 def frozen_part(config: ModelConfig, part: str) -> torch.nn.Module:
-    """The vae or image_encoder that a local config.pretrained describes, else Stable Diffusion Image Variations', without numbers."""
+    """The vae or image_encoder that a local config.pretrained describes, else Stable Diffusion Image Variations',
+    without numbers."""
     from diffusers import AutoencoderKL
     from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
     described = Path(config.pretrained) / part / "config.json" if config.pretrained else Path()
     with torch.device("meta"):
         if part == "image_encoder":
-            return CLIPVisionModelWithProjection(CLIPVisionConfig.from_json_file(described) if described.is_file() else CLIPVisionConfig(
-                hidden_size=1024, intermediate_size=4096, projection_dim=768, num_hidden_layers=24, num_attention_heads=16, image_size=224, patch_size=14))
+            return CLIPVisionModelWithProjection(
+                CLIPVisionConfig.from_json_file(described)
+                if described.is_file()
+                else CLIPVisionConfig(
+                    hidden_size=1024,
+                    intermediate_size=4096,
+                    projection_dim=768,
+                    num_hidden_layers=24,
+                    num_attention_heads=16,
+                    image_size=224,
+                    patch_size=14,
+                )
+            )
         if described.is_file():
             return AutoencoderKL.from_config(AutoencoderKL.load_config(described.parent))
-        return AutoencoderKL(down_block_types=("DownEncoderBlock2D",) * 4, up_block_types=("UpDecoderBlock2D",) * 4,
-                             block_out_channels=(128, 256, 512, 512), layers_per_block=2, latent_channels=4)
+        return AutoencoderKL(
+            down_block_types=("DownEncoderBlock2D",) * 4,
+            up_block_types=("UpDecoderBlock2D",) * 4,
+            block_out_channels=(128, 256, 512, 512),
+            layers_per_block=2,
+            latent_channels=4,
+        )
 
 
 def _counted(call) -> tuple[float, float]:
@@ -173,7 +203,9 @@ def _counted(call) -> tuple[float, float]:
 
 def rendering_share(config: ModelConfig, train: TrainConfig, domains: int) -> float:
     """Of the objects of a step, how many the loss by rendering sees on average."""
-    lit = {DOMAINS.index(d) for d in LIT} <= {DOMAINS.index(d) for d in config.domains} and domains == len(config.domains)
+    lit = {DOMAINS.index(d) for d in LIT} <= {DOMAINS.index(d) for d in config.domains} and domains == len(
+        config.domains
+    )
     if not lit or train.pbr_weight == 0:
         return 0.0
     signal, deviation = signal_and_noise(config)
@@ -190,25 +222,46 @@ def shading_bytes(config: ModelConfig, train: TrainConfig, views: int) -> float:
     memory, start = LiveBytes(), torch.rand(shape)
     with memory:
         predicted = start.clone().requires_grad_()
-        rendering_error(predicted, start, order, planes, lights, view_directions(config)[:views], train.pbr_pixels, 0.0, torch.Generator()).backward()
+        rendering_error(
+            predicted,
+            start,
+            order,
+            planes,
+            lights,
+            view_directions(config)[:views],
+            train.pbr_pixels,
+            0.0,
+            torch.Generator(),
+        ).backward()
     return float(memory.peak)
 
 
 def data_bytes(config: ModelConfig, domains: int, views: int) -> float:
-    """What one object of a step takes as data: its planes, their encoding, and clean, noise, noisy and condition latents."""
+    """What one object of a step takes as data: its planes, their encoding, and clean, noise, noisy and condition
+    latents."""
     codec = structure(config).codec
     pixels, latent = config.image_size**2, codec.side**2
     images = domains * views
-    return 4.0 * (PLANES["mask"].stop * pixels * (len(config.views) + views) + images * 3 * pixels
-                  + images * latent * (3 * codec.latent_channels + codec.condition_channels))
+    return 4.0 * (
+        PLANES["mask"].stop * pixels * (len(config.views) + views)
+        + images * 3 * pixels
+        + images * latent * (3 * codec.latent_channels + codec.condition_channels)
+    )
 
 
 def plan_of(config: ModelConfig, train: TrainConfig) -> dict:
     """The report of `gdtool train --plan`: weights, and for each phase FLOPs, memory and seconds of a step."""
     weights = parameter_count(structure(config))
     frozen = frozen_cost(config)
-    report: dict = {"weights": weights, "weights_bytes": weights * BYTES_PER_WEIGHT, "steps": train.steps, "utilisation": UTILISATION,
-                    "frozen_parts_counted": frozen is not None, "phases": [], "hours": {}}
+    report: dict = {
+        "weights": weights,
+        "weights_bytes": weights * BYTES_PER_WEIGHT,
+        "steps": train.steps,
+        "utilisation": UTILISATION,
+        "frozen_parts_counted": frozen is not None,
+        "phases": [],
+        "hours": {},
+    }
     done, hours = 0.0, {(gpu, n): 0.0 for gpu in GPUS for n in (1, 8)}
     for phase in train.phases:
         steps, done = round((phase.share - done) * train.steps), phase.share
@@ -216,21 +269,30 @@ def plan_of(config: ModelConfig, train: TrainConfig) -> dict:
         report["phases"].append({"steps": steps, **own})
         for gpu, (peak, _, link) in GPUS.items():
             for n in (1, 8):
-                exchange = 0.0 if n == 1 else 2 * (n - 1) / n * weights * 4 / link  # ring all-reduce of float32 gradients
+                # Ring all-reduce of float32 gradients.
+                exchange = 0.0 if n == 1 else 2 * (n - 1) / n * weights * 4 / link
                 hours[gpu, n] += steps * (own["flops_per_step"] / (n * peak * UTILISATION) + exchange) / 3600
     for gpu, (_, capacity, _) in GPUS.items():
         # each part of a batch is split over the GPUs
-        fits = {str(n): max(p["bytes"] - p["growing_bytes"] * (1 - -(-p["objects_at_once"] // n) / p["objects_at_once"])
-                            for p in report["phases"]) < 0.9 * capacity for n in (1, 8)}
+        fits = {
+            str(n): max(
+                p["bytes"] - p["growing_bytes"] * (1 - -(-p["objects_at_once"] // n) / p["objects_at_once"])
+                for p in report["phases"]
+            )
+            < 0.9 * capacity
+            for n in (1, 8)
+        }
         report["hours"][gpu] = {"1": hours[gpu, 1], "8": hours[gpu, 8], "fits": fits}
     return report
 
 
-def phase_cost(config: ModelConfig, train: TrainConfig, phase: Phase, frozen: dict | None, weights: int, *, fused: bool = True) -> dict:
+def phase_cost(
+    config: ModelConfig, train: TrainConfig, phase: Phase, frozen: dict | None, weights: int, *, fused: bool = True
+) -> dict:
     """FLOPs of a step of a phase, averaged over the timesteps, and the most bytes that one holds.
 
-    The loss by rendering is decoded and held for as many objects as have little noise: on average in FLOPs, all in bytes.
-    """
+    The loss by rendering is decoded and held for as many objects as have little noise: on average in FLOPs, all in
+    bytes."""
     domains, views = min(phase.domains, len(config.domains)), min(phase.views, len(config.views))
     batch = phase.batch or train.batch
     part = -(-batch // train.accumulate)
@@ -248,24 +310,39 @@ def phase_cost(config: ModelConfig, train: TrainConfig, phase: Phase, frozen: di
     growing = data + network + rendering
     held = max(data + own["encode_bytes"], growing + (own["decode_bytes"] if share else 0.0))
     copies = weights * 2 if dtype == torch.bfloat16 else 0
-    return {"domains": domains, "views": views, "batch": batch, "objects_at_once": part,
-            "flops_per_step": flops * batch / part + batch * (encoding + decoding + own["object"]),
-            "vae_flops_per_step": batch * (encoding + decoding), "rendering_share": share, "rendering_bytes": rendering,
-            "growing_bytes": growing, "activation_bytes": held, "bytes": weights * BYTES_PER_WEIGHT + copies + own["weights_bytes"] + held}
+    return {
+        "domains": domains,
+        "views": views,
+        "batch": batch,
+        "objects_at_once": part,
+        "flops_per_step": flops * batch / part + batch * (encoding + decoding + own["object"]),
+        "vae_flops_per_step": batch * (encoding + decoding),
+        "rendering_share": share,
+        "rendering_bytes": rendering,
+        "growing_bytes": growing,
+        "activation_bytes": held,
+        "bytes": weights * BYTES_PER_WEIGHT + copies + own["weights_bytes"] + held,
+    }
 
 
 def text_of(report: dict) -> str:
     """The report as lines for a terminal."""
-    lines = [f"{report['weights'] / 1e6:.1f} million weights: {report['weights_bytes'] / GB:.2f} GB with gradients, moments and average",
-             "", "phase  steps    batch  at once  domains x views  PFLOP/step  activations  memory"]
+    lines = [
+        f"{report['weights'] / 1e6:.1f} million weights: {report['weights_bytes'] / GB:.2f} GB with gradients, moments and average",
+        "",
+        "phase  steps    batch  at once  domains x views  PFLOP/step  activations  memory",
+    ]
     for i, p in enumerate(report["phases"], 1):
-        lines.append(f"{i:5d}  {p['steps']:<7d}  {p['batch']:5d}  {p['objects_at_once']:7d}  {p['domains']:7d} x {p['views']:<5d}  "
-                     f"{p['flops_per_step'] / 1e15:10.4g}  {p['activation_bytes'] / GB:8.2f} GB  {p['bytes'] / GB:6.2f} GB")
+        lines.append(
+            f"{i:5d}  {p['steps']:<7d}  {p['batch']:5d}  {p['objects_at_once']:7d}  {p['domains']:7d} x {p['views']:<5d}  "
+            f"{p['flops_per_step'] / 1e15:10.4g}  {p['activation_bytes'] / GB:8.2f} GB  {p['bytes'] / GB:6.2f} GB"
+        )
     lines += ["", f"estimated at {report['utilisation']:.0%} of the peak in bfloat16:"]
     for gpu, row in report["hours"].items():
-        one, eight = (f"{row[n]:8.1f} h{'' if row['fits'][n] else ' (does not fit: raise accumulate)'}" for n in ("1", "8"))
+        one, eight = (
+            f"{row[n]:8.1f} h{'' if row['fits'][n] else ' (does not fit: raise accumulate)'}" for n in ("1", "8")
+        )
         lines.append(f"{gpu:12s}  1 GPU {one}   8 GPUs {eight}")
     if not report["frozen_parts_counted"]:
         lines.append("not counted: the frozen VAE and CLIP (pip install 'gdtool[hub]')")
     return "\n".join(lines)
-

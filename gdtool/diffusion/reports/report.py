@@ -13,8 +13,8 @@ import torch
 
 from gdtool.diffusion.config import DOMAINS, ModelConfig, TrainConfig
 from gdtool.diffusion.data.objects import Objects, from_bytes
-from gdtool.diffusion.network.encoding import BACKGROUND, encode
 from gdtool.diffusion.inference.sampling import sample_images
+from gdtool.diffusion.network.encoding import BACKGROUND, encode
 
 
 def validation(state, objects: Objects, precision: str) -> tuple[np.ndarray, dict[str, float]]:
@@ -60,7 +60,9 @@ def append_validation(path: Path, step: int, seconds: float, psnr: dict[str, flo
         writer = csv.DictWriter(file, head)
         writer.writeheader()
         writer.writerows(kept)
-        writer.writerow({"step": step, "seconds": f"{seconds:.1f}"} | {name: f"{value:.3f}" for name, value in psnr.items()})
+        writer.writerow(
+            {"step": step, "seconds": f"{seconds:.1f}"} | {name: f"{value:.3f}" for name, value in psnr.items()}
+        )
 
 
 def _tile(images: torch.Tensor) -> np.ndarray:
@@ -70,8 +72,14 @@ def _tile(images: torch.Tensor) -> np.ndarray:
 
 
 def machine() -> str:
-    model = next((line.split(":", 1)[1].strip() for line in open("/proc/cpuinfo") if line.startswith("model name")), platform.processor()) \
-        if os.path.exists("/proc/cpuinfo") else platform.processor()
+    model = (
+        next(
+            (line.split(":", 1)[1].strip() for line in open("/proc/cpuinfo") if line.startswith("model name")),
+            platform.processor(),
+        )
+        if os.path.exists("/proc/cpuinfo")
+        else platform.processor()
+    )
     return f"{model}, {os.cpu_count()} cores"
 
 
@@ -82,7 +90,7 @@ def card(preset: str, model: ModelConfig, train: TrainConfig, facts: dict) -> st
     return f"""# Multi-view PBR diffusion model, preset {preset}
 
 One picture to {len(model.views)} orthographic views of {model.image_size} x {model.image_size} pixels in {len(model.domains)} domains
-({', '.join(model.domains)}). Trained by `gdtool train`; load it with `gdtool sample-views --model`.
+({", ".join(model.domains)}). Trained by `gdtool train`; load it with `gdtool sample-views --model`.
 
 | | |
 |---|---|

@@ -21,8 +21,8 @@ import torch
 import torch.distributed as dist
 from torch import nn
 
-# The first process decodes the data and makes validation pictures while the others wait for it, which PyTorch allows for
-# 10 or 30 minutes. torchrun ends all when one dies, so a long wait hides nothing.
+# The first process decodes the data and makes validation pictures while the others wait for it, which PyTorch allows
+# for 10 or 30 minutes. torchrun ends all when one dies, so a long wait hides nothing.
 PATIENCE = timedelta(days=2)
 
 
@@ -52,9 +52,8 @@ def leave() -> None:
     """End this process, and as the first one the others, whether they were given work or wait for it still. With one
     process nothing; with several it does not return.
 
-    It leaves without the interpreter's own end: DDP keeps the group's threads alive, and one of them that lets go of its
-    last tensor while the interpreter ends aborts the process (pytorch/pytorch#179291; seen once in 40 runs).
-    """
+    It leaves without the interpreter's own end: DDP keeps the group's threads alive, and one of them that lets go of
+    its last tensor while the interpreter ends aborts the process (pytorch/pytorch#179291; seen once in 40 runs)."""
     if int(os.environ.get("WORLD_SIZE", "1")) < 2:
         return
     if not dist.is_initialized():
@@ -85,7 +84,9 @@ def total(figures: dict[str, float]) -> dict[str, float]:
         return figures
     every: list = [None] * size()
     dist.all_gather_object(every, figures)
-    return {name: sum(one.get(name, 0.0) for one in every) for name in dict.fromkeys(name for one in every for name in one)}
+    return {
+        name: sum(one.get(name, 0.0) for one in every) for name in dict.fromkeys(name for one in every for name in one)
+    }
 
 
 def wrap(objective: nn.Module) -> nn.Module:
@@ -126,7 +127,8 @@ def local(x: torch.Tensor, whole: bool = False) -> torch.Tensor:
 
 
 def whole(x: torch.Tensor, like: torch.Tensor | None = None) -> torch.Tensor:
-    """All of a tensor of which each process holds a part, itself or as its local part (then like says how it is split)."""
+    """All of a tensor of which each process holds a part, itself or as its local part (then like says how it is
+    split)."""
     if like is not None and hasattr(like, "full_tensor") and not hasattr(x, "full_tensor"):
         from torch.distributed.tensor import DTensor
 
@@ -144,7 +146,8 @@ def sharded(x: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
 
 
 def gathered(state):
-    """state with whole weights and averages, for writing and for validation; every process takes part. state stays as it is."""
+    """state with whole weights and averages, for writing and for validation; every process takes part. state stays as
+    it is."""
     if not is_sharded(state.model):
         return state
     from gdtool.diffusion.network.model import Model

@@ -24,17 +24,17 @@ import torch
 
 from gdtool.core.errors import InputError
 from gdtool.core.reading import parse_json
-from gdtool.diffusion.training import distributed
-from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.config import DOMAINS, ModelConfig, Phase, TrainConfig
 from gdtool.diffusion.data.objects import Batch, Objects, draw, object_order
-from gdtool.diffusion.network.encoding import BACKGROUND, encode, encode_condition
-from gdtool.diffusion.training.losses import LIT, image_error, rendering_error, view_directions
-from gdtool.diffusion.network.model import Model
-from gdtool.diffusion.training.optimizer import MOMENTS, make_optimizer, restore_moments
 from gdtool.diffusion.inference.sampling import precision_context
+from gdtool.diffusion.network.attention import Layout
+from gdtool.diffusion.network.encoding import BACKGROUND, encode, encode_condition
+from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.network.schedule import loss_weight
 from gdtool.diffusion.network.tensors import read_tensors
+from gdtool.diffusion.training import distributed
+from gdtool.diffusion.training.losses import LIT, image_error, rendering_error, view_directions
+from gdtool.diffusion.training.optimizer import MOMENTS, make_optimizer, restore_moments
 
 CHECKPOINT = "checkpoint.safetensors"
 MOST_SKIPPED = 10  # steps in a row with a gradient that is not finite: the run is lost
@@ -115,7 +115,9 @@ def choose(config: ModelConfig, phase: Phase, seed: int, step: int) -> Step:
     return Step(domains, views, seed, step)
 
 
-def losses(model: Model, batch: Batch, step: Step, generators: list[torch.Generator], train: TrainConfig) -> dict[str, torch.Tensor]:
+def losses(
+    model: Model, batch: Batch, step: Step, generators: list[torch.Generator], train: TrainConfig
+) -> dict[str, torch.Tensor]:
     """The objective of one micro-batch and its parts by name; every figure is a mean over its objects.
 
     generators: one for each object, from which all that is random about it comes.
@@ -126,7 +128,9 @@ def losses(model: Model, batch: Batch, step: Step, generators: list[torch.Genera
 
     # per object: timestep, whether it is the last one, what is dropped, background
     dice = torch.stack([torch.rand(4, generator=generator) for generator in generators])
-    background = torch.tensor([BACKGROUND[config.backgrounds[int(x * len(config.backgrounds))]] for x in dice[:, 3]], device=device)
+    background = torch.tensor(
+        [BACKGROUND[config.backgrounds[int(x * len(config.backgrounds))]] for x in dice[:, 3]], device=device
+    )
     planes = batch.planes[:, step.views]
     truth = encode(planes, step.domains, background)  # (b, d, k, 3, h, w)
     clean = model.codec.encode(truth.flatten(0, 2))
@@ -144,7 +148,9 @@ def losses(model: Model, batch: Batch, step: Step, generators: list[torch.Genera
     latent_off = (drop >= train.drop_embedding) & (drop < train.drop_embedding + train.drop_both + train.drop_latent)
     with precision_context(device, train.precision):
         context = model.encoder(rgba) * ~embedding_off[:, None, None]
-        condition = model.condition_latents(rgba, layout, step.views) * ~latent_off.repeat_interleave(n)[:, None, None, None]
+        condition = (
+            model.condition_latents(rgba, layout, step.views) * ~latent_off.repeat_interleave(n)[:, None, None, None]
+        )
         predicted = model.predict_clean(noisy, condition, t, context, layout, step.views)
 
     counted, square = image_error(predicted, clean, b, step.domains, config, train)  # (b, d) each
@@ -163,15 +169,26 @@ def losses(model: Model, batch: Batch, step: Step, generators: list[torch.Genera
         rendered = []
         for i in near.tolist():
             images = model.codec.decode(latents[i].flatten(0, 1)).unflatten(0, latents.shape[1:3])
-            error = rendering_error(images, truth[i][lit], order, planes[i], batch.lights[i], directions, train.pbr_pixels,
-                                    float(background[i]), generators[i])
+            error = rendering_error(
+                images,
+                truth[i][lit],
+                order,
+                planes[i],
+                batch.lights[i],
+                directions,
+                train.pbr_pixels,
+                float(background[i]),
+                generators[i],
+            )
             rendered.append(snr[i].clamp(max=train.snr_gamma) * error)
         parts["rendering"] = (torch.stack(rendered).sum() / b).detach()
         total = total + train.pbr_weight * torch.stack(rendered).sum() / b
     return {"loss": total, **parts}
 
 
-def train_step(state: State, objects: Objects, train: TrainConfig, seed: int, minutes: float | None, device: str) -> dict[str, float]:
+def train_step(
+    state: State, objects: Objects, train: TrainConfig, seed: int, minutes: float | None, device: str
+) -> dict[str, float]:
     """One optimiser step over the phase's objects in `accumulate` parts; updates state."""
     config, progress = state.model.config, progress_of(state, train, minutes)
     phase = phase_at(progress, train)
@@ -183,7 +200,11 @@ def train_step(state: State, objects: Objects, train: TrainConfig, seed: int, mi
     places, sums = np.arange(len(idx)), {}
     # Every process takes its share of each part of the batch; its gradients' mean is what the processes agree on.
     if len(idx) < distributed.size():
-        raise InputError("batch", f"of {len(idx)} objects is less than one for each of {distributed.size()} processes", "raise --batch")
+        raise InputError(
+            "batch",
+            f"of {len(idx)} objects is less than one for each of {distributed.size()} processes",
+            "raise --batch",
+        )
     count = min(train.accumulate, len(idx) // distributed.size())
     parts_of = [distributed.share_of(part) for part in np.array_split(places, count)]
     for number, part in enumerate(parts_of):
@@ -238,15 +259,23 @@ def load_checkpoint(state: State, workspace: Path, identity: str) -> bool:
     tensors, metadata = read_tensors(path)
     record = _record(metadata, path)
     if record["identity"] != identity:
-        raise InputError(path, "belongs to a run with another configuration", "remove it or train with the same options")
+        raise InputError(
+            path, "belongs to a run with another configuration", "remove it or train with the same options"
+        )
     with torch.no_grad():
         for name, p in state.model.named_parameters():
             p.copy_(distributed.sharded(tensors[f"model/{name}"], p))
             state.average[name].copy_(distributed.local(distributed.sharded(tensors[f"average/{name}"], p)))
             moments = {key: tensors[f"{key}/{name}"] for key in MOMENTS if f"{key}/{name}" in tensors}
             if moments:
-                restore_moments(state.optimizer, p, {
-                    key: value if key == "step" else distributed.sharded(value.to(p.device), p) for key, value in moments.items()})
+                restore_moments(
+                    state.optimizer,
+                    p,
+                    {
+                        key: value if key == "step" else distributed.sharded(value.to(p.device), p)
+                        for key, value in moments.items()
+                    },
+                )
     state.step, state.seconds = record["step"], record["seconds"]
     return True
 
@@ -256,7 +285,9 @@ def _record(metadata: dict[str, str], path: Path) -> dict[str, Any]:
     try:
         return msgspec.to_builtins(msgspec.convert(parse_json(metadata.get("state", ""), path), _Record))
     except msgspec.ValidationError as error:
-        raise InputError(path, f"is not a checkpoint of gdtool ({error})", "remove it, and the training starts anew") from None
+        raise InputError(
+            path, f"is not a checkpoint of gdtool ({error})", "remove it, and the training starts anew"
+        ) from None
 
 
 class _Record(msgspec.Struct, forbid_unknown_fields=True):
@@ -265,12 +296,24 @@ class _Record(msgspec.Struct, forbid_unknown_fields=True):
     identity: str
 
 
-def run_training(model: Model, objects: Objects, train: TrainConfig, workspace: Path, *, seed: int, minutes: float | None = None,
-                 checkpoint_every: int = 200, validate_every: int = 1000, validate: Callable[[State], None] = lambda state: None,
-                 device: str = "cpu", warn: Callable[[str], None] = lambda message: None, log: Callable[[dict], None] = lambda record: None,
-                 progress=lambda iterable, total, label: iterable) -> State:
-    """Train until the steps or the minutes are spent; resumes from workspace. The first process writes workspace/loss.csv, and gives
-    each of its rows to log.
+def run_training(
+    model: Model,
+    objects: Objects,
+    train: TrainConfig,
+    workspace: Path,
+    *,
+    seed: int,
+    minutes: float | None = None,
+    checkpoint_every: int = 200,
+    validate_every: int = 1000,
+    validate: Callable[[State], None] = lambda state: None,
+    device: str = "cpu",
+    warn: Callable[[str], None] = lambda message: None,
+    log: Callable[[dict], None] = lambda record: None,
+    progress=lambda iterable, total, label: iterable,
+) -> State:
+    """Train until the steps or the minutes are spent; resumes from workspace. The first process writes
+    workspace/loss.csv, and gives each of its rows to log.
 
     Raises InputError when MOST_SKIPPED steps in a row had a gradient that is not finite; before that warns of each.
     """
@@ -280,14 +323,19 @@ def run_training(model: Model, objects: Objects, train: TrainConfig, workspace: 
     state.average = {name: x.to(device) for name, x in state.average.items()}
     resumed = load_checkpoint(state, workspace, identity)
     log_path = workspace / "loss.csv"
-    with open(log_path if distributed.rank() == 0 else os.devnull, "r+" if resumed and log_path.is_file() else "w", newline="") as file:
+    with open(
+        log_path if distributed.rank() == 0 else os.devnull, "r+" if resumed and log_path.is_file() else "w", newline=""
+    ) as file:
         writer = _continued(file, state.step if resumed else 0, model.config.domains)
         bar = iter(progress(range(state.step, train.steps), train.steps, "training"))
         while progress_of(state, train, minutes) < 1:
             start = time.perf_counter()
             record = train_step(state, objects, train, seed, minutes, device)
             state.seconds += distributed.total({"s": time.perf_counter() - start})["s"] / distributed.size()
-            writer.writerow({k: (f"{v:.6g}" if isinstance(v, float) else v) for k, v in record.items()} | {"seconds": f"{state.seconds:.1f}"})
+            writer.writerow(
+                {k: (f"{v:.6g}" if isinstance(v, float) else v) for k, v in record.items()}
+                | {"seconds": f"{state.seconds:.1f}"}
+            )
             file.flush()
             log(record)
             _tell_skipped(state, warn)
@@ -306,8 +354,11 @@ def run_training(model: Model, objects: Objects, train: TrainConfig, workspace: 
 
 def _tell_skipped(state: State, warn: Callable[[str], None]) -> None:
     if state.skipped >= MOST_SKIPPED:
-        raise InputError("training", f"has a gradient that is not finite in {MOST_SKIPPED} steps up to {state.step}",
-                         "lower learning_rate, or set precision to float32, in the configuration; the checkpoint has finite weights")
+        raise InputError(
+            "training",
+            f"has a gradient that is not finite in {MOST_SKIPPED} steps up to {state.step}",
+            "lower learning_rate, or set precision to float32, in the configuration; the checkpoint has finite weights",
+        )
     if state.skipped:
         warn(f"step {state.step} is left out: its gradient is not finite ({state.skipped} in a row)")
 

@@ -19,14 +19,21 @@ def linear(srgb: torch.Tensor) -> torch.Tensor:
     return torch.where(srgb <= 0.04045, srgb / 12.92, high)
 
 
-def image_error(predicted: torch.Tensor, clean: torch.Tensor, objects: int, domains: tuple[int, ...], config: ModelConfig,
-                train: TrainConfig) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean error of latents (b d k, c, h, w) per object and domain, (b, d): as the training counts it, and plainly squared.
+def image_error(
+    predicted: torch.Tensor,
+    clean: torch.Tensor,
+    objects: int,
+    domains: tuple[int, ...],
+    config: ModelConfig,
+    train: TrainConfig,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean error of latents (b d k, c, h, w) per object and domain, (b, d): as the training counts it, and plainly
+    squared.
 
     train.domain_weights are of each domain's values; the coverage in a scalar domain's third channel weighs 1. In
     train.absolute_domains the values count by their distance, of a normal in all three axes, rounded off below SOFTNESS
-    (Charbonnier's loss), all else by its square. The VAE's latents have no channel of coverage and are weighted as a whole.
-    """
+    (Charbonnier's loss), all else by its square. The VAE's latents have no channel of coverage and are weighted as a
+    whole."""
     square = (predicted - clean).float().square()
     if config.codec != "patch":
         square = square.mean((1, 2, 3)).unflatten(0, (objects, len(domains), -1)).mean(2)
@@ -47,14 +54,22 @@ def view_directions(config: ModelConfig) -> torch.Tensor:
     return torch.tensor(np.stack([by_name[name] for name in config.views]), dtype=torch.float32)
 
 
-def rendering_error(predicted: torch.Tensor, truth: torch.Tensor, order: dict[int, int], planes: torch.Tensor, lights: torch.Tensor, views: torch.Tensor,
-                    pixels: int, background: float, generator: torch.Generator) -> torch.Tensor:
+def rendering_error(
+    predicted: torch.Tensor,
+    truth: torch.Tensor,
+    order: dict[int, int],
+    planes: torch.Tensor,
+    lights: torch.Tensor,
+    views: torch.Tensor,
+    pixels: int,
+    background: float,
+    generator: torch.Generator,
+) -> torch.Tensor:
     """Mean squared difference of the closed-form renderings of predicted and true maps under the object's light.
 
-    predicted, truth (d, k, 3, h, w) encoded images of one object; order: index into DOMAINS to position along d; planes (k, 13, h, w); lights (16, 7);
-    views (k, 3). Radiance c is compared as c / (1 + c), or the few highlights would be all that counts. At random
-    foreground pixels, float32 throughout. 0 for an object that is not seen.
-    """
+    predicted, truth (d, k, 3, h, w) encoded images of one object; order: index into DOMAINS to position along d; planes
+    (k, 13, h, w); lights (16, 7); views (k, 3). Radiance c is compared as c / (1 + c), or the few highlights would be
+    all that counts. At random foreground pixels, float32 throughout. 0 for an object that is not seen."""
     from gdtool.shading.bsdf.closed_form import shade
     from gdtool.shading.bsdf.sg import SphericalGaussians
 
@@ -68,9 +83,15 @@ def rendering_error(predicted: torch.Tensor, truth: torch.Tensor, order: dict[in
 
     def render(images: torch.Tensor) -> torch.Tensor:
         picked = images[:, k, :, row, column].transpose(0, 1)  # (d, pixels, 3)
-        values = decode({d: picked[order[DOMAINS.index(d)]][..., None, None] for d in LIT}, mask[k, row, column][:, None, None], background)
+        values = decode(
+            {d: picked[order[DOMAINS.index(d)]][..., None, None] for d in LIT},
+            mask[k, row, column][:, None, None],
+            background,
+        )
         flat = {d: x.flatten(1) for d, x in values.items()}
-        radiance = shade(flat["normal"], views[k], linear(flat["albedo"]), flat["roughness"][:, 0], flat["metallic"][:, 0], light)
+        radiance = shade(
+            flat["normal"], views[k], linear(flat["albedo"]), flat["roughness"][:, 0], flat["metallic"][:, 0], light
+        )
         return radiance / (1 + radiance)
 
     with torch.no_grad():

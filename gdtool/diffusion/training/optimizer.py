@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from gdtool.core.errors import ResourceError, UsageError
-from gdtool.diffusion.training import distributed
 from gdtool.diffusion.config import TrainConfig
+from gdtool.diffusion.training import distributed
 
 # What reads or writes pixels or labels is no map between features: Muon's authors leave first and last layers to AdamW.
 ENDS = ("conv_in", "conv_out", "class_embedding", "time_embedding", "position", "condition_gate", "embed")
@@ -15,7 +15,8 @@ SMALLEST = 32  # rows and columns below which a matrix is left to AdamW
 
 
 class MuonAndAdam:
-    """torch.optim.Muon (Jordan et al. 2024) and AdamW as one optimiser; a convolution is the matrix (outputs, inputs · taps).
+    """torch.optim.Muon (Jordan et al. 2024) and AdamW as one optimiser; a convolution is the matrix (outputs, inputs ·
+    taps).
 
     Muon's step is scaled to AdamW's usual size, so both go by one learning rate. state maps the network's own
     parameters to their moments, as every optimiser's does.
@@ -26,7 +27,9 @@ class MuonAndAdam:
             raise ResourceError("muon", f"is not in torch {torch.__version__}", "use 2.11 or later, or optimizer adamw")
         self.matrices = matrices
         self.flat = [torch.nn.Parameter(p.detach().view(p.shape[0], -1)) for p in matrices]  # the same memory
-        self.muon = torch.optim.Muon(self.flat, lr=1.0, weight_decay=train.weight_decay, momentum=0.95, adjust_lr_fn="match_rms_adamw")
+        self.muon = torch.optim.Muon(
+            self.flat, lr=1.0, weight_decay=train.weight_decay, momentum=0.95, adjust_lr_fn="match_rms_adamw"
+        )
         self.adam = torch.optim.AdamW(rest, lr=1.0, betas=train.betas, fused=True)
         for group in self.muon.param_groups:
             group["rate"] = 1.0
@@ -34,7 +37,11 @@ class MuonAndAdam:
 
     @property
     def state(self) -> dict:
-        own = {p: self.muon.state[flat] for p, flat in zip(self.matrices, self.flat, strict=True) if flat in self.muon.state}
+        own = {
+            p: self.muon.state[flat]
+            for p, flat in zip(self.matrices, self.flat, strict=True)
+            if flat in self.muon.state
+        }
         return {**self.adam.state, **own}
 
     def restore(self, p: torch.Tensor, moments: dict[str, torch.Tensor]) -> None:
@@ -61,17 +68,28 @@ def make_optimizer(model: torch.nn.Module, train: TrainConfig):
     groups: dict[tuple[bool, float], list] = {}
     matrices = []
     for name, p in model.named_parameters():
-        inner = p.ndim >= 2 and min(p.shape[0], p[0].numel()) >= SMALLEST and not any(end in name.split(".") for end in ENDS)
+        inner = (
+            p.ndim >= 2
+            and min(p.shape[0], p[0].numel()) >= SMALLEST
+            and not any(end in name.split(".") for end in ENDS)
+        )
         if train.optimizer == "muon" and inner:
             matrices.append(p)
             continue
         rate = train.class_rate if ".class_embedding." in f".{name}" else 1.0
         groups.setdefault((p.ndim >= 2, rate), []).append(p)
-    rest = [{"params": ps, "weight_decay": train.weight_decay if decays else 0.0, "rate": rate} for (decays, rate), ps in groups.items()]
+    rest = [
+        {"params": ps, "weight_decay": train.weight_decay if decays else 0.0, "rate": rate}
+        for (decays, rate), ps in groups.items()
+    ]
     if not matrices:
         return torch.optim.AdamW(rest, lr=1.0, betas=train.betas, fused=True)
     if distributed.is_sharded(model):
-        raise UsageError("optimizer", "muon needs whole matrices, GDTOOL_SHARD splits them", "train without GDTOOL_SHARD, or with adamw")
+        raise UsageError(
+            "optimizer",
+            "muon needs whole matrices, GDTOOL_SHARD splits them",
+            "train without GDTOOL_SHARD, or with adamw",
+        )
     return MuonAndAdam(matrices, rest, train)
 
 

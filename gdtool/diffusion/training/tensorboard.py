@@ -1,4 +1,5 @@
-"""A training's figures and validation pictures as TensorBoard's event files, for those who watch several runs at once."""
+"""A training's figures and validation pictures as TensorBoard's event files, for those who watch several runs at
+once."""
 
 from __future__ import annotations
 
@@ -12,17 +13,21 @@ if TYPE_CHECKING:
 
 
 class Events:
-    """Event files in a folder, written from the first record on. Raises ResourceError without the package tensorboard."""
+    """Event files in a folder, written from the first record on. Raises ResourceError without the package
+    tensorboard."""
 
     def __init__(self, folder: Path):
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:
-            raise ResourceError("--tensorboard", "needs the package tensorboard", "pip install 'gdtool[tensorboard]', or leave it out") from None
+            raise ResourceError(
+                "--tensorboard", "needs the package tensorboard", "pip install 'gdtool[tensorboard]', or leave it out"
+            ) from None
         self._open, self._folder, self._writer = SummaryWriter, folder, None
 
     def _at(self, step: int):
-        if self._writer is None:  # a resumed run goes over the steps since its checkpoint again: those of before are purged
+        # A resumed run goes over the steps since its checkpoint again: those of before are purged.
+        if self._writer is None:
             self._writer = self._open(str(self._folder), purge_step=step, flush_secs=10)
         return self._writer
 

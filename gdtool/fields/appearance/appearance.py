@@ -13,8 +13,8 @@ MATERIALS = ("albedo", "roughness", "metallic")
 
 @dataclass
 class Appearance:
-    """albedo (v, 3), roughness, metallic, confidence (v,); views (v,) uint8 and residual (v,) as of a Surface; light: record
-    of light.json or None; figures; what was skipped."""
+    """albedo (v, 3), roughness, metallic, confidence (v,); views (v,) uint8 and residual (v,) as of a Surface; light:
+    record of light.json or None; figures; what was skipped."""
 
     albedo: np.ndarray
     roughness: np.ndarray
@@ -27,21 +27,41 @@ class Appearance:
     skipped: list[tuple[str, str]] = field(default_factory=list)
 
 
-def appearance(cameras, mask: np.ndarray, images: dict[str, np.ndarray], vertices: np.ndarray, faces: np.ndarray,
-               normals: np.ndarray, step: float, light: dict | None, seed: int,
-               shadows: bool = True) -> Appearance:
+def appearance(
+    cameras,
+    mask: np.ndarray,
+    images: dict[str, np.ndarray],
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray,
+    step: float,
+    light: dict | None,
+    seed: int,
+    shadows: bool = True,
+) -> Appearance:
     """Fuse the material views; recover the light from color; take from color what no material view gives.
 
     shadows: whether color is explained with what the surface hides from the light, or as if nothing were hidden.
     """
-    from gdtool.fields.appearance.light import color_samples, materials_from_color, recover_light, unoccluded, visibility
+    from gdtool.fields.appearance.light import (
+        color_samples,
+        materials_from_color,
+        recover_light,
+        unoccluded,
+        visibility,
+    )
 
     rng = np.random.default_rng(seed)
     seen = observe(cameras, mask, vertices, faces, normals, 0.5 * step)
     weight = seen.weight.sum(0)
-    out = Appearance(np.full((len(vertices), 3), 0.5, np.float32), np.full(len(vertices), 0.5, np.float32),
-                     np.zeros(len(vertices), np.float32), (1 - np.exp(-4 * weight)).astype(np.float32),
-                     (seen.weight > 0).sum(0).astype(np.uint8), np.zeros(len(vertices), np.float32))
+    out = Appearance(
+        np.full((len(vertices), 3), 0.5, np.float32),
+        np.full(len(vertices), 0.5, np.float32),
+        np.zeros(len(vertices), np.float32),
+        (1 - np.exp(-4 * weight)).astype(np.float32),
+        (seen.weight > 0).sum(0).astype(np.uint8),
+        np.zeros(len(vertices), np.float32),
+    )
     fused = {}
     for name in (*MATERIALS, "color"):
         if name in images and (name != "color" or "albedo" not in images):
@@ -65,11 +85,20 @@ def appearance(cameras, mask: np.ndarray, images: dict[str, np.ndarray], vertice
     reaches = visibility(vertices, faces, normals, 0.5 * step, rng) if shadows else unoccluded(normals)
     if "albedo" in fused:
         vertex, view, color = samples
-        out.light, residual = recover_light(normals[vertex], view, color, out.albedo[vertex], out.roughness[vertex],
-                                            out.metallic[vertex], reaches.at(vertex), light)
+        out.light, residual = recover_light(
+            normals[vertex],
+            view,
+            color,
+            out.albedo[vertex],
+            out.roughness[vertex],
+            out.metallic[vertex],
+            reaches.at(vertex),
+            light,
+        )
     else:
-        albedo, roughness, metallic, out.light, residual = materials_from_color(normals, fused["color"], weight, reaches,
-                                                                                samples, light)
+        albedo, roughness, metallic, out.light, residual = materials_from_color(
+            normals, fused["color"], weight, reaches, samples, light
+        )
         out.albedo = spread(albedo, weight, faces)
         # A roughness or metallic view, where there is one, says more than the single number found.
         out.roughness = out.roughness if "roughness" in fused else np.full(len(vertices), roughness, np.float32)

@@ -22,8 +22,15 @@ _PRIOR = 0.25  # rays
 MEAN_ALBEDO = 0.45  # light and albedo are only known up to a factor; this is where it is put
 
 
-def color_samples(cameras, color: np.ndarray, mask: np.ndarray, seen: Observations, vertices: np.ndarray, rng: np.random.Generator,
-                  count: int = SAMPLES):
+def color_samples(
+    cameras,
+    color: np.ndarray,
+    mask: np.ndarray,
+    seen: Observations,
+    vertices: np.ndarray,
+    rng: np.random.Generator,
+    count: int = SAMPLES,
+):
     """Pairs of a vertex and a view that sees it well: vertex (n,), direction to the camera (n, 3), color (n, 3) linear.
 
     Clipped colors are left out: they say only "at least".
@@ -32,7 +39,9 @@ def color_samples(cameras, color: np.ndarray, mask: np.ndarray, seen: Observatio
     for k, camera in enumerate(cameras):
         pixels = seen.pixels[k]
         chosen = np.flatnonzero(seen.weight[k] > 0.02)
-        both = bilinear(np.concatenate([color[k] * mask[k][..., None], mask[k][..., None]], -1).astype(np.float32), pixels[chosen])
+        both = bilinear(
+            np.concatenate([color[k] * mask[k][..., None], mask[k][..., None]], -1).astype(np.float32), pixels[chosen]
+        )
         value.append(both[:, :3] / np.maximum(both[:, 3:], 1e-6))
         vertex.append(chosen)
         view.append(toward_camera(camera, vertices[chosen]))
@@ -56,7 +65,9 @@ def _response(normals, view, albedo, roughness, metallic, axes, sharpness, seen:
     with torch.no_grad():
         for axis, width in zip(axes, sharpness, strict=True):
             lobe = SphericalGaussians(tensor(axis[None]), tensor([width]), torch.ones(1, 3))
-            out.append(shade(tensor(normals), tensor(view), tensor(albedo), tensor(roughness), tensor(metallic), lobe).numpy())
+            out.append(
+                shade(tensor(normals), tensor(view), tensor(albedo), tensor(roughness), tensor(metallic), lobe).numpy()
+            )
     return np.stack(out, -1) * seen.of_lobes(axes, sharpness)[:, None]
 
 
@@ -74,17 +85,19 @@ def fit_amplitudes(response: np.ndarray, color: np.ndarray, rounds: int = 4) -> 
     for _ in range(rounds):
         for channel in range(3):
             rows = response[:, channel] * weight[:, None]
-            ridge = 1e-3 * np.sqrt((rows ** 2).sum() / response.shape[2]) * np.eye(response.shape[2])
+            ridge = 1e-3 * np.sqrt((rows**2).sum() / response.shape[2]) * np.eye(response.shape[2])
             # The triangular factor stands for all rows, so the iterations of nnls see 16 of them.
             q, r = np.linalg.qr(np.concatenate([rows, ridge]))
-            amplitudes[:, channel] = nnls(r, q[:len(rows)].T @ (color[:, channel] * weight))[0]
+            amplitudes[:, channel] = nnls(r, q[: len(rows)].T @ (color[:, channel] * weight))[0]
         residual = (np.einsum("nck,kc->nc", response, amplitudes) - color).mean(1) / scale
         gap = np.where(residual > 0, 2 * residual, residual) / 0.25
-        weight = 1 / (1 + gap ** 2)
+        weight = 1 / (1 + gap**2)
     return amplitudes, float(np.abs(residual).mean())
 
 
-def recover_light(normals, view, color, albedo, roughness, metallic, seen: Visibility, known: dict | None = None) -> tuple[dict, float]:
+def recover_light(
+    normals, view, color, albedo, roughness, metallic, seen: Visibility, known: dict | None = None
+) -> tuple[dict, float]:
     """A record of light.json that explains color (n, 3) of points with known materials, and its relative residual.
 
     known: a light whose axes and sharpness to keep. Else sixteen lobes spread evenly, of the sharpness that fits best.
@@ -97,16 +110,26 @@ def recover_light(normals, view, color, albedo, roughness, metallic, seen: Visib
         shapes = [(fibonacci(16), np.full(16, width)) for width in SHARPNESS]
     best = None
     for axes, sharpness in shapes:
-        amplitudes, residual = fit_amplitudes(_response(normals, view, albedo, roughness, metallic, axes, sharpness, seen), color)
+        amplitudes, residual = fit_amplitudes(
+            _response(normals, view, albedo, roughness, metallic, axes, sharpness, seen), color
+        )
         if best is None or residual < best[1]:
-            best = ({"kind": "spherical_gaussians", "axes": axes.tolist(), "sharpness": sharpness.tolist(),
-                     "amplitudes": amplitudes.tolist()}, residual)
+            best = (
+                {
+                    "kind": "spherical_gaussians",
+                    "axes": axes.tolist(),
+                    "sharpness": sharpness.tolist(),
+                    "amplitudes": amplitudes.tolist(),
+                },
+                residual,
+            )
     return best
 
 
 @dataclass(frozen=True)
 class Visibility:
-    """What the surface leaves open: directions (v, r, 3) over each vertex' hemisphere, by the cosine; open (v, r) bool."""
+    """What the surface leaves open: directions (v, r, 3) over each vertex' hemisphere, by the cosine; open (v, r)
+    bool."""
 
     directions: np.ndarray
     open: np.ndarray
@@ -126,8 +149,14 @@ class Visibility:
         return np.maximum(share, LEAST_VISIBLE)
 
 
-def visibility(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, offset: float, rng: np.random.Generator,
-               rays: int = 16) -> Visibility:
+def visibility(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray,
+    offset: float,
+    rng: np.random.Generator,
+    rays: int = 16,
+) -> Visibility:
     """Which of rays directions from each vertex meet the surface again; offset: world units they start off it."""
     from gdtool.geometry.rays import RayCaster
 
@@ -142,8 +171,11 @@ def visibility(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, off
     for k in range(rays):
         radius = np.sqrt((k + 0.5) / rays)
         angle = 2 * np.pi * (turn + k * 0.618034)
-        direction = (radius * np.cos(angle)[:, None] * tangent + radius * np.sin(angle)[:, None] * bitangent
-                     + np.sqrt(1 - radius ** 2) * normals)
+        direction = (
+            radius * np.cos(angle)[:, None] * tangent
+            + radius * np.sin(angle)[:, None] * bitangent
+            + np.sqrt(1 - radius**2) * normals
+        )
         directions[:, k], free[:, k] = direction, ~caster.occluded(origins, np.ascontiguousarray(direction))
     return Visibility(directions, free)
 
@@ -153,8 +185,9 @@ def unoccluded(normals: np.ndarray) -> Visibility:
     return Visibility(np.asarray(normals, np.float32)[:, None], np.ones((len(normals), 1), bool))
 
 
-def materials_from_color(normals: np.ndarray, color: np.ndarray, weight: np.ndarray, seen: Visibility, samples,
-                         light: dict | None) -> tuple[np.ndarray, float, float, dict, float]:
+def materials_from_color(
+    normals: np.ndarray, color: np.ndarray, weight: np.ndarray, seen: Visibility, samples, light: dict | None
+) -> tuple[np.ndarray, float, float, dict, float]:
     """Albedo (v, 3), one roughness, one metallic, the light and its residual, from fused color (v, 3) alone.
 
     samples: what color_samples gave. light: a known light; without one it is what explains the color of an object of
@@ -171,9 +204,19 @@ def materials_from_color(normals: np.ndarray, color: np.ndarray, weight: np.ndar
     best = None
     for roughness, metallic in ((0.25, 0.0), (0.5, 0.0), (0.8, 0.0), (0.3, 1.0), (0.6, 1.0)):
         fixed = (np.full(len(vertex), roughness), np.full(len(vertex), metallic), shaded)
-        found, residual = (light, 0.0) if light is not None else recover_light(normals[vertex], view, value, grey, *fixed)
+        found, residual = (
+            (light, 0.0) if light is not None else recover_light(normals[vertex], view, value, grey, *fixed)
+        )
         if light is not None:
-            lit = _response(normals[vertex], view, grey, *fixed[:2], np.asarray(light["axes"]), np.asarray(light["sharpness"]), shaded)
+            lit = _response(
+                normals[vertex],
+                view,
+                grey,
+                *fixed[:2],
+                np.asarray(light["axes"]),
+                np.asarray(light["sharpness"]),
+                shaded,
+            )
             lit = np.einsum("nck,kc->nc", lit, np.asarray(light["amplitudes"]))
             residual = float(np.abs(lit / max(lit.mean(), 1e-9) - value / max(value.mean(), 1e-9)).mean())
         # Metal needs to pay its way: most things are not.
@@ -187,11 +230,13 @@ def materials_from_color(normals: np.ndarray, color: np.ndarray, weight: np.ndar
     white, black, rough = torch.ones(count, 3), torch.zeros(count, 3), torch.full((count,), roughness)
     with torch.no_grad():
         for k in range(len(found["axes"])):
-            lobe = SphericalGaussians.from_record({name: found[name][k:k + 1] for name in ("axes", "sharpness", "amplitudes")})
+            lobe = SphericalGaussians.from_record(
+                {name: found[name][k : k + 1] for name in ("axes", "sharpness", "amplitudes")}
+            )
             diffuse, specular = shade_parts(n, n, white, rough, torch.full((count,), metallic), lobe)
-            unit_color += (specular if metallic else diffuse).numpy() * arrives[:, k:k + 1]
+            unit_color += (specular if metallic else diffuse).numpy() * arrives[:, k : k + 1]
             if not metallic:
-                base += shade_parts(n, n, black, rough, torch.zeros(count), lobe)[1].numpy() * arrives[:, k:k + 1]
+                base += shade_parts(n, n, black, rough, torch.zeros(count), lobe)[1].numpy() * arrives[:, k : k + 1]
     floor = 0.05 * unit_color.mean()
     albedo = np.maximum(color - base, 0.1 * color) / np.maximum(unit_color, floor)
     if light is None:

@@ -28,8 +28,9 @@ def toward_camera(camera: Camera, points: np.ndarray) -> np.ndarray:
     return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
 
 
-def observe(cameras: list[Camera], mask: np.ndarray, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray,
-            offset: float) -> Observations:
+def observe(
+    cameras: list[Camera], mask: np.ndarray, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, offset: float
+) -> Observations:
     """Which views (mask (k, h, w)) see which vertices, by rays against the surface itself.
 
     offset: world units a ray starts off the surface, along the normal and toward the camera. The weight is the
@@ -58,7 +59,9 @@ def observe(cameras: list[Camera], mask: np.ndarray, vertices: np.ndarray, faces
     return Observations(np.stack(weights), np.stack(places))
 
 
-def fuse(images: np.ndarray, mask: np.ndarray, seen: Observations, sigma: float = 0.05) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def fuse(
+    images: np.ndarray, mask: np.ndarray, seen: Observations, sigma: float = 0.05
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One value a vertex from k views: images (k, h, w, c) -> value (v, c), total weight (v,), residual (v,).
 
     A weighted mean, reweighted twice by each view's distance from it (Geman-McClure of scale sigma), so that a view
@@ -88,8 +91,9 @@ def neighbour_matrix(faces: np.ndarray, count: int):
 
     rows = faces[:, [0, 1, 2]].ravel()
     columns = faces[:, [1, 2, 0]].ravel()
-    graph = coo_matrix((np.ones(2 * len(rows), np.float32), (np.r_[rows, columns], np.r_[columns, rows])),
-                       shape=(count, count)).tocsr()
+    graph = coo_matrix(
+        (np.ones(2 * len(rows), np.float32), (np.r_[rows, columns], np.r_[columns, rows])), shape=(count, count)
+    ).tocsr()
     graph.data[:] = 1.0
     return graph
 

@@ -21,9 +21,11 @@ SLACK = 0.5  # steps that noisy silhouettes cut too little
 _CHUNK = 1 << 16  # samples at a time: their arrays stay in the cache
 
 
-def combined_distance(sights: list[Sight], points: np.ndarray, step: float, limit: float, noise: float = 0.0,
-                      outvoted: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distance (n,) float32 of points (n, 3) by all views, clipped to +-limit, and how it was measured (n,) uint8.
+def combined_distance(
+    sights: list[Sight], points: np.ndarray, step: float, limit: float, noise: float = 0.0, outvoted: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Signed distance (n,) float32 of points (n, 3) by all views, clipped to +-limit, and how it was measured (n,)
+    uint8.
 
     Outside where any view sees free space. The magnitude is that of the nearest surface among the views that agree
     with the sign; estimates within about a third of a step of it are averaged by their weights. With noise (world
@@ -36,7 +38,7 @@ def combined_distance(sights: list[Sight], points: np.ndarray, step: float, limi
     deep = [s for s in sights if s.planes is not None]
 
     def measure(start: int) -> None:
-        part = points[start:start + _CHUNK]
+        part = points[start : start + _CHUNK]
         hull = np.stack([hull_distance(sight, part) for sight in sights]).astype(np.float32)
         ending = (np.abs(hull) < step).sum(0)
         value = _vote(hull, outvoted)
@@ -50,9 +52,11 @@ def combined_distance(sights: list[Sight], points: np.ndarray, step: float, limi
             # Noisy views have noisy masks, even after their edges were brought together.
             value = np.maximum(value - (SLACK * step if noise else 0.0), fused)
             close = (np.abs(free - value) < step + noise) & (weight > WEAK) & (free > -limit)
-            seen = np.maximum(seen, np.where((close & smooth).any(0), SMOOTHLY, np.where(close.any(0), ROUGHLY, UNSEEN)))
-        out[start:start + _CHUNK] = np.clip(value, -limit, limit)
-        measured[start:start + _CHUNK] = seen
+            seen = np.maximum(
+                seen, np.where((close & smooth).any(0), SMOOTHLY, np.where(close.any(0), ROUGHLY, UNSEEN))
+            )
+        out[start : start + _CHUNK] = np.clip(value, -limit, limit)
+        measured[start : start + _CHUNK] = seen
 
     # numpy lets go of the interpreter lock; each chunk writes its own part.
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
@@ -71,8 +75,13 @@ def _nearest_surface(value: np.ndarray, weight: np.ndarray, blend: float, limit:
     nearest_free = np.where(free & firm, value, np.inf).min(0)
     nearest_firm = np.where(near, value, -np.inf).max(0)
     nearest_weak = np.where(free, value, np.inf).min(0)
-    reference = np.where(np.isfinite(nearest_free), nearest_free, np.where(
-        np.isfinite(nearest_firm), nearest_firm, np.where(np.isfinite(nearest_weak), nearest_weak, value.max(0))))
+    reference = np.where(
+        np.isfinite(nearest_free),
+        nearest_free,
+        np.where(
+            np.isfinite(nearest_firm), nearest_firm, np.where(np.isfinite(nearest_weak), nearest_weak, value.max(0))
+        ),
+    )
     share = weight * np.exp(-(((value - reference) / blend) ** 2)) + 1e-12
     return (share * value).sum(0) / share.sum(0)
 
@@ -118,7 +127,9 @@ def _mean_surface(value: np.ndarray, weight: np.ndarray, limit: float) -> np.nda
     return np.where(total > 1e-3, (share * value).sum(0) / np.maximum(total, 1e-3), value.max(0))
 
 
-def hull_bounds(sights: list[Sight], outvoted: int = 0, reach: float = 0.75, samples: int = 48) -> tuple[np.ndarray, np.ndarray]:
+def hull_bounds(
+    sights: list[Sight], outvoted: int = 0, reach: float = 0.75, samples: int = 48
+) -> tuple[np.ndarray, np.ndarray]:
     """Box (low, high) around the silhouettes' common cone, found on a coarse grid over [-reach, reach]^3."""
     step = 2 * reach / (samples - 1)
     axis = np.linspace(-reach, reach, samples)
@@ -130,7 +141,9 @@ def hull_bounds(sights: list[Sight], outvoted: int = 0, reach: float = 0.75, sam
     return near.min(0) - step, near.max(0) + step
 
 
-def carve(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 0) -> tuple[Grid, np.ndarray, np.ndarray]:
+def carve(
+    sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 0
+) -> tuple[Grid, np.ndarray, np.ndarray]:
     """Grid, its signed distances (a, b, c) float32 and how each is known (a, b, c) uint8.
 
     Exact in a band around the surface and +-limit (3 steps, more with noise) elsewhere.
@@ -150,9 +163,11 @@ def carve(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 
             touched[tuple(seen.T)] = True
     fine = fine_points(dilate(band_cells(coarse < 0, touched), int(round(noise / step))), COARSE)
     values = np.repeat(np.repeat(np.repeat(np.where(coarse < 0, -limit, limit), COARSE, 0), COARSE, 1), COARSE, 2)
-    values = np.ascontiguousarray(values[:grid.shape[0], :grid.shape[1], :grid.shape[2]], np.float32)
+    values = np.ascontiguousarray(values[: grid.shape[0], : grid.shape[1], : grid.shape[2]], np.float32)
     measured = np.zeros(grid.shape, np.uint8)
-    values[fine], measured[fine] = combined_distance(sights, grid.points(np.argwhere(fine)), step, limit, noise, outvoted)
+    values[fine], measured[fine] = combined_distance(
+        sights, grid.points(np.argwhere(fine)), step, limit, noise, outvoted
+    )
     return grid, values, measured
 
 

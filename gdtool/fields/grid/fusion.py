@@ -8,23 +8,34 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.cameras import Camera
-from gdtool.fields.views.depth_alignment import Corrections, corrections, disagreement, slope_rows
-from gdtool.fields.grid.carve import carve, silhouettes_outvoted, smooth_unseen
 from gdtool.fields.clock import Clock
-from gdtool.fields.views.photometric import Picture
+from gdtool.fields.grid.carve import carve, silhouettes_outvoted, smooth_unseen
 from gdtool.fields.grid.refine import FOLD_DEGREES, bumpiness, drop_debris, follow_normals, measured_planes, refine
 from gdtool.fields.grid.shown import restore_shown
-from gdtool.fields.views.prepared_view import WEAK, Sight, free_distance, hull_distance, pixel_footprint, prepare, with_edge
 from gdtool.fields.grid.thin import near_points, restore_thin
+from gdtool.fields.views.depth_alignment import Corrections, corrections, disagreement, slope_rows
+from gdtool.fields.views.photometric import Picture
+from gdtool.fields.views.prepared_view import (
+    WEAK,
+    Sight,
+    free_distance,
+    hull_distance,
+    pixel_footprint,
+    prepare,
+    with_edge,
+)
 from gdtool.geometry.grids import edge_counts, extract
 from gdtool.geometry.normals import vertex_normals
 from gdtool.geometry.sharpen import dihedral_degrees, restore_creases
 
 LEAST_NOISE = 0.3  # grid steps: of views that had to be brought together
 OVER_EDGE = 0.25  # steps that a sharp edge may stand out of what the views leave, whose pixels round it off
-# Pixels by which the surface of views that a model made comes out too small: parts that they disagree about go, edges first.
+# Pixels by which the surface of views that a model made comes out too small: parts that they disagree about go, edges
+# first.
 SMALL = 0.2
-BUMPY = 3.5  # degrees between the surface of views that disagree and their normals: exact normals come to 3, a model's to 4 and more
+# Degrees between the surface of views that disagree and their normals: exact normals come to 3, a model's to 4 and
+# more.
+BUMPY = 3.5
 CREASE_ROUNDS = 4  # tries without what folded over
 MAX_SAMPLES = 320  # along the longest side: 33 million samples, 0.6 GB at the peak
 # Rounds of bringing views together: how far apart two surfaces may lie to be taken for one (world units), and how stiff
@@ -32,8 +43,9 @@ MAX_SAMPLES = 320  # along the longest side: 33 million samples, 0.6 GB at the p
 ROUNDS = ((0.08, 4.0), (0.06, 1.0), (0.04, 0.3), (0.03, 0.3))
 MORE_ROUNDS, PLATEAU = 4, 0.05
 DRAFT = 2.0  # grid steps of the draft that is made first when time is short
-# What materials solved from color (the slowest way) and writing take of a draft's seconds at the same step. Fusing grows with the step to the power -2.4
-# (the narrow band to -2, where the surface may lie to -3), the rest with the number of vertices.
+# What materials solved from color (the slowest way) and writing take of a draft's seconds at the same step. Fusing
+# grows with the step to the power -2.4 (the narrow band to -2, where the surface may lie to -3), the rest with the
+# number of vertices.
 AFTER, FUSING, SURFACE = 1.5, 2.4, 2.0
 
 
@@ -44,9 +56,9 @@ def _silent(text: str) -> None:
 @dataclass(frozen=True)
 class Shape:
     """A closed mesh, outward: vertices (v, 3) float64, faces (f, 3) int32, support (v,): weight of the views that
-    measured each vertex; step: the grid's, world units; pieces dropped as debris; bumps: degrees by which the normals of
-    views that disagree differed from the surface's, None where they did not matter; restored: share of the picture's mask behind
-    which the views together left nothing."""
+    measured each vertex; step: the grid's, world units; pieces dropped as debris; bumps: degrees by which the normals
+    of views that disagree differed from the surface's, None where they did not matter; restored: share of the picture's
+    mask behind which the views together left nothing."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -57,10 +69,15 @@ class Shape:
     restored: float = 0.0
 
 
-def prepare_all(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray | None, normal: np.ndarray | None) -> list[Sight]:
+def prepare_all(
+    cameras: list[Camera], mask: np.ndarray, depth: np.ndarray | None, normal: np.ndarray | None
+) -> list[Sight]:
     """Prepare every view that shows anything; views whose mask is empty are left out."""
-    return [prepare(camera, mask[k], None if depth is None else depth[k], None if normal is None else normal[k])
-            for k, camera in enumerate(cameras) if (mask[k] > 0.5).any()]
+    return [
+        prepare(camera, mask[k], None if depth is None else depth[k], None if normal is None else normal[k])
+        for k, camera in enumerate(cameras)
+        if (mask[k] > 0.5).any()
+    ]
 
 
 def finest_pixel(cameras: list[Camera]) -> float:
@@ -73,23 +90,35 @@ def grid_step(cameras: list[Camera], resolution: int) -> float:
     return 1.0 / resolution if resolution else float(np.clip(0.8 * finest_pixel(cameras), 1.0 / MAX_SAMPLES, 1.0 / 64))
 
 
-def depth_for(cameras: list[Camera], mask: np.ndarray, normal: np.ndarray, alike: dict[str, np.ndarray] | None = None) -> np.ndarray:
-    """Depth (k, h, w) from normals (k, h, w, 3) and silhouettes; alike: albedo, roughness and metallic views where there are any."""
+def depth_for(
+    cameras: list[Camera], mask: np.ndarray, normal: np.ndarray, alike: dict[str, np.ndarray] | None = None
+) -> np.ndarray:
+    """Depth (k, h, w) from normals (k, h, w, 3) and silhouettes; alike: albedo, roughness and metallic views where
+    there are any."""
     from gdtool.fields.grid.carve import hull_bounds
     from gdtool.fields.views.normal_integration import depth_from_normals
 
     sights = prepare_all(cameras, mask, None, None)
-    return depth_from_normals(cameras, mask, normal, alike or {}, sights, hull_bounds(sights, silhouettes_outvoted(sights)))
+    return depth_from_normals(
+        cameras, mask, normal, alike or {}, sights, hull_bounds(sights, silhouettes_outvoted(sights))
+    )
 
 
-def align_depth(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray | None, normal: np.ndarray | None,
-                step: float, clock: Clock | None = None, tell: Callable[[str], None] = _silent,
-                colors: Sequence[np.ndarray] = ()) -> tuple[list[Sight], float, float]:
+def align_depth(
+    cameras: list[Camera],
+    mask: np.ndarray,
+    depth: np.ndarray | None,
+    normal: np.ndarray | None,
+    step: float,
+    clock: Clock | None = None,
+    tell: Callable[[str], None] = _silent,
+    colors: Sequence[np.ndarray] = (),
+) -> tuple[list[Sight], float, float]:
     """Prepared views whose surfaces were brought together where they disagree, the disagreement before and after.
 
-    colors: images (k, h, w, 3), linear, of what looks alike from all sides. Views that agree to a tenth of a step at three quarters of
-    their points are left as they are: of views that end at one another's silhouettes half may agree by that alone.
-    """
+    colors: images (k, h, w, 3), linear, of what looks alike from all sides. Views that agree to a tenth of a step at
+    three quarters of their points are left as they are: of views that end at one another's silhouettes half may agree
+    by that alone."""
     sights = prepare_all(cameras, mask, depth, normal)
     before = disagreement(sights)
     if disagreement(sights, share=0.75) < 0.1 * step:
@@ -99,9 +128,16 @@ def align_depth(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray | Non
     return sights, before, max(after, LEAST_NOISE * step)
 
 
-def bring_together(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray, normal: np.ndarray | None, sights: list[Sight],
-                   clock: Clock | None = None, tell: Callable[[str], None] = _silent,
-                   colors: Sequence[np.ndarray] = ()) -> tuple[list[Sight], float]:
+def bring_together(
+    cameras: list[Camera],
+    mask: np.ndarray,
+    depth: np.ndarray,
+    normal: np.ndarray | None,
+    sights: list[Sight],
+    clock: Clock | None = None,
+    tell: Callable[[str], None] = _silent,
+    colors: Sequence[np.ndarray] = (),
+) -> tuple[list[Sight], float]:
     """Corrected views and their disagreement. sights: the views as they were given, prepared.
 
     Rounds go on until the disagreement falls no more, or until half of the clock's time is spent; each leaves whole
@@ -117,7 +153,10 @@ def bring_together(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray, n
         changed = np.array(depth)
         for place, k in enumerate(kept):
             changed[k] = np.where(depth[k] > 0, depth[k] + found.depth(place, mask[k].shape), 0)
-        sights = [with_edge(sight, edge) for sight, edge in zip(prepare_all(cameras, mask, changed, normal), found.edge, strict=True)]
+        sights = [
+            with_edge(sight, edge)
+            for sight, edge in zip(prepare_all(cameras, mask, changed, normal), found.edge, strict=True)
+        ]
         previous, after = after, disagreement(sights)
         tell(f"round {count}: views disagree by {after:.5f}, {previous:.5f} before")
         plateau = count >= len(ROUNDS) and after > (1 - PLATEAU) * previous
@@ -126,13 +165,20 @@ def bring_together(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray, n
     return sights, after
 
 
-def fuse_within(sights: list[Sight], step: float, noise: float, outvoted: int, clock: Clock, shaded: bool = True,
-                grow: float = 0.0, known: str = "") -> tuple[Shape, str]:
+def fuse_within(
+    sights: list[Sight],
+    step: float,
+    noise: float,
+    outvoted: int,
+    clock: Clock,
+    shaded: bool = True,
+    grow: float = 0.0,
+    known: str = "",
+) -> tuple[Shape, str]:
     """fuse_views at the finest step that the clock has time for, and what was left out for it ("" for nothing).
 
-    With an end in sight a draft is made first, which tells how quick the machine is and is the result when nothing finer
-    can be done in time.
-    """
+    With an end in sight a draft is made first, which tells how quick the machine is and is the result when nothing
+    finer can be done in time."""
     if not clock.limited:
         return fuse_views(sights, step, noise, outvoted, shaded, grow, known), ""
     began = clock.spent()
@@ -141,15 +187,25 @@ def fuse_within(sights: list[Sight], step: float, noise: float, outvoted: int, c
     for coarser in (1.0, 1.4):
         finer = DRAFT / coarser
         if seconds * (finer**FUSING + AFTER * finer**SURFACE) <= clock.left():
-            return fuse_views(sights, coarser * step, noise, outvoted, shaded, grow, known), "" if coarser == 1 else f"at {coarser} of its step"
+            return fuse_views(
+                sights, coarser * step, noise, outvoted, shaded, grow, known
+            ), "" if coarser == 1 else f"at {coarser} of its step"
     return draft, f"at {DRAFT:g} of its step"
 
 
-def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 0, shaded: bool = True, grow: float = 0.0,
-               known: str = "") -> Shape:
-    """Mesh of the prepared views. noise: world units by which they disagree; outvoted: see silhouettes_outvoted; shaded:
-    whether their normals are views' own, and not made of their depth; grow: world units by which the surface is moved out; known: name of the view whose
-    silhouette is no guess, all of which the mesh shows (shown.py), where views disagree; "" for none.
+def fuse_views(
+    sights: list[Sight],
+    step: float,
+    noise: float = 0.0,
+    outvoted: int = 0,
+    shaded: bool = True,
+    grow: float = 0.0,
+    known: str = "",
+) -> Shape:
+    """Mesh of the prepared views. noise: world units by which they disagree; outvoted: see silhouettes_outvoted;
+    shaded: whether their normals are views' own, and not made of their depth; grow: world units by which the surface is
+    moved out; known: name of the view whose silhouette is no guess, all of which the mesh shows (shown.py), where views
+    disagree; "" for none.
 
     Raises ValueError when the silhouettes have no common volume.
     """
@@ -171,7 +227,9 @@ def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: i
     reach = 1.5 * step + noise
     support = measured_planes(sights, vertices, vertex_normals(vertices, faces), reach)[2]
     deep = any(s.planes is not None for s in sights)
-    vertices, faces, dropped = drop_debris(vertices, faces, support if deep else np.ones(len(vertices)), step, hollows=deep and not noise)
+    vertices, faces, dropped = drop_debris(
+        vertices, faces, support if deep else np.ones(len(vertices)), step, hollows=deep and not noise
+    )
     if not noise and not outvoted:
         # A sheet's two sides would both be drawn onto its one measured surface.
         moved = refine(vertices, faces, sights, step, reach=reach)
@@ -185,19 +243,23 @@ def fuse_views(sights: list[Sight], step: float, noise: float = 0.0, outvoted: i
 
 
 def _smoothed(values: np.ndarray, noise: float) -> np.ndarray:
-    """Distances of views that disagree by noise (steps), smoothed as much as that asks for; fins that more would take away
-    are taken away: views from beside leave them where they see a sheet edge-on."""
+    """Distances of views that disagree by noise (steps), smoothed as much as that asks for; fins that more would take
+    away are taken away: views from beside leave them where they see a sheet edge-on."""
     from scipy.ndimage import binary_dilation, gaussian_filter
 
     little, more = (gaussian_filter(values, min(least + noise, 2.5), truncate=2.5) for least in (0.6, 1.0))
     return np.where(binary_dilation(more < 0, iterations=2), little, more)
 
 
-def with_creases(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], fixed: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """The closed mesh with the bevels that marching cubes leaves along sharp edges drawn out; as given where that opens it.
+def with_creases(
+    vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], fixed: np.ndarray, step: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The closed mesh with the bevels that marching cubes leaves along sharp edges drawn out; as given where that opens
+    it.
 
     fixed (v,) bool: vertices that stay. None moves out of the silhouettes, nor into what a view sees to be free.
     """
+
     def outside(points: np.ndarray) -> np.ndarray:
         far = np.max([hull_distance(sight, points) for sight in sights], 0)
         for sight in sights:
@@ -213,7 +275,9 @@ def with_creases(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], f
     for _ in range(CREASE_ROUNDS):
         sharp, sharp_faces, _ = restore_creases(vertices, faces, accept=accept)
         folded = folds(sharp, sharp_faces)
-        fresh = near_points(vertices, folded, 2 * step) & ~near_points(vertices, folds(vertices, faces), 2 * step) & ~fixed
+        fresh = (
+            near_points(vertices, folded, 2 * step) & ~near_points(vertices, folds(vertices, faces), 2 * step) & ~fixed
+        )
         if not fresh.any():
             break
         fixed |= fresh

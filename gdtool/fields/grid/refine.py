@@ -37,8 +37,17 @@ def measured_planes(sights: list[Sight], vertices: np.ndarray, normals: np.ndarr
     return matrix, vector, total
 
 
-def refine(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: float, *, reach: float, rounds: int = 2,
-           smoothness: float = 0.2, iterations: int = 40) -> np.ndarray:
+def refine(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    sights: list[Sight],
+    step: float,
+    *,
+    reach: float,
+    rounds: int = 2,
+    smoothness: float = 0.2,
+    iterations: int = 40,
+) -> np.ndarray:
     """New positions (v, 3): least squares of distances to the measured planes and of the umbrella Laplacian.
 
     Seen vertices follow the planes; unseen ones minimise bending, held where the carving put them and inside
@@ -65,16 +74,25 @@ def refine(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: f
     return _unfold(_inside_silhouettes(vertices, start, sights, 0.25 * step), start, faces)
 
 
-def follow_normals(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], step: float, *, reach: float, rounds: int = 3,
-                   bending: float = 1.0, iterations: int = 300) -> np.ndarray:
-    """New positions (v, 3) of a surface fused from views that disagree: where it lies it says itself, what form it has their normals.
+def follow_normals(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    sights: list[Sight],
+    step: float,
+    *,
+    reach: float,
+    rounds: int = 3,
+    bending: float = 1.0,
+    iterations: int = 300,
+) -> np.ndarray:
+    """New positions (v, 3) of a surface fused from views that disagree: where it lies it says itself, what form it has
+    their normals.
 
     Depths that differ a little from view to view leave bumps, which are low and steep; the normals show none. Every
-    vertex moves along its own normal, so that edges come to lie across the normals shown there, and is held where it was
-    (Nehab et al., "Efficiently Combining Positions and Normals for Precise 3D Geometry", 2005): bumps shorter than about
-    WAVELENGTH go. What no view shows moves along with what is around it. reach: how far off a view's surface may be
-    (world units).
-    """
+    vertex moves along its own normal, so that edges come to lie across the normals shown there, and is held where it
+    was (Nehab et al., "Efficiently Combining Positions and Normals for Precise 3D Geometry", 2005): bumps shorter than
+    about WAVELENGTH go. What no view shows moves along with what is around it. reach: how far off a view's surface may
+    be (world units)."""
     from scipy.sparse import csr_array, diags_array
 
     start, ends = vertices, edges_of(faces).ends
@@ -84,7 +102,10 @@ def follow_normals(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight],
 
     def differences(at_a: np.ndarray, at_b: np.ndarray) -> csr_array:
         """Matrix (e, v) of at_a (e,) times the value at an edge's one end less at_b (e,) times that at the other."""
-        return csr_array((np.stack([at_a, -at_b], 1).ravel(), ends.ravel(), np.arange(0, 2 * len(ends) + 1, 2)), (len(ends), len(vertices)))
+        return csr_array(
+            (np.stack([at_a, -at_b], 1).ravel(), ends.ravel(), np.arange(0, 2 * len(ends) + 1, 2)),
+            (len(ends), len(vertices)),
+        )
 
     for _ in range(rounds):
         own = vertex_normals(vertices, faces)
@@ -96,21 +117,34 @@ def follow_normals(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight],
         known = stiff * np.minimum(trust[a], trust[b])
         slant = differences(np.einsum("ei,ei->e", across, own[a]), np.einsum("ei,ei->e", across, own[b]))
         level = differences(np.ones(len(ends)), np.ones(len(ends)))
-        matrix = slant.T @ diags_array(known) @ slant + level.T @ diags_array(stiff - known) @ level + bending * umbrella.T @ umbrella
-        right = (-slant.T @ (known * np.einsum("ei,ei->e", across, along))
-                 - bending * umbrella.T @ np.einsum("vi,vi->v", own, umbrella @ vertices)
-                 - hold * np.einsum("vi,vi->v", own, vertices - start))
-        move = conjugate_gradients(lambda u, matrix=matrix: matrix @ u + hold * u, right[:, None], (matrix.diagonal() + hold)[:, None], iterations)
+        matrix = (
+            slant.T @ diags_array(known) @ slant
+            + level.T @ diags_array(stiff - known) @ level
+            + bending * umbrella.T @ umbrella
+        )
+        right = (
+            -slant.T @ (known * np.einsum("ei,ei->e", across, along))
+            - bending * umbrella.T @ np.einsum("vi,vi->v", own, umbrella @ vertices)
+            - hold * np.einsum("vi,vi->v", own, vertices - start)
+        )
+        move = conjugate_gradients(
+            lambda u, matrix=matrix: matrix @ u + hold * u,
+            right[:, None],
+            (matrix.diagonal() + hold)[:, None],
+            iterations,
+        )
         vertices = vertices + np.clip(move, -step, step) * own
     return _unfold(_inside_silhouettes(vertices, start, sights, 0.25 * step), start, faces)
 
 
-def shown_normals(sights: list[Sight], vertices: np.ndarray, normals: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normal (v, 3) that the views show at the vertices of a surface, and the trust in it (v,) in 0..1, 0 where none does.
+def shown_normals(
+    sights: list[Sight], vertices: np.ndarray, normals: np.ndarray, reach: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normal (v, 3) that the views show at the vertices of a surface, and the trust in it (v,) in 0..1, 0 where
+    none does.
 
-    normals (v, 3): the surface's own; what a view shows farther than reach (world units) away, or turned away from them,
-    is another surface.
-    """
+    normals (v, 3): the surface's own; what a view shows farther than reach (world units) away, or turned away from
+    them, is another surface."""
     total = np.zeros((len(vertices), 3))
     for sight in sights:
         if sight.planes is None:
@@ -160,7 +194,8 @@ def conjugate_gradients(apply, right: np.ndarray, diagonal: np.ndarray, iteratio
 
 
 def _inside_silhouettes(vertices: np.ndarray, start: np.ndarray, sights: list[Sight], slack: float) -> np.ndarray:
-    """Vertices that left a silhouette by more than slack, and farther than they began, go back along their way until they have not."""
+    """Vertices that left a silhouette by more than slack, and farther than they began, go back along their way until
+    they have not."""
     share = np.ones(len(vertices))
     for sight in sights:
         before, after = hull_distance(sight, start), hull_distance(sight, vertices)
@@ -174,8 +209,8 @@ def _inside_silhouettes(vertices: np.ndarray, start: np.ndarray, sights: list[Si
 
 
 def _unfold(vertices: np.ndarray, start: np.ndarray, faces: np.ndarray, rounds: int = 8) -> np.ndarray:
-    """Vertices of faces that turned over on the way from start, or folded onto a neighbour, go back half of their way, and
-    those around them less of theirs, until none has."""
+    """Vertices of faces that turned over on the way from start, or folded onto a neighbour, go back half of their way,
+    and those around them less of theirs, until none has."""
     before, _ = face_normals(start, faces)
     beside = edges_of(faces).face_pairs()[1]
     folded_before = _folded(before, beside)
@@ -202,22 +237,28 @@ def _folded(normals: np.ndarray, beside: np.ndarray) -> np.ndarray:
     return np.einsum("ij,ij->i", normals[beside[:, 0]], normals[beside[:, 1]]) < np.cos(np.radians(FOLD_DEGREES))
 
 
-def drop_debris(vertices: np.ndarray, faces: np.ndarray, support: np.ndarray, step: float, hollows: bool = False) -> tuple[np.ndarray, np.ndarray, int]:
+def drop_debris(
+    vertices: np.ndarray, faces: np.ndarray, support: np.ndarray, step: float, hollows: bool = False
+) -> tuple[np.ndarray, np.ndarray, int]:
     """The mesh without inner bubbles and without pieces that are tiny or that no view supports (v,): and how many went.
 
-    The largest piece always stays. hollows: an inner wall that views saw stays too (of views that agree: others see through walls).
-    """
+    The largest piece always stays. hollows: an inner wall that views saw stays too (of views that agree: others see
+    through walls)."""
     labels, volume = _pieces(vertices, faces)
     held = np.bincount(labels, support[faces].mean(1) > 0.02)
     # Of a plate seen edge-on only the rim has support: a few faces say that it is there.
-    seen = np.where(volume > 0, (held > 0.2 * np.bincount(labels)) | (held >= _SEEN_FACES), hollows & (held >= _HOLLOW_FACES))
+    seen = np.where(
+        volume > 0, (held > 0.2 * np.bincount(labels)) | (held >= _SEEN_FACES), hollows & (held >= _HOLLOW_FACES)
+    )
     keep = (np.abs(volume) > (2 * step) ** 3) & seen
     keep[np.argmax(volume)] = True
     vertices, faces, _ = keep_faces(vertices, faces, keep[labels])
     return vertices, faces, int((~keep).sum())
 
 
-def keep_pieces(vertices: np.ndarray, faces: np.ndarray, step: float, share: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
+def keep_pieces(
+    vertices: np.ndarray, faces: np.ndarray, step: float, share: float = 0.01
+) -> tuple[np.ndarray, np.ndarray]:
     """The pieces that hold more than share of the largest one's volume, and no bubbles."""
     labels, volume = _pieces(vertices, faces)
     vertices, faces, _ = keep_faces(vertices, faces, (volume > max(share * volume.max(), (2 * step) ** 3))[labels])
@@ -229,4 +270,6 @@ def _pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     labels = components(faces, len(vertices))
     order = np.argsort(labels, kind="stable")
     bounds = np.searchsorted(labels[order], np.arange(int(labels.max()) + 2))
-    return labels, np.array([signed_volume(vertices, faces[order[a:b]]) for a, b in zip(bounds[:-1], bounds[1:], strict=True)])
+    return labels, np.array(
+        [signed_volume(vertices, faces[order[a:b]]) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    )

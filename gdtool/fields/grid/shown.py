@@ -1,8 +1,8 @@
 """What the picture shows and the fused views lost: wings, chimneys, twigs that the other views look through.
 
-Of views that a model made of one picture, that picture's outline alone is no guess. Each of its pixels has something behind it: where
-the views together leave nothing there, it is put between the depths that the picture's own view and the one that faces it have.
-"""
+Of views that a model made of one picture, that picture's outline alone is no guess. Each of its pixels has something
+behind it: where the views together leave nothing there, it is put between the depths that the picture's own view and
+the one that faces it have."""
 
 from __future__ import annotations
 
@@ -25,17 +25,23 @@ _CHUNK = 1 << 16
 
 
 def opposite(sights: Sequence[Sight], known: Sight) -> Sight | None:
-    """The view that faces a view, both orthographic and of one size, so that one shows the other's outline mirrored; None where there is none."""
+    """The view that faces a view, both orthographic and of one size, so that one shows the other's outline mirrored;
+    None where there is none."""
     facing = known.camera.world_from_camera[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
     for sight in sights:
-        if known.camera.projection == sight.camera.projection == "orthographic" and known.mask.shape == sight.mask.shape \
-                and known.camera.pixel_size == sight.camera.pixel_size and np.allclose(sight.camera.world_from_camera[:3, :3], facing, atol=1e-6):
+        if (
+            known.camera.projection == sight.camera.projection == "orthographic"
+            and known.mask.shape == sight.mask.shape
+            and known.camera.pixel_size == sight.camera.pixel_size
+            and np.allclose(sight.camera.world_from_camera[:3, :3], facing, atol=1e-6)
+        ):
             return sight
     return None
 
 
 def lost_pixels(values: np.ndarray, grid: Grid, sight: Sight) -> np.ndarray:
-    """Pixels (h, w) bool of a view's mask behind which the grid of signed distances has no inside; without specks and edges."""
+    """Pixels (h, w) bool of a view's mask behind which the grid of signed distances has no inside; without specks and
+    edges."""
     from scipy.ndimage import binary_opening, distance_transform_edt, label
 
     h, w = sight.mask.shape
@@ -53,11 +59,11 @@ def lost_pixels(values: np.ndarray, grid: Grid, sight: Sight) -> np.ndarray:
 
 
 def restore_shown(values: np.ndarray, grid: Grid, sights: Sequence[Sight], known: Sight) -> tuple[np.ndarray, float]:
-    """Signed distances (a, b, c) float32 with an inside behind all that the known view shows, and the share of its mask that had none.
+    """Signed distances (a, b, c) float32 with an inside behind all that the known view shows, and the share of its mask
+    that had none.
 
-    values: negative inside, the distances from which the surface will be taken. Without a view from the other side a part is as thick as it
-    is wide, up to WIDEST pixels.
-    """
+    values: negative inside, the distances from which the surface will be taken. Without a view from the other side a
+    part is as thick as it is wide, up to WIDEST pixels."""
     from scipy.ndimage import distance_transform_edt, maximum_filter
 
     lost = lost_pixels(values, grid, known) if known.points is not None else np.zeros(known.mask.shape, bool)
@@ -75,7 +81,12 @@ def restore_shown(values: np.ndarray, grid: Grid, sights: Sequence[Sight], known
         behind = _depth(other, zone[:, ::-1])[:, ::-1]
         last = np.where(behind > 0, between - behind, last)
     middle, half = (first + last) / 2, np.maximum((last - first) / 2, np.maximum(ROUND * wide, THINNEST * grid.step))
-    edge = np.maximum(np.where(zone, 0.5 - distance_transform_edt(zone), distance_transform_edt(~zone) - 0.5), known.silhouette) * foot
+    edge = (
+        np.maximum(
+            np.where(zone, 0.5 - distance_transform_edt(zone), distance_transform_edt(~zone) - 0.5), known.silhouette
+        )
+        * foot
+    )
     edge -= np.maximum(FLATTEST * grid.step - maximum_filter(-edge, 3), 0.0)
     # Beyond the zone the nearest values within it.
     nearest = tuple(distance_transform_edt(~(zone & (first > 0)), return_distances=False, return_indices=True))
@@ -87,7 +98,7 @@ def restore_shown(values: np.ndarray, grid: Grid, sights: Sequence[Sight], known
         pixels, depth = project(camera, grid.points(index))
         at = bilinear(slab, pixels)
         distance = np.maximum(np.abs(depth - at[:, 0]) - at[:, 1], at[:, 2])
-        flat[start:start + _CHUNK] = np.minimum(flat[start:start + _CHUNK], distance)
+        flat[start : start + _CHUNK] = np.minimum(flat[start : start + _CHUNK], distance)
     return out, float(lost.sum() / mask.sum())
 
 
@@ -98,4 +109,6 @@ def _depth(sight: Sight, zone: np.ndarray) -> np.ndarray:
     has = zone & (sight.weight > 0)
     depth = (sight.points - sight.camera.position) @ -sight.camera.backward
     total = gaussian_filter(has.astype(np.float64), SMOOTH)
-    return np.where(zone & (total > 1e-3), gaussian_filter(np.where(has, depth, 0.0), SMOOTH) / np.maximum(total, 1e-3), 0.0)
+    return np.where(
+        zone & (total > 1e-3), gaussian_filter(np.where(has, depth, 0.0), SMOOTH) / np.maximum(total, 1e-3), 0.0
+    )

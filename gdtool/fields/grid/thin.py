@@ -17,8 +17,11 @@ _CHUNK = 4096  # points whose cubes of samples are held at once, some 35 KB each
 _REGION = 8  # pixels: fewer that touch are noise at an edge
 
 
-def lost_points(values: np.ndarray, before: np.ndarray, grid: Grid, sights: list[Sight]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (n, 3) that views see outside the grid's surface, their normals (n, 3) and pixel sizes on the surface (n,).
+def lost_points(
+    values: np.ndarray, before: np.ndarray, grid: Grid, sights: list[Sight]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (n, 3) that views see outside the grid's surface, their normals (n, 3) and pixel sizes on the surface
+    (n,).
 
     before: the distances before smoothing; a seen surface with no inside behind it there is a sheet.
     """
@@ -48,7 +51,9 @@ def lost_points(values: np.ndarray, before: np.ndarray, grid: Grid, sights: list
     return np.concatenate(points), np.concatenate(normals), np.concatenate(sizes)
 
 
-def restore_thin(values: np.ndarray, before: np.ndarray, grid: Grid, sights: list[Sight]) -> tuple[np.ndarray, np.ndarray]:
+def restore_thin(
+    values: np.ndarray, before: np.ndarray, grid: Grid, sights: list[Sight]
+) -> tuple[np.ndarray, np.ndarray]:
     """Signed distances in which no seen region is lost, and the points (n, 3) of what was thickened.
 
     before: the distances before smoothing, which may still hold a part that smoothing took.
@@ -58,7 +63,7 @@ def restore_thin(values: np.ndarray, before: np.ndarray, grid: Grid, sights: lis
         return values, points
     out = values.copy()
     for start in range(0, len(points), _CHUNK):
-        around = _around(points[start:start + _CHUNK], grid, 2)[0].ravel()
+        around = _around(points[start : start + _CHUNK], grid, 2)[0].ravel()
         out.ravel()[around] = np.minimum(out.ravel()[around], before.ravel()[around])
     points, normals, sizes = lost_points(out, before, grid, sights)
     for start in range(0, len(points), _CHUNK):

@@ -15,10 +15,17 @@ import torch
 from torch import Tensor
 
 from gdtool.fields.neural.networks import FREQUENCIES, MaterialNetwork, SdfNetwork
-from gdtool.fields.neural.surface_sampling import first_crossing, implicit_points, median_of_cdf, neus_weights, secant_root, unit
+from gdtool.fields.neural.surface_sampling import (
+    first_crossing,
+    implicit_points,
+    median_of_cdf,
+    neus_weights,
+    secant_root,
+    unit,
+)
 from gdtool.shading.bsdf.closed_form import shade
-from gdtool.shading.sampling import fibonacci
 from gdtool.shading.bsdf.sg import SphericalGaussians
+from gdtool.shading.sampling import fibonacci
 
 SAMPLES, NARROW = 64, 8  # along a ray, and between the crossing's two ends
 LIGHTS = 16
@@ -54,8 +61,11 @@ class Fit:
     def lights(self) -> SphericalGaussians:
         """Sixteen lobes spread evenly; amplitudes softplus of the parameters."""
         axes = torch.as_tensor(fibonacci(LIGHTS), dtype=self.light.dtype, device=self.light.device)
-        return SphericalGaussians(axes, torch.full((LIGHTS,), 8.0, dtype=self.light.dtype, device=self.light.device),
-                                  torch.nn.functional.softplus(self.light))
+        return SphericalGaussians(
+            axes,
+            torch.full((LIGHTS,), 8.0, dtype=self.light.dtype, device=self.light.device),
+            torch.nn.functional.softplus(self.light),
+        )
 
 
 def start(seed: int, device: str) -> Fit:
@@ -73,14 +83,22 @@ def one_cycle(progress: float, warm: float = 0.1) -> float:
     return 0.5 * (1 + math.cos(math.pi * min((progress - warm) / (1 - warm), 1.0)))
 
 
-def fit_distances(fit: Fit, sample: Callable[[int], tuple[Tensor, Tensor]], steps: int, batch: int, track,
-                  spent: Callable[[], float], half_share: float = 0.0) -> float:
-    """Fit the SDF network to known distances: sample(n) gives points (n, 3) and distances (n,). Returns the last mean error.
+def fit_distances(
+    fit: Fit,
+    sample: Callable[[int], tuple[Tensor, Tensor]],
+    steps: int,
+    batch: int,
+    track,
+    spent: Callable[[], float],
+    half_share: float = 0.0,
+) -> float:
+    """Fit the SDF network to known distances: sample(n) gives points (n, 3) and distances (n,). Returns the last mean
+    error.
 
-    spent() is the share of the time that is gone: the schedule follows it where it is ahead of the steps, so that it ends
-    with a small rate whatever the machine. half_share: of the schedule, with layers in bfloat16; their last digit is a
-    few thousandths of the object, so the rest has to be float32. Frequencies are let in one by one over the first half.
-    """
+    spent() is the share of the time that is gone: the schedule follows it where it is ahead of the steps, so that it
+    ends with a small rate whatever the machine. half_share: of the schedule, with layers in bfloat16; their last digit
+    is a few thousandths of the object, so the rest has to be float32. Frequencies are let in one by one over the first
+    half."""
     device = fit.light.device
     optimiser = torch.optim.Adam(fit.sdf.parameters(), lr=0.0)
     error = 0.0
@@ -106,8 +124,16 @@ def fit_distances(fit: Fit, sample: Callable[[int], tuple[Tensor, Tensor]], step
     return error
 
 
-def find_surface(sdf: SdfNetwork, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, rule: str = "secant",
-                 sharpness: float = 300.0, samples: int = SAMPLES) -> tuple[Tensor, Tensor, Tensor]:
+def find_surface(
+    sdf: SdfNetwork,
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    rule: str = "secant",
+    sharpness: float = 300.0,
+    samples: int = SAMPLES,
+) -> tuple[Tensor, Tensor, Tensor]:
     """Depth along rays (n,) of the first crossing, whether there is one (n,), and the point of least distance (n, 3).
 
     rule: "median" of the CDF of eight samples between the crossing's ends, or "secant" through them.
@@ -130,8 +156,12 @@ def find_surface(sdf: SdfNetwork, origins: Tensor, directions: Tensor, near: Ten
             # One step of regula falsi more: the chord of a curved field misses by its second order.
             value = sdf(origins + depth[:, None] * directions)
             ahead = value >= 0
-            depth = secant_root(torch.where(ahead, depth, t0), torch.where(ahead, t1, depth),
-                                torch.where(ahead, value, f0), torch.where(ahead, f1, value))
+            depth = secant_root(
+                torch.where(ahead, depth, t0),
+                torch.where(ahead, t1, depth),
+                torch.where(ahead, value, f0),
+                torch.where(ahead, f1, value),
+            )
         return depth, found, closest
 
 
@@ -139,12 +169,19 @@ def volume_losses(fit: Fit, pixels: Pixels, chosen: Tensor) -> dict[str, Tensor]
     """NeuS-style losses of rays: opacity against the mask, expected normal, depth and material against the views."""
     origins, directions = pixels.origins[chosen], pixels.directions[chosen]
     near, far, inside = pixels.near[chosen], pixels.far[chosen], pixels.inside[chosen].float()
-    t = near[:, None] + (far - near)[:, None] * (torch.arange(SAMPLES, device=near.device) + torch.rand(1, device=near.device)) / SAMPLES
+    t = (
+        near[:, None]
+        + (far - near)[:, None]
+        * (torch.arange(SAMPLES, device=near.device) + torch.rand(1, device=near.device))
+        / SAMPLES
+    )
     values, gradient = fit.sdf.with_gradient(origins[:, None] + t[..., None] * directions[:, None])
     weights = neus_weights(values, fit.sharpness.exp())
     opacity = weights.sum(1).clamp(1e-4, 1 - 1e-4)
-    losses = {"mask": torch.nn.functional.binary_cross_entropy(opacity, inside),
-              "eikonal": ((gradient.norm(dim=-1) - 1) ** 2).mean()}
+    losses = {
+        "mask": torch.nn.functional.binary_cross_entropy(opacity, inside),
+        "eikonal": ((gradient.norm(dim=-1) - 1) ** 2).mean(),
+    }
     middle = (t[:, 1:] + t[:, :-1]) / 2
     hit = inside / inside.sum().clamp_min(1)
     if "normal" in pixels.values:
@@ -155,11 +192,14 @@ def volume_losses(fit: Fit, pixels: Pixels, chosen: Tensor) -> dict[str, Tensor]
     return losses
 
 
-def surface_losses(fit: Fit, pixels: Pixels, chosen: Tensor, rule: str, brdf: str,
-                   samples: int = SAMPLES) -> dict[str, Tensor]:
+def surface_losses(
+    fit: Fit, pixels: Pixels, chosen: Tensor, rule: str, brdf: str, samples: int = SAMPLES
+) -> dict[str, Tensor]:
     """Losses at explicit surface points, and of rays that hit where the mask is empty or miss where it is full."""
     origins, directions, inside = pixels.origins[chosen], pixels.directions[chosen], pixels.inside[chosen]
-    depth, found, closest = find_surface(fit.sdf, origins, directions, pixels.near[chosen], pixels.far[chosen], rule, samples=samples)
+    depth, found, closest = find_surface(
+        fit.sdf, origins, directions, pixels.near[chosen], pixels.far[chosen], rule, samples=samples
+    )
     losses: dict[str, Tensor] = {}
     wrong = found != inside
     if wrong.any():
@@ -181,16 +221,23 @@ def surface_losses(fit: Fit, pixels: Pixels, chosen: Tensor, rule: str, brdf: st
         losses["normal"] = (1 - (normal * wanted["normal"]).sum(-1)).mean()
     material = fit.material(points)
     albedo, roughness, metallic = material[:, :3], material[:, 3], material[:, 4]
-    losses["material"] = sum(((value - wanted[name]).abs().mean() for name, value in
-                              (("albedo", albedo), ("roughness", roughness), ("metallic", metallic)) if name in wanted),
-                             torch.zeros((), device=here.device))
+    losses["material"] = sum(
+        (
+            (value - wanted[name]).abs().mean()
+            for name, value in (("albedo", albedo), ("roughness", roughness), ("metallic", metallic))
+            if name in wanted
+        ),
+        torch.zeros((), device=here.device),
+    )
     if "color" in wanted:
         f0 = 0.08 * material[:, 5:6] if brdf == "paper" else 0.04
         lit = shade(normal, -directions[good], albedo, roughness, metallic, fit.lights(), brdf, f0)
         losses["color"] = (tone(lit) - tone(wanted["color"])).abs().mean()
         if "albedo" not in wanted:
             # Light and albedo are known up to a scale: hold the mean albedo, and keep what color does not tell quiet.
-            losses["prior"] = 0.1 * (albedo.mean() - 0.5) ** 2 + 0.02 * (roughness - 0.5).pow(2).mean() + 0.05 * metallic.mean()
+            losses["prior"] = (
+                0.1 * (albedo.mean() - 0.5) ** 2 + 0.02 * (roughness - 0.5).pow(2).mean() + 0.05 * metallic.mean()
+            )
     return losses
 
 
@@ -199,13 +246,30 @@ def tone(radiance: Tensor) -> Tensor:
     return (radiance.clamp_min(0) + 1e-3).pow(1 / 2.2)
 
 
-def train(fit: Fit, pixels: Pixels, *, volume_steps: int, surface_steps: int, batch: int, seed: int, rule: str, brdf: str, track,
-          spent: Callable[[], float], samples: int = SAMPLES) -> int:
-    """Volume start, then explicit surface; returns the steps done. spent(): share of the time that is gone, as in fit_distances."""
+def train(
+    fit: Fit,
+    pixels: Pixels,
+    *,
+    volume_steps: int,
+    surface_steps: int,
+    batch: int,
+    seed: int,
+    rule: str,
+    brdf: str,
+    track,
+    spent: Callable[[], float],
+    samples: int = SAMPLES,
+) -> int:
+    """Volume start, then explicit surface; returns the steps done. spent(): share of the time that is gone, as in
+    fit_distances."""
     generator = torch.Generator().manual_seed(seed)
     device = fit.light.device
-    parameters = [{"params": fit.sdf.parameters(), "lr": 2e-4}, {"params": fit.material.parameters(), "lr": 2e-3},
-                  {"params": [fit.light], "lr": 1e-2}, {"params": [fit.sharpness], "lr": 5e-3}]
+    parameters = [
+        {"params": fit.sdf.parameters(), "lr": 2e-4},
+        {"params": fit.material.parameters(), "lr": 2e-3},
+        {"params": [fit.light], "lr": 1e-2},
+        {"params": [fit.sharpness], "lr": 5e-3},
+    ]
     optimiser = torch.optim.Adam(parameters)
     highest = [group["lr"] for group in parameters]
     steps = volume_steps + surface_steps
@@ -230,7 +294,9 @@ def train(fit: Fit, pixels: Pixels, *, volume_steps: int, surface_steps: int, ba
         losses = volume_losses(fit, pixels, pick) if volume else surface_losses(fit, pixels, pick, rule, brdf, samples)
         if not volume:
             around = (torch.rand(size // 4, 3, generator=generator) * 1.1 - 0.55).to(device)
-            losses["eikonal"] = losses.get("eikonal", 0.0) + ((fit.sdf.with_gradient(around)[1].norm(dim=-1) - 1) ** 2).mean()
+            losses["eikonal"] = (
+                losses.get("eikonal", 0.0) + ((fit.sdf.with_gradient(around)[1].norm(dim=-1) - 1) ** 2).mean()
+            )
         loss = sum(WEIGHTS.get(name, 1.0) * value for name, value in losses.items())
         optimiser.zero_grad()
         loss.backward()

@@ -50,7 +50,7 @@ class SdfNetwork(nn.Module):
                 if k == 0:
                     layer.weight[:, 3:] = 0
                 elif k == skip:
-                    layer.weight[:, -(ENCODED - 3):] = 0
+                    layer.weight[:, -(ENCODED - 3) :] = 0
             nn.init.normal_(self.last.weight, math.sqrt(math.pi / width), 1e-4)
             nn.init.zeros_(self.last.bias)
             # At this width the random layers miss the sphere's slope and radius by a quarter: set both exactly.
@@ -73,7 +73,7 @@ class SdfNetwork(nn.Module):
     def show_frequencies(self, count: float) -> None:
         """Let the first count frequencies of the encoding through, the next one in part, and no other."""
         share = (count - torch.arange(FREQUENCIES, device=self.window.device)).clamp(0, 1).repeat_interleave(3)
-        self.window[3:3 + 6 * FREQUENCIES] = torch.cat([share, share])
+        self.window[3 : 3 + 6 * FREQUENCIES] = torch.cat([share, share])
 
     def turn_outward(self) -> bool:
         """Change the sign of a field that is negative on the box of side 2 around the object; says whether it was.
@@ -94,7 +94,7 @@ class SdfNetwork(nn.Module):
         with torch.enable_grad():
             points = points.detach().requires_grad_(True)
             value = self(points)
-            gradient, = torch.autograd.grad(value.sum(), points, create_graph=create_graph)
+            (gradient,) = torch.autograd.grad(value.sum(), points, create_graph=create_graph)
         return value, gradient
 
 

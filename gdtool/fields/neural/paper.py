@@ -39,21 +39,33 @@ class PaperOptions:
     precision: str = "float32"
 
 
-def distance_pool(vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Points (count, 3) and their signed distances (count,) to a closed mesh: most near it, the rest anywhere in the box."""
+def distance_pool(
+    vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (count, 3) and their signed distances (count,) to a closed mesh: most near it, the rest anywhere in the
+    box."""
     from gdtool.geometry.distance import closest_points, sample_surface, winding_number
 
     near = sample_surface(vertices, faces, count * 3 // 4, rng)[0]
-    spread = np.repeat([0.004, 0.015, 0.06], -(-len(near) // 3))[:len(near), None]
-    points = np.concatenate([near + spread * rng.standard_normal(near.shape), rng.uniform(-0.6, 0.6, (count - len(near), 3))])
+    spread = np.repeat([0.004, 0.015, 0.06], -(-len(near) // 3))[: len(near), None]
+    points = np.concatenate(
+        [near + spread * rng.standard_normal(near.shape), rng.uniform(-0.6, 0.6, (count - len(near), 3))]
+    )
     distance = closest_points(points, vertices, faces)[0]
     inside = winding_number(points, vertices, faces) > 0.5
     order = rng.permutation(len(points))
     return points[order], np.where(inside, -distance, distance)[order]
 
 
-def gather_pixels(cameras: list[Camera], mask: np.ndarray, images: dict[str, np.ndarray], vertices: np.ndarray, faces: np.ndarray,
-                  device: str, reach: float):
+def gather_pixels(
+    cameras: list[Camera],
+    mask: np.ndarray,
+    images: dict[str, np.ndarray],
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    device: str,
+    reach: float,
+):
     """Pixels of all views for networks_fit: those fully inside, and those outside near the silhouette."""
     import torch
     from scipy.ndimage import distance_transform_edt
@@ -73,10 +85,12 @@ def gather_pixels(cameras: list[Camera], mask: np.ndarray, images: dict[str, np.
         origins, directions = (x[chosen] for x in rays(camera))
         hit = caster.first_hit(origins, directions)
         middle = -(origins * directions).sum(1)
-        half = np.sqrt(np.maximum(radius ** 2 - ((origins + middle[:, None] * directions) ** 2).sum(1), 1e-4))
+        half = np.sqrt(np.maximum(radius**2 - ((origins + middle[:, None] * directions) ** 2).sum(1), 1e-4))
         found = (hit.face_idx >= 0) & inside[chosen]
         place = np.where(found, hit.distance, 0.0)
-        place[~found] = closest_approach(origins[~found], directions[~found], (middle - half)[~found], (middle + half)[~found], vertices)
+        place[~found] = closest_approach(
+            origins[~found], directions[~found], (middle - half)[~found], (middle + half)[~found], vertices
+        )
         # A ray that has to miss passes the surface at some distance: a wider part of it is watched.
         around = np.where(found, reach, max(2 * reach, 0.06))
         near, far = place - around, place + around
@@ -87,15 +101,26 @@ def gather_pixels(cameras: list[Camera], mask: np.ndarray, images: dict[str, np.
             row[name] = value / -(directions @ camera.backward) if name == "depth" else value
         for name, value in row.items():
             parts.setdefault(name, []).append(np.asarray(value))
-    joined = {name: torch.as_tensor(np.concatenate(value), device=device,
-                                    dtype=torch.bool if name == "inside" else torch.float32) for name, value in parts.items()}
+    joined = {
+        name: torch.as_tensor(
+            np.concatenate(value), device=device, dtype=torch.bool if name == "inside" else torch.float32
+        )
+        for name, value in parts.items()
+    }
     fixed = ("origins", "directions", "inside", "near", "far")
     return Pixels(*(joined[name] for name in fixed), {n: v for n, v in joined.items() if n not in fixed})
 
 
-def closest_approach(origins: np.ndarray, directions: np.ndarray, near: np.ndarray, far: np.ndarray, vertices: np.ndarray,
-                     samples: int = 32) -> np.ndarray:
-    """Where along rays (n, 3) between near and far (n,) one of samples points is nearest to a vertex: distances (n,)."""
+def closest_approach(
+    origins: np.ndarray,
+    directions: np.ndarray,
+    near: np.ndarray,
+    far: np.ndarray,
+    vertices: np.ndarray,
+    samples: int = 32,
+) -> np.ndarray:
+    """Where along rays (n, 3) between near and far (n,) one of samples points is nearest to a vertex: distances
+    (n,)."""
     from scipy.spatial import cKDTree
 
     share = (np.arange(samples) + 0.5) / samples
@@ -112,8 +137,8 @@ def evaluate_sdf(sdf, points: np.ndarray, device: str, chunk: int = 1 << 17) -> 
     out = np.empty(len(points), np.float32)
     with torch.no_grad():
         for start in range(0, len(points), chunk):
-            part = torch.as_tensor(points[start:start + chunk], dtype=torch.float32, device=device)
-            out[start:start + chunk] = sdf(part).cpu().numpy()
+            part = torch.as_tensor(points[start : start + chunk], dtype=torch.float32, device=device)
+            out[start : start + chunk] = sdf(part).cpu().numpy()
     return out
 
 
@@ -130,7 +155,9 @@ def extract_network(sdf, step: float, device: str) -> tuple[np.ndarray, np.ndarr
     values = coarse
     for axis in range(3):
         values = np.repeat(values, factor, axis)
-    values = np.ascontiguousarray(np.where(values < 0, -step, step)[:grid.shape[0], :grid.shape[1], :grid.shape[2]], np.float32)
+    values = np.ascontiguousarray(
+        np.where(values < 0, -step, step)[: grid.shape[0], : grid.shape[1], : grid.shape[2]], np.float32
+    )
     values[fine] = evaluate_sdf(sdf, grid.points(np.argwhere(fine)), device)
     return extract(values, grid)
 
@@ -142,13 +169,24 @@ def network_materials(material, points: np.ndarray, device: str) -> dict[str, np
     out = []
     with torch.no_grad():
         for start in range(0, len(points), 1 << 17):
-            out.append(material(torch.as_tensor(points[start:start + (1 << 17)], dtype=torch.float32, device=device)).cpu().numpy())
+            out.append(
+                material(torch.as_tensor(points[start : start + (1 << 17)], dtype=torch.float32, device=device))
+                .cpu()
+                .numpy()
+            )
     value = np.concatenate(out)
     return {"albedo": value[:, :3], "roughness": value[:, 3:4], "metallic": value[:, 4:5]}
 
 
-def fit_networks(cameras: list[Camera], mask: np.ndarray, images: dict[str, np.ndarray], vertices: np.ndarray, faces: np.ndarray,
-                 options: PaperOptions, track: Callable):
+def fit_networks(
+    cameras: list[Camera],
+    mask: np.ndarray,
+    images: dict[str, np.ndarray],
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    options: PaperOptions,
+    track: Callable,
+):
     """Fit both networks to the views, starting from a closed mesh. track(count, label) iterates with progress.
 
     Returns the Fit and a dict of figures (errors, steps done, whether the budget ended it).
@@ -170,12 +208,30 @@ def fit_networks(cameras: list[Camera], mask: np.ndarray, images: dict[str, np.n
     def spent(share: float) -> float:
         return (time.monotonic() - began) / (share * options.budget) if options.budget else 0.0
 
-    error = fit_distances(fit, sample, options.distance_steps, 4096, track, lambda: spent(START_SHARE),
-                          HALF_SHARE if options.precision == "bfloat16" else 0.0)
+    error = fit_distances(
+        fit,
+        sample,
+        options.distance_steps,
+        4096,
+        track,
+        lambda: spent(START_SHARE),
+        HALF_SHARE if options.precision == "bfloat16" else 0.0,
+    )
     reach, samples = _MEASURED if "depth" in images else _BOUNDED
     pixels = gather_pixels(cameras, mask, images, vertices, faces, options.device, reach)
-    done = train(fit, pixels, volume_steps=options.volume_steps, surface_steps=options.surface_steps, batch=options.batch,
-                 seed=options.seed, rule=options.rule, brdf=options.brdf, track=track, spent=lambda: spent(1.0), samples=samples)
+    done = train(
+        fit,
+        pixels,
+        volume_steps=options.volume_steps,
+        surface_steps=options.surface_steps,
+        batch=options.batch,
+        seed=options.seed,
+        rule=options.rule,
+        brdf=options.brdf,
+        track=track,
+        spent=lambda: spent(1.0),
+        samples=samples,
+    )
     figures = {"distance_error": error, "steps": done}
     if fit.history:
         figures |= {f"loss_{name}": value for name, value in fit.history[-1].items() if name != "step"}
@@ -185,14 +241,23 @@ def fit_networks(cameras: list[Camera], mask: np.ndarray, images: dict[str, np.n
 def light_record(fit) -> dict:
     """The fitted light as a record of light.json."""
     lights = fit.lights()
-    return {"kind": "spherical_gaussians", "axes": lights.axes.tolist(), "sharpness": lights.sharpness.tolist(),
-            "amplitudes": lights.amplitudes.detach().cpu().tolist()}
+    return {
+        "kind": "spherical_gaussians",
+        "axes": lights.axes.tolist(),
+        "sharpness": lights.sharpness.tolist(),
+        "amplitudes": lights.amplitudes.detach().cpu().tolist(),
+    }
 
 
 def save_field(path, fit) -> None:
     """Both networks as one safetensors file: names "sdf.…" and "material.…", float32."""
     from safetensors.torch import save_file
 
-    tensors = {f"sdf.{k}": v for k, v in fit.sdf.state_dict().items()} | {f"material.{k}": v for k, v in fit.material.state_dict().items()}
-    save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, str(path),
-              {"encoding": "10 frequencies of pi", "skip": "4"})
+    tensors = {f"sdf.{k}": v for k, v in fit.sdf.state_dict().items()} | {
+        f"material.{k}": v for k, v in fit.material.state_dict().items()
+    }
+    save_file(
+        {name: value.detach().cpu().contiguous() for name, value in tensors.items()},
+        str(path),
+        {"encoding": "10 frequencies of pi", "skip": "4"},
+    )

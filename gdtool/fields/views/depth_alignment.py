@@ -21,7 +21,8 @@ LARGEST = 0.06  # world units: no correction is larger
 PRIOR_SIZE = 0.01  # world units: how large a correction is expected to be
 PRIOR = 0.005  # what that expectation counts beside the matches
 SLOPE_LENGTH = 0.2  # world units over which normals go wrong by as much as depth does
-SLOPES, RIMS, EXTENTS = 0.4, 0.01, 0.3  # what the other evidence counts; rims lie beside curved outlines, so they only settle silhouettes
+# What the other evidence counts; rims lie beside curved outlines, so they only settle silhouettes.
+SLOPES, RIMS, EXTENTS = 0.4, 0.01, 0.3
 COLORS = 0.002  # world units: a color as wrong as usual counts like a plane so far off
 WALL = 1.5  # pixels: what lies between surfaces that two views see from opposite sides is at least so thick
 RIM_COSINE = 0.15  # normals this square to an axis belong to the outline
@@ -68,7 +69,8 @@ def agreement(sights: list[Sight], reach: float = 0.04, stride: int = 3) -> floa
 
 
 def normals_fit_depth(cameras: list[Camera], mask: np.ndarray, depth: np.ndarray, normal: np.ndarray) -> float:
-    """Share of the pixels whose normal lies within 60 degrees of what the slope of the depth says; 1 when none can be judged.
+    """Share of the pixels whose normal lies within 60 degrees of what the slope of the depth says; 1 when none can be
+    judged.
 
     mask (k, h, w), depth (k, h, w), normal (k, h, w, 3). True views give 0.9 and more, however rough a normal map.
     """
@@ -98,9 +100,8 @@ class _Match:
 def _matches(sights: list[Sight], reach: float, stride: int, walls: float = 0.0):
     """Pairs of views that see the same surface: same direction of normal and within reach of each other's plane.
 
-    With walls, pairs that see the two sides of one wall and leave it thinner than so many pixels, or less than nothing; the
-    distance is then how much it lacks.
-    """
+    With walls, pairs that see the two sides of one wall and leave it thinner than so many pixels, or less than nothing;
+    the distance is then how much it lacks."""
     for i, first in enumerate(sights):
         if first.planes is None:
             continue
@@ -117,8 +118,16 @@ def _matches(sights: list[Sight], reach: float, stride: int, walls: float = 0.0)
             same = cosine > 0.8 if walls == 0 else (cosine < -0.8) & (distance > -wall)
             same &= (np.abs(distance) < reach) & (weight > 0.1)
             if same.any():
-                yield _Match(i, j, points[same], distance[same] + wall, np.minimum(weight, own)[same], normal[same],
-                             project(first.camera, points[same])[0], project(second.camera, points[same])[0])
+                yield _Match(
+                    i,
+                    j,
+                    points[same],
+                    distance[same] + wall,
+                    np.minimum(weight, own)[same],
+                    normal[same],
+                    project(first.camera, points[same])[0],
+                    project(second.camera, points[same])[0],
+                )
 
 
 def _control_weights(pixels: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -191,7 +200,9 @@ class _System:
 
         # All rows in one sparse matrix: its square is made dense but once.
         place = np.concatenate([places.ravel() for _, places, _, _ in self.rows])
-        value = np.concatenate([(coefficients * np.sqrt(weight)[:, None]).ravel() for coefficients, _, _, weight in self.rows])
+        value = np.concatenate(
+            [(coefficients * np.sqrt(weight)[:, None]).ravel() for coefficients, _, _, weight in self.rows]
+        )
         width = np.concatenate([np.full(len(target), places.shape[1]) for _, places, target, _ in self.rows])
         rows = csr_matrix((value, place, np.concatenate([[0], np.cumsum(width)])), (len(width), self.unknowns))
         vector = rows.T @ np.concatenate([np.sqrt(weight) * target for _, _, target, weight in self.rows])
@@ -201,17 +212,23 @@ class _System:
         return Corrections(found[:size].reshape(self.count, -1), found[size:])
 
 
-def corrections(sights: list[Sight], slopes: list[tuple], before: Corrections, reach: float, stiffness: float = 1.0,
-                stride: int = 3, pictures: Sequence[list[Picture]] = ()) -> Corrections:
+def corrections(
+    sights: list[Sight],
+    slopes: list[tuple],
+    before: Corrections,
+    reach: float,
+    stiffness: float = 1.0,
+    stride: int = 3,
+    pictures: Sequence[list[Picture]] = (),
+) -> Corrections:
     """The whole correction of views that `before` has already been applied to, by one robust linear least squares.
 
-    A point of one view, moved along its ray, lies on another view's plane, moved along its own, and has the color that the
-    other shows there (pictures: of every view, once for each domain of colors); what two views see from opposite sides keeps
-    a thickness; the corrected depth rises as the normals say (slopes: see slope_rows, of the views as they were given);
-    what one view sees edge-on lies on its silhouette; two silhouettes reach equally far along the direction that both show
-    at full length. Priors keep corrections small and smooth. What all views of a point get wrong in common the planes
-    cannot tell, but all else can.
-    """
+    A point of one view, moved along its ray, lies on another view's plane, moved along its own, and has the color that
+    the other shows there (pictures: of every view, once for each domain of colors); what two views see from opposite
+    sides keeps a thickness; the corrected depth rises as the normals say (slopes: see slope_rows, of the views as they
+    were given); what one view sees edge-on lies on its silhouette; two silhouettes reach equally far along the
+    direction that both show at full length. Priors keep corrections small and smooth. What all views of a point get
+    wrong in common the planes cannot tell, but all else can."""
     system, size = _System(len(sights)), CONTROL * CONTROL
     total = 0.0
     matches = list(_matches(sights, reach, stride))
@@ -220,7 +237,9 @@ def corrections(sights: list[Sight], slopes: list[tuple], before: Corrections, r
             slope, difference, weight = color_rows(m.points, m.here, m.there, of_view[m.i], of_view[m.j], m.weight)
             weights, places = _control_weights(m.here, sights[m.i].mask.shape)
             done = (before.control[m.i][places] * weights).sum(1)
-            system.add(weights * slope[:, None], system.of_view(m.i, places), slope * done - difference, COLORS**2 * weight)
+            system.add(
+                weights * slope[:, None], system.of_view(m.i, places), slope * done - difference, COLORS**2 * weight
+            )
     for m in chain(matches, _matches(sights, reach, stride, WALL)):
         weight = m.weight / (1 + (m.distance / (0.5 * reach)) ** 2) ** 2
         total += weight.sum()
@@ -231,7 +250,9 @@ def corrections(sights: list[Sight], slopes: list[tuple], before: Corrections, r
         slope_there = (m.normal @ sights[m.j].camera.backward)[:, None]
         coefficients = np.concatenate([w_here * slope_here, w_there * slope_there], 1)
         places = np.concatenate([system.of_view(m.i, c_here), system.of_view(m.j, c_there)], 1)
-        done = (before.control[m.i][c_here] * w_here).sum(1) * slope_here[:, 0] + (before.control[m.j][c_there] * w_there).sum(1) * slope_there[:, 0]
+        done = (before.control[m.i][c_here] * w_here).sum(1) * slope_here[:, 0] + (
+            before.control[m.j][c_there] * w_there
+        ).sum(1) * slope_there[:, 0]
         system.add(coefficients, places, done - m.distance, weight)
     if total == 0:
         return before
@@ -246,15 +267,15 @@ def corrections(sights: list[Sight], slopes: list[tuple], before: Corrections, r
     bending = _bending()
     one = stiffness * PRIOR * bending.T @ bending * per_view / size + unit * np.eye(size)
     for k, sight in enumerate(sights):
-        prior[k * size:(k + 1) * size, k * size:(k + 1) * size] = one
+        prior[k * size : (k + 1) * size, k * size : (k + 1) * size] = one
         foot = float(np.median(pixel_footprint(sight.camera, np.linalg.norm(sight.camera.position))))
         prior[system.edge(k), system.edge(k)] = PRIOR * per_view * (PRIOR_SIZE / foot) ** 2
     return system.solve(prior)
 
 
 def slope_rows(sight: Sight, stride: int = 2, apart: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What the normals say of a view's depth correction: coefficients (n, 8) and control indices (n, 8) of its slope, the
-    slope that fits (n,) and weights (n,). Across `apart` pixels, where the surface is smooth."""
+    """What the normals say of a view's depth correction: coefficients (n, 8) and control indices (n, 8) of its slope,
+    the slope that fits (n,) and weights (n,). Across `apart` pixels, where the surface is smooth."""
     h, w = sight.mask.shape
     good = (sight.weight > 0.1) & ~sight.rough & ~sight.broken
     normal, parts = sight.planes[..., :3], []
@@ -279,7 +300,14 @@ def slope_rows(sight: Sight, stride: int = 2, apart: int = 2) -> tuple[np.ndarra
         w_b, c_b = _control_weights(there, (h, w))
         scale = 1 / across[keep][:, None]
         # Height over the plane must vanish: moved apart by more depth, the far end sinks.
-        parts.append((np.concatenate([-w_a * scale, w_b * scale], 1), np.concatenate([c_a, c_b], 1), slope[keep], facing[keep] ** 2))
+        parts.append(
+            (
+                np.concatenate([-w_a * scale, w_b * scale], 1),
+                np.concatenate([c_a, c_b], 1),
+                slope[keep],
+                facing[keep] ** 2,
+            )
+        )
     return tuple(np.concatenate(x) for x in zip(*parts, strict=True))
 
 
@@ -325,11 +353,19 @@ def _add_extents(system: _System, sights: list[Sight], before: Corrections, per_
             continue
         foot = sights[i].camera.pixel_size
         for sign in (1, -1):
-            gap = float((outlines[i] @ along).max() - (outlines[j] @ along).max()) / length if sign > 0 else \
-                -float((outlines[i] @ along).min() - (outlines[j] @ along).min()) / length
+            gap = (
+                float((outlines[i] @ along).max() - (outlines[j] @ along).max()) / length
+                if sign > 0
+                else -float((outlines[i] @ along).min() - (outlines[j] @ along).min()) / length
+            )
             if abs(gap) < 8 * foot:  # more is no matter of the edge
                 coefficients, places = np.array([[1.0, -1.0]]), np.array([[system.edge(i), system.edge(j)]])
-                system.add(coefficients, places, np.array([before.edge[i] - before.edge[j] - gap]), np.array([EXTENTS * per_view]))
+                system.add(
+                    coefficients,
+                    places,
+                    np.array([before.edge[i] - before.edge[j] - gap]),
+                    np.array([EXTENTS * per_view]),
+                )
 
 
 def _outline(sight: Sight) -> np.ndarray | None:

@@ -1,11 +1,10 @@
 """Depth of views that hold none: where along each pixel's ray the other views show the same thing.
 
 A sweep along the rays with semi-global matching (Hirschmüller, "Stereo Processing by Semiglobal Matching and Mutual
-Information", 2008). What is compared looks alike from all sides: normals in world axes, albedo, roughness, metallic. The
-normals say two things more: how depth goes on from a pixel to the next, so that a slope is as smooth as a wall that
-faces the camera; and which views can see a point at all. The first sweep trusts the better half of these; the second one
-knows from the first which of them the point is hidden from, and whom it would hide.
-"""
+Information", 2008). What is compared looks alike from all sides: normals in world axes, albedo, roughness, metallic.
+The normals say two things more: how depth goes on from a pixel to the next, so that a slope is as smooth as a wall that
+faces the camera; and which views can see a point at all. The first sweep trusts the better half of these; the second
+one knows from the first which of them the point is hidden from, and whom it would hide."""
 
 from __future__ import annotations
 
@@ -35,33 +34,45 @@ MOST = 512  # depths that are tried
 
 @dataclass(frozen=True)
 class Matched:
-    """Depth along the viewing axis (h, w), 0 where unknown, and the trust in it (h, w) in 0..1, at the view's own size."""
+    """Depth along the viewing axis (h, w), 0 where unknown, and the trust in it (h, w) in 0..1, at the view's own
+    size."""
 
     depth: np.ndarray
     trust: np.ndarray
 
 
-def slopes(camera: Camera, normal: np.ndarray, least: float, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How the depth of a plane with world normal (…, 3) grows over one pixel to the right and one down, and how it faces the ray.
+def slopes(
+    camera: Camera, normal: np.ndarray, least: float, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How the depth of a plane with world normal (…, 3) grows over one pixel to the right and one down, and how it
+    faces the ray.
 
     Depth as stretched() has it: what it grows by then hangs on the normal alone. directions (…, 3): of the rays. Planes
     that face the ray less than least are taken to face it so much.
     """
     axes = camera.world_from_camera[:3, :3]
     right, down = pixel_steps(camera)
-    facing = normal @ camera.backward if camera.projection == "orthographic" else (normal * directions).sum(-1) / (directions @ camera.backward)
+    facing = (
+        normal @ camera.backward
+        if camera.projection == "orthographic"
+        else (normal * directions).sum(-1) / (directions @ camera.backward)
+    )
     held = np.maximum(facing, least)
     return normal @ axes[:, 0] / held * right, -(normal @ axes[:, 1]) / held * down, facing
 
 
 def pixel_steps(camera: Camera) -> tuple[float, float]:
     """What a pixel's width and height are in stretched depth."""
-    return (camera.pixel_size, camera.pixel_size) if camera.projection == "orthographic" else (1 / camera.fx, 1 / camera.fy)
+    return (
+        (camera.pixel_size, camera.pixel_size)
+        if camera.projection == "orthographic"
+        else (1 / camera.fx, 1 / camera.fy)
+    )
 
 
 def stretched(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """Depth of an orthographic camera as it is, of a perspective one its logarithm: a plane's slope over the picture is then
-    the same at any distance."""
+    """Depth of an orthographic camera as it is, of a perspective one its logarithm: a plane's slope over the picture is
+    then the same at any distance."""
     return depth if camera.projection == "orthographic" else np.log(np.maximum(depth, 1e-9))
 
 
@@ -71,7 +82,8 @@ def unstretched(camera: Camera, depth: np.ndarray) -> np.ndarray:
 
 
 class _View:
-    """A view at the size it is matched at: the n pixels that show something, their rays, what they show, depths to try."""
+    """A view at the size it is matched at: the n pixels that show something, their rays, what they show, depths to
+    try."""
 
     def __init__(self, camera: Camera, mask: np.ndarray, looks: np.ndarray, normal: np.ndarray, box: np.ndarray):
         self.camera, self.factor = camera, max(1, round(max(mask.shape) / SIZE))
@@ -115,13 +127,18 @@ def _shrunk(image: np.ndarray, factor: int) -> np.ndarray:
     return padded.reshape(-(-h // factor), factor, -(-w // factor), factor, c).mean((1, 3)).astype(np.float32)
 
 
-def match_views(cameras: list[Camera], mask: np.ndarray, normal: np.ndarray, alike: dict[str, np.ndarray], sights: list[Sight],
-                box: tuple[np.ndarray, np.ndarray]) -> list[Matched]:
+def match_views(
+    cameras: list[Camera],
+    mask: np.ndarray,
+    normal: np.ndarray,
+    alike: dict[str, np.ndarray],
+    sights: list[Sight],
+    box: tuple[np.ndarray, np.ndarray],
+) -> list[Matched]:
     """Depth of every view from what the others show. mask (k, h, w), normal (k, h, w, 3).
 
-    alike: further images (k, h, w[, 3]) that NOISE names, linear. sights: the prepared views that show anything, for their
-    silhouettes; box: low and high corner of what they can hold. A view that shows nothing has depth 0.
-    """
+    alike: further images (k, h, w[, 3]) that NOISE names, linear. sights: the prepared views that show anything, for
+    their silhouettes; box: low and high corner of what they can hold. A view that shows nothing has depth 0."""
     corners = np.stack(np.meshgrid(*zip(*box, strict=True), indexing="ij"), -1).reshape(-1, 3)
     looks = _looks({"normal": normal, **alike})
     views = [_View(*given, corners) for given in zip(cameras, mask, looks, normal, strict=True)]
@@ -133,13 +150,20 @@ def match_views(cameras: list[Camera], mask: np.ndarray, normal: np.ndarray, ali
             view.looks, view.own = view.looks / doubt**0.5, view.own / doubt**0.5
         found = _sweep(views, sights, None, NEARER * doubt)
     found = _sweep(views, sights, _known(views, found), NEARER * doubt)
-    return [_full_size(view, depth, trust, own) for view, depth, trust, own in
-            zip(views, found, _confirmed(views, found), mask, strict=True)]
+    return [
+        _full_size(view, depth, trust, own)
+        for view, depth, trust, own in zip(views, found, _confirmed(views, found), mask, strict=True)
+    ]
 
 
-def _sweep(views: list[_View], sights: list[Sight], known: dict[int, tuple[np.ndarray, np.ndarray]] | None, nearer: float) -> list[np.ndarray]:
+def _sweep(
+    views: list[_View], sights: list[Sight], known: dict[int, tuple[np.ndarray, np.ndarray]] | None, nearer: float
+) -> list[np.ndarray]:
     """Stretched depth (n,) of every view's pixels; see _swept and _least."""
-    return [_least(_swept(view, [other for other in views if other is not view], sights, known, nearer), view) for view in views]
+    return [
+        _least(_swept(view, [other for other in views if other is not view], sights, known, nearer), view)
+        for view in views
+    ]
 
 
 def _misfit(views: list[_View], found: list[np.ndarray]) -> float:
@@ -171,8 +195,13 @@ def _looks(images: dict[str, np.ndarray]) -> np.ndarray:
     return np.concatenate(parts, -1).astype(np.float32)
 
 
-def _swept(view: _View, others: list[_View], sights: list[Sight], known: dict[int, tuple[np.ndarray, np.ndarray]] | None,
-           nearer: float) -> np.ndarray:
+def _swept(
+    view: _View,
+    others: list[_View],
+    sights: list[Sight],
+    known: dict[int, tuple[np.ndarray, np.ndarray]] | None,
+    nearer: float,
+) -> np.ndarray:
     """Cost (n, candidates) of every depth that is tried, NEVER where a silhouette rules it out.
 
     known: depth and trust (h, w) of the others by id, from an earlier sweep.
@@ -189,8 +218,13 @@ def _swept(view: _View, others: list[_View], sights: list[Sight], known: dict[in
         entered[allowed] = np.fmin(entered[allowed], world)
         behind = world - entered[allowed]
         hidden = np.full(len(allowed), HIDDEN)
-        compared = [(*_compared(view, other, points, allowed), cosine[allowed], other) for other, cosine in zip(others, facing.T, strict=True)]
-        cost[allowed, k] = (_unordered(compared, hidden) if known is None else _ordered(compared, hidden, known)) + nearer * behind
+        compared = [
+            (*_compared(view, other, points, allowed), cosine[allowed], other)
+            for other, cosine in zip(others, facing.T, strict=True)
+        ]
+        cost[allowed, k] = (
+            _unordered(compared, hidden) if known is None else _ordered(compared, hidden, known)
+        ) + nearer * behind
     return cost
 
 
@@ -203,8 +237,11 @@ def _facing(other: _View, view: _View) -> np.ndarray:
     return (view.normal * toward).sum(1) / np.maximum(np.linalg.norm(toward, axis=1), 1e-9)
 
 
-def _compared(view: _View, other: _View, points: np.ndarray, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What view shows at points[chosen] beside what the other shows there: difference (m,) in 0..1, pixels (m, 2), depth (m,)."""
+def _compared(
+    view: _View, other: _View, points: np.ndarray, chosen: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What view shows at points[chosen] beside what the other shows there: difference (m,) in 0..1, pixels (m, 2),
+    depth (m,)."""
     pixels, depth = other.seen(points[chosen])
     gap = bilinear(other.looks, pixels) - view.own[chosen]
     difference = np.minimum(np.einsum("ij,ij->i", gap, gap) / WORST**2, 1.0)
@@ -212,7 +249,8 @@ def _compared(view: _View, other: _View, points: np.ndarray, chosen: np.ndarray)
 
 
 def _unordered(compared: list, hidden: np.ndarray) -> np.ndarray:
-    """Cost (m,) when nothing is known of who hides whom: by the view that fits best, of three and more by the best two."""
+    """Cost (m,) when nothing is known of who hides whom: by the view that fits best, of three and more by the best
+    two."""
     if not compared:
         return hidden
     each = np.stack([np.where(cosine > FACING, difference, np.inf) for difference, _, _, cosine, _ in compared])
@@ -223,20 +261,24 @@ def _unordered(compared: list, hidden: np.ndarray) -> np.ndarray:
 
 
 def _ordered(compared: list, hidden: np.ndarray, known: dict[int, tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Cost (m,) by the views whose own surface is met there; a point that would hide what another shows for sure costs most."""
+    """Cost (m,) by the views whose own surface is met there; a point that would hide what another shows for sure costs
+    most."""
     total, share, blocks = HIDDEN_SHARE * hidden, np.full(len(hidden), HIDDEN_SHARE), np.zeros(len(hidden))
     for difference, pixels, depth, cosine, other in compared:
         surface, trust = (bilinear(image[..., None], pixels)[:, 0] for image in known[id(other)])
         reach = MET * other.pixel / np.maximum(cosine, 0.3)
         covered = bilinear(other.mask[..., None], pixels)[:, 0] > 0.5
-        weight = np.where((cosine > FACING) & covered & (np.abs(depth - surface) < reach), cosine * np.maximum(trust, 0.2), 0.0)
+        weight = np.where(
+            (cosine > FACING) & covered & (np.abs(depth - surface) < reach), cosine * np.maximum(trust, 0.2), 0.0
+        )
         total, share = total + weight * difference, share + weight
         blocks = np.maximum(blocks, np.where(covered & (depth < surface - reach), trust, 0.0))
     return np.maximum(total / share, blocks)
 
 
 def _least(cost: np.ndarray, view: _View) -> np.ndarray:
-    """Stretched depth (n,) of least cost, each pixel's and what its neighbours' planes ask for; NaN where all is ruled out."""
+    """Stretched depth (n,) of least cost, each pixel's and what its neighbours' planes ask for; NaN where all is ruled
+    out."""
     right, down, facing = slopes(view.camera, view.normal, FACING, view.directions)
     scale = view.factor / view.step
     image = np.full((*view.shown.shape, cost.shape[1]), NEVER, np.float32)
@@ -245,7 +287,12 @@ def _least(cost: np.ndarray, view: _View) -> np.ndarray:
     jump = view.image(JUMP * np.clip(facing / 0.5, 0.15, 1.0)).astype(np.float32)
     total = np.zeros_like(image)
     for slope, turn in ((right, (0, 1, 2)), (down, (1, 0, 2))):
-        along = [image.transpose(turn), view.shown.transpose(turn[:2]), view.image(slope * scale).transpose(turn[:2]), jump.transpose(turn[:2])]
+        along = [
+            image.transpose(turn),
+            view.shown.transpose(turn[:2]),
+            view.image(slope * scale).transpose(turn[:2]),
+            jump.transpose(turn[:2]),
+        ]
         for way in (1, -1):
             total += _passed(*(x[:, ::way] for x in along), way)[:, ::way].transpose(turn)
     total = total[view.shown]
@@ -268,24 +315,35 @@ def _passed(cost: np.ndarray, shown: np.ndarray, slope: np.ndarray, jump: np.nda
         from_there = every - way * (slope[:, column] + slope[:, column - 1])[:, None] / 2
         whole = np.floor(from_there).astype(np.int64)
         part = (from_there - whole).astype(np.float32)
-        plane = np.take_along_axis(previous, whole.clip(0, last), 1) * (1 - part) + np.take_along_axis(previous, (whole + 1).clip(0, last), 1) * part
+        plane = (
+            np.take_along_axis(previous, whole.clip(0, last), 1) * (1 - part)
+            + np.take_along_axis(previous, (whole + 1).clip(0, last), 1) * part
+        )
         plane[(from_there < 0) | (from_there > last)] = NEVER
         beside = np.full_like(plane, NEVER)
         beside[:, 1:] = plane[:, :-1]
         np.minimum(beside[:, :-1], plane[:, 1:], out=beside[:, :-1])
-        added = np.minimum(np.minimum(plane, beside + LITTLE), lowest + np.minimum(jump[:, column], jump[:, column - 1])[:, None]) - lowest
+        added = (
+            np.minimum(
+                np.minimum(plane, beside + LITTLE), lowest + np.minimum(jump[:, column], jump[:, column - 1])[:, None]
+            )
+            - lowest
+        )
         out[:, column] += np.where((shown[:, column] & shown[:, column - 1])[:, None], added, 0)
     return out
 
 
 def _known(views: list[_View], found: list[np.ndarray]) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """Each view's depth (h, w), carried on beyond its outline, and the trust in it (h, w), by id."""
-    return {id(view): (_carried_on(view, unstretched(view.camera, depth))[0], view.image(trust))
-            for view, depth, trust in zip(views, found, _confirmed(views, found), strict=True)}
+    return {
+        id(view): (_carried_on(view, unstretched(view.camera, depth))[0], view.image(trust))
+        for view, depth, trust in zip(views, found, _confirmed(views, found), strict=True)
+    }
 
 
 def _carried_on(view: _View, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """values (n,) as an image (h, w) that goes on with the nearest one where there is none, and where there are some (h, w)."""
+    """values (n,) as an image (h, w) that goes on with the nearest one where there is none, and where there are some
+    (h, w)."""
     from scipy.ndimage import distance_transform_edt
 
     image = view.image(values, np.nan)
@@ -296,7 +354,8 @@ def _carried_on(view: _View, values: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _confirmed(views: list[_View], found: list[np.ndarray]) -> list[np.ndarray]:
-    """Trust (n,) in each view's depths: 1 where another view has the point, 0 where none, .1 where more would be hidden by it."""
+    """Trust (n,) in each view's depths: 1 where another view has the point, 0 where none, .1 where more would be hidden
+    by it."""
     surfaces = [_carried_on(view, unstretched(view.camera, depth))[0] for view, depth in zip(views, found, strict=True)]
     out = []
     for view, depth in zip(views, found, strict=True):

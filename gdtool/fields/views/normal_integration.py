@@ -9,16 +9,19 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.cameras import Camera, rays
-from gdtool.fields.views.prepared_view import Sight
 from gdtool.fields.views.multiview_stereo import Matched, match_views, pixel_steps, slopes, stretched, unstretched
+from gdtool.fields.views.prepared_view import Sight
 
 MIN_FACING = 0.15  # normals turned farther away say little about depth
 HOLD, LEAST_HOLD = 0.02, 1e-5  # weight of a matched depth against one pixel's slope, by its trust
-_FIRST_STEP, _STEP = 6.0, 2.0  # pixels: a step in depth that is so far off the slope counts a quarter; at first, and then
+# pixels: a step in depth that is so far off the slope counts a quarter; at first, and then.
+_FIRST_STEP, _STEP = 6.0, 2.0
 _ASTRAY = 4.0  # pixels: likewise a matched depth
 
 
-def integrate_normals(camera: Camera, mask: np.ndarray, normal: np.ndarray, matched: Matched, rounds: int = 6) -> np.ndarray:
+def integrate_normals(
+    camera: Camera, mask: np.ndarray, normal: np.ndarray, matched: Matched, rounds: int = 6
+) -> np.ndarray:
     """Depth (h, w), 0 outside the mask (h, w), from world normals (h, w, 3) and the depth that matching found.
 
     Minimises the differences of neighbouring depths against the slopes and a pull to the matched depth, each counted
@@ -50,7 +53,9 @@ def integrate_normals(camera: Camera, mask: np.ndarray, normal: np.ndarray, matc
         targets.append(((slope + np.roll(slope, -1, axis)) / 2)[pair])
         trust.append(np.clip(np.minimum(facing, np.roll(facing, -1, axis))[pair], 0.02, 1.0) ** 2)
         size += len(a)
-    differences = coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(size, count)).tocsr()
+    differences = coo_matrix(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(size, count)
+    ).tocsr()
     target, trust = np.concatenate(targets), np.concatenate(trust)
     start, held = stretched(camera, matched.depth[inside]), HOLD * matched.trust[inside] + LEAST_HOLD
     depth = start.copy()
@@ -59,15 +64,29 @@ def integrate_normals(camera: Camera, mask: np.ndarray, normal: np.ndarray, matc
         weight = trust / (1 + gap**2) ** 2
         hold = held / (1 + ((depth - start) / (_ASTRAY * pixel)) ** 2) ** 2
         system = differences.T @ diags(weight) @ differences + diags(hold)
-        depth = cg(system, differences.T @ (weight * target) + hold * start, x0=depth, rtol=1e-6, maxiter=300, M=diags(1 / system.diagonal()))[0]
+        depth = cg(
+            system,
+            differences.T @ (weight * target) + hold * start,
+            x0=depth,
+            rtol=1e-6,
+            maxiter=300,
+            M=diags(1 / system.diagonal()),
+        )[0]
     out = np.zeros(mask.shape, np.float32)
     out[inside] = unstretched(camera, depth)
     return out
 
 
-def depth_from_normals(cameras: list[Camera], mask: np.ndarray, normal: np.ndarray, alike: dict[str, np.ndarray], sights: list[Sight],
-                       box: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Depth (k, h, w) of all views from normals and silhouettes, and from further images that look alike from all sides.
+def depth_from_normals(
+    cameras: list[Camera],
+    mask: np.ndarray,
+    normal: np.ndarray,
+    alike: dict[str, np.ndarray],
+    sights: list[Sight],
+    box: tuple[np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """Depth (k, h, w) of all views from normals and silhouettes, and from further images that look alike from all
+    sides.
 
     See match_views for the arguments.
     """

@@ -37,14 +37,15 @@ class Picture:
         return cls(camera, color, across, down)
 
 
-def color_rows(points: np.ndarray, here: np.ndarray, there: np.ndarray, first: Picture, second: Picture, trust: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def color_rows(
+    points: np.ndarray, here: np.ndarray, there: np.ndarray, first: Picture, second: Picture, trust: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """How a view's depth has to change for its points to look like what another view shows at their places.
 
-    points (n, 3) that the first view shows at pixels here (n, 2) and that fall on pixels there (n, 2) of the second; trust
-    (n,). Returns the slope (n,) of the difference in color per world unit of the first view's depth, the difference (n,)
-    that it shall undo, and weights (n,): one over the variance that the two views' colors differ by, less for outliers. Each
-    channel of a view may be brighter or have an offset.
-    """
+    points (n, 3) that the first view shows at pixels here (n, 2) and that fall on pixels there (n, 2) of the second;
+    trust (n,). Returns the slope (n,) of the difference in color per world unit of the first view's depth, the
+    difference (n,) that it shall undo, and weights (n,): one over the variance that the two views' colors differ by,
+    less for outliers. Each channel of a view may be brighter or have an offset."""
     own, shown = bilinear(first.color, here), bilinear(second.color, there)
     _, direction = rays(first.camera, here)
     farther = points + _STEP * direction / np.maximum(-(direction @ first.camera.backward), 1e-9)[:, None]
@@ -53,7 +54,8 @@ def color_rows(points: np.ndarray, here: np.ndarray, there: np.ndarray, first: P
     weight = trust
     for _ in range(3):
         difference = shown - np.stack([_matched(x, y, weight) for x, y in zip(own.T, shown.T, strict=True)], -1)
-        noise = max(1.5 * float(np.median(np.abs(difference))), LEAST_NOISE)  # 1.5: from a median to a standard deviation
+        # 1.5: from a median to a standard deviation.
+        noise = max(1.5 * float(np.median(np.abs(difference))), LEAST_NOISE)
         weight = trust / (1 + (difference**2).mean(1) / (2 * noise) ** 2) ** 2
     size = np.linalg.norm(slope, axis=1)
     return size, (slope * difference).sum(1) / np.maximum(size, 1e-9), weight / noise**2

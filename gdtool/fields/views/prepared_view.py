@@ -25,8 +25,8 @@ class Sight:
 
     planes: unit normal and offset of the tangent plane behind each pixel (n·x = offset); weight: trust in it, 0 where
     there is no depth; rough: pixels whose neighbourhood is no single smooth surface; broken: pixels beside a jump in
-    depth; curtain: distance to an occluding contour in pixels; silhouette: signed distance to the mask's edge in pixels, negative inside; points (h, w, 3).
-    """
+    depth; curtain: distance to an occluding contour in pixels; silhouette: signed distance to the mask's edge in
+    pixels, negative inside; points (h, w, 3)."""
 
     camera: Camera
     mask: np.ndarray
@@ -57,8 +57,9 @@ def silhouette_distance(mask: np.ndarray) -> np.ndarray:
     if not (cover >= 0.5).any():
         return np.full((h, w), float(np.hypot(h, w)), np.float32)
     inside = cover >= 0.5
-    out = np.where(inside, 0.5 - distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1],
-                   distance_transform_edt(~inside) - 0.5)
+    out = np.where(
+        inside, 0.5 - distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1], distance_transform_edt(~inside) - 0.5
+    )
     segments = []
     for line in find_contours(np.pad(cover, 1), 0.5):
         steps = np.linspace(0, 1, 8, endpoint=False)[None, :, None]
@@ -80,9 +81,13 @@ def normals_from_depth(points: np.ndarray, valid: np.ndarray, backward: np.ndarr
         behind = np.roll(ahead, 1, axis)
         good_ahead = valid & np.roll(valid, -1, axis)
         good_behind = np.roll(good_ahead, 1, axis)
-        length_ahead = np.where(good_ahead, (ahead ** 2).sum(-1), np.inf)
-        length_behind = np.where(good_behind, (behind ** 2).sum(-1), np.inf)
-        both = good_ahead & good_behind & (np.maximum(length_ahead, length_behind) < 4 * np.minimum(length_ahead, length_behind))
+        length_ahead = np.where(good_ahead, (ahead**2).sum(-1), np.inf)
+        length_behind = np.where(good_behind, (behind**2).sum(-1), np.inf)
+        both = (
+            good_ahead
+            & good_behind
+            & (np.maximum(length_ahead, length_behind) < 4 * np.minimum(length_ahead, length_behind))
+        )
         side = np.where((length_ahead <= length_behind)[..., None], ahead, behind)
         tangent = np.where(both[..., None], ahead + behind, side)
         tangents.append(np.where((good_ahead | good_behind)[..., None], tangent, 0.0))
@@ -106,8 +111,9 @@ def pixel_footprint(camera: Camera, depth) -> np.ndarray:
     return np.asarray(depth) / camera.fx
 
 
-def prepare(camera: Camera, mask: np.ndarray, depth: np.ndarray | None = None,
-            normal: np.ndarray | None = None) -> Sight:
+def prepare(
+    camera: Camera, mask: np.ndarray, depth: np.ndarray | None = None, normal: np.ndarray | None = None
+) -> Sight:
     """Prepare one view: mask (h, w) coverage, depth (h, w) along the axis and normal (h, w, 3) world, either optional.
 
     Pixels whose depth fits no neighbour (an average over an edge) tell only that the view before them is free. Without
@@ -126,8 +132,11 @@ def prepare(camera: Camera, mask: np.ndarray, depth: np.ndarray | None = None,
     length = np.linalg.norm(normal, axis=-1)
     valid &= length > 0.1
     normal = np.where(valid[..., None], normal / np.maximum(length, 0.1)[..., None], 0.0)
-    toward = np.where(camera.projection == "orthographic", camera.backward,
-                      -rays(camera)[1]) if camera.projection != "orthographic" else camera.backward
+    toward = (
+        np.where(camera.projection == "orthographic", camera.backward, -rays(camera)[1])
+        if camera.projection != "orthographic"
+        else camera.backward
+    )
     cosine = (normal * toward).sum(-1)
 
     shown = _Shown(points, normal, valid, foot)
@@ -137,17 +146,33 @@ def prepare(camera: Camera, mask: np.ndarray, depth: np.ndarray | None = None,
     planes = np.concatenate([normal, (normal * points).sum(-1, keepdims=True)], -1).astype(np.float32)
     curtain = shown.image(shown.curtain(normal[valid], firm), np.inf).astype(np.float32)
     firm = shown.image(firm, False)
-    weight = np.where(firm, np.clip(cosine, 0.05, 1.0) ** 2 * mask ** 2, _FAINT * valid).astype(np.float32)
-    return Sight(camera, mask, silhouette, cropped, planes, weight, ~(firm & shown.image(smooth, False)), shown.image(broken, False),
-                 curtain, points.astype(np.float32))
+    weight = np.where(firm, np.clip(cosine, 0.05, 1.0) ** 2 * mask**2, _FAINT * valid).astype(np.float32)
+    return Sight(
+        camera,
+        mask,
+        silhouette,
+        cropped,
+        planes,
+        weight,
+        ~(firm & shown.image(smooth, False)),
+        shown.image(broken, False),
+        curtain,
+        points.astype(np.float32),
+    )
 
 
 class _Shown:
-    """The n pixels of a view that show a surface, beside their neighbours: points and normals (h, w, 3), valid and foot (h, w)."""
+    """The n pixels of a view that show a surface, beside their neighbours: points and normals (h, w, 3), valid and foot
+    (h, w)."""
 
     def __init__(self, points: np.ndarray, normal: np.ndarray, valid: np.ndarray, foot: np.ndarray):
         rim = [(CURTAIN_REACH,) * 2] * 2
-        self.valid, self.foot, self.inner, self.columns = valid, foot[valid], np.pad(valid, rim), valid.shape[1] + 2 * CURTAIN_REACH
+        self.valid, self.foot, self.inner, self.columns = (
+            valid,
+            foot[valid],
+            np.pad(valid, rim),
+            valid.shape[1] + 2 * CURTAIN_REACH,
+        )
         self.points, self.normals = (np.pad(x, [*rim, (0, 0)]).reshape(-1, 3) for x in (points, normal))
         self.at = np.flatnonzero(self.inner)
         self.point, self.normal = self.points[self.at], self.normals[self.at]
@@ -159,16 +184,27 @@ class _Shown:
         return out
 
     def gaps(self, shift: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Whether the neighbour shows something too (n,), its height over this pixel's plane, and this one's over the neighbour's."""
+        """Whether the neighbour shows something too (n,), its height over this pixel's plane, and this one's over the
+        neighbour's."""
         beside = self.at + shift[0] * self.columns + shift[1]
         delta = self.points[beside] - self.point
-        return self.inner.ravel()[beside], np.einsum("ij,ij->i", self.normal, delta), -np.einsum("ij,ij->i", self.normals[beside], delta)
+        return (
+            self.inner.ravel()[beside],
+            np.einsum("ij,ij->i", self.normal, delta),
+            -np.einsum("ij,ij->i", self.normals[beside], delta),
+        )
 
     def judged(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(n,) each: which pixels' depth fits two neighbours and does not float between a nearer surface on one side and a
-        farther one on the other (an average over an edge), which lie amid one smooth surface, and which beside a jump."""
+        """(n,) each: which pixels' depth fits two neighbours and does not float between a nearer surface on one side
+        and a farther one on the other (an average over an edge), which lie amid one smooth surface, and which beside a
+        jump."""
         count = len(self.at)
-        agree, smooth, broken, flying = np.zeros(count, int), np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
+        agree, smooth, broken, flying = (
+            np.zeros(count, int),
+            np.ones(count, bool),
+            np.zeros(count, bool),
+            np.zeros(count, bool),
+        )
         for shift in ((0, 1), (1, 0), (1, 1), (1, -1)):
             heights = []
             for i, j in (shift, (-shift[0], -shift[1])):
@@ -183,7 +219,8 @@ class _Shown:
         return (agree >= 2) & ~flying, smooth, broken
 
     def curtain(self, normal: np.ndarray, firm: np.ndarray) -> np.ndarray:
-        """Pixels (n,) from each pixel to the nearest one whose surface stands in front of its plane (an occluding contour).
+        """Pixels (n,) from each pixel to the nearest one whose surface stands in front of its plane (an occluding
+        contour).
 
         normal (n, 3): of the planes. What is not firm (n,) hides nothing but what is not firm either.
         """
@@ -197,27 +234,33 @@ class _Shown:
                     beside = self.at + i * self.columns + j
                     there = hiding.ravel()[beside] | (self.inner.ravel()[beside] & ~firm)
                     height = np.einsum("ij,ij->i", normal, self.points[beside] - self.point)
-                    out = np.where(there & (height > (1.0 + distance) * self.foot), np.minimum(out, distance - 0.5), out)
+                    out = np.where(
+                        there & (height > (1.0 + distance) * self.foot), np.minimum(out, distance - 0.5), out
+                    )
         return out
 
 
 def with_edge(sight: Sight, edge: float) -> Sight:
-    """The view with its silhouette grown all around by edge (world units at the origin's distance; negative shrinks it).
+    """The view with its silhouette grown all around by edge (world units at the origin's distance; negative shrinks
+    it).
 
-    Pixels that it gains show nothing: that the view before them is free, as far as the nearest pixel's depth, is what they tell.
-    """
+    Pixels that it gains show nothing: that the view before them is free, as far as the nearest pixel's depth, is what
+    they tell."""
     from scipy.ndimage import distance_transform_edt
 
     foot = float(pixel_footprint(sight.camera, float(np.linalg.norm(sight.camera.position))))
     grown = replace(sight, silhouette=(sight.silhouette - edge / foot).astype(np.float32))
     if sight.planes is None or edge <= 0 or not (sight.weight > 0).any():
         return grown
-    gained = (grown.silhouette < 1) & (sight.weight == 0)  # and the pixels around them, between which points are looked up
+    # And the pixels around them, between which points are looked up.
+    gained = (grown.silhouette < 1) & (sight.weight == 0)
     row, column = distance_transform_edt(sight.weight == 0, return_distances=False, return_indices=True)[:, gained]
     depth = np.zeros(sight.mask.shape)
     depth[gained] = (sight.points[row, column] - sight.camera.position) @ -sight.camera.backward
     points, planes, weight = backproject(sight.camera, depth)[gained], sight.planes.copy(), sight.weight.copy()
-    planes[gained] = np.concatenate([np.broadcast_to(sight.camera.backward, points.shape), points @ sight.camera.backward[:, None]], -1)
+    planes[gained] = np.concatenate(
+        [np.broadcast_to(sight.camera.backward, points.shape), points @ sight.camera.backward[:, None]], -1
+    )
     weight[gained] = _FAINT
     places = sight.points.copy()
     places[gained] = points
@@ -225,7 +268,8 @@ def with_edge(sight: Sight, edge: float) -> Sight:
 
 
 def hull_distance(sight: Sight, points: np.ndarray) -> np.ndarray:
-    """Signed distance (n,) of points (n, 3) to the view's silhouette cone, positive outside. A lower bound of the object's."""
+    """Signed distance (n,) of points (n, 3) to the view's silhouette cone, positive outside. A lower bound of the
+    object's."""
     pixels, depth = project(sight.camera, points)
     value = bilinear(sight.silhouette[..., None], pixels)[:, 0]
     h, w = sight.mask.shape
@@ -248,7 +292,8 @@ def free_distance(sight: Sight, points: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def tangent_distance(sight: Sight, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """free_distance, the unit normal (n, 3) of the plane it was measured to, and where the surface there is smooth (n,)."""
+    """free_distance, the unit normal (n, 3) of the plane it was measured to, and where the surface there is smooth
+    (n,)."""
     pixels, depth = project(sight.camera, points)
     h, w = sight.mask.shape
     column = np.clip(pixels[:, 0].astype(np.int64), 0, w - 1)
@@ -267,7 +312,12 @@ def tangent_distance(sight: Sight, points: np.ndarray) -> tuple[np.ndarray, np.n
     weight = np.where(bounded, np.minimum(weight, WEAK), weight)
     inside = (pixels[:, 0] >= 0) & (pixels[:, 0] < w) & (pixels[:, 1] >= 0) & (pixels[:, 1] < h)
     known = (weight > 0) & inside & (depth > 0)
-    return np.where(known, value, -np.inf), np.where(known, weight, 0.0), mixed[:, :3] * scale[:, None], known & ~single & ~bounded
+    return (
+        np.where(known, value, -np.inf),
+        np.where(known, weight, 0.0),
+        mixed[:, :3] * scale[:, None],
+        known & ~single & ~bounded,
+    )
 
 
 def bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -279,5 +329,6 @@ def bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     column, row = x.astype(np.int64), y.astype(np.int64)
     fx, fy = (x - column).astype(np.float32)[:, None], (y - row).astype(np.float32)[:, None]
     corner = row * w + column
-    return ((flat[corner] * (1 - fx) + flat[corner + 1] * fx) * (1 - fy)
-            + (flat[corner + w] * (1 - fx) + flat[corner + w + 1] * fx) * fy)
+    return (flat[corner] * (1 - fx) + flat[corner + 1] * fx) * (1 - fy) + (
+        flat[corner + w] * (1 - fx) + flat[corner + w + 1] * fx
+    ) * fy

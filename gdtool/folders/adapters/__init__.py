@@ -1,8 +1,7 @@
 """Readers of other programs' pictures: each turns a folder into cameras and images in gdtool's conventions.
 
-An adapter is a module with `recognises(folder) -> bool` and `read(folder) -> Pictures`; ADAPTERS lists them in the order
-in which they are asked. Add a module and its name, and `gdtool import-views` reads one format more.
-"""
+An adapter is a module with `recognises(folder) -> bool` and `read(folder) -> Pictures`; ADAPTERS lists them in the
+order in which they are asked. Add a module and its name, and `gdtool import-views` reads one format more."""
 
 from __future__ import annotations
 
@@ -39,7 +38,11 @@ def adapter(folder: Path, name: str = "auto") -> ModuleType:
         module = import_module(f"{__name__}.{known}")
         if module.recognises(folder):
             return module
-    wanted = "a Wonder3D output, a transforms.json or a cameras.json with pictures" if name == "auto" else import_module(f"{__name__}.{name}").LOOKS_LIKE
+    wanted = (
+        "a Wonder3D output, a transforms.json or a cameras.json with pictures"
+        if name == "auto"
+        else import_module(f"{__name__}.{name}").LOOKS_LIKE
+    )
     raise InputError(folder, f"does not hold {wanted}", "name the folder that holds it")
 
 
@@ -55,5 +58,9 @@ def stacked(parts: list[np.ndarray], paths: list[Path]) -> np.ndarray:
     """Images of one size as one array. Raises InputError naming the first of another size."""
     for part, path in zip(parts, paths, strict=True):
         if part.shape != parts[0].shape:
-            raise InputError(path, f"is {part.shape[1]}x{part.shape[0]}, {paths[0].name} {parts[0].shape[1]}x{parts[0].shape[0]}", "scale all views to one size")
+            raise InputError(
+                path,
+                f"is {part.shape[1]}x{part.shape[0]}, {paths[0].name} {parts[0].shape[1]}x{parts[0].shape[0]}",
+                "scale all views to one size",
+            )
     return np.stack(parts)

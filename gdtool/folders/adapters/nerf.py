@@ -18,7 +18,8 @@ from gdtool.folders.adapters import Pictures, linear_color, stacked
 LOOKS_LIKE = "a transforms.json"
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".exr")  # Blender's exporter leaves the suffix out
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-_LEAST_PIXELS, _MOST_PIXELS = 1e-3, 1e9  # of a size or a focal length that can be meant; the latter also of what a matrix holds
+# Of a size or a focal length that can be meant; the latter also of what a matrix holds.
+_LEAST_PIXELS, _MOST_PIXELS = 1e-3, 1e9
 _FILES = ("transforms.json", "transforms_train.json")
 
 
@@ -34,8 +35,16 @@ def read(folder: Path) -> Pictures:
     path = next(folder / name for name in _FILES if (folder / name).is_file())
     record = read_json(path)
     frames = record.get("frames") if isinstance(record, dict) else None
-    if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) and isinstance(f.get("file_path"), str) for f in frames):
-        raise InputError(path, "holds no list of frames with a file_path each", 'write "frames": [{"file_path": …, "transform_matrix": …}, …]')
+    if (
+        not isinstance(frames, list)
+        or not frames
+        or not all(isinstance(f, dict) and isinstance(f.get("file_path"), str) for f in frames)
+    ):
+        raise InputError(
+            path,
+            "holds no list of frames with a file_path each",
+            'write "frames": [{"file_path": …, "transform_matrix": …}, …]',
+        )
     cameras, colors, masks, paths, held = [], [], [], [], 0
     for frame in frames:
         picture = _picture(path, frame["file_path"])
@@ -45,7 +54,12 @@ def read(folder: Path) -> Pictures:
         masks.append(foreground(image, subject=picture))
         paths.append(picture)
         held += colors[-1].nbytes + masks[-1].nbytes
-        require_memory(2 * held, path, f"{len(paths)} pictures up to {picture.name}", "scale the pictures down or list fewer frames")
+        require_memory(
+            2 * held,
+            path,
+            f"{len(paths)} pictures up to {picture.name}",
+            "scale the pictures down or list fewer frames",
+        )
     return Pictures(cameras, {"color": stacked(colors, paths)}, np.stack(masks), up="z")
 
 
@@ -60,12 +74,17 @@ def _picture(path: Path, name: str) -> Path:
 
 def _camera(path: Path, record: dict[str, Any], name: str, width: int, height: int) -> Camera:
     """One frame's camera; intrinsics for another size than the picture's are scaled to it."""
+
     def value(key: str, default: float | None = None, least: float = -_MOST_PIXELS) -> float:
         found = record.get(key, default)
         if not isinstance(found, (int, float)) or isinstance(found, bool):
             raise InputError(path, f"frame {name}: {key} is missing or no number", f"write {key} as a number")
         if not least <= found <= _MOST_PIXELS:
-            raise InputError(path, f"frame {name}: {key} is {found:g}, not within {least:g} to {_MOST_PIXELS:g}", f"write {key} within these bounds")
+            raise InputError(
+                path,
+                f"frame {name}: {key} is {found:g}, not within {least:g} to {_MOST_PIXELS:g}",
+                f"write {key} within these bounds",
+            )
         return float(found)
 
     for key in _DISTORTION:
@@ -77,19 +96,42 @@ def _camera(path: Path, record: dict[str, Any], name: str, width: int, height: i
     fy = value("fl_y", fx, _LEAST_PIXELS)
     pose = _matrix(record.get("transform_matrix"))
     if pose is None:
-        raise InputError(path, f"frame {name}: transform_matrix is not 4x4 numbers up to {_MOST_PIXELS:g}", "write four rows of four numbers")
+        raise InputError(
+            path,
+            f"frame {name}: transform_matrix is not 4x4 numbers up to {_MOST_PIXELS:g}",
+            "write four rows of four numbers",
+        )
     rigid = np.eye(4)
     u, size, vt = np.linalg.svd(pose[:3, :3])
     if size[-1] < 0.99 * size[0] or size[0] == 0 or np.linalg.det(u @ vt) < 0:
-        raise InputError(path, f"frame {name}: transform_matrix is not a rotation and translation", "remove scale, shear and mirroring from it")
+        raise InputError(
+            path,
+            f"frame {name}: transform_matrix is not a rotation and translation",
+            "remove scale, shear and mirroring from it",
+        )
     rigid[:3, :3], rigid[:3, 3] = u @ vt, pose[:3, 3]
     sx, sy = width / across, height / down
-    return Camera(name, rigid, width, height, "perspective", 0.0, fx * sx, fy * sy, value("cx", across / 2) * sx, value("cy", down / 2) * sy)
+    return Camera(
+        name,
+        rigid,
+        width,
+        height,
+        "perspective",
+        0.0,
+        fx * sx,
+        fy * sy,
+        value("cx", across / 2) * sx,
+        value("cy", down / 2) * sy,
+    )
 
 
 def _matrix(rows: Any) -> np.ndarray | None:
     """(3 or 4, 4) float64 of nested lists; None for anything else than so many numbers of at most _MOST_PIXELS."""
-    if not isinstance(rows, list) or len(rows) not in (3, 4) or not all(isinstance(row, list) and len(row) == 4 for row in rows):
+    if (
+        not isinstance(rows, list)
+        or len(rows) not in (3, 4)
+        or not all(isinstance(row, list) and len(row) == 4 for row in rows)
+    ):
         return None
     numbers = [x for row in rows for x in row]
     if not all(isinstance(x, (int, float)) and not isinstance(x, bool) and abs(x) <= _MOST_PIXELS for x in numbers):

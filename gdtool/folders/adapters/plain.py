@@ -1,4 +1,5 @@
-"""A plain folder: cameras.json in gdtool's own form, and pictures as <domain>/<view>.<suffix> or, colors, <view>.<suffix>.
+"""A plain folder: cameras.json in gdtool's own form, and pictures as <domain>/<view>.<suffix> or, colors,
+<view>.<suffix>.
 
 What schemas/views.md says of encodings holds, except that any readable image format will do and that a view without a
 mask/<view> is masked by its color's alpha, else by its difference from a plain background.
@@ -44,7 +45,9 @@ def read(folder: Path) -> Pictures:
             stored.append(image.reshape(*_size(path, camera, image), -1))
             passing = sum(x.nbytes for x in stored) * 4 // stored[0].itemsize * 2  # as float32, each alone and stacked
             held = sum(x.nbytes for x in images.values()) + passing
-            require_memory(held, folder, f"pictures up to {domain}/{camera.name}", "scale the pictures down or list fewer cameras")
+            require_memory(
+                held, folder, f"pictures up to {domain}/{camera.name}", "scale the pictures down or list fewer cameras"
+            )
         first = first or domain
         if domain == "color":
             masks = stored
@@ -52,19 +55,28 @@ def read(folder: Path) -> Pictures:
         elif domain == "albedo":
             images[domain] = stacked([linear_color(image) for image in stored], paths)
         elif domain == "normal":
-            images[domain] = decode_normal(stacked([unit_range(image[..., :3]).astype(np.float32) for image in stored], paths))
+            images[domain] = decode_normal(
+                stacked([unit_range(image[..., :3]).astype(np.float32) for image in stored], paths)
+            )
         elif domain == "depth" and any(image.dtype.kind != "f" for image in stored):
             raise InputError(paths[0], "is not floating point: depth is in world units", "write it as .exr")
         else:
             images[domain] = stacked([unit_range(image[..., 0]).astype(np.float32) for image in stored], paths)
     if not images:
-        raise InputError(folder, "has no domain with a picture of every view in cameras.json", f"add pictures, for example color/{cameras[0].name}.png")
+        raise InputError(
+            folder,
+            "has no domain with a picture of every view in cameras.json",
+            f"add pictures, for example color/{cameras[0].name}.png",
+        )
     mask = []
     for k, camera in enumerate(cameras):
         given = _find(folder, "mask", camera.name)
         if given is None and masks is None:
-            raise InputError(folder / "mask", f"has no picture of {camera.name}, and there is no color to tell the subject by",
-                             f"add mask/{camera.name}.png")
+            raise InputError(
+                folder / "mask",
+                f"has no picture of {camera.name}, and there is no color to tell the subject by",
+                f"add mask/{camera.name}.png",
+            )
         if given is None:
             mask.append(foreground(masks[k], subject=_find(folder, "color", camera.name)))
         else:
@@ -86,6 +98,9 @@ def _find(folder: Path, domain: str, view: str) -> Path | None:
 
 def _size(path: Path, camera, image: np.ndarray) -> tuple[int, int]:
     if image.shape[:2] != (camera.height, camera.width):
-        raise InputError(path, f"is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}",
-                         "scale the picture, or write its size into cameras.json")
+        raise InputError(
+            path,
+            f"is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}",
+            "scale the picture, or write its size into cameras.json",
+        )
     return image.shape[:2]

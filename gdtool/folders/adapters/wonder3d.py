@@ -34,8 +34,18 @@ def read(folder: Path) -> Pictures:
     if stored.shape[-1] != 4:
         raise InputError(paths[0], "has no alpha, where Wonder3D puts the mask", "run its background removal first")
     mask = unit_range(stored[..., 3]).astype(np.float32)
-    images = {"normal": np.where(mask[..., None] > 0, decode_normal(unit_range(stored[..., :3]).astype(np.float32)), 0).astype(np.float32)}
-    colors = [next((p for p in (folder / "masked_colors" / f"rgb_000_{n}.png", folder / f"rgb_000_{n}.png") if p.is_file()), None) for n in names]
+    images = {
+        "normal": np.where(
+            mask[..., None] > 0, decode_normal(unit_range(stored[..., :3]).astype(np.float32)), 0
+        ).astype(np.float32)
+    }
+    colors = [
+        next(
+            (p for p in (folder / "masked_colors" / f"rgb_000_{n}.png", folder / f"rgb_000_{n}.png") if p.is_file()),
+            None,
+        )
+        for n in names
+    ]
     if all(colors):
         images["color"] = stacked([linear_color(read_image(path)) for path in colors], colors)
         if images["color"].shape[:3] != mask.shape:

@@ -1,4 +1,5 @@
-"""Fewer irregular vertices in a quad mesh: pairs of a vertex of three and one of five edges led to one another, where they cancel."""
+"""Fewer irregular vertices in a quad mesh: pairs of a vertex of three and one of five edges led to one another, where
+they cancel."""
 
 from __future__ import annotations
 
@@ -16,10 +17,9 @@ _FLAT_COSINE = 0.8  # between the normals of two quads whose edge may go: crease
 def cancel_pairs(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Quads (q, 4) of a manifold with as many faces and vertices, fewer of those of other than four edges.
 
-    Such a pair moves on by the rotation of an edge, one way or the other, and leaves regular quads behind (Peng et al. 2011,
-    Connectivity editing for quadrilateral meshes). Each is led both ways until a rotation beside it leaves less that is irregular,
-    or put back. Faces that do not all look the same way out are left as they are.
-    """
+    Such a pair moves on by the rotation of an edge, one way or the other, and leaves regular quads behind (Peng et al.
+    2011, Connectivity editing for quadrilateral meshes). Each is led both ways until a rotation beside it leaves less
+    that is irregular, or put back. Faces that do not all look the same way out are left as they are."""
     valence, inner = valences(faces, len(vertices))
     net = _Net(vertices, faces, valence, inner)
     if not net.oriented():
@@ -35,7 +35,8 @@ def cancel_pairs(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Turn:
-    """The edge `old` between two faces gives way to the edge `new` between two other corners of the hexagon around it."""
+    """The edge `old` between two faces gives way to the edge `new` between two other corners of the hexagon around
+    it."""
 
     old: tuple[int, int]
     new: tuple[int, int]
@@ -51,7 +52,11 @@ class _Net:
     """Quads whose edges can be rotated."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, valence: np.ndarray, inner: np.ndarray):
-        self.faces, self.valence, self._inner = [tuple(face) for face in faces.tolist()], valence.tolist(), inner.tolist()
+        self.faces, self.valence, self._inner = (
+            [tuple(face) for face in faces.tolist()],
+            valence.tolist(),
+            inner.tolist(),
+        )
         self._points = vertices.tolist()
         self._face_of: dict[tuple[int, int], int] = {}  # which face walks an edge in this direction
         self._face_at = [0] * len(valence)  # one of those around each vertex
@@ -65,18 +70,21 @@ class _Net:
     def gain_beside(self, *vertices: int) -> bool:
         """Whether there were rotations of edges at vertices that leave less that is irregular; they are done."""
         found = False
-        while better := next((one for vertex in vertices for other in self._neighbours(vertex)
-                              for one in self._turns(vertex, other)), None):
+        while better := next(
+            (one for vertex in vertices for other in self._neighbours(vertex) for one in self._turns(vertex, other)),
+            None,
+        ):
             self._apply(better)
             found = True
         return found
 
     def lead(self, vertex: int, way: int, steps: int) -> bool | None:
-        """Whether its pair was led that way until it gained; otherwise it is where it was. None where there is no such way."""
+        """Whether its pair was led that way until it gained; otherwise it is where it was. None where there is no such
+        way."""
         path: list[_Turn] = []
         for _ in range(steps):
             ways = [turn for turn in self._neutral(vertex) if not path or set(turn.new) != set(path[-1].old)]
-            turn = next(iter(ways[0 if path else way:]), None)
+            turn = next(iter(ways[0 if path else way :]), None)
             if turn is None:
                 if not path:
                     return None
@@ -91,13 +99,14 @@ class _Net:
         return False
 
     def _neutral(self, vertex: int) -> Iterator[_Turn]:
-        """Rotations of its edges that take one from it and give one to a vertex of three, and leave as much that is irregular."""
+        """Rotations of its edges that take one from it and give one to a vertex of three, and leave as much that is
+        irregular."""
         for other in self._neighbours(vertex):
             yield from self._turns(vertex, other, neutral=True)
 
     def _turns(self, p: int, q: int, neutral: bool = False) -> Iterator[_Turn]:
-        """The two rotations of an edge, those of them that leave quads of a manifold, no vertex of two edges, and less that is irregular;
-        or if neutral as much, and one edge more at a vertex of three."""
+        """The two rotations of an edge, those of them that leave quads of a manifold, no vertex of two edges, and less
+        that is irregular; or if neutral as much, and one edge more at a vertex of three."""
         valence, inner = self.valence, self._inner
         if valence[p] < 4 or valence[q] < 4 or not (inner[p] and inner[q]):
             return
@@ -108,9 +117,18 @@ class _Net:
         r, s, t, u = *self._after(one, q), *self._after(two, p)
         for x, y in ((r, t), (s, u)):
             threes = (valence[x] < 4) + (valence[y] < 4)
-            if not ((fewer + threes == 2 and 3 in (valence[x], valence[y]) if neutral else fewer + threes > 2) and inner[x] and inner[y]):
+            if not (
+                (fewer + threes == 2 and 3 in (valence[x], valence[y]) if neutral else fewer + threes > 2)
+                and inner[x]
+                and inner[y]
+            ):
                 continue
-            if (x, y) in self._face_of or (y, x) in self._face_of or len({p, q, r, s, t, u}) < 6 or not self._flat(one, two):
+            if (
+                (x, y) in self._face_of
+                or (y, x) in self._face_of
+                or len({p, q, r, s, t, u}) < 6
+                or not self._flat(one, two)
+            ):
                 continue
             after = ((r, s, p, t), (t, u, q, r)) if x == r else ((s, p, t, u), (u, q, r, s))
             yield _Turn((p, q), (x, y), (one, two), (self.faces[one], self.faces[two]), after)

@@ -19,7 +19,9 @@ def cancel_irregular(vertices: np.ndarray, faces: np.ndarray, rounds: int = 4) -
         odd = lambda number: (number != 4).astype(np.int64)  # noqa: E731
         v = valence[faces]
         before = odd(v).sum(1)
-        gain = np.stack([before - odd(v[:, i] + v[:, i + 2] - 2) - odd(v[:, 1 - i] - 1) - odd(v[:, 3 - i] - 1) for i in (0, 1)], 1)
+        gain = np.stack(
+            [before - odd(v[:, i] + v[:, i + 2] - 2) - odd(v[:, 1 - i] - 1) - odd(v[:, 3 - i] - 1) for i in (0, 1)], 1
+        )
         usable = inner[faces].all(1) & (v > 2).all(1)
         gain[~usable] = 0
         # The corners that lose an edge keep three.

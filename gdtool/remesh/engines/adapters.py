@@ -16,7 +16,8 @@ _FACES_PER_QUAD = 4
 
 
 def on_few(vertices: np.ndarray, faces: np.ndarray, quads: int, wanted: Invariants) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh collapsed to what so many quads can show, where that keeps the invariants that it has: half of Instant Meshes' time.
+    """A mesh collapsed to what so many quads can show, where that keeps the invariants that it has: half of Instant
+    Meshes' time.
 
     It cuts long edges itself, so its cost follows the vertices that it is given more than those that it makes.
     """
@@ -30,7 +31,9 @@ def on_few(vertices: np.ndarray, faces: np.ndarray, quads: int, wanted: Invarian
     return (few_vertices, few) if invariants(few) == wanted else (vertices, faces)
 
 
-def run_instant_meshes(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float) -> tuple[np.ndarray, np.ndarray]:
+def run_instant_meshes(
+    vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Instant Meshes (Jakob et al. 2015): a quarter as many mixed faces, then one regular subdivision to pure quads.
 
     Its deterministic mode, so that equal input gives equal files. Intrinsic smoothing leaves a tenth fewer irregular
@@ -38,17 +41,37 @@ def run_instant_meshes(vertices: np.ndarray, faces: np.ndarray, quads: int, crea
     """
     pynanoinstantmeshes = imported("pynanoinstantmeshes")
     out, found = pynanoinstantmeshes.remesh(
-        np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.uint32), vertex_count=max(quads // 4, 4), rosy=4, posy=4,
-        creaseAngle=float(crease_degrees), align_to_boundaries=bool((edges_of(faces).count == 1).any()), extrinsic=True,
-        smooth_iter=0, deterministic=True)
+        np.ascontiguousarray(vertices, np.float32),
+        np.ascontiguousarray(faces, np.uint32),
+        vertex_count=max(quads // 4, 4),
+        rosy=4,
+        posy=4,
+        creaseAngle=float(crease_degrees),
+        align_to_boundaries=bool((edges_of(faces).count == 1).any()),
+        extrinsic=True,
+        smooth_iter=0,
+        deterministic=True,
+    )
     return np.asarray(out, np.float64), np.asarray(found, np.int64)
 
 
-def run_quadriflow(vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float) -> tuple[np.ndarray, np.ndarray]:
-    """QuadriFlow (Huang et al. 2018) through pyQuadriFlow, an optional package. It ends the process on non-manifold input."""
+def run_quadriflow(
+    vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """QuadriFlow (Huang et al. 2018) through pyQuadriFlow, an optional package. It ends the process on non-manifold
+    input."""
     pyQuadriFlow = imported("pyQuadriFlow.pyQuadriFlow")
-    found = pyQuadriFlow.pyquadriflow(int(quads), 0, np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.int32),
-                                      crease_degrees > 0, False, False, False, False)
+    found = pyQuadriFlow.pyquadriflow(
+        int(quads),
+        0,
+        np.ascontiguousarray(vertices, np.float32),
+        np.ascontiguousarray(faces, np.int32),
+        crease_degrees > 0,
+        False,
+        False,
+        False,
+        False,
+    )
     return np.asarray(found["vertices"], np.float64), np.asarray(found["faces"], np.int64)
 
 

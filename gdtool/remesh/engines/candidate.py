@@ -8,9 +8,11 @@ import numpy as np
 
 from gdtool.geometry import repair, topology
 from gdtool.geometry.distance import by_place
-from gdtool.remesh.fit.feature_curves import Constraints
 from gdtool.geometry.mesh_quality import scaled_jacobian, valences
+from gdtool.remesh.connectivity.edge_rotation import cancel_pairs
+from gdtool.remesh.connectivity.irregular_vertices import cancel_irregular
 from gdtool.remesh.engines.adapters import ENGINES, on_few
+from gdtool.remesh.fit.feature_curves import Constraints
 from gdtool.remesh.fit.shaping import (
     CUT_OFF,
     CUT_SUBDIVIDED,
@@ -27,22 +29,22 @@ from gdtool.remesh.fit.shaping import (
     sticks_out,
     surface_of,
 )
-from gdtool.remesh.connectivity.edge_rotation import cancel_pairs
 from gdtool.remesh.fit.surface_projection import fill_holes, remove_doublets
 from gdtool.remesh.task import Part
-from gdtool.remesh.connectivity.irregular_vertices import cancel_irregular
 
 LOST, ADDED, PIECES = "handles are lost", "handles are added", "pieces are lost or joined"
 _NEAR_EDGES, _LEAST_JACOBIAN = 0.75, 0.2  # nearer and squarer than this, a result is taken without a look at others
 _NEAR_OUTLINE = 0.9  # edge lengths: shaping hardly brings what is farther within _NEAR_EDGES
 _OUT_EDGES = 0.55  # what sticks out less is finer than a quad
-_BARE_EDGES, _BARE_SHARE = 2.0, 0.02  # surface so far from an engine's quads is no matter of tips, and how much of it is too much
+# Surface so far from an engine's quads is no matter of tips, and how much of it is too much.
+_BARE_EDGES, _BARE_SHARE = 2.0, 0.02
 _MENDINGS = 4  # rounds of filling holes and parting what meets at a vertex
 
 
 @dataclass(frozen=True)
 class Way:
-    """An engine, the subdivisions after it, factors on the count to try side by side, the crease angle that it is told."""
+    """An engine, the subdivisions after it, factors on the count to try side by side, the crease angle that it is
+    told."""
 
     engine: str
     subdivisions: int
@@ -51,7 +53,11 @@ class Way:
 
     @property
     def label(self) -> str:
-        return self.engine + (f", {self.subdivisions} subdivision" if self.subdivisions else "") + ("" if self.degrees else ", creases left out")
+        return (
+            self.engine
+            + (f", {self.subdivisions} subdivision" if self.subdivisions else "")
+            + ("" if self.degrees else ", creases left out")
+        )
 
     def near(self, count: float) -> list[float]:
         """Numbers to ask for side by side, as far from one another as the first, `count` in their middle."""
@@ -105,10 +111,15 @@ class Candidate:
 
     def usable(self, part: Part) -> bool:
         """Without a fault, or with one that is finer than its quads."""
-        return self.fault is None or self.fault == LOST and sticks_out(self.vertices, self.quads, part.surface) < 2 * _OUT_EDGES * part.edge
+        return (
+            self.fault is None
+            or self.fault == LOST
+            and sticks_out(self.vertices, self.quads, part.surface) < 2 * _OUT_EDGES * part.edge
+        )
 
     def leaves_out(self, part: Part) -> str | None:
-        """What is wrong with it before it is drawn, where it does without parts of the surface that drawing does not bring back."""
+        """What is wrong with it before it is drawn, where it does without parts of the surface that drawing does not
+        bring back."""
         bare = left_out(surface_of(self.vertices, self.quads), part.surface, (_BARE_EDGES * part.edge,))[0]
         return f"{LEAVES_OUT} {bare:.1%} of the surface" if bare > _BARE_SHARE else None
 
@@ -121,7 +132,9 @@ class Candidate:
     def trace(self, part: Part) -> None:
         """Find its outline, once."""
         if self.outline is None:
-            self.outline = outlined(self.vertices, self.quads, part.surface, part.features, self.way.subdivisions, part.request)
+            self.outline = outlined(
+                self.vertices, self.quads, part.surface, part.features, self.way.subdivisions, part.request
+            )
 
     def promising(self, part: Part) -> bool:
         """Whether its outline is so near to the surface that it can come out good."""
@@ -142,7 +155,8 @@ class Candidate:
             self.wrong = f"{STICKS_OUT} {over:.2g} edge lengths"  # else what is lost was finer than a quad
         if self.wrong is None and subdivisions and self.least < part.request.least_jacobian:
             self.wrong = f"has a quad of scaled Jacobian {self.least:.2g}"
-        if self.wrong and subdivisions and not self.fault and self.far <= FAR_SUBDIVIDED and not self.outline.hopeless:  # else it is not shaped to its end
+        # Else it is not shaped to its end.
+        if self.wrong and subdivisions and not self.fault and self.far <= FAR_SUBDIVIDED and not self.outline.hopeless:
             self.passable = fault_of(vertices, quads, surface, part.edge, FAR_EDGES, CUT_OFF)[0] is None
 
     def _irregular(self) -> int:
@@ -161,7 +175,8 @@ def candidate(vertices: np.ndarray, faces: np.ndarray, way: Way, asked: float) -
 
 
 def _by_place(vertices: np.ndarray, quads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same mesh, its vertices and quads in an order in which those near to one another follow one another: what reads it finds them in the cache."""
+    """The same mesh, its vertices and quads in an order in which those near to one another follow one another: what
+    reads it finds them in the cache."""
     if not len(quads):
         return vertices, quads
     order = by_place(vertices)
@@ -170,8 +185,11 @@ def _by_place(vertices: np.ndarray, quads: np.ndarray) -> tuple[np.ndarray, np.n
     return vertices[order], number[quads[by_place(vertices[quads].mean(1))]]
 
 
-def judged(quad_vertices: np.ndarray, quad_faces: np.ndarray, wanted: topology.Invariants) -> tuple[str | None, np.ndarray, np.ndarray]:
-    """What is wrong with an engine's result for a surface of these invariants, or None, and the result without its small defects."""
+def judged(
+    quad_vertices: np.ndarray, quad_faces: np.ndarray, wanted: topology.Invariants
+) -> tuple[str | None, np.ndarray, np.ndarray]:
+    """What is wrong with an engine's result for a surface of these invariants, or None, and the result without its
+    small defects."""
     closed, _, pieces, euler_number = wanted
     if quad_faces.ndim != 2 or quad_faces.shape[1] != 4 or not len(quad_faces):
         return "no quads", quad_vertices, quad_faces

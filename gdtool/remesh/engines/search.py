@@ -8,20 +8,21 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from gdtool.core.child import ChildFailed, begin, prepare
+from gdtool.geometry.simplify import CHILD_MODULES
 from gdtool.remesh.engines.candidate import Candidate, Way, candidate
 from gdtool.remesh.fit.shaping import FAR_EDGES, TOO_COARSE, settled
-from gdtool.geometry.simplify import CHILD_MODULES
 from gdtool.remesh.task import Part, Record, Request
 
 _AT_ONCE = 2  # candidates of the first way
 _TRIES, _MOST_MORE = 3, 2.0  # of one way, to come near enough to the count; times what was asked for before
 _MOST_TORN = 0.1  # of the quads may be missing from a result that another density may mend
-# Megabytes that an engine has, and more for each quad and triangle: several times what it needs, but for holes that Instant Meshes
-# fills for ever, with half a gigabyte a second.
+# Megabytes that an engine has, and more for each quad and triangle: several times what it needs, but for holes that
+# Instant Meshes fills for ever, with half a gigabyte a second.
 _MEMORY = 2000, 4e-3
 _FOR_A_HANDLE = 250  # quads: a coarser mesh subdivided to fewer loses some
 _MANY = 3000  # quads of a mesh that is tried coarser and subdivided
-_ASTRAY_EDGES, _NEARER = 1.75, 0.75  # so far from the surface the best may not come out good: one at so many times its distance goes before it
+# So far from the surface the best may not come out good: one at so many times its distance goes before it.
+_ASTRAY_EDGES, _NEARER = 1.75, 0.75
 
 Found = tuple[np.ndarray, np.ndarray, str]  # vertices (v, 3), quads (q, 4), the way that they were made
 
@@ -29,12 +30,20 @@ Found = tuple[np.ndarray, np.ndarray, str]  # vertices (v, 3), quads (q, 4), the
 def _ways(quads: int, request: Request) -> list[Way]:
     """In the order to try.
 
-    A coarser mesh subdivided has a quarter of the irregular vertices; it fails where features, or walls, are finer than its quads.
-    """
+    A coarser mesh subdivided has a quarter of the irregular vertices; it fails where features, or walls, are finer than
+    its quads."""
     engine = "instant-meshes" if request.engine == "auto" else request.engine
-    out = [Way(engine, 1, (0.985, 1.005), request.crease_degrees)] if engine == "instant-meshes" and quads >= _MANY else []
+    out = (
+        [Way(engine, 1, (0.985, 1.005), request.crease_degrees)]
+        if engine == "instant-meshes" and quads >= _MANY
+        else []
+    )
     # Where a seam of the engine's fields fails, it often holds at a slightly different density.
-    out += [Way(engine, 0, (1.0,), request.crease_degrees), Way(engine, 0, (1.02,), request.crease_degrees), Way(engine, 0, (0.98,), 0.0)]
+    out += [
+        Way(engine, 0, (1.0,), request.crease_degrees),
+        Way(engine, 0, (1.02,), request.crease_degrees),
+        Way(engine, 0, (0.98,), 0.0),
+    ]
     return out + [Way("instant-meshes", 0, (1.0,), request.crease_degrees)] * (request.engine == "quadriflow")
 
 
@@ -45,7 +54,8 @@ def prepare_engines(quads: int, request: Request) -> None:
 
 
 def _between(gave: list[tuple[float, int]], wanted: float) -> float | None:
-    """What to ask for where one number gave fewer quads than wanted and another more: a number between them. gave: (asked, count) of each."""
+    """What to ask for where one number gave fewer quads than wanted and another more: a number between them. gave:
+    (asked, count) of each."""
     fewer, more = [one for one in gave if one[1] < wanted], [one for one in gave if one[1] > wanted]
     if not fewer or not more:
         return None
@@ -92,7 +102,8 @@ class Trial:
 
     def _by(self, way: Way) -> Found | None:
         quads = self.part.quads
-        asked, extra = [quads * factor for factor in way.factors], 0  # extra: quads of the tips that are drawn out of the engine's
+        # extra: quads of the tips that are drawn out of the engine's.
+        asked, extra = [quads * factor for factor in way.factors], 0
         gave: list[tuple[float, int]] = []
         for turn in range(_TRIES):
             wanted = quads - extra
@@ -104,7 +115,11 @@ class Trial:
             together = self._several and not way.subdivisions
             if together and len(best.quads):
                 self.whole = best
-            if (together or usable and (self._several or not counted)) and len(best.quads) and (bare := best.leaves_out(self.part)):
+            if (
+                (together or usable and (self._several or not counted))
+                and len(best.quads)
+                and (bare := best.leaves_out(self.part))
+            ):
                 return self._failed(way, bare)
             if not counted and (usable or together):
                 if turn and count * _MOST_MORE < wanted:
@@ -139,9 +154,18 @@ class Trial:
     def _candidates(self, way: Way, asked: list[float], wanted: float) -> list[Candidate]:
         """What comes of each number asked for, made side by side, the best first."""
         part, request, start = self.part, self.part.request, time.perf_counter()
-        running = [begin(candidate, part.vertices, part.faces, way, number,
-                         seconds=request.for_a_run,
-                         memory_mb=min(int(_MEMORY[0] + _MEMORY[1] * (number + len(part.faces))), request.memory_mb)) for number in asked]
+        running = [
+            begin(
+                candidate,
+                part.vertices,
+                part.faces,
+                way,
+                number,
+                seconds=request.for_a_run,
+                memory_mb=min(int(_MEMORY[0] + _MEMORY[1] * (number + len(part.faces))), request.memory_mb),
+            )
+            for number in asked
+        ]
         # Found out while the children work.
         if way.subdivisions and part.thin:
             for child in running:
@@ -163,11 +187,14 @@ class Trial:
         """The second before the first where the first is in doubt, and the second much nearer to the surface."""
         first, second, *others = candidates
         far = first.astray(self.part)
-        nearer = far > _ASTRAY_EDGES and self.part.counted(second.count, wanted) and second.astray(self.part) < _NEARER * far
+        nearer = (
+            far > _ASTRAY_EDGES and self.part.counted(second.count, wanted) and second.astray(self.part) < _NEARER * far
+        )
         return [second, first, *others] if nearer else candidates
 
     def _of_count(self, candidates: list[Candidate], extra: int) -> Iterator[Candidate]:
-        """Those that have about as many quads as asked for once tips are drawn out of theirs, at the first `extra` more, and those that are hopeless."""
+        """Those that have about as many quads as asked for once tips are drawn out of theirs, at the first `extra`
+        more, and those that are hopeless."""
         quads = self.part.quads
         for one in candidates:
             if one is not candidates[0] and not self.part.counted(one.count + extra, quads):
@@ -178,7 +205,8 @@ class Trial:
                 yield one
 
     def _drawn(self, candidates: Iterable[Candidate]) -> Candidate | None:
-        """The first that comes out good, those that do not promise to last; where none does the one that comes nearest to the surface."""
+        """The first that comes out good, those that do not promise to last; where none does the one that comes nearest
+        to the surface."""
         start, done = time.perf_counter(), []
         for one in self._promising_first(candidates):
             one.draw(self.part)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.geometry.normals import face_normals
-from gdtool.remesh.fit.shaping import better, evened
 from gdtool.remesh.fallback.pair_and_split import few_for_even, of_even, of_own, split_count
+from gdtool.remesh.fit.shaping import better, evened
 from gdtool.remesh.task import Part
 
 
@@ -19,7 +19,15 @@ def split(part: Part) -> tuple[np.ndarray, np.ndarray]:
     ground.surface = part.surface
     found = part.cut
     if found is None and not few_for_even(part.faces, quads):
-        found = of_even(part.vertices, part.faces, quads, request.crease_degrees, request.for_the_rest, request.memory_mb, lambda: ground.features)
+        found = of_even(
+            part.vertices,
+            part.faces,
+            quads,
+            request.crease_degrees,
+            request.for_the_rest,
+            request.memory_mb,
+            lambda: ground.features,
+        )
     if found is None:
         found = of_own(part.vertices, part.faces, quads, request.for_the_rest, lambda: ground.features)
     traced, constraints = evened(*found, ground.surface, ground.features, request)

@@ -12,9 +12,12 @@ from gdtool.geometry.topology import edges_of
 
 _CORNER_TURN_DEGREES = 50.0
 _THINNEST = 0.05  # height over longest side of a triangle that has no direction of its own: simplifying folds some over
-_SHORT_EDGES = 8.0  # around a curve that reaches no farther, vertices are found by their tree, around others along an axis
+# Around a curve that reaches no farther, vertices are found by their tree, around others along an axis.
+_SHORT_EDGES = 8.0
 _CHOICES = 4  # vertices that a curve may be drawn from where it has no corner of its own: the nearest may be another's
-_HANGING = 2.0  # times what is short: a corner from which longer segments go is drawn less far, for each would leave the surface all along
+# Times what is short: a corner from which longer segments go is drawn less far, for each would leave the surface all
+# along.
+_HANGING = 2.0
 _STRAIGHT = 0.35  # the sine of a quad's corner below which features may not hold both its sides
 
 
@@ -31,11 +34,13 @@ class Features:
     corners: np.ndarray
 
     def in_strips(self, width: float) -> float:
-        """Share of the curves' length that edges strips no wider than that, as the rims of thin plates do: curves that shorter ones
-        meet at both ends."""
+        """Share of the curves' length that edges strips no wider than that, as the rims of thin plates do: curves that
+        shorter ones meet at both ends."""
         if not self:
             return 0.0
-        length = np.bincount(self.curve, np.linalg.norm(self.points[self.segments[:, 0]] - self.points[self.segments[:, 1]], axis=1))
+        length = np.bincount(
+            self.curve, np.linalg.norm(self.points[self.segments[:, 0]] - self.points[self.segments[:, 1]], axis=1)
+        )
         met = np.zeros(len(self.points), bool)
         met[self.segments[(length < width)[self.curve]]] = True
         edging = (length >= width) & (np.bincount(self.curve, met[self.segments].sum(1)) >= 2)
@@ -59,12 +64,14 @@ def find_features(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float
     border = edges.ends[edges.count != 2]
     strong = np.concatenate([angle > crease_degrees, np.ones(len(border), bool)])
     segments = np.concatenate([ends, border])
-    weak = np.concatenate([angle > 0.6 * crease_degrees, strong[len(ends):]])
+    weak = np.concatenate([angle > 0.6 * crease_degrees, strong[len(ends) :]])
     segments, strong = segments[weak], strong[weak]
     length = np.linalg.norm(vertices[segments[:, 0]] - vertices[segments[:, 1]], axis=1)
     n = len(vertices)
     if len(segments):
-        _, label = connected_components(coo_matrix((np.ones(len(segments)), (segments[:, 0], segments[:, 1])), (n, n)), False)
+        _, label = connected_components(
+            coo_matrix((np.ones(len(segments)), (segments[:, 0], segments[:, 1])), (n, n)), False
+        )
         total = np.bincount(label[segments[:, 0]], length, label.max() + 1)
         sharp = np.bincount(label[segments[:, 0]], length * strong, label.max() + 1)
         keep = (total >= shortest) & (sharp >= np.maximum(0.3 * total, shortest / 2))
@@ -96,7 +103,9 @@ def _arcs(points: np.ndarray, segments: np.ndarray) -> Features:
     ends_of = segments.ravel()
     owner = np.repeat(np.arange(s), 2)
     inner = ~is_corner[ends_of]
-    graph = coo_matrix((np.ones(int(inner.sum())), (owner[inner], s + ends_of[inner])), (s + len(points), s + len(points)))
+    graph = coo_matrix(
+        (np.ones(int(inner.sum())), (owner[inner], s + ends_of[inner])), (s + len(points), s + len(points))
+    )
     _, label = connected_components(graph, False)
     curve = np.unique(label[:s], return_inverse=True)[1].ravel()
     return Features(points, segments, curve, np.flatnonzero(is_corner))
@@ -107,9 +116,8 @@ def _tidy(points: np.ndarray, segments: np.ndarray, short: float) -> Features:
 
     Slivers along a crease make spurs, bubbles and doubled corners: arcs that end freely or return to their corner are
     dropped when short, short arcs between two corners drawn together into one corner. No corner comes farther than
-    `short` that way, for what hangs on it would leave the surface: an arc that asks for more is a gap from then on. Where long
-    segments hang on both corners, as on the short edges of a thin plate, the arc stays.
-    """
+    `short` that way, for what hangs on it would leave the surface: an arc that asks for more is a gap from then on.
+    Where long segments hang on both corners, as on the short edges of a thin plate, the arc stays."""
     came = np.zeros(len(points))  # how far what was drawn into a corner came
     for _ in range(12):
         features = _arcs(points, segments)
@@ -131,7 +139,9 @@ def _tidy(points: np.ndarray, segments: np.ndarray, short: float) -> Features:
         loop = (high < 0) | (low == high)
         free = ~loop & ((degree[np.clip(low, 0, len(points) - 1)] == 1) | (degree[high] == 1))
         drop = (loop & (length < 4 * short)) | (free & (length < 2 * short))
-        draw = np.flatnonzero(~loop & ~free & (length < np.maximum(reach[np.clip(low, 0, len(points) - 1)], reach[high])))
+        draw = np.flatnonzero(
+            ~loop & ~free & (length < np.maximum(reach[np.clip(low, 0, len(points) - 1)], reach[high]))
+        )
         if not drop.any() and not len(draw):
             break
         onto_corner = np.arange(len(points))
@@ -144,7 +154,11 @@ def _tidy(points: np.ndarray, segments: np.ndarray, short: float) -> Features:
             keep, lose = (a, b) if (-reach[a], degree[a]) >= (-reach[b], degree[b]) else (b, a)
             farthest = came[lose] + np.linalg.norm(points[keep] - points[lose])
             if a != b and farthest <= reach[lose]:
-                onto_corner[lose], came[keep], reach[keep] = keep, max(came[keep], farthest), min(reach[keep], reach[lose])
+                onto_corner[lose], came[keep], reach[keep] = (
+                    keep,
+                    max(came[keep], farthest),
+                    min(reach[keep], reach[lose]),
+                )
             drop[i] = True
         while (onto_corner[onto_corner] != onto_corner).any():
             onto_corner = onto_corner[onto_corner]
@@ -156,11 +170,17 @@ def _tidy(points: np.ndarray, segments: np.ndarray, short: float) -> Features:
     return _arcs(points[used], segments.reshape(-1, 2))
 
 
-def closest_on_segments(queries: np.ndarray, points: np.ndarray, segments: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """For queries (n, 3): distance (n,), segment (n,) and the closest point (n, 3) on segments (s, 2) of points (p, 3)."""
+def closest_on_segments(
+    queries: np.ndarray, points: np.ndarray, segments: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For queries (n, 3): distance (n,), segment (n,) and the closest point (n, 3) on segments (s, 2) of points (p,
+    3)."""
     igl = imported("igl")
     squared, segment, point = igl.point_mesh_squared_distance(
-        np.ascontiguousarray(queries, np.float64), np.ascontiguousarray(points, np.float64), np.ascontiguousarray(segments, np.int64))[:3]
+        np.ascontiguousarray(queries, np.float64),
+        np.ascontiguousarray(points, np.float64),
+        np.ascontiguousarray(segments, np.int64),
+    )[:3]
     return np.sqrt(np.maximum(squared, 0)), np.asarray(segment), np.asarray(point)
 
 
@@ -214,7 +234,7 @@ def trace(vertices: np.ndarray, faces: np.ndarray, features: Features, edge: flo
     begin = np.searchsorted(ends[:, 0], np.arange(count + 1))
     allowed, number, live = np.full(count, np.inf), np.full(count, -1), np.zeros(0, np.int64)
     for curve in range(len(bounds) - 1):
-        segments = features.segments[order[bounds[curve]:bounds[curve + 1]]]
+        segments = features.segments[order[bounds[curve] : bounds[curve + 1]]]
         stations = _stations(segments, features, at_corner, tree, taken, edge)
         if len(stations) < 2:
             continue
@@ -223,7 +243,7 @@ def trace(vertices: np.ndarray, faces: np.ndarray, features: Features, edge: flo
         if (radius := np.linalg.norm(high - low) / 2) < _SHORT_EDGES * edge:
             around = np.array(tree.query_ball_point((low + high) / 2, radius, return_sorted=True), np.int64)
         else:
-            around = np.sort(by_x[np.searchsorted(sorted_x, low[0]):np.searchsorted(sorted_x, high[0], "right")])
+            around = np.sort(by_x[np.searchsorted(sorted_x, low[0]) : np.searchsorted(sorted_x, high[0], "right")])
         place = vertices[around]
         near = around[((place >= low) & (place <= high)).all(1)]
         far, _, _ = closest_on_segments(vertices[near], features.points, segments)
@@ -245,7 +265,10 @@ def trace(vertices: np.ndarray, faces: np.ndarray, features: Features, edge: flo
         mean = allowed[usable].mean(1) / edge
         cost = np.linalg.norm(vertices[usable[:, 0]] - vertices[usable[:, 1]], axis=1) * (1 + 8 * mean**2)
         # Edges come in the order of their ends, as the rows of a sparse matrix do.
-        graph = csr_array((cost, number[usable[:, 1]], np.searchsorted(number[usable[:, 0]], np.arange(len(here) + 1))), (len(here), len(here)))
+        graph = csr_array(
+            (cost, number[usable[:, 1]], np.searchsorted(number[usable[:, 0]], np.arange(len(here) + 1))),
+            (len(here), len(here)),
+        )
         found: list[int] = []
         for a, b in zip(stations[:-1], stations[1:], strict=True):
             if number[a] < 0 or number[b] < 0:
@@ -270,8 +293,11 @@ def trace(vertices: np.ndarray, faces: np.ndarray, features: Features, edge: flo
     return out, Constraints(curve_of, fixed, np.concatenate(paths), np.concatenate(path_curves))
 
 
-def _stations(segments: np.ndarray, features: Features, at_corner: dict[int, int], tree, taken: np.ndarray, edge: float) -> list[int]:
-    """Vertices the path along one curve has to visit in order: its corners; of a closed curve a few of its own, and the first again."""
+def _stations(
+    segments: np.ndarray, features: Features, at_corner: dict[int, int], tree, taken: np.ndarray, edge: float
+) -> list[int]:
+    """Vertices the path along one curve has to visit in order: its corners; of a closed curve a few of its own, and the
+    first again."""
     ordered = _ordered(segments)
     points = features.points[ordered]
     walked = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])

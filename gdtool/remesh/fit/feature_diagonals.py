@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from gdtool.remesh.fit.feature_curves import Constraints, closest_on_segments
 from gdtool.geometry.mesh_quality import columns_of
-from gdtool.remesh.fit.surface_projection import Surface
 from gdtool.geometry.topology import edges_of
+from gdtool.remesh.fit.feature_curves import Constraints, closest_on_segments
+from gdtool.remesh.fit.surface_projection import Surface
 
 _FLAT = 1e-3  # a quad whose diagonals pass within this share of its size needs no choice
 
@@ -17,9 +17,8 @@ _FLAT = 1e-3  # a quad whose diagonals pass within this share of its size needs 
 def crossed(faces: np.ndarray, before: Constraints, after: Constraints) -> tuple[np.ndarray, np.ndarray]:
     """Quads (k,) of faces (q, 4) that a feature now crosses from corner to corner, and its curve (k,).
 
-    before and after are the constraints around features.untied, which lets the corner between two others off their curve:
-    from there on the curve runs along the diagonal of the quad.
-    """
+    before and after are the constraints around features.untied, which lets the corner between two others off their
+    curve: from there on the curve runs along the diagonal of the quad."""
     width = len(before.curve) + 1
     path = np.sort(before.path, 1)
     order = np.argsort(path[:, 0] * width + path[:, 1])
@@ -32,13 +31,22 @@ def crossed(faces: np.ndarray, before: Constraints, after: Constraints) -> tuple
     curve = np.where(key[place] == asked, before.path_curve[order][place], -1)  # of the edge that starts at each corner
     let_off = (before.curve[faces] >= 0) & (after.curve[faces] < 0)
     on = (after.curve >= 0) | after.fixed
-    found = let_off & (curve >= 0) & (curve == np.roll(curve, 1, 1)) & on[following] & on[np.roll(faces, 1, 1)] & ~on[np.roll(faces, 2, 1)]
+    found = (
+        let_off
+        & (curve >= 0)
+        & (curve == np.roll(curve, 1, 1))
+        & on[following]
+        & on[np.roll(faces, 1, 1)]
+        & ~on[np.roll(faces, 2, 1)]
+    )
     face_idx, corner = np.nonzero(found)
     once = np.unique(face_idx, return_index=True)[1]
     return face_idx[once], curve[face_idx[once], corner[once]]
 
 
-def held_at_centres(constraints: Constraints, first_centre: int, face_idx: np.ndarray, curve: np.ndarray) -> Constraints:
+def held_at_centres(
+    constraints: Constraints, first_centre: int, face_idx: np.ndarray, curve: np.ndarray
+) -> Constraints:
     """Constraints of the subdivided mesh, the centres of those quads (k,) held to the curve (k,) that crosses them."""
     held = constraints.curve.copy()
     held[first_centre + face_idx] = curve
@@ -61,7 +69,8 @@ def cut_along_features(vertices: np.ndarray, faces: np.ndarray, surface: Surface
 
 
 def to_rim(vertices: np.ndarray, faces: np.ndarray, surface: Surface, reach: float) -> np.ndarray:
-    """Vertices (v, 3) with those on the boundary of the quads drawn to the boundary of the surface where it is within `reach`."""
+    """Vertices (v, 3) with those on the boundary of the quads drawn to the boundary of the surface where it is within
+    `reach`."""
     theirs = edges_of(surface.faces)
     segments = theirs.ends[theirs.count == 1]
     if not len(segments):

@@ -1,34 +1,42 @@
-"""Quads made square where they are: each asks for the rectangle nearest to it, each vertex gives its quads their mean."""
+"""Quads made square where they are: each asks for the rectangle nearest to it, each vertex gives its quads their
+mean."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from gdtool.geometry.distance import closest_points
-from gdtool.remesh.fit.feature_curves import Constraints, Features
 from gdtool.geometry.mesh_quality import columns_of, polygon_normals, scaled_jacobian, worst_jacobian
-from gdtool.remesh.fit.surface_projection import Slide, Surface, normals_below, relax, still_vertices
-from gdtool.remesh.fit.untangle import unfold
 from gdtool.geometry.topology import edges_of, triangulated
 from gdtool.geometry.vectors import cross, dot
+from gdtool.remesh.fit.feature_curves import Constraints, Features
+from gdtool.remesh.fit.surface_projection import Slide, Surface, normals_below, relax, still_vertices
+from gdtool.remesh.fit.untangle import unfold
 
 _SQUARE_SHARE = 0.4  # of the way from the nearest rectangle to the nearest square
 _POOR = 0.6  # quads with a smaller scaled Jacobian pull harder
 _NORMALS_EVERY = 6
 _THIN = 0.3  # quads of a smaller scaled Jacobian stay where they are balanced
-_FEW_BAD, _MOST_IN_VAIN = 8, 2  # more bad quads than these are given up after so many rounds in a row that leave most of them
+# More bad quads than these are given up after so many rounds in a row that leave most of them.
+_FEW_BAD, _MOST_IN_VAIN = 8, 2
 _MOST_LEFT = 0.75
 
 
-def square_up(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
-              iterations: int, strength: float = 1.2) -> np.ndarray:
+def square_up(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    surface: Surface,
+    features: Features,
+    constraints: Constraints,
+    iterations: int,
+    strength: float = 1.2,
+) -> np.ndarray:
     """Vertices (v, 3) such that the quads (f, 4) have right angles, on the surface and on the feature curves.
 
     Shape projection (Bouaziz et al. 2012) onto rectangles in the plane of the surface below each quad. That plane says
     which way round a quad goes, so folded quads are asked to turn over. The best vertices met are returned: fewest
-    folded quads first, then the largest mean Jacobian. strength: of the way that vertices go at once; beyond 1 ten rounds do what
-    takes fifteen at 0.8.
-    """
+    folded quads first, then the largest mean Jacobian. strength: of the way that vertices go at once; beyond 1 ten
+    rounds do what takes fifteen at 0.8."""
     if not len(faces) or not iterations:
         return vertices
     still = still_vertices(edges_of(faces), len(vertices), constraints)
@@ -57,28 +65,34 @@ def square_up(vertices: np.ndarray, faces: np.ndarray, surface: Surface, feature
 
 
 def balance(vertices: np.ndarray, faces: np.ndarray, surface: Surface, constraints: Constraints) -> np.ndarray:
-    """Vertices moved off the surface by the mean height of it above their quads, so that as much of it lies above as below.
+    """Vertices moved off the surface by the mean height of it above their quads, so that as much of it lies above as
+    below.
 
     A quad whose corners lie on a curved surface lies beneath it everywhere: half of its error is that it does. Features
-    and boundaries stay where they are, and so do quads that do not run along the surface and thin ones that it would make thinner.
-    """
+    and boundaries stay where they are, and so do quads that do not run along the surface and thin ones that it would
+    make thinner."""
     edges = edges_of(faces)
     free = (constraints.curve < 0) & ~still_vertices(edges, len(vertices), constraints)
     normals, area = polygon_normals(vertices, faces)
     corners = vertices[faces]
-    # Of the two triangles that the quad is cut into: centroids, and middles of the edges, which are those of the quads beside them too.
+    # Of the two triangles that the quad is cut into: centroids, and middles of the edges, which are those of the quads
+    # beside them too.
     a, b, c, d = (corners[:, i] for i in range(4))
     inner = np.concatenate([(a + b + c) / 3, (a + c + d) / 3, (a + c) / 2])
     samples = np.concatenate([inner, vertices[edges.ends].mean(1)])
     weight = np.array([3, 3, 2, 1, 1, 1, 1]) / 12
     _, face_idx, point = surface.closest(samples)
-    own = np.concatenate([np.arange(len(inner)).reshape(3, -1).T, len(inner) + edges.half_edge_idx.reshape(-1, 4)], 1)  # (q, 7)
+    # (q, 7).
+    own = np.concatenate([np.arange(len(inner)).reshape(3, -1).T, len(inner) + edges.half_edge_idx.reshape(-1, 4)], 1)
     height = np.einsum("qki,qi->qk", (point - samples).take(own, 0), normals)
     along = np.einsum("qki,qi->qk", surface.normals[face_idx].take(own, 0), normals) > 0.9
     mean = np.where(along.all(1) & (np.abs(height).max(1) < 0.1 * np.sqrt(area)), height @ weight, 0.0)
     flat, shares = faces.ravel(), np.repeat(area, 4)
     total = np.maximum(np.bincount(flat, shares, len(vertices)), 1e-300)
-    move = np.stack([np.bincount(flat, shares * np.repeat(mean * normals[:, i], 4), len(vertices)) for i in range(3)], -1) / total[:, None]
+    move = (
+        np.stack([np.bincount(flat, shares * np.repeat(mean * normals[:, i], 4), len(vertices)) for i in range(3)], -1)
+        / total[:, None]
+    )
     out = np.where(free[:, None], vertices + move, vertices)
     before, after = scaled_jacobian(vertices, faces), scaled_jacobian(out, faces)
     thin = faces[(after < _THIN) & (after < before)]
@@ -87,7 +101,8 @@ def balance(vertices: np.ndarray, faces: np.ndarray, surface: Surface, constrain
 
 
 def _rectangles(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(3, 4, q) corners of the rectangle nearest to each quad with corners (3, 4, q), counter-clockwise about normals (3, q)."""
+    """(3, 4, q) corners of the rectangle nearest to each quad with corners (3, 4, q), counter-clockwise about normals
+    (3, q)."""
     centre = p.mean(1, keepdims=True)
     offset = p - centre
     x = offset[:, 0] - (offset[:, 0] * normals).sum(0) * normals
@@ -107,7 +122,8 @@ def _rectangles(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
     a = (z[0] - 1j * z[1] - z[2] + 1j * z[3]) / 4
     strength = np.abs(a)
     a = np.where(strength > 1e-9 * size, a / np.maximum(strength, 1e-300), 1) * np.maximum(strength, 0.5 * size)
-    # The nearest rectangle: diagonals of one length that keep their directions. A rectangle's corners lie opposite in pairs.
+    # The nearest rectangle: diagonals of one length that keep their directions. A rectangle's corners lie opposite in
+    # pairs.
     one, two = (z[0] - z[2]) / 2, (z[1] - z[3]) / 2
     one_length, two_length = np.abs(one), np.abs(two)
     half = (one_length + two_length) / 2
@@ -119,14 +135,23 @@ def _rectangles(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return centre + np.stack([first, second, -first, -second], 1)
 
 
-def ease(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
-         least: float = 0.2, rounds: int = 6, tips: np.ndarray | None = None, most_bare: float = 0.5) -> tuple[np.ndarray, Constraints]:
-    """Surroundings of quads that stay worse than `least` let off their feature curves and evened out; what got better is kept.
+def ease(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    surface: Surface,
+    features: Features,
+    constraints: Constraints,
+    least: float = 0.2,
+    rounds: int = 6,
+    tips: np.ndarray | None = None,
+    most_bare: float = 0.5,
+) -> tuple[np.ndarray, Constraints]:
+    """Surroundings of quads that stay worse than `least` let off their feature curves and evened out; what got better
+    is kept.
 
-    A path along a crease that winds cannot be straightened by moving vertices; here it is given up for a few quads. Evened out, corners
-    and tips of the surface shrink back: where that would leave them bare by more than most_bare edge lengths, the vertices at corners
-    stay. tips: vertices that stay anyway.
-    """
+    A path along a crease that winds cannot be straightened by moving vertices; here it is given up for a few quads.
+    Evened out, corners and tips of the surface shrink back: where that would leave them bare by more than most_bare
+    edge lengths, the vertices at corners stay. tips: vertices that stay anyway."""
     in_vain, left = 0, np.inf
     for turn in range(rounds):
         bad = scaled_jacobian(vertices, faces) < least
@@ -148,7 +173,9 @@ def ease(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Fe
         mesh_rim = still_vertices(edges_of(faces), len(vertices), constraints) & ~constraints.fixed
         for loose in (near, near & ~constraints.fixed):
             # Off their curves inside; where they were at the rim.
-            mine = Constraints(np.full(len(used), -1), (~loose | mesh_rim)[used], constraints.path[:0], constraints.path_curve[:0])
+            mine = Constraints(
+                np.full(len(used), -1), (~loose | mesh_rim)[used], constraints.path[:0], constraints.path_curve[:0]
+            )
             trial = relax(before, local, surface, features, mine, 10 + 10 * turn)
             trial = square_up(trial, local, surface, features, mine, 10)
             trial = unfold(trial, local, surface, features, mine, most_visits=1500)
@@ -158,14 +185,19 @@ def ease(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Fe
                 vertices = vertices.copy()
                 vertices[used] = trial
                 kept = ~loose[constraints.path].any(1)
-                constraints = Constraints(np.where(loose, -1, constraints.curve), constraints.fixed & ~loose, constraints.path[kept],
-                                          constraints.path_curve[kept])
+                constraints = Constraints(
+                    np.where(loose, -1, constraints.curve),
+                    constraints.fixed & ~loose,
+                    constraints.path[kept],
+                    constraints.path_curve[kept],
+                )
                 break
     return vertices, constraints
 
 
 def _leaves_bare(before: np.ndarray, after: np.ndarray, faces: np.ndarray, most: float) -> bool:
-    """Whether some of the places of vertices (v, 3) are more than so many edge lengths from the quads (f, 4) once these have moved."""
+    """Whether some of the places of vertices (v, 3) are more than so many edge lengths from the quads (f, 4) once these
+    have moved."""
     edge = (polygon_normals(before, faces)[1].sum() / len(faces)) ** 0.5
     return bool(closest_points(before, after, triangulated(faces)[0])[0].max() > most * edge)
 

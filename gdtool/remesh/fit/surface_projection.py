@@ -7,10 +7,10 @@ from itertools import pairwise
 import numpy as np
 
 from gdtool.geometry.distance import SearchTree
-from gdtool.remesh.fit.feature_curves import Constraints, Features, closest_on_segments
 from gdtool.geometry.mesh_quality import polygon_normals, valences
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.topology import Edges, compact, corner_fans, edges_of
+from gdtool.remesh.fit.feature_curves import Constraints, Features, closest_on_segments
 
 _EXACT_EVERY = 5  # steps between two searches for the closest point; the others stay in its plane
 _BENT_COSINE = 0.97  # between a quad's normal and that of the surface below its centre
@@ -80,7 +80,10 @@ class Slide:
         self._held = held[np.argsort(constraints.curve[held], kind="stable")]  # curve by curve
         curve = constraints.curve[self._held]
         first = np.flatnonzero(np.diff(curve, prepend=-1)).tolist()
-        self._curves = [(slice(start, end), features.segments[features.curve == curve[start]]) for start, end in pairwise([*first, len(curve)])]
+        self._curves = [
+            (slice(start, end), features.segments[features.curve == curve[start]])
+            for start, end in pairwise([*first, len(curve)])
+        ]
         self._normals: np.ndarray | None = None
         self._steps = 0
         self.placed: np.ndarray | None = None  # what exact() gave last
@@ -107,20 +110,31 @@ class Slide:
         if last or self._normals is None or self._steps % _EXACT_EVERY == 0:
             return self.exact(moved)
         out, way = moved.copy(), moved - vertices
-        for own, direction, start, sign in ((self._free, self._normals, moved, -1), (self._held, self._lines, vertices, 1)):
+        for own, direction, start, sign in (
+            (self._free, self._normals, moved, -1),
+            (self._held, self._lines, vertices, 1),
+        ):
             out[own] = start[own] + sign * np.einsum("ni,ni->n", way[own], direction)[:, None] * direction
         return out
 
 
-def relax(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, constraints: Constraints,
-          iterations: int, strength: float = 0.6) -> np.ndarray:
+def relax(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    surface: Surface,
+    features: Features,
+    constraints: Constraints,
+    iterations: int,
+    strength: float = 0.6,
+) -> np.ndarray:
     """Vertices evened out along the surface: each moves toward the mean of its neighbours and back onto the surface."""
     edges = edges_of(faces)
     average = _average_matrix(edges.ends, len(vertices))
     along = _average_matrix(constraints.path, len(vertices)) if len(constraints.path) else None
     held = (constraints.curve >= 0) & ~constraints.fixed
     if along is not None:
-        held &= np.diff(along.indptr) == 2  # where a path breaks off its end would draw back, and leave the feature bare
+        # Where a path breaks off its end would draw back, and leave the feature bare.
+        held &= np.diff(along.indptr) == 2
     still = still_vertices(edges, len(vertices), constraints)
     slide = Slide(surface, features, constraints)
     for turn in range(iterations):
@@ -134,14 +148,16 @@ def relax(vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: F
 
 
 def still_vertices(edges: Edges, count: int, constraints: Constraints) -> np.ndarray:
-    """(v,) bool: of `count` vertices those that may not move: corners of features, and boundaries that no curve leads."""
+    """(v,) bool: of `count` vertices those that may not move: corners of features, and boundaries that no curve
+    leads."""
     boundary = np.zeros(count, bool)
     boundary[edges.ends[edges.count != 2].ravel()] = True
     return constraints.fixed | (boundary & (constraints.curve < 0))
 
 
 def normals_below(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> np.ndarray:
-    """(f, 3) unit normal of the surface under each quad: at its centre, of one beside which it is bent also half-way to its corners."""
+    """(f, 3) unit normal of the surface under each quad: at its centre, of one beside which it is bent also half-way to
+    its corners."""
     corners = vertices[faces]
     centre = corners.mean(1, keepdims=True)
     below = surface.normals[surface.closest(centre[:, 0])[1]]
@@ -159,13 +175,14 @@ class Lists:
         self.start = np.concatenate([[0], np.cumsum(np.bincount(key, minlength=count))])
 
     def __getitem__(self, key: int) -> np.ndarray:
-        return self.value[self.start[key]:self.start[key + 1]]
+        return self.value[self.start[key] : self.start[key + 1]]
 
     def lengths(self, keys: np.ndarray) -> np.ndarray:
         return self.start[keys + 1] - self.start[keys]
 
     def rows(self, keys: np.ndarray) -> np.ndarray:
-        """The lists of keys (k,), none of which is empty, as rows: short ones end in their last value again and again."""
+        """The lists of keys (k,), none of which is empty, as rows: short ones end in their last value again and
+        again."""
         length = self.lengths(keys)
         return self.value[self.start[keys][:, None] + np.minimum(np.arange(length.max()), length[:, None] - 1)]
 
@@ -181,7 +198,8 @@ def neighbours(ends: np.ndarray, count: int) -> Lists:
 
 
 def fill_holes(vertices: np.ndarray, faces: np.ndarray, longest: int = 64) -> tuple[np.ndarray, np.ndarray]:
-    """Quads (f, 4) with boundary loops of an even number of edges, at most `longest`, closed by quads around a new vertex.
+    """Quads (f, 4) with boundary loops of an even number of edges, at most `longest`, closed by quads around a new
+    vertex.
 
     Where two holes meet at a vertex, each is closed by itself.
     """
@@ -219,7 +237,9 @@ def fill_holes(vertices: np.ndarray, faces: np.ndarray, longest: int = 64) -> tu
         new_faces.extend([centre, loop[i - 1], loop[i], loop[(i + 1) % len(loop)]] for i in range(0, len(loop), 2))
     if not new_faces:
         return vertices, faces
-    return np.concatenate([vertices, *(p[None] for p in new_points)]), np.concatenate([faces, np.array(new_faces, faces.dtype)])
+    return np.concatenate([vertices, *(p[None] for p in new_points)]), np.concatenate(
+        [faces, np.array(new_faces, faces.dtype)]
+    )
 
 
 def remove_doublets(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from gdtool.geometry.distance import closest_points, sample_surface
+from gdtool.geometry.topology import components, edges_of, euler_number, triangulated
 from gdtool.remesh.fit.feature_curves import Constraints
 from gdtool.remesh.fit.surface_projection import Surface
-from gdtool.geometry.topology import components, edges_of, euler_number, triangulated
 
-_BARE, _CLOSE, _STRAYS = 0.5, 0.75, 1.0  # edge lengths from the quads: what belongs to a tip, what is near enough, what makes one
+# Edge lengths from the quads: what belongs to a tip, what is near enough, what makes one.
+_BARE, _CLOSE, _STRAYS = 0.5, 0.75, 1.0
 _TIP = 1.5  # edge lengths that a tip measures at most which one vertex reaches
 _STEP = 1.5  # edge lengths that a tip is drawn out at once
 _HELD = 0.75  # of the farthest that a vertex moves: those that move so far stay there
@@ -20,18 +21,29 @@ _MOST_STEPS = 24
 _POINTS = 20000
 
 
-def draw_out(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, surface: Surface, edge: float,
-             most_added: float = 0.03) -> tuple[np.ndarray, np.ndarray, Constraints, np.ndarray, float, np.ndarray]:
+def draw_out(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    constraints: Constraints,
+    surface: Surface,
+    edge: float,
+    most_added: float = 0.03,
+) -> tuple[np.ndarray, np.ndarray, Constraints, np.ndarray, float, np.ndarray]:
     """Quads (f, 4) of mean edge length `edge` extruded over what of the surface strays from them, farthest first.
 
-    The vertices (v, 3) nearest to a tip move along it, an edge or two at a time, with the quads around them, and a ring of
-    new quads follows each step, as one would model a horn by hand, until most_added of the quads are new: what needs more is no matter of tips.
-    A tip that is nearer than an edge takes one vertex and no ring. Closed and manifold as before, of as many pieces and handles. Returns vertices, faces,
-    constraints, in which the tips are fixed, the tips' vertices (t,), how far the surface was from the quads at most before the last
-    vertices moved, and how far samples (n,) spread over its area were.
-    """
+    The vertices (v, 3) nearest to a tip move along it, an edge or two at a time, with the quads around them, and a ring
+    of new quads follows each step, as one would model a horn by hand, until most_added of the quads are new: what needs
+    more is no matter of tips. A tip that is nearer than an edge takes one vertex and no ring. Closed and manifold as
+    before, of as many pieces and handles. Returns vertices, faces, constraints, in which the tips are fixed, the tips'
+    vertices (t,), how far the surface was from the quads at most before the last vertices moved, and how far samples
+    (n,) spread over its area were."""
     step = max(len(surface.vertices) // _POINTS, 1)
-    points = samples = np.concatenate([surface.vertices[::step], sample_surface(surface.vertices, surface.faces, _POINTS // 2, np.random.default_rng(0))[0]])
+    points = samples = np.concatenate(
+        [
+            surface.vertices[::step],
+            sample_surface(surface.vertices, surface.faces, _POINTS // 2, np.random.default_rng(0))[0],
+        ]
+    )
     most, given = len(faces) * (1 + most_added), constraints
     triangles, face_idx = triangulated(faces)
     away, nearest, _ = closest_points(points, vertices, triangles)
@@ -48,7 +60,9 @@ def draw_out(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, 
         for tip in _apart(points, away, edge):
             if away[tip].max() < _CLOSE * edge or len(faces) > most:
                 break
-            found = _extruded(vertices, faces, constraints, points[tip], face_idx[nearest[tip]], away[tip], surface, edge)
+            found = _extruded(
+                vertices, faces, constraints, points[tip], face_idx[nearest[tip]], away[tip], surface, edge
+            )
             if found is None:
                 alive[tip] = False
             else:
@@ -65,11 +79,25 @@ def draw_out(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, 
     if constraints is not given:
         constraints = _still_paths(constraints, faces)
     before = np.concatenate([given.fixed, np.zeros(len(vertices) - len(given.fixed), bool)])
-    return vertices, faces, constraints, np.flatnonzero(constraints.fixed & ~before), float(of_samples[0].max()), of_samples[0][-(_POINTS // 2):]
+    return (
+        vertices,
+        faces,
+        constraints,
+        np.flatnonzero(constraints.fixed & ~before),
+        float(of_samples[0].max()),
+        of_samples[0][-(_POINTS // 2) :],
+    )
 
 
-def _reached(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, points: np.ndarray, away: np.ndarray,
-             nearest: np.ndarray, edge: float) -> tuple[np.ndarray, Constraints]:
+def _reached(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    constraints: Constraints,
+    points: np.ndarray,
+    away: np.ndarray,
+    nearest: np.ndarray,
+    edge: float,
+) -> tuple[np.ndarray, Constraints]:
     """Tips that end less than an edge from the quads: the nearest vertex moves there and stays.
 
     points (n, 3) of the surface, how far each is `away` (n,), and the quad `nearest` (n,) to it.
@@ -86,9 +114,11 @@ def _reached(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, 
     return out, _extended(constraints, len(vertices), moved, moved)
 
 
-def _nearest(points: np.ndarray, away: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far points (n, 3) are from the triangles (t, 3), and the nearest of these, where most are about `away` (n,): of few points
-    only what is as near is searched."""
+def _nearest(
+    points: np.ndarray, away: np.ndarray, vertices: np.ndarray, triangles: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far points (n, 3) are from the triangles (t, 3), and the nearest of these, where most are about `away` (n,):
+    of few points only what is as near is searched."""
     from scipy.spatial import cKDTree
 
     corners = vertices[triangles]
@@ -110,14 +140,25 @@ def _apart(points: np.ndarray, away: np.ndarray, edge: float) -> list[np.ndarray
     from scipy.spatial import cKDTree
 
     pairs = cKDTree(points).query_pairs(edge, output_type="ndarray")
-    count, label = connected_components(coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(points),) * 2), False)
+    count, label = connected_components(
+        coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(points),) * 2), False
+    )
     tips = [np.flatnonzero(label == k) for k in range(count)]
     return sorted(tips, key=lambda tip: -away[tip].max())
 
 
-def _extruded(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, points: np.ndarray, quads: np.ndarray, away: np.ndarray,
-              surface: Surface, edge: float) -> tuple[np.ndarray, np.ndarray, Constraints] | None:
-    """One tip drawn out: points (n, 3) of it, the quad (n,) nearest to each, and how far away (n,); None where no disc of quads lies under it."""
+def _extruded(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    constraints: Constraints,
+    points: np.ndarray,
+    quads: np.ndarray,
+    away: np.ndarray,
+    surface: Surface,
+    edge: float,
+) -> tuple[np.ndarray, np.ndarray, Constraints] | None:
+    """One tip drawn out: points (n, 3) of it, the quad (n,) nearest to each, and how far away (n,); None where no disc
+    of quads lies under it."""
     corner = faces[quads, np.linalg.norm(vertices[faces[quads]] - points[:, None], axis=-1).argmin(1)]
     # The farthest point within a step of each vertex, or the nearest where all are farther.
     order = np.argsort(np.where(away <= _STEP * edge, -away, away), kind="stable")
@@ -163,12 +204,18 @@ def _sparse(points: np.ndarray, order: list[int], distance: float) -> list[int]:
 
 
 def _border(faces: np.ndarray, patch: np.ndarray, cap: np.ndarray) -> np.ndarray | None:
-    """The directed edges (n, 2) around a patch of the faces, in a row; None unless it is a disc that the vertices `cap` alone lie inside."""
+    """The directed edges (n, 2) around a patch of the faces, in a row; None unless it is a disc that the vertices `cap`
+    alone lie inside."""
     own = faces[patch]
     edges = edges_of(own)
     half = edges.half_ends[edges.count[edges.half_edge_idx] == 1]
     # Inner edges of two quads, a rim that no vertex lies on twice, one piece without handles.
-    if (edges.count > 2).any() or edges.turned.any() or len(np.unique(half[:, 0])) < len(half) or np.isin(half, cap).any():
+    if (
+        (edges.count > 2).any()
+        or edges.turned.any()
+        or len(np.unique(half[:, 0])) < len(half)
+        or np.isin(half, cap).any()
+    ):
         return None
     if components(own)[0] != 1 or euler_number(own) != 1 or len(np.unique(own)) != len(half) + len(cap):
         return None
@@ -182,9 +229,10 @@ def _border(faces: np.ndarray, patch: np.ndarray, cap: np.ndarray) -> np.ndarray
 
 
 def _extended(constraints: Constraints, count: int, moved: np.ndarray, fixed: np.ndarray) -> Constraints:
-    """The constraints for so many vertices, without what held those that moved, their paths as they were; `fixed` hold still."""
+    """The constraints for so many vertices, without what held those that moved, their paths as they were; `fixed` hold
+    still."""
     curve, still = np.full(count, -1), np.zeros(count, bool)
-    curve[:len(constraints.curve)], still[:len(constraints.fixed)] = constraints.curve, constraints.fixed
+    curve[: len(constraints.curve)], still[: len(constraints.fixed)] = constraints.curve, constraints.fixed
     curve[moved], still[moved], still[fixed] = -1, False, True
     return replace(constraints, curve=curve, fixed=still)
 
@@ -192,5 +240,7 @@ def _extended(constraints: Constraints, count: int, moved: np.ndarray, fixed: np
 def _still_paths(constraints: Constraints, faces: np.ndarray) -> Constraints:
     """Of the paths those edges that are still there, and still held at both ends."""
     ends, path, width = edges_of(faces).ends, np.sort(constraints.path, 1), len(constraints.curve) + 1
-    kept = np.isin(path[:, 0] * width + path[:, 1], ends[:, 0] * width + ends[:, 1]) & (constraints.curve[path] >= 0).all(1)
+    kept = np.isin(path[:, 0] * width + path[:, 1], ends[:, 0] * width + ends[:, 1]) & (
+        constraints.curve[path] >= 0
+    ).all(1)
     return replace(constraints, path=constraints.path[kept], path_curve=constraints.path_curve[kept])

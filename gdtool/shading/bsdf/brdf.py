@@ -34,9 +34,9 @@ def f0_of(albedo: Tensor, metallic: Tensor, f0: float | Tensor) -> Tensor:
 
 
 def fresnel(f0: Tensor, cosine: Tensor) -> Tensor:
-    """Schlick 1994: f0 + (1 − f0)(1 − c)^5; f0 (..., 3), cosine (...). In float32 within 2 machine epsilons for f0 of 0.04 and
-    more: what rounding took from 1 − c, exact by Sterbenz's lemma, goes back in before the fifth power makes it five
-    times larger."""
+    """Schlick 1994: f0 + (1 − f0)(1 − c)^5; f0 (..., 3), cosine (...). In float32 within 2 machine epsilons for f0 of
+    0.04 and more: what rounding took from 1 − c, exact by Sterbenz's lemma, goes back in before the fifth power makes
+    it five times larger."""
     c = cosine.clamp(0.0, 1.0)
     x = 1 - c
     lost = ((1 - x) - c).detach()
@@ -80,8 +80,17 @@ def disney_diffuse(roughness: Tensor, n_l: Tensor, n_v: Tensor, l_h: Tensor) -> 
     return (1 + (f90 - 1) * (1 - n_l) ** 5) * (1 + (f90 - 1) * (1 - n_v) ** 5)
 
 
-def reflectance(brdf: Brdf, albedo: Tensor, roughness: Tensor, metallic: Tensor, f0: Tensor, n_l: Tensor, n_v: Tensor,
-                n_h: Tensor, v_h: Tensor) -> tuple[Tensor, Tensor]:
+def reflectance(
+    brdf: Brdf,
+    albedo: Tensor,
+    roughness: Tensor,
+    metallic: Tensor,
+    f0: Tensor,
+    n_l: Tensor,
+    n_v: Tensor,
+    n_h: Tensor,
+    v_h: Tensor,
+) -> tuple[Tensor, Tensor]:
     """Diffuse and specular BRDF (..., 3) at one pair of directions, without the cosine; f0 (..., 3) from f0_of."""
     fresnel_term = fresnel(f0, v_h)
     specular = fresnel_term * (ndf(alpha_of(roughness), n_h) * visibility(brdf, roughness, n_l, n_v))[..., None]

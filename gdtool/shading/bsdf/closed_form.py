@@ -1,10 +1,9 @@
 """Unshadowed color under spherical-Gaussian light in closed form, differentiable in everything.
 
-Diffuse: clamped-cosine integral of each lobe. Specular, a blend of two estimates by x = 2 λ_light r⁴ (n·o):
-where the light is broader than the reflection lobe, the lobe as an SG about the mirror direction (Wang et al. 2009) times
-the light; where it is sharper, the light's energy times a GGX filtered by the light's width (after Tokuyoshi 2015,
-"Virtual spherical Gaussian lights for real-time glossy indirect illumination").
-"""
+Diffuse: clamped-cosine integral of each lobe. Specular, a blend of two estimates by x = 2 λ_light r⁴ (n·o): where the
+light is broader than the reflection lobe, the lobe as an SG about the mirror direction (Wang et al. 2009) times the
+light; where it is sharper, the light's energy times a GGX filtered by the light's width (after Tokuyoshi 2015, "Virtual
+spherical Gaussian lights for real-time glossy indirect illumination")."""
 
 from __future__ import annotations
 
@@ -40,8 +39,16 @@ def disney_mean(roughness: Tensor, n_v: Tensor) -> Tensor:
     return (1 + (f90 - 1) / 21) * (1 + (f90 - 1) * (1 - v) ** 5)
 
 
-def shade(normal: Tensor, view: Tensor, albedo: Tensor, roughness: Tensor, metallic: Tensor, lights: SphericalGaussians,
-          brdf: Brdf = "gltf", f0: float | Tensor = 0.04) -> Tensor:
+def shade(
+    normal: Tensor,
+    view: Tensor,
+    albedo: Tensor,
+    roughness: Tensor,
+    metallic: Tensor,
+    lights: SphericalGaussians,
+    brdf: Brdf = "gltf",
+    f0: float | Tensor = 0.04,
+) -> Tensor:
     """Linear radiance (..., 3) toward view.
 
     normal, view (..., 3) unit, view toward the eye; albedo (..., 3) linear; roughness, metallic (...); f0 a number or
@@ -51,8 +58,16 @@ def shade(normal: Tensor, view: Tensor, albedo: Tensor, roughness: Tensor, metal
     return diffuse + specular
 
 
-def shade_parts(normal: Tensor, view: Tensor, albedo: Tensor, roughness: Tensor, metallic: Tensor, lights: SphericalGaussians,
-                brdf: Brdf = "gltf", f0: float | Tensor = 0.04) -> tuple[Tensor, Tensor]:
+def shade_parts(
+    normal: Tensor,
+    view: Tensor,
+    albedo: Tensor,
+    roughness: Tensor,
+    metallic: Tensor,
+    lights: SphericalGaussians,
+    brdf: Brdf = "gltf",
+    f0: float | Tensor = 0.04,
+) -> tuple[Tensor, Tensor]:
     """Diffuse and specular radiance (..., 3) of shade."""
     known = (dot(normal, normal) > 0.25).to(normal.dtype)[..., None]
     n_v = dot(normal, view).clamp(MIN_VIEW_COSINE, 1.0)
@@ -69,8 +84,17 @@ def shade_parts(normal: Tensor, view: Tensor, albedo: Tensor, roughness: Tensor,
     return diffuse, specular
 
 
-def _specular(normal: Tensor, view: Tensor, n_v: Tensor, roughness: Tensor, f0: Tensor, light_cosine: Tensor, received: Tensor,
-              lights: SphericalGaussians, brdf: Brdf) -> Tensor:
+def _specular(
+    normal: Tensor,
+    view: Tensor,
+    n_v: Tensor,
+    roughness: Tensor,
+    f0: Tensor,
+    light_cosine: Tensor,
+    received: Tensor,
+    lights: SphericalGaussians,
+    brdf: Brdf,
+) -> Tensor:
     alpha = alpha_of(roughness)
     alpha2 = alpha * alpha
 
@@ -99,12 +123,22 @@ def _specular(normal: Tensor, view: Tensor, n_v: Tensor, roughness: Tensor, f0: 
     return (lobes * lights.amplitudes).sum(-2)
 
 
-def closed_form_image(frame: dict[str, np.ndarray], camera: Camera, lobes: SphericalGaussians, brdf: str = "gltf") -> np.ndarray:
+def closed_form_image(
+    frame: dict[str, np.ndarray], camera: Camera, lobes: SphericalGaussians, brdf: str = "gltf"
+) -> np.ndarray:
     """(h, w, 3) unshadowed linear radiance of a view's own maps under spherical Gaussians; 0 where nothing is seen."""
     inside = frame["mask"] > 0
     view = -rays(camera)[1][inside]
-    maps = [torch.tensor(x, dtype=torch.float32) for x in (frame["normal"][inside], view, frame["albedo"][inside],
-                                                           frame["roughness"][inside], frame["metallic"][inside])]
+    maps = [
+        torch.tensor(x, dtype=torch.float32)
+        for x in (
+            frame["normal"][inside],
+            view,
+            frame["albedo"][inside],
+            frame["roughness"][inside],
+            frame["metallic"][inside],
+        )
+    ]
     out = np.zeros((*inside.shape, 3), np.float32)
     with torch.no_grad():
         out[inside] = shade(*maps, lobes.to(torch.float32), brdf).numpy()

@@ -1,4 +1,5 @@
-"""Reflection of surface points as scalars per pair of point and direction: evaluated, and sampled by visible normals."""
+"""Reflection of surface points as scalars per pair of point and direction: evaluated, and sampled by visible
+normals."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ def rows_of(x: np.ndarray, part: slice = slice(None)):
 
 
 class Surface:
-    """Reflection of n points toward the eye: evaluated and sampled for k directions each, vectors as three (k, n) tensors.
+    """Reflection of n points toward the eye: evaluated and sampled for k directions each, vectors as three (k, n)
+    tensors.
 
     toward (n, 3) unit, values as of SurfaceLookup.attributes, part of both is taken.
     """
@@ -35,8 +37,14 @@ class Surface:
         from gdtool.shading.bsdf.brdf import alpha_of
 
         self.brdf = brdf
-        self.normal, self.view, self.geometric = (rows_of(x, part) for x in (values["normal"], toward, values["geometric_normal"]))
-        self.albedo, self.metallic, self.roughness = rows_of(values["albedo"], part), tensor_of(values["metallic"][part]), tensor_of(values["roughness"][part])
+        self.normal, self.view, self.geometric = (
+            rows_of(x, part) for x in (values["normal"], toward, values["geometric_normal"])
+        )
+        self.albedo, self.metallic, self.roughness = (
+            rows_of(values["albedo"], part),
+            tensor_of(values["metallic"][part]),
+            tensor_of(values["roughness"][part]),
+        )
         # As brdf.f0_of.
         self.f0 = tensor_of(values["f0"][part]) * (1 - self.metallic) + self.albedo * self.metallic
         self.alpha = alpha_of(self.roughness)
@@ -62,8 +70,8 @@ class Surface:
         return luminance * (f0 * terms[0] + (1 - f0) * terms[1] + diffuse * terms[2])
 
     def evaluate(self, x, y, z):
-        """[D V c, D V c w, d c / π, d c w / π] with c = n·l and d the diffuse model's factor; density of sample(); and whether
-        the direction is above the horizon of both the shading and the true normal."""
+        """[D V c, D V c w, d c / π, d c w / π] with c = n·l and d the diffuse model's factor; density of sample(); and
+        whether the direction is above the horizon of both the shading and the true normal."""
         from gdtool.shading.bsdf.brdf import disney_diffuse, ndf, visibility_gltf, visibility_paper
 
         nx, ny, nz = self.normal

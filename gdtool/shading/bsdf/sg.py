@@ -27,7 +27,9 @@ class SphericalGaussians:
 
     def to(self, *args, **kwargs) -> SphericalGaussians:
         """Tensor.to of all parts."""
-        return SphericalGaussians(self.axes.to(*args, **kwargs), self.sharpness.to(*args, **kwargs), self.amplitudes.to(*args, **kwargs))
+        return SphericalGaussians(
+            self.axes.to(*args, **kwargs), self.sharpness.to(*args, **kwargs), self.amplitudes.to(*args, **kwargs)
+        )
 
     @classmethod
     def from_record(cls, light: dict, dtype: torch.dtype = torch.float32) -> SphericalGaussians:
@@ -89,10 +91,9 @@ def integral(sharpness: Tensor) -> Tensor:
 def hemisphere_integral(sharpness: Tensor, cosine: Tensor) -> Tensor:
     """∫ G over the hemisphere whose pole makes the given cosine with the axis, for amplitude 1.
 
-    Meder & Brüderlin 2018's blend of the hemispheres about the axis and away from it, the share by the error function as
-    Tokuyoshi 2022 ("Accurate Diffuse Lighting from Spherical Gaussian Lights"): within 4.4e-3 of the sphere integral, at
-    λ = 10 (1.1e-2 with Meder & Brüderlin's hyperbolic tangent).
-    """
+    Meder & Brüderlin 2018's blend of the hemispheres about the axis and away from it, the share by the error function
+    as Tokuyoshi 2022 ("Accurate Diffuse Lighting from Spherical Gaussian Lights"): within 4.4e-3 of the sphere
+    integral, at λ = 10 (1.1e-2 with Meder & Brüderlin's hyperbolic tangent)."""
     s = sharpness.clamp(0, MAX_SHARPNESS)
     c = cosine.clamp(-1, 1)
     small = s < 1e-4

@@ -1,4 +1,5 @@
-"""Light made by our own code: three bundled studios and a seeded random one, all sums of spherical Gaussians and boxes."""
+"""Light made by our own code: three bundled studios and a seeded random one, all sums of spherical Gaussians and
+boxes."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ def direction(azimuth: float, elevation: float) -> np.ndarray:
 
 
 def _boxes(image: np.ndarray, directions: np.ndarray, boxes: list[tuple]) -> None:
-    """Add softboxes (azimuth, elevation, half width, half height in radians, edge softness, color) to image in place."""
+    """Add softboxes (azimuth, elevation, half width, half height in radians, edge softness, color) to image in
+    place."""
     for azimuth, elevation, wide, high, soft, color in boxes:
         forward = direction(azimuth, elevation)
         right = np.cross((0.0, 1.0, 0.0), forward)
@@ -42,17 +44,36 @@ def bundled(name: str) -> Environment:
     image = np.zeros_like(d)
     if name == "dark":
         image += np.where(up > 0, 0.006 + 0.01 * np.exp(-6 * up), 0.008) * np.array([0.7, 0.85, 1.2])
-        image += 0.03 * np.exp(-(up / 0.08) ** 2) * np.array([1.3, 0.9, 0.6])
-        _boxes(image, d, [(35, 32, 0.10, 0.10, 0.04, (26, 19, 11)), (-70, 22, 0.07, 0.16, 0.04, (9, 12, 20)),
-                          (150, 40, 0.09, 0.05, 0.03, (16, 12, 8)), (-140, 12, 0.25, 0.04, 0.03, (3, 2, 4))])
+        image += 0.03 * np.exp(-((up / 0.08) ** 2)) * np.array([1.3, 0.9, 0.6])
+        _boxes(
+            image,
+            d,
+            [
+                (35, 32, 0.10, 0.10, 0.04, (26, 19, 11)),
+                (-70, 22, 0.07, 0.16, 0.04, (9, 12, 20)),
+                (150, 40, 0.09, 0.05, 0.03, (16, 12, 8)),
+                (-140, 12, 0.25, 0.04, 0.03, (3, 2, 4)),
+            ],
+        )
     elif name == "mid":
         image += (0.16 + 0.10 * np.maximum(up, 0) + 0.05 * up) * np.array([1.0, 0.98, 0.95])
-        _boxes(image, d, [(45, 35, 0.38, 0.38, 0.10, (7.0, 6.8, 6.4)), (-60, 15, 0.25, 0.55, 0.10, (1.9, 2.1, 2.5)),
-                          (165, 45, 0.55, 0.16, 0.08, (3.2, 3.2, 3.4)), (0, 80, 0.45, 0.45, 0.20, (1.5, 1.5, 1.5))])
+        _boxes(
+            image,
+            d,
+            [
+                (45, 35, 0.38, 0.38, 0.10, (7.0, 6.8, 6.4)),
+                (-60, 15, 0.25, 0.55, 0.10, (1.9, 2.1, 2.5)),
+                (165, 45, 0.55, 0.16, 0.08, (3.2, 3.2, 3.4)),
+                (0, 80, 0.45, 0.45, 0.20, (1.5, 1.5, 1.5)),
+            ],
+        )
     elif name == "bright":
         sky = np.maximum(up, 0) ** 0.5
-        image += np.where(up > 0, (1 - sky) * np.array([1.15, 1.2, 1.25]) + sky * np.array([0.30, 0.55, 1.05]),
-                          np.array([0.32, 0.29, 0.25]) * (0.6 + 0.4 * np.exp(8 * np.minimum(up, 0))))
+        image += np.where(
+            up > 0,
+            (1 - sky) * np.array([1.15, 1.2, 1.25]) + sky * np.array([0.30, 0.55, 1.05]),
+            np.array([0.32, 0.29, 0.25]) * (0.6 + 0.4 * np.exp(8 * np.minimum(up, 0))),
+        )
         _boxes(image, d, [(55, 48, 0.035, 0.035, 0.02, (700, 640, 560))])
         glow = np.maximum(d @ direction(55, 48), 0)[..., None]
         image += 1.6 * glow**60 * np.array([1.0, 0.95, 0.85])
@@ -79,7 +100,11 @@ def random_lobes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.n
     warmth = np.exp(rng.normal(0, 0.18, (8, 1)) * np.array([1.0, 0.1, -1.0]))
     # Power is the lobe's share of irradiance, so that a sharp lamp is brighter, not weaker.
     amplitude = power[:, None] * warmth * sharpness[:, None] / (2 * np.pi)
-    return np.concatenate([room, axes]), np.concatenate([np.full(8, 3.0), sharpness]), np.concatenate([level * tint, amplitude])
+    return (
+        np.concatenate([room, axes]),
+        np.concatenate([np.full(8, 3.0), sharpness]),
+        np.concatenate([level * tint, amplitude]),
+    )
 
 
 def paint(axes: np.ndarray, sharpness: np.ndarray, amplitudes: np.ndarray, height: int, name: str = "") -> Environment:

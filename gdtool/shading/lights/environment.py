@@ -45,7 +45,8 @@ class Environment:
 
     @cached_property
     def pdf(self) -> np.ndarray:
-        """(h, w) density of sample() per steradian: luminance, with a floor so that nothing bright in one channel is lost."""
+        """(h, w) density of sample() per steradian: luminance, with a floor so that nothing bright in one channel is
+        lost."""
         value = self.image.max(-1) + 1e-4 * float(self.image.max(initial=0))
         mass = value * self.solid_angles[:, None]
         total = float(mass.sum())
@@ -75,7 +76,9 @@ class Environment:
         columns = np.cumsum(mass / np.maximum(mass.sum(1, keepdims=True), 1e-300), 1)
         columns[:, -1] = 1.0
         ladder = (columns + np.arange(height)[:, None]).ravel()
-        found = np.minimum(np.searchsorted(ladder, row + np.clip(uniform[:, 1], 0, 1 - 1e-12), side="right"), height * width - 1)
+        found = np.minimum(
+            np.searchsorted(ladder, row + np.clip(uniform[:, 1], 0, 1 - 1e-12), side="right"), height * width - 1
+        )
         column = np.clip(found - row * width, 0, width - 1)
         before = np.where(column > 0, columns[row, column - 1], 0.0)
         within_column = (uniform[:, 1] - before) / np.maximum(columns[row, column] - before, 1e-300)
@@ -98,7 +101,8 @@ class Environment:
         return current
 
     def cut(self, height: int) -> Environment:
-        """The same light in at least so many rows, pixels repeated: sums by their middles err by 1.6 % with 8 rows, .02 % with 64."""
+        """The same light in at least so many rows, pixels repeated: sums by their middles err by 1.6 % with 8 rows, .02
+        % with 64."""
         times = max(-(-height // self.image.shape[0]), 1)
         across = max(-(-2 * height // self.image.shape[1]), 1)
         return self if times == across == 1 else replace(self, image=self.image.repeat(times, 0).repeat(across, 1))
@@ -110,7 +114,8 @@ class Environment:
         return np.maximum(normals @ small.directions.reshape(-1, 3).T, 0) @ weighted
 
     def metered(self) -> Environment:
-        """The light scaled so that a white card (albedo 0.8) turned to where it is brightest has radiance METERED_WHITE.
+        """The light scaled so that a white card (albedo 0.8) turned to where it is brightest has radiance
+        METERED_WHITE.
 
         Metering the light and not the object keeps a black object black.
         """

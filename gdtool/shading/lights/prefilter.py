@@ -14,9 +14,19 @@ import numpy as np
 
 from gdtool.shading.lights.environment import Environment
 
-# Roughness of the levels that may be made, each with its image's side, as broad lobes vary slowly, and the side of the light
-# of which it sums all texels; 0: it samples the lobe.
-LADDER = ((0.08, 256, 0), (0.14, 128, 0), (0.2, 128, 0), (0.3, 64, 64), (0.4, 32, 64), (0.5, 32, 32), (0.62, 32, 32), (0.78, 32, 32), (1.0, 32, 32))
+# Roughness of the levels that may be made, each with its image's side, as broad lobes vary slowly, and the side of the
+# light of which it sums all texels; 0: it samples the lobe.
+LADDER = (
+    (0.08, 256, 0),
+    (0.14, 128, 0),
+    (0.2, 128, 0),
+    (0.3, 64, 64),
+    (0.4, 32, 64),
+    (0.5, 32, 32),
+    (0.62, 32, 32),
+    (0.78, 32, 32),
+    (1.0, 32, 32),
+)
 LOBE_SAMPLES = 64
 # Normals summed for at a time: what lies between the products stays in the cache.
 PART = 64
@@ -43,7 +53,9 @@ def octahedral_directions(side: int) -> np.ndarray:
     r = 1 - np.abs(d)
     phi = np.where(r > 0, ((b - a) / np.where(r > 0, r, 1) + 1) * (np.pi / 4), 0)
     ring = r * np.sqrt(np.maximum(2 - r * r, 0))
-    out = np.stack([np.copysign(ring * np.cos(phi), s), np.copysign(1 - r * r, d), np.copysign(ring * np.sin(phi), t)], -1)
+    out = np.stack(
+        [np.copysign(ring * np.cos(phi), s), np.copysign(1 - r * r, d), np.copysign(ring * np.sin(phi), t)], -1
+    )
     return out.reshape(-1, 3)
 
 
@@ -55,13 +67,23 @@ class LightPyramid:
 
         height, width = environment.image.shape[:2]
         self.side = 1 << max(0, int(math.log2(math.sqrt(height * width) / 2)))
-        x, y, z = (torch.as_tensor(np.ascontiguousarray(c), dtype=torch.float32) for c in environment.directions.reshape(-1, 3).T)
+        x, y, z = (
+            torch.as_tensor(np.ascontiguousarray(c), dtype=torch.float32)
+            for c in environment.directions.reshape(-1, 3).T
+        )
         s, t = octahedral(x, y, z)
-        texel = ((t * self.side).long().clamp_max(self.side - 1) * self.side + (s * self.side).long().clamp_max(self.side - 1)).numpy()
+        texel = (
+            (t * self.side).long().clamp_max(self.side - 1) * self.side
+            + (s * self.side).long().clamp_max(self.side - 1)
+        ).numpy()
         area = np.repeat(environment.solid_angles, width)
         total = np.bincount(texel, area, self.side**2)
         image = np.stack([np.bincount(texel, area * c, self.side**2) for c in environment.image.reshape(-1, 3).T], 1)
-        image = np.where(total[:, None] > 0, image / np.maximum(total, 1e-30)[:, None], environment.radiance(octahedral_directions(self.side)))
+        image = np.where(
+            total[:, None] > 0,
+            image / np.maximum(total, 1e-30)[:, None],
+            environment.radiance(octahedral_directions(self.side)),
+        )
         levels = [image.reshape(self.side, self.side, 3)]
         while len(levels[-1]) > 1:
             fine = levels[-1]
@@ -72,13 +94,16 @@ class LightPyramid:
         self.texel_angle = 4 * math.pi / self.side**2
 
     def mean(self, x, y, z, solid_angle):
-        """Radiance (3, k, n) toward (k, n), averaged over a texel of the level whose solid angle is the next below solid_angle (k, 1)."""
+        """Radiance (3, k, n) toward (k, n), averaged over a texel of the level whose solid angle is the next below
+        solid_angle (k, 1)."""
         level = (0.5 * (solid_angle * (1 / self.texel_angle)).log2()).long().clamp(0, self.depth - 1)
         side = self.side >> level
         s, t = octahedral(x, y, z)
         column = (s * side).long().minimum(side - 1)
         row = (t * side).long().minimum(side - 1)
-        return self.texels.index_select(1, (row.mul_(side).add_(column).add_(self.offsets[level])).reshape(-1)).view(3, *column.shape)
+        return self.texels.index_select(1, (row.mul_(side).add_(column).add_(self.offsets[level])).reshape(-1)).view(
+            3, *column.shape
+        )
 
 
 class IrradianceMap:
@@ -88,17 +113,28 @@ class IrradianceMap:
         import torch
 
         small = environment.shrunk(64).cut(64)
-        # The first and last row are the poles: half a row away from one, its own value would be 0.7 % off under a studio.
+        # The first and last row are the poles: half a row away from one, its own value would be 0.7 % off under a
+        # studio.
         theta = np.arange(height) / (height - 1) * np.pi
         phi = ((np.arange(2 * height) + 0.5) / (2 * height) - 0.5) * 2 * np.pi
         ring = np.sin(theta)[:, None]
-        normals = np.stack([ring * np.cos(phi), np.broadcast_to(np.cos(theta)[:, None], (height, 2 * height)), ring * np.sin(phi)], -1)
-        weighted = torch.as_tensor((small.image * small.solid_angles[:, None, None]).reshape(-1, 3), dtype=torch.float32)
+        normals = np.stack(
+            [ring * np.cos(phi), np.broadcast_to(np.cos(theta)[:, None], (height, 2 * height)), ring * np.sin(phi)], -1
+        )
+        weighted = torch.as_tensor(
+            (small.image * small.solid_angles[:, None, None]).reshape(-1, 3), dtype=torch.float32
+        )
         toward = torch.as_tensor(small.directions.reshape(-1, 3).T, dtype=torch.float32)
         parts = torch.as_tensor(normals.reshape(-1, 3), dtype=torch.float32).split(PART)
-        self.values = torch.cat([(part @ toward).clamp_min_(0) @ weighted for part in parts]).numpy().reshape(height, 2 * height, 3)
+        self.values = (
+            torch.cat([(part @ toward).clamp_min_(0) @ weighted for part in parts])
+            .numpy()
+            .reshape(height, 2 * height, 3)
+        )
         # A column more on each side, from the other one.
-        self.wrapped = torch.from_numpy(np.concatenate([self.values[:, -1:], self.values, self.values[:, :1]], 1).transpose(2, 0, 1).copy())
+        self.wrapped = torch.from_numpy(
+            np.concatenate([self.values[:, -1:], self.values, self.values[:, :1]], 1).transpose(2, 0, 1).copy()
+        )
 
     def lookup(self, normals):
         """(3, n) from unit normals (3, n), tensors."""
@@ -132,8 +168,8 @@ class Prefiltered:
 
         n_v = (normal * view).sum(0)
         mirror = 2 * n_v * normal - view
-        # Tried under two lights: nearer the integral than the mirror direction; Lagarde's (1 − r)(√(1 − r) + r) is better from
-        # r = 0.3 (studio) or 0.5 (mid) on, and worse below.
+        # Tried under two lights: nearer the integral than the mirror direction; Lagarde's (1 − r)(√(1 − r) + r) is
+        # better from r = 0.3 (studio) or 0.5 (mid) on, and worse below.
         middle = torch.lerp(normal, mirror, 1 - roughness**2)
         middle = middle / (middle * middle).sum(0).sqrt().clamp_min(1e-12)
         below, above, fraction = _levels(lobe_roughness(roughness, n_v))
@@ -142,7 +178,9 @@ class Prefiltered:
             weight = torch.where(above == level, fraction, 0.0) + torch.where(below == level, 1 - fraction, 0.0)
             used = (weight > 0).nonzero()[:, 0]
             if len(used):
-                light.index_add_(1, used, weight[used] * read_octahedral(self._image(level), *middle.index_select(1, used)))
+                light.index_add_(
+                    1, used, weight[used] * read_octahedral(self._image(level), *middle.index_select(1, used))
+                )
         share = _bilinear(self.table, n_v.clamp(0, 1) * TABLE - 0.5, roughness.clamp(0, 1) * TABLE - 0.5)
         return light * share[0], light * share[1]
 
@@ -167,15 +205,15 @@ class Prefiltered:
 def lobe_roughness(roughness, n_v):
     """Of the lobe seen along its own normal that is as wide as the one seen at cosine n_v; (n,) tensors.
 
-    A half vector off by an angle moves the reflection by twice that in the plane of view and normal, and by n·v times that
-    across: the lobe's solid angle shrinks by n·v, so that α, of which it is the square, does by its root. Measured on a
-    normal-mapped glossy metal under a studio: 26.8 dB inside the outline, 28.7 with it.
-    """
+    A half vector off by an angle moves the reflection by twice that in the plane of view and normal, and by n·v times
+    that across: the lobe's solid angle shrinks by n·v, so that α, of which it is the square, does by its root. Measured
+    on a normal-mapped glossy metal under a studio: 26.8 dB inside the outline, 28.7 with it."""
     return roughness * n_v.clamp(0.05, 1) ** 0.25
 
 
 def _levels(roughness):
-    """Steps of the ladder below and above (n,) roughness, and how far it is between them; one step where it is on one."""
+    """Steps of the ladder below and above (n,) roughness, and how far it is between them; one step where it is on
+    one."""
     import torch
 
     ladder = torch.tensor([r for r, *_ in LADDER])
@@ -193,7 +231,9 @@ def filtered_light(pyramid: LightPyramid, roughness: float, side: int, dense: in
 
     normal = torch.as_tensor(octahedral_directions(side), dtype=torch.float32)
     a2 = roughness**4
-    image = (_sum_of_all(pyramid, normal, a2, dense) if dense else _sum_of_samples(pyramid, normal, a2)).reshape(side, side, 3)
+    image = (_sum_of_all(pyramid, normal, a2, dense) if dense else _sum_of_samples(pyramid, normal, a2)).reshape(
+        side, side, 3
+    )
     # Over an edge of the octahedron lies the same edge, turned around.
     rows = torch.cat([image[:1].flip(1), image, image[-1:].flip(1)])
     columns = torch.cat([rows[:, :1].flip(0), rows, rows[:, -1:].flip(0)], 1)
@@ -206,7 +246,7 @@ def _sum_of_all(pyramid: LightPyramid, normal, a2: float, dense: int):
 
     level = max(0, (pyramid.side // dense).bit_length() - 1)
     side = pyramid.side >> level
-    light = pyramid.texels[:, pyramid.offsets[level]:pyramid.offsets[level] + side * side].T.contiguous()
+    light = pyramid.texels[:, pyramid.offsets[level] : pyramid.offsets[level] + side * side].T.contiguous()
     toward = torch.as_tensor(octahedral_directions(side), dtype=torch.float32)
     out = []
     for part in normal.split(PART):
@@ -231,12 +271,21 @@ def _sum_of_samples(pyramid: LightPyramid, normal, a2: float):
     density = a2 / (math.pi * ((1 - cosine**2) + a2 * cosine**2) ** 2) / 4
     # A half vector at angle θ reflects the normal to 2 θ.
     up, ring = 2 * cosine**2 - 1, 2 * cosine * (1 - cosine**2).clamp_min(0).sqrt()
-    weight, angle, ring, up, phi = up.clamp_min(0), (2 / (LOBE_SAMPLES * density))[:, None], ring[:, None], up[:, None], phi[:, None]
+    weight, angle, ring, up, phi = (
+        up.clamp_min(0),
+        (2 / (LOBE_SAMPLES * density))[:, None],
+        ring[:, None],
+        up[:, None],
+        phi[:, None],
+    )
     out = []
     for part in normal.split(1024):
         n = part.unbind(1)
         tangent, bitangent = frame(*n)
-        direction = [t * (ring * phi.cos()) + b * (ring * phi.sin()) + c * up for t, b, c in zip(tangent, bitangent, n, strict=True)]
+        direction = [
+            t * (ring * phi.cos()) + b * (ring * phi.sin()) + c * up
+            for t, b, c in zip(tangent, bitangent, n, strict=True)
+        ]
         out.append((pyramid.mean(*direction, angle) * weight[:, None]).sum(1).T)
     return torch.cat(out) / weight.sum()
 
@@ -256,7 +305,9 @@ def _bilinear(image, row, column):
     flat = image.reshape(channels, -1)
     at = r * width + c
     fr, fc = row - r, column - c
-    upper, lower = (flat.index_select(1, at + start).lerp(flat.index_select(1, at + start + 1), fc) for start in (0, width))
+    upper, lower = (
+        flat.index_select(1, at + start).lerp(flat.index_select(1, at + start + 1), fc) for start in (0, width)
+    )
     return upper.lerp(lower, fr)
 
 
@@ -264,16 +315,22 @@ def lobe_table(brdf: str = "gltf", samples: int = 256):
     """(2, TABLE, TABLE) by n·v and roughness: ∫ D V c dl under Fresnel 1 and (1 − v·h)^5, visible normals sampled."""
     import torch
 
-    from gdtool.shading.sampling import sobol
     from gdtool.shading.bsdf.reflection import Surface
+    from gdtool.shading.sampling import sobol
 
     side = (np.arange(TABLE) + 0.5) / TABLE
     n_v, roughness = (x.ravel() for x in np.meshgrid(side, side, indexing="ij"))
     count = len(n_v)
     view = np.stack([np.sqrt(1 - n_v**2), 0 * n_v, n_v], 1)
     normal = np.tile((0.0, 0.0, 1.0), (count, 1))
-    values = {"normal": normal, "geometric_normal": normal, "albedo": np.ones((count, 3)), "metallic": np.ones(count),
-              "roughness": roughness, "f0": np.full(count, 0.04)}
+    values = {
+        "normal": normal,
+        "geometric_normal": normal,
+        "albedo": np.ones((count, 3)),
+        "metallic": np.ones(count),
+        "roughness": roughness,
+        "f0": np.full(count, 0.04),
+    }
     surface = Surface(view, values, slice(None), brdf)
     uniform = [torch.as_tensor(u, dtype=torch.float32)[:, None].expand(-1, count) for u in sobol(samples, 2, 7).T]
     direction = surface.sample(*uniform, torch.zeros(samples, count))

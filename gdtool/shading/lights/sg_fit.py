@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.shading.lights.environment import Environment
-from gdtool.shading.lights.bundled import COUNT
-from gdtool.shading.sampling import fibonacci
 from gdtool.shading.bsdf.sg import SphericalGaussians
+from gdtool.shading.lights.bundled import COUNT
+from gdtool.shading.lights.environment import Environment
+from gdtool.shading.sampling import fibonacci
 
 # Rows of the image that is fitted, and the logarithm of the sharpest lobe that its pixels can tell from a sharper one.
 ROWS = 32
@@ -16,7 +16,9 @@ SHARPEST = float(np.log(250.0))
 IRRADIANCE_WEIGHT = 30.0
 
 
-def fit_sg(environment: Environment, count: int = COUNT, seed: int = 0, steps: int = 300) -> tuple[SphericalGaussians, dict[str, float]]:
+def fit_sg(
+    environment: Environment, count: int = COUNT, seed: int = 0, steps: int = 300
+) -> tuple[SphericalGaussians, dict[str, float]]:
     """count lobes that fit the radiance by solid angle, and the fit's error (see fit_error).
 
     Half the lobes start on the brightest places (each hiding its surroundings from the next), half spread evenly; Adam
@@ -36,12 +38,16 @@ def fit_sg(environment: Environment, count: int = COUNT, seed: int = 0, steps: i
     axes, sharpness, amplitudes = _start(d, radiance, weight, count, seed)
 
     generator = torch.Generator().manual_seed(seed)
-    normals = torch.nn.functional.normalize(torch.randn(128, 3, generator=generator, dtype=torch.float64), dim=1).float()
+    normals = torch.nn.functional.normalize(
+        torch.randn(128, 3, generator=generator, dtype=torch.float64), dim=1
+    ).float()
     directions, target = torch.tensor(d, dtype=torch.float32), torch.tensor(radiance, dtype=torch.float32)
     area = torch.tensor(weight / weight.sum(), dtype=torch.float32)
     transport = normals.matmul(directions.T).clamp_min(0) * area * 4
     irradiance = transport @ target
-    parameters = [torch.tensor(x, dtype=torch.float32, requires_grad=True) for x in (axes, np.log(sharpness), np.log(amplitudes))]
+    parameters = [
+        torch.tensor(x, dtype=torch.float32, requires_grad=True) for x in (axes, np.log(sharpness), np.log(amplitudes))
+    ]
     optimizer = torch.optim.Adam(parameters, lr=0.05)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for _ in range(steps):
@@ -56,13 +62,18 @@ def fit_sg(environment: Environment, count: int = COUNT, seed: int = 0, steps: i
         schedule.step()
     with torch.no_grad():
         axis = torch.nn.functional.normalize(parameters[0], dim=1)
-        lobes = SphericalGaussians(axis.double(), parameters[1].clamp(-1.0, SHARPEST).exp().double(), parameters[2].clamp(-12, 12).exp().double() * mean)
+        lobes = SphericalGaussians(
+            axis.double(),
+            parameters[1].clamp(-1.0, SHARPEST).exp().double(),
+            parameters[2].clamp(-12, 12).exp().double() * mean,
+        )
     return lobes, fit_error(environment, lobes)
 
 
 def fit_error(environment: Environment, lobes: SphericalGaussians) -> dict[str, float]:
-    """radiance_rms: RMS over the sphere of the radiance's error, irradiance_rms and irradiance_max the same over normals,
-    each relative to the RMS (maximum) of the truth; energy: relative error of the total. Of the 32-row image."""
+    """radiance_rms: RMS over the sphere of the radiance's error, irradiance_rms and irradiance_max the same over
+    normals, each relative to the RMS (maximum) of the truth; energy: relative error of the total. Of the 32-row
+    image."""
     import torch
 
     from gdtool.shading.bsdf.sg import cosine_integral, evaluate
@@ -84,7 +95,9 @@ def fit_error(environment: Environment, lobes: SphericalGaussians) -> dict[str, 
     }
 
 
-def _start(d: np.ndarray, radiance: np.ndarray, weight: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _start(
+    d: np.ndarray, radiance: np.ndarray, weight: np.ndarray, count: int, seed: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     peaks = count // 2
     bright = radiance.sum(1)
     hidden = bright.copy()

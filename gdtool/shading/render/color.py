@@ -11,8 +11,15 @@ from gdtool.shading.render.direct import DirectLight
 from gdtool.shading.render.render import Renderer
 
 
-def render_color(scene: Scene, camera: Camera, environment: Environment, samples: int = 16, light_samples: int = 16,
-                 seed: int = 0, brdf: str = "gltf") -> tuple[np.ndarray, np.ndarray]:
+def render_color(
+    scene: Scene,
+    camera: Camera,
+    environment: Environment,
+    samples: int = 16,
+    light_samples: int = 16,
+    seed: int = 0,
+    brdf: str = "gltf",
+) -> tuple[np.ndarray, np.ndarray]:
     """Lit color (h, w, 3) linear radiance, direct light with shadows, and mask (h, w)."""
     renderer = Renderer(scene)
     light = DirectLight(renderer, environment, light_samples, seed, brdf)

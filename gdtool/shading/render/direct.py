@@ -1,13 +1,13 @@
-"""Direct light of an environment with shadows: multiple importance sampling of the light and the reflection, Embree visibility.
+"""Direct light of an environment with shadows: multiple importance sampling of the light and the reflection, Embree
+visibility.
 
-Everything per pair of point and direction is a scalar: with Schlick's Fresnel, F = f0 + (f90 − f0) w, reflected radiance is a
-linear combination of four sums over the directions, in which only w depends on them.
+Everything per pair of point and direction is a scalar: with Schlick's Fresnel, F = f0 + (f90 − f0) w, reflected
+radiance is a linear combination of four sums over the directions, in which only w depends on them.
 
-Diffuse light that nothing hides is known without rays and without noise: irradiance from a table. The sampled directions
-only have to say what is hidden. With V the sum over visible directions, U over all of them and B what is known, the
-estimate is V + β (B − U), β the visible share of U in the pixel: a control variate where little is hidden, 0 where
-everything is, and unbiased for any β that does not depend on the noise.
-"""
+Diffuse light that nothing hides is known without rays and without noise: irradiance from a table. The sampled
+directions only have to say what is hidden. With V the sum over visible directions, U over all of them and B what is
+known, the estimate is V + β (B − U), β the visible share of U in the pixel: a control variate where little is hidden, 0
+where everything is, and unbiased for any β that does not depend on the noise."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from gdtool.shading.bsdf.reflection import Surface, rows_of, tensor_of
 from gdtool.shading.lights.environment import LUMINANCE, Environment
 from gdtool.shading.sampling import sobol
-from gdtool.shading.bsdf.reflection import Surface, rows_of, tensor_of
 
 if TYPE_CHECKING:
     from gdtool.shading.render.render import Points, Renderer
@@ -48,8 +48,17 @@ class DirectLight:
     is 0. shadows False leaves visibility out. known False leaves out what is known without rays.
     """
 
-    def __init__(self, renderer: Renderer, environment: Environment, samples: int, seed: int = 0, brdf: str = "gltf", shadows: bool = True,
-                 mode: Literal["sampled", "prefiltered"] = "sampled", known: bool = True):
+    def __init__(
+        self,
+        renderer: Renderer,
+        environment: Environment,
+        samples: int,
+        seed: int = 0,
+        brdf: str = "gltf",
+        shadows: bool = True,
+        mode: Literal["sampled", "prefiltered"] = "sampled",
+        known: bool = True,
+    ):
         from gdtool.shading.lights.prefilter import IrradianceMap, LightPyramid, Prefiltered
 
         self.renderer, self.environment, self.brdf, self.shadows, self.seed = renderer, environment, brdf, shadows, seed
@@ -60,14 +69,19 @@ class DirectLight:
             raise ValueError("sampled light needs samples")
         with ThreadPoolExecutor(renderer.caster.threads) as pool:
             known_light = pool.submit(IrradianceMap, environment)
-            prefiltered = pool.submit(lambda: Prefiltered(LightPyramid(environment), brdf)) if mode == "prefiltered" else None
+            prefiltered = (
+                pool.submit(lambda: Prefiltered(LightPyramid(environment), brdf)) if mode == "prefiltered" else None
+            )
             if self.samples:
                 directions, radiance, density = environment.sample(sobol(POOL, 2, seed))
                 dice = np.random.default_rng(seed).random(POOL)
-                # Runs of (x, y, z, red, green, blue, density, dice) for the light and of three numbers and dice for the reflection.
+                # Runs of (x, y, z, red, green, blue, density, dice) for the light and of three numbers and dice for the
+                # reflection.
                 self.pool = self._runs_of(*directions.T, *radiance.T, density, dice)
                 self.pattern = self._runs_of(*sobol(POOL, 3, seed + 1).T, dice)
-            self.pixels = tensor_of(np.concatenate([environment.image.reshape(-1, 3), environment.pdf.reshape(-1, 1)], 1))
+            self.pixels = tensor_of(
+                np.concatenate([environment.image.reshape(-1, 3), environment.pdf.reshape(-1, 1)], 1)
+            )
             self.irradiance = known_light.result()
             self.prefiltered = None if prefiltered is None else prefiltered.result()
 
@@ -96,7 +110,14 @@ class DirectLight:
             part = slice(start, start + step)
             counted += self._chunk(points, part, None if runs is None else runs[:, part], sums[..., part])
         cast, below, convex, rare = counted.tolist()
-        self.renderer.counts.spend("directions", at, shadow_rays=cast, shadow_rays_below_horizon=below, shadow_rays_convex=convex, shadow_rays_rare=rare)
+        self.renderer.counts.spend(
+            "directions",
+            at,
+            shadow_rays=cast,
+            shadow_rays_below_horizon=below,
+            shadow_rays_convex=convex,
+            shadow_rays_rare=rare,
+        )
         out = self._combined(points, sums)
         out += points.values["emissive"].T
         unlit = points.values["unlit"]
@@ -107,9 +128,9 @@ class DirectLight:
     def _runs(self, points: Points) -> np.ndarray:
         """(2, n) which run of the pool and of the pattern each point takes.
 
-        The samples of a pixel take neighbouring runs, which together are one larger stratified set, and so are its first
-        two, four, eight of them. Which block of runs that is, and where in it the pixel begins, is drawn by its number.
-        """
+        The samples of a pixel take neighbouring runs, which together are one larger stratified set, and so are its
+        first two, four, eight of them. Which block of runs that is, and where in it the pixel begins, is drawn by its
+        number."""
         k = self.samples
         block = min(1 << max(0, points.together - 1).bit_length(), max(1, POOL // k // 16))
         out = np.empty((2, len(points)), np.int64)
@@ -118,7 +139,9 @@ class DirectLight:
             out[which] = (number // block) % (POOL // k // block) * block + ((points.sample % block) ^ (number % block))
         return out
 
-    def _chunk(self, points: Points, part: slice, runs: np.ndarray | None, sums: np.ndarray) -> tuple[int, int, int, int]:
+    def _chunk(
+        self, points: Points, part: slice, runs: np.ndarray | None, sums: np.ndarray
+    ) -> tuple[int, int, int, int]:
         """Fill sums (SUMS, 3, n); the counts of _hide."""
         import torch
 
@@ -130,8 +153,10 @@ class DirectLight:
             result[7], result[8] = self.prefiltered.specular(surface.normal, surface.view, surface.roughness)
         if not k:
             return 0, 0, 0, 0
-        drawn, numbers = (torch.stack([one.index_select(1, torch.from_numpy(run)) for one in pool]).unbind(1)
-                          for pool, run in zip((self.pool, self.pattern), runs, strict=True))
+        drawn, numbers = (
+            torch.stack([one.index_select(1, torch.from_numpy(run)) for one in pool]).unbind(1)
+            for pool, run in zip((self.pool, self.pattern), runs, strict=True)
+        )
         mirrored = surface.sample(*numbers[:3])
         found = self.pixels.index_select(0, self._pixel(*mirrored).reshape(-1)).view(k, -1, 4)
         direction = [torch.cat(pair) for pair in zip(drawn[:3], mirrored, strict=True)]
@@ -142,10 +167,22 @@ class DirectLight:
         if self.shadows:
             luminance = sum(float(share) * c for share, c in zip(LUMINANCE, light, strict=True))
             brightness = surface.brightness(terms, luminance).mul_(visible)
-            counted = self._hide(points, part, surface, direction, (visible, everything), above, brightness, torch.cat([drawn[7], numbers[3]]))
+            counted = self._hide(
+                points,
+                part,
+                surface,
+                direction,
+                (visible, everything),
+                above,
+                brightness,
+                torch.cat([drawn[7], numbers[3]]),
+            )
         # Only prefiltered light asks what share of the reflection is visible.
         split = self.mode == "prefiltered"
-        for which, weight, kept in ((0, visible, terms), (4 if split else 6, everything, terms[:3] if split else terms[2:3])):
+        for which, weight, kept in (
+            (0, visible, terms),
+            (4 if split else 6, everything, terms[:3] if split else terms[2:3]),
+        ):
             for row, term in enumerate(kept, which):
                 weighted = term * weight
                 for channel, c in enumerate(light):
@@ -161,14 +198,15 @@ class DirectLight:
         column = ((torch.atan2(z, x) * (0.5 / math.pi) + 0.5) * width).long().clamp(0, width - 1)
         return row * width + column
 
-    def _hide(self, points: Points, part: slice, surface: Surface, direction, weights, above, brightness, dice) -> tuple[int, int, int, int]:
-        """Take the first of two weights (m, n) from directions that something hides; how many shadow rays that took, and how
-        many directions needed none: below the horizon, on convex objects, and for bringing too little light.
+    def _hide(
+        self, points: Points, part: slice, surface: Surface, direction, weights, above, brightness, dice
+    ) -> tuple[int, int, int, int]:
+        """Take the first of two weights (m, n) from directions that something hides; how many shadow rays that took,
+        and how many directions needed none: below the horizon, on convex objects, and for bringing too little light.
 
         A direction that brings less than RARE of what its point's directions do on average is followed only with the
-        probability brightness / (RARE of that), and counts for as many more (Russian roulette): the mean stays what it is.
-        Both weights tell so, and where nothing is hidden they stay the same.
-        """
+        probability brightness / (RARE of that), and counts for as many more (Russian roulette): the mean stays what it
+        is. Both weights tell so, and where nothing is hidden they stay the same."""
         import torch
 
         ask = above
@@ -197,7 +235,10 @@ class DirectLight:
         from gdtool.shading.bsdf.closed_form import disney_mean, fresnel_loss
 
         values, sums = points.values, torch.from_numpy(sums)
-        albedo, metallic, f0, f90 = rows_of(values["albedo"]), *(tensor_of(values[name]) for name in ("metallic", "f0", "f90"))
+        albedo, metallic, f0, f90 = (
+            rows_of(values["albedo"]),
+            *(tensor_of(values[name]) for name in ("metallic", "f0", "f90")),
+        )
         f0 = f0 * (1 - metallic) + albedo * metallic
         # How much reflection grows toward grazing: to 1, or to what KHR_materials_specular leaves of a dielectric's.
         growth = f90 * (1 - metallic) + metallic - f0
@@ -206,12 +247,16 @@ class DirectLight:
         starts = np.flatnonzero(np.diff(points.pixel, prepend=-1))
 
         def share(known: list) -> torch.Tensor:
-            return torch.from_numpy(np.repeat(_share(*(x.numpy() for x in known), starts), np.diff(starts, append=len(points))))
+            return torch.from_numpy(
+                np.repeat(_share(*(x.numpy() for x in known), starts), np.diff(starts, append=len(points)))
+            )
 
         if self.mode == "prefiltered":
             seen = [1.0, 1.0] if not self.samples else [share(x) for x in (reflect, diffuse)]
             n_v, roughness = (rows_of(values["normal"]) * rows_of(points.view)).sum(0), tensor_of(values["roughness"])
-            factor = 1 - f0 - growth * fresnel_loss(n_v) if self.brdf == "gltf" else disney_mean(roughness, n_v.clamp(0, 1))
+            factor = (
+                1 - f0 - growth * fresnel_loss(n_v) if self.brdf == "gltf" else disney_mean(roughness, n_v.clamp(0, 1))
+            )
             specular, received = reflect[2] * seen[0], diffuse[2] * seen[1] * factor
         else:
             specular, received = reflect[0], diffuse[0]

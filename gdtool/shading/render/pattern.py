@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-# Seeds of the pixel's pattern: of six hundred pairs tried, the one with which 4 to 64 samples measured straight edges best.
+# Seeds of the pixel's pattern: of six hundred pairs tried, the one with which 4 to 64 samples measured straight edges
+# best.
 PATTERN_SEEDS = (4292928315, 3747378854)
 
 
 def pixel_pattern(count: int, first: int = 4) -> np.ndarray:
-    """(count, 2) points in [0, 1)² of Sobol's first two dimensions, scrambled: each pass is spread evenly, and so are all up
-    to it together. The first pass has first points, each further one as many as all before it.
+    """(count, 2) points in [0, 1)² of Sobol's first two dimensions, scrambled: each pass is spread evenly, and so are
+    all up to it together. The first pass has first points, each further one as many as all before it.
 
     Hash-based nested scrambling (Burley 2020, "Practical hash-based Owen scrambling"). What a pass adds is moved, a
-    little, so that its mean is the centre: a plane's average is then its value there. Without scrambling that would put a
-    pass on top of the one before.
-    """
+    little, so that its mean is the centre: a plane's average is then its value there. Without scrambling that would put
+    a pass on top of the one before."""
     index = np.arange(count, dtype=np.uint32)
     second = np.zeros(count, np.uint32)
     column = np.uint32(1 << 31)

@@ -1,8 +1,8 @@
 """Images of a scene by Embree: exact buffers of its geometry and material, and lit color.
 
 A pixel is a box: its value is the mean over samples spread evenly inside it. Every pixel of the object's projected
-bounds gets BASE samples; their number is doubled as long as coverage, or a mean that is not yet known to TOLERANCE, asks
-for more, up to the number that is allowed.
+bounds gets BASE samples; their number is doubled as long as coverage, or a mean that is not yet known to TOLERANCE,
+asks for more, up to the number that is allowed.
 
 Transparency: MASK as glTF says; BLEND is seen where alpha >= 0.5 and not there below, since a buffer has one surface.
 Faces are seen from both sides, whatever the material's doubleSided says.
@@ -28,13 +28,13 @@ from gdtool.shading.render.pattern import pixel_pattern
 from gdtool.shading.render.surface_points import SurfaceLookup
 
 BASE = 4
-# Samples up to which pixels beside the object's outline, or beside an uneven pixel, get more whatever their own say: what
-# makes the other one uneven may reach in between theirs.
+# Samples up to which pixels beside the object's outline, or beside an uneven pixel, get more whatever their own say:
+# what makes the other one uneven may reach in between theirs.
 EDGE = 8
 # Alpha-tested layers that a ray passes at most.
 MAX_LAYERS = 32
-# Error of a pixel's mean as a picture stores it (sRGB, (n + 1) / 2) above which it gets more samples: of buffers, and of
-# color, whose noise costs more to take away.
+# Error of a pixel's mean as a picture stores it (sRGB, (n + 1) / 2) above which it gets more samples: of buffers, and
+# of color, whose noise costs more to take away.
 TOLERANCE = {"normal": 0.009, "albedo": 0.009, "roughness": 0.009, "metallic": 0.009, "color": 0.018}
 # What values are multiplied by for a picture; None: the sRGB curve.
 STORED = {"normal": 0.5, "albedo": None, "roughness": 1.0, "metallic": 1.0, "color": None}
@@ -59,9 +59,9 @@ class Goal:
 
 @dataclass
 class Points:
-    """Seen points, one a sample: pixel (n,) flat index, which sample of the pixel (n,), position (n, 3), view (n, 3) unit
-    toward the eye, depth (n,), and the attributes of SurfaceLookup. The samples of a pixel follow each other; together is
-    how many a pixel that is seen in full has once these are added."""
+    """Seen points, one a sample: pixel (n,) flat index, which sample of the pixel (n,), position (n, 3), view (n, 3)
+    unit toward the eye, depth (n,), and the attributes of SurfaceLookup. The samples of a pixel follow each other;
+    together is how many a pixel that is seen in full has once these are added."""
 
     pixel: np.ndarray
     sample: np.ndarray
@@ -160,7 +160,9 @@ class Renderer:
             out[active[alpha >= cutoff]] = True
             through = alpha < cutoff
             active = active[through]
-            origin = origin[through] + directions[active] * (hits.distance[found][through] + 1e-5 * self.extent)[:, None]
+            origin = (
+                origin[through] + directions[active] * (hits.distance[found][through] + 1e-5 * self.extent)[:, None]
+            )
         return out
 
     def may_be_hidden(self, position: np.ndarray, geometric_normal: np.ndarray) -> np.ndarray | None:
@@ -180,15 +182,25 @@ class Renderer:
         return (max(low[1], 0), min(high[1], camera.height), max(low[0], 0), min(high[0], camera.width))
 
     def see(self, camera: Camera, pixel: np.ndarray, pattern: np.ndarray, first: int, emission: bool = True) -> Points:
-        """Points that pixels (m,) see at the places pattern[first:], of which a pixel has as many as pattern (k, 2) has rows."""
+        """Points that pixels (m,) see at the places pattern[first:], of which a pixel has as many as pattern (k, 2) has
+        rows."""
         sample = np.arange(first, len(pattern))
-        x, y = ((start[:, None] + offset).ravel() for start, offset in zip((pixel % camera.width, pixel // camera.width), pattern[first:].T, strict=True))
+        x, y = (
+            (start[:, None] + offset).ravel()
+            for start, offset in zip((pixel % camera.width, pixel // camera.width), pattern[first:].T, strict=True)
+        )
         pixel, sample = np.repeat(pixel, len(sample)), np.tile(sample, len(pixel))
         origins, directions = rays(camera, np.stack([x, y]).T)
         along = -dot(directions.T, camera.backward)
         if camera.projection == "orthographic":
             # Start in front of the object, not at a plane that may cut it.
-            back = max(0.0, float((_corners(self.bounds) @ camera.backward).max()) - float(camera.position @ camera.backward)) + 1e-3 * self.extent
+            back = (
+                max(
+                    0.0,
+                    float((_corners(self.bounds) @ camera.backward).max()) - float(camera.position @ camera.backward),
+                )
+                + 1e-3 * self.extent
+            )
             origins += camera.backward * back
         else:
             back = 0.0
@@ -208,7 +220,8 @@ class Renderer:
         return Points(pixel, sample, position, -directions, depth, values, len(pattern))
 
     def each(self, work: Callable[[Camera], dict], cameras: Iterable[Camera]) -> Iterator[dict]:
-        """work(camera) of each, in order, two at once: while the sums of one are looked through, the other one's rays are traced."""
+        """work(camera) of each, in order, two at once: while the sums of one are looked through, the other one's rays
+        are traced."""
         with ThreadPoolExecutor(min(2, self.caster.threads)) as pool:
             yield from pool.map(work, cameras)
 
@@ -218,11 +231,16 @@ class Renderer:
         begun = time.perf_counter()
         height, width = camera.height, camera.width
         top, bottom, left, right = self.window(camera)
-        self.counts.spend("bounds", begun, pixels=height * width, pixels_in_bounds=max(bottom - top, 0) * max(right - left, 0))
+        self.counts.spend(
+            "bounds", begun, pixels=height * width, pixels_in_bounds=max(bottom - top, 0) * max(right - left, 0)
+        )
         total, pattern = _Sums(height * width), pixel_pattern(samples, BASE)
         pixel = (np.arange(top, bottom)[:, None] * width + np.arange(left, right)[None]).ravel()
         done, taken = 0, 0
-        tolerance = {name: limit if goal.psnr is None else min(limit, 0.5 * 10 ** (-goal.psnr / 20)) for name, limit in TOLERANCE.items()}
+        tolerance = {
+            name: limit if goal.psnr is None else min(limit, 0.5 * 10 ** (-goal.psnr / 20))
+            for name, limit in TOLERANCE.items()
+        }
         while len(pixel) and done < samples:
             count = min(max(2 * done, BASE), samples)
             more = count - done
@@ -239,7 +257,7 @@ class Renderer:
 
             waiting: deque = deque()
             for start in range(0, len(pixel), step):
-                waiting.append(self.pool.submit(look, pixel[start:start + step]))
+                waiting.append(self.pool.submit(look, pixel[start : start + step]))
                 if len(waiting) > 4 * self.caster.threads:
                     total.add(*waiting.popleft().result())
             for found in waiting:
@@ -293,7 +311,8 @@ class _Sums:
                 self.squares[name][owner] += np.add.reduceat(value * value, starts, axis=1).T
 
     def error(self, name: str, pixel: np.ndarray) -> np.ndarray:
-        """Squared error (n,) to expect of the means of pixels (n,), as a picture stores them, mean over the channels."""
+        """Squared error (n,) to expect of the means of pixels (n,), as a picture stores them, mean over the
+        channels."""
         count = np.maximum(self.seen[pixel], 1)[:, None]
         mean = self.sums[name][pixel] / count
         variance = np.maximum(self.squares[name][pixel] / count - mean * mean, 0)
@@ -319,10 +338,12 @@ class _Sums:
         self.before, self.asked_before = mean, self.asked.copy()
         return out
 
-    def uneven(self, pixel: np.ndarray, width: int, height: int, tolerance: dict[str, float], done: int) -> tuple[np.ndarray, np.ndarray]:
-        """Of the pixels given, those partly covered, those whose means are not known to their tolerance, and as long as few
-        samples (done) may have missed something those at the outline and beside any of the others; and how badly each is
-        known, squared, in units of the tolerance."""
+    def uneven(
+        self, pixel: np.ndarray, width: int, height: int, tolerance: dict[str, float], done: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Of the pixels given, those partly covered, those whose means are not known to their tolerance, and as long as
+        few samples (done) may have missed something those at the outline and beside any of the others; and how badly
+        each is known, squared, in units of the tolerance."""
         seen = self.seen[pixel]
         partly = (seen > 0) & (seen < self.asked[pixel])
         if done <= EDGE:

@@ -8,17 +8,23 @@ from gdtool.cameras import Camera, camera_at
 from gdtool.cameras.camera import DISTANCE, HALF_WIDTH
 
 
-def camera(azimuth: float, elevation: float, name: str, size: int, fov: float = 0.0, half_width: float = HALF_WIDTH) -> Camera:
+def camera(
+    azimuth: float, elevation: float, name: str, size: int, fov: float = 0.0, half_width: float = HALF_WIDTH
+) -> Camera:
     """A camera that has the normalised object in full; fov (degrees across) 0 is orthographic.
 
     A perspective camera stands where it sees a sphere of radius half_width in full.
     """
     if not fov:
         return camera_at(azimuth, elevation, name=name, size=size, half_width=half_width)
-    return camera_at(azimuth, elevation, name=name, size=size, fov_degrees=fov, distance=half_width / np.sin(np.radians(fov) / 2))
+    return camera_at(
+        azimuth, elevation, name=name, size=size, fov_degrees=fov, distance=half_width / np.sin(np.radians(fov) / 2)
+    )
 
 
-def turntable(views: int, size: int, elevation: float = 0.0, fov: float = 0.0, stops: tuple[tuple[str, float], ...] = ()) -> list[Camera]:
+def turntable(
+    views: int, size: int, elevation: float = 0.0, fov: float = 0.0, stops: tuple[tuple[str, float], ...] = ()
+) -> list[Camera]:
     """Cameras evenly around the object, the first in front, going toward +X; or at named stops (name, azimuth)."""
     stops = stops or tuple((f"{k:03d}", 360.0 * k / views) for k in range(views))
     return [camera(azimuth, elevation, name, size, fov) for name, azimuth in stops]

@@ -13,8 +13,12 @@ if TYPE_CHECKING:
     from gdtool.shading.render.direct import DirectLight
     from gdtool.shading.render.render import Renderer
 
-TEXTURES = {"base color": "base_color_texture", "metallic-roughness": "metallic_roughness_texture", "normal": "normal_texture",
-            "emissive": "emissive_texture"}
+TEXTURES = {
+    "base color": "base_color_texture",
+    "metallic-roughness": "metallic_roughness_texture",
+    "normal": "normal_texture",
+    "emissive": "emissive_texture",
+}
 
 
 def savings(renderer: Renderer, samples: int, light: DirectLight | None) -> list[tuple[str, str, float]]:
@@ -26,8 +30,14 @@ def savings(renderer: Renderer, samples: int, light: DirectLight | None) -> list
     if absent:
         each = _lookup_seconds() * taken
         out += [(f"{what} lookups", "no material has such a texture", each) for what in absent]
-    flat = [what for what, name in TEXTURES.items() if what not in absent
-            and all(t is None or renderer.lookup.constant(t) is not None for t in (getattr(m, name) for m in scene.materials))]
+    flat = [
+        what
+        for what, name in TEXTURES.items()
+        if what not in absent
+        and all(
+            t is None or renderer.lookup.constant(t) is not None for t in (getattr(m, name) for m in scene.materials)
+        )
+    ]
     out += [(f"{what} lookups", "the texture is one value everywhere", _lookup_seconds() * taken) for what in flat]
     if renderer.tested is None:
         out.append(("alpha tests", "every material is opaque", _lookup_seconds() * taken))
@@ -40,13 +50,21 @@ def savings(renderer: Renderer, samples: int, light: DirectLight | None) -> list
         even = 1 - counts.pixels_refined / max(counts.pixels_in_bounds, 1)
         reason = f"{even:.0%} of the pixels in bounds are even and got {BASE} of {samples}; {counts.samples / max(counts.pixels_in_bounds, 1):.1f} on average"
         out.append(("samples", reason, fewer * counts.seconds.get("samples", 0.0) / taken))
-    directions = counts.shadow_rays + counts.shadow_rays_below_horizon + counts.shadow_rays_convex + counts.shadow_rays_rare
+    directions = (
+        counts.shadow_rays + counts.shadow_rays_below_horizon + counts.shadow_rays_convex + counts.shadow_rays_rare
+    )
     each = counts.seconds.get("directions", 0.0) / max(directions, 1)
     if counts.shadow_rays_below_horizon:
         reason = f"{counts.shadow_rays_below_horizon / directions:.0%} of the directions are below the horizon"
         out.append(("shadow rays", reason, counts.shadow_rays_below_horizon * each))
     if counts.shadow_rays_convex:
-        out.append(("shadow rays of convex objects", "nothing lies in front of a convex object's outside", counts.shadow_rays_convex * each))
+        out.append(
+            (
+                "shadow rays of convex objects",
+                "nothing lies in front of a convex object's outside",
+                counts.shadow_rays_convex * each,
+            )
+        )
     if counts.shadow_rays_rare:
         reason = f"{counts.shadow_rays_rare / directions:.0%} of the directions bring little light and were left out by chance, the others counting for more"
         out.append(("shadow rays toward little light", reason, counts.shadow_rays_rare * each))

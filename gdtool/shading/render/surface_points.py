@@ -37,7 +37,8 @@ def _columns(values: np.ndarray, dtype=np.float32) -> np.ndarray:
 
 @dataclass
 class _At:
-    """Points of the surface: face_idx (n,), corners (3, n), weights (3, n) float64 and float32, footprint (n,) or None."""
+    """Points of the surface: face_idx (n,), corners (3, n), weights (3, n) float64 and float32, footprint (n,) or
+    None."""
 
     face_idx: np.ndarray
     corners: np.ndarray
@@ -49,8 +50,13 @@ class _At:
         return len(self.face_idx)
 
     def part(self, chosen: np.ndarray) -> _At:
-        return _At(self.face_idx[chosen], self.corners[:, chosen], self.exact[:, chosen], self.weights[:, chosen],
-                   None if self.footprint is None else self.footprint[chosen])
+        return _At(
+            self.face_idx[chosen],
+            self.corners[:, chosen],
+            self.exact[:, chosen],
+            self.weights[:, chosen],
+            None if self.footprint is None else self.footprint[chosen],
+        )
 
 
 class SurfaceLookup:
@@ -115,8 +121,8 @@ class SurfaceLookup:
         return _At(face_idx, np.take(self._faces, face_idx, axis=1), exact, exact.astype(np.float32), footprint)
 
     def _read(self, textures: dict[str, Texture | None], at: _At) -> dict[str, np.ndarray]:
-        """By name (c, n) linear texels of the textures that there are and whose UV set there is; those of one layout are
-        looked up at once."""
+        """By name (c, n) linear texels of the textures that there are and whose UV set there is; those of one layout
+        are looked up at once."""
         together: dict[tuple, list[str]] = {}
         out: dict[str, np.ndarray] = {}
         for name, texture in textures.items():
@@ -177,7 +183,9 @@ class SurfaceLookup:
         found = corner_tangents(scene.vertices, scene.faces, normals, self._uv(texture), scene.faces, normal_idx)
         self._tangents[texture.uv_set] = _columns(found.reshape(-1, 4))
 
-    def _normal_mapped(self, texture: Texture, scale: float, texel: np.ndarray, normal: np.ndarray, tangent: np.ndarray) -> np.ndarray:
+    def _normal_mapped(
+        self, texture: Texture, scale: float, texel: np.ndarray, normal: np.ndarray, tangent: np.ndarray
+    ) -> np.ndarray:
         """(3, n) unit normals from a map's texels (c, n), normals (3, n) and tangents (4, n)."""
         along, across, up = (np.float32(2) * texel[i] - np.float32(1) for i in range(3))
         if scale != 1.0:
@@ -185,7 +193,10 @@ class SurfaceLookup:
         c, s = np.cos(texture.rotation), np.sin(texture.rotation)
         if s != 0.0 or texture.scale[0] < 0 or texture.scale[1] < 0:
             # The map's axes are turned against the UV's: bring the perturbation back to the UV's axes.
-            along, across = along * np.float32(np.sign(texture.scale[0])), across * np.float32(np.sign(texture.scale[1]))
+            along, across = (
+                along * np.float32(np.sign(texture.scale[0])),
+                across * np.float32(np.sign(texture.scale[1])),
+            )
             c, s = np.float32(c), np.float32(s)
             along, across = c * along + s * across, -s * along + c * across
         across *= tangent[3]
@@ -201,7 +212,8 @@ class SurfaceLookup:
         return out
 
     def alpha(self, face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Alpha (n,) and the alpha below which a point is not there (n,): 0 for OPAQUE, the cutoff for MASK, 0.5 for BLEND."""
+        """Alpha (n,) and the alpha below which a point is not there (n,): 0 for OPAQUE, the cutoff for MASK, 0.5 for
+        BLEND."""
         scene, at = self.scene, self._at(face_idx, barycentric)
         alpha, cutoff = np.ones(len(at), np.float32), np.zeros(len(at), np.float32)
         owner = scene.material_idx[at.face_idx]
@@ -221,11 +233,17 @@ class SurfaceLookup:
             cutoff[chosen] = material.alpha_cutoff if material.alpha_mode == "MASK" else 0.5
         return alpha, cutoff
 
-    def attributes(self, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None,
-                   directions: np.ndarray | None = None, emission: bool = True) -> dict[str, np.ndarray]:
+    def attributes(
+        self,
+        face_idx: np.ndarray,
+        barycentric: np.ndarray,
+        footprint: np.ndarray | None = None,
+        directions: np.ndarray | None = None,
+        emission: bool = True,
+    ) -> dict[str, np.ndarray]:
         """Attributes at n points: albedo, emissive (n, 3) linear, roughness, metallic, alpha (n,), normal and
-        geometric_normal (n, 3) unit, f0 and f90 (n,) of the dielectric part at normal and at grazing incidence (KHR_materials_ior, _specular),
-        unlit (n,) bool; float32.
+        geometric_normal (n, 3) unit, f0 and f90 (n,) of the dielectric part at normal and at grazing incidence
+        (KHR_materials_ior, _specular), unlit (n,) bool; float32.
 
         footprint (n,): width in world units that a point stands for; picks the texture level. directions (n, 3): rays
         that see the points; normals are then turned to the seen side, as glTF asks for double-sided materials (and as
@@ -248,8 +266,15 @@ class SurfaceLookup:
             at = slice(None) if alone else np.flatnonzero(owner == m)
             here = points if alone else points.part(at)
             glows = emission and any(material.emissive)
-            texels = self._read({"color": material.base_color_texture, "surface": material.metallic_roughness_texture, "normal": material.normal_texture,
-                                 "emissive": material.emissive_texture if glows else None}, here)
+            texels = self._read(
+                {
+                    "color": material.base_color_texture,
+                    "surface": material.metallic_roughness_texture,
+                    "normal": material.normal_texture,
+                    "emissive": material.emissive_texture if glows else None,
+                },
+                here,
+            )
             color = np.repeat(np.asarray(material.base_color, np.float32)[:, None], len(here), 1)
             texel = texels.get("color")
             if texel is not None:
@@ -267,14 +292,21 @@ class SurfaceLookup:
             metallic[at] = np.float32(material.metallic) * (texel[2] if known else np.float32(1))
             if glows:
                 texel = texels.get("emissive")
-                emissive[:, at] = np.asarray(material.emissive, np.float32)[:, None] * (texel[:3] if texel is not None else np.float32(1))
+                emissive[:, at] = np.asarray(material.emissive, np.float32)[:, None] * (
+                    texel[:3] if texel is not None else np.float32(1)
+                )
             unlit[at] = material.unlit
             f0[at] = min(((material.ior - 1) / (material.ior + 1)) ** 2 * material.specular, 1.0)
             f90[at] = min(material.specular, 1.0)
             texel = texels.get("normal")
             if texel is not None and len(texel) >= 3:
-                mapped = self._normal_mapped(material.normal_texture, material.normal_scale, texel, vertex_normal[:, at],
-                                             self._tangent(material.normal_texture, here))
+                mapped = self._normal_mapped(
+                    material.normal_texture,
+                    material.normal_scale,
+                    texel,
+                    vertex_normal[:, at],
+                    self._tangent(material.normal_texture, here),
+                )
                 if normal is vertex_normal:
                     normal = mapped if alone else vertex_normal.copy()
                 if not alone:
@@ -286,10 +318,22 @@ class SurfaceLookup:
             normal = normal * np.where(dot(vertex_normal, geometric) < 0, np.float32(-1), np.float32(1))
         for values in (albedo, roughness, metallic, alpha):
             np.clip(values, 0, 1, out=values)
-        return {"albedo": albedo.T, "roughness": roughness, "metallic": metallic, "alpha": alpha, "emissive": np.maximum(emissive, 0).T, "unlit": unlit,
-                "f0": f0, "f90": f90, "normal": normal.T, "geometric_normal": geometric.T}
+        return {
+            "albedo": albedo.T,
+            "roughness": roughness,
+            "metallic": metallic,
+            "alpha": alpha,
+            "emissive": np.maximum(emissive, 0).T,
+            "unlit": unlit,
+            "f0": f0,
+            "f90": f90,
+            "normal": normal.T,
+            "geometric_normal": geometric.T,
+        }
 
 
-def surface_attributes(scene: Scene, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None) -> dict[str, np.ndarray]:
+def surface_attributes(
+    scene: Scene, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
     """SurfaceLookup(scene).attributes for one call: see there."""
     return SurfaceLookup(scene).attributes(np.asarray(face_idx), np.asarray(barycentric, np.float64), footprint)

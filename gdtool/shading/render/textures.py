@@ -42,16 +42,24 @@ def wrap_index(index: np.ndarray, size: int, wrap: str) -> np.ndarray:
 
 def same_layout(texture: Texture) -> tuple:
     """What textures must share to be read at once: equal keys mean equal texels and weights at every uv."""
-    return (texture.uv_set, texture.offset, texture.rotation, texture.scale, texture.wrap_u, texture.wrap_v, texture.filter,
-            texture.image.shape[:2], texture.image.dtype.str)
+    return (
+        texture.uv_set,
+        texture.offset,
+        texture.rotation,
+        texture.scale,
+        texture.wrap_u,
+        texture.wrap_v,
+        texture.filter,
+        texture.image.shape[:2],
+        texture.image.dtype.str,
+    )
 
 
 class TextureReader:
     """Texels of textures of one layout, side by side as linear float32: channels of the first, then of the next.
 
-    The finest level stays as stored, image by image; coarser ones are box averages of about 2x2, made when asked. Threads
-    may read at once.
-    """
+    The finest level stays as stored, image by image; coarser ones are box averages of about 2x2, made when asked.
+    Threads may read at once."""
 
     def __init__(self, *textures: Texture):
         self.texture = textures[0]
@@ -63,7 +71,9 @@ class TextureReader:
         self.levels: list[np.ndarray] = []
         top = {"u1": 255, "u2": 65535}.get(self.images[0].dtype.str[1:])
         self._unit = np.float32(1.0 if top is None else 1.0 / top)
-        self._table = None if top is None else linear_from_srgb(np.arange(top + 1, dtype=self.images[0].dtype)).astype(np.float32)
+        self._table = (
+            None if top is None else linear_from_srgb(np.arange(top + 1, dtype=self.images[0].dtype)).astype(np.float32)
+        )
         self._lock = threading.Lock()
         # How many lookups the finest level had, and all of it decoded once they were many.
         self._asked, self._decoded = 0, None
@@ -86,7 +96,8 @@ class TextureReader:
         return out
 
     def _decode(self, texels: np.ndarray, colored: bool, out: np.ndarray) -> None:
-        """Texels (..., c) as one image stores them into out, linear float32; channel by channel, as short rows are slow."""
+        """Texels (..., c) as one image stores them into out, linear float32; channel by channel, as short rows are
+        slow."""
         for i, srgb in enumerate(_colored(texels.shape[-1], colored)):
             if srgb:
                 out[..., i] = self._linear(texels[..., i])
@@ -95,7 +106,11 @@ class TextureReader:
 
     def _linear(self, values: np.ndarray) -> np.ndarray:
         """float32 of stored sRGB values."""
-        return linear_from_srgb(values).astype(np.float32, copy=False) if self._table is None else np.take(self._table, values)
+        return (
+            linear_from_srgb(values).astype(np.float32, copy=False)
+            if self._table is None
+            else np.take(self._table, values)
+        )
 
     def level(self, k: int) -> np.ndarray:
         """(h // 2^k, w // 2^k, c) linear float32, at least 1 by 1."""
@@ -116,7 +131,8 @@ class TextureReader:
             return self.levels[k - 1]
 
     def _levelled(self, k: int, count: int) -> np.ndarray | None:
-        """Level k where it is worth having as linear numbers for count lookups more; None: texels are decoded as they are read."""
+        """Level k where it is worth having as linear numbers for count lookups more; None: texels are decoded as they
+        are read."""
         if k:
             return self.level(k)
         with self._lock:
@@ -137,15 +153,15 @@ class TextureReader:
 
         def make(row: int) -> None:
             for i, (image, part) in enumerate(zip(finer, parts, strict=True)):
-                halved(image, coarse[row:row + BAND // 2, :, part], row, None if colored is None else colored[i])
+                halved(image, coarse[row : row + BAND // 2, :, part], row, None if colored is None else colored[i])
 
         _each_band(make, len(coarse), BAND // 2)
         self.levels.append(coarse)
 
     def _halved_even(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
-        """Means of 2x2 texels into out, rows of the coarser level from row on. colored: whether finer is stored in sRGB; None:
-        it is linear."""
-        band = finer[2 * row:2 * (row + len(out))]
+        """Means of 2x2 texels into out, rows of the coarser level from row on. colored: whether finer is stored in
+        sRGB; None: it is linear."""
+        band = finer[2 * row : 2 * (row + len(out))]
         wide = {"u1": np.uint16, "u2": np.uint32}.get(band.dtype.str[1:], np.float32)
         for i, srgb in enumerate([False] * band.shape[2] if colored is None else _colored(band.shape[2], colored)):
             values = band[..., i]
@@ -158,14 +174,14 @@ class TextureReader:
 
     def _halved_odd(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
         """The same where a side is odd: a coarser texel is wider than two, and takes its share of a third."""
-        rows, columns = _shares(finer.shape[0])[:, row:row + len(out)], _shares(finer.shape[1])
-        band = finer[2 * row:2 * (row + len(out)) + 1]
+        rows, columns = _shares(finer.shape[0])[:, row : row + len(out)], _shares(finer.shape[1])
+        band = finer[2 * row : 2 * (row + len(out)) + 1]
         if colored is not None:
             linear = np.empty(band.shape, np.float32)
             self._decode(band, colored, linear)
             band = linear
-        across = sum(share[:, None] * band[:, tap::2][:, :len(share)] for tap, share in enumerate(columns))
-        out[...] = sum(share[:, None, None] * across[tap::2][:len(share)] for tap, share in enumerate(rows))
+        across = sum(share[:, None] * band[:, tap::2][:, : len(share)] for tap, share in enumerate(columns))
+        out[...] = sum(share[:, None, None] * across[tap::2][: len(share)] for tap, share in enumerate(rows))
 
     def read(self, uv: np.ndarray, texels_per_sample: np.ndarray | None = None) -> np.ndarray:
         """(n, c) linear float32 at uv (n, 2), texture transform included.

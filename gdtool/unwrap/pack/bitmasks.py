@@ -28,8 +28,9 @@ def upright_box(uv: np.ndarray) -> np.ndarray:
 
 
 def _mask(rim: np.ndarray, span: np.ndarray, cells_per_unit: float, gap: float, share: float) -> np.ndarray:
-    """(h, w) bool: cells of which more than a share lies within `gap` cells of the chart in [0, span] with the outline rim (s, 2, 2),
-    whose corner lies at cell (gap, gap). Supersampled; with a share of 0 no cell that the chart comes so near is missed."""
+    """(h, w) bool: cells of which more than a share lies within `gap` cells of the chart in [0, span] with the outline
+    rim (s, 2, 2), whose corner lies at cell (gap, gap). Supersampled; with a share of 0 no cell that the chart comes so
+    near is missed."""
     shape = np.ceil(span * cells_per_unit + 2 * gap).astype(int)
     width, height = shape * _FINE
     outline = (rim * cells_per_unit + gap) * _FINE
@@ -41,19 +42,20 @@ def _mask(rim: np.ndarray, span: np.ndarray, cells_per_unit: float, gap: float, 
     radius = gap * _FINE + (0.0 if share else 0.75)
     reach = int(radius)
     before = np.zeros((height, width + 2 * reach + 1), np.int32)
-    np.cumsum(covered, 1, out=before[:, reach + 1:reach + 1 + width])
-    before[:, reach + 1 + width:] = before[:, reach + width:reach + width + 1]
+    np.cumsum(covered, 1, out=before[:, reach + 1 : reach + 1 + width])
+    before[:, reach + 1 + width :] = before[:, reach + width : reach + width + 1]
     out = np.zeros((height, width), bool)
     for dy in range(-reach, reach + 1):
         dx = int((radius**2 - dy**2) ** 0.5)
-        row = before[:, reach + 1 + dx:reach + 1 + dx + width] > before[:, reach - dx:reach - dx + width]
-        out[max(dy, 0):height + min(dy, 0)] |= row[max(-dy, 0):height - max(dy, 0)]
+        row = before[:, reach + 1 + dx : reach + 1 + dx + width] > before[:, reach - dx : reach - dx + width]
+        out[max(dy, 0) : height + min(dy, 0)] |= row[max(-dy, 0) : height - max(dy, 0)]
     cells = out.reshape(shape[1], _FINE, shape[0], _FINE)
     return cells.sum((1, 3)) > share * _FINE**2 if share else cells.any((1, 3))
 
 
 def _filled(outline: np.ndarray, height: int, width: int) -> np.ndarray:
-    """(height, width) bool: cells whose centre lies within closed outlines (s, 2, 2), in cells, by the even-odd rule."""
+    """(height, width) bool: cells whose centre lies within closed outlines (s, 2, 2), in cells, by the even-odd
+    rule."""
     (xa, ya), (xb, yb) = outline[:, 0].T, outline[:, 1].T
     low = np.ceil(np.minimum(ya, yb) - 0.5).astype(int)
     count = np.ceil(np.maximum(ya, yb) - 0.5).astype(int) - low
@@ -61,7 +63,11 @@ def _filled(outline: np.ndarray, height: int, width: int) -> np.ndarray:
     row = low[each] + np.arange(len(each)) - np.repeat(np.cumsum(count) - count, count)
     x = xa[each] + (row + 0.5 - ya[each]) / (yb - ya)[each] * (xb - xa)[each]
     column = np.clip(np.ceil(x - 0.5).astype(int), 0, width)
-    crossed = np.bincount(row * (width + 1) + column, minlength=height * (width + 1)).astype(np.uint8).reshape(height, width + 1)
+    crossed = (
+        np.bincount(row * (width + 1) + column, minlength=height * (width + 1))
+        .astype(np.uint8)
+        .reshape(height, width + 1)
+    )
     return (np.cumsum(crossed[:, :-1], 1, dtype=np.uint8) & 1).view(bool)
 
 
@@ -76,21 +82,27 @@ def _walked(outline: np.ndarray) -> np.ndarray:
 def rim_of(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """(s, 2, 2) the segments of a chart's outline: uv of the edges that one triangle has."""
     following = triangles[:, [1, 2, 0]]
-    key = np.sort((np.minimum(triangles, following).astype(np.int64) * len(uv) + np.maximum(triangles, following)).ravel())
+    key = np.sort(
+        (np.minimum(triangles, following).astype(np.int64) * len(uv) + np.maximum(triangles, following)).ravel()
+    )
     once = np.ones(len(key) + 1, bool)
     once[1:-1] = key[1:] != key[:-1]
     return uv[np.stack(np.divmod(key[once[1:] & once[:-1]], len(uv)), -1)]
 
 
-def turned(rim: np.ndarray, uv: np.ndarray, cells_per_unit: float, gap: float, share: float = 0.0) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def turned(
+    rim: np.ndarray, uv: np.ndarray, cells_per_unit: float, gap: float, share: float = 0.0
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """A chart's mask with half the gap around it at each quarter turn, and its uv (v, 2) in cells of that mask."""
     mask = _mask(rim, uv.max(0), cells_per_unit, gap / 2, share)
     h, w = mask.shape
     at = uv * cells_per_unit + gap / 2
     # As np.rot90 turns the mask: its rows are v, its columns u.
     u, v = at.T
-    return ([np.rot90(mask, quarter) for quarter in range(4)],
-            [at, np.stack([v, w - u], -1), np.stack([w - u, h - v], -1), np.stack([h - v, u], -1)])
+    return (
+        [np.rot90(mask, quarter) for quarter in range(4)],
+        [at, np.stack([v, w - u], -1), np.stack([w - u, h - v], -1), np.stack([h - v, u], -1)],
+    )
 
 
 class Shapes:
@@ -102,7 +114,15 @@ class Shapes:
     """
 
     def __init__(self, boxed: list, cells_per_unit: float, gap: float, side: int, share: float = 0.0):
-        self.stride, self.uv, self.shapes, self.runs, self.bits, self._rim, self._turns = side + 1, [], [], [], [], [], []
+        self.stride, self.uv, self.shapes, self.runs, self.bits, self._rim, self._turns = (
+            side + 1,
+            [],
+            [],
+            [],
+            [],
+            [],
+            [],
+        )
         self._windows: dict[int, tuple[dict, dict]] = {}
         self._meetings: dict[int, int] = {}
         for uv, rim in boxed:
@@ -115,22 +135,34 @@ class Shapes:
             self.runs.append([pairs[turn % 2][turn // 2] for turn in range(4)])
             self.bits.append([bits_of(mask, self.stride) if small else 0 for mask in masks])
             seen = list(zip(self.bits[-1], self.shapes[-1], strict=True))
-            self._turns.append([turn for turn in range(4) if seen[turn] not in seen[:turn]])  # turned onto itself a chart finds what it found
+            # Turned onto itself a chart finds what it found.
+            self._turns.append([turn for turn in range(4) if seen[turn] not in seen[:turn]])
             own = self.bits[-1][0]
             within = own & own << 1 & own >> 1 & own << self.stride & own >> self.stride
             self._rim.append(own.bit_count() - within.bit_count())  # cells that can touch others
 
     def border(self, side: int) -> int:
         """The cells along the border of a square of `side` cells."""
-        return (1 << side) - 1 | ((1 << side) - 1) << (side - 1) * self.stride | _every(1 | 1 << side - 1, side, self.stride)
+        return (
+            (1 << side) - 1
+            | ((1 << side) - 1) << (side - 1) * self.stride
+            | _every(1 | 1 << side - 1, side, self.stride)
+        )
 
-    def placed(self, i: int, taken: int, border: int, side: int, contact: float,
-               others: list[tuple[int, tuple[int, int, int]]] | None = None) -> tuple[int, int, int] | None:
+    def placed(
+        self,
+        i: int,
+        taken: int,
+        border: int,
+        side: int,
+        contact: float,
+        others: list[tuple[int, tuple[int, int, int]]] | None = None,
+    ) -> tuple[int, int, int] | None:
         """(turn, x, y) of chart i in a square of `side` cells beside the cells taken, or None where there is no room.
 
-        It goes where it stays low; contact weighs touching others and the walls, border(side), against that. others: the charts that take
-        these cells, and where: quicker where the same few charts are placed over and over, as what they leave free of each other is kept.
-        """
+        It goes where it stays low; contact weighs touching others and the walls, border(side), against that. others:
+        the charts that take these cells, and where: quicker where the same few charts are placed over and over, as what
+        they leave free of each other is kept."""
         stride = self.stride
         walls = taken << 1 | taken >> 1 | taken << stride | taken >> stride | border
         windows = {}, {}
@@ -168,7 +200,8 @@ class Shapes:
         """The places where chart i at this turn meets one of the others, each at (turn, x, y)."""
         h, w = self.shapes[i][turn]
         hit, last, stride, meetings = 0, (h - 1) * self.stride + w - 1, self.stride, self._meetings
-        # Where it meets a cell are its own cells mirrored there: as it is half a turn on, its last cell where its first was.
+        # Where it meets a cell are its own cells mirrored there: as it is half a turn on, its last cell where its first
+        # was.
         own = 4 * i + (turn ^ 2)
         first = 4 * len(self.bits) * own
         for j, (other_turn, x, y) in others:
@@ -181,8 +214,9 @@ class Shapes:
         return hit
 
     def _sum(self, one: int, two: int) -> int:
-        """The Minkowski sum of two charts' cells, each given as 4 i + turn. Rows longer than the stride go on in the next: what comes
-        there does so from left of the square, and no chart whose first cell is there would end within it."""
+        """The Minkowski sum of two charts' cells, each given as 4 i + turn. Rows longer than the stride go on in the
+        next: what comes there does so from left of the square, and no chart whose first cell is there would end within
+        it."""
         if len(self.runs[one // 4][one % 4]) > len(self.runs[two // 4][two % 4]):
             one, two = two, one
         windows, cells, out = self._windows.setdefault(two, ({}, {})), self.bits[two // 4][two % 4], 0
@@ -206,11 +240,19 @@ class Shapes:
         return max(x + w, y + h)
 
 
-def _free(runs: list[tuple[int, int, int, int]], size: tuple[int, int], taken: int, windows: tuple[dict, dict], side: int, stride: int) -> int:
-    """The places in a square of `side` cells where a chart of size (h, w) that has these runs is clear of what is taken.
+def _free(
+    runs: list[tuple[int, int, int, int]],
+    size: tuple[int, int],
+    taken: int,
+    windows: tuple[dict, dict],
+    side: int,
+    stride: int,
+) -> int:
+    """The places in a square of `side` cells where a chart of size (h, w) that has these runs is clear of what is
+    taken.
 
-    windows: by level k the cells from which on 2**k cells of the row, and of the column, have any taken; those that are missing are added.
-    """
+    windows: by level k the cells from which on 2**k cells of the row, and of the column, have any taken; those that are
+    missing are added."""
     free, hit = _every((1 << side - size[1] + 1) - 1, side - size[0] + 1, stride), 0
     for number, (axis, level, one, two) in enumerate(runs, 1):
         window = windows[axis].get(level)
@@ -248,18 +290,23 @@ def _every(row: int, count: int, stride: int) -> int:
 def bits_of(mask: np.ndarray, stride: int) -> int:
     """A mask (h, w) bool as one integer, rows `stride` bits apart."""
     rows = np.zeros((mask.shape[0], stride), bool)
-    rows[:, :mask.shape[1]] = mask
+    rows[:, : mask.shape[1]] = mask
     return int.from_bytes(np.packbits(rows, bitorder="little").tobytes(), "little")
 
 
 def _places(bits: int) -> np.ndarray:
     """The numbers of the bits that are set."""
-    return np.flatnonzero(np.unpackbits(np.frombuffer(bits.to_bytes(bits.bit_length() // 8 + 1, "little"), np.uint8), bitorder="little").view(bool))
+    return np.flatnonzero(
+        np.unpackbits(
+            np.frombuffer(bits.to_bytes(bits.bit_length() // 8 + 1, "little"), np.uint8), bitorder="little"
+        ).view(bool)
+    )
 
 
 def _runs(mask: np.ndarray, stride: int) -> tuple[list, list]:
-    """Runs of cells in the rows of mask (h, w), or the columns where these are fewer, the longest first, as it is and half a turn on:
-    (axis, level, one, two) of each, 2**level cells from one and from two cover it, axis 1 is down a column."""
+    """Runs of cells in the rows of mask (h, w), or the columns where these are fewer, the longest first, as it is and
+    half a turn on: (axis, level, one, two) of each, 2**level cells from one and from two cover it, axis 1 is down a
+    column."""
     axis = int(mask.shape[0] > mask.shape[1])
     lines = mask.T if axis else mask
     along, across = (stride, 1) if axis else (1, stride)
@@ -273,4 +320,7 @@ def _runs(mask: np.ndarray, stride: int) -> tuple[list, list]:
     level = np.frexp(length)[1] - 1
     rest, last = (length - (1 << level)) * along, (mask.shape[0] - 1) * stride + mask.shape[1] - 1
     levels, axes = level.tolist(), [axis] * len(level)
-    return tuple(list(zip(axes, levels, first.tolist(), (first + rest).tolist(), strict=True)) for first in (one, last - one - (length - 1) * along))
+    return tuple(
+        list(zip(axes, levels, first.tolist(), (first + rest).tolist(), strict=True))
+        for first in (one, last - one - (length - 1) * along)
+    )

@@ -9,12 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gdtool.unwrap.pack.compact import ROUGH, Fine
 from gdtool.unwrap.pack.bitmasks import Shapes, rim_of, upright_box
+from gdtool.unwrap.pack.compact import ROUGH, Fine
 
-_COARSE = ((48, 144), (160, 160), (4000, 320))  # for up to so many charts: cells of the square's side in which orders are tried
+# For up to so many charts: cells of the square's side in which orders are tried.
+_COARSE = ((48, 144), (160, 160), (4000, 320))
 _DENSITY = 0.66  # share of a square of so many cells that the charts would fill
-# Of a cell, that a chart has to take of it for the cell to count as its own: on the fine grid the rest finds room, mostly; else the next.
+# Of a cell, that a chart has to take of it for the cell to count as its own: on the fine grid the rest finds room,
+# mostly; else the next.
 _OWN = 0.2, 0.1
 _LEAST = (0.45, 0.12)  # shares of the square that charts have to fill, first and at the very least
 _GROWS = 0.02  # of its side, that a square grows by where a chart finds no room
@@ -30,7 +32,8 @@ _MOST_BY_SEARCH = 160  # charts for which orders are searched
 
 
 class Layout(NamedTuple):
-    """Charts in a square of `side` cells: (turn, x, y) of each, the order they were placed in, the weight of contact."""
+    """Charts in a square of `side` cells: (turn, x, y) of each, the order they were placed in, the weight of
+    contact."""
 
     side: int
     at: list[tuple[int, int, int]]
@@ -38,15 +41,16 @@ class Layout(NamedTuple):
     contact: float
 
 
-def best_packed(variants: Iterable[list[tuple[np.ndarray, np.ndarray]]], gap: float
-                ) -> tuple[int, float, list[tuple[list[int], float]], int]:
-    """Which of several ways to cut one surface into charts packs best, by a short search, the share of the square that it
-    fills (0, 0 where none can be told), the orders and weights of contact to pack it in, and how many ways it leapt over.
+def best_packed(
+    variants: Iterable[list[tuple[np.ndarray, np.ndarray]]], gap: float
+) -> tuple[int, float, list[tuple[list[int], float]], int]:
+    """Which of several ways to cut one surface into charts packs best, by a short search, the share of the square that
+    it fills (0, 0 where none can be told), the orders and weights of contact to pack it in, and how many ways it leapt
+    over.
 
-    variants: each cut a step further than the one before. The first that fills WELL_PACKED of the square will do, and where
-    one lacks several times _NEXT_GAINS of that, the next ones are leapt over. Else each later one has to gain more than the
-    seams it adds are worth, _GAIN of the square and _GAIN_PER_CHART for each chart.
-    """
+    variants: each cut a step further than the one before. The first that fills WELL_PACKED of the square will do, and
+    where one lacks several times _NEXT_GAINS of that, the next ones are leapt over. Else each later one has to gain
+    more than the seams it adds are worth, _GAIN of the square and _GAIN_PER_CHART for each chart."""
     best, best_share, best_count, best_ways, leapt, leap = 0, 0.0, 0, [], 0, 0
     known: dict[tuple[int, int], list] = {}
     numbered = enumerate(variants)
@@ -61,21 +65,30 @@ def best_packed(variants: Iterable[list[tuple[np.ndarray, np.ndarray]]], gap: fl
         share = _DENSITY * (cells / found[0].side) ** 2 if found else 0.0
         leap = int((WELL_PACKED - share) / _NEXT_GAINS) if WELL_PACKED > share > 0 else 0
         if share > best_share + (_GAIN + _GAIN_PER_CHART * (len(charts) - best_count) if best_share else 0.0):
-            best, best_share, best_count, best_ways = i, share, len(charts), [(layout.order, layout.contact) for layout in found[:2]]
+            best, best_share, best_count, best_ways = (
+                i,
+                share,
+                len(charts),
+                [(layout.order, layout.contact) for layout in found[:2]],
+            )
         if best_share > WELL_PACKED:
             break
     return best, best_share, best_ways, leapt
 
 
-def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, ways: list[tuple[list[int], float]] | None = None,
-         until: float = np.inf) -> tuple[list[np.ndarray], float]:
+def pack(
+    charts: list[tuple[np.ndarray, np.ndarray]],
+    gap: float,
+    ways: list[tuple[list[int], float]] | None = None,
+    until: float = np.inf,
+) -> tuple[list[np.ndarray], float]:
     """Places for charts: their uv (v, 2) in [0, 1], v up, all at one scale, and that scale (uv per unit of surface).
 
     charts: uv at the scale of the surface and triangles of each. gap: smallest distance between charts, and half of it
-    to the border, in uv. Several orders and weights are tried on a coarse grid, the best of them tightened on a fine one; the
-    charts keep their resolution, what is sought is the smallest square that holds them. ways: best_packed's, to start from.
-    until: when to seek no longer, on the clock time.monotonic; where nothing is found by then the charts stand in rows.
-    """
+    to the border, in uv. Several orders and weights are tried on a coarse grid, the best of them tightened on a fine
+    one; the charts keep their resolution, what is sought is the smallest square that holds them. ways: best_packed's,
+    to start from. until: when to seek no longer, on the clock time.monotonic; where nothing is found by then the charts
+    stand in rows."""
     if time.monotonic() > until:
         return _shelves([uv - uv.min(0) for uv, _ in charts], gap)
     boxed, area = _boxed(charts)
@@ -89,20 +102,28 @@ def pack(charts: list[tuple[np.ndarray, np.ndarray]], gap: float, ways: list[tup
         cells, shapes, found = _drafted(boxed, area, gap, share, (ways or []) if share == _OWN[0] else [], until)
         cells_per_unit = cells * (_DENSITY / area) ** 0.5
         if found and searched:
-            if share == _OWN[0] and Fine(boxed, shapes, cells_per_unit, [found[0].side], gap, ROUGH).apart(found[0].at) is None:
+            if (
+                share == _OWN[0]
+                and Fine(boxed, shapes, cells_per_unit, [found[0].side], gap, ROUGH).apart(found[0].at) is None
+            ):
                 continue  # one in the other, as arcs of rings are
             found = _improved(shapes, found, _TRIES, until)
             best = found[:_SETTLED]
-            packed = Fine(boxed, shapes, cells_per_unit, [one.side for one in best], gap).settled([one.at for one in best])
+            packed = Fine(boxed, shapes, cells_per_unit, [one.side for one in best], gap).settled(
+                [one.at for one in best]
+            )
             if packed:
                 return packed
         if found and not share:  # nowhere too near another as it is
-            return [(shapes.uv[i][turn] + [x, y]) / found[0].side for i, (turn, x, y) in enumerate(found[0].at)], cells_per_unit / found[0].side
+            return [
+                (shapes.uv[i][turn] + [x, y]) / found[0].side for i, (turn, x, y) in enumerate(found[0].at)
+            ], cells_per_unit / found[0].side
     return _shelves([uv for uv, _ in boxed], gap)
 
 
 def _boxed(charts: list, known: dict[tuple[int, int], list] | None = None) -> tuple[list, float]:
-    """Charts set upright, with their outlines, and their area. known: of charts that come again, by the ids of their arrays."""
+    """Charts set upright, with their outlines, and their area. known: of charts that come again, by the ids of their
+    arrays."""
     known, found = {} if known is None else known, []
     for chart in charts:
         one = known.setdefault((id(chart[0]), id(chart[1])), [chart])
@@ -119,17 +140,18 @@ def _upright(uv: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, flo
     return uv, rim_of(uv, t), float(np.abs(a * d - b * c).sum()) / 2
 
 
-def _drafted(boxed: list, area: float, gap: float, share: float, ways: list[tuple[list[int], float]],
-             until: float = np.inf) -> tuple[int, Shapes | None, list[Layout]]:
-    """Cells of the side of a square that the charts fill to _DENSITY, the charts on that grid, and layouts of them, best first: of a few
-    orders, or of ways, orders with their weights of contact."""
+def _drafted(
+    boxed: list, area: float, gap: float, share: float, ways: list[tuple[list[int], float]], until: float = np.inf
+) -> tuple[int, Shapes | None, list[Layout]]:
+    """Cells of the side of a square that the charts fill to _DENSITY, the charts on that grid, and layouts of them,
+    best first: of a few orders, or of ways, orders with their weights of contact."""
     cells = next(cells for most, cells in _COARSE if len(boxed) <= most)
     shapes = None
     for least in _LEAST:
         most = int(cells * (_DENSITY / least) ** 0.5)
         shapes = Shapes(boxed, cells * (_DENSITY / area) ** 0.5, gap * (cells if share else most), most, share)
         found: list[Layout] = []
-        for order, contact in ways or _first_ways(shapes)[:6 if len(boxed) <= _MOST_BY_SEARCH else 1]:
+        for order, contact in ways or _first_ways(shapes)[: 6 if len(boxed) <= _MOST_BY_SEARCH else 1]:
             # Later ones have to do better, and the first has no room to grow beyond what it is asked for.
             side, largest = (found[0].side - 1,) * 2 if found else (int(0.9 * cells), most)
             layout = _placed(shapes, order, side, largest, contact, until)
@@ -141,8 +163,8 @@ def _drafted(boxed: list, area: float, gap: float, share: float, ways: list[tupl
 
 
 def _improved(shapes: Shapes, found: list[Layout], tries: int, until: float) -> list[Layout]:
-    """The layouts, and better ones, best first: of small changes of the best order, in several chains: each soon ends where no small
-    change helps. tries: charts placed."""
+    """The layouts, and better ones, best first: of small changes of the best order, in several chains: each soon ends
+    where no small change helps. tries: charts placed."""
     if not found or tries < _CHAINS * len(found[0].order):
         return found
     each = tries // len(found[0].order) // _CHAINS
@@ -152,7 +174,8 @@ def _improved(shapes: Shapes, found: list[Layout], tries: int, until: float) -> 
 
 
 def _chain(shapes: Shapes, best: Layout, tries: int, number: int, until: float) -> list[Layout]:
-    """Ever smaller layouts, found by changing the place of a few charts in the order of the best so far, again and again."""
+    """Ever smaller layouts, found by changing the place of a few charts in the order of the best so far, again and
+    again."""
     rng, found = np.random.default_rng(number), []  # the same for each mesh: results do not depend on chance
     known: dict[tuple[int, float], dict] = {}
     for _ in range(tries):
@@ -162,20 +185,36 @@ def _chain(shapes: Shapes, best: Layout, tries: int, number: int, until: float) 
         moved = rng.integers(len(place), size=int(rng.integers(1, 4)))
         place[moved] += rng.normal(0, _MOVES * len(place), len(moved))
         contact = float(np.clip(best.contact * rng.choice([0.6, 1.0, 1.0, 1.6]), 0.15, 2.0))
-        layout = _placed(shapes, np.argsort(place, kind="stable").tolist(), best.side - 1, best.side - 1, contact, until,
-                         known.setdefault((best.side, contact), {}), tries >= _OFTEN)
+        layout = _placed(
+            shapes,
+            np.argsort(place, kind="stable").tolist(),
+            best.side - 1,
+            best.side - 1,
+            contact,
+            until,
+            known.setdefault((best.side, contact), {}),
+            tries >= _OFTEN,
+        )
         if layout is not None:
             best = layout
             found.append(layout)
     return found
 
 
-def _placed(shapes: Shapes, order: list[int], side: int, most: int, contact: float, until: float, known: dict | None = None,
-            often: bool = False) -> Layout | None:
-    """Charts placed one by one in a square of `side` cells, which grows up to `most` where one finds no room; None where that is not
-    enough, or the time is over. known: {chart: (its place, known of those placed behind it)}, kept between orders for one side and contact;
-    often: these charts are placed so often that it is worth keeping where two of them meet.
-    """
+def _placed(
+    shapes: Shapes,
+    order: list[int],
+    side: int,
+    most: int,
+    contact: float,
+    until: float,
+    known: dict | None = None,
+    often: bool = False,
+) -> Layout | None:
+    """Charts placed one by one in a square of `side` cells, which grows up to `most` where one finds no room; None
+    where that is not enough, or the time is over. known: {chart: (its place, known of those placed behind it)}, kept
+    between orders for one side and contact; often: these charts are placed so often that it is worth keeping where two
+    of them meet."""
     taken, at, others = 0, [(0, 0, 0)] * len(order), []
     border, after = shapes.border(side), {} if known is None else known
     for i in order:
@@ -199,7 +238,11 @@ def _placed(shapes: Shapes, order: list[int], side: int, most: int, contact: flo
 def _first_ways(shapes: Shapes) -> list[tuple[list[int], float]]:
     """Orders to place the charts in, largest first, each with a weight of contact against height."""
     shape = np.array([of_turn[0] for of_turn in shapes.shapes])
-    return [(np.argsort(-rank, kind="stable").tolist(), contact) for contact in (0.5, 1.0, 0.3) for rank in (shape.prod(1), shape.max(1))]
+    return [
+        (np.argsort(-rank, kind="stable").tolist(), contact)
+        for contact in (0.5, 1.0, 0.3)
+        for rank in (shape.prod(1), shape.max(1))
+    ]
 
 
 def _shelves(boxed: list[np.ndarray], gap: float) -> tuple[list[np.ndarray], float]:

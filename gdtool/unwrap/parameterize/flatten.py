@@ -26,9 +26,9 @@ class Flat(NamedTuple):
 def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, max_stretch: float) -> Flat:
     """One connected chart laid flat: uv (v, 2), v up, at the scale of the surface, or why it has to be cut.
 
-    vertices (v, 3), triangles (t, 3), a manifold with boundary. Least-squares conformal map (Lévy et al. 2002), or Tutte's
-    embedding where that folds, then SLIM (Rabinovich et al. 2017) on the symmetric Dirichlet energy until good_stretch.
-    """
+    vertices (v, 3), triangles (t, 3), a manifold with boundary. Least-squares conformal map (Lévy et al. 2002), or
+    Tutte's embedding where that folds, then SLIM (Rabinovich et al. 2017) on the symmetric Dirichlet energy until
+    good_stretch."""
     edges = edges_of(triangles)
     border = edges.count == 1
     if not border.any():
@@ -75,7 +75,8 @@ def _scaled(uv: np.ndarray, triangles: np.ndarray, area: np.ndarray) -> np.ndarr
 
 
 def onto_plane(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
-    """The chart seen along its mean normal, when all of it faces that way and none lies on another: exact for flat charts."""
+    """The chart seen along its mean normal, when all of it faces that way and none lies on another: exact for flat
+    charts."""
     uv = _seen(vertices, triangles)
     return None if uv is None or overlapping(uv, triangles).any() else uv
 
@@ -104,8 +105,14 @@ def _conformal(vertices: np.ndarray, triangles: np.ndarray, border: np.ndarray) 
         return None
     length = float(np.linalg.norm(vertices[two] - vertices[one]))
     try:
-        uv = np.asarray(igl.lscm(np.ascontiguousarray(vertices), np.ascontiguousarray(triangles, np.int64), np.array([one, two], np.int64),
-                                 np.array([[0.0, 0.0], [length, 0.0]]))[0])
+        uv = np.asarray(
+            igl.lscm(
+                np.ascontiguousarray(vertices),
+                np.ascontiguousarray(triangles, np.int64),
+                np.array([one, two], np.int64),
+                np.array([[0.0, 0.0], [length, 0.0]]),
+            )[0]
+        )
     except RuntimeError:  # triangles without an area make its matrix singular
         return None
     if not np.isfinite(uv).all():
@@ -114,8 +121,8 @@ def _conformal(vertices: np.ndarray, triangles: np.ndarray, border: np.ndarray) 
 
 
 def conformal_from(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> np.ndarray | None:
-    """uv (v, 2) with what is not finite among the corners of triangles (t, 3) laid by the least-squares conformal map that keeps the rest;
-    None where less than two of these are given, or they have no area."""
+    """uv (v, 2) with what is not finite among the corners of triangles (t, 3) laid by the least-squares conformal map
+    that keeps the rest; None where less than two of these are given, or they have no area."""
     igl = imported("igl")
     own, local = np.unique(triangles, return_inverse=True)
     given = np.isfinite(uv[own, 0])
@@ -123,8 +130,14 @@ def conformal_from(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) 
         return None
     if not given.all():
         try:
-            laid = np.asarray(igl.lscm(np.ascontiguousarray(vertices[own]), np.ascontiguousarray(local.reshape(-1, 3), np.int64),
-                                       np.flatnonzero(given), np.ascontiguousarray(uv[own[given]]))[0])
+            laid = np.asarray(
+                igl.lscm(
+                    np.ascontiguousarray(vertices[own]),
+                    np.ascontiguousarray(local.reshape(-1, 3), np.int64),
+                    np.flatnonzero(given),
+                    np.ascontiguousarray(uv[own[given]]),
+                )[0]
+            )
         except RuntimeError:  # as in _conformal()
             return None
         uv = uv.copy()
@@ -153,19 +166,35 @@ def _tutte(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
     uv[loop] = np.stack([np.cos(angle), np.sin(angle)], -1)
     inner = np.setdiff1d(np.arange(n), loop)
     if len(inner):
-        uv[inner] = spsolve(laplacian[inner][:, inner].tocsc(), -laplacian[inner][:, loop] @ uv[loop]).reshape(len(inner), 2)
+        uv[inner] = spsolve(laplacian[inner][:, inner].tocsc(), -laplacian[inner][:, loop] @ uv[loop]).reshape(
+            len(inner), 2
+        )
     return uv * [1.0, -1.0] if _areas(uv, triangles).sum() < 0 else uv
 
 
-def _isometric(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray, surface: Isometry, good_stretch: float,
-               max_stretch: float) -> tuple[np.ndarray, float]:
-    """uv after SLIM, and its stretch: until good_stretch, until it gains little, or until it is clear that it will not come to max_stretch."""
+def _isometric(
+    vertices: np.ndarray,
+    triangles: np.ndarray,
+    uv: np.ndarray,
+    surface: Isometry,
+    good_stretch: float,
+    max_stretch: float,
+) -> tuple[np.ndarray, float]:
+    """uv after SLIM, and its stretch: until good_stretch, until it gains little, or until it is clear that it will not
+    come to max_stretch."""
     igl = imported("igl")
     best, before = uv, surface.stretch(uv)
     if before < good_stretch:
         return best, before
-    state = igl.slim_precompute(np.asfortranarray(vertices, np.float64), np.asfortranarray(triangles, np.int32), np.asfortranarray(uv),
-                                igl.MappingEnergyType.SYMMETRIC_DIRICHLET, np.zeros(0, np.int32), np.zeros((0, 2), order="F"), 0.0)
+    state = igl.slim_precompute(
+        np.asfortranarray(vertices, np.float64),
+        np.asfortranarray(triangles, np.int32),
+        np.asfortranarray(uv),
+        igl.MappingEnergyType.SYMMETRIC_DIRICHLET,
+        np.zeros(0, np.int32),
+        np.zeros((0, 2), order="F"),
+        0.0,
+    )
     for steps in _SLIM_STEPS:
         found = np.asarray(igl.slim_solve(state, steps))[:, :2]
         if not np.isfinite(found).all() or not upright(found, triangles):
@@ -179,7 +208,10 @@ def _isometric(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray, surf
 
 def singular_values(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(t, 2) singular values, larger first, of the map from uv to the surface, and the triangles' areas (t,)."""
-    e1, e2 = vertices[triangles[:, 1]] - vertices[triangles[:, 0]], vertices[triangles[:, 2]] - vertices[triangles[:, 0]]
+    e1, e2 = (
+        vertices[triangles[:, 1]] - vertices[triangles[:, 0]],
+        vertices[triangles[:, 2]] - vertices[triangles[:, 0]],
+    )
     u1, u2 = uv[triangles[:, 1]] - uv[triangles[:, 0]], uv[triangles[:, 2]] - uv[triangles[:, 0]]
     det = u1[:, 0] * u2[:, 1] - u1[:, 1] * u2[:, 0]
     safe = np.where(np.abs(det) > 0, det, 1e-300)[:, None]
@@ -197,7 +229,8 @@ def stretch(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> floa
 
 
 class Isometry:
-    """How far maps of triangles (t, 3) of vertices (v, 3) to the plane are from one: what they all share is computed once."""
+    """How far maps of triangles (t, 3) of vertices (v, 3) to the plane are from one: what they all share is computed
+    once."""
 
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
         self._abc = tuple(triangles.T)
@@ -208,11 +241,14 @@ class Isometry:
         self.area = np.sqrt((normal * normal).sum(0)) / 2
 
     def squared(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(t,) mean square of the two singular values of the map from uv (v, 2) to each triangle, and its area in uv, not negative."""
+        """(t,) mean square of the two singular values of the map from uv (v, 2) to each triangle, and its area in uv,
+        not negative."""
         a, b, c = self._abc
         (u, v), (s, t), (e, f, g) = (uv[b] - uv[a]).T, (uv[c] - uv[a]).T, self._metric
         flat = np.abs(u * t - v * s)
-        return (e * (s * s + t * t) - 2 * f * (u * s + v * t) + g * (u * u + v * v)) / (2 * np.maximum(flat, 1e-150) ** 2), flat / 2
+        return (e * (s * s + t * t) - 2 * f * (u * s + v * t) + g * (u * u + v * v)) / (
+            2 * np.maximum(flat, 1e-150) ** 2
+        ), flat / 2
 
     def at_scale(self, uv: np.ndarray) -> float:
         """L2 stretch where one unit of uv is one of the surface: below 1 where it lies larger."""
@@ -229,7 +265,8 @@ class Isometry:
 
 
 def lies_on_itself(uv: np.ndarray, triangles: np.ndarray, edges: Edges, disk: bool) -> bool:
-    """overlapping().any(). What a rim winds around once lies on nothing: of a disk whose rim does not come to itself that is all."""
+    """overlapping().any(). What a rim winds around once lies on nothing: of a disk whose rim does not come to itself
+    that is all."""
     if not np.ptp(uv, 0).max() > 0:
         return True
     rim = np.flatnonzero(edges.count[edges.half_edge_idx] == 1)
@@ -238,7 +275,8 @@ def lies_on_itself(uv: np.ndarray, triangles: np.ndarray, edges: Edges, disk: bo
 
 
 def _covered(uv: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
-    """A chart in the unit square, (v, 2), and how many of its triangles own each texel of a grid finer than they are, size and (size, size)."""
+    """A chart in the unit square, (v, 2), and how many of its triangles own each texel of a grid finer than they are,
+    size and (size, size)."""
     size = int(np.clip(10 * len(triangles) ** 0.5, 64, 512))
     at = (uv - uv.min(0)) / np.ptp(uv, 0).max()
     return at, size, owner_count(at, triangles, size)
@@ -264,10 +302,11 @@ def overlapping(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def rim_crossings(uv: np.ndarray, ends: np.ndarray, at_once: int = 2_000_000) -> tuple[np.ndarray, bool]:
-    """(n,) the segments of (s, 2), ends in points uv (v, 2), that cross another with which they share no end; whether any touch.
+    """(n,) the segments of (s, 2), ends in points uv (v, 2), that cross another with which they share no end; whether
+    any touch.
 
-    Sweep over u, exact to rounding. Where the ends of two lie in one place, as those of a cut do, they may cross there or only touch.
-    """
+    Sweep over u, exact to rounding. Where the ends of two lie in one place, as those of a cut do, they may cross there
+    or only touch."""
     low, high = uv[ends].min(1), uv[ends].max(1)
     order = np.argsort(low[:, 0], kind="stable")
     ends, low, high = ends[order], low[order], high[order]
@@ -279,7 +318,9 @@ def rim_crossings(uv: np.ndarray, ends: np.ndarray, at_once: int = 2_000_000) ->
         base = total[start - 1] if start else 0
         stop = max(start + 1, int(np.searchsorted(total, base + at_once, "right")))
         one = np.repeat(np.arange(start, stop), number[start:stop])
-        two = one + 1 + np.arange(len(one)) - np.repeat(total[start:stop] - number[start:stop] - base, number[start:stop])
+        two = (
+            one + 1 + np.arange(len(one)) - np.repeat(total[start:stop] - number[start:stop] - base, number[start:stop])
+        )
         near = (low[one, 1] <= high[two, 1]) & (low[two, 1] <= high[one, 1])
         pair = np.stack([one[near], two[near]], -1)
         at = ends[pair]

@@ -1,4 +1,5 @@
-"""All charts laid flat: small ones joined, those that lie on themselves peeled, cut where that does not help or all of them stretch too much."""
+"""All charts laid flat: small ones joined, those that lie on themselves peeled, cut where that does not help or all of
+them stretch too much."""
 
 from __future__ import annotations
 
@@ -13,11 +14,11 @@ import numpy as np
 from gdtool.geometry.mesh_quality import polygon_normals
 from gdtool.geometry.repair import one_vertex_per_fan
 from gdtool.geometry.topology import triangulated
-from gdtool.unwrap.segment.charts import Adjacency, bisect, own_corners
-from gdtool.unwrap.segment.straight_cuts import connected, part_of
 from gdtool.unwrap.parameterize.flatten import Flat, flatten, onto_plane, stretch, upright
+from gdtool.unwrap.segment.charts import Adjacency, bisect, own_corners
 from gdtool.unwrap.segment.merge import joined, joined_stretch
 from gdtool.unwrap.segment.overlaps import onto_neighbours, peel
+from gdtool.unwrap.segment.straight_cuts import connected, part_of
 
 _WHOLE = 1.4  # stretch of all charts together over 1, in units of what is good for one: with more the worst are cut
 _MOST_RELIEVED = 16, 0.5  # charts that are cut for that: so many, and this share of all
@@ -42,15 +43,22 @@ class Laid:
         return [f"{count} charts were cut: a chart {reason}" for reason, count in self.cut.items()]
 
 
-def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good_stretch: float, max_stretch: float,
-                proxy: tuple[np.ndarray, np.ndarray] | None = None, by: tuple[float, float] = (np.inf, np.inf),
-                part: np.ndarray | None = None) -> tuple[list, list[str]]:
+def flatten_all(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    label: np.ndarray,
+    good_stretch: float,
+    max_stretch: float,
+    proxy: tuple[np.ndarray, np.ndarray] | None = None,
+    by: tuple[float, float] = (np.inf, np.inf),
+    part: np.ndarray | None = None,
+) -> tuple[list, list[str]]:
     """Each chart of faces (f, 4), label (f,), laid flat, and what was cut: Laid.charts and a line for each reason.
 
-    proxy, vertices and triangles: a coarse mesh of the surface, on which joining is tried. Without one nothing is joined and
-    charts are laid flat by projection alone, cut until that works. by: when, on the clock time.monotonic, projection alone goes on
-    with what is left, and when each face of that becomes a chart. part (f,): what stays together where a chart is cut, if it can.
-    """
+    proxy, vertices and triangles: a coarse mesh of the surface, on which joining is tried. Without one nothing is
+    joined and charts are laid flat by projection alone, cut until that works. by: when, on the clock time.monotonic,
+    projection alone goes on with what is left, and when each face of that becomes a chart. part (f,): what stays
+    together where a chart is cut, if it can."""
     adjacency, part = Adjacency(vertices, faces), label if part is None else part
     vertices, faces = one_vertex_per_fan(vertices, faces)
 
@@ -70,13 +78,25 @@ def flatten_all(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, good
     return laid.charts, laid.reasons()
 
 
-def lay(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, part: np.ndarray, sets: list[np.ndarray],
-        good_stretch: float, max_stretch: float, by: tuple[float, float] = (np.inf, np.inf), *, peeling: bool = False,
-        projected: bool = False) -> Laid:
-    """Sets of faces laid flat, cut where they do not lie so; a set of several labels (f,), joined, may stretch less and comes apart first.
+def lay(
+    adjacency: Adjacency,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    label: np.ndarray,
+    part: np.ndarray,
+    sets: list[np.ndarray],
+    good_stretch: float,
+    max_stretch: float,
+    by: tuple[float, float] = (np.inf, np.inf),
+    *,
+    peeling: bool = False,
+    projected: bool = False,
+) -> Laid:
+    """Sets of faces laid flat, cut where they do not lie so; a set of several labels (f,), joined, may stretch less and
+    comes apart first.
 
-    part, by: as flatten_all()'s. peeling: take off what lies on other parts of a chart, where that is little. projected: by projection alone.
-    """
+    part, by: as flatten_all()'s. peeling: take off what lies on other parts of a chart, where that is little.
+    projected: by projection alone."""
     laid, queue = Laid(), sets[::-1]
     while queue:
         faces_idx, now = queue.pop(), time.monotonic()
@@ -92,7 +112,12 @@ def lay(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, label: np
         if projected:
             flat = Flat(onto_plane(points, triangles), "is not flat")
         else:
-            flat = flatten(points, triangles.astype(np.int64), good_stretch, max_stretch if len(parts) == 1 else joined_stretch(good_stretch))
+            flat = flatten(
+                points,
+                triangles.astype(np.int64),
+                good_stretch,
+                max_stretch if len(parts) == 1 else joined_stretch(good_stretch),
+            )
         uv = flat.uv
         if uv is None and len(parts) > 1:  # joined on the proxy, and do not lie flat together here
             queue.extend(faces_idx[part] for part in parts)
@@ -103,7 +128,11 @@ def lay(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, label: np
             laid.charts.append((faces_idx, corners, uv, triangles))
             continue
         laid.cut[flat.reason] += 1
-        keep = peel(adjacency, faces_idx, triangles, face_idx, flat.overlapped) if peeling and flat.overlapped is not None else None
+        keep = (
+            peel(adjacency, faces_idx, triangles, face_idx, flat.overlapped)
+            if peeling and flat.overlapped is not None
+            else None
+        )
         if keep is not None:
             largest, *others = sorted(connected(adjacency, faces_idx, keep), key=np.count_nonzero, reverse=True)
             laid.charts.append(part_of((faces_idx, corners, flat.overlapped, triangles), largest))
@@ -114,12 +143,20 @@ def lay(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, label: np
     return laid
 
 
-def _relieve(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, part: np.ndarray, laid: Laid, further: Callable[[list[np.ndarray]], Laid],
-             good_stretch: float) -> None:
-    """The charts that make all of them together stretch too much cut, in place, those that weigh most first; further: lays the parts.
+def _relieve(
+    adjacency: Adjacency,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    part: np.ndarray,
+    laid: Laid,
+    further: Callable[[list[np.ndarray]], Laid],
+    good_stretch: float,
+) -> None:
+    """The charts that make all of them together stretch too much cut, in place, those that weigh most first; further:
+    lays the parts.
 
-    The square of the whole's stretch is the mean of the charts' squares by area: each is laid at the scale of the surface.
-    """
+    The square of the whole's stretch is the mean of the charts' squares by area: each is laid at the scale of the
+    surface."""
     most = _MOST_RELIEVED[0] + int(_MOST_RELIEVED[1] * len(laid.charts))
     allowed = ((1 + _WHOLE * (good_stretch - 1)) ** 2 - 1) * float(adjacency.area.sum())
 
@@ -154,13 +191,15 @@ def _relieve(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, part
 
 
 def _halves(adjacency: Adjacency, part: np.ndarray, faces_idx: np.ndarray) -> list[np.ndarray]:
-    """Two or more connected sets of a chart's faces, cut between its parts, part (f,), where it has several: they begin and end at creases."""
+    """Two or more connected sets of a chart's faces, cut between its parts, part (f,), where it has several: they begin
+    and end at creases."""
     half, area = bisect(adjacency, faces_idx), adjacency.area[faces_idx]
     if half.all() or not half.any():
         half = np.arange(len(faces_idx)) < len(faces_idx) // 2
     place = np.unique(part[faces_idx], return_inverse=True)[1]
     share = np.bincount(place, area * half) / np.maximum(np.bincount(place, area), 1e-300)
-    whole = (share > np.clip(0.5, share.min(), np.nextafter(share.max(), 0)))[place]  # some on each side, unless their shares are equal
+    # Some on each side, unless their shares are equal.
+    whole = (share > np.clip(0.5, share.min(), np.nextafter(share.max(), 0)))[place]
     half = half if whole.all() else whole
     number = adjacency.pieces(faces_idx, half)
     return [faces_idx[number == n] for n in range(number.max() + 1)]
@@ -173,7 +212,8 @@ def _sets(label: np.ndarray) -> list[np.ndarray]:
 
 
 def _face_by_face(vertices: np.ndarray, faces: np.ndarray, faces_idx: np.ndarray) -> list[tuple]:
-    """A chart of each of some faces (k,), seen along its normal; where it folds so, a square or right triangle of its size."""
+    """A chart of each of some faces (k,), seen along its normal; where it folds so, a square or right triangle of its
+    size."""
     own = faces[faces_idx]
     corner = vertices[np.where(own < 0, own[:, :1], own)]
     x = corner[:, 1] - corner[:, 0]
@@ -184,7 +224,14 @@ def _face_by_face(vertices: np.ndarray, faces: np.ndarray, faces_idx: np.ndarray
     for face, used, flat, points in zip(faces_idx.tolist(), own >= 0, uv, corner, strict=True):
         corners = np.where(used, np.arange(4), -1)[None]
         flat, triangles = flat[used], triangulated(corners)[0]
-        charts.append((np.array([face]), corners, flat if upright(flat, triangles) else _alone(points[used], corners[0]), triangles))
+        charts.append(
+            (
+                np.array([face]),
+                corners,
+                flat if upright(flat, triangles) else _alone(points[used], corners[0]),
+                triangles,
+            )
+        )
     return charts
 
 
@@ -193,5 +240,5 @@ def _alone(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     used = corners[corners >= 0]
     size = max(float(np.ptp(points, 0).max()), 1e-6)
     uv = np.zeros((len(points), 2))
-    uv[used] = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)[:len(used)] * size
+    uv[used] = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)[: len(used)] * size
     return uv

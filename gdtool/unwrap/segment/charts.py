@@ -20,7 +20,8 @@ _SMALLEST_SHARE = 0.003  # of the area; a smaller chart joins a neighbour if it 
 
 
 def run_xatlas(vertices: np.ndarray, triangles: np.ndarray, max_cost: float) -> np.ndarray:
-    """(t,) chart of each triangle, by xatlas; runs in a child, because xatlas can hang. Triangles it drops have chart -1."""
+    """(t,) chart of each triangle, by xatlas; runs in a child, because xatlas can hang. Triangles it drops have chart
+    -1."""
     xatlas = imported("xatlas")
     charts = xatlas.ChartOptions()
     charts.max_cost = max_cost
@@ -36,7 +37,8 @@ def run_xatlas(vertices: np.ndarray, triangles: np.ndarray, max_cost: float) -> 
 
 
 class Adjacency:
-    """Faces (k, 2) that share an edge, with what a seam along that edge costs (k,): its length, a tenth of it on creases."""
+    """Faces (k, 2) that share an edge, with what a seam along that edge costs (k,): its length, a tenth of it on
+    creases."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
         edges = edges_of(faces)
@@ -51,7 +53,9 @@ class Adjacency:
         # Where the two faces walk the edge in one direction (a turned face) a chart cannot go on.
         turned = edges.turned[edge_idx]
         order = np.argsort(self.pairs[~turned][:, 0], kind="stable")
-        self.pairs, self.cost, self.crease, self.ends = (x[~turned][order] for x in (self.pairs, self.cost, self.crease, self.ends))
+        self.pairs, self.cost, self.crease, self.ends = (
+            x[~turned][order] for x in (self.pairs, self.cost, self.crease, self.ends)
+        )
         self._begin = np.searchsorted(self.pairs[:, 0], np.arange(self.count + 1))
 
     def within(self, faces_idx: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -65,18 +69,21 @@ class Adjacency:
         return rows[inside], pairs[inside]
 
     def pieces(self, faces_idx: np.ndarray, side: np.ndarray | None = None) -> np.ndarray:
-        """(k,) number, from 0 on, of the set that each of faces_idx (k,) is connected in, through faces of faces_idx alone, and where there
-        are sides (k,), of its own."""
+        """(k,) number, from 0 on, of the set that each of faces_idx (k,) is connected in, through faces of faces_idx
+        alone, and where there are sides (k,), of its own."""
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
 
         _, pairs = self.within(faces_idx)
         if side is not None:
             pairs = pairs[side[pairs[:, 0]] == side[pairs[:, 1]]]
-        return connected_components(coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(faces_idx),) * 2), False)[1]
+        return connected_components(
+            coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(faces_idx),) * 2), False
+        )[1]
 
     def connected(self, label: np.ndarray) -> np.ndarray:
-        """Labels (f,) such that each is one connected set of faces: sets of one label that do not touch get their own."""
+        """Labels (f,) such that each is one connected set of faces: sets of one label that do not touch get their
+        own."""
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
 
@@ -95,7 +102,9 @@ class Adjacency:
         near = border[self.pairs]
         face = np.concatenate([self.pairs[near[:, 0], 0], self.pairs[near[:, 1], 1], faces_idx])
         vote = np.concatenate([label[self.pairs[near[:, 0], 1]], label[self.pairs[near[:, 1], 0]], label[faces_idx]])
-        weight = np.concatenate([self.cost[near[:, 0]], self.cost[near[:, 1]], np.broadcast_to(own, self.count)[faces_idx]])
+        weight = np.concatenate(
+            [self.cost[near[:, 0]], self.cost[near[:, 1]], np.broadcast_to(own, self.count)[faces_idx]]
+        )
         width = int(label.max()) + 1
         key, inverse = np.unique(face * width + vote, return_inverse=True)
         total = np.bincount(inverse.ravel(), weight)
@@ -105,26 +114,38 @@ class Adjacency:
         return out
 
 
-def find_charts(adjacency: Callable[[], Adjacency], vertices: np.ndarray, faces: np.ndarray, *, until: float,
-                max_cost: float) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray], list[str]]:
-    """(f,) chart of each face, all connected, (f,) its part of that, the coarse mesh (vertices, triangles) they were found on, and what
-    failed on the way.
+def find_charts(
+    adjacency: Callable[[], Adjacency], vertices: np.ndarray, faces: np.ndarray, *, until: float, max_cost: float
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray], list[str]]:
+    """(f,) chart of each face, all connected, (f,) its part of that, the coarse mesh (vertices, triangles) they were
+    found on, and what failed on the way.
 
-    vertices (v, 3) in a unit box, faces (f, 4), adjacency gives theirs; until: when to have given up, on the clock time.monotonic.
-    Without xatlas' help the faces go by the box side they look at.
-    """
+    vertices (v, 3) in a unit box, faces (f, 4), adjacency gives theirs; until: when to have given up, on the clock
+    time.monotonic. Without xatlas' help the faces go by the box side they look at."""
     from gdtool.geometry.distance import closest_points
     from gdtool.geometry.simplify import simplify
 
     failed: list[str] = []
     triangles, _ = triangulated(faces)
-    proxy_vertices, proxy, _, report = simplify(vertices, triangles.astype(np.int64), _PROXY_TRIANGLES, measured=False, meanwhile=adjacency,
-                                                   seconds=max(until - time.monotonic(), _SHORTEST))
+    proxy_vertices, proxy, _, report = simplify(
+        vertices,
+        triangles.astype(np.int64),
+        _PROXY_TRIANGLES,
+        measured=False,
+        meanwhile=adjacency,
+        seconds=max(until - time.monotonic(), _SHORTEST),
+    )
     if report["method"] == "vertex clustering":
         proxy_vertices, proxy = vertices, triangles
     try:
-        chart = call(run_xatlas, proxy_vertices.astype(np.float32), proxy.astype(np.int32), max_cost,
-                     seconds=max(until - time.monotonic(), _SHORTEST), memory_mb=8000)
+        chart = call(
+            run_xatlas,
+            proxy_vertices.astype(np.float32),
+            proxy.astype(np.int32),
+            max_cost,
+            seconds=max(until - time.monotonic(), _SHORTEST),
+            memory_mb=8000,
+        )
         centre = vertices[np.where(faces < 0, faces[:, :1], faces)].mean(1)
         label = chart[closest_points(centre, proxy_vertices, proxy)[1]]
         if (label < 0).all():
@@ -157,14 +178,18 @@ def own_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np
     low, high = np.minimum(corners, following)[used], np.maximum(corners, following)[used]
     key = np.sort(low * len(points) + high)
     low, high = np.divmod(key[1:][key[1:] == key[:-1]], len(points))
-    fans = np.bincount(corners[used], minlength=len(points)) - np.bincount(low, minlength=len(points)) - np.bincount(high, minlength=len(points))
+    fans = (
+        np.bincount(corners[used], minlength=len(points))
+        - np.bincount(low, minlength=len(points))
+        - np.bincount(high, minlength=len(points))
+    )
     several = fans.max(initial=0) > 1 or (key[2:] == key[:-2]).any()
     return one_vertex_per_fan(points, corners) if several else (points, corners)
 
 
 def tidy(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """Labels with short, straight seams that prefer creases, without islands too small to be a chart; and what these charts were made
-    of: labels from when each island had joined one neighbour."""
+    """Labels with short, straight seams that prefer creases, without islands too small to be a chart; and what these
+    charts were made of: labels from when each island had joined one neighbour."""
     first = label
     typical = np.median(adjacency.cost) if len(adjacency.cost) else 0.0
     parity = (np.arange(adjacency.count) * 2654435761 >> 7) % 2
@@ -213,7 +238,9 @@ def bisect(adjacency: Adjacency, faces_idx: np.ndarray) -> np.ndarray:
     size = np.sqrt(adjacency.area[faces_idx])
     length = (size[pairs[:, 0]] + size[pairs[:, 1]]) / 2 * np.where(adjacency.crease[inside], 5.0, 1.0) + 1e-12
     a, b = pairs.T
-    graph = coo_matrix((np.concatenate([length, length]), (np.concatenate([a, b]), np.concatenate([b, a]))), (len(faces_idx),) * 2).tocsr()
+    graph = coo_matrix(
+        (np.concatenate([length, length]), (np.concatenate([a, b]), np.concatenate([b, a]))), (len(faces_idx),) * 2
+    ).tocsr()
 
     def far_from(start: int) -> tuple[int, np.ndarray]:
         distance = dijkstra(graph, indices=start)

@@ -6,8 +6,8 @@ import numpy as np
 
 from gdtool.geometry.mesh_quality import polygon_normals
 from gdtool.geometry.repair import one_vertex_per_fan
-from gdtool.unwrap.segment.charts import Adjacency, own_corners
 from gdtool.unwrap.parameterize.flatten import flatten
+from gdtool.unwrap.segment.charts import Adjacency, own_corners
 
 _JOINS = 40  # attempts to join two charts
 _JOIN_SHARE = 0.02  # charts smaller than this share of the area are joined to others
@@ -18,9 +18,16 @@ def joined_stretch(good_stretch: float) -> float:
     return 1 + 2 * (good_stretch - 1)
 
 
-def joined(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, proxy_vertices: np.ndarray, proxy: np.ndarray, good_stretch: float) -> np.ndarray:
-    """Labels (f,) of faces (f, 4) with small charts joined to the neighbour with the longest common seam, where the two lie
-    flat together on the proxy, triangles (t, 3) of the same surface."""
+def joined(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    label: np.ndarray,
+    proxy_vertices: np.ndarray,
+    proxy: np.ndarray,
+    good_stretch: float,
+) -> np.ndarray:
+    """Labels (f,) of faces (f, 4) with small charts joined to the neighbour with the longest common seam, where the two
+    lie flat together on the proxy, triangles (t, 3) of the same surface."""
     proxy_vertices, proxy = one_vertex_per_fan(proxy_vertices, proxy)
     adjacency = Adjacency(proxy_vertices, np.concatenate([proxy, np.full((len(proxy), 1), -1)], 1))
     place = _brought_over(vertices, faces, label, proxy_vertices, proxy, adjacency)
@@ -55,13 +62,21 @@ def joined(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, proxy_ver
     return onto[label]
 
 
-def _brought_over(vertices: np.ndarray, faces: np.ndarray, label: np.ndarray, proxy_vertices: np.ndarray, proxy: np.ndarray,
-                  adjacency: Adjacency) -> np.ndarray:
-    """(t,) label of the face nearest to each triangle of the proxy and facing like it; -1 beside each label's largest piece."""
+def _brought_over(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    label: np.ndarray,
+    proxy_vertices: np.ndarray,
+    proxy: np.ndarray,
+    adjacency: Adjacency,
+) -> np.ndarray:
+    """(t,) label of the face nearest to each triangle of the proxy and facing like it; -1 beside each label's largest
+    piece."""
     from scipy.spatial import cKDTree
 
     normals, area = polygon_normals(vertices, faces)
-    reach = 2 * float(np.sqrt(area.mean()))  # opposite sides of a wall thinner than this are told apart by where they face
+    # Opposite sides of a wall thinner than this are told apart by where they face.
+    reach = 2 * float(np.sqrt(area.mean()))
     centres = vertices[np.where(faces < 0, faces[:, :1], faces)].mean(1)
     tree = cKDTree(np.concatenate([centres, reach * normals], 1))
     place = label[tree.query(np.concatenate([proxy_vertices[proxy].mean(1), reach * adjacency.normals], 1))[1]]

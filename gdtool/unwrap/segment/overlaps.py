@@ -5,8 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.geometry.topology import edges_of, triangulated
+from gdtool.unwrap.parameterize.flatten import (
+    Isometry,
+    conformal_from,
+    flatten,
+    is_disk,
+    lies_on_itself,
+    overlapping,
+    upright,
+)
 from gdtool.unwrap.segment.charts import Adjacency, own_corners
-from gdtool.unwrap.parameterize.flatten import Isometry, conformal_from, flatten, is_disk, lies_on_itself, overlapping, upright
 from gdtool.unwrap.segment.merge import joined_stretch
 
 _MOST = 0.2  # of a chart's area, that is taken off; where more lies on itself the chart is cut
@@ -16,12 +24,13 @@ _STAYS = 4  # times a piece's faces: a chart of more stays as it lies, and the p
 _STRETCH = 1.1  # of a piece beside such a chart, at its scale, either way
 
 
-def peel(adjacency: Adjacency, faces_idx: np.ndarray, triangles: np.ndarray, face_idx: np.ndarray, overlapped: np.ndarray) -> np.ndarray | None:
+def peel(
+    adjacency: Adjacency, faces_idx: np.ndarray, triangles: np.ndarray, face_idx: np.ndarray, overlapped: np.ndarray
+) -> np.ndarray | None:
     """(k,) bool: faces of a chart that lie flat and apart from each other; None where too many would have to go.
 
-    faces_idx (k,); triangles (t, 3); face_idx (t,) the face of each, a place in faces_idx; overlapped (v, 2): as flatten() gave it up.
-    Of the faces that lie on others connected sets go, the smallest first, until none does.
-    """
+    faces_idx (k,); triangles (t, 3); face_idx (t,) the face of each, a place in faces_idx; overlapped (v, 2): as
+    flatten() gave it up. Of the faces that lie on others connected sets go, the smallest first, until none does."""
     on_others = overlapping(overlapped, triangles)
     keep, area = np.ones(len(faces_idx), bool), adjacency.area[faces_idx]
     while on_others.any():
@@ -34,13 +43,19 @@ def peel(adjacency: Adjacency, faces_idx: np.ndarray, triangles: np.ndarray, fac
     return keep
 
 
-def onto_neighbours(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarray, charts: list, pieces: list[tuple[int, np.ndarray]],
-                    good_stretch: float) -> list[tuple[int, np.ndarray]]:
+def onto_neighbours(
+    adjacency: Adjacency,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    charts: list,
+    pieces: list[tuple[int, np.ndarray]],
+    good_stretch: float,
+) -> list[tuple[int, np.ndarray]]:
     """Which of the pieces lie flat with none of the charts beside them; the others join one, in place.
 
-    charts (faces_idx, corners, uv, triangles), as flatten_all() returns them; pieces: a face of the chart that it lay on, and is not
-    offered to again, and its faces. Chart and piece together stretch no more than two charts that are joined may.
-    """
+    charts (faces_idx, corners, uv, triangles), as flatten_all() returns them; pieces: a face of the chart that it lay
+    on, and is not offered to again, and its faces. Chart and piece together stretch no more than two charts that are
+    joined may."""
     owner, number = np.full((2, adjacency.count), -1)
     for i, chart in enumerate(charts):
         owner[chart[0]] = i
@@ -73,16 +88,19 @@ def onto_neighbours(adjacency: Adjacency, vertices: np.ndarray, faces: np.ndarra
     return left
 
 
-def _laid_beside(points: np.ndarray, corners: np.ndarray, triangles: np.ndarray, chart: tuple, most: float) -> np.ndarray | None:
-    """uv (v, 2) of a chart and a piece, points (v, 3), corners (k, 4) of the chart's faces and then the piece's, triangles (t, 3) of both:
-    the chart as it lies, the piece conformally from their seam on. None where it does not lie flat so, or a cut of the chart would close."""
+def _laid_beside(
+    points: np.ndarray, corners: np.ndarray, triangles: np.ndarray, chart: tuple, most: float
+) -> np.ndarray | None:
+    """uv (v, 2) of a chart and a piece, points (v, 3), corners (k, 4) of the chart's faces and then the piece's,
+    triangles (t, 3) of both: the chart as it lies, the piece conformally from their seam on. None where it does not lie
+    flat so, or a cut of the chart would close."""
     _, old, lies, own = chart
-    at = corners[:len(old)][old >= 0]
+    at = corners[: len(old)][old >= 0]
     uv = np.full((len(points), 2), np.nan)
     uv[at] = lies[old[old >= 0]]
     if (uv[at] != lies[old[old >= 0]]).any():
         return None
-    piece = triangles[len(own):]
+    piece = triangles[len(own) :]
     uv = conformal_from(points, piece, uv)
     if uv is None or not upright(uv, triangles):
         return None

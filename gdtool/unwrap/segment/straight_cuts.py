@@ -21,12 +21,11 @@ _SMALLEST = 0.004  # of all area, that a part has to have
 
 
 def cut_to_pack(adjacency: Adjacency, charts: list, counts: list[int]) -> Iterator[list]:
-    """Charts (faces_idx, corners, uv, triangles) with the ill-shaped ones cut along straight lines of their plane, as far as the
-    quads allow: for each of the rising counts a list of about so many charts, until no cut is worth it.
+    """Charts (faces_idx, corners, uv, triangles) with the ill-shaped ones cut along straight lines of their plane, as
+    far as the quads allow: for each of the rising counts a list of about so many charts, until no cut is worth it.
 
-    First come the cuts for which the smallest rectangles around the charts lose most, for each chart added. Texture coordinates
-    stay: parts of what is flat are flat.
-    """
+    First come the cuts for which the smallest rectangles around the charts lose most, for each chart added. Texture
+    coordinates stay: parts of what is flat are flat."""
     total = float(adjacency.area.sum())
     number = itertools.count()  # of equal ones the earlier
     whole, queue = [], []
@@ -57,24 +56,30 @@ class _Piece:
 
     @cached_property
     def cut(self) -> tuple[float, list[_Piece]] | None:
-        """What the rectangles around its parts have less than its own, and these, two or three; None where no cut will do."""
+        """What the rectangles around its parts have less than its own, and these, two or three; None where no cut will
+        do."""
         found = _halves(self._adjacency, self.chart, self._smallest)
-        return found and (found[0], [_Piece(self._adjacency, part_of(self.chart, half), self._smallest) for half in found[1]])
+        return found and (
+            found[0],
+            [_Piece(self._adjacency, part_of(self.chart, half), self._smallest) for half in found[1]],
+        )
 
     @cached_property
     def rate(self) -> float:
-        """The area that rectangles lose for each chart that is added, by this cut or by it and those of its parts: a ring's halves
-        save nothing, their halves do."""
+        """The area that rectangles lose for each chart that is added, by this cut or by it and those of its parts: a
+        ring's halves save nothing, their halves do."""
         if self.cut is None:
             return -np.inf
         saved, added = self.cut[0], len(self.cut[1]) - 1
         more = [part.cut for part in self.cut[1] if part.cut is not None and part.cut[0] > 0]
-        return max(saved / added, (saved + sum(one for one, _ in more)) / (added + sum(len(parts) - 1 for _, parts in more)))
+        return max(
+            saved / added, (saved + sum(one for one, _ in more)) / (added + sum(len(parts) - 1 for _, parts in more))
+        )
 
 
 def _halves(adjacency: Adjacency, chart: tuple, smallest: float) -> tuple[float, list[np.ndarray]] | None:
-    """The area that rectangles lose by a cut of the chart, and masks (k,) of its faces, two or three, each connected; None where
-    none will do. Of straight lines the one is taken for which the rectangles are smallest."""
+    """The area that rectangles lose by a cut of the chart, and masks (k,) of its faces, two or three, each connected;
+    None where none will do. Of straight lines the one is taken for which the rectangles are smallest."""
     faces_idx, corners, uv, _ = chart
     area = adjacency.area[faces_idx]
     if area.sum() < 2 * smallest:
@@ -88,7 +93,8 @@ def _halves(adjacency: Adjacency, chart: tuple, smallest: float) -> tuple[float,
     found = []
     for row, seen in zip(across, sample, strict=True):
         line = row.min() + _OFFSETS * np.ptp(row)
-        covered = np.bincount(np.searchsorted(line, row, "right"), area, len(line) + 1).cumsum()[:-1]  # before each line
+        # Before each line.
+        covered = np.bincount(np.searchsorted(line, row, "right"), area, len(line) + 1).cumsum()[:-1]
         order = np.argsort(seen, kind="stable")
         count = np.searchsorted(seen[order], line, "left")
         good = (count > 0) & (count < len(seen)) & (np.minimum(covered, area.sum() - covered) >= smallest)
@@ -107,14 +113,16 @@ def _halves(adjacency: Adjacency, chart: tuple, smallest: float) -> tuple[float,
 
 
 def _pieces(pairs: np.ndarray, half: np.ndarray, area: np.ndarray, smallest: float) -> np.ndarray:
-    """(k,) number, from 0 on, of the connected part of its side, half (k,) bool, that each face is in; pairs (r, 2) of faces share
-    an edge. Parts below `smallest`, which a line leaves along a rim that is not straight, change sides."""
+    """(k,) number, from 0 on, of the connected part of its side, half (k,) bool, that each face is in; pairs (r, 2) of
+    faces share an edge. Parts below `smallest`, which a line leaves along a rim that is not straight, change sides."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     for crumbs_may_change in (True, False):
         together = pairs[half[pairs[:, 0]] == half[pairs[:, 1]]]
-        number = connected_components(coo_matrix((np.ones(len(together)), (together[:, 0], together[:, 1])), (len(half),) * 2), False)[1]
+        number = connected_components(
+            coo_matrix((np.ones(len(together)), (together[:, 0], together[:, 1])), (len(half),) * 2), False
+        )[1]
         crumb = np.bincount(number, area) < smallest
         if not crumbs_may_change or not crumb.any():
             break
@@ -123,7 +131,8 @@ def _pieces(pairs: np.ndarray, half: np.ndarray, area: np.ndarray, smallest: flo
 
 
 def _spans(values: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far values (a, n) spread before each of the rising counts (c,), 0 < count < n, and from it on: (a, c) both."""
+    """How far values (a, n) spread before each of the rising counts (c,), 0 < count < n, and from it on: (a, c)
+    both."""
     first, at = np.unique(np.append(0, counts), return_inverse=True)
     high, low = np.maximum.reduceat(values, first, 1), np.minimum.reduceat(values, first, 1)
     before = np.maximum.accumulate(high, 1) - np.minimum.accumulate(low, 1)

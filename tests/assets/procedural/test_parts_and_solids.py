@@ -16,7 +16,9 @@ def test_volumes_of_known_shapes():
     assert volume(parts.cylinder(0.5, 2.0, bevel=0.001, count=200)) == pytest.approx(np.pi * 0.5, rel=2e-3)
     assert volume(parts.ball(0.5, 1.0, 0.25, count=120)) == pytest.approx(4 / 3 * np.pi * 0.125, rel=3e-3)
     ring = np.stack([np.cos(w := 2 * np.pi * np.arange(200) / 200), np.sin(w), 0 * w], -1)
-    assert volume(parts.tube(ring, 0.1, closed=True, outline=parts.circle(60))) == pytest.approx(2 * np.pi**2 * 0.01, rel=5e-3)
+    assert volume(parts.tube(ring, 0.1, closed=True, outline=parts.circle(60))) == pytest.approx(
+        2 * np.pi**2 * 0.01, rel=5e-3
+    )
 
 
 def test_marching_cubes_meets_the_analytic_surface():

@@ -55,11 +55,17 @@ def test_a_seed_does_not_depend_on_what_was_made_before():
 
 
 def test_objects_do_not_depend_on_threads_or_hash_seed():
-    script = ("import hashlib\nfrom gdtool.assets.procedural import generate\nh = hashlib.sha256()\n"
-              "for seed, kind in ((246, 'burger'), (1, 'rock'), (2, 'quadruped'), (3, 'boat'), (4, 'bread')):\n"
-              "    s = generate(seed, kind)\n    [h.update(a.tobytes()) for a in (s.vertices, s.faces, s.normals, *s.uvs)]\nprint(h.hexdigest())")
-    digests = {subprocess.run([sys.executable, "-c", script], env={**os.environ, **extra}, capture_output=True, check=True).stdout
-               for extra in ({"OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "1"}, {"OMP_NUM_THREADS": "2", "PYTHONHASHSEED": "2"})}
+    script = (
+        "import hashlib\nfrom gdtool.assets.procedural import generate\nh = hashlib.sha256()\n"
+        "for seed, kind in ((246, 'burger'), (1, 'rock'), (2, 'quadruped'), (3, 'boat'), (4, 'bread')):\n"
+        "    s = generate(seed, kind)\n    [h.update(a.tobytes()) for a in (s.vertices, s.faces, s.normals, *s.uvs)]\nprint(h.hexdigest())"
+    )
+    digests = {
+        subprocess.run(
+            [sys.executable, "-c", script], env={**os.environ, **extra}, capture_output=True, check=True
+        ).stdout
+        for extra in ({"OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "1"}, {"OMP_NUM_THREADS": "2", "PYTHONHASHSEED": "2"})
+    }
     assert len(digests) == 1
 
 
@@ -105,9 +111,16 @@ def test_materials_and_texture_coordinates_are_in_range(seed):
     for uv in scene.uvs:
         assert uv.shape == (len(scene.vertices), 2) and np.isfinite(uv).all() and np.abs(uv).max() <= 32
     for material in scene.materials:
-        assert all(0 <= c <= 1 for c in material.base_color) and 0 <= material.metallic <= 1 and 0 <= material.roughness <= 1
-        for texture, encoding in ((material.base_color_texture, "srgb"), (material.metallic_roughness_texture, "linear"),
-                                  (material.normal_texture, "linear")):
+        assert (
+            all(0 <= c <= 1 for c in material.base_color)
+            and 0 <= material.metallic <= 1
+            and 0 <= material.roughness <= 1
+        )
+        for texture, encoding in (
+            (material.base_color_texture, "srgb"),
+            (material.metallic_roughness_texture, "linear"),
+            (material.normal_texture, "linear"),
+        ):
             if texture is not None:
                 assert texture.image.dtype == np.uint8 and texture.image.shape[2] == 3 and texture.encoding == encoding
                 assert texture.uv_set in (0, 1)
