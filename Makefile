@@ -2,14 +2,14 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: venv demo test stress extras-test fuzz bench bench-assets bench-materials bench-reconstruct bench-render bench-relight bench-sheets bench-throughput bench-cutout bench-picture bench-sample bench-model schemas docs-check model data clean
+.PHONY: venv demo test lint lint-known stress extras-test fuzz bench bench-assets bench-materials bench-reconstruct bench-render bench-relight bench-sheets bench-throughput bench-cutout bench-picture bench-sample bench-model schemas docs-check model data clean
 
 venv: .venv/.done
 
 .venv/.done: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --constraint constraints.txt torch==2.13.0
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[test,bench,codecs]"
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[test,bench,codecs,lint]"
 	touch $@
 
 # One image to a finished asset, in ./demo.asset
@@ -18,6 +18,16 @@ demo: venv
 
 test: venv
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" --numprocesses auto --dist loadfile  # a process for each core
+
+# Layout and types. mypy may find nothing new: tests/mypy_baseline.txt lists what is known, `make lint-known` writes it again, shorter.
+LINTED := gdtool commands tests benchmarks examples
+lint: venv
+	$(BIN)/ruff check $(LINTED)
+	$(BIN)/ruff format --check $(LINTED)
+	$(BIN)/mypy | $(BIN)/mypy-baseline filter
+
+lint-known: venv
+	$(BIN)/mypy | $(BIN)/mypy-baseline sync
 
 stress: venv
 	$(BIN)/python -m pytest -m slow

@@ -321,7 +321,10 @@ def stage_command(stage: Stage, help: str) -> click.Command:
     if stage.dataset:
         text = "Only every Nth source from the Ith on, for job arrays that share -o: 1/N to N/N."
         params.append(click.Option(["--shard"], type=TEXT, metavar="I/N", help=text))
-        text = "Fan out on the Ray cluster at ADDRESS, a source a task; local: on this machine's cores. Nodes share the folders. Needs gdtool[ray]."
+        text = (
+            "Fan out on the Ray cluster at ADDRESS, a source a task; local: on this machine's cores. Nodes share the "
+            "folders. Needs gdtool[ray]."
+        )
         params.append(click.Option(["--ray"], type=TEXT, metavar="ADDRESS", help=text))
     params += [
         click.Option(

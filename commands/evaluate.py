@@ -25,7 +25,10 @@ def _one(text, reference, views, options):
     "--reference",
     type=TEXT,
     metavar="PATH",
-    help="What to measure against: a folder, a model file or procedural:SEED; found along the provenance chain without it.",
+    help=(
+        "What to measure against: a folder, a model file or procedural:SEED; found along the provenance chain "
+        "without it."
+    ),
 )
 @click.option(
     "--views",

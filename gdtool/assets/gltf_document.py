@@ -167,7 +167,7 @@ class GltfFile:
         """The first length bytes of a file, fewer where it has fewer."""
         try:
             self.check_memory(min(path.stat().st_size, length), f"buffer {index}", SIMPLIFY)
-            with open(path, "rb") as file:
+            with path.open("rb") as file:
                 return file.read(length)
         except OSError as error:
             raise from_os_error(error, path) from None

@@ -162,7 +162,8 @@ class MaterialReader:
         given = [t for t in (diffuse_texture, specular_texture) if t is not None]
         if len({_lookup(t) for t in given}) > 1:
             raise self.file.refuse(
-                f"material {index} is specular-glossiness with two different texture lookups, which gdtool cannot convert",
+                f"material {index} is specular-glossiness with two different texture lookups, which gdtool cannot "
+                f"convert",
                 "export it as metallic-roughness",
             )
         height, width = max(t.image.shape[0] for t in given), max(t.image.shape[1] for t in given)

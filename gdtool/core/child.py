@@ -61,7 +61,7 @@ def begin(
     waiting = _waiting.get(module)
     place = None
     with contextlib.suppress(OSError):  # it may have been deleted
-        place = os.getcwd()
+        place = str(Path.cwd())
     request = _pickled((place, module, function.__qualname__, args, kwargs, memory_mb))
     process = waiting.pop() if waiting else _started((module,))
     return Running(f"{module}:{function.__qualname__}", process, request, seconds)
@@ -223,7 +223,7 @@ def _answer(module: str, name: str, args: tuple, kwargs: dict[str, Any], memory_
 def _limit_memory(megabytes: int) -> None:
     import resource
 
-    with open("/proc/self/statm") as file:
+    with Path("/proc/self/statm").open() as file:
         now = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     limit, most = now + megabytes * 2**20, resource.getrlimit(resource.RLIMIT_AS)[1]
     if most != resource.RLIM_INFINITY:  # a child's child cannot have more than the child

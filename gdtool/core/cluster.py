@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 from gdtool.core.errors import GdtoolError, ResourceError
@@ -23,7 +24,7 @@ def each(address: str, work: Callable[[str], Any], texts: Iterator[str], cores: 
     ray = _connected(address)
     try:
         task = ray.remote(num_cpus=cores, max_retries=1)(_within)
-        folder = os.getcwd()
+        folder = str(Path.cwd())
         waiting: dict[Any, str] = {}
         for text in texts:
             waiting[task.remote(folder, work, text)] = text

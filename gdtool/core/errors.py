@@ -121,7 +121,8 @@ _ASKED = re.compile(r"(?:unable|tried) to allocate ([\d.]+) ?(bytes|[KMGT]i?B)",
 _NO_LIBRARY = re.compile(r"([\w+.-]+\.so[.\d]*): cannot open shared object file")
 # What torch, OpenCV and C++ say when memory runs out; numpy and Python raise MemoryError.
 _NO_MEMORY = re.compile(
-    r"out of memory|bad_alloc|can't allocate memory|not enough memory|insufficient memory|failed to allocate|unable to allocate",
+    r"out of memory|bad_alloc|can't allocate memory|not enough memory|insufficient memory|failed to allocate|unable "
+    r"to allocate",
     re.I,
 )
 _NO_THREAD = re.compile(r"can't start new thread|resource temporarily unavailable", re.I)

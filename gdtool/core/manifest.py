@@ -92,7 +92,7 @@ def digest_of(value: Any) -> str:
 
 def file_sha256(path: Path) -> str:
     """sha256 of a file's bytes."""
-    with open(path, "rb") as file:
+    with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

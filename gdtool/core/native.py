@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib
 import os
+from pathlib import Path
 from types import ModuleType
 
 from gdtool.core.errors import GdtoolError, ResourceError, first_line, is_unmapped, missing_library
@@ -75,13 +76,14 @@ def require_address_space(size: int, what: str) -> None:
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit == resource.RLIM_INFINITY:
             return
-        with open("/proc/self/statm") as file:
+        with Path("/proc/self/statm").open() as file:
             left = limit - int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     except (ImportError, OSError):  # Windows, or no /proc to tell what is used
         return
     if size > left:
         raise MemoryError(
-            f"unable to allocate {size / 2**30:.2f} GiB for {what}: {max(left, 0) / 2**30:.2f} GiB of the limit are left"
+            f"unable to allocate {size / 2**30:.2f} GiB for {what}: {max(left, 0) / 2**30:.2f} GiB of the limit are "
+            f"left"
         )
 
 

@@ -28,7 +28,7 @@ def output_place(path: Path) -> Path:
         raise UsageError(ascii(str(path)), fault, CURE)
     place = path
     if path.is_symlink():
-        place = path.parent / os.readlink(path)
+        place = path.parent / path.readlink()
         if place.is_symlink():
             raise UsageError(path, "is a link to a link", "name the folder itself with -o")
     if place.exists() and not place.is_dir():

@@ -43,7 +43,7 @@ def locked(target: Path, wait_seconds: float = 3600.0) -> Iterator[None]:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             # The holder before us removes the file when it is done: a lock on a removed file guards nothing.
-            if os.path.exists(path) and os.stat(path).st_ino == os.fstat(handle).st_ino:
+            if path.exists() and path.stat().st_ino == os.fstat(handle).st_ino:
                 break
         except OSError as error:
             if error.errno not in (errno.EAGAIN, errno.EACCES):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import math
-import os
 import stat
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,7 @@ def require_regular_file(path: Path) -> None:
     OutputError where it cannot be looked at.
     """
     try:
-        mode = os.stat(path).st_mode
+        mode = Path(path).stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(path, "does not exist", "check the path") from None
     except ValueError:  # a NUL in the name

@@ -143,7 +143,7 @@ class _Uris(msgspec.Struct):
 def _gltf_files(path: Path) -> Iterator[Path]:
     document = msgspec.json.decode(path.read_bytes().removeprefix(b"\xef\xbb\xbf"), type=_Uris)
     for item in (*document.buffers, *document.images):
-        if item.uri is not None and not item.uri[:5].lower() == "data:":
+        if item.uri is not None and item.uri[:5].lower() != "data:":
             try:
                 named = uri_path(path.parent, item.uri, path, "the URI")
                 if is_readable(named):
@@ -154,7 +154,7 @@ def _gltf_files(path: Path) -> Iterator[Path]:
 
 def _obj_files(path: Path) -> list[Path]:
     libraries: dict[str, Path] = {}
-    with open(path, encoding="utf-8", errors="replace") as file:
+    with path.open(encoding="utf-8", errors="replace") as file:
         for line in file:
             if "mtllib" in line and len(words := line.split(None, 1)) == 2 and words[0] == "mtllib":
                 try:

@@ -279,7 +279,8 @@ def run_one(
         except BaseException as error:
             if _is_resumable(stage, out.place_of_workspace):
                 log.say(
-                    f"{named}: what is done so far is kept in {out.place_of_workspace}; the same command goes on from it"
+                    f"{named}: what is done so far is kept in {out.place_of_workspace}; the same command goes on "
+                    f"from it"
                 )
             if isinstance(error, OSError):
                 raise from_os_error(error, target) from error
@@ -360,7 +361,7 @@ def write_dataset_index(root: Path, results: list[Result]) -> Path:
     )
     temporary = root / f".{MANIFEST}.partial"
     temporary.write_bytes(encode(manifest))
-    os.replace(temporary, root / MANIFEST)
+    temporary.replace(root / MANIFEST)
     return root
 
 

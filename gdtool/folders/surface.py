@@ -103,7 +103,7 @@ def write_surface_ply(path: Path, surface: Surface) -> None:
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertex)}"]
     lines += [f"property {kinds[layout[name].str]} {name}" for name in layout.names]
     lines += [f"element face {len(face)}", "property list uchar int vertex_indices", "end_header", ""]
-    with open(path, "wb") as file:
+    with path.open("wb") as file:
         file.write("\n".join(lines).encode())
         file.write(vertex.tobytes())
         file.write(face.tobytes())

@@ -81,7 +81,8 @@ def _check_png(path: Path, file: BinaryIO) -> None:
         if checksum != struct.unpack(">I", crc)[0]:
             raise InputError(
                 path,
-                f"is damaged (bad checksum in the PNG's {kind.decode() if kind.isalpha() and kind.isascii() else 'chunks'})",
+                f"is damaged (bad checksum in the PNG's "
+                f"{kind.decode() if kind.isalpha() and kind.isascii() else 'chunks'})",
                 COPY,
             )
         if kind == b"IHDR" and length >= 8 and max(struct.unpack_from(">II", body)) > MAX_SIDE:

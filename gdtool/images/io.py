@@ -44,7 +44,7 @@ def read_image(path: str | Path) -> np.ndarray:
     path = Path(path)
     require_regular_file(path)
     try:
-        with open(path, "rb") as file:
+        with Path(path).open("rb") as file:
             head = file.read(64)
             check_container(path, head, file)
     except OSError as error:
@@ -128,7 +128,8 @@ def _check_spec(path: Path, spec) -> None:
     if spec.width > MAX_SIDE or spec.height > MAX_SIDE or spec.image_bytes() > MAX_BYTES:
         raise ResourceError(
             path,
-            f"is {spec.width}x{spec.height} pixels in {spec.nchannels} channels ({spec.image_bytes() / 2**30:.1f} GiB), more than "
+            f"is {spec.width}x{spec.height} pixels in {spec.nchannels} channels ({spec.image_bytes() / 2**30:.1f} "
+            f"GiB), more than "
             f"{MAX_SIDE} a side or {MAX_BYTES >> 30} GiB",
             "scale it down",
         )
@@ -266,7 +267,7 @@ def _write(path: Path, image: np.ndarray, kind: str) -> None:
         spec["png:compressionLevel"] = 4  # on baked maps a third of the time of 6 and 8 % more bytes
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(path, "wb"):
+        with path.open("wb"):
             pass  # a plain error when the place cannot be written
     except OSError as error:
         raise from_os_error(error, path) from None
@@ -283,7 +284,8 @@ def _write(path: Path, image: np.ndarray, kind: str) -> None:
             path.unlink()
         raise OutputError(
             path,
-            f"was not written whole ({_lower(fact.strip().splitlines()[0]) if fact.strip() else 'it reads back otherwise'})",
+            f"was not written whole "
+            f"({_lower(fact.strip().splitlines()[0]) if fact.strip() else 'it reads back otherwise'})",
             "free some space or choose another -o",
         )
 
@@ -334,5 +336,5 @@ def _plain_name(path: Path, writing: bool = False) -> Iterator[str]:
     except UnicodeEncodeError:
         with temporary_folder() as folder:
             link = folder / ("image" + (path.suffix if writing else ""))
-            link.symlink_to(os.path.abspath(path))
+            link.symlink_to(path.absolute())
             yield str(link)

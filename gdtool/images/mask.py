@@ -116,7 +116,8 @@ def _labels(lab: np.ndarray, color: np.ndarray, subject: object, tell: Callable[
     if fitted is None:
         labels = _labels_without_plain_background(color, subject)
         tell(
-            f"{subject}: the background is not plain; the subject was cut out by its colors and may lack parts: look at it, or give a mask"
+            f"{subject}: the background is not plain; the subject was cut out by its colors and may lack parts: look "
+            f"at it, or give a mask"
         )
         return labels
     background, spread = fitted

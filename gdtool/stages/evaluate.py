@@ -46,8 +46,9 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     frame: Annotated[
         Literal["auto", "source", "box", "same"],
         Meta(
-            description="how a model file gets into the result's frame: source = by the result's source_from_world, box = centred with longest "
-            "side 1, same = it is there already; auto: same for two files, source where the result has one, else box"
+            description="how a model file gets into the result's frame: source = by the result's source_from_world, "
+            "box = centred with longest side 1, same = it is there already; auto: same for two files, source where the "
+            "result has one, else box"
         ),
     ] = "auto"
     samples: Annotated[int, Meta(ge=100, le=10_000_000, description="points drawn on each surface")] = 100_000

@@ -82,7 +82,10 @@ def _check_key(folder: Folder) -> Iterator[str]:
         options[name] = digest(path)
     given = [(entry.role, entry.digest) for entry in manifest.inputs]
     if key_of(manifest.stage, manifest.stage_version, options, given) != manifest.key:
-        yield f"{folder.path / MANIFEST}: options and inputs are not those that the key was made of; run gdtool {manifest.stage} again"
+        yield (
+            f"{folder.path / MANIFEST}: options and inputs are not those that the key was made of; run gdtool "
+            f"{manifest.stage} again"
+        )
 
 
 def _needed(folder: Folder) -> set[str]:
@@ -126,11 +129,17 @@ def _check_views(folder: Folder) -> Iterator[str]:
         if "normal" in views.images:
             length = np.linalg.norm(views.images["normal"][k][inside], axis=-1)
             if len(length) and np.abs(length - 1).max() > 0.05:
-                yield f"{folder.file(f'normal/{camera.name}.png')}: holds normals that are not unit (length {length.min():.3f} to {length.max():.3f})"
+                yield (
+                    f"{folder.file(f'normal/{camera.name}.png')}: holds normals that are not unit (length "
+                    f"{length.min():.3f} to {length.max():.3f})"
+                )
         if "depth" in views.images:
             depth = views.images["depth"][k][inside]
             if len(depth) and (depth.min() < camera.near - 1e-4 or depth.max() > camera.far + 1e-4):
-                yield f"{folder.file(f'depth/{camera.name}.exr')}: is not within near {camera.near:g} and far {camera.far:g}"
+                yield (
+                    f"{folder.file(f'depth/{camera.name}.exr')}: is not within near {camera.near:g} and far "
+                    f"{camera.far:g}"
+                )
 
 
 def _check_dataset(folder: Folder) -> Iterator[str]:
@@ -159,7 +168,9 @@ def _check_surface(folder: Folder) -> Iterator[str]:
 
     surface = read_surface(folder)
     if is_watertight(surface.faces) != folder.content.watertight:
-        yield f"{folder.file('surface.ply')}: the manifest says watertight = {folder.content.watertight}, which it is not"
+        yield (
+            f"{folder.file('surface.ply')}: the manifest says watertight = {folder.content.watertight}, which it is not"
+        )
     yield from _check_counts(folder, len(surface.vertices), {"faces": len(surface.faces)})
 
 

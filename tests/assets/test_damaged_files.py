@@ -12,7 +12,10 @@ from gdtool.images.io import encode_png, read_image, write_exr
 from tests.assets.gltf_files import quad
 from tests.assets.test_load import FACES, ply, stl
 
-OBJ = b"v 0 0 0 1 0 0\nv 1 0 0 1 1 1\nv 1 1 0 0 0 1\nv 0 1 0 0 0 0\nvt 0 0\nvt 1 0\nvn 0 0 1\nusemtl a\nf 1/1/1 2/2/1 3/1/1 4/1/1\nf -1//1 -2//1 -3//1\n"
+OBJ = (
+    b"v 0 0 0 1 0 0\nv 1 0 0 1 1 1\nv 1 1 0 0 0 1\nv 0 1 0 0 0 0\nvt 0 0\nvt 1 0\nvn 0 0 1\nusemtl a\nf 1/1/1 2/2/1 "
+    b"3/1/1 4/1/1\nf -1//1 -2//1 -3//1\n"
+)
 
 
 def textured_quad() -> bytes:

@@ -25,7 +25,8 @@ def ply(extra: str = "", rows: list[str] | None = None) -> str:
     rows = rows or [" ".join(map(str, p)) for p in CORNERS]
     faces = "\n".join("3 " + " ".join(map(str, face)) for face in FACES)
     return (
-        f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\nproperty float x\nproperty float y\nproperty float z\n{extra}"
+        f"ply\nformat ascii 1.0\nelement vertex {len(rows)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"{extra}"
         f"element face {len(FACES)}\nproperty list uchar int vertex_indices\nend_header\n"
         + "\n".join(rows)
         + "\n"
@@ -42,7 +43,10 @@ def test_stl_is_welded(tmp_path):
 
 
 def test_ply_with_colours_and_normals(tmp_path):
-    extra = "property float nx\nproperty float ny\nproperty float nz\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n"
+    extra = (
+        "property float nx\nproperty float ny\nproperty float nz\nproperty uchar red\nproperty uchar green\nproperty "
+        "uchar blue\n"
+    )
     rows = [" ".join(map(str, p)) + " 0 0 2 255 188 0" for p in CORNERS]
     (tmp_path / "x.ply").write_text(ply(extra, rows))
     scene = load_scene(tmp_path / "x.ply")

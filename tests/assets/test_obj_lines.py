@@ -30,7 +30,8 @@ def same(one: obj_lines.ObjLines, two: obj_lines.ObjLines) -> bool:
         FULL + "f 1//1 2//1 3//1\n",
         "# by hand\no one\n"
         + SQUARE
-        + "g a b\ns off\nmtllib a b.mtl\nusemtl red paint\nf 1 2 3\n\nusemtl blue\n\nl 1 2\nf 2 3 4\nusemtl red paint\nf 1 2 4\n",
+        + "g a b\ns off\nmtllib a b.mtl\nusemtl red paint\nf 1 2 3\n\nusemtl blue\n\n"
+        + "l 1 2\nf 2 3 4\nusemtl red paint\nf 1 2 4\n",
         "v 1e-3 -2.5E+4 +.5 1 0 0.25\nv 1 2 3\t0 0 1\nv 4 5 6 1 1 1 \nf 1 2 3\n",
         "v 0 0 0 1\nv 1 0 0 1\nv 0 1 0 1\nvt 0 0 0\nf 1/1 2/1 3/1\n",
         "v 0.1 0.12345678901234567 1e-320\nv nan 0 0\nv inf 0 -0\nf 1 2 3\n",

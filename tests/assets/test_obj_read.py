@@ -95,7 +95,8 @@ def test_maps(tmp_path):
     m = read(
         tmp_path,
         MATERIALS,
-        "newmtl a\nKd 0 0 0\nmap_Kd -s 1 1 1 -clamp on my color.png\nmap_Pr rough.png\nmap_Pm -imfchan b orm.png\nmap_Bump -bm 1 flat.png\n",
+        "newmtl a\nKd 0 0 0\nmap_Kd -s 1 1 1 -clamp on my color.png\nmap_Pr rough.png\nmap_Pm -imfchan b orm.png\n"
+        "map_Bump -bm 1 flat.png\n",
     ).materials[0]
     np.testing.assert_array_equal(m.base_color_texture.image, color)
     assert (

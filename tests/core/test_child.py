@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -193,14 +194,17 @@ def below(pid):
 def alive(pid):
     """Whether a process runs (a zombie that nobody has reaped yet does not)."""
     try:
-        with open(f"/proc/{pid}/stat") as file:
+        with Path(f"/proc/{pid}/stat").open() as file:
             return file.read().rsplit(")", 1)[1].split()[0] != "Z"
     except FileNotFoundError:
         return False
 
 
 def test_children_die_with_their_parent():
-    code = "from gdtool.core import child; from tests.core.test_child import double, hang; child.prepare(double); child.call(hang, seconds=50)"
+    code = (
+        "from gdtool.core import child; from tests.core.test_child import double, hang; child.prepare(double); "
+        "child.call(hang, seconds=50)"
+    )
     parent = subprocess.Popen([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(ROOT)})
     children = []
     for _ in range(100):

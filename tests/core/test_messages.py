@@ -20,9 +20,12 @@ from tests.conftest import ROOT
 ERRORS = {"GdtoolError": 2, "InputError": 2, "UsageError": 2, "OutputError": 2, "ResourceError": 2}
 # A cure that says no more than this names no option, command or value.
 GENERIC = re.compile(
-    r"(please )?((check|fix|correct|repair|change|see|look at|verify|use|give|provide|choose|try) (it|that|the|your|a|an|another|other|valid|right|correct"
-    r"|the right|the correct|a valid|a correct|a different|another valid)?( )?(input|file|files|folder|data|value|values|arguments?|options?|configuration"
-    r"|documentation|docs|manual|message|format|name|setting|settings|again|once more)?|try again|retry|run it again|contact .*|report it|unknown|none|n/?a)\W*",
+    r"(please )?((check|fix|correct|repair|change|see|look at|verify|use|give|provide|choose|try) "
+    r"(it|that|the|your|a|an|another|other|valid|right|correct"
+    r"|the right|the correct|a valid|a correct|a different|another valid)?( "
+    r")?(input|file|files|folder|data|value|values|arguments?|options?|configuration"
+    r"|documentation|docs|manual|message|format|name|setting|settings|again|once more)?|try again|retry|run it "
+    r"again|contact .*|report it|unknown|none|n/?a)\W*",
     re.IGNORECASE,
 )
 # Another program's command, with its own options.
@@ -317,7 +320,7 @@ def test_every_option_named_is_one_that_the_command_has():
     for message in MESSAGES:
         allowed, commands = EXCEPTIONS.get((message.file, message.function), (set(), ""))[0], commands_of(message.file)
         for text in message.words():
-            kept = OPTION.sub(lambda found: "" if found[0] in allowed else found[0], text)
+            kept = OPTION.sub(lambda found, allowed=allowed: "" if found[0] in allowed else found[0], text)
             wrong += [(message.where, fault) for fault in faults_of_options(kept, commands)]
     assert not wrong, "\n".join(f"{where}: {fault}" for where, fault in wrong)
 

@@ -111,7 +111,7 @@ def test_a_missing_file_of_a_result_is_made_again(made):
 
 def test_an_output_that_holds_the_source(cat):
     Path("in").mkdir()
-    os.rename(cat, "in/cat.png")
+    Path(cat).rename("in/cat.png")
     assert "holds the source" in refused("in/cat.png", output=Path("in"))
     assert "holds the source" in refused("in/cat.png", output=Path())
     assert Path("in/cat.png").read_bytes() == b"cat"
@@ -119,7 +119,7 @@ def test_an_output_that_holds_the_source(cat):
 
 def test_an_output_that_is_reached_by_another_name_for_the_source(cat):
     Path("in").mkdir()
-    os.rename(cat, "in/cat.png")
+    Path(cat).rename("in/cat.png")
     Path("alias").symlink_to("in")
     assert "holds the source" in refused("in/cat.png", output=Path("alias"))
 

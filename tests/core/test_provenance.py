@@ -1,7 +1,6 @@
 """Provenance is followed by path and digest."""
 
 import dataclasses
-import os
 import shutil
 from pathlib import Path
 
@@ -82,7 +81,7 @@ def test_a_path_through_a_linked_folder_records_where_things_really_lie():
     assert [one.manifest.digest for one in ancestors(again, CURE)] == [folder.manifest.digest]
     moved = Path("b/c/d")
     moved.mkdir(parents=True)
-    os.rename("disk", "b/c/d/disk")  # a chain that moves as a whole is whole
+    Path("disk").rename("b/c/d/disk")  # a chain that moves as a whole is whole
     assert [one.manifest.digest for one in ancestors(open_folder(moved / "disk/deep/second"), CURE)] == [
         folder.manifest.digest
     ]

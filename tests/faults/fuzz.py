@@ -127,7 +127,10 @@ def text_seed(kind: str) -> bytes:
     from gdtool.folders.records import write_cameras
 
     if kind == "obj":
-        return b"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nf 1/1 2/2 3/3 4/1\nf -1/1 -2/2 -3/3\n"
+        return (
+            b"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nf 1/1 2/2 3/3 4/1\nf -1/1 "
+            b"-2/2 -3/3\n"
+        )
     if kind == "json":
         content = MeshContent(vertices=8, quads=6, triangles=0, watertight=True)
         return encode(

@@ -182,7 +182,10 @@ def make_pool(pool: Path) -> None:
     (pool / "mine").mkdir()
     (pool / "mine/diary.txt").write_text("mine")
     (pool / "link").symlink_to("mine")
-    chain = "render-dataset box.glb --domains color,normal,depth,albedo,roughness,metallic|reconstruct|remesh|unwrap|bake|relight"
+    chain = (
+        "render-dataset box.glb --domains "
+        "color,normal,depth,albedo,roughness,metallic|reconstruct|remesh|unwrap|bake|relight"
+    )
     source: list[str] = []
     for step in chain.split("|"):
         name, *words = step.split()
@@ -350,7 +353,7 @@ def state(folder: Path) -> dict[str, str]:
     out = {}
     for path in sorted(folder.rglob("*")):
         if path.is_symlink():
-            out[str(path)] = "-> " + os.readlink(path)
+            out[str(path)] = f"-> {path.readlink()}"
         elif path.is_file():
             out[str(path)] = hashlib.sha256(path.read_bytes()).hexdigest()
     return out
@@ -359,7 +362,7 @@ def state(folder: Path) -> dict[str, str]:
 def run_case(words: list[str], given: bytes, folder: Path) -> tuple[int, str, str]:
     """Exit code (124: it did not end in time), stdout and stderr of the command, in a copy of this process: it has
     imported what commands need."""
-    files = [tempfile.TemporaryFile() for _ in range(3)]
+    files = [tempfile.TemporaryFile() for _ in range(3)]  # noqa: SIM115 - closed at the end
     files[0].write(given)
     files[0].seek(0)
     pid = os.fork()
@@ -371,9 +374,9 @@ def run_case(words: list[str], given: bytes, folder: Path) -> tuple[int, str, st
             for number, file in enumerate(files):
                 os.dup2(file.fileno(), number)
             sys.stdin, sys.stdout, sys.stderr = (
-                open(0),
-                open(1, "w", errors="surrogateescape"),
-                open(2, "w", errors="backslashreplace"),
+                os.fdopen(0),
+                os.fdopen(1, "w", errors="surrogateescape"),
+                os.fdopen(2, "w", errors="backslashreplace"),
             )
             sys.argv = ["gdtool", *words]
             from gdtool.commands import main

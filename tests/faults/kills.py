@@ -30,7 +30,7 @@ EVENTS = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.chmod", "os.utim
 def watched(act) -> None:
     """Call act(what) before each operation on the file system that touches an output in the working folder, and before
     the swap."""
-    here = os.getcwd()
+    here = Path.cwd()
 
     def hook(event: str, arguments: tuple) -> None:
         if event not in EVENTS:
@@ -38,8 +38,8 @@ def watched(act) -> None:
         if event == "open" and not (isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR)):
             return
         name = os.fsdecode(arguments[0]) if isinstance(arguments[0], (str, bytes, os.PathLike)) else ""
-        place = os.path.join(here, name)
-        if os.path.relpath(place, here).split(os.sep)[0].lstrip(".").split(".")[0] == "out":
+        place = Path(os.path.relpath(here / name, here))
+        if place.parts[:1] and place.parts[0].lstrip(".").split(".")[0] == "out":
             act(f"{event} {name}")
 
     sys.addaudithook(hook)

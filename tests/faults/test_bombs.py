@@ -39,7 +39,10 @@ def little_memory(monkeypatch):
 
 def test_what_one_input_may_take_follows_the_limit_of_the_process():
     """In a child: a limit cannot be raised again."""
-    code = "import resource; from gdtool.core.memory import most_held; a = most_held(); resource.setrlimit(resource.RLIMIT_AS, (1 << 30,) * 2); print(a > most_held() == 1 << 29)"
+    code = (
+        "import resource; from gdtool.core.memory import most_held; a = most_held(); "
+        "resource.setrlimit(resource.RLIMIT_AS, (1 << 30,) * 2); print(a > most_held() == 1 << 29)"
+    )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT).stdout == "True\n"
 
 
@@ -167,7 +170,7 @@ def test_views_of_one_buffer_are_no_copies(tmp_path):
 
 @pytest.mark.parametrize("name", ["a.obj", "a.ply", "a.stl"])
 def test_a_large_sparse_file_is_not_read(tmp_path, little_memory, name):
-    with open(tmp_path / name, "wb") as file:
+    with (tmp_path / name).open("wb") as file:
         file.truncate(200 << 20)
     with pytest.raises(ResourceError, match="GiB"):
         load_scene(tmp_path / name)
@@ -223,7 +226,8 @@ def test_reading_an_exr_takes_little_more_than_what_it_gives(tmp_path, names, ki
     width = 2048 if len(names) > 4 else 4096
     exr(tmp_path / "x.exr", width, width // 2, list(names), kind)
     code = (
-        "import resource, sys, numpy, OpenImageIO; from gdtool.images.io import read_image; size = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024\n"
+        "import resource, sys, numpy, OpenImageIO; from gdtool.images.io import read_image; size = lambda: "
+        "resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024\n"
         "before = size(); image = read_image(sys.argv[1]); print((size() - before) / image.nbytes)"
     )
     done = subprocess.run(
@@ -299,7 +303,7 @@ def work(tmp_path):
 
 def test_a_sparse_member_is_refused(tmp_path, work):
     """1 GiB of nothing in some kilobytes."""
-    with open(tmp_path / "manifest.json", "wb") as file:
+    with (tmp_path / "manifest.json").open("wb") as file:
         file.truncate(1 << 30)
     subprocess.run(["tar", "-c", "--sparse", "-f", "a.tar", "manifest.json"], check=True, cwd=tmp_path)
     assert (tmp_path / "a.tar").stat().st_size < 100_000

@@ -25,7 +25,8 @@ def scattered(count):
         (
             scattered(20),
             ["--faces", 60],
-            "it has 20 separate pieces, and each takes at least 12 faces or so (engines: not tried, 20 pieces of so few quads)",
+            "it has 20 separate pieces, and each takes at least 12 faces or so (engines: not tried, 20 pieces of so "
+            "few quads)",
         ),
         (torus(24), ["--faces", 16, "--engine", "split"], "fewer would close some of its 1 handles"),
         (scattered(40), ["--triangles", 100], "it has 40 separate pieces, and each takes at least 4 faces or so"),

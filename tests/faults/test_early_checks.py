@@ -6,6 +6,7 @@ import importlib.util
 import os
 import sys
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -104,7 +105,7 @@ def test_lights_that_are_there_pass(files):
 
         load_environment("black.exr")
     name = "caf\udce9.exr"
-    os.rename("light.exr", name)
+    Path("light.exr").rename(name)
     early.require_environment("--env", name, ())
 
 
@@ -198,5 +199,5 @@ def test_a_compiled_network_is_kept_out_of_tmpdir(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     with sample_views._compiler_cache():
         place = os.environ["TORCHINDUCTOR_CACHE_DIR"]
-        assert os.path.isdir(place)
-    assert not os.path.exists(place)
+        assert Path(place).is_dir()
+    assert not Path(place).exists()

@@ -57,7 +57,7 @@ def until(happens, process, seconds=20):
 
 def listens(process):
     """Whether a process handles SIGHUP, which Python by itself does not."""
-    with contextlib.suppress(FileNotFoundError), open(f"/proc/{process.pid}/status") as file:
+    with contextlib.suppress(FileNotFoundError), Path(f"/proc/{process.pid}/status").open() as file:
         caught = next(line for line in file if line.startswith("SigCgt"))
         return bool(int(caught.split()[1], 16) >> (signal.SIGHUP - 1) & 1)
     return False
@@ -104,7 +104,8 @@ class OutOfMemoryError(RuntimeError):
         (no_array(), ResourceError, "ran out of memory"),
         (
             RuntimeError(
-                "[enforce fail at alloc_cpu.cpp:114] . DefaultCPUAllocator: can't allocate memory: you tried to allocate 1 bytes."
+                "[enforce fail at alloc_cpu.cpp:114] . DefaultCPUAllocator: can't allocate memory: you tried to "
+                "allocate 1 bytes."
             ),
             ResourceError,
             "ran out of memory",
@@ -313,7 +314,10 @@ def test_a_stage_with_seconds_ends_by_twice_of_them_and_5():
     limits.require_time(20.0, 10.0, "--seconds", "mesh", "lower --faces")
     with pytest.raises(
         ResourceError,
-        match="mesh: needs about 220 s in the quickest way, and --seconds 10 allows less; raise --seconds to 220, or lower",
+        match=(
+            "mesh: needs about 220 s in the quickest way, and --seconds 10 allows less; raise --seconds to 220, or "
+            "lower"
+        ),
     ):
         limits.require_time(220.0, 10.0, "--seconds", "mesh", "lower --faces")
 
@@ -392,7 +396,8 @@ def test_a_plugin_that_cannot_be_imported_is_told_and_the_rest_works(gdtool_here
     assert helped.returncode == 0 and "broken" in helped.stdout and "remesh" in helped.stdout
     done = gdtool_here("broken", "x")
     assert done.returncode == 5 and lines_of(done.stderr) == [
-        "gdtool: plugin broken: cannot be loaded (ValueError: at import); pip uninstall odd_package, or install a release of it that works with this gdtool"
+        "gdtool: plugin broken: cannot be loaded (ValueError: at import); pip uninstall odd_package, or install a "
+        "release of it that works with this gdtool"
     ]
     monkeypatch.setattr(Plugin, "load", lambda self: print)
     assert "is no click command" in gdtool_here("broken").stderr

@@ -108,8 +108,8 @@ def whole():
 @pytest.mark.parametrize(
     "fault, told",
     [
-        (dict(seconds=0.01, memory_mb=8000), "took longer than 0.01 s"),
-        (dict(seconds=60, memory_mb=1), "needs more than 1 MB"),
+        ({"seconds": 0.01, "memory_mb": 8000}, "took longer than 0.01 s"),
+        ({"seconds": 60, "memory_mb": 1}, "needs more than 1 MB"),
     ],
     ids=["time", "memory"],
 )

@@ -15,7 +15,7 @@ TRIANGLES = np.concatenate([QUADS[:, :3], QUADS[:, [0, 2, 3]]])
 
 
 def obj(vertices, faces) -> str:
-    return "".join("v %r %r %r\n" % tuple(map(float, p)) for p in vertices) + "".join(
+    return "".join("v {!r} {!r} {!r}\n".format(*map(float, p)) for p in vertices) + "".join(
         "f " + " ".join(str(i + 1) for i in f) + "\n" for f in faces
     )
 

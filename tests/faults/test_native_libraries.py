@@ -95,7 +95,8 @@ def test_a_package_that_cannot_be_loaded_is_not_taken_for_one_that_is_not_instal
     broken("fcpw", "numpy.core.multiarray failed to import\nmore lines")
     with pytest.raises(
         ResourceError,
-        match=r"^fcpw: cannot be loaded \(numpy.core.multiarray failed to import\); pip install --force-reinstall fcpw$",
+        match=r"^fcpw: cannot be loaded \(numpy.core.multiarray failed to import\); "
+        r"pip install --force-reinstall fcpw$",
     ):
         imported_if_installed("fcpw")
 

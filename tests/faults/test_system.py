@@ -154,7 +154,10 @@ def test_empty_stdin_fails_the_pipe(gdtool):
     ):
         done = gdtool(command)
         assert done.returncode == 2 and len(lines_of(done.stderr)) == 1 and done.stdout == "", command
-    pipe = f"{sys.executable} -m gdtool reconstruct nothing | {sys.executable} -m gdtool remesh | {sys.executable} -m gdtool unwrap"
+    pipe = (
+        f"{sys.executable} -m gdtool reconstruct nothing | {sys.executable} -m gdtool remesh | {sys.executable} -m "
+        f"gdtool unwrap"
+    )
     done = subprocess.run(["bash", "-c", pipe], capture_output=True, text=True)
     assert done.returncode == 2 and done.stdout == "" and "Traceback" not in done.stderr
 

@@ -134,7 +134,8 @@ def test_surface_comes_back_and_missing_properties_have_their_defaults():
         and np.allclose(back.confidence, 0.5)
     )
     bare = (
-        b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float "
+        b"z\n"
         b"element face 1\nproperty list uchar uint vertex_indices\nend_header\n"
         + CUBE[:3].astype("<f4").tobytes()
         + b"\x03"

@@ -129,7 +129,7 @@ def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 
 def write_obj(path, vertices, faces) -> None:
-    lines = ["v %.17g %.17g %.17g" % tuple(p) for p in vertices] + [
+    lines = ["v {:.17g} {:.17g} {:.17g}".format(*p) for p in vertices] + [
         "f " + " ".join(str(i + 1) for i in face) for face in faces.tolist()
     ]
     path.write_text("\n".join(lines) + "\n")

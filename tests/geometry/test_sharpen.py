@@ -37,8 +37,8 @@ def test_bevels_collapse_onto_vertices_they_had():
     out, found = sharpen.collapse_bevels(vertices, faces, np.ones(len(vertices), bool), longest)
     assert len(found) < 0.9 * len(faces) and topology.invariants(found) == topology.invariants(faces)
     assert {tuple(place) for place in out.tolist()} < {tuple(place) for place in vertices.tolist()}
-    for moved, longest in ((np.zeros(len(vertices), bool), longest), (np.ones(len(vertices), bool), 0.0)):
-        same, same_faces = sharpen.collapse_bevels(vertices, faces, moved, longest)
+    for moved, most in ((np.zeros(len(vertices), bool), longest), (np.ones(len(vertices), bool), 0.0)):
+        same, same_faces = sharpen.collapse_bevels(vertices, faces, moved, most)
         assert (same == vertices).all() and (same_faces == faces).all()
 
 

@@ -254,7 +254,7 @@ def test_goes_on_after_a_kill(gdtool, box, tmp_path):
     assert [one["path"] for one in manifest(tmp_path / "data")["content"]["objects"]] == [
         f"{name}.asset/views" for name in "abc"
     ]
-    assert not [path for path in (tmp_path / "data").rglob(".*")]
+    assert not list((tmp_path / "data").rglob(".*"))
     assert gdtool("validate", tmp_path / "data").returncode == 0
 
 
@@ -281,7 +281,7 @@ def test_memory_does_not_grow_with_the_number_of_objects(monkeypatch):
                 )
             )
             assert [r.status for r in results] == ["done"] * 5
-        with open("/proc/self/statm") as file:
+        with Path("/proc/self/statm").open() as file:
             return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
     settled = rounds(4)

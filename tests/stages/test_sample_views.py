@@ -243,7 +243,9 @@ def test_a_result_that_the_model_is_unsure_of_is_told(gdtool, picture, tiny_mode
 def test_loading_a_model_leaves_pytorchs_compiler_out():
     # It takes a second to import, and one operation on the meta device, where shapes are checked, can do that.
     code = (
-        "import sys; from pathlib import Path; import gdtool.models; from gdtool.diffusion.checkpoint.weights import load_model; "
-        "load_model(Path(gdtool.models.__file__).parent / 'default'); print([m for m in ('torch._dynamo', 'sympy') if m in sys.modules])"
+        "import sys; from pathlib import Path; import gdtool.models; from gdtool.diffusion.checkpoint.weights import "
+        "load_model; "
+        "load_model(Path(gdtool.models.__file__).parent / 'default'); print([m for m in ('torch._dynamo', 'sympy') "
+        "if m in sys.modules])"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

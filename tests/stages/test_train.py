@@ -35,10 +35,10 @@ def test_train_writes_a_model_that_validates_and_then_skips(gdtool, spheres, tmp
         and manifest["content"]["steps"] == 4
         and manifest["content"]["report"]["objects"] == 2
     )
-    rows = list(csv.DictReader(open(model / "loss.csv")))
+    rows = list(csv.DictReader((model / "loss.csv").read_text().splitlines()))
     assert [int(row["step"]) for row in rows] == [1, 2, 3, 4] and all(float(row["loss"]) > 0 for row in rows)
     assert (model / "validation" / "step_000004.png").stat().st_size > 1000
-    told = list(csv.DictReader(open(model / "validation.csv")))
+    told = list(csv.DictReader((model / "validation.csv").read_text().splitlines()))
     assert [row["step"] for row in told] == ["4"] and 0 < float(told[0]["color"]) < 60 and float(told[0]["seconds"]) > 0
     assert (model / "loss.png").is_file() and "spheres" not in (model / "card.md").read_text()
     assert not list(model.glob("**/*.pt")) and load_file(model / "model.safetensors")
@@ -53,7 +53,7 @@ def test_tensorboard_has_every_row_of_the_log(gdtool, spheres, tmp_path):
     assert run.returncode == 0, run.stderr
     found = loader.EventAccumulator(str(tmp_path / "model/tensorboard"))
     found.Reload()
-    rows = list(csv.DictReader(open(tmp_path / "model/loss.csv")))
+    rows = list(csv.DictReader((tmp_path / "model/loss.csv").read_text().splitlines()))
     assert [(event.step, pytest.approx(event.value, rel=1e-4)) for event in found.Scalars("loss")] == [
         (int(row["step"]), float(row["loss"])) for row in rows
     ]

@@ -120,10 +120,10 @@ def reflected(
     helper = torch.eye(3, dtype=dtype)[int(pole.abs().argmin())]
     x = normalize(torch.linalg.cross(helper, pole))
     y = torch.linalg.cross(pole, x)
-    l = local[:, :1] * x + local[:, 1:2] * y + local[:, 2:] * pole
+    light = local[:, :1] * x + local[:, 1:2] * y + local[:, 2:] * pole
     w = weight[:, None].expand(-1, spokes).reshape(-1)
-    h = normalize(l + v)
-    n_l = l[:, 2].clamp_min(0)
+    h = normalize(light + v)
+    n_l = light[:, 2].clamp_min(0)
     a, r, m = (torch.as_tensor(t, dtype=dtype) for t in (albedo, roughness, metallic))
     diffuse, specular = models.reflectance(
         kind,
@@ -136,5 +136,5 @@ def reflected(
         h[:, 2].clamp(0, 1),
         (h * v).sum(-1).clamp(0, 1),
     )
-    radiance = evaluate(lights.to(dtype), l) * (n_l * w)[:, None]
+    radiance = evaluate(lights.to(dtype), light) * (n_l * w)[:, None]
     return (diffuse * radiance).sum(0), (specular * radiance).sum(0)

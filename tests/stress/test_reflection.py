@@ -49,20 +49,20 @@ def test_fresnel():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_visibility(kind):
-    l, v = (x.reshape(-1) for x in torch.meshgrid(cosines(201), cosines(201), indexing="ij"))
+    light, v = (x.reshape(-1) for x in torch.meshgrid(cosines(201), cosines(201), indexing="ij"))
     for r in (0.0, 1e-12, 0.045, 0.1, 0.3, 0.7, 1.0):
         roughness = torch.tensor(r)
-        value = models.visibility(kind, roughness, l, v)
+        value = models.visibility(kind, roughness, light, v)
         assert torch.isfinite(value).all() and (value > 0).all()
         alpha = models.alpha_of(roughness)
         if kind == "gltf":
-            exact = models.visibility_gltf(alpha.double(), l.double(), v.double())
+            exact = models.visibility_gltf(alpha.double(), light.double(), v.double())
         else:
             exact = models.visibility_paper(
-                roughness.double().clamp_min(float(torch.tensor(models.MIN_ROUGHNESS))), l.double(), v.double()
+                roughness.double().clamp_min(float(torch.tensor(models.MIN_ROUGHNESS))), light.double(), v.double()
             )
         assert worst_ulp(value, exact) <= 4
-        assert torch.allclose(value, models.visibility(kind, roughness, v, l), rtol=4 * ULP)  # reciprocal
+        assert torch.allclose(value, models.visibility(kind, roughness, v, light), rtol=4 * ULP)  # reciprocal
 
 
 def test_ndf_is_accurate_and_normalised():
@@ -289,8 +289,8 @@ def test_no_frame_and_no_channel_is_special(scene, seed):
 @given(unit_vectors(), unit_vectors(), st.floats(0, 1, width=32), st.floats(0, 1, width=32), st.sampled_from(KINDS))
 def test_the_models_are_reciprocal(light_direction, view, roughness, metallic, kind):
     """Both BRDFs, pointwise; not their closed forms, which are evaluated at the mirror direction."""
-    l, v = light_direction.double(), view.double()
-    h = normalize(l + v)
+    light, v = light_direction.double(), view.double()
+    h = normalize(light + v)
     r, m, albedo = (torch.tensor(x, dtype=torch.float64) for x in (roughness, metallic, [0.8, 0.4, 0.1]))
     args = models.f0_of(albedo, m, 0.04)
 
@@ -299,7 +299,7 @@ def test_the_models_are_reciprocal(light_direction, view, roughness, metallic, k
             models.reflectance(kind, albedo, r, m, args, a[2].abs(), b[2].abs(), h[2].abs(), (h * v).sum().clamp(0, 1))
         )
 
-    assert torch.allclose(value(l, v), value(v, l), rtol=1e-12)
+    assert torch.allclose(value(light, v), value(v, light), rtol=1e-12)
 
 
 def adversaries():

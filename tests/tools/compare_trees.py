@@ -61,7 +61,8 @@ def cases() -> list[Case]:
     add("views", "render-dataset procedural:3 --size 128")
     add(
         "views_turned",
-        "render-dataset procedural:12 --size 96 --rig turntable --views 3 --fov 40 --elevation 20 --light mid --turn 45",
+        "render-dataset procedural:12 --size 96 --rig turntable --views 3 --fov 40 --elevation 20 --light mid --turn "
+        "45",
     )
     add(
         "views_solid",
@@ -73,7 +74,8 @@ def cases() -> list[Case]:
     add("views_real", "render-dataset assets/mesh/odedstein/spot/spot.obj --size 128", "mesh/odedstein/spot/spot.obj")
     add(
         "objects",
-        "render-dataset procedural:20..22 --size 64 --samples 4 --condition-views 2 --domains color,normal,depth,albedo,roughness,metallic",
+        "render-dataset procedural:20..22 --size 64 --samples 4 --condition-views 2 --domains "
+        "color,normal,depth,albedo,roughness,metallic",
     )
     # import-views: a plain folder, one of Wonder3D's, NeRF's
     add("views_plain", "import-views sources/plain --format plain")
@@ -453,7 +455,7 @@ class Comparison:
 
 def _without_times(path: Path) -> list[list[str]]:
     """The cells of a .csv file without its columns of times."""
-    with open(path, newline="") as file:
+    with path.open(newline="") as file:
         rows = list(csv.reader(file))
     kept = [k for k, name in enumerate(rows[0]) if not re.search("minutes|seconds", name)]
     return [[row[k] for k in kept] for row in rows]

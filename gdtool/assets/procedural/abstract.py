@@ -144,12 +144,12 @@ def stack(rng) -> Assembly:
         s, finish = rng.uniform(0.2, 0.5), tiles.pick(rng)
         kind, turn = rng.integers(5), rng.choice([0, 0, 45])
         part, tall = [
-            (lambda: box(1.4 * s, 1.1 * s, 1.4 * s, 0.03, 10), 1.1 * s),
-            (lambda: ball(s, count=36), 2 * s),
-            (lambda: cylinder(s, s, count=44), s),
-            (lambda: cone(s, 1.6 * s, 40).moved(y=-0.8 * s), 1.6 * s),
+            (lambda s: box(1.4 * s, 1.1 * s, 1.4 * s, 0.03, 10), 1.1 * s),
+            (lambda s: ball(s, count=36), 2 * s),
+            (lambda s: cylinder(s, s, count=44), s),
+            (lambda s: cone(s, 1.6 * s, 40).moved(y=-0.8 * s), 1.6 * s),
             (
-                lambda: tube(
+                lambda s: tube(
                     s * np.stack([np.cos(w := 2 * np.pi * np.arange(48) / 48), 0 * w, np.sin(w)], -1),
                     0.3 * s,
                     closed=True,
@@ -158,7 +158,7 @@ def stack(rng) -> Assembly:
                 0.6 * s,
             ),
         ][kind]
-        part = part().turned("y", turn).moved(y=y + tall / 2)
+        part = part(s).turned("y", turn).moved(y=y + tall / 2)
         if rng.uniform() < 0.35:
             a.add_pair(part.moved(s * rng.uniform(1.0, 1.5)), finish)
         else:

@@ -41,7 +41,7 @@ class Assembly:
             points = (np.concatenate([part.vertices for part in parts]) - center) * scale
             directions = np.concatenate([part.normals for part in parts])
             starts = np.cumsum([0, *[len(part.vertices) for part in parts]])
-            triangles = np.concatenate([part.faces + start for part, start in zip(parts, starts)])
+            triangles = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
             look = self.finishes[members[0]](
                 Shape(points, directions, lambda p=points, n=directions, f=triangles: convexity(p, n, f))
             )

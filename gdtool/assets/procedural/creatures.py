@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from gdtool.assets.procedural import finishes, solids, tiles
@@ -481,7 +483,7 @@ def dragon(rng) -> Assembly:
     wing, span, rise = tiles.pick(rng, "skin"), rng.uniform(0.6, 0.95), rng.uniform(0.3, 0.6)
     fingers = np.array([(0.45, 1.0), (1.0, 0.62), (0.9, 0.0), (0.5, -0.18)]) * np.array([span, rise])
     rim = [(0.0, 0.1), tuple(fingers[0])]
-    for start, end in zip(fingers[:-1], fingers[1:]):  # the skin sags between the fingers
+    for start, end in itertools.pairwise(fingers):  # the skin sags between the fingers
         rim += [tuple(0.82 * (start + end) / 2 + 0.18 * np.array([0.4 * span, 0.3 * rise])), tuple(end)]
     middle = np.array([0.42 * span, 0.35 * rise])
     fold, lean = rng.uniform(-10, 35), rng.uniform(-25, 15)

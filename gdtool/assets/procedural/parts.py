@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -252,7 +253,7 @@ def refined(profile: np.ndarray, step: float) -> np.ndarray:
     """The polyline (k, c) with extra rows so that no piece is longer than `step` in its first two columns."""
     profile = np.asarray(profile, float)
     rows = [profile[:1]]
-    for a, b in zip(profile[:-1], profile[1:]):
+    for a, b in itertools.pairwise(profile):
         pieces = max(1, int(np.ceil(np.hypot(*(b - a)[:2]) / step)))
         rows.append(a + (b - a) * (np.arange(1, pieces + 1) / pieces)[:, None])
     return np.concatenate(rows)

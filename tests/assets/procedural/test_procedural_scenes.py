@@ -39,8 +39,8 @@ def test_the_same_seed_gives_the_same_scene_and_another_one_another():
         first, second = generate(seed), generate(seed)
         assert same_array(first.vertices, second.vertices) and same_array(first.faces, second.faces)
         assert same_array(first.normals, second.normals) and same_array(first.material_idx, second.material_idx)
-        assert all(same_array(a, b) for a, b in zip(first.uvs, second.uvs))
-        for a, b in zip(first.materials, second.materials):
+        assert all(same_array(a, b) for a, b in zip(first.uvs, second.uvs, strict=True))
+        for a, b in zip(first.materials, second.materials, strict=True):
             assert (a.name, a.base_color, a.metallic, a.roughness) == (b.name, b.base_color, b.metallic, b.roughness)
             if a.base_color_texture is not None:
                 assert same_array(a.base_color_texture.image, b.base_color_texture.image)
@@ -58,7 +58,8 @@ def test_objects_do_not_depend_on_threads_or_hash_seed():
     script = (
         "import hashlib\nfrom gdtool.assets.procedural import generate\nh = hashlib.sha256()\n"
         "for seed, kind in ((246, 'burger'), (1, 'rock'), (2, 'quadruped'), (3, 'boat'), (4, 'bread')):\n"
-        "    s = generate(seed, kind)\n    [h.update(a.tobytes()) for a in (s.vertices, s.faces, s.normals, *s.uvs)]\nprint(h.hexdigest())"
+        "    s = generate(seed, kind)\n    [h.update(a.tobytes()) for a in (s.vertices, s.faces, s.normals, *s.uvs)]\n"
+        "print(h.hexdigest())"
     )
     digests = {
         subprocess.run(
