@@ -104,12 +104,12 @@ def debugging() -> bool:
 
 
 def report(error: GdtoolError) -> None:
-    """One line on stderr."""
+    """Write an error as one line to stderr."""
     report_text(str(error).removeprefix("gdtool: "))
 
 
 def report_text(text: str) -> None:
-    """A line of gdtool's on stderr."""
+    """Write one of gdtool's lines to stderr."""
     log.line(f"gdtool: {text}")
 
 
@@ -183,7 +183,7 @@ def set_verbosity(quiet: bool, verbose: bool) -> None:
 
 
 def option_from_field(field: Any, hint: Any) -> click.Option:
-    """The click option of one field of a msgspec Struct: name, type, bounds, default and help come from it."""
+    """Return the click option of one field of a msgspec Struct: name, type, bounds, default and help come from it."""
     meta, inner, optional = msgspec.Meta(), hint, False
     if typing.get_origin(inner) is typing.Annotated:
         inner, meta = typing.get_args(inner)[0], typing.get_args(inner)[1]
@@ -231,7 +231,7 @@ def options_from(struct: type) -> list[click.Option]:
 
 
 def build_options(struct: type, values: dict[str, Any]) -> Any:
-    """The Struct from parsed values, checked against its constraints. Raises UsageError."""
+    """Return the Struct from parsed values, checked against its constraints. Raises UsageError."""
     try:
         return msgspec.convert({field.name: values[field.name] for field in msgspec.structs.fields(struct)}, struct)
     except msgspec.ValidationError as error:
@@ -242,7 +242,7 @@ _SHARD = re.compile(r"([0-9]{1,9})/([0-9]{1,9})")
 
 
 def shard_of(text: str | None) -> tuple[int, int]:
-    """The I and N of I/N. Raises UsageError."""
+    """Return the I and N of I/N. Raises UsageError."""
     if text is None:
         return 1, 1
     match = _SHARD.fullmatch(text)
@@ -252,8 +252,8 @@ def shard_of(text: str | None) -> tuple[int, int]:
 
 
 def help_of(module: types.ModuleType) -> str:
-    """A module's docstring as click help: pasted examples keep their line breaks. Under python -OO it is read from the
-    source."""
+    """Return a module's docstring as click help: pasted examples keep their line breaks. Under python -OO it is read
+    from the source."""
     text = module.__doc__
     if text is None:
         import ast
@@ -267,7 +267,7 @@ MOST_THREADS = 1024
 
 
 def stage_command(stage: Stage, help: str) -> click.Command:
-    """The command line of a stage."""
+    """Return the command line of a stage."""
 
     def invoke(**values: Any) -> int:
         from gdtool.core.runner import Settings, run_all

@@ -45,7 +45,8 @@ def _plugins():
 
 
 def _loaded(plugin) -> click.Command:
-    """The command that an entry point names. Raises ResourceError where it cannot be imported or is no command."""
+    """Return the command that an entry point names. Raises ResourceError where it cannot be imported or is no
+    command."""
     package = plugin.dist.name if plugin.dist is not None else plugin.module
     cure = f"pip uninstall {package}, or install a release of it that works with this gdtool"
     try:

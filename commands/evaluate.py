@@ -40,6 +40,7 @@ def _one(text, reference, views, options):
 )
 @verbosity_options
 def command(results, reference, views, as_json, quiet, verbose, debug, **values):
+    """Measure results against a reference and write the figures to stdout."""
     set_verbosity(quiet, verbose)
     options = build_options(stage.Options, values)
     failed, done = [], 0

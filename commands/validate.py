@@ -21,6 +21,7 @@ SHOWN = 10  # the first faults are enough to start mending
 @click.argument("paths", metavar="[SOURCES]...", nargs=-1, type=TEXT)
 @verbosity_options
 def command(paths, as_json, quiet, verbose, debug):
+    """Check each source and return the exit code."""
     set_verbosity(quiet, verbose)
     code = 0
     for text in sources.incoming(paths):

@@ -1,0 +1,1 @@
+"""Read scenes from glTF, OBJ, PLY and STL files, write glTF, and generate objects."""

@@ -71,7 +71,7 @@ class GltfFile:
         self.notes += [f"extension {printed(name)} is ignored" for name in ignored]
 
     def refuse(self, fact: str, cure: str) -> InputError:
-        """The error to raise for a fault of this file."""
+        """Return the error to raise for a fault of this file."""
         return InputError(self.path, fact, cure)
 
     def item(self, items: Sequence[Any], index: int, what: str) -> Any:
@@ -145,7 +145,7 @@ class GltfFile:
         return path
 
     def buffer(self, index: int) -> memoryview:
-        """The bytes of a buffer, byteLength of them."""
+        """Return the bytes of a buffer, byteLength of them."""
         if index not in self._buffers:
             record = self.item(self.document.buffers, index, "buffer")
             if record.uri is not None:
@@ -164,7 +164,7 @@ class GltfFile:
         return self._buffers[index]
 
     def _read_buffer(self, path: Path, length: int, index: int) -> bytes:
-        """The first length bytes of a file, fewer where it has fewer."""
+        """Return the first length bytes of a file, fewer where it has fewer."""
         try:
             self.check_memory(min(path.stat().st_size, length), f"buffer {index}", SIMPLIFY)
             with path.open("rb") as file:
@@ -173,7 +173,7 @@ class GltfFile:
             raise from_os_error(error, path) from None
 
     def view(self, index: int) -> memoryview:
-        """The bytes of a buffer view, decompressed where EXT_meshopt_compression packs them."""
+        """Return the bytes of a buffer view, decompressed where EXT_meshopt_compression packs them."""
         if index not in self._views:
             record = self.item(self.document.buffer_views, index, "buffer view")
             packed = record.extensions.EXT_meshopt_compression
@@ -203,7 +203,7 @@ class GltfFile:
         require_memory(size, self.path, what, cure)
 
     def accessor(self, index: int) -> tuple[np.ndarray, Accessor]:
-        """The stored numbers of an accessor, (count, ...) in their own type with sparse values set in, and its
+        """Return the stored numbers of an accessor, (count, ...) in their own type with sparse values set in, and its
         record."""
         record: Accessor = self.item(self.document.accessors, index, "accessor")
         dtype, shape = np.dtype(_DTYPES[record.component_type]), _SHAPES[record.type]
@@ -264,7 +264,7 @@ class GltfFile:
         return out
 
     def floats(self, index: int, always_normalized: bool = False) -> np.ndarray:
-        """An accessor as float64, normalised integers decoded (specification, section 3.11).
+        """Return an accessor as float64, normalised integers decoded (specification, section 3.11).
 
         always_normalized: integers are normalised even where the file forgets to say so.
         """
@@ -275,5 +275,5 @@ class GltfFile:
 
 
 def printed(name: str) -> str:
-    """A name from the file for a message: as it is where it is printable, else escaped."""
+    """Return a name from the file for a message: as it is where it is printable, else escaped."""
     return name if name.isprintable() and len(name) <= 80 else shown(name)

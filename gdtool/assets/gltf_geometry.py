@@ -50,8 +50,8 @@ def check_geometry(file: GltfFile, visible: list[int]) -> None:
 
 
 def predicted_geometry(file: GltfFile, visible: list[int]) -> Geometry:
-    """What the meshes of the visible nodes expand to; no buffer is read. Raises InputError for references that lead
-    nowhere."""
+    """Return what the meshes of the visible nodes expand to; no buffer is read. Raises InputError for references that
+    lead nowhere."""
     parts = vertices = faces = kept = most = 0
     flat_corners = 0
     names: set[str] = set()

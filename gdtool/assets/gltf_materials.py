@@ -128,7 +128,7 @@ class MaterialReader:
         return self._images[index]
 
     def _converted(self, material: Material, record: SpecularGlossiness, index: int) -> Material:
-        """The metallic-roughness material that reflects most nearly what the specular-glossiness one does."""
+        """Return the metallic-roughness material that reflects most nearly what the specular-glossiness one does."""
         diffuse_texture = self._texture(record.diffuse_texture, "srgb")
         specular_texture = self._texture(record.specular_glossiness_texture, "srgb")
         if specular_texture is None:

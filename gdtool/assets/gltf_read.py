@@ -145,7 +145,7 @@ def _local_matrix(file: GltfFile, node: Node, index: int) -> np.ndarray:
 
 
 def _read_primitive(file: GltfFile, primitive: Primitive, weights: tuple[float, ...], subject: str) -> Part | None:
-    """The primitive in its node's space; None for points and lines."""
+    """Return the primitive in its node's space; None for points and lines."""
     if primitive.mode < 4:
         file.notes.append(f"{subject}: {'points' if primitive.mode == 0 else 'lines'} are left out")
         return None
@@ -289,7 +289,7 @@ def _joint_matrices(
 
 
 def _placed(part: Part, matrix: np.ndarray) -> Part:
-    """The part under matrix (4, 4), or (v, 4, 4) one per vertex. A mirroring matrix turns the faces' winding."""
+    """Return the part under matrix (4, 4), or (v, 4, 4) one per vertex. A mirroring matrix turns the faces' winding."""
 
     def apply(linear: np.ndarray, vectors: np.ndarray) -> np.ndarray:
         return np.einsum("...ij,...j->...i", linear, vectors)
@@ -312,7 +312,7 @@ def _placed(part: Part, matrix: np.ndarray) -> Part:
 
 
 def _compact(part: Part) -> Part:
-    """The part without the vertices that no face refers to: primitives often share one long buffer."""
+    """Return the part without the vertices that no face refers to: primitives often share one long buffer."""
     used, faces = np.unique(part.faces, return_inverse=True)
     if len(used) == len(part.vertices):
         return part
@@ -387,7 +387,8 @@ def _joined(file: GltfFile, parts: list[Part]) -> Scene:
 
 
 def _flat(part: Part) -> Part:
-    """The part with every face's corners its own and the face's normal on them: glTF's rule for missing normals."""
+    """Return the part with every face's corners its own and the face's normal on them: glTF's rule for missing
+    normals."""
     from gdtool.geometry.normals import face_normals
 
     corner = part.faces.reshape(-1)

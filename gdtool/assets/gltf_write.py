@@ -45,7 +45,7 @@ def write_glb(
 
 
 def glb_bytes(scene: Scene, extras: dict[str, Any] | None = None, made: dict[int, str | bytes] | None = None) -> bytes:
-    """The content of the file that write_glb writes."""
+    """Return the content of the file that write_glb writes."""
     _check(scene)
     document = _Document(made or {})
     uv_slots = [i for i, uv in enumerate(scene.uvs) if uv is not None]
@@ -245,7 +245,7 @@ class _Document:
         return self._append("accessors", item)
 
     def texture(self, texture: Texture, encoding: str, uv_slots: list[int]) -> dict[str, Any]:
-        """The textureInfo of a texture."""
+        """Return the textureInfo of a texture."""
         magnify, minify = _FILTERS[texture.filter]
         sampler = self.unique(
             "samplers",
@@ -287,7 +287,7 @@ class _Document:
         return len(self.json[kind]) - 1
 
     def packed(self) -> bytes:
-        """The GLB (glTF 2.0 specification, section 4)."""
+        """Return the GLB (glTF 2.0 specification, section 4)."""
         if self.extensions:
             self.json["extensionsUsed"] = sorted(self.extensions)
         self.binary += b"\0" * (-len(self.binary) % 4)

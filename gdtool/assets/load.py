@@ -59,8 +59,8 @@ def load_scene(source: str | Path) -> Scene:
 
 
 def _checked(scene: Scene, path: Path) -> Scene:
-    """The scene without faces of which two corners coincide; those whose three lie on a line stay, being seams that
-    keep a mesh closed. Raises InputError for what no stage can work on."""
+    """Return the scene without faces of which two corners coincide; those whose three lie on a line stay, being seams
+    that keep a mesh closed. Raises InputError for what no stage can work on."""
     if not len(scene.faces):
         raise InputError(path, "has no faces", "export the model with its faces")
     if scene.faces.min() < 0 or scene.faces.max() >= len(scene.vertices):
@@ -113,7 +113,7 @@ def _degenerate(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, bo
 
 
 def _with_sound_normals(scene: Scene) -> Scene:
-    """The scene with the faces' own normals where a given one has no length."""
+    """Return the scene with the faces' own normals where a given one has no length."""
     if scene.normals is None:
         return scene
     bad = np.linalg.norm(scene.normals, axis=1) < 0.5

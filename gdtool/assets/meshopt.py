@@ -9,7 +9,7 @@ from gdtool.core.errors import InputError, ResourceError
 
 
 def decode_view(source: bytes, packed: MeshoptView, path: Path) -> bytes:
-    """The bytes that a compressed buffer view stands for: count elements, byteStride apart.
+    """Return the bytes that a compressed buffer view stands for: count elements, byteStride apart.
 
     path: the file that holds it, for messages. Raises InputError for a stream that does not decode, ResourceError
     without the package."""

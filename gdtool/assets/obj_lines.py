@@ -177,7 +177,7 @@ def _at_once(data: bytes) -> ObjLines | None:
 def _payload(
     text: np.ndarray, starts: np.ndarray, ends: np.ndarray, rows: np.ndarray, letters: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The bytes of some lines with their keys, of so many letters, blanked, and where each line begins there."""
+    """Return the bytes of some lines with their keys, of so many letters, blanked, and where each line begins there."""
     which = np.flatnonzero(rows)
     begin, length = starts[which], ends[which] - starts[which] + 1
     if len(which) and which[-1] - which[0] == len(which) - 1:  # one behind the other
@@ -200,7 +200,7 @@ def _words(payload: np.ndarray) -> np.ndarray:
 
 
 def _alike(words: np.ndarray, begin: np.ndarray) -> np.ndarray | None:
-    """The words (w,) of each of the lines (lines, words of each); None where some have more than others."""
+    """Return the words (w,) of each of the lines (lines, words of each); None where some have more than others."""
     if not len(begin) or len(words) % len(begin):
         return None
     table = words.reshape(len(begin), -1)
@@ -220,8 +220,8 @@ def _parsed(payload: np.ndarray, kind: type, count: int) -> np.ndarray:
 
 
 def _numbers(payload: np.ndarray, begin: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """The first `width` numbers of each line, and the fourth to sixth where there are so many, (lines, width) and
-    (lines or 0, 3)."""
+    """Return the first `width` numbers of each line, and the fourth to sixth where there are so many, (lines, width)
+    and (lines or 0, 3)."""
     if not len(begin):
         return np.empty((0, width)), np.empty((0, 3))
     table = _alike(_words(payload), begin)

@@ -21,7 +21,7 @@ _MERGED_BYTES = 48
 def obj_materials(
     path: Path, libraries: list[str], names: list[str], has_colors: bool
 ) -> tuple[tuple[Material, ...], list[str]]:
-    """The materials of an OBJ, one for each name in order, and notes about what was assumed.
+    """Return the materials of an OBJ, one for each name in order, and notes about what was assumed.
 
     base color: map_Kd (then Kd is ignored, as Blender does), else Kd, linear. roughness: map_Pr, Pr, else from Ns where
     Ks reflects at all: (2 / (Ns + 2))^(1/4), the GGX width of that Blinn-Phong lobe; else 0.5. metallic: map_Pm, Pm,
@@ -157,8 +157,8 @@ class _Textures:
         self._held = 0  # bytes
 
     def image(self, words: list[str], library: Path, folder: str) -> np.ndarray | None:
-        """The image of a texture statement, its one channel where -imfchan asks for it; None (and a note) when it
-        cannot be read.
+        """Return the image of a texture statement, its one channel where -imfchan asks for it; None (and a note) when
+        it cannot be read.
 
         words: those behind the keyword; library: the .mtl, and folder: its place relative to the model's.
         """

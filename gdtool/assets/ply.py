@@ -27,7 +27,7 @@ _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def binary_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Records of the vertices (v,) and triangles (f, 3), in the file's own types, of a PLY's bytes.
+    """Return records of the vertices (v,) and triangles (f, 3), in the file's own types, of a PLY's bytes.
 
     Raises ValueError with what keeps the file from being one vertex element of numbers and then one face element of
     triangles and nothing else, in binary.
@@ -53,7 +53,7 @@ def binary_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _layout(header: list[str], order: str) -> tuple[dict[str, int], np.dtype, np.dtype]:
-    """Counts by element, and the records of vertices and faces. Raises ValueError, IndexError or KeyError."""
+    """Return counts by element, and the records of vertices and faces. Raises ValueError, IndexError or KeyError."""
     counts: dict[str, int] = {}
     fields, lists, element = [], [], ""
     for line in header:

@@ -79,7 +79,7 @@ def read_scan(path: str | Path) -> Scene:
 
 
 def _plain_stl(data: bytes) -> _Scan | None:
-    """A binary STL; None for what is not as long as that says it is."""
+    """Return a binary STL; None for what is not as long as that says it is."""
     if (
         len(data) < _STL_HEADER
         or (len(data) - _STL_HEADER) != int.from_bytes(data[80:84], "little") * _STL_FACE.itemsize
@@ -90,7 +90,8 @@ def _plain_stl(data: bytes) -> _Scan | None:
 
 
 def _plain_ply(data: bytes) -> _Scan | None:
-    """A binary PLY of triangles whose vertices have places, normals and 8-bit colours, if not more; None for others."""
+    """Return a binary PLY of triangles whose vertices have places, normals and 8-bit colours, if not more; None for
+    others."""
     try:
         records, faces = binary_ply(data)
     except ValueError:

@@ -86,7 +86,7 @@ def camera_at(
     half_width: float = HALF_WIDTH,
     fov_degrees: float | None = None,
 ) -> Camera:
-    """A camera on a sphere around the origin, looking at it. Angles in degrees; with fov_degrees (across)
+    """Return a camera on a sphere around the origin, looking at it. Angles in degrees; with fov_degrees (across)
     perspective."""
     a, e = np.radians(azimuth), np.radians(elevation)
     position = distance * np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
@@ -101,7 +101,7 @@ def camera_at(
 
 
 def rig(name: str, size: int) -> list[Camera]:
-    """A named rig of square cameras: "six" (DESIGN's default) or "wonder3d" (same azimuths, orthographic width
+    """Return a named rig of square cameras: "six" (DESIGN's default) or "wonder3d" (same azimuths, orthographic width
     1.35)."""
     half_widths = {"six": HALF_WIDTH, "wonder3d": 1.35 / 2}
     if name not in half_widths:

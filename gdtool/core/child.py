@@ -81,7 +81,8 @@ def end_waiting() -> None:
 
 
 def _module_of(function: Callable[..., Any]) -> str:
-    """The name that a child imports the function's module by; of a script that is running, the name of its file."""
+    """Return the name that a child imports the function's module by; of a script that is running, the name of its
+    file."""
     if function.__module__ != "__main__":
         return function.__module__
     main = sys.modules["__main__"]

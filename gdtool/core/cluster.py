@@ -93,7 +93,7 @@ def _next(ray: Any, waiting: dict[Any, str]) -> Any:
 
 
 def _within(folder: str, work: Callable[[str], Any], text: str) -> Any:
-    """What a worker does: everything relative is meant from the driver's folder."""
+    """Return what a worker does: everything relative is meant from the driver's folder."""
     from gdtool.core import log
 
     log.level = log.QUIET

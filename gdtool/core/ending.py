@@ -104,8 +104,8 @@ def certainly(clean_up: Callable[[], None]) -> Iterator[None]:
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """A folder of this process in the system's folder for temporary files, removed at the end of the block whatever
-    ends it."""
+    """Return a folder of this process in the system's folder for temporary files, removed at the end of the block
+    whatever ends it."""
     import shutil
     import tempfile
 

@@ -80,7 +80,7 @@ _BAD_NAMES = {
 
 
 def from_os_error(error: OSError, subject: object) -> GdtoolError:
-    """The error to report for an OSError: what failed is in its file name, else in subject.
+    """Return the error to report for an OSError: what failed is in its file name, else in subject.
 
     InputError for names that are too long or lead in a circle, ResourceError for the machine's limits, OutputError for
     all else."""
@@ -133,13 +133,13 @@ _MOST_SHOWN = 200  # characters of another program's message
 
 
 def first_line(error: BaseException) -> str:
-    """What an exception says, cut to a part of a line."""
+    """Return what an exception says, cut to a part of a line."""
     return (str(error).strip() or "no message").splitlines()[0][:_MOST_SHOWN]
 
 
 def missing_library(error: ImportError) -> GdtoolError | None:
-    """The error to report for an import that lacks a shared library of the system or a Python package; None for any
-    other.
+    """Return the error to report for an import that lacks a shared library of the system or a Python package; None for
+    any other.
 
     A module of gdtool that cannot be imported is a fault of gdtool.
     """
@@ -158,7 +158,7 @@ def missing_library(error: ImportError) -> GdtoolError | None:
 
 
 def from_exception(error: Exception, subject: object) -> GdtoolError:
-    """The error to report for anything that was raised while working on subject.
+    """Return the error to report for anything that was raised while working on subject.
 
     GdtoolError: itself. OutputError, InputError or ResourceError for what the system, the memory, a device or a missing
     library does. A GdtoolError with exit code 1, "internal error", for all else."""
@@ -207,7 +207,7 @@ def asked_for(error: BaseException) -> str:
 
 
 def internal_error(error: BaseException, subject: object) -> GdtoolError:
-    """The error to report for a fault of gdtool itself."""
+    """Return the error to report for a fault of gdtool itself."""
     return GdtoolError(
         subject,
         f"internal error ({type(error).__name__}: {first_line(error)})",

@@ -21,10 +21,12 @@ class Folder:
 
     @property
     def kind(self) -> str:
+        """The kind of the folder, such as 'views' (a key of kinds.CONTENTS)."""
         return self.manifest.kind
 
     @property
     def content(self) -> Content:
+        """What the manifest says that the folder holds."""
         return self.manifest.content
 
     @property
@@ -64,7 +66,7 @@ def open_folder(path: Path | str, kinds: tuple[str, ...] = (), reader: str = "",
 
 
 def dataset_objects(dataset: Folder) -> Iterator[Folder]:
-    """The views folders that a dataset lists, in its order; their files are not checked.
+    """Yield the views folders that a dataset lists, in its order; their files are not checked.
 
     Raises InputError for one that leaves the dataset, is missing, or is not the one listed (another digest).
     """

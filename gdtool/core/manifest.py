@@ -97,7 +97,7 @@ def file_sha256(path: Path) -> str:
 
 
 def encode(manifest: Manifest) -> bytes:
-    """The bytes of manifest.json: indented, in field order, one trailing newline."""
+    """Return the bytes of manifest.json: indented, in field order, one trailing newline."""
     try:
         return msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n"
     except UnicodeEncodeError:
@@ -106,7 +106,7 @@ def encode(manifest: Manifest) -> bytes:
 
 
 def _nearest(message: str, types: tuple[type, ...]) -> str:
-    """A hint for msgspec's unknown field message: the known field nearest to the unknown one."""
+    """Return a hint for msgspec's unknown field message: the known field nearest to the unknown one."""
     unknown = re.search(r"unknown field `([^`]+)`", message)
     if not unknown:
         return ""
@@ -151,7 +151,7 @@ def _files_named_in(content: Content) -> Iterator[str]:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest of a folder. Raises InputError when there is none or it is faulty."""
+    """Return the manifest of a folder. Raises InputError when there is none or it is faulty."""
     path = folder / MANIFEST
     if not path.is_file():
         fact = (
@@ -164,7 +164,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def check_files(folder: Path, manifest: Manifest) -> None:
-    """Raises InputError when a listed file is missing, leaves the folder by a link, or has another size or hash."""
+    """Raise InputError when a listed file is missing, leaves the folder by a link, or has another size or hash."""
     for entry in manifest.files:
         path = path_inside(folder, entry.path, folder / MANIFEST, "file")
         if not path.is_file():
@@ -180,7 +180,7 @@ def check_files(folder: Path, manifest: Manifest) -> None:
 
 
 def _maker(manifest: Manifest) -> str:
-    """What wrote a folder, for a message."""
+    """Return what wrote a folder, for a message."""
     return f"gdtool {manifest.stage}" if manifest.key else "the program that wrote it"
 
 

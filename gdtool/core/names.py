@@ -24,7 +24,7 @@ _BYTE_ESCAPES = range(0xDC80, 0xDD00)
 
 
 def text_fault(text: str, byte_escapes: bool = False) -> str | None:
-    """What makes text unfit to be a name or a line of output; None where nothing does.
+    """Return what makes text unfit to be a name or a line of output; None where nothing does.
 
     NUL, control characters (C0, DEL, C1) and lone surrogates. byte_escapes: accept U+DC80 to U+DCFF, which stand for
     the bytes of a name on disk that is not UTF-8."""
@@ -40,7 +40,7 @@ def text_fault(text: str, byte_escapes: bool = False) -> str | None:
 
 
 def name_fault(text: str, byte_escapes: bool = False) -> str | None:
-    """What makes text unfit to be one component of a path; None where nothing does."""
+    """Return what makes text unfit to be one component of a path; None where nothing does."""
     if not text:
         return "is empty"
     if text in (".", ".."):
@@ -69,7 +69,7 @@ def checked_name(text: str, subject: object, what: str) -> str:
 def path_inside(
     folder: Path, relative: str, subject: object, what: str, *, levels_up: int = 0, byte_escapes: bool = False
 ) -> Path:
-    """The path that a name inside a file stands for: folder / relative, below folder, links followed.
+    """Return the path that a name inside a file stands for: folder / relative, below folder, links followed.
 
     relative: components with forward slashes; an absolute one, a drive, a backslash, control characters, lone
     surrogates and over-long names are refused. levels_up: how many folders above `folder` still belong to it. subject:
@@ -94,7 +94,8 @@ def path_inside(
 def relative_parts(
     relative: str, subject: object, what: str, *, levels_up: int | None = 0, byte_escapes: bool = False
 ) -> tuple[str, ...]:
-    """The components of a relative path in a file, "." left out and ".." kept. Raises InputError as path_inside() does.
+    """Return the components of a relative path in a file, "." left out and ".." kept. Raises InputError as
+    path_inside() does.
 
     levels_up: how far ".." may lead above the start; None: as far as it likes.
     """
@@ -129,7 +130,7 @@ def relative_parts(
 
 
 def uri_path(folder: Path, uri: str, subject: object, what: str, *, levels_up: int = 0) -> Path:
-    """The path of the file that a relative URI or a customary file name in a model stands for.
+    """Return the path of the file that a relative URI or a customary file name in a model stands for.
 
     It is percent-decoded first and judged then. A file that is really called as the URI is written, percent signs and
     all, goes before; backslashes are taken for slashes. A scheme (file:, http:, C:) is refused. Raises InputError."""
@@ -156,8 +157,8 @@ def shown(text: str, most: int = 80) -> str:
 
 
 def name_from_path(text: str) -> str:
-    """An object's name from a file's: bytes that are not UTF-8 are read as Latin-1, and what no name may hold becomes
-    underscores."""
+    """Return an object's name from a file's: bytes that are not UTF-8 are read as Latin-1, and what no name may hold
+    becomes underscores."""
     plain = "".join(chr(ord(c) - 0xDC00) if ord(c) in _BYTE_ESCAPES else c for c in text)
     name = "".join("_" if c in "/\\" or text_fault(c) else c for c in plain)
     if _DRIVE.match(name):

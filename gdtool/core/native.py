@@ -33,7 +33,8 @@ def imported(module: str) -> ModuleType:
 
 
 def imported_if_installed(module: str) -> ModuleType | None:
-    """imported(), but None where the package is not installed: for one that has an equal substitute."""
+    """Import a module as imported() does; None where its package is not installed. For one that has an equal
+    substitute."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
@@ -45,7 +46,7 @@ def imported_if_installed(module: str) -> ModuleType | None:
 
 
 def import_error(error: ImportError | OSError, module: str) -> GdtoolError | MemoryError:
-    """The error to report for a failed import of `module`.
+    """Return the error to report for a failed import of `module`.
 
     MemoryError where there was no room for it: in a child with a memory limit that is a reason to fall back, elsewhere
     exit code 5."""

@@ -43,8 +43,8 @@ class Origin:
 
 
 def origins(folder: Folder) -> Iterator[Origin]:
-    """What a folder was made from, generated objects left out; paths in manifests are relative to where the folder
-    really lies."""
+    """Yield what a folder was made from, generated objects left out; paths in manifests are relative to where the
+    folder really lies."""
     for entry in folder.manifest.inputs:
         if not entry.path.startswith("procedural:"):
             parts = relative_parts(entry.path, folder.path / MANIFEST, "input", levels_up=None, byte_escapes=True)
@@ -52,7 +52,7 @@ def origins(folder: Folder) -> Iterator[Origin]:
 
 
 def ancestors(folder: Folder, cure: str) -> Iterator[Folder]:
-    """The folders that this one was made from, nearest first, as far as they still lie where the manifests say; a
+    """Yield the folders that this one was made from, nearest first, as far as they still lie where the manifests say; a
     model's network is none.
 
     cure: what to do about a folder that was replaced since, for the message.
@@ -75,7 +75,7 @@ def ancestors(folder: Folder, cure: str) -> Iterator[Folder]:
 
 
 def find_ancestor(folder: Folder, kind: str, cure: str) -> Folder | None:
-    """The nearest folder of a kind along the provenance chain (the folder itself included), or None. Raises as
+    """Return the nearest folder of a kind along the provenance chain (the folder itself included), or None. Raises as
     ancestors() does."""
     if folder.kind == kind:
         return folder
@@ -83,7 +83,8 @@ def find_ancestor(folder: Folder, kind: str, cure: str) -> Folder | None:
 
 
 def missing_origin(folder: Folder, cure: str) -> Origin | None:
-    """The first thing along the provenance chain that lies no more where the manifests say; None where all is there.
+    """Return the first thing along the provenance chain that lies no more where the manifests say; None where all is
+    there.
     Raises as ancestors() does."""
     for one in (folder, *ancestors(folder, cure)):
         for origin in origins(one):
@@ -93,7 +94,7 @@ def missing_origin(folder: Folder, cure: str) -> Origin | None:
 
 
 def find_source(folder: Folder, cure: str) -> str | None:
-    """The first input along the chain that is not a folder: a file path, procedural:SEED, or None.
+    """Return the first input along the chain that is not a folder: a file path, procedural:SEED, or None.
 
     Raises InputError where the file or a folder on the way was replaced since; cure as for ancestors().
     """

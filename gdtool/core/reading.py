@@ -48,7 +48,7 @@ def require_regular_file(path: Path) -> None:
 
 
 def bytes_of(path: Path) -> bytes:
-    """The bytes of a file that the user named.
+    """Return the bytes of a file that the user named.
 
     Raises InputError where it is no regular file, ResourceError where it is larger than one input may be, OutputError
     where it cannot be read."""

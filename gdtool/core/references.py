@@ -39,8 +39,8 @@ _OPTION_WORDS = {
 
 
 def obj_file(model: Path, name: str, subject: Path, what: str, folder: str = "") -> Path | None:
-    """The path that a name in an .obj or .mtl stands for; None for an empty name or ".", which exporters write for no
-    file.
+    """Return the path that a name in an .obj or .mtl stands for; None for an empty name or ".", which exporters write
+    for no file.
 
     model: the .obj. folder: what the name is relative to, itself relative to the model's folder. Backslashes are taken
     for slashes, and of an absolute name only the last part counts. subject, what: as in path_inside(). Raises
@@ -52,8 +52,8 @@ def obj_file(model: Path, name: str, subject: Path, what: str, folder: str = "")
 
 
 def obj_texture(model: Path, name: str, subject: Path, what: str, folder: str = "") -> Path | None:
-    """The texture that a name in an .mtl stands for, as obj_file(); looked for in TEXTURE_PLACES, the first where none
-    holds it.
+    """Return the texture that a name in an .mtl stands for, as obj_file(); looked for in TEXTURE_PLACES, the first
+    where none holds it.
 
     Raises InputError also for a FIFO, a device or a socket.
     """
@@ -73,7 +73,7 @@ def obj_texture(model: Path, name: str, subject: Path, what: str, folder: str = 
 
 
 def obj_libraries(model: Path, line: str) -> Iterator[tuple[str, Path]]:
-    """The name and path of each library of an mtllib line: one name that holds spaces, or several names. Raises
+    """Yield the name and path of each library of an mtllib line: one name that holds spaces, or several names. Raises
     InputError."""
     try:
         whole = obj_file(model, line, model, "the material library")
@@ -88,7 +88,7 @@ def obj_libraries(model: Path, line: str) -> Iterator[tuple[str, Path]]:
 
 
 def library_folder(name: str) -> str:
-    """The folder of a library that an mtllib line names so, relative to the model's."""
+    """Return the folder of a library that an mtllib line names so, relative to the model's."""
     return _plain(name).rpartition("/")[0]
 
 
@@ -117,8 +117,8 @@ def is_readable(path: Path) -> bool:
 
 
 def referred_files(path: Path) -> list[Path]:
-    """The regular files that a .gltf or .obj names, of those that its reader would open. Never raises: the reader tells
-    what is wrong."""
+    """Return the regular files that a .gltf or .obj names, of those that its reader would open. Never raises: the
+    reader tells what is wrong."""
     try:
         if not path.is_file():
             return []

@@ -107,7 +107,7 @@ class SecondInputs:
 
 
 def second_inputs(stage: Stage, source: Source, given: dict[str, str | None]) -> SecondInputs:
-    """The stage's other inputs: what the flags name, else what lies along the provenance chain.
+    """Return the stage's other inputs: what the flags name, else what lies along the provenance chain.
 
     Raises InputError where a folder on the way there was replaced since, UsageError where a required one is not there.
     """
@@ -160,8 +160,8 @@ def names_file(field: Any) -> bool:
 
 
 def key_of(stage: str, version: int, options: dict[str, Any], inputs: list[tuple[str, str]]) -> str:
-    """What tells one result of a stage from another: sha256 of its name, version, options (files by digest), and (role,
-    digest) of its inputs."""
+    """Return what tells one result of a stage from another: sha256 of its name, version, options (files by digest), and
+    (role, digest) of its inputs."""
     return digest_of([stage, version, options, inputs])
 
 
@@ -193,7 +193,7 @@ def stale_reason(
 
 
 def _refuse_other_source(target: Path, stage: Stage, source: Source, chosen: bool) -> None:
-    """A default place that another source's result holds is not overwritten."""
+    """Raise UsageError where the default output folder holds the result of another source."""
     if chosen or stage.gathers or isinstance(source, Folder) or not is_folder(target):
         return
     before = next((entry.path for entry in read_manifest(target).inputs if entry.role == "source"), None)
@@ -368,7 +368,7 @@ def write_dataset_index(root: Path, results: list[Result]) -> Path:
 def _attempt(
     stage: Stage, text: str, *, options: Any, flags: dict[str, str | None], settings: Settings
 ) -> Result | GdtoolError:
-    """The result of one source, or what was wrong with it."""
+    """Return the result of one source, or what was wrong with it."""
     try:
         source = sources.resolve(text, stage.reads, stage.name, allow_missing=settings.dry_run)
         return run_one(stage, [source], options, flags, settings)

@@ -45,7 +45,7 @@ def expand(text: str) -> Iterator[str]:
 
 
 def incoming(arguments: tuple[str, ...]) -> Iterator[str]:
-    """Sources in order: the arguments, or without any the lines of stdin, each as soon as it arrives.
+    """Yield sources in order: the arguments, or without any the lines of stdin, each as soon as it arrives.
 
     Raises UsageError when both are empty: a pipe whose first stage failed fails as a whole. Also for what can be no
     source, before any of the arguments is worked on."""
@@ -66,7 +66,7 @@ MAX_LINE_BYTES = 2**20  # of stdin; a line of --json with all that was skipped t
 
 
 def _lines() -> Iterator[str]:
-    """The sources that stdin names, a line each: paths, or objects of --json. Raises UsageError."""
+    """Yield the sources that stdin names, a line each: paths, or objects of --json. Raises UsageError."""
     if sys.stdin is None or sys.stdin.isatty():
         return
     for raw in iter(functools.partial(sys.stdin.buffer.readline, MAX_LINE_BYTES + 1), b""):
@@ -80,7 +80,7 @@ def _lines() -> Iterator[str]:
 
 
 def _folder_of(raw: bytes, line: str) -> str | None:
-    """The folder that a line of --json names; None where it names none. Raises UsageError."""
+    """Return the folder that a line of --json names; None where it names none. Raises UsageError."""
     try:
         record = parse_json(raw, "stdin")
     except InputError as error:
@@ -97,7 +97,7 @@ def _folder_of(raw: bytes, line: str) -> str | None:
 
 
 def _checked(text: str) -> str:
-    """A source, which has to be one line. Raises UsageError for control characters and NUL."""
+    """Return a source, which has to be one line. Raises UsageError for control characters and NUL."""
     fault = text_fault(text, byte_escapes=True)
     if fault:
         raise UsageError(shown(text), fault, "rename it without that character")
@@ -141,7 +141,8 @@ HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+$")
 
 
 def hub_folder(text: str, revision: str = "") -> str:
-    """The folder that a Hugging Face hub id names, downloaded once; any other text, and what exists here, is itself.
+    """Return the folder that a Hugging Face hub id names, downloaded once; any other text, and what exists here, is
+    itself.
 
     revision: a branch, tag or commit there; "": its main branch.
 
@@ -168,7 +169,7 @@ def hub_folder(text: str, revision: str = "") -> str:
 
 
 def name_of(source: Source) -> str:
-    """The object's name: of a folder what its manifest says, of a file its stem."""
+    """Return the object's name: of a folder what its manifest says, of a file its stem."""
     if isinstance(source, Folder):
         return source.name
     if isinstance(source, str):

@@ -27,7 +27,7 @@ FILE = {"file": True}
 
 
 def file_option(description: str) -> Any:
-    """The annotation of an option that names a file, or one of a stage's built-in names."""
+    """Return the annotation of an option that names a file, or one of a stage's built-in names."""
     return Annotated[str | None, msgspec.Meta(description=description, extra=FILE)]
 
 
@@ -79,7 +79,7 @@ class Stage:
     checkpoint: str = ""
 
     def second(self, flag: str) -> SecondInput:
-        """The declaration of a second input."""
+        """Return the declaration of a second input."""
         found = self.second_inputs[flag]
         return SecondInput(found) if isinstance(found, str) else found
 

@@ -100,5 +100,5 @@ def write_mesh(out: Output, mesh: QuadMesh) -> None:
 
 
 def read_mesh(folder: Folder) -> QuadMesh:
-    """The mesh of a mesh or atlas folder. Raises InputError."""
+    """Return the mesh of a mesh or atlas folder. Raises InputError."""
     return read_obj(folder.file("mesh.obj"))

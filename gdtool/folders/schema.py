@@ -41,7 +41,7 @@ def _document(title: str, root: dict[str, Any], definitions: dict[str, Any]) -> 
 
 
 def text(schema: dict[str, Any]) -> str:
-    """The text of a schema file."""
+    """Return the text of a schema file."""
     return json.dumps(schema, indent=1, ensure_ascii=False) + "\n"
 
 

@@ -107,8 +107,8 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
 
 
 def read_picture(folder: Folder, cameras: list[Camera]) -> tuple[np.ndarray, Camera] | None:
-    """The picture (h, w, 4), linear color and straight alpha, that a views folder was made of, and the camera it looks
-    through.
+    """Return the picture (h, w, 4), linear color and straight alpha, that a views folder was made of, and the camera it
+    looks through.
 
     None where the folder holds none. Raises InputError for one that is not a whole number of times as fine as its view.
     """

@@ -1,0 +1,1 @@
+"""Work on triangle meshes: rays, distances, topology, repair, simplification, tangents, quality."""

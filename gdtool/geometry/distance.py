@@ -86,8 +86,8 @@ def _fcpw_search(vertices: np.ndarray, faces: np.ndarray) -> _Search | None:
 
 
 def by_place(points: np.ndarray) -> np.ndarray:
-    """An order (n,) of points (n, 3) in which those near to one another follow one another: what is read for one is
-    still in the cache for the next."""
+    """Return an order (n,) of points (n, 3) in which those near to one another follow one another: what is read for one
+    is still in the cache for the next."""
     low, high = points.min(0), points.max(0)
     cell = ((points - low) * (_CELLS / (float((high - low).max()) or 1.0))).astype(np.uint16)
     # Of 16 bits: in linear time.

@@ -28,7 +28,7 @@ class Grid:
 
 
 def grid_over(low: np.ndarray, high: np.ndarray, step: float, margin: int, multiple: int = 1) -> Grid:
-    """The grid of the given step that covers the box low..high and margin points more on each side.
+    """Return the grid of the given step that covers the box low..high and margin points more on each side.
 
     The number of cells along each axis is a multiple of `multiple`, and the grid is centred on the box.
     """
@@ -82,7 +82,7 @@ def sample_trilinear(values: np.ndarray, index: np.ndarray) -> np.ndarray:
 
 
 def extract(values: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """The zero surface as a closed mesh: vertices (v, 3) float64 world, faces (f, 3) int32 wound outward.
+    """Return the zero surface as a closed mesh: vertices (v, 3) float64 world, faces (f, 3) int32 wound outward.
 
     Lewiner's marching cubes (topologically consistent) on the grid padded with outside, so that nothing stays open.
     Values nearer to zero than a thousandth of a step are pushed off it: a level equal to a sample makes faces of zero
@@ -122,7 +122,7 @@ def components(faces: np.ndarray, vertex_count: int) -> np.ndarray:
 
 
 def keep_faces(vertices: np.ndarray, faces: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The mesh of faces where keep (f,) is true, without unused vertices, and the old index of each vertex."""
+    """Return the mesh of faces where keep (f,) is true, without unused vertices, and the old index of each vertex."""
     faces = faces[keep]
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[used], faces.reshape(-1, 3).astype(np.int32), used

@@ -15,7 +15,8 @@ def columns_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def polygon_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals (f, 3) and areas (f,) of faces (f, 4), -1 as fourth corner of triangles (Newell's vector area)."""
+    """Return unit normals (f, 3) and areas (f,) of faces (f, 4), -1 as fourth corner of triangles (Newell's vector
+    area)."""
     triangle = faces[:, 3] < 0
     # A triangle is a quad whose fourth corner is its first.
     p = columns_of(vertices, np.where(triangle[:, None], faces[:, [0, 1, 2, 0]], faces) if triangle.any() else faces)
@@ -24,7 +25,7 @@ def polygon_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
 
 
 def _normal_of(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals (3, q) and areas (q,) of quads with corners (3, 4, q)."""
+    """Return unit normals (3, q) and areas (q,) of quads with corners (3, 4, q)."""
     vector = cross(p[:, 2] - p[:, 0], p[:, 3] - p[:, 1])
     length = np.sqrt(dot(vector, vector))
     return vector / np.maximum(length, 1e-300), length / 2
@@ -113,7 +114,7 @@ def distance_figures(
     seed: int = 0,
     source=None,
 ) -> dict[str, float]:
-    """Sampled distances between two surfaces in their unit: mean of both directions, largest of both, mean normal
+    """Sample distances between two surfaces in their unit: mean of both directions, largest of both, mean normal
     angle.
 
     source: quad_shape.Surface of the source, where its search tree is there already.

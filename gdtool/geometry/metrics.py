@@ -80,7 +80,7 @@ def surface_protocol(
     threshold: float = 0.01,
     cells: int = IOU_CELLS,
 ) -> dict[str, float]:
-    """The "surface" protocol: distances from area-weighted samples of each surface to the other *surface*.
+    """Return the "surface" protocol: distances from area-weighted samples of each surface to the other *surface*.
 
     Unit: the truth's largest extent. distance is the mean of accuracy (result to truth) and completeness (truth to
     result); precision and recall are the shares within the threshold, f_score their harmonic mean. normal_degrees is
@@ -198,7 +198,7 @@ def _cell_centers(cells: int, side: float) -> np.ndarray:
 def syncdreamer_protocol(
     vertices: np.ndarray, faces: np.ndarray, true_vertices: np.ndarray, true_faces: np.ndarray
 ) -> dict[str, float]:
-    """The "syncdreamer" protocol, which published tables of single-image methods use (Liu et al. 2023).
+    """Return the "syncdreamer" protocol, which published tables of single-image methods use (Liu et al. 2023).
 
     Both are moved alike so that the truth is centred with largest extent 1. Sixteen fixed 256^2 depth views of each are
     back-projected and voxel-downsampled at 0.01; chamfer is the mean unsquared distance to the nearest point each way,
@@ -228,7 +228,7 @@ def syncdreamer_protocol(
 
 
 def sync_cameras() -> list[Camera]:
-    """The sixteen fixed cameras of the protocol."""
+    """Return the sixteen fixed cameras of the protocol."""
     return [
         camera_at(
             360 * i / SYNC_VIEWS,
@@ -253,7 +253,7 @@ def depth_cloud(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def voxel_downsample(points: np.ndarray, size: float) -> np.ndarray:
-    """The mean of the points in each occupied voxel of a grid that starts at their minimum."""
+    """Return the mean of the points in each occupied voxel of a grid that starts at their minimum."""
     if not len(points):
         return points
     cell = np.floor((points - points.min(0)) / size).astype(np.int64)

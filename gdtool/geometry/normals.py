@@ -10,7 +10,7 @@ CHUNK = 2**14  # faces at a time: what they need in between stays in the cache
 
 
 def face_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals (f, 3) and areas (f,) of triangles; zero-area faces have normal 0."""
+    """Return unit normals (f, 3) and areas (f,) of triangles; zero-area faces have normal 0."""
     # A row per coordinate: several times faster than (f, 3) products.
     rows = np.ascontiguousarray(vertices.T)
     kind = np.result_type(vertices, np.float32)
@@ -23,8 +23,8 @@ def face_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, n
 
 
 def normals_of(position: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals (3, f) and areas (f,) of triangles: position (3, v), corners (3, f). Quickest of some CHUNK at a
-    time."""
+    """Return unit normals (3, f) and areas (f,) of triangles: position (3, v), corners (3, f). Quickest of some CHUNK
+    at a time."""
     a, b, c = (position.take(corner, 1) for corner in corners)
     normal = cross(b - a, c - a)
     length = np.sqrt(dot(normal, normal))

@@ -135,7 +135,7 @@ class RayCaster:
         return out
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
-        """The nearest hit of each ray, from either side of a face. origins, directions (n, 3)."""
+        """Return the nearest hit of each ray, from either side of a face. origins, directions (n, 3)."""
         origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
         face_idx = self._run(origins, directions, "INTERSECT", None)
         distance, barycentric = np.full(len(face_idx), np.inf), np.zeros((3, len(face_idx))).T

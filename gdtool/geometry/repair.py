@@ -49,7 +49,7 @@ def check(vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh") -> 
 def clean(
     vertices: np.ndarray, faces: np.ndarray, subject: object = "mesh"
 ) -> tuple[np.ndarray, np.ndarray, dict[str, int | bool], bool]:
-    """A manifold, consistently oriented mesh of the same shape, what had to be done to it, and whether it is
+    """Return a manifold, consistently oriented mesh of the same shape, what had to be done to it, and whether it is
     watertight.
 
     vertices (v, 3) float, faces (f, 3). A closed, manifold mesh passes unchanged except for unused vertices. Raises

@@ -8,8 +8,8 @@ _MIX = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9)
 
 
 def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What np.unique finds along axis 0: the rows that differ (u, k) in rising order, where each is first (u,), and
-    which each row is (n,).
+    """Return what np.unique finds along axis 0: the rows that differ (u, k) in rising order, where each is first (u,),
+    and which each row is (n,).
 
     rows (n, k), integers or floating point without NaN; 0 and -0 are one number.
     """

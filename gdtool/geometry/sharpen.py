@@ -205,8 +205,8 @@ def _sides(normals: np.ndarray, valid: np.ndarray, degrees: float) -> tuple[np.n
 def _meeting_point(
     points: np.ndarray, normals: np.ndarray, centroids: np.ndarray, cluster: np.ndarray, sides: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The point nearest to points (p, 3) where the planes of their k faces' normals and centroids (3, k, p), grouped by
-    cluster (k, p) into sides (p,), meet, and the rms distance (p,) to those planes."""
+    """Return the point nearest to points (p, 3) where the planes of their k faces' normals and centroids (3, k, p),
+    grouped by cluster (k, p) into sides (p,), meet, and the rms distance (p,) to those planes."""
     weight = np.zeros(cluster.shape)
     for i in range(3):  # each side counts the same, however many of its faces are near
         mine = cluster == i
@@ -275,9 +275,9 @@ class _Rims:
         self.stays, self.became = np.ones(len(faces), bool), np.arange(len(vertices))
 
     def collapse(self, edges: np.ndarray) -> None:
-        """The edges (e, 2) taken in their order, each where it can be by then.
+        """Collapse edges (e, 2) in their order, each where it still can be.
 
-        All at once that have no face around them in common with an earlier one: what comes of it is the same.
+        Edges that share no face around them with an earlier one are collapsed at once: the result is the same.
         """
         a, b = edges.T
         turn, near = np.arange(len(a)), np.flatnonzero(self.stays)

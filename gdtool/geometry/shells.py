@@ -65,7 +65,7 @@ def _closed(faces: np.ndarray, body: np.ndarray, count: int) -> np.ndarray:
 
 
 def told(vertices: np.ndarray, faces: np.ndarray, welded: bool = True) -> str | None:
-    """A line for the user where there are internal shells; None where there are none. Arguments as of
+    """Return a line for the user where there are internal shells; None where there are none. Arguments as of
     internal_shells()."""
     count, share = internal_shells(vertices, faces, welded)
     if not count:

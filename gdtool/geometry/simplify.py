@@ -88,8 +88,8 @@ def _flat(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def collapse(
     vertices: np.ndarray, faces: np.ndarray, target_faces: int, aggressiveness: float, unit: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What the child runs: fast-simplification's quadric collapse (Garland & Heckbert 1997), with lengths in units of
-    `unit`.
+    """Return what the child runs: fast-simplification's quadric collapse (Garland & Heckbert 1997), with lengths in
+    units of `unit`.
 
     It takes all edges whose error is below a bound that rises from round to round, from the same number whatever the
     size of the mesh: in a large unit the first rounds take what they meet, which leaves even triangles; in a small one
@@ -110,18 +110,18 @@ def _edge(vertices: np.ndarray, faces: np.ndarray, count: int) -> float:
 
 
 def median_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """The median length of the edges, of some of them."""
+    """Return the median length of the edges, of some of them."""
     corners = vertices[_few(faces)]
     return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1)))
 
 
 def _few(faces: np.ndarray) -> np.ndarray:
-    """Some 20,000 of the faces, enough to tell their size."""
+    """Return some 20,000 of the faces, enough to tell their size."""
     return faces[:: max(len(faces) // 20000, 1)]
 
 
 def collapse_topology(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """What the child runs where the quicker collapse tears the mesh: MeshLab's, which refuses what changes the
+    """Return what the child runs where the quicker collapse tears the mesh: MeshLab's, which refuses what changes the
     topology.
 
     Without its cleaning afterwards, which joins what coincides.
@@ -137,7 +137,7 @@ def collapse_topology(vertices: np.ndarray, faces: np.ndarray, target_faces: int
 
 
 def collapse_by_way(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """What the child runs where the quicker collapse does not come to its end: that one as far as it goes well,
+    """Return what the child runs where the quicker collapse does not come to its end: that one as far as it goes well,
     MeshLab's from there.
 
     A third of the time of MeshLab's alone. No triangles at all where the quicker one does not come so far either.
@@ -168,8 +168,8 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
 def reduced(
     vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple, even: bool, crease_degrees: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """What the child runs: one of the collapses above of what is shaken, or uneven, first, and before that drawn out to
-    creases that turn by more than crease_degrees, if any; and how many vertices were."""
+    """Return what the child runs: one of the collapses above of what is shaken, or uneven, first, and before that drawn
+    out to creases that turn by more than crease_degrees, if any; and how many vertices were."""
     moved = 0
     if crease_degrees:
         vertices, faces, creases = restore_creases(vertices, faces, crease_degrees)
@@ -193,7 +193,7 @@ def simplify(
     measured: bool = True,
     meanwhile: Callable[[], object] = lambda: None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, dict[str, float | int | str]]:
-    """A mesh of about target_faces triangles of the same shape and topology.
+    """Return a mesh of about target_faces triangles of the same shape and topology.
 
     vertices (v, 3), faces (f, 3), attributes (v, a) or None. Returns vertices, faces, attributes (read at the closest
     point of the input) and a report: faces, method, and error, the largest distance of the result's vertices and of the
@@ -306,8 +306,8 @@ def _collapsed(
     is_closed: Callable[[], bool],
     meanwhile: Callable[[], object],
 ) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str], int | None]:
-    """What the first way leaves that keeps the mesh as closed as it is, or None; its name, what failed, and how many
-    vertices were drawn out to creases, None where no child came to tell."""
+    """Return what the first way leaves that keeps the mesh as closed as it is, or None; its name, what failed, and how
+    many vertices were drawn out to creases, None where no child came to tell."""
     # The quick collapse tears a closed mesh now and then (a handful of edges with four faces), at one pace and not at
     # another, and of parts made of slivers it collapses nothing, at any; MeshLab's takes ten times as long.
     quick = [("collapse", (target_faces, pace, unit)) for pace in _PACES]

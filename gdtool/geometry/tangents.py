@@ -147,7 +147,8 @@ def frames_of(normal: np.ndarray, tangent: np.ndarray, sign: np.ndarray) -> np.n
 
 
 def encode_tangent_space(normal: np.ndarray, tangent: np.ndarray, sign: np.ndarray, world: np.ndarray) -> np.ndarray:
-    """Unit tangent-space normals (n, 3), +Y up, that decode to the unit world normals (n, 3) in interpolated frames.
+    """Return unit tangent-space normals (n, 3), +Y up, that decode to the unit world normals (n, 3) in interpolated
+    frames.
 
     normal and tangent (n, 3) need be neither unit nor orthogonal, the bitangent is sign (n,) · cross(normal, tangent).
     """

@@ -138,7 +138,8 @@ def split_vertices(faces: np.ndarray) -> np.ndarray:
 def corner_fans(
     faces: np.ndarray, mates: np.ndarray | None = None, edges: Edges | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The fan (f, c) each face corner belongs to (numbered over the mesh), and the number of fans at each vertex.
+    """Return the fan (f, c) each face corner belongs to (numbered over the mesh), and the number of fans at each
+    vertex.
 
     Fans go on across edges of exactly two faces, and across mates (k, 2), pairs of half edges that belong together.
     edges: those of the faces, where they are known."""
@@ -178,7 +179,7 @@ def corner_fans(
 
 
 def components(faces: np.ndarray) -> tuple[int, np.ndarray]:
-    """Number of pieces and the piece (f,) of each face; faces that share an edge are of one piece."""
+    """Return number of pieces and the piece (f,) of each face; faces that share an edge are of one piece."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -275,7 +276,7 @@ def _plain(faces: np.ndarray) -> bool:
 
 
 def _counting_order(keys: np.ndarray, width: int) -> np.ndarray:
-    """What np.argsort(keys, kind="stable") gives for keys (n,) below width, in linear time: as a sparse matrix'
+    """Return what np.argsort(keys, kind="stable") gives for keys (n,) below width, in linear time: as a sparse matrix'
     rows."""
     from scipy.sparse import csr_array
 

@@ -9,7 +9,8 @@ from gdtool.geometry.topology import Edges, corner_fans, edges_of
 
 
 def unpinched(vertices: np.ndarray, faces: np.ndarray, rounds: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """A closed triangle mesh two sheets of which share an edge, with a copy of the edge and its ends for each sheet.
+    """Return a closed triangle mesh two sheets of which share an edge, with a copy of the edge and its ends for each
+    sheet.
 
     faces (f, 3). Faces on both sides of one wedge of the inside stay together; what comes off is a piece of its own.
     Edges of an odd number of faces, or of more one way than the other, are left."""

@@ -1,0 +1,1 @@
+"""Read, write, convert, mask and measure pictures (OpenImageIO)."""

@@ -49,7 +49,7 @@ def unit_range(image: np.ndarray) -> np.ndarray:
 
 
 def encode_normal(normal: np.ndarray) -> np.ndarray:
-    """Unit normals (..., 3), or 0 for background -> 0.5 n + 0.5 in [0, 1]."""
+    """Return unit normals (..., 3), or 0 for background -> 0.5 n + 0.5 in [0, 1]."""
     return 0.5 * np.asarray(normal) + 0.5
 
 
@@ -65,7 +65,7 @@ def decode_normal(encoded: np.ndarray) -> np.ndarray:
 
 
 def rgba(image: np.ndarray) -> np.ndarray:
-    """Stored image (h, w), (h, w, 1..4) -> (h, w, 4) float32 as encoded, alpha 1 where there is none."""
+    """Convert a stored image (h, w) or (h, w, 1..4) to (h, w, 4) float32 as encoded, alpha 1 where there is none."""
     x = unit_range(image).astype(np.float32)
     x = x.reshape(*x.shape[:2], -1)
     alpha = x[..., -1:] if x.shape[2] in (2, 4) else np.ones_like(x[..., :1])

@@ -45,8 +45,8 @@ def check_container(path: Path, head: bytes, file: BinaryIO) -> None:
 
 
 def suffix_of(head: bytes) -> str:
-    """The suffix that the first bytes of an image call for: OpenImageIO tries the suffix's format first, and only then
-    tells why it fails."""
+    """Return the suffix that the first bytes of an image call for: OpenImageIO tries the suffix's format first, and
+    only then tells why it fails."""
     if head[:4] == b"RIFF":
         return ".webp" if head[8:12] == b"WEBP" else ""
     signatures = {
@@ -98,7 +98,7 @@ def _check_png(path: Path, file: BinaryIO) -> None:
 
 
 def _check_jpeg(path: Path, file: BinaryIO) -> None:
-    """That the scan begins and an end-of-image marker follows it (ITU-T T.81, annex B)."""
+    """Check that the scan begins and an end-of-image marker follows it (ITU-T T.81, annex B)."""
     file.seek(0)
     content = file.read()
     at = 2

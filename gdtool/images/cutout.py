@@ -27,14 +27,15 @@ def cut_out(color: np.ndarray, subject: object, cure: str) -> np.ndarray:
 
 
 def both_frames(color: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """What the narrow and the wide frame give, (h, w) boolean each, and their overlap (intersection over union)."""
+    """Return what the narrow and the wide frame give, (h, w) boolean each, and their overlap (intersection over
+    union)."""
     narrow, wide = (_grabcut(color, inset) for inset in INSETS)
     either = (narrow | wide).sum()
     return narrow, wide, float((narrow & wide).sum() / either) if either else 0.0
 
 
 def _grabcut(color: np.ndarray, inset: float) -> np.ndarray:
-    """The largest piece of what GrabCut finds, its holes kept."""
+    """Return the largest piece of what GrabCut finds, its holes kept."""
     from scipy import ndimage
 
     cv2 = imported("cv2")

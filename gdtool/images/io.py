@@ -236,7 +236,7 @@ def write_exr(path: str | Path, image: np.ndarray) -> None:
 
 
 def encode_png(image: np.ndarray, bits: int = 8) -> bytes:
-    """The bytes of the file that write_png writes."""
+    """Return the bytes of the file that write_png writes."""
     with temporary_folder() as folder:
         path = folder / "image.png"
         write_png(path, image, bits)
@@ -291,7 +291,7 @@ def _write(path: Path, image: np.ndarray, kind: str) -> None:
 
 
 def _again(path: Path) -> np.ndarray:
-    """The stored pixels, before alpha is divided."""
+    """Return the stored pixels, before alpha is divided."""
     import OpenImageIO as oiio
 
     if path.suffix.lower() != ".exr":
@@ -329,7 +329,7 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _plain_name(path: Path, writing: bool = False) -> Iterator[str]:
-    """A name that OpenImageIO takes: itself, or where it is not UTF-8 a link to it under another name."""
+    """Return a name that OpenImageIO takes: itself, or where it is not UTF-8 a link to it under another name."""
     try:
         str(path).encode()
         yield str(path)

@@ -132,7 +132,7 @@ def _has_material(source: Source) -> bool:
 
 
 def _truth_along(result: Source) -> Source | None:
-    """The model that a result was made from: a file or procedural:SEED, or the views that carry their model; or
+    """Return the model that a result was made from: a file or procedural:SEED, or the views that carry their model; or
     None."""
     if not isinstance(result, Folder):
         return None
@@ -150,7 +150,8 @@ def _truth_along(result: Source) -> Source | None:
 
 
 def _model_of(reference: Source) -> Source | None:
-    """What of a reference has geometry: itself, the model in a views folder or the one it was made from, or None."""
+    """Return what of a reference has geometry: itself, the model in a views folder or the one it was made from, or
+    None."""
     if _kind(reference) == "renders":
         return None
     if _kind(reference) != "views" or reference.content.model:
@@ -159,7 +160,7 @@ def _model_of(reference: Source) -> Source | None:
 
 
 def read_geometry(source: Source) -> Geometry:
-    """The triangles of anything that has some. Raises InputError."""
+    """Return the triangles of anything that has some. Raises InputError."""
     import numpy as np
 
     if _kind(source) == "model":
@@ -249,7 +250,7 @@ def _surfaces(geometry: Geometry, truth: Source, options: Options, views: Folder
 
 
 def _brought_in(truth: Geometry, result: Geometry, frame: str) -> np.ndarray:
-    """The vertices of a model file in the frame that the result is measured in."""
+    """Return the vertices of a model file in the frame that the result is measured in."""
     import numpy as np
 
     from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
@@ -268,7 +269,7 @@ def _brought_in(truth: Geometry, result: Geometry, frame: str) -> np.ndarray:
 
 
 def _pictures(result: Folder, reference: Source | None) -> Report:
-    """Views against views or renders against renders."""
+    """Return views against views or renders against renders."""
     from gdtool.images.metrics import resized_views, views_metrics
 
     if reference is None:
@@ -335,7 +336,7 @@ def _read_renders(folder: Folder) -> tuple[dict[str, np.ndarray], np.ndarray, li
 
 
 def _check_cameras(result: Folder, reference: Folder, names: list[str]) -> None:
-    """Raises InputError when a view was not taken from the same place. The sizes of the pictures may differ."""
+    """Raise InputError when a view was not taken from the same place. The sizes of the pictures may differ."""
     import numpy as np
 
     from gdtool.folders.records import read_cameras
@@ -359,7 +360,7 @@ def _check_cameras(result: Folder, reference: Folder, names: list[str]) -> None:
 
 
 def _rendered(result: Source, views: Folder) -> Report:
-    """The result's buffers through the cameras of the views, against the views' own pictures."""
+    """Return the result's buffers through the cameras of the views, against the views' own pictures."""
     import numpy as np
 
     from gdtool.folders.views import read_views
@@ -382,7 +383,7 @@ def _rendered(result: Source, views: Folder) -> Report:
 
 
 def _scenes(source: Source) -> list[tuple[Scene, dict[str, Callable[[dict[str, np.ndarray]], np.ndarray]]]]:
-    """What to render of a result, in the normalised frame, and which image of the buffers is which domain.
+    """Return what to render of a result, in the normalised frame, and which image of the buffers is which domain.
 
     A surface has its material per vertex, which a Scene has for base color only: roughness and metallic are rendered as
     the base color of a second one.
@@ -429,7 +430,7 @@ def _rgba(color: np.ndarray) -> np.ndarray:
 
 
 def _normalised(scene: Scene, folder: Folder) -> Scene:
-    """A scene in its source's frame, brought into the normalised one."""
+    """Return a scene in its source's frame, brought into the normalised one."""
     from dataclasses import replace
 
     import numpy as np
@@ -456,7 +457,7 @@ UNITS = {"degrees": "°", "psnr": " dB"}
 
 
 def table(report: Report) -> str:
-    """The report for a reader: what it is about, then the figures in their groups."""
+    """Return the report for a reader: what it is about, then the figures in their groups."""
     lines: list[str] = []
 
     def add(name: str, label: str) -> None:

@@ -36,7 +36,7 @@ STAGES = (
 
 
 def faults(path: Path) -> Iterator[str]:
-    """What is wrong with a folder or a .glb/.gltf, one line each; nothing when it is right.
+    """Yield what is wrong with a folder or a .glb/.gltf, one line each; nothing when it is right.
 
     Raises ResourceError where that cannot be told here: a package or memory is missing.
     """
@@ -63,7 +63,7 @@ def _read(check: Callable[[], Iterator[str]]) -> Iterator[str]:
 
 
 def _check_key(folder: Folder) -> Iterator[str]:
-    """That the key is the one that the stage, its version, the options and the inputs give.
+    """Check that the key is the one that the stage, its version, the options and the inputs give.
 
     Nothing is said of a manifest without a key or of another program's stage, nor where an option names a file that
     lies elsewhere by now: its digest is part of the key."""

@@ -38,7 +38,8 @@ def _family(name: str) -> dict:
 
 
 def generate(seed: int, kind: str | None = None) -> Scene:
-    """The object of a seed (>= 0); `kind` (see `kinds()`) forces what it is. Raises ValueError for an unknown kind.
+    """Return the object of a seed (>= 0); `kind` (see `kinds()`) forces what it is. Raises ValueError for an unknown
+    kind.
 
     The scene is normalised (bounding box centred, longest side 1), about 2,000 to 40,000 faces.
     """

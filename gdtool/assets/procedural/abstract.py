@@ -121,7 +121,7 @@ def gear(rng) -> Assembly:
 
 
 def prism(rng) -> Assembly:
-    """A twisted or tapered prism over a random symmetric polygon, perhaps stacked."""
+    """Return a twisted or tapered prism over a random symmetric polygon, perhaps stacked."""
     a, y = Assembly(), 0.0
     for _ in range(int(rng.integers(1, 4))):
         sides = int(rng.integers(3, 9))
@@ -138,7 +138,7 @@ def prism(rng) -> Assembly:
 
 
 def stack(rng) -> Assembly:
-    """A symmetric sculpture of a few plain primitives."""
+    """Return a symmetric sculpture of a few plain primitives."""
     a, y = Assembly(), 0.0
     for _ in range(int(rng.integers(2, 6))):
         s, finish = rng.uniform(0.2, 0.5), tiles.pick(rng)
@@ -168,7 +168,7 @@ def stack(rng) -> Assembly:
 
 
 def blob(rng) -> Assembly:
-    """A mirror-symmetric smooth blend of balls and limbs with bumps."""
+    """Return a mirror-symmetric smooth blend of balls and limbs with bumps."""
     a = Assembly()
     shapes = [solids.ellipsoid((0, 0, 0), rng.uniform(0.25, 0.45, 3))]
     for _ in range(int(rng.integers(2, 7))):

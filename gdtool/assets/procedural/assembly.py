@@ -17,11 +17,12 @@ class Assembly:
         self.finishes: list[Finish] = []
 
     def add(self, part: Part, finish: Finish) -> None:
+        """Add a part with its finish."""
         self.parts.append(part)
         self.finishes.append(finish)
 
     def add_pair(self, part: Part, finish: Finish) -> None:
-        """The part and its mirror image in x."""
+        """Add a part and its mirror image in x."""
         self.add(part, finish)
         self.add(part.mirrored(), finish)
 

@@ -22,7 +22,7 @@ from gdtool.assets.procedural.parts import (
 
 
 def gable(width: float, height: float, depth: float, overhang: float = 0.0, power: float = 1.0) -> Part:
-    """A roof with its ridge along z, from y = 0 to `height`."""
+    """Return a roof with its ridge along z, from y = 0 to `height`."""
     w = width / 2 + overhang
     slope = np.stack([w * (1 - (t := np.linspace(0, 1, 6))), height * t**power], -1)
     outline = np.vstack(
@@ -37,7 +37,7 @@ def gable(width: float, height: float, depth: float, overhang: float = 0.0, powe
 
 
 def hip(width: float, height: float, depth: float, overhang: float = 0.05, top: float = 0.02) -> Part:
-    """A four-sided pointed roof from y = 0 to `height`."""
+    """Return a four-sided pointed roof from y = 0 to `height`."""
     profile = refined([(0, 0), (1, 0), (1, 0.02), (top, height), (0, height)], 0.1)
     return loft(profile, rectangle(width + 2 * overhang, depth + 2 * overhang), boxed=True)
 
@@ -58,6 +58,7 @@ def window(
 
 
 def house(rng) -> Assembly:
+    """Return a house: walls, roof, door, windows, perhaps a chimney."""
     a = Assembly()
     width, depth, storeys = rng.uniform(0.7, 1.3), rng.uniform(0.6, 1.2), int(rng.integers(1, 4))
     tall = 0.42 * storeys + rng.uniform(0, 0.2)
@@ -120,6 +121,7 @@ def _crenels(a: Assembly, r: float, y: float, count: int, size: float, finish) -
 
 
 def castle(rng) -> Assembly:
+    """Return a castle: walls, towers, a gate."""
     a = Assembly()
     half, wall_h = rng.uniform(0.5, 0.8), rng.uniform(0.35, 0.6)
     stone, roof, wood = tiles.pick(rng, "wall"), tiles.pick(rng, "roof"), tiles.pick(rng, "wood")
@@ -262,7 +264,7 @@ def tower(rng) -> Assembly:
 
 
 def pyramid(rng) -> Assembly:
-    """Stepped pyramid with stairs and a temple on top, or a smooth one."""
+    """Return a stepped pyramid with stairs and a temple on top, or a smooth one."""
     a, stone = Assembly(), tiles.pick(rng, "stone")
     other = stone if rng.uniform() < 0.5 else tiles.pick(rng, "stone")
     if rng.uniform() < 0.25:

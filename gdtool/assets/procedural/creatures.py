@@ -24,7 +24,7 @@ def fur_color(rng) -> np.ndarray:
 
 
 def eyes(a: Assembly, rng, x: float, y: float, z: float, size: float, outward: float = 0.25) -> None:
-    """A pair of eyes at +-x, bead-like or with iris."""
+    """Add a pair of eyes at +-x, bead-like or with iris."""
     style = rng.uniform()
     finish = finishes.glossy(rng, BLACK) if style < 0.4 else finishes.gazing(rng, np.array([outward, 0.0, 1.0]))
     a.add_pair(ball(size, size * rng.uniform(0.9, 1.2), size * 0.8, 20).moved(x, y, z), finish)
@@ -48,6 +48,7 @@ def face(a: Assembly, rng, center, r: float, coat, snout: float) -> None:
 
 
 def ears(a: Assembly, rng, center, r: float, coat) -> None:
+    """Add a pair of ears about a head."""
     x, y, z = center
     kind = rng.integers(5)
     if kind == 0:  # pointed
@@ -76,6 +77,7 @@ def ears(a: Assembly, rng, center, r: float, coat) -> None:
 
 
 def horns(a: Assembly, rng, center, r: float) -> None:
+    """Add a pair of horns to a head."""
     x, y, z = center
     finish = (
         finishes.matte(rng, hsv(0.11, rng.uniform(0.1, 0.4), rng.uniform(0.3, 0.9)))
@@ -171,7 +173,7 @@ def quadruped(rng) -> Assembly:
 
 
 def sitting(rng) -> Assembly:
-    """A sitting cat, dog, bear or owl-like toy: pear body, big head, paws in front."""
+    """Return a sitting cat, dog, bear or owl-like toy: pear body, big head, paws in front."""
     a = Assembly()
     coat, r, girth = tiles.pick(rng, "fur", fur_color(rng)), rng.uniform(0.3, 0.45), rng.uniform(0.32, 0.5)
     head = (0.0, 0.42 + r * 0.75, 0.08)
@@ -295,7 +297,7 @@ def dress_head(a: Assembly, rng, head, r: float, chance: float) -> None:
 
 
 def figure(rng) -> Assembly:
-    """A standing person, robot, gnome or snowman-like toy of separate body parts."""
+    """Return a standing person, robot, gnome or snowman-like toy of separate body parts."""
     a = Assembly()
     r, hips, shoulder = rng.uniform(0.16, 0.34), rng.uniform(0.14, 0.26), rng.uniform(0.2, 0.34)
     leg, torso = rng.uniform(0.25, 0.6), rng.uniform(0.35, 0.6)
@@ -382,6 +384,7 @@ def figure(rng) -> Assembly:
 
 
 def fish(rng) -> Assembly:
+    """Return a fish: body, fins, tail, eyes."""
     a = Assembly()
     tall, wide = rng.uniform(0.25, 0.5), rng.uniform(0.14, 0.3)
     coat, fin = tiles.pick(rng, "fur", finishes.any_color(rng)), tiles.pick(rng, "skin")

@@ -62,7 +62,7 @@ def hsv(hue: float, saturation: float, value: float) -> np.ndarray:
 
 
 def any_color(rng: np.random.Generator) -> np.ndarray:
-    """A linear colour as things have: vivid, muted, pastel, earth, grey, dark or white."""
+    """Return a linear colour as things have: vivid, muted, pastel, earth, grey, dark or white."""
     kind = rng.choice(7, p=[0.26, 0.2, 0.13, 0.18, 0.08, 0.07, 0.08])
     hue = rng.uniform()
     if kind == 0:
@@ -82,12 +82,13 @@ def any_color(rng: np.random.Generator) -> np.ndarray:
 
 
 def near_color(rng: np.random.Generator, color: np.ndarray, amount: float = 0.5) -> np.ndarray:
-    """A darker or lighter relative of a linear colour."""
+    """Return a darker or lighter relative of a linear colour."""
     factor = np.exp(rng.normal(0, amount))
     return np.clip(color * factor * np.exp(rng.normal(0, 0.15 * amount, 3)), 0.01, 0.95)
 
 
 def any_metal(rng: np.random.Generator) -> np.ndarray:
+    """Return the linear reflectance of a metal, chosen at random."""
     return np.array(METALS[list(METALS)[rng.integers(len(METALS))]])
 
 
@@ -137,18 +138,22 @@ def plain(color: np.ndarray, roughness: float, metallic: float = 0.0, name: str 
 
 
 def plastic(rng, color=None) -> Finish:
+    """Return a smooth dielectric finish."""
     return plain(any_color(rng) if color is None else color, rng.uniform(0.2, 0.6), name="plastic")
 
 
 def metal(rng, color=None) -> Finish:
+    """Return a metallic finish."""
     return plain(any_metal(rng) if color is None else color, rng.uniform(0.12, 0.55), 1.0, name="metal")
 
 
 def matte(rng, color=None) -> Finish:
+    """Return a rough dielectric finish."""
     return plain(any_color(rng) if color is None else color, rng.uniform(0.65, 0.98), name="matte")
 
 
 def glossy(rng, color=None) -> Finish:
+    """Return a polished dielectric finish."""
     return plain(any_color(rng) if color is None else color, rng.uniform(0.06, 0.22), name="glossy")
 
 
@@ -162,7 +167,7 @@ def _table(
     speckle: float = 0.25,
     wrap: str = "clamp",
 ) -> Material:
-    """A lookup image over (pattern, dirt): layers (start in [0, 1], linear colour, roughness, metallic) along u.
+    """Return a lookup image over (pattern, dirt): layers (start in [0, 1], linear colour, roughness, metallic) along u.
 
     v darkens and roughens from 0 to 1 by `speckle`.
     """
@@ -223,7 +228,7 @@ def banded(rng, color=None, axis=None, frequency=None) -> Finish:
 
 
 def gradient(rng, color=None, direction=None) -> Finish:
-    """A smooth change of colour along a direction, by default upward."""
+    """Return a smooth change of colour along a direction, by default upward."""
     color = any_color(rng) if color is None else color
     other = near_color(rng, any_color(rng) if rng.uniform() < 0.5 else color, 0.6)
     axis = np.array([0.0, 1.0, 0.0]) if direction is None else np.asarray(direction, float)
@@ -288,7 +293,7 @@ def crackled(rng, color=None, other=None) -> Finish:
 
 
 def chequered(rng, color=None) -> Finish:
-    """A checkerboard in the first UV set."""
+    """Return a checkerboard in the first UV set."""
     color = any_color(rng) if color is None else color
     first, second = _surface_pair(rng, color), _surface_pair(rng, any_color(rng))
     u, v = patterns.tile_grid(64)
@@ -363,8 +368,8 @@ def topped(rng, color=None, top=None) -> Finish:
 
 
 def gazing(rng, direction: np.ndarray, iris=None, white=None) -> Finish:
-    """An eyeball: black pupil, coloured iris, white, by the angle between the normal and `direction` (right eye's, x >=
-    0)."""
+    """Return an eyeball: black pupil, coloured iris, white, by the angle between the normal and `direction` (right
+    eye's, x >= 0)."""
     iris = any_color(rng) if iris is None else iris
     white = np.array([0.9, 0.9, 0.87]) if white is None else white
     black = np.array([0.01, 0.01, 0.012])

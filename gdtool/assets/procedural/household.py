@@ -34,6 +34,7 @@ def _leg(rng, height: float, size: float):
 
 
 def chair(rng) -> Assembly:
+    """Return a chair: seat, legs, back."""
     a = Assembly()
     wood, seat = (
         tiles.pick(rng, ["wood", "paint", "metal"][rng.integers(3)]),
@@ -64,6 +65,7 @@ def chair(rng) -> Assembly:
 
 
 def table(rng) -> Assembly:
+    """Return a table: a top on legs or a foot."""
     a, wood = Assembly(), tiles.pick(rng, "wood" if rng.uniform() < 0.6 else "any")
     top = wood if rng.uniform() < 0.5 else tiles.pick(rng, "any")
     height, thick = rng.uniform(0.4, 0.8), rng.uniform(0.04, 0.09)
@@ -94,6 +96,7 @@ def table(rng) -> Assembly:
 
 
 def sofa(rng) -> Assembly:
+    """Return a sofa: cushions, arms, back."""
     a, cloth, wood = Assembly(), tiles.pick(rng, "cloth"), tiles.pick(rng, "wood")
     w, d = rng.uniform(0.7, 1.6), rng.uniform(0.55, 0.75)
     cushion = cloth if rng.uniform() < 0.5 else tiles.pick(rng, "cloth")
@@ -123,6 +126,7 @@ def sofa(rng) -> Assembly:
 
 
 def bed(rng) -> Assembly:
+    """Return a bed: frame, mattress, pillows."""
     a, wood, sheet = Assembly(), tiles.pick(rng, "wood"), tiles.pick(rng, "cloth")
     w, d = rng.uniform(0.6, 0.95), rng.uniform(1.0, 1.3)
     a.add(box(w, 0.16, d, 0.02).moved(y=0.2), wood)
@@ -258,6 +262,7 @@ def carton(rng) -> Assembly:
 
 
 def books(rng) -> Assembly:
+    """Return a stack or row of books."""
     a, y = Assembly(), 0.0
     for _ in range(int(rng.integers(1, 6))):
         w, d, thick, turn = rng.uniform(0.6, 0.9), rng.uniform(0.8, 1.1), rng.uniform(0.09, 0.25), rng.normal(0, 12)

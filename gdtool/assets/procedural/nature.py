@@ -269,6 +269,7 @@ def cake(rng) -> Assembly:
 
 
 def icecream(rng) -> Assembly:
+    """Return an ice cream: scoops on a cone."""
     a, tall = Assembly(), rng.uniform(0.7, 1.0)
     wafer = tiles.woven(rng, hsv(0.09, 0.6, 0.8))
     r = rng.uniform(0.26, 0.34)
@@ -418,7 +419,7 @@ def tree(rng) -> Assembly:
 
 
 def potted(rng) -> Assembly:
-    """A pot with cactus, flowers or leaves."""
+    """Return a pot with cactus, flowers or leaves."""
     a, r, h = Assembly(), rng.uniform(0.24, 0.36), rng.uniform(0.3, 0.5)
     pot = tiles.pick(rng, "ceramic", hsv(0.05, 0.65, 0.7) if rng.uniform() < 0.4 else None)
     a.add(
@@ -481,7 +482,7 @@ def potted(rng) -> Assembly:
 
 
 def rock(rng) -> Assembly:
-    """A boulder, gem or crystal cluster."""
+    """Return a boulder, gem or crystal cluster."""
     a = Assembly()
     if rng.uniform() < 0.5:
         bump, cuts = patterns.noise_field(rng, 0.7, 3.0), rng.normal(size=(9, 3))

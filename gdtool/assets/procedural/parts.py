@@ -25,6 +25,7 @@ class Part:
     extent: tuple[float, float] | None = None
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Part:
+        """Return the part moved by (x, y, z)."""
         return replace(self, vertices=self.vertices + np.array([x, y, z], float))
 
     def scaled(self, x: float, y: float | None = None, z: float | None = None) -> Part:
@@ -49,7 +50,7 @@ class Part:
         return replace(self, vertices=product(self.vertices, matrix), normals=product(self.normals, matrix))
 
     def mirrored(self) -> Part:
-        """The other hand: x negated."""
+        """Return the other hand: x negated."""
         return self.scaled(-1.0, 1.0, 1.0)
 
 
@@ -103,7 +104,8 @@ def _crease_flags(quads: np.ndarray, axis: int, wraps: bool, cosine: float) -> n
 
 
 def grid_part(points: np.ndarray, closed: bool = False, crease_degrees: float = 38.0, boxed: bool = False) -> Part:
-    """The closed surface through a grid of points (rows, columns, 3); columns wrap around, rows too when `closed`.
+    """Return the closed surface through a grid of points (rows, columns, 3); columns wrap around, rows too when
+    `closed`.
 
     An open grid must begin and end in a row of coincident points (a pole). Grid lines that bend by more than
     `crease_degrees` get separate normals. `boxed` chooses box-projected texture coordinates instead of the grid's own.
@@ -170,7 +172,8 @@ def grid_part(points: np.ndarray, closed: bool = False, crease_degrees: float = 
 
 
 def box_projected(part: Part) -> Part:
-    """The part with texture coordinates projected along each face's dominant axis, vertices doubled at the seams."""
+    """Return the part with texture coordinates projected along each face's dominant axis, vertices doubled at the
+    seams."""
     corners = part.vertices[part.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     axis = np.abs(normal).argmax(axis=1)
@@ -189,7 +192,7 @@ def box_projected(part: Part) -> Part:
 
 
 def circle(count: int = 40) -> np.ndarray:
-    """Unit circle (count, 2) as outline for `loft`."""
+    """Return unit circle (count, 2) as outline for `loft`."""
     angle = 2 * np.pi * np.arange(count) / count
     return np.stack([np.cos(angle), np.sin(angle)], -1)
 
@@ -233,7 +236,7 @@ def loft(
     boxed: bool = False,
     twist_degrees: float = 0.0,
 ) -> Part:
-    """An outline (n, 2) in x and z carried up a profile of rows (scale, height) or (scale, height, inset).
+    """Return an outline (n, 2) in x and z carried up a profile of rows (scale, height) or (scale, height, inset).
 
     The first and the last row must have scale 0. inset moves the outline's sides inward by a length (bevels).
     """
@@ -250,7 +253,7 @@ def loft(
 
 
 def refined(profile: np.ndarray, step: float) -> np.ndarray:
-    """The polyline (k, c) with extra rows so that no piece is longer than `step` in its first two columns."""
+    """Return the polyline (k, c) with extra rows so that no piece is longer than `step` in its first two columns."""
     profile = np.asarray(profile, float)
     rows = [profile[:1]]
     for a, b in itertools.pairwise(profile):
@@ -269,7 +272,8 @@ def smooth_curve(knots: np.ndarray, count: int) -> np.ndarray:
 
 
 def extrusion(outline: np.ndarray, height: float, bevel: float = 0.02, rows: int = 6) -> Part:
-    """An outline about the origin from y = 0 to `height` with bevelled rims; box-projected texture coordinates."""
+    """Return an outline about the origin from y = 0 to `height` with bevelled rims; box-projected texture
+    coordinates."""
     bevel = min(bevel, 0.45 * height, 0.4 * float(np.linalg.norm(outline, axis=1).min()))
     wall = [(1.0, y, 0.0) for y in np.linspace(bevel, height - bevel, rows)]
     caps = np.array([0.0, 0.3, 0.6])
@@ -279,7 +283,7 @@ def extrusion(outline: np.ndarray, height: float, bevel: float = 0.02, rows: int
 
 
 def box(width: float, height: float, depth: float, bevel: float = 0.02, subdivisions: int = 6) -> Part:
-    """A bevelled box about the origin."""
+    """Return a bevelled box about the origin."""
     part = extrusion(rectangle(width, depth, subdivisions), height, min(bevel, 0.2 * min(width, height, depth)))
     return part.moved(y=-height / 2)
 
@@ -287,7 +291,7 @@ def box(width: float, height: float, depth: float, bevel: float = 0.02, subdivis
 def cylinder(
     radius: float, height: float, bevel: float = 0.02, count: int = 36, top_radius: float | None = None
 ) -> Part:
-    """A bevelled cylinder or truncated cone about the origin, along y."""
+    """Return a bevelled cylinder or truncated cone about the origin, along y."""
     top = radius if top_radius is None else top_radius
     bevel = min(bevel, 0.3 * min(radius, max(top, 1e-3)), 0.3 * height)
     h = height / 2
@@ -299,7 +303,7 @@ def cylinder(
 
 
 def ball(rx: float, ry: float | None = None, rz: float | None = None, count: int = 32) -> Part:
-    """An ellipsoid about the origin."""
+    """Return an ellipsoid about the origin."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, count // 2 + 1)
     profile = np.stack([np.cos(angle), np.sin(angle)], -1)
     profile[[0, -1], 0] = 0
@@ -307,13 +311,13 @@ def ball(rx: float, ry: float | None = None, rz: float | None = None, count: int
 
 
 def cone(radius: float, height: float, count: int = 32) -> Part:
-    """A cone from y = 0 to `height`, its foot slightly rounded."""
+    """Return a cone from y = 0 to `height`, its foot slightly rounded."""
     profile = refined([(0, 0), (0.97 * radius, 0), (radius, 0.03 * height), (0, height)], height / 8)
     return loft(profile, circle(count))
 
 
 def tube(path: np.ndarray, radius: float | np.ndarray, closed: bool = False, outline: np.ndarray | None = None) -> Part:
-    """A tube of radius (k,) or one number along points (k, 3); open ends are rounded off. Parallel-transported
+    """Return a tube of radius (k,) or one number along points (k, 3); open ends are rounded off. Parallel-transported
     frame."""
     path = np.asarray(path, float)
     outline = circle(16) if outline is None else outline

@@ -10,7 +10,8 @@ from gdtool.assets.procedural.parts import product
 
 
 def noise_field(rng: np.random.Generator, frequency: float, octaves: float = 2.0, waves: int = 28) -> Callable:
-    """A smooth random function of points (n, 3), about unit variance: a sum of sines from `frequency` up by `octaves`.
+    """Return a smooth random function of points (n, 3), about unit variance: a sum of sines from `frequency` up by
+    `octaves`.
 
     frequency in cycles per unit length; higher waves are weaker in proportion.
     """

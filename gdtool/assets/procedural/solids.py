@@ -31,7 +31,7 @@ def ellipsoid(center: Sequence[float], radii: float | Sequence[float]) -> Distan
 
 
 def limb(start: Sequence[float], end: Sequence[float], radius: float, end_radius: float | None = None) -> Distance:
-    """A capsule whose radius changes linearly from start to end."""
+    """Return a capsule whose radius changes linearly from start to end."""
     a, b = np.asarray(start, np.float32), np.asarray(end, np.float32)
     grow = np.float32((radius if end_radius is None else end_radius) - radius)
 
@@ -49,7 +49,7 @@ def chain(points: Sequence[Sequence[float]], radii: Sequence[float], blend: floa
 
 
 def block(center: Sequence[float], half: Sequence[float], rounding: float = 0.02) -> Distance:
-    """A box with rounded edges; half are its half sides, rounding included."""
+    """Return a box with rounded edges; half are its half sides, rounding included."""
     center = np.asarray(center, np.float32)
     inner = np.maximum(np.asarray(half, np.float32) - rounding, 1e-3)
 
@@ -63,7 +63,7 @@ def block(center: Sequence[float], half: Sequence[float], rounding: float = 0.02
 def rod(
     center: Sequence[float], radius: float, half_length: float, axis: str = "y", rounding: float = 0.01
 ) -> Distance:
-    """A cylinder along a coordinate axis with rounded rims."""
+    """Return a cylinder along a coordinate axis with rounded rims."""
     center, k = np.asarray(center, np.float32), "xyz".index(axis)
     others = [i for i in range(3) if i != k]
 
@@ -78,7 +78,7 @@ def rod(
 
 
 def ring(center: Sequence[float], radius: float, thickness: float, axis: str = "y") -> Distance:
-    """A torus about a coordinate axis."""
+    """Return a torus about a coordinate axis."""
     center, k = np.asarray(center, np.float32), "xyz".index(axis)
     others = [i for i in range(3) if i != k]
 
@@ -90,13 +90,13 @@ def ring(center: Sequence[float], radius: float, thickness: float, axis: str = "
 
 
 def turned(shape: Distance, axis: str, degrees: float, about: Sequence[float] = (0, 0, 0)) -> Distance:
-    """The shape rotated about a point."""
+    """Return the shape rotated about a point."""
     matrix, about = rotation(axis, -degrees).astype(np.float32), np.asarray(about, np.float32)
     return lambda points: shape(product(points - about, matrix) + about)
 
 
 def both_sides(shape: Distance) -> Distance:
-    """The shape and its mirror image in x; model it at x >= 0."""
+    """Return the shape and its mirror image in x; model it at x >= 0."""
     return lambda points: shape(np.concatenate([np.abs(points[:, :1]), points[:, 1:]], axis=1))
 
 
@@ -115,13 +115,13 @@ def blended(shapes: Sequence[Distance], width: float) -> Distance:
 
 
 def carved(shape: Distance, hole: Distance, width: float = 0.02) -> Distance:
-    """The shape without the hole, the rim rounded over `width`."""
+    """Return the shape without the hole, the rim rounded over `width`."""
     negative = blended([lambda points: -shape(points), hole], width)
     return lambda points: -negative(points)
 
 
 def common(shapes: Sequence[Distance], width: float = 0.02) -> Distance:
-    """What all shapes share, edges rounded over `width`."""
+    """Return what all shapes share, edges rounded over `width`."""
     negative = blended([lambda points, s=shape: -s(points) for shape in shapes], width)
     return lambda points: -negative(points)
 
@@ -139,7 +139,7 @@ def _sampled(shape: Distance, axes: list[np.ndarray]) -> np.ndarray:
 
 
 def polygonised(shape: Distance, resolution: int = 52, reach: float = 1.6) -> Part:
-    """The zero surface as a closed part; the longest side of its bounding box gets `resolution` cells.
+    """Return the zero surface as a closed part; the longest side of its bounding box gets `resolution` cells.
 
     The shape must lie inside the cube [-reach, reach]. Raises ValueError when it is empty.
     """

@@ -243,7 +243,7 @@ THEMES = {
 
 
 def pick(rng: np.random.Generator, theme: str = "any", color: np.ndarray | None = None) -> Finish:
-    """A finish of the theme with its own random stream, so that its details do not shift later choices."""
+    """Return a finish of the theme with its own random stream, so that its details do not shift later choices."""
     choices = THEMES[theme]
     chosen = choices[rng.integers(len(choices))]
     own = np.random.default_rng(rng.integers(2**62))

@@ -10,6 +10,7 @@ from gdtool.assets.procedural.parts import ball, box, circle, cone, cylinder, lo
 
 
 def wheels(a: Assembly, rng, x: float, y: float, zs, r: float, width: float) -> None:
+    """Add a pair of wheels at each of the places zs along a vehicle."""
     tire, hub = finishes.matte(rng, np.full(3, rng.uniform(0.01, 0.06))), finishes.metal(rng)
     t = np.linspace(-np.pi / 2, np.pi / 2, 9)
     profile = np.vstack(
@@ -27,6 +28,7 @@ def wheels(a: Assembly, rng, x: float, y: float, zs, r: float, width: float) -> 
 
 
 def car(rng) -> Assembly:
+    """Return a car: body, cabin, windows, wheels."""
     a = Assembly()
     w, length, r = rng.uniform(0.26, 0.36), rng.uniform(0.6, 0.85), rng.uniform(0.13, 0.19)
     low, cab = rng.uniform(0.16, 0.26), rng.uniform(0.15, 0.28)
@@ -59,6 +61,7 @@ def car(rng) -> Assembly:
 
 
 def truck(rng) -> Assembly:
+    """Return a truck: cabin, load, wheels."""
     a = Assembly()
     w, cab, bed, r = rng.uniform(0.26, 0.34), rng.uniform(0.35, 0.5), rng.uniform(0.7, 1.1), rng.uniform(0.13, 0.18)
     paint, dark = tiles.pick(rng, "paint"), finishes.plastic(rng, np.full(3, 0.03))
@@ -102,7 +105,7 @@ def truck(rng) -> Assembly:
 
 
 def train(rng) -> Assembly:
-    """A steam engine: boiler, chimney, domes, cabin, cow-catcher."""
+    """Return a steam engine: boiler, chimney, domes, cabin, cow-catcher."""
     a, paint, metal = Assembly(), tiles.pick(rng, "paint"), tiles.pick(rng, "metal")
     r, length = rng.uniform(0.2, 0.28), rng.uniform(0.8, 1.1)
     a.add(cylinder(r, length, 0.03, 44).turned("x", 90).moved(0, 0.32, 0.15), paint)
@@ -128,6 +131,7 @@ def train(rng) -> Assembly:
 
 
 def boat(rng) -> Assembly:
+    """Return a boat: hull, deck, cabin or mast."""
     a, hull = Assembly(), tiles.pick(rng, "paint" if rng.uniform() < 0.6 else "wood")
     w, length, tall = rng.uniform(0.25, 0.38), rng.uniform(0.7, 0.9), rng.uniform(0.25, 0.35)
     body = solids.common(
@@ -169,6 +173,7 @@ def boat(rng) -> Assembly:
 
 
 def aeroplane(rng) -> Assembly:
+    """Return an aeroplane: fuselage, wings, tail."""
     a, paint, wing = Assembly(), tiles.pick(rng, "paint"), tiles.pick(rng, "paint")
     r, span, sweep = rng.uniform(0.11, 0.18), rng.uniform(0.7, 1.0), rng.uniform(0, 30)
     knots = [(0.02, -0.95), (r * 0.5, -0.6), (r, -0.1), (r, 0.45), (r * 0.7, 0.7), (0.03, 0.85)]
@@ -194,6 +199,7 @@ def aeroplane(rng) -> Assembly:
 
 
 def rocket(rng) -> Assembly:
+    """Return a rocket: body, nose, fins."""
     a, paint, fin = Assembly(), tiles.pick(rng, "paint"), tiles.pick(rng, "paint")
     r, tall = rng.uniform(0.2, 0.32), rng.uniform(1.3, 1.7)
     curve = smooth_curve([(r * 0.7, 0.0), (r, tall * 0.35), (r * 0.85, tall * 0.65), (0.02, tall)], 36)

@@ -10,7 +10,7 @@ from gdtool.assets.procedural.parts import Part, ball, circle, cylinder, loft, r
 
 
 def walled(outer: np.ndarray, thickness: float, segments: int = 48, outline: np.ndarray | None = None) -> Part:
-    """An open vessel: outer profile rows (radius, height) from the foot's axis to the rim, returned inside at
+    """Return an open vessel: outer profile rows (radius, height) from the foot's axis to the rim, returned inside at
     `thickness`."""
     outer = np.asarray(outer, float)
     inner = outer[outer[:, 1] > outer[0, 1] + 1.5 * thickness]
@@ -31,7 +31,7 @@ def _outline(rng, plain_share: float = 0.6) -> np.ndarray:
 
 
 def body_curve(rng, height: float, foot: float, belly: float, neck: float, rim: float, count: int = 28) -> np.ndarray:
-    """A random vessel contour (count, 2) through foot, belly, neck and rim radii."""
+    """Return a random vessel contour (count, 2) through foot, belly, neck and rim radii."""
     where = np.sort(rng.uniform([0.2, 0.65], [0.5, 0.88]))
     curve = smooth_curve(
         [(foot, 0.02 * height), (belly, where[0] * height), (neck, where[1] * height), (rim, height)], count
@@ -49,6 +49,7 @@ def _handle(rng, start, end, bulge: float, radius: float) -> Part:
 
 
 def vase(rng) -> Assembly:
+    """Return a vase: a turned profile, perhaps with a pattern."""
     a, height = Assembly(), rng.uniform(0.9, 1.8)
     curve = body_curve(
         rng, height, rng.uniform(0.15, 0.35), rng.uniform(0.3, 0.6), rng.uniform(0.1, 0.3), rng.uniform(0.15, 0.42)
@@ -78,6 +79,7 @@ def vase(rng) -> Assembly:
 
 
 def bottle(rng) -> Assembly:
+    """Return a bottle with a cap."""
     a, height, r = Assembly(), rng.uniform(1.2, 1.9), rng.uniform(0.22, 0.42)
     neck, shoulder = r * rng.uniform(0.25, 0.5), rng.uniform(0.5, 0.7)
     knots = [
@@ -101,6 +103,7 @@ def bottle(rng) -> Assembly:
 
 
 def cup(rng) -> Assembly:
+    """Return a cup with a handle."""
     a, height = Assembly(), rng.uniform(0.7, 1.2)
     rim = rng.uniform(0.35, 0.5)
     foot = rim * rng.uniform(0.55, 1.0)
@@ -200,6 +203,7 @@ def teapot(rng) -> Assembly:
 
 
 def bowl(rng) -> Assembly:
+    """Return a bowl, perhaps with fruit."""
     a, height, rim = Assembly(), rng.uniform(0.25, 0.6), rng.uniform(0.5, 0.7)
     foot = rim * rng.uniform(0.3, 0.6)
     curve = np.vstack(
@@ -221,6 +225,7 @@ def bowl(rng) -> Assembly:
 
 
 def goblet(rng) -> Assembly:
+    """Return a goblet: bowl, stem, foot."""
     a, height = Assembly(), rng.uniform(1.2, 1.8)
     base, stem, rim = rng.uniform(0.3, 0.42), rng.uniform(0.04, 0.09), rng.uniform(0.28, 0.45)
     knot = rng.uniform(0.35, 0.5) * height
@@ -246,6 +251,7 @@ def goblet(rng) -> Assembly:
 
 
 def lamp(rng) -> Assembly:
+    """Return a lamp: foot, stem, shade."""
     a, stem = Assembly(), rng.uniform(0.7, 1.2)
     finish = tiles.pick(rng, "metal" if rng.uniform() < 0.5 else "ceramic")
     belly = rng.uniform(0.08, 0.35)
@@ -259,6 +265,7 @@ def lamp(rng) -> Assembly:
 
 
 def candle(rng) -> Assembly:
+    """Return a candle on a holder."""
     a, count = Assembly(), int(rng.choice([1, 1, 3]))
     stand = tiles.pick(rng, "metal")
     wax = finishes.plastic(rng, finishes.any_color(rng))
@@ -301,7 +308,7 @@ def candle(rng) -> Assembly:
 
 
 def barrel(rng) -> Assembly:
-    """A barrel, drum, jar or tin: bulging body, hoops, a lid."""
+    """Return a barrel, drum, jar or tin: bulging body, hoops, a lid."""
     a, height, r = Assembly(), rng.uniform(0.9, 1.4), rng.uniform(0.35, 0.5)
     bulge = r * rng.uniform(1.0, 1.25)
     theme = ["wood", "paint", "ceramic", "metal"][rng.integers(4)]

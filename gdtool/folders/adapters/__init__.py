@@ -33,7 +33,7 @@ class Pictures:
 
 
 def adapter(folder: Path, name: str = "auto") -> ModuleType:
-    """The adapter of that name, or the first that recognises the folder. Raises InputError."""
+    """Return the adapter of that name, or the first that recognises the folder. Raises InputError."""
     for known in ADAPTERS if name == "auto" else (name,):
         module = import_module(f"{__name__}.{known}")
         if module.recognises(folder):

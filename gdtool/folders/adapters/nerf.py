@@ -24,6 +24,7 @@ _FILES = ("transforms.json", "transforms_train.json")
 
 
 def recognises(folder: Path) -> bool:
+    """Return whether a folder looks like one of this program."""
     return any((folder / name).is_file() for name in _FILES)
 
 
@@ -64,7 +65,7 @@ def read(folder: Path) -> Pictures:
 
 
 def _picture(path: Path, name: str) -> Path:
-    """The picture that a file_path names, within the folder of transforms.json. Raises InputError."""
+    """Return the picture that a file_path names, within the folder of transforms.json. Raises InputError."""
     for suffix in _SUFFIXES:
         found = uri_path(path.parent, name + suffix, path, "file_path")
         if is_readable(found):

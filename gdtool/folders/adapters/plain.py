@@ -24,6 +24,7 @@ _SUFFIXES = (".png", ".exr", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
 
 def recognises(folder: Path) -> bool:
+    """Return whether a folder looks like one of this program."""
     return (folder / "cameras.json").is_file()
 
 

@@ -20,6 +20,7 @@ LOOKS_LIKE = "normals_000_front.png and the like"
 
 
 def recognises(folder: Path) -> bool:
+    """Return whether a folder looks like one of this program."""
     return (folder / "normals_000_front.png").is_file()
 
 
