@@ -1,6 +1,6 @@
 """What bakes are measured on: textured models, each with the quad mesh that its material is baked for.
 
-The first is the bake case of ../shared/peers: a marching-cubes solid of 166,000 triangles with 1024² textures that were
+The first is a marching-cubes solid of 166,000 triangles with 1024² textures that were
 rasterised from a closed-form material. The others are public models with their own textures. All are in a unit box, and
 kept in a folder as NAME.glb and NAME_VERSIONS.npz (vertices, faces (f, 4), uv with (0, 0) at the top left, face_uvs),
 for remeshing takes longer than baking."""
@@ -29,7 +29,7 @@ class Case:
 
 
 def material(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Base color (n, 3) linear, roughness (n,), metallic (n,) of ../shared/peers' closed-form material at (n, 3) in a
+    """Base color (n, 3) linear, roughness (n,), metallic (n,) of a closed-form material at (n, 3) in a
     unit box."""
     x, y, z = np.moveaxis(points, -1, 0)
     waves = (

@@ -30,7 +30,7 @@ class Fine:
 
 
 def part(x, y, z):
-    """The sharp part of ../shared/peers: a box with a bore along z and a ball on top."""
+    """A sharp part: a box with a bore along z and a ball on top."""
     (a, b, c), ball = _PART["half"], _PART["ball"]
     beyond = np.stack([abs(x) - a, abs(y) - b, abs(z) - c])
     box = np.linalg.norm(np.maximum(beyond, 0), axis=0) + np.minimum(beyond.max(0), 0)

@@ -34,7 +34,7 @@ from reconstruct_report import COLUMNS, OURS, PAPER, kind, markdown, plot
 FIRST_SEED = 3_000_000  # procedural objects that the bundled model has not seen
 MODEL_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 LEFT_OUT = ("_col.obj",)  # collision shapes beside the models
-# Of ../shared/assets: ten Google Scanned Objects, then smooth, thin, flat and sharp-edged solids.
+# Of the folder --models: ten Google Scanned Objects, then smooth, thin, flat and sharp-edged solids.
 SUITE = (
     *(
         f"gso/vima/{n}.obj"

@@ -101,7 +101,7 @@ def camera_at(
 
 
 def rig(name: str, size: int) -> list[Camera]:
-    """Return a named rig of square cameras: "six" (DESIGN's default) or "wonder3d" (same azimuths, orthographic width
+    """Return a named rig of square cameras: "six" (the default) or "wonder3d" (same azimuths, orthographic width
     1.35)."""
     half_widths = {"six": HALF_WIDTH, "wonder3d": 1.35 / 2}
     if name not in half_widths:

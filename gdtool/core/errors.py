@@ -10,7 +10,7 @@ import re
 class GdtoolError(Exception):
     """An error with a one-line message `subject: fact; cure` and an exit code.
 
-    Raised directly it means exit 1; the subclasses mean what DESIGN's table of exit codes says.
+    Raised directly it means exit 1; the subclasses have the exit codes of docs/format.md.
     """
 
     exit_code = 1

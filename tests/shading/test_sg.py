@@ -1,4 +1,4 @@
-"""Spherical Gaussians against mpmath and float64 quadrature, over METHOD.md's sweeps (the fast half)."""
+"""Spherical Gaussians against mpmath and float64 quadrature, over sweeps of their arguments (the fast half)."""
 
 from __future__ import annotations
 

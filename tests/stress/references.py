@@ -15,7 +15,7 @@ ULP = float(np.finfo(np.float32).eps)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(300)
 N = torch.tensor([0.0, 0.0, 1.0])
 
-# λ of METHOD.md's sweep, with the ends of the formats and the places where the code changes its form.
+# Values of λ to sweep, with the ends of the formats and the places where the code changes its form.
 SHARPNESS = (
     0.0,
     1e-45,

@@ -1,4 +1,4 @@
-"""METHOD.md's sweep of the fields: NeuS opacity, first crossing, normals of distances, encoding, bfloat16 networks."""
+"""Sweeps of the fields: NeuS opacity, first crossing, normals of distances, encoding, bfloat16 networks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""METHOD.md's sweep of spherical Gaussians: integral, product, hemisphere, cosine. λ from 0 and 1e-45 to float32's
+"""Sweeps of spherical Gaussians: integral, product, hemisphere, cosine. λ from 0 and 1e-45 to float32's
 largest."""
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def check_product(p1: torch.Tensor, s1: float, p2: torch.Tensor, s2: float) -> N
     total, length, drop = float(a) + float(b), float(length), float(drop)
     assert np.isfinite(axis).all() and math.isfinite(sharpness) and exponent <= 0 and np.linalg.norm(axis) < 1 + 1e-6
     assert abs(sharpness - length) <= 2e-6 * max(total, 1e-20), (s1, s2)
-    # The amplitude exp(exponent), relative while float32 can hold it, as METHOD.md asks where its logarithm is
+    # The amplitude exp(exponent), relative while float32 can hold it, where its logarithm is
     # moderate.
     if drop > -80:
         assert abs(exponent - drop) <= 2e-6 * max(1.0, abs(drop)), (s1, s2)

@@ -1,4 +1,4 @@
-"""METHOD.md's sweep of reflection: Fresnel, G and V, the specular lobe, furnace, reciprocity, and what must not
+"""Sweeps of reflection: Fresnel, G and V, the specular lobe, furnace, reciprocity, and what must not
 matter."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""METHOD.md's sweep of what is read and stored: texture levels, tangent frames, texels' owners, quantisation, sRGB."""
+"""Sweeps of what is read and stored: texture levels, tangent frames, texels' owners, quantisation, sRGB."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def test_quantisation_is_within_half_a_step(bits, tmp_path):
 
 
 def test_sixteen_bit_normals_and_depths():
-    """METHOD.md: 8-bit xyz errs by 0.38°, 16 bits by next to nothing; depth over 3 units by 4.6e-5 in 16 bits."""
+    """8-bit xyz errs by 0.38°, 16 bits by next to nothing; depth over 3 units by 4.6e-5 in 16 bits."""
     n = np.random.default_rng(0).normal(size=(50_000, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     worst = {}
