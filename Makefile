@@ -50,30 +50,32 @@ bench: venv
 # Remesh and unwrap beside their peers, over solids and the models in $(MESHES), bake and the finished asset over the textured models
 # in $(TEXTURED); with PEERS_PYTHON, a Python that has bpy, beside Blender, with pyQuadriFlow (the extra quadriflow) beside that as well.
 # Each stops after about twelve minutes and goes on where it was: run it again while the last line says so.
-ASSETS ?= ../shared/assets/mesh
-MESHES ?= $(foreach name,bunny/bunny wingnut/wingnut torus/torus penguin/penguin spot/spot fish/fish,$(ASSETS)/odedstein/$(name).obj) \
-	$(foreach name,animal potion nascar,$(ASSETS)/threestudio/$(name).obj) \
-	$(foreach name,fandisk.obj cycloidal.ply featuretype.STL,$(ASSETS)/trimesh/$(name))
-TEXTURED ?= ../shared/assets/glb ../shared/assets/gltf
+# ASSETS: a folder of public models, lights and pictures, in mesh/, glb/, gltf/, gso/, hdr/ and images/; without it only what gdtool makes itself is
+# measured, and targets that need it say so.
+ASSETS ?=
+MESHES ?= $(if $(ASSETS),$(wildcard $(foreach name,bunny/bunny wingnut/wingnut torus/torus penguin/penguin spot/spot fish/fish,$(ASSETS)/mesh/odedstein/$(name).obj) \
+	$(foreach name,animal potion nascar,$(ASSETS)/mesh/threestudio/$(name).obj) \
+	$(foreach name,fandisk.obj cycloidal.ply featuretype.STL,$(ASSETS)/mesh/trimesh/$(name))))
+TEXTURED ?= $(if $(ASSETS),$(wildcard $(ASSETS)/glb $(ASSETS)/gltf))
 PEERS_PYTHON ?=
 bench-assets: venv
-	$(BIN)/python benchmarks/remesh.py $(wildcard $(MESHES)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
+	$(BIN)/python benchmarks/remesh.py $(MESHES) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
 	$(BIN)/python benchmarks/remesh_draws.py
 	$(BIN)/python benchmarks/remesh_nets.py
-	$(BIN)/python benchmarks/remesh_models.py $(wildcard $(MESHES)) $(wildcard $(TEXTURED))
-	$(BIN)/python benchmarks/unwrap.py $(wildcard $(MESHES)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
-	$(BIN)/python benchmarks/bake.py $(wildcard $(TEXTURED)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
-	$(BIN)/python benchmarks/asset.py $(wildcard $(TEXTURED)) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
+	$(BIN)/python benchmarks/remesh_models.py $(MESHES) $(TEXTURED)
+	$(BIN)/python benchmarks/unwrap.py $(MESHES) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
+	$(BIN)/python benchmarks/bake.py $(TEXTURED) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
+	$(BIN)/python benchmarks/asset.py $(TEXTURED) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
 
 # Materials of reconstructed surfaces, from material views and from color alone, with and without visibility.
 bench-materials: venv
 	$(BIN)/python benchmarks/materials.py $(ARGS)
 
-# Reconstruction beside its peers, on public models in ../shared/assets (where there are any) and procedural objects: an hour
+# Reconstruction beside its peers, on the public models in $(ASSETS) (where it is set) and procedural objects: an hour
 # on two quiet cores, begun for a quarter of it each time: it goes on where it was. ARGS=--all for every disturbance and budget of
 # every model (hours), ARGS="--models DIR" for models of your own.
 bench-reconstruct: venv
-	$(BIN)/python benchmarks/reconstruct.py $(ARGS)
+	$(BIN)/python benchmarks/reconstruct.py $(if $(ASSETS),--assets $(ASSETS)) $(ARGS)
 
 # Time against error of rendering and relighting; set MODEL (textured), ENV (lat-long) and PEERS_PYTHON, a Python that can
 # import bpy, mitsuba or both (and OpenImageIO). A quarter of an hour each on two cores with both peers.
@@ -96,7 +98,7 @@ bench-sample: venv
 
 # GrabCut on pictures laid over photographed environments: two minutes.
 bench-cutout: venv
-	$(BIN)/python benchmarks/cutout.py ../shared/assets/images ../shared/assets/hdr
+	$(if $(ASSETS),$(BIN)/python benchmarks/cutout.py $(ASSETS)/images $(ASSETS)/hdr,@echo "skipped: set ASSETS to a folder with images/ and hdr/")
 
 # What the picture adds to the albedo of the views: MODELS (textured files) in 512 px, half a minute each.
 bench-picture: venv
@@ -149,11 +151,11 @@ model: data
 	$(BIN)/python benchmarks/model_mean.py $(DATA)/one $(DATA)/other -o $(DATA)/mean
 	$(BIN)/gdtool train $(DATA)/new $(DATA)/new_turned --start $(DATA)/mean --size 128 --config benchmarks/model_geometry.json --minutes $(LAST) --seed 2 -o $(DATA)/last
 	$(BIN)/python benchmarks/model_mean.py $(DATA)/mean $(DATA)/last -o $(DATA)/model
-	$(BIN)/python benchmarks/model_doubt.py $(DATA)/held_out --model $(DATA)/model --calibrate $(DATA)/validation --photographs ../shared/assets/images -o docs/benchmarks
+	$(BIN)/python benchmarks/model_doubt.py $(DATA)/held_out --model $(DATA)/model --calibrate $(DATA)/validation $(if $(ASSETS),--photographs $(ASSETS)/images) -o docs/benchmarks
 	$(BIN)/python benchmarks/model_quality.py $(DATA)/held_out --model $(DATA)/model --train $(DATA)/objects $(DATA)/new $(DATA)/new_turned -o docs/benchmarks --install
 	$(BIN)/python benchmarks/model_quality.py $(DATA)/turned --steps 1 --name model_quality_turned -o docs/benchmarks
 	$(BIN)/python benchmarks/model_curve.py $(DATA)/held_out --model $(DATA)/model
-	$(BIN)/python benchmarks/model_sheets.py $(DATA)/held_out ../shared/assets/images
+	$(BIN)/python benchmarks/model_sheets.py $(DATA)/held_out $(if $(ASSETS),$(ASSETS)/images)
 
 # The bundled model beside the nearest training object on four times as many held-out objects, its surfaces of them, and what
 # the parts of the method are worth: nine small trainings, an hour or two.

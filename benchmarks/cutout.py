@@ -1,7 +1,7 @@
 """Cutting subjects out of backgrounds that are not plain: GrabCut's overlap with the truth, and how well its own check
 tells.
 
-    python benchmarks/cutout.py ../shared/assets/images ../shared/assets/hdr -o docs/benchmarks
+    python benchmarks/cutout.py $ASSETS/images $ASSETS/hdr -o docs/benchmarks
 
 Pictures with alpha (first folder) are laid over crops of photographed environments (second folder, three each), so the
 truth is known. Two minutes on two quiet cores. Written as it goes.

@@ -2,7 +2,7 @@ r"""Whether the warnings of sample-views tell which pictures a model does badly,
 
     DOMAINS=color,normal,depth,albedo,roughness,metallic
     gdtool render-dataset procedural:950000..950299 --size 128 --samples 4 --light-samples 4 --domains $DOMAINS -o validation
-    python benchmarks/model_doubt.py held_out --model my-model --calibrate validation --real real --photographs ../shared/assets/images -o docs/benchmarks
+    python benchmarks/model_doubt.py held_out --model my-model --calibrate validation --real real --photographs $ASSETS/images -o docs/benchmarks
 
 held_out and real are those of benchmarks/model_quality.py; photographs are pictures with alpha, whose truth nobody
 knows. --calibrate: objects that the model was neither trained nor is measured on. The limits that one in twenty of them

@@ -2,7 +2,7 @@ r"""How good a model is on objects it was not trained on, beside two baselines; 
 
     gdtool render-dataset procedural:900000..900099 --size 128 --condition-views 3 -o held_out
     python benchmarks/model_quality.py held_out --model my-model --train objects -o docs/benchmarks --install
-    gdtool render-dataset ../shared/assets/glb/*.glb ../shared/assets/gltf/*/*.gltf $(find ../shared/assets/gso -name '*.obj' | grep -v _col) \
+    gdtool render-dataset $ASSETS/glb/*.glb $ASSETS/gltf/*/*.gltf $(find $ASSETS/gso -name '*.obj' | grep -v _col) \
         --size 128 --samples 8 --light-samples 4 --condition-views 3 -o real
     python benchmarks/model_quality.py real --train objects --steps 1 --name model_quality_real --objects "real models" -o docs/benchmarks
     gdtool render-dataset procedural:900000..900099 --turn 45 --size 128 --condition-views 3 -o turned

@@ -1,6 +1,7 @@
-"""What a model makes of twelve held-out objects and of twelve photographs, to look at: one sheet each.
+"""What a model makes of twelve held-out objects and of twelve pictures of other things, to look at: one sheet each.
 
-    python benchmarks/model_sheets.py out/model/held_out ../shared/assets/images -o docs/benchmarks
+    gdtool render-dataset MODELS --domains color --condition-views 1 --light LIGHT.hdr -o out/pictures
+    python benchmarks/model_sheets.py out/model/held_out out/pictures --sources $ASSETS/SOURCES.tsv -o docs/benchmarks
 
 Each block is one picture: the picture as the model is shown it, then its six views (columns) in color, normal, depth,
 albedo, roughness and metallic (rows) over white. Pictures need alpha. A minute on two quiet cores.
@@ -28,6 +29,7 @@ from gdtool.images.io import read_image, write_png
 from gdtool.images.metrics import over_white
 
 COUNT, COLUMNS, GAP = 12, 3, 12
+MOST_BYTES = 300_000  # of a picture in docs/
 
 
 def photograph(path: Path, size: int) -> np.ndarray:
@@ -80,34 +82,53 @@ def sheet(blocks: list[np.ndarray]) -> np.ndarray:
     return out
 
 
-def credit(path: Path) -> str:
-    """Where a picture comes from and under what licence, as a SOURCES.tsv (path, repository, path there, licence) above
-    it says."""
-    for folder in path.resolve().parents:
-        if (folder / "SOURCES.tsv").is_file():
-            for line in (folder / "SOURCES.tsv").read_text().splitlines():
-                name, repository, _, licence = (line.split("\t") + 4 * [""])[:4]
-                if folder / name == path.resolve():
-                    return f" ({repository}, {licence})"
+def name_of(picture: Path) -> str:
+    """What a picture shows: the object of its views folder, else the name of its file."""
+    return picture.parents[2].stem if picture.parent.name == "condition" else picture.stem
+
+
+def credit(name: str, sources: Path | None) -> str:
+    """Where the model of that name comes from and under what licence, as a table (path, repository, path there, licence)
+    says."""
+    for line in sources.read_text().splitlines() if sources else []:
+        path, repository, _, licence = (line.split("\t") + 4 * [""])[:4]
+        if Path(path).stem == name and Path(path).suffix in (".glb", ".gltf", ".obj"):
+            return f" ({repository}, {licence})"
     return ""
+
+
+def write_jpeg(path: Path, picture: np.ndarray) -> None:
+    """Write a picture (h, w, 3) in 0..1 at half its size, in no more than MOST_BYTES."""
+    from PIL import Image
+
+    image = Image.fromarray((picture * 255 + 0.5).astype(np.uint8)).reduce(2)
+    for quality in (90, 80, 70, 60, 50, 40):
+        image.save(path, quality=quality)
+        if path.stat().st_size <= MOST_BYTES:
+            return
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("held_out", type=Path)
-    parser.add_argument("photographs", type=Path)
+    parser.add_argument(
+        "pictures", type=Path, help="folder with pictures, or with views folders, whose condition/ holds them"
+    )
+    parser.add_argument("--sources", type=Path, help="table of models, their repositories and licences, to credit")
     parser.add_argument("--model", type=Path, default=DEFAULT_MODEL)
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks"))
     arguments = parser.parse_args()
     model = load_model(arguments.model)
     size = model.config.image_size
-    pictures = [path for path in sorted(arguments.photographs.rglob("*.png")) if read_image(path).shape[-1] == 4]
-    write_png(
-        arguments.output / "model_photographs.png",
+    found = sorted(arguments.pictures.rglob("condition/000.png")) or sorted(arguments.pictures.rglob("*.png"))
+    pictures = [path for path in found if read_image(path).shape[-1] == 4]
+    write_jpeg(
+        arguments.output / "model_pictures.jpg",
         sheet([block(model, photograph(path, size)) for path in pictures[:COUNT]]),
     )
     folders = views_folders([arguments.held_out])[:COUNT]
-    lines = [f"{i + 1}. {path.stem}{credit(path)}" for i, path in enumerate(pictures[:COUNT])]
+    names = [name_of(path) for path in pictures[:COUNT]]
+    lines = [f"{i + 1}. {name}{credit(name, arguments.sources)}" for i, name in enumerate(names)]
     (arguments.output / "model_sheets.md").write_text(
         "\n".join(
             [
@@ -115,7 +136,7 @@ def main() -> None:
                 "",
                 "A block a picture: as the model is shown it, then its six views in color, normal, depth, albedo, roughness and metallic.",
                 "",
-                "![twelve pictures](model_photographs.png)",
+                "![twelve pictures](model_pictures.jpg)",
                 "",
                 "The pictures, row by row:",
                 "",

@@ -1,9 +1,8 @@
 r"""What the picture that views were made of adds to the albedo that is baked from them.
 
-    A=../shared/assets
-    gdtool render-dataset $A/glb/{Barrel,BoxTextured,CesiumMilkTruck,ExplodingBarrel,Fox,egyptian_cat,seagulf,target,house}.glb \
-        $A/gltf/{painted_wooden_stool_1k,sofa_03_1k,tea_set_01_1k,wooden_table_02_1k}/*.gltf $A/gso/aloha/*/meshes/model.obj \
-        $A/gso/vima/{bull_figure,toy_train}.obj --size 512 --samples 4 --light-samples 4 --domains color,albedo -o out/fine
+    gdtool render-dataset $ASSETS/glb/{Barrel,BoxTextured,CesiumMilkTruck,ExplodingBarrel,Fox,egyptian_cat,seagulf,target,house}.glb \
+        $ASSETS/gltf/{painted_wooden_stool_1k,sofa_03_1k,tea_set_01_1k,wooden_table_02_1k}/*.gltf $ASSETS/gso/aloha/*/meshes/model.obj \
+        $ASSETS/gso/vima/{bull_figure,toy_train}.obj --size 512 --samples 4 --light-samples 4 --domains color,albedo -o out/fine
     python benchmarks/picture.py out/fine -o docs/benchmarks
 
 Each object's front view in 512 px is the picture and the truth. The albedo at the model's size, the bundled model's and

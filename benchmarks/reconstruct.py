@@ -64,7 +64,7 @@ ALWAYS = ("carved hull", "capped Poisson")
 
 def models(given: argparse.Namespace) -> list[tuple[str, str]]:
     """Name and source of every model to take, procedural ones mixed in evenly."""
-    found = [given.assets / path for path in SUITE if (given.assets / path).exists()]
+    found = [given.assets / path for path in SUITE if (given.assets / path).exists()] if given.assets else []
     for place in given.models:
         paths = (
             [place] if place.is_file() else sorted(p for p in place.rglob("*") if p.suffix.lower() in MODEL_SUFFIXES)
@@ -358,8 +358,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--assets",
         type=Path,
-        default=Path(__file__).parents[2] / "shared" / "assets",
-        help="folder that holds the models of the suite",
+        help="folder that holds the models of the suite; without it they are left out",
     )
     parser.add_argument("--procedural", type=int, default=4, help="number of procedural objects (default 4)")
     parser.add_argument(

@@ -1,6 +1,6 @@
 """Model to asset and back: how near the finished asset is to the PBR model it was made from.
 
-    python benchmarks/roundtrip.py ../shared/assets/glb ../shared/assets/gltf -o docs/benchmarks/roundtrip.md
+    python benchmarks/roundtrip.py $ASSETS/glb $ASSETS/gltf -o docs/benchmarks/roundtrip.md
 
 Every model under the given folders (or files) that has metallic-roughness textures, or every one with --all, goes
 through
