@@ -88,8 +88,8 @@ def name_of(picture: Path) -> str:
 
 
 def credit(name: str, sources: Path | None) -> str:
-    """Where the model of that name comes from and under what licence, as a table (path, repository, path there, licence)
-    says."""
+    """Where the model of that name comes from and under what licence, as a table (path, repository, path there,
+    licence) says."""
     for line in sources.read_text().splitlines() if sources else []:
         path, repository, _, licence = (line.split("\t") + 4 * [""])[:4]
         if Path(path).stem == name and Path(path).suffix in (".glb", ".gltf", ".obj"):

@@ -23,6 +23,10 @@ COMMANDS = {
 }
 
 
+# The variable through which a shell asks for completions, as click names it.
+COMPLETION = "_GDTOOL_COMPLETE"
+
+
 def _cli() -> object:
     from ._group import cli
 
@@ -44,6 +48,10 @@ def main(load: Callable[[], object] = _cli) -> None:
         from ._common import guarded
 
         command = load()
+        if COMPLETION in os.environ:
+            from click.shell_completion import shell_complete
+
+            sys.exit(shell_complete(command, {}, "gdtool", COMPLETION, os.environ[COMPLETION]))
     except BaseException as error:
         if ending.received is not None:
             sys.exit(128 + ending.received)

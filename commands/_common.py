@@ -132,6 +132,7 @@ def exit_code(failed: list[GdtoolError], done: int) -> int:
     return 0 if not failed else codes.pop() if not done and len(codes) == 1 else 1
 
 
+LOG_FILE_HELP = "Append all that is told, with times, to a file."
 VERBOSITY = {
     ("-q", "--quiet"): "Tell only errors.",
     ("-v", "--verbose"): "Tell steps and skips.",
@@ -171,15 +172,18 @@ TEXT = Text()
 
 
 def verbosity_options(function: Callable) -> Callable:
-    """--json, -q, -v and --debug, for commands that print a report."""
+    """Add --json, --log-file, -q, -v and --debug, for commands that print a report."""
+    function = click.option("--log-file", type=TEXT, metavar="PATH", help=LOG_FILE_HELP)(function)
     for flags, text in reversed(VERBOSITY.items()):
         function = click.option(*flags, is_flag=True, help=text)(function)
     return click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")(function)
 
 
-def set_verbosity(quiet: bool, verbose: bool) -> None:
-    """Apply -q and -v."""
+def set_verbosity(quiet: bool, verbose: bool, log_file: str | None) -> None:
+    """Apply -q, -v and --log-file. Raises OutputError where the file cannot be written."""
     log.level = log.QUIET if quiet else log.VERBOSE if verbose else log.NORMAL
+    if log_file:
+        log.keep_in(Path(log_file))
 
 
 def option_from_field(field: Any, hint: Any) -> click.Option:
@@ -273,7 +277,7 @@ def stage_command(stage: Stage, help: str) -> click.Command:
         from gdtool.core.runner import Settings, run_all
         from gdtool.stages.early import require_device
 
-        set_verbosity(values["quiet"], values["verbose"])
+        set_verbosity(values["quiet"], values["verbose"], values["log_file"])
         arguments = values["sources"]
         shard = shard_of(values.get("shard"))
         settings = Settings(
@@ -345,5 +349,6 @@ def stage_command(stage: Stage, help: str) -> click.Command:
             help="Where networks run.",
         ),
     ]
+    params.append(click.Option(["--log-file"], type=TEXT, metavar="PATH", help=LOG_FILE_HELP))
     params += [click.Option(list(flags), is_flag=True, help=text) for flags, text in VERBOSITY.items()]
     return click.Command(stage.name, callback=invoke, params=params, help=help)

@@ -39,9 +39,9 @@ def _one(text, reference, views, options):
     help="Views that the result was made from; found along the provenance chain without it.",
 )
 @verbosity_options
-def command(results, reference, views, as_json, quiet, verbose, debug, **values):
+def command(results, reference, views, as_json, log_file, quiet, verbose, debug, **values):
     """Measure results against a reference and write the figures to stdout."""
-    set_verbosity(quiet, verbose)
+    set_verbosity(quiet, verbose, log_file)
     options = build_options(stage.Options, values)
     failed, done = [], 0
     for text in sources.incoming(results):

@@ -20,9 +20,9 @@ SHOWN = 10  # the first faults are enough to start mending
 @click.command("validate", help=help_of(stage))
 @click.argument("paths", metavar="[SOURCES]...", nargs=-1, type=TEXT)
 @verbosity_options
-def command(paths, as_json, quiet, verbose, debug):
+def command(paths, as_json, log_file, quiet, verbose, debug):
     """Check each source and return the exit code."""
-    set_verbosity(quiet, verbose)
+    set_verbosity(quiet, verbose, log_file)
     code = 0
     for text in sources.incoming(paths):
         try:

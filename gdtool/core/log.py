@@ -1,13 +1,29 @@
-"""What a run tells on stderr: one line an event, and bars only on a terminal."""
+"""Tell what a run does: one line an event on stderr, all lines with their times in a file, and bars only on a
+terminal."""
 
 from __future__ import annotations
 
 import contextlib
+import datetime
 import sys
 from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TextIO
+
+from gdtool.core.errors import from_os_error
 
 QUIET, NORMAL, VERBOSE = 0, 1, 2
 level = NORMAL
+_file: TextIO | None = None
+
+
+def keep_in(path: Path) -> None:
+    """Append each line from now on, whatever the verbosity, to a file, with its time. Raises OutputError."""
+    global _file
+    try:
+        _file = path.open("a", encoding="utf-8", errors="backslashreplace")
+    except OSError as error:
+        raise from_os_error(error, path) from None
 
 
 def printable(text: str) -> str:
@@ -25,23 +41,30 @@ def _shown(character: str) -> str:
     return character
 
 
-def line(text: str) -> None:
-    """Print text to stderr as one line. Where stderr cannot be written (closed, on a full disk) the work goes on."""
-    with contextlib.suppress(OSError, ValueError):
-        print(printable(text), file=sys.stderr, flush=True)
+def line(text: str, shown: bool = True) -> None:
+    """Print text to stderr as one line, where shown, and keep it in the file of keep_in().
+
+    Where stderr or the file cannot be written (closed, on a full disk) the work goes on.
+    """
+    if shown:
+        with contextlib.suppress(OSError, ValueError):
+            print(printable(text), file=sys.stderr, flush=True)
+    if _file is not None:
+        time = datetime.datetime.now().astimezone().isoformat(timespec="milliseconds")
+        with contextlib.suppress(OSError, ValueError):
+            print(time, printable(text), file=_file, flush=True)
 
 
 def say(text: str, at: int = NORMAL) -> None:
     """Print a line to stderr when the verbosity is at least `at`."""
-    if level >= at:
-        line(text)
+    line(text, shown=level >= at)
 
 
 def status(text: str) -> None:
-    """How a step gets on: a line on stderr when verbose, else, on a terminal, a line that the next one replaces."""
-    if level >= VERBOSE:
-        say(f"    {text}", at=VERBOSE)
-    elif level == NORMAL and sys.stderr.isatty():
+    """Tell how a step gets on: a line on stderr when verbose, else, on a terminal, a line that the next one
+    replaces."""
+    say(f"    {text}", at=VERBOSE)
+    if level == NORMAL and sys.stderr.isatty():
         with contextlib.suppress(OSError, ValueError):
             print(f"\r\033[K  {printable(text)}", end="\r", file=sys.stderr, flush=True)
 
