@@ -6,6 +6,10 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import click
 
 # Subcommand: what --help says of it. The module is the name with underscores.
 COMMANDS = {
@@ -27,13 +31,13 @@ COMMANDS = {
 COMPLETION = "_GDTOOL_COMPLETE"
 
 
-def _cli() -> object:
+def _cli() -> click.Command:
     from ._group import cli
 
     return cli
 
 
-def main(load: Callable[[], object] = _cli) -> None:
+def main(load: Callable[[], click.Command] = _cli) -> None:
     """Run the click command that load() gives, which may import what it likes, and exit with one of the documented
     codes."""
     _open_streams()

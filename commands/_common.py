@@ -198,7 +198,7 @@ def option_from_field(field: Any, hint: Any) -> click.Option:
             inner, meta = typing.get_args(inner)[0], typing.get_args(inner)[1]
     name = field.name.replace("_", "-")
     text = meta.description or ""
-    common = {
+    common: dict[str, Any] = {
         "default": None if optional and field.default is None else field.default,
         "show_default": not optional,
         "help": text,
@@ -218,7 +218,7 @@ def option_from_field(field: Any, hint: Any) -> click.Option:
         )
     if inner in (int, float):
         lowest, highest = (meta.ge, meta.gt), (meta.le, meta.lt)
-        bounds = {
+        bounds: dict[str, Any] = {
             "min": next((x for x in lowest if x is not None), None),
             "max": next((x for x in highest if x is not None), None),
             "min_open": meta.gt is not None,
@@ -262,7 +262,7 @@ def help_of(module: types.ModuleType) -> str:
     if text is None:
         import ast
 
-        text = ast.get_docstring(ast.parse(Path(module.__file__).read_text(encoding="utf-8")), clean=False) or ""
+        text = ast.get_docstring(ast.parse(Path(module.__file__ or "").read_text(encoding="utf-8")), clean=False) or ""
     return text.replace("Example:\n", "\b\nExample:\n").replace("Examples:\n", "\b\nExamples:\n")
 
 

@@ -7,6 +7,7 @@ import json
 import click
 
 from gdtool.core import ending, sources
+from gdtool.core.folder import Folder
 from gdtool.stages import evaluate as stage
 
 from ._common import TEXT, build_options, emit, exit_code, help_of, options_from, set_verbosity, tell, verbosity_options
@@ -16,6 +17,7 @@ def _one(text, reference, views, options):
     found = sources.resolve(text, stage.READS, "evaluate")
     against = sources.resolve(reference, stage.READS, "--reference of evaluate") if reference else None
     rig = sources.resolve(views, ("views",), "--views of evaluate") if views else None
+    assert rig is None or isinstance(rig, Folder)
     return stage.evaluate(found, against, options, rig)
 
 

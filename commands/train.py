@@ -16,6 +16,7 @@ command.params.append(
         help="Tell memory, FLOPs and time of the training, computed from its structure; no data.",
     )
 )
+assert command.callback is not None
 _train = command.callback
 
 

@@ -1,5 +1,5 @@
 """`python -m gdtool` runs the same command line as the installed `gdtool` script."""
 
-from gdtool.commands import main
+from gdtool.commands import main  # type: ignore[import-not-found]  # commands/, installed under this name
 
 main()

@@ -86,7 +86,7 @@ def _module_of(function: Callable[..., Any]) -> str:
     if function.__module__ != "__main__":
         return function.__module__
     main = sys.modules["__main__"]
-    return main.__spec__.name if main.__spec__ else Path(main.__file__).stem
+    return main.__spec__.name if main.__spec__ else Path(main.__file__ or "").stem
 
 
 class Running:
@@ -154,6 +154,7 @@ def _started(modules: tuple[str, ...]) -> subprocess.Popen:
         env=_SETTINGS | os.environ,
     )
     with contextlib.suppress(BrokenPipeError):  # it is dead already: result() says of what
+        assert process.stdin is not None  # a pipe
         process.stdin.write(pickle.dumps((sys.path, modules)))
         process.stdin.flush()
     return process
@@ -203,7 +204,7 @@ def serve() -> None:
 def _answer(module: str, name: str, args: tuple, kwargs: dict[str, Any], memory_mb: int | None) -> tuple[str, Any]:
     """Run the function: "done" and its result, "error" and a GdtoolError, or "failed" and why."""
     try:
-        function = importlib.import_module(module)
+        function: Any = importlib.import_module(module)
         for part in name.split("."):
             function = getattr(function, part)
         if memory_mb is not None and sys.platform == "linux":

@@ -90,7 +90,7 @@ def from_os_error(error: OSError, subject: object) -> GdtoolError:
         return InputError(place, fact, _BAD_NAMES[error.errno])
     if error.errno in _LIMITS:
         return ResourceError(place, fact, _LIMITS[error.errno])
-    return OutputError(place, fact, _CURES.get(error.errno, "check that the disk and the folder can be used"))
+    return OutputError(place, fact, _CURES.get(error.errno or 0, "check that the disk and the folder can be used"))
 
 
 # The Debian package that brings a shared library; these are what the packages that gdtool needs are linked with.

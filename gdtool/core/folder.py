@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gdtool.core.errors import InputError
-from gdtool.core.kinds import MADE_BY, Content
+from gdtool.core.kinds import MADE_BY, Content, DatasetContent
 from gdtool.core.manifest import MANIFEST, Manifest, check_files, read_manifest
 from gdtool.core.names import path_inside
 
@@ -70,7 +70,9 @@ def dataset_objects(dataset: Folder) -> Iterator[Folder]:
 
     Raises InputError for one that leaves the dataset, is missing, or is not the one listed (another digest).
     """
-    for entry in dataset.content.objects:
+    content = dataset.content
+    assert isinstance(content, DatasetContent)
+    for entry in content.objects:
         path = path_inside(dataset.path, entry.path, dataset.path / MANIFEST, "object")
         found = open_folder(path, ("views",), "a dataset", check=False)
         if found.manifest.digest != entry.digest:

@@ -105,7 +105,7 @@ def encode(manifest: Manifest) -> bytes:
         return json.dumps(msgspec.to_builtins(manifest), indent=1).encode() + b"\n"
 
 
-def _nearest(message: str, types: tuple[type, ...]) -> str:
+def _nearest(message: str, types: tuple[type[msgspec.Struct], ...]) -> str:
     """Return a hint for msgspec's unknown field message: the known field nearest to the unknown one."""
     unknown = re.search(r"unknown field `([^`]+)`", message)
     if not unknown:
@@ -119,7 +119,7 @@ def decode(raw: Any, path: Path) -> Manifest:
     """Check parsed JSON against the format. Raises InputError that names path and the fault."""
     if isinstance(raw, dict) and isinstance(raw.get("format"), int) and raw["format"] > FORMAT:
         raise InputError(path, f"has format {raw['format']}, this gdtool reads up to {FORMAT}", "upgrade gdtool")
-    nested = (Manifest, FileEntry, InputEntry, Skip, RunRecord)
+    nested: tuple[type[msgspec.Struct], ...] = (Manifest, FileEntry, InputEntry, Skip, RunRecord)
     try:
         manifest = msgspec.convert(raw, Manifest)
         if manifest.kind not in CONTENTS:

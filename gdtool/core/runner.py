@@ -116,10 +116,12 @@ def second_inputs(stage: Stage, source: Source, given: dict[str, str | None]) ->
     for flag in stage.second_inputs:
         wanted = stage.second(flag)
         gone = None
-        if given.get(flag):
+        if named := given.get(flag):
             kinds = (wanted.kind, sources.PICTURES) if wanted.foreign else (wanted.kind,)
-            place = sources.hub_folder(given[flag]) if wanted.foreign else given[flag]
-            out[flag] = sources.resolve(place, kinds, f"--{flag} of {stage.name}")
+            place = sources.hub_folder(named) if wanted.foreign else named
+            opened = sources.resolve(place, kinds, f"--{flag} of {stage.name}")
+            assert not isinstance(opened, str)  # second inputs are folders or files
+            out[flag] = opened
         elif wanted.search and isinstance(source, Folder):
             cure = f"run the stages after it again, or name it with --{flag}"
             found = find_ancestor(source, wanted.kind, cure)
@@ -385,9 +387,10 @@ def _on_cluster(work: functools.partial, stream: Iterator[str], settings: Settin
     """One source a task; a task takes the cores that --threads says, one without it."""
     from gdtool.core import cluster
 
-    threads = settings.threads or 1
+    threads, address = settings.threads or 1, settings.ray
+    assert address is not None
     work.keywords["settings"] = dataclasses.replace(settings, threads=threads, ray=None)
-    for result in cluster.each(settings.ray, work, stream, threads):
+    for result in cluster.each(address, work, stream, threads):
         if isinstance(result, Result):
             log.say(
                 f"{result.path}: {result.status}" + (f" in {result.seconds:.1f} s" if result.status == "done" else "")

@@ -72,8 +72,8 @@ def _lines() -> Iterator[str]:
     for raw in iter(functools.partial(sys.stdin.buffer.readline, MAX_LINE_BYTES + 1), b""):
         if len(raw) > MAX_LINE_BYTES:
             raise UsageError("stdin", f"has a line of more than {MAX_LINE_BYTES} bytes", "pipe paths in, one a line")
-        line = os.fsdecode(raw.rstrip(b"\r\n"))
-        if line.startswith("{"):
+        line: str | None = os.fsdecode(raw.rstrip(b"\r\n"))
+        if line and line.startswith("{"):
             line = _folder_of(raw, line)
         if line:
             yield _checked(line)
