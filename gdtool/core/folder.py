@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from gdtool.core.errors import InputError
 from gdtool.core.kinds import MADE_BY, Content, DatasetContent
 from gdtool.core.manifest import MANIFEST, Manifest, check_files, read_manifest
 from gdtool.core.names import path_inside
+
+ContentT = TypeVar("ContentT", bound=Content)
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,12 @@ class Folder:
     @property
     def content(self) -> Content:
         """What the manifest says that the folder holds."""
+        return self.manifest.content
+
+    def content_as(self, wanted: type[ContentT]) -> ContentT:
+        """Return the content as the type of its kind. Raises TypeError for a folder of another kind."""
+        if not isinstance(self.manifest.content, wanted):
+            raise TypeError(f"{self.path} holds {self.kind}, not {wanted.__name__}")
         return self.manifest.content
 
     @property
@@ -70,9 +79,7 @@ def dataset_objects(dataset: Folder) -> Iterator[Folder]:
 
     Raises InputError for one that leaves the dataset, is missing, or is not the one listed (another digest).
     """
-    content = dataset.content
-    assert isinstance(content, DatasetContent)
-    for entry in content.objects:
+    for entry in dataset.content_as(DatasetContent).objects:
         path = path_inside(dataset.path, entry.path, dataset.path / MANIFEST, "object")
         found = open_folder(path, ("views",), "a dataset", check=False)
         if found.manifest.digest != entry.digest:

@@ -37,7 +37,7 @@ def write_obj(path: Path, mesh: QuadMesh, header: tuple[str, ...] = ()) -> None:
     """Write v, vt (v up, OBJ's convention) and f lines; header lines come first."""
     lines = [*header]
     lines += ["v {:.9g} {:.9g} {:.9g}".format(*p) for p in mesh.vertices]
-    if mesh.uv is not None:
+    if mesh.uv is not None and mesh.face_uvs is not None:
         lines += [f"vt {u:.9g} {1 - v:.9g}" for u, v in mesh.uv]
         for face, corners in zip(mesh.faces.tolist(), mesh.face_uvs.tolist(), strict=True):
             lines.append("f " + " ".join(f"{v + 1}/{t + 1}" for v, t in zip(face, corners, strict=True) if v >= 0))

@@ -95,13 +95,13 @@ def write_surface_ply(path: Path, surface: Surface) -> None:
             vertex[name] = values[:, axis]
     for name in ("roughness", "metallic", "confidence"):
         vertex[name] = np.clip(getattr(surface, name), 0, 1)
-    if known:
+    if known and surface.views is not None:
         vertex["views"], vertex["residual"] = np.minimum(surface.views, 255), surface.residual
     face = np.empty(len(surface.faces), _FACE)
     face["count"], face["idx"] = 3, surface.faces
     kinds = {"<f4": "float", "|u1": "uchar"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertex)}"]
-    lines += [f"property {kinds[layout[name].str]} {name}" for name in layout.names]
+    lines += [f"property {kinds[layout[name].str]} {name}" for name in layout.names or ()]
     lines += [f"element face {len(face)}", "property list uchar int vertex_indices", "end_header", ""]
     with path.open("wb") as file:
         file.write("\n".join(lines).encode())
@@ -144,7 +144,7 @@ def read_surface(folder: Folder) -> Surface:
     else:
         albedo = np.full((len(vertex), 3), 0.8, np.float32)
     normals = columns(vertex, "nx ny nz").astype(np.float32) if {"nx", "ny", "nz"} <= set(names) else None
-    light = read_record(folder.file("light.json")) if folder.content.light else None
+    light = read_record(folder.file("light.json")) if folder.content_as(SurfaceContent).light else None
     return Surface(
         vertices,
         faces.astype(np.int32),

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from gdtool.cameras import Camera
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
-from gdtool.core.kinds import DOMAINS, IDENTITY, ViewsContent
+from gdtool.core.kinds import DOMAINS, IDENTITY, Domain, ViewsContent
 from gdtool.core.memory import require_memory
 from gdtool.core.stage import Output
 from gdtool.folders.records import read_cameras, read_record, write_cameras, write_record
@@ -44,7 +44,7 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
     from gdtool.images.io import read_image
 
     cameras = read_cameras(folder.file("cameras.json"))
-    content: ViewsContent = folder.content
+    content = folder.content_as(ViewsContent)
     if tuple(camera.name for camera in cameras) != tuple(content.views):
         raise InputError(
             folder.file("cameras.json"),
@@ -93,7 +93,7 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
         "render fewer or smaller views",
     )
     mask = np.stack([load("mask", c.name, c) for c in cameras]).astype(np.float32)
-    images = {}
+    images: dict[str, np.ndarray] = {}
     for domain in wanted:
         stack = np.stack([load(domain, c.name, c) for c in cameras]).astype(np.float32)
         if domain == "normal":
@@ -115,7 +115,7 @@ def read_picture(folder: Folder, cameras: list[Camera]) -> tuple[np.ndarray, Cam
     from gdtool.images.color import linear_from_srgb, unit_range
     from gdtool.images.io import read_image
 
-    content: ViewsContent = folder.content
+    content = folder.content_as(ViewsContent)
     if not content.picture:
         return None
     camera = next((camera for camera in cameras if camera.name == content.picture), None)
@@ -181,7 +181,7 @@ def write_views(out: Output, views: Views, *, source_from_world: np.ndarray | No
         picture = contact_sheet(sheet, labels_top=list(views.images), labels_left=list(views.names))
         write_png(out.path("contact_sheet.png"), picture)
     matrix = IDENTITY if source_from_world is None else tuple(float(x) for x in np.asarray(source_from_world).ravel())
-    present = tuple(d for d in (*DOMAINS, "closed_form") if d in views.images)
+    present = cast(tuple[Domain, ...], tuple(d for d in (*DOMAINS, "closed_form") if d in views.images))
     out.content = ViewsContent(
         views=views.names, domains=present, source_from_world=matrix, light=views.light is not None, **extra
     )

@@ -46,7 +46,8 @@ def read(folder: Path) -> Pictures:
             "holds no list of frames with a file_path each",
             'write "frames": [{"file_path": …, "transform_matrix": …}, …]',
         )
-    cameras, colors, masks, paths, held = [], [], [], [], 0
+    cameras: list[Camera] = []
+    colors, masks, paths, held = [], [], [], 0
     for frame in frames:
         picture = _picture(path, frame["file_path"])
         image = read_image(picture)

@@ -35,10 +35,12 @@ def read(folder: Path) -> Pictures:
     from gdtool.images.mask import foreground
 
     cameras = read_cameras(folder / "cameras.json")
-    images, masks, first = {}, None, ""
+    images: dict[str, np.ndarray] = {}
+    masks: list[np.ndarray] | None = None
+    first = ""
     for domain in DOMAINS:
-        paths = [_find(folder, domain, camera.name) for camera in cameras]
-        if not all(paths):
+        paths = [path for camera in cameras if (path := _find(folder, domain, camera.name)) is not None]
+        if len(paths) < len(cameras):
             continue
         stored = []
         for path, camera in zip(paths, cameras, strict=True):
@@ -79,11 +81,12 @@ def read(folder: Path) -> Pictures:
                 f"add mask/{camera.name}.png",
             )
         if given is None:
+            assert masks is not None
             mask.append(foreground(masks[k], subject=_find(folder, "color", camera.name)))
         else:
-            stored = read_image(given)
-            _size(given, camera, stored)
-            mask.append(unit_range(stored.reshape(camera.height, camera.width, -1)[..., 0]).astype(np.float32))
+            image = read_image(given)
+            _size(given, camera, image)
+            mask.append(unit_range(image.reshape(camera.height, camera.width, -1)[..., 0]).astype(np.float32))
     return Pictures(cameras, images, np.stack(mask))
 
 
@@ -104,4 +107,4 @@ def _size(path: Path, camera, image: np.ndarray) -> tuple[int, int]:
             f"is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}",
             "scale the picture, or write its size into cameras.json",
         )
-    return image.shape[:2]
+    return camera.height, camera.width

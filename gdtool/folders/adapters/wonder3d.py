@@ -40,14 +40,9 @@ def read(folder: Path) -> Pictures:
             mask[..., None] > 0, decode_normal(unit_range(stored[..., :3]).astype(np.float32)), 0
         ).astype(np.float32)
     }
-    colors = [
-        next(
-            (p for p in (folder / "masked_colors" / f"rgb_000_{n}.png", folder / f"rgb_000_{n}.png") if p.is_file()),
-            None,
-        )
-        for n in names
-    ]
-    if all(colors):
+    places = [(folder / "masked_colors" / f"rgb_000_{n}.png", folder / f"rgb_000_{n}.png") for n in names]
+    colors = [next(path for path in two if path.is_file()) for two in places if any(path.is_file() for path in two)]
+    if len(colors) == len(names):
         images["color"] = stacked([linear_color(read_image(path)) for path in colors], colors)
         if images["color"].shape[:3] != mask.shape:
             raise InputError(colors[0], "has another size than its normals", "scale colors and normals to one size")
