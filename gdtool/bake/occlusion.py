@@ -24,7 +24,7 @@ def _basis(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([1 + sign * x * x * a, sign * b, -sign * x], 1), np.stack([b, sign + y * y * a, -y], 1)
 
 
-def openness(
+def ambient_visibility(
     points: np.ndarray,
     normals: np.ndarray,
     caster,

@@ -11,7 +11,7 @@ import numpy as np
 from gdtool.assets.scene import Scene
 from gdtool.bake.picture import Picture
 from gdtool.bake.pipeline import Lookup, ViewsOfSource, vertex_lookup, with_views
-from gdtool.bake.project_views import pixel_footprint, sight_of
+from gdtool.bake.project_views import pixel_footprint, view_visibility
 from gdtool.bake.reproject import Places, Source
 from gdtool.folders.surface import Surface
 from gdtool.folders.views import Views
@@ -102,8 +102,8 @@ def from_surface(
     detail = 0.5 * _edge(source)
     if not images:
         return Origin(source, lookup, normals, label, detail=detail)
-    sights = [sight_of(camera, source.caster, mask) for camera, mask in zip(views.cameras, views.mask, strict=True)]
-    lookup, domains = with_views(lookup, source, ViewsOfSource(sights, images, views.mask, picture))
+    visibilities = [view_visibility(camera, source.caster, mask) for camera, mask in zip(views.cameras, views.mask, strict=True)]
+    lookup, domains = with_views(lookup, source, ViewsOfSource(visibilities, images, views.mask, picture))
     label = ("" if label == "vertices" else label + ", ") + "views: " + " ".join(domains)
     detail = min(detail, 0.5 * _view_pixel(views))
     if picture is not None and "albedo" in domains:

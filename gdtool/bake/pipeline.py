@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gdtool.bake.occlusion import openness
+from gdtool.bake.occlusion import ambient_visibility
 from gdtool.bake.picture import Picture
-from gdtool.bake.project_views import Sight, observe, steadiness
+from gdtool.bake.project_views import ViewVisibility, observe, silhouette_margin
 from gdtool.bake.reproject import Places, Source, reproject
 from gdtool.bake.supersample import supersample
 from gdtool.bake.target import TEXELS_AT_ONCE, Target, Texels, surface_at
@@ -28,7 +28,7 @@ class ViewsOfSource:
     images: domain (albedo linear, roughness, metallic, normal) to (k, h, w[, c]); mask (k, h, w); picture: what one of
     them was made of."""
 
-    sights: list[Sight]
+    visibilities: list[ViewVisibility]
     images: dict[str, np.ndarray]
     mask: np.ndarray
     picture: Picture | None = None
@@ -74,7 +74,7 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
     channel = np.cumsum([0, *(image.shape[-1] for image in encoded.values())])
     pictured = None
     if views.picture is not None and "albedo" in domains:
-        pictured = next(k for k, sight in enumerate(views.sights) if sight.camera.name == views.picture.camera.name)
+        pictured = next(k for k, visibility in enumerate(views.visibilities) if visibility.camera.name == views.picture.camera.name)
 
     def looked(places: Places) -> dict[str, np.ndarray]:
         out = dict(lookup(places))
@@ -82,7 +82,7 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
         prior = [srgb_from_linear(out[d]) if d == "albedo" else out[d] for d in domains]
         prior = np.concatenate([p if p.ndim == 2 else p[:, None] for p in prior], 1)
         value, seen, shares = observe(
-            points, out["normal"], views.sights, stack, views.mask, prior, known=pictured, colors=channel[1]
+            points, out["normal"], views.visibilities, stack, views.mask, prior, known=pictured, colors=channel[1]
         )
         for k, domain in enumerate(domains):
             own, read = prior[:, channel[k] : channel[k + 1]], value[:, channel[k] : channel[k + 1]]
@@ -98,7 +98,7 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
                 linear_from_srgb(mixed) if domain == "albedo" else mixed if out[domain].ndim == 2 else mixed[:, 0]
             )
         if pictured is not None:
-            _sharpen(out, points, views.picture, views.sights[pictured], seen * shares[pictured])
+            _sharpen(out, points, views.picture, views.visibilities[pictured], seen * shares[pictured])
         out["seen"] = seen
         if "confidence" in out:
             out["confidence"] = seen + (1 - seen) * out["confidence"]
@@ -107,13 +107,13 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
     return looked, domains
 
 
-def _sharpen(out: dict[str, np.ndarray], points: np.ndarray, picture: Picture, sight: Sight, share: np.ndarray) -> None:
+def _sharpen(out: dict[str, np.ndarray], points: np.ndarray, picture: Picture, visibility: ViewVisibility, share: np.ndarray) -> None:
     """Multiply what the picture has in finer pixels into the albedo of points (n, 3), by the share (n,) that its view
     has in it.
 
     What a metal shows is what it mirrors, and no detail of its own.
     """
-    share = share * steadiness(sight, points) * (1 - out["metallic"])
+    share = share * silhouette_margin(visibility, points) * (1 - out["metallic"])
     seen = np.flatnonzero(share > 0.01)
     out["albedo"] = np.array(out["albedo"], np.float32)
     out["albedo"][seen] = np.clip(out["albedo"][seen] * (1 + share[seen, None] * (picture.at(points[seen]) - 1)), 0, 1)
@@ -188,7 +188,7 @@ def bake(
 def occlusion_tracer(
     target: Target, source: Source, reach: np.ndarray, normals: np.ndarray, rays: int, seed: int, threads: int = 1
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """trace(face_idx, barycentric) -> openness (n,) of the source at places on the target; normals (v, 3) of the
+    """trace(face_idx, barycentric) -> ambient_visibility (n,) of the source at places on the target; normals (v, 3) of the
     source."""
     lift = 5e-4 * source.extent
 
@@ -201,7 +201,7 @@ def occlusion_tracer(
             smooth = source.at(places.face_idx, places.barycentric, normals)
             side = dot(smooth, geometric)[:, None]
             smooth = unit(np.where(np.abs(side) > 0.2, smooth * np.sign(side), geometric))
-            return openness(at + geometric * lift, smooth, source.caster, rays, seed + part.start, lift=0.0)
+            return ambient_visibility(at + geometric * lift, smooth, source.caster, rays, seed + part.start, lift=0.0)
 
         parts = [slice(s, s + 8192) for s in range(0, len(face_idx), 8192)]
         traced = list(mapped(run, parts, threads))

@@ -117,10 +117,10 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.images.io import write_png
     from gdtool.shading.bsdf.closed_form import closed_form_image
     from gdtool.shading.lights.studio import studio
-    from gdtool.shading.render.direct import DirectLight
+    from gdtool.shading.render.direct import DirectLight, LightOptions
     from gdtool.shading.render.render import Goal, Renderer
     from gdtool.shading.render.rigs import turntable
-    from gdtool.shading.render.skipped_work import savings
+    from gdtool.shading.render.skipped_work import skipped_work
     from gdtool.stages.limits import held_to
 
     torch.set_num_threads(1)  # shading runs in threads of its own
@@ -143,7 +143,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         direct = color = None
         if options.light != "sg":
             direct = DirectLight(
-                renderer, environment, options.light_samples, options.seed, options.brdf, mode=options.light
+                renderer, environment, options.light_samples, options.seed, options.brdf, LightOptions(options.light)
             )
             color = direct.color(options.exposure)
         open_ended = options.budget is not None or options.target_psnr is not None
@@ -176,7 +176,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         out.skip("shadows", "the closed form has none")
     else:
         out.skip("the light's fit by spherical Gaussians", f"--light {options.light} does not use it")
-    for what, why, seconds in savings(renderer, samples, direct):
+    for what, why, seconds in skipped_work(renderer, samples, direct):
         out.skip(what, why, seconds)
     known = [x for x in reached if x is not None]
     if options.target_psnr is not None and (not known or min(known) < options.target_psnr):

@@ -146,7 +146,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     with out.step("render"):
         frames = list(
             out.progress(
-                renderer.each(lambda camera: _view(renderer, camera, lamps, options), cameras), len(cameras), "views"
+                renderer.render_each(lambda camera: _view(renderer, camera, lamps, options), cameras), len(cameras), "views"
             )
         )
     wanted = [d for d in ALL if d in options.domains]
@@ -372,7 +372,7 @@ def _write_conditions(
     from gdtool.shading.render.rigs import condition_camera
 
     cameras = [condition_camera(rng, f"{i:03d}", options.size) for i in range(options.condition_views)]
-    frames = renderer.each(
+    frames = renderer.render_each(
         lambda camera: renderer.buffers(camera, options.samples, direct.color(options.exposure)), cameras
     )
     for camera, frame in zip(cameras, out.progress(frames, len(cameras), "conditions"), strict=True):
@@ -383,11 +383,11 @@ def _write_conditions(
 
 def _tell_skips(out: Output, renderer: Renderer, options: Options, lamps: _Lamps | None) -> None:
     """What the scene did not need."""
-    from gdtool.shading.render.skipped_work import savings
+    from gdtool.shading.render.skipped_work import skipped_work
 
     if lamps is None:
         out.skip("light", "neither color, closed_form nor condition images are asked for")
-    for what, why, seconds in savings(renderer, options.samples, None if lamps is None else lamps.direct):
+    for what, why, seconds in skipped_work(renderer, options.samples, None if lamps is None else lamps.direct):
         out.skip(what, why, seconds)
     for domain in ALL:
         if domain not in options.domains:

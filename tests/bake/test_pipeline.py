@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.bake.maps import make_maps
-from gdtool.bake.occlusion import bake_occlusion, openness
+from gdtool.bake.occlusion import bake_occlusion, ambient_visibility
 from gdtool.bake.pipeline import bake, occlusion_tracer, vertex_lookup
 from gdtool.bake.reproject import Source, vertex_reach
 from gdtool.bake.target import Target, corner_normals, points_at, texels_of
@@ -168,11 +168,11 @@ def test_openness_of_a_plane_a_corner_and_a_box():
     points = np.array([[0.05, 0, 0.0], [0.05, 0, 1.0], [0.05, 0, -1.0]])
     up = np.tile([0.0, 1, 0], (3, 1))
     # An infinite wall at right angles hides half of the cosine-weighted hemisphere.
-    np.testing.assert_allclose(openness(points, up, source.caster, 4096, 0), 0.5, atol=0.01)
-    np.testing.assert_allclose(openness(points + (25, 0, 0), up, source.caster, 64, 0, reach=1.0), 1)
+    np.testing.assert_allclose(ambient_visibility(points, up, source.caster, 4096, 0), 0.5, atol=0.01)
+    np.testing.assert_allclose(ambient_visibility(points + (25, 0, 0), up, source.caster, 64, 0, reach=1.0), 1)
     vertices, faces = sphere(2)
     inside = Source(vertices, faces[:, ::-1])
-    assert openness(np.zeros((1, 3)), np.array([[0, 1.0, 0]]), inside.caster, 64, 0)[0] == 0
+    assert ambient_visibility(np.zeros((1, 3)), np.array([[0, 1.0, 0]]), inside.caster, 64, 0)[0] == 0
 
 
 def test_occlusion_of_a_torus_agrees_with_many_rays_and_repeats(torus_bake):

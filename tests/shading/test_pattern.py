@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.shading.render.pattern import pixel_pattern
-from gdtool.shading.render.render import SPREAD, SPREAD_POWER
+from gdtool.shading.render.render import ERROR_SCALE, ERROR_POWER
 
 
 @pytest.mark.parametrize("count", [4, 8, 16, 32, 64])
@@ -37,4 +37,4 @@ def test_the_expected_error_is_that_of_straight_edges(count):
     mean = covered(pixel_pattern(count))
     error = np.sqrt(((mean - covered(fine)) ** 2).mean())
     standard = np.sqrt((mean * (1 - mean) / count).mean())
-    assert error / standard == pytest.approx(SPREAD * count**SPREAD_POWER, rel=1 / 3)
+    assert error / standard == pytest.approx(ERROR_SCALE * count**ERROR_POWER, rel=1 / 3)

@@ -17,7 +17,7 @@ from gdtool.shading.lights.prefilter import (
     read_octahedral,
 )
 from gdtool.shading.lights.studio import studio
-from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.render.direct import DirectLight, LightOptions
 from gdtool.shading.render.render import Goal, Renderer
 from tests.shading.test_render import GREY, sphere, uniform
 
@@ -88,7 +88,7 @@ def test_prefiltered_is_near_the_converged_picture(light):
     pictures = []
     for samples, mode in ((64, "sampled"), (2, "prefiltered")):
         renderer = Renderer(sphere())
-        frame = renderer.buffers(camera, 16, DirectLight(renderer, env, samples, mode=mode).color())
+        frame = renderer.buffers(camera, 16, DirectLight(renderer, env, samples, options=LightOptions(mode)).color())
         pictures.append(np.clip(frame["color"][frame["mask"] == 1], 0, 1) ** (1 / 2.2))
     assert np.isfinite(pictures[1]).all()
     assert -10 * np.log10(((pictures[0] - pictures[1]) ** 2).mean()) > 30
