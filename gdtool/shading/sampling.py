@@ -27,13 +27,9 @@ def fibonacci(count: int) -> np.ndarray:
 def orthonormal_basis(x, y, z):
     """Complete unit normals to right-handed orthonormal bases.
 
-    Args:
-        x, y, z: the normals' components, each an array or a tensor of one shape.
-
-    Returns:
-        The tangent's three components, and the bitangent's three: tangent × bitangent = normal.
-
-    The basis is continuous but at the plane z = 0 (Duff et al. 2017, "Building an Orthonormal Basis, Revisited").
+    x, y, z are the normals' components, arrays or tensors of one shape. Returns the tangent's three components and the
+    bitangent's: tangent × bitangent = normal. The basis is continuous except at the plane z = 0 (Duff et al. 2017,
+    "Building an Orthonormal Basis, Revisited").
     """
     if isinstance(z, np.ndarray):
         sign = np.where(z < 0, -1, 1).astype(z.dtype)

@@ -41,17 +41,17 @@ def quadrature(view, albedo, roughness, metallic, lights, kind="gltf", rings=240
     helper = torch.tensor([0.0, 1.0, 0.0], dtype=dtype)
     x = normalize(torch.linalg.cross(helper, pole))
     y = torch.linalg.cross(pole, x)
-    l = local[:, :1] * x + local[:, 1:2] * y + local[:, 2:] * pole
+    toward = local[:, :1] * x + local[:, 1:2] * y + local[:, 2:] * pole
     w = weight[:, None].expand(-1, spokes).reshape(-1)
     v = view.to(dtype)
-    h = normalize(l + v)
-    n_l = l[:, 2].clamp_min(0)
+    h = normalize(toward + v)
+    n_l = toward[:, 2].clamp_min(0)
     a, r, m = (torch.as_tensor(t, dtype=dtype) for t in (albedo, roughness, metallic))
     f0 = models.f0_of(a, m, 0.04)
     diffuse, specular = models.reflectance(
         kind, a, r, m, f0, n_l, v[2].expand_as(n_l), h[:, 2], (h * v).sum(-1).clamp(0, 1)
     )
-    radiance = evaluate(lights.to(dtype), l) * (n_l * w)[:, None]
+    radiance = evaluate(lights.to(dtype), toward) * (n_l * w)[:, None]
     return (diffuse * radiance).sum(0), (specular * radiance).sum(0)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.shading.render.pattern import pixel_pattern
-from gdtool.shading.render.render import ERROR_SCALE, ERROR_POWER
+from gdtool.shading.render.render import ERROR_POWER, ERROR_SCALE
 
 
 @pytest.mark.parametrize("count", [4, 8, 16, 32, 64])

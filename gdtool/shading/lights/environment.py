@@ -93,7 +93,7 @@ class Environment:
         return directions, self.image[row, column], self.pdf[row, column]
 
     def shrunk(self, height: int) -> Environment:
-        """Halve the resolution while it has 2 * height rows, and keep the energy: pixels are averaged by solid angle."""
+        """Halve the resolution while there are 2 * height rows; averages by solid angle keep the energy."""
         current = self
         while current.image.shape[0] >= 2 * height and not any(side % 2 for side in current.image.shape[:2]):
             weight = current.solid_angles

@@ -184,8 +184,8 @@ class Prefiltered:
 
         n_v = (normal * view).sum(0)
         mirror = 2 * n_v * normal - view
-        # Under the two lights tried this is nearer to the integral than the mirror direction. The weight of Lagarde & de
-        # Rousiers, (1 − r)(√(1 − r) + r), is better from r = 0.3 or 0.5 on, and worse below.
+        # Under the two lights tried this is nearer to the integral than the mirror direction. The weight of Lagarde &
+        # de Rousiers, (1 − r)(√(1 − r) + r), is better from r = 0.3 or 0.5 on, and worse below.
         middle = torch.lerp(normal, mirror, 1 - roughness**2)
         middle = middle / (middle * middle).sum(0).sqrt().clamp_min(1e-12)
         below, above, fraction = _levels(lobe_roughness(roughness, n_v))

@@ -27,7 +27,7 @@ from gdtool.shading.lights.environment import LUMINANCE, Environment
 from gdtool.shading.sampling import sobol
 
 if TYPE_CHECKING:
-    from gdtool.shading.render.render import ShadingPoints, Renderer
+    from gdtool.shading.render.render import Renderer, ShadingPoints
 
 # Directions that are drawn once from the light; each point uses its own run of them.
 POOL = 1 << 16

@@ -128,7 +128,7 @@ class Renderer:
         self.pool = ThreadPoolExecutor(self.caster.threads)
 
     def trace(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the first hits that pass the alpha test: face_idx (n,), -1 for none, distance (n,), barycentric (n, 3)."""
+        """Find first hits that pass the alpha test: face_idx (n,), -1 for none, distance (n,), barycentric (n, 3)."""
         hits = self.caster.first_hit(origins, directions)
         face_idx, distance, barycentric = hits.face_idx, hits.distance, hits.barycentric
         if self.tested is None:
