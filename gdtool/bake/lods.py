@@ -1,7 +1,7 @@
-"""Coarser levels of a finished mesh that share its atlas: seam-preserving decimation after unwrapping.
+"""Make coarser levels of an unwrapped mesh that share its maps, by decimation that preserves UV seams.
 
-The same maps serve every level, because a point of a coarse level has about the texture coordinates of the point of the
-full mesh that it stands for; `drift` measures how nearly.
+A point of a coarse level has about the same texture coordinates as the point of the full mesh that it stands for. So
+the same maps serve every level; `drift` measures how well.
 """
 
 from __future__ import annotations
@@ -19,19 +19,20 @@ from gdtool.core.native import imported
 def collapse_textured(
     vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray, target_faces: int, folder: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the child runs: MeshLab's quadric collapse in position and texture space (Garland & Heckbert 1998), seams
-    kept.
+    """Collapse edges by quadrics of position and texture coordinates, seams kept; runs in a child process.
 
-    vertices (v, 3), faces (t, 3), corner_uvs (t, 3, 2) of the corners. folder: where its files may be; whoever starts
-    the child removes it, since a child that is killed cannot. Returns the same of about target_faces triangles."""
+    MeshLab's filter, after Garland & Heckbert 1998. vertices (v, 3), faces (t, 3), corner_uvs (t, 3, 2). folder holds
+    temporary files; the parent removes it, since a killed child cannot. Returns the same three arrays, of about
+    target_faces triangles.
+    """
     from gdtool.images.io import write_png
 
     pymeshlab = imported("pymeshlab")
     # The filter wants a mesh with a texture, which only a file can give it.
     write_png(Path(folder, "blank.png"), np.zeros((2, 2, 3), np.uint8))
     Path(folder, "full.mtl").write_text("newmtl one\nmap_Kd blank.png\n")
-    lines = ["mtllib full.mtl", "usemtl one", *("v %.9g %.9g %.9g" % tuple(p) for p in vertices.tolist())]
-    lines += ["vt %.9g %.9g" % tuple(p) for p in corner_uvs.reshape(-1, 2).tolist()]
+    lines = ["mtllib full.mtl", "usemtl one", *(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist())]
+    lines += [f"vt {u:.9g} {v:.9g}" for u, v in corner_uvs.reshape(-1, 2).tolist()]
     lines += [
         "f " + " ".join(f"{v + 1}/{3 * k + i + 1}" for i, v in enumerate(face)) for k, face in enumerate(faces.tolist())
     ]
@@ -55,9 +56,9 @@ def collapse_textured(
 
 
 def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[Target | None, str]:
-    """A target of about target_faces triangles with the texture coordinates of the full one, or None and why not.
+    """Decimate a target to about target_faces triangles, in a child process with a time limit in seconds.
 
-    It has more where fewer would tear a seam.
+    It keeps more triangles where fewer would tear a seam. Returns the level, or None and why there is none.
     """
     try:
         with temporary_folder() as folder:
@@ -80,9 +81,10 @@ def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[
 
 
 def drift(level: Target, full: Target, size: int = 1024, count: int = 20_000) -> dict[str, float]:
-    """How far the level's surface is from the full mesh's at the same texture coordinates, as a share of its extent.
+    """Measure how far a level's surface is from the full mesh's at the same texture coordinates.
 
-    drift_mean, drift_p99; outside: share of the level's surface whose texture coordinates lie in no chart.
+    Compares `count` points of the level, on a chart image of side `size`. Returns drift_mean and drift_p99, shares of
+    the full mesh's extent, and outside, the share of the level's surface whose texture coordinates lie in no chart.
     """
     from gdtool.geometry.distance import sample_surface
     from gdtool.geometry.uv_raster import Barycentrics, extend_owners, owners_of
@@ -91,7 +93,7 @@ def drift(level: Target, full: Target, size: int = 1024, count: int = 20_000) ->
     uv = np.einsum("nk,nkc->nc", barycentric, level.uv[level.face_uvs[face_idx]])
     owner = owners_of(full.uv, full.face_uvs, size)
     inside = Barycentrics(full.uv, full.face_uvs)
-    # A chart's border texel may have its centre outside: two rings are what bilinear lookups can reach.
+    # A texel at a chart's border may have its centre outside the chart: bilinear lookups reach two rings of those.
     ring, ring_owner, _ = extend_owners(inside, owner.reshape(size, size), 2)
     owner[ring] = ring_owner
     column, row = np.clip((uv * size).astype(np.int64), 0, size - 1).T

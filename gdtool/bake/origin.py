@@ -102,7 +102,9 @@ def from_surface(
     detail = 0.5 * _edge(source)
     if not images:
         return Origin(source, lookup, normals, label, detail=detail)
-    visibilities = [view_visibility(camera, source.caster, mask) for camera, mask in zip(views.cameras, views.mask, strict=True)]
+    visibilities = [
+        view_visibility(camera, source.caster, mask) for camera, mask in zip(views.cameras, views.mask, strict=True)
+    ]
     lookup, domains = with_views(lookup, source, ViewsOfSource(visibilities, images, views.mask, picture))
     label = ("" if label == "vertices" else label + ", ") + "views: " + " ".join(domains)
     detail = min(detail, 0.5 * _view_pixel(views))

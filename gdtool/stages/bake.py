@@ -97,9 +97,9 @@ def check(inputs: Inputs, options: Options) -> None:
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Bake one atlas."""
-    from gdtool.bake.maps import make_maps
+    from gdtool.bake.maps import MapOptions, make_maps
     from gdtool.bake.occlusion import bake_occlusion
-    from gdtool.bake.pipeline import bake, occlusion_tracer
+    from gdtool.bake.pipeline import BakeOptions, bake, occlusion_tracer
     from gdtool.bake.reproject import vertex_reach
     from gdtool.bake.target import texel_width, texels_of
 
@@ -134,11 +134,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             origin.source,
             origin.lookup,
             reach,
-            samples=samples,
-            threads=out.threads,
+            BakeOptions(samples, out.threads, options.height, options.confidence),
             progress=out.progress,
-            height=options.height,
-            confidence=options.confidence,
         )
     occlusion = None
     if options.ao:
@@ -153,12 +150,14 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         maps = make_maps(
             texels,
             baked.values,
-            occlusion=occlusion,
-            bits=options.bits,
-            padding=options.padding or None,
-            normal_map=options.normal_map,
-            threads=out.threads,
-            **({"least_alpha": origin.alpha_cutoff} if origin.alpha_mode == "MASK" else {}),
+            occlusion,
+            MapOptions(
+                bits=options.bits,
+                padding=options.padding or None,
+                normal_map=options.normal_map,
+                threads=out.threads,
+                **({"least_alpha": origin.alpha_cutoff} if origin.alpha_mode == "MASK" else {}),
+            ),
         )
     for what, reason, seconds in maps.skipped:
         out.skip(what, reason, seconds)
@@ -406,7 +405,7 @@ def _write(
     """Write the folder's files and set out.content."""
     import dataclasses
 
-    from gdtool.bake.asset import write_models
+    from gdtool.bake.asset import AssetMeshes, AssetOptions, write_models
     from gdtool.geometry.frames import transform_points
 
     if options.source_frame:
@@ -423,7 +422,11 @@ def _write(
         mesh = dataclasses.replace(mesh, vertices=target.vertices)
     usd = f"asset.{options.usd}" if options.usd != "none" else ""
     files = write_models(
-        out.path, target, mesh, face_idx, maps, origin, inputs.name, options.normal_convention, usd, levels, out.threads
+        out.path,
+        AssetMeshes(target, mesh, face_idx, tuple(levels)),
+        maps,
+        origin,
+        AssetOptions(inputs.name, options.normal_convention, usd, out.threads),
     )
     out.content = AssetContent(
         size=maps.size,

@@ -101,7 +101,7 @@ def _front_places(vertices, faces, normals):
 
 def test_a_picture_tells_color_where_other_views_face_the_surface_better_and_nothing_else():
     """A plane at 40 degrees to the front camera and 5 to the next; only colors follow the picture's view."""
-    from gdtool.bake.project_views import observe, view_visibility
+    from gdtool.bake.project_views import ViewStack, observe, view_visibility
     from gdtool.geometry.rays import RayCaster
 
     cameras = [camera for camera in rig("six", 64) if camera.name in ("front", "front_right")]
@@ -116,8 +116,8 @@ def test_a_picture_tells_color_where_other_views_face_the_surface_better_and_not
     stack = np.stack([np.full((64, 64, 4), value, np.float32) for value in (0.3, 0.4)])
     points = np.random.default_rng(0).uniform(-0.15, 0.15, (40, 2)) @ np.stack([across, up])
     normals, mask = np.tile(normal, (40, 1)), np.ones((2, 64, 64), np.float32)
-    alike = observe(points, normals, visibilities, stack, mask)[0]
-    value, _, shares = observe(points, normals, visibilities, stack, mask, known=0, colors=3)
+    alike = observe(points, normals, ViewStack(visibilities, stack, mask)).values
+    value, _, shares = observe(points, normals, ViewStack(visibilities, stack, mask, 0, 3))
     assert (alike > 0.37).all()
     assert (value[:, :3] < 0.36).all() and (shares[0] > 0.45).all()
     np.testing.assert_allclose(value[:, 3], alike[:, 3], atol=1e-6)

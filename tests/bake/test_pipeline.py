@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gdtool.bake.maps import make_maps
-from gdtool.bake.occlusion import bake_occlusion, ambient_visibility
-from gdtool.bake.pipeline import bake, occlusion_tracer, vertex_lookup
+from gdtool.bake.occlusion import ambient_visibility, bake_occlusion
+from gdtool.bake.pipeline import BakeOptions, bake, occlusion_tracer, vertex_lookup
 from gdtool.bake.reproject import Source, vertex_reach
 from gdtool.bake.target import Target, corner_normals, points_at, texels_of
 from gdtool.geometry.tangents import decode_tangent_space
@@ -37,7 +37,7 @@ def torus_bake():
     attributes = {"albedo": albedo_of(fine), "roughness": 0.5 + 0.3 * fine[:, 0], "metallic": np.full(len(fine), 0.25)}
     lookup = vertex_lookup(source, attributes, fine_normals)
     reach = vertex_reach(coarse, faces, source)
-    return target, texels, source, lookup, reach, bake(target, texels, source, lookup, reach, threads=2)
+    return target, texels, source, lookup, reach, bake(target, texels, source, lookup, reach, BakeOptions(threads=2))
 
 
 def test_analytic_albedo_within_psnr_bound(torus_bake):
@@ -80,7 +80,7 @@ def test_supersampling_only_where_it_varies_and_nearer_the_texel_mean(torus_bake
         }
 
     one = bake(target, texels, source, stripes, reach).values["albedo"][: texels.inside]
-    many = bake(target, texels, source, stripes, reach, samples=16)
+    many = bake(target, texels, source, stripes, reach, BakeOptions(samples=16))
     assert np.abs(many.values["albedo"][: texels.inside] - 0.5).mean() < 0.7 * np.abs(one - 0.5).mean()
     assert 0.4 < many.report["supersampled_share"] < 0.9
 
