@@ -91,7 +91,7 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     from gdtool.bake.reproject import vertex_reach
     from gdtool.bake.target import samples_for, texel_width, texels_of
     from gdtool.images.io import encode_pngs
-    from gdtool.stages.bake import target_of
+    from gdtool.bake.inputs import target_of
 
     threads = len(os.sched_getaffinity(0))
     scene, mesh = load_scene(case.glb), read_low(case)
@@ -151,7 +151,7 @@ def blender(
 ) -> dict[str, float]:
     """Cost of Blender's bake; its maps go to out (.npz). Raises RuntimeError."""
     from gdtool.geometry.topology import triangulated
-    from gdtool.stages.bake import target_of
+    from gdtool.bake.inputs import target_of
 
     mesh = read_low(case)
     target, low = target_of(mesh)[0], out.with_name("low.npz")

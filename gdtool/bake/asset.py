@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -13,6 +13,7 @@ from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.bake.maps import Maps
 from gdtool.bake.target import Target
 from gdtool.folders.mesh import QuadMesh
+from gdtool.geometry.frames import transform_points
 from gdtool.geometry.tangents import weld
 
 
@@ -57,6 +58,25 @@ class AssetOptions:
     convention: str = "opengl"
     usd: str = ""
     threads: int = 1
+
+
+def in_source_frame(meshes: AssetMeshes, matrix: np.ndarray) -> AssetMeshes:
+    """Move meshes from the normalised frame to the source's by a similarity (4, 4): vertices, normals and tangents."""
+    turn = matrix[:3, :3] / (matrix[:3, 0] ** 2).sum() ** 0.5
+
+    def moved(target: Target) -> Target:
+        tangents = target.tangents.copy()
+        tangents[..., :3] = tangents[..., :3] @ turn.T
+        return replace(
+            target,
+            vertices=transform_points(matrix, target.vertices),
+            normals=target.normals @ turn.T,
+            tangents=tangents,
+        )
+
+    target = moved(meshes.target)
+    mesh = replace(meshes.mesh, vertices=target.vertices)
+    return AssetMeshes(target, mesh, meshes.face_idx, tuple(moved(level) for level in meshes.levels))
 
 
 def material_of(

@@ -6,6 +6,7 @@ the same maps serve every level; `drift` measures how well.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,53 @@ from gdtool.bake.target import Target
 from gdtool.core.child import ChildFailed, call
 from gdtool.core.ending import temporary_folder
 from gdtool.core.native import imported
+from gdtool.core.threads import mapped
+
+# The largest mean drift of a level, as a share of the extent: beyond it, a level shows the maps of other parts.
+MAX_DRIFT = 0.02
+# A level that cannot come down to what is asked is still worth having with less than this share of the one before.
+MAX_SHARE = 0.9
+# The most triangles of a level, as a multiple of what is asked, without a warning.
+MAX_EXCESS = 1.5
+
+
+@dataclass
+class Levels:
+    """Coarser levels, finest first; figures for the report; what was left out and why; warnings."""
+
+    targets: list[Target] = field(default_factory=list)
+    report: dict[str, float] = field(default_factory=dict)
+    skipped: list[tuple[str, str]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def make_levels(target: Target, count: int, threads: int = 1) -> Levels:
+    """Make coarser levels of a target, `count` with the full one, each of half the triangles of the one before.
+
+    Levels that cannot be made, are hardly coarser, or drift too far on the maps are left out.
+    """
+    counts = [max(len(target.faces) >> k, 4) for k in range(1, count)]
+    out, previous = Levels(), len(target.faces)
+    # Each level is made by a child process: threads only wait for them.
+    for wanted, (level, why) in zip(counts, mapped(lambda n: coarser(target, n), counts, threads), strict=True):
+        if level is not None and len(level.faces) > max(MAX_SHARE * previous, MAX_EXCESS * wanted):
+            level, why = None, f"it cannot have fewer than {len(level.faces)} triangles without tearing a seam"
+        if level is None:
+            out.skipped.append((f"level of {wanted} triangles", why))
+            continue
+        drifted = drift(level, target)
+        if drifted["drift_mean"] > MAX_DRIFT:
+            why = f"it would slide {100 * drifted['drift_mean']:.1f} % of the extent on the maps"
+            out.skipped.append((f"level of {wanted} triangles", why))
+            continue
+        previous = len(level.faces)
+        if previous > MAX_EXCESS * wanted:
+            out.warnings.append(f"the level of {wanted} triangles has {previous}: fewer would tear a seam")
+        out.targets.append(level)
+        name = f"lod{len(out.targets)}"
+        out.report[f"{name}_triangles"] = len(level.faces)
+        out.report |= {f"{name}_{figure}": value for figure, value in drifted.items()}
+    return out
 
 
 def collapse_textured(

@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from gdtool.bake.padding import Gutters
 from gdtool.bake.target import Texels
+from gdtool.core.errors import ResourceError
 from gdtool.core.threads import mapped
 
 # A channel that spans no more than this, in stored units, is constant: one step of 8 bits, and rounding.
@@ -18,6 +20,8 @@ CONSTANT_RANGE = 1.5 / 255
 # A normal map is flat when 99.5 % of it lies within this angle of straight up: 8 bits store normals to 0.4 degrees.
 FLAT_DEGREES = 1.0
 _ROWS_AT_ONCE = 64  # few enough that intermediate rows stay in the cache
+# Bytes of memory per texel of a bake, measured by benchmarks/bake.py at 2048 and 4096 on an atlas that is 72 % full.
+BYTES_PER_TEXEL = 130
 HEIGHT_BITS = 16  # a step of 8 bits is a visible terrace
 
 
@@ -66,6 +70,28 @@ class Maps:
     emissive: np.ndarray | None = None
     extra: dict[str, np.ndarray] = field(default_factory=dict)
     skipped: list[SkippedMap] = field(default_factory=list)
+
+
+def require_map_memory(name: str, size: int) -> None:
+    """Raise ResourceError when maps of size x size texels will not fit into free memory, rather than be killed midway.
+
+    name: of the object, for the message.
+    """
+    needed = BYTES_PER_TEXEL * size * size
+    try:
+        free = next(
+            int(line.split()[1]) * 1024
+            for line in Path("/proc/meminfo").read_text().splitlines()
+            if line.startswith("MemAvailable")
+        )
+    except (OSError, StopIteration):
+        return
+    if needed > free:
+        raise ResourceError(
+            name,
+            f"maps of {size} texels need about {needed / 2**30:.0f} GB of memory, {free / 2**30:.0f} GB are free",
+            "lower --size",
+        )
 
 
 def quantise(image: np.ndarray, bits: int) -> np.ndarray:

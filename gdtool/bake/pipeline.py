@@ -46,6 +46,10 @@ class Baked:
     seen: np.ndarray | None
     report: dict[str, float] = field(default_factory=dict)
 
+    def seen_share(self, inside: int) -> float:
+        """Compute the share of the first `inside` texels that views show with a confidence above one half."""
+        return 0.0 if self.seen is None else float((self.seen[:inside] > 0.5).mean())
+
 
 @dataclass(frozen=True)
 class BakeOptions:

@@ -192,6 +192,17 @@ def size_for(target: Target, detail: float, least: int = 256, most: int = 4096) 
     return int(np.clip(2 ** np.ceil(np.log2(max(wanted, 1))), least, most))
 
 
+def fineness(target: Target, detail: float, size: int | None, samples: int | None) -> tuple[int, int]:
+    """Choose the size of the maps, and the samples of a texel where the source varies, for a source of that detail.
+
+    A given size or number of samples is kept, samples rounded to a square number.
+    """
+    size = size or size_for(target, detail)
+    if samples is None:
+        return size, samples_for(texel_width(target, size), detail)
+    return size, round(samples**0.5) ** 2
+
+
 def samples_for(width: float, detail: float) -> int:
     """Choose the samples of a texel of some width where a source with detail of some width varies, in one unit."""
     return 4 if width > COARSE_TEXEL * detail else 1

@@ -3,9 +3,8 @@
 from dataclasses import replace
 
 from gdtool.bake import lods
-from gdtool.bake.lods import coarser, drift
+from gdtool.bake.lods import coarser, drift, make_levels
 from gdtool.bake.target import Target, size_for
-from gdtool.stages import bake
 from tests.bake.shapes import torus, triangles_of, unwrapped
 
 
@@ -49,34 +48,22 @@ def _span(full):
     return texel_width(full, 1)
 
 
-class Told:
-    """What a stage's Output is told."""
-
-    threads = 1
-
-    def __init__(self):
-        self.said, self.warned = [], []
-
-    def skip(self, what, reason, saved_seconds=None):
-        self.said.append((what, reason))
-
-    def warn(self, text):
-        self.warned.append(text)
-
-
 def test_a_level_that_slides_on_its_maps_is_left_out_and_named(monkeypatch):
-    full, told, report = target(), Told(), {}
+    full = target()
     # A level whose texture corners are those of the opposite side.
     half, _ = coarser(full, len(full.faces) // 2)
     wrong = replace(half, vertices=half.vertices * (-1, 1, 1))
     monkeypatch.setattr(lods, "coarser", lambda target, n: (wrong, "") if n == len(full.faces) // 2 else (half, ""))
-    assert bake._levels(full, 3, told, report) == [half]
-    assert report["lod1_triangles"] == len(half.faces) and report["lod1_drift_mean"] < 8e-3
-    assert len(told.said) == 1 and "slide" in told.said[0][1]
+    made = make_levels(full, 3)
+    assert made.targets == [half]
+    assert made.report["lod1_triangles"] == len(half.faces)
+    assert made.report["lod1_drift_mean"] < 8e-3
+    assert len(made.skipped) == 1
+    assert "slide" in made.skipped[0][1]
 
 
 def test_a_level_that_seams_keep_from_its_count_stays_where_it_is_coarser_than_the_last(monkeypatch):
-    full, told = target(), Told()
+    full = target()
     count = len(full.faces)
     levels = {
         count // 2: coarser(full, count // 2)[0],
@@ -84,6 +71,9 @@ def test_a_level_that_seams_keep_from_its_count_stays_where_it_is_coarser_than_t
         count // 8: coarser(full, int(0.38 * count))[0],
     }
     monkeypatch.setattr(lods, "coarser", lambda target, n: (levels[n], ""))
-    assert bake._levels(full, 4, told, {}) == [levels[count // 2], levels[count // 4]]
-    assert len(told.warned) == 1 and "fewer would tear a seam" in told.warned[0]
-    assert len(told.said) == 1 and f"fewer than {len(levels[count // 8].faces)} triangles" in told.said[0][1]
+    made = make_levels(full, 4)
+    assert made.targets == [levels[count // 2], levels[count // 4]]
+    assert len(made.warnings) == 1
+    assert "fewer would tear a seam" in made.warnings[0]
+    assert len(made.skipped) == 1
+    assert f"fewer than {len(levels[count // 8].faces)} triangles" in made.skipped[0][1]
