@@ -11,7 +11,7 @@ Example:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 from msgspec import Meta
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from gdtool.assets.scene import Scene
     from gdtool.cameras import Camera
-    from gdtool.shading.bsdf.sg import SphericalGaussians
     from gdtool.shading.render.direct import DirectLight
     from gdtool.shading.render.render import Renderer
 
@@ -117,10 +116,12 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Light one asset or model."""
     import contextlib
 
+    import numpy as np
     import torch
 
     from gdtool.shading.lights.studio import studio
     from gdtool.shading.render.direct import DirectLight, LightOptions
+    from gdtool.shading.render.pictures import PictureOptions, render_pictures
     from gdtool.shading.render.render import Renderer
     from gdtool.shading.render.rigs import turntable
     from gdtool.stages.limits import held_to
@@ -139,9 +140,12 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         if options.light != "sg":
             how = LightOptions(options.light)
             direct = DirectLight(renderer, environment, options.light_samples, options.seed, options.brdf, how)
-        rendered = _render(renderer, direct, lobes, cameras, options, out)
+        how = PictureOptions(
+            _most_samples(options), options.exposure, options.brdf, options.budget, options.target_psnr
+        )
+        rendered = render_pictures(renderer, direct or lobes, cameras, how, out.progress)
     with out.step("write"):
-        _write(out, cameras, rendered.pictures)
+        _write(out, cameras, rendered.images)
     known = [x for x in rendered.psnr if x is not None]
     _tell(out, options, renderer, direct, known)
     out.content = RendersContent(
@@ -151,7 +155,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         exposure=options.exposure,
         source_from_world=tuple(float(x) for x in matrix.ravel()),
         report={
-            "clipped_share": rendered.mean_clipped(),
+            "clipped_share": float(np.mean(rendered.clipped)),
             "environment_scale": environment.scale,
             "samples": renderer.counts.samples,
             "shadow_rays": renderer.counts.shadow_rays,
@@ -159,20 +163,6 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             **{f"light_fit_{name}": value for name, value in record["fit_error"].items()},
         },
     )
-
-
-class _Rendered(NamedTuple):
-    """Each view's picture (h, w, 4) sRGB with alpha, share of clipped pixels, and estimated PSNR in dB or None."""
-
-    pictures: list[np.ndarray]
-    clipped: list[float]
-    psnr: list[float | None]
-
-    def mean_clipped(self) -> float:
-        """Average the share of clipped pixels over the views."""
-        import numpy as np
-
-        return float(np.mean(self.clipped))
 
 
 def _most_samples(options: Options) -> int:
@@ -196,41 +186,6 @@ def _read_scene(inputs: Inputs, out: Output) -> tuple[Scene, np.ndarray]:
     for note in scene.notes:
         out.warn(note)
     return scene, matrix
-
-
-def _render(
-    renderer: Renderer,
-    direct: DirectLight | None,
-    lobes: SphericalGaussians,
-    cameras: list[Camera],
-    options: Options,
-    out: Output,
-) -> _Rendered:
-    """Render all views by direct light, or by the lobes in closed form where there is none."""
-    import time
-
-    import numpy as np
-
-    from gdtool.images.color import srgb_from_linear
-    from gdtool.shading.bsdf.closed_form import closed_form_image
-    from gdtool.shading.render.render import Goal
-
-    shade = None if direct is None else direct.color(options.exposure)
-    rendered, begun = _Rendered([], [], []), time.perf_counter()
-    for number, camera in enumerate(out.progress(cameras, len(cameras), "frames")):
-        seconds = None
-        if options.budget is not None:
-            # Each view gets an equal part of what is left of the budget.
-            seconds = max(0.0, options.budget - (time.perf_counter() - begun)) / (len(cameras) - number)
-        frame = renderer.buffers(camera, _most_samples(options), shade, Goal(seconds, options.target_psnr))
-        rendered.psnr.append(renderer.counts.estimated_psnr)
-        if shade is None:
-            frame["color"] = closed_form_image(frame, camera, lobes, options.brdf) * options.exposure
-        seen = frame["color"][frame["mask"] > 0]
-        rendered.clipped.append(float((seen > 1).mean()) if len(seen) else 0.0)
-        color = srgb_from_linear(np.clip(frame["color"], 0, 1))
-        rendered.pictures.append(np.concatenate([color, frame["mask"][..., None]], -1))
-    return rendered
 
 
 def _write(out: Output, cameras: list[Camera], pictures: list[np.ndarray]) -> None:
