@@ -17,12 +17,15 @@ def target():
 def test_a_level_has_the_triangles_asked_for_and_stays_on_its_texels():
     full = target()
     same = drift(full, full)
-    assert same["drift_p99"] < 2e-3 and same["outside"] == 0
+    assert same["drift_p99"] < 2e-3
+    assert same["outside"] == 0
     level, why = coarser(full, len(full.faces) // 2)
-    assert why == "" and abs(len(level.faces) - len(full.faces) // 2) <= 2
+    assert why == ""
+    assert abs(len(level.faces) - len(full.faces) // 2) <= 2
     # A quarter of a triangle's edge at most, and no part of the surface that reads another chart.
     found = drift(level, full)
-    assert found["drift_mean"] < 0.008 and found["outside"] < 0.01
+    assert found["drift_mean"] < 0.008
+    assert found["outside"] < 0.01
     # Every chart turns the way it did: a mirrored one would turn its normal map round.
     u, v = (level.uv[level.face_uvs[:, k]] - level.uv[level.face_uvs[:, 0]] for k in (1, 2))
     whole_u, whole_v = (full.uv[full.face_uvs[:, k]] - full.uv[full.face_uvs[:, 0]] for k in (1, 2))
@@ -39,7 +42,8 @@ def test_size_is_the_power_of_two_that_holds_the_detail():
     assert size_for(full, width) == 512
     assert size_for(full, width * 1.05) == size_for(full, width / 1.05) == 512  # a tenth coarser is as fine as asked
     assert size_for(full, width / 1.5) == 1024
-    assert size_for(full, width * 1000) == 256 and size_for(full, width / 1000) == 4096
+    assert size_for(full, width * 1000) == 256
+    assert size_for(full, width / 1000) == 4096
 
 
 def _span(full):

@@ -30,9 +30,12 @@ def values(texels, albedo=(0.5, 0.2, 0.1), roughness=0.4, metallic=0.0, normal=(
 
 def test_constants_become_factors(texels):
     maps = make_maps(texels, values(texels), np.ones(len(texels), np.float32))
-    assert maps.base_color is None and maps.orm is None and maps.normal is None
+    assert maps.base_color is None
+    assert maps.orm is None
+    assert maps.normal is None
     np.testing.assert_allclose(maps.factors["base_color"], (0.5, 0.2, 0.1, 1.0), atol=1e-5)
-    assert maps.factors["roughness"] == (pytest.approx(0.4),) and maps.factors["metallic"] == (0.0,)
+    assert maps.factors["roughness"] == (pytest.approx(0.4),)
+    assert maps.factors["metallic"] == (0.0,)
     assert {what for what, _, _ in maps.skipped} == {
         "base_color map",
         "roughness and metallic map",
@@ -47,12 +50,14 @@ def test_orm_packs_as_gltf_says_and_a_constant_channel_stays_a_factor(texels):
     given["roughness"] = np.linspace(0.2, 0.8, len(texels), dtype=np.float32)
     occlusion = np.full(len(texels), 0.5, np.float32)
     maps = make_maps(texels, given, occlusion)
-    assert maps.factors["roughness"] == (1.0,) and maps.factors["metallic"] == (0.0,)
+    assert maps.factors["roughness"] == (1.0,)
+    assert maps.factors["metallic"] == (0.0,)
     inside = maps.orm.reshape(-1, 3)[texels.texel]
     np.testing.assert_array_equal(inside[:, 0], 128)
     np.testing.assert_allclose(inside[:, 1] / 255, given["roughness"], atol=0.5 / 255 + 1e-6)
     np.testing.assert_array_equal(inside[:, 2], 255)  # times the factor 0
-    assert maps.has_occlusion and maps.has_roughness_metallic
+    assert maps.has_occlusion
+    assert maps.has_roughness_metallic
 
 
 def test_base_color_is_srgb_and_gutters_hold_no_black(texels):

@@ -58,7 +58,8 @@ def test_normal_map_decodes_to_the_fine_normals(torus_bake):
     decoded = decode_tangent_space(frames, np.rint((baked.values["tangent_normal"] * 0.5 + 0.5) * 255) / 255 * 2 - 1)
     _, truth = nearest_on_torus(points)
     angle = np.degrees(np.arccos(np.clip((decoded * truth).sum(1), -1, 1)))[: texels.inside]
-    assert angle.mean() < 0.5 and angle.max() < 4
+    assert angle.mean() < 0.5
+    assert angle.max() < 4
     flat = frames[..., 2] / np.linalg.norm(frames[..., 2], axis=1, keepdims=True)
     unbaked = np.degrees(np.arccos(np.clip((flat * truth).sum(1), -1, 1)))
     assert angle.mean() < 0.7 * unbaked.mean()
@@ -160,7 +161,7 @@ def test_corner_normals_are_smooth_on_a_sphere_and_split_on_a_cube():
     np.testing.assert_allclose(np.abs(joined), 3**-0.5, atol=1e-9)
 
 
-def test_openness_of_a_plane_a_corner_and_a_box():
+def test_ambient_visibility_of_a_plane_a_corner_and_a_box():
     plane = np.array([[-50.0, 0, -50], [50, 0, -50], [50, 0, 50], [-50, 0, 50]])
     wall = np.array([[0.0, 0, -50], [0, 50, -50], [0, 50, 50], [0, 0, 50]])
     quad = np.array([[0, 2, 1], [0, 3, 2]])

@@ -169,7 +169,8 @@ def test_finite_and_never_negative_at_every_adversary(kind):
     # One light a point: lights broadcast like everything else.
     lights = SphericalGaussians(tensors[4], tensors[5], tensors[6])
     value = shade(tensors[0], views[view], *tensors[1:4], lights, kind)
-    assert torch.isfinite(value).all() and (value >= 0).all()
+    assert torch.isfinite(value).all()
+    assert (value >= 0).all()
     value.sum().backward()
     for t in tensors:
         bad = ~torch.isfinite(t.grad).reshape(count, -1).all(1)
@@ -214,7 +215,8 @@ def test_visibility_and_fresnel_at_their_ends():
             values = models.visibility(
                 kind, torch.tensor(r), torch.tensor([0.0, 1.0, 1.0 + 1e-7, 0.0]), torch.tensor([0.0, 1.0, 1.0, 1.0])
             )
-            assert torch.isfinite(values).all() and (values > 0).all()
+            assert torch.isfinite(values).all()
+            assert (values > 0).all()
             # Both cosines 1: no masking at all leaves 1/4.
             assert float(values[1]) == pytest.approx(0.25, rel=1e-6)
     f0 = torch.tensor([0.04, 0.5, 1.0])

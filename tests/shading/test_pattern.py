@@ -10,7 +10,8 @@ from gdtool.shading.render.render import ERROR_POWER, ERROR_SCALE
 @pytest.mark.parametrize("count", [4, 8, 16, 32, 64])
 def test_every_pass_is_even_and_centred(count):
     points = pixel_pattern(count)
-    assert points.min() >= 0 and points.max() < 1
+    assert points.min() >= 0
+    assert points.max() < 1
     assert np.abs(points.mean(0) - 0.5).max() < 1e-6
     # Sobol's points lie one in each column and each row as many as there are; centring moves them by up to another.
     for axis in (0, 1):

@@ -29,13 +29,12 @@ def test_convex_is_what_lies_on_its_hull(most, monkeypatch):
     monkeypatch.setattr(rays, "_MOST_BY_PAIRS", most)
     ball = sphere(rings=24)
     turned = ball.vertices @ np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    assert (
-        is_convex(ball.vertices, ball.faces)
-        and is_convex(turned * [1, 2, 3], ball.faces)
-        and is_convex(ball.vertices, ball.faces[:, ::-1])
-    )
+    assert is_convex(ball.vertices, ball.faces)
+    assert is_convex(turned * [1, 2, 3], ball.faces)
+    assert is_convex(ball.vertices, ball.faces[:, ::-1])
     # Open; in a plane.
-    assert is_convex(ball.vertices, ball.faces[:500]) and is_convex(ball.vertices * [1, 0, 1], ball.faces[:60])
+    assert is_convex(ball.vertices, ball.faces[:500])
+    assert is_convex(ball.vertices * [1, 0, 1], ball.faces[:60])
     for corner in (0, 300, 1199):
         dented = ball.vertices.copy()
         dented[corner] *= 0.98
@@ -49,7 +48,8 @@ def test_convex_objects_need_no_shadow_rays(monkeypatch):
     monkeypatch.setattr(direct, "ROULETTE_SHARE", 0.0)
     vertices, faces = cube()
     ball = sphere(rings=12)
-    assert is_convex(vertices, faces) and is_convex(ball.vertices, ball.faces)
+    assert is_convex(vertices, faces)
+    assert is_convex(ball.vertices, ball.faces)
     dented = np.array(vertices, float)
     dented[0] *= 0.2
     assert not is_convex(dented, faces)
@@ -100,7 +100,8 @@ def test_a_texture_of_one_value_is_a_factor():
     few, all_ = (renderer.buffers(rig("six", 48)[1], 8) for renderer in renderers)
     assert all(np.array_equal(few[name], all_[name]) for name in few)
     told = {what: why for what, why, _ in skipped_work(renderers[0], 8, None)}
-    assert "one value" in told["base color lookups"] and "metallic-roughness lookups" not in told
+    assert "one value" in told["base color lookups"]
+    assert "metallic-roughness lookups" not in told
 
 
 def two_balls() -> Scene:
@@ -128,7 +129,8 @@ def test_leaving_out_rays_toward_little_light_keeps_the_mean(monkeypatch):
         means.append(np.mean(pictures, 0))
         noises.append(np.std(pictures, 0).mean())
         rays.append(renderer.counts.shadow_rays)
-    assert renderer.counts.shadow_rays_rare > 0 and rays[1] < 0.9 * rays[0]
+    assert renderer.counts.shadow_rays_rare > 0
+    assert rays[1] < 0.9 * rays[0]
     assert abs(means[1].mean() / means[0].mean() - 1) < 5e-3
     assert np.abs(means[1] - means[0]).max() < 0.03 * means[0].max()
     assert noises[1] < 1.1 * noises[0]
