@@ -84,6 +84,7 @@ class Clock:
 def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     """In a child: bake as the stage does, steps timed; the maps before they are stored go to out (.npz)."""
     from gdtool.assets.load import load_scene
+    from gdtool.bake.inputs import target_of
     from gdtool.bake.maps import MapOptions, make_maps
     from gdtool.bake.occlusion import bake_occlusion
     from gdtool.bake.origin import from_scene
@@ -91,7 +92,6 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     from gdtool.bake.reproject import vertex_reach
     from gdtool.bake.target import samples_for, texel_width, texels_of
     from gdtool.images.io import encode_pngs
-    from gdtool.bake.inputs import target_of
 
     threads = len(os.sched_getaffinity(0))
     scene, mesh = load_scene(case.glb), read_low(case)
@@ -150,8 +150,8 @@ def blender(
     python: Path, case: Case, size: int, samples: int, occlusion: int, out: Path, limit: float
 ) -> dict[str, float]:
     """Cost of Blender's bake; its maps go to out (.npz). Raises RuntimeError."""
-    from gdtool.geometry.topology import triangulated
     from gdtool.bake.inputs import target_of
+    from gdtool.geometry.topology import triangulated
 
     mesh = read_low(case)
     target, low = target_of(mesh)[0], out.with_name("low.npz")

@@ -54,7 +54,9 @@ def main() -> None:
     renderer = render.Renderer(scene, len(os.sched_getaffinity(0)))
     color = None
     if asked.light in ("sampled", "prefiltered"):
-        color = DirectLight(renderer, environment, asked.light_samples, asked.seed, options=LightOptions(asked.light)).color()
+        color = DirectLight(
+            renderer, environment, asked.light_samples, asked.seed, options=LightOptions(asked.light)
+        ).color()
     cameras = {camera.name: camera for camera in rig("six", asked.size)}
 
     def view(camera):

@@ -115,7 +115,9 @@ def test_frames_are_unit_square_and_handed():
         [0.7, 0.7, -1e-12],
     ]
     n = torch.tensor(directions / np.linalg.norm(directions, axis=1, keepdims=True), dtype=torch.float32)
-    tangent, bitangent = (torch.stack([c.expand(len(n)) for c in v], 1).double() for v in orthonormal_basis(*n.unbind(1)))
+    tangent, bitangent = (
+        torch.stack([c.expand(len(n)) for c in v], 1).double() for v in orthonormal_basis(*n.unbind(1))
+    )
     normal = n.double()
     for a, b, wanted in (
         (tangent, tangent, 1),
