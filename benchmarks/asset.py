@@ -65,12 +65,12 @@ def lit(
     """Views.images of a scene under a light (color linear, and the material buffers, (k, h, w[, c])), and its
     coverage."""
     from gdtool.shading.lights.studio import studio
-    from gdtool.shading.render.direct import DirectLight
+    from gdtool.shading.render.direct import DirectLight, LightOptions
     from gdtool.shading.render.render import Renderer
     from gdtool.shading.render.rigs import turntable
 
     renderer = Renderer(scene, threads)
-    color = DirectLight(renderer, studio(light, 0, fit=False)[0], 8, 0, mode="prefiltered").color()
+    color = DirectLight(renderer, studio(light, 0, fit=False)[0], 8, 0, options=LightOptions("prefiltered")).color()
     frames = [renderer.buffers(camera, samples, color) for camera in turntable(VIEWS, size, 10.0)[views]]
     stacked = {name: np.stack([frame[name] for frame in frames]) for name in frames[0]}
     return stacked, stacked.pop("mask")

@@ -84,14 +84,14 @@ class Clock:
 def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     """In a child: bake as the stage does, steps timed; the maps before they are stored go to out (.npz)."""
     from gdtool.assets.load import load_scene
-    from gdtool.bake.maps import make_maps
+    from gdtool.bake.inputs import target_of
+    from gdtool.bake.maps import MapOptions, make_maps
     from gdtool.bake.occlusion import bake_occlusion
     from gdtool.bake.origin import from_scene
-    from gdtool.bake.pipeline import bake, occlusion_tracer
+    from gdtool.bake.pipeline import BakeOptions, bake, occlusion_tracer
     from gdtool.bake.reproject import vertex_reach
     from gdtool.bake.target import samples_for, texel_width, texels_of
     from gdtool.images.io import encode_pngs
-    from gdtool.stages.bake import target_of
 
     threads = len(os.sched_getaffinity(0))
     scene, mesh = load_scene(case.glb), read_low(case)
@@ -102,7 +102,7 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     texels = texels_of(target, size, threads=threads)
     reach = vertex_reach(target.vertices, target.faces, origin.source)
     baked = bake(
-        target, texels, origin.source, origin.lookup, reach, samples=samples_for(width, origin.detail), threads=threads
+        target, texels, origin.source, origin.lookup, reach, BakeOptions(samples_for(width, origin.detail), threads)
     )
     wall, processor = clock()
     traced, trace = None, None
@@ -111,7 +111,7 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
         trace = occlusion_tracer(target, origin.source, reach, origin.normals, 64, 0, threads)
         traced = bake_occlusion(target, texels, trace, threads=threads)
         cost["occlusion s"], cost["occlusion cpu"] = clock()
-    maps = make_maps(texels, baked.values, occlusion=traced, normal_map="on", threads=threads)
+    maps = make_maps(texels, baked.values, traced, MapOptions(normal_map="on", threads=threads))
     more = clock()
     cost |= {"bake s": wall + more[0], "bake cpu": processor + more[1]}
     images = [image for image in (maps.base_color, maps.orm, maps.normal) if image is not None]
@@ -150,8 +150,8 @@ def blender(
     python: Path, case: Case, size: int, samples: int, occlusion: int, out: Path, limit: float
 ) -> dict[str, float]:
     """Cost of Blender's bake; its maps go to out (.npz). Raises RuntimeError."""
+    from gdtool.bake.inputs import target_of
     from gdtool.geometry.topology import triangulated
-    from gdtool.stages.bake import target_of
 
     mesh = read_low(case)
     target, low = target_of(mesh)[0], out.with_name("low.npz")

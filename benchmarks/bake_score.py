@@ -19,8 +19,8 @@ class Truth:
 
     def __init__(self, case: Case):
         from gdtool.assets.load import load_scene
+        from gdtool.bake.inputs import target_of
         from gdtool.shading.render.surface_points import SurfaceLookup
-        from gdtool.stages.bake import target_of
 
         self.scene = load_scene(case.glb)
         self.target = target_of(read_low(case))[0]

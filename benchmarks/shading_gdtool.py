@@ -35,7 +35,7 @@ def main() -> None:
     from gdtool.shading.bsdf.closed_form import closed_form_image
     from gdtool.shading.lights.studio import studio
     from gdtool.shading.render import render
-    from gdtool.shading.render.direct import DirectLight
+    from gdtool.shading.render.direct import DirectLight, LightOptions
 
     # What the renderer imports when it first needs it: no renderer's seconds have its imports in them.
     for module in (
@@ -48,13 +48,15 @@ def main() -> None:
         importlib.import_module(module)
     scene = normalised(load_scene(asked.model))
     if asked.converged:
-        render.BASE = asked.samples
+        render.BASE_SAMPLES = asked.samples
     environment, lobes, _ = studio(asked.env, asked.seed, fit=asked.light == "sg")
     wall, processor = time.perf_counter(), time.process_time()
     renderer = render.Renderer(scene, len(os.sched_getaffinity(0)))
     color = None
     if asked.light in ("sampled", "prefiltered"):
-        color = DirectLight(renderer, environment, asked.light_samples, asked.seed, mode=asked.light).color()
+        color = DirectLight(
+            renderer, environment, asked.light_samples, asked.seed, options=LightOptions(asked.light)
+        ).color()
     cameras = {camera.name: camera for camera in rig("six", asked.size)}
 
     def view(camera):
@@ -65,7 +67,7 @@ def main() -> None:
             frame["color"] = frame["color"] * frame["mask"][..., None]
         return frame
 
-    frames = list(renderer.each(view, [cameras[name] for name in asked.views.split(",")]))
+    frames = list(renderer.render_each(view, [cameras[name] for name in asked.views.split(",")]))
     seconds = {"wall s": time.perf_counter() - wall, "cpu s": time.process_time() - processor}
     np.savez(
         asked.out,

@@ -1,10 +1,11 @@
-"""The finished asset: a glTF scene and Wavefront files of a baked target and its maps."""
+"""Write the finished asset: glTF, Wavefront and OpenUSD files of a baked target and its maps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -12,24 +13,79 @@ from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.bake.maps import Maps
 from gdtool.bake.target import Target
 from gdtool.folders.mesh import QuadMesh
+from gdtool.geometry.frames import transform_points
 from gdtool.geometry.tangents import weld
 
 
-class Drawn(Protocol):
-    """How a surface is drawn, as texture.origin.Origin says."""
+class SurfaceModes(Protocol):
+    """How viewers show a surface; bake.origin.Origin is one."""
 
     alpha_mode: str
     alpha_cutoff: float
     double_sided: bool
 
 
+class CornerNormals(NamedTuple):
+    """Shading normals of a quad mesh: idx (f, 4) into normals (n, 3); -1 for a triangle's fourth corner."""
+
+    idx: np.ndarray
+    normals: np.ndarray
+
+
+@dataclass(frozen=True)
+class AssetMeshes:
+    """The meshes of an asset.
+
+    target: the triangles that were baked. mesh: the quads they came from. face_idx (t,): the quad of each triangle.
+    levels: coarser levels of detail, finest first.
+    """
+
+    target: Target
+    mesh: QuadMesh
+    face_idx: np.ndarray
+    levels: tuple[Target, ...] = ()
+
+
+@dataclass(frozen=True)
+class AssetOptions:
+    """How to write an asset.
+
+    name: of the object. convention: "opengl" or "directx", the green channel of normal.png. usd: file name of the
+    OpenUSD file; empty for none. threads: of the PNG encoder.
+    """
+
+    name: str
+    convention: str = "opengl"
+    usd: str = ""
+    threads: int = 1
+
+
+def in_source_frame(meshes: AssetMeshes, matrix: np.ndarray) -> AssetMeshes:
+    """Move meshes from the normalised frame to the source's by a similarity (4, 4): vertices, normals and tangents."""
+    turn = matrix[:3, :3] / (matrix[:3, 0] ** 2).sum() ** 0.5
+
+    def moved(target: Target) -> Target:
+        tangents = target.tangents.copy()
+        tangents[..., :3] = tangents[..., :3] @ turn.T
+        return replace(
+            target,
+            vertices=transform_points(matrix, target.vertices),
+            normals=target.normals @ turn.T,
+            tangents=tangents,
+        )
+
+    target = moved(meshes.target)
+    mesh = replace(meshes.mesh, vertices=target.vertices)
+    return AssetMeshes(target, mesh, meshes.face_idx, tuple(moved(level) for level in meshes.levels))
+
+
 def material_of(
     maps: Maps, name: str, alpha_mode: str = "OPAQUE", alpha_cutoff: float = 0.5, double_sided: bool = False
 ) -> Material:
-    """The glTF material of maps; every factor is explicit."""
+    """Make the glTF material of maps; every factor is explicit."""
 
-    # A texture repeats by default; clamped, a chart at the map's edge does not read the opposite edge.
     def texture(image: np.ndarray | None, encoding: str) -> Texture | None:
+        """Make a texture that clamps, so that a chart at the map's edge does not read the opposite edge."""
         return None if image is None else Texture(image, encoding, wrap_u="clamp", wrap_v="clamp")
 
     orm = texture(maps.orm, "linear")
@@ -51,7 +107,10 @@ def material_of(
 
 
 def scene_of(target: Target, maps: Maps, material: Material, name: str) -> Scene:
-    """Triangles of the target, corners that agree in everything shared; tangents only when a normal map needs them."""
+    """Make a scene of the target's triangles. Corners that agree in everything become one vertex.
+
+    Tangents are written only where a normal map needs them.
+    """
     corner = np.arange(len(target.faces) * 3)
     position_idx, uv_idx = target.faces.ravel(), target.face_uvs.ravel()
     normals, tangents = target.normals.reshape(-1, 3), target.tangents.reshape(-1, 4)
@@ -61,7 +120,7 @@ def scene_of(target: Target, maps: Maps, material: Material, name: str) -> Scene
     vertex = weld(*columns)
     first = np.full(vertex.max(initial=-1) + 1, len(corner), np.int64)
     np.minimum.at(first, vertex, corner)
-    # Numbered as they come up, so that neighbours in the file are neighbours on the mesh.
+    # Vertices are numbered in order of first use, so that neighbours in the file are neighbours on the mesh.
     order = np.argsort(first, kind="stable")
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
@@ -80,23 +139,19 @@ def scene_of(target: Target, maps: Maps, material: Material, name: str) -> Scene
 def write_obj(
     path: Path,
     mesh: QuadMesh,
-    face_normals_idx: np.ndarray,
-    normals: np.ndarray,
+    corners: CornerNormals,
     maps: Maps,
     files: dict[str, str],
     name: str,
 ) -> None:
-    """Write path (.obj) with the quads as they are, and the .mtl beside it, named alike.
-
-    face_normals_idx (f, 4) into normals (n, 3), -1 with a triangle's fourth corner. files: map name to file name.
-    """
+    """Write the quads as an .obj, and its .mtl beside it under the same name; files: file name by map name."""
     library = path.with_suffix(".mtl")
     lines = [f"mtllib {library.name}", f"o {_word(name)}"]
-    lines += ["v %.9g %.9g %.9g" % tuple(p) for p in mesh.vertices.tolist()]
-    lines += ["vt %.9g %.9g" % (u, 1 - v) for u, v in mesh.uv.tolist()]
-    lines += ["vn %.6g %.6g %.6g" % tuple(n) for n in normals.tolist()]
+    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
+    lines += [f"vt {u:.9g} {1 - v:.9g}" for u, v in mesh.uv.tolist()]
+    lines += [f"vn {x:.6g} {y:.6g} {z:.6g}" for x, y, z in corners.normals.tolist()]
     lines.append("usemtl material")
-    for face, uvs, ns in zip(mesh.faces.tolist(), mesh.face_uvs.tolist(), face_normals_idx.tolist(), strict=True):
+    for face, uvs, ns in zip(mesh.faces.tolist(), mesh.face_uvs.tolist(), corners.idx.tolist(), strict=True):
         lines.append(
             "f " + " ".join(f"{v + 1}/{t + 1}/{n + 1}" for v, t, n in zip(face, uvs, ns, strict=True) if v >= 0)
         )
@@ -105,16 +160,15 @@ def write_obj(
 
 
 def _word(name: str) -> str:
+    """Replace what an .obj object name cannot hold by underscores."""
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in name) or "object"
 
 
 def material_library(maps: Maps, files: dict[str, str]) -> str:
-    """Text of the .mtl: the classic fields, and the physically based ones (Pr, Pm, norm) that newer readers know.
+    """Compose the .mtl: the classic fields, and the physically based ones (Pr, Pm, norm) that newer readers know.
 
-    The normal map is named twice: Blender's importer leaves norm out, and takes map_Bump for a normal map of strength
-    -bm.
-
-    Scalar maps are channels of the packed map: -imfchan is the format's own way to say which (Wavefront MTL 4.2).
+    The normal map is named twice: Blender's importer ignores norm, and takes map_Bump for a normal map of strength -bm.
+    Roughness and metallic are channels of the packed map, chosen by -imfchan (Wavefront MTL 4.2).
     """
     r, g, b, a = maps.factors["base_color"]
     lines = [
@@ -141,90 +195,82 @@ def material_library(maps: Maps, files: dict[str, str]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def corner_normals_of_quads(mesh: QuadMesh, target: Target, face_idx: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Normals of the quads' corners out of their triangles': face_normals_idx (f, 4), normals (n, 3).
+def corner_normals_of_quads(meshes: AssetMeshes) -> CornerNormals:
+    """Collect the normals of the quads' corners from their triangles.
 
-    face_idx (t,) says which quad each triangle of the target came from; the first triangle of a quad has its corners
-    0, 1, 2, the second 0, 2, 3.
+    The first triangle of a quad has its corners 0, 1, 2, the second 0, 2, 3.
     """
+    mesh, target, face_idx = meshes.mesh, meshes.target, meshes.face_idx
     first = np.searchsorted(face_idx, np.arange(len(mesh.faces)))
     second = np.minimum(first + 1, len(face_idx) - 1)
     corners = np.concatenate([target.normals[first], target.normals[second][:, 2:]], 1)
     idx = weld(corners.reshape(-1, 3))
     normals = np.zeros((idx.max() + 1, 3))
     normals[idx] = corners.reshape(-1, 3)
-    return np.where(mesh.is_quad[:, None] | (np.arange(4) < 3), idx.reshape(-1, 4), -1), normals
+    return CornerNormals(np.where(mesh.is_quad[:, None] | (np.arange(4) < 3), idx.reshape(-1, 4), -1), normals)
 
 
 def write_models(
-    path: Callable[[str], Path],
-    target: Target,
-    mesh: QuadMesh,
-    face_idx: np.ndarray,
-    maps: Maps,
-    surface: Drawn,
-    name: str,
-    convention: str,
-    usd: str,
-    levels: list[Target],
-    threads: int = 1,
+    path: Callable[[str], Path], meshes: AssetMeshes, maps: Maps, surface: SurfaceModes, options: AssetOptions
 ) -> dict[str, str]:
-    """Write asset.glb, asset.obj, the maps, OpenUSD where usd names a suffix, and asset_lod1.glb and on; the maps'
-    files.
+    """Write asset.glb, asset.obj, the maps, asset_lod1.glb and on, and OpenUSD where asked for.
 
-    path(file name) says where. face_idx (t,) is the quad of each triangle. The coarser levels refer to the maps' files.
+    path(file name) says where. The coarser levels refer to the maps' files instead of holding them. Returns the file
+    name of each map.
     """
     from gdtool.assets.gltf_write import write_glb
-    from gdtool.bake.maps import contact_sheet_of, directx
+    from gdtool.bake.maps import contact_sheet_of
     from gdtool.images.io import encode_pngs, write_png
 
-    material = material_of(maps, name, surface.alpha_mode, surface.alpha_cutoff, surface.double_sided)
-    shown = {
-        key: image
-        for key, image in (
-            ("base_color", maps.base_color),
-            ("orm", maps.orm),
-            ("normal", maps.normal),
-            ("emissive", maps.emissive),
-        )
-        if image is not None
-    }
+    material = material_of(maps, options.name, surface.alpha_mode, surface.alpha_cutoff, surface.double_sided)
+    by_name = {"base_color": maps.base_color, "orm": maps.orm, "normal": maps.normal, "emissive": maps.emissive}
+    images = {name: image for name, image in by_name.items() if image is not None}
     # Encoding a large map takes as long as baking it: once, for the .glb and for the file beside it.
-    encoded = dict(zip(shown, encode_pngs(list(shown.values()), threads=threads), strict=True))
+    encoded = dict(zip(images, encode_pngs(list(images.values()), threads=options.threads), strict=True))
     write_glb(
         path("asset.glb"),
-        scene_of(target, maps, material, name),
-        made={id(shown[key]): content for key, content in encoded.items()},
+        scene_of(meshes.target, maps, material, options.name),
+        made={id(images[name]): content for name, content in encoded.items()},
     )
-    files, beside = {key: f"{key}.png" for key in shown}, {id(image): f"{key}.png" for key, image in shown.items()}
-    for key, content in encoded.items():
-        if key == "normal" and convention == "directx":
-            write_png(path(files[key]), directx(maps.normal))
-            if not levels:
-                continue
-            beside[id(maps.normal)] = "normal_opengl.png"
-        path(beside[id(shown[key])]).write_bytes(content)
-    for k, level in enumerate(levels, 1):
-        write_glb(path(f"asset_lod{k}.glb"), scene_of(level, maps, material, name), made=beside)
-    for key, image in maps.extra.items():
-        files[key] = f"{key}.png"
-        write_png(path(files[key]), image)
-    normals_idx, normals = corner_normals_of_quads(mesh, target, face_idx)
-    write_obj(path("asset.obj"), mesh, normals_idx, normals, maps, files, name)
-    if usd:
+    beside = _write_maps(path, maps, images, encoded, options.convention, bool(meshes.levels))
+    for k, level in enumerate(meshes.levels, 1):
+        write_glb(path(f"asset_lod{k}.glb"), scene_of(level, maps, material, options.name), made=beside)
+    files = {name: f"{name}.png" for name in images}
+    for name, image in maps.extra.items():
+        files[name] = f"{name}.png"
+        write_png(path(files[name]), image)
+    corners = corner_normals_of_quads(meshes)
+    write_obj(path("asset.obj"), meshes.mesh, corners, maps, files, options.name)
+    if options.usd:
         from gdtool.bake.usd import write_usd
 
-        write_usd(
-            path(usd),
-            mesh,
-            normals_idx,
-            normals,
-            maps,
-            files,
-            convention,
-            surface.alpha_mode,
-            surface.alpha_cutoff,
-            surface.double_sided,
-        )
+        write_usd(path(options.usd), meshes.mesh, corners, maps, files, options.convention, surface)
     write_png(path("contact_sheet.png"), contact_sheet_of(maps))
     return files
+
+
+def _write_maps(
+    path: Callable[[str], Path],
+    maps: Maps,
+    images: dict[str, np.ndarray],
+    encoded: dict[str, bytes],
+    convention: str,
+    has_levels: bool,
+) -> dict[int, str]:
+    """Write the maps that the material refers to; returns the file name, by id of the image, that a glTF may refer to.
+
+    With the directx convention, normal.png has its green channel inverted. glTF knows opengl only: so the coarser
+    levels refer to normal_opengl.png.
+    """
+    from gdtool.bake.maps import directx
+    from gdtool.images.io import write_png
+
+    beside = {id(image): f"{name}.png" for name, image in images.items()}
+    for name, content in encoded.items():
+        if name == "normal" and convention == "directx":
+            write_png(path("normal.png"), directx(maps.normal))
+            if not has_levels:
+                continue
+            beside[id(maps.normal)] = "normal_opengl.png"
+        path(beside[id(images[name])]).write_bytes(content)
+    return beside

@@ -1,11 +1,12 @@
-"""Coarser levels of a finished mesh that share its atlas: seam-preserving decimation after unwrapping.
+"""Make coarser levels of an unwrapped mesh that share its maps, by decimation that preserves UV seams.
 
-The same maps serve every level, because a point of a coarse level has about the texture coordinates of the point of the
-full mesh that it stands for; `drift` measures how nearly.
+A point of a coarse level has about the same texture coordinates as the point of the full mesh that it stands for. So
+the same maps serve every level; `drift` measures how well.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,24 +15,72 @@ from gdtool.bake.target import Target
 from gdtool.core.child import ChildFailed, call
 from gdtool.core.ending import temporary_folder
 from gdtool.core.native import imported
+from gdtool.core.threads import mapped
+
+# The largest mean drift of a level, as a share of the extent: beyond it, a level shows the maps of other parts.
+MAX_DRIFT = 0.02
+# A level that cannot come down to what is asked is still worth having with less than this share of the one before.
+MAX_SHARE = 0.9
+# The most triangles of a level, as a multiple of what is asked, without a warning.
+MAX_EXCESS = 1.5
+
+
+@dataclass
+class Levels:
+    """Coarser levels, finest first; figures for the report; what was left out and why; warnings."""
+
+    targets: list[Target] = field(default_factory=list)
+    report: dict[str, float] = field(default_factory=dict)
+    skipped: list[tuple[str, str]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def make_levels(target: Target, count: int, threads: int = 1) -> Levels:
+    """Make coarser levels of a target, `count` with the full one, each of half the triangles of the one before.
+
+    Levels that cannot be made, are hardly coarser, or drift too far on the maps are left out.
+    """
+    counts = [max(len(target.faces) >> k, 4) for k in range(1, count)]
+    out, previous = Levels(), len(target.faces)
+    # Each level is made by a child process: threads only wait for them.
+    for wanted, (level, why) in zip(counts, mapped(lambda n: coarser(target, n), counts, threads), strict=True):
+        if level is not None and len(level.faces) > max(MAX_SHARE * previous, MAX_EXCESS * wanted):
+            level, why = None, f"it cannot have fewer than {len(level.faces)} triangles without tearing a seam"
+        if level is None:
+            out.skipped.append((f"level of {wanted} triangles", why))
+            continue
+        drifted = drift(level, target)
+        if drifted["drift_mean"] > MAX_DRIFT:
+            why = f"it would slide {100 * drifted['drift_mean']:.1f} % of the extent on the maps"
+            out.skipped.append((f"level of {wanted} triangles", why))
+            continue
+        previous = len(level.faces)
+        if previous > MAX_EXCESS * wanted:
+            out.warnings.append(f"the level of {wanted} triangles has {previous}: fewer would tear a seam")
+        out.targets.append(level)
+        name = f"lod{len(out.targets)}"
+        out.report[f"{name}_triangles"] = len(level.faces)
+        out.report |= {f"{name}_{figure}": value for figure, value in drifted.items()}
+    return out
 
 
 def collapse_textured(
     vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray, target_faces: int, folder: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the child runs: MeshLab's quadric collapse in position and texture space (Garland & Heckbert 1998), seams
-    kept.
+    """Collapse edges by quadrics of position and texture coordinates, seams kept; runs in a child process.
 
-    vertices (v, 3), faces (t, 3), corner_uvs (t, 3, 2) of the corners. folder: where its files may be; whoever starts
-    the child removes it, since a child that is killed cannot. Returns the same of about target_faces triangles."""
+    MeshLab's filter, after Garland & Heckbert 1998. vertices (v, 3), faces (t, 3), corner_uvs (t, 3, 2). folder holds
+    temporary files; the parent removes it, since a killed child cannot. Returns the same three arrays, of about
+    target_faces triangles.
+    """
     from gdtool.images.io import write_png
 
     pymeshlab = imported("pymeshlab")
     # The filter wants a mesh with a texture, which only a file can give it.
     write_png(Path(folder, "blank.png"), np.zeros((2, 2, 3), np.uint8))
     Path(folder, "full.mtl").write_text("newmtl one\nmap_Kd blank.png\n")
-    lines = ["mtllib full.mtl", "usemtl one", *("v %.9g %.9g %.9g" % tuple(p) for p in vertices.tolist())]
-    lines += ["vt %.9g %.9g" % tuple(p) for p in corner_uvs.reshape(-1, 2).tolist()]
+    lines = ["mtllib full.mtl", "usemtl one", *(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist())]
+    lines += [f"vt {u:.9g} {v:.9g}" for u, v in corner_uvs.reshape(-1, 2).tolist()]
     lines += [
         "f " + " ".join(f"{v + 1}/{3 * k + i + 1}" for i, v in enumerate(face)) for k, face in enumerate(faces.tolist())
     ]
@@ -55,9 +104,9 @@ def collapse_textured(
 
 
 def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[Target | None, str]:
-    """A target of about target_faces triangles with the texture coordinates of the full one, or None and why not.
+    """Decimate a target to about target_faces triangles, in a child process with a time limit in seconds.
 
-    It has more where fewer would tear a seam.
+    It keeps more triangles where fewer would tear a seam. Returns the level, or None and why there is none.
     """
     try:
         with temporary_folder() as folder:
@@ -80,9 +129,10 @@ def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[
 
 
 def drift(level: Target, full: Target, size: int = 1024, count: int = 20_000) -> dict[str, float]:
-    """How far the level's surface is from the full mesh's at the same texture coordinates, as a share of its extent.
+    """Measure how far a level's surface is from the full mesh's at the same texture coordinates.
 
-    drift_mean, drift_p99; outside: share of the level's surface whose texture coordinates lie in no chart.
+    Compares `count` points of the level, on a chart image of side `size`. Returns drift_mean and drift_p99, shares of
+    the full mesh's extent, and outside, the share of the level's surface whose texture coordinates lie in no chart.
     """
     from gdtool.geometry.distance import sample_surface
     from gdtool.geometry.uv_raster import Barycentrics, extend_owners, owners_of
@@ -91,7 +141,7 @@ def drift(level: Target, full: Target, size: int = 1024, count: int = 20_000) ->
     uv = np.einsum("nk,nkc->nc", barycentric, level.uv[level.face_uvs[face_idx]])
     owner = owners_of(full.uv, full.face_uvs, size)
     inside = Barycentrics(full.uv, full.face_uvs)
-    # A chart's border texel may have its centre outside: two rings are what bilinear lookups can reach.
+    # A texel at a chart's border may have its centre outside the chart: bilinear lookups reach two rings of those.
     ring, ring_owner, _ = extend_owners(inside, owner.reshape(size, size), 2)
     owner[ring] = ring_owner
     column, row = np.clip((uv * size).astype(np.int64), 0, size - 1).T

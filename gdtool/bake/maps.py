@@ -1,35 +1,64 @@
-"""Maps as files hold them: packing, quantising, and what needs no map at all."""
+"""Make the maps that files hold: pack and quantise values, and leave out what is constant."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from gdtool.bake.padding import Gutters
 from gdtool.bake.target import Texels
+from gdtool.core.errors import ResourceError
 from gdtool.core.threads import mapped
 
-# Smaller differences than this, in stored units, are no detail: one step of 8 bits and rounding.
+# A channel that spans no more than this, in stored units, is constant: one step of 8 bits, and rounding.
 CONSTANT_RANGE = 1.5 / 255
-# 99.5 % of a normal map within this angle of straight up is flat: 8 bits store normals to 0.4 degrees.
+# A normal map is flat when 99.5 % of it lies within this angle of straight up: 8 bits store normals to 0.4 degrees.
 FLAT_DEGREES = 1.0
-_ROWS_AT_ONCE = 64
+_ROWS_AT_ONCE = 64  # few enough that intermediate rows stay in the cache
+# Bytes of memory per texel of a bake, measured by benchmarks/bake.py at 2048 and 4096 on an atlas that is 72 % full.
+BYTES_PER_TEXEL = 130
 HEIGHT_BITS = 16  # a step of 8 bits is a visible terrace
+
+
+class SkippedMap(NamedTuple):
+    """A map that was left out: what, why, and the seconds that storing it would have taken, None where nothing is."""
+
+    what: str
+    why: str
+    seconds: float | None
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """How to store maps.
+
+    bits: 8 or 16 a channel. padding: texels of gutter around charts; None: as far as there is room. normal_map: "auto"
+    leaves a flat one out. least_alpha: color of less alpha is never seen and is filled like a gutter; otherwise
+    filtering would bleed what painters leave there, mostly black, into its surroundings.
+    """
+
+    bits: int = 8
+    padding: int | None = None
+    normal_map: Literal["auto", "on", "off"] = "auto"
+    least_alpha: float = 0.5 / 255
+    threads: int = 1
 
 
 @dataclass(frozen=True)
 class Maps:
-    """Maps as stored, uint8 or uint16, (s, s, c), None where a factor or nothing takes their place.
+    """Maps as stored, (s, s, c) uint8 or uint16; None where a factor takes a map's place or there is nothing to store.
 
-    base_color RGB(A) sRGB; orm R occlusion, G roughness, B metallic; normal tangent space, +Y up; emissive RGB sRGB;
-    extra: grey maps that no material refers to, height and confidence. factors: base_color linear RGBA, roughness,
-    metallic, emissive linear RGB where anything shines, what the material's factors have to be; height, the distance
-    that 0 and 1 of that map stand for below and above the surface. has_occlusion: orm's R means something.
-    has_roughness_metallic: G and B do. skipped: (what, why, seconds that gutters and storing would have taken, those of
-    one that is stored, or None)."""
+    base_color: sRGB, perhaps with alpha. orm: R occlusion, G roughness, B metallic. normal: tangent space, +Y up.
+    emissive: sRGB. extra: grey maps that no material refers to, height and confidence.
+    factors: the material's factors by name: base_color linear RGBA, roughness, metallic, and emissive linear RGB where
+    anything shines; height is the distance above and below the surface that 1 and 0 of that map stand for.
+    has_occlusion, has_roughness_metallic: whether the R, or the G and B, of orm mean something.
+    """
 
     size: int
     base_color: np.ndarray | None
@@ -40,11 +69,33 @@ class Maps:
     has_roughness_metallic: bool = False
     emissive: np.ndarray | None = None
     extra: dict[str, np.ndarray] = field(default_factory=dict)
-    skipped: list[tuple[str, str, float | None]] = field(default_factory=list)
+    skipped: list[SkippedMap] = field(default_factory=list)
+
+
+def require_map_memory(name: str, size: int) -> None:
+    """Raise ResourceError when maps of size x size texels will not fit into free memory, rather than be killed midway.
+
+    name: of the object, for the message.
+    """
+    needed = BYTES_PER_TEXEL * size * size
+    try:
+        free = next(
+            int(line.split()[1]) * 1024
+            for line in Path("/proc/meminfo").read_text().splitlines()
+            if line.startswith("MemAvailable")
+        )
+    except (OSError, StopIteration):
+        return
+    if needed > free:
+        raise ResourceError(
+            name,
+            f"maps of {size} texels need about {needed / 2**30:.0f} GB of memory, {free / 2**30:.0f} GB are free",
+            "lower --size",
+        )
 
 
 def quantise(image: np.ndarray, bits: int) -> np.ndarray:
-    """[0, 1] floats to uint8 or uint16, to the nearest step."""
+    """Round floats in [0, 1] to the nearest step of uint8 or uint16."""
     top, kind = (255, np.uint8) if bits == 8 else (65535, np.uint16)
     scaled = np.clip(image, 0, 1)
     scaled *= image.dtype.type(top)
@@ -54,8 +105,10 @@ def quantise(image: np.ndarray, bits: int) -> np.ndarray:
 def constant_of(
     values: np.ndarray, tolerance: float = CONSTANT_RANGE, encoding: Callable = lambda x: x
 ) -> np.ndarray | None:
-    """The middle of values (n,) or (n, c), float64, when no channel spans more than tolerance, else None; both as
-    encoding, which is monotonic, has them."""
+    """Return the middle of values (n,) or (n, c), float64, when no channel spans more than tolerance, else None.
+
+    Both are measured after encoding, a monotonic function.
+    """
     if not len(values):
         return None
     low, high = (encoding(np.clip(end, 0, 1).astype(np.float64)) for end in (values.min(0), values.max(0)))
@@ -63,10 +116,10 @@ def constant_of(
 
 
 def flat_angle(tangent_normals: np.ndarray) -> float:
-    """Angle in degrees from straight up that 99.5 % of tangent-space normals (n, 3) stay within."""
+    """Measure the angle in degrees from straight up within which 99.5 % of tangent-space normals (n, 3) lie."""
     if not len(tangent_normals):
         return 0.0
-    # The component that is straight up falls as the angle grows: its percentile is the angle's, and needs no sine.
+    # The upward component falls as the angle grows: its percentile is the cosine of the angle's.
     up = float(np.percentile(tangent_normals[:, 2], 0.5))
     return float(np.degrees(np.arccos(np.clip(up, -1, 1))))
 
@@ -74,111 +127,162 @@ def flat_angle(tangent_normals: np.ndarray) -> float:
 def make_maps(
     texels: Texels,
     values: dict[str, np.ndarray],
-    *,
     occlusion: np.ndarray | None = None,
-    bits: int = 8,
-    padding: int | None = None,
-    normal_map: str = "auto",
-    least_alpha: float = 0.5 / 255,
-    threads: int = 1,
+    options: MapOptions = MapOptions(),
 ) -> Maps:
-    """Maps of what texels read (bake.Baked.values): albedo, roughness, metallic, tangent_normal, perhaps alpha,
-    emissive (n, 3) linear, height (n,) in the target's units, confidence (n,) in [0, 1].
+    """Make the maps of what n texels read.
 
-    occlusion (n,) or None. normal_map "auto" leaves a flat map out. Gutters are filled over `padding` texels,
-    everywhere when None. Color of less alpha than least_alpha is never seen: it is filled like a gutter, or filtering
-    would draw what painters leave there, black mostly, around all that is seen."""
-    from gdtool.images.color import linear_from_srgb, srgb_from_linear
+    Args:
+        texels: where they lie.
+        values: as bake.Baked.values: albedo, roughness, metallic, tangent_normal, and perhaps alpha, emissive (n, 3)
+            linear, height (n,) in the target's units, confidence (n,) in [0, 1].
+        occlusion: (n,) ambient occlusion, 1 where nothing is occluded.
+        options: how to store them.
+    """
+    from gdtool.images.color import srgb_from_linear
 
-    inside = slice(0, texels.inside)
-    skipped: list[tuple[str, str]] = []
-    layers: dict[str, list[np.ndarray | None]] = {}
+    layers = _Layers()
     color = [values["albedo"][:, k] for k in range(3)]
-    alpha = np.clip(values["alpha"], 0, 1) if "alpha" in values else None
-    if alpha is not None and alpha[inside].min() >= 1 - CONSTANT_RANGE:
-        alpha = None
-        skipped.append(("alpha", "opaque everywhere"))
-    constants = (
-        [constant_of(channel[inside], encoding=srgb_from_linear) for channel in color] if alpha is None else [None]
-    )
-    if any(constant is None for constant in constants):
-        factors: dict[str, tuple[float, ...]] = {"base_color": (1.0, 1.0, 1.0, 1.0)}
-        layers["base_color"] = color if alpha is None else [*color, alpha]
-    else:
-        factors = {"base_color": (*(round(float(x), 6) for x in linear_from_srgb(np.array(constants))), 1.0)}
-        skipped.append(("base_color map", "base color is constant: a factor says it"))
-    packed: list[np.ndarray | None] = [None, None, None]
-    for channel, name in ((1, "roughness"), (2, "metallic")):
-        constant = constant_of(values[name][inside])
-        if constant is None:
-            factors[name] = (1.0,)
-            packed[channel] = values[name]
-        else:
-            factors[name] = (round(float(constant), 6),)
-    varies = any(channel is not None for channel in packed)
-    if not varies:
-        skipped.append(("roughness and metallic map", "both are constant: factors say them"))
-    open_everywhere = occlusion is not None and occlusion[inside].min(initial=1) > 1 - 2 / 255
-    if open_everywhere:
-        skipped.append(("occlusion map", "nothing is occluded"))
-    has_occlusion = occlusion is not None and not open_everywhere
-    if has_occlusion:
-        packed[0] = occlusion
-    if varies or has_occlusion:
-        layers["orm"] = packed
-    angle = flat_angle(values["tangent_normal"][inside])
-    if normal_map == "on" or (normal_map == "auto" and angle > FLAT_DEGREES):
-        layers["normal"] = list(np.moveaxis(values["tangent_normal"], -1, 0))
-    elif normal_map == "auto":
-        skipped.append(("normal map", f"would be flat: {angle:.2f} degrees"))
-    if "emissive" in values and (top := float(values["emissive"][inside].max(initial=0))) > CONSTANT_RANGE:
-        shining = [values["emissive"][:, k] / np.float32(top) for k in range(3)]
-        constants = [constant_of(channel[inside], encoding=srgb_from_linear) for channel in shining]
-        if any(constant is None for constant in constants):
-            factors["emissive"], layers["emissive"] = (round(top, 6),) * 3, shining
-        else:
-            factors["emissive"] = tuple(round(float(x) * top, 6) for x in linear_from_srgb(np.array(constants)))
-            skipped.append(("emissive map", "emission is constant: a factor says it"))
-    if "height" in values:
-        reach = max(float(np.abs(values["height"][inside]).max(initial=0)), 1e-6)
-        factors["height"], layers["height"] = (reach,), [0.5 + 0.5 * values["height"] / np.float32(reach)]
-    if "confidence" in values:
-        layers["confidence"] = [values["confidence"]]
-    gutters = Gutters(texels.mask(), padding)
+    alpha = _add_base_color(layers, texels, values, color)
+    has_roughness_metallic, has_occlusion = _add_orm(layers, texels, values, occlusion)
+    _add_normal(layers, texels, values, options)
+    _add_emissive(layers, texels, values)
+    _add_extra(layers, texels, values)
+    gutters = Gutters(texels.mask(), options.padding)
     planes = {
         name: [
             _Plane(channel, gutters, srgb_from_linear if name in ("base_color", "emissive") and k < 3 else None)
             # Alpha, the fourth channel, is never sRGB.
-            for k, channel in enumerate(layer)
+            for k, channel in enumerate(channels)
         ]
-        for name, layer in layers.items()
+        for name, channels in layers.channels.items()
     }
-    if alpha is not None and (hidden := alpha < least_alpha).any() and not hidden.all():
-        seen = Gutters(texels.image(~hidden), padding)
+    if alpha is not None and (hidden := alpha < options.least_alpha).any() and not hidden.all():
+        seen = Gutters(texels.image(~hidden), options.padding)
         planes["base_color"][:3] = [
             _Plane(np.where(hidden, np.float32(0), channel), seen, srgb_from_linear) for channel in color
         ]
     start = time.perf_counter()
-    stored = _stored(texels, planes, {name: HEIGHT_BITS if name == "height" else bits for name in planes}, threads)
-    one = (time.perf_counter() - start) / len(stored) if stored else None
+    bits = {name: HEIGHT_BITS if name == "height" else options.bits for name in planes}
+    stored = _stored(texels, planes, bits, options.threads)
+    each = (time.perf_counter() - start) / len(stored) if stored else None
     return Maps(
         texels.size,
         stored.get("base_color"),
         stored.get("orm"),
         stored.get("normal"),
-        factors,
+        layers.factors,
         has_occlusion,
-        varies,
+        has_roughness_metallic,
         stored.get("emissive"),
         {name: stored[name] for name in ("height", "confidence") if name in stored},
-        [(what, why, one if what.endswith("map") else None) for what, why in skipped],
+        [SkippedMap(what, why, each if what.endswith("map") else None) for what, why in layers.skipped],
     )
+
+
+@dataclass
+class _Layers:
+    """Maps while they are chosen: channels (n,) of each that is stored, factors, and what is left out and why.
+
+    A channel that is None is 1 everywhere.
+    """
+
+    channels: dict[str, list[np.ndarray | None]] = field(default_factory=dict)
+    factors: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    skipped: list[tuple[str, str]] = field(default_factory=list)
+
+
+def _add_base_color(
+    layers: _Layers, texels: Texels, values: dict[str, np.ndarray], color: list[np.ndarray]
+) -> np.ndarray | None:
+    """Add base color, as a map or a factor; returns alpha (n,), None where everything is opaque."""
+    from gdtool.images.color import linear_from_srgb, srgb_from_linear
+
+    inside = slice(0, texels.inside)
+    alpha = np.clip(values["alpha"], 0, 1) if "alpha" in values else None
+    if alpha is not None and alpha[inside].min() >= 1 - CONSTANT_RANGE:
+        alpha = None
+        layers.skipped.append(("alpha", "opaque everywhere"))
+    constants = (
+        [constant_of(channel[inside], encoding=srgb_from_linear) for channel in color] if alpha is None else [None]
+    )
+    if any(constant is None for constant in constants):
+        layers.factors["base_color"] = (1.0, 1.0, 1.0, 1.0)
+        layers.channels["base_color"] = color if alpha is None else [*color, alpha]
+    else:
+        layers.factors["base_color"] = (*(round(float(x), 6) for x in linear_from_srgb(np.array(constants))), 1.0)
+        layers.skipped.append(("base_color map", "base color is constant: a factor says it"))
+    return alpha
+
+
+def _add_orm(
+    layers: _Layers, texels: Texels, values: dict[str, np.ndarray], occlusion: np.ndarray | None
+) -> tuple[bool, bool]:
+    """Add roughness, metallic and occlusion; returns whether roughness or metallic varies, and occlusion is stored."""
+    inside = slice(0, texels.inside)
+    packed: list[np.ndarray | None] = [None, None, None]
+    for channel, name in ((1, "roughness"), (2, "metallic")):
+        constant = constant_of(values[name][inside])
+        if constant is None:
+            layers.factors[name] = (1.0,)
+            packed[channel] = values[name]
+        else:
+            layers.factors[name] = (round(float(constant), 6),)
+    varies = any(channel is not None for channel in packed)
+    if not varies:
+        layers.skipped.append(("roughness and metallic map", "both are constant: factors say them"))
+    open_everywhere = occlusion is not None and occlusion[inside].min(initial=1) > 1 - 2 / 255
+    if open_everywhere:
+        layers.skipped.append(("occlusion map", "nothing is occluded"))
+    has_occlusion = occlusion is not None and not open_everywhere
+    if has_occlusion:
+        packed[0] = occlusion
+    if varies or has_occlusion:
+        layers.channels["orm"] = packed
+    return varies, has_occlusion
+
+
+def _add_normal(layers: _Layers, texels: Texels, values: dict[str, np.ndarray], options: MapOptions) -> None:
+    """Add the normal map, unless options leave it out."""
+    angle = flat_angle(values["tangent_normal"][: texels.inside])
+    if options.normal_map == "on" or (options.normal_map == "auto" and angle > FLAT_DEGREES):
+        layers.channels["normal"] = list(np.moveaxis(values["tangent_normal"], -1, 0))
+    elif options.normal_map == "auto":
+        layers.skipped.append(("normal map", f"would be flat: {angle:.2f} degrees"))
+
+
+def _add_emissive(layers: _Layers, texels: Texels, values: dict[str, np.ndarray]) -> None:
+    """Add emission, as a map scaled to [0, 1] with a factor, or as a factor alone."""
+    from gdtool.images.color import linear_from_srgb, srgb_from_linear
+
+    inside = slice(0, texels.inside)
+    if "emissive" not in values or (top := float(values["emissive"][inside].max(initial=0))) <= CONSTANT_RANGE:
+        return
+    scaled = [values["emissive"][:, k] / np.float32(top) for k in range(3)]
+    constants = [constant_of(channel[inside], encoding=srgb_from_linear) for channel in scaled]
+    if any(constant is None for constant in constants):
+        layers.factors["emissive"], layers.channels["emissive"] = (round(top, 6),) * 3, scaled
+    else:
+        layers.factors["emissive"] = tuple(round(float(x) * top, 6) for x in linear_from_srgb(np.array(constants)))
+        layers.skipped.append(("emissive map", "emission is constant: a factor says it"))
+
+
+def _add_extra(layers: _Layers, texels: Texels, values: dict[str, np.ndarray]) -> None:
+    """Add the height and confidence maps where their values are there."""
+    if "height" in values:
+        reach = max(float(np.abs(values["height"][: texels.inside]).max(initial=0)), 1e-6)
+        layers.factors["height"] = (reach,)
+        layers.channels["height"] = [0.5 + 0.5 * values["height"] / np.float32(reach)]
+    if "confidence" in values:
+        layers.channels["confidence"] = [values["confidence"]]
 
 
 @dataclass(frozen=True)
 class _Plane:
-    """One channel of a map: values (n,) in [0, 1], or of a unit vector; None for 1 everywhere. encoding: what they are
-    put through first."""
+    """One channel of a map.
+
+    values (n,) in [0, 1], or a component of unit vectors; None for 1 everywhere. encoding: applied before storing.
+    """
 
     values: np.ndarray | None
     gutters: Gutters
@@ -188,8 +292,10 @@ class _Plane:
 def _stored(
     texels: Texels, layers: dict[str, list[_Plane]], bits: dict[str, int], threads: int
 ) -> dict[str, np.ndarray]:
-    """(s, s, c) uint8 or uint16 of each layer's channels, gutters filled; "normal" is stored as 0.5 n + 0.5 of unit
-    vectors."""
+    """Store each layer's channels as (s, s, c) uint8 or uint16, gutters filled.
+
+    "normal" is made unit after filling, and stored as 0.5 n + 0.5.
+    """
     out = {
         name: np.empty((texels.size, texels.size, len(layer)), np.uint8 if bits[name] == 8 else np.uint16)
         for name, layer in layers.items()
@@ -228,14 +334,14 @@ def _stored(
 
 
 def directx(normal: np.ndarray) -> np.ndarray:
-    """A stored normal map with its green channel turned: +Y down."""
+    """Return a stored normal map with its green channel inverted, +Y down."""
     out = normal.copy()
     out[..., 1] = np.iinfo(normal.dtype).max - normal[..., 1]
     return out
 
 
 def contact_sheet_of(maps: Maps, width: int = 384) -> np.ndarray:
-    """(h, w, 3) uint8 picture of the maps side by side, channels of the packed one apart; factors as plain squares."""
+    """Show the maps side by side, channels of the packed one apart and factors as squares: (h, w, 3) uint8."""
     from gdtool.images.color import srgb_from_linear
     from gdtool.images.contact import contact_sheet
 

@@ -1,4 +1,4 @@
-"""Ambient occlusion: the share of the cosine-weighted hemisphere that a surface point sees open."""
+"""Bake ambient occlusion: the unoccluded share of the cosine-weighted hemisphere over a surface point."""
 
 from __future__ import annotations
 
@@ -7,24 +7,16 @@ import numpy as np
 from gdtool.bake.target import TEXELS_AT_ONCE, Target, Texels, surface_at, texels_of
 from gdtool.core.threads import mapped
 from gdtool.geometry.tangents import dot, unit
+from gdtool.shading.sampling import orthonormal_basis
 
 
 def cosine_directions(count: int) -> np.ndarray:
-    """(count, 2) points of the unit square: an R2 low-discrepancy sequence (Roberts 2018)."""
+    """Make (count, 2) points of the unit square, by the R2 low-discrepancy sequence (Roberts 2018)."""
     golden = 1.32471795724474602596
     return (0.5 + np.arange(1, count + 1)[:, None] * np.array([1 / golden, 1 / golden**2])) % 1.0
 
 
-def _basis(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors (n, 3) that make a right-handed frame with unit normals (n, 3) (Duff et al. 2017)."""
-    x, y, z = normals.T
-    sign = np.where(z < 0, -1, 1).astype(normals.dtype)
-    a = -1 / (sign + z)
-    b = x * y * a
-    return np.stack([1 + sign * x * x * a, sign * b, -sign * x], 1), np.stack([b, sign + y * y * a, -y], 1)
-
-
-def openness(
+def ambient_visibility(
     points: np.ndarray,
     normals: np.ndarray,
     caster,
@@ -33,40 +25,42 @@ def openness(
     reach: float = np.inf,
     lift: float = 1e-4,
 ) -> np.ndarray:
-    """(n,) float32 in [0, 1]: share of ray_count cosine-distributed rays from points (n, 3) that leave the surface.
+    """Trace the share of ray_count cosine-distributed rays from points (n, 3) that leave the surface: (n,) in [0, 1].
 
-    caster is a geometry.quick_rays.QuickCaster. Rays start `lift` above the surface and are blocked within reach only.
+    normals (n, 3) unit; caster is a geometry.quick_rays.QuickCaster. Rays start `lift` above the surface, and only what
+    lies within reach blocks them.
     """
     rng = np.random.default_rng(seed)
     normals = normals.astype(np.float32)
     turn, shift = rng.random(len(points), np.float32) * np.float32(2 * np.pi), rng.random(len(points), np.float32)
-    # The pattern is turned by an angle of the point's own once, instead of every direction for every ray.
-    one, two = _basis(normals)
+    # Each point's basis is turned once by a random angle, instead of every ray's direction.
+    tangent, bitangent = (np.stack(axis, 1) for axis in orthonormal_basis(*normals.T))
     cosine, sine = np.cos(turn)[:, None], np.sin(turn)[:, None]
-    one, two = cosine * one + sine * two, cosine * two - sine * one
+    tangent, bitangent = cosine * tangent + sine * bitangent, cosine * bitangent - sine * tangent
     origins = points + normals * points.dtype.type(lift)
     blocked = np.zeros(len(points), np.int32)
     for square, angle in cosine_directions(ray_count) * (1, 2 * np.pi):
         radius = (shift + np.float32(square)) % np.float32(1)
         up, radius = np.sqrt(1 - radius)[:, None], np.sqrt(radius)[:, None]
-        across = np.float32(np.cos(angle)) * one + np.float32(np.sin(angle)) * two
+        across = np.float32(np.cos(angle)) * tangent + np.float32(np.sin(angle)) * bitangent
         blocked += caster.quick_occluded(origins, radius * across + up * normals, reach)
     return (1 - blocked / ray_count).astype(np.float32)
 
 
 def bake_occlusion(target: Target, texels: Texels, trace, scale: int = 4, threads: int = 1) -> np.ndarray:
-    """Occlusion (n,) float32 for texels, traced at 1/scale of the map's size and upsampled along the surface.
+    """Bake ambient visibility (n,) float32 of texels: traced at 1/scale of the map's size, and upsampled.
 
-    trace(face_idx, barycentric) -> (m,) gives the occlusion at places on the target. A coarse texel helps a fine one
-    only when it lies near it in space and its surface looks the same way, so nothing leaks from one chart, or one side
-    of an edge, to another. Fine texels that no coarse one helps are traced."""
+    trace(face_idx, barycentric) -> (m,) gives the ambient visibility at places on the target. The upsampling is joint
+    bilateral: a coarse texel counts for a fine one only where it is near in space and faces the same way. So nothing
+    leaks between charts or across an edge. Fine texels without a similar coarse one are traced.
+    """
     size = texels.size
     coarse = texels_of(target, max(1, -(-size // scale)), rings=0)
     slot = np.full(coarse.size * coarse.size, -1, np.int32)
     slot[coarse.texel] = np.arange(len(coarse), dtype=np.int32)
     at, facing, _, _ = surface_at(target, coarse.face_idx, coarse.barycentric)
     spacing = np.float32(_spacing(at, slot.reshape(coarse.size, coarse.size)))
-    # Position in spacings, direction and occlusion of each: one gather reads all.
+    # Of each coarse texel: position in units of the spacing, normal and visibility; one gather reads all.
     known = np.concatenate([at / spacing, unit(facing), trace(coarse.face_idx, coarse.barycentric)[:, None]], 1)
     known[:, 6] = _smoothed(known, slot.reshape(coarse.size, coarse.size))
     out = np.zeros(len(texels), np.float32)
@@ -74,7 +68,7 @@ def bake_occlusion(target: Target, texels: Texels, trace, scale: int = 4, thread
 
     def run(part: slice) -> None:
         at, facing, _, _ = surface_at(target, texels.face_idx[part], texels.barycentric[part])
-        own = np.concatenate([at / spacing, unit(facing)], 1)
+        fine = np.concatenate([at / spacing, unit(facing)], 1)
         row, column = np.divmod(texels.texel[part], size)
         u = (column.astype(np.float32) + np.float32(0.5)) * np.float32(coarse.size / size) - np.float32(0.5)
         v = (row.astype(np.float32) + np.float32(0.5)) * np.float32(coarse.size / size) - np.float32(0.5)
@@ -85,7 +79,7 @@ def bake_occlusion(target: Target, texels: Texels, trace, scale: int = 4, thread
             k = slot[np.clip(r0 + dr, 0, coarse.size - 1) * coarse.size + np.clip(c0 + dc, 0, coarse.size - 1)]
             share = (u if dc else 1 - u) * (v if dr else 1 - v) + np.float32(1e-3)
             near = np.take(known, k, axis=0)
-            weight = np.where(k >= 0, share * _kinship(near, own), np.float32(0))
+            weight = np.where(k >= 0, share * _similarity(near, fine), np.float32(0))
             total += weight
             value += weight * near[:, 6]
         helped[part] = total > 1e-5
@@ -97,13 +91,13 @@ def bake_occlusion(target: Target, texels: Texels, trace, scale: int = 4, thread
     alone = np.flatnonzero(~helped[: texels.inside])
     if len(alone):
         out[alone] = trace(texels.face_idx[alone], texels.barycentric[alone])
-    # Beyond a crease the surface goes on in another direction: around charts the inside is continued instead.
+    # Beyond a crease the surface faces elsewhere: the rings around charts continue their inside instead.
     continue_into_rings(texels, out)
     return out
 
 
 def continue_into_rings(texels: Texels, values: np.ndarray) -> None:
-    """Give the texels around the charts the mean of their neighbours' values (n,), inner ones first; changes values."""
+    """Fill the rings around the charts, inner ones first, by means of known neighbours; changes values (n,)."""
     size, ring = texels.size, texels.texel[texels.inside :]
     slot = np.full((size + 2) * (size + 2), -1, np.int32)
     place = (texels.texel // size + 1) * (size + 2) + texels.texel % size + 1
@@ -122,30 +116,29 @@ def continue_into_rings(texels: Texels, values: np.ndarray) -> None:
         waiting = waiting[~reached]
 
 
-def _kinship(near: np.ndarray, own: np.ndarray, wider: float = 1.0, reach: float = 3.0) -> np.ndarray:
-    """(n,) in [0, 1]: how much a place says about another one; 0 beyond reach spacings, which are `wider` times as
-    large.
+def _similarity(near: np.ndarray, other: np.ndarray, wider: float = 1.0, reach: float = 3.0) -> np.ndarray:
+    """Weight pairs of places by distance and normal: (n,) in [0, 1], 0 at `reach` spacings times `wider`.
 
-    near and own (n, 6 or more): position in spacings, unit direction.
+    near and other (n, 6 or more): position in units of the spacing, and unit normal.
     """
-    offset = near[:, :3] - own[:, :3]
+    offset = near[:, :3] - other[:, :3]
     apart = dot(offset, offset) * np.float32(1 / wider**2)
-    alike = np.clip(dot(near[:, 3:6], own[:, 3:6]), 0, 1)
+    alike = np.clip(dot(near[:, 3:6], other[:, 3:6]), 0, 1)
     alike *= alike
     return np.where(apart < np.float32(reach**2), alike * alike * np.exp(np.float32(-0.5) * apart), np.float32(0))
 
 
 def _smoothed(known: np.ndarray, slot: np.ndarray) -> np.ndarray:
-    """known[:, 6] (m,) averaged over the 5 x 5 coarse texels around each, as far as they are of one piece of surface.
+    """Denoise known[:, 6] (m,) over 5 x 5 coarse texels, each weighted by its similarity in space and normal.
 
-    slot (s, s) is the index of each coarse texel, -1 where there is none. Takes out most of the noise of few rays.
+    slot (s, s) is the index of each coarse texel, -1 where there is none. Removes most of the noise of few rays.
     """
     row, column = np.nonzero(slot >= 0)
-    own = slot[row, column]
+    texel = slot[row, column]
     padded = np.pad(slot, 2, constant_values=-1)
     out = known[:, 6].copy()
-    for start in range(0, len(own), TEXELS_AT_ONCE):
-        here = own[start : start + TEXELS_AT_ONCE]
+    for start in range(0, len(texel), TEXELS_AT_ONCE):
+        here = texel[start : start + TEXELS_AT_ONCE]
         r, c, mine = row[start : start + TEXELS_AT_ONCE], column[start : start + TEXELS_AT_ONCE], known[here]
         total, value = np.ones(len(here), np.float32), mine[:, 6].copy()
         for dr in range(-2, 3):
@@ -154,8 +147,8 @@ def _smoothed(known: np.ndarray, slot: np.ndarray) -> np.ndarray:
                     continue
                 k = padded[r + 2 + dr, c + 2 + dc]
                 near = np.take(known, k, axis=0)
-                # Wider than for interpolation: noise is to be averaged, and occlusion varies slowly.
-                weight = np.where(k >= 0, _kinship(near, mine, wider=2.0), np.float32(0))
+                # Wider than for upsampling: occlusion varies slowly, and more neighbours take out more noise.
+                weight = np.where(k >= 0, _similarity(near, mine, wider=2.0), np.float32(0))
                 total += weight
                 value += weight * near[:, 6]
         out[here] = value / total
@@ -163,7 +156,7 @@ def _smoothed(known: np.ndarray, slot: np.ndarray) -> np.ndarray:
 
 
 def _spacing(at: np.ndarray, slot: np.ndarray) -> float:
-    """What a coarse texel spans in space: the typical distance between neighbours of one chart."""
+    """Estimate the width of a coarse texel in space: the median distance between horizontal neighbours."""
     left, right = slot[:, :-1], slot[:, 1:]
     both = (left >= 0) & (right >= 0)
     if not both.any():

@@ -1,4 +1,4 @@
-"""What a bake reads from: a surface with its views, or a model with its textures."""
+"""Prepare what a bake reads from: a surface with its views, or a model with its textures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from gdtool.assets.scene import Scene
 from gdtool.bake.picture import Picture
 from gdtool.bake.pipeline import Lookup, ViewsOfSource, vertex_lookup, with_views
-from gdtool.bake.project_views import pixel_footprint, sight_of
+from gdtool.bake.project_views import pixel_footprint, view_visibility
 from gdtool.bake.reproject import Places, Source
 from gdtool.folders.surface import Surface
 from gdtool.folders.views import Views
@@ -22,11 +22,12 @@ from gdtool.geometry.tangents import dot
 
 @dataclass(frozen=True)
 class Origin:
-    """A source in the normalised frame, its material lookup, its vertex normals (v, 3), and how its surface is drawn.
+    """A source in the normalised frame, its material lookup, its vertex normals (v, 3), and how viewers show it.
 
-    label says where materials come from, for the report. detail is the width of the finest detail that the source
-    holds, in the normalised frame: a texel of its textures, half a pixel of its views, a pixel of the picture they were
-    made of or half an edge of its mesh."""
+    label: where materials come from, for the report. detail: width of the finest detail that the source has, in the
+    normalised frame. It is a texel of its textures, half a pixel of its views, a pixel of the picture they were
+    generated from, or half an edge of its mesh.
+    """
 
     source: Source
     lookup: Lookup
@@ -39,10 +40,10 @@ class Origin:
 
 
 def material_field(path: Path, device: str = "cpu") -> Callable[[np.ndarray], dict[str, np.ndarray]]:
-    """The material network of a surface's field.safetensors: points (n, 3) to albedo (n, 3), roughness (n,), metallic
-    (n,).
+    """Load the material network of a surface's field.safetensors, as a function of points (n, 3).
 
-    Raises InputError for a file that is damaged or holds another network.
+    The function returns albedo (n, 3), roughness (n,) and metallic (n,). Raises InputError for a file that is damaged
+    or holds another network.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
@@ -65,11 +66,11 @@ def material_field(path: Path, device: str = "cpu") -> Callable[[np.ndarray], di
         ) from None
     network = network.to(device).eval()
 
-    def at(points: np.ndarray) -> dict[str, np.ndarray]:
+    def materials_at(points: np.ndarray) -> dict[str, np.ndarray]:
         out = network_materials(network, points, device)
         return {name: value if name == "albedo" else value[:, 0] for name, value in out.items()}
 
-    return at
+    return materials_at
 
 
 def from_surface(
@@ -78,10 +79,11 @@ def from_surface(
     field: Callable[[np.ndarray], dict[str, np.ndarray]] | None = None,
     picture: Picture | None = None,
 ) -> Origin:
-    """A surface; views give material and normals where they see it well, its vertices elsewhere.
+    """Prepare a surface: views give material and normals where they see it well, its vertices elsewhere.
 
-    field (material_field) takes the vertices' place for the materials that no view shows. picture: what one of the
-    views was made of, for its finer detail."""
+    field (material_field) replaces the vertices for materials that the views lack. picture: the one that the views were
+    generated from, for its finer detail.
+    """
     source = Source(surface.vertices, surface.faces)
     normals = surface.normals if surface.normals is not None else vertex_normals(surface.vertices, surface.faces)
     attributes = {
@@ -94,16 +96,18 @@ def from_surface(
     images = dict(views.images) if views is not None else {}
     label = "vertices"
     if field is not None:
-        shown = [name for name in ("albedo", "roughness", "metallic") if name not in images]
-        if shown:
-            lookup, label = _with_field(lookup, source, field, shown), "field: " + " ".join(shown)
+        missing = [name for name in ("albedo", "roughness", "metallic") if name not in images]
+        if missing:
+            lookup, label = _with_field(lookup, source, field, missing), "field: " + " ".join(missing)
     if "normal" in images and not _views_are_finer(views, source):
         del images["normal"]
     detail = 0.5 * _edge(source)
     if not images:
         return Origin(source, lookup, normals, label, detail=detail)
-    sights = [sight_of(camera, source.caster, mask) for camera, mask in zip(views.cameras, views.mask, strict=True)]
-    lookup, domains = with_views(lookup, source, ViewsOfSource(sights, images, views.mask, picture))
+    visibilities = [
+        view_visibility(camera, source.caster, mask) for camera, mask in zip(views.cameras, views.mask, strict=True)
+    ]
+    lookup, domains = with_views(lookup, source, ViewsOfSource(visibilities, images, views.mask, picture))
     label = ("" if label == "vertices" else label + ", ") + "views: " + " ".join(domains)
     detail = min(detail, 0.5 * _view_pixel(views))
     if picture is not None and "albedo" in domains:
@@ -114,33 +118,37 @@ def from_surface(
 def _with_field(
     lookup: Lookup, source: Source, field: Callable[[np.ndarray], dict[str, np.ndarray]], names: list[str]
 ) -> Lookup:
-    def looked(places: Places) -> dict[str, np.ndarray]:
+    """Make a lookup that takes the named materials from a field, the rest from lookup."""
+
+    def with_field(places: Places) -> dict[str, np.ndarray]:
         read = field(source.at(places.face_idx, places.barycentric, source.vertices))
         return {**lookup(places), **{name: read[name] for name in names}}
 
-    return looked
+    return with_field
 
 
 def _views_are_finer(views: Views, source: Source) -> bool:
-    """Whether a view's pixel is no larger than the surface's typical edge, so that its normals can hold more detail."""
+    """Tell whether view normals can hold more detail: a pixel spans at most 1.5 times the surface's typical edge."""
     return _view_pixel(views) <= 1.5 * _edge(source)
 
 
 def _edge(source: Source) -> float:
-    """Typical edge of the source's triangles."""
+    """Measure the median edge length of the source's triangles."""
     corners = source.vertices[source.faces]
     return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1)))
 
 
 def _view_pixel(views: Views) -> float:
-    """What a view's pixel spans in the middle of its depth range."""
+    """Compute the width of a view's pixel in the middle of its depth range."""
     camera = views.cameras[0]
     return float(pixel_footprint(camera, (camera.near + camera.far) / 2))
 
 
 def texture_detail(scene: Scene) -> float | None:
-    """What a texel of a scene's finest textures spans on its surface, in its units: the median over the area that has
-    textures; None where nothing has."""
+    """Measure the width of a texel of a scene's finest textures on its surface, in the scene's units.
+
+    The median over the textured area; None where nothing is textured.
+    """
     from gdtool.geometry.normals import face_normals
 
     area = face_normals(scene.vertices, scene.faces)[1]
@@ -153,11 +161,11 @@ def texture_detail(scene: Scene) -> float | None:
             material.normal_texture,
             material.emissive_texture,
         )
-        found = [t for t in textures if t is not None and t.uv_set < len(scene.uvs) and scene.uvs[t.uv_set] is not None]
-        if not found:
+        used = [t for t in textures if t is not None and t.uv_set < len(scene.uvs) and scene.uvs[t.uv_set] is not None]
+        if not used:
             continue
         density = np.zeros(int(faces.sum()))
-        for texture in found:
+        for texture in used:
             u, v = (
                 scene.uvs[texture.uv_set][scene.faces[faces][:, k]]
                 - scene.uvs[texture.uv_set][scene.faces[faces][:, 0]]
@@ -166,9 +174,9 @@ def texture_detail(scene: Scene) -> float | None:
             height, width = texture.image.shape[:2]
             covered = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) * abs(texture.scale[0] * texture.scale[1])
             density = np.maximum(density, covered * height * width)
-        there = (density > 0) & (area[faces] > 0)
-        widths.append(np.sqrt(area[faces][there] / density[there]))
-        weights.append(area[faces][there])
+        valid = (density > 0) & (area[faces] > 0)
+        widths.append(np.sqrt(area[faces][valid] / density[valid]))
+        weights.append(area[faces][valid])
     if not widths or not sum(map(len, widths)):
         return None
     spans, weight = np.concatenate(widths), np.concatenate(weights)
@@ -179,10 +187,11 @@ def texture_detail(scene: Scene) -> float | None:
 def from_scene(
     scene: Scene, source_from_world: np.ndarray, footprint: Callable[[float], float] = lambda detail: 0.0
 ) -> Origin:
-    """A model with its own textures, in its own frame; source_from_world (4, 4) takes the normalised frame there.
+    """Prepare a textured model in its file's frame; source_from_world (4, 4) maps the normalised frame to it.
 
-    footprint(detail) is the width, in the normalised frame, that the model's textures are averaged over where they are
-    read, when the model's detail (see Origin) is known."""
+    footprint(detail) is the width, in the normalised frame, over which the textures are averaged where they are read;
+    detail is the model's (see Origin).
+    """
     from gdtool.shading.render.surface_points import SurfaceLookup
 
     matrix = invert_similarity(source_from_world)
@@ -191,7 +200,7 @@ def from_scene(
     source = Source(transform_points(matrix, scene.vertices), scene.faces)
     normals = scene.normals @ turn.T if scene.normals is not None else vertex_normals(source.vertices, source.faces)
 
-    # Single precision places a texel of a 16384² texture within 1/1000 of itself, in half the time.
+    # Single precision is exact to 1/1000 of a texel of a 16384² texture, and takes half the time.
     points = SurfaceLookup(
         replace(
             scene,
@@ -199,16 +208,16 @@ def from_scene(
             uvs=tuple(None if uv is None else uv.astype(np.float32) for uv in scene.uvs),
         )
     )
-    own = texture_detail(scene)
-    # Vertex colors, or nothing but factors: the mesh says how fine it is.
-    detail = 0.5 * _edge(source) if own is None else own / float(np.sqrt((source_from_world[:3, 0] ** 2).sum()))
+    texel = texture_detail(scene)
+    # With vertex colors, or factors only, the mesh limits the detail.
+    detail = 0.5 * _edge(source) if texel is None else texel / float(np.sqrt((source_from_world[:3, 0] ** 2).sum()))
     width = footprint(detail) * np.sqrt((source_from_world[:3, 0] ** 2).sum())
 
     def lookup(places: Places) -> dict[str, np.ndarray]:
         read = points.attributes(places.face_idx, places.barycentric, np.full(len(places.face_idx), width, np.float32))
-        # einsum: a product of so thin matrices by BLAS keeps a second thread busy with waiting.
+        # einsum: for matrices this thin, BLAS keeps a second thread waiting busily.
         normal = read["normal"] if unturned else np.einsum("nk,ck->nc", read["normal"], turn)
-        # Files whose winding and normals disagree are common; the winding says which side is outside.
+        # Files whose winding and normals disagree are common: the winding decides which side is outside.
         inward = dot(normal, source.normals_of(places.face_idx)) < 0
         if inward.any():
             normal[inward] *= -1

@@ -1,4 +1,4 @@
-"""Filling the texels that no chart owns, so that filtering and mip levels never mix in a foreign colour."""
+"""Fill the texels that no chart covers, so that filtering and mip levels mix in no foreign color."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-_ROWS_AT_ONCE = 32  # few enough that what is computed of them stays in the cache
+_ROWS_AT_ONCE = 32  # few enough that intermediate rows stay in the cache
 
 
 class Gutters:
-    """Fills the texels outside a mask (h, w) from those inside; the mask's levels are made once for all channels.
+    """Fill the texels outside a mask (h, w) from those inside, by push and pull.
 
-    Averages of what is known are pushed up a pyramid, and pulled down into what is not (Gortler et al. 1996, "The
-    Lumigraph", section 3.5). Beyond `padding` texels from the mask all become the channel's mean inside; None: no
-    limit."""
+    Averages of known texels are pushed up a pyramid, and pulled down into unknown ones (Gortler et al. 1996, "The
+    Lumigraph", section 3.5). Texels more than `padding` away from the mask get the channel's mean inside; None: no
+    limit. The pyramid of weights is made once for all channels.
+    """
 
     def __init__(self, mask: np.ndarray, padding: int | None = None):
         self.mask = np.asarray(mask, bool)
@@ -24,7 +25,7 @@ class Gutters:
             from scipy.ndimage import distance_transform_edt
 
             self._far = distance_transform_edt(self._empty) > padding
-        # Above the finest level, where a texel is known or not: weights, and what the sums of a level are divided by.
+        # For each level above the finest: weights in [0, 1], and the inverse of the sum of weights below.
         self._weights: list[np.ndarray] = []
         self._inverse: list[np.ndarray] = []
         weight = self.mask.astype(np.float32)
@@ -35,7 +36,7 @@ class Gutters:
             self._weights.append(weight)
 
     def fill(self, channel: np.ndarray, background: float | None = None) -> np.ndarray:
-        """channel (h, w) float32, 0 outside the mask, is filled and given back. background takes the mean's place."""
+        """Fill a channel (h, w) float32, 0 outside the mask, in place; background replaces the mean. Returns it."""
         if not self._weights:
             return channel
         if self._far is not None and background is None:
@@ -57,7 +58,7 @@ class Gutters:
 
 
 def _summed(image: np.ndarray) -> np.ndarray:
-    """Sums over 2 x 2 texels of (h, w); an odd last row or column counts alone."""
+    """Sum 2 x 2 texels of (h, w); an odd last row or column is padded with 0."""
     height, width = image.shape
     if height % 2 or width % 2:
         image = np.pad(image, ((0, height % 2), (0, width % 2)))
@@ -66,7 +67,7 @@ def _summed(image: np.ndarray) -> np.ndarray:
 
 
 def _doubled(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """image (h, w) at twice the size, cut to shape, between texels linear."""
+    """Enlarge an image (h, w) twofold, linearly, and crop it to shape."""
     out = np.empty(shape, image.dtype)
     for rows, band in _doubled_rows(image, shape):
         out[rows] = band
@@ -74,8 +75,10 @@ def _doubled(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _doubled_rows(image: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[slice, np.ndarray]]:
-    """_doubled's rows, some at a time. A texel's centre lies a quarter of a coarse texel from its parent's, so weights
-    are three quarters and one."""
+    """Yield the rows of _doubled in bands.
+
+    A texel's centre lies a quarter of a coarse texel from its parent's: linear weights are 3/4 and 1/4.
+    """
     height, width = image.shape
     for first in range(0, height, _ROWS_AT_ONCE):
         rows = np.arange(first, min(first + _ROWS_AT_ONCE, height))
@@ -92,17 +95,19 @@ def _doubled_rows(image: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[s
 
 
 def push_pull(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """(h, w, c) or (h, w) float32: image with the texels outside mask (h, w) filled from those inside, which stay as
-    they are. An all-empty mask gives the image back."""
+    """Fill all texels outside mask (h, w) from those inside: image (h, w, c) or (h, w), float32.
+
+    An empty mask returns the image unchanged.
+    """
     return fill_gutters(image, mask)
 
 
 def fill_gutters(
     image: np.ndarray, mask: np.ndarray, padding: int | None = None, background: float | None = None
 ) -> np.ndarray:
-    """Fill `padding` texels around the charts (all texels when None); farther ones get background (default: the mean).
+    """Fill `padding` texels around the mask, all texels when None; farther ones get background, else the mean.
 
-    image (h, w, c) or (h, w) float, mask (h, w) bool of the texels that are known.
+    image (h, w, c) or (h, w) float; mask (h, w) bool of the known texels, which stay unchanged.
     """
     mask = np.asarray(mask, bool)
     if not mask.any() or mask.all():

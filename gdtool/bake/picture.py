@@ -1,10 +1,11 @@
-"""What the picture that views were made of adds to them: it is finer than the view that shows the same.
+"""Add fine detail to a view's albedo from the picture that the views were generated from.
 
-High-pass modulation with a local gain, by which satellites' sharp grey images sharpen their coarse colored ones (Vivone
-et al., "A Critical Comparison Among Pansharpening Algorithms", 2015): what the picture has in finer pixels over what it
-has in the view's is a factor on the view's albedo. How far it is paint and not light is told by the next coarser
-detail: the gain is the regression of the view's albedo, whose light was taken out, on the picture, both at the view's
-size."""
+The picture is finer than the view that shows the same. This is high-pass modulation with a local gain, as in
+pansharpening of satellite images (Vivone et al. 2015, "A Critical Comparison Among Pansharpening Algorithms"). The
+ratio of the picture to itself blurred to the view's resolution is a factor on the view's albedo. The gain says how much
+of the detail is paint and how much is light. It is the local regression of the view's albedo, which has no light in it,
+on the picture, both at the view's resolution.
+"""
 
 from __future__ import annotations
 
@@ -17,27 +18,30 @@ from gdtool.fields.views.prepared_view import bilinear
 from gdtool.images.detail import DARK, detail_gain
 from gdtool.images.metrics import resized
 
-MOST = 4.0  # as a factor, and one over it the least
+MAX_FACTOR = 4.0  # largest factor on the albedo; the smallest is its inverse
 
 
 @dataclass(frozen=True)
 class Picture:
-    """factor (h, w, 3) float32, linear, in the frame of camera, the view's; finer: pixels of it across one of the
-    view's."""
+    """Factors (h, w, 3) float32 on linear albedo, in the image frame of the view's camera.
+
+    finer: how many of its pixels lie across one of the view's.
+    """
 
     factor: np.ndarray
     camera: Camera
     finer: int
 
     def at(self, points: np.ndarray) -> np.ndarray:
-        """The factors (n, 3) at points (n, 3) that the view sees."""
+        """Interpolate the factors (n, 3) at points (n, 3) that the view sees."""
         return bilinear(self.factor, project(self.camera, points)[0] * self.finer)
 
 
 def picture_of(image: np.ndarray, camera: Camera, albedo: np.ndarray) -> Picture:
-    """What image (H, W, 4), linear color and straight alpha, adds to a view's albedo (h, w, 3), linear, of camera.
+    """Compute the factors that an image (H, W, 4) adds to a view's albedo (h, w, 3).
 
-    H and W are the same multiple of h and w; both show the same.
+    The image has linear color and straight alpha, the albedo is linear. Both show the same; H and W are the same
+    multiple of h and w.
     """
     large, small = image.shape[:2], (camera.height, camera.width)
     weighted = np.concatenate([image[..., :3] * image[..., 3:], image[..., 3:]], -1)
@@ -52,5 +56,5 @@ def picture_of(image: np.ndarray, camera: Camera, albedo: np.ndarray) -> Picture
         1,
     )
     gain = resized(gain, *large)
-    factor = np.exp(np.clip(fine - coarse, -np.log(MOST), np.log(MOST)) * gain[..., None])
+    factor = np.exp(np.clip(fine - coarse, -np.log(MAX_FACTOR), np.log(MAX_FACTOR)) * gain[..., None])
     return Picture(np.where(shown, factor, 1).astype(np.float32), camera, large[0] // small[0])

@@ -1,4 +1,4 @@
-"""Baking: what each texel of a mesh's map reads from the surface the mesh stands for."""
+"""Bake what each texel of a mesh's map reads from the surface that the mesh stands for."""
 
 from __future__ import annotations
 
@@ -7,28 +7,29 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gdtool.bake.occlusion import openness
+from gdtool.bake.occlusion import ambient_visibility
 from gdtool.bake.picture import Picture
-from gdtool.bake.project_views import Sight, observe, steadiness
+from gdtool.bake.project_views import ViewStack, ViewVisibility, observe, silhouette_margin
 from gdtool.bake.reproject import Places, Source, reproject
 from gdtool.bake.supersample import supersample
 from gdtool.bake.target import TEXELS_AT_ONCE, Target, Texels, surface_at
 from gdtool.core.threads import mapped
 from gdtool.geometry.tangents import dot, encode_tangent_space, unit
 
-# Looks the material of places up: dict of albedo (n, 3) linear, roughness (n,), metallic (n,), normal (n, 3) unit in
-# world axes, and alpha (n,) where the source has one.
+# Looks the material of n places up: albedo (n, 3) linear, roughness (n,), metallic (n,), normal (n, 3) unit in world
+# axes, and alpha (n,) where the source has one.
 Lookup = Callable[[Places], dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class ViewsOfSource:
-    """Views of the source and what their cameras see of it.
+    """Views of the source, and what their cameras see of it.
 
-    images: domain (albedo linear, roughness, metallic, normal) to (k, h, w[, c]); mask (k, h, w); picture: what one of
-    them was made of."""
+    images: (k, h, w[, c]) by domain: albedo linear, roughness, metallic, normal. mask (k, h, w) coverage. picture: the
+    finer picture that one of the views was made from.
+    """
 
-    sights: list[Sight]
+    visibilities: list[ViewVisibility]
     images: dict[str, np.ndarray]
     mask: np.ndarray
     picture: Picture | None = None
@@ -36,21 +37,41 @@ class ViewsOfSource:
 
 @dataclass(frozen=True)
 class Baked:
-    """What the n texels read: values by name, float32; seen (n,) the views' confidence, None without views."""
+    """What n texels read: float32 values by name, and the views' confidence seen (n,), None without views.
+
+    report: figures for the manifest.
+    """
 
     values: dict[str, np.ndarray]
     seen: np.ndarray | None
     report: dict[str, float] = field(default_factory=dict)
 
+    def seen_share(self, inside: int) -> float:
+        """Compute the share of the first `inside` texels that views show with a confidence above one half."""
+        return 0.0 if self.seen is None else float((self.seen[:inside] > 0.5).mean())
+
+
+@dataclass(frozen=True)
+class BakeOptions:
+    """How to bake: samples per texel where neighbours differ (a square number), threads, and two more values to keep.
+
+    height: how far above the target, along its normal, the source lies. confidence: the lookup's confidence.
+    """
+
+    samples: int = 1
+    threads: int = 1
+    height: bool = False
+    confidence: bool = False
+
 
 def vertex_lookup(source: Source, attributes: dict[str, np.ndarray], normals: np.ndarray) -> Lookup:
-    """Lookup of attributes and unit normals (v, 3) per vertex of the source."""
+    """Make a lookup that interpolates attributes and unit normals (v, 3) of the source's vertices."""
 
     def lookup(places: Places) -> dict[str, np.ndarray]:
         out = {name: source.at(places.face_idx, places.barycentric, values) for name, values in attributes.items()}
         normal = source.at(places.face_idx, places.barycentric, normals)
         geometric = source.face_normals[places.face_idx]
-        # A vertex normal that points to the other side of its own face is damaged.
+        # A vertex normal that points to the other side of its face is damaged.
         out["normal"] = unit(np.where(dot(normal, geometric)[:, None] > 0, normal, geometric))
         return out
 
@@ -58,9 +79,9 @@ def vertex_lookup(source: Source, attributes: dict[str, np.ndarray], normals: np
 
 
 def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lookup, list[str]]:
-    """A lookup that reads the views where they see a place well, blended by their confidence into the given lookup.
+    """Make a lookup that reads the views, blended into the given lookup by their confidence.
 
-    Adds the entry "seen", the confidence (n,). Also returns the domains that come from views.
+    It adds the value "seen" (n,), the confidence. Also returns the domains that come from views.
     """
     from gdtool.images.color import linear_from_srgb, srgb_from_linear
 
@@ -74,46 +95,49 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
     channel = np.cumsum([0, *(image.shape[-1] for image in encoded.values())])
     pictured = None
     if views.picture is not None and "albedo" in domains:
-        pictured = next(k for k, sight in enumerate(views.sights) if sight.camera.name == views.picture.camera.name)
+        pictured = next(
+            k for k, visibility in enumerate(views.visibilities) if visibility.camera.name == views.picture.camera.name
+        )
 
-    def looked(places: Places) -> dict[str, np.ndarray]:
+    images = ViewStack(views.visibilities, stack, views.mask, pictured, channel[1])
+
+    def blended(places: Places) -> dict[str, np.ndarray]:
         out = dict(lookup(places))
         points = source.at(places.face_idx, places.barycentric, source.vertices)
         prior = [srgb_from_linear(out[d]) if d == "albedo" else out[d] for d in domains]
         prior = np.concatenate([p if p.ndim == 2 else p[:, None] for p in prior], 1)
-        value, seen, shares = observe(
-            points, out["normal"], views.sights, stack, views.mask, prior, known=pictured, colors=channel[1]
-        )
+        value, seen, shares = observe(points, out["normal"], images, prior)
         for k, domain in enumerate(domains):
-            own, read = prior[:, channel[k] : channel[k + 1]], value[:, channel[k] : channel[k + 1]]
+            base, read = prior[:, channel[k] : channel[k + 1]], value[:, channel[k] : channel[k + 1]]
             share = seen[:, None]
             if domain == "normal":
                 read = unit(read)
-                # A view's normal bends the surface's, it does not replace it: 60 degrees off is a mistake.
-                share = share * np.clip((dot(read, own)[:, None] - 0.5) / 0.2, 0, 1)
-            mixed = own + share * (read - own)
+                # A view's normal refines the surface's: one that is 60 degrees off is taken for a mistake.
+                share = share * np.clip((dot(read, base)[:, None] - 0.5) / 0.2, 0, 1)
+            mixed = base + share * (read - base)
             if domain == "normal":
                 mixed = unit(mixed)
             out[domain] = (
                 linear_from_srgb(mixed) if domain == "albedo" else mixed if out[domain].ndim == 2 else mixed[:, 0]
             )
         if pictured is not None:
-            _sharpen(out, points, views.picture, views.sights[pictured], seen * shares[pictured])
+            _sharpen(out, points, views.picture, views.visibilities[pictured], seen * shares[pictured])
         out["seen"] = seen
         if "confidence" in out:
             out["confidence"] = seen + (1 - seen) * out["confidence"]
         return out
 
-    return looked, domains
+    return blended, domains
 
 
-def _sharpen(out: dict[str, np.ndarray], points: np.ndarray, picture: Picture, sight: Sight, share: np.ndarray) -> None:
-    """Multiply what the picture has in finer pixels into the albedo of points (n, 3), by the share (n,) that its view
-    has in it.
+def _sharpen(
+    out: dict[str, np.ndarray], points: np.ndarray, picture: Picture, visibility: ViewVisibility, share: np.ndarray
+) -> None:
+    """Multiply the picture's fine detail into the albedo of points (n, 3), by its view's share (n,) in it.
 
-    What a metal shows is what it mirrors, and no detail of its own.
+    Metals are left out: what they show is a reflection, not detail of the material.
     """
-    share = share * steadiness(sight, points) * (1 - out["metallic"])
+    share = share * silhouette_margin(visibility, points) * (1 - out["metallic"])
     seen = np.flatnonzero(share > 0.01)
     out["albedo"] = np.array(out["albedo"], np.float32)
     out["albedo"][seen] = np.clip(out["albedo"][seen] * (1 + share[seen, None] * (picture.at(points[seen]) - 1)), 0, 1)
@@ -122,7 +146,10 @@ def _sharpen(out: dict[str, np.ndarray], points: np.ndarray, picture: Picture, s
 def _read(
     target: Target, source: Source, lookup: Lookup, reach: np.ndarray, face_idx: np.ndarray, barycentric: np.ndarray
 ) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, ...], Places]:
-    """What lookup says of the places that stand for places on the target; what surface_at says; and the places."""
+    """Look up the source at places on the target.
+
+    Returns the lookup's values, the target's surface_at, and the places on the source.
+    """
     frame = surface_at(target, face_idx, barycentric)
     places = reproject(frame[0], unit(frame[1]), reach[face_idx], source)
     read = lookup(places)
@@ -137,19 +164,18 @@ def bake(
     source: Source,
     lookup: Lookup,
     reach: np.ndarray,
-    samples: int = 1,
-    threads: int = 1,
+    options: BakeOptions = BakeOptions(),
     progress: Callable = lambda iterable, total, label: iterable,
-    height: bool = False,
-    confidence: bool = False,
 ) -> Baked:
     """Bake what lookup says of the source into the texels.
 
-    reach (t,) from reproject.vertex_reach. samples per texel (a square number) are taken where neighbouring texels
-    differ, one elsewhere (supersample.supersample). values has albedo, roughness, metallic, tangent_normal (n, 3) and
-    whatever else lookup gives besides normal; where they are asked for height (n,), how far above the target, along its
-    normal, the source lies, and the lookup's confidence (n,), 0 where the normal leads to nothing and the nearest point
-    serves."""
+    reach (t,) is from reproject.vertex_reach. progress(iterable, total, label) reports the parts done.
+
+    The values are albedo, roughness, metallic, tangent_normal (n, 3), and whatever else lookup gives besides normal.
+    Where options ask for them, also height (n,) and confidence (n,). The confidence is 0 where no ray along the normal
+    meets the source and the nearest point serves. Where neighbouring texels differ, values are means over several
+    samples (supersample.supersample).
+    """
     reach = reach.astype(np.float32)
     values: dict[str, np.ndarray] = {}
     by_ray = np.empty(len(texels), bool)
@@ -157,30 +183,32 @@ def bake(
     def read(face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[dict[str, np.ndarray], Places]:
         out, frame, places = _read(target, source, lookup, reach, face_idx, barycentric)
         out["tangent_normal"] = encode_tangent_space(*frame[1:], out.pop("normal"))
-        if height:
+        if options.height:
             out["height"] = dot(
                 source.at(places.face_idx, places.barycentric, source.vertices) - frame[0], unit(frame[1])
             )
         certain = out.pop("confidence", None)
-        if confidence:
+        if options.confidence:
             out["confidence"] = np.where(places.by_ray, certain, 0)
         return out, places
 
     def run(part: slice) -> None:
-        found, places = read(texels.face_idx[part], texels.barycentric[part])
-        for name, value in found.items():
-            # setdefault is atomic: threads that come first at the same time agree on one array.
+        values_here, places = read(texels.face_idx[part], texels.barycentric[part])
+        for name, value in values_here.items():
+            # setdefault is atomic: threads that get here at the same time agree on one array.
             if name not in values:
                 values.setdefault(name, np.empty((*value.shape[:0:-1], len(texels)), np.float32).T)
             values[name][part] = value
         by_ray[part] = places.by_ray
 
     parts = [slice(s, min(s + TEXELS_AT_ONCE, len(texels))) for s in range(0, len(texels), TEXELS_AT_ONCE)]
-    for _ in progress(mapped(run, parts, threads), len(parts), "bake"):
+    for _ in progress(mapped(run, parts, options.threads), len(parts), "bake"):
         pass
     report = {"texels": texels.inside, "nearest_point_share": float(1 - by_ray[: texels.inside].mean())}
-    if samples > 1:
-        report["supersampled_share"] = supersample(target, texels, values, lambda *at: read(*at)[0], samples, threads)
+    if options.samples > 1:
+        report["supersampled_share"] = supersample(
+            target, texels, values, lambda *at: read(*at)[0], options.samples, options.threads
+        )
     seen = values.pop("seen", None)
     return Baked(values, seen, report)
 
@@ -188,8 +216,10 @@ def bake(
 def occlusion_tracer(
     target: Target, source: Source, reach: np.ndarray, normals: np.ndarray, rays: int, seed: int, threads: int = 1
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """trace(face_idx, barycentric) -> openness (n,) of the source at places on the target; normals (v, 3) of the
-    source."""
+    """Make trace(face_idx, barycentric) -> (n,), the ambient visibility of the source at places on the target.
+
+    normals (v, 3) are the source's; rays is their number per place.
+    """
     lift = 5e-4 * source.extent
 
     def trace(face_idx: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
@@ -201,7 +231,7 @@ def occlusion_tracer(
             smooth = source.at(places.face_idx, places.barycentric, normals)
             side = dot(smooth, geometric)[:, None]
             smooth = unit(np.where(np.abs(side) > 0.2, smooth * np.sign(side), geometric))
-            return openness(at + geometric * lift, smooth, source.caster, rays, seed + part.start, lift=0.0)
+            return ambient_visibility(at + geometric * lift, smooth, source.caster, rays, seed + part.start, lift=0.0)
 
         parts = [slice(s, s + 8192) for s in range(0, len(face_idx), 8192)]
         traced = list(mapped(run, parts, threads))

@@ -1,44 +1,71 @@
-"""Reading materials for points of a surface out of the views that see them."""
+"""Read the materials of surface points from the views that see them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from gdtool.cameras import Camera, project, rays
 from gdtool.geometry.tangents import dot, unit
 
-# Below this cosine between normal and viewing direction a view has stretched its pixels too far to be read.
-GRAZING = 0.12
-_SUPERSAMPLE = 2
-# Views that differ by less, in stored units, agree.
-TOLERANCE = 0.15
-# How much better a picture sees color than the views that were made of it, at the same angle; never more than one that
-# faces the surface.
-KNOWN = 4.0
+# The least cosine between normal and viewing direction at which a view is read: below, its pixels are too stretched.
+MIN_FACING_COSINE = 0.12
+# Rays per pixel and direction when a camera's visibility is traced.
+_RAYS_PER_PIXEL_SIDE = 2
+# The largest difference, in stored units of [0, 1], between views that agree.
+AGREEMENT_TOLERANCE = 0.15
+# Factor on the quality of the reference view for colors, up to that of a view that faces the surface: it is the picture
+# that the other views were generated from.
+REFERENCE_GAIN = 4.0
 
 
 @dataclass(frozen=True)
-class Sight:
-    """What one camera sees of the surface, per pixel of its image.
+class ViewVisibility:
+    """What one camera sees of the surface, for each pixel of its image.
 
-    low, high (h, w): nearest and farthest depth among the pixel's samples, inf and -inf where all miss;
-    clear (h, w): distance in pixels to the nearest silhouette or depth step, at least 0.5.
+    nearest, farthest (h, w): depths of the pixel's nearest and farthest sample; inf and -inf where all miss.
+    edge_distance (h, w): pixels to the nearest silhouette or depth step, at least 0.5.
     """
 
     camera: Camera
-    low: np.ndarray
-    high: np.ndarray
-    clear: np.ndarray
+    nearest: np.ndarray
+    farthest: np.ndarray
+    edge_distance: np.ndarray
 
 
-def sight_of(camera: Camera, caster, mask: np.ndarray) -> Sight:
-    """What a camera sees of a surface, by rays; mask (h, w) is the view's own coverage, whose border counts as
-    silhouette."""
+@dataclass(frozen=True)
+class ViewStack:
+    """Images of k views, to be read together.
+
+    values (k, h, w, c) in stored units, not premultiplied; mask (k, h, w) coverage. reference: the view that the others
+    were generated from, None where there is none; color_channels: how many of the first channels are its colors.
+    """
+
+    visibilities: list[ViewVisibility]
+    values: np.ndarray
+    mask: np.ndarray
+    reference: int | None = None
+    color_channels: int = 0
+
+
+class Observation(NamedTuple):
+    """What views say about n points: values (n, c), confidence (n,) in [0, 1], and each view's share (k, n)."""
+
+    values: np.ndarray
+    confidence: np.ndarray
+    shares: np.ndarray
+
+
+def view_visibility(camera: Camera, caster, mask: np.ndarray) -> ViewVisibility:
+    """Trace what a camera sees of a surface.
+
+    mask (h, w) is the view's coverage; its border counts as silhouette.
+    """
     from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter
 
-    h, w, n = camera.height, camera.width, _SUPERSAMPLE
+    h, w, n = camera.height, camera.width, _RAYS_PER_PIXEL_SIDE
     x, y = np.meshgrid((np.arange(w * n) + 0.5) / n, (np.arange(h * n) + 0.5) / n)
     origins, directions = rays(camera, np.stack([x, y], -1))
     hits = caster.first_hit(origins.reshape(-1, 3), directions.reshape(-1, 3))
@@ -47,44 +74,44 @@ def sight_of(camera: Camera, caster, mask: np.ndarray) -> Sight:
     depth = np.where(miss, np.inf, hits.distance * along)
     samples = depth.reshape(h, n, w, n).swapaxes(1, 2).reshape(h, w, n * n)
     missed = np.isinf(samples)
-    low, high = samples.min(-1), np.where(missed, -np.inf, samples).max(-1)
-    # A step: neighbouring pixels whose depths differ by more than a surface at 80 degrees would make them.
-    span = maximum_filter(np.where(np.isinf(high), camera.far, high), 3) - minimum_filter(
-        np.where(np.isinf(low), camera.far, low), 3
+    nearest, farthest = samples.min(-1), np.where(missed, -np.inf, samples).max(-1)
+    # A depth step: neighbouring pixels differ by more than on a surface that is tilted by 80 degrees.
+    span = maximum_filter(np.where(np.isinf(farthest), camera.far, farthest), 3) - minimum_filter(
+        np.where(np.isinf(nearest), camera.far, nearest), 3
     )
-    step = span > 2 * pixel_footprint(camera, np.where(np.isinf(low), camera.far, low)) * np.tan(np.radians(80))
+    step = span > 2 * pixel_footprint(camera, np.where(np.isinf(nearest), camera.far, nearest)) * np.tan(np.radians(80))
     edge = step | missed.any(-1) | (mask < 0.999)
     edge = np.pad(edge, 1, constant_values=True)
-    return Sight(camera, low, high, np.maximum(distance_transform_edt(~edge)[1:-1, 1:-1], 0.5))
+    return ViewVisibility(camera, nearest, farthest, np.maximum(distance_transform_edt(~edge)[1:-1, 1:-1], 0.5))
 
 
 def pixel_footprint(camera: Camera, depth: np.ndarray | float) -> np.ndarray | float:
-    """World size of a pixel at a depth along the viewing axis."""
+    """Compute the width in world units of a pixel at a depth along the viewing axis."""
     return camera.pixel_size + 0 * depth if camera.projection == "orthographic" else depth / camera.fx
 
 
 def _toward(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """(n, 3) unit directions from points to the camera."""
+    """Compute unit directions (n, 3) from points to the camera."""
     if camera.projection == "orthographic":
         return np.broadcast_to(camera.backward, points.shape)
     return unit(camera.position - points)
 
 
 def _read(
-    sight: Sight,
-    stack: np.ndarray,
+    visibility: ViewVisibility,
+    image: np.ndarray,
     mask: np.ndarray,
     points: np.ndarray,
     normals: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One view at the points that face it: their indices (m,), values (m, c), quality (m,) in [0, 1].
+    """Read one view at the points that it shows: their indices (m,), values (m, c), quality (m,) in [0, 1].
 
-    stack (h, w, c) straight values, mask (h, w). Bilinear over those of the four pixels that show this part of the
-    surface: inside the mask and at its depth. Never a background or a part in front.
+    image (h, w, c) and mask (h, w) of the view. Values are interpolated between those of the four nearest pixels that
+    lie inside the mask and at the point's depth. So neither the background nor an occluder is mixed in.
     """
-    camera = sight.camera
+    camera = visibility.camera
     cosine = dot(normals, _toward(camera, points))
-    facing = np.flatnonzero(cosine > GRAZING)
+    facing = np.flatnonzero(cosine > MIN_FACING_COSINE)
     pixel, depth = project(camera, points[facing])
     h, w = mask.shape
     seen = (pixel[:, 0] > 0) & (pixel[:, 1] > 0) & (pixel[:, 0] < w) & (pixel[:, 1] < h) & (depth > 0)
@@ -94,86 +121,85 @@ def _read(
     tolerance = pixel_footprint(camera, depth) * (1.0 + 1.5 * slope)
     corner = np.floor(pixel).astype(np.int64)
     fraction = pixel - corner
-    weight_sum, clear = np.zeros(len(facing)), np.zeros(len(facing))
-    value = np.zeros((len(facing), stack.shape[-1]))
+    weight_sum, edge_distance = np.zeros(len(facing)), np.zeros(len(facing))
+    value = np.zeros((len(facing), image.shape[-1]))
     for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
         column, row = np.clip(corner[:, 0] + dx, 0, w - 1), np.clip(corner[:, 1] + dy, 0, h - 1)
         share = np.abs(1 - dx - fraction[:, 0]) * np.abs(1 - dy - fraction[:, 1])
-        here = (sight.low[row, column] >= depth - tolerance) & (sight.high[row, column] <= depth + tolerance)
+        here = (visibility.nearest[row, column] >= depth - tolerance) & (
+            visibility.farthest[row, column] <= depth + tolerance
+        )
         weight = np.where(here, share * mask[row, column], 0)
         weight_sum += weight
-        clear += weight * sight.clear[row, column]
-        value += weight[:, None] * stack[row, column]
+        edge_distance += weight * visibility.edge_distance[row, column]
+        value += weight[:, None] * image[row, column]
     read = weight_sum > 1e-3
-    facing, value, clear, weight_sum = facing[read], value[read], clear[read], weight_sum[read]
+    facing, value, edge_distance, weight_sum = facing[read], value[read], edge_distance[read], weight_sum[read]
     cosine = cosine[read]
     value /= weight_sum[:, None]
-    # Three pixels from a silhouette a view is as good as it gets; at it, still better than none.
-    away = np.clip(0.3 + 0.7 * (clear / weight_sum - 0.5) / 2.5, 0.3, 1.0)
+    # Quality rises from 0.3 at a silhouette, still better than nothing, to 1 three pixels from it.
+    away = np.clip(0.3 + 0.7 * (edge_distance / weight_sum - 0.5) / 2.5, 0.3, 1.0)
     return facing, value, cosine * away * weight_sum
 
 
-def steadiness(sight: Sight, points: np.ndarray) -> np.ndarray:
-    """(n,) in [0, 1]: 0 where points (n, 3) lie within a pixel of a silhouette or a step in depth, 1 from two on."""
-    pixel = np.floor(project(sight.camera, points)[0]).astype(np.int64)
-    h, w = sight.clear.shape
-    return np.clip(sight.clear[np.clip(pixel[:, 1], 0, h - 1), np.clip(pixel[:, 0], 0, w - 1)] - 1, 0, 1)
+def silhouette_margin(visibility: ViewVisibility, points: np.ndarray) -> np.ndarray:
+    """Rate how far points (n, 3) are from silhouettes and depth steps: 0 within one pixel, 1 from two on, (n,)."""
+    pixel = np.floor(project(visibility.camera, points)[0]).astype(np.int64)
+    h, w = visibility.edge_distance.shape
+    return np.clip(visibility.edge_distance[np.clip(pixel[:, 1], 0, h - 1), np.clip(pixel[:, 0], 0, w - 1)] - 1, 0, 1)
 
 
 def observe(
     points: np.ndarray,
     normals: np.ndarray,
-    sights: list[Sight],
-    stack: np.ndarray,
-    mask: np.ndarray,
+    views: ViewStack,
     prior: np.ndarray | None = None,
     sharpness: float = 6.0,
-    known: int | None = None,
-    colors: int = 0,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the views say about points (n, 3) of the surface with unit normals (n, 3).
+) -> Observation:
+    """Blend what the views say about points (n, 3) of the surface with unit normals (n, 3).
 
-    stack (k, h, w, c) and mask (k, h, w) of the k sights. Views are weighted by facing, distance to silhouettes and
-    coverage; the best one counts far more than the next (its power is sharpness), so detail is not averaged away, and
-    the change from one view to another is smooth. A view that differs from all others and from prior (n, c) fades out,
-    but not the known one, which the others were made of: of the first channels, its colors, it counts as if of KNOWN
-    times the quality, 1 at most. Returns values (n, c) float32, confidence (n,) float32 in [0, 1], 0 where no view sees
-    the point, and each view's share (k, n) of the values, of the colors where one is known."""
-    count, channels = len(points), stack.shape[-1]
-    value = np.zeros((len(sights), count, channels), np.float32)
-    quality = np.zeros((len(sights), count), np.float32)
+    A view's quality grows with facing, distance to silhouettes and coverage; its weight is the quality to the power
+    sharpness. So the best view dominates and detail is not averaged away, yet the change from one view to another is
+    smooth. A view that differs from the others and from prior (n, c) fades out, but the reference never does. For its
+    color channels, the reference has REFERENCE_GAIN times the quality, 1 at most.
+
+    The confidence is 0 where no view sees a point. Shares are those of the colors where there is a reference.
+    """
+    count, channels = len(points), views.values.shape[-1]
+    value = np.zeros((len(views.visibilities), count, channels), np.float32)
+    quality = np.zeros((len(views.visibilities), count), np.float32)
     low, high = np.full((count, channels), np.inf, np.float32), np.full((count, channels), -np.inf, np.float32)
     if prior is not None:
         low, high = prior.astype(np.float32), prior.astype(np.float32)
-    for k, sight in enumerate(sights):
-        seen, read, good = _read(sight, stack[k], mask[k], points, normals)
+    for k, visibility in enumerate(views.visibilities):
+        seen, read, good = _read(visibility, views.values[k], views.mask[k], points, normals)
         value[k, seen], quality[k, seen] = read, good
         low[seen], high[seen] = np.minimum(low[seen], read), np.maximum(high[seen], read)
+    reference, colors = views.reference, views.color_channels
     best = quality.max(0)
     confidence = np.clip((best - 0.04) / 0.11, 0, 1)
     share = quality / np.maximum(best, 1e-6)
-    disputed = np.flatnonzero((high - low > TOLERANCE).any(1))
+    disputed = np.flatnonzero((high - low > AGREEMENT_TOLERANCE).any(1))
     if len(disputed):
         faded = _fade_outliers(value[:, disputed], share[:, disputed], None if prior is None else prior[disputed])
-        if known is not None:
-            faded[known] = share[known, disputed]
+        if reference is not None:
+            faded[reference] = share[reference, disputed]
         share[:, disputed] = faded
     weight = share**sharpness
     total = weight.sum(0)
     mean = np.einsum("kn,knc->nc", weight / np.maximum(total, 1e-12), value)
-    if known is not None:
-        weight[known] *= np.minimum(KNOWN, 1 / np.maximum(quality[known], 1e-6)) ** sharpness
+    if reference is not None:
+        weight[reference] *= np.minimum(REFERENCE_GAIN, 1 / np.maximum(quality[reference], 1e-6)) ** sharpness
         mean[:, :colors] = np.einsum("kn,knc->nc", weight / np.maximum(weight.sum(0), 1e-12), value[..., :colors])
     weight /= np.maximum(weight.sum(0), 1e-12)
-    return mean.astype(np.float32), np.where(total > 0, confidence, 0).astype(np.float32), weight
+    return Observation(mean.astype(np.float32), np.where(total > 0, confidence, 0).astype(np.float32), weight)
 
 
 def _fade_outliers(value: np.ndarray, share: np.ndarray, prior: np.ndarray | None) -> np.ndarray:
-    """share (k, n), less where a view's value (k, n, c) is far from the median of all that see the point and prior (n,
-    c).
+    """Lower the shares (k, n) of views whose value (k, n, c) is far from the median of all views and prior (n, c).
 
-    Only where at least three opinions are there. The loss is gradual, from half the tolerance to twice it, so that a
-    view on which the others gain does not end in an edge on the surface; a trace stays, so that one view always counts.
+    Only where there are at least three opinions. The loss grows gradually, from half the tolerance to twice it, so that
+    a view does not end in an edge on the surface. A trace of 5 % remains, so that one view always counts.
     """
     opinions = np.where((share > 0)[..., None], value, np.nan)
     if prior is not None:
@@ -183,5 +209,5 @@ def _fade_outliers(value: np.ndarray, share: np.ndarray, prior: np.ndarray | Non
     ordered = np.sort(opinions, axis=0)
     middle, column = (np.maximum(number, 1) - 1) / 2, np.arange(len(number))
     median = (ordered[np.floor(middle).astype(int), column] + ordered[np.ceil(middle).astype(int), column]) / 2
-    away = np.abs(value - median[None]).max(-1) / TOLERANCE
+    away = np.abs(value - median[None]).max(-1) / AGREEMENT_TOLERANCE
     return np.where(number >= 3, share * np.clip((2 - away) / 1.5, 0.05, 1), share)

@@ -1,10 +1,11 @@
-"""From a point on the mesh that is baked to the place on the source surface that it stands for."""
+"""Find, for points of the baked mesh, the places on the source surface that they stand for."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Lock
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,17 +14,19 @@ from gdtool.geometry.distance import barycentric_of, bisected
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.tangents import dot, weld
 
-# A place on the source is on the right side when its face's normal agrees with the mesh's normal: dot product above
-# this.
+# The least dot product of the source face's normal with the mesh's normal at which the face is on the right side.
 AGREEMENT = 0.1
+# Faces that a ray meets before it gives up.
 _RETRIES = 4
-# Faces with an edge of more than this share of the source are cut for the search of closest points, while there are no
-# more than so many.
-_LONG, _MOST_CUT = 1 / 16, 100_000
+# For the search of closest points, faces with an edge longer than this share of the source's extent are cut; long faces
+# make its tree slow.
+_LONG_EDGE = 1 / 16
+# The most faces that cutting may lead to.
+_MOST_CUT = 100_000
 
 
 class Nearest:
-    """Closest points on some faces of a mesh; the tree is kept (libigl builds one per call otherwise).
+    """Find closest points on some faces of a mesh; keeps the search tree, which libigl builds on each call otherwise.
 
     vertices (v, 3), faces (f, 3), chosen (m,) indices of the faces to look among, all when None.
     """
@@ -32,7 +35,7 @@ class Nearest:
         igl = imported("igl")
         some = faces if chosen is None else faces[chosen]
         cut_vertices, cut, whole = bisected(
-            vertices, some, _LONG * float(np.ptp(vertices, axis=0).max(initial=0)), _MOST_CUT
+            vertices, some, _LONG_EDGE * float(np.ptp(vertices, axis=0).max(initial=0)), _MOST_CUT
         )
         self._vertices, self._faces = (
             np.ascontiguousarray(cut_vertices, np.float64),
@@ -43,7 +46,7 @@ class Nearest:
         self._tree.init(self._vertices, self._faces)
 
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """face_idx (n,) into all faces and the closest point (n, 3) to each of points (n, 3)."""
+        """Find the closest point (n, 3) to each of points (n, 3), and its face_idx (n,) among all faces."""
         _, face, point = self._tree.squared_distance(
             self._vertices, self._faces, np.ascontiguousarray(points, np.float64)
         )
@@ -51,8 +54,10 @@ class Nearest:
 
 
 class Source:
-    """Triangles to bake from: vertices (v, 3), faces (f, 3), face_normals (f, 3) unit, and what finds places on
-    them."""
+    """Triangles to bake from, with their ray caster and search trees.
+
+    vertices (v, 3), faces (f, 3), face_normals (f, 3) unit; extent: longest side of the bounding box.
+    """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
         from gdtool.geometry.quick_rays import QuickCaster
@@ -67,23 +72,24 @@ class Source:
         self._lock = Lock()
 
     def normals_of(self, face_idx: np.ndarray) -> np.ndarray:
-        """(n, 3) float32 unit normals of faces, component by component in memory."""
+        """Gather unit normals (n, 3) float32 of faces, each component side by side in memory."""
         return np.take(self._normal_rows, face_idx, axis=1).T
 
     @cached_property
     def twins(self) -> np.ndarray:
-        """(f,) int32: the face that has the same corners and looks the other way, -1 where there is none."""
+        """Index (f,) int32 of the face with the same corners that faces the other way, -1 where there is none."""
         corners = np.sort(weld(self.vertices)[self.faces], axis=1)
         order = np.lexsort(corners.T)
-        one, two = order[:-1], order[1:]
-        paired = (corners[one] == corners[two]).all(1) & (dot(self.face_normals[one], self.face_normals[two]) < 0)
-        one, two = one[paired], two[paired]
+        first, second = order[:-1], order[1:]
+        same = (corners[first] == corners[second]).all(1)
+        paired = same & (dot(self.face_normals[first], self.face_normals[second]) < 0)
+        first, second = first[paired], second[paired]
         out = np.full(len(self.faces), -1, np.int32)
-        out[one], out[two] = two, one
+        out[first], out[second] = second, first
         return out
 
     def facing(self, axis: int, sign: float) -> Nearest | None:
-        """Nearest among the faces within 75 degrees of a coordinate axis; None when there are none."""
+        """Return the search tree of the faces within 75 degrees of a signed coordinate axis; None without faces."""
         with self._lock:
             if (axis, sign) not in self._facing:
                 chosen = np.flatnonzero(self.face_normals[:, axis] * sign > 0.25)
@@ -91,8 +97,10 @@ class Source:
             return self._facing[axis, sign]
 
     def turn_to(self, points: np.ndarray, normals: np.ndarray) -> bool:
-        """Turn all faces round where the source is inside out: where nine in ten of those nearest to points (n, 3) look
-        away from normals (n, 3). Returns whether it was."""
+        """Flip all face normals if the source is inside out, and return whether it was.
+
+        It is when nine in ten of the faces nearest to points (n, 3) face away from normals (n, 3).
+        """
         face, _ = self.nearest.closest(points)
         if not len(face) or (dot(self.face_normals[face], normals) < 0).mean() < 0.9:
             return False
@@ -101,15 +109,18 @@ class Source:
         return True
 
     def at(self, face_idx: np.ndarray, barycentric: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Vertex values (v,) or (v, c), interpolated at places on faces: (n,) or (n, c)."""
+        """Interpolate vertex values (v,) or (v, c) at places on faces: (n,) or (n, c)."""
         corners = values[self.faces[face_idx]]
         return np.einsum("nk,nk...->n...", barycentric.astype(corners.dtype, copy=False), corners)
 
 
 @dataclass(frozen=True)
 class Places:
-    """Places on a source: face_idx (n,), barycentric (n, 3) float32, by_ray (n,) bool, False where by nearest point,
-    and from_behind (n,) bool, where the back of the face is meant."""
+    """Places on a source.
+
+    face_idx (n,), barycentric (n, 3) float32; by_ray (n,) bool, False where the nearest point was taken; from_behind
+    (n,) bool, whether the back of the face is meant.
+    """
 
     face_idx: np.ndarray
     barycentric: np.ndarray
@@ -118,16 +129,29 @@ class Places:
 
 
 def vertex_reach(vertices: np.ndarray, faces: np.ndarray, source: Source) -> np.ndarray:
-    """How far from each triangle's points to look for the source, (t,): its cage.
+    """Compute how far from each triangle to look for the source, (t,): the offset of its cage.
 
-    Twice the largest distance of its corners to the source, and a share of its size for the bulge between them. A
-    corner that lies far out (a part that remeshing lost) does not count for more than the 99th percentile of all."""
+    This is twice the largest distance of its corners to the source, plus a share of its size for the bulge between
+    them. Distances are capped at the 99th percentile, since a corner may lie far out where remeshing lost a part.
+    """
     distance = np.linalg.norm(source.nearest.closest(vertices)[1] - vertices, axis=1)
     distance = np.minimum(distance, np.percentile(distance, 99) + 1e-12)
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1).max(1)
     extent = float(np.ptp(vertices, axis=0).max())
     return 2 * distance[faces].max(1) + 0.3 * np.minimum(longest, np.percentile(longest, 99)) + 1e-4 * extent
+
+
+class _Hits(NamedTuple):
+    """Where n rays meet the source: face_idx (n,), -1 for none, distance (n,), barycentric (n, 3).
+
+    behind (k,): the rays that stopped at a face met from behind.
+    """
+
+    face_idx: np.ndarray
+    distance: np.ndarray
+    barycentric: np.ndarray
+    behind: np.ndarray
 
 
 def _march(
@@ -138,19 +162,19 @@ def _march(
     source: Source,
     start: float,
     through: bool = True,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """First face on the right side along each ray within reach: face_idx (n,), -1 for none, distance (n,), barycentric
-    (n, 3).
+) -> _Hits:
+    """Find the first face on the right side along each ray, within reach.
 
-    Faces on the wrong side are stepped through, unless a ray that may not go through meets the first of them from
-    behind: these rays (k,) come last, with the place of that face and a distance of infinity."""
+    Rays begin `start` before their points. They step through faces on the wrong side. Without `through`, a ray whose
+    first face is met from behind stops there: it has that face, a distance of infinity, and is listed in behind.
+    """
     face, t, barycentric = source.caster.quick_hits(points - directions * points.dtype.type(start), directions)
     t -= np.float32(start)
     near = (face >= 0) & (t <= reach)
     cosine = dot(source.normals_of(face), normals)
     good = near & (cosine > AGREEMENT)
     back = near & (cosine < -AGREEMENT) & (not through)
-    # The other side of a wall: step through it and look on.
+    # Hits on the other side of a wall: step through it and continue.
     active = np.flatnonzero(near & ~good & ~back)
     face[~(good | back)] = -1
     distance = np.where(good, np.abs(t), np.float32(np.inf))
@@ -165,24 +189,25 @@ def _march(
         near = (hit_face >= 0) & (t <= reach[active])
         active, hit_face, hit_at, t = active[near], hit_face[near], hit_at[near], t[near]
         agrees = dot(source.normals_of(hit_face), normals[active]) > AGREEMENT
-        found = active[agrees]
-        face[found], distance[found], barycentric[found] = hit_face[agrees], np.abs(t[agrees]), hit_at[agrees]
+        done = active[agrees]
+        face[done], distance[done], barycentric[done] = hit_face[agrees], np.abs(t[agrees]), hit_at[agrees]
         active, travelled = active[~agrees], t[~agrees] + start
-    return face, distance, barycentric, np.flatnonzero(back)
+    return _Hits(face, distance, barycentric, np.flatnonzero(back))
 
 
 def _nearest_agreeing(
     points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest place whose face looks the same way as the normal: face_idx (n,), point (n, 3).
+    """Find the nearest place whose face agrees with the normal: face_idx (n,), point (n, 3).
 
-    Plain nearest if none does; and where that lies within reach (n,) but none that looks the same way: the back of a
-    sheet that has but one side."""
+    The plain nearest place is taken where none agrees. It is also taken where it lies within reach (n,) and no place
+    that agrees does: then it is the back of a one-sided sheet.
+    """
     face, point = source.nearest.closest(points)
     wrong = np.flatnonzero(dot(source.face_normals[face], normals) <= AGREEMENT)
     if not len(wrong):
         return face, point
-    # The normal's main component is at least 1/sqrt(3): the faces near that axis hold most of those that agree.
+    # A normal's largest component is at least 1/√3: the faces near that axis include most of those that agree.
     axis = np.abs(normals[wrong]).argmax(1)
     sign = np.sign(normals[wrong, axis])
     for k in range(3):
@@ -202,15 +227,15 @@ def _nearest_agreeing(
 def _slide_off_edges(
     points: np.ndarray, normals: np.ndarray, source: Source, met: np.ndarray, face: np.ndarray, barycentric: np.ndarray
 ) -> None:
-    """Where a ray met (n,) bool a slanted face from afar, take the nearest place instead if it agrees; changes face,
-    barycentric.
+    """Take the nearest place, if it agrees, where a ray met a slanted face far away; changes face and barycentric.
 
-    At a crease that remeshing cut off, the normal leads past the edge to a place well away from the nearest one.
+    At a crease that remeshing cut off, the normal leads past the edge, to a place well away from the nearest one. met
+    (n,) bool: which points' places come from rays.
     """
     cosine = dot(source.normals_of(face), normals)
     slanted = np.flatnonzero(met & (cosine > AGREEMENT) & (cosine < 0.99))
     away = source.at(face[slanted], barycentric[slanted], source.vertices) - points[slanted]
-    # How far beside the nearest place the ray went, were the face a plane.
+    # Distance from the hit to the nearest place, if the face were a plane.
     beside = np.sqrt(dot(away, away) * np.maximum(1 - cosine[slanted] ** 2, 0))
     slanted = slanted[beside > 2e-5 * source.extent]
     if not len(slanted):
@@ -223,7 +248,7 @@ def _slide_off_edges(
 
 
 def _turn_over(source: Source, places: np.ndarray, face: np.ndarray, barycentric: np.ndarray) -> None:
-    """Move those of the places (k,) that lie on a face with a twin to the twin; changes face, barycentric."""
+    """Move places (k,) on a face with a twin (Source.twins) to the twin; changes face and barycentric."""
     if not len(places):
         return
     twin = source.twins[face[places]]
@@ -233,14 +258,15 @@ def _turn_over(source: Source, places: np.ndarray, face: np.ndarray, barycentric
 
 
 def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source) -> Places:
-    """Where points (n, 3) with unit normals (n, 3) of the baked mesh lie on the source.
+    """Find where points (n, 3) with unit normals (n, 3) of the baked mesh lie on the source.
 
-    The nearest face along the normal, outward or inward within reach (n,), that looks the same way; the nearest such
-    place in any direction where the normal meets none. So nothing is read from the other side of a thin wall. A sheet
-    without another side is read from behind, and nothing through it."""
+    A ray goes along the normal, outward and inward, within reach (n,). The nearest face that faces the same way is
+    taken. Where the ray meets none, the nearest such place in any direction is taken. So nothing is read from the other
+    side of a thin wall. A one-sided sheet is read from behind, and nothing is read through it.
+    """
     start = 2e-5 * source.extent
     face, distance, barycentric, behind = _march(points, -normals, normals, reach, source, start, through=False)
-    # Two sheets that look the same way have a third between them: outward cannot be nearer than what is this near.
+    # Between two sheets that face the same way lies a third: outward there is nothing nearer than so near a hit.
     rest = np.flatnonzero(distance > 5e-4 * source.extent)
     out_face, out_distance, out_at, _ = _march(
         points[rest], normals[rest], normals[rest], np.minimum(reach, distance)[rest], source, start
@@ -251,16 +277,16 @@ def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source
         out_distance[outward],
         out_at[outward],
     )
-    # Inside something whose front is not there: a sheet with one side, unless its other side lies on it.
+    # Points behind a one-sided sheet, unless its other side coincides with it.
     behind = behind[np.isinf(distance[behind])]
     _turn_over(source, behind, face, barycentric)
-    lost = np.flatnonzero(face < 0)
-    if len(lost):
-        face[lost], nearest = _nearest_agreeing(points[lost], normals[lost], reach[lost], source)
-        barycentric[lost] = barycentric_of(nearest, source.vertices[source.faces[face[lost]]])
+    missed = np.flatnonzero(face < 0)
+    if len(missed):
+        face[missed], nearest = _nearest_agreeing(points[missed], normals[missed], reach[missed], source)
+        barycentric[missed] = barycentric_of(nearest, source.vertices[source.faces[face[missed]]])
     by_ray, from_behind = np.ones(len(points), bool), np.zeros(len(points), bool)
-    by_ray[lost] = False
+    by_ray[missed] = False
     _slide_off_edges(points, normals, source, by_ray, face, barycentric)
-    for some in (behind, lost):
-        from_behind[some] = dot(source.normals_of(face[some]), normals[some]) <= 0
+    for rows in (behind, missed):
+        from_behind[rows] = dot(source.normals_of(face[rows]), normals[rows]) <= 0
     return Places(face, barycentric, by_ray, from_behind)

@@ -1,4 +1,4 @@
-"""Several samples to a texel, where one does not stand for all of it."""
+"""Average several samples in the texels where the source varies."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gdtool.core.threads import mapped
 from gdtool.geometry.tangents import unit
 from gdtool.geometry.uv_raster import Barycentrics, owners_of
 
-# Neighbouring texels that differ by no more than this, in stored units, are of one piece: eight steps of 8 bits.
+# The largest difference, in stored units, between neighbouring texels that need one sample each: eight steps of 8 bits.
 TOLERANCE = 0.03
 _COMPARED = ("albedo", "roughness", "metallic", "tangent_normal", "alpha", "emissive")
 _ROWS_AT_ONCE = 64
@@ -20,8 +20,7 @@ _ROWS_AT_ONCE = 64
 def varying(
     texels: Texels, values: dict[str, np.ndarray], threads: int = 1, tolerance: float = TOLERANCE
 ) -> np.ndarray:
-    """(m,) indices of the texels that differ by more than tolerance, in anything as it is stored, from one of the eight
-    beside them."""
+    """Find the texels (m,) that differ in a stored value by more than tolerance from one of eight neighbours."""
     from gdtool.images.color import srgb_from_linear
 
     size, mask = texels.size, texels.mask()
@@ -48,7 +47,7 @@ def varying(
 
 
 def _extreme(image: np.ndarray, pick: Callable) -> np.ndarray:
-    """(h, w) of image (h, w): what pick finds among each texel and the eight beside it."""
+    """Apply pick (np.minimum or np.maximum) to each texel of (h, w) and its eight neighbours."""
     for axis in (0, 1):
         image = np.moveaxis(image, axis, 0)
         out = image.copy()
@@ -66,13 +65,13 @@ def supersample(
     samples: int,
     threads: int = 1,
 ) -> float:
-    """Change values (n, …) of the texels that vary to means over samples, a square number, of each; the share of texels
-    that vary.
+    """Replace the values (n, …) of varying texels by means over several samples; changes values.
 
-    read(face_idx, barycentric) says what values has of any places on the target. A sample is read in the triangle that
-    owns its place, and does not count where none does: so a texel has the mean of what its charts cover of it. Where
-    they cover no sample it keeps what it has. Color is averaged by how much of it is seen, tangent_normal made a unit
-    vector again."""
+    samples is a square number. read(face_idx, barycentric) gives the same values at any places on the target. A sample
+    is read in the triangle that covers its place, and does not count where none does. So a texel gets the mean over the
+    part of it that charts cover; one without a covered sample keeps its value. Color is weighted by alpha, and
+    tangent_normal is made unit again. Returns the share of texels that vary.
+    """
     side, size, chosen = int(round(samples**0.5)), texels.size, varying(texels, values, threads)
     barycentrics, texel = Barycentrics(target.uv, target.face_uvs), texels.texel[chosen]
     offsets = [((k % side + 0.5) / side, (k // side + 0.5) / side) for k in range(side * side)]
@@ -103,19 +102,21 @@ def supersample(
 def _means(
     taken: Iterable[tuple[np.ndarray, dict[str, np.ndarray]]], count: int, like: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Which of count texels have samples, known (m,), and the means (m, …) of those, of what like names.
+    """Average samples of `count` texels: returns the texels that have any (m,), and their means (m, …) by name.
 
-    taken: for one sample of each texel after another, the texels (k,) that have it and what was read there."""
+    taken yields, for the first sample of all texels, then the second and so on, the texels (k,) that have it and the
+    values read there. like names the values.
+    """
     total = {name: np.zeros((count, *value.shape[1:]), np.float32) for name, value in like.items()}
     samples, shown = np.zeros(count, np.float32), np.zeros(count, np.float32)
-    for there, found in taken:
+    for there, read in taken:
         samples[there] += 1
-        if "alpha" in found:
-            seen = np.maximum(found["alpha"], np.float32(1e-4))
+        if "alpha" in read:
+            seen = np.maximum(read["alpha"], np.float32(1e-4))
             shown[there] += seen
-            found["albedo"] = found["albedo"] * seen[:, None]
+            read["albedo"] = read["albedo"] * seen[:, None]
         for name, sums in total.items():
-            sums[there] += found[name]
+            sums[there] += read[name]
     known = np.flatnonzero(samples)
     out = {}
     for name, sums in total.items():

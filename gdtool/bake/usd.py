@@ -1,4 +1,4 @@
-"""The finished asset as OpenUSD: quads as they are, UsdPreviewSurface, the maps that lie beside the file.
+"""Write the finished asset as OpenUSD: its quads, a UsdPreviewSurface, and references to the maps beside the file.
 
 Needs the package usd-core (extra `usd`). UsdPreviewSurface: https://openusd.org/release/spec_usdpreviewsurface.html
 """
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gdtool.bake.asset import CornerNormals, SurfaceModes
 from gdtool.bake.maps import Maps
 from gdtool.core.errors import OutputError, ResourceError
 from gdtool.core.native import imported_if_installed
@@ -28,20 +29,16 @@ def require() -> None:
 def write_usd(
     path: Path,
     mesh: QuadMesh,
-    normals_idx: np.ndarray,
-    normals: np.ndarray,
+    corners: CornerNormals,
     maps: Maps,
     files: dict[str, str],
-    convention: str = "opengl",
-    alpha_mode: str = "OPAQUE",
-    alpha_cutoff: float = 0.5,
-    double_sided: bool = False,
+    convention: str,
+    surface: SurfaceModes,
 ) -> None:
-    """Write path, a .usda or a .usdz that packs it with its maps.
+    """Write a .usda, or a .usdz that packs it with its maps.
 
-    normals_idx (f, 4) into normals (n, 3), -1 with a triangle's fourth corner; files: map name to the name of the file
-    beside path; convention: of normal.png. Metres, Y up, right-handed, as glTF. Raises OutputError when the package
-    cannot be written.
+    files: file name, beside path, by map name. convention: "opengl" or "directx", of normal.png. Units and axes are
+    glTF's: metres, Y up, right-handed. Raises OutputError when the package cannot be written.
     """
     from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
@@ -59,17 +56,17 @@ def write_usd(
     prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.ravel()[corner].astype(np.int32)))
     prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     prim.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
-    prim.CreateDoubleSidedAttr(double_sided)
+    prim.CreateDoubleSidedAttr(surface.double_sided)
     primvars = UsdGeom.PrimvarsAPI(prim)
     uv = np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], 1).astype(np.float32)  # (0, 0) is the image's bottom left
     st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
     st.Set(Vt.Vec2fArray.FromNumpy(uv))
     st.SetIndices(Vt.IntArray.FromNumpy(mesh.face_uvs.ravel()[corner].astype(np.int32)))
     shading = primvars.CreatePrimvar("normals", Sdf.ValueTypeNames.Normal3fArray, UsdGeom.Tokens.faceVarying)
-    shading.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, np.float32)))
-    shading.SetIndices(Vt.IntArray.FromNumpy(normals_idx.ravel()[corner].astype(np.int32)))
+    shading.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(corners.normals, np.float32)))
+    shading.SetIndices(Vt.IntArray.FromNumpy(corners.idx.ravel()[corner].astype(np.int32)))
 
-    material = _material(stage, maps, files, convention, alpha_mode, alpha_cutoff)
+    material = _material(stage, maps, files, convention, surface)
     UsdShade.MaterialBindingAPI.Apply(prim.GetPrim()).Bind(material)
     stage.GetRootLayer().Save()
     if path.suffix == ".usdz":
@@ -81,8 +78,8 @@ def write_usd(
             raise OutputError(path, "could not be packed", "free some space or write --usd usda")
 
 
-def _material(stage, maps: Maps, files: dict[str, str], convention: str, alpha_mode: str, alpha_cutoff: float):
-    """UsdPreviewSurface with a texture per map and channel, values where a map is constant."""
+def _material(stage, maps: Maps, files: dict[str, str], convention: str, modes: SurfaceModes):
+    """Define a UsdPreviewSurface, with a texture for each map and plain values where a map is constant."""
     from pxr import Gf, Sdf, UsdShade
 
     types = Sdf.ValueTypeNames
@@ -95,6 +92,7 @@ def _material(stage, maps: Maps, files: dict[str, str], convention: str, alpha_m
     coordinates.CreateInput("varname", types.String).Set("st")
 
     def texture(name: str, space: str, scale, bias=None):
+        """Define a texture of a map's file; values are scale * texel + bias."""
         shader = UsdShade.Shader.Define(stage, f"{MATERIAL}/{name}")
         shader.CreateIdAttr("UsdUVTexture")
         shader.CreateInput("file", types.Asset).Set(f"./{files[name]}")
@@ -108,6 +106,7 @@ def _material(stage, maps: Maps, files: dict[str, str], convention: str, alpha_m
         return shader
 
     def feed(name: str, kind, shader, output: str, value=None):
+        """Connect an input of the surface to a texture's output, or set it to a value where there is no texture."""
         entry = surface.CreateInput(name, kind)
         if shader is None:
             entry.Set(value)
@@ -144,9 +143,9 @@ def _material(stage, maps: Maps, files: dict[str, str], convention: str, alpha_m
     if "normal" in files:
         up = 2.0 if convention == "opengl" else -2.0  # of the green channel
         feed("normal", types.Normal3f, texture("normal", "raw", (2.0, up, 2.0, 1.0), (-1.0, -up / 2, -1.0, 0.0)), "rgb")
-    if alpha_mode != "OPAQUE":
+    if modes.alpha_mode != "OPAQUE":
         has_alpha = base is not None and maps.base_color.shape[2] == 4
         feed("opacity", types.Float, base if has_alpha else None, "a", color[3])
-        if alpha_mode == "MASK":
-            surface.CreateInput("opacityThreshold", types.Float).Set(alpha_cutoff)
+        if modes.alpha_mode == "MASK":
+            surface.CreateInput("opacityThreshold", types.Float).Set(modes.alpha_cutoff)
     return material

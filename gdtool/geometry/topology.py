@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gdtool.geometry.hashing import splitmix64
+
 _FAN = 64  # edges at a vertex; of more a walk around it step by step takes too long
 _CHUNK = 2**14  # triangles at a time: what they need in between stays in the cache
 _FEW = 4000  # keys, below which sorting is quicker than building a sparse matrix
@@ -104,9 +106,7 @@ def even(faces: np.ndarray) -> bool:
         start = np.ascontiguousarray(faces[i : i + _CHUNK].T, np.uint64)
         end = start[[1, 2, 0]]
         key = np.minimum(start, end) << np.uint64(32) | np.maximum(start, end)
-        key = (key ^ key >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
-        key = (key ^ key >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
-        together ^= np.bitwise_xor.reduce(key ^ key >> np.uint64(31), axis=None)
+        together ^= np.bitwise_xor.reduce(splitmix64(key), axis=None)
     return not together
 
 

@@ -11,7 +11,7 @@ Example:
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 from msgspec import Meta
@@ -21,7 +21,15 @@ from gdtool.core.folder import Folder
 from gdtool.core.kinds import RendersContent
 from gdtool.core.stage import LEAST_EXPOSURE, MOST_EXPOSURE, MOST_SECONDS, MOST_SEED, Inputs, Output, Stage, file_option
 
-# Samples per pixel at which a view ends that was to end by itself.
+if TYPE_CHECKING:
+    import numpy as np
+
+    from gdtool.assets.scene import Scene
+    from gdtool.cameras import Camera
+    from gdtool.shading.render.direct import DirectLight
+    from gdtool.shading.render.render import Renderer
+
+# The most samples per pixel of a view that --budget or --target-psnr ends.
 OPEN_ENDED = 4096
 
 
@@ -36,7 +44,9 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     light: Annotated[
         Literal["sampled", "prefiltered", "sg"],
         Meta(
-            description="how --env lights: sampled, exact direct light with shadows; prefiltered, the light averaged over reflection lobes, shadows from a few rays; sg, closed form of sixteen spherical Gaussians, no shadows"
+            description="how --env lights: sampled, exact direct light with shadows; "
+            "prefiltered, the light averaged over reflection lobes, shadows from a few rays; "
+            "sg, closed form of sixteen spherical Gaussians, no shadows"
         ),
     ] = "sampled"
     samples: Annotated[
@@ -48,7 +58,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         Meta(
             ge=0,
             le=1024,
-            description="directions per sample, from the light and from the reflection each; 0, prefiltered only: no shadows",
+            description="directions per sample, from the light and from the reflection each; "
+            "0, prefiltered only: no shadows",
         ),
     ] = 4
     budget: (
@@ -57,7 +68,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             Meta(
                 gt=0,
                 le=MOST_SECONDS,
-                description="seconds for the rendering of all views, up to 4096 samples per pixel; the pictures then depend on the machine",
+                description="seconds for the rendering of all views, up to 4096 samples per pixel; "
+                "the pictures then depend on the machine",
             ),
         ]
         | None
@@ -103,101 +115,110 @@ def check(inputs: Inputs, options: Options) -> None:
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Light one asset or model."""
     import contextlib
-    import dataclasses
-    import time
 
     import numpy as np
     import torch
 
-    from gdtool.assets.load import load_scene
-    from gdtool.folders.records import write_cameras
-    from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
-    from gdtool.images.color import srgb_from_linear
-    from gdtool.images.contact import contact_sheet
-    from gdtool.images.io import write_png
-    from gdtool.shading.bsdf.closed_form import closed_form_image
     from gdtool.shading.lights.studio import studio
-    from gdtool.shading.render.direct import DirectLight
-    from gdtool.shading.render.render import Goal, Renderer
+    from gdtool.shading.render.direct import DirectLight, LightOptions
+    from gdtool.shading.render.pictures import PictureOptions, render_pictures
+    from gdtool.shading.render.render import Renderer
     from gdtool.shading.render.rigs import turntable
-    from gdtool.shading.render.skipped_work import savings
     from gdtool.stages.limits import held_to
 
-    torch.set_num_threads(1)  # shading runs in threads of its own
+    torch.set_num_threads(1)  # shading runs in threads of this program
+    scene, matrix = _read_scene(inputs, out)
+    with out.step("light"):
+        environment, lobes, record = studio(options.env or "mid", options.seed, fit=options.light == "sg")
+    cameras = turntable(options.views, options.size, options.elevation, options.fov)
+    cure = "raise --budget, or lower --size or --views"
+    held = (
+        contextlib.nullcontext() if options.budget is None else held_to(options.budget, "--budget", inputs.name, cure)
+    )
+    with held, out.step("render"):
+        renderer, direct = Renderer(scene, out.threads), None
+        if options.light != "sg":
+            how = LightOptions(options.light)
+            direct = DirectLight(renderer, environment, options.light_samples, options.seed, options.brdf, how)
+        how = PictureOptions(
+            _most_samples(options), options.exposure, options.brdf, options.budget, options.target_psnr
+        )
+        rendered = render_pictures(renderer, direct or lobes, cameras, how, out.progress)
+    with out.step("write"):
+        _write(out, cameras, rendered.images)
+    known = [x for x in rendered.psnr if x is not None]
+    _tell(out, options, renderer, direct, known)
+    out.content = RendersContent(
+        frames=len(cameras),
+        environment=environment.name,
+        light=options.light,
+        exposure=options.exposure,
+        source_from_world=tuple(float(x) for x in matrix.ravel()),
+        report={
+            "clipped_share": float(np.mean(rendered.clipped)),
+            "environment_scale": environment.scale,
+            "samples": renderer.counts.samples,
+            "shadow_rays": renderer.counts.shadow_rays,
+            **({"estimated_psnr": min(known)} if known else {}),
+            **{f"light_fit_{name}": value for name, value in record["fit_error"].items()},
+        },
+    )
+
+
+def _most_samples(options: Options) -> int:
+    """Return the most samples per pixel: those of --samples, or OPEN_ENDED where a goal ends a view."""
+    return options.samples if options.budget is None and options.target_psnr is None else OPEN_ENDED
+
+
+def _read_scene(inputs: Inputs, out: Output) -> tuple[Scene, np.ndarray]:
+    """Read the asset or model in the normalised frame, and the matrix (4, 4) from there to its file's frame."""
+    import dataclasses
+
+    import numpy as np
+
+    from gdtool.assets.load import load_scene
+    from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
+
     with out.step("read"):
         scene = load_scene(inputs.main.file("asset.glb") if isinstance(inputs.main, Folder) else inputs.main)
         matrix = unit_box(scene.vertices[np.unique(scene.faces)])
         scene = dataclasses.replace(scene, vertices=transform_points(invert_similarity(matrix), scene.vertices))
     for note in scene.notes:
         out.warn(note)
-    with out.step("light"):
-        environment, lobes, record = studio(options.env or "mid", options.seed, fit=options.light == "sg")
-    cameras = turntable(options.views, options.size, options.elevation, options.fov)
-    frames, clipped = [], []
-    cure = "raise --budget, or lower --size or --views"
-    held = (
-        contextlib.nullcontext() if options.budget is None else held_to(options.budget, "--budget", inputs.name, cure)
-    )
-    with held, out.step("render"):
-        renderer = Renderer(scene, out.threads)
-        direct = color = None
-        if options.light != "sg":
-            direct = DirectLight(
-                renderer, environment, options.light_samples, options.seed, options.brdf, mode=options.light
-            )
-            color = direct.color(options.exposure)
-        open_ended = options.budget is not None or options.target_psnr is not None
-        samples = OPEN_ENDED if open_ended else options.samples
-        reached, begun = [], time.perf_counter()
-        for number, camera in enumerate(out.progress(cameras, len(cameras), "frames")):
-            # Each view gets an even part of what is left of the budget.
-            left = (
-                None
-                if options.budget is None
-                else max(0.0, options.budget - (time.perf_counter() - begun)) / (len(cameras) - number)
-            )
-            frame = renderer.buffers(camera, samples, color, Goal(left, options.target_psnr))
-            reached.append(renderer.counts.estimated_psnr)
-            if color is None:
-                frame["color"] = closed_form_image(frame, camera, lobes, options.brdf) * options.exposure
-            seen = frame["color"][frame["mask"] > 0]
-            clipped.append(float((seen > 1).mean()) if len(seen) else 0.0)
-            frames.append(
-                np.concatenate([srgb_from_linear(np.clip(frame["color"], 0, 1)), frame["mask"][..., None]], -1)
-            )
-    with out.step("write"):
-        for camera, frame in zip(cameras, frames, strict=True):
-            write_png(out.path(f"{camera.name}.png"), frame)
-        write_cameras(out.path("cameras.json"), cameras)
-        columns = int(np.ceil(np.sqrt(len(frames))))
-        rows = [frames[i : i + columns] for i in range(0, len(frames), columns)]
-        write_png(out.path("contact_sheet.png"), contact_sheet(rows))
+    return scene, matrix
+
+
+def _write(out: Output, cameras: list[Camera], pictures: list[np.ndarray]) -> None:
+    """Write the pictures, their cameras, and a contact sheet that is about square."""
+    import math
+
+    from gdtool.folders.records import write_cameras
+    from gdtool.images.contact import contact_sheet
+    from gdtool.images.io import write_png
+
+    for camera, picture in zip(cameras, pictures, strict=True):
+        write_png(out.path(f"{camera.name}.png"), picture)
+    write_cameras(out.path("cameras.json"), cameras)
+    columns = math.ceil(math.sqrt(len(pictures)))
+    rows = [pictures[i : i + columns] for i in range(0, len(pictures), columns)]
+    write_png(out.path("contact_sheet.png"), contact_sheet(rows))
+
+
+def _tell(
+    out: Output, options: Options, renderer: Renderer, direct: DirectLight | None, known_psnr: list[float]
+) -> None:
+    """Record what was left out, and warn of a --target-psnr that was not reached."""
+    from gdtool.shading.render.skipped_work import skipped_work
+
+    samples = _most_samples(options)
     if options.light == "sg":
         out.skip("shadows", "the closed form has none")
     else:
         out.skip("the light's fit by spherical Gaussians", f"--light {options.light} does not use it")
-    for what, why, seconds in savings(renderer, samples, direct):
+    for what, why, seconds in skipped_work(renderer, samples, direct):
         out.skip(what, why, seconds)
-    known = [x for x in reached if x is not None]
-    if options.target_psnr is not None and (not known or min(known) < options.target_psnr):
+    if options.target_psnr is not None and (not known_psnr or min(known_psnr) < options.target_psnr):
         out.warn(f"--target-psnr {options.target_psnr:g} was not reached by {samples} samples per pixel")
-    counts = renderer.counts
-    report = {
-        "clipped_share": float(np.mean(clipped)),
-        "environment_scale": environment.scale,
-        "samples": counts.samples,
-        "shadow_rays": counts.shadow_rays,
-        **({"estimated_psnr": min(known)} if known else {}),
-        **{f"light_fit_{k}": v for k, v in record["fit_error"].items()},
-    }
-    out.content = RendersContent(
-        frames=len(frames),
-        environment=environment.name,
-        light=options.light,
-        exposure=options.exposure,
-        source_from_world=tuple(float(x) for x in matrix.ravel()),
-        report=report,
-    )
 
 
 STAGE = Stage(

@@ -10,7 +10,7 @@ from gdtool.assets.gltf_read import read_gltf
 from gdtool.cameras import camera_at
 from gdtool.core.errors import InputError
 from gdtool.shading.lights.environment import Environment
-from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.render.direct import DirectLight, LightOptions
 from gdtool.shading.render.render import Renderer, render_buffers
 from gdtool.shading.render.surface_points import surface_attributes
 from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad, with_textures
@@ -93,7 +93,11 @@ def seen(scene, *, azimuth=0.0, elevation=0.0, size=32, light=1.0, samples=16) -
     """A view of the scene under a uniform light, without shadows."""
     renderer = Renderer(scene, 1)
     direct = DirectLight(
-        renderer, Environment(np.full((8, 16, 3), light, np.float32), "uniform"), samples, 0, shadows=False
+        renderer,
+        Environment(np.full((8, 16, 3), light, np.float32), "uniform"),
+        samples,
+        0,
+        options=LightOptions(shadows=False),
     )
     return renderer.buffers(camera_at(azimuth, elevation, name="v", size=size), 4, direct.color())
 

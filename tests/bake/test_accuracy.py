@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gdtool.bake.maps import make_maps
-from gdtool.bake.pipeline import bake, vertex_lookup
+from gdtool.bake.pipeline import BakeOptions, bake, vertex_lookup
 from gdtool.bake.reproject import Source, vertex_reach
 from gdtool.bake.target import Target, points_at, texels_of
 from gdtool.images.color import srgb_from_linear
@@ -49,7 +49,7 @@ def stored():
         source,
         vertex_lookup(source, attributes, fine_normals),
         vertex_reach(coarse, faces, source),
-        threads=2,
+        BakeOptions(threads=2),
     )
     maps = make_maps(texels, baked.values)
     return target, texels, {"albedo": maps.base_color / 255, "roughness": maps.orm[..., 1:2] / 255}

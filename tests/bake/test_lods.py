@@ -3,9 +3,8 @@
 from dataclasses import replace
 
 from gdtool.bake import lods
-from gdtool.bake.lods import coarser, drift
+from gdtool.bake.lods import coarser, drift, make_levels
 from gdtool.bake.target import Target, size_for
-from gdtool.stages import bake
 from tests.bake.shapes import torus, triangles_of, unwrapped
 
 
@@ -18,12 +17,15 @@ def target():
 def test_a_level_has_the_triangles_asked_for_and_stays_on_its_texels():
     full = target()
     same = drift(full, full)
-    assert same["drift_p99"] < 2e-3 and same["outside"] == 0
+    assert same["drift_p99"] < 2e-3
+    assert same["outside"] == 0
     level, why = coarser(full, len(full.faces) // 2)
-    assert why == "" and abs(len(level.faces) - len(full.faces) // 2) <= 2
+    assert why == ""
+    assert abs(len(level.faces) - len(full.faces) // 2) <= 2
     # A quarter of a triangle's edge at most, and no part of the surface that reads another chart.
     found = drift(level, full)
-    assert found["drift_mean"] < 0.008 and found["outside"] < 0.01
+    assert found["drift_mean"] < 0.008
+    assert found["outside"] < 0.01
     # Every chart turns the way it did: a mirrored one would turn its normal map round.
     u, v = (level.uv[level.face_uvs[:, k]] - level.uv[level.face_uvs[:, 0]] for k in (1, 2))
     whole_u, whole_v = (full.uv[full.face_uvs[:, k]] - full.uv[full.face_uvs[:, 0]] for k in (1, 2))
@@ -40,7 +42,8 @@ def test_size_is_the_power_of_two_that_holds_the_detail():
     assert size_for(full, width) == 512
     assert size_for(full, width * 1.05) == size_for(full, width / 1.05) == 512  # a tenth coarser is as fine as asked
     assert size_for(full, width / 1.5) == 1024
-    assert size_for(full, width * 1000) == 256 and size_for(full, width / 1000) == 4096
+    assert size_for(full, width * 1000) == 256
+    assert size_for(full, width / 1000) == 4096
 
 
 def _span(full):
@@ -49,34 +52,22 @@ def _span(full):
     return texel_width(full, 1)
 
 
-class Told:
-    """What a stage's Output is told."""
-
-    threads = 1
-
-    def __init__(self):
-        self.said, self.warned = [], []
-
-    def skip(self, what, reason, saved_seconds=None):
-        self.said.append((what, reason))
-
-    def warn(self, text):
-        self.warned.append(text)
-
-
 def test_a_level_that_slides_on_its_maps_is_left_out_and_named(monkeypatch):
-    full, told, report = target(), Told(), {}
+    full = target()
     # A level whose texture corners are those of the opposite side.
     half, _ = coarser(full, len(full.faces) // 2)
     wrong = replace(half, vertices=half.vertices * (-1, 1, 1))
     monkeypatch.setattr(lods, "coarser", lambda target, n: (wrong, "") if n == len(full.faces) // 2 else (half, ""))
-    assert bake._levels(full, 3, told, report) == [half]
-    assert report["lod1_triangles"] == len(half.faces) and report["lod1_drift_mean"] < 8e-3
-    assert len(told.said) == 1 and "slide" in told.said[0][1]
+    made = make_levels(full, 3)
+    assert made.targets == [half]
+    assert made.report["lod1_triangles"] == len(half.faces)
+    assert made.report["lod1_drift_mean"] < 8e-3
+    assert len(made.skipped) == 1
+    assert "slide" in made.skipped[0][1]
 
 
 def test_a_level_that_seams_keep_from_its_count_stays_where_it_is_coarser_than_the_last(monkeypatch):
-    full, told = target(), Told()
+    full = target()
     count = len(full.faces)
     levels = {
         count // 2: coarser(full, count // 2)[0],
@@ -84,6 +75,9 @@ def test_a_level_that_seams_keep_from_its_count_stays_where_it_is_coarser_than_t
         count // 8: coarser(full, int(0.38 * count))[0],
     }
     monkeypatch.setattr(lods, "coarser", lambda target, n: (levels[n], ""))
-    assert bake._levels(full, 4, told, {}) == [levels[count // 2], levels[count // 4]]
-    assert len(told.warned) == 1 and "fewer would tear a seam" in told.warned[0]
-    assert len(told.said) == 1 and f"fewer than {len(levels[count // 8].faces)} triangles" in told.said[0][1]
+    made = make_levels(full, 4)
+    assert made.targets == [levels[count // 2], levels[count // 4]]
+    assert len(made.warnings) == 1
+    assert "fewer would tear a seam" in made.warnings[0]
+    assert len(made.skipped) == 1
+    assert f"fewer than {len(levels[count // 8].faces)} triangles" in made.skipped[0][1]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.bake.maps import constant_of, contact_sheet_of, directx, flat_angle, make_maps, quantise
+from gdtool.bake.maps import MapOptions, constant_of, contact_sheet_of, directx, flat_angle, make_maps, quantise
 from gdtool.bake.target import Target, texels_of
 from gdtool.geometry.uv_raster import rasterize_uv
 
@@ -29,10 +29,13 @@ def values(texels, albedo=(0.5, 0.2, 0.1), roughness=0.4, metallic=0.0, normal=(
 
 
 def test_constants_become_factors(texels):
-    maps = make_maps(texels, values(texels), occlusion=np.ones(len(texels), np.float32))
-    assert maps.base_color is None and maps.orm is None and maps.normal is None
+    maps = make_maps(texels, values(texels), np.ones(len(texels), np.float32))
+    assert maps.base_color is None
+    assert maps.orm is None
+    assert maps.normal is None
     np.testing.assert_allclose(maps.factors["base_color"], (0.5, 0.2, 0.1, 1.0), atol=1e-5)
-    assert maps.factors["roughness"] == (pytest.approx(0.4),) and maps.factors["metallic"] == (0.0,)
+    assert maps.factors["roughness"] == (pytest.approx(0.4),)
+    assert maps.factors["metallic"] == (0.0,)
     assert {what for what, _, _ in maps.skipped} == {
         "base_color map",
         "roughness and metallic map",
@@ -46,13 +49,15 @@ def test_orm_packs_as_gltf_says_and_a_constant_channel_stays_a_factor(texels):
     given = values(texels)
     given["roughness"] = np.linspace(0.2, 0.8, len(texels), dtype=np.float32)
     occlusion = np.full(len(texels), 0.5, np.float32)
-    maps = make_maps(texels, given, occlusion=occlusion)
-    assert maps.factors["roughness"] == (1.0,) and maps.factors["metallic"] == (0.0,)
+    maps = make_maps(texels, given, occlusion)
+    assert maps.factors["roughness"] == (1.0,)
+    assert maps.factors["metallic"] == (0.0,)
     inside = maps.orm.reshape(-1, 3)[texels.texel]
     np.testing.assert_array_equal(inside[:, 0], 128)
     np.testing.assert_allclose(inside[:, 1] / 255, given["roughness"], atol=0.5 / 255 + 1e-6)
     np.testing.assert_array_equal(inside[:, 2], 255)  # times the factor 0
-    assert maps.has_occlusion and maps.has_roughness_metallic
+    assert maps.has_occlusion
+    assert maps.has_roughness_metallic
 
 
 def test_base_color_is_srgb_and_gutters_hold_no_black(texels):
@@ -82,22 +87,22 @@ def test_color_that_is_never_seen_darkens_no_neighbour(texels, least):
     given["albedo"][:] = (0.2, 0.5, 0.3)
     given["albedo"][hidden] = 0
     given["alpha"] = np.where(hidden, 0.9 * least, 1).astype(np.float32)
-    stored = make_maps(texels, given, least_alpha=least).base_color
+    stored = make_maps(texels, given, options=MapOptions(least_alpha=least)).base_color
     at = stored.reshape(-1, 4)[texels.texel]
     np.testing.assert_array_equal(at[:, :3], np.tile(at[~hidden][0, :3], (len(at), 1)))
     assert stored[..., :3].min() > 100
     np.testing.assert_array_equal(at[:, 3], np.rint(given["alpha"] * 255))
     given["alpha"][hidden] = 1.1 * least + 0.01  # is seen: stays as it is
-    at = make_maps(texels, given, least_alpha=least).base_color.reshape(-1, 4)[texels.texel]
+    at = make_maps(texels, given, options=MapOptions(least_alpha=least)).base_color.reshape(-1, 4)[texels.texel]
     assert at[hidden][:, :3].max() == 0
 
 
 def test_normal_map_only_where_it_says_something(texels):
     tilt = lambda degrees: (np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees)))  # noqa: E731
     assert make_maps(texels, values(texels, normal=tilt(0.8))).normal is None
-    assert make_maps(texels, values(texels, normal=tilt(0.8)), normal_map="on").normal is not None
-    assert make_maps(texels, values(texels, normal=tilt(5)), normal_map="off").normal is None
-    maps = make_maps(texels, values(texels, normal=tilt(5)), bits=16)
+    assert make_maps(texels, values(texels, normal=tilt(0.8)), options=MapOptions(normal_map="on")).normal is not None
+    assert make_maps(texels, values(texels, normal=tilt(5)), options=MapOptions(normal_map="off")).normal is None
+    maps = make_maps(texels, values(texels, normal=tilt(5)), options=MapOptions(bits=16))
     assert maps.normal.dtype == np.uint16
     decoded = maps.normal.reshape(-1, 3)[texels.texel] / 65535 * 2 - 1
     np.testing.assert_allclose(decoded, np.tile(tilt(5), (len(texels), 1)), atol=4e-5)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gdtool.bake.maps import make_maps
-from gdtool.bake.occlusion import bake_occlusion, openness
-from gdtool.bake.pipeline import bake, occlusion_tracer, vertex_lookup
+from gdtool.bake.occlusion import ambient_visibility, bake_occlusion
+from gdtool.bake.pipeline import BakeOptions, bake, occlusion_tracer, vertex_lookup
 from gdtool.bake.reproject import Source, vertex_reach
 from gdtool.bake.target import Target, corner_normals, points_at, texels_of
 from gdtool.geometry.tangents import decode_tangent_space
@@ -37,7 +37,7 @@ def torus_bake():
     attributes = {"albedo": albedo_of(fine), "roughness": 0.5 + 0.3 * fine[:, 0], "metallic": np.full(len(fine), 0.25)}
     lookup = vertex_lookup(source, attributes, fine_normals)
     reach = vertex_reach(coarse, faces, source)
-    return target, texels, source, lookup, reach, bake(target, texels, source, lookup, reach, threads=2)
+    return target, texels, source, lookup, reach, bake(target, texels, source, lookup, reach, BakeOptions(threads=2))
 
 
 def test_analytic_albedo_within_psnr_bound(torus_bake):
@@ -58,7 +58,8 @@ def test_normal_map_decodes_to_the_fine_normals(torus_bake):
     decoded = decode_tangent_space(frames, np.rint((baked.values["tangent_normal"] * 0.5 + 0.5) * 255) / 255 * 2 - 1)
     _, truth = nearest_on_torus(points)
     angle = np.degrees(np.arccos(np.clip((decoded * truth).sum(1), -1, 1)))[: texels.inside]
-    assert angle.mean() < 0.5 and angle.max() < 4
+    assert angle.mean() < 0.5
+    assert angle.max() < 4
     flat = frames[..., 2] / np.linalg.norm(frames[..., 2], axis=1, keepdims=True)
     unbaked = np.degrees(np.arccos(np.clip((flat * truth).sum(1), -1, 1)))
     assert angle.mean() < 0.7 * unbaked.mean()
@@ -80,7 +81,7 @@ def test_supersampling_only_where_it_varies_and_nearer_the_texel_mean(torus_bake
         }
 
     one = bake(target, texels, source, stripes, reach).values["albedo"][: texels.inside]
-    many = bake(target, texels, source, stripes, reach, samples=16)
+    many = bake(target, texels, source, stripes, reach, BakeOptions(samples=16))
     assert np.abs(many.values["albedo"][: texels.inside] - 0.5).mean() < 0.7 * np.abs(one - 0.5).mean()
     assert 0.4 < many.report["supersampled_share"] < 0.9
 
@@ -160,7 +161,7 @@ def test_corner_normals_are_smooth_on_a_sphere_and_split_on_a_cube():
     np.testing.assert_allclose(np.abs(joined), 3**-0.5, atol=1e-9)
 
 
-def test_openness_of_a_plane_a_corner_and_a_box():
+def test_ambient_visibility_of_a_plane_a_corner_and_a_box():
     plane = np.array([[-50.0, 0, -50], [50, 0, -50], [50, 0, 50], [-50, 0, 50]])
     wall = np.array([[0.0, 0, -50], [0, 50, -50], [0, 50, 50], [0, 0, 50]])
     quad = np.array([[0, 2, 1], [0, 3, 2]])
@@ -168,11 +169,11 @@ def test_openness_of_a_plane_a_corner_and_a_box():
     points = np.array([[0.05, 0, 0.0], [0.05, 0, 1.0], [0.05, 0, -1.0]])
     up = np.tile([0.0, 1, 0], (3, 1))
     # An infinite wall at right angles hides half of the cosine-weighted hemisphere.
-    np.testing.assert_allclose(openness(points, up, source.caster, 4096, 0), 0.5, atol=0.01)
-    np.testing.assert_allclose(openness(points + (25, 0, 0), up, source.caster, 64, 0, reach=1.0), 1)
+    np.testing.assert_allclose(ambient_visibility(points, up, source.caster, 4096, 0), 0.5, atol=0.01)
+    np.testing.assert_allclose(ambient_visibility(points + (25, 0, 0), up, source.caster, 64, 0, reach=1.0), 1)
     vertices, faces = sphere(2)
     inside = Source(vertices, faces[:, ::-1])
-    assert openness(np.zeros((1, 3)), np.array([[0, 1.0, 0]]), inside.caster, 64, 0)[0] == 0
+    assert ambient_visibility(np.zeros((1, 3)), np.array([[0, 1.0, 0]]), inside.caster, 64, 0)[0] == 0
 
 
 def test_occlusion_of_a_torus_agrees_with_many_rays_and_repeats(torus_bake):

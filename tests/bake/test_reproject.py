@@ -64,7 +64,8 @@ def test_reach_covers_the_distance_but_not_the_object():
     coarse, coarse_quads, _ = torus(40, 20, minor=0.145)
     faces = triangles_of(coarse_quads)
     reach = vertex_reach(coarse, faces, Source(vertices, triangles_of(quads)))
-    assert reach.min() > 0.005 and reach.max() < 0.08
+    assert reach.min() > 0.005
+    assert reach.max() < 0.08
 
 
 def test_a_sheet_without_another_side_is_read_from_behind():
@@ -94,7 +95,8 @@ def test_a_sheet_is_not_looked_through():
         points = np.column_stack([rng.uniform(-0.4, 0.4, (500, 2)), np.full(500, height)])
         places = reproject(points, np.tile([0.0, 0.0, 1.0], (500, 1)), np.full(500, 0.05), source)
         np.testing.assert_allclose(at(source, places), points * (1, 1, 0), atol=1e-6)
-        assert places.from_behind.all() and places.by_ray.all()
+        assert places.from_behind.all()
+        assert places.by_ray.all()
 
 
 def test_of_two_faces_back_to_back_the_one_that_looks_the_same_way_is_read():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.bake import supersample
-from gdtool.bake.pipeline import bake, vertex_lookup
+from gdtool.bake.pipeline import BakeOptions, bake, vertex_lookup
 from gdtool.bake.reproject import Source, vertex_reach
 from gdtool.bake.target import COARSE_TEXEL, Target, samples_for, texels_of
 from gdtool.images.color import srgb_from_linear
@@ -36,9 +36,7 @@ def plate(material, left=4.0, right=28.0, samples=16, threads=1):
         return {name: value.astype(np.float32) for name, value in (plain | material(x)).items()}
 
     texels = texels_of(target, SIZE)
-    baked = bake(
-        target, texels, source, lookup, vertex_reach(vertices, faces, source), samples=samples, threads=threads
-    )
+    baked = bake(target, texels, source, lookup, vertex_reach(vertices, faces, source), BakeOptions(samples, threads))
     return {name: texels.image(value) for name, value in baked.values.items()}
 
 
@@ -90,18 +88,19 @@ def ring():
 
 
 def test_any_number_of_threads_gives_the_same(ring):
-    one, three = (bake(*ring, samples=4, threads=threads) for threads in (1, 3))
-    assert one.report == three.report and 0.02 < one.report["supersampled_share"] < 0.98
+    one, three = (bake(*ring, BakeOptions(4, threads)) for threads in (1, 3))
+    assert one.report == three.report
+    assert 0.02 < one.report["supersampled_share"] < 0.98
     for name, value in one.values.items():
         np.testing.assert_array_equal(value, three.values[name])
 
 
 def test_texels_left_with_one_sample_are_within_the_tolerance(ring, monkeypatch):
     texels = ring[1]
-    some = bake(*ring, samples=4).values
+    some = bake(*ring, BakeOptions(4)).values
     left = np.setdiff1d(np.arange(texels.inside), supersample.varying(texels, bake(*ring).values))
     monkeypatch.setattr(supersample, "varying", lambda texels, values, threads: np.arange(len(texels)))
-    every = bake(*ring, samples=4).values
+    every = bake(*ring, BakeOptions(4)).values
     assert len(left) > 100
     assert (
         np.abs(srgb_from_linear(some["albedo"]) - srgb_from_linear(every["albedo"]))[left].max() < supersample.TOLERANCE

@@ -41,17 +41,17 @@ def quadrature(view, albedo, roughness, metallic, lights, kind="gltf", rings=240
     helper = torch.tensor([0.0, 1.0, 0.0], dtype=dtype)
     x = normalize(torch.linalg.cross(helper, pole))
     y = torch.linalg.cross(pole, x)
-    l = local[:, :1] * x + local[:, 1:2] * y + local[:, 2:] * pole
+    toward = local[:, :1] * x + local[:, 1:2] * y + local[:, 2:] * pole
     w = weight[:, None].expand(-1, spokes).reshape(-1)
     v = view.to(dtype)
-    h = normalize(l + v)
-    n_l = l[:, 2].clamp_min(0)
+    h = normalize(toward + v)
+    n_l = toward[:, 2].clamp_min(0)
     a, r, m = (torch.as_tensor(t, dtype=dtype) for t in (albedo, roughness, metallic))
     f0 = models.f0_of(a, m, 0.04)
     diffuse, specular = models.reflectance(
         kind, a, r, m, f0, n_l, v[2].expand_as(n_l), h[:, 2], (h * v).sum(-1).clamp(0, 1)
     )
-    radiance = evaluate(lights.to(dtype), l) * (n_l * w)[:, None]
+    radiance = evaluate(lights.to(dtype), toward) * (n_l * w)[:, None]
     return (diffuse * radiance).sum(0), (specular * radiance).sum(0)
 
 
@@ -169,7 +169,8 @@ def test_finite_and_never_negative_at_every_adversary(kind):
     # One light a point: lights broadcast like everything else.
     lights = SphericalGaussians(tensors[4], tensors[5], tensors[6])
     value = shade(tensors[0], views[view], *tensors[1:4], lights, kind)
-    assert torch.isfinite(value).all() and (value >= 0).all()
+    assert torch.isfinite(value).all()
+    assert (value >= 0).all()
     value.sum().backward()
     for t in tensors:
         bad = ~torch.isfinite(t.grad).reshape(count, -1).all(1)
@@ -214,7 +215,8 @@ def test_visibility_and_fresnel_at_their_ends():
             values = models.visibility(
                 kind, torch.tensor(r), torch.tensor([0.0, 1.0, 1.0 + 1e-7, 0.0]), torch.tensor([0.0, 1.0, 1.0, 1.0])
             )
-            assert torch.isfinite(values).all() and (values > 0).all()
+            assert torch.isfinite(values).all()
+            assert (values > 0).all()
             # Both cosines 1: no masking at all leaves 1/4.
             assert float(values[1]) == pytest.approx(0.25, rel=1e-6)
     f0 = torch.tensor([0.04, 0.5, 1.0])

@@ -18,8 +18,10 @@ from gdtool.shading.lights.studio import studio
 def test_directions_of_pixels():
     env = Environment(np.zeros((64, 128, 3)))
     d = env.directions
-    assert d[0, 0, 1] > 0.99 and d[-1, 0, 1] < -0.99  # the top row is up
-    assert d[32, 64, 0] > 0.99 and d[32, 96, 2] > 0.99  # the middle is +X, three quarters +Z (three.js)
+    assert d[0, 0, 1] > 0.99  # the top row is up
+    assert d[-1, 0, 1] < -0.99
+    assert d[32, 64, 0] > 0.99  # the middle is +X, three quarters +Z (three.js)
+    assert d[32, 96, 2] > 0.99
     assert np.array_equal(env.pixel_of(d.reshape(-1, 3)), np.arange(64 * 128))
     assert env.solid_angles.sum() * 128 == pytest.approx(4 * np.pi)
 
@@ -43,36 +45,42 @@ def test_black_rows_and_one_bright_pixel():
     image[4, 7] = 100
     env = Environment(image)
     directions, _, density = env.sample(np.random.default_rng(1).random((1000, 2)))
-    assert (env.pixel_of(directions) == 4 * 32 + 7).mean() > 0.9 and np.isfinite(density).all() and (density > 0).all()
+    assert (env.pixel_of(directions) == 4 * 32 + 7).mean() > 0.9
+    assert np.isfinite(density).all()
+    assert (density > 0).all()
 
 
 @pytest.mark.parametrize("name", BUNDLED)
 def test_bundled_lights_are_metered_and_fitted(name):
     env, lobes, record = studio(name)
-    assert env.name == record["environment"] == name and np.isfinite(env.image).all() and (env.image >= 0).all()
+    assert env.name == record["environment"] == name
+    assert np.isfinite(env.image).all()
+    assert (env.image >= 0).all()
     around = Environment(np.zeros((24, 48, 3))).directions.reshape(-1, 3)
     white = (env.irradiance(around) @ [0.2126, 0.7152, 0.0722]).max() * 0.8 / np.pi
     assert white == pytest.approx(METERED_WHITE, rel=0.05)
     assert len(lobes.sharpness) == 16
-    assert record["fit_error"]["irradiance_rms"] < 0.01 and abs(record["fit_error"]["energy"]) < 0.01
+    assert record["fit_error"]["irradiance_rms"] < 0.01
+    assert abs(record["fit_error"]["energy"]) < 0.01
 
 
 def test_a_light_made_of_lobes_is_found_again():
     axes = np.stack([direction(30, 40), direction(-100, 10)])
     env = paint(axes, np.array([20.0, 4.0]), np.array([[3.0, 2, 1], [0.5, 0.5, 1]]), 32)
     lobes, error = fit_sg(env)
-    assert error["radiance_rms"] < 0.1 and error["irradiance_rms"] < 0.02
+    assert error["radiance_rms"] < 0.1
+    assert error["irradiance_rms"] < 0.02
     assert fit_sg(env, steps=5)[1] == fit_sg(env, steps=5)[1]
 
 
 def test_random_studios_differ_and_repeat():
     one, two = (random_lobes(np.random.default_rng(k)) for k in (1, 2))
-    assert not np.allclose(one[2], two[2]) and all(
-        np.array_equal(a, b) for a, b in zip(one, random_lobes(np.random.default_rng(1)), strict=True)
-    )
+    assert not np.allclose(one[2], two[2])
+    assert all(np.array_equal(a, b) for a, b in zip(one, random_lobes(np.random.default_rng(1)), strict=True))
     for seed in range(20):
         _, lobes, record = studio(f"random:{seed}")
-        assert (lobes.amplitudes >= 0).all() and record["fit_error"]["irradiance_rms"] < 0.01
+        assert (lobes.amplitudes >= 0).all()
+        assert record["fit_error"]["irradiance_rms"] < 0.01
 
 
 def test_what_is_no_environment(tmp_path):

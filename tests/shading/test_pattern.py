@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from gdtool.shading.render.pattern import pixel_pattern
-from gdtool.shading.render.render import SPREAD, SPREAD_POWER
+from gdtool.shading.render.render import ERROR_POWER, ERROR_SCALE
 
 
 @pytest.mark.parametrize("count", [4, 8, 16, 32, 64])
 def test_every_pass_is_even_and_centred(count):
     points = pixel_pattern(count)
-    assert points.min() >= 0 and points.max() < 1
+    assert points.min() >= 0
+    assert points.max() < 1
     assert np.abs(points.mean(0) - 0.5).max() < 1e-6
     # Sobol's points lie one in each column and each row as many as there are; centring moves them by up to another.
     for axis in (0, 1):
@@ -37,4 +38,4 @@ def test_the_expected_error_is_that_of_straight_edges(count):
     mean = covered(pixel_pattern(count))
     error = np.sqrt(((mean - covered(fine)) ** 2).mean())
     standard = np.sqrt((mean * (1 - mean) / count).mean())
-    assert error / standard == pytest.approx(SPREAD * count**SPREAD_POWER, rel=1 / 3)
+    assert error / standard == pytest.approx(ERROR_SCALE * count**ERROR_POWER, rel=1 / 3)

@@ -64,7 +64,8 @@ def test_sphere_normals_depth_and_coverage(fov):
         area = out["mask"].sum() * camera.pixel_size**2
         assert area == pytest.approx(np.pi * 0.25, rel=2e-3)
     assert np.allclose(out["albedo"][inside], (0.5, 0.25, 0.125), atol=1e-6)
-    assert np.allclose(out["roughness"][inside], 0.5) and not out["metallic"].any()
+    assert np.allclose(out["roughness"][inside], 0.5)
+    assert not out["metallic"].any()
     outside = out["mask"] == 0
     assert not any(out[name][outside].any() for name in ("normal", "depth", "albedo", "roughness"))
 
@@ -74,8 +75,11 @@ def test_coverage_of_a_quad_that_cuts_pixels():
     half = 10.25 * camera.pixel_size
     out = render_buffers(quad(GREY, half=half), camera, samples=64)
     row = out["mask"][32]
-    assert row[21] == pytest.approx(0.25, abs=0.05) and row[42] == pytest.approx(0.25, abs=0.05)
-    assert (row[22:42] == 1).all() and not row[:21].any() and not row[43:].any()
+    assert row[21] == pytest.approx(0.25, abs=0.05)
+    assert row[42] == pytest.approx(0.25, abs=0.05)
+    assert (row[22:42] == 1).all()
+    assert not row[:21].any()
+    assert not row[43:].any()
 
 
 def test_every_pass_of_a_pixels_samples_tells_something_new():
@@ -88,7 +92,9 @@ def test_every_pass_of_a_pixels_samples_tells_something_new():
         return ((points - 0.5) @ np.stack([np.cos(angle), np.sin(angle)]) < offset).mean(0)
 
     pattern, truth = pixel_pattern(64), covered(grid)
-    assert len(np.unique(pattern, axis=0)) == 64 and pattern.min() >= 0 and pattern.max() < 1
+    assert len(np.unique(pattern, axis=0)) == 64
+    assert pattern.min() >= 0
+    assert pattern.max() < 1
     for count in (4, 8, 16, 32, 64):
         assert np.allclose(pattern[:count].mean(0), 0.5, atol=1e-3)
         error = np.sqrt(((covered(pattern[:count]) - truth) ** 2).mean())
@@ -132,8 +138,10 @@ def test_pictures_are_not_mirrored_in_any_view():
 def test_texture_is_upright_and_wraps():
     material = dataclasses.replace(GREY, base_color=(1, 1, 1, 1), base_color_texture=four_colors())
     albedo = render_buffers(quad(material), rig("six", 64)[0], samples=4)["albedo"]
-    assert np.allclose(albedo[20, 20], (1, 0, 0)) and np.allclose(albedo[20, 44], (0, 1, 0))
-    assert np.allclose(albedo[44, 20], (0, 0, 1)) and np.allclose(albedo[44, 44], 1)
+    assert np.allclose(albedo[20, 20], (1, 0, 0))
+    assert np.allclose(albedo[20, 44], (0, 1, 0))
+    assert np.allclose(albedo[44, 20], (0, 0, 1))
+    assert np.allclose(albedo[44, 44], 1)
     for wrap, wanted in {"repeat": (1, 0, 0), "mirror": (0, 1, 0), "clamp": (0, 1, 0)}.items():
         texture = dataclasses.replace(four_colors(), wrap_u=wrap, wrap_v="clamp")
         scene = quad(dataclasses.replace(material, base_color_texture=texture))
@@ -187,10 +195,10 @@ def test_alpha_mask_lets_rays_through_and_blend_counts_from_one_half():
             uvs=(np.concatenate([near.uvs[0], far.uvs[0]]),),
         )
         out = render_buffers(scene, rig("six", 64)[0], samples=4)
-        assert np.allclose(out["albedo"][32, 20], 1) and np.allclose(out["albedo"][32, 44], (0, 0, 1))
-        assert out["depth"][32, 20] == pytest.approx(1.8, abs=1e-5) and out["depth"][32, 44] == pytest.approx(
-            2.2, abs=1e-5
-        )
+        assert np.allclose(out["albedo"][32, 20], 1)
+        assert np.allclose(out["albedo"][32, 44], (0, 0, 1))
+        assert out["depth"][32, 20] == pytest.approx(1.8, abs=1e-5)
+        assert out["depth"][32, 44] == pytest.approx(2.2, abs=1e-5)
         renderer = Renderer(scene)
         # From behind the hole the sky is open, behind the solid half it is not.
         origins = np.array([[-0.25, 0, -0.1], [0.25, 0, -0.1]])
@@ -212,7 +220,8 @@ def test_lambert_quad_under_a_hemisphere_and_its_shadow():
     camera = rig("six", 32)[0]
     open_sky, mask = render_color(floor, camera, uniform(), samples=4, light_samples=64)
     lit = open_sky[mask == 1].mean()
-    assert 0.47 < lit < 0.54 and MIN_ROUGHNESS < 0.1
+    assert 0.47 < lit < 0.54
+    assert MIN_ROUGHNESS < 0.1
     # A long wall of height 0.5 at x = 0.5: at distance d it hides (1 - d / sqrt(d² + 0.25)) / 2 of the cosine-weighted
     # sky.
     wall = quad(GREY, half=4.0)
@@ -242,7 +251,8 @@ def test_same_seed_same_pixels_and_noise_falls_with_samples():
         return np.sqrt(((image - best)[mask == 1] ** 2).mean())
 
     assert error(more) < 0.4 * error(one)
-    assert (one >= 0).all() and np.isfinite(one).all()
+    assert (one >= 0).all()
+    assert np.isfinite(one).all()
 
 
 def test_light_is_unbiased_at_few_directions():

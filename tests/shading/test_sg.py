@@ -1,4 +1,4 @@
-"""Spherical Gaussians against mpmath and float64 quadrature, over sweeps of their arguments (the fast half)."""
+"""Spherical Gaussians against mpmath and float64 quadrature, over sweeps of sharpness and angle (the fast half)."""
 
 from __future__ import annotations
 
@@ -55,7 +55,8 @@ def test_product_against_mpmath(gap):
                 drop = length - t1 - t2
             scale = float(t1 + t2)
             worst = max(worst, abs(float(sharpness) - float(length)) / scale)
-            assert np.isfinite(float(exponent)) and float(exponent) <= 0
+            assert np.isfinite(float(exponent))
+            assert float(exponent) <= 0
             # The amplitude exp(exponent): relative while it is not negligible.
             if drop > -30:
                 error = abs(float(exponent) - float(drop))
@@ -97,7 +98,8 @@ def test_cosine_and_hemisphere_integrals(value):
     peak = cosine_by_quadrature(value, 1.0, True)
     exact = np.array([cosine_by_quadrature(value, x, True) for x in cosine])
     got = sg.cosine_integral(s, c).double().numpy()
-    assert (got >= 0).all() and np.abs(got - exact).max() / peak < 2e-3
+    assert (got >= 0).all()
+    assert np.abs(got - exact).max() / peak < 2e-3
     half = np.array([cosine_by_quadrature(value, x, False) for x in cosine])
     assert np.abs(sg.hemisphere_integral(s, c).double().numpy() - half).max() / float(sg.integral(s[0])) < 1.2e-2
 
@@ -108,7 +110,8 @@ def test_float32_rounding_of_the_integrals(value):
     for function in (sg.cosine_integral, sg.hemisphere_integral):
         low = function(torch.tensor(value, dtype=torch.float32), c).double()
         high = function(torch.tensor(float(np.float32(value)), dtype=torch.float64), c.double())
-        assert torch.isfinite(low).all() and (low >= 0).all()
+        assert torch.isfinite(low).all()
+        assert (low >= 0).all()
         # Sharp lobes turn a rounding of the cosine into one of the result: compare on the scale of the peak.
         assert float((low - high).abs().max() / high.max()) < 2e-6
 

@@ -15,10 +15,10 @@ from gdtool.assets.scene import Scene, Texture
 from gdtool.cameras import rig
 from gdtool.geometry import rays
 from gdtool.geometry.rays import is_convex
-from gdtool.shading.bsdf.reflection import Surface
-from gdtool.shading.lights.prefilter import LADDER
+from gdtool.shading.bsdf.reflection import PointReflection
+from gdtool.shading.lights.prefilter import ROUGHNESS_LEVELS
 from gdtool.shading.lights.studio import studio
-from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.render.direct import DirectLight, LightOptions
 from gdtool.shading.render.render import Renderer
 from tests.geometry.solids import cube
 from tests.shading.test_render import GREY, four_colors, quad, sphere
@@ -29,13 +29,12 @@ def test_convex_is_what_lies_on_its_hull(most, monkeypatch):
     monkeypatch.setattr(rays, "_MOST_BY_PAIRS", most)
     ball = sphere(rings=24)
     turned = ball.vertices @ np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    assert (
-        is_convex(ball.vertices, ball.faces)
-        and is_convex(turned * [1, 2, 3], ball.faces)
-        and is_convex(ball.vertices, ball.faces[:, ::-1])
-    )
+    assert is_convex(ball.vertices, ball.faces)
+    assert is_convex(turned * [1, 2, 3], ball.faces)
+    assert is_convex(ball.vertices, ball.faces[:, ::-1])
     # Open; in a plane.
-    assert is_convex(ball.vertices, ball.faces[:500]) and is_convex(ball.vertices * [1, 0, 1], ball.faces[:60])
+    assert is_convex(ball.vertices, ball.faces[:500])
+    assert is_convex(ball.vertices * [1, 0, 1], ball.faces[:60])
     for corner in (0, 300, 1199):
         dented = ball.vertices.copy()
         dented[corner] *= 0.98
@@ -46,10 +45,11 @@ def test_convex_is_what_lies_on_its_hull(most, monkeypatch):
 
 def test_convex_objects_need_no_shadow_rays(monkeypatch):
     # Without chance, whose dice fall only where rays may be cast.
-    monkeypatch.setattr(direct, "RARE", 0.0)
+    monkeypatch.setattr(direct, "ROULETTE_SHARE", 0.0)
     vertices, faces = cube()
     ball = sphere(rings=12)
-    assert is_convex(vertices, faces) and is_convex(ball.vertices, ball.faces)
+    assert is_convex(vertices, faces)
+    assert is_convex(ball.vertices, ball.faces)
     dented = np.array(vertices, float)
     dented[0] *= 0.2
     assert not is_convex(dented, faces)
@@ -79,7 +79,7 @@ def test_skipping_even_pixels_changes_nothing_that_counts(monkeypatch):
     renderer = Renderer(scene)
     adaptive = renderer.buffers(camera, 16)
     few = renderer.counts.samples
-    monkeypatch.setattr(render, "BASE", 16)
+    monkeypatch.setattr(render, "BASE_SAMPLES", 16)
     full = Renderer(scene).buffers(camera, 16)
     assert few < 0.8 * 16 * 64 * 64
     assert np.abs(adaptive["albedo"] - full["albedo"])[full["mask"] > 0].mean() < 2e-3
@@ -88,7 +88,7 @@ def test_skipping_even_pixels_changes_nothing_that_counts(monkeypatch):
 
 def test_a_texture_of_one_value_is_a_factor():
     """Not looked up, and the picture is the same to the bit; the manifest's skip names it."""
-    from gdtool.shading.render.skipped_work import savings
+    from gdtool.shading.render.skipped_work import skipped_work
 
     flat = Texture(np.full((8, 8, 3), (200, 100, 50), np.uint8), "srgb")
     scene = quad(
@@ -99,8 +99,9 @@ def test_a_texture_of_one_value_is_a_factor():
     renderers[1].lookup.skip_constant = False
     few, all_ = (renderer.buffers(rig("six", 48)[1], 8) for renderer in renderers)
     assert all(np.array_equal(few[name], all_[name]) for name in few)
-    told = {what: why for what, why, _ in savings(renderers[0], 8, None)}
-    assert "one value" in told["base color lookups"] and "metallic-roughness lookups" not in told
+    told = {what: why for what, why, _ in skipped_work(renderers[0], 8, None)}
+    assert "one value" in told["base color lookups"]
+    assert "metallic-roughness lookups" not in told
 
 
 def two_balls() -> Scene:
@@ -118,8 +119,8 @@ def test_leaving_out_rays_toward_little_light_keeps_the_mean(monkeypatch):
     hardly more noise."""
     scene, camera, light = two_balls(), rig("six", 24)[1], studio("mid", fit=False)[0]
     means, noises, rays = [], [], []
-    for share in (0.0, direct.RARE):
-        monkeypatch.setattr(direct, "RARE", share)
+    for share in (0.0, direct.ROULETTE_SHARE):
+        monkeypatch.setattr(direct, "ROULETTE_SHARE", share)
         pictures = []
         for seed in range(48):
             renderer = Renderer(scene)
@@ -128,7 +129,8 @@ def test_leaving_out_rays_toward_little_light_keeps_the_mean(monkeypatch):
         means.append(np.mean(pictures, 0))
         noises.append(np.std(pictures, 0).mean())
         rays.append(renderer.counts.shadow_rays)
-    assert renderer.counts.shadow_rays_rare > 0 and rays[1] < 0.9 * rays[0]
+    assert renderer.counts.shadow_rays_rare > 0
+    assert rays[1] < 0.9 * rays[0]
     assert abs(means[1].mean() / means[0].mean() - 1) < 5e-3
     assert np.abs(means[1] - means[0]).max() < 0.03 * means[0].max()
     assert noises[1] < 1.1 * noises[0]
@@ -137,16 +139,16 @@ def test_leaving_out_rays_toward_little_light_keeps_the_mean(monkeypatch):
 def test_directions_below_the_horizon_bring_nothing(monkeypatch):
     """Followed all the same, they meet the surface that they start from, but for a few that leave over an edge (1 in
     1000)."""
-    monkeypatch.setattr(direct, "RARE", 0.0)
+    monkeypatch.setattr(direct, "ROULETTE_SHARE", 0.0)
     scene, camera, light = two_balls(), rig("six", 24)[1], studio("mid", fit=False)[0]
-    evaluate, frames, rays = Surface.evaluate, [], []
+    evaluate, frames, rays = PointReflection.evaluate, [], []
 
     def all_above(self, *direction):
         terms, density, above = evaluate(self, *direction)
         return terms, density, torch.ones_like(above)
 
     for followed in (evaluate, all_above):
-        monkeypatch.setattr(Surface, "evaluate", followed)
+        monkeypatch.setattr(PointReflection, "evaluate", followed)
         renderer = Renderer(scene)
         frames.append(renderer.buffers(camera, 4, DirectLight(renderer, light, 4).color())["color"])
         rays.append(renderer.counts.shadow_rays)
@@ -192,9 +194,9 @@ def test_prefiltered_levels_that_nothing_needs_are_not_missed():
     camera, light, frames = rig("six", 32)[1], studio("mid", fit=False)[0], []
     for everything in (False, True):
         renderer = Renderer(sphere(rings=24))
-        shading = DirectLight(renderer, light, 0, mode="prefiltered")
+        shading = DirectLight(renderer, light, 0, options=LightOptions("prefiltered"))
         if everything:
-            shading.prefiltered.prepare(np.array([r for r, *_ in LADDER], np.float32))
+            shading.prefiltered.prepare(np.array([level.roughness for level in ROUGHNESS_LEVELS], np.float32))
         frames.append(renderer.buffers(camera, 4, shading.color())["color"])
-        assert (len(shading.prefiltered.images) == len(LADDER)) == everything
+        assert (len(shading.prefiltered.images) == len(ROUGHNESS_LEVELS)) == everything
     assert np.array_equal(*frames)

@@ -190,15 +190,14 @@ def test_a_mesh_file_in_either_frame_finds_the_surface(gdtool, tmp_path):
     assert np.abs(maps[0] - maps[1]).max() <= 1
 
 
-def test_maps_that_do_not_fit_are_refused_with_the_figure(gdtool, chain, monkeypatch):
+def test_maps_that_do_not_fit_are_refused_with_the_figure(monkeypatch):
+    from gdtool.bake.maps import require_map_memory
     from gdtool.core.errors import ResourceError
-    from gdtool.core.stage import Inputs
-    from gdtool.stages.bake import _check_memory
 
     monkeypatch.setattr(Path, "read_text", lambda self, *_: "MemTotal: 9 kB\nMemAvailable:   1048576 kB\n")
-    _check_memory(Inputs(chain, "ring"), 2048)
+    require_map_memory("ring", 2048)
     with pytest.raises(ResourceError, match=r"4096 texels need about 2 GB of memory, 1 GB are free; lower --size"):
-        _check_memory(Inputs(chain, "ring"), 4096)
+        require_map_memory("ring", 4096)
 
 
 def test_broken_faces_do_not_stop_it(gdtool, chain, tmp_path):

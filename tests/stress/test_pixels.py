@@ -15,7 +15,7 @@ from scipy.stats import t as student
 from gdtool.assets.scene import Material, Scene
 from gdtool.cameras import camera_at
 from gdtool.shading.lights.bundled import bundled
-from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.render.direct import DirectLight, LightOptions
 from gdtool.shading.render.render import Renderer
 from tests.stress.test_scenes import ball
 
@@ -38,7 +38,7 @@ def stage(material: Material) -> Scene:
 
 def picture(renderer: Renderer, environment, seed: int, directions: int, brdf: str = "gltf", **options) -> np.ndarray:
     return renderer.buffers(
-        CAMERA, SAMPLES, DirectLight(renderer, environment, directions, seed, brdf, **options).color()
+        CAMERA, SAMPLES, DirectLight(renderer, environment, directions, seed, brdf, LightOptions(**options)).color()
     )["color"].astype(np.float64)
 
 
@@ -74,9 +74,9 @@ def test_sampled_light_agrees_with_the_converged(material, light, brdf, known):
     """The plain estimate is unbiased; the one that is used for glTF's Lambert, the known irradiance times the visible
     share, is a ratio of two estimates, off by up to 0.1 % where a pixel is half in shadow."""
     renderer, environment = Renderer(stage(MATERIALS[material]), 1), bundled(light).shrunk(64)
-    reference = [picture(renderer, environment, 1000 + k, 1024, brdf, known=False) for k in range(4)]
+    reference = [picture(renderer, environment, 1000 + k, 1024, brdf, control_variate=False) for k in range(4)]
     error = np.std(reference, 0, ddof=1) / 2
-    draws = np.stack([picture(renderer, environment, seed, 16, brdf, known=known) for seed in range(DRAWS)])
+    draws = np.stack([picture(renderer, environment, seed, 16, brdf, control_variate=known) for seed in range(DRAWS)])
     assert z_test(draws, np.mean(reference, 0), error, 2e-3 if known else 0.0) > SIGNIFICANCE
 
 

@@ -15,7 +15,7 @@ from gdtool.shading.bsdf.closed_form import closed_form_image, shade
 from gdtool.shading.bsdf.sg import SphericalGaussians
 from gdtool.shading.lights.bundled import bundled
 from gdtool.shading.lights.environment import Environment
-from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.render.direct import DirectLight, LightOptions
 from gdtool.shading.render.render import Renderer
 
 SHINY = Material(base_color=(1, 1, 1, 1), metallic=1.0, roughness=0.0)
@@ -104,7 +104,7 @@ def rendered(
     scene: Scene, environment: Environment, *, fov: float | None = 30.0, brdf: str = "gltf", size: int = 16, **options
 ) -> dict[str, np.ndarray]:
     renderer = Renderer(scene, 1)
-    light = DirectLight(renderer, environment, options.pop("samples", 4), 0, brdf, **options)
+    light = DirectLight(renderer, environment, options.pop("samples", 4), 0, brdf, LightOptions(**options))
     return renderer.buffers(camera_at(20.0, 10.0, name="v", size=size, fov_degrees=fov), 4, light.color())
 
 

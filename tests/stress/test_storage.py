@@ -17,8 +17,8 @@ from gdtool.geometry.tangents import corner_tangents
 from gdtool.geometry.uv_raster import owner_count
 from gdtool.images.color import decode_normal, encode_normal, linear_from_srgb, srgb_from_linear
 from gdtool.images.io import read_image, write_png
-from gdtool.shading.bsdf.reflection import frame
 from gdtool.shading.render.textures import TextureReader
+from gdtool.shading.sampling import orthonormal_basis
 from tests.geometry.test_uv_raster import exact_owner
 
 settings.register_profile("stress", derandomize=True, deadline=None, print_blob=True)
@@ -115,7 +115,9 @@ def test_frames_are_unit_square_and_handed():
         [0.7, 0.7, -1e-12],
     ]
     n = torch.tensor(directions / np.linalg.norm(directions, axis=1, keepdims=True), dtype=torch.float32)
-    tangent, bitangent = (torch.stack([c.expand(len(n)) for c in v], 1).double() for v in frame(*n.unbind(1)))
+    tangent, bitangent = (
+        torch.stack([c.expand(len(n)) for c in v], 1).double() for v in orthonormal_basis(*n.unbind(1))
+    )
     normal = n.double()
     for a, b, wanted in (
         (tangent, tangent, 1),

@@ -17,7 +17,7 @@ from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
 from gdtool.images.color import srgb_from_linear
 from gdtool.images.io import write_png
 from gdtool.shading.lights.studio import studio
-from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.render.direct import DirectLight, LightOptions
 from gdtool.shading.render.render import Renderer, render_buffers
 
 
@@ -32,7 +32,9 @@ def main(model: str, out: str, mode: str = "lit") -> None:
     else:
         renderer = Renderer(scene)
         images = renderer.buffers(
-            front, 16, DirectLight(renderer, studio(mode, 0, fit=False)[0], 16, shadows=False).color()
+            front,
+            16,
+            DirectLight(renderer, studio(mode, 0, fit=False)[0], 16, options=LightOptions(shadows=False)).color(),
         )
         color, mask = images["color"], images["mask"]
     write_png(out, np.concatenate([srgb_from_linear(np.clip(color, 0, 1)), mask[..., None]], -1))

@@ -1,6 +1,6 @@
-"""The two reflection models: glTF 2.0's (appendix B) and the paper's (Disney / Schlick-GGX), in torch.
+"""Evaluate the two reflection models in torch: glTF 2.0's (appendix B) and the paper's (Disney / Schlick-GGX).
 
-Cosines are clamped to [MIN_COSINE, 1]; roughness is perceptual (α = r²) and shaded with r >= MIN_ROUGHNESS.
+Cosines are clamped to [MIN_COSINE, 1]. Roughness is perceptual, α = r², and shaded with r >= MIN_ROUGHNESS.
 """
 
 from __future__ import annotations
@@ -13,30 +13,32 @@ from torch import Tensor
 
 Brdf = Literal["gltf", "paper"]
 
-MIN_ROUGHNESS = 0.045  # below, 1 / r⁴ leaves float16 and mirrors alias anyway
-MIN_COSINE = 1e-3
+MIN_ROUGHNESS = 0.045  # below it 1 / r⁴ overflows float16, and mirrors alias anyway
+MIN_COSINE = 1e-3  # keeps 1 / cosine finite at grazing directions
 
 
 def clamp_cosine(cosine: Tensor) -> Tensor:
-    """To [MIN_COSINE, 1]."""
+    """Clamp a cosine to [MIN_COSINE, 1]."""
     return cosine.clamp(MIN_COSINE, 1.0)
 
 
 def alpha_of(roughness: Tensor) -> Tensor:
-    """α = r², r clamped to [MIN_ROUGHNESS, 1]."""
+    """Convert perceptual roughness, clamped to [MIN_ROUGHNESS, 1], to α = r²."""
     return roughness.clamp(MIN_ROUGHNESS, 1.0) ** 2
 
 
 def f0_of(albedo: Tensor, metallic: Tensor, f0: float | Tensor) -> Tensor:
-    """Reflectance at normal incidence (..., 3): f0 for dielectrics, the albedo for metals."""
+    """Blend the reflectance at normal incidence (..., 3): f0 for dielectrics, the albedo for metals."""
     m = metallic[..., None]
     return f0 * (1 - m) + albedo * m
 
 
 def fresnel(f0: Tensor, cosine: Tensor) -> Tensor:
-    """Schlick 1994: f0 + (1 − f0)(1 − c)^5; f0 (..., 3), cosine (...). In float32 within 2 machine epsilons for f0 of
-    0.04 and more: what rounding took from 1 − c, exact by Sterbenz's lemma, goes back in before the fifth power makes
-    it five times larger."""
+    """Evaluate Schlick's Fresnel term (1994), f0 + (1 − f0)(1 − c)^5, for f0 (..., 3) and cosine (...).
+
+    In float32 it is within 2 machine epsilons for f0 >= 0.04. The rounding error of 1 − c is known exactly (Sterbenz's
+    lemma); it is added back before the fifth power makes it five times larger.
+    """
     c = cosine.clamp(0.0, 1.0)
     x = 1 - c
     lost = ((1 - x) - c).detach()
@@ -46,7 +48,10 @@ def fresnel(f0: Tensor, cosine: Tensor) -> Tensor:
 
 
 def ndf(alpha: Tensor, n_h: Tensor) -> Tensor:
-    """GGX (Trowbridge & Reitz 1975): α² / (π ((n·h)²(α² − 1) + 1)²), with 1 − (n·h)² from the factors."""
+    """Evaluate the GGX normal distribution (Trowbridge & Reitz 1975), α² / (π ((n·h)²(α² − 1) + 1)²).
+
+    1 − (n·h)² is computed as (1 − n·h)(1 + n·h), which does not cancel near the normal.
+    """
     c = n_h.clamp(0.0, 1.0)
     a2 = alpha * alpha
     base = (1 - c) * (1 + c) + a2 * c * c
@@ -54,28 +59,31 @@ def ndf(alpha: Tensor, n_h: Tensor) -> Tensor:
 
 
 def visibility_gltf(alpha: Tensor, n_l: Tensor, n_v: Tensor) -> Tensor:
-    """Height-correlated Smith, divided by 4 (n·l)(n·v) (Heitz 2014)."""
+    """Evaluate height-correlated Smith shadowing, divided by 4 (n·l)(n·v) (Heitz 2014)."""
     a2 = alpha * alpha
-    l, v = clamp_cosine(n_l), clamp_cosine(n_v)
-    root_v = torch.sqrt((1 - v) * (1 + v) * a2 + v * v)
-    root_l = torch.sqrt((1 - l) * (1 + l) * a2 + l * l)
-    return 0.5 / (l * root_v + v * root_l)
+    n_l, n_v = clamp_cosine(n_l), clamp_cosine(n_v)
+    root_v = torch.sqrt((1 - n_v) * (1 + n_v) * a2 + n_v * n_v)
+    root_l = torch.sqrt((1 - n_l) * (1 + n_l) * a2 + n_l * n_l)
+    return 0.5 / (n_l * root_v + n_v * root_l)
 
 
 def visibility_paper(roughness: Tensor, n_l: Tensor, n_v: Tensor) -> Tensor:
-    """Schlick-GGX with k = (r + 1)² / 8, the cosines of its numerator cancelled: 1 / (4 (l(1−k)+k)(v(1−k)+k))."""
+    """Evaluate Schlick-GGX shadowing with k = (r + 1)² / 8, divided by 4 (n·l)(n·v).
+
+    The cosines cancel: 1 / (4 (n·l (1 − k) + k)(n·v (1 − k) + k)).
+    """
     k = (roughness.clamp(MIN_ROUGHNESS, 1.0) + 1) ** 2 / 8
-    l, v = clamp_cosine(n_l), clamp_cosine(n_v)
-    return 0.25 / ((l * (1 - k) + k) * (v * (1 - k) + k))
+    n_l, n_v = clamp_cosine(n_l), clamp_cosine(n_v)
+    return 0.25 / ((n_l * (1 - k) + k) * (n_v * (1 - k) + k))
 
 
 def visibility(brdf: Brdf, roughness: Tensor, n_l: Tensor, n_v: Tensor) -> Tensor:
-    """G / (4 (n·l)(n·v)) of the model."""
+    """Evaluate a model's shadowing term G / (4 (n·l)(n·v))."""
     return visibility_gltf(alpha_of(roughness), n_l, n_v) if brdf == "gltf" else visibility_paper(roughness, n_l, n_v)
 
 
 def disney_diffuse(roughness: Tensor, n_l: Tensor, n_v: Tensor, l_h: Tensor) -> Tensor:
-    """Factor on albedo / π of Disney's diffuse (Burley 2012)."""
+    """Evaluate the factor on albedo / π of Disney's diffuse model (Burley 2012)."""
     f90 = 0.5 + 2 * roughness * l_h * l_h
     return (1 + (f90 - 1) * (1 - n_l) ** 5) * (1 + (f90 - 1) * (1 - n_v) ** 5)
 
@@ -91,7 +99,10 @@ def reflectance(
     n_h: Tensor,
     v_h: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Diffuse and specular BRDF (..., 3) at one pair of directions, without the cosine; f0 (..., 3) from f0_of."""
+    """Evaluate the diffuse and the specular BRDF (..., 3) at a pair of directions, without the cosine.
+
+    f0 (..., 3) from f0_of. More than seven parameters: they are the terms of the formula, each a tensor.
+    """
     fresnel_term = fresnel(f0, v_h)
     specular = fresnel_term * (ndf(alpha_of(roughness), n_h) * visibility(brdf, roughness, n_l, n_v))[..., None]
     diffuse = albedo * ((1 - metallic) / math.pi)[..., None]

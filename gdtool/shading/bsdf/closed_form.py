@@ -1,9 +1,12 @@
-"""Unshadowed color under spherical-Gaussian light in closed form, differentiable in everything.
+"""Shade points under spherical Gaussian light in closed form, without shadows; differentiable in everything.
 
-Diffuse: clamped-cosine integral of each lobe. Specular, a blend of two estimates by x = 2 λ_light r⁴ (n·o): where the
-light is broader than the reflection lobe, the lobe as an SG about the mirror direction (Wang et al. 2009) times the
-light; where it is sharper, the light's energy times a GGX filtered by the light's width (after Tokuyoshi 2015, "Virtual
-spherical Gaussian lights for real-time glossy indirect illumination")."""
+Diffuse light is the clamped-cosine integral of each lobe. Specular light blends two estimates, by x = 2 λ_light r⁴ n·v:
+
+- Light that is broader than the reflection lobe: the lobe as a spherical Gaussian about the mirror direction, times the
+  light (Wang et al. 2009, "All-frequency rendering of dynamic, spatially-varying reflectance").
+- Light that is sharper: its energy times a GGX filtered by the light's width (after Tokuyoshi 2015, "Virtual spherical
+  Gaussian lights for real-time glossy indirect illumination").
+"""
 
 from __future__ import annotations
 
@@ -17,13 +20,16 @@ from gdtool.cameras import Camera, rays
 from gdtool.shading.bsdf.brdf import Brdf, alpha_of, clamp_cosine, f0_of, fresnel, ndf, visibility
 from gdtool.shading.bsdf.sg import MAX_SHARPNESS, SphericalGaussians, cosine_integral, dot, integral, normalize, product
 
-# The mirror-direction forms divide by n·o; grazing pixels are few and nothing closed-form is good there.
+# The least n·v that is shaded: the forms about the mirror direction divide by it. Pixels at grazing angles are few, and
+# no closed form is good there.
 MIN_VIEW_COSINE = 0.05
 
 
 def fresnel_loss(n_v: Tensor) -> Tensor:
-    """Cosine-weighted mean of (1 − v·h)^5 over the light's hemisphere, by n·v: quartic fit in 1 − n·v to quadrature
-    (largest error 1e-5)."""
+    """Approximate the cosine-weighted mean of (1 − v·h)^5 over the light's hemisphere, by n·v.
+
+    A quartic in 1 − n·v, fitted to quadrature with a largest error of 1e-5.
+    """
     x = 1 - n_v.clamp(0.0, 1.0)
     return FRESNEL_LOSS[0] + x * (FRESNEL_LOSS[1] + x * (FRESNEL_LOSS[2] + x * (FRESNEL_LOSS[3] + x * FRESNEL_LOSS[4])))
 
@@ -32,7 +38,7 @@ FRESNEL_LOSS = (8.2276e-05, 2.01991e-03, 9.31524e-03, 7.78369e-03, 8.96193e-03)
 
 
 def disney_mean(roughness: Tensor, n_v: Tensor) -> Tensor:
-    """Cosine-weighted mean of Disney's diffuse factor over the light's hemisphere (see fresnel_loss)."""
+    """Approximate the cosine-weighted mean of Disney's diffuse factor over the light's hemisphere."""
     # E[(1 − n·l)^5] = 1/21 and E[(l·h)²] = (1 + E[l·v]) / 2 with E[l·v] = 2/3 n·v under the cosine density.
     v = n_v.clamp(0.0, 1.0)
     f90 = 0.5 + roughness * (1 + (2 / 3) * v)
@@ -49,10 +55,11 @@ def shade(
     brdf: Brdf = "gltf",
     f0: float | Tensor = 0.04,
 ) -> Tensor:
-    """Linear radiance (..., 3) toward view.
+    """Compute the linear radiance (..., 3) that points reflect toward view.
 
-    normal, view (..., 3) unit, view toward the eye; albedo (..., 3) linear; roughness, metallic (...); f0 a number or
-    (..., 1). A zero normal gives 0; a view below the horizon is shaded as grazing. Everything broadcasts.
+    normal and view (..., 3) are unit, view toward the eye; albedo (..., 3) linear; roughness, metallic (...); f0, the
+    dielectric reflectance, a number or (..., 1). A zero normal gives 0. A view below the horizon is shaded as grazing.
+    Everything broadcasts. More than seven parameters: they are the terms of the formula, each differentiable.
     """
     diffuse, specular = shade_parts(normal, view, albedo, roughness, metallic, lights, brdf, f0)
     return diffuse + specular
@@ -68,7 +75,7 @@ def shade_parts(
     brdf: Brdf = "gltf",
     f0: float | Tensor = 0.04,
 ) -> tuple[Tensor, Tensor]:
-    """Diffuse and specular radiance (..., 3) of shade."""
+    """Compute the diffuse and the specular part (..., 3) of shade, with the same parameters."""
     known = (dot(normal, normal) > 0.25).to(normal.dtype)[..., None]
     n_v = dot(normal, view).clamp(MIN_VIEW_COSINE, 1.0)
     light_cosine = dot(normal[..., None, :], lights.axes)
@@ -95,6 +102,11 @@ def _specular(
     lights: SphericalGaussians,
     brdf: Brdf,
 ) -> Tensor:
+    """Compute the specular radiance (..., 3); takes what shade_parts has computed already, hence nine parameters.
+
+    n_v (...) clamped; f0 (..., 3) from f0_of; light_cosine and received (..., k): cosine and clamped-cosine integral of
+    each lobe.
+    """
     alpha = alpha_of(roughness)
     alpha2 = alpha * alpha
 
@@ -126,7 +138,10 @@ def _specular(
 def closed_form_image(
     frame: dict[str, np.ndarray], camera: Camera, lobes: SphericalGaussians, brdf: str = "gltf"
 ) -> np.ndarray:
-    """(h, w, 3) unshadowed linear radiance of a view's own maps under spherical Gaussians; 0 where nothing is seen."""
+    """Shade a view's material maps under spherical Gaussians, without shadows: (h, w, 3) linear radiance.
+
+    frame has normal, albedo, roughness, metallic and mask (h, w[, c]), as Renderer.buffers; 0 where the mask is.
+    """
     inside = frame["mask"] > 0
     view = -rays(camera)[1][inside]
     maps = [

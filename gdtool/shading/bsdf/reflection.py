@@ -1,5 +1,8 @@
-"""Reflection of surface points as scalars per pair of point and direction: evaluated, and sampled by visible
-normals."""
+"""Evaluate and sample the reflection of many surface points, several directions each.
+
+A vector per pair of point and direction is kept as three tensors, one a component: sums then run over numbers that lie
+side by side.
+"""
 
 from __future__ import annotations
 
@@ -8,29 +11,36 @@ import math
 import numpy as np
 
 from gdtool.shading.lights.environment import LUMINANCE
+from gdtool.shading.sampling import orthonormal_basis
 
+# The least share of sampled directions that go to the specular lobe: dull points keep some, so weights stay bounded.
 MIN_SPECULAR_SHARE = 0.1
-# Normal maps may turn a normal away from the eye: such points are shaded as seen at grazing.
+# The least n·v that is shaded. Normal maps may turn a normal away from the eye: such points are shaded as grazing.
 MIN_VIEW_COSINE = 0.02
 
 
 def tensor_of(x: np.ndarray):
-    """A float32 tensor of an array."""
+    """Make a float32 tensor of an array."""
     import torch
 
     return torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)
 
 
 def rows_of(x: np.ndarray, part: slice = slice(None)):
-    """A (c, n) float32 tensor of vectors (n, c)."""
+    """Make a (c, n) float32 tensor of the vectors (n, c) that part selects."""
     return tensor_of(x.T[:, part])
 
 
-class Surface:
-    """Reflection of n points toward the eye: evaluated and sampled for k directions each, vectors as three (k, n)
-    tensors.
+class PointReflection:
+    """The reflection of n points toward the eye, for k directions each.
 
-    toward (n, 3) unit, values as of SurfaceLookup.attributes, part of both is taken.
+    Directions are three (k, n) tensors, one a component.
+
+    Args:
+        toward: (m, 3) unit directions to the eye.
+        values: attributes of the m points, as SurfaceLookup.attributes returns them.
+        part: which n of the m points are meant.
+        brdf: "gltf" or "paper" (see brdf.Brdf).
     """
 
     def __init__(self, toward: np.ndarray, values: dict[str, np.ndarray], part: slice, brdf: str):
@@ -55,14 +65,14 @@ class Surface:
         diffuse = self.albedo.amax(0) * (1 - self.metallic)
         self.share = (reflect / (reflect + diffuse).clamp_min(1e-6)).clamp(MIN_SPECULAR_SHARE, 1.0)
 
-    def lifted(self, position: np.ndarray, offset: float):
-        """(3, n) tensor of positions (n, 3) moved a little off the surface, to the seen side."""
+    def offset_origins(self, position: np.ndarray, offset: float):
+        """Move positions (n, 3) by offset along the geometric normal, as starts of shadow rays: a (3, n) tensor."""
         import torch
 
         return torch.from_numpy((position.T + np.float32(offset) * self.geometric.numpy()).astype(np.float32))
 
     def brightness(self, terms, luminance):
-        """(k, n) about how bright directions of a luminance (k, n) are reflected, from the terms of evaluate."""
+        """Estimate the reflected luminance (k, n) of light with luminance (k, n), from the terms of evaluate."""
         import torch
 
         weights = torch.from_numpy(LUMINANCE.astype(np.float32))
@@ -70,8 +80,14 @@ class Surface:
         return luminance * (f0 * terms[0] + (1 - f0) * terms[1] + diffuse * terms[2])
 
     def evaluate(self, x, y, z):
-        """[D V c, D V c w, d c / π, d c w / π] with c = n·l and d the diffuse model's factor; density of sample(); and
-        whether the direction is above the horizon of both the shading and the true normal."""
+        """Evaluate the reflection of light from directions (x, y, z), three (k, n) tensors.
+
+        Returns:
+            Four (k, n) terms: D V c, D V c w, d c / π and d c w / π. c = n·l, w = (1 − v·h)^5 is Schlick's Fresnel
+            weight, d the factor of the diffuse model.
+            The density (k, n) with which sample() draws the direction, per steradian.
+            Whether the direction (k, n) lies above the horizon of the shading normal and of the geometric one.
+        """
         from gdtool.shading.bsdf.brdf import disney_diffuse, ndf, visibility_gltf, visibility_paper
 
         nx, ny, nz = self.normal
@@ -101,16 +117,20 @@ class Surface:
         return (specular, specular * w, diffuse, diffuse * w), density, above
 
     def sample(self, u, v, pick):
-        """Directions (three (k, n)) from uniform numbers (k, n): visible normals mirrored, or cosine-weighted."""
+        """Draw directions, three (k, n) tensors, from uniform numbers u, v and pick (k, n).
+
+        Where pick is below the specular share, the view is mirrored at a visible normal (spherical caps, Dupuy &
+        Benyoub 2023); elsewhere the direction is cosine-weighted.
+        """
         import torch
 
-        (tx, ty, tz), (bx, by, bz) = frame(*self.normal)
+        (tx, ty, tz), (bx, by, bz) = orthonormal_basis(*self.normal)
         (nx, ny, nz), (vx, vy, vz) = self.normal, self.view
         a = self.alpha
         ex, ey = tx * vx + ty * vy + tz * vz, bx * vx + by * vy + bz * vz
         length = (ex * ex + ey * ey + self.n_v * self.n_v).rsqrt()
         ex, ey, ez = ex * length, ey * length, self.n_v * length
-        # Spherical caps (Dupuy & Benyoub 2023).
+        # The view in the space where the GGX lobe is a hemisphere, then a point of the cap of its visible normals.
         sx, sy = a * ex, a * ey
         length = (sx * sx + sy * sy + ez * ez).rsqrt()
         sx, sy, sz = sx * length, sy * length, ez * length
@@ -128,13 +148,3 @@ class Surface:
         y = torch.where(glossy, twice * my - ey, radius * sin_phi)
         z = torch.where(glossy, twice * mz - ez, (1 - u).clamp_min(0).sqrt())
         return x * tx + y * bx + z * nx, x * ty + y * by + z * ny, x * tz + y * bz + z * nz
-
-
-def frame(x, y, z):
-    """Tangent and bitangent of unit normals, three components each (Duff et al. 2017)."""
-    import torch
-
-    sign = torch.where(z < 0, -1.0, 1.0)
-    a = -1 / (sign + z)
-    b = x * y * a
-    return (1 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)

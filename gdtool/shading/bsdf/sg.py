@@ -26,40 +26,40 @@ class SphericalGaussians:
     amplitudes: Tensor
 
     def to(self, *args, **kwargs) -> SphericalGaussians:
-        """Tensor.to of all parts."""
+        """Move or cast all parts, as Tensor.to."""
         return SphericalGaussians(
             self.axes.to(*args, **kwargs), self.sharpness.to(*args, **kwargs), self.amplitudes.to(*args, **kwargs)
         )
 
     @classmethod
     def from_record(cls, light: dict, dtype: torch.dtype = torch.float32) -> SphericalGaussians:
-        """From a record of light.json (folders.records.read_record)."""
+        """Read the lobes of a light.json record, as folders.records.read_record returns it."""
         return cls(*(torch.as_tensor(light[name], dtype=dtype) for name in ("axes", "sharpness", "amplitudes")))
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
-    """Sum over the last axis of a product."""
+    """Take the dot product over the last axis."""
     return (a * b).sum(-1)
 
 
 def normalize(v: Tensor) -> Tensor:
-    """v / |v|; shorter than 1e-12 stays short, with a finite gradient."""
+    """Divide v by its length; vectors shorter than 1e-12 stay short, with a finite gradient."""
     return v * torch.rsqrt(dot(v, v).clamp_min(_TINY))[..., None]
 
 
 def lobe(axis: Tensor, sharpness: Tensor, v: Tensor) -> Tensor:
-    """exp(−λ |v − p|² / 2): the chord form loses nothing near the axis, where λ(v·p − 1) cancels."""
+    """Evaluate a lobe as exp(−λ |v − p|² / 2): exact near the axis, where λ(v·p − 1) cancels."""
     chord = v - axis
     return torch.exp(-0.5 * sharpness * dot(chord, chord))
 
 
 def evaluate(g: SphericalGaussians, v: Tensor) -> Tensor:
-    """Radiance (..., 3) from directions v (..., 3)."""
+    """Evaluate the radiance (..., 3) from directions v (..., 3)."""
     return lobe(g.axes, g.sharpness, v[..., None, :]) @ g.amplitudes
 
 
 def product(axis1: Tensor, sharpness1: Tensor, axis2: Tensor, sharpness2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Product of two unit-amplitude lobes: axis (..., 3), sharpness, and the logarithm of its amplitude (<= 0).
+    """Multiply two lobes of amplitude 1: returns axis (..., 3), sharpness, and the logarithm of the amplitude (<= 0).
 
     λ² = S² − 2 λ₁λ₂ q with S = λ₁ + λ₂ and q = |p₁ − p₂|² / 2; beyond a right angle (λ₁ − λ₂)² + λ₁λ₂ |p₁ + p₂|²,
     which does not cancel there. Wang et al. 2009, rearranged.
@@ -81,7 +81,7 @@ def product(axis1: Tensor, sharpness1: Tensor, axis2: Tensor, sharpness2: Tensor
 
 
 def integral(sharpness: Tensor) -> Tensor:
-    """∫ G over the sphere for amplitude 1: −2π expm1(−2λ)/λ, 4π at λ = 0."""
+    """Integrate a lobe of amplitude 1 over the sphere: −2π expm1(−2λ)/λ, 4π at λ = 0."""
     small = sharpness < 1e-4
     s = torch.where(small, torch.ones_like(sharpness), sharpness)
     series = 4 * math.pi * (1 - sharpness + (2 / 3) * sharpness * sharpness)
@@ -89,11 +89,12 @@ def integral(sharpness: Tensor) -> Tensor:
 
 
 def hemisphere_integral(sharpness: Tensor, cosine: Tensor) -> Tensor:
-    """∫ G over the hemisphere whose pole makes the given cosine with the axis, for amplitude 1.
+    """Integrate a lobe of amplitude 1 over a hemisphere whose pole makes the given cosine with the axis.
 
-    Meder & Brüderlin 2018's blend of the hemispheres about the axis and away from it, the share by the error function
-    as Tokuyoshi 2022 ("Accurate Diffuse Lighting from Spherical Gaussian Lights"): within 4.4e-3 of the sphere
-    integral, at λ = 10 (1.1e-2 with Meder & Brüderlin's hyperbolic tangent)."""
+    Blends the integrals of the hemispheres about the axis and away from it (Meder & Brüderlin 2018). The share comes
+    from the error function (Tokuyoshi 2022, "Accurate Diffuse Lighting from Spherical Gaussian Lights"). Largest error:
+    4.4e-3 of the sphere integral, at λ = 10; 1.1e-2 with Meder & Brüderlin's hyperbolic tangent.
+    """
     s = sharpness.clamp(0, MAX_SHARPNESS)
     c = cosine.clamp(-1, 1)
     small = s < 1e-4
@@ -108,8 +109,10 @@ _A, _B, _C, _D, _E = 2.73608316, 17.0212978, 4.01008267, 15.2191563, 76.0878963
 
 
 def cosine_integral(sharpness: Tensor, cosine: Tensor) -> Tensor:
-    """∫ G(v) max(0, v·n) dv for amplitude 1, cosine = p·n. Tokuyoshi 2024 ("A Fast and Accurate Spherical Gaussian ×
-    Clamped Cosine Integral"); error at most 1.6e-3 of the peak (λ = 5), 5e-6 at λ = 0.1, 5e-9 at 1e4. Never negative.
+    """Integrate a lobe of amplitude 1 times max(0, v·n) over the sphere; cosine = p·n. Never negative.
+
+    Tokuyoshi 2024, "A Fast and Accurate Spherical Gaussian × Clamped Cosine Integral". The error is at most 1.6e-3 of
+    the peak, at λ = 5; 5e-6 at λ = 0.1, 5e-9 at 1e4.
     """
     s = sharpness.clamp(0, MAX_SHARPNESS)
     c = cosine.clamp(-1, 1)

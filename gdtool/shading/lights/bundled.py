@@ -1,9 +1,9 @@
-"""Light made by our own code: three bundled studios and a seeded random one, all sums of spherical Gaussians and
-boxes."""
+"""Make environment lights by formula: three bundled ones, and random studios of spherical Gaussians."""
 
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,33 +11,48 @@ from gdtool.shading.lights.environment import Environment
 from gdtool.shading.sampling import fibonacci
 
 BUNDLED = ("dark", "mid", "bright")
-COUNT = 16  # lobes of a light, as in the paper
+COUNT = 16  # lobes of a fitted or random light, as in the paper
 
 
 def direction(azimuth: float, elevation: float) -> np.ndarray:
-    """(3,) unit; degrees, azimuth 0 is +Z and positive toward +X, as for cameras."""
+    """Convert azimuth and elevation in degrees to a unit direction (3,); azimuth 0 is +Z, 90 is +X, as for cameras."""
     a, e = np.radians(azimuth), np.radians(elevation)
     return np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
 
 
-def _boxes(image: np.ndarray, directions: np.ndarray, boxes: list[tuple]) -> None:
-    """Add softboxes (azimuth, elevation, half width, half height in radians, edge softness, color) to image in
-    place."""
-    for azimuth, elevation, wide, high, soft, color in boxes:
-        forward = direction(azimuth, elevation)
+class Softbox(NamedTuple):
+    """A rectangular lamp: its middle in degrees, half width and half height in radians, edge softness as the tangent of
+    the angle over which it fades, linear radiance.
+    """
+
+    azimuth: float
+    elevation: float
+    half_width: float
+    half_height: float
+    softness: float
+    color: tuple[float, float, float]
+
+
+def _add_softboxes(image: np.ndarray, directions: np.ndarray, boxes: list[Softbox]) -> None:
+    """Add softboxes to image (h, w, 3) in place; directions (h, w, 3) of its pixels."""
+    for box in boxes:
+        forward = direction(box.azimuth, box.elevation)
         right = np.cross((0.0, 1.0, 0.0), forward)
         right /= np.linalg.norm(right)
         up = np.cross(forward, right)
         depth = directions @ forward
-        x = np.abs(directions @ right) / np.maximum(depth, 1e-6) - np.tan(wide)
-        y = np.abs(directions @ up) / np.maximum(depth, 1e-6) - np.tan(high)
-        inside = np.clip(0.5 - np.maximum(x, y) / soft, 0, 1) * (depth > 0)
-        image += inside[..., None] * np.asarray(color)
+        x = np.abs(directions @ right) / np.maximum(depth, 1e-6) - np.tan(box.half_width)
+        y = np.abs(directions @ up) / np.maximum(depth, 1e-6) - np.tan(box.half_height)
+        inside = np.clip(0.5 - np.maximum(x, y) / box.softness, 0, 1) * (depth > 0)
+        image += inside[..., None] * np.asarray(box.color)
 
 
 @lru_cache(maxsize=3)
 def bundled(name: str) -> Environment:
-    """dark: a night with a few lamps; mid: a photographer's studio; bright: a clear day with the sun. 256 x 512."""
+    """Make a bundled light of 256 x 512 pixels.
+
+    dark: a night with a few lamps; mid: a photographer's studio; bright: a clear day with the sun.
+    """
     canvas = Environment(np.zeros((256, 512, 3)))
     d = canvas.directions
     up = d[..., 1:2]
@@ -45,26 +60,26 @@ def bundled(name: str) -> Environment:
     if name == "dark":
         image += np.where(up > 0, 0.006 + 0.01 * np.exp(-6 * up), 0.008) * np.array([0.7, 0.85, 1.2])
         image += 0.03 * np.exp(-((up / 0.08) ** 2)) * np.array([1.3, 0.9, 0.6])
-        _boxes(
+        _add_softboxes(
             image,
             d,
             [
-                (35, 32, 0.10, 0.10, 0.04, (26, 19, 11)),
-                (-70, 22, 0.07, 0.16, 0.04, (9, 12, 20)),
-                (150, 40, 0.09, 0.05, 0.03, (16, 12, 8)),
-                (-140, 12, 0.25, 0.04, 0.03, (3, 2, 4)),
+                Softbox(35, 32, 0.10, 0.10, 0.04, (26, 19, 11)),
+                Softbox(-70, 22, 0.07, 0.16, 0.04, (9, 12, 20)),
+                Softbox(150, 40, 0.09, 0.05, 0.03, (16, 12, 8)),
+                Softbox(-140, 12, 0.25, 0.04, 0.03, (3, 2, 4)),
             ],
         )
     elif name == "mid":
         image += (0.16 + 0.10 * np.maximum(up, 0) + 0.05 * up) * np.array([1.0, 0.98, 0.95])
-        _boxes(
+        _add_softboxes(
             image,
             d,
             [
-                (45, 35, 0.38, 0.38, 0.10, (7.0, 6.8, 6.4)),
-                (-60, 15, 0.25, 0.55, 0.10, (1.9, 2.1, 2.5)),
-                (165, 45, 0.55, 0.16, 0.08, (3.2, 3.2, 3.4)),
-                (0, 80, 0.45, 0.45, 0.20, (1.5, 1.5, 1.5)),
+                Softbox(45, 35, 0.38, 0.38, 0.10, (7.0, 6.8, 6.4)),
+                Softbox(-60, 15, 0.25, 0.55, 0.10, (1.9, 2.1, 2.5)),
+                Softbox(165, 45, 0.55, 0.16, 0.08, (3.2, 3.2, 3.4)),
+                Softbox(0, 80, 0.45, 0.45, 0.20, (1.5, 1.5, 1.5)),
             ],
         )
     elif name == "bright":
@@ -74,7 +89,7 @@ def bundled(name: str) -> Environment:
             (1 - sky) * np.array([1.15, 1.2, 1.25]) + sky * np.array([0.30, 0.55, 1.05]),
             np.array([0.32, 0.29, 0.25]) * (0.6 + 0.4 * np.exp(8 * np.minimum(up, 0))),
         )
-        _boxes(image, d, [(55, 48, 0.035, 0.035, 0.02, (700, 640, 560))])
+        _add_softboxes(image, d, [Softbox(55, 48, 0.035, 0.035, 0.02, (700, 640, 560))])
         glow = np.maximum(d @ direction(55, 48), 0)[..., None]
         image += 1.6 * glow**60 * np.array([1.0, 0.95, 0.85])
     else:
@@ -83,9 +98,10 @@ def bundled(name: str) -> Environment:
 
 
 def random_lobes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A random studio as 16 lobes: axes (16, 3), sharpness (16,), amplitudes (16, 3).
+    """Draw a random studio of 16 lobes: axes (16, 3), sharpness (16,), amplitudes (16, 3).
 
-    Eight broad ones are the room (brighter above, tinted), two to eight are lamps; a lamp that is off has amplitude 0.
+    Eight broad lobes are the room, tinted and brighter above. The other eight are lamps, of which two to eight are on;
+    one that is off has amplitude 0.
     """
     room = fibonacci(8)
     tint = np.exp(rng.normal(0, 0.15, (8, 3)))
@@ -98,7 +114,7 @@ def random_lobes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.n
     sharpness = np.exp(rng.uniform(np.log(6), np.log(250), 8))
     power = np.exp(rng.normal(0, 0.6, 8)) * np.concatenate([[2.2], np.full(7, 0.8)]) * (np.arange(8) < lamps)
     warmth = np.exp(rng.normal(0, 0.18, (8, 1)) * np.array([1.0, 0.1, -1.0]))
-    # Power is the lobe's share of irradiance, so that a sharp lamp is brighter, not weaker.
+    # Power is a lamp's irradiance: at the same power, a sharper lobe has a larger amplitude.
     amplitude = power[:, None] * warmth * sharpness[:, None] / (2 * np.pi)
     return (
         np.concatenate([room, axes]),
@@ -108,7 +124,7 @@ def random_lobes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def paint(axes: np.ndarray, sharpness: np.ndarray, amplitudes: np.ndarray, height: int, name: str = "") -> Environment:
-    """Lobes drawn into a lat-long image of that height."""
+    """Evaluate lobes into a lat-long image of that height."""
     d = Environment(np.zeros((height, 2 * height, 3))).directions
     image = np.zeros_like(d)
     for axis, s, amplitude in zip(axes, sharpness, amplitudes, strict=True):

@@ -1,4 +1,4 @@
-"""Light from all around: lat-long images and their importance sampling.
+"""Hold, sample and meter environment lights: lat-long images of distant radiance.
 
 A lat-long image (h, w, 3) holds linear radiance; row 0 is straight up (+Y). Column u = 0.5 + atan2(z, x) / 2π of the
 width, as three.js reads them: the middle of the image is +X, three quarters across is +Z. Radiance is constant over a
@@ -12,15 +12,16 @@ from functools import cached_property
 
 import numpy as np
 
+# Weights of linear sRGB channels in luminance (Rec. 709).
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
-# Radiance of a white card (albedo 0.8) under the metered light: what exposure 1 means for every environment.
+# Radiance of a white card (albedo 0.8) under a metered light. So exposure 1 means the same for every environment.
 METERED_WHITE = 0.8
 
 
 @dataclass(frozen=True)
 class Environment:
-    """image (h, w, 3) linear radiance >= 0, lat-long; scale is what the file's radiance was multiplied by."""
+    """A lat-long image (h, w, 3) of linear radiance >= 0; scale is the factor on the file's radiance."""
 
     image: np.ndarray
     name: str = ""
@@ -28,14 +29,14 @@ class Environment:
 
     @cached_property
     def solid_angles(self) -> np.ndarray:
-        """(h,) steradians of one pixel of each row, exact."""
+        """Solid angle in steradians of one pixel of each row, (h,), exact."""
         height, width = self.image.shape[:2]
         edges = np.cos(np.linspace(0, np.pi, height + 1))
         return (edges[:-1] - edges[1:]) * (2 * np.pi / width)
 
     @cached_property
     def directions(self) -> np.ndarray:
-        """(h, w, 3) unit directions of pixel centres (in solid angle)."""
+        """Unit directions (h, w, 3) of the pixels' centres, halfway in solid angle."""
         height, width = self.image.shape[:2]
         edges = np.cos(np.linspace(0, np.pi, height + 1))
         y = 0.5 * (edges[:-1] + edges[1:])[:, None]
@@ -45,26 +46,28 @@ class Environment:
 
     @cached_property
     def pdf(self) -> np.ndarray:
-        """(h, w) density of sample() per steradian: luminance, with a floor so that nothing bright in one channel is
-        lost."""
+        """Density (h, w) of sample() per steradian: proportional to the brightest channel, with a small floor."""
         value = self.image.max(-1) + 1e-4 * float(self.image.max(initial=0))
         mass = value * self.solid_angles[:, None]
         total = float(mass.sum())
         return value / total if total > 0 else np.full(value.shape, 1 / (4 * np.pi))
 
     def pixel_of(self, directions: np.ndarray) -> np.ndarray:
-        """Flat pixel index (n,) of unit directions (n, 3)."""
+        """Find the flat pixel index (n,) of unit directions (n, 3)."""
         height, width = self.image.shape[:2]
         row = np.arccos(np.clip(directions[:, 1], -1, 1)) * (height / np.pi)
         column = (np.arctan2(directions[:, 2], directions[:, 0]) * (0.5 / np.pi) + 0.5) * width
         return np.minimum(row.astype(np.int64), height - 1) * width + np.minimum(column.astype(np.int64), width - 1)
 
     def radiance(self, directions: np.ndarray) -> np.ndarray:
-        """(n, 3) from unit directions (n, 3)."""
+        """Look the radiance (n, 3) of unit directions (n, 3) up."""
         return self.image.reshape(-1, 3)[self.pixel_of(directions)]
 
     def sample(self, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Directions (n, 3), radiance (n, 3) and density (n,) per steradian from uniform (n, 2) in [0, 1)."""
+        """Draw directions in proportion to the pdf, from uniform numbers (n, 2) in [0, 1).
+
+        Returns unit directions (n, 3), their radiance (n, 3) and density (n,) per steradian.
+        """
         height, width = self.image.shape[:2]
         mass = self.pdf * self.solid_angles[:, None]
         rows = np.cumsum(mass.sum(1))
@@ -72,14 +75,14 @@ class Environment:
         row = np.minimum(np.searchsorted(rows, at, side="right"), height - 1)
         sums = mass.sum(1)
         within_row = (at - (rows[row] - sums[row])) / np.maximum(sums[row], 1e-300)
-        # All rows' cumulative sums in one increasing sequence: one search finds every column.
+        # All rows' cumulative sums, row r shifted by r, increase throughout: one search finds every column.
         columns = np.cumsum(mass / np.maximum(mass.sum(1, keepdims=True), 1e-300), 1)
         columns[:, -1] = 1.0
-        ladder = (columns + np.arange(height)[:, None]).ravel()
-        found = np.minimum(
-            np.searchsorted(ladder, row + np.clip(uniform[:, 1], 0, 1 - 1e-12), side="right"), height * width - 1
+        increasing = (columns + np.arange(height)[:, None]).ravel()
+        index = np.minimum(
+            np.searchsorted(increasing, row + np.clip(uniform[:, 1], 0, 1 - 1e-12), side="right"), height * width - 1
         )
-        column = np.clip(found - row * width, 0, width - 1)
+        column = np.clip(index - row * width, 0, width - 1)
         before = np.where(column > 0, columns[row, column - 1], 0.0)
         within_column = (uniform[:, 1] - before) / np.maximum(columns[row, column] - before, 1e-300)
         edges = np.cos(np.linspace(0, np.pi, height + 1))
@@ -90,7 +93,7 @@ class Environment:
         return directions, self.image[row, column], self.pdf[row, column]
 
     def shrunk(self, height: int) -> Environment:
-        """The same light at a lower resolution, energy kept: pixels are averaged by solid angle."""
+        """Halve the resolution while there are 2 * height rows; averages by solid angle keep the energy."""
         current = self
         while current.image.shape[0] >= 2 * height and not any(side % 2 for side in current.image.shape[:2]):
             weight = current.solid_angles
@@ -101,23 +104,24 @@ class Environment:
         return current
 
     def cut(self, height: int) -> Environment:
-        """The same light in at least so many rows, pixels repeated: sums by their middles err by 1.6 % with 8 rows, .02
-        % with 64."""
+        """Repeat pixels until there are at least height rows.
+
+        A sum that evaluates pixels at their centres errs by 1.6 % with 8 rows, by 0.02 % with 64.
+        """
         times = max(-(-height // self.image.shape[0]), 1)
         across = max(-(-2 * height // self.image.shape[1]), 1)
         return self if times == across == 1 else replace(self, image=self.image.repeat(times, 0).repeat(across, 1))
 
     def irradiance(self, normals: np.ndarray) -> np.ndarray:
-        """(n, 3) ∫ L max(0, n·l) dl, by the pixels of a shrunk copy."""
+        """Integrate L max(0, n·l) dl for unit normals (n, 3), over the pixels of a copy of 32 rows: (n, 3)."""
         small = self.shrunk(32).cut(32)
         weighted = (small.image * small.solid_angles[:, None, None]).reshape(-1, 3)
         return np.maximum(normals @ small.directions.reshape(-1, 3).T, 0) @ weighted
 
     def metered(self) -> Environment:
-        """The light scaled so that a white card (albedo 0.8) turned to where it is brightest has radiance
-        METERED_WHITE.
+        """Scale the light so that a white card, albedo 0.8, turned toward most light has radiance METERED_WHITE.
 
-        Metering the light and not the object keeps a black object black.
+        Metering the light instead of the picture keeps a black object black.
         """
         around = Environment(np.zeros((12, 24, 3))).directions.reshape(-1, 3)
         brightest = float((self.irradiance(around) @ LUMINANCE).max()) * 0.8 / np.pi

@@ -1,4 +1,4 @@
-"""The light that a name or a file stands for."""
+"""Load an environment light from a bundled name or an image file."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from gdtool.images.io import read_image
 from gdtool.shading.lights.bundled import BUNDLED, bundled
 from gdtool.shading.lights.environment import Environment
 
-# Bytes that a pixel takes while a light is metered, fitted and sampled: 48 measured by tracemalloc, and 32 for the
+# Bytes of memory per pixel while a light is metered, fitted and sampled: 48 measured by tracemalloc, and 32 for the
 # tensors of direct.py.
 HELD_PER_PIXEL = 80
 
 
 def load_environment(source: str | Path) -> Environment:
-    """A bundled light by name (dark, mid, bright), or a lat-long .hdr or .exr image. Raises InputError, and
-    ResourceError for one too large.
+    """Load a bundled light by its name (dark, mid, bright), or a lat-long .hdr or .exr image.
 
-    Alpha is ignored; negative radiance, which some tools leave behind, counts as 0.
+    Alpha is ignored. Negative radiance, which some tools leave behind, counts as 0. Raises InputError for a file that
+    is no such image, and ResourceError for one that does not fit into memory.
     """
     if str(source) in BUNDLED:
         return bundled(str(source))

@@ -1,7 +1,7 @@
-"""An environment averaged in advance: over growing solid angles, over the hemisphere, and over reflection lobes.
+"""Average an environment in advance: over growing solid angles, over the hemisphere, and over reflection lobes.
 
-Directions are laid out on the equal-area octahedron (Clarberg 2008, "Fast equal-area mapping of the (hemi)sphere using
-SIMD"), pole up: every texel has the same solid angle, so halving the image is exact averaging.
+Images of directions use the equal-area octahedral map (Clarberg 2008, "Fast equal-area mapping of the (hemi)sphere
+using SIMD"), pole up. Every texel has the same solid angle, so halving the image averages exactly.
 """
 
 from __future__ import annotations
@@ -9,32 +9,46 @@ from __future__ import annotations
 import math
 import threading
 import time
+from typing import NamedTuple
 
 import numpy as np
 
 from gdtool.shading.lights.environment import Environment
 
-# Roughness of the levels that may be made, each with its image's side, as broad lobes vary slowly, and the side of the
-# light of which it sums all texels; 0: it samples the lobe.
-LADDER = (
-    (0.08, 256, 0),
-    (0.14, 128, 0),
-    (0.2, 128, 0),
-    (0.3, 64, 64),
-    (0.4, 32, 64),
-    (0.5, 32, 32),
-    (0.62, 32, 32),
-    (0.78, 32, 32),
-    (1.0, 32, 32),
+
+class RoughnessLevel(NamedTuple):
+    """A roughness that the light is prefiltered for.
+
+    side: of the prefiltered image; broad lobes vary slowly and need few texels. light_side: of the light's image, all
+    texels of which are summed; 0 samples the lobe instead.
+    """
+
+    roughness: float
+    side: int
+    light_side: int
+
+
+ROUGHNESS_LEVELS = (
+    RoughnessLevel(0.08, 256, 0),
+    RoughnessLevel(0.14, 128, 0),
+    RoughnessLevel(0.2, 128, 0),
+    RoughnessLevel(0.3, 64, 64),
+    RoughnessLevel(0.4, 32, 64),
+    RoughnessLevel(0.5, 32, 32),
+    RoughnessLevel(0.62, 32, 32),
+    RoughnessLevel(0.78, 32, 32),
+    RoughnessLevel(1.0, 32, 32),
 )
+# Half vectors drawn from a lobe, where it is sampled.
 LOBE_SAMPLES = 64
-# Normals summed for at a time: what lies between the products stays in the cache.
-PART = 64
-TABLE = 32
+# Normals that are summed for at once: the matrices between the products stay in the cache.
+NORMALS_AT_ONCE = 64
+# Rows and columns of the table of a lobe's share of light.
+TABLE_SIDE = 32
 
 
 def octahedral(x, y, z):
-    """Image coordinates (s, t) in [0, 1] of unit directions, tensors of any shape."""
+    """Map unit directions (tensors of any shape) to image coordinates (s, t) in [0, 1], octahedral and equal-area."""
     import torch
 
     r = (1 - y.abs()).clamp_min(0).sqrt()
@@ -46,7 +60,7 @@ def octahedral(x, y, z):
 
 
 def octahedral_directions(side: int) -> np.ndarray:
-    """(side * side, 3) unit directions of the texels' centres, row by row."""
+    """List the unit directions (side * side, 3) of the texels' centres, row by row."""
     t, s = np.meshgrid((np.arange(side) + 0.5) / side * 2 - 1, (np.arange(side) + 0.5) / side * 2 - 1, indexing="ij")
     a, b = np.abs(s), np.abs(t)
     d = 1 - a - b
@@ -60,7 +74,7 @@ def octahedral_directions(side: int) -> np.ndarray:
 
 
 class LightPyramid:
-    """Mean radiance of an environment over solid angles that double with each half level."""
+    """Hold an environment's mean radiance over solid angles of 4, 16, 64, … texels, as a mip pyramid."""
 
     def __init__(self, environment: Environment):
         import torch
@@ -94,8 +108,10 @@ class LightPyramid:
         self.texel_angle = 4 * math.pi / self.side**2
 
     def mean(self, x, y, z, solid_angle):
-        """Radiance (3, k, n) toward (k, n), averaged over a texel of the level whose solid angle is the next below
-        solid_angle (k, 1)."""
+        """Read the mean radiance (3, k, n) toward directions (k, n), over about a solid angle (k, 1) in steradians.
+
+        The nearest texel is read, of the coarsest level whose texels are no larger than solid_angle.
+        """
         level = (0.5 * (solid_angle * (1 / self.texel_angle)).log2()).long().clamp(0, self.depth - 1)
         side = self.side >> level
         s, t = octahedral(x, y, z)
@@ -107,14 +123,13 @@ class LightPyramid:
 
 
 class IrradianceMap:
-    """∫ L max(0, n·l) dl of an environment for normals on a lat-long grid, read bilinearly."""
+    """Tabulate an environment's irradiance, ∫ L max(0, n·l) dl, for normals on a lat-long grid."""
 
     def __init__(self, environment: Environment, height: int = 48):
         import torch
 
         small = environment.shrunk(64).cut(64)
-        # The first and last row are the poles: half a row away from one, its own value would be 0.7 % off under a
-        # studio.
+        # The first and last row are the poles: rows that begin half a step away are 0.7 % off there under a studio.
         theta = np.arange(height) / (height - 1) * np.pi
         phi = ((np.arange(2 * height) + 0.5) / (2 * height) - 0.5) * 2 * np.pi
         ring = np.sin(theta)[:, None]
@@ -125,19 +140,19 @@ class IrradianceMap:
             (small.image * small.solid_angles[:, None, None]).reshape(-1, 3), dtype=torch.float32
         )
         toward = torch.as_tensor(small.directions.reshape(-1, 3).T, dtype=torch.float32)
-        parts = torch.as_tensor(normals.reshape(-1, 3), dtype=torch.float32).split(PART)
+        parts = torch.as_tensor(normals.reshape(-1, 3), dtype=torch.float32).split(NORMALS_AT_ONCE)
         self.values = (
             torch.cat([(part @ toward).clamp_min_(0) @ weighted for part in parts])
             .numpy()
             .reshape(height, 2 * height, 3)
         )
-        # A column more on each side, from the other one.
+        # One column more on each side, copied from the opposite side.
         self.wrapped = torch.from_numpy(
             np.concatenate([self.values[:, -1:], self.values, self.values[:, :1]], 1).transpose(2, 0, 1).copy()
         )
 
     def lookup(self, normals):
-        """(3, n) from unit normals (3, n), tensors."""
+        """Interpolate the irradiance (3, n) of unit normals (3, n) bilinearly."""
         import torch
 
         height, width = self.values.shape[:2]
@@ -148,28 +163,29 @@ class IrradianceMap:
 
 
 class Prefiltered:
-    """Reflection of an environment as a product of two tables: its light averaged over the lobe seen along the normal
-    (one image a roughness, made when first asked for), and the lobe's share of light by angle and roughness.
+    """Look the specular reflection of an environment up, as a product of two tables.
 
-    The split sum of Karis 2013 ("Real shading in Unreal Engine 4"), the lobe's middle turned toward the normal as rough
-    lobes are (Lagarde & de Rousiers 2014, "Moving Frostbite to PBR").
+    One is the light averaged over the lobe as seen along the normal, an image for each of ROUGHNESS_LEVELS, made when
+    first needed. The other is the lobe's share of light by angle and roughness. This is the split sum of Karis 2013
+    ("Real shading in Unreal Engine 4"). The lobe's middle is turned toward the normal, as that of rough lobes is
+    (Lagarde & de Rousiers 2014, "Moving Frostbite to PBR").
     """
 
     def __init__(self, pyramid: LightPyramid, brdf: str = "gltf"):
         self.pyramid, self.brdf = pyramid, brdf
         self.images: dict[int, object] = {}
         self.seconds = 0.0
-        self.locks = [threading.Lock() for _ in LADDER]
+        self.locks = [threading.Lock() for _ in ROUGHNESS_LEVELS]
         self.table = lobe_table(brdf)
 
     def specular(self, normal, view, roughness):
-        """Two (3, n) tensors a, b: reflected light is f0 a + (1 − f0) b. normal, view (3, n) unit, roughness (n,)."""
+        """Return two (3, n) tensors a, b: reflected light is f0 a + (1 − f0) b. normal, view (3, n) unit."""
         import torch
 
         n_v = (normal * view).sum(0)
         mirror = 2 * n_v * normal - view
-        # Tried under two lights: nearer the integral than the mirror direction; Lagarde's (1 − r)(√(1 − r) + r) is
-        # better from r = 0.3 (studio) or 0.5 (mid) on, and worse below.
+        # Under the two lights tried this is nearer to the integral than the mirror direction. The weight of Lagarde &
+        # de Rousiers, (1 − r)(√(1 − r) + r), is better from r = 0.3 or 0.5 on, and worse below.
         middle = torch.lerp(normal, mirror, 1 - roughness**2)
         middle = middle / (middle * middle).sum(0).sqrt().clamp_min(1e-12)
         below, above, fraction = _levels(lobe_roughness(roughness, n_v))
@@ -181,11 +197,11 @@ class Prefiltered:
                 light.index_add_(
                     1, used, weight[used] * read_octahedral(self._image(level), *middle.index_select(1, used))
                 )
-        share = _bilinear(self.table, n_v.clamp(0, 1) * TABLE - 0.5, roughness.clamp(0, 1) * TABLE - 0.5)
+        share = _bilinear(self.table, n_v.clamp(0, 1) * TABLE_SIDE - 0.5, roughness.clamp(0, 1) * TABLE_SIDE - 0.5)
         return light * share[0], light * share[1]
 
     def prepare(self, roughness: np.ndarray) -> None:
-        """Make the images that roughness (n,) needs; those that nobody makes yet first."""
+        """Make the images that roughness (n,) needs, first those that no other thread is making."""
         import torch
 
         needed = torch.unique(torch.cat(_levels(torch.as_tensor(roughness))[:2])).tolist()
@@ -193,63 +209,69 @@ class Prefiltered:
             self._image(level)
 
     def _image(self, level: int):
-        # Threads may make different levels at once, but each only one.
+        """Return the image of a level, and make it first where needed; threads wait for one that is being made."""
         with self.locks[level]:
             if level not in self.images:
-                at = time.perf_counter()
-                self.images[level] = filtered_light(self.pyramid, *LADDER[level])
-                self.seconds += time.perf_counter() - at
+                begun = time.perf_counter()
+                self.images[level] = filtered_light(self.pyramid, *ROUGHNESS_LEVELS[level])
+                self.seconds += time.perf_counter() - begun
         return self.images[level]
 
 
 def lobe_roughness(roughness, n_v):
-    """Of the lobe seen along its own normal that is as wide as the one seen at cosine n_v; (n,) tensors.
+    """Convert roughness (n,) seen at cosine n_v (n,) to that of an equally wide lobe seen along the normal.
 
-    A half vector off by an angle moves the reflection by twice that in the plane of view and normal, and by n·v times
-    that across: the lobe's solid angle shrinks by n·v, so that α, of which it is the square, does by its root. Measured
-    on a normal-mapped glossy metal under a studio: 26.8 dB inside the outline, 28.7 with it."""
+    Tilting the half vector moves the reflection twice as far in the plane of view and normal, and n·v times that across
+    it. So the lobe's solid angle shrinks by n·v, α by its root, and roughness by its fourth root. Measured on a
+    normal-mapped glossy metal under a studio: 28.7 dB inside the outline with it, 26.8 without.
+    """
     return roughness * n_v.clamp(0.05, 1) ** 0.25
 
 
 def _levels(roughness):
-    """Steps of the ladder below and above (n,) roughness, and how far it is between them; one step where it is on
-    one."""
+    """Find the levels below and above roughness (n,), and the fraction of the way between them.
+
+    Both are the same where roughness is exactly a level's.
+    """
     import torch
 
-    ladder = torch.tensor([r for r, *_ in LADDER])
-    inside = roughness.clamp(LADDER[0][0], 1.0).contiguous()
-    above = torch.searchsorted(ladder, inside)
-    below = torch.where(ladder[above] == inside, above, above - 1)
-    fraction = (inside - ladder[below]) / (ladder[above] - ladder[below]).clamp_min(1e-6)
+    known = torch.tensor([level.roughness for level in ROUGHNESS_LEVELS])
+    inside = roughness.clamp(ROUGHNESS_LEVELS[0].roughness, 1.0).contiguous()
+    above = torch.searchsorted(known, inside)
+    below = torch.where(known[above] == inside, above, above - 1)
+    fraction = (inside - known[below]) / (known[above] - known[below]).clamp_min(1e-6)
     return below, above, fraction
 
 
-def filtered_light(pyramid: LightPyramid, roughness: float, side: int, dense: int):
-    """(3, side + 2, side + 2) light averaged over the GGX lobe around each direction, weighted by its cosine, with a
-    border that wraps. The lobe is the one seen along its own normal."""
+def filtered_light(pyramid: LightPyramid, roughness: float, side: int, light_side: int):
+    """Average the light over the GGX lobe seen along its normal, weighted by the cosine, for each direction.
+
+    side, light_side: as of RoughnessLevel. Returns an octahedral image (3, side + 2, side + 2) with a border that wraps
+    around, so that bilinear lookups need no special case.
+    """
     import torch
 
     normal = torch.as_tensor(octahedral_directions(side), dtype=torch.float32)
     a2 = roughness**4
-    image = (_sum_of_all(pyramid, normal, a2, dense) if dense else _sum_of_samples(pyramid, normal, a2)).reshape(
-        side, side, 3
-    )
-    # Over an edge of the octahedron lies the same edge, turned around.
+    image = (
+        _sum_all_texels(pyramid, normal, a2, light_side) if light_side else _sum_lobe_samples(pyramid, normal, a2)
+    ).reshape(side, side, 3)
+    # Beyond an edge of the octahedron lies the same edge in reverse order.
     rows = torch.cat([image[:1].flip(1), image, image[-1:].flip(1)])
     columns = torch.cat([rows[:, :1].flip(0), rows, rows[:, -1:].flip(0)], 1)
     return columns.permute(2, 0, 1).contiguous()
 
 
-def _sum_of_all(pyramid: LightPyramid, normal, a2: float, dense: int):
-    """(n, 3) by every texel of the pyramid's level with so many a side, or of its finest."""
+def _sum_all_texels(pyramid: LightPyramid, normal, a2: float, light_side: int):
+    """Average (n, 3) over all texels of the pyramid's level of that side, or of its finest; a2 = α²."""
     import torch
 
-    level = max(0, (pyramid.side // dense).bit_length() - 1)
+    level = max(0, (pyramid.side // light_side).bit_length() - 1)
     side = pyramid.side >> level
     light = pyramid.texels[:, pyramid.offsets[level] : pyramid.offsets[level] + side * side].T.contiguous()
     toward = torch.as_tensor(octahedral_directions(side), dtype=torch.float32)
     out = []
-    for part in normal.split(PART):
+    for part in normal.split(NORMALS_AT_ONCE):
         cosine = (part @ toward.T).clamp_(0, 1)
         # (n·h)² is (1 + n·l) / 2, so that D's bracket is (1 + a2)/2 − (1 − a2)/2 n·l.
         weight = torch.mul(cosine, -0.5 * (1 - a2)).add_(0.5 * (1 + a2)).square_().reciprocal_().mul_(cosine)
@@ -257,13 +279,15 @@ def _sum_of_all(pyramid: LightPyramid, normal, a2: float, dense: int):
     return torch.cat(out)
 
 
-def _sum_of_samples(pyramid: LightPyramid, normal, a2: float):
-    """(n, 3) by half vectors drawn from the lobe, each reading the pyramid over twice the solid angle that it stands
-    for, so that neighbours overlap (after Křivánek & Colbert 2008, "Real-time shading with filtered importance
-    sampling")."""
+def _sum_lobe_samples(pyramid: LightPyramid, normal, a2: float):
+    """Average (n, 3) over half vectors drawn from the lobe; a2 = α².
+
+    Each reads the pyramid over twice the solid angle that it stands for, so that neighbours overlap (after Křivánek &
+    Colbert 2008, "Real-time shading with filtered importance sampling").
+    """
     import torch
 
-    from gdtool.shading.bsdf.reflection import frame
+    from gdtool.shading.sampling import orthonormal_basis
 
     u = (torch.arange(LOBE_SAMPLES) + 0.5) / LOBE_SAMPLES
     phi = torch.arange(LOBE_SAMPLES) * (math.pi * (3 - math.sqrt(5)))
@@ -281,7 +305,7 @@ def _sum_of_samples(pyramid: LightPyramid, normal, a2: float):
     out = []
     for part in normal.split(1024):
         n = part.unbind(1)
-        tangent, bitangent = frame(*n)
+        tangent, bitangent = orthonormal_basis(*n)
         direction = [
             t * (ring * phi.cos()) + b * (ring * phi.sin()) + c * up
             for t, b, c in zip(tangent, bitangent, n, strict=True)
@@ -291,14 +315,14 @@ def _sum_of_samples(pyramid: LightPyramid, normal, a2: float):
 
 
 def read_octahedral(image, x, y, z):
-    """(3, n) bilinear from an image of filtered_light."""
+    """Interpolate an image of filtered_light bilinearly at unit directions: (3, n)."""
     side = image.shape[1] - 2
     s, t = octahedral(x, y, z)
     return _bilinear(image, t * side + 0.5, s * side + 0.5)
 
 
 def _bilinear(image, row, column):
-    """(c, n) from image (c, h, w) at rows and columns (n,) of texel centres, clamped."""
+    """Interpolate an image (c, h, w) at rows and columns (n,), texel centres at integers, clamped at the border."""
     channels, height, width = image.shape
     row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
     r, c = row.long().clamp_max(height - 2), column.long().clamp_max(width - 2)
@@ -312,13 +336,16 @@ def _bilinear(image, row, column):
 
 
 def lobe_table(brdf: str = "gltf", samples: int = 256):
-    """(2, TABLE, TABLE) by n·v and roughness: ∫ D V c dl under Fresnel 1 and (1 − v·h)^5, visible normals sampled."""
+    """Integrate D V c dl with Fresnel 1, and with (1 − v·h)^5, for a grid of n·v and roughness.
+
+    Returns (2, TABLE_SIDE, TABLE_SIDE), by sampling visible normals.
+    """
     import torch
 
-    from gdtool.shading.bsdf.reflection import Surface
+    from gdtool.shading.bsdf.reflection import PointReflection
     from gdtool.shading.sampling import sobol
 
-    side = (np.arange(TABLE) + 0.5) / TABLE
+    side = (np.arange(TABLE_SIDE) + 0.5) / TABLE_SIDE
     n_v, roughness = (x.ravel() for x in np.meshgrid(side, side, indexing="ij"))
     count = len(n_v)
     view = np.stack([np.sqrt(1 - n_v**2), 0 * n_v, n_v], 1)
@@ -331,10 +358,10 @@ def lobe_table(brdf: str = "gltf", samples: int = 256):
         "roughness": roughness,
         "f0": np.full(count, 0.04),
     }
-    surface = Surface(view, values, slice(None), brdf)
+    surface = PointReflection(view, values, slice(None), brdf)
     uniform = [torch.as_tensor(u, dtype=torch.float32)[:, None].expand(-1, count) for u in sobol(samples, 2, 7).T]
     direction = surface.sample(*uniform, torch.zeros(samples, count))
     terms, density, above = surface.evaluate(*direction)
     weight = above / density.clamp_min(1e-20)
-    # The metal's density is all visible normals: share is 1.
-    return torch.stack([(terms[0] * weight).mean(0), (terms[1] * weight).mean(0)]).reshape(2, TABLE, TABLE)
+    # For a metal every sample is a visible normal: the specular share is 1.
+    return torch.stack([(terms[0] * weight).mean(0), (terms[1] * weight).mean(0)]).reshape(2, TABLE_SIDE, TABLE_SIDE)

@@ -1,4 +1,4 @@
-"""Fitting spherical Gaussians to an environment."""
+"""Fit spherical Gaussians to an environment."""
 
 from __future__ import annotations
 
@@ -9,21 +9,24 @@ from gdtool.shading.lights.bundled import COUNT
 from gdtool.shading.lights.environment import Environment
 from gdtool.shading.sampling import fibonacci
 
-# Rows of the image that is fitted, and the logarithm of the sharpest lobe that its pixels can tell from a sharper one.
+# Rows of the image that is fitted.
 ROWS = 32
+# Logarithm of the largest sharpness that pixels of that size can tell from a larger one.
 SHARPEST = float(np.log(250.0))
-# Diffuse color is nearly all irradiance: an error of 1 % there counts like one of about 5 % of the radiance.
+# Weight of the squared irradiance error against the squared radiance error. Irradiance makes nearly all of a diffuse
+# color: an error of 1 % there counts like one of about 5 % of the radiance.
 IRRADIANCE_WEIGHT = 30.0
 
 
 def fit_sg(
     environment: Environment, count: int = COUNT, seed: int = 0, steps: int = 300
 ) -> tuple[SphericalGaussians, dict[str, float]]:
-    """count lobes that fit the radiance by solid angle, and the fit's error (see fit_error).
+    """Fit count lobes to an environment's radiance; also returns the fit's error (see fit_error).
 
-    Half the lobes start on the brightest places (each hiding its surroundings from the next), half spread evenly; Adam
-    on axes, log sharpness and log amplitudes minimises the squared error of radiance raised to 1/2 plus that of
-    irradiance, so that neither the sun nor the sky is all that counts.
+    Half of the lobes start at the brightest places, each hiding its surroundings from the next. The other half are
+    spread evenly. Adam optimises axes, log sharpness and log amplitudes for that many steps. The loss is the squared
+    error of the radiance's square root, by solid angle, plus that of irradiance: so neither the sun nor the sky is all
+    that counts. Raises ValueError for an environment without light.
     """
     import torch
 
@@ -71,9 +74,11 @@ def fit_sg(
 
 
 def fit_error(environment: Environment, lobes: SphericalGaussians) -> dict[str, float]:
-    """radiance_rms: RMS over the sphere of the radiance's error, irradiance_rms and irradiance_max the same over
-    normals, each relative to the RMS (maximum) of the truth; energy: relative error of the total. Of the 32-row
-    image."""
+    """Measure a fit's errors on the environment's 32-row image.
+
+    radiance_rms: RMS error over the sphere, relative to the RMS radiance. irradiance_rms, irradiance_max: RMS and
+    largest error over normals, relative to the RMS and the largest irradiance. energy: relative error of the total.
+    """
     import torch
 
     from gdtool.shading.bsdf.sg import cosine_integral, evaluate
@@ -98,6 +103,10 @@ def fit_error(environment: Environment, lobes: SphericalGaussians) -> dict[str, 
 def _start(
     d: np.ndarray, radiance: np.ndarray, weight: np.ndarray, count: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Choose the fit's starting axes (k, 3), sharpness (k,) and amplitudes (k, 3).
+
+    d (n, 3) are the pixels' directions, radiance (n, 3), weight (n,) their solid angles.
+    """
     peaks = count // 2
     bright = radiance.sum(1)
     hidden = bright.copy()

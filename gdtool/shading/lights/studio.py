@@ -1,4 +1,4 @@
-"""A light ready for use: environment, metered, with its spherical Gaussians and their record."""
+"""Prepare a light for use: a metered environment, its spherical Gaussians, and the record of light.json."""
 
 from __future__ import annotations
 
@@ -14,14 +14,20 @@ from gdtool.shading.lights.environment import Environment
 from gdtool.shading.lights.load import load_environment
 from gdtool.shading.lights.sg_fit import fit_error, fit_sg
 
-# Height of the image that a random studio is drawn into for sampling; its sharpest lobe is 7 degrees wide.
+# Height in pixels of a random studio's image: 2.8 degrees a pixel, where the sharpest lobe is 7 degrees wide.
 RANDOM_HEIGHT = 64
 
 
 def studio(source: str, seed: int = 0, fit: bool = True) -> tuple[Environment, SphericalGaussians, dict[str, Any]]:
-    """random:NUMBER, a bundled light's name, or a lat-long file -> the metered environment, its lobes, and the record
-    of light.json. A random studio is made of lobes, so nothing is fitted and the error is that of its pixels; without
-    fit other lights have no lobes and an empty error."""
+    """Prepare the light that source names: random:NUMBER, a bundled light, or a lat-long file.
+
+    A random studio is made of lobes: nothing is fitted, and the error is that of its pixels. Without fit, other lights
+    have no lobes and an empty error. seed: of the fit.
+
+    Returns:
+        The metered environment, its lobes, and the record of light.json. Raises InputError for a source that is none
+        of these.
+    """
     import torch
 
     if source.startswith("random:"):

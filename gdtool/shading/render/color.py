@@ -1,4 +1,4 @@
-"""Lit color of a scene from one camera: the renderer and the light together."""
+"""Render the lit color of a scene from one camera: the renderer and the light together."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def render_color(
     seed: int = 0,
     brdf: str = "gltf",
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lit color (h, w, 3) linear radiance, direct light with shadows, and mask (h, w)."""
+    """Render direct light with shadows: color (h, w, 3) linear radiance, and mask (h, w) coverage."""
     renderer = Renderer(scene)
     light = DirectLight(renderer, environment, light_samples, seed, brdf)
     images = renderer.buffers(camera, samples, light.color())

@@ -1,13 +1,14 @@
-"""Direct light of an environment with shadows: multiple importance sampling of the light and the reflection, Embree
-visibility.
+"""Estimate the direct light of an environment on surface points, with ray-cast shadows.
 
-Everything per pair of point and direction is a scalar: with Schlick's Fresnel, F = f0 + (f90 − f0) w, reflected
-radiance is a linear combination of four sums over the directions, in which only w depends on them.
+Directions are drawn from the light and from the reflection, and combined by multiple importance sampling. With
+Schlick's Fresnel, F = f0 + (f90 − f0) w, reflected radiance is a linear combination of four sums over the directions:
+only w depends on the direction. So everything per pair of point and direction is a scalar.
 
-Diffuse light that nothing hides is known without rays and without noise: irradiance from a table. The sampled
-directions only have to say what is hidden. With V the sum over visible directions, U over all of them and B what is
-known, the estimate is V + β (B − U), β the visible share of U in the pixel: a control variate where little is hidden, 0
-where everything is, and unbiased for any β that does not depend on the noise."""
+Unshadowed diffuse light is known without rays and noise: a table has the irradiance. The sampled directions then only
+have to say how much of it is hidden. V is the sum over visible directions, U the sum over all of them, B the table's
+value. The estimate is V + β (B − U), a control variate, with β the visible share of U in the pixel. β is near 1 where
+little is hidden and 0 where everything is. The estimate is unbiased for any β that does not depend on the noise.
+"""
 
 from __future__ import annotations
 
@@ -15,37 +16,85 @@ import math
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from gdtool.shading.bsdf.reflection import Surface, rows_of, tensor_of
+from gdtool.geometry.hashing import splitmix64
+from gdtool.shading.bsdf.reflection import PointReflection, rows_of, tensor_of
 from gdtool.shading.lights.environment import LUMINANCE, Environment
 from gdtool.shading.sampling import sobol
 
 if TYPE_CHECKING:
-    from gdtool.shading.render.render import Points, Renderer
+    from gdtool.shading.render.render import Renderer, ShadingPoints
 
-# Directions drawn once from the light; each point takes its own run of them.
+# Directions that are drawn once from the light; each point uses its own run of them.
 POOL = 1 << 16
-# Point-times-direction pairs shaded at once: many enough that calls cost little beside them.
+# Pairs of point and direction that are shaded at once: enough that the cost of the calls is small beside them.
 PAIRS = 1 << 17
-# Share of what a point's directions bring on average that one must bring for its shadow ray to be certain.
-RARE = 0.5
-# Sums of a point: of visible directions reflection, its part w, diffuse, its part w; of all directions the first three;
-# known without directions reflection, its part w, diffuse.
-SUMS = 10
-# What little all directions together found counts as so much visible light of what is known.
+# A direction needs this share of the mean brightness of its point's directions for its shadow ray to be certain.
+ROULETTE_SHARE = 0.5
+# Visible light, as a share of the table's, that is assumed where the directions of a pixel bring next to nothing.
 PRIOR = 0.02
+
+# Rows of a point's sums. Each block has the specular sum, its part with the Fresnel weight w, and the diffuse sum; the
+# first has the diffuse sum's part with w as well.
+VISIBLE, VISIBLE_DIFFUSE, VISIBLE_DIFFUSE_FRESNEL = 0, 2, 3  # over the directions that nothing hides
+ALL, ALL_DIFFUSE = 4, 6  # over all directions
+KNOWN, KNOWN_DIFFUSE = 7, 9  # from tables, without directions
+SUMS = 10
+
+
+@dataclass(frozen=True)
+class LightOptions:
+    """How DirectLight estimates.
+
+    mode: "sampled" becomes exact as samples grow. "prefiltered" takes the reflection from the split sum, and from the
+    samples only its visible share.
+    shadows: whether rays decide what is visible.
+    control_variate: whether unshadowed diffuse light comes from the irradiance table.
+    """
+
+    mode: Literal["sampled", "prefiltered"] = "sampled"
+    shadows: bool = True
+    control_variate: bool = True
+
+
+class _RayCounts(NamedTuple):
+    """Shadow rays of a chunk: cast, and not needed since below the horizon, on a convex object, toward little light."""
+
+    cast: int = 0
+    below_horizon: int = 0
+    convex: int = 0
+    rare: int = 0
+
+
+class _Candidates(NamedTuple):
+    """Directions of n points, k each, that may need shadow rays.
+
+    direction: three (k, n) tensors; above (k, n) bool, over the horizon; brightness (k, n), what each would bring;
+    roulette (k, n), uniform numbers.
+    """
+
+    direction: list
+    above: object
+    brightness: object
+    roulette: object
 
 
 class DirectLight:
-    """An estimator of the light that points reflect toward the eye.
+    """Estimate the light that surface points reflect toward the eye.
 
-    samples: directions a point draws from the light, and as many from its reflection, each weighted by the balance
-    heuristic (Veach 1997): f L cos / (n p_light + n p_reflection). mode "sampled" becomes exact as samples grow;
-    "prefiltered" takes reflection from the split sum and from the samples only its visible share, none when samples
-    is 0. shadows False leaves visibility out. known False leaves out what is known without rays.
+    Args:
+        renderer: of the scene that casts the shadows.
+        environment: the light.
+        samples: directions that a point draws from the light, and as many from its reflection; rounded to a power of
+            two. 0 leaves shadows out, in mode "prefiltered" only. Directions are weighted by the balance heuristic
+            (Veach 1997): f L cos / (n p_light + n p_reflection).
+        seed: of the directions.
+        brdf: "gltf" or "paper" (see brdf.Brdf).
+        options: how to estimate.
     """
 
     def __init__(
@@ -55,142 +104,134 @@ class DirectLight:
         samples: int,
         seed: int = 0,
         brdf: str = "gltf",
-        shadows: bool = True,
-        mode: Literal["sampled", "prefiltered"] = "sampled",
-        known: bool = True,
+        options: LightOptions = LightOptions(),
     ):
         from gdtool.shading.lights.prefilter import IrradianceMap, LightPyramid, Prefiltered
 
-        self.renderer, self.environment, self.brdf, self.shadows, self.seed = renderer, environment, brdf, shadows, seed
-        self.mode, self.known = mode, known
-        # Runs start at multiples of their length, a power of two, so that each is a stratified set of its own.
+        self.renderer, self.environment, self.brdf, self.seed = renderer, environment, brdf, seed
+        self.mode, self.shadows, self.control_variate = options.mode, options.shadows, options.control_variate
+        # Runs start at multiples of their length, a power of two, so that each is a stratified set.
         self.samples = 1 << round(math.log2(samples)) if samples else 0
-        if not self.samples and mode == "sampled":
+        if not self.samples and self.mode == "sampled":
             raise ValueError("sampled light needs samples")
         with ThreadPoolExecutor(renderer.caster.threads) as pool:
-            known_light = pool.submit(IrradianceMap, environment)
+            irradiance = pool.submit(IrradianceMap, environment)
             prefiltered = (
-                pool.submit(lambda: Prefiltered(LightPyramid(environment), brdf)) if mode == "prefiltered" else None
+                pool.submit(lambda: Prefiltered(LightPyramid(environment), brdf))
+                if self.mode == "prefiltered"
+                else None
             )
             if self.samples:
                 directions, radiance, density = environment.sample(sobol(POOL, 2, seed))
-                dice = np.random.default_rng(seed).random(POOL)
-                # Runs of (x, y, z, red, green, blue, density, dice) for the light and of three numbers and dice for the
-                # reflection.
-                self.pool = self._runs_of(*directions.T, *radiance.T, density, dice)
-                self.pattern = self._runs_of(*sobol(POOL, 3, seed + 1).T, dice)
+                roulette = np.random.default_rng(seed).random(POOL)
+                # Channels of the light's pool: x, y, z, red, green, blue, density, roulette number; of the
+                # reflection's: three numbers for PointReflection.sample, and a roulette number.
+                self.pool = self._as_runs(*directions.T, *radiance.T, density, roulette)
+                self.pattern = self._as_runs(*sobol(POOL, 3, seed + 1).T, roulette)
             self.pixels = tensor_of(
                 np.concatenate([environment.image.reshape(-1, 3), environment.pdf.reshape(-1, 1)], 1)
             )
-            self.irradiance = known_light.result()
+            self.irradiance = irradiance.result()
             self.prefiltered = None if prefiltered is None else prefiltered.result()
 
-    def _runs_of(self, *values: np.ndarray):
-        """(k, c, POOL / k) of c arrays (POOL,)."""
+    def _as_runs(self, *values: np.ndarray):
+        """Cut c arrays (POOL,) into runs of k = samples numbers: a tensor (k, c, POOL / k)."""
         return tensor_of(np.stack(values).reshape(len(values), -1, self.samples).transpose(2, 0, 1))
 
-    def color(self, exposure: float = 1.0) -> Callable[[Points], dict[str, np.ndarray]]:
-        """The shading that Renderer.buffers takes for a color image."""
+    def color(self, exposure: float = 1.0) -> Callable[[ShadingPoints], dict[str, np.ndarray]]:
+        """Return the shading that Renderer.buffers takes for a color image, times exposure."""
         return lambda points: {"color": self.radiance(points) * np.float32(exposure)}
 
-    def radiance(self, points: Points) -> np.ndarray:
-        """(n, 3) linear radiance toward the eye, emission included."""
+    def radiance(self, points: ShadingPoints) -> np.ndarray:
+        """Estimate the linear radiance (n, 3) of n points toward the eye, emission included."""
         k = self.samples
         step = max(1, PAIRS // max(2 * k, 2))
         sums = np.zeros((SUMS, 3, len(points)), np.float32)
-        runs = self._runs(points) if k else None
+        runs = self._choose_runs(points) if k else None
         if self.mode == "prefiltered" and len(points):
             from gdtool.shading.lights.prefilter import lobe_roughness
 
             n_v = (rows_of(points.values["normal"]) * rows_of(points.view)).sum(0)
             self.prefiltered.prepare(lobe_roughness(tensor_of(points.values["roughness"]), n_v))
 
-        at, counted = time.perf_counter(), np.zeros(4, np.int64)
+        begun, counted = time.perf_counter(), np.zeros(len(_RayCounts._fields), np.int64)
         for start in range(0, len(points), step):
             part = slice(start, start + step)
-            counted += self._chunk(points, part, None if runs is None else runs[:, part], sums[..., part])
-        cast, below, convex, rare = counted.tolist()
+            counted += self._accumulate(points, part, None if runs is None else runs[:, part], sums[..., part])
+        counts = _RayCounts(*counted.tolist())
         self.renderer.counts.spend(
             "directions",
-            at,
-            shadow_rays=cast,
-            shadow_rays_below_horizon=below,
-            shadow_rays_convex=convex,
-            shadow_rays_rare=rare,
+            begun,
+            shadow_rays=counts.cast,
+            shadow_rays_below_horizon=counts.below_horizon,
+            shadow_rays_convex=counts.convex,
+            shadow_rays_rare=counts.rare,
         )
-        out = self._combined(points, sums)
+        out = self._compose(points, sums)
         out += points.values["emissive"].T
         unlit = points.values["unlit"]
         if unlit.any():
             out[:, unlit] = points.values["albedo"].T[:, unlit]
         return out.T
 
-    def _runs(self, points: Points) -> np.ndarray:
-        """(2, n) which run of the pool and of the pattern each point takes.
+    def _choose_runs(self, points: ShadingPoints) -> np.ndarray:
+        """Choose each point's run of the pool and of the pattern: indices (2, n).
 
-        The samples of a pixel take neighbouring runs, which together are one larger stratified set, and so are its
-        first two, four, eight of them. Which block of runs that is, and where in it the pixel begins, is drawn by its
-        number."""
+        The samples of a pixel use neighbouring runs. Together these are one larger stratified set, and so are the first
+        two, four or eight of them. A hash of the pixel's index chooses the block of runs and where in it to begin.
+        """
         k = self.samples
-        block = min(1 << max(0, points.together - 1).bit_length(), max(1, POOL // k // 16))
+        block = min(1 << max(0, points.per_pixel - 1).bit_length(), max(1, POOL // k // 16))
         out = np.empty((2, len(points)), np.int64)
         for which in (0, 1):
-            number = _scrambled(points.pixel + (points.sample // block) * 0x5851F42D, self.seed * 2 + which)
+            number = _hashed(points.pixel + (points.sample // block) * 0x5851F42D, self.seed * 2 + which)
             out[which] = (number // block) % (POOL // k // block) * block + ((points.sample % block) ^ (number % block))
         return out
 
-    def _chunk(
-        self, points: Points, part: slice, runs: np.ndarray | None, sums: np.ndarray
-    ) -> tuple[int, int, int, int]:
-        """Fill sums (SUMS, 3, n); the counts of _hide."""
+    def _accumulate(self, points: ShadingPoints, part: slice, runs: np.ndarray | None, sums: np.ndarray) -> _RayCounts:
+        """Fill sums (SUMS, 3, n) of some of the points, and count their shadow rays."""
         import torch
 
         k = self.samples
-        surface = Surface(points.view, points.values, part, self.brdf)
+        surface = PointReflection(points.view, points.values, part, self.brdf)
         result = torch.from_numpy(sums)
-        result[9] = self.irradiance.lookup(surface.normal) / math.pi
+        result[KNOWN_DIFFUSE] = self.irradiance.lookup(surface.normal) / math.pi
         if self.mode == "prefiltered":
-            result[7], result[8] = self.prefiltered.specular(surface.normal, surface.view, surface.roughness)
+            result[KNOWN], result[KNOWN + 1] = self.prefiltered.specular(
+                surface.normal, surface.view, surface.roughness
+            )
         if not k:
-            return 0, 0, 0, 0
+            return _RayCounts()
         drawn, numbers = (
-            torch.stack([one.index_select(1, torch.from_numpy(run)) for one in pool]).unbind(1)
+            torch.stack([sample.index_select(1, torch.from_numpy(run)) for sample in pool]).unbind(1)
             for pool, run in zip((self.pool, self.pattern), runs, strict=True)
         )
         mirrored = surface.sample(*numbers[:3])
-        found = self.pixels.index_select(0, self._pixel(*mirrored).reshape(-1)).view(k, -1, 4)
+        lookup = self.pixels.index_select(0, self._pixel(*mirrored).reshape(-1)).view(k, -1, 4)
         direction = [torch.cat(pair) for pair in zip(drawn[:3], mirrored, strict=True)]
-        *light, p_light = (torch.cat([drawn[3 + i], found[..., i]]) for i in range(4))
+        *light, p_light = (torch.cat([drawn[3 + i], lookup[..., i]]) for i in range(4))
         terms, p_reflect, above = surface.evaluate(*direction)
         everything = 1 / (p_light + p_reflect).mul_(k).clamp_min_(1e-20)
-        visible, counted = everything * above, (0, 0, 0, 0)
+        visible, counted = everything * above, _RayCounts()
         if self.shadows:
             luminance = sum(float(share) * c for share, c in zip(LUMINANCE, light, strict=True))
             brightness = surface.brightness(terms, luminance).mul_(visible)
-            counted = self._hide(
-                points,
-                part,
-                surface,
-                direction,
-                (visible, everything),
-                above,
-                brightness,
-                torch.cat([drawn[7], numbers[3]]),
-            )
-        # Only prefiltered light asks what share of the reflection is visible.
+            candidates = _Candidates(direction, above, brightness, torch.cat([drawn[7], numbers[3]]))
+            counted = self._apply_shadows(points.position[part], surface, candidates, (visible, everything))
+        # Only prefiltered light asks what share of the specular reflection is visible.
         split = self.mode == "prefiltered"
-        for which, weight, kept in (
-            (0, visible, terms),
-            (4 if split else 6, everything, terms[:3] if split else terms[2:3]),
+        for first_row, weight, kept in (
+            (VISIBLE, visible, terms),
+            (ALL if split else ALL_DIFFUSE, everything, terms[:3] if split else terms[2:3]),
         ):
-            for row, term in enumerate(kept, which):
+            for row, term in enumerate(kept, first_row):
                 weighted = term * weight
                 for channel, c in enumerate(light):
                     torch.sum(weighted * c, 0, out=result[row, channel])
         return counted
 
     def _pixel(self, x, y, z):
-        """Environment.pixel_of in float32."""
+        """Find the flat pixel index of directions, as Environment.pixel_of but in float32."""
         import torch
 
         height, width = self.environment.image.shape[:2]
@@ -198,36 +239,37 @@ class DirectLight:
         column = ((torch.atan2(z, x) * (0.5 / math.pi) + 0.5) * width).long().clamp(0, width - 1)
         return row * width + column
 
-    def _hide(
-        self, points: Points, part: slice, surface: Surface, direction, weights, above, brightness, dice
-    ) -> tuple[int, int, int, int]:
-        """Take the first of two weights (m, n) from directions that something hides; how many shadow rays that took,
-        and how many directions needed none: below the horizon, on convex objects, and for bringing too little light.
+    def _apply_shadows(
+        self, position: np.ndarray, surface: PointReflection, candidates: _Candidates, weights: tuple
+    ) -> _RayCounts:
+        """Set the first of two weights (k, n) to 0 for the directions that something hides.
 
-        A direction that brings less than RARE of what its point's directions do on average is followed only with the
-        probability brightness / (RARE of that), and counts for as many more (Russian roulette): the mean stays what it
-        is. Both weights tell so, and where nothing is hidden they stay the same."""
+        Russian roulette saves rays toward little light. A direction brighter than ROULETTE_SHARE of the mean of its
+        point's directions is always followed. A darker one is followed with a probability proportional to its
+        brightness, and its weights grow by the inverse: the mean stays what it is.
+        """
         import torch
 
+        direction, above, brightness, roulette = candidates
         ask = above
-        inner = self.renderer.may_be_hidden(points.position[part], surface.geometric.T.numpy())
+        inner = self.renderer.may_be_hidden(position, surface.geometric.T.numpy())
         if inner is not None:
             ask = above & torch.from_numpy(inner)
-        chance = (brightness / (RARE * brightness.mean(0)).clamp_min(1e-20)).clamp_max_(1)
-        follow = ask & (dice < chance)
+        chance = (brightness / (ROULETTE_SHARE * brightness.mean(0)).clamp_min(1e-20)).clamp_max_(1)
+        follow = ask & (roulette < chance)
         times = torch.where(ask, torch.where(follow, chance.clamp_min_(1e-20).reciprocal_(), 0.0), 1.0)
         for weight in weights:
             weight *= times
         flat = follow.reshape(-1).nonzero()[:, 0]
         n = above.shape[1]
-        origins = surface.lifted(points.position[part], 2e-4 * self.renderer.extent).index_select(1, flat % n)
+        origins = surface.offset_origins(position, 2e-4 * self.renderer.extent).index_select(1, flat % n)
         rays = torch.stack([c.reshape(-1).index_select(0, flat) for c in direction])
         weights[0].view(-1)[flat[torch.from_numpy(self.renderer.occluded(origins.numpy().T, rays.numpy().T))]] = 0.0
         lit, asked = int(above.sum()), int(ask.sum())
-        return len(flat), above.numel() - lit, lit - asked, asked - len(flat)
+        return _RayCounts(len(flat), above.numel() - lit, lit - asked, asked - len(flat))
 
-    def _combined(self, points: Points, sums: np.ndarray) -> np.ndarray:
-        """(3, n) radiance without emission."""
+    def _compose(self, points: ShadingPoints, sums: np.ndarray) -> np.ndarray:
+        """Compose radiance (3, n), without emission, from the points' sums (SUMS, 3, n)."""
         if not len(points):
             return np.empty((3, 0), np.float32)
         import torch
@@ -242,13 +284,14 @@ class DirectLight:
         f0 = f0 * (1 - metallic) + albedo * metallic
         # How much reflection grows toward grazing: to 1, or to what KHR_materials_specular leaves of a dielectric's.
         growth = f90 * (1 - metallic) + metallic - f0
-        reflect = [f0 * sums[i] + growth * sums[i + 1] for i in (0, 4, 7)]
-        diffuse = [sums[i] for i in (2, 6, 9)]
+        reflect = [f0 * sums[i] + growth * sums[i + 1] for i in (VISIBLE, ALL, KNOWN)]
+        diffuse = [sums[i] for i in (VISIBLE_DIFFUSE, ALL_DIFFUSE, KNOWN_DIFFUSE)]
         starts = np.flatnonzero(np.diff(points.pixel, prepend=-1))
 
         def share(known: list) -> torch.Tensor:
+            """Repeat each pixel's visible share for its points: (n,)."""
             return torch.from_numpy(
-                np.repeat(_share(*(x.numpy() for x in known), starts), np.diff(starts, append=len(points)))
+                np.repeat(_visible_share(*(x.numpy() for x in known), starts), np.diff(starts, append=len(points)))
             )
 
         if self.mode == "prefiltered":
@@ -261,23 +304,21 @@ class DirectLight:
         else:
             specular, received = reflect[0], diffuse[0]
             if self.brdf == "gltf":
-                if self.known:
+                if self.control_variate:
                     received = received + share(diffuse) * (diffuse[2] - diffuse[1])
-                received = (1 - f0) * received - growth * sums[3]
+                received = (1 - f0) * received - growth * sums[VISIBLE_DIFFUSE_FRESNEL]
         return (specular + (albedo * (1 - metallic) * received).clamp_min_(0)).numpy()
 
 
-def _share(visible: np.ndarray, everything: np.ndarray, known: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """(m,) visible share of light in each run of points (3, n) that begins at starts (m,)."""
+def _visible_share(visible: np.ndarray, everything: np.ndarray, known: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Estimate the visible share (m,) of the light in each run of points (3, n) that begins at starts (m,)."""
     r, g, b = LUMINANCE.astype(np.float32)
     v, u, k = (np.add.reduceat(r * x[0] + g * x[1] + b * x[2], starts) for x in (visible, everything, known))
     return np.clip((v + PRIOR * k) / np.maximum(u + PRIOR * k, np.float32(1e-20)), 0, 1)
 
 
-def _scrambled(index: np.ndarray, seed: int) -> np.ndarray:
-    """Well-mixed non-negative integers from (n,) indices: the finaliser of SplitMix64 (Steele et al. 2014)."""
+def _hashed(index: np.ndarray, seed: int) -> np.ndarray:
+    """Hash indices (n,) and a seed to well-mixed non-negative int64, by SplitMix64."""
     with np.errstate(over="ignore"):
-        x = index.astype(np.uint64) + np.uint64((seed * 0x9E3779B97F4A7C15) % 2**64)
-        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        return ((x ^ (x >> np.uint64(31))) >> np.uint64(1)).astype(np.int64)
+        x = splitmix64(index.astype(np.uint64) + np.uint64((seed * 0x9E3779B97F4A7C15) % 2**64))
+        return (x >> np.uint64(1)).astype(np.int64)

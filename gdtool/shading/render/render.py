@@ -1,11 +1,11 @@
-"""Images of a scene by Embree: exact buffers of its geometry and material, and lit color.
+"""Render images of a scene by ray casting: buffers of its geometry and material, and lit color.
 
-A pixel is a box: its value is the mean over samples spread evenly inside it. Every pixel of the object's projected
-bounds gets BASE samples; their number is doubled as long as coverage, or a mean that is not yet known to TOLERANCE,
-asks for more, up to the number that is allowed.
+A pixel is a box: its value is the mean over samples spread evenly inside it. Sampling is adaptive. Every pixel in the
+object's projected bounds gets BASE_SAMPLES. Their number doubles, up to the allowed one, while the pixel is partly
+covered or its mean is not known to TOLERANCE.
 
-Transparency: MASK as glTF says; BLEND is seen where alpha >= 0.5 and not there below, since a buffer has one surface.
-Faces are seen from both sides, whatever the material's doubleSided says.
+Transparency: MASK materials are cut as glTF says. BLEND materials are seen where alpha >= 0.5 and absent below, since a
+buffer holds one surface. Faces are seen from both sides, whatever the material's doubleSided says.
 """
 
 from __future__ import annotations
@@ -27,41 +27,48 @@ from gdtool.images.color import srgb_from_linear
 from gdtool.shading.render.pattern import pixel_pattern
 from gdtool.shading.render.surface_points import SurfaceLookup
 
-BASE = 4
-# Samples up to which pixels beside the object's outline, or beside an uneven pixel, get more whatever their own say:
-# what makes the other one uneven may reach in between theirs.
-EDGE = 8
-# Alpha-tested layers that a ray passes at most.
+# Samples of every pixel in bounds: the fewest from which an error can be estimated.
+BASE_SAMPLES = 4
+# While pixels have at most this many samples, those beside an outline or beside an unresolved pixel get more too: the
+# detail that leaves the neighbour unresolved may pass between their samples.
+OUTLINE_SAMPLES = 8
+# The most alpha-tested layers that a ray passes through; behind them it meets nothing.
 MAX_LAYERS = 32
-# Error of a pixel's mean as a picture stores it (sRGB, (n + 1) / 2) above which it gets more samples: of buffers, and
-# of color, whose noise costs more to take away.
+# The standard error of a pixel's mean, in the units a picture stores (sRGB, (n + 1) / 2), above which it gets more
+# samples. Color gets a larger one: its noise costs more to take away.
 TOLERANCE = {"normal": 0.009, "albedo": 0.009, "roughness": 0.009, "metallic": 0.009, "color": 0.018}
-# What values are multiplied by for a picture; None: the sRGB curve.
-STORED = {"normal": 0.5, "albedo": None, "roughness": 1.0, "metallic": 1.0, "color": None}
-# Samples spread evenly know a mean better than random ones do, the more of them the better: measured, the error of n is
-# SPREAD n^SPREAD_POWER times the standard error (0.47 for 4, 0.25 for 64; tests/shading/test_pattern.py).
-SPREAD, SPREAD_POWER = 0.65, -0.2
-# Directions to the light are spread over a pixel's samples less evenly.
-COLOR_SPREAD = 0.8
+# Factor from a value to the units a picture stores; None: the sRGB curve.
+STORED_SCALE = {"normal": 0.5, "albedo": None, "roughness": 1.0, "metallic": 1.0, "color": None}
+# The error of a mean over n evenly spread samples is ERROR_SCALE n^ERROR_POWER times the standard error of random ones:
+# 0.47 for 4 and 0.25 for 64, measured in tests/shading/test_pattern.py.
+ERROR_SCALE, ERROR_POWER = 0.65, -0.2
+# The same factor for color, whose directions to the light are spread less evenly over a pixel's samples.
+COLOR_ERROR_SCALE = 0.8
 DOMAINS = ("normal", "depth", "albedo", "roughness", "metallic")
-# Samples that a thread works on at once: with four such bands a thread waiting, what is held at once.
+# Samples that a thread works on at once. Up to four such bands wait for each thread, which bounds the memory.
 BAND_SAMPLES = 1 << 16
 
 
 @dataclass(frozen=True)
 class Goal:
-    """When to stop before all samples are taken: after seconds, or when the color's error, estimated from what the last
-    samples changed, is psnr dB (of 1, sRGB, over the covered pixels)."""
+    """When to stop before a view has all its samples.
+
+    seconds: after that time. psnr: when the color's estimated error is that many dB (peak 1, sRGB, over the covered
+    pixels).
+    """
 
     seconds: float | None = None
     psnr: float | None = None
 
 
 @dataclass
-class Points:
-    """Seen points, one a sample: pixel (n,) flat index, which sample of the pixel (n,), position (n, 3), view (n, 3)
-    unit toward the eye, depth (n,), and the attributes of SurfaceLookup. The samples of a pixel follow each other;
-    together is how many a pixel that is seen in full has once these are added."""
+class ShadingPoints:
+    """Surface points that a camera sees, one for each sample that hits; the samples of a pixel follow each other.
+
+    pixel (n,) flat index; sample (n,) number within the pixel; position (n, 3); view (n, 3) unit toward the eye; depth
+    (n,) along the viewing axis; values: attributes as SurfaceLookup.attributes returns them; per_pixel: samples that a
+    fully covered pixel has once these are added.
+    """
 
     pixel: np.ndarray
     sample: np.ndarray
@@ -69,7 +76,7 @@ class Points:
     view: np.ndarray
     depth: np.ndarray
     values: dict[str, np.ndarray]
-    together: int = 1
+    per_pixel: int = 1
 
     def __len__(self) -> int:
         return len(self.pixel)
@@ -77,7 +84,7 @@ class Points:
 
 @dataclass
 class Counts:
-    """What a rendering did and did not need to do."""
+    """Count the work that a renderer did and left out, over all its views; seconds are by step."""
 
     pixels: int = 0
     pixels_in_bounds: int = 0
@@ -92,7 +99,7 @@ class Counts:
     lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def spend(self, what: str, since: float, **more: int) -> None:
-        """Add the seconds since a time of time.perf_counter, and to other counts by name; threads may call at once."""
+        """Add the seconds since a time.perf_counter() to a step, and more to other counts by name; thread-safe."""
         with self.lock:
             self.seconds[what] = self.seconds.get(what, 0.0) + time.perf_counter() - since
             for name, count in more.items():
@@ -100,7 +107,7 @@ class Counts:
 
 
 class Renderer:
-    """A scene made ready for rendering: ray casters and material lookup."""
+    """Render views of one scene; holds its ray casters, material lookup and thread pool."""
 
     def __init__(self, scene: Scene, threads: int | None = None):
         self.scene = scene
@@ -121,7 +128,7 @@ class Renderer:
         self.pool = ThreadPoolExecutor(self.caster.threads)
 
     def trace(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """First hits that are there after the alpha test: face_idx (n,), distance (n,), barycentric (n, 3)."""
+        """Find first hits that pass the alpha test: face_idx (n,), -1 for none, distance (n,), barycentric (n, 3)."""
         hits = self.caster.first_hit(origins, directions)
         face_idx, distance, barycentric = hits.face_idx, hits.distance, hits.barycentric
         if self.tested is None:
@@ -144,7 +151,7 @@ class Renderer:
         return face_idx, distance, barycentric
 
     def occluded(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(n,) bool: whether a surface that passes the alpha test lies along each ray."""
+        """Test whether a surface that passes the alpha test lies along each ray: (n,) bool."""
         out = self.solid_caster.occluded(origins, directions)
         if self.tested is None:
             return out
@@ -152,38 +159,42 @@ class Renderer:
         origin = origins[active].astype(np.float64)
         for _ in range(MAX_LAYERS):
             hits = self.tested_caster.first_hit(origin, directions[active])
-            found = hits.found
-            active, origin = active[found], origin[found]
+            hit = hits.found
+            active, origin = active[hit], origin[hit]
             if not len(active):
                 break
-            alpha, cutoff = self.lookup.alpha(self.tested_faces[hits.face_idx[found]], hits.barycentric[found])
+            alpha, cutoff = self.lookup.alpha(self.tested_faces[hits.face_idx[hit]], hits.barycentric[hit])
             out[active[alpha >= cutoff]] = True
             through = alpha < cutoff
             active = active[through]
-            origin = (
-                origin[through] + directions[active] * (hits.distance[found][through] + 1e-5 * self.extent)[:, None]
-            )
+            origin = origin[through] + directions[active] * (hits.distance[hit][through] + 1e-5 * self.extent)[:, None]
         return out
 
     def may_be_hidden(self, position: np.ndarray, geometric_normal: np.ndarray) -> np.ndarray | None:
-        """(n,) bool: whether anything can lie in front of points, or None where all may; no point on the outside of a
-        convex scene is hidden from any direction above its horizon."""
+        """Test whether anything can lie in front of points (n, 3): (n,) bool, or None where all may be hidden.
+
+        A point on the outside of a convex scene is hidden from no direction above its horizon.
+        """
         if not self.convex:
             return None
         return ((position - self.bounds.mean(0)) * geometric_normal).sum(1) <= 0
 
     def window(self, camera: Camera) -> tuple[int, int, int, int]:
-        """Rows and columns (top, bottom, left, right) of the object's projected bounds."""
-        used = self.scene.vertices if len(self.scene.vertices) < 200_000 else _corners(self.bounds)
+        """Find the rows and columns (top, bottom, left, right) of the object's projected bounds."""
+        used = self.scene.vertices if len(self.scene.vertices) < 200_000 else _box_corners(self.bounds)
         pixels, depth = project(camera, used)
         if camera.projection == "perspective" and (depth <= 1e-6).any():
             return 0, camera.height, 0, camera.width
         low, high = np.floor(pixels.min(0)).astype(int), np.ceil(pixels.max(0)).astype(int)
         return (max(low[1], 0), min(high[1], camera.height), max(low[0], 0), min(high[0], camera.width))
 
-    def see(self, camera: Camera, pixel: np.ndarray, pattern: np.ndarray, first: int, emission: bool = True) -> Points:
-        """Points that pixels (m,) see at the places pattern[first:], of which a pixel has as many as pattern (k, 2) has
-        rows."""
+    def trace_pixels(
+        self, camera: Camera, pixel: np.ndarray, pattern: np.ndarray, first: int, emission: bool = True
+    ) -> ShadingPoints:
+        """Find the surface points that pixels (m,) see at the subpixel offsets pattern[first:].
+
+        pattern (k, 2) has all the samples that a pixel then has. Without emission, it is not looked up.
+        """
         sample = np.arange(first, len(pattern))
         x, y = (
             (start[:, None] + offset).ravel()
@@ -197,16 +208,17 @@ class Renderer:
             back = (
                 max(
                     0.0,
-                    float((_corners(self.bounds) @ camera.backward).max()) - float(camera.position @ camera.backward),
+                    float((_box_corners(self.bounds) @ camera.backward).max())
+                    - float(camera.position @ camera.backward),
                 )
                 + 1e-3 * self.extent
             )
             origins += camera.backward * back
         else:
             back = 0.0
-        at = time.perf_counter()
+        begun = time.perf_counter()
         face_idx, distance, barycentric = self.trace(origins, directions)
-        self.counts.spend("rays", at, samples=len(pixel))
+        self.counts.spend("rays", begun, samples=len(pixel))
         hit = np.flatnonzero(face_idx >= 0)
         if len(hit) < len(pixel):
             pixel, sample, face_idx, distance, along = (x.take(hit) for x in (pixel, sample, face_idx, distance, along))
@@ -217,24 +229,32 @@ class Renderer:
         values = self.lookup.attributes(face_idx, barycentric, width / np.sqrt(len(pattern)), directions, emission)
         position = directions * distance[:, None]
         position += origins
-        return Points(pixel, sample, position, -directions, depth, values, len(pattern))
+        return ShadingPoints(pixel, sample, position, -directions, depth, values, len(pattern))
 
-    def each(self, work: Callable[[Camera], dict], cameras: Iterable[Camera]) -> Iterator[dict]:
-        """work(camera) of each, in order, two at once: while the sums of one are looked through, the other one's rays
-        are traced."""
+    def render_each(self, work: Callable[[Camera], dict], cameras: Iterable[Camera]) -> Iterator[dict]:
+        """Yield work(camera) of each camera, in order, two at once.
+
+        While one view's sums are evaluated, the other one's rays are traced.
+        """
         with ThreadPoolExecutor(min(2, self.caster.threads)) as pool:
             yield from pool.map(work, cameras)
 
     def buffers(self, camera: Camera, samples: int = 16, shade=None, goal: Goal = Goal()) -> dict[str, np.ndarray]:
-        """Domain images (h, w[, c]) float32 and "mask": see render_buffers. shade(points) -> {"color": (n, 3)} adds an
-        image. samples: the most that a pixel gets."""
+        """Render one view: an image (h, w[, c]) float32 for each domain, and "mask", as render_buffers says.
+
+        Args:
+            camera: the view.
+            samples: the most samples of a pixel.
+            shade: shade(points) -> {"color": (n, 3)} adds the image "color".
+            goal: when to stop earlier.
+        """
         begun = time.perf_counter()
         height, width = camera.height, camera.width
         top, bottom, left, right = self.window(camera)
         self.counts.spend(
             "bounds", begun, pixels=height * width, pixels_in_bounds=max(bottom - top, 0) * max(right - left, 0)
         )
-        total, pattern = _Sums(height * width), pixel_pattern(samples, BASE)
+        film, pattern = _Film(height * width), pixel_pattern(samples, BASE_SAMPLES)
         pixel = (np.arange(top, bottom)[:, None] * width + np.arange(left, right)[None]).ravel()
         done, taken = 0, 0
         tolerance = {
@@ -242,56 +262,68 @@ class Renderer:
             for name, limit in TOLERANCE.items()
         }
         while len(pixel) and done < samples:
-            count = min(max(2 * done, BASE), samples)
-            more = count - done
-            # Several bands are as many for one thread as for the other, or one waits; a small picture is one band.
-            bands = -(-len(pixel) * more // BAND_SAMPLES)
-            step = -(-len(pixel) // (bands if bands == 1 else -(-bands // self.caster.threads) * self.caster.threads))
-
-            def look(part: np.ndarray, first: int = done, count: int = count) -> tuple[np.ndarray, int, Points, dict]:
-                at = time.perf_counter()
-                points = self.see(camera, part, pattern[:count], first, shade is not None)
-                shaded = shade(points) if shade is not None and len(points) else {}
-                self.counts.spend("samples", at, pixels_refined=len(part) if first == BASE else 0)
-                return part, count - first, points, shaded
-
-            waiting: deque = deque()
-            for start in range(0, len(pixel), step):
-                waiting.append(self.pool.submit(look, pixel[start : start + step]))
-                if len(waiting) > 4 * self.caster.threads:
-                    total.add(*waiting.popleft().result())
-            for found in waiting:
-                total.add(*found.result())
-            taken += len(pixel) * more
-            change = total.change()
+            count = min(max(2 * done, BASE_SAMPLES), samples)
+            self._add_samples(film, camera, pixel, pattern[:count], done, shade)
+            taken += len(pixel) * (count - done)
+            psnr = film.update_psnr()
             done = count
-            if done >= samples or not total.seen.any():
+            if done >= samples or not film.hits.any():
                 break
-            if goal.psnr is not None and done > BASE and change is not None and change >= goal.psnr:
+            if goal.psnr is not None and done > BASE_SAMPLES and psnr is not None and psnr >= goal.psnr:
                 break
-            pixel, error = total.uneven(pixel, width, height, tolerance, done)
+            pixel, error = film.unresolved(pixel, width, height, tolerance, done)
             if goal.seconds is not None:
                 spent = time.perf_counter() - begun
                 room = int((goal.seconds - spent) / spent * taken / done) if goal.seconds > spent else 0
                 if room < len(pixel):
                     pixel = np.sort(pixel[np.argsort(-error, kind="stable")[:room]])
-        self.counts.estimated_psnr = total.change()
-        return total.images(camera, () if shade is None else ("color",))
+        self.counts.estimated_psnr = film.update_psnr()
+        return film.images(camera, () if shade is None else ("color",))
+
+    def _add_samples(
+        self, film: _Film, camera: Camera, pixel: np.ndarray, pattern: np.ndarray, first: int, shade
+    ) -> None:
+        """Add the samples pattern[first:] of pixels (m,) to the film, band by band in the thread pool."""
+        more = len(pattern) - first
+        # Each thread gets as many bands as the others, or one would wait; a small picture is one band.
+        bands = -(-len(pixel) * more // BAND_SAMPLES)
+        step = -(-len(pixel) // (bands if bands == 1 else -(-bands // self.caster.threads) * self.caster.threads))
+
+        def trace_band(part: np.ndarray) -> tuple[np.ndarray, int, ShadingPoints, dict]:
+            begun = time.perf_counter()
+            points = self.trace_pixels(camera, part, pattern, first, shade is not None)
+            shaded = shade(points) if shade is not None and len(points) else {}
+            self.counts.spend("samples", begun, pixels_refined=len(part) if first == BASE_SAMPLES else 0)
+            return part, more, points, shaded
+
+        waiting: deque = deque()
+        for start in range(0, len(pixel), step):
+            waiting.append(self.pool.submit(trace_band, pixel[start : start + step]))
+            if len(waiting) > 4 * self.caster.threads:
+                film.add(*waiting.popleft().result())
+        for band in waiting:
+            film.add(*band.result())
 
 
-class _Sums:
-    """Sums over samples, a row a pixel."""
+class _Film:
+    """Accumulate sums and sums of squares over samples, a row for each pixel.
+
+    samples (p,) counts a pixel's samples, hits (p,) those that hit the surface.
+    """
 
     def __init__(self, pixels: int):
         self.pixels = pixels
-        self.asked, self.seen = np.zeros(pixels), np.zeros(pixels)
+        self.samples, self.hits = np.zeros(pixels), np.zeros(pixels)
         self.sums: dict[str, np.ndarray] = {}
         self.squares: dict[str, np.ndarray] = {}
-        self.before: np.ndarray | None = None
+        # Of the last call of update_psnr: means, samples, and each pixel's squared error.
+        self.last_mean: np.ndarray | None = None
+        self.last_samples: np.ndarray | None = None
+        self.squared_change: np.ndarray | None = None
 
-    def add(self, asked: np.ndarray, times: int, points: Points, shaded: dict[str, np.ndarray]) -> None:
-        """What pixels (m,) saw with so many samples each."""
-        self.asked[asked] += times
+    def add(self, pixel: np.ndarray, times: int, points: ShadingPoints, shaded: dict[str, np.ndarray]) -> None:
+        """Add the points that `times` samples of each of pixels (m,) hit, and their shaded values."""
+        self.samples[pixel] += times
         if not len(points):
             return
         values = {k: points.values[k] for k in ("normal", "albedo", "roughness", "metallic")}
@@ -300,72 +332,83 @@ class _Sums:
         # The samples of a pixel follow each other.
         starts = np.flatnonzero(np.diff(points.pixel, prepend=-1))
         owner = points.pixel[starts]
-        self.seen[owner] += np.diff(starts, append=len(points))
+        self.hits[owner] += np.diff(starts, append=len(points))
         for name, value in values.items():
             value = np.ascontiguousarray(np.atleast_2d(value.T), np.float64 if name == "depth" else np.float32)
             if name not in self.sums:
                 self.sums[name] = np.zeros((self.pixels, len(value)))
                 self.squares[name] = np.zeros((self.pixels, len(value)))
             self.sums[name][owner] += np.add.reduceat(value, starts, axis=1).T
-            if name in STORED:
+            if name in STORED_SCALE:
                 self.squares[name][owner] += np.add.reduceat(value * value, starts, axis=1).T
 
     def error(self, name: str, pixel: np.ndarray) -> np.ndarray:
-        """Squared error (n,) to expect of the means of pixels (n,), as a picture stores them, mean over the
-        channels."""
-        count = np.maximum(self.seen[pixel], 1)[:, None]
+        """Estimate the squared error (n,) of the means of pixels (n,), in stored units, averaged over channels."""
+        count = np.maximum(self.hits[pixel], 1)[:, None]
         mean = self.sums[name][pixel] / count
         variance = np.maximum(self.squares[name][pixel] / count - mean * mean, 0)
-        slope = _srgb_slope(mean) if STORED[name] is None else STORED[name]
-        spread = COLOR_SPREAD if name == "color" else SPREAD * count**SPREAD_POWER
+        slope = _srgb_slope(mean) if STORED_SCALE[name] is None else STORED_SCALE[name]
+        spread = COLOR_ERROR_SCALE if name == "color" else ERROR_SCALE * count**ERROR_POWER
         return (variance / count * (slope * spread) ** 2).mean(1)
 
-    def change(self) -> float | None:
-        """The color's error in dB as the last change of the means tells it: half of the samples against all of them."""
+    def update_psnr(self) -> float | None:
+        """Estimate the color's error in dB from what the samples since the last call changed; None while unknown.
+
+        The last pass doubles a pixel's samples: half of them are compared with all.
+        """
         if "color" not in self.sums:
             return None
-        covered = np.flatnonzero(self.seen)
-        mean = np.clip(self.sums["color"] / np.maximum(self.seen, 1)[:, None], 0, 1)
-        out = None
-        if self.before is not None and len(covered):
-            moved = ((srgb_from_linear(mean[covered]) - srgb_from_linear(self.before[covered])) ** 2).mean(1)
-            # A pixel that got nothing new is as good as its samples say.
-            self.moved[covered] = np.where(self.asked[covered] > self.asked_before[covered], moved, self.moved[covered])
-            out = float(-10 * np.log10(max(self.moved[covered].mean(), 1e-10)))
+        covered = np.flatnonzero(self.hits)
+        mean = np.clip(self.sums["color"] / np.maximum(self.hits, 1)[:, None], 0, 1)
+        psnr = None
+        if self.last_mean is not None and len(covered):
+            change = ((srgb_from_linear(mean[covered]) - srgb_from_linear(self.last_mean[covered])) ** 2).mean(1)
+            # A pixel without new samples keeps its last estimate.
+            self.squared_change[covered] = np.where(
+                self.samples[covered] > self.last_samples[covered], change, self.squared_change[covered]
+            )
+            psnr = float(-10 * np.log10(max(self.squared_change[covered].mean(), 1e-10)))
         elif len(covered):
-            self.moved = np.zeros(self.pixels)
-            self.moved[covered] = self.error("color", covered)
-        self.before, self.asked_before = mean, self.asked.copy()
-        return out
+            self.squared_change = np.zeros(self.pixels)
+            self.squared_change[covered] = self.error("color", covered)
+        self.last_mean, self.last_samples = mean, self.samples.copy()
+        return psnr
 
-    def uneven(
+    def unresolved(
         self, pixel: np.ndarray, width: int, height: int, tolerance: dict[str, float], done: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Of the pixels given, those partly covered, those whose means are not known to their tolerance, and as long as
-        few samples (done) may have missed something those at the outline and beside any of the others; and how badly
-        each is known, squared, in units of the tolerance."""
-        seen = self.seen[pixel]
-        partly = (seen > 0) & (seen < self.asked[pixel])
-        if done <= EDGE:
-            covered = (self.seen > 0).reshape(height, width)
-            whole = (self.seen == self.asked).reshape(height, width) & covered
-            partly |= ((seen == 0) & _beside(covered)[pixel]) | ((seen > 0) & _beside(~whole)[pixel])
+        """Choose those of pixels (m,) that need more samples, and rate each one's squared error.
+
+        Chosen are partly covered pixels, and those whose mean is not known to the tolerance. While they have few
+        samples (done <= OUTLINE_SAMPLES), also those at the outline and beside a chosen one.
+
+        Returns:
+            The chosen pixels (n,), and their squared error (n,) in units of the squared tolerance; inf where partly
+            covered.
+        """
+        hits = self.hits[pixel]
+        partly = (hits > 0) & (hits < self.samples[pixel])
+        if done <= OUTLINE_SAMPLES:
+            covered = (self.hits > 0).reshape(height, width)
+            whole = (self.hits == self.samples).reshape(height, width) & covered
+            partly |= ((hits == 0) & _dilated(covered)[pixel]) | ((hits > 0) & _dilated(~whole)[pixel])
         worst = np.zeros(len(pixel))
-        some = np.flatnonzero(seen > 0)
-        for name in STORED:
+        some = np.flatnonzero(hits > 0)
+        for name in STORED_SCALE:
             if name in self.sums:
                 worst[some] = np.maximum(worst[some], self.error(name, pixel[some]) / tolerance[name] ** 2)
         chosen = partly | (worst > 1)
-        if done <= EDGE:
-            found = np.zeros(width * height, bool)
-            found[pixel[chosen]] = True
-            chosen |= (seen > 0) & _beside(found.reshape(height, width))[pixel]
+        if done <= OUTLINE_SAMPLES:
+            image = np.zeros(width * height, bool)
+            image[pixel[chosen]] = True
+            chosen |= (hits > 0) & _dilated(image.reshape(height, width))[pixel]
         return pixel[chosen], np.where(partly, np.inf, worst)[chosen]
 
     def images(self, camera: Camera, more: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
+        """Divide the sums into images (h, w[, c]) float32 of the domains and of more names, and the mask."""
         shape = (camera.height, camera.width)
-        out = {"mask": (self.seen / np.maximum(self.asked, 1)).reshape(shape).astype(np.float32)}
-        count = np.maximum(self.seen, 1)[:, None]
+        out = {"mask": (self.hits / np.maximum(self.samples, 1)).reshape(shape).astype(np.float32)}
+        count = np.maximum(self.hits, 1)[:, None]
         for name in (*DOMAINS, *more):
             if name not in self.sums:
                 self.sums[name] = np.zeros((self.pixels, 3 if name in ("normal", "albedo", "color") else 1))
@@ -379,25 +422,30 @@ class _Sums:
         return out
 
 
-def _beside(inside: np.ndarray) -> np.ndarray:
-    """(h * w,) bool: pixels that are inside (h, w), or have a neighbour of eight that is."""
+def _dilated(inside: np.ndarray) -> np.ndarray:
+    """Dilate a bool image (h, w) by one pixel in all eight directions; flat (h * w,)."""
     padded = np.pad(inside, 1)
     rows = padded[:-2] | padded[1:-1] | padded[2:]
     return (rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]).ravel()
 
 
 def _srgb_slope(x: np.ndarray) -> np.ndarray:
-    """Derivative of the sRGB curve; 0 beyond 1, where a picture is clipped."""
+    """Differentiate the sRGB curve at linear values x; 0 beyond 1, where a picture is clipped."""
     inside = np.clip(x, 0.0031308, 1)
     return np.where(x > 1, 0.0, np.where(x <= 0.0031308, 12.92, 1.055 / 2.4 * inside ** (1 / 2.4 - 1)))
 
 
-def _corners(bounds: np.ndarray) -> np.ndarray:
-    """(8, 3) corners of a box (2, 3)."""
+def _box_corners(bounds: np.ndarray) -> np.ndarray:
+    """List the corners (8, 3) of a box (2, 3)."""
     return np.stack(np.meshgrid(*bounds.T, indexing="ij"), -1).reshape(-1, 3)
 
 
 def render_buffers(scene: Scene, camera: Camera, samples: int = 16) -> dict[str, np.ndarray]:
-    """Exact buffers of a scene: normal (h, w, 3) shading normals in world axes, depth (h, w), albedo (h, w, 3) linear,
-    roughness, metallic (h, w), mask (h, w) coverage. Averages over the covered part; 0 where nothing is seen."""
+    """Render a scene's buffers for one camera.
+
+    Returns:
+        normal (h, w, 3) shading normals in world axes, depth (h, w), albedo (h, w, 3) linear, roughness (h, w),
+        metallic (h, w), mask (h, w) coverage; float32. Values are means over the covered part of a pixel, 0 where
+        nothing is seen.
+    """
     return Renderer(scene).buffers(camera, samples)

@@ -1,4 +1,4 @@
-"""Cameras for pictures: turntables, spheres, and the random ones of condition images."""
+"""Place cameras around the normalised object: turntables, spheres, and the random ones of condition images."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from gdtool.cameras.camera import DISTANCE, HALF_WIDTH
 def camera(
     azimuth: float, elevation: float, name: str, size: int, fov: float = 0.0, half_width: float = HALF_WIDTH
 ) -> Camera:
-    """A camera that has the normalised object in full; fov (degrees across) 0 is orthographic.
+    """Make a camera that sees the whole normalised object; angles in degrees, fov across, 0 is orthographic.
 
-    A perspective camera stands where it sees a sphere of radius half_width in full.
+    A perspective camera stands where a sphere of radius half_width fills its view.
     """
     if not fov:
         return camera_at(azimuth, elevation, name=name, size=size, half_width=half_width)
@@ -25,13 +25,13 @@ def camera(
 def turntable(
     views: int, size: int, elevation: float = 0.0, fov: float = 0.0, stops: tuple[tuple[str, float], ...] = ()
 ) -> list[Camera]:
-    """Cameras evenly around the object, the first in front, going toward +X; or at named stops (name, azimuth)."""
+    """Place cameras evenly around the object, from the front toward +X; or at named stops (name, azimuth)."""
     stops = stops or tuple((f"{k:03d}", 360.0 * k / views) for k in range(views))
     return [camera(azimuth, elevation, name, size, fov) for name, azimuth in stops]
 
 
 def sphere(views: int, size: int, fov: float = 0.0) -> list[Camera]:
-    """Cameras spread evenly over the sphere around the object."""
+    """Spread cameras evenly over the sphere around the object."""
     from gdtool.shading.sampling import fibonacci
 
     out = []
@@ -41,8 +41,11 @@ def sphere(views: int, size: int, fov: float = 0.0) -> list[Camera]:
 
 
 def condition_camera(rng: np.random.Generator, name: str, size: int) -> Camera:
-    """A photographer in front of the object: elevation −15° to 30°, orthographic or perspective (20° to 60°), object
-    filling 60 to 100 % of what the rig's view leaves it."""
+    """Draw a camera in front of the object, as a photographer would stand.
+
+    Elevation −15° to 30°, orthographic or perspective of 20° to 60°, the object at 60 to 100 % of its size in the rig's
+    views.
+    """
     elevation, perspective = rng.uniform(-15, 30), rng.random() < 0.5
     fov, scale = rng.uniform(20, 60), rng.uniform(0.6, 1.0)
     return camera(0.0, float(elevation), name, size, float(fov) if perspective else 0.0, HALF_WIDTH / float(scale))

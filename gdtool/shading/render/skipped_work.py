@@ -1,13 +1,13 @@
-"""What a rendering did not do because the scene did not need it, and about how long that would have taken."""
+"""Report the work that a rendering left out because the scene did not need it, and about how long it would take."""
 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from gdtool.shading.render.render import BASE
+from gdtool.shading.render.render import BASE_SAMPLES
 
 if TYPE_CHECKING:
     from gdtool.shading.render.direct import DirectLight
@@ -21,73 +21,110 @@ TEXTURES = {
 }
 
 
-def savings(renderer: Renderer, samples: int, light: DirectLight | None) -> list[tuple[str, str, float]]:
-    """(what, why, seconds) of each skip. Seconds are what one such step took here, times the steps left out; those of a
-    texture that is not there are what reading a tiny one takes."""
-    counts, scene, out = renderer.counts, renderer.scene, []
-    taken = max(counts.samples, 1)
+class SkippedStep(NamedTuple):
+    """One thing that was left out: what, why, and the seconds that it would have taken."""
+
+    what: str
+    why: str
+    seconds: float
+
+
+def skipped_work(renderer: Renderer, samples: int, light: DirectLight | None) -> list[SkippedStep]:
+    """List what the renderer and the light left out so far; samples is the most that a pixel could get.
+
+    Seconds are the time that one such step took here, times the number of steps left out. For a texture that does not
+    exist they are the time of reading a tiny one.
+    """
+    return [
+        *_texture_lookups(renderer),
+        *_samples(renderer, samples),
+        *_shadow_rays(renderer),
+        *([] if light is None else _prefiltered_levels(light)),
+    ]
+
+
+def _texture_lookups(renderer: Renderer) -> list[SkippedStep]:
+    """List the lookups of textures that are absent or constant, and alpha tests where all is opaque."""
+    scene, taken, out = renderer.scene, max(renderer.counts.samples, 1), []
     absent = [what for what, name in TEXTURES.items() if all(getattr(m, name) is None for m in scene.materials)]
     if absent:
-        each = _lookup_seconds() * taken
-        out += [(f"{what} lookups", "no material has such a texture", each) for what in absent]
-    flat = [
-        what
-        for what, name in TEXTURES.items()
-        if what not in absent
-        and all(
-            t is None or renderer.lookup.constant(t) is not None for t in (getattr(m, name) for m in scene.materials)
-        )
-    ]
-    out += [(f"{what} lookups", "the texture is one value everywhere", _lookup_seconds() * taken) for what in flat]
+        seconds = float(_lookup_seconds() * taken)
+        out += [SkippedStep(f"{what} lookups", "no material has such a texture", seconds) for what in absent]
+    for what, name in TEXTURES.items():
+        textures = [getattr(material, name) for material in scene.materials]
+        if what not in absent and all(t is None or renderer.lookup.constant(t) is not None for t in textures):
+            seconds = float(_lookup_seconds() * taken)
+            out.append(SkippedStep(f"{what} lookups", "the texture is one value everywhere", seconds))
     if renderer.tested is None:
-        out.append(("alpha tests", "every material is opaque", _lookup_seconds() * taken))
+        out.append(SkippedStep("alpha tests", "every material is opaque", float(_lookup_seconds() * taken)))
+    return out
+
+
+def _samples(renderer: Renderer, samples: int) -> list[SkippedStep]:
+    """List rays outside the object's bounds, and samples of pixels whose mean was known before."""
+    counts, out = renderer.counts, []
+    taken = max(counts.samples, 1)
     if counts.pixels_in_bounds < counts.pixels:
         outside = counts.pixels - counts.pixels_in_bounds
-        reason = f"{outside / counts.pixels:.0%} of the pixels lie outside the object's projected bounds"
-        out.append(("rays", reason, outside * min(BASE, samples) * counts.seconds.get("rays", 0.0) / taken))
+        why = f"{outside / counts.pixels:.0%} of the pixels lie outside the object's projected bounds"
+        seconds = outside * min(BASE_SAMPLES, samples) * counts.seconds.get("rays", 0.0) / taken
+        out.append(SkippedStep("rays", why, float(seconds)))
     fewer = counts.pixels_in_bounds * samples - counts.samples
     if fewer > 0:
-        even = 1 - counts.pixels_refined / max(counts.pixels_in_bounds, 1)
-        reason = f"{even:.0%} of the pixels in bounds are even and got {BASE} of {samples}; {counts.samples / max(counts.pixels_in_bounds, 1):.1f} on average"
-        out.append(("samples", reason, fewer * counts.seconds.get("samples", 0.0) / taken))
-    directions = (
-        counts.shadow_rays + counts.shadow_rays_below_horizon + counts.shadow_rays_convex + counts.shadow_rays_rare
-    )
-    each = counts.seconds.get("directions", 0.0) / max(directions, 1)
-    if counts.shadow_rays_below_horizon:
-        reason = f"{counts.shadow_rays_below_horizon / directions:.0%} of the directions are below the horizon"
-        out.append(("shadow rays", reason, counts.shadow_rays_below_horizon * each))
-    if counts.shadow_rays_convex:
-        out.append(
-            (
-                "shadow rays of convex objects",
-                "nothing lies in front of a convex object's outside",
-                counts.shadow_rays_convex * each,
-            )
+        in_bounds = max(counts.pixels_in_bounds, 1)
+        uniform = 1 - counts.pixels_refined / in_bounds
+        why = (
+            f"{uniform:.0%} of the pixels in bounds are even and got {BASE_SAMPLES} of {samples}; "
+            f"{counts.samples / in_bounds:.1f} on average"
         )
-    if counts.shadow_rays_rare:
-        reason = f"{counts.shadow_rays_rare / directions:.0%} of the directions bring little light and were left out by chance, the others counting for more"
-        out.append(("shadow rays toward little light", reason, counts.shadow_rays_rare * each))
-    if light is not None and light.prefiltered is not None and light.prefiltered.images:
-        from gdtool.shading.lights.prefilter import LADDER
+        out.append(SkippedStep("samples", why, float(fewer * counts.seconds.get("samples", 0.0) / taken)))
+    return out
 
-        made = light.prefiltered.images
-        if len(made) < len(LADDER):
-            texels = sum(side**2 for _, side, _ in LADDER)
-            here = sum(LADDER[level][1] ** 2 for level in made)
-            reason = f"the scene's roughness needs {len(made)} of {len(LADDER)}"
-            out.append(("prefiltered levels", reason, light.prefiltered.seconds * (texels - here) / here))
-    return [(what, why, float(seconds)) for what, why, seconds in out]
+
+def _shadow_rays(renderer: Renderer) -> list[SkippedStep]:
+    """List the shadow rays that were not cast."""
+    counts, out = renderer.counts, []
+    below, convex, rare = counts.shadow_rays_below_horizon, counts.shadow_rays_convex, counts.shadow_rays_rare
+    directions = counts.shadow_rays + below + convex + rare
+    each = counts.seconds.get("directions", 0.0) / max(directions, 1)
+    if below:
+        why = f"{below / directions:.0%} of the directions are below the horizon"
+        out.append(SkippedStep("shadow rays", why, float(below * each)))
+    if convex:
+        why = "nothing lies in front of a convex object's outside"
+        out.append(SkippedStep("shadow rays of convex objects", why, float(convex * each)))
+    if rare:
+        why = (
+            f"{rare / directions:.0%} of the directions bring little light and were left out by chance, "
+            "the others counting for more"
+        )
+        out.append(SkippedStep("shadow rays toward little light", why, float(rare * each)))
+    return out
+
+
+def _prefiltered_levels(light: DirectLight) -> list[SkippedStep]:
+    """List the prefiltered images that the scene's roughness did not need."""
+    from gdtool.shading.lights.prefilter import ROUGHNESS_LEVELS
+
+    if light.prefiltered is None or not light.prefiltered.images:
+        return []
+    made = light.prefiltered.images
+    if len(made) == len(ROUGHNESS_LEVELS):
+        return []
+    texels = sum(level.side**2 for level in ROUGHNESS_LEVELS)
+    here = sum(ROUGHNESS_LEVELS[k].side ** 2 for k in made)
+    why = f"the scene's roughness needs {len(made)} of {len(ROUGHNESS_LEVELS)}"
+    return [SkippedStep("prefiltered levels", why, float(light.prefiltered.seconds * (texels - here) / here))]
 
 
 def _lookup_seconds(count: int = 4096) -> float:
-    """Seconds that reading a texture at one point takes on this machine."""
+    """Measure the seconds that reading a texture at one point takes on this machine."""
     from gdtool.assets.scene import Texture
     from gdtool.shading.render.textures import TextureReader
 
     reader = TextureReader(Texture(np.zeros((2, 2, 3), np.uint8), "srgb"))
     uv = np.random.default_rng(0).random((count, 2))
+    reader.read(uv)  # the first read warms up
+    begun = time.perf_counter()
     reader.read(uv)
-    at = time.perf_counter()
-    reader.read(uv)
-    return (time.perf_counter() - at) / count
+    return (time.perf_counter() - begun) / count

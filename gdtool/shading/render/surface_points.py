@@ -1,7 +1,7 @@
-"""What a scene's surface is made of at given points of its triangles (glTF 2.0 metallic-roughness).
+"""Look a scene's material up at points of its triangles (glTF 2.0 metallic-roughness).
 
-In here vectors of n points are (3, n), each component on its own in memory, float32 but for what texture coordinates
-need: so sums run over numbers that lie side by side. What goes out is (n, 3), a view of that.
+Inside this module vectors of n points are (3, n), so that each component lies side by side in memory. They are float32,
+except where texture coordinates need float64. What is returned is (n, 3), a transposed view.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gdtool.assets.scene import Scene, Texture
+from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.vectors import dot
 from gdtool.shading.render.textures import TextureReader, same_layout
@@ -20,7 +20,7 @@ ATTRIBUTES = ("albedo", "roughness", "metallic", "normal", "geometric_normal", "
 
 
 def _interpolated(values: np.ndarray, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(c, n) values (c, v) at the corners (3, n), by barycentric weights (3, n)."""
+    """Interpolate values (c, v) at corners (3, n) by barycentric weights (3, n): (c, n)."""
     out = np.take(values, corners[0], axis=1)
     out *= weights[0]
     for i in (1, 2):
@@ -31,14 +31,17 @@ def _interpolated(values: np.ndarray, corners: np.ndarray, weights: np.ndarray) 
 
 
 def _columns(values: np.ndarray, dtype=np.float32) -> np.ndarray:
-    """(c, n) from (n, c), each component on its own in memory."""
+    """Transpose (n, c) to contiguous (c, n)."""
     return np.ascontiguousarray(np.asarray(values).T, dtype)
 
 
 @dataclass
-class _At:
-    """Points of the surface: face_idx (n,), corners (3, n), weights (3, n) float64 and float32, footprint (n,) or
-    None."""
+class _Places:
+    """Places on the surface.
+
+    face_idx (n,); corners (3, n) vertex indices; exact, weights (3, n): barycentric in float64, float32; footprint
+    (n,), width in world units that a place stands for, or None.
+    """
 
     face_idx: np.ndarray
     corners: np.ndarray
@@ -49,8 +52,9 @@ class _At:
     def __len__(self) -> int:
         return len(self.face_idx)
 
-    def part(self, chosen: np.ndarray) -> _At:
-        return _At(
+    def part(self, chosen: np.ndarray) -> _Places:
+        """Return the chosen places, by index."""
+        return _Places(
             self.face_idx[chosen],
             self.corners[:, chosen],
             self.exact[:, chosen],
@@ -60,7 +64,7 @@ class _At:
 
 
 class SurfaceLookup:
-    """Material lookup of one scene; textures' coarser levels and tangents are made when first needed."""
+    """Look one scene's materials up; mip levels and tangents are made when first needed. Thread-safe."""
 
     def __init__(self, scene: Scene):
         self.scene = scene
@@ -77,11 +81,12 @@ class SurfaceLookup:
         self._uvs = [_columns(uv, np.float64) for uv in scene.uvs]
 
     def alpha_faces(self) -> np.ndarray:
-        """(f,) bool: faces whose material is alpha-tested (MASK or BLEND)."""
+        """Tell which faces have an alpha-tested material, MASK or BLEND: (f,) bool."""
         tested = np.array([m.alpha_mode != "OPAQUE" for m in self.scene.materials] or [False])
         return tested[self.scene.material_idx]
 
     def _reader(self, *textures: Texture) -> TextureReader:
+        """Return the reader of textures of one layout, made when first asked for."""
         key = tuple(id(t) for t in textures)
         with self._lock:
             if key not in self._readers:
@@ -89,7 +94,7 @@ class SurfaceLookup:
             return self._readers[key]
 
     def constant(self, texture: Texture) -> np.ndarray | None:
-        """(c,) linear value of a texture whose texels are all the same: a factor that was stored as a map."""
+        """Return the linear value (c,) of a texture whose texels are all the same, else None."""
         if id(texture) not in self._constants:
             texels = texture.image.reshape(-1, 1 if texture.image.ndim == 2 else texture.image.shape[2])
             scatter = texels[:: max(1, len(texels) // 64)]
@@ -98,11 +103,12 @@ class SurfaceLookup:
         return self._constants[id(texture)]
 
     def _uv(self, texture: Texture) -> np.ndarray | None:
+        """Return the texture's UV set (v, 2), None where the scene lacks it."""
         sets = self.scene.uvs
         return sets[texture.uv_set] if texture.uv_set < len(sets) else None
 
     def _density(self, texture: Texture, face_idx: np.ndarray) -> np.ndarray:
-        """Texels per world unit (n,) on faces, square root of the ratio of areas."""
+        """Compute texels per world unit (n,) on faces: the root of the ratio of areas."""
         with self._lock:
             self._measure_uv(texture)
         height, width = texture.image.shape[:2]
@@ -110,54 +116,58 @@ class SurfaceLookup:
         return np.sqrt(self._uv_areas[texture.uv_set][face_idx] * stretch)
 
     def _measure_uv(self, texture: Texture) -> None:
+        """Compute the ratio (f,) of each face's area in the texture's UV set to its area in space."""
         if texture.uv_set not in self._uv_areas:
             a, b, c = (self._uv(texture)[self.scene.faces[:, i]] for i in range(3))
             u, v = b - a, c - a
             area = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
             self._uv_areas[texture.uv_set] = area / np.maximum(self.face_areas, 1e-300)
 
-    def _at(self, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None) -> _At:
+    def _places(self, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None) -> _Places:
+        """Gather places from faces (n,) and barycentric coordinates (n, 3)."""
         face_idx, exact = np.asarray(face_idx, np.intp), _columns(barycentric, np.float64)
-        return _At(face_idx, np.take(self._faces, face_idx, axis=1), exact, exact.astype(np.float32), footprint)
+        return _Places(face_idx, np.take(self._faces, face_idx, axis=1), exact, exact.astype(np.float32), footprint)
 
-    def _read(self, textures: dict[str, Texture | None], at: _At) -> dict[str, np.ndarray]:
-        """By name (c, n) linear texels of the textures that there are and whose UV set there is; those of one layout
-        are looked up at once."""
-        together: dict[tuple, list[str]] = {}
+    def _read(self, textures: dict[str, Texture | None], at: _Places) -> dict[str, np.ndarray]:
+        """Read textures at places: linear texels (c, n) by name, for those that exist and whose UV set exists.
+
+        Textures of one layout are read together.
+        """
+        layouts: dict[tuple, list[str]] = {}
         out: dict[str, np.ndarray] = {}
         for name, texture in textures.items():
             if texture is None or self._uv(texture) is None:
                 continue
             value = self.constant(texture) if self.skip_constant else None
             if value is None:
-                together.setdefault(same_layout(texture), []).append(name)
+                layouts.setdefault(same_layout(texture), []).append(name)
             else:
                 out[name] = np.broadcast_to(value[:, None], (len(value), len(at)))
-        places = {}
-        for names in together.values():
+        uvs = {}
+        for names in layouts.values():
             texture = textures[names[0]]
-            if texture.uv_set not in places:
-                places[texture.uv_set] = _interpolated(self._uvs[texture.uv_set], at.corners, at.exact).T
+            if texture.uv_set not in uvs:
+                uvs[texture.uv_set] = _interpolated(self._uvs[texture.uv_set], at.corners, at.exact).T
             width = None if at.footprint is None else at.footprint * self._density(texture, at.face_idx)
             reader = self._reader(*(textures[name] for name in names))
-            texels = reader.read(places[texture.uv_set], width).T
+            texels = reader.read(uvs[texture.uv_set], width).T
             out |= {name: texels[part] for name, part in zip(names, reader.parts, strict=True)}
         return out
 
-    def _shading_normals(self, at: _At) -> np.ndarray:
-        """(3, n) unit interpolated vertex normals, the face's where there are none."""
+    def _shading_normals(self, at: _Places) -> np.ndarray:
+        """Interpolate unit vertex normals (3, n); the face's normal where there are none."""
         if self._normals is None:
             return np.take(self._flat, at.face_idx, axis=1)
         smooth = _interpolated(self._normals, at.corners, at.weights)
         length = np.sqrt(dot(smooth, smooth))
-        none = np.flatnonzero(length <= 1e-6)
-        if len(none):
-            smooth[:, none], length[none] = self._flat[:, at.face_idx[none]], 1.0
+        vanishing = np.flatnonzero(length <= 1e-6)
+        if len(vanishing):
+            smooth[:, vanishing], length[vanishing] = self._flat[:, at.face_idx[vanishing]], 1.0
         smooth /= length
         return smooth
 
-    def _tangent(self, texture: Texture, at: _At) -> np.ndarray:
-        """(4, n) interpolated tangents: the file's, else MikkTSpace's for the texture's UV set."""
+    def _tangent(self, texture: Texture, at: _Places) -> np.ndarray:
+        """Interpolate tangents (4, n): the file's, else MikkTSpace's for the texture's UV set."""
         with self._lock:
             self._make_tangents(texture)
         values = self._tangents[texture.uv_set]
@@ -168,7 +178,7 @@ class SurfaceLookup:
         return out
 
     def _make_tangents(self, texture: Texture) -> None:
-        """(4, v) where the file has them at its vertices, else (4, 3 f) at the faces' corners."""
+        """Make the tangents of a UV set: (4, v) at vertices where the file has them, else (4, 3 f) at face corners."""
         if texture.uv_set in self._tangents:
             return
         scene = self.scene
@@ -177,22 +187,22 @@ class SurfaceLookup:
             return
         from gdtool.geometry.tangents import corner_tangents
 
-        own = scene.normals is None
-        normals = self.face_normals if own else scene.normals
-        normal_idx = np.repeat(np.arange(len(scene.faces))[:, None], 3, 1) if own else None
-        found = corner_tangents(scene.vertices, scene.faces, normals, self._uv(texture), scene.faces, normal_idx)
-        self._tangents[texture.uv_set] = _columns(found.reshape(-1, 4))
+        flat = scene.normals is None
+        normals = self.face_normals if flat else scene.normals
+        normal_idx = np.repeat(np.arange(len(scene.faces))[:, None], 3, 1) if flat else None
+        tangents = corner_tangents(scene.vertices, scene.faces, normals, self._uv(texture), scene.faces, normal_idx)
+        self._tangents[texture.uv_set] = _columns(tangents.reshape(-1, 4))
 
     def _normal_mapped(
         self, texture: Texture, scale: float, texel: np.ndarray, normal: np.ndarray, tangent: np.ndarray
     ) -> np.ndarray:
-        """(3, n) unit normals from a map's texels (c, n), normals (3, n) and tangents (4, n)."""
+        """Apply a normal map: unit normals (3, n) from its texels (c, n), vertex normals (3, n) and tangents (4, n)."""
         along, across, up = (np.float32(2) * texel[i] - np.float32(1) for i in range(3))
         if scale != 1.0:
             along, across = along * np.float32(scale), across * np.float32(scale)
         c, s = np.cos(texture.rotation), np.sin(texture.rotation)
         if s != 0.0 or texture.scale[0] < 0 or texture.scale[1] < 0:
-            # The map's axes are turned against the UV's: bring the perturbation back to the UV's axes.
+            # The texture transform turns the map's axes: turn the perturbation back to the UV's axes.
             along, across = (
                 along * np.float32(np.sign(texture.scale[0])),
                 across * np.float32(np.sign(texture.scale[1])),
@@ -212,9 +222,11 @@ class SurfaceLookup:
         return out
 
     def alpha(self, face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Alpha (n,) and the alpha below which a point is not there (n,): 0 for OPAQUE, the cutoff for MASK, 0.5 for
-        BLEND."""
-        scene, at = self.scene, self._at(face_idx, barycentric)
+        """Look alpha (n,) up, and the cutoff (n,) below which a point is absent.
+
+        The cutoff is 0 for OPAQUE materials, the material's for MASK, 0.5 for BLEND.
+        """
+        scene, at = self.scene, self._places(face_idx, barycentric)
         alpha, cutoff = np.ones(len(at), np.float32), np.zeros(len(at), np.float32)
         owner = scene.material_idx[at.face_idx]
         for m in np.unique(owner):
@@ -241,21 +253,25 @@ class SurfaceLookup:
         directions: np.ndarray | None = None,
         emission: bool = True,
     ) -> dict[str, np.ndarray]:
-        """Attributes at n points: albedo, emissive (n, 3) linear, roughness, metallic, alpha (n,), normal and
-        geometric_normal (n, 3) unit, f0 and f90 (n,) of the dielectric part at normal and at grazing incidence
-        (KHR_materials_ior, _specular), unlit (n,) bool; float32.
+        """Look all attributes of n points up.
 
-        footprint (n,): width in world units that a point stands for; picks the texture level. directions (n, 3): rays
-        that see the points; normals are then turned to the seen side, as glTF asks for double-sided materials (and as
-        is done here for all, since files whose winding and normals disagree are common). Without emission it is 0, and
-        not looked up.
+        Args:
+            face_idx: (n,) faces.
+            barycentric: (n, 3) coordinates on them.
+            footprint: (n,) widths in world units that the points stand for; they choose the mip level.
+            directions: (n, 3) rays that see the points. Normals are then turned to the seen side, as glTF asks for
+                double-sided materials. This is done for all materials, since files whose winding and normals disagree
+                are common.
+            emission: whether to look the emission up; it is 0 otherwise.
+
+        Returns:
+            albedo and emissive (n, 3) linear, roughness, metallic and alpha (n,), normal and geometric_normal (n, 3)
+            unit, f0 and f90 (n,) of the dielectric part at normal and grazing incidence (KHR_materials_ior, _specular),
+            all float32; unlit (n,) bool.
         """
         scene, n = self.scene, len(face_idx)
-        points = self._at(face_idx, barycentric, None if footprint is None else np.broadcast_to(footprint, (n,)))
-        albedo, emissive = np.empty((3, n), np.float32), np.zeros((3, n), np.float32)
-        roughness, metallic = np.empty(n, np.float32), np.empty(n, np.float32)
-        alpha, unlit = np.ones(n, np.float32), np.zeros(n, bool)
-        f0, f90 = np.empty(n, np.float32), np.empty(n, np.float32)
+        points = self._places(face_idx, barycentric, None if footprint is None else np.broadcast_to(footprint, (n,)))
+        out = _Attributes.empty(n)
         vertex_normal = self._shading_normals(points)
         normal = vertex_normal
         owner = scene.material_idx[points.face_idx]
@@ -265,39 +281,22 @@ class SurfaceLookup:
             alone = len(present) == 1
             at = slice(None) if alone else np.flatnonzero(owner == m)
             here = points if alone else points.part(at)
-            glows = emission and any(material.emissive)
+            shines = emission and any(material.emissive)
             texels = self._read(
                 {
                     "color": material.base_color_texture,
                     "surface": material.metallic_roughness_texture,
                     "normal": material.normal_texture,
-                    "emissive": material.emissive_texture if glows else None,
+                    "emissive": material.emissive_texture if shines else None,
                 },
                 here,
             )
-            color = np.repeat(np.asarray(material.base_color, np.float32)[:, None], len(here), 1)
-            texel = texels.get("color")
-            if texel is not None:
-                color[:3] *= texel[:3] if len(texel) >= 3 else texel[:1]
-                if len(texel) in (2, 4):
-                    color[3] *= texel[-1]
-            if self._colors is not None:
-                color *= _interpolated(self._colors, here.corners, here.weights)
-            albedo[:, at] = color[:3]
-            if material.alpha_mode != "OPAQUE":
-                alpha[at] = color[3]
-            texel = texels.get("surface")
-            known = texel is not None and len(texel) >= 3
-            roughness[at] = np.float32(material.roughness) * (texel[1] if known else np.float32(1))
-            metallic[at] = np.float32(material.metallic) * (texel[2] if known else np.float32(1))
-            if glows:
+            self._fill(out, at, material, texels, here)
+            if shines:
                 texel = texels.get("emissive")
-                emissive[:, at] = np.asarray(material.emissive, np.float32)[:, None] * (
+                out.emissive[:, at] = np.asarray(material.emissive, np.float32)[:, None] * (
                     texel[:3] if texel is not None else np.float32(1)
                 )
-            unlit[at] = material.unlit
-            f0[at] = min(((material.ior - 1) / (material.ior + 1)) ** 2 * material.specular, 1.0)
-            f90[at] = min(material.specular, 1.0)
             texel = texels.get("normal")
             if texel is not None and len(texel) >= 3:
                 mapped = self._normal_mapped(
@@ -316,17 +315,70 @@ class SurfaceLookup:
             side = dot(geometric, directions.T)
             geometric = geometric * np.where(side > 0, np.float32(-1), np.float32(1))
             normal = normal * np.where(dot(vertex_normal, geometric) < 0, np.float32(-1), np.float32(1))
-        for values in (albedo, roughness, metallic, alpha):
+        return out.as_dict(normal, geometric)
+
+    def _fill(self, out: _Attributes, at, material: Material, texels: dict[str, np.ndarray], here: _Places) -> None:
+        """Fill the points `at` of out, all of one material, but for their normals and emission."""
+        color = np.repeat(np.asarray(material.base_color, np.float32)[:, None], len(here), 1)
+        texel = texels.get("color")
+        if texel is not None:
+            color[:3] *= texel[:3] if len(texel) >= 3 else texel[:1]
+            if len(texel) in (2, 4):
+                color[3] *= texel[-1]
+        if self._colors is not None:
+            color *= _interpolated(self._colors, here.corners, here.weights)
+        out.albedo[:, at] = color[:3]
+        if material.alpha_mode != "OPAQUE":
+            out.alpha[at] = color[3]
+        texel = texels.get("surface")
+        textured = texel is not None and len(texel) >= 3
+        out.roughness[at] = np.float32(material.roughness) * (texel[1] if textured else np.float32(1))
+        out.metallic[at] = np.float32(material.metallic) * (texel[2] if textured else np.float32(1))
+        out.unlit[at] = material.unlit
+        out.f0[at] = min(((material.ior - 1) / (material.ior + 1)) ** 2 * material.specular, 1.0)
+        out.f90[at] = min(material.specular, 1.0)
+
+
+@dataclass
+class _Attributes:
+    """Attributes of n points while they are filled: vectors (3, n), scalars (n,)."""
+
+    albedo: np.ndarray
+    emissive: np.ndarray
+    roughness: np.ndarray
+    metallic: np.ndarray
+    alpha: np.ndarray
+    unlit: np.ndarray
+    f0: np.ndarray
+    f90: np.ndarray
+
+    @classmethod
+    def empty(cls, n: int) -> _Attributes:
+        """Allocate the attributes of n points: opaque, lit and without emission."""
+        return cls(
+            albedo=np.empty((3, n), np.float32),
+            emissive=np.zeros((3, n), np.float32),
+            roughness=np.empty(n, np.float32),
+            metallic=np.empty(n, np.float32),
+            alpha=np.ones(n, np.float32),
+            unlit=np.zeros(n, bool),
+            f0=np.empty(n, np.float32),
+            f90=np.empty(n, np.float32),
+        )
+
+    def as_dict(self, normal: np.ndarray, geometric: np.ndarray) -> dict[str, np.ndarray]:
+        """Clip to valid ranges, and return by name with the normals; vectors (n, 3)."""
+        for values in (self.albedo, self.roughness, self.metallic, self.alpha):
             np.clip(values, 0, 1, out=values)
         return {
-            "albedo": albedo.T,
-            "roughness": roughness,
-            "metallic": metallic,
-            "alpha": alpha,
-            "emissive": np.maximum(emissive, 0).T,
-            "unlit": unlit,
-            "f0": f0,
-            "f90": f90,
+            "albedo": self.albedo.T,
+            "roughness": self.roughness,
+            "metallic": self.metallic,
+            "alpha": self.alpha,
+            "emissive": np.maximum(self.emissive, 0).T,
+            "unlit": self.unlit,
+            "f0": self.f0,
+            "f90": self.f90,
             "normal": normal.T,
             "geometric_normal": geometric.T,
         }
@@ -335,5 +387,5 @@ class SurfaceLookup:
 def surface_attributes(
     scene: Scene, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
-    """SurfaceLookup(scene).attributes for one call: see there."""
+    """Look attributes of a scene up once: SurfaceLookup(scene).attributes."""
     return SurfaceLookup(scene).attributes(np.asarray(face_idx), np.asarray(barycentric, np.float64), footprint)

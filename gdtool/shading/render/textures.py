@@ -1,4 +1,4 @@
-"""Texture lookup: wrap modes, bilinear filter, box-filtered levels, sRGB decoded before filtering."""
+"""Look textures up: wrap modes, bilinear filter, box-filtered mip levels, sRGB decoded before filtering."""
 
 from __future__ import annotations
 
@@ -11,18 +11,21 @@ from gdtool.assets.scene import Texture
 from gdtool.core.threads import cores
 from gdtool.images.color import linear_from_srgb
 
-# Rows that a thread works on when a level is built: bounds the memory of a 4k texture; and those decoded at a time, few
-# enough that what lies between stays in the cache.
-BAND, CACHED = 256, 16
-# Lookups, as a share of the texels, after which decoding the finest level once costs less than going on texel by texel;
-# and the most numbers that it may then have (256 MB).
-WORTH = 0.15
+# Rows that a thread works on when a level is built; bounds the memory for a 4k texture.
+BAND = 256
+# Rows that are decoded at once: few enough that intermediate values stay in the cache.
+CACHED_ROWS = 16
+# Lookups, as a share of the finest level's texels, from which decoding all of it once costs less than decoding texels
+# one by one; and the most float32 numbers that it may have then (256 MB).
+DECODE_SHARE = 0.15
 MAX_DECODED = 1 << 26
 
 
 def transform_uv(texture: Texture, uv: np.ndarray) -> np.ndarray:
-    """KHR_texture_transform: offset + rotation * (scale * uv); a positive angle turns uv counter-clockwise as drawn
-    with v down, so the picture turns clockwise. uv (n, 2)."""
+    """Apply KHR_texture_transform to uv (n, 2): offset + rotation * (scale * uv).
+
+    A positive angle turns uv counter-clockwise where v points down, so the picture turns clockwise.
+    """
     if texture.rotation == 0.0 and texture.scale == (1.0, 1.0) and texture.offset == (0.0, 0.0):
         return uv
     c, s = np.cos(texture.rotation), np.sin(texture.rotation)
@@ -31,7 +34,7 @@ def transform_uv(texture: Texture, uv: np.ndarray) -> np.ndarray:
 
 
 def wrap_index(index: np.ndarray, size: int, wrap: str) -> np.ndarray:
-    """Texel indices (n,) int64, any value, to [0, size) by a glTF wrap mode."""
+    """Wrap texel indices (n,) int64 of any value into [0, size), by a glTF wrap mode."""
     if wrap == "clamp":
         return np.clip(index, 0, size - 1)
     if wrap == "mirror":
@@ -41,7 +44,7 @@ def wrap_index(index: np.ndarray, size: int, wrap: str) -> np.ndarray:
 
 
 def same_layout(texture: Texture) -> tuple:
-    """What textures must share to be read at once: equal keys mean equal texels and weights at every uv."""
+    """Return a key of all that decides which texels and weights a uv reads; textures of one key are read together."""
     return (
         texture.uv_set,
         texture.offset,
@@ -56,10 +59,11 @@ def same_layout(texture: Texture) -> tuple:
 
 
 class TextureReader:
-    """Texels of textures of one layout, side by side as linear float32: channels of the first, then of the next.
+    """Read textures of one layout as linear float32, their channels side by side.
 
-    The finest level stays as stored, image by image; coarser ones are box averages of about 2x2, made when asked.
-    Threads may read at once."""
+    The finest level stays as the images store it. Coarser levels are box averages of about 2 x 2 texels, made when
+    first needed. Several threads may read at once.
+    """
 
     def __init__(self, *textures: Texture):
         self.texture = textures[0]
@@ -67,7 +71,7 @@ class TextureReader:
         ends = np.cumsum([image.shape[2] for image in self.images])
         self.parts = [slice(int(end) - image.shape[2], int(end)) for image, end in zip(self.images, ends, strict=True)]
         self.colored = [t.encoding == "srgb" for t in textures]
-        # Coarser levels: of half the size, a quarter, …
+        # Coarser levels: half the size, a quarter, …
         self.levels: list[np.ndarray] = []
         top = {"u1": 255, "u2": 65535}.get(self.images[0].dtype.str[1:])
         self._unit = np.float32(1.0 if top is None else 1.0 / top)
@@ -75,11 +79,12 @@ class TextureReader:
             None if top is None else linear_from_srgb(np.arange(top + 1, dtype=self.images[0].dtype)).astype(np.float32)
         )
         self._lock = threading.Lock()
-        # How many lookups the finest level had, and all of it decoded once they were many.
+        # Lookups of the finest level so far, and all of it decoded once they are many.
         self._asked, self._decoded = 0, None
 
     @property
     def channels(self) -> int:
+        """How many channels all textures have together."""
         return self.parts[-1].stop
 
     @property
@@ -88,7 +93,7 @@ class TextureReader:
         return max(self.images[0].shape[:2]).bit_length()
 
     def stored(self, index: np.ndarray) -> np.ndarray:
-        """(n, c) linear float32 of texels (n,) of the finest level, row by row; alpha is never sRGB."""
+        """Decode texels (n,) of the finest level, by row-major index, to (n, c) linear float32; alpha is never sRGB."""
         out = np.empty((len(index), self.channels), np.float32)
         for image, part, colored in zip(self.images, self.parts, self.colored, strict=True):
             texels = np.take(image.reshape(-1, image.shape[2]), index, axis=0)
@@ -96,8 +101,10 @@ class TextureReader:
         return out
 
     def _decode(self, texels: np.ndarray, colored: bool, out: np.ndarray) -> None:
-        """Texels (..., c) as one image stores them into out, linear float32; channel by channel, as short rows are
-        slow."""
+        """Decode stored texels (..., c) of one image into out, linear float32.
+
+        Channel by channel: numpy is slow on rows as short as a texel.
+        """
         for i, srgb in enumerate(_colored(texels.shape[-1], colored)):
             if srgb:
                 out[..., i] = self._linear(texels[..., i])
@@ -105,7 +112,7 @@ class TextureReader:
                 np.multiply(texels[..., i], self._unit, out=out[..., i], dtype=np.float32, casting="same_kind")
 
     def _linear(self, values: np.ndarray) -> np.ndarray:
-        """float32 of stored sRGB values."""
+        """Decode stored sRGB values to linear float32."""
         return (
             linear_from_srgb(values).astype(np.float32, copy=False)
             if self._table is None
@@ -113,14 +120,14 @@ class TextureReader:
         )
 
     def level(self, k: int) -> np.ndarray:
-        """(h // 2^k, w // 2^k, c) linear float32, at least 1 by 1."""
+        """Return level k: (h // 2^k, w // 2^k, c) linear float32, at least 1 by 1."""
         if k == 0:
             out = np.empty((*self.images[0].shape[:2], self.channels), np.float32)
 
             def decode(row: int) -> None:
                 for image, part, colored in zip(self.images, self.parts, self.colored, strict=True):
-                    for start in range(row, min(row + BAND, len(out)), CACHED):
-                        rows = slice(start, min(start + CACHED, row + BAND))
+                    for start in range(row, min(row + BAND, len(out)), CACHED_ROWS):
+                        rows = slice(start, min(start + CACHED_ROWS, row + BAND))
                         self._decode(image[rows], colored, out[rows, :, part])
 
             _each_band(decode, len(out), BAND)
@@ -131,18 +138,18 @@ class TextureReader:
             return self.levels[k - 1]
 
     def _levelled(self, k: int, count: int) -> np.ndarray | None:
-        """Level k where it is worth having as linear numbers for count lookups more; None: texels are decoded as they
-        are read."""
+        """Return level k decoded, or None where decoding single texels is cheaper for count more lookups."""
         if k:
             return self.level(k)
         with self._lock:
             texels = self.images[0].shape[0] * self.images[0].shape[1]
             self._asked += count
-            if self._decoded is None and self._asked > WORTH * texels and texels * self.channels <= MAX_DECODED:
+            if self._decoded is None and self._asked > DECODE_SHARE * texels and texels * self.channels <= MAX_DECODED:
                 self._decoded = self.level(0)
             return self._decoded
 
     def _make_next(self) -> None:
+        """Append the next coarser level."""
         finer = self.levels[-1:] or self.images
         parts = [slice(0, self.channels)] if self.levels else self.parts
         height, width = finer[0].shape[:2]
@@ -159,21 +166,23 @@ class TextureReader:
         self.levels.append(coarse)
 
     def _halved_even(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
-        """Means of 2x2 texels into out, rows of the coarser level from row on. colored: whether finer is stored in
-        sRGB; None: it is linear."""
+        """Average 2 x 2 texels into out, rows of the coarser level from row on.
+
+        colored: whether finer is stored in sRGB; None where it is linear float32.
+        """
         band = finer[2 * row : 2 * (row + len(out))]
         wide = {"u1": np.uint16, "u2": np.uint32}.get(band.dtype.str[1:], np.float32)
         for i, srgb in enumerate([False] * band.shape[2] if colored is None else _colored(band.shape[2], colored)):
             values = band[..., i]
             if srgb:
                 values = self._linear(values)
-            # Sums of four stay exact as they are stored: decoding is left for the quarter.
+            # Sums of four stored integers are exact; so only a quarter as many numbers need scaling.
             pairs = np.add(values[0::2], values[1::2], dtype=np.float32 if srgb else wide)
             unit = np.float32(0.25) * (np.float32(1) if srgb or colored is None else self._unit)
             np.multiply(pairs[:, 0::2] + pairs[:, 1::2], unit, out=out[..., i], casting="same_kind", dtype=np.float32)
 
     def _halved_odd(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
-        """The same where a side is odd: a coarser texel is wider than two, and takes its share of a third."""
+        """Average as _halved_even where a side is odd: a coarser texel covers a bit of a third one, by its area."""
         rows, columns = _shares(finer.shape[0])[:, row : row + len(out)], _shares(finer.shape[1])
         band = finer[2 * row : 2 * (row + len(out)) + 1]
         if colored is not None:
@@ -184,10 +193,10 @@ class TextureReader:
         out[...] = sum(share[:, None, None] * across[tap::2][: len(share)] for tap, share in enumerate(rows))
 
     def read(self, uv: np.ndarray, texels_per_sample: np.ndarray | None = None) -> np.ndarray:
-        """(n, c) linear float32 at uv (n, 2), texture transform included.
+        """Read (n, c) linear float32 at uv (n, 2), to which the texture transform is applied.
 
-        texels_per_sample (n,): width of what a sample stands for, in texels of the finest level; the nearest level at
-        least as sharp as that is read, so supersampling converges to the finest level's box average. NaN counts as 0.
+        texels_per_sample (n,) is the width of a sample's footprint, in texels of the finest level; NaN counts as 0. The
+        nearest level at least as sharp is read. So supersampling converges to the finest level's box average.
         """
         uv = transform_uv(self.texture, np.nan_to_num(np.asarray(uv, np.float64), posinf=0.0, neginf=0.0))
         if texels_per_sample is None or self.depth == 1 or self.texture.filter == "nearest":
@@ -205,6 +214,7 @@ class TextureReader:
         return out
 
     def _read_level(self, uv: np.ndarray, k: int) -> np.ndarray:
+        """Read (n, c) from level k at transformed uv (n, 2)."""
         image = self._levelled(k, len(uv))
         height, width = self.images[0].shape[:2] if image is None else image.shape[:2]
         flat = None if image is None else image.reshape(-1, self.channels)
@@ -232,7 +242,7 @@ class TextureReader:
 
 
 def _each_band(work, rows: int, band: int) -> None:
-    """work(first row) of every band, on all cores."""
+    """Call work(first row) for every band of rows, on all cores."""
     starts = range(0, rows, band)
     if len(starts) > 1:
         with ThreadPoolExecutor(cores()) as pool:
@@ -242,13 +252,13 @@ def _each_band(work, rows: int, band: int) -> None:
 
 
 def _colored(channels: int, colored: bool) -> list[bool]:
-    """Which channels of one image are sRGB: alpha never is."""
+    """Tell which channels of an image are sRGB; alpha never is."""
     last = channels if channels in (1, 3) else channels - 1
     return [colored and i < last for i in range(channels)]
 
 
 def _shares(size: int) -> np.ndarray:
-    """(taps, max(size // 2, 1)) float32: how much of a coarser texel i the finer ones 2i, 2i + 1, … are, by area."""
+    """Compute the share by area of finer texels 2i, 2i + 1, … in coarser texel i: (taps, max(size // 2, 1)) float32."""
     half = size // 2
     if half == 0:
         return np.ones((1, 1), np.float32)
@@ -259,7 +269,7 @@ def _shares(size: int) -> np.ndarray:
 
 
 def _between(a: np.ndarray, b: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-    """a + fraction (b − a), in the place of b."""
+    """Interpolate a + fraction (b − a), overwriting b."""
     b -= a
     b *= fraction
     b += a

@@ -1,0 +1,69 @@
+"""Render lit pictures of a scene, under direct light or in closed form, until a goal is reached."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from gdtool.cameras import Camera
+from gdtool.images.color import srgb_from_linear
+from gdtool.shading.bsdf.closed_form import closed_form_image
+from gdtool.shading.bsdf.sg import SphericalGaussians
+from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.render.render import Goal, Renderer
+
+
+@dataclass(frozen=True)
+class PictureOptions:
+    """How to render pictures.
+
+    samples: the most per pixel. exposure: factor on the color. brdf: of the closed form. seconds: for all views
+    together. psnr: estimated dB at which a view is done.
+    """
+
+    samples: int
+    exposure: float = 1.0
+    brdf: str = "gltf"
+    seconds: float | None = None
+    psnr: float | None = None
+
+
+class Pictures(NamedTuple):
+    """Each view's picture (h, w, 4) sRGB with alpha, share of clipped pixels, and estimated PSNR in dB or None."""
+
+    images: list[np.ndarray]
+    clipped: list[float]
+    psnr: list[float | None]
+
+
+def render_pictures(
+    renderer: Renderer,
+    light: DirectLight | SphericalGaussians,
+    cameras: list[Camera],
+    options: PictureOptions,
+    progress: Callable = lambda iterable, total, label: iterable,
+) -> Pictures:
+    """Render a picture for each camera: by direct light with shadows, or by lobes in closed form without.
+
+    progress(iterable, total, label) reports the views done.
+    """
+    shade = light.color(options.exposure) if isinstance(light, DirectLight) else None
+    out, begun = Pictures([], [], []), time.perf_counter()
+    for number, camera in enumerate(progress(cameras, len(cameras), "frames")):
+        seconds = None
+        if options.seconds is not None:
+            # Each view gets an equal part of the time that is left.
+            seconds = max(0.0, options.seconds - (time.perf_counter() - begun)) / (len(cameras) - number)
+        frame = renderer.buffers(camera, options.samples, shade, Goal(seconds, options.psnr))
+        out.psnr.append(renderer.counts.estimated_psnr)
+        if shade is None:
+            frame["color"] = closed_form_image(frame, camera, light, options.brdf) * options.exposure
+        seen = frame["color"][frame["mask"] > 0]
+        out.clipped.append(float((seen > 1).mean()) if len(seen) else 0.0)
+        color = srgb_from_linear(np.clip(frame["color"], 0, 1))
+        out.images.append(np.concatenate([color, frame["mask"][..., None]], -1))
+    return out
