@@ -97,14 +97,21 @@ def main() -> None:
     parser.add_argument("--grid", type=int, default=140, help="points along an edge that the nets are marched on")
     given = parser.parse_args()
     head, rows = busy(), []
-    limits = {module: module._FOR_A_HANDLE for module in (quads, search, pair_and_split)}
+    limits = {
+        (module, name): getattr(module, name)
+        for module, name in (
+            (quads, "_MIN_QUADS_PER_HANDLE"),
+            (search, "_MIN_QUADS_PER_HANDLE"),
+            (pair_and_split, "_MIN_TRIANGLES_PER_HANDLE"),
+        )
+    }
     for kind, cells in NETS:
         vertices, faces = net(kind, cells, given.grid)
         handles = topology.handles(faces, topology.components(faces)[0])
         for count in COUNTS:
             for name in ("as they are", "without"):
-                for module, limit in limits.items():
-                    module._FOR_A_HANDLE = limit if name == "as they are" else 0
+                for (module, constant), limit in limits.items():
+                    setattr(module, constant, limit if name == "as they are" else 0)
                 say(f"{kind} {cells}: {count}, limits {name}")
                 rows.append(
                     {

@@ -280,7 +280,7 @@ def _decimated(vertices, faces, options: Options, out: Output):
 
 
 def _quads(vertices, faces, options: Options, out: Output):
-    from gdtool.remesh.face_budget import coarsest
+    from gdtool.remesh.face_budget import coarsest_within
     from gdtool.remesh.task import Request
 
     request = Request(
@@ -293,7 +293,7 @@ def _quads(vertices, faces, options: Options, out: Output):
     )
     way, apart = _way(vertices, faces, options, out)
     if options.max_deviation:
-        vertices, quads, record, reached = coarsest(vertices, faces, request, options.max_deviation, way)
+        vertices, quads, record, reached = coarsest_within(vertices, faces, request, options.max_deviation, way)
         if reached > options.max_deviation:
             out.warn(
                 f"{reached:.2g} from the surface with {len(quads)} quads, farther than --max-deviation; allow more --faces"

@@ -38,7 +38,7 @@ def in_this_process(monkeypatch, engine=None) -> list:
     def begin(_, *given, **limits):
         calls.append(given)
         try:
-            return Ended(quad_candidate.candidate(*given))
+            return Ended(quad_candidate.make_candidate(*given))
         except ChildFailed as failure:
             return Ended(failure)
 

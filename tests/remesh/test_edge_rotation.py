@@ -9,7 +9,7 @@ from gdtool.geometry.mesh_quality import valences
 from gdtool.geometry.sharpen import dihedral_degrees
 from gdtool.remesh.connectivity.edge_rotation import cancel_pairs
 from gdtool.remesh.engines import candidate as quad_candidate
-from gdtool.remesh.engines.candidate import Way, candidate
+from gdtool.remesh.engines.candidate import EngineAttempt, make_candidate
 from tests.geometry.solids import marching, plane, quad_cube, quad_torus
 
 
@@ -102,9 +102,9 @@ def test_creases_stay():
 
 def test_an_engine_s_quads_have_fewer(monkeypatch):
     vertices, faces = marching(lambda x, y, z: (np.hypot(x, y) - 0.6) ** 2 + z**2 - 0.06 - 0.02 * np.sin(7 * x), 48)
-    way = Way("instant-meshes", 1, (1.0,), 30.0)
-    found = candidate(vertices / 2, faces, way, 8000)
+    attempt = EngineAttempt("instant-meshes", 1, (1.0,), 30.0)
+    found = make_candidate(vertices / 2, faces, attempt, 8000)
     monkeypatch.setattr(quad_candidate, "cancel_pairs", lambda _, quads: quads)
-    before = candidate(vertices / 2, faces, way, 8000)
+    before = make_candidate(vertices / 2, faces, attempt, 8000)
     assert found.fault is None and found.count == before.count and topology.is_watertight(found.quads)
     assert irregular(found.vertices, found.quads) < 0.9 * irregular(before.vertices, before.quads)

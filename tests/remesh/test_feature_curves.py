@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.geometry.sharpen import dihedral_degrees
-from gdtool.remesh.fit.feature_curves import Features, _tidy, find_features, trace
+from gdtool.remesh.fit.feature_curves import Features, _clean_arcs, find_features, trace_features
 from tests.geometry.solids import cube
 
 FACES = np.array([(0, 1, 4), (1, 2, 4), (0, 4, 2), (0, 2, 3)])
@@ -43,7 +43,7 @@ def test_corners_in_a_row_are_not_all_drawn_into_one():
     segments = np.concatenate(
         [np.stack([root[:-1], root[1:]], -1)] + [np.stack([root + y, root + y + 1], -1) for y in range(length - 1)]
     )
-    found = _tidy(points, segments, short)
+    found = _clean_arcs(points, segments, short)
     ends = found.points[found.segments]
     assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() <= 1 + short
     # No tooth is lost, and the corners that are left stand on the spine.
@@ -66,7 +66,8 @@ def test_both_rims_of_a_thin_plate_are_kept(thickness):
     length = np.linalg.norm(found.points[found.segments[:, 0]] - found.points[found.segments[:, 1]], axis=1)
     assert len(found.corners) == 8 and length.sum() == pytest.approx(8 + 4 * thickness)
     assert (
-        found.in_strips(2 * thickness) == pytest.approx(8 / (8 + 4 * thickness)) and found.in_strips(thickness / 2) == 0
+        found.share_in_strips(2 * thickness) == pytest.approx(8 / (8 + 4 * thickness))
+        and found.share_in_strips(thickness / 2) == 0
     )
 
 
@@ -80,7 +81,7 @@ def test_a_curve_whose_corner_has_no_vertex_of_its_own_is_followed_all_the_same(
     faces = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]], -1).reshape(-1, 4)
     points = np.array([(3.0, 10.1, 0), (17.0, 10.0, 0), (3.0, 10.3, 0), (17.0, 11.0, 0)])
     features = Features(points, np.array([(0, 1), (2, 3)]), np.array([0, 1]), np.arange(4))
-    _, held = trace(vertices, faces, features, 1.0)
+    _, held = trace_features(vertices, faces, features, 1.0)
     for curve in (0, 1):
         path = vertices[held.path[held.path_curve == curve]].reshape(-1, 3)
         assert len(path) and path[:, 0].min() <= 4 and path[:, 0].max() == 17

@@ -12,8 +12,8 @@ from gdtool.remesh.fallback import smoothed
 from gdtool.remesh.fallback.pair_and_split import pair_and_split
 from gdtool.remesh.fit import shaping
 from gdtool.remesh.fit.feature_curves import NO_FEATURES
-from gdtool.remesh.fit.surface_projection import Surface
-from gdtool.remesh.task import Part, Request
+from gdtool.remesh.fit.surface_projection import ProjectionTarget
+from gdtool.remesh.task import RemeshPatch, Request
 from tests.geometry.solids import cube, joined, rod, sphere, torus, volume
 from tests.remesh.engines import whole
 
@@ -38,7 +38,7 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
 
     monkeypatch.setattr(quad_split, "simplify", losing)
     asked = 1800  # 800 triangles, of which 1.15 times as many lose the piece and 1.3 times keep it
-    out, found = quad_split.of_own(vertices, faces, asked, 60.0)
+    out, found = quad_split.quads_from_input(vertices, faces, asked, 60.0)
     assert tried[:3] == [800, 919, 1040] and topology.components(found)[0] == 2
     assert asked < len(found) < 1.5 * asked < 1.8 * len(faces)
 
@@ -50,9 +50,9 @@ def test_even_triangles_are_sought_no_longer_than_they_come_nearer_to_their_numb
     runs, mesh_set = [], pymeshlab.MeshSet
     monkeypatch.setattr(pymeshlab, "MeshSet", lambda: runs.append(1) or mesh_set())
     cubes = joined(*((cube()[0] + (3 * i, 0, 0), cube()[1]) for i in range(20)))
-    assert len(quad_split.even_triangles(*cubes, 100, 30.0)[1]) == 240 and len(runs) == 2
+    assert len(quad_split.isotropic_triangles(*cubes, 100, 30.0)[1]) == 240 and len(runs) == 2
     runs.clear()
-    assert abs(len(quad_split.even_triangles(*sphere(24), 500, 30.0)[1]) / 500 - 1) < 0.05 and 1 <= len(runs) <= 4
+    assert abs(len(quad_split.isotropic_triangles(*sphere(24), 500, 30.0)[1]) / 500 - 1) < 0.05 and 1 <= len(runs) <= 4
 
 
 @pytest.mark.parametrize(
@@ -69,11 +69,11 @@ def test_even_triangles_are_sought_no_longer_than_they_come_nearer_to_their_numb
 def test_even_triangles_that_would_be_too_few_are_not_sought(monkeypatch, mesh, quads, few):
     """Twelve for a piece, and eighty for a handle."""
     sought = []
-    monkeypatch.setattr(smoothed, "of_even", lambda *given: sought.append(given))
+    monkeypatch.setattr(smoothed, "quads_from_isotropic", lambda *given: sought.append(given))
     monkeypatch.setattr(smoothed, "split_count", lambda faces, quads: quads)
-    part = Part(*mesh, quads, 0.1, Request(quads=quads), lambda: Surface(*mesh))
-    _, faces = smoothed.split(part)
-    assert quad_split.few_for_even(mesh[1], quads) == few
+    patch = RemeshPatch(*mesh, quads, 0.1, Request(quads=quads), lambda: ProjectionTarget(*mesh))
+    _, faces = smoothed.split(patch)
+    assert quad_split.too_few_for_isotropic(mesh[1], quads) == few
     assert len(sought) == (not few)
     assert topology.is_watertight(faces)
 
@@ -81,7 +81,7 @@ def test_even_triangles_that_would_be_too_few_are_not_sought(monkeypatch, mesh, 
 def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
     """Pins with few triangles around: what bends too much stays single, and there are fewer triangles for it."""
     vertices, faces = joined(*((pin[0] + (0.3 * k, 0, 0), pin[1]) for k, pin in enumerate([rod(24)] * 8)))
-    _, found = quad_split.of_own(vertices, faces, 400, 60.0)
+    _, found = quad_split.quads_from_input(vertices, faces, 400, 60.0)
     assert abs(len(found) / 400 - 1) < 0.1 and topology.components(found)[0] == 8 and topology.is_watertight(found)
 
 
@@ -111,10 +111,15 @@ def test_quads_without_area_are_evened_out_where_their_neighbours_stay(monkeypat
     a, b, c, d = quad_faces[100]
     split[b], split[d] = split[a], split[c]
     assert polygon_normals(split, quad_faces)[1][100] < 1e-12
-    monkeypatch.setattr(shaping, "_let_go", lambda *given: np.arange(len(quad_faces)))
-    surface, request = Surface(vertices, faces), Request(quads=600)
-    out = shaping.better(
-        split, quad_faces, *shaping.evened(split, quad_faces, surface, NO_FEATURES, request), surface, request, surface
+    monkeypatch.setattr(shaping, "_abandoning_faces", lambda *given: np.arange(len(quad_faces)))
+    surface, request = ProjectionTarget(vertices, faces), Request(quads=600)
+    out = shaping.keep_better_vertices(
+        split,
+        quad_faces,
+        *shaping.smoothed(split, quad_faces, surface, NO_FEATURES, request),
+        surface,
+        request,
+        surface,
     )
     edge = (polygon_normals(out, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
     assert polygon_normals(out, quad_faces)[1].min() > 1e-4 * edge**2

@@ -15,9 +15,9 @@ from gdtool.remesh.engines import candidate as quad_candidate
 from gdtool.remesh.engines import search
 from gdtool.remesh.engines.candidate import Candidate
 from gdtool.remesh.fit.feature_curves import Constraints
-from gdtool.remesh.fit.shaping import Outline, fault_of, left_out, surface_of
-from gdtool.remesh.fit.surface_projection import Surface
-from gdtool.remesh.task import Part, Record, Request
+from gdtool.remesh.fit.shaping import SnappedQuads, rejection_reason, target_of_quads, uncovered_shares
+from gdtool.remesh.fit.surface_projection import ProjectionTarget
+from gdtool.remesh.task import Record, RemeshPatch, Request
 from tests.geometry.solids import cube, marching, quad_cube, sphere, torus, volume
 from tests.remesh.engines import Ended, around, in_this_process, inner_face, whole
 
@@ -46,15 +46,15 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
     # Drawn onto the large sphere the small one would become it.
     monkeypatch.setattr(
         quad_candidate,
-        "outlined",
-        lambda vertices, faces, *_: Outline(
+        "snap_to_features",
+        lambda vertices, faces, *_: SnappedQuads(
             vertices,
             faces,
             Constraints.none(len(vertices)),
             tips=np.zeros(0, int),
             edge=1.0,
-            far=0.0,
-            limit=1.0,
+            distance_edges=0.0,
+            limit_edges=1.0,
             hopeless=True,
         ),
     )
@@ -72,12 +72,15 @@ def test_of_two_the_one_much_nearer_to_the_surface_comes_first_where_the_other_i
     """Balls without a cap, and whole ones."""
     vertices, faces = sphere(24, 0.4)
     out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
-    part = Part(vertices, faces, 1000, 0.045, Request(), None)
-    way = search.Way("instant-meshes", 0, (1.0,), 30.0)
-    two = [
-        Candidate(way, 1000, None, *topology.compact(out, found[out[found].mean(1)[:, 2] < height])) for height in tops
+    patch = RemeshPatch(vertices, faces, 1000, 0.045, Request(), None)
+    attempt = search.EngineAttempt("instant-meshes", 0, (1.0,), 30.0)
+    pair = [
+        Candidate(attempt, 1000, None, *topology.compact(out, found[out[found].mean(1)[:, 2] < height]))
+        for height in tops
     ]
-    assert [id(one) for one in search.Trial(part, Record())._nearer_first(two, wanted)] == [id(two[k]) for k in order]
+    assert [id(one) for one in search.EngineSearch(patch, Record())._nearer_first(pair, wanted)] == [
+        id(pair[k]) for k in order
+    ]
 
 
 def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(monkeypatch):
@@ -85,18 +88,21 @@ def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(mon
     over."""
     vertices, faces = sphere(24, 0.4)
     out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
-    part = Part(vertices, faces, 1000, 0.045, Request(), None)
+    patch = RemeshPatch(vertices, faces, 1000, 0.045, Request(), None)
     height = out[found].mean(1)[:, 2]
     left = [
         Candidate(
-            search.Way("instant-meshes", 0, (1.0,), 30.0), 1000, None, *topology.compact(out, found[height < most])
-        ).leaves_out(part)
+            search.EngineAttempt("instant-meshes", 0, (1.0,), 30.0),
+            1000,
+            None,
+            *topology.compact(out, found[height < most]),
+        ).missing_surface(patch)
         for most in (1.0, 0.37, 0.0)
     ]
     assert left[:2] == [None, None] and "leaves out 3" in left[2]
     calls = in_this_process(monkeypatch, lambda *_: topology.compact(out, found[height < 0.0]))
-    monkeypatch.setattr(quad_candidate, "judged", lambda vertices, found, *_: (None, vertices, found))
-    monkeypatch.setattr(search.Trial, "_drawn", None)
+    monkeypatch.setattr(quad_candidate, "repair_and_judge", lambda vertices, found, *_: (None, vertices, found))
+    monkeypatch.setattr(search.EngineSearch, "_fit_first_good", None)
     _, _, record = quads.remesh(vertices, faces, Request(quads=1000))
     assert len(calls) == 1 and record.engine == "pair and split" and "leaves out" in record.failed[0]
 
@@ -105,18 +111,20 @@ def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(mon
 def test_a_coarser_mesh_is_given_up_where_walls_are_thinner_than_quads(thickness, thin):
     vertices, faces = igl.upsample(*cube(), 5)
     vertices = vertices * (0.9, 0.9, thickness)
-    part = Part(vertices, faces, 4000, (2 * 0.81 / 4000) ** 0.5, Request(), None)
-    assert part.thin == thin
+    patch = RemeshPatch(vertices, faces, 4000, (2 * 0.81 / 4000) ** 0.5, Request(), None)
+    assert patch.has_thin_walls == thin
     wedge = vertices.copy()
     wedge[:, 2] *= 0.01 + (wedge[:, 0] + 0.45) / 0.9 * 0.7 / thickness
-    assert not Part(wedge, faces, 4000, 0.02, Request(), None).thin
+    assert not RemeshPatch(wedge, faces, 4000, 0.02, Request(), None).has_thin_walls
     # One side of a sheet is no wall, nor is what lies outside, before it.
-    assert not Part(
-        vertices, faces[face_normals(vertices, faces)[0][:, 2] > 0.5], 2000, part.edge, Request(), None
-    ).thin
+    assert not RemeshPatch(
+        vertices, faces[face_normals(vertices, faces)[0][:, 2] > 0.5], 2000, patch.edge, Request(), None
+    ).has_thin_walls
     # A coarse mesh is not asked.
-    assert not Part(cube()[0] * (0.9, 0.9, thickness), cube()[1], 4000, part.edge, Request(), None).thin
-    assert not Part(vertices, faces[:, ::-1], 4000, part.edge, Request(), None).thin
+    assert not RemeshPatch(
+        cube()[0] * (0.9, 0.9, thickness), cube()[1], 4000, patch.edge, Request(), None
+    ).has_thin_walls
+    assert not RemeshPatch(vertices, faces[:, ::-1], 4000, patch.edge, Request(), None).has_thin_walls
     # Without creases, or its narrow sides tell.
     _, found, record = quads.remesh(vertices, faces, Request(quads=4000, crease_degrees=0.0))
     assert (
@@ -170,7 +178,7 @@ def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
     corners, sides = around(faces, middle)
     assert len(corners) == 4 and len(sides) == 4
     torn = np.delete(faces, [*corners[1:], *sides], 0)
-    fault, out, found = quad_candidate.judged(vertices, torn, topology.invariants(faces))
+    fault, out, found = quad_candidate.repair_and_judge(vertices, torn, topology.invariants(faces))
     assert fault is None and whole(found) and topology.components(found)[0] == 1 and len(found) < len(faces)
     assert volume(out, triangulated(found)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
 
@@ -184,8 +192,8 @@ def test_candidates_are_in_the_order_of_place(monkeypatch):
     monkeypatch.setitem(
         quad_candidate.ENGINES, "quadriflow", lambda *_: (vertices[mixed], rng.permutation(number[faces]))
     )
-    one = quad_candidate.candidate(
-        vertices, triangulated(faces)[0], quad_candidate.Way("quadriflow", 0, (1.0,), 30.0), len(faces)
+    one = quad_candidate.make_candidate(
+        vertices, triangulated(faces)[0], quad_candidate.EngineAttempt("quadriflow", 0, (1.0,), 30.0), len(faces)
     )
     assert one.fault is None and len(one.quads) == len(faces)
 
@@ -200,29 +208,33 @@ def test_candidates_are_in_the_order_of_place(monkeypatch):
 
 def test_output_without_area_is_no_quads():
     vertices, faces = quad_cube(1)
-    assert quad_candidate.judged(vertices, faces[:, [0, 1, 1, 0]], topology.invariants(faces))[0] == "no quads"
+    assert (
+        quad_candidate.repair_and_judge(vertices, faces[:, [0, 1, 1, 0]], topology.invariants(faces))[0] == "no quads"
+    )
 
 
 def test_quads_that_cut_edges_off_do_not_do():
     vertices, faces = quad_cube(3)
-    surface, edge = Surface(vertices, triangulated(faces)[0]), 0.125 * np.ptp(vertices[:, 0])
-    assert fault_of(vertices, faces, surface, edge, 1.0, 0.005)[0] is None
+    surface, edge = ProjectionTarget(vertices, triangulated(faces)[0]), 0.125 * np.ptp(vertices[:, 0])
+    assert rejection_reason(vertices, faces, surface, edge, 1.0, 0.005)[0] is None
     cut = vertices.copy()
     on_two = np.isclose(np.abs(vertices), np.abs(vertices).max()).sum(1) >= 2  # the cube's twelve edges
     cut[on_two] *= 1 - 0.5 * edge / np.ptp(vertices[:, 0])
-    assert fault_of(cut, faces, surface, edge, 1.0, 0.5)[0] is None
-    assert fault_of(cut, faces, surface, edge, 1.0, 0.005)[0].startswith("cuts off")
+    assert rejection_reason(cut, faces, surface, edge, 1.0, 0.5)[0] is None
+    assert rejection_reason(cut, faces, surface, edge, 1.0, 0.005)[0].startswith("cuts off")
 
 
 def test_surface_that_the_quads_do_without_is_measured():
     vertices, faces = cube()
     lid = faces[np.all(vertices[faces][:, :, 2] == vertices[:, 2].max(), 1)]
     rest = np.array([f for f in faces.tolist() if f not in lid.tolist()])
-    surface = Surface(vertices, faces)
+    surface = ProjectionTarget(vertices, faces)
     closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, rest))
-    assert left_out(surface_of(vertices, closed), surface, (0.1,)) == [0]
+    assert uncovered_shares(target_of_quads(vertices, closed), surface, (0.1,)) == [0]
     # The lid but its rim.
-    assert left_out(surface_of(vertices, opened), surface, (0.1, 2.0)) == pytest.approx([0.8**2 / 6, 0], abs=0.02)
+    assert uncovered_shares(target_of_quads(vertices, opened), surface, (0.1, 2.0)) == pytest.approx(
+        [0.8**2 / 6, 0], abs=0.02
+    )
 
 
 def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_finer_one_comes(monkeypatch):
@@ -239,19 +251,21 @@ def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_fine
     calls = in_this_process(monkeypatch)
     monkeypatch.setitem(quad_candidate.ENGINES, "instant-meshes", torn)
     monkeypatch.setattr(
-        quad_candidate, "fault_of", lambda *given: ("cuts off 0.7% of the surface" if given[-1] < 0.007 else None, 0.5)
+        quad_candidate,
+        "rejection_reason",
+        lambda *given: ("cuts off 0.7% of the surface" if given[-1] < 0.007 else None, 0.5),
     )
     vertices, faces = sphere(96, 0.45)
     _, found, record = quads.remesh(vertices, faces, Request(quads=4000))
     assert record.engine == "instant-meshes, 1 subdivision" and whole(found) and abs(len(found) / 4000 - 1) <= 0.03
     assert "cuts off" in record.failed[0] and "SIGSEGV" in record.failed[1]
-    assert sum(not way.subdivisions for _, _, way, _ in calls) == 1
+    assert sum(not attempt.subdivisions for _, _, attempt, _ in calls) == 1
     monkeypatch.setattr(quad_candidate, "FAR_SUBDIVIDED", 0.4)  # farther than that it is not unfolded
     assert quads.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
     monkeypatch.undo()
     in_this_process(monkeypatch)
     monkeypatch.setitem(quad_candidate.ENGINES, "instant-meshes", torn)
-    monkeypatch.setattr(quad_candidate, "fault_of", lambda *given: ("cuts off 2% of the surface", 0.5))
+    monkeypatch.setattr(quad_candidate, "rejection_reason", lambda *given: ("cuts off 2% of the surface", 0.5))
     assert quads.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
 
 
@@ -267,38 +281,49 @@ def test_when_the_time_is_over_no_engine_is_begun():
 
 
 def test_every_round_asks_for_two_densities():
-    way = search._ways(20000, Request())[0]
-    assert len(way.near(20000)) == 2 and np.mean(way.near(20000)) == pytest.approx(20000)
-    assert way.near(20000)[1] / way.near(20000)[0] == pytest.approx(way.factors[1] / way.factors[0])
+    attempt = search._attempts(20000, Request())[0]
+    assert len(attempt.counts_around(20000)) == 2 and np.mean(attempt.counts_around(20000)) == pytest.approx(20000)
+    assert attempt.counts_around(20000)[1] / attempt.counts_around(20000)[0] == pytest.approx(
+        attempt.factors[1] / attempt.factors[0]
+    )
 
 
 def test_what_is_asked_next_lies_between_what_gave_too_few_and_what_gave_too_many():
     """An engine's count may jump by a twentieth: in proportion to the last answer what gave too many would be asked for
     again."""
-    gave = [(19700.0, 20868), (20100.0, 21164)]
-    assert search._between(gave, 20000) is None and search._between(gave, 22000) is None
-    gave += [(18691.0, 19164), (19070.0, 18844)]
-    assert search._between(gave, 20000) == pytest.approx(19186, abs=1)
+    answers = [search.EngineAnswer(19700.0, 20868), search.EngineAnswer(20100.0, 21164)]
+    assert search._interpolate_request(answers, 20000) is None and search._interpolate_request(answers, 22000) is None
+    answers += [search.EngineAnswer(18691.0, 19164), search.EngineAnswer(19070.0, 18844)]
+    assert search._interpolate_request(answers, 20000) == pytest.approx(19186, abs=1)
 
 
 def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypatch):
     """The first in rank where it will do, without a look at the other, and the other first where the first's outline
     leaves out more; where none does, what comes nearest to it."""
-    way = search._ways(20000, Request())[0]
+    attempt = search._attempts(20000, Request())[0]
     drawn = []
 
     def candidate(far, least, wrong=None, outline=0.5):
-        found = Candidate(way, 1000, None, np.zeros((0, 3)), np.zeros((0, 4), int), far=far, least=least, wrong=wrong)
+        found = Candidate(
+            attempt,
+            1000,
+            None,
+            np.zeros((0, 3)),
+            np.zeros((0, 4), int),
+            distance_edges=far,
+            min_jacobian=least,
+            rejection=wrong,
+        )
         found.asked_of_outline = outline
         return found
 
-    def outlined(one, part):
-        one.outline = one.asked_of_outline
-        return one.outline < 1
+    def snap_to_features(one, patch):
+        one.snapped = one.asked_of_outline
+        return one.snapped < 1
 
-    monkeypatch.setattr(Candidate, "promising", outlined)
-    monkeypatch.setattr(Candidate, "draw", lambda one, part: drawn.append(one))
-    choose = search.Trial(Part(*cube(), 1000, 0.1, Request(), None), Record())._drawn
+    monkeypatch.setattr(Candidate, "is_promising", snap_to_features)
+    monkeypatch.setattr(Candidate, "fit", lambda one, patch: drawn.append(one))
+    choose = search.EngineSearch(RemeshPatch(*cube(), 1000, 0.1, Request(), None), Record())._fit_first_good
     good, better, bare, thin = candidate(0.5, 0.3), candidate(0.1, 0.9), candidate(0.9, 0.5), candidate(0.3, 0.1)
     assert choose([good, better]) is good and drawn == [good] and choose([bare, good]) is good
     assert choose([candidate(0.1, 0.9, "leaves out 1 % of the surface"), thin]) is thin
@@ -306,7 +331,7 @@ def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypa
     drawn.clear()
     late = candidate(0.9, 0.3, outline=1.1)
     assert choose([late, good]) is good and drawn == [good]
-    late.outline = None
+    late.snapped = None
     drawn.clear()
     assert choose([late, candidate(2.0, 0.5)]) is late and drawn[1] is late and len(drawn) == 2
 
@@ -314,22 +339,25 @@ def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypa
 def test_the_quads_of_tips_count_before_any_are_drawn(monkeypatch):
     """What has too many quads with those of its tips is not drawn; another that has as many tips but fewer quads is,
     and only then a new one asked for."""
-    way = search._ways(20000, Request())[0]
-    trial = search.Trial(Part(*cube(), 4000, 0.1, Request(), None), Record())
+    attempt = search._attempts(20000, Request())[0]
+    search_run = search.EngineSearch(RemeshPatch(*cube(), 4000, 0.1, Request(), None), Record())
 
     def candidate(count, tips, hopeless=False):
-        found = Candidate(way, count, None, np.zeros((0, 3)), np.zeros((count // 4, 4), int))
-        found.traced = Outline(
+        found = Candidate(attempt, count, None, np.zeros((0, 3)), np.zeros((count // 4, 4), int))
+        found.traced = SnappedQuads(
             np.zeros((0, 3)), np.zeros((count + tips, 4), int), None, np.zeros(0, int), 0.1, 0.0, 1.0, hopeless
         )
         return found
 
-    monkeypatch.setattr(Candidate, "trace", lambda one, part: setattr(one, "outline", one.traced))
+    monkeypatch.setattr(Candidate, "snap", lambda one, patch: setattr(one, "snapped", one.traced))
     plain, far, fewer = candidate(4000, 0), candidate(4100, 100), candidate(3900, 100)
-    assert next(trial._of_count([plain, far], 0)) is plain and far.outline is None
-    assert list(trial._of_count([far, fewer, candidate(4080, 100)], 0)) == [fewer]
-    assert trial._drawn(trial._of_count([far, plain := candidate(4060, 0)], 0)) is None and plain.outline is None
-    assert list(trial._of_count([hopeless := candidate(4100, 100, hopeless=True)], 0)) == [hopeless]
+    assert next(search_run._with_right_count([plain, far], 0)) is plain and far.snapped is None
+    assert list(search_run._with_right_count([far, fewer, candidate(4080, 100)], 0)) == [fewer]
+    assert (
+        search_run._fit_first_good(search_run._with_right_count([far, plain := candidate(4060, 0)], 0)) is None
+        and plain.snapped is None
+    )
+    assert list(search_run._with_right_count([hopeless := candidate(4100, 100, hopeless=True)], 0)) == [hopeless]
 
 
 def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypatch):
@@ -339,11 +367,14 @@ def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypat
     vertices, faces = cube()
     vertices = vertices * (1, 0.8, 0.02)
     out, found, record = quads.remesh(vertices, faces, Request(quads=8000))
-    assert all(not way.subdivisions for _, _, way, _ in calls) and "not tried, its quads are wider" in record.failed[0]
+    assert (
+        all(not attempt.subdivisions for _, _, attempt, _ in calls)
+        and "not tried, its quads are wider" in record.failed[0]
+    )
     assert record.engine == "instant-meshes" and whole(found)
     corners = vertices[np.abs(vertices[:, None] - out[None]).max(-1).min(1) < 1e-9]
     assert len(corners) == 8
-    assert left_out(surface_of(out, found), Surface(vertices, faces), (0.005,)) == [0.0]
+    assert uncovered_shares(target_of_quads(out, found), ProjectionTarget(vertices, faces), (0.005,)) == [0.0]
 
 
 @pytest.mark.parametrize("given, least, most", [(16000, 2000, 2500), (500, 500, 500)])

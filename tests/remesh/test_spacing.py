@@ -5,7 +5,7 @@ import numpy as np
 from gdtool.geometry import topology
 from gdtool.geometry.mesh_quality import scaled_jacobian
 from gdtool.remesh import pipeline
-from gdtool.remesh.spacing import spread
+from gdtool.remesh.spacing import separate_pieces
 from gdtool.remesh.task import Request
 from tests.geometry.solids import cube, joined, sphere
 
@@ -23,7 +23,7 @@ def test_pieces_are_laid_apart_and_brought_back():
         ((0.1, 0.1, 0.1), (0, 0, 0)),
         ((0.9, 0.05, 0.05), (0, 0, 0.4)),
     )
-    found = spread(vertices, faces, 0.1)
+    found = separate_pieces(vertices, faces, 0.1)
     _, piece = topology.components(faces)
     boxes_of = [
         (found.vertices[faces[piece == k]].min((0, 1)), found.vertices[faces[piece == k]].max((0, 1))) for k in range(4)
@@ -31,15 +31,15 @@ def test_pieces_are_laid_apart_and_brought_back():
     for i, (low, high) in enumerate(boxes_of):
         for other_low, other_high in boxes_of[:i]:
             assert (np.maximum(low - other_high, other_low - high)).max() >= 0.1 - 1e-9
-    assert np.abs(found.back(found.vertices) - vertices).max() < 1e-12
+    assert np.abs(found.to_original(found.vertices) - vertices).max() < 1e-12
     middle = found.vertices[faces].mean(1)
-    assert np.abs(found.back(middle) - vertices[faces].mean(1)).max() < 1e-12
+    assert np.abs(found.to_original(middle) - vertices[faces].mean(1)).max() < 1e-12
 
 
 def test_what_is_one_piece_or_apart_as_it_is_stays():
-    assert spread(*cube(), 0.1) is None
-    assert spread(*boxes((0.3, (0, 0, 0)), (0.3, (0, 0.5, 0))), 0.1) is None
-    assert spread(*boxes((0.3, (0, 0, 0)), (0.3, (0, 0.5, 0))), 0.25) is not None
+    assert separate_pieces(*cube(), 0.1) is None
+    assert separate_pieces(*boxes((0.3, (0, 0, 0)), (0.3, (0, 0.5, 0))), 0.1) is None
+    assert separate_pieces(*boxes((0.3, (0, 0, 0)), (0.3, (0, 0.5, 0))), 0.25) is not None
 
 
 def test_quads_of_one_piece_are_not_drawn_onto_another():

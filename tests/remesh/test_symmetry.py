@@ -5,7 +5,7 @@ import pytest
 
 from gdtool.geometry import topology
 from gdtool.geometry.normals import face_normals
-from gdtool.remesh.symmetry import half_of, joined_with_mirror, mirror_plane
+from gdtool.remesh.symmetry import half_mesh, join_with_mirror, mirror_plane
 from tests.geometry.solids import cube, sphere, torus
 
 
@@ -13,7 +13,7 @@ from tests.geometry.solids import cube, sphere, torus
 def test_half_has_half_the_area_and_ends_at_the_plane(axis):
     vertices, faces = torus(31)
     vertices = vertices + 0.003 * (np.arange(3) == axis)  # the plane cuts through faces
-    half_vertices, half = half_of(vertices, faces, axis)
+    half_vertices, half = half_mesh(vertices, faces, axis)
     whole = face_normals(vertices, faces)[1].sum()
     assert face_normals(half_vertices, half)[1].sum() == pytest.approx(whole / 2, rel=0.02)
     edges = topology.edges_of(half)
@@ -39,6 +39,6 @@ def test_halves_of_a_box_close():
     side = (vertices[quads][..., 0] < 0).all(1)
     half = vertices.copy()
     half[:, 0] = np.where(half[:, 0] < 0, 0.02, half[:, 0])  # the open end near the plane
-    out, found = joined_with_mirror(half, quads[~side], 0, 0.5)
+    out, found = join_with_mirror(half, quads[~side], 0, 0.5)
     assert len(found) == 10 and topology.is_watertight(found) and np.ptp(out[:, 0]) == pytest.approx(1)
     assert (np.abs(out[:, 0]) < 1e-12).sum() == 4
