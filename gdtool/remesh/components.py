@@ -9,7 +9,8 @@ from gdtool.geometry.distance import closest_points
 from gdtool.remesh.engines.candidate import Candidate, repair_and_judge
 from gdtool.remesh.fallback.pair_and_split import split_count
 from gdtool.remesh.fit.shaping import CUT_OFF, finalize, fit_to_surface, rejection_reason, snap_to_features
-from gdtool.remesh.task import COUNT_TOLERANCE, QuadResult, RemeshPatch
+from gdtool.remesh.limits import COUNT_TOLERANCE
+from gdtool.remesh.task import QuadResult, RemeshPatch
 
 SMALL_PIECE_QUADS = 48  # a piece whose share is fewer quads is small: engines lose such pieces beside large ones
 _MAX_SMALL_SHARE = 4  # small pieces together get at most one over this of all quads

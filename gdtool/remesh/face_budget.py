@@ -7,9 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from gdtool.geometry import topology
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.simplify import deviation
 from gdtool.geometry.topology import triangulated
+from gdtool.remesh.limits import COUNT_TOLERANCE
 from gdtool.remesh.pipeline import remesh
 from gdtool.remesh.task import Record, Request
 
@@ -21,6 +23,13 @@ _MAX_RUNS = 6
 def quads_of_size(vertices: np.ndarray, faces: np.ndarray, size: float) -> int:
     """Return how many quads with sides of `size` cover the triangles: their area over size squared."""
     return round(face_normals(vertices, faces)[1].sum() / size**2)
+
+
+def is_finished(quads: np.ndarray, count: int) -> bool:
+    """Whether quads (q, 4) already are about `count`, closed and manifold, so that nothing is left to do."""
+    return (
+        abs(len(quads) / count - 1) <= COUNT_TOLERANCE and topology.is_watertight(quads) and topology.is_manifold(quads)
+    )
 
 
 def coarsest_within(

@@ -17,15 +17,7 @@ from gdtool.geometry.rays import RayCaster
 from gdtool.geometry.vectors import dot
 from gdtool.remesh.fit.feature_curves import Features, find_features
 from gdtool.remesh.fit.surface_projection import ProjectionTarget
-
-COUNT_TOLERANCE = 0.03  # relative error of the number of quads that the command promises
-MIN_QUADS, MAX_QUADS = 16, 2_000_000  # that can be requested
-QUADS_OF_A_PIECE = 12  # least number of quads for a separate piece: a closed body of fewer loses its shape
-MIN_QUAD_SIZE = 1e-5  # of the longest side: a closed surface would need billions of smaller quads
-
-# Seconds for each quad in the quickest way (paired triangles), with reading and writing: 400,000 quads of
-# procedural:7 on two cores of 2.5 GHz.
-SECONDS_PER_QUAD = 1.1e-4
+from gdtool.remesh.limits import COUNT_TOLERANCE, QUADS_OF_A_PIECE
 
 # Share of the time limit in which engines may start; the rest is for steps that need no engine.
 _ENGINES_SHARE = 0.7

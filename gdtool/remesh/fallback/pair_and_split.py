@@ -19,7 +19,7 @@ from gdtool.geometry.normals import face_normals
 from gdtool.geometry.simplify import simplify
 from gdtool.geometry.topology import compact, components, edges_of, handles, invariants, is_manifold
 from gdtool.remesh.fit.surface_projection import subdivide
-from gdtool.remesh.task import QUADS_OF_A_PIECE
+from gdtool.remesh.limits import QUADS_OF_A_PIECE
 
 _QUADS_PER_TRIANGLE = 2.25  # that pair_and_split makes, where most triangles find a partner
 _COUNT_TOLERANCE = 0.03  # relative error of the number of triangles, or quads, at which no further try is made
