@@ -3,6 +3,7 @@
 import numpy as np
 
 from gdtool.geometry.topology import triangulated
+from gdtool.unwrap.chart import Chart
 from gdtool.unwrap.segment.charts import Adjacency
 from gdtool.unwrap.segment.straight_cuts import cut_to_pack
 
@@ -19,7 +20,7 @@ def plates(*cells):
         uv = np.stack([x.ravel(), y.ravel()], -1)
         used, local = np.unique(own, return_inverse=True)
         local = local.reshape(-1, 4)
-        charts.append((faces + np.arange(len(own)), local, uv[used], triangulated(local)[0]))
+        charts.append(Chart(faces + np.arange(len(own)), local, uv[used], triangulated(local)[0]))
         points.append(np.concatenate([uv, np.full((len(uv), 1), float(height))], 1))
         quads.append(own + vertices)
         vertices, faces = vertices + len(uv), faces + len(own)
