@@ -3,9 +3,9 @@ without them.
 
     python benchmarks/remesh_nets.py [-o docs/benchmarks] [--grid 140]
 
-Struts and Schwarz' P surface, marched. "as they are": the limits of quads._FOR_A_HANDLE, quad_ways._FOR_A_HANDLE and
-quad_split._FOR_A_HANDLE; "without": all of them nought. "handles": as many as in the net, or what is made of them.
-Seconds are of quads.remesh alone. Writes remesh_nets.md.
+Struts and Schwarz' P surface, marched. "as they are": the limits _MIN_QUADS_PER_HANDLE of remesh.pipeline and
+remesh.engines.search, and _MIN_TRIANGLES_PER_HANDLE of remesh.fallback.pair_and_split; "without": all of them zero.
+"handles": as many as in the net, or what is made of them. Seconds are of remesh() alone. Writes remesh_nets.md.
 """
 
 from __future__ import annotations

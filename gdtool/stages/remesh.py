@@ -82,11 +82,8 @@ def check(inputs: Inputs, options: Options) -> None:
     from gdtool.stages import early
 
     if 0 < options.quad_size < MIN_QUAD_SIZE:
-        raise UsageError(
-            f"--quad-size {options.quad_size:g}",
-            f"is smaller than {MIN_QUAD_SIZE:g} of the longest side",
-            "use 0 to go by --faces",
-        )
+        fact = f"is smaller than {MIN_QUAD_SIZE:g} of the longest side"
+        raise UsageError(f"--quad-size {options.quad_size:g}", fact, "use 0 to go by --faces")
     if options.engine in ENGINE_PACKAGES and not options.triangles:
         module, cure = ENGINE_PACKAGES[options.engine]
         early.require_installed(module, f"--engine {options.engine}", cure)
@@ -187,14 +184,8 @@ def _goal(options: Options):
     from gdtool.remesh.methods import Goal
     from gdtool.remesh.task import Request
 
-    request = Request(
-        quads=options.faces,
-        crease_degrees=options.crease_angle,
-        engine=options.engine,
-        seconds=options.seconds,
-        smooth_iterations=options.smooth_iterations,
-        restore_creases=options.restore_creases,
-    )
+    same = {name: getattr(options, name) for name in ("engine", "seconds", "smooth_iterations", "restore_creases")}
+    request = Request(quads=options.faces, crease_degrees=options.crease_angle, **same)
     return Goal(request, options.triangles, options.max_deviation, options.symmetry)
 
 

@@ -62,67 +62,21 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
 
     import numpy as np
 
-    from gdtool.folders.mesh import QuadMesh, write_mesh
+    from gdtool.folders.mesh import write_mesh
     from gdtool.geometry import topology
     from gdtool.images.io import write_png
-    from gdtool.stages.limits import require_time
     from gdtool.stages.mesh_source import read_quad_mesh
     from gdtool.unwrap import pipeline, preview
-    from gdtool.unwrap.limits import SECONDS_PER_FACE
-    from gdtool.unwrap.symmetry import copy_twin_corners
 
     with out.step("read"):
         mesh, matrix = read_quad_mesh(inputs, out)
     padding = options.padding or pipeline.padding_for_mips(options.size, options.mip_safe)
-    kept, tried = False, []
-    if mesh.uv is not None and not options.redo:
-        reason = pipeline.invalid_reason(
-            mesh.vertices, mesh.faces.astype(np.int64), mesh.uv, mesh.face_uvs.astype(np.int64)
-        )
-        kept = reason is None
-        if kept:
-            out.skip("unwrapping", "the mesh has valid texture coordinates; --redo makes new ones")
-        else:
-            out.warn(f"{inputs.name}: its texture coordinates are not kept: {reason}")
+    kept, tried, twin = _keeps_uv(mesh, options, inputs, out), [], np.full(len(mesh.faces), -1)
     if not kept:
-        require_time(
-            SECONDS_PER_FACE * len(mesh.faces),
-            options.seconds,
-            "--seconds",
-            inputs.name,
-            "run gdtool remesh with fewer --faces before",
-        )
-        request = pipeline.Request(
-            size=options.size, padding=padding, max_stretch=options.max_stretch, seconds=options.seconds
-        )
-        with out.step("unwrap"):
-            twin, corner = _twins(mesh, options, inputs, out)
-            without_twin = np.flatnonzero(twin < 0)
-            result = pipeline.unwrap(mesh.vertices, mesh.faces[without_twin].astype(np.int64), request)
-        tried = result.failed
-        for what, why, seconds in result.skipped:
-            out.skip(what, why, seconds)
-        mesh = QuadMesh(
-            mesh.vertices, mesh.faces, result.uv, copy_twin_corners(result.face_uvs, without_twin, twin, corner)
-        )
-    else:
-        twin = np.full(len(mesh.faces), -1)
+        mesh, tried, twin = _unwrapped(mesh, padding, options, inputs, out)
     with out.step("measure"):
-        faces, face_uvs = mesh.faces.astype(np.int64), mesh.face_uvs.astype(np.int64)
-        # Faces that share a twin's texels on purpose are left out.
-        report = pipeline.figures(mesh.vertices, faces[twin < 0], mesh.uv, face_uvs[twin < 0])
-        report["shared"] = float((twin >= 0).mean())
-        report["texels_per_unit"] = pipeline.texels_per_unit(
-            mesh.vertices, mesh.faces, mesh.uv, mesh.face_uvs, options.size
-        )
-        if kept and report["mirrored"] > 0:
-            out.warn(
-                f"{inputs.name}: {report['mirrored']:.0%} of the surface is mirrored in its texture coordinates; "
-                "tangent-space normal maps hold there in MikkTSpace alone, and --redo makes coordinates without "
-                "mirrored charts"
-            )
-        if report["overlap"] > 0 and not kept:
-            out.warn(f"{inputs.name}: charts overlap on {100 * report['overlap']:.2g} % of what they cover")
+        report = _report(mesh, twin, kept, options, inputs, out)
+    faces, face_uvs = mesh.faces.astype(np.int64), mesh.face_uvs.astype(np.int64)
     with out.step("preview"):
         chart = pipeline.uv_islands(mesh.vertices, faces, face_uvs)[0]
         write_png(out.path("layout.png"), preview.layout(faces, mesh.uv, face_uvs, chart))
@@ -143,6 +97,69 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         tried=tuple(tried),
         source_from_world=tuple(float(x) for x in matrix.ravel()),
     )
+
+
+def _keeps_uv(mesh, options: Options, inputs: Inputs, out: Output) -> bool:
+    """Whether the mesh's own texture coordinates are kept; say so, or warn why they are not."""
+    import numpy as np
+
+    from gdtool.unwrap.pipeline import invalid_reason
+
+    if mesh.uv is None or options.redo:
+        return False
+    reason = invalid_reason(mesh.vertices, mesh.faces.astype(np.int64), mesh.uv, mesh.face_uvs.astype(np.int64))
+    if reason is None:
+        out.skip("unwrapping", "the mesh has valid texture coordinates; --redo makes new ones")
+    else:
+        out.warn(f"{inputs.name}: its texture coordinates are not kept: {reason}")
+    return reason is None
+
+
+def _unwrapped(mesh, padding: int, options: Options, inputs: Inputs, out: Output):
+    """Return the mesh with new texture coordinates, what was tried, and the twin (f,) of each face or -1."""
+    import numpy as np
+
+    from gdtool.folders.mesh import QuadMesh
+    from gdtool.stages.limits import require_time
+    from gdtool.unwrap import pipeline
+    from gdtool.unwrap.limits import SECONDS_PER_FACE
+    from gdtool.unwrap.symmetry import copy_twin_corners
+
+    needed, cure = SECONDS_PER_FACE * len(mesh.faces), "run gdtool remesh with fewer --faces before"
+    require_time(needed, options.seconds, "--seconds", inputs.name, cure)
+    request = pipeline.Request(
+        size=options.size, padding=padding, max_stretch=options.max_stretch, seconds=options.seconds
+    )
+    with out.step("unwrap"):
+        twin, corner = _twins(mesh, options, inputs, out)
+        without_twin = np.flatnonzero(twin < 0)
+        result = pipeline.unwrap(mesh.vertices, mesh.faces[without_twin].astype(np.int64), request)
+    for what, why, seconds in result.skipped:
+        out.skip(what, why, seconds)
+    face_uvs = copy_twin_corners(result.face_uvs, without_twin, twin, corner)
+    return QuadMesh(mesh.vertices, mesh.faces, result.uv, face_uvs), result.failed, twin
+
+
+def _report(mesh, twin, kept: bool, options: Options, inputs: Inputs, out: Output) -> dict:
+    """Return figures of the texture coordinates; warn of mirrored and overlapping charts."""
+    import numpy as np
+
+    from gdtool.unwrap.pipeline import figures, texels_per_unit
+
+    faces, face_uvs = mesh.faces.astype(np.int64), mesh.face_uvs.astype(np.int64)
+    # Faces that share a twin's texels on purpose are left out.
+    report = figures(mesh.vertices, faces[twin < 0], mesh.uv, face_uvs[twin < 0])
+    report["shared"] = float((twin >= 0).mean())
+    report["texels_per_unit"] = texels_per_unit(mesh.vertices, mesh.faces, mesh.uv, mesh.face_uvs, options.size)
+    if kept and report["mirrored"] > 0:
+        out.warn(
+            f"{inputs.name}: {report['mirrored']:.0%} of the surface is mirrored in its texture coordinates; "
+            "tangent-space normal maps hold there in MikkTSpace alone, and --redo makes coordinates without "
+            "mirrored charts"
+        )
+    if report["overlap"] > 0 and not kept:
+        out.warn(f"{inputs.name}: charts overlap on {100 * report['overlap']:.2g} % of what they cover")
+    return report
 
 
 def _twins(mesh, options: Options, inputs: Inputs, out: Output):

@@ -104,9 +104,9 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> UnwrapR
         prepare(flatten_all, (*CHILD_MODULES, "igl"))
         return Adjacency(unit, faces)
 
-    found = find_charts(adjacency, unit, faces, until=deadlines.charts_found, max_cost=request.max_cost)
-    charts, failed = _flatten_in_child(unit, faces, found, request, deadlines)
-    failed = found.failed + failed
+    segmentation = find_charts(adjacency, unit, faces, until=deadlines.charts_found, max_cost=request.max_cost)
+    charts, failed = _flatten_in_child(unit, faces, segmentation, request, deadlines)
+    failed = segmentation.failed + failed
     gap = request.padding / request.size
     orders, skipped = [], []
     if time.monotonic() < deadlines.packed:
@@ -125,7 +125,7 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> UnwrapR
 
 
 def _flatten_in_child(
-    vertices: np.ndarray, faces: np.ndarray, found: Segmentation, request: Request, deadlines: _Deadlines
+    vertices: np.ndarray, faces: np.ndarray, segmentation: Segmentation, request: Request, deadlines: _Deadlines
 ) -> tuple[list[Chart], list[str]]:
     """Flatten the charts in a child process; where it fails, project charts by the side of a box they look at."""
     limits = FlattenLimits(request.good_stretch, request.max_stretch, deadlines.shaped, deadlines.projected)
@@ -134,10 +134,10 @@ def _flatten_in_child(
             flatten_all,
             vertices,
             faces,
-            found.label,
+            segmentation.label,
             limits,
-            found.proxy,
-            found.part,
+            segmentation.proxy,
+            segmentation.part,
             seconds=max(deadlines.child_killed - time.monotonic(), _MIN_CHILD_SECONDS),
             memory_mb=_CHILD_MEMORY_MB,
         )
@@ -145,7 +145,7 @@ def _flatten_in_child(
         return child.result()
     except ChildFailed as failure:
         until = time.monotonic() + deadlines.projected - deadlines.shaped
-        charts, reasons = flatten_all(vertices, faces, found.label, replace(limits, single_after=until))
+        charts, reasons = flatten_all(vertices, faces, segmentation.label, replace(limits, single_after=until))
         return charts, [f"flattening: {failure}; charts by the side they look at", *reasons]
 
 
@@ -262,11 +262,11 @@ def invalid_reason(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face
         return "some are not finite"
     if uv.min() < -_UV_SLACK or uv.max() > 1 + _UV_SLACK:
         return "some lie outside the unit square"
-    found = figures(vertices, faces, uv, face_uvs)
-    if found["overlap"] > _MAX_KEPT_OVERLAP:
-        return f"they overlap on {100 * found['overlap']:.1f} % of what they cover"
-    if found["degenerate"] > _MAX_KEPT_DEGENERATE:
-        return f"{100 * found['degenerate']:.1f} % of the faces have no area there"
+    measured = figures(vertices, faces, uv, face_uvs)
+    if measured["overlap"] > _MAX_KEPT_OVERLAP:
+        return f"they overlap on {100 * measured['overlap']:.1f} % of what they cover"
+    if measured["degenerate"] > _MAX_KEPT_DEGENERATE:
+        return f"{100 * measured['degenerate']:.1f} % of the faces have no area there"
     return None
 
 

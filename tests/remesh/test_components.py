@@ -21,15 +21,15 @@ def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
     both = RemeshPatch(vertices, faces, 4000, 0.03, Request(), None)
     assert quad_pieces.accept_good_pieces(both, None)[0] is None
     patches = quad_pieces.remaining_patches(both, np.zeros(2, bool), 4000)
-    assert len(patches) == 2 and not any(patch.skip_engines for patch in patches)
-    assert sum(patch.quads for patch in patches) == 4000 and min(patch.quads for patch in patches) >= 4000 * 0.02
+    assert len(patches) == 2
+    assert not any(patch.skip_engines for patch in patches)
+    assert sum(patch.quads for patch in patches) == 4000
+    assert min(patch.quads for patch in patches) >= 4000 * 0.02
     assert sum(patch.tolerance * patch.quads for patch in patches) == pytest.approx(0.03 * 4000)
     few = quad_pieces.remaining_patches(both, np.array([True, False]), 1000)[0]
-    assert (
-        few.tolerance * few.quads == pytest.approx(0.03 * 4000)
-        and few.has_count(1000 + 119, 1000)
-        and not few.has_count(1000 - 121, 1000)
-    )
+    assert few.tolerance * few.quads == pytest.approx(0.03 * 4000)
+    assert few.has_count(1000 + 119, 1000)
+    assert not few.has_count(1000 - 121, 1000)
     assert quad_pieces.remaining_patches(both, np.array([True, False]), 400)[0].tolerance == 0.15
     tried = []
     real = search.EngineSearch.run
@@ -40,7 +40,9 @@ def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
 
     monkeypatch.setattr(search.EngineSearch, "run", fails_together)
     out, found, _ = pipeline.remesh(vertices, faces, Request(quads=4000))
-    assert tried == [2, 1, 1] and topology.components(found)[0] == 2 and whole(found)
+    assert tried == [2, 1, 1]
+    assert topology.components(found)[0] == 2
+    assert whole(found)
     assert abs(len(found) / 4000 - 1) <= 0.03
 
 
@@ -62,7 +64,9 @@ def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless)
     monkeypatch.setattr(quad_pieces, "repair_and_judge", fails)
     out, found, record = pipeline.remesh(vertices, faces, Request(quads=4000))
     assert record.engine == ("instant-meshes; pair and split" if hopeless else "instant-meshes")
-    assert topology.components(found)[0] == 21 and whole(found) and abs(len(found) / 4000 - 1) <= 0.03
+    assert topology.components(found)[0] == 21
+    assert whole(found)
+    assert abs(len(found) / 4000 - 1) <= 0.03
     small = found[(out[found][..., 2] < 0.15).all(1)]
     # Eight of a ball's hundred; of paired triangles a fifth and more.
     assert topology_figures(*topology.compact(out, small))["irregular_share"] < 0.1
@@ -83,14 +87,17 @@ def test_pieces_are_kept_as_they_were_drawn_where_the_others_can_make_up_for_the
     whole.fitted = out, found, Constraints.none(len(out))
     monkeypatch.setattr(quad_pieces, "snap_to_features", None)
     made, good = quad_pieces.accept_good_pieces(patch, whole)
-    assert good.all() == good.any() == kept and (made is None) != kept
+    assert good.all() == good.any() == kept
+    assert (made is None) != kept
     assert not kept or len(made[1]) == len(found) and made[2] == "instant-meshes"
 
 
 def test_small_piece_is_not_lost():
     vertices, faces = joined(sphere(40, 0.7), sphere(40, 0.05, (0.9, 0.9, 0.9)))
     out, found, record = pipeline.remesh(vertices / 2, faces, Request(quads=1000))
-    assert topology.components(found)[0] == 2 and whole(found) and "pair and split" in record.engine
+    assert topology.components(found)[0] == 2
+    assert whole(found)
+    assert "pair and split" in record.engine
     assert np.linalg.norm(out - 0.45, axis=1).min() < 0.05
 
 
@@ -117,5 +124,6 @@ def test_the_count_holds_where_small_pieces_take_more_than_their_share():
     trays = [(vertices + 0.05 * corner + 0.3, faces[:-2]) for corner in corners]
     vertices, faces = joined(sphere(60, 0.25), *trays)
     out, found, _ = pipeline.remesh(vertices, faces, Request(quads=4000, engine="split"))
-    assert abs(len(found) / 4000 - 1) < 0.03 and topology.components(found)[0] == 101
+    assert abs(len(found) / 4000 - 1) < 0.03
+    assert topology.components(found)[0] == 101
     assert 1000 < (np.linalg.norm(out, axis=1)[found].max(1) < 0.27).sum() < 2700

@@ -37,14 +37,14 @@ def opened(vertices: np.ndarray, faces: np.ndarray, at: int, apart: float) -> tu
 def test_a_folded_quad_goes_and_its_surroundings_stay(apart):
     vertices, faces = quad_torus()
     torn, quads, _ = opened(vertices, faces, 17, apart)
-    assert topology.is_watertight(quads) and len(quads) == len(faces) + 1 and scaled_jacobian(torn, quads).min() < 0.05
+    assert topology.is_watertight(quads)
+    assert len(quads) == len(faces) + 1
+    assert scaled_jacobian(torn, quads).min() < 0.05
     out, found, _ = collapse_folded_quads(torn, quads, target_of_quads(vertices, faces), Constraints.none(len(torn)))
-    assert (
-        len(found) == len(faces)
-        and len(out) == len(vertices)
-        and topology.is_watertight(found)
-        and topology.is_manifold(found)
-    )
+    assert len(found) == len(faces)
+    assert len(out) == len(vertices)
+    assert topology.is_watertight(found)
+    assert topology.is_manifold(found)
     assert topology.euler_number(found) == topology.euler_number(faces)
     assert scaled_jacobian(out, found).min() > 0.8 * scaled_jacobian(vertices, faces).min()
     assert len(np.unique(np.concatenate([out, vertices]).round(9), axis=0)) <= len(vertices) + 1
@@ -58,11 +58,13 @@ def test_what_is_held_stays():
     out, found, _ = collapse_folded_quads(
         torn, quads, target_of_quads(vertices, faces), replace(constraints, fixed=np.ones(len(torn), bool))
     )
-    assert out is torn and found is quads
+    assert out is torn
+    assert found is quads
     # One of the two is held: it is the one that stays, where it was.
     constraints.curve[new[2]] = -1
     out, found, after = collapse_folded_quads(torn, quads, target_of_quads(vertices, faces), constraints)
-    assert len(found) == len(faces) and (after.curve >= 0).sum() == 1
+    assert len(found) == len(faces)
+    assert (after.curve >= 0).sum() == 1
     assert (out[after.curve >= 0] == torn[new[0]]).all()
 
 
@@ -71,4 +73,5 @@ def test_nothing_happens_without_folded_quads():
     out, found, _ = collapse_folded_quads(
         vertices, faces, target_of_quads(vertices, faces), Constraints.none(len(vertices))
     )
-    assert out is vertices and found is faces
+    assert out is vertices
+    assert found is faces

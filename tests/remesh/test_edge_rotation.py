@@ -43,7 +43,9 @@ def test_what_was_pulled_apart_closes(apart):
     torn = sheared(quads, [(i * n + 3, i * n + 4) for i in range(2, 2 + apart)])
     assert irregular(points, torn) == 4
     found = cancel_pairs(points, torn)
-    assert irregular(points, found) == 0 and topology.is_watertight(found) and topology.is_manifold(found)
+    assert irregular(points, found) == 0
+    assert topology.is_watertight(found)
+    assert topology.is_manifold(found)
     assert len(found) == len(quads)
 
 
@@ -93,11 +95,9 @@ def test_creases_stay():
     found = cancel_pairs(points, torn)
     kept = {tuple(sorted(edge)) for edge in topology.edges_of(found).ends.tolist()}
     assert crease <= kept
-    assert (
-        topology.is_watertight(found)
-        and topology.is_manifold(found)
-        and irregular(points, found) < irregular(points, torn) / 2
-    )
+    assert topology.is_watertight(found)
+    assert topology.is_manifold(found)
+    assert irregular(points, found) < irregular(points, torn) / 2
 
 
 def test_an_engine_s_quads_have_fewer(monkeypatch):
@@ -106,5 +106,7 @@ def test_an_engine_s_quads_have_fewer(monkeypatch):
     found = make_candidate(vertices / 2, faces, attempt, 8000)
     monkeypatch.setattr(quad_candidate, "cancel_pairs", lambda _, quads: quads)
     before = make_candidate(vertices / 2, faces, attempt, 8000)
-    assert found.fault is None and found.count == before.count and topology.is_watertight(found.quads)
+    assert found.fault is None
+    assert found.count == before.count
+    assert topology.is_watertight(found.quads)
     assert irregular(found.vertices, found.quads) < 0.9 * irregular(before.vertices, before.quads)

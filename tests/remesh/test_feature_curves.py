@@ -32,7 +32,10 @@ def test_a_folded_sliver_is_no_crease():
 def test_a_crease_beside_a_sliver_is_kept():
     ends, _, angle = dihedral_degrees(square(60.0), FACES, 0.05)
     at = {tuple(sorted(pair)): degrees for pair, degrees in zip(ends.tolist(), angle, strict=True)}
-    assert at[0, 2] < 1e-5 and at[0, 4] == pytest.approx(60) and at[2, 4] == pytest.approx(60) and at[1, 4] < 1e-5
+    assert at[0, 2] < 1e-5
+    assert at[0, 4] == pytest.approx(60)
+    assert at[2, 4] == pytest.approx(60)
+    assert at[1, 4] < 1e-5
 
 
 def test_corners_in_a_row_are_not_all_drawn_into_one():
@@ -47,9 +50,8 @@ def test_corners_in_a_row_are_not_all_drawn_into_one():
     ends = found.points[found.segments]
     assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() <= 1 + short
     # No tooth is lost, and the corners that are left stand on the spine.
-    assert (found.points[:, 1] == length - 1).sum() == teeth and 1 < len(
-        np.unique(ends[ends[..., 1] == 0], axis=0)
-    ) < teeth
+    assert (found.points[:, 1] == length - 1).sum() == teeth
+    assert 1 < len(np.unique(ends[ends[..., 1] == 0], axis=0)) < teeth
 
 
 def plate(thickness: float) -> tuple[np.ndarray, np.ndarray]:
@@ -64,11 +66,10 @@ def test_both_rims_of_a_thin_plate_are_kept(thickness):
     vertices, faces = plate(thickness)
     found = find_features(vertices, faces, 30.0, 0.03)
     length = np.linalg.norm(found.points[found.segments[:, 0]] - found.points[found.segments[:, 1]], axis=1)
-    assert len(found.corners) == 8 and length.sum() == pytest.approx(8 + 4 * thickness)
-    assert (
-        found.share_in_strips(2 * thickness) == pytest.approx(8 / (8 + 4 * thickness))
-        and found.share_in_strips(thickness / 2) == 0
-    )
+    assert len(found.corners) == 8
+    assert length.sum() == pytest.approx(8 + 4 * thickness)
+    assert found.share_in_strips(2 * thickness) == pytest.approx(8 / (8 + 4 * thickness))
+    assert found.share_in_strips(thickness / 2) == 0
 
 
 def test_a_curve_whose_corner_has_no_vertex_of_its_own_is_followed_all_the_same():
@@ -84,4 +85,6 @@ def test_a_curve_whose_corner_has_no_vertex_of_its_own_is_followed_all_the_same(
     _, held = trace_features(vertices, faces, features, 1.0)
     for curve in (0, 1):
         path = vertices[held.path[held.path_curve == curve]].reshape(-1, 3)
-        assert len(path) and path[:, 0].min() <= 4 and path[:, 0].max() == 17
+        assert len(path)
+        assert path[:, 0].min() <= 4
+        assert path[:, 0].max() == 17

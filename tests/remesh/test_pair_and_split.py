@@ -22,7 +22,9 @@ def test_pairing_gives_the_asked_count_exactly():
     vertices, faces = sphere(24)
     for count in (3 * len(faces) - 500, int(2.2 * len(faces))):
         out, found = pair_and_split(vertices, faces, count)
-        assert abs(len(found) - count) <= 1 and whole(found) and volume(out, found) > 0
+        assert abs(len(found) - count) <= 1
+        assert whole(found)
+        assert volume(out, found) > 0
 
 
 def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypatch):
@@ -39,7 +41,8 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
     monkeypatch.setattr(quad_split, "simplify", losing)
     asked = 1800  # 800 triangles, of which 1.15 times as many lose the piece and 1.3 times keep it
     out, found = quad_split.quads_from_input(vertices, faces, asked, 60.0)
-    assert tried[:3] == [800, 919, 1040] and topology.components(found)[0] == 2
+    assert tried[:3] == [800, 919, 1040]
+    assert topology.components(found)[0] == 2
     assert asked < len(found) < 1.5 * asked < 1.8 * len(faces)
 
 
@@ -50,9 +53,11 @@ def test_even_triangles_are_sought_no_longer_than_they_come_nearer_to_their_numb
     runs, mesh_set = [], pymeshlab.MeshSet
     monkeypatch.setattr(pymeshlab, "MeshSet", lambda: runs.append(1) or mesh_set())
     cubes = joined(*((cube()[0] + (3 * i, 0, 0), cube()[1]) for i in range(20)))
-    assert len(quad_split.isotropic_triangles(*cubes, 100, 30.0)[1]) == 240 and len(runs) == 2
+    assert len(quad_split.isotropic_triangles(*cubes, 100, 30.0)[1]) == 240
+    assert len(runs) == 2
     runs.clear()
-    assert abs(len(quad_split.isotropic_triangles(*sphere(24), 500, 30.0)[1]) / 500 - 1) < 0.05 and 1 <= len(runs) <= 4
+    assert abs(len(quad_split.isotropic_triangles(*sphere(24), 500, 30.0)[1]) / 500 - 1) < 0.05
+    assert 1 <= len(runs) <= 4
 
 
 @pytest.mark.parametrize(
@@ -82,7 +87,9 @@ def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
     """Pins with few triangles around: what bends too much stays single, and there are fewer triangles for it."""
     vertices, faces = joined(*((pin[0] + (0.3 * k, 0, 0), pin[1]) for k, pin in enumerate([rod(24)] * 8)))
     _, found = quad_split.quads_from_input(vertices, faces, 400, 60.0)
-    assert abs(len(found) / 400 - 1) < 0.1 and topology.components(found)[0] == 8 and topology.is_watertight(found)
+    assert abs(len(found) / 400 - 1) < 0.1
+    assert topology.components(found)[0] == 8
+    assert topology.is_watertight(found)
 
 
 @pytest.mark.parametrize("shape", ["slivers", "coincident"])
@@ -97,10 +104,14 @@ def test_splitting_makes_square_quads_of_any_triangles(shape):
         vertices[8:, 0] += np.ptp(vertices[:8, 0])  # shares a side with the first
     vertices = vertices / np.ptp(vertices, 0).max()
     out, found, record = quads.remesh(vertices, faces, Request(quads=3000, engine="split"))
-    assert record.engine == "pair and split" and whole(found) and abs(len(found) / 3000 - 1) <= 0.03
+    assert record.engine == "pair and split"
+    assert whole(found)
+    assert abs(len(found) / 3000 - 1) <= 0.03
     assert topology.components(found)[0] == topology.components(faces)[0]
     figures = shape_figures(out, found)
-    assert figures["jacobian_mean"] > 0.85 and figures["folded_share"] == 0 and figures["angle_deviation_deg"] < 18
+    assert figures["jacobian_mean"] > 0.85
+    assert figures["folded_share"] == 0
+    assert figures["angle_deviation_deg"] < 18
     assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.01
 
 

@@ -27,8 +27,10 @@ def test_dead_engine_is_replaced(monkeypatch, failure):
     monkeypatch.setattr(search, "begin", lambda *_, **__: Ended(ChildFailed(failure)))
     vertices, faces = torus()
     _, found, record = quads.remesh(vertices / 2, faces, Request(quads=900))
-    assert record.engine == "pair and split" and any(failure in text for text in record.failed)
-    assert whole(found) and abs(len(found) / 900 - 1) <= 0.03
+    assert record.engine == "pair and split"
+    assert any(failure in text for text in record.failed)
+    assert whole(found)
+    assert abs(len(found) / 900 - 1) <= 0.03
 
 
 @pytest.mark.parametrize("outcome, runs", [("a smaller sphere", 1), ("a crash", 3)])
@@ -59,7 +61,9 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
         ),
     )
     _, found, record = quads.remesh(vertices / 2, faces, Request(quads=1000))
-    assert len(calls) == runs and record.engine == "pair and split" and whole(found)
+    assert len(calls) == runs
+    assert record.engine == "pair and split"
+    assert whole(found)
     assert outcome == "a crash" or "strays" in record.failed[0]
 
 
@@ -99,12 +103,15 @@ def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(mon
         ).missing_surface(patch)
         for most in (1.0, 0.37, 0.0)
     ]
-    assert left[:2] == [None, None] and "leaves out 3" in left[2]
+    assert left[:2] == [None, None]
+    assert "leaves out 3" in left[2]
     calls = in_this_process(monkeypatch, lambda *_: topology.compact(out, found[height < 0.0]))
     monkeypatch.setattr(quad_candidate, "repair_and_judge", lambda vertices, found, *_: (None, vertices, found))
     monkeypatch.setattr(search.EngineSearch, "_fit_first_good", None)
     _, _, record = quads.remesh(vertices, faces, Request(quads=1000))
-    assert len(calls) == 1 and record.engine == "pair and split" and "leaves out" in record.failed[0]
+    assert len(calls) == 1
+    assert record.engine == "pair and split"
+    assert "leaves out" in record.failed[0]
 
 
 @pytest.mark.parametrize("thickness, thin", [(0.03, True), (0.05, False)])
@@ -127,11 +134,9 @@ def test_a_coarser_mesh_is_given_up_where_walls_are_thinner_than_quads(thickness
     assert not RemeshPatch(vertices, faces[:, ::-1], 4000, patch.edge, Request(), None).has_thin_walls
     # Without creases, or its narrow sides tell.
     _, found, record = quads.remesh(vertices, faces, Request(quads=4000, crease_degrees=0.0))
-    assert (
-        whole(found)
-        and any("walls" in text for text in record.failed) == thin
-        and not (thin and "1 subdivision" in record.engine)
-    )
+    assert whole(found)
+    assert any("walls" in text for text in record.failed) == thin
+    assert not (thin and "1 subdivision" in record.engine)
 
 
 def with_tunnel(vertices, faces, length):
@@ -154,10 +159,13 @@ def test_a_handle_is_given_up_only_where_it_is_finer_than_a_quad(monkeypatch, sh
     vertices, faces = sphere(96, 0.4)
     out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
     vertices, faces = with_tunnel(vertices, faces, 0.07) if given_up else bored_ball()
-    assert topology.is_watertight(faces) and topology.is_manifold(faces) and topology.euler_number(faces) == 0
+    assert topology.is_watertight(faces)
+    assert topology.is_manifold(faces)
+    assert topology.euler_number(faces) == 0
     in_this_process(monkeypatch, lambda *_: (out, found))  # an engine that makes a ball of it
     _, found, record = quads.remesh(vertices, faces, Request(quads=1000))
-    assert whole(found) and (record.engine == "instant-meshes, handles are lost") == given_up
+    assert whole(found)
+    assert (record.engine == "instant-meshes, handles are lost") == given_up
     assert topology.euler_number(found) == (2 if given_up else 0)
 
 
@@ -167,19 +175,23 @@ def test_torn_output_is_not_believed(monkeypatch):
     in_this_process(monkeypatch, lambda *_: (np.random.default_rng(0).random((8, 3)), book))
     vertices, faces = sphere(24)
     _, found, record = quads.remesh(vertices / 2, faces, Request(quads=300))
-    assert (
-        whole(found) and record.engine == "pair and split" and any("pieces are lost" in text for text in record.failed)
-    )
+    assert whole(found)
+    assert record.engine == "pair and split"
+    assert any("pieces are lost" in text for text in record.failed)
 
 
 def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
     vertices, faces = quad_cube(3)
     middle = inner_face(vertices, faces)
     corners, sides = around(faces, middle)
-    assert len(corners) == 4 and len(sides) == 4
+    assert len(corners) == 4
+    assert len(sides) == 4
     torn = np.delete(faces, [*corners[1:], *sides], 0)
     fault, out, found = quad_candidate.repair_and_judge(vertices, torn, topology.invariants(faces))
-    assert fault is None and whole(found) and topology.components(found)[0] == 1 and len(found) < len(faces)
+    assert fault is None
+    assert whole(found)
+    assert topology.components(found)[0] == 1
+    assert len(found) < len(faces)
     assert volume(out, triangulated(found)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
 
 
@@ -195,7 +207,8 @@ def test_candidates_are_in_the_order_of_place(monkeypatch):
     one = quad_candidate.make_candidate(
         vertices, triangulated(faces)[0], quad_candidate.EngineAttempt("quadriflow", 0, (1.0,), 30.0), len(faces)
     )
-    assert one.fault is None and len(one.quads) == len(faces)
+    assert one.fault is None
+    assert len(one.quads) == len(faces)
 
     def places(v, q):
         return sorted(map(tuple, v[q].reshape(len(q), 12).tolist()))
@@ -257,8 +270,11 @@ def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_fine
     )
     vertices, faces = sphere(96, 0.45)
     _, found, record = quads.remesh(vertices, faces, Request(quads=4000))
-    assert record.engine == "instant-meshes, 1 subdivision" and whole(found) and abs(len(found) / 4000 - 1) <= 0.03
-    assert "cuts off" in record.failed[0] and "SIGSEGV" in record.failed[1]
+    assert record.engine == "instant-meshes, 1 subdivision"
+    assert whole(found)
+    assert abs(len(found) / 4000 - 1) <= 0.03
+    assert "cuts off" in record.failed[0]
+    assert "SIGSEGV" in record.failed[1]
     assert sum(not attempt.subdivisions for _, _, attempt, _ in calls) == 1
     monkeypatch.setattr(quad_candidate, "FAR_SUBDIVIDED", 0.4)  # farther than that it is not unfolded
     assert quads.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
@@ -274,15 +290,17 @@ def test_when_the_time_is_over_no_engine_is_begun():
     vertices, faces = sphere(96, 0.45)
     start = time.monotonic()
     out, found, record = quads.remesh(vertices, faces, Request(quads=4000, seconds=0.0))
-    assert record.engine == "pair and split" and record.failed == [
-        "instant-meshes, 1 subdivision: not tried, the time is over"
-    ]
-    assert whole(found) and abs(len(found) / 4000 - 1) <= 0.03 and time.monotonic() - start < 30
+    assert record.engine == "pair and split"
+    assert record.failed == ["instant-meshes, 1 subdivision: not tried, the time is over"]
+    assert whole(found)
+    assert abs(len(found) / 4000 - 1) <= 0.03
+    assert time.monotonic() - start < 30
 
 
 def test_every_round_asks_for_two_densities():
     attempt = search._attempts(20000, Request())[0]
-    assert len(attempt.counts_around(20000)) == 2 and np.mean(attempt.counts_around(20000)) == pytest.approx(20000)
+    assert len(attempt.counts_around(20000)) == 2
+    assert np.mean(attempt.counts_around(20000)) == pytest.approx(20000)
     assert attempt.counts_around(20000)[1] / attempt.counts_around(20000)[0] == pytest.approx(
         attempt.factors[1] / attempt.factors[0]
     )
@@ -292,7 +310,8 @@ def test_what_is_asked_next_lies_between_what_gave_too_few_and_what_gave_too_man
     """An engine's count may jump by a twentieth: in proportion to the last answer what gave too many would be asked for
     again."""
     answers = [search.EngineAnswer(19700.0, 20868), search.EngineAnswer(20100.0, 21164)]
-    assert search._interpolate_request(answers, 20000) is None and search._interpolate_request(answers, 22000) is None
+    assert search._interpolate_request(answers, 20000) is None
+    assert search._interpolate_request(answers, 22000) is None
     answers += [search.EngineAnswer(18691.0, 19164), search.EngineAnswer(19070.0, 18844)]
     assert search._interpolate_request(answers, 20000) == pytest.approx(19186, abs=1)
 
@@ -325,15 +344,21 @@ def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypa
     monkeypatch.setattr(Candidate, "fit", lambda one, patch: drawn.append(one))
     choose = search.EngineSearch(RemeshPatch(*cube(), 1000, 0.1, Request(), None), Record())._fit_first_good
     good, better, bare, thin = candidate(0.5, 0.3), candidate(0.1, 0.9), candidate(0.9, 0.5), candidate(0.3, 0.1)
-    assert choose([good, better]) is good and drawn == [good] and choose([bare, good]) is good
+    assert choose([good, better]) is good
+    assert drawn == [good]
+    assert choose([bare, good]) is good
     assert choose([candidate(0.1, 0.9, "leaves out 1 % of the surface"), thin]) is thin
-    assert choose([bare, thin]) is bare and choose([candidate(2.0, 0.5), thin]) is thin
+    assert choose([bare, thin]) is bare
+    assert choose([candidate(2.0, 0.5), thin]) is thin
     drawn.clear()
     late = candidate(0.9, 0.3, outline=1.1)
-    assert choose([late, good]) is good and drawn == [good]
+    assert choose([late, good]) is good
+    assert drawn == [good]
     late.snapped = None
     drawn.clear()
-    assert choose([late, candidate(2.0, 0.5)]) is late and drawn[1] is late and len(drawn) == 2
+    assert choose([late, candidate(2.0, 0.5)]) is late
+    assert drawn[1] is late
+    assert len(drawn) == 2
 
 
 def test_the_quads_of_tips_count_before_any_are_drawn(monkeypatch):
@@ -351,12 +376,11 @@ def test_the_quads_of_tips_count_before_any_are_drawn(monkeypatch):
 
     monkeypatch.setattr(Candidate, "snap", lambda one, patch: setattr(one, "snapped", one.traced))
     plain, far, fewer = candidate(4000, 0), candidate(4100, 100), candidate(3900, 100)
-    assert next(search_run._with_right_count([plain, far], 0)) is plain and far.snapped is None
+    assert next(search_run._with_right_count([plain, far], 0)) is plain
+    assert far.snapped is None
     assert list(search_run._with_right_count([far, fewer, candidate(4080, 100)], 0)) == [fewer]
-    assert (
-        search_run._fit_first_good(search_run._with_right_count([far, plain := candidate(4060, 0)], 0)) is None
-        and plain.snapped is None
-    )
+    assert search_run._fit_first_good(search_run._with_right_count([far, plain := candidate(4060, 0)], 0)) is None
+    assert plain.snapped is None
     assert list(search_run._with_right_count([hopeless := candidate(4100, 100, hopeless=True)], 0)) == [hopeless]
 
 
@@ -367,11 +391,10 @@ def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypat
     vertices, faces = cube()
     vertices = vertices * (1, 0.8, 0.02)
     out, found, record = quads.remesh(vertices, faces, Request(quads=8000))
-    assert (
-        all(not attempt.subdivisions for _, _, attempt, _ in calls)
-        and "not tried, its quads are wider" in record.failed[0]
-    )
-    assert record.engine == "instant-meshes" and whole(found)
+    assert all(not attempt.subdivisions for _, _, attempt, _ in calls)
+    assert "not tried, its quads are wider" in record.failed[0]
+    assert record.engine == "instant-meshes"
+    assert whole(found)
     corners = vertices[np.abs(vertices[:, None] - out[None]).max(-1).min(1) < 1e-9]
     assert len(corners) == 8
     assert uncovered_shares(target_of_quads(out, found), ProjectionTarget(vertices, faces), (0.005,)) == [0.0]
@@ -389,9 +412,7 @@ def test_an_engine_has_a_memory_limit_of_its_own_within_the_request(monkeypatch,
     monkeypatch.setattr(search, "begin", begin)
     vertices, faces = sphere(48, 0.45)
     _, found, record = quads.remesh(vertices, faces, Request(quads=4000, memory_mb=given))
-    assert (
-        limits
-        and all(least <= limit <= most for limit in limits)
-        and record.engine == "pair and split"
-        and whole(found)
-    )
+    assert limits
+    assert all(least <= limit <= most for limit in limits)
+    assert record.engine == "pair and split"
+    assert whole(found)

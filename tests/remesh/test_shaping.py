@@ -51,4 +51,6 @@ def test_tips_stay_where_folded_quads_before_them_are_taken_out(monkeypatch):
         shaping.fit_to_surface(
             SnappedQuads(vertices, quads, constraints, tips, 0.1, 0.0, 1.0, False), None, None, Request()
         )
-    assert len(eased) == 1 and np.array_equal(eased[0], vertices[tips])  # of the folded ones alone
+    # of the folded ones alone
+    assert len(eased) == 1
+    assert np.array_equal(eased[0], vertices[tips])

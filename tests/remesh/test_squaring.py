@@ -27,7 +27,8 @@ def test_folded_quads_are_turned_over_again_and_stay_on_the_surface():
     bent[40] += [0.19, 0.17, 0]  # past its neighbour
     assert scaled_jacobian(bent, quads).min() < 0
     out = square_up(bent, quads, ProjectionTarget(*plane()), NO_FEATURES, Constraints.none(len(vertices)), 20)
-    assert scaled_jacobian(out, quads).min() > 0.8 and np.abs(out[:, 2]).max() < 1e-12
+    assert scaled_jacobian(out, quads).min() > 0.8
+    assert np.abs(out[:, 2]).max() < 1e-12
     rim = np.abs(vertices[:, :2]).max(1) > 0.49
     assert np.array_equal(out[rim], vertices[rim])
 
@@ -40,8 +41,11 @@ def test_middle_of_three_corners_in_a_row_is_let_off_its_curve():
     fixed = np.zeros(len(vertices), bool)
     fixed[[38, 50]] = True
     found = release_straight_corners(vertices, quads, Constraints(curve, fixed, path, np.zeros(4, np.int64)))
-    assert found.curve[40] == -1 and found.curve[49] == -1 and found.curve[39] == 0
-    assert found.path.tolist() == [[38, 39]] and found.fixed[[38, 50]].all()
+    assert found.curve[40] == -1
+    assert found.curve[49] == -1
+    assert found.curve[39] == 0
+    assert found.path.tolist() == [[38, 39]]
+    assert found.fixed[[38, 50]].all()
     fixed[[40, 49]] = True  # true corners of the surface, square here: they stay
     assert (
         len(release_straight_corners(vertices, quads, Constraints(curve, fixed, path, np.zeros(4, np.int64))).path) == 4
@@ -56,7 +60,8 @@ def test_a_corner_pinned_in_the_wrong_place_is_eased():
     fixed[40] = True
     pinned = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
     out, left = release_and_smooth(bent, quads, ProjectionTarget(*plane()), NO_FEATURES, pinned)
-    assert scaled_jacobian(out, quads).min() >= 0.2 and not left.fixed[40]
+    assert scaled_jacobian(out, quads).min() >= 0.2
+    assert not left.fixed[40]
 
 
 @pytest.mark.parametrize("moved, by", [(49, (0.1, -0.1, 0)), (41, (0, 0.2, 0))])
@@ -77,11 +82,14 @@ def test_a_tip_beside_folded_quads_stays_where_easing_would_draw_it_back(height,
         return closest_points(vertices[[tip]], out, triangles)[0][0] * 8  # edges are 1/8 long
 
     out, left = release_and_smooth(bent, quads, surface, NO_FEATURES, held)
-    assert scaled_jacobian(out, quads).min() > 0.5 and bare(out) < 1e-9 and left.fixed[tip]
+    assert scaled_jacobian(out, quads).min() > 0.5
+    assert bare(out) < 1e-9
+    assert left.fixed[tip]
     out, left = release_and_smooth(
         bent, quads, surface, NO_FEATURES, held, options=ReleaseOptions(max_uncovered_edges=2.0)
     )
-    assert 0.75 < bare(out) < 2 and not left.fixed[tip]
+    assert 0.75 < bare(out) < 2
+    assert not left.fixed[tip]
 
 
 def test_easing_folds_nothing_that_was_not_folded():
@@ -110,6 +118,7 @@ def test_balancing_lifts_quads_to_the_surface_but_leaves_thin_ones():
     before = scaled_jacobian(vertices, quads)
     out = balance_heights(vertices, quads, ball, Constraints.none(len(vertices)))
     after = scaled_jacobian(out, quads)
-    assert (before < 0.3).any() and (after[before < 0.3] >= before[before < 0.3] - 1e-12).all()
+    assert (before < 0.3).any()
+    assert (after[before < 0.3] >= before[before < 0.3] - 1e-12).all()
     centre = np.abs(ball.closest(out[quads].mean(1))[0]).mean(), np.abs(ball.closest(vertices[quads].mean(1))[0]).mean()
     assert centre[0] < 0.8 * centre[1]

@@ -36,11 +36,13 @@ def test_many_folds_are_mended_at_once_and_the_rest_stays():
         find_features(*plane(), 181.0, 1.0),
         Constraints.none(len(vertices)),
     )
-    assert scaled_jacobian(out, faces).min() > 0.2 and np.abs(out[:, 2]).max() < 1e-12
+    assert scaled_jacobian(out, faces).min() > 0.2
+    assert np.abs(out[:, 2]).max() < 1e-12
     touched = np.unique(faces[scaled_jacobian(vertices, faces) < 0.3])
     around = np.unique(faces[np.isin(faces, touched).any(1)])
     still = np.setdiff1d(np.arange(len(vertices)), around)
-    assert len(still) and np.array_equal(out[still], vertices[still])
+    assert len(still)
+    assert np.array_equal(out[still], vertices[still])
 
 
 def test_what_is_fixed_leaves_its_place_in_the_last_rounds_only():

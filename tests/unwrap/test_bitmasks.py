@@ -35,7 +35,8 @@ def test_places_are_free_and_none_is_found_in_a_full_square():
     for i in range(4):
         place = shapes.find_place(i, taken, border, 40, 0.5)
         cells = shapes.cells_at(i, place)
-        assert not cells & taken and shapes.extent_at(i, place) <= 40
+        assert not cells & taken
+        assert shapes.extent_at(i, place) <= 40
         taken |= cells
     assert shapes.find_place(0, (1 << 41 * 40) - 1, border, 40, 0.5) is None
 
@@ -87,9 +88,9 @@ def test_a_layout_whose_charts_touch_is_moved_apart():
         [[Placement(0, 0, 0), Placement(0, 10, 0), Placement(0, 0, 10), Placement(0, 10, 10)]]
     )
     low, high = np.array([uv.min(0) for uv in places]), np.array([uv.max(0) for uv in places])
-    assert (
-        low.min() >= 0.4 * gap and high.max() <= 1 - 0.4 * gap and high - low == pytest.approx(np.full((4, 2), scale))
-    )
+    assert low.min() >= 0.4 * gap
+    assert high.max() <= 1 - 0.4 * gap
+    assert high - low == pytest.approx(np.full((4, 2), scale))
     apart = np.maximum(low[:, None] - high[None], low[None] - high[:, None]).max(-1)
     assert apart[~np.eye(4, dtype=bool)].min() >= 0.99 * gap
     assert 4 * scale**2 > 0.85
@@ -114,7 +115,8 @@ def test_no_orders_are_sought_for_a_grid_on_which_charts_do_not_come_apart(monke
     monkeypatch.setattr(FineGridCompactor, "separate", lambda *given: None)
     places, _ = search.pack(charts, 0.002)
     shares = [given[0].shapes for given in sought]
-    assert len(sought) == 2 and shares[0] != shares[1]
+    assert len(sought) == 2
+    assert shares[0] != shares[1]
     assert (
         owner_count(np.concatenate(places), np.concatenate([triangles + 4 * i for i in range(14)]), 2048) <= 1
     ).all()

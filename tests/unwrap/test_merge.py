@@ -75,7 +75,8 @@ def test_what_lay_flat_together_on_the_proxy_alone_comes_apart_again(monkeypatch
     for i, (faces_idx, _, uv, _) in enumerate(charts):
         owner[faces_idx] = i
         assert np.isfinite(uv).all()
-    assert len(charts) == 2 and ((owner == owner[label.argmax()]) == (label == 1)).all()
+    assert len(charts) == 2
+    assert ((owner == owner[label.argmax()]) == (label == 1)).all()
 
 
 def test_a_chart_that_touches_itself_in_a_vertex_has_it_twice():

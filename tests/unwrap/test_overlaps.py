@@ -75,7 +75,8 @@ def test_a_peeled_band_is_two_charts_and_not_many_halves():
         schedule.FlattenLimits(GOOD, 1.5),
         (vertices, triangulated(faces)[0].astype(np.int64)),
     )
-    assert len(charts) == 2 and cut == ["1 charts were cut: a chart overlaps itself"]
+    assert len(charts) == 2
+    assert cut == ["1 charts were cut: a chart overlaps itself"]
     assert sorted(np.concatenate([chart[0] for chart in charts])) == list(range(len(faces)))
     for _, _, uv, triangles in charts:
         assert not overlapping_triangles(uv, triangles).any()
@@ -107,12 +108,13 @@ def test_a_piece_goes_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
         ), charts
 
     count, charts = left(piece)
-    assert (
-        not count and len(charts[0][0]) == len(dome) and sorted(charts[1][0]) == sorted(np.concatenate([flat, piece]))
-    )
+    assert not count
+    assert len(charts[0][0]) == len(dome)
+    assert sorted(charts[1][0]) == sorted(np.concatenate([flat, piece]))
     # What it came off does not get it back; with nothing flat beside it, it is left; so are all once enough has been
     # tried.
-    assert left(flat, [flat])[0] == 1 and left(dome, [flat])[0] == 0
+    assert left(flat, [flat])[0] == 1
+    assert left(dome, [flat])[0] == 0
     assert left(piece, [dome], 1 + 1e-9)[0] == 1
     monkeypatch.setattr("gdtool.unwrap.segment.overlaps._MAX_WORK", -1)
     assert left(piece)[0] == 1
@@ -131,6 +133,7 @@ def test_a_chart_much_larger_than_a_piece_stays_as_it_lies(columns, stays):
         Adjacency(vertices, faces), vertices, faces, charts, [OverlapPiece(int(piece[0]), piece)], 1.01
     )
     faces_idx, corners, uv, triangles = charts[0]
-    assert sorted(faces_idx) == list(range(144)) and not overlapping_triangles(uv, triangles).any()
+    assert sorted(faces_idx) == list(range(144))
+    assert not overlapping_triangles(uv, triangles).any()
     assert (uv[: len(lies)] == lies).all() == stays
     assert stretch(chart_mesh(vertices, faces[faces_idx])[0], triangles, uv) < 1.02

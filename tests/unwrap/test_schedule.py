@@ -33,12 +33,14 @@ def test_charts_that_stretch_most_are_cut_until_the_whole_stretches_little(monke
     monkeypatch.setattr(schedule, "merge_small_charts", lambda *given: label)
     charts, why = schedule.flatten_all(vertices, faces, label, schedule.FlattenLimits(1.01, 1.5), proxy)
     assert 1.002 < whole_stretch(vertices, faces, charts) < 1.014
-    assert 3 <= len(charts) <= 8 and any("stretches more than most" in line for line in why)
+    assert 3 <= len(charts) <= 8
+    assert any("stretches more than most" in line for line in why)
     assert sorted(np.concatenate([chart[0] for chart in charts])) == list(range(len(faces)))
     assert not any(overlapping_triangles(uv, triangles.astype(np.int64)).any() for _, _, uv, triangles in charts)
     monkeypatch.setattr(schedule, "_MAX_TOTAL_EXCESS", np.inf)
     charts, _ = schedule.flatten_all(vertices, faces, label, schedule.FlattenLimits(1.01, 1.5), proxy)
-    assert len(charts) == 2 and whole_stretch(vertices, faces, charts) > 1.02
+    assert len(charts) == 2
+    assert whole_stretch(vertices, faces, charts) > 1.02
 
 
 def test_charts_that_stretch_little_stay_whole():
@@ -60,7 +62,8 @@ def test_what_cannot_be_relieved_ends(monkeypatch):
         crumpled, faces, label, schedule.FlattenLimits(1.0000001, 1.1), (crumpled, faces[:, :3])
     )
     cuts = [int(line.split()[0]) for line in why if "more than most" in line]
-    assert cuts and cuts[0] >= 16
+    assert cuts
+    assert cuts[0] >= 16
     assert sorted(np.concatenate([chart[0] for chart in charts])) == list(range(len(faces)))
 
 
@@ -73,7 +76,6 @@ def test_a_chart_is_cut_between_its_parts_and_without_any_through_the_middle():
     adjacency, column = Adjacency(vertices, faces), np.arange(400) % 20
     for part, first in ((column >= 6, 6), (np.where(column < 12, 7, np.where(column < 15, 3, 5)), 12)):
         one, other = schedule._split_set(adjacency, part, np.arange(400))
-        assert {len(one), len(other)} == {20 * first, 400 - 20 * first} and (column[one] < first).all() != (
-            column[other] < first
-        ).all()
+        assert {len(one), len(other)} == {20 * first, 400 - 20 * first}
+        assert (column[one] < first).all() != (column[other] < first).all()
     assert min(map(len, schedule._split_set(adjacency, np.zeros(400, int), np.arange(400)))) > 150

@@ -271,12 +271,12 @@ def remove_doublets(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
             pair = ring[v]
             if len(pair) != 2 or set(faces[pair].ravel().tolist()) & touched:
                 continue
-            one, two = faces[pair[0]].tolist(), faces[pair[1]].tolist()
-            opposite = one[(one.index(v) + 2) % 4], two[(two.index(v) + 2) % 4]
+            first, second = faces[pair[0]].tolist(), faces[pair[1]].tolist()
+            opposite = first[(first.index(v) + 2) % 4], second[(second.index(v) + 2) % 4]
             if opposite[0] == opposite[1]:
                 continue
-            touched.update(one, two)
-            faces[pair[0], one.index(v)] = opposite[1]
+            touched.update(first, second)
+            faces[pair[0], first.index(v)] = opposite[1]
             dead[pair[1]] = True
         if not dead.any():
             break

@@ -71,7 +71,7 @@ def extrude_tips(
             sample_surface(surface.vertices, surface.faces, _SAMPLES // 2, np.random.default_rng(0))[0],
         ]
     )
-    max_faces, given = len(faces) * (1 + max_added), constraints
+    max_faces, input_constraints = len(faces) * (1 + max_added), constraints
     triangles, face_idx = triangulated(faces)
     away, nearest, _ = closest_points(points, vertices, triangles)
     of_samples = away, face_idx[nearest]  # None once the quads have changed
@@ -87,8 +87,8 @@ def extrude_tips(
         for tip in _group_tips(points, away, edge):
             if away[tip].max() < _CLOSE * edge or len(faces) > max_faces:
                 break
-            found = _Tip(points[tip], face_idx[nearest[tip]], away[tip])
-            extruded = _extrude_tip(vertices, faces, constraints, found, surface, edge)
+            samples_of_tip = _Tip(points[tip], face_idx[nearest[tip]], away[tip])
+            extruded = _extrude_tip(vertices, faces, constraints, samples_of_tip, surface, edge)
             if extruded is None:
                 alive[tip] = False
             else:
@@ -103,9 +103,9 @@ def extrude_tips(
         of_samples = away, face_idx[nearest]
     away, nearest = of_samples
     vertices, constraints = _move_to_near_tips(vertices, faces, constraints, _Tip(samples, nearest, away), edge)
-    if constraints is not given:
+    if constraints is not input_constraints:
         constraints = _remaining_paths(constraints, faces)
-    was_fixed = np.concatenate([given.fixed, np.zeros(len(vertices) - len(given.fixed), bool)])
+    was_fixed = np.concatenate([input_constraints.fixed, np.zeros(len(vertices) - len(input_constraints.fixed), bool)])
     tips = np.flatnonzero(constraints.fixed & ~was_fixed)
     return ExtrudedQuads(vertices, faces, constraints, tips, float(away.max()), away[-(_SAMPLES // 2) :])
 

@@ -64,9 +64,9 @@ def _mask(rim: np.ndarray, span: np.ndarray, cells_per_unit: float, gap: float, 
     shape = np.ceil(span * cells_per_unit + 2 * gap).astype(int)
     width, height = shape * _FINE
     outline = (rim * cells_per_unit + gap) * _FINE
-    covered = _filled(outline, height, width)
+    covered = _fill_outline(outline, height, width)
     # Tips thinner than a fine cell lie between cell centres: samples along the outline, half a cell apart, find them.
-    column, row = np.minimum(_walked(outline).astype(int), (width - 1, height - 1)).T
+    column, row = np.minimum(_sample_segments(outline).astype(int), (width - 1, height - 1)).T
     covered[row, column] = True
     # Grow by a disk, row by row.
     radius = gap * _FINE + (0.0 if share else _FINE_HALF_DIAGONAL)
@@ -83,7 +83,7 @@ def _mask(rim: np.ndarray, span: np.ndarray, cells_per_unit: float, gap: float, 
     return cells.sum((1, 3)) > share * _FINE**2 if share else cells.any((1, 3))
 
 
-def _filled(outline: np.ndarray, height: int, width: int) -> np.ndarray:
+def _fill_outline(outline: np.ndarray, height: int, width: int) -> np.ndarray:
     """Fill closed outlines (s, 2, 2), in cells, by the even-odd rule: (height, width) bool for cell centres."""
     (xa, ya), (xb, yb) = outline[:, 0].T, outline[:, 1].T
     low = np.ceil(np.minimum(ya, yb) - 0.5).astype(int)
@@ -100,12 +100,12 @@ def _filled(outline: np.ndarray, height: int, width: int) -> np.ndarray:
     return (np.cumsum(crossed[:, :-1], 1, dtype=np.uint8) & 1).view(bool)
 
 
-def _walked(outline: np.ndarray) -> np.ndarray:
+def _sample_segments(outline: np.ndarray) -> np.ndarray:
     """Sample points (n, 2) along segments (s, 2, 2), at most half a unit apart."""
-    one, two = outline[:, 0], outline[:, 1]
-    steps = np.ceil(2 * np.abs(two - one).max(1)).astype(int) + 1
+    starts, ends = outline[:, 0], outline[:, 1]
+    steps = np.ceil(2 * np.abs(ends - starts).max(1)).astype(int) + 1
     along = (np.arange(steps.sum()) - np.repeat(np.cumsum(steps) - steps, steps)) / np.repeat(steps, steps)
-    return np.repeat(one, steps, 0) + along[:, None] * np.repeat(two - one, steps, 0)
+    return np.repeat(starts, steps, 0) + along[:, None] * np.repeat(ends - starts, steps, 0)
 
 
 def outline_of(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -179,7 +179,7 @@ class ChartMasks:
         return (
             (1 << side) - 1
             | ((1 << side) - 1) << (side - 1) * self.stride
-            | _every(1 | 1 << side - 1, side, self.stride)
+            | _repeat_row(1 | 1 << side - 1, side, self.stride)
         )
 
     def find_place(
@@ -199,7 +199,7 @@ class ChartMasks:
         each other is cached.
         """
         stride = self.stride
-        walls = taken << 1 | taken >> 1 | taken << stride | taken >> stride | border
+        touching = taken << 1 | taken >> 1 | taken << stride | taken >> stride | border
         windows = {}, {}
         best = None
         for turn in self._turns[i]:
@@ -207,9 +207,9 @@ class ChartMasks:
             if max(h, w) > side:
                 continue
             if others is None:
-                free = _free(self.runs[i][turn], (h, w), taken, windows, side, stride)
+                free = _free_places(self.runs[i][turn], (h, w), taken, windows, side, stride)
             else:
-                free = _every((1 << side - w + 1) - 1, side - h + 1, stride)
+                free = _repeat_row((1 << side - w + 1) - 1, side - h + 1, stride)
                 free = (free | (hit := self._blocked_places(i, turn, others))) ^ hit
             # Only corners: places blocked above and to the left, or above and to the right.
             blocked = free << stride | free << 1 & free >> 1
@@ -219,14 +219,14 @@ class ChartMasks:
                 corners &= (1 << max(int((best[0] + most) * side - h - _RIGHTWARD_COST * w) + 1, 0) * stride) - 1
             if not corners:
                 continue
-            places = _places(corners)
+            places = _set_bits(corners)
             y, x = np.divmod(places, stride)
             height_cost = (y + h + _RIGHTWARD_COST * (x + w)) / side
             mask_bits = self.bits[i][turn]
             for k in np.argsort(height_cost, kind="stable").tolist():
                 if best is not None and height_cost[k] - most >= best[0] - 1e-9:
                     break
-                cost = float(height_cost[k]) - contact * (walls >> int(places[k]) & mask_bits).bit_count() / (
+                cost = float(height_cost[k]) - contact * (touching >> int(places[k]) & mask_bits).bit_count() / (
                     2 * (h + w)
                 )
                 if best is None or cost < best[0] - 1e-9:
@@ -249,19 +249,19 @@ class ChartMasks:
             hit |= meeting << shift if shift >= 0 else meeting >> -shift
         return hit
 
-    def _minkowski_sum(self, one: int, two: int) -> int:
+    def _minkowski_sum(self, first: int, second: int) -> int:
         """Return the Minkowski sum of two charts' cells; each chart is given as 4 i + turn.
 
         Rows longer than the stride continue in the next row. What lands there comes from left of the square, and no
         chart whose first cell is there would end within the square.
         """
-        if len(self.runs[one // 4][one % 4]) > len(self.runs[two // 4][two % 4]):
-            one, two = two, one
-        windows, cells, out = self._windows.setdefault(two, ({}, {})), self.bits[two // 4][two % 4], 0
-        for axis, level, a, b in self.runs[one // 4][one % 4]:
+        if len(self.runs[first // 4][first % 4]) > len(self.runs[second // 4][second % 4]):
+            first, second = second, first
+        windows, cells, out = self._windows.setdefault(second, ({}, {})), self.bits[second // 4][second % 4], 0
+        for axis, level, a, b in self.runs[first // 4][first % 4]:
             window = windows[axis].get(level)
             if window is None:
-                window = _window(cells, windows[axis], level, self.stride if axis else 1)
+                window = _spread_bits(cells, windows[axis], level, self.stride if axis else 1)
             out |= window << a
             if b > a:
                 out |= window << b
@@ -278,7 +278,7 @@ class ChartMasks:
         return max(x + w, y + h)
 
 
-def _free(
+def _free_places(
     runs: list[Run],
     size: tuple[int, int],
     taken: int,
@@ -291,11 +291,11 @@ def _free(
     runs and size (h, w) of the chart. windows: a cache for rows and for columns; by level k, the cells from which on
     any of 2**k cells is taken.
     """
-    free, hit = _every((1 << side - size[1] + 1) - 1, side - size[0] + 1, stride), 0
+    free, hit = _repeat_row((1 << side - size[1] + 1) - 1, side - size[0] + 1, stride), 0
     for number, (axis, level, first_start, second_start) in enumerate(runs, 1):
         window = windows[axis].get(level)
         if window is None:
-            window = _window(taken, windows[axis], level, -stride if axis else -1)
+            window = _spread_bits(taken, windows[axis], level, -stride if axis else -1)
         hit |= window >> first_start
         if second_start > first_start:
             hit |= window >> second_start
@@ -304,18 +304,18 @@ def _free(
     return (free | hit) ^ hit
 
 
-def _window(cells: int, known: dict[int, int], level: int, step: int) -> int:
+def _spread_bits(cells: int, known: dict[int, int], level: int, step: int) -> int:
     """Return cells spread over 2**level places, `step` bits apart; `known` caches lower levels."""
     if level not in known:
         if not level:
             known[level] = cells
         else:
-            less, far = _window(cells, known, level - 1, step), step << level - 1
+            less, far = _spread_bits(cells, known, level - 1, step), step << level - 1
             known[level] = less | (less << far if far > 0 else less >> -far)
     return known[level]
 
 
-def _every(row: int, count: int, stride: int) -> int:
+def _repeat_row(row: int, count: int, stride: int) -> int:
     """Return the bits of one row repeated in `count` rows."""
     out, have = row, 1
     while have < count:
@@ -332,7 +332,7 @@ def bits_of(mask: np.ndarray, stride: int) -> int:
     return int.from_bytes(np.packbits(rows, bitorder="little").tobytes(), "little")
 
 
-def _places(bits: int) -> np.ndarray:
+def _set_bits(bits: int) -> np.ndarray:
     """Return the numbers of the bits that are set."""
     return np.flatnonzero(
         np.unpackbits(

@@ -256,9 +256,9 @@ class StretchMeasure:
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
         self._abc = tuple(triangles.T)
         a, b, c = self._abc
-        one, two = (vertices[b] - vertices[a]).T, (vertices[c] - vertices[a]).T
-        self._metric = (one * one).sum(0), (one * two).sum(0), (two * two).sum(0)
-        normal = one[[1, 2, 0]] * two[[2, 0, 1]] - one[[2, 0, 1]] * two[[1, 2, 0]]
+        side_ab, side_ac = (vertices[b] - vertices[a]).T, (vertices[c] - vertices[a]).T
+        self._metric = (side_ab * side_ab).sum(0), (side_ab * side_ac).sum(0), (side_ac * side_ac).sum(0)
+        normal = side_ab[[1, 2, 0]] * side_ac[[2, 0, 1]] - side_ab[[2, 0, 1]] * side_ac[[1, 2, 0]]
         self.area = np.sqrt((normal * normal).sum(0)) / 2
 
     def squared(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -343,24 +343,27 @@ def rim_crossings(uv: np.ndarray, ends: np.ndarray, at_once: int = 2_000_000) ->
     # Each with those behind it in order that begin before it ends.
     number = np.searchsorted(low[:, 0], high[:, 0], "right") - np.arange(len(ends)) - 1
     total = np.cumsum(number)
-    start, found, touches = 0, [], False
+    start, crossings, touches = 0, [], False
     while start < len(ends):
         base = total[start - 1] if start else 0
         stop = max(start + 1, int(np.searchsorted(total, base + at_once, "right")))
-        one = np.repeat(np.arange(start, stop), number[start:stop])
-        two = (
-            one + 1 + np.arange(len(one)) - np.repeat(total[start:stop] - number[start:stop] - base, number[start:stop])
+        first = np.repeat(np.arange(start, stop), number[start:stop])
+        second = (
+            first
+            + 1
+            + np.arange(len(first))
+            - np.repeat(total[start:stop] - number[start:stop] - base, number[start:stop])
         )
-        near = (low[one, 1] <= high[two, 1]) & (low[two, 1] <= high[one, 1])
-        pair = np.stack([one[near], two[near]], -1)
+        near = (low[first, 1] <= high[second, 1]) & (low[second, 1] <= high[first, 1])
+        pair = np.stack([first[near], second[near]], -1)
         at = ends[pair]
         pair = pair[(at[:, 0, :, None] != at[:, 1, None, :]).all((1, 2))]
         (a, b), (c, d) = uv[ends[pair[:, 0]]].swapaxes(0, 1), uv[ends[pair[:, 1]]].swapaxes(0, 1)
-        one, other = _orientation(a, b, c) * _orientation(a, b, d), _orientation(c, d, a) * _orientation(c, d, b)
-        found.append(pair[(one < 0) & (other < 0)])
-        touches = touches or bool(((one <= 0) & (other <= 0) & (one * other == 0)).any())
+        first, cd_side = _orientation(a, b, c) * _orientation(a, b, d), _orientation(c, d, a) * _orientation(c, d, b)
+        crossings.append(pair[(first < 0) & (cd_side < 0)])
+        touches = touches or bool(((first <= 0) & (cd_side <= 0) & (first * cd_side == 0)).any())
         start = stop
-    return np.unique(order[np.concatenate(found).ravel()]) if found else np.zeros(0, np.int64), touches
+    return np.unique(order[np.concatenate(crossings).ravel()]) if crossings else np.zeros(0, np.int64), touches
 
 
 def _orientation(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:

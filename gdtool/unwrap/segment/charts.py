@@ -248,14 +248,14 @@ def tidy_labels(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> tu
             break
         key, inverse = np.unique(pair[mine][:, 0] * len(area) + pair[mine][:, 1], return_inverse=True)
         total = np.bincount(inverse.ravel(), weight[mine])
-        onto = np.arange(len(area))
+        merged_into = np.arange(len(area))
         for k in np.argsort(total, kind="stable").tolist():
-            onto[key[k] // len(area)] = key[k] % len(area)
+            merged_into[key[k] // len(area)] = key[k] % len(area)
         # Two small neighbours must not swap: only toward the larger, or the lower number.
-        target = onto
+        target = merged_into
         swap = (target[target] == np.arange(len(area))) & (target > np.arange(len(area)))
-        onto = np.where(swap, np.arange(len(area)), target)
-        label = adjacency.connected_labels(onto[label])
+        merged_into = np.where(swap, np.arange(len(area)), target)
+        label = adjacency.connected_labels(merged_into[label])
         part = label if turn == 0 else part
     return label, part
 
@@ -279,7 +279,7 @@ def split_in_half(adjacency: Adjacency, faces_idx: np.ndarray) -> np.ndarray:
         distance = dijkstra(graph, indices=start)
         return int(np.where(np.isfinite(distance), distance, -1).argmax()), distance
 
-    one, _ = far_from(0)
-    two, from_one = far_from(one)
-    _, from_two = far_from(two)
-    return from_two < from_one
+    first, _ = far_from(0)
+    second, from_first = far_from(first)
+    _, from_second = far_from(second)
+    return from_second < from_first

@@ -46,15 +46,15 @@ def merge_small_charts(
         # Seams in the open count ten times those on creases (Adjacency.cost).
         seam = np.bincount(inverse.ravel(), adjacency.cost[is_seam])
         area = np.bincount(proxy_label[proxy_label >= 0], adjacency.area[proxy_label >= 0], count)
-        one, two = key // count, key % count
-        smaller = np.minimum(area[one], area[two])
+        first, second = key // count, key % count
+        smaller = np.minimum(area[first], area[second])
         priority = np.where(smaller < _SMALL_SHARE * total, seam / np.sqrt(smaller + 1e-300), 0)
         for k in np.argsort(-priority, kind="stable").tolist():
-            if priority[k] > 0 and (int(one[k]), int(two[k])) not in tried:
+            if priority[k] > 0 and (int(first[k]), int(second[k])) not in tried:
                 break
         else:
             break
-        i, j = int(one[k]), int(two[k])
+        i, j = int(first[k]), int(second[k])
         tried.add((i, j))
         points, triangles = chart_mesh(proxy_vertices, proxy[(proxy_label == i) | (proxy_label == j)])
         if (
