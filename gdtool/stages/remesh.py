@@ -1,7 +1,7 @@
 """Surface to clean quads: about as many as asked, along creases and flat parts, watertight where the surface is.
 
 Use it after reconstruct, or on any mesh file (.obj, .ply, .stl, .glb) whose triangles you want to edit, subdivide or
-animate. Bevels that marching cubes left are drawn out to the creases they cut off. A mesh that already meets the
+animate. Bevels that marching cubes left are restored to the creases they cut off. A mesh that already meets the
 request is passed through. --triangles N decimates instead; --symmetry auto mirrors one half where the surface allows
 it.
 

@@ -1,4 +1,4 @@
-"""Mesh to atlas: few charts, cut along quad edges and creases, laid flat without mirroring and packed for mip-mapping.
+"""Mesh to atlas: few charts, cut along quad edges and creases, flattened without mirroring and packed for mip-mapping.
 
 Use it after remesh, or on a mesh file of your own. Texture coordinates that a mesh already has are kept when they are
 valid, unless --redo. With --symmetry the halves of a symmetric mesh share their texels. layout.png shows the charts,

@@ -40,13 +40,15 @@ def test_a_folded_quad_goes_and_its_surroundings_stay(apart):
     assert topology.is_watertight(quads)
     assert len(quads) == len(faces) + 1
     assert scaled_jacobian(torn, quads).min() < 0.05
-    out, found, _ = collapse_folded_quads(torn, quads, target_of_quads(vertices, faces), Constraints.none(len(torn)))
-    assert len(found) == len(faces)
+    out, quads_out, _ = collapse_folded_quads(
+        torn, quads, target_of_quads(vertices, faces), Constraints.none(len(torn))
+    )
+    assert len(quads_out) == len(faces)
     assert len(out) == len(vertices)
-    assert topology.is_watertight(found)
-    assert topology.is_manifold(found)
-    assert topology.euler_number(found) == topology.euler_number(faces)
-    assert scaled_jacobian(out, found).min() > 0.8 * scaled_jacobian(vertices, faces).min()
+    assert topology.is_watertight(quads_out)
+    assert topology.is_manifold(quads_out)
+    assert topology.euler_number(quads_out) == topology.euler_number(faces)
+    assert scaled_jacobian(out, quads_out).min() > 0.8 * scaled_jacobian(vertices, faces).min()
     assert len(np.unique(np.concatenate([out, vertices]).round(9), axis=0)) <= len(vertices) + 1
 
 
@@ -55,23 +57,23 @@ def test_what_is_held_stays():
     torn, quads, new = opened(vertices, faces, 17, 0.1)
     constraints = Constraints.none(len(torn))
     constraints.curve[[new[0], new[2]]] = 0
-    out, found, _ = collapse_folded_quads(
+    out, quads_out, _ = collapse_folded_quads(
         torn, quads, target_of_quads(vertices, faces), replace(constraints, fixed=np.ones(len(torn), bool))
     )
     assert out is torn
-    assert found is quads
+    assert quads_out is quads
     # One of the two is held: it is the one that stays, where it was.
     constraints.curve[new[2]] = -1
-    out, found, after = collapse_folded_quads(torn, quads, target_of_quads(vertices, faces), constraints)
-    assert len(found) == len(faces)
+    out, quads_out, after = collapse_folded_quads(torn, quads, target_of_quads(vertices, faces), constraints)
+    assert len(quads_out) == len(faces)
     assert (after.curve >= 0).sum() == 1
     assert (out[after.curve >= 0] == torn[new[0]]).all()
 
 
 def test_nothing_happens_without_folded_quads():
     vertices, faces = quad_torus()
-    out, found, _ = collapse_folded_quads(
+    out, quads_out, _ = collapse_folded_quads(
         vertices, faces, target_of_quads(vertices, faces), Constraints.none(len(vertices))
     )
     assert out is vertices
-    assert found is faces
+    assert quads_out is faces

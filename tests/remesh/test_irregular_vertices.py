@@ -29,15 +29,15 @@ def test_an_opened_vertex_closes_again():
     more_points, more = opened(points, quads, 40)
     assert topology.is_watertight(more)
     assert (valences(more, len(more_points))[0] != 4).sum() == 4
-    out, found = cancel_irregular(more_points, more)
-    assert len(found) == len(quads)
-    assert topology.is_watertight(found)
-    assert topology.is_manifold(found)
-    assert (valences(found, len(out))[0] == 4).all()
+    out, quads_out = cancel_irregular(more_points, more)
+    assert len(quads_out) == len(quads)
+    assert topology.is_watertight(quads_out)
+    assert topology.is_manifold(quads_out)
+    assert (valences(quads_out, len(out))[0] == 4).all()
 
 
 def test_a_regular_mesh_stays():
     points, quads = quad_torus()
-    out, found = cancel_irregular(points, quads)
-    assert (found == quads).all()
+    out, quads_out = cancel_irregular(points, quads)
+    assert (quads_out == quads).all()
     assert (out == points).all()

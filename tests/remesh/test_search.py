@@ -10,8 +10,8 @@ from gdtool.core.child import ChildFailed
 from gdtool.geometry import topology
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.topology import triangulated
-from gdtool.remesh import pipeline as quads
-from gdtool.remesh.engines import candidate as quad_candidate
+from gdtool.remesh import pipeline
+from gdtool.remesh.engines import candidate as candidates
 from gdtool.remesh.engines import search
 from gdtool.remesh.engines.candidate import Candidate
 from gdtool.remesh.fit.feature_curves import Constraints
@@ -26,28 +26,28 @@ from tests.remesh.engines import Ended, around, in_this_process, inner_face, who
 def test_dead_engine_is_replaced(monkeypatch, failure):
     monkeypatch.setattr(search, "begin", lambda *_, **__: Ended(ChildFailed(failure)))
     vertices, faces = torus()
-    _, found, record = quads.remesh(vertices / 2, faces, Request(quads=900))
+    _, quads_out, record = pipeline.remesh(vertices / 2, faces, Request(quads=900))
     assert record.engine == "pair and split"
     assert any(failure in text for text in record.failed)
-    assert whole(found)
-    assert abs(len(found) / 900 - 1) <= 0.03
+    assert whole(quads_out)
+    assert abs(len(quads_out) / 900 - 1) <= 0.03
 
 
 @pytest.mark.parametrize("outcome, runs", [("a smaller sphere", 1), ("a crash", 3)])
 def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypatch, outcome, runs):
     """Another density or no creases mend a seam that tore; a part that is too fine for the quads stays so."""
     vertices, faces = sphere(24)
-    out, found, _ = quads.remesh(vertices / 2, faces, Request(quads=1000, engine="split"))
+    out, quads_out, _ = pipeline.remesh(vertices / 2, faces, Request(quads=1000, engine="split"))
 
     def engine(*_):
         if outcome == "a crash":
             raise ChildFailed("died of SIGSEGV")
-        return out / 2, found
+        return out / 2, quads_out
 
     calls = in_this_process(monkeypatch, engine)
     # Drawn onto the large sphere the small one would become it.
     monkeypatch.setattr(
-        quad_candidate,
+        candidates,
         "snap_to_features",
         lambda vertices, faces, *_: SnappedQuads(
             vertices,
@@ -60,10 +60,10 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
             hopeless=True,
         ),
     )
-    _, found, record = quads.remesh(vertices / 2, faces, Request(quads=1000))
+    _, quads_out, record = pipeline.remesh(vertices / 2, faces, Request(quads=1000))
     assert len(calls) == runs
     assert record.engine == "pair and split"
-    assert whole(found)
+    assert whole(quads_out)
     assert outcome == "a crash" or "strays" in record.failed[0]
 
 
@@ -75,11 +75,11 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
 def test_of_two_the_one_much_nearer_to_the_surface_comes_first_where_the_other_is_in_doubt(tops, wanted, order):
     """Balls without a cap, and whole ones."""
     vertices, faces = sphere(24, 0.4)
-    out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
+    out, quads_out, _ = pipeline.remesh(vertices, faces, Request(quads=1000, engine="split"))
     patch = RemeshPatch(vertices, faces, 1000, 0.045, Request(), None)
     attempt = search.EngineAttempt("instant-meshes", 0, (1.0,), 30.0)
     pair = [
-        Candidate(attempt, 1000, None, *topology.compact(out, found[out[found].mean(1)[:, 2] < height]))
+        Candidate(attempt, 1000, None, *topology.compact(out, quads_out[out[quads_out].mean(1)[:, 2] < height]))
         for height in tops
     ]
     assert [id(one) for one in search.EngineSearch(patch, Record())._nearer_first(pair, wanted)] == [
@@ -91,24 +91,24 @@ def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(mon
     """Half a ball, a tenth too few quads; a whole one lacks nothing, nor one without a cap that its tip can be drawn
     over."""
     vertices, faces = sphere(24, 0.4)
-    out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
+    out, quads_out, _ = pipeline.remesh(vertices, faces, Request(quads=1000, engine="split"))
     patch = RemeshPatch(vertices, faces, 1000, 0.045, Request(), None)
-    height = out[found].mean(1)[:, 2]
+    height = out[quads_out].mean(1)[:, 2]
     left = [
         Candidate(
             search.EngineAttempt("instant-meshes", 0, (1.0,), 30.0),
             1000,
             None,
-            *topology.compact(out, found[height < most]),
+            *topology.compact(out, quads_out[height < most]),
         ).missing_surface(patch)
         for most in (1.0, 0.37, 0.0)
     ]
     assert left[:2] == [None, None]
     assert "leaves out 3" in left[2]
-    calls = in_this_process(monkeypatch, lambda *_: topology.compact(out, found[height < 0.0]))
-    monkeypatch.setattr(quad_candidate, "repair_and_judge", lambda vertices, found, *_: (None, vertices, found))
+    calls = in_this_process(monkeypatch, lambda *_: topology.compact(out, quads_out[height < 0.0]))
+    monkeypatch.setattr(candidates, "repair_and_judge", lambda vertices, quads_out, *_: (None, vertices, quads_out))
     monkeypatch.setattr(search.EngineSearch, "_fit_first_good", None)
-    _, _, record = quads.remesh(vertices, faces, Request(quads=1000))
+    _, _, record = pipeline.remesh(vertices, faces, Request(quads=1000))
     assert len(calls) == 1
     assert record.engine == "pair and split"
     assert "leaves out" in record.failed[0]
@@ -133,8 +133,8 @@ def test_a_coarser_mesh_is_given_up_where_walls_are_thinner_than_quads(thickness
     ).has_thin_walls
     assert not RemeshPatch(vertices, faces[:, ::-1], 4000, patch.edge, Request(), None).has_thin_walls
     # Without creases, or its narrow sides tell.
-    _, found, record = quads.remesh(vertices, faces, Request(quads=4000, crease_degrees=0.0))
-    assert whole(found)
+    _, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000, crease_degrees=0.0))
+    assert whole(quads_out)
     assert any("walls" in text for text in record.failed) == thin
     assert not (thin and "1 subdivision" in record.engine)
 
@@ -157,16 +157,16 @@ def bored_ball():
 @pytest.mark.parametrize("shape, given_up", [("a skin-deep tunnel", True), ("a bore", False)])
 def test_a_handle_is_given_up_only_where_it_is_finer_than_a_quad(monkeypatch, shape, given_up):
     vertices, faces = sphere(96, 0.4)
-    out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
+    out, quads_out, _ = pipeline.remesh(vertices, faces, Request(quads=1000, engine="split"))
     vertices, faces = with_tunnel(vertices, faces, 0.07) if given_up else bored_ball()
     assert topology.is_watertight(faces)
     assert topology.is_manifold(faces)
     assert topology.euler_number(faces) == 0
-    in_this_process(monkeypatch, lambda *_: (out, found))  # an engine that makes a ball of it
-    _, found, record = quads.remesh(vertices, faces, Request(quads=1000))
-    assert whole(found)
+    in_this_process(monkeypatch, lambda *_: (out, quads_out))  # an engine that makes a ball of it
+    _, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=1000))
+    assert whole(quads_out)
     assert (record.engine == "instant-meshes, handles are lost") == given_up
-    assert topology.euler_number(found) == (2 if given_up else 0)
+    assert topology.euler_number(quads_out) == (2 if given_up else 0)
 
 
 def test_torn_output_is_not_believed(monkeypatch):
@@ -174,8 +174,8 @@ def test_torn_output_is_not_believed(monkeypatch):
     book = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [1, 0, 6, 7]])
     in_this_process(monkeypatch, lambda *_: (np.random.default_rng(0).random((8, 3)), book))
     vertices, faces = sphere(24)
-    _, found, record = quads.remesh(vertices / 2, faces, Request(quads=300))
-    assert whole(found)
+    _, quads_out, record = pipeline.remesh(vertices / 2, faces, Request(quads=300))
+    assert whole(quads_out)
     assert record.engine == "pair and split"
     assert any("pieces are lost" in text for text in record.failed)
 
@@ -187,12 +187,12 @@ def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
     assert len(corners) == 4
     assert len(sides) == 4
     torn = np.delete(faces, [*corners[1:], *sides], 0)
-    fault, out, found = quad_candidate.repair_and_judge(vertices, torn, topology.invariants(faces))
+    fault, out, quads_out = candidates.repair_and_judge(vertices, torn, topology.invariants(faces))
     assert fault is None
-    assert whole(found)
-    assert topology.components(found)[0] == 1
-    assert len(found) < len(faces)
-    assert volume(out, triangulated(found)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
+    assert whole(quads_out)
+    assert topology.components(quads_out)[0] == 1
+    assert len(quads_out) < len(faces)
+    assert volume(out, triangulated(quads_out)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
 
 
 def test_candidates_are_in_the_order_of_place(monkeypatch):
@@ -201,11 +201,9 @@ def test_candidates_are_in_the_order_of_place(monkeypatch):
     rng = np.random.default_rng(1)
     mixed, number = rng.permutation(len(vertices)), np.empty(len(vertices), np.int64)
     number[mixed] = np.arange(len(vertices))
-    monkeypatch.setitem(
-        quad_candidate.ENGINES, "quadriflow", lambda *_: (vertices[mixed], rng.permutation(number[faces]))
-    )
-    one = quad_candidate.make_candidate(
-        vertices, triangulated(faces)[0], quad_candidate.EngineAttempt("quadriflow", 0, (1.0,), 30.0), len(faces)
+    monkeypatch.setitem(candidates.ENGINES, "quadriflow", lambda *_: (vertices[mixed], rng.permutation(number[faces])))
+    one = candidates.make_candidate(
+        vertices, triangulated(faces)[0], candidates.EngineAttempt("quadriflow", 0, (1.0,), 30.0), len(faces)
     )
     assert one.fault is None
     assert len(one.quads) == len(faces)
@@ -221,9 +219,7 @@ def test_candidates_are_in_the_order_of_place(monkeypatch):
 
 def test_output_without_area_is_no_quads():
     vertices, faces = quad_cube(1)
-    assert (
-        quad_candidate.repair_and_judge(vertices, faces[:, [0, 1, 1, 0]], topology.invariants(faces))[0] == "no quads"
-    )
+    assert candidates.repair_and_judge(vertices, faces[:, [0, 1, 1, 0]], topology.invariants(faces))[0] == "no quads"
 
 
 def test_quads_that_cut_edges_off_do_not_do():
@@ -254,7 +250,7 @@ def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_fine
     """Of a coarser mesh subdivided less is put up with than of a finer one, for the finer one comes after it; where it
     does not, it is better than none."""
 
-    engine = quad_candidate.ENGINES["instant-meshes"]
+    engine = candidates.ENGINES["instant-meshes"]
 
     def torn(vertices, faces, quads, degrees):
         if quads > 2000:
@@ -262,38 +258,38 @@ def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_fine
         return engine(vertices, faces, quads, degrees)
 
     calls = in_this_process(monkeypatch)
-    monkeypatch.setitem(quad_candidate.ENGINES, "instant-meshes", torn)
+    monkeypatch.setitem(candidates.ENGINES, "instant-meshes", torn)
     monkeypatch.setattr(
-        quad_candidate,
+        candidates,
         "rejection_reason",
         lambda *given: ("cuts off 0.7% of the surface" if given[-1] < 0.007 else None, 0.5),
     )
     vertices, faces = sphere(96, 0.45)
-    _, found, record = quads.remesh(vertices, faces, Request(quads=4000))
+    _, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000))
     assert record.engine == "instant-meshes, 1 subdivision"
-    assert whole(found)
-    assert abs(len(found) / 4000 - 1) <= 0.03
+    assert whole(quads_out)
+    assert abs(len(quads_out) / 4000 - 1) <= 0.03
     assert "cuts off" in record.failed[0]
     assert "SIGSEGV" in record.failed[1]
     assert sum(not attempt.subdivisions for _, _, attempt, _ in calls) == 1
-    monkeypatch.setattr(quad_candidate, "FAR_SUBDIVIDED", 0.4)  # farther than that it is not unfolded
-    assert quads.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
+    monkeypatch.setattr(candidates, "FAR_SUBDIVIDED", 0.4)  # farther than that it is not unfolded
+    assert pipeline.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
     monkeypatch.undo()
     in_this_process(monkeypatch)
-    monkeypatch.setitem(quad_candidate.ENGINES, "instant-meshes", torn)
-    monkeypatch.setattr(quad_candidate, "rejection_reason", lambda *given: ("cuts off 2% of the surface", 0.5))
-    assert quads.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
+    monkeypatch.setitem(candidates.ENGINES, "instant-meshes", torn)
+    monkeypatch.setattr(candidates, "rejection_reason", lambda *given: ("cuts off 2% of the surface", 0.5))
+    assert pipeline.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
 
 
 def test_when_the_time_is_over_no_engine_is_begun():
     """What was asked for comes all the same, as paired triangles, and the record says why."""
     vertices, faces = sphere(96, 0.45)
     start = time.monotonic()
-    out, found, record = quads.remesh(vertices, faces, Request(quads=4000, seconds=0.0))
+    out, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000, seconds=0.0))
     assert record.engine == "pair and split"
     assert record.failed == ["instant-meshes, 1 subdivision: not tried, the time is over"]
-    assert whole(found)
-    assert abs(len(found) / 4000 - 1) <= 0.03
+    assert whole(quads_out)
+    assert abs(len(quads_out) / 4000 - 1) <= 0.03
     assert time.monotonic() - start < 30
 
 
@@ -323,7 +319,7 @@ def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypa
     drawn = []
 
     def candidate(far, least, wrong=None, outline=0.5):
-        found = Candidate(
+        quads_out = Candidate(
             attempt,
             1000,
             None,
@@ -333,8 +329,8 @@ def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypa
             min_jacobian=least,
             rejection=wrong,
         )
-        found.asked_of_outline = outline
-        return found
+        quads_out.asked_of_outline = outline
+        return quads_out
 
     def snap_to_features(one, patch):
         one.snapped = one.asked_of_outline
@@ -368,11 +364,11 @@ def test_the_quads_of_tips_count_before_any_are_drawn(monkeypatch):
     search_run = search.EngineSearch(RemeshPatch(*cube(), 4000, 0.1, Request(), None), Record())
 
     def candidate(count, tips, hopeless=False):
-        found = Candidate(attempt, count, None, np.zeros((0, 3)), np.zeros((count // 4, 4), int))
-        found.traced = SnappedQuads(
+        quads_out = Candidate(attempt, count, None, np.zeros((0, 3)), np.zeros((count // 4, 4), int))
+        quads_out.traced = SnappedQuads(
             np.zeros((0, 3)), np.zeros((count + tips, 4), int), None, np.zeros(0, int), 0.1, 0.0, 1.0, hopeless
         )
-        return found
+        return quads_out
 
     monkeypatch.setattr(Candidate, "snap", lambda one, patch: setattr(one, "snapped", one.traced))
     plain, far, fewer = candidate(4000, 0), candidate(4100, 100), candidate(3900, 100)
@@ -390,14 +386,14 @@ def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypat
     calls = in_this_process(monkeypatch)
     vertices, faces = cube()
     vertices = vertices * (1, 0.8, 0.02)
-    out, found, record = quads.remesh(vertices, faces, Request(quads=8000))
+    out, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=8000))
     assert all(not attempt.subdivisions for _, _, attempt, _ in calls)
     assert "not tried, its quads are wider" in record.failed[0]
     assert record.engine == "instant-meshes"
-    assert whole(found)
+    assert whole(quads_out)
     corners = vertices[np.abs(vertices[:, None] - out[None]).max(-1).min(1) < 1e-9]
     assert len(corners) == 8
-    assert uncovered_shares(target_of_quads(out, found), ProjectionTarget(vertices, faces), (0.005,)) == [0.0]
+    assert uncovered_shares(target_of_quads(out, quads_out), ProjectionTarget(vertices, faces), (0.005,)) == [0.0]
 
 
 @pytest.mark.parametrize("given, least, most", [(16000, 2000, 2500), (500, 500, 500)])
@@ -411,8 +407,8 @@ def test_an_engine_has_a_memory_limit_of_its_own_within_the_request(monkeypatch,
 
     monkeypatch.setattr(search, "begin", begin)
     vertices, faces = sphere(48, 0.45)
-    _, found, record = quads.remesh(vertices, faces, Request(quads=4000, memory_mb=given))
+    _, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000, memory_mb=given))
     assert limits
     assert all(least <= limit <= most for limit in limits)
     assert record.engine == "pair and split"
-    assert whole(found)
+    assert whole(quads_out)

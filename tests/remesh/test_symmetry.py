@@ -45,8 +45,8 @@ def test_halves_of_a_box_close():
     side = (vertices[quads][..., 0] < 0).all(1)
     half = vertices.copy()
     half[:, 0] = np.where(half[:, 0] < 0, 0.02, half[:, 0])  # the open end near the plane
-    out, found = join_with_mirror(half, quads[~side], 0, 0.5)
-    assert len(found) == 10
-    assert topology.is_watertight(found)
+    out, quads_out = join_with_mirror(half, quads[~side], 0, 0.5)
+    assert len(quads_out) == 10
+    assert topology.is_watertight(quads_out)
     assert np.ptp(out[:, 0]) == pytest.approx(1)
     assert (np.abs(out[:, 0]) < 1e-12).sum() == 4

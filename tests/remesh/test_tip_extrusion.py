@@ -42,14 +42,14 @@ def test_a_horn_is_drawn_out(length, bend):
     vertices, faces, edge = ball()
     surface = ProjectionTarget(*horned(length, bend=bend))
     assert max_distance(target_of_quads(vertices, faces), surface) > 1.4 * edge
-    out, found, constraints, tips, _, _ = extrude_tips(
+    out, quads_out, constraints, tips, _, _ = extrude_tips(
         vertices, faces, Constraints.none(len(vertices)), surface, edge, max_added=0.3
     )
-    assert max_distance(target_of_quads(out, found), surface) < 0.8 * edge
-    assert topology.is_watertight(found)
-    assert topology.is_manifold(found)
-    assert topology.euler_number(found) == 2
-    assert len(faces) < len(found) < 1.2 * len(faces)
+    assert max_distance(target_of_quads(out, quads_out), surface) < 0.8 * edge
+    assert topology.is_watertight(quads_out)
+    assert topology.is_manifold(quads_out)
+    assert topology.euler_number(quads_out) == 2
+    assert len(faces) < len(quads_out) < 1.2 * len(faces)
     assert len(tips)
     assert constraints.fixed[tips].all()
     assert len(constraints.curve) == len(out)
@@ -63,18 +63,18 @@ def test_a_horn_is_drawn_out(length, bend):
 
 def test_no_more_quads_than_allowed_are_spent():
     vertices, faces, edge = ball()
-    found = extrude_tips(
+    quads_out = extrude_tips(
         vertices, faces, Constraints.none(len(vertices)), ProjectionTarget(*horned(0.25)), edge, max_added=0.01
     )[1]
-    assert 0 < len(found) - len(faces) < 0.01 * len(faces) + 40  # those of the step that went over it
+    assert 0 < len(quads_out) - len(faces) < 0.01 * len(faces) + 40  # those of the step that went over it
 
 
 def test_what_is_near_enough_is_left_alone():
     vertices, faces, edge = ball()
     surface = ProjectionTarget(*horned(0.4 * edge))
-    out, found, _, tips, far, _ = extrude_tips(vertices, faces, Constraints.none(len(vertices)), surface, edge)
+    out, quads_out, _, tips, far, _ = extrude_tips(vertices, faces, Constraints.none(len(vertices)), surface, edge)
     assert out is vertices
-    assert found is faces
+    assert quads_out is faces
     assert not len(tips)
     assert far == pytest.approx(0.4 * edge, rel=0.2)
 
@@ -114,8 +114,10 @@ def test_one_vertex_reaches_a_tip_that_is_less_than_an_edge_away():
     vertices, faces, edge = ball()
     surface = ProjectionTarget(*horned(0.9 * edge))
     assert 0.6 * edge < max_distance(target_of_quads(vertices, faces), surface) < edge
-    out, found, constraints, tips, _, _ = extrude_tips(vertices, faces, Constraints.none(len(vertices)), surface, edge)
-    assert found is faces
+    out, quads_out, constraints, tips, _, _ = extrude_tips(
+        vertices, faces, Constraints.none(len(vertices)), surface, edge
+    )
+    assert quads_out is faces
     assert max_distance(target_of_quads(out, faces), surface) < 0.4 * edge
     assert len(tips) == 1
     assert constraints.fixed[tips].all()
@@ -131,8 +133,8 @@ def test_paths_along_creases_end_where_a_tip_is_drawn_out():
     curve = np.full(len(vertices), -1)
     curve[around] = 0
     held = Constraints(curve, np.zeros(len(vertices), bool), path, np.zeros(len(path), int))
-    _, found, constraints, tips, _, _ = extrude_tips(vertices, faces, held, ProjectionTarget(*horned(0.2)), edge)
-    edges = set(map(tuple, topology.edges_of(found).ends.tolist()))
+    _, quads_out, constraints, tips, _, _ = extrude_tips(vertices, faces, held, ProjectionTarget(*horned(0.2)), edge)
+    edges = set(map(tuple, topology.edges_of(quads_out).ends.tolist()))
     assert 0.8 * len(path) < len(constraints.path) < len(path)
     assert all(tuple(sorted(ends)) in edges for ends in constraints.path.tolist())
     assert (constraints.curve[tips] < 0).all()
@@ -142,13 +144,13 @@ def test_an_engine_that_cuts_a_horn_short_is_still_taken(monkeypatch):
     vertices, faces = horned(0.35, 0.04)
     asked = Request(quads=2000)
     edge = (4 * np.pi * 0.4**2 / 2000) ** 0.5
-    out, found, record = pipeline.remesh(vertices, faces, asked)
-    figures = distance_figures(out, triangulated(found)[0], vertices, faces, 20000)
+    out, quads_out, record = pipeline.remesh(vertices, faces, asked)
+    figures = distance_figures(out, triangulated(quads_out)[0], vertices, faces, 20000)
     assert "instant-meshes" in record.engine
-    assert abs(len(found) / 2000 - 1) <= 0.03
-    assert topology.is_watertight(found)
+    assert abs(len(quads_out) / 2000 - 1) <= 0.03
+    assert topology.is_watertight(quads_out)
     assert figures["hausdorff"] < 2 * edge
-    assert (scaled_jacobian(out, found) <= 0).mean() < 0.003
+    assert (scaled_jacobian(out, quads_out) <= 0).mean() < 0.003
     in_this_process(monkeypatch)
     monkeypatch.setattr(
         shaping, "extrude_tips", lambda v, f, constraints, *_: (v, f, constraints, None, 0.0, np.zeros(1))
