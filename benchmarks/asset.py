@@ -214,12 +214,12 @@ def beside_three(asset: Path) -> dict[str, float]:
 
 def charts(case: Case, size: int) -> np.ndarray:
     """(size, size, 3) of the texture coordinates."""
-    from gdtool.unwrap.pipeline import islands
+    from gdtool.unwrap.pipeline import uv_islands
     from gdtool.unwrap.preview import layout
 
     low = read_low(case)
     faces, face_uvs = low.faces.astype(np.int64), low.face_uvs.astype(np.int64)
-    return layout(faces, low.uv, face_uvs, islands(low.vertices, faces, face_uvs)[0], size)
+    return layout(faces, low.uv, face_uvs, uv_islands(low.vertices, faces, face_uvs)[0], size)
 
 
 def baked(case: Case, folder: Path) -> tuple[Path, dict[str, float]]:

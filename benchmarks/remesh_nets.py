@@ -3,9 +3,9 @@ without them.
 
     python benchmarks/remesh_nets.py [-o docs/benchmarks] [--grid 140]
 
-Struts and Schwarz' P surface, marched. "as they are": the limits of quads._FOR_A_HANDLE, quad_ways._FOR_A_HANDLE and
-quad_split._FOR_A_HANDLE; "without": all of them nought. "handles": as many as in the net, or what is made of them.
-Seconds are of quads.remesh alone. Writes remesh_nets.md.
+Struts and Schwarz' P surface, marched. "as they are": the limits _MIN_QUADS_PER_HANDLE of remesh.pipeline and
+remesh.engines.search, and _MIN_TRIANGLES_PER_HANDLE of remesh.fallback.pair_and_split; "without": all of them zero.
+"handles": as many as in the net, or what is made of them. Seconds are of remesh() alone. Writes remesh_nets.md.
 """
 
 from __future__ import annotations
@@ -97,14 +97,21 @@ def main() -> None:
     parser.add_argument("--grid", type=int, default=140, help="points along an edge that the nets are marched on")
     given = parser.parse_args()
     head, rows = busy(), []
-    limits = {module: module._FOR_A_HANDLE for module in (quads, search, pair_and_split)}
+    limits = {
+        (module, name): getattr(module, name)
+        for module, name in (
+            (quads, "_MIN_QUADS_PER_HANDLE"),
+            (search, "_MIN_QUADS_PER_HANDLE"),
+            (pair_and_split, "_MIN_TRIANGLES_PER_HANDLE"),
+        )
+    }
     for kind, cells in NETS:
         vertices, faces = net(kind, cells, given.grid)
         handles = topology.handles(faces, topology.components(faces)[0])
         for count in COUNTS:
             for name in ("as they are", "without"):
-                for module, limit in limits.items():
-                    module._FOR_A_HANDLE = limit if name == "as they are" else 0
+                for (module, constant), limit in limits.items():
+                    setattr(module, constant, limit if name == "as they are" else 0)
                 say(f"{kind} {cells}: {count}, limits {name}")
                 rows.append(
                     {

@@ -98,7 +98,7 @@ def measure(
     from gdtool.core.child import ChildFailed, call
     from gdtool.geometry.topology import triangulated
     from gdtool.images.io import write_png
-    from gdtool.unwrap.pipeline import figures, islands
+    from gdtool.unwrap.pipeline import figures, uv_islands
     from gdtool.unwrap.preview import checkerboard, layout
 
     triangles = triangulated(faces)[0].astype(np.int64)
@@ -123,7 +123,7 @@ def measure(
                 "overlap": overlapping(mine, uv, face_uvs),
             }
             if way in ("ours", "xatlas", BLENDER):
-                chart = islands(vertices, mine, face_uvs)[0]
+                chart = uv_islands(vertices, mine, face_uvs)[0]
                 (asked.kept / "pictures").mkdir(parents=True, exist_ok=True)
                 write_png(
                     asked.kept / "pictures" / file_name(name, f"{way} layout"), layout(mine, uv, face_uvs, chart, 420)

@@ -1,4 +1,4 @@
-"""How many quads a surface needs: the coarsest mesh within a distance."""
+"""Find how many quads a surface needs: the count of a quad size, and the coarsest mesh within a distance."""
 
 from __future__ import annotations
 
@@ -7,41 +7,63 @@ from dataclasses import replace
 
 import numpy as np
 
+from gdtool.geometry import topology
+from gdtool.geometry.normals import face_normals
 from gdtool.geometry.simplify import deviation
 from gdtool.geometry.topology import triangulated
+from gdtool.remesh.limits import COUNT_TOLERANCE
 from gdtool.remesh.pipeline import remesh
 from gdtool.remesh.task import Record, Request
 
-_FEWEST = 64
-_CLOSE_ENOUGH = 1.15  # counts nearer than this to each other are not told apart
-_MOST_RUNS = 6
+_MIN_QUADS = 64  # fewer are not tried
+_SAME_COUNT = 1.15  # counts within this factor of each other are not told apart: another run gains too little
+_MAX_RUNS = 6
 
 
-def coarsest(
-    vertices: np.ndarray, faces: np.ndarray, request: Request, limit: float, way: Callable[..., tuple] | None = None
+def quads_of_size(vertices: np.ndarray, faces: np.ndarray, size: float) -> int:
+    """Return how many quads with sides of `size` cover the triangles: their area over size squared."""
+    return round(face_normals(vertices, faces)[1].sum() / size**2)
+
+
+def is_finished(quads: np.ndarray, count: int) -> bool:
+    """Whether quads (q, 4) already are about `count`, closed and manifold, so that nothing is left to do."""
+    return (
+        abs(len(quads) / count - 1) <= COUNT_TOLERANCE and topology.is_watertight(quads) and topology.is_manifold(quads)
+    )
+
+
+def coarsest_within(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    request: Request,
+    limit: float,
+    make_quads: Callable[..., tuple] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, Record, float]:
-    """The fewest quads, at most request.quads, that stay within `limit` of the surface, and the distance they reach.
+    """Find the fewest quads, at most request.quads, that stay within the distance `limit` of the surface.
 
-    The distance is of vertices of both meshes to the other surface (simplify.deviation). It falls about as one over the
-    number of quads, which tells the next number to try; when even request.quads are too few they are returned. way:
-    what makes quads, called as remesh is."""
-    too_few, enough = min(_FEWEST, request.quads) / _CLOSE_ENOUGH, None
+    Returns vertices, quads, the record and the distance reached. The distance is the largest from the vertices of
+    either mesh to the other surface (simplify.deviation). It falls about as one over the number of quads, which
+    predicts the next count to try. When even request.quads are too few, those are returned.
+
+    make_quads: called as remesh(vertices, faces, request); None is remesh itself.
+    """
+    too_few, enough = min(_MIN_QUADS, request.quads) / _SAME_COUNT, None
     quads = request.quads
-    for _ in range(_MOST_RUNS):
-        out, found, record = (way or remesh)(vertices, faces, replace(request, quads=quads))
-        reached = deviation(vertices, faces, out, triangulated(found)[0])
+    for _ in range(_MAX_RUNS):
+        quad_vertices, quad_faces, record = (make_quads or remesh)(vertices, faces, replace(request, quads=quads))
+        reached = deviation(vertices, faces, quad_vertices, triangulated(quad_faces)[0])
         if reached <= limit:
-            enough = (quads, (out, found, record, reached))
+            enough = (quads, (quad_vertices, quad_faces, record, reached))
         else:
             if enough is None:
-                return out, found, record, reached
+                return quad_vertices, quad_faces, record, reached
             too_few = quads
-        if enough[0] <= _CLOSE_ENOUGH * too_few or request.for_engines <= 0:
+        if enough[0] <= _SAME_COUNT * too_few or request.engine_seconds_left <= 0:
             break
         guess = quads * 1.05 * reached / limit
         middle = (too_few * enough[0]) ** 0.5
         inside = 1.05 * too_few < guess < 0.95 * enough[0]
-        quads = int(max(guess if inside else middle, min(_FEWEST, request.quads)))
+        quads = int(max(guess if inside else middle, min(_MIN_QUADS, request.quads)))
         if quads >= enough[0]:
             break
     return enough[1]

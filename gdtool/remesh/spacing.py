@@ -1,5 +1,4 @@
-"""Pieces of a mesh laid out beside one another, so that nothing made of one is drawn onto another that it nearly
-touches."""
+"""Move the pieces of a mesh apart before remeshing, so that no quads are fitted to a neighbouring piece."""
 
 from __future__ import annotations
 
@@ -8,34 +7,35 @@ import numpy as np
 from gdtool.geometry import topology
 from gdtool.geometry.distance import closest_points
 
-# Of larger meshes pieces are not looked for; more pieces are left where they are.
-_MOST_FACES, _MOST_PIECES = 200_000, 1000
+_MAX_FACES = 200_000  # pieces of larger meshes are not looked for: that takes too long
+_MAX_PIECES = 1000  # more pieces stay where they are: all pairs of boxes are compared
 
 
-class Spread:
-    """The mesh with its pieces apart: vertices (v, 3), the faces (f, 3) as they were."""
+class SeparatedPieces:
+    """A mesh whose pieces were moved: vertices (v, 3); the faces are those of the input."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, piece: np.ndarray, offset: np.ndarray):
+        """piece (f,): the piece of each face. offset (pieces, 3): how far each piece moves."""
         self._faces, self._piece, self._offset = faces, piece, offset
-        of_vertex = np.zeros(len(vertices), np.int64)
-        of_vertex[faces.ravel()] = np.repeat(piece, 3)
-        self.vertices = vertices + offset[of_vertex]
+        piece_of_vertex = np.zeros(len(vertices), np.int64)
+        piece_of_vertex[faces.ravel()] = np.repeat(piece, 3)
+        self.vertices = vertices + offset[piece_of_vertex]
 
-    def back(self, vertices: np.ndarray) -> np.ndarray:
-        """Where points (n, 3) on or near the spread pieces were before."""
-        return vertices - self._offset[self._piece[closest_points(vertices, self.vertices, self._faces)[1]]]
+    def to_original(self, points: np.ndarray) -> np.ndarray:
+        """Move points (n, 3) on or near the separated pieces back to where the pieces came from."""
+        return points - self._offset[self._piece[closest_points(points, self.vertices, self._faces)[1]]]
 
 
-def spread(vertices: np.ndarray, faces: np.ndarray, gap: float) -> Spread | None:
-    """The pieces in rows, their bounding boxes `gap` apart at least; None where they are so already, or are too many to
-    tell.
+def separate_pieces(vertices: np.ndarray, faces: np.ndarray, gap: float) -> SeparatedPieces | None:
+    """Place the pieces in rows, with at least `gap` between their bounding boxes.
 
-    vertices (v, 3), faces (f, 3).
+    vertices (v, 3), faces (f, 3). Returns None where the boxes are that far apart already, or where the mesh or the
+    number of its pieces is too large.
     """
-    if len(faces) > _MOST_FACES:
+    if len(faces) > _MAX_FACES:
         return None
     count, piece = topology.components(faces)
-    if not 1 < count <= _MOST_PIECES:
+    if not 1 < count <= _MAX_PIECES:
         return None
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     for corner in faces.T:
@@ -45,11 +45,11 @@ def spread(vertices: np.ndarray, faces: np.ndarray, gap: float) -> Spread | None
     if (meet & meet.T).sum() == count:
         return None
     size = high - low + gap
-    width = max((size[:, 0] * size[:, 1]).sum() ** 0.5, size[:, 0].max())
-    place, x, y, row = np.zeros((count, 3)), 0.0, 0.0, 0.0
+    row_width = max((size[:, 0] * size[:, 1]).sum() ** 0.5, size[:, 0].max())
+    position, x, y, row_height = np.zeros((count, 3)), 0.0, 0.0, 0.0
     for k in np.argsort(-size[:, 1], kind="stable").tolist():
-        if x + size[k, 0] > width:
-            x, y, row = 0.0, y + row, 0.0
-        place[k, :2] = x, y
-        x, row = x + size[k, 0], max(row, size[k, 1])
-    return Spread(vertices, faces, piece, place - low)
+        if x + size[k, 0] > row_width:
+            x, y, row_height = 0.0, y + row_height, 0.0
+        position[k, :2] = x, y
+        x, row_height = x + size[k, 0], max(row_height, size[k, 1])
+    return SeparatedPieces(vertices, faces, piece, position - low)

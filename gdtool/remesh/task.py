@@ -1,4 +1,4 @@
-"""What remeshing is asked for, what it works on, and the record of what it did."""
+"""Values of remeshing: the request, the record of what was done, the patch to remesh, and its quads."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,82 +16,101 @@ from gdtool.geometry.normals import face_normals
 from gdtool.geometry.rays import RayCaster
 from gdtool.geometry.vectors import dot
 from gdtool.remesh.fit.feature_curves import Features, find_features
-from gdtool.remesh.fit.surface_projection import Surface
+from gdtool.remesh.fit.surface_projection import ProjectionTarget
+from gdtool.remesh.limits import COUNT_TOLERANCE, QUADS_OF_A_PIECE
 
-COUNT_TOLERANCE = 0.03
-QUADS_OF_A_PIECE = 12  # at least
-_ENGINES_SHARE, _LEAST_SECONDS = 0.7, 20.0
-_SHORTEST_RUN = 0.05  # seconds
-_NARROW_EDGES, _FEW_NARROW = 1.5, 0.05  # share of the creases' length
-_WALL_EDGES, _PARALLEL, _FEW_THIN = 2.0, 0.9, 7e-4  # cosine between the two sides of a wall; share of the surface
-_RAYS, _OFF = 20_000, 1e-4  # edge lengths under the surface that they start
-_FEATURE_EDGES = 3  # quads long: shorter creases are noise
-# About as few as were found to keep one: 40 of a torus of one handle, 21 a handle of a lattice of 28.
+# Share of the time limit in which engines may start; the rest is for steps that need no engine.
+_ENGINES_SHARE = 0.7
+_MIN_FALLBACK_SECONDS = 20.0  # for steps without which there is no result, however late it is
+_MIN_CHILD_SECONDS = 0.05
+
+# Edge lengths: creases nearer to each other than this form a strip too narrow for a coarser mesh ...
+_NARROW_EDGES = 1.5
+_MAX_NARROW_SHARE = 0.05  # ... and this share of the creases' length may lie in strips.
+_WALL_EDGES = 2.0  # edge lengths: walls thinner than this are too thin for a coarser mesh
+_WALL_COSINE = 0.9  # least cosine between the normals of a wall's two sides; below it is a wedge
+_MAX_WALL_SHARE = 7e-4  # of the surface may bound thin walls
+_WALL_RAYS = 20_000  # cast into the surface to find walls
+_RAY_OFFSET = 1e-4  # edge lengths: rays start this far under the surface
+_MIN_FEATURE_EDGES = 3  # edge lengths: shorter features are noise
+
+# Faces for each handle below which count_reason() names the handles: about as few as were found to keep one (40 of a
+# torus of one handle, 21 a handle of a lattice of 28).
 _FACES_OF_A_HANDLE = 40
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for: about `quads` faces; creases sharper than crease_degrees followed; time limit of the whole,
-    memory limit of a child."""
+    """What the caller asks for: about `quads` quads that follow creases sharper than `crease_degrees`.
+
+    `seconds` limits the whole run, counted from when the request is made; `memory_mb` limits one child process.
+    """
 
     quads: int = 20000
     crease_degrees: float = 30.0
     engine: str = "auto"
     smooth_iterations: int = 5
     restore_creases: bool = True
-    # From when the request is made; engines have a share of them, the rest is for what needs none.
     seconds: float = 120.0
     memory_mb: int = 16000
-    least_jacobian: float = 0.0  # a coarser mesh subdivided is passed over where its worst quad is worse
-    begun: float = field(default_factory=time.monotonic)
+    min_jacobian: float = 0.0  # a subdivided result whose worst quad has a smaller scaled Jacobian is rejected
+    started: float = field(default_factory=time.monotonic)
 
     @property
-    def for_engines(self) -> float:
-        """Seconds in which engines may still be tried; below zero when what is not done by then goes without one."""
-        return self.begun + _ENGINES_SHARE * self.seconds - time.monotonic()
+    def engine_seconds_left(self) -> float:
+        """Seconds in which engines may still start; 0 or less when the time for engines is over."""
+        return self.started + _ENGINES_SHARE * self.seconds - time.monotonic()
 
     @property
-    def for_a_run(self) -> float:
-        """Seconds that a child has, which works for an engine."""
-        return max(self.for_engines, _SHORTEST_RUN)
+    def child_seconds(self) -> float:
+        """Time limit of one engine's child process, in seconds."""
+        return max(self.engine_seconds_left, _MIN_CHILD_SECONDS)
 
     @property
-    def for_the_rest(self) -> float:
-        """Seconds for what a result cannot do without: those left, and some however late it is."""
-        return max(self.begun + self.seconds - time.monotonic(), _LEAST_SECONDS)
+    def fallback_seconds(self) -> float:
+        """Seconds for steps without which there is no result: what is left of the whole, and never too few."""
+        return max(self.started + self.seconds - time.monotonic(), _MIN_FALLBACK_SECONDS)
+
+
+class QuadResult(NamedTuple):
+    """Quads of a patch, and the method that made them as the manifest names it.
+
+    vertices (v, 3), quads (q, 4).
+    """
+
+    vertices: np.ndarray
+    quads: np.ndarray
+    method: str
 
 
 @dataclass
 class Record:
-    """What was done: the engine whose result was taken, what was tried before and why not, figures, seconds by step."""
+    """What a run did: the engine taken, what failed before and why, figures for the report, seconds by step."""
 
     engine: str = ""
     failed: list[str] = field(default_factory=list)
     figures: dict[str, float | int | bool | str] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
-    source: Surface | None = None  # the input with its search tree, built while a child worked
+    source: ProjectionTarget | None = None  # the input with its search tree, built while a child worked
 
     def clock(self, name: str, start: float) -> None:
+        """Add the seconds since `start` (time.perf_counter) to a step."""
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
-    def add(self, other: Record) -> None:
-        """What was tried, and the seconds, of a part."""
-        self.failed += other.failed
-        for name, seconds in other.seconds.items():
-            self.seconds[name] = self.seconds.get(name, 0.0) + seconds
 
+def count_reason(
+    faces: np.ndarray, made: int, asked: int, tried: list[str], min_of_a_piece: int = QUADS_OF_A_PIECE
+) -> str:
+    """Return a sentence on why a mesh has `made` faces instead of the `asked` ones, as far as that is known.
 
-def count_reason(faces: np.ndarray, made: int, asked: int, tried: list[str], of_a_piece: int = QUADS_OF_A_PIECE) -> str:
-    """Why a mesh got `made` faces and not those asked for, as far as that is known.
-
-    faces (f, 3): the manifold that they were made from; tried: what failed on the way; of_a_piece: the fewest faces of
-    a piece."""
+    faces (f, 3): the manifold they were made from. tried: what failed on the way. min_of_a_piece: the fewest faces of
+    a piece.
+    """
     pieces = topology.components(faces)[0]
     if made < asked:
         reason = "no way that was tried came nearer to the count"
-    elif asked < of_a_piece * pieces:
-        reason = f"it has {pieces} separate pieces, and each takes at least {of_a_piece} faces or so"
+    elif asked < min_of_a_piece * pieces:
+        reason = f"it has {pieces} separate pieces, and each takes at least {min_of_a_piece} faces or so"
     elif asked < _FACES_OF_A_HANDLE * (handles := topology.handles(faces, pieces)):
         reason = f"fewer would close some of its {handles} handles"
     else:
@@ -99,80 +119,94 @@ def count_reason(faces: np.ndarray, made: int, asked: int, tried: list[str], of_
 
 
 @dataclass
-class Part:
-    """Triangles that are to be made into `quads` quads, `edge` long each; what is known of them is found out once."""
+class RemeshPatch:
+    """Triangles to remesh: the whole surface or some of its pieces. What is derived from them is computed once.
 
-    vertices: np.ndarray  # (v, 3)
-    faces: np.ndarray  # (f, 3)
+    vertices (v, 3) in a unit box, faces (f, 3). `quads` is the wanted count and `edge` the wanted edge length.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
     quads: int
     edge: float
     request: Request
-    fine: Callable[[], Surface]  # the whole input as it was before it was simplified
-    given_up: bool = False  # no engine is tried
-    tolerance: float = COUNT_TOLERANCE  # share of the quads that there may be more or fewer
-    cut: tuple[np.ndarray, np.ndarray] | None = None  # quads of its own triangles, where these were made before
+    full_surface: Callable[[], ProjectionTarget]  # the whole input as it was before it was simplified
+    skip_engines: bool = False
+    tolerance: float = COUNT_TOLERANCE  # relative error of the count that is accepted
+    input_quads: tuple[np.ndarray, np.ndarray] | None = None  # vertices and quads cut from its triangles beforehand
 
-    def of(self, faces: np.ndarray, quads: int, given_up: bool = False, tolerance: float = COUNT_TOLERANCE) -> Part:
-        """Some of the triangles: faces (f,) bool."""
-        return Part(
-            *topology.compact(self.vertices, self.faces[faces]),
+    def subset(
+        self, chosen: np.ndarray, quads: int, skip_engines: bool = False, tolerance: float = COUNT_TOLERANCE
+    ) -> RemeshPatch:
+        """Return a patch of some of the triangles. chosen (f,) bool."""
+        return RemeshPatch(
+            *topology.compact(self.vertices, self.faces[chosen]),
             quads,
             self.edge,
             self.request,
-            self.fine,
-            given_up,
+            self.full_surface,
+            skip_engines,
             tolerance,
         )
 
-    def counted(self, count: int, wanted: float) -> bool:
-        """Whether so many quads are about as many as wanted."""
+    def has_count(self, count: int, wanted: float) -> bool:
+        """Whether a count is within the tolerance of the wanted one."""
         return abs(count / wanted - 1) <= self.tolerance
 
     @cached_property
     def pieces(self) -> tuple[int, np.ndarray]:
-        """How many, and which each triangle belongs to."""
+        """Number of connected pieces, and (f,) the piece of each triangle."""
         return topology.components(self.faces)
 
     @property
-    def crumbs(self) -> bool:
-        """Whether it is pieces of fewer quads each than the least that one is made of."""
+    def has_only_tiny_pieces(self) -> bool:
+        """Whether its pieces get fewer quads on average than a piece needs."""
         return self.quads < QUADS_OF_A_PIECE * self.pieces[0]
 
     @cached_property
     def handles(self) -> int:
+        """Number of handles (the sum of the genus of all pieces)."""
         return topology.handles(self.faces, self.pieces[0])
 
     @cached_property
     def piece_areas(self) -> np.ndarray:
-        """Area of each piece."""
+        """(pieces,) area of each piece."""
         return np.bincount(self.pieces[1], face_normals(self.vertices, self.faces)[1], self.pieces[0])
 
     @cached_property
-    def surface(self) -> Surface:
-        return Surface(self.vertices, self.faces)
+    def surface(self) -> ProjectionTarget:
+        """The triangles with their search tree."""
+        return ProjectionTarget(self.vertices, self.faces)
 
     @cached_property
-    def narrow(self) -> bool:
-        """Whether more than a few creases lie in pairs closer together than _NARROW_EDGES, as on thin plates and small
-        bevels; not asked of what has more triangles than quads."""
-        return len(self.faces) < self.quads and self.features.in_strips(_NARROW_EDGES * self.edge) > _FEW_NARROW
+    def has_narrow_strips(self) -> bool:
+        """Whether more than a few creases lie in pairs closer than _NARROW_EDGES, as on thin plates and small bevels.
+
+        Always False for a mesh with more triangles than quads.
+        """
+        return (
+            len(self.faces) < self.quads
+            and self.features.share_in_strips(_NARROW_EDGES * self.edge) > _MAX_NARROW_SHARE
+        )
 
     @cached_property
-    def thin(self) -> bool:
-        """Whether more than a little of the surface bounds walls thinner than two quads are wide, as rays into it tell.
-        Wedges are none; not asked of what has fewer triangles than quads, as a coarser mesh may do there all the
-        same."""
+    def has_thin_walls(self) -> bool:
+        """Whether more than a little of the surface bounds walls thinner than _WALL_EDGES, found by rays cast inward.
+
+        Always False for a mesh with fewer triangles than quads, for which a coarser mesh may work all the same.
+        """
         if len(self.faces) < self.quads:
             return False
-        points, face_idx = sample_surface(self.vertices, self.faces, _RAYS, np.random.default_rng(0))[:2]
+        points, face_idx = sample_surface(self.vertices, self.faces, _WALL_RAYS, np.random.default_rng(0))[:2]
         normals = face_normals(self.vertices, self.faces)[0]
         inward = -normals[face_idx]
-        hits = RayCaster(self.vertices, self.faces, 1).first_hit(points + _OFF * self.edge * inward, inward)
-        out_again = dot(normals[hits.face_idx].T, inward.T) > _PARALLEL
-        return bool((hits.found & out_again & (hits.distance < _WALL_EDGES * self.edge)).mean() > _FEW_THIN)
+        hits = RayCaster(self.vertices, self.faces, 1).first_hit(points + _RAY_OFFSET * self.edge * inward, inward)
+        leaves = dot(normals[hits.face_idx].T, inward.T) > _WALL_COSINE
+        return bool((hits.found & leaves & (hits.distance < _WALL_EDGES * self.edge)).mean() > _MAX_WALL_SHARE)
 
     @cached_property
     def features(self) -> Features:
+        """Creases and boundaries of the triangles."""
         return find_features(
-            self.vertices, self.faces, self.request.crease_degrees or 181.0, _FEATURE_EDGES * self.edge
+            self.vertices, self.faces, self.request.crease_degrees or 181.0, _MIN_FEATURE_EDGES * self.edge
         )

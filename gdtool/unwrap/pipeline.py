@@ -1,36 +1,45 @@
-"""Texture coordinates for a mesh of quads: charts, laid flat, packed; and the figures that tell how good they are."""
+"""Unwrap a mesh of quads: find charts, flatten them, pack them; and measure the result."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import import_module
+from typing import NamedTuple
 
 import numpy as np
 
 from gdtool.core.child import ChildFailed, begin, prepare
+from gdtool.geometry.mesh_quality import polygon_normals
 from gdtool.geometry.simplify import CHILD_MODULES, reduced
 from gdtool.geometry.topology import triangulated
 from gdtool.geometry.uv_raster import owner_count
-from gdtool.unwrap.pack.search import WELL_PACKED, best_packed, pack
+from gdtool.unwrap.chart import Chart
+from gdtool.unwrap.pack.search import WELL_PACKED, PlacementOrder, choose_cut, pack
 from gdtool.unwrap.parameterize.flatten import singular_values, stretch
-from gdtool.unwrap.parameterize.schedule import flatten_all
-from gdtool.unwrap.segment.charts import Adjacency, find_charts, run_xatlas
+from gdtool.unwrap.parameterize.schedule import FlattenLimits, flatten_all
+from gdtool.unwrap.segment.charts import Adjacency, Segmentation, find_charts, run_xatlas
 from gdtool.unwrap.segment.straight_cuts import cut_to_pack
 
-# Charts that cutting for packing adds, about, and ends with, at most.
-_MORE_CHARTS, _MOST_CUT = (5, 9, 13, 18, 23, 27), 43
-# Shares of the time by which charts are found, shaped, projected, a child that has not ended is given up, and charts
-# are packed.
-_SHARES = 0.2, 0.6, 0.7, 0.8, 0.9
-_SHORTEST = 0.05  # seconds of a child
+# Cutting for packing is tried with about this many charts more, and ends with at most this many.
+_MORE_CHARTS, _MAX_CHARTS_TO_CUT = (5, 9, 13, 18, 23, 27), 43
+_MIN_CHILD_SECONDS, _CHILD_MEMORY_MB = 0.05, 8000
+_MIN_AREA_SHARE, _MIN_UV_AREA = 1e-12, 1e-14  # of the surface, of the square: triangles of less are degenerate
+_UV_SLACK = 1e-6  # by which kept texture coordinates may leave the unit square: rounding
+# Shares of what is covered, and of the triangles, up to which a mesh's own texture coordinates are kept.
+_MAX_KEPT_OVERLAP, _MAX_KEPT_DEGENERATE = 0.001, 0.01
+_MAX_ANISOTROPY = 100  # ratio of singular values that one triangle counts as at most
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for. padding: texels between charts at `size`; seconds: time limit of the whole."""
+    """What the caller asks for.
+
+    size: texels of the texture's side; padding: texels between charts at that size; max_stretch: a chart with more L2
+    stretch is cut; good_stretch: flattening stops there; max_cost: xatlas' limit on a chart; seconds: time limit.
+    """
 
     size: int = 2048
     padding: int = 8
@@ -40,136 +49,171 @@ class Request:
     seconds: float = 120.0
 
 
+class _Deadlines(NamedTuple):
+    """When each step has to end, on the clock time.monotonic."""
+
+    charts_found: float
+    shaped: float  # from here on charts are only projected
+    projected: float  # from here on each face becomes a chart
+    child_killed: float
+    packed: float
+
+
+_DEADLINE_SHARES = _Deadlines(0.2, 0.6, 0.7, 0.8, 0.9)  # of the time limit
+
+
+class Skipped(NamedTuple):
+    """Work that was not done: what, why, and the seconds it would have taken."""
+
+    what: str
+    why: str
+    seconds: float
+
+
 @dataclass
-class Unwrapped:
-    """uv (c, 2) in [0, 1], (0, 0) at the image's top left; face_uvs (f, 4) into it, -1 with a triangle's fourth corner;
-    chart (f,); what was tried and failed on the way; what was skipped, why, and the seconds that it would have
-    taken."""
+class UnwrapResult:
+    """Texture coordinates of a mesh.
+
+    uv (c, 2) in [0, 1], (0, 0) at the image's top left; face_uvs (f, 4) rows of uv, -1 for a triangle's fourth corner;
+    chart (f,): the chart of each face; failed: sentences on what was tried and failed.
+    """
 
     uv: np.ndarray
     face_uvs: np.ndarray
     chart: np.ndarray
     failed: list[str] = field(default_factory=list)
-    skipped: list[tuple[str, str, float]] = field(default_factory=list)
+    skipped: list[Skipped] = field(default_factory=list)
 
 
-def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> Unwrapped:
-    """Texture coordinates of quads and triangles faces (f, 4); a quad lies in one chart, its corners flat together.
+def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> UnwrapResult:
+    """Make texture coordinates for quads and triangles, faces (f, 4); a quad lies in one chart.
 
     vertices (v, 3) finite. Charts are never mirrored and do not overlap; all have one texel density. As the time runs
-    out the rest goes in simpler ways: charts by the side of a box that they look at, laid flat by projection, at last
-    face by face, in rows."""
-    begun = time.monotonic()
-    found_by, shaped_by, projected_by, hung_by, packed_by = (begun + share * request.seconds for share in _SHARES)
+    out, simpler ways take over: charts by the side of a box that faces look at, flattened by projection, at last each
+    face as a chart, packed in rows.
+    """
+    started = time.monotonic()
+    deadlines = _Deadlines(*(started + share * request.seconds for share in _DEADLINE_SHARES))
     prepare(reduced, CHILD_MODULES)
     extent = float(np.ptp(vertices[np.unique(faces[faces >= 0])], 0).max())
     unit = (vertices - vertices.mean(0)) / (extent if extent > 0 else 1.0)
 
     @cache
-    def adjacency() -> Adjacency:  # asked for first while a child simplifies the mesh
+    def adjacency() -> Adjacency:  # first asked for while a child simplifies the mesh
         prepare(run_xatlas)
         prepare(flatten_all, (*CHILD_MODULES, "igl"))
         return Adjacency(unit, faces)
 
-    label, part, proxy, failed = find_charts(adjacency, unit, faces, until=found_by, max_cost=request.max_cost)
+    segmentation = find_charts(adjacency, unit, faces, until=deadlines.charts_found, max_cost=request.max_cost)
+    charts, failed = _flatten_in_child(unit, faces, segmentation, request, deadlines)
+    failed = segmentation.failed + failed
+    gap = request.padding / request.size
+    orders, skipped = [], []
+    if time.monotonic() < deadlines.packed:
+        charts, orders, skipped = _cut_for_packing(adjacency(), charts, gap, deadlines.packed)
+    placed, _ = pack([(chart.uv, chart.triangles) for chart in charts], gap, orders, deadlines.packed)
+    face_uvs = np.full(faces.shape, -1, np.int64)
+    chart_of_face = np.zeros(len(faces), np.int64)
+    offset = 0
+    for i, (chart, uv) in enumerate(zip(charts, placed, strict=True)):
+        face_uvs[chart.faces_idx] = np.where(chart.corners >= 0, chart.corners + offset, -1)
+        chart_of_face[chart.faces_idx] = i
+        offset += len(uv)
+    uv = np.concatenate(placed)
+    top_down = np.clip(np.stack([uv[:, 0], 1 - uv[:, 1]], -1), 0, 1)
+    return UnwrapResult(top_down, face_uvs.astype(np.int32), chart_of_face, failed, skipped)
+
+
+def _flatten_in_child(
+    vertices: np.ndarray, faces: np.ndarray, segmentation: Segmentation, request: Request, deadlines: _Deadlines
+) -> tuple[list[Chart], list[str]]:
+    """Flatten the charts in a child process; where it fails, project charts by the side of a box they look at."""
+    limits = FlattenLimits(request.good_stretch, request.max_stretch, deadlines.shaped, deadlines.projected)
     try:
         child = begin(
             flatten_all,
-            unit,
+            vertices,
             faces,
-            label,
-            request.good_stretch,
-            request.max_stretch,
-            proxy,
-            (shaped_by, projected_by),
-            part,
-            seconds=max(hung_by - time.monotonic(), _SHORTEST),
-            memory_mb=8000,
+            segmentation.label,
+            limits,
+            segmentation.proxy,
+            segmentation.part,
+            seconds=max(deadlines.child_killed - time.monotonic(), _MIN_CHILD_SECONDS),
+            memory_mb=_CHILD_MEMORY_MB,
         )
-        import_module("scipy.spatial")  # packing would wait for it
-        flat, more = child.result()
+        import_module("scipy.spatial")  # which packing needs, while the child works
+        return child.result()
     except ChildFailed as failure:
-        late = time.monotonic() + projected_by - shaped_by
-        flat, more = flatten_all(unit, faces, label, request.good_stretch, request.max_stretch, by=(shaped_by, late))
-        failed.append(f"flattening: {failure}; charts by the side they look at")
-    failed += more
-    ways, skipped = [], []
-    if time.monotonic() < packed_by:
-        flat, ways, skipped = _cut_to_pack(adjacency(), flat, request.padding / request.size, packed_by)
-    places, _ = pack([(uv, triangles) for _, _, uv, triangles in flat], request.padding / request.size, ways, packed_by)
-    face_uvs = np.full(faces.shape, -1, np.int64)
-    chart = np.zeros(len(faces), np.int64)
-    offset = 0
-    for i, ((faces_idx, corners, _, _), uv) in enumerate(zip(flat, places, strict=True)):
-        face_uvs[faces_idx] = np.where(corners >= 0, corners + offset, -1)
-        chart[faces_idx] = i
-        offset += len(uv)
-    uv = np.concatenate(places)
-    return Unwrapped(
-        np.clip(np.stack([uv[:, 0], 1 - uv[:, 1]], -1), 0, 1), face_uvs.astype(np.int32), chart, failed, skipped
-    )
+        until = time.monotonic() + deadlines.projected - deadlines.shaped
+        charts, reasons = flatten_all(vertices, faces, segmentation.label, replace(limits, single_after=until))
+        return charts, [f"flattening: {failure}; charts by the side they look at", *reasons]
 
 
-def _cut_to_pack(
-    adjacency: Adjacency, flat: list, gap: float, until: float
-) -> tuple[list, list, list[tuple[str, str, float]]]:
-    """The charts, cut further where that fills the square better; orders to pack them in that were found on the way;
-    what was skipped."""
-    counts = [len(flat) + more for more in _MORE_CHARTS if len(flat) + more <= _MOST_CUT]
-    tried, start = [flat], time.monotonic()
+def _cut_for_packing(
+    adjacency: Adjacency, charts: list[Chart], gap: float, until: float
+) -> tuple[list[Chart], list[PlacementOrder], list[Skipped]]:
+    """Cut the charts further where that fills the square better.
 
-    def variants() -> Iterator[list]:
-        yield [(uv, triangles) for _, _, uv, triangles in flat]
-        for charts in counts and cut_to_pack(adjacency, flat, counts):
+    Returns the charts, orders to pack them in that were found on the way, and what was skipped.
+    """
+    counts = [len(charts) + more for more in _MORE_CHARTS if len(charts) + more <= _MAX_CHARTS_TO_CUT]
+    tried, start = [charts], time.monotonic()
+
+    def variants() -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
+        yield [(chart.uv, chart.triangles) for chart in charts]
+        for cut_charts in counts and cut_to_pack(adjacency, charts, counts):
             if time.monotonic() > until:
                 return
-            tried.append(charts)
-            yield [(uv, triangles) for _, _, uv, triangles in charts]
+            tried.append(cut_charts)
+            yield [(chart.uv, chart.triangles) for chart in cut_charts]
 
-    chosen, share, ways, leapt = best_packed(variants(), gap)
+    best = choose_cut(variants(), gap)
     skipped, took = [], time.monotonic() - start
-    if leapt:
+    if best.skipped:
         skipped.append(
-            (
-                f"packing {leapt} ways to cut",
+            Skipped(
+                f"packing {best.skipped} ways to cut",
                 "the charts before filled too little of the square",
-                leapt * took / (len(tried) - leapt),
+                best.skipped * took / (len(tried) - best.skipped),
             )
         )
-    if share > WELL_PACKED and len(tried) <= len(counts):
-        skipped.append(("cutting further for packing", f"the charts fill {share:.0%} of the square", took))
-    return tried[chosen], ways, skipped
+    if best.share > WELL_PACKED and len(tried) <= len(counts):
+        skipped.append(Skipped("cutting further for packing", f"the charts fill {best.share:.0%} of the square", took))
+    return tried[best.index], best.orders, skipped
 
 
 def figures(
     vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, size: int = 1024
 ) -> dict[str, float | int]:
-    """Charts, coverage and overlap of the unit square, L2 stretch, angle and area distortion, mirrored share, seam
-    length.
+    """Measure texture coordinates: charts, coverage and overlap of the square, stretch, distortion, mirroring and
+    seams.
 
-    Mirrored and overlap are shares of area; seam length is in diagonals of the bounding box, each seam counted once.
+    size: texels of the raster for coverage and overlap. Stretch is L2; mirrored and overlap are shares of area; seam
+    length is in diagonals of the bounding box, each seam counted once.
     """
     triangles, face_idx = triangulated(faces)
     corners = corner_triangles(face_uvs, face_idx)
-    # One mesh whose vertices are the texture corners, so that singular values see both sides of a seam apart.
+    # A mesh with one vertex for each texture corner, so that the two sides of a seam are measured apart.
     points = np.zeros((len(uv), 3))
     points[corners.ravel()] = vertices[triangles.ravel()]
     upward = np.stack([uv[:, 0], 1 - uv[:, 1]], -1)
     values, area = singular_values(points, corners, upward)
     a, b, c = (upward[corners[:, i]] for i in range(3))
     flat = ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
-    use = (area > 1e-12 * area.sum()) & (np.abs(flat) > 1e-14)
+    use = (area > _MIN_AREA_SHARE * area.sum()) & (np.abs(flat) > _MIN_UV_AREA)
     weight = area[use] / area[use].sum()
     ratio = np.abs(flat[use]) / np.abs(flat[use]).sum() / weight
     count = owner_count(uv, corners, size)
-    label, seam = islands(vertices, faces, face_uvs)
+    label, seam = uv_islands(vertices, faces, face_uvs)
     return {
         "charts": int(label.max()) + 1,
         "coverage": float((count > 0).mean()),
         "overlap": float((count > 1).sum() / max((count > 0).sum(), 1)),
         "stretch": stretch(points, corners, upward),
         "area_distortion": float((weight * np.maximum(ratio, 1 / ratio)).sum()),
-        "angle_distortion": float((weight * np.minimum(values[use, 0] / np.maximum(values[use, 1], 1e-12), 100)).sum()),
+        "angle_distortion": float(
+            (weight * np.minimum(values[use, 0] / np.maximum(values[use, 1], 1e-12), _MAX_ANISOTROPY)).sum()
+        ),
         "mirrored": float(area[flat < 0].sum() / area.sum()),
         "degenerate": float(1 - use.mean()),
         "seam_length": seam / float(np.linalg.norm(np.ptp(vertices, 0))),
@@ -177,15 +221,17 @@ def figures(
 
 
 def corner_triangles(face_uvs: np.ndarray, face_idx: np.ndarray) -> np.ndarray:
-    """Texture corners (t, 3) of the triangles that triangulated() cuts the faces into."""
+    """Return texture corners (t, 3) of the triangles that triangulated() cuts the faces into."""
     second = np.zeros(len(face_idx), bool)
     second[1:] = face_idx[1:] == face_idx[:-1]
     return np.take_along_axis(face_uvs[face_idx], np.where(second[:, None], [0, 2, 3], [0, 1, 2]), 1).astype(np.int64)
 
 
-def islands(vertices: np.ndarray, faces: np.ndarray, face_uvs: np.ndarray) -> tuple[np.ndarray, float]:
-    """The chart (f,) of each face, joined wherever an edge has the same texture corners on both sides, and the length
-    of the edges that have not."""
+def uv_islands(vertices: np.ndarray, faces: np.ndarray, face_uvs: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return (f,) the chart of each face, and the length of all seams.
+
+    Faces are in one chart where their shared edge has the same texture corners on both sides.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -196,12 +242,41 @@ def islands(vertices: np.ndarray, faces: np.ndarray, face_uvs: np.ndarray) -> tu
     edge_idx, pairs = edges.face_pairs()
     first = (np.cumsum(edges.count) - edges.count)[edge_idx]
     ends_uv = edges_of(face_uvs).half_ends  # in the same order of corners
-    one, two = ends_uv[order[first]], ends_uv[order[first + 1]]
+    first_uv, second_uv = ends_uv[order[first]], ends_uv[order[first + 1]]
     backward = edges.half_ends[order[first]][:, 0] != edges.half_ends[order[first + 1]][:, 0]
-    two = np.where(backward[:, None], two[:, ::-1], two)
-    joined = (one == two).all(1)
-    graph = coo_matrix((np.ones(int(joined.sum())), (pairs[joined, 0], pairs[joined, 1])), (len(faces), len(faces)))
-    ends = edges.ends[edge_idx[~joined]]
+    second_uv = np.where(backward[:, None], second_uv[:, ::-1], second_uv)
+    merge_small_charts = (first_uv == second_uv).all(1)
+    graph = coo_matrix(
+        (np.ones(int(merge_small_charts.sum())), (pairs[merge_small_charts, 0], pairs[merge_small_charts, 1])),
+        (len(faces), len(faces)),
+    )
+    ends = edges.ends[edge_idx[~merge_small_charts]]
     return connected_components(graph, False)[1], float(
         np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1).sum()
     )
+
+
+def invalid_reason(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray) -> str | None:
+    """Return why texture coordinates of a mesh cannot be kept, None where they can."""
+    if not np.isfinite(uv).all():
+        return "some are not finite"
+    if uv.min() < -_UV_SLACK or uv.max() > 1 + _UV_SLACK:
+        return "some lie outside the unit square"
+    measured = figures(vertices, faces, uv, face_uvs)
+    if measured["overlap"] > _MAX_KEPT_OVERLAP:
+        return f"they overlap on {100 * measured['overlap']:.1f} % of what they cover"
+    if measured["degenerate"] > _MAX_KEPT_DEGENERATE:
+        return f"{100 * measured['degenerate']:.1f} % of the faces have no area there"
+    return None
+
+
+def texels_per_unit(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, size: int) -> float:
+    """Return the texel density: how many texels of a texture of `size` a unit of the surface has."""
+    flat = np.concatenate([uv, np.zeros((len(uv), 1))], 1)
+    area = polygon_normals(vertices, faces)[1].sum()
+    return float(size * (polygon_normals(flat, face_uvs)[1].sum() / area) ** 0.5)
+
+
+def padding_for_mips(size: int, smallest_mip: int) -> int:
+    """Return the texels between charts at `size` that leave one texel at the mip level of size `smallest_mip`."""
+    return max(-(-size // min(smallest_mip, size)), 1)

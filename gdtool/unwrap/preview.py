@@ -1,4 +1,4 @@
-"""Pictures of texture coordinates: the layout of the charts, and the mesh under a checkerboard."""
+"""Render previews of texture coordinates: the layout of the charts, and the mesh under a checkerboard."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from gdtool.geometry.topology import triangulated
 from gdtool.geometry.uv_raster import rasterize_uv
 from gdtool.unwrap.pipeline import corner_triangles
 
-_CHECKS = 32
+_CHECKS = 32  # squares of the checkerboard along the side of the texture
 
 
 def _colors(count: int) -> np.ndarray:
-    """(count, 3) distinct light colours: hues a golden ratio apart."""
+    """Return (count, 3) distinct light colours: hues a golden ratio apart."""
     hue = (np.arange(count) * 0.618034) % 1
     return 0.62 + 0.3 * np.cos(2 * np.pi * (hue[:, None] + np.array([0, 1 / 3, 2 / 3])))
 
 
 def layout(faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, chart: np.ndarray, size: int = 1024) -> np.ndarray:
-    """(size, size, 3) in [0, 1]: each chart in a colour, faces told apart by shade, white where nothing is."""
+    """Render the charts (size, size, 3) in [0, 1]: one colour a chart, faces told apart by shade, white elsewhere."""
     _, face_idx = triangulated(faces)
     owner, _ = rasterize_uv(uv, corner_triangles(face_uvs, face_idx), size)
     face = np.where(owner >= 0, face_idx[owner], -1)
@@ -37,7 +37,7 @@ def layout(faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, chart: np.nd
 def checkerboard(
     vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, chart: np.ndarray, size: int = 512
 ) -> np.ndarray:
-    """(size, 2 size, 3) in [0, 1]: the mesh from front right and back left under a checkerboard, charts tinted."""
+    """Render the mesh (size, 2 size, 3) in [0, 1] under a checkerboard, charts tinted: front right and back left."""
     from gdtool.cameras import rays, rig
     from gdtool.geometry.normals import face_normals
     from gdtool.geometry.rays import RayCaster

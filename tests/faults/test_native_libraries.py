@@ -49,7 +49,7 @@ USES = {
         lambda: winding_number(np.zeros((1, 3)), *TRIANGLE),
         lambda: Nearest(*TRIANGLE),
         lambda: repair._split(*TRIANGLE),
-        lambda: pair_and_split.of_own(*TRIANGLE, 16, 1.0),
+        lambda: pair_and_split.quads_from_input(*TRIANGLE, 16, 1.0),
         lambda: flatten._conformal(*TRIANGLE, np.array([0, 1, 2])),
     ],
     "fcpw": [lambda: _fcpw_search(*TRIANGLE)],
@@ -57,7 +57,7 @@ USES = {
     "fast_simplification": [lambda: simplify.collapse(*TRIANGLE, 1, 5.0)],
     "pymeshlab": [
         lambda: simplify.collapse_topology(*TRIANGLE, 1),
-        lambda: pair_and_split.even_triangles(*TRIANGLE, 10, 30.0),
+        lambda: pair_and_split.isotropic_triangles(*TRIANGLE, 10, 30.0),
         lambda: lods.collapse_textured(*TRIANGLE, np.zeros((1, 3, 2)), 1, "."),
     ],
     "pynanoinstantmeshes": [lambda: run_instant_meshes(*TRIANGLE, 100, 30.0)],

@@ -6,7 +6,7 @@ import numpy as np
 
 from gdtool.core.child import ChildFailed
 from gdtool.geometry import topology
-from gdtool.remesh.engines import candidate as quad_candidate
+from gdtool.remesh.engines import candidate as candidates
 from gdtool.remesh.engines import search
 
 
@@ -38,12 +38,12 @@ def in_this_process(monkeypatch, engine=None) -> list:
     def begin(_, *given, **limits):
         calls.append(given)
         try:
-            return Ended(quad_candidate.candidate(*given))
+            return Ended(candidates.make_candidate(*given))
         except ChildFailed as failure:
             return Ended(failure)
 
     if engine is not None:
-        monkeypatch.setattr(quad_candidate, "ENGINES", dict.fromkeys(quad_candidate.ENGINES, engine))
+        monkeypatch.setattr(candidates, "ENGINES", dict.fromkeys(candidates.ENGINES, engine))
     monkeypatch.setattr(search, "begin", begin)
     return calls
 

@@ -20,8 +20,9 @@ def test_what_is_collapsed_is_given_where_its_tears_can_be_mended(monkeypatch):
 
     monkeypatch.setattr(simplify, "collapse", tearing)
     assert not topology.is_watertight(tearing()[1])
-    _, found = adapters.on_few(vertices, faces, 300, wanted)
-    assert len(few) <= len(found) < len(few) + 12 and topology.invariants(found) == wanted
+    _, collapsed = adapters.simplify_for_engine(vertices, faces, 300, wanted)
+    assert len(few) <= len(collapsed) < len(few) + 12
+    assert topology.invariants(collapsed) == wanted
     # What loses half of it is not: the engine has the mesh as it was.
     monkeypatch.setattr(simplify, "collapse", lambda *_: (few_vertices, few[: len(few) // 2]))
-    assert adapters.on_few(vertices, faces, 300, wanted)[1] is faces
+    assert adapters.simplify_for_engine(vertices, faces, 300, wanted)[1] is faces

@@ -6,11 +6,10 @@ import pytest
 from gdtool.geometry import topology
 from gdtool.geometry.mesh_quality import distance_figures, topology_figures
 from gdtool.geometry.topology import triangulated
-from gdtool.remesh import components as quad_pieces
-from gdtool.remesh import pipeline
+from gdtool.remesh import components, pipeline
 from gdtool.remesh.engines import candidate, search
 from gdtool.remesh.fit.feature_curves import Constraints
-from gdtool.remesh.task import Part, Request
+from gdtool.remesh.task import RemeshPatch, Request
 from tests.geometry.solids import cube, joined, sphere
 from tests.remesh.engines import in_this_process, whole
 
@@ -18,30 +17,32 @@ from tests.remesh.engines import in_this_process, whole
 def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
     """Each has its share of the quads asked for, the small one enough for its shape, and none is lost."""
     vertices, faces = joined(sphere(48, 0.4, (0, -0.2, 0)), sphere(48, 0.12, (0, 0.5, 0)))
-    both = Part(vertices, faces, 4000, 0.03, Request(), None)
-    assert quad_pieces.well_made(both, None)[0] is None
-    parts = quad_pieces.apart(both, np.zeros(2, bool), 4000)
-    assert len(parts) == 2 and not any(part.given_up for part in parts)
-    assert sum(part.quads for part in parts) == 4000 and min(part.quads for part in parts) >= 4000 * 0.02
-    assert sum(part.tolerance * part.quads for part in parts) == pytest.approx(0.03 * 4000)
-    few = quad_pieces.apart(both, np.array([True, False]), 1000)[0]
-    assert (
-        few.tolerance * few.quads == pytest.approx(0.03 * 4000)
-        and few.counted(1000 + 119, 1000)
-        and not few.counted(1000 - 121, 1000)
-    )
-    assert quad_pieces.apart(both, np.array([True, False]), 400)[0].tolerance == 0.15
+    both = RemeshPatch(vertices, faces, 4000, 0.03, Request(), None)
+    assert components.accept_good_pieces(both, None)[0] is None
+    patches = components.remaining_patches(both, np.zeros(2, bool), 4000)
+    assert len(patches) == 2
+    assert not any(patch.skip_engines for patch in patches)
+    assert sum(patch.quads for patch in patches) == 4000
+    assert min(patch.quads for patch in patches) >= 4000 * 0.02
+    assert sum(patch.tolerance * patch.quads for patch in patches) == pytest.approx(0.03 * 4000)
+    few = components.remaining_patches(both, np.array([True, False]), 1000)[0]
+    assert few.tolerance * few.quads == pytest.approx(0.03 * 4000)
+    assert few.has_count(1000 + 119, 1000)
+    assert not few.has_count(1000 - 121, 1000)
+    assert components.remaining_patches(both, np.array([True, False]), 400)[0].tolerance == 0.15
     tried = []
-    real = search.Trial.run
+    real = search.EngineSearch.run
 
-    def fails_together(trial):
-        tried.append(trial.part.pieces[0])
-        return None if tried[-1] > 1 else real(trial)
+    def fails_together(search_run):
+        tried.append(search_run.patch.pieces[0])
+        return None if tried[-1] > 1 else real(search_run)
 
-    monkeypatch.setattr(search.Trial, "run", fails_together)
-    out, found, _ = pipeline.remesh(vertices, faces, Request(quads=4000))
-    assert tried == [2, 1, 1] and topology.components(found)[0] == 2 and whole(found)
-    assert abs(len(found) / 4000 - 1) <= 0.03
+    monkeypatch.setattr(search.EngineSearch, "run", fails_together)
+    out, quads_out, _ = pipeline.remesh(vertices, faces, Request(quads=4000))
+    assert tried == [2, 1, 1]
+    assert topology.components(quads_out)[0] == 2
+    assert whole(quads_out)
+    assert abs(len(quads_out) / 4000 - 1) <= 0.03
 
 
 @pytest.mark.parametrize("hopeless", [False, True])
@@ -50,7 +51,7 @@ def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless)
     ball, large = sphere(64, 0.09), sphere(48, 0.3)
     balls = [(ball[0] + (0.22 * i, 0.22 * j, 0), ball[1]) for i in range(5) for j in range(4)]
     vertices, faces = joined(*balls, (large[0] + (0.4, 0.3, 0.5), large[1]))
-    real = candidate.judged
+    real = candidate.repair_and_judge
 
     def fails(quad_vertices, quad_faces, wanted):
         fault, *mended = real(quad_vertices, quad_faces, wanted)
@@ -58,15 +59,17 @@ def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless)
         return "not watertight, though the input is" if bad else fault, *mended
 
     in_this_process(monkeypatch)
-    monkeypatch.setattr(candidate, "judged", fails)
-    monkeypatch.setattr(quad_pieces, "judged", fails)
-    out, found, record = pipeline.remesh(vertices, faces, Request(quads=4000))
+    monkeypatch.setattr(candidate, "repair_and_judge", fails)
+    monkeypatch.setattr(components, "repair_and_judge", fails)
+    out, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000))
     assert record.engine == ("instant-meshes; pair and split" if hopeless else "instant-meshes")
-    assert topology.components(found)[0] == 21 and whole(found) and abs(len(found) / 4000 - 1) <= 0.03
-    small = found[(out[found][..., 2] < 0.15).all(1)]
+    assert topology.components(quads_out)[0] == 21
+    assert whole(quads_out)
+    assert abs(len(quads_out) / 4000 - 1) <= 0.03
+    small = quads_out[(out[quads_out][..., 2] < 0.15).all(1)]
     # Eight of a ball's hundred; of paired triangles a fifth and more.
     assert topology_figures(*topology.compact(out, small))["irregular_share"] < 0.1
-    assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.02
+    assert distance_figures(out, triangulated(quads_out)[0], vertices, faces, 5000)["hausdorff"] < 0.02
 
 
 @pytest.mark.parametrize("wanted, kept", [(1.0, True), (1.2, False)])
@@ -74,21 +77,28 @@ def test_pieces_are_kept_as_they_were_drawn_where_the_others_can_make_up_for_the
     """Two balls of which an engine's quads are those of both: all are kept, or none where there are a sixth too few;
     none is drawn again."""
     meshes = [sphere(24, 0.3, (x, 0, 0)) for x in (-0.4, 0.4)]
-    out, found = quad_pieces.joined([pipeline.remesh(*mesh, Request(quads=500, engine="split"))[:2] for mesh in meshes])
-    part = Part(*joined(*meshes), round(wanted * len(found)), 0.05, Request(), None)
-    part.fine = lambda: part.surface
-    whole = candidate.Candidate(search.Way("instant-meshes", 0, (1.0,), 30.0), len(found), None, out, found)
-    whole.drawn = out, found, Constraints.none(len(out))
-    monkeypatch.setattr(quad_pieces, "outlined", None)
-    made, good = quad_pieces.well_made(part, whole)
-    assert good.all() == good.any() == kept and (made is None) != kept
-    assert not kept or len(made[1]) == len(found) and made[2] == "instant-meshes"
+    out, quads_out = components.concatenate_meshes(
+        [pipeline.remesh(*mesh, Request(quads=500, engine="split"))[:2] for mesh in meshes]
+    )
+    patch = RemeshPatch(*joined(*meshes), round(wanted * len(quads_out)), 0.05, Request(), None)
+    patch.full_surface = lambda: patch.surface
+    whole = candidate.Candidate(
+        search.EngineAttempt("instant-meshes", 0, (1.0,), 30.0), len(quads_out), None, out, quads_out
+    )
+    whole.fitted = out, quads_out, Constraints.none(len(out))
+    monkeypatch.setattr(components, "snap_to_features", None)
+    made, good = components.accept_good_pieces(patch, whole)
+    assert good.all() == good.any() == kept
+    assert (made is None) != kept
+    assert not kept or len(made[1]) == len(quads_out) and made[2] == "instant-meshes"
 
 
 def test_small_piece_is_not_lost():
     vertices, faces = joined(sphere(40, 0.7), sphere(40, 0.05, (0.9, 0.9, 0.9)))
-    out, found, record = pipeline.remesh(vertices / 2, faces, Request(quads=1000))
-    assert topology.components(found)[0] == 2 and whole(found) and "pair and split" in record.engine
+    out, quads_out, record = pipeline.remesh(vertices / 2, faces, Request(quads=1000))
+    assert topology.components(quads_out)[0] == 2
+    assert whole(quads_out)
+    assert "pair and split" in record.engine
     assert np.linalg.norm(out - 0.45, axis=1).min() < 0.05
 
 
@@ -96,14 +106,16 @@ def test_pieces_of_a_few_quads_each_are_not_given_to_an_engine(monkeypatch):
     """Twenty boxes of about eight quads each beside a ball: an engine sees the ball alone."""
     vertices, faces = cube(0.02)
     vertices, faces = joined(sphere(48, 0.4), *((vertices + (0.45, 0.05 * k - 0.5, 0), faces) for k in range(20)))
-    tried, run = [], search.Trial.run
-    monkeypatch.setattr(search.Trial, "run", lambda trial: tried.append(trial.part.pieces[0]) or run(trial))
-    _, found, record = pipeline.remesh(vertices, faces, Request(quads=4000))
+    tried, run = [], search.EngineSearch.run
+    monkeypatch.setattr(
+        search.EngineSearch, "run", lambda search_run: tried.append(search_run.patch.pieces[0]) or run(search_run)
+    )
+    _, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000))
     assert tried == [1]
     assert "engines: not tried, 20 pieces of so few quads" in record.failed
-    assert topology.components(found)[0] == 21
-    assert whole(found)
-    assert abs(len(found) / 4000 - 1) <= 0.03
+    assert topology.components(quads_out)[0] == 21
+    assert whole(quads_out)
+    assert abs(len(quads_out) / 4000 - 1) <= 0.03
 
 
 def test_the_count_holds_where_small_pieces_take_more_than_their_share():
@@ -112,6 +124,7 @@ def test_the_count_holds_where_small_pieces_take_more_than_their_share():
     vertices, faces = cube(0.01)
     trays = [(vertices + 0.05 * corner + 0.3, faces[:-2]) for corner in corners]
     vertices, faces = joined(sphere(60, 0.25), *trays)
-    out, found, _ = pipeline.remesh(vertices, faces, Request(quads=4000, engine="split"))
-    assert abs(len(found) / 4000 - 1) < 0.03 and topology.components(found)[0] == 101
-    assert 1000 < (np.linalg.norm(out, axis=1)[found].max(1) < 0.27).sum() < 2700
+    out, quads_out, _ = pipeline.remesh(vertices, faces, Request(quads=4000, engine="split"))
+    assert abs(len(quads_out) / 4000 - 1) < 0.03
+    assert topology.components(quads_out)[0] == 101
+    assert 1000 < (np.linalg.norm(out, axis=1)[quads_out].max(1) < 0.27).sum() < 2700

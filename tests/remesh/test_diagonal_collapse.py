@@ -9,9 +9,9 @@ import pytest
 
 from gdtool.geometry import topology
 from gdtool.geometry.mesh_quality import scaled_jacobian
-from gdtool.remesh.connectivity.diagonal_collapse import without_folded
+from gdtool.remesh.connectivity.diagonal_collapse import collapse_folded_quads
 from gdtool.remesh.fit.feature_curves import Constraints
-from gdtool.remesh.fit.shaping import surface_of
+from gdtool.remesh.fit.shaping import target_of_quads
 from tests.geometry.solids import quad_torus
 
 
@@ -37,16 +37,18 @@ def opened(vertices: np.ndarray, faces: np.ndarray, at: int, apart: float) -> tu
 def test_a_folded_quad_goes_and_its_surroundings_stay(apart):
     vertices, faces = quad_torus()
     torn, quads, _ = opened(vertices, faces, 17, apart)
-    assert topology.is_watertight(quads) and len(quads) == len(faces) + 1 and scaled_jacobian(torn, quads).min() < 0.05
-    out, found, _ = without_folded(torn, quads, surface_of(vertices, faces), Constraints.none(len(torn)))
-    assert (
-        len(found) == len(faces)
-        and len(out) == len(vertices)
-        and topology.is_watertight(found)
-        and topology.is_manifold(found)
+    assert topology.is_watertight(quads)
+    assert len(quads) == len(faces) + 1
+    assert scaled_jacobian(torn, quads).min() < 0.05
+    out, quads_out, _ = collapse_folded_quads(
+        torn, quads, target_of_quads(vertices, faces), Constraints.none(len(torn))
     )
-    assert topology.euler_number(found) == topology.euler_number(faces)
-    assert scaled_jacobian(out, found).min() > 0.8 * scaled_jacobian(vertices, faces).min()
+    assert len(quads_out) == len(faces)
+    assert len(out) == len(vertices)
+    assert topology.is_watertight(quads_out)
+    assert topology.is_manifold(quads_out)
+    assert topology.euler_number(quads_out) == topology.euler_number(faces)
+    assert scaled_jacobian(out, quads_out).min() > 0.8 * scaled_jacobian(vertices, faces).min()
     assert len(np.unique(np.concatenate([out, vertices]).round(9), axis=0)) <= len(vertices) + 1
 
 
@@ -55,18 +57,23 @@ def test_what_is_held_stays():
     torn, quads, new = opened(vertices, faces, 17, 0.1)
     constraints = Constraints.none(len(torn))
     constraints.curve[[new[0], new[2]]] = 0
-    out, found, _ = without_folded(
-        torn, quads, surface_of(vertices, faces), replace(constraints, fixed=np.ones(len(torn), bool))
+    out, quads_out, _ = collapse_folded_quads(
+        torn, quads, target_of_quads(vertices, faces), replace(constraints, fixed=np.ones(len(torn), bool))
     )
-    assert out is torn and found is quads
+    assert out is torn
+    assert quads_out is quads
     # One of the two is held: it is the one that stays, where it was.
     constraints.curve[new[2]] = -1
-    out, found, after = without_folded(torn, quads, surface_of(vertices, faces), constraints)
-    assert len(found) == len(faces) and (after.curve >= 0).sum() == 1
+    out, quads_out, after = collapse_folded_quads(torn, quads, target_of_quads(vertices, faces), constraints)
+    assert len(quads_out) == len(faces)
+    assert (after.curve >= 0).sum() == 1
     assert (out[after.curve >= 0] == torn[new[0]]).all()
 
 
 def test_nothing_happens_without_folded_quads():
     vertices, faces = quad_torus()
-    out, found, _ = without_folded(vertices, faces, surface_of(vertices, faces), Constraints.none(len(vertices)))
-    assert out is vertices and found is faces
+    out, quads_out, _ = collapse_folded_quads(
+        vertices, faces, target_of_quads(vertices, faces), Constraints.none(len(vertices))
+    )
+    assert out is vertices
+    assert quads_out is faces

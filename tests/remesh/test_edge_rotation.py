@@ -8,8 +8,8 @@ from gdtool.geometry import topology
 from gdtool.geometry.mesh_quality import valences
 from gdtool.geometry.sharpen import dihedral_degrees
 from gdtool.remesh.connectivity.edge_rotation import cancel_pairs
-from gdtool.remesh.engines import candidate as quad_candidate
-from gdtool.remesh.engines.candidate import Way, candidate
+from gdtool.remesh.engines import candidate as candidates
+from gdtool.remesh.engines.candidate import EngineAttempt, make_candidate
 from tests.geometry.solids import marching, plane, quad_cube, quad_torus
 
 
@@ -42,17 +42,19 @@ def test_what_was_pulled_apart_closes(apart):
     points, quads = quad_torus(n)
     torn = sheared(quads, [(i * n + 3, i * n + 4) for i in range(2, 2 + apart)])
     assert irregular(points, torn) == 4
-    found = cancel_pairs(points, torn)
-    assert irregular(points, found) == 0 and topology.is_watertight(found) and topology.is_manifold(found)
-    assert len(found) == len(quads)
+    quads_out = cancel_pairs(points, torn)
+    assert irregular(points, quads_out) == 0
+    assert topology.is_watertight(quads_out)
+    assert topology.is_manifold(quads_out)
+    assert len(quads_out) == len(quads)
 
 
 def test_what_is_too_far_apart_is_put_back():
     n = 40
     points, quads = quad_torus(n)
     torn = sheared(quads, [(i * n + 3, i * n + 4) for i in range(2, 22)])
-    found = cancel_pairs(points, torn)
-    assert {frozenset(f) for f in found.tolist()} == {frozenset(f) for f in torn.tolist()}
+    quads_out = cancel_pairs(points, torn)
+    assert {frozenset(f) for f in quads_out.tolist()} == {frozenset(f) for f in torn.tolist()}
 
 
 def test_a_regular_mesh_and_an_open_one_stay():
@@ -90,21 +92,21 @@ def test_creases_stay():
         valence = valences(turned, len(points))[0]
         if valence.min() > 2 and topology.is_manifold(turned):
             torn = turned
-    found = cancel_pairs(points, torn)
-    kept = {tuple(sorted(edge)) for edge in topology.edges_of(found).ends.tolist()}
+    quads_out = cancel_pairs(points, torn)
+    kept = {tuple(sorted(edge)) for edge in topology.edges_of(quads_out).ends.tolist()}
     assert crease <= kept
-    assert (
-        topology.is_watertight(found)
-        and topology.is_manifold(found)
-        and irregular(points, found) < irregular(points, torn) / 2
-    )
+    assert topology.is_watertight(quads_out)
+    assert topology.is_manifold(quads_out)
+    assert irregular(points, quads_out) < irregular(points, torn) / 2
 
 
 def test_an_engine_s_quads_have_fewer(monkeypatch):
     vertices, faces = marching(lambda x, y, z: (np.hypot(x, y) - 0.6) ** 2 + z**2 - 0.06 - 0.02 * np.sin(7 * x), 48)
-    way = Way("instant-meshes", 1, (1.0,), 30.0)
-    found = candidate(vertices / 2, faces, way, 8000)
-    monkeypatch.setattr(quad_candidate, "cancel_pairs", lambda _, quads: quads)
-    before = candidate(vertices / 2, faces, way, 8000)
-    assert found.fault is None and found.count == before.count and topology.is_watertight(found.quads)
-    assert irregular(found.vertices, found.quads) < 0.9 * irregular(before.vertices, before.quads)
+    attempt = EngineAttempt("instant-meshes", 1, (1.0,), 30.0)
+    quads_out = make_candidate(vertices / 2, faces, attempt, 8000)
+    monkeypatch.setattr(candidates, "cancel_pairs", lambda _, quads: quads)
+    before = make_candidate(vertices / 2, faces, attempt, 8000)
+    assert quads_out.fault is None
+    assert quads_out.count == before.count
+    assert topology.is_watertight(quads_out.quads)
+    assert irregular(quads_out.vertices, quads_out.quads) < 0.9 * irregular(before.vertices, before.quads)

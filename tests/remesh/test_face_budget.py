@@ -17,15 +17,23 @@ def counted(monkeypatch):
         return vertices, np.zeros((request.quads, 4), np.int64), Record()
 
     monkeypatch.setattr(face_budget, "remesh", remesh)
-    monkeypatch.setattr(face_budget, "deviation", lambda v, f, out, found: 2 / (len(found) / 2))
+    monkeypatch.setattr(face_budget, "deviation", lambda v, f, out, quads_out: 2 / (len(quads_out) / 2))
     return asked
 
 
 def test_fewest_quads_within_a_distance_are_found_in_a_few_runs(counted):
-    _, found, _, reached = face_budget.coarsest(np.zeros((3, 3)), np.zeros((1, 3), int), Request(quads=20000), 0.002)
-    assert reached <= 0.002 and 1000 <= len(found) <= 1150 and len(counted) <= 6
+    _, quads_out, _, reached = face_budget.coarsest_within(
+        np.zeros((3, 3)), np.zeros((1, 3), int), Request(quads=20000), 0.002
+    )
+    assert reached <= 0.002
+    assert 1000 <= len(quads_out) <= 1150
+    assert len(counted) <= 6
 
 
 def test_when_all_are_too_few_the_most_are_given(counted):
-    _, found, _, reached = face_budget.coarsest(np.zeros((3, 3)), np.zeros((1, 3), int), Request(quads=500), 0.002)
-    assert len(found) == 500 and reached > 0.002 and counted == [500]
+    _, quads_out, _, reached = face_budget.coarsest_within(
+        np.zeros((3, 3)), np.zeros((1, 3), int), Request(quads=500), 0.002
+    )
+    assert len(quads_out) == 500
+    assert reached > 0.002
+    assert counted == [500]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.geometry.sharpen import dihedral_degrees
-from gdtool.remesh.fit.feature_curves import Features, _tidy, find_features, trace
+from gdtool.remesh.fit.feature_curves import Features, _clean_arcs, find_features, trace_features
 from tests.geometry.solids import cube
 
 FACES = np.array([(0, 1, 4), (1, 2, 4), (0, 4, 2), (0, 2, 3)])
@@ -32,7 +32,10 @@ def test_a_folded_sliver_is_no_crease():
 def test_a_crease_beside_a_sliver_is_kept():
     ends, _, angle = dihedral_degrees(square(60.0), FACES, 0.05)
     at = {tuple(sorted(pair)): degrees for pair, degrees in zip(ends.tolist(), angle, strict=True)}
-    assert at[0, 2] < 1e-5 and at[0, 4] == pytest.approx(60) and at[2, 4] == pytest.approx(60) and at[1, 4] < 1e-5
+    assert at[0, 2] < 1e-5
+    assert at[0, 4] == pytest.approx(60)
+    assert at[2, 4] == pytest.approx(60)
+    assert at[1, 4] < 1e-5
 
 
 def test_corners_in_a_row_are_not_all_drawn_into_one():
@@ -43,13 +46,12 @@ def test_corners_in_a_row_are_not_all_drawn_into_one():
     segments = np.concatenate(
         [np.stack([root[:-1], root[1:]], -1)] + [np.stack([root + y, root + y + 1], -1) for y in range(length - 1)]
     )
-    found = _tidy(points, segments, short)
+    found = _clean_arcs(points, segments, short)
     ends = found.points[found.segments]
     assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() <= 1 + short
     # No tooth is lost, and the corners that are left stand on the spine.
-    assert (found.points[:, 1] == length - 1).sum() == teeth and 1 < len(
-        np.unique(ends[ends[..., 1] == 0], axis=0)
-    ) < teeth
+    assert (found.points[:, 1] == length - 1).sum() == teeth
+    assert 1 < len(np.unique(ends[ends[..., 1] == 0], axis=0)) < teeth
 
 
 def plate(thickness: float) -> tuple[np.ndarray, np.ndarray]:
@@ -64,10 +66,10 @@ def test_both_rims_of_a_thin_plate_are_kept(thickness):
     vertices, faces = plate(thickness)
     found = find_features(vertices, faces, 30.0, 0.03)
     length = np.linalg.norm(found.points[found.segments[:, 0]] - found.points[found.segments[:, 1]], axis=1)
-    assert len(found.corners) == 8 and length.sum() == pytest.approx(8 + 4 * thickness)
-    assert (
-        found.in_strips(2 * thickness) == pytest.approx(8 / (8 + 4 * thickness)) and found.in_strips(thickness / 2) == 0
-    )
+    assert len(found.corners) == 8
+    assert length.sum() == pytest.approx(8 + 4 * thickness)
+    assert found.share_in_strips(2 * thickness) == pytest.approx(8 / (8 + 4 * thickness))
+    assert found.share_in_strips(thickness / 2) == 0
 
 
 def test_a_curve_whose_corner_has_no_vertex_of_its_own_is_followed_all_the_same():
@@ -80,7 +82,9 @@ def test_a_curve_whose_corner_has_no_vertex_of_its_own_is_followed_all_the_same(
     faces = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]], -1).reshape(-1, 4)
     points = np.array([(3.0, 10.1, 0), (17.0, 10.0, 0), (3.0, 10.3, 0), (17.0, 11.0, 0)])
     features = Features(points, np.array([(0, 1), (2, 3)]), np.array([0, 1]), np.arange(4))
-    _, held = trace(vertices, faces, features, 1.0)
+    _, held = trace_features(vertices, faces, features, 1.0)
     for curve in (0, 1):
         path = vertices[held.path[held.path_curve == curve]].reshape(-1, 3)
-        assert len(path) and path[:, 0].min() <= 4 and path[:, 0].max() == 17
+        assert len(path)
+        assert path[:, 0].min() <= 4
+        assert path[:, 0].max() == 17

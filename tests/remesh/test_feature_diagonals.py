@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from gdtool.remesh.fit.feature_curves import Constraints, untied
-from gdtool.remesh.fit.feature_diagonals import crossed, cut_along_features, held_at_centres
-from gdtool.remesh.fit.surface_projection import Surface, subdivide
+from gdtool.remesh.fit.feature_curves import Constraints, release_straight_corners
+from gdtool.remesh.fit.feature_diagonals import choose_diagonals, hold_centres, quads_crossed_by_features
+from gdtool.remesh.fit.surface_projection import ProjectionTarget, subdivide
 
 
 def grid(n: int = 4):
@@ -24,21 +24,25 @@ def test_a_path_round_a_corner_crosses_its_quad():
     before = Constraints(curve, np.zeros(len(vertices), bool), path, np.full(3, 3))
     # Of the two corners in the staircase one is let off here; the other stays.
     after = Constraints(np.where(np.arange(len(vertices)) == 6, -1, curve), before.fixed, path[2:], np.full(1, 3))
-    face_idx, found = crossed(faces, before, after)
-    assert len(face_idx) == 1 and set(faces[face_idx[0]]) == {5, 6, 10, 11} and found.tolist() == [3]
+    face_idx, found = quads_crossed_by_features(faces, before, after)
+    assert len(face_idx) == 1
+    assert set(faces[face_idx[0]]) == {5, 6, 10, 11}
+    assert found.tolist() == [3]
     new_vertices, _, halved = subdivide(vertices, faces, after)
-    held = held_at_centres(halved, len(new_vertices) - len(faces), face_idx, found)
+    held = hold_centres(halved, len(new_vertices) - len(faces), face_idx, found)
     added = np.flatnonzero(held.curve != halved.curve)
     assert np.allclose(new_vertices[added], [[0.5, 1.5, 0]])
-    released = untied(vertices, faces, before)
-    assert (released.curve[[6, 11]] < 0).all() and not len(crossed(faces, before, before)[0])
+    released = release_straight_corners(vertices, faces, before)
+    assert (released.curve[[6, 11]] < 0).all()
+    assert not len(quads_crossed_by_features(faces, before, before)[0])
 
 
 def test_bent_quads_are_cut_along_the_ridge():
     # The ridge runs from the first corner to the third.
     ridge = np.array([[0, 0, 0], [2, 0, -1], [2, 2, 0], [0, 2, -1.0]])
-    surface = Surface(ridge, np.array([[0, 1, 2], [0, 2, 3]]))
+    surface = ProjectionTarget(ridge, np.array([[0, 1, 2], [0, 2, 3]]))
     for turn in range(4):
         quad = np.roll([0, 1, 2, 3], turn)[None]
-        out = cut_along_features(ridge, quad, surface)[0]
-        assert out[0] in (0, 2) and np.roll(out, -int(np.argmin(out))).tolist() == [0, 1, 2, 3]
+        out = choose_diagonals(ridge, quad, surface)[0]
+        assert out[0] in (0, 2)
+        assert np.roll(out, -int(np.argmin(out))).tolist() == [0, 1, 2, 3]

@@ -6,14 +6,14 @@ import pytest
 from gdtool.geometry import simplify, topology
 from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, shape_figures
 from gdtool.geometry.topology import triangulated
-from gdtool.remesh import pipeline as quads
-from gdtool.remesh.fallback import pair_and_split as quad_split
+from gdtool.remesh import pipeline
+from gdtool.remesh.fallback import pair_and_split as fallback
 from gdtool.remesh.fallback import smoothed
 from gdtool.remesh.fallback.pair_and_split import pair_and_split
 from gdtool.remesh.fit import shaping
 from gdtool.remesh.fit.feature_curves import NO_FEATURES
-from gdtool.remesh.fit.surface_projection import Surface
-from gdtool.remesh.task import Part, Request
+from gdtool.remesh.fit.surface_projection import ProjectionTarget
+from gdtool.remesh.task import RemeshPatch, Request
 from tests.geometry.solids import cube, joined, rod, sphere, torus, volume
 from tests.remesh.engines import whole
 
@@ -21,8 +21,10 @@ from tests.remesh.engines import whole
 def test_pairing_gives_the_asked_count_exactly():
     vertices, faces = sphere(24)
     for count in (3 * len(faces) - 500, int(2.2 * len(faces))):
-        out, found = pair_and_split(vertices, faces, count)
-        assert abs(len(found) - count) <= 1 and whole(found) and volume(out, found) > 0
+        out, quads_out = pair_and_split(vertices, faces, count)
+        assert abs(len(quads_out) - count) <= 1
+        assert whole(quads_out)
+        assert volume(out, quads_out) > 0
 
 
 def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypatch):
@@ -36,11 +38,12 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
         own = simplify.simplify(*large, target - (len(small[1]) if target > 1000 else 0), measured=False)
         return (*(joined(small, own[:2]) if target > 1000 else own[:2]), None, {})
 
-    monkeypatch.setattr(quad_split, "simplify", losing)
+    monkeypatch.setattr(fallback, "simplify", losing)
     asked = 1800  # 800 triangles, of which 1.15 times as many lose the piece and 1.3 times keep it
-    out, found = quad_split.of_own(vertices, faces, asked, 60.0)
-    assert tried[:3] == [800, 919, 1040] and topology.components(found)[0] == 2
-    assert asked < len(found) < 1.5 * asked < 1.8 * len(faces)
+    out, quads_out = fallback.quads_from_input(vertices, faces, asked, 60.0)
+    assert tried[:3] == [800, 919, 1040]
+    assert topology.components(quads_out)[0] == 2
+    assert asked < len(quads_out) < 1.5 * asked < 1.8 * len(faces)
 
 
 def test_even_triangles_are_sought_no_longer_than_they_come_nearer_to_their_number(monkeypatch):
@@ -50,9 +53,11 @@ def test_even_triangles_are_sought_no_longer_than_they_come_nearer_to_their_numb
     runs, mesh_set = [], pymeshlab.MeshSet
     monkeypatch.setattr(pymeshlab, "MeshSet", lambda: runs.append(1) or mesh_set())
     cubes = joined(*((cube()[0] + (3 * i, 0, 0), cube()[1]) for i in range(20)))
-    assert len(quad_split.even_triangles(*cubes, 100, 30.0)[1]) == 240 and len(runs) == 2
+    assert len(fallback.isotropic_triangles(*cubes, 100, 30.0)[1]) == 240
+    assert len(runs) == 2
     runs.clear()
-    assert abs(len(quad_split.even_triangles(*sphere(24), 500, 30.0)[1]) / 500 - 1) < 0.05 and 1 <= len(runs) <= 4
+    assert abs(len(fallback.isotropic_triangles(*sphere(24), 500, 30.0)[1]) / 500 - 1) < 0.05
+    assert 1 <= len(runs) <= 4
 
 
 @pytest.mark.parametrize(
@@ -69,11 +74,11 @@ def test_even_triangles_are_sought_no_longer_than_they_come_nearer_to_their_numb
 def test_even_triangles_that_would_be_too_few_are_not_sought(monkeypatch, mesh, quads, few):
     """Twelve for a piece, and eighty for a handle."""
     sought = []
-    monkeypatch.setattr(smoothed, "of_even", lambda *given: sought.append(given))
+    monkeypatch.setattr(smoothed, "quads_from_isotropic", lambda *given: sought.append(given))
     monkeypatch.setattr(smoothed, "split_count", lambda faces, quads: quads)
-    part = Part(*mesh, quads, 0.1, Request(quads=quads), lambda: Surface(*mesh))
-    _, faces = smoothed.split(part)
-    assert quad_split.few_for_even(mesh[1], quads) == few
+    patch = RemeshPatch(*mesh, quads, 0.1, Request(quads=quads), lambda: ProjectionTarget(*mesh))
+    _, faces = smoothed.split(patch)
+    assert fallback.too_few_for_isotropic(mesh[1], quads) == few
     assert len(sought) == (not few)
     assert topology.is_watertight(faces)
 
@@ -81,8 +86,10 @@ def test_even_triangles_that_would_be_too_few_are_not_sought(monkeypatch, mesh, 
 def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
     """Pins with few triangles around: what bends too much stays single, and there are fewer triangles for it."""
     vertices, faces = joined(*((pin[0] + (0.3 * k, 0, 0), pin[1]) for k, pin in enumerate([rod(24)] * 8)))
-    _, found = quad_split.of_own(vertices, faces, 400, 60.0)
-    assert abs(len(found) / 400 - 1) < 0.1 and topology.components(found)[0] == 8 and topology.is_watertight(found)
+    _, quads_out = fallback.quads_from_input(vertices, faces, 400, 60.0)
+    assert abs(len(quads_out) / 400 - 1) < 0.1
+    assert topology.components(quads_out)[0] == 8
+    assert topology.is_watertight(quads_out)
 
 
 @pytest.mark.parametrize("shape", ["slivers", "coincident"])
@@ -96,12 +103,16 @@ def test_splitting_makes_square_quads_of_any_triangles(shape):
         vertices = vertices.copy()
         vertices[8:, 0] += np.ptp(vertices[:8, 0])  # shares a side with the first
     vertices = vertices / np.ptp(vertices, 0).max()
-    out, found, record = quads.remesh(vertices, faces, Request(quads=3000, engine="split"))
-    assert record.engine == "pair and split" and whole(found) and abs(len(found) / 3000 - 1) <= 0.03
-    assert topology.components(found)[0] == topology.components(faces)[0]
-    figures = shape_figures(out, found)
-    assert figures["jacobian_mean"] > 0.85 and figures["folded_share"] == 0 and figures["angle_deviation_deg"] < 18
-    assert distance_figures(out, triangulated(found)[0], vertices, faces, 5000)["hausdorff"] < 0.01
+    out, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=3000, engine="split"))
+    assert record.engine == "pair and split"
+    assert whole(quads_out)
+    assert abs(len(quads_out) / 3000 - 1) <= 0.03
+    assert topology.components(quads_out)[0] == topology.components(faces)[0]
+    figures = shape_figures(out, quads_out)
+    assert figures["jacobian_mean"] > 0.85
+    assert figures["folded_share"] == 0
+    assert figures["angle_deviation_deg"] < 18
+    assert distance_figures(out, triangulated(quads_out)[0], vertices, faces, 5000)["hausdorff"] < 0.01
 
 
 def test_quads_without_area_are_evened_out_where_their_neighbours_stay(monkeypatch):
@@ -111,10 +122,15 @@ def test_quads_without_area_are_evened_out_where_their_neighbours_stay(monkeypat
     a, b, c, d = quad_faces[100]
     split[b], split[d] = split[a], split[c]
     assert polygon_normals(split, quad_faces)[1][100] < 1e-12
-    monkeypatch.setattr(shaping, "_let_go", lambda *given: np.arange(len(quad_faces)))
-    surface, request = Surface(vertices, faces), Request(quads=600)
-    out = shaping.better(
-        split, quad_faces, *shaping.evened(split, quad_faces, surface, NO_FEATURES, request), surface, request, surface
+    monkeypatch.setattr(shaping, "_abandoning_faces", lambda *given: np.arange(len(quad_faces)))
+    surface, request = ProjectionTarget(vertices, faces), Request(quads=600)
+    out = shaping.keep_better_vertices(
+        split,
+        quad_faces,
+        *shaping.smoothed(split, quad_faces, surface, NO_FEATURES, request),
+        surface,
+        request,
+        surface,
     )
     edge = (polygon_normals(out, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
     assert polygon_normals(out, quad_faces)[1].min() > 1e-4 * edge**2

@@ -10,14 +10,14 @@ from gdtool.core.child import ChildFailed
 from gdtool.geometry import topology
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.topology import triangulated
-from gdtool.remesh import pipeline as quads
-from gdtool.remesh.engines import candidate as quad_candidate
+from gdtool.remesh import pipeline
+from gdtool.remesh.engines import candidate as candidates
 from gdtool.remesh.engines import search
 from gdtool.remesh.engines.candidate import Candidate
 from gdtool.remesh.fit.feature_curves import Constraints
-from gdtool.remesh.fit.shaping import Outline, fault_of, left_out, surface_of
-from gdtool.remesh.fit.surface_projection import Surface
-from gdtool.remesh.task import Part, Record, Request
+from gdtool.remesh.fit.shaping import SnappedQuads, rejection_reason, target_of_quads, uncovered_shares
+from gdtool.remesh.fit.surface_projection import ProjectionTarget
+from gdtool.remesh.task import Record, RemeshPatch, Request
 from tests.geometry.solids import cube, marching, quad_cube, sphere, torus, volume
 from tests.remesh.engines import Ended, around, in_this_process, inner_face, whole
 
@@ -26,40 +26,44 @@ from tests.remesh.engines import Ended, around, in_this_process, inner_face, who
 def test_dead_engine_is_replaced(monkeypatch, failure):
     monkeypatch.setattr(search, "begin", lambda *_, **__: Ended(ChildFailed(failure)))
     vertices, faces = torus()
-    _, found, record = quads.remesh(vertices / 2, faces, Request(quads=900))
-    assert record.engine == "pair and split" and any(failure in text for text in record.failed)
-    assert whole(found) and abs(len(found) / 900 - 1) <= 0.03
+    _, quads_out, record = pipeline.remesh(vertices / 2, faces, Request(quads=900))
+    assert record.engine == "pair and split"
+    assert any(failure in text for text in record.failed)
+    assert whole(quads_out)
+    assert abs(len(quads_out) / 900 - 1) <= 0.03
 
 
 @pytest.mark.parametrize("outcome, runs", [("a smaller sphere", 1), ("a crash", 3)])
 def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypatch, outcome, runs):
     """Another density or no creases mend a seam that tore; a part that is too fine for the quads stays so."""
     vertices, faces = sphere(24)
-    out, found, _ = quads.remesh(vertices / 2, faces, Request(quads=1000, engine="split"))
+    out, quads_out, _ = pipeline.remesh(vertices / 2, faces, Request(quads=1000, engine="split"))
 
     def engine(*_):
         if outcome == "a crash":
             raise ChildFailed("died of SIGSEGV")
-        return out / 2, found
+        return out / 2, quads_out
 
     calls = in_this_process(monkeypatch, engine)
     # Drawn onto the large sphere the small one would become it.
     monkeypatch.setattr(
-        quad_candidate,
-        "outlined",
-        lambda vertices, faces, *_: Outline(
+        candidates,
+        "snap_to_features",
+        lambda vertices, faces, *_: SnappedQuads(
             vertices,
             faces,
             Constraints.none(len(vertices)),
             tips=np.zeros(0, int),
             edge=1.0,
-            far=0.0,
-            limit=1.0,
+            distance_edges=0.0,
+            limit_edges=1.0,
             hopeless=True,
         ),
     )
-    _, found, record = quads.remesh(vertices / 2, faces, Request(quads=1000))
-    assert len(calls) == runs and record.engine == "pair and split" and whole(found)
+    _, quads_out, record = pipeline.remesh(vertices / 2, faces, Request(quads=1000))
+    assert len(calls) == runs
+    assert record.engine == "pair and split"
+    assert whole(quads_out)
     assert outcome == "a crash" or "strays" in record.failed[0]
 
 
@@ -71,59 +75,68 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
 def test_of_two_the_one_much_nearer_to_the_surface_comes_first_where_the_other_is_in_doubt(tops, wanted, order):
     """Balls without a cap, and whole ones."""
     vertices, faces = sphere(24, 0.4)
-    out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
-    part = Part(vertices, faces, 1000, 0.045, Request(), None)
-    way = search.Way("instant-meshes", 0, (1.0,), 30.0)
-    two = [
-        Candidate(way, 1000, None, *topology.compact(out, found[out[found].mean(1)[:, 2] < height])) for height in tops
+    out, quads_out, _ = pipeline.remesh(vertices, faces, Request(quads=1000, engine="split"))
+    patch = RemeshPatch(vertices, faces, 1000, 0.045, Request(), None)
+    attempt = search.EngineAttempt("instant-meshes", 0, (1.0,), 30.0)
+    pair = [
+        Candidate(attempt, 1000, None, *topology.compact(out, quads_out[out[quads_out].mean(1)[:, 2] < height]))
+        for height in tops
     ]
-    assert [id(one) for one in search.Trial(part, Record())._nearer_first(two, wanted)] == [id(two[k]) for k in order]
+    assert [id(one) for one in search.EngineSearch(patch, Record())._nearer_first(pair, wanted)] == [
+        id(pair[k]) for k in order
+    ]
 
 
 def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(monkeypatch):
     """Half a ball, a tenth too few quads; a whole one lacks nothing, nor one without a cap that its tip can be drawn
     over."""
     vertices, faces = sphere(24, 0.4)
-    out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
-    part = Part(vertices, faces, 1000, 0.045, Request(), None)
-    height = out[found].mean(1)[:, 2]
+    out, quads_out, _ = pipeline.remesh(vertices, faces, Request(quads=1000, engine="split"))
+    patch = RemeshPatch(vertices, faces, 1000, 0.045, Request(), None)
+    height = out[quads_out].mean(1)[:, 2]
     left = [
         Candidate(
-            search.Way("instant-meshes", 0, (1.0,), 30.0), 1000, None, *topology.compact(out, found[height < most])
-        ).leaves_out(part)
+            search.EngineAttempt("instant-meshes", 0, (1.0,), 30.0),
+            1000,
+            None,
+            *topology.compact(out, quads_out[height < most]),
+        ).missing_surface(patch)
         for most in (1.0, 0.37, 0.0)
     ]
-    assert left[:2] == [None, None] and "leaves out 3" in left[2]
-    calls = in_this_process(monkeypatch, lambda *_: topology.compact(out, found[height < 0.0]))
-    monkeypatch.setattr(quad_candidate, "judged", lambda vertices, found, *_: (None, vertices, found))
-    monkeypatch.setattr(search.Trial, "_drawn", None)
-    _, _, record = quads.remesh(vertices, faces, Request(quads=1000))
-    assert len(calls) == 1 and record.engine == "pair and split" and "leaves out" in record.failed[0]
+    assert left[:2] == [None, None]
+    assert "leaves out 3" in left[2]
+    calls = in_this_process(monkeypatch, lambda *_: topology.compact(out, quads_out[height < 0.0]))
+    monkeypatch.setattr(candidates, "repair_and_judge", lambda vertices, quads_out, *_: (None, vertices, quads_out))
+    monkeypatch.setattr(search.EngineSearch, "_fit_first_good", None)
+    _, _, record = pipeline.remesh(vertices, faces, Request(quads=1000))
+    assert len(calls) == 1
+    assert record.engine == "pair and split"
+    assert "leaves out" in record.failed[0]
 
 
 @pytest.mark.parametrize("thickness, thin", [(0.03, True), (0.05, False)])
 def test_a_coarser_mesh_is_given_up_where_walls_are_thinner_than_quads(thickness, thin):
     vertices, faces = igl.upsample(*cube(), 5)
     vertices = vertices * (0.9, 0.9, thickness)
-    part = Part(vertices, faces, 4000, (2 * 0.81 / 4000) ** 0.5, Request(), None)
-    assert part.thin == thin
+    patch = RemeshPatch(vertices, faces, 4000, (2 * 0.81 / 4000) ** 0.5, Request(), None)
+    assert patch.has_thin_walls == thin
     wedge = vertices.copy()
     wedge[:, 2] *= 0.01 + (wedge[:, 0] + 0.45) / 0.9 * 0.7 / thickness
-    assert not Part(wedge, faces, 4000, 0.02, Request(), None).thin
+    assert not RemeshPatch(wedge, faces, 4000, 0.02, Request(), None).has_thin_walls
     # One side of a sheet is no wall, nor is what lies outside, before it.
-    assert not Part(
-        vertices, faces[face_normals(vertices, faces)[0][:, 2] > 0.5], 2000, part.edge, Request(), None
-    ).thin
+    assert not RemeshPatch(
+        vertices, faces[face_normals(vertices, faces)[0][:, 2] > 0.5], 2000, patch.edge, Request(), None
+    ).has_thin_walls
     # A coarse mesh is not asked.
-    assert not Part(cube()[0] * (0.9, 0.9, thickness), cube()[1], 4000, part.edge, Request(), None).thin
-    assert not Part(vertices, faces[:, ::-1], 4000, part.edge, Request(), None).thin
+    assert not RemeshPatch(
+        cube()[0] * (0.9, 0.9, thickness), cube()[1], 4000, patch.edge, Request(), None
+    ).has_thin_walls
+    assert not RemeshPatch(vertices, faces[:, ::-1], 4000, patch.edge, Request(), None).has_thin_walls
     # Without creases, or its narrow sides tell.
-    _, found, record = quads.remesh(vertices, faces, Request(quads=4000, crease_degrees=0.0))
-    assert (
-        whole(found)
-        and any("walls" in text for text in record.failed) == thin
-        and not (thin and "1 subdivision" in record.engine)
-    )
+    _, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000, crease_degrees=0.0))
+    assert whole(quads_out)
+    assert any("walls" in text for text in record.failed) == thin
+    assert not (thin and "1 subdivision" in record.engine)
 
 
 def with_tunnel(vertices, faces, length):
@@ -144,13 +157,16 @@ def bored_ball():
 @pytest.mark.parametrize("shape, given_up", [("a skin-deep tunnel", True), ("a bore", False)])
 def test_a_handle_is_given_up_only_where_it_is_finer_than_a_quad(monkeypatch, shape, given_up):
     vertices, faces = sphere(96, 0.4)
-    out, found, _ = quads.remesh(vertices, faces, Request(quads=1000, engine="split"))
+    out, quads_out, _ = pipeline.remesh(vertices, faces, Request(quads=1000, engine="split"))
     vertices, faces = with_tunnel(vertices, faces, 0.07) if given_up else bored_ball()
-    assert topology.is_watertight(faces) and topology.is_manifold(faces) and topology.euler_number(faces) == 0
-    in_this_process(monkeypatch, lambda *_: (out, found))  # an engine that makes a ball of it
-    _, found, record = quads.remesh(vertices, faces, Request(quads=1000))
-    assert whole(found) and (record.engine == "instant-meshes, handles are lost") == given_up
-    assert topology.euler_number(found) == (2 if given_up else 0)
+    assert topology.is_watertight(faces)
+    assert topology.is_manifold(faces)
+    assert topology.euler_number(faces) == 0
+    in_this_process(monkeypatch, lambda *_: (out, quads_out))  # an engine that makes a ball of it
+    _, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=1000))
+    assert whole(quads_out)
+    assert (record.engine == "instant-meshes, handles are lost") == given_up
+    assert topology.euler_number(quads_out) == (2 if given_up else 0)
 
 
 def test_torn_output_is_not_believed(monkeypatch):
@@ -158,21 +174,25 @@ def test_torn_output_is_not_believed(monkeypatch):
     book = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [1, 0, 6, 7]])
     in_this_process(monkeypatch, lambda *_: (np.random.default_rng(0).random((8, 3)), book))
     vertices, faces = sphere(24)
-    _, found, record = quads.remesh(vertices / 2, faces, Request(quads=300))
-    assert (
-        whole(found) and record.engine == "pair and split" and any("pieces are lost" in text for text in record.failed)
-    )
+    _, quads_out, record = pipeline.remesh(vertices / 2, faces, Request(quads=300))
+    assert whole(quads_out)
+    assert record.engine == "pair and split"
+    assert any("pieces are lost" in text for text in record.failed)
 
 
 def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
     vertices, faces = quad_cube(3)
     middle = inner_face(vertices, faces)
     corners, sides = around(faces, middle)
-    assert len(corners) == 4 and len(sides) == 4
+    assert len(corners) == 4
+    assert len(sides) == 4
     torn = np.delete(faces, [*corners[1:], *sides], 0)
-    fault, out, found = quad_candidate.judged(vertices, torn, topology.invariants(faces))
-    assert fault is None and whole(found) and topology.components(found)[0] == 1 and len(found) < len(faces)
-    assert volume(out, triangulated(found)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
+    fault, out, quads_out = candidates.repair_and_judge(vertices, torn, topology.invariants(faces))
+    assert fault is None
+    assert whole(quads_out)
+    assert topology.components(quads_out)[0] == 1
+    assert len(quads_out) < len(faces)
+    assert volume(out, triangulated(quads_out)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
 
 
 def test_candidates_are_in_the_order_of_place(monkeypatch):
@@ -181,13 +201,12 @@ def test_candidates_are_in_the_order_of_place(monkeypatch):
     rng = np.random.default_rng(1)
     mixed, number = rng.permutation(len(vertices)), np.empty(len(vertices), np.int64)
     number[mixed] = np.arange(len(vertices))
-    monkeypatch.setitem(
-        quad_candidate.ENGINES, "quadriflow", lambda *_: (vertices[mixed], rng.permutation(number[faces]))
+    monkeypatch.setitem(candidates.ENGINES, "quadriflow", lambda *_: (vertices[mixed], rng.permutation(number[faces])))
+    one = candidates.make_candidate(
+        vertices, triangulated(faces)[0], candidates.EngineAttempt("quadriflow", 0, (1.0,), 30.0), len(faces)
     )
-    one = quad_candidate.candidate(
-        vertices, triangulated(faces)[0], quad_candidate.Way("quadriflow", 0, (1.0,), 30.0), len(faces)
-    )
-    assert one.fault is None and len(one.quads) == len(faces)
+    assert one.fault is None
+    assert len(one.quads) == len(faces)
 
     def places(v, q):
         return sorted(map(tuple, v[q].reshape(len(q), 12).tolist()))
@@ -200,36 +219,38 @@ def test_candidates_are_in_the_order_of_place(monkeypatch):
 
 def test_output_without_area_is_no_quads():
     vertices, faces = quad_cube(1)
-    assert quad_candidate.judged(vertices, faces[:, [0, 1, 1, 0]], topology.invariants(faces))[0] == "no quads"
+    assert candidates.repair_and_judge(vertices, faces[:, [0, 1, 1, 0]], topology.invariants(faces))[0] == "no quads"
 
 
 def test_quads_that_cut_edges_off_do_not_do():
     vertices, faces = quad_cube(3)
-    surface, edge = Surface(vertices, triangulated(faces)[0]), 0.125 * np.ptp(vertices[:, 0])
-    assert fault_of(vertices, faces, surface, edge, 1.0, 0.005)[0] is None
+    surface, edge = ProjectionTarget(vertices, triangulated(faces)[0]), 0.125 * np.ptp(vertices[:, 0])
+    assert rejection_reason(vertices, faces, surface, edge, 1.0, 0.005)[0] is None
     cut = vertices.copy()
     on_two = np.isclose(np.abs(vertices), np.abs(vertices).max()).sum(1) >= 2  # the cube's twelve edges
     cut[on_two] *= 1 - 0.5 * edge / np.ptp(vertices[:, 0])
-    assert fault_of(cut, faces, surface, edge, 1.0, 0.5)[0] is None
-    assert fault_of(cut, faces, surface, edge, 1.0, 0.005)[0].startswith("cuts off")
+    assert rejection_reason(cut, faces, surface, edge, 1.0, 0.5)[0] is None
+    assert rejection_reason(cut, faces, surface, edge, 1.0, 0.005)[0].startswith("cuts off")
 
 
 def test_surface_that_the_quads_do_without_is_measured():
     vertices, faces = cube()
     lid = faces[np.all(vertices[faces][:, :, 2] == vertices[:, 2].max(), 1)]
     rest = np.array([f for f in faces.tolist() if f not in lid.tolist()])
-    surface = Surface(vertices, faces)
+    surface = ProjectionTarget(vertices, faces)
     closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, rest))
-    assert left_out(surface_of(vertices, closed), surface, (0.1,)) == [0]
+    assert uncovered_shares(target_of_quads(vertices, closed), surface, (0.1,)) == [0]
     # The lid but its rim.
-    assert left_out(surface_of(vertices, opened), surface, (0.1, 2.0)) == pytest.approx([0.8**2 / 6, 0], abs=0.02)
+    assert uncovered_shares(target_of_quads(vertices, opened), surface, (0.1, 2.0)) == pytest.approx(
+        [0.8**2 / 6, 0], abs=0.02
+    )
 
 
 def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_finer_one_comes(monkeypatch):
     """Of a coarser mesh subdivided less is put up with than of a finer one, for the finer one comes after it; where it
     does not, it is better than none."""
 
-    engine = quad_candidate.ENGINES["instant-meshes"]
+    engine = candidates.ENGINES["instant-meshes"]
 
     def torn(vertices, faces, quads, degrees):
         if quads > 2000:
@@ -237,99 +258,126 @@ def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_fine
         return engine(vertices, faces, quads, degrees)
 
     calls = in_this_process(monkeypatch)
-    monkeypatch.setitem(quad_candidate.ENGINES, "instant-meshes", torn)
+    monkeypatch.setitem(candidates.ENGINES, "instant-meshes", torn)
     monkeypatch.setattr(
-        quad_candidate, "fault_of", lambda *given: ("cuts off 0.7% of the surface" if given[-1] < 0.007 else None, 0.5)
+        candidates,
+        "rejection_reason",
+        lambda *given: ("cuts off 0.7% of the surface" if given[-1] < 0.007 else None, 0.5),
     )
     vertices, faces = sphere(96, 0.45)
-    _, found, record = quads.remesh(vertices, faces, Request(quads=4000))
-    assert record.engine == "instant-meshes, 1 subdivision" and whole(found) and abs(len(found) / 4000 - 1) <= 0.03
-    assert "cuts off" in record.failed[0] and "SIGSEGV" in record.failed[1]
-    assert sum(not way.subdivisions for _, _, way, _ in calls) == 1
-    monkeypatch.setattr(quad_candidate, "FAR_SUBDIVIDED", 0.4)  # farther than that it is not unfolded
-    assert quads.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
+    _, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000))
+    assert record.engine == "instant-meshes, 1 subdivision"
+    assert whole(quads_out)
+    assert abs(len(quads_out) / 4000 - 1) <= 0.03
+    assert "cuts off" in record.failed[0]
+    assert "SIGSEGV" in record.failed[1]
+    assert sum(not attempt.subdivisions for _, _, attempt, _ in calls) == 1
+    monkeypatch.setattr(candidates, "FAR_SUBDIVIDED", 0.4)  # farther than that it is not unfolded
+    assert pipeline.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
     monkeypatch.undo()
     in_this_process(monkeypatch)
-    monkeypatch.setitem(quad_candidate.ENGINES, "instant-meshes", torn)
-    monkeypatch.setattr(quad_candidate, "fault_of", lambda *given: ("cuts off 2% of the surface", 0.5))
-    assert quads.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
+    monkeypatch.setitem(candidates.ENGINES, "instant-meshes", torn)
+    monkeypatch.setattr(candidates, "rejection_reason", lambda *given: ("cuts off 2% of the surface", 0.5))
+    assert pipeline.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
 
 
 def test_when_the_time_is_over_no_engine_is_begun():
     """What was asked for comes all the same, as paired triangles, and the record says why."""
     vertices, faces = sphere(96, 0.45)
     start = time.monotonic()
-    out, found, record = quads.remesh(vertices, faces, Request(quads=4000, seconds=0.0))
-    assert record.engine == "pair and split" and record.failed == [
-        "instant-meshes, 1 subdivision: not tried, the time is over"
-    ]
-    assert whole(found) and abs(len(found) / 4000 - 1) <= 0.03 and time.monotonic() - start < 30
+    out, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000, seconds=0.0))
+    assert record.engine == "pair and split"
+    assert record.failed == ["instant-meshes, 1 subdivision: not tried, the time is over"]
+    assert whole(quads_out)
+    assert abs(len(quads_out) / 4000 - 1) <= 0.03
+    assert time.monotonic() - start < 30
 
 
 def test_every_round_asks_for_two_densities():
-    way = search._ways(20000, Request())[0]
-    assert len(way.near(20000)) == 2 and np.mean(way.near(20000)) == pytest.approx(20000)
-    assert way.near(20000)[1] / way.near(20000)[0] == pytest.approx(way.factors[1] / way.factors[0])
+    attempt = search._attempts(20000, Request())[0]
+    assert len(attempt.counts_around(20000)) == 2
+    assert np.mean(attempt.counts_around(20000)) == pytest.approx(20000)
+    assert attempt.counts_around(20000)[1] / attempt.counts_around(20000)[0] == pytest.approx(
+        attempt.factors[1] / attempt.factors[0]
+    )
 
 
 def test_what_is_asked_next_lies_between_what_gave_too_few_and_what_gave_too_many():
     """An engine's count may jump by a twentieth: in proportion to the last answer what gave too many would be asked for
     again."""
-    gave = [(19700.0, 20868), (20100.0, 21164)]
-    assert search._between(gave, 20000) is None and search._between(gave, 22000) is None
-    gave += [(18691.0, 19164), (19070.0, 18844)]
-    assert search._between(gave, 20000) == pytest.approx(19186, abs=1)
+    answers = [search.EngineAnswer(19700.0, 20868), search.EngineAnswer(20100.0, 21164)]
+    assert search._interpolate_request(answers, 20000) is None
+    assert search._interpolate_request(answers, 22000) is None
+    answers += [search.EngineAnswer(18691.0, 19164), search.EngineAnswer(19070.0, 18844)]
+    assert search._interpolate_request(answers, 20000) == pytest.approx(19186, abs=1)
 
 
 def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypatch):
     """The first in rank where it will do, without a look at the other, and the other first where the first's outline
     leaves out more; where none does, what comes nearest to it."""
-    way = search._ways(20000, Request())[0]
+    attempt = search._attempts(20000, Request())[0]
     drawn = []
 
     def candidate(far, least, wrong=None, outline=0.5):
-        found = Candidate(way, 1000, None, np.zeros((0, 3)), np.zeros((0, 4), int), far=far, least=least, wrong=wrong)
-        found.asked_of_outline = outline
-        return found
+        quads_out = Candidate(
+            attempt,
+            1000,
+            None,
+            np.zeros((0, 3)),
+            np.zeros((0, 4), int),
+            distance_edges=far,
+            min_jacobian=least,
+            rejection=wrong,
+        )
+        quads_out.asked_of_outline = outline
+        return quads_out
 
-    def outlined(one, part):
-        one.outline = one.asked_of_outline
-        return one.outline < 1
+    def snap_to_features(one, patch):
+        one.snapped = one.asked_of_outline
+        return one.snapped < 1
 
-    monkeypatch.setattr(Candidate, "promising", outlined)
-    monkeypatch.setattr(Candidate, "draw", lambda one, part: drawn.append(one))
-    choose = search.Trial(Part(*cube(), 1000, 0.1, Request(), None), Record())._drawn
+    monkeypatch.setattr(Candidate, "is_promising", snap_to_features)
+    monkeypatch.setattr(Candidate, "fit", lambda one, patch: drawn.append(one))
+    choose = search.EngineSearch(RemeshPatch(*cube(), 1000, 0.1, Request(), None), Record())._fit_first_good
     good, better, bare, thin = candidate(0.5, 0.3), candidate(0.1, 0.9), candidate(0.9, 0.5), candidate(0.3, 0.1)
-    assert choose([good, better]) is good and drawn == [good] and choose([bare, good]) is good
+    assert choose([good, better]) is good
+    assert drawn == [good]
+    assert choose([bare, good]) is good
     assert choose([candidate(0.1, 0.9, "leaves out 1 % of the surface"), thin]) is thin
-    assert choose([bare, thin]) is bare and choose([candidate(2.0, 0.5), thin]) is thin
+    assert choose([bare, thin]) is bare
+    assert choose([candidate(2.0, 0.5), thin]) is thin
     drawn.clear()
     late = candidate(0.9, 0.3, outline=1.1)
-    assert choose([late, good]) is good and drawn == [good]
-    late.outline = None
+    assert choose([late, good]) is good
+    assert drawn == [good]
+    late.snapped = None
     drawn.clear()
-    assert choose([late, candidate(2.0, 0.5)]) is late and drawn[1] is late and len(drawn) == 2
+    assert choose([late, candidate(2.0, 0.5)]) is late
+    assert drawn[1] is late
+    assert len(drawn) == 2
 
 
 def test_the_quads_of_tips_count_before_any_are_drawn(monkeypatch):
     """What has too many quads with those of its tips is not drawn; another that has as many tips but fewer quads is,
     and only then a new one asked for."""
-    way = search._ways(20000, Request())[0]
-    trial = search.Trial(Part(*cube(), 4000, 0.1, Request(), None), Record())
+    attempt = search._attempts(20000, Request())[0]
+    search_run = search.EngineSearch(RemeshPatch(*cube(), 4000, 0.1, Request(), None), Record())
 
     def candidate(count, tips, hopeless=False):
-        found = Candidate(way, count, None, np.zeros((0, 3)), np.zeros((count // 4, 4), int))
-        found.traced = Outline(
+        quads_out = Candidate(attempt, count, None, np.zeros((0, 3)), np.zeros((count // 4, 4), int))
+        quads_out.traced = SnappedQuads(
             np.zeros((0, 3)), np.zeros((count + tips, 4), int), None, np.zeros(0, int), 0.1, 0.0, 1.0, hopeless
         )
-        return found
+        return quads_out
 
-    monkeypatch.setattr(Candidate, "trace", lambda one, part: setattr(one, "outline", one.traced))
+    monkeypatch.setattr(Candidate, "snap", lambda one, patch: setattr(one, "snapped", one.traced))
     plain, far, fewer = candidate(4000, 0), candidate(4100, 100), candidate(3900, 100)
-    assert next(trial._of_count([plain, far], 0)) is plain and far.outline is None
-    assert list(trial._of_count([far, fewer, candidate(4080, 100)], 0)) == [fewer]
-    assert trial._drawn(trial._of_count([far, plain := candidate(4060, 0)], 0)) is None and plain.outline is None
-    assert list(trial._of_count([hopeless := candidate(4100, 100, hopeless=True)], 0)) == [hopeless]
+    assert next(search_run._with_right_count([plain, far], 0)) is plain
+    assert far.snapped is None
+    assert list(search_run._with_right_count([far, fewer, candidate(4080, 100)], 0)) == [fewer]
+    assert search_run._fit_first_good(search_run._with_right_count([far, plain := candidate(4060, 0)], 0)) is None
+    assert plain.snapped is None
+    assert list(search_run._with_right_count([hopeless := candidate(4100, 100, hopeless=True)], 0)) == [hopeless]
 
 
 def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypatch):
@@ -338,12 +386,14 @@ def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypat
     calls = in_this_process(monkeypatch)
     vertices, faces = cube()
     vertices = vertices * (1, 0.8, 0.02)
-    out, found, record = quads.remesh(vertices, faces, Request(quads=8000))
-    assert all(not way.subdivisions for _, _, way, _ in calls) and "not tried, its quads are wider" in record.failed[0]
-    assert record.engine == "instant-meshes" and whole(found)
+    out, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=8000))
+    assert all(not attempt.subdivisions for _, _, attempt, _ in calls)
+    assert "not tried, its quads are wider" in record.failed[0]
+    assert record.engine == "instant-meshes"
+    assert whole(quads_out)
     corners = vertices[np.abs(vertices[:, None] - out[None]).max(-1).min(1) < 1e-9]
     assert len(corners) == 8
-    assert left_out(surface_of(out, found), Surface(vertices, faces), (0.005,)) == [0.0]
+    assert uncovered_shares(target_of_quads(out, quads_out), ProjectionTarget(vertices, faces), (0.005,)) == [0.0]
 
 
 @pytest.mark.parametrize("given, least, most", [(16000, 2000, 2500), (500, 500, 500)])
@@ -357,10 +407,8 @@ def test_an_engine_has_a_memory_limit_of_its_own_within_the_request(monkeypatch,
 
     monkeypatch.setattr(search, "begin", begin)
     vertices, faces = sphere(48, 0.45)
-    _, found, record = quads.remesh(vertices, faces, Request(quads=4000, memory_mb=given))
-    assert (
-        limits
-        and all(least <= limit <= most for limit in limits)
-        and record.engine == "pair and split"
-        and whole(found)
-    )
+    _, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000, memory_mb=given))
+    assert limits
+    assert all(least <= limit <= most for limit in limits)
+    assert record.engine == "pair and split"
+    assert whole(quads_out)

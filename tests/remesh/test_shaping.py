@@ -4,7 +4,7 @@ import numpy as np
 
 from gdtool.remesh.fit import shaping
 from gdtool.remesh.fit.feature_curves import Constraints
-from gdtool.remesh.fit.shaping import Outline
+from gdtool.remesh.fit.shaping import SnappedQuads
 from gdtool.remesh.task import Request
 from tests.geometry.solids import quad_cube
 
@@ -28,19 +28,29 @@ def test_tips_stay_where_folded_quads_before_them_are_taken_out(monkeypatch):
 
     held = constraints.curve, constraints.fixed, constraints.path, constraints.path_curve
     monkeypatch.setattr(
-        shaping, "_squared", lambda vertices, faces, surface, features, constraints, request: (vertices, constraints)
+        shaping,
+        "_square_twice",
+        lambda vertices, faces, surface, features, constraints, request: (vertices, constraints),
     )
     monkeypatch.setattr(
-        shaping, "_unfolded", lambda vertices, faces, surface, features, constraints, tips: (vertices, constraints)
+        shaping,
+        "_untangle_and_release",
+        lambda vertices, faces, surface, features, constraints, tips: (vertices, constraints),
     )
-    monkeypatch.setattr(shaping, "without_folded", without_one)
-    monkeypatch.setattr(shaping, "unfold", lambda vertices, *_: vertices)
+    monkeypatch.setattr(shaping, "collapse_folded_quads", without_one)
+    monkeypatch.setattr(shaping, "untangle", lambda vertices, *_: vertices)
     monkeypatch.setattr(
-        shaping, "ease", lambda vertices, *given, tips, **_: eased.append(vertices[tips]) or (vertices, given[3])
+        shaping,
+        "release_and_smooth",
+        lambda vertices, *given, tips, **_: eased.append(vertices[tips]) or (vertices, given[3]),
     )
     for jacobian in (0.1, -0.1):
         monkeypatch.setattr(
             shaping, "scaled_jacobian", lambda vertices, faces, jacobian=jacobian: np.full(len(faces), jacobian)
         )
-        shaping.drawn(Outline(vertices, quads, constraints, tips, 0.1, 0.0, 1.0, False), None, None, Request())
-    assert len(eased) == 1 and np.array_equal(eased[0], vertices[tips])  # of the folded ones alone
+        shaping.fit_to_surface(
+            SnappedQuads(vertices, quads, constraints, tips, 0.1, 0.0, 1.0, False), None, None, Request()
+        )
+    # of the folded ones alone
+    assert len(eased) == 1
+    assert np.array_equal(eased[0], vertices[tips])

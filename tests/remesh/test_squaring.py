@@ -6,9 +6,9 @@ import pytest
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.mesh_quality import scaled_jacobian
 from gdtool.geometry.topology import triangulated
-from gdtool.remesh.fit.feature_curves import Constraints, Features, untied
-from gdtool.remesh.fit.squaring import balance, ease, square_up
-from gdtool.remesh.fit.surface_projection import Surface
+from gdtool.remesh.fit.feature_curves import Constraints, Features, release_straight_corners
+from gdtool.remesh.fit.squaring import ReleaseOptions, balance_heights, release_and_smooth, square_up
+from gdtool.remesh.fit.surface_projection import ProjectionTarget
 from tests.geometry.solids import plane, sphere
 
 NO_FEATURES = Features(np.zeros((0, 3)), np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
@@ -26,8 +26,9 @@ def test_folded_quads_are_turned_over_again_and_stay_on_the_surface():
     bent = vertices.copy()
     bent[40] += [0.19, 0.17, 0]  # past its neighbour
     assert scaled_jacobian(bent, quads).min() < 0
-    out = square_up(bent, quads, Surface(*plane()), NO_FEATURES, Constraints.none(len(vertices)), 20)
-    assert scaled_jacobian(out, quads).min() > 0.8 and np.abs(out[:, 2]).max() < 1e-12
+    out = square_up(bent, quads, ProjectionTarget(*plane()), NO_FEATURES, Constraints.none(len(vertices)), 20)
+    assert scaled_jacobian(out, quads).min() > 0.8
+    assert np.abs(out[:, 2]).max() < 1e-12
     rim = np.abs(vertices[:, :2]).max(1) > 0.49
     assert np.array_equal(out[rim], vertices[rim])
 
@@ -39,11 +40,16 @@ def test_middle_of_three_corners_in_a_row_is_let_off_its_curve():
     curve[[39, 40, 49]] = 0
     fixed = np.zeros(len(vertices), bool)
     fixed[[38, 50]] = True
-    found = untied(vertices, quads, Constraints(curve, fixed, path, np.zeros(4, np.int64)))
-    assert found.curve[40] == -1 and found.curve[49] == -1 and found.curve[39] == 0
-    assert found.path.tolist() == [[38, 39]] and found.fixed[[38, 50]].all()
+    found = release_straight_corners(vertices, quads, Constraints(curve, fixed, path, np.zeros(4, np.int64)))
+    assert found.curve[40] == -1
+    assert found.curve[49] == -1
+    assert found.curve[39] == 0
+    assert found.path.tolist() == [[38, 39]]
+    assert found.fixed[[38, 50]].all()
     fixed[[40, 49]] = True  # true corners of the surface, square here: they stay
-    assert len(untied(vertices, quads, Constraints(curve, fixed, path, np.zeros(4, np.int64))).path) == 4
+    assert (
+        len(release_straight_corners(vertices, quads, Constraints(curve, fixed, path, np.zeros(4, np.int64))).path) == 4
+    )
 
 
 def test_a_corner_pinned_in_the_wrong_place_is_eased():
@@ -53,8 +59,9 @@ def test_a_corner_pinned_in_the_wrong_place_is_eased():
     fixed = np.zeros(len(vertices), bool)
     fixed[40] = True
     pinned = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
-    out, left = ease(bent, quads, Surface(*plane()), NO_FEATURES, pinned)
-    assert scaled_jacobian(out, quads).min() >= 0.2 and not left.fixed[40]
+    out, left = release_and_smooth(bent, quads, ProjectionTarget(*plane()), NO_FEATURES, pinned)
+    assert scaled_jacobian(out, quads).min() >= 0.2
+    assert not left.fixed[40]
 
 
 @pytest.mark.parametrize("moved, by", [(49, (0.1, -0.1, 0)), (41, (0, 0.2, 0))])
@@ -64,7 +71,7 @@ def test_a_tip_beside_folded_quads_stays_where_easing_would_draw_it_back(height,
     tip = 40
     vertices[tip, 2] = height
     triangles = triangulated(quads)[0]
-    surface, held = Surface(vertices, triangles.astype(np.int64)), Constraints.none(len(vertices))
+    surface, held = ProjectionTarget(vertices, triangles.astype(np.int64)), Constraints.none(len(vertices))
     held.fixed[tip] = True
     bent = vertices.copy()
     bent[moved] += by
@@ -74,10 +81,15 @@ def test_a_tip_beside_folded_quads_stays_where_easing_would_draw_it_back(height,
     def bare(out):
         return closest_points(vertices[[tip]], out, triangles)[0][0] * 8  # edges are 1/8 long
 
-    out, left = ease(bent, quads, surface, NO_FEATURES, held)
-    assert scaled_jacobian(out, quads).min() > 0.5 and bare(out) < 1e-9 and left.fixed[tip]
-    out, left = ease(bent, quads, surface, NO_FEATURES, held, most_bare=2.0)
-    assert 0.75 < bare(out) < 2 and not left.fixed[tip]
+    out, left = release_and_smooth(bent, quads, surface, NO_FEATURES, held)
+    assert scaled_jacobian(out, quads).min() > 0.5
+    assert bare(out) < 1e-9
+    assert left.fixed[tip]
+    out, left = release_and_smooth(
+        bent, quads, surface, NO_FEATURES, held, options=ReleaseOptions(max_uncovered_edges=2.0)
+    )
+    assert 0.75 < bare(out) < 2
+    assert not left.fixed[tip]
 
 
 def test_easing_folds_nothing_that_was_not_folded():
@@ -88,7 +100,9 @@ def test_easing_folds_nothing_that_was_not_folded():
         pinned = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
         bent = vertices + rng.normal(0, 0.06, vertices.shape) * (1, 1, 0)
         before = scaled_jacobian(bent, quads)
-        after = scaled_jacobian(ease(bent, quads, Surface(*plane()), NO_FEATURES, pinned)[0], quads)
+        after = scaled_jacobian(
+            release_and_smooth(bent, quads, ProjectionTarget(*plane()), NO_FEATURES, pinned)[0], quads
+        )
         assert (after <= 0).sum() <= (before <= 0).sum()
 
 
@@ -98,12 +112,13 @@ def test_balancing_lifts_quads_to_the_surface_but_leaves_thin_ones():
     vertices = vertices * 0.3
     thin = quads[[10, 30, 50]]
     vertices[thin[:, 0]] = 0.55 * vertices[thin[:, 1]] + 0.45 * vertices[thin[:, 3]]
-    ball = Surface(*sphere(48, 0.8))
+    ball = ProjectionTarget(*sphere(48, 0.8))
     vertices[:, 2] = np.sqrt(0.8**2 - (vertices[:, :2] ** 2).sum(1))
     vertices = ball.closest(vertices)[2]
     before = scaled_jacobian(vertices, quads)
-    out = balance(vertices, quads, ball, Constraints.none(len(vertices)))
+    out = balance_heights(vertices, quads, ball, Constraints.none(len(vertices)))
     after = scaled_jacobian(out, quads)
-    assert (before < 0.3).any() and (after[before < 0.3] >= before[before < 0.3] - 1e-12).all()
+    assert (before < 0.3).any()
+    assert (after[before < 0.3] >= before[before < 0.3] - 1e-12).all()
     centre = np.abs(ball.closest(out[quads].mean(1))[0]).mean(), np.abs(ball.closest(vertices[quads].mean(1))[0]).mean()
     assert centre[0] < 0.8 * centre[1]

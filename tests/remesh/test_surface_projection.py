@@ -17,11 +17,9 @@ def test_grid_figures():
     faces = np.stack([i, i + 1, i + 6, i + 5], -1)
     vertices = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1)
     figures = topology_figures(vertices, faces) | shape_figures(vertices, faces)
-    assert (
-        figures["irregular_share"] == 0
-        and figures["boundary_edges"] == 16
-        and figures["jacobian_min"] == pytest.approx(1)
-    )
+    assert figures["irregular_share"] == 0
+    assert figures["boundary_edges"] == 16
+    assert figures["jacobian_min"] == pytest.approx(1)
     vertices[6] += [1.5, 1.5, 0]  # past the opposite corner: folded
     assert scaled_jacobian(vertices, faces).min() < 0
 
@@ -29,9 +27,11 @@ def test_grid_figures():
 def test_subdivision_of_a_cube_is_regular_but_for_eight_corners():
     vertices, faces = cube()
     quad = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
-    out, found, _ = subdivide(vertices, quad)
-    assert len(found) == 24 and whole(found) and volume(out, found) == pytest.approx(1)
-    assert topology_figures(out, found)["irregular_share"] == pytest.approx(8 / 26)
+    out, quads_out, _ = subdivide(vertices, quad)
+    assert len(quads_out) == 24
+    assert whole(quads_out)
+    assert volume(out, quads_out) == pytest.approx(1)
+    assert topology_figures(out, quads_out)["irregular_share"] == pytest.approx(8 / 26)
     mixed = np.concatenate([np.concatenate([faces, np.full((12, 1), -1)], 1)[[1, 2]], quad[2:]])
     assert len(subdivide(vertices, mixed)[1]) == 2 * 3 + 4 * 4
 
@@ -47,6 +47,8 @@ def test_two_holes_that_meet_at_a_vertex_are_closed_each_by_itself():
     vertices, faces = quad_cube(3)
     middle = inner_face(vertices, faces)
     open_faces = np.delete(faces, [middle, around(faces, middle)[0][0]], 0)
-    out, found = fill_holes(vertices, open_faces)
-    assert len(out) == len(vertices) and len(found) == len(faces) and whole(found)
-    assert volume(out, triangulated(found)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
+    out, quads_out = fill_holes(vertices, open_faces)
+    assert len(out) == len(vertices)
+    assert len(quads_out) == len(faces)
+    assert whole(quads_out)
+    assert volume(out, triangulated(quads_out)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))

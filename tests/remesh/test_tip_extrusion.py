@@ -10,9 +10,9 @@ from gdtool.geometry.topology import triangulated
 from gdtool.remesh import pipeline
 from gdtool.remesh.fit import shaping
 from gdtool.remesh.fit.feature_curves import Constraints
-from gdtool.remesh.fit.shaping import farthest, surface_of
-from gdtool.remesh.fit.surface_projection import Surface
-from gdtool.remesh.fit.tip_extrusion import draw_out
+from gdtool.remesh.fit.shaping import max_distance, target_of_quads
+from gdtool.remesh.fit.surface_projection import ProjectionTarget
+from gdtool.remesh.fit.tip_extrusion import extrude_tips
 from gdtool.remesh.task import Request
 from tests.geometry.solids import quad_cube, sphere
 from tests.remesh.engines import in_this_process
@@ -40,33 +40,43 @@ def ball(rounds=4):
 @pytest.mark.parametrize("length, bend", [(0.08, 0.0), (0.25, 0.0), (0.25, 0.15)])
 def test_a_horn_is_drawn_out(length, bend):
     vertices, faces, edge = ball()
-    surface = Surface(*horned(length, bend=bend))
-    assert farthest(surface_of(vertices, faces), surface) > 1.4 * edge
-    out, found, constraints, tips, _, _ = draw_out(
-        vertices, faces, Constraints.none(len(vertices)), surface, edge, most_added=0.3
+    surface = ProjectionTarget(*horned(length, bend=bend))
+    assert max_distance(target_of_quads(vertices, faces), surface) > 1.4 * edge
+    out, quads_out, constraints, tips, _, _ = extrude_tips(
+        vertices, faces, Constraints.none(len(vertices)), surface, edge, max_added=0.3
     )
-    assert farthest(surface_of(out, found), surface) < 0.8 * edge
-    assert topology.is_watertight(found) and topology.is_manifold(found) and topology.euler_number(found) == 2
-    assert len(faces) < len(found) < 1.2 * len(faces)
-    assert len(tips) and constraints.fixed[tips].all() and len(constraints.curve) == len(out)
+    assert max_distance(target_of_quads(out, quads_out), surface) < 0.8 * edge
+    assert topology.is_watertight(quads_out)
+    assert topology.is_manifold(quads_out)
+    assert topology.euler_number(quads_out) == 2
+    assert len(faces) < len(quads_out) < 1.2 * len(faces)
+    assert len(tips)
+    assert constraints.fixed[tips].all()
+    assert len(constraints.curve) == len(out)
     apex = surface.vertices[surface.vertices[:, 0].argmax()]
     assert np.linalg.norm(out[tips] - apex, axis=1).min() < 0.9 * edge
     # The quads away from the horn are those that were there.
     same = (vertices == out[: len(vertices)]).all(1)
-    assert same.sum() > 0.97 * len(vertices) and (vertices[~same, 0] > 0.3).all()
+    assert same.sum() > 0.97 * len(vertices)
+    assert (vertices[~same, 0] > 0.3).all()
 
 
 def test_no_more_quads_than_allowed_are_spent():
     vertices, faces, edge = ball()
-    found = draw_out(vertices, faces, Constraints.none(len(vertices)), Surface(*horned(0.25)), edge, most_added=0.01)[1]
-    assert 0 < len(found) - len(faces) < 0.01 * len(faces) + 40  # those of the step that went over it
+    quads_out = extrude_tips(
+        vertices, faces, Constraints.none(len(vertices)), ProjectionTarget(*horned(0.25)), edge, max_added=0.01
+    )[1]
+    assert 0 < len(quads_out) - len(faces) < 0.01 * len(faces) + 40  # those of the step that went over it
 
 
 def test_what_is_near_enough_is_left_alone():
     vertices, faces, edge = ball()
-    surface = Surface(*horned(0.4 * edge))
-    out, found, _, tips, far, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
-    assert out is vertices and found is faces and not len(tips) and far == pytest.approx(0.4 * edge, rel=0.2)
+    surface = ProjectionTarget(*horned(0.4 * edge))
+    out, quads_out, _, tips, far, _ = extrude_tips(vertices, faces, Constraints.none(len(vertices)), surface, edge)
+    assert out is vertices
+    assert quads_out is faces
+    assert not len(tips)
+    assert far == pytest.approx(0.4 * edge, rel=0.2)
 
 
 def test_what_is_bare_is_told_by_area_and_not_by_how_many_vertices_are_there():
@@ -76,9 +86,9 @@ def test_what_is_bare_is_told_by_area_and_not_by_how_many_vertices_are_there():
     fine, triangles = sphere(160, 0.4)
     narrow = fine[:, 0] > 0.39
     fine = np.where(narrow[:, None], fine * (1 + 0.4 * edge / 0.4), fine)  # lifted by less than what makes a tip
-    many = Surface(*_cut_in_four(fine, triangles, narrow[triangles].all(1), 3))
+    many = ProjectionTarget(*_cut_in_four(fine, triangles, narrow[triangles].all(1), 3))
     assert (many.vertices[:, 0] > 0.39).mean() > 0.5
-    far, away = draw_out(vertices, faces, Constraints.none(len(vertices)), many, edge)[4:]
+    far, away = extrude_tips(vertices, faces, Constraints.none(len(vertices)), many, edge)[4:]
     share = face_normals(many.vertices, many.faces)[1] * (many.vertices[many.faces].mean(1)[:, 0] > 0.39)
     assert far == pytest.approx(0.4 * edge, rel=0.2)
     assert (away > 0.25 * edge).mean() == pytest.approx(
@@ -102,11 +112,16 @@ def _cut_in_four(vertices, faces, which, rounds):
 
 def test_one_vertex_reaches_a_tip_that_is_less_than_an_edge_away():
     vertices, faces, edge = ball()
-    surface = Surface(*horned(0.9 * edge))
-    assert 0.6 * edge < farthest(surface_of(vertices, faces), surface) < edge
-    out, found, constraints, tips, _, _ = draw_out(vertices, faces, Constraints.none(len(vertices)), surface, edge)
-    assert found is faces and farthest(surface_of(out, faces), surface) < 0.4 * edge
-    assert len(tips) == 1 and constraints.fixed[tips].all() and (out == vertices).all(1).sum() == len(vertices) - 1
+    surface = ProjectionTarget(*horned(0.9 * edge))
+    assert 0.6 * edge < max_distance(target_of_quads(vertices, faces), surface) < edge
+    out, quads_out, constraints, tips, _, _ = extrude_tips(
+        vertices, faces, Constraints.none(len(vertices)), surface, edge
+    )
+    assert quads_out is faces
+    assert max_distance(target_of_quads(out, faces), surface) < 0.4 * edge
+    assert len(tips) == 1
+    assert constraints.fixed[tips].all()
+    assert (out == vertices).all(1).sum() == len(vertices) - 1
 
 
 def test_paths_along_creases_end_where_a_tip_is_drawn_out():
@@ -118,24 +133,28 @@ def test_paths_along_creases_end_where_a_tip_is_drawn_out():
     curve = np.full(len(vertices), -1)
     curve[around] = 0
     held = Constraints(curve, np.zeros(len(vertices), bool), path, np.zeros(len(path), int))
-    _, found, constraints, tips, _, _ = draw_out(vertices, faces, held, Surface(*horned(0.2)), edge)
-    edges = set(map(tuple, topology.edges_of(found).ends.tolist()))
+    _, quads_out, constraints, tips, _, _ = extrude_tips(vertices, faces, held, ProjectionTarget(*horned(0.2)), edge)
+    edges = set(map(tuple, topology.edges_of(quads_out).ends.tolist()))
     assert 0.8 * len(path) < len(constraints.path) < len(path)
-    assert (
-        all(tuple(sorted(ends)) in edges for ends in constraints.path.tolist()) and (constraints.curve[tips] < 0).all()
-    )
+    assert all(tuple(sorted(ends)) in edges for ends in constraints.path.tolist())
+    assert (constraints.curve[tips] < 0).all()
 
 
 def test_an_engine_that_cuts_a_horn_short_is_still_taken(monkeypatch):
     vertices, faces = horned(0.35, 0.04)
     asked = Request(quads=2000)
     edge = (4 * np.pi * 0.4**2 / 2000) ** 0.5
-    out, found, record = pipeline.remesh(vertices, faces, asked)
-    figures = distance_figures(out, triangulated(found)[0], vertices, faces, 20000)
-    assert "instant-meshes" in record.engine and abs(len(found) / 2000 - 1) <= 0.03 and topology.is_watertight(found)
-    assert figures["hausdorff"] < 2 * edge and (scaled_jacobian(out, found) <= 0).mean() < 0.003
+    out, quads_out, record = pipeline.remesh(vertices, faces, asked)
+    figures = distance_figures(out, triangulated(quads_out)[0], vertices, faces, 20000)
+    assert "instant-meshes" in record.engine
+    assert abs(len(quads_out) / 2000 - 1) <= 0.03
+    assert topology.is_watertight(quads_out)
+    assert figures["hausdorff"] < 2 * edge
+    assert (scaled_jacobian(out, quads_out) <= 0).mean() < 0.003
     in_this_process(monkeypatch)
-    monkeypatch.setattr(shaping, "draw_out", lambda v, f, constraints, *_: (v, f, constraints, None, 0.0, np.zeros(1)))
+    monkeypatch.setattr(
+        shaping, "extrude_tips", lambda v, f, constraints, *_: (v, f, constraints, None, 0.0, np.zeros(1))
+    )
     assert pipeline.remesh(vertices, faces, asked)[2].engine == "pair and split"
 
 
@@ -146,8 +165,9 @@ def test_what_is_held_on_a_blunt_tip_leaves_room_for_quads():
     # A ridge some edges wide and a tenth of that thick: all vertices of its cap are drawn about as far.
     blunt = (fine[:, 0] > 0) & (abs(fine[:, 1]) < 2.2 * edge) & (abs(fine[:, 2]) < 0.4 * edge)
     fine[blunt, 0] += 1.4 * edge
-    out, _, _, tips, _, _ = draw_out(
-        vertices, faces, Constraints.none(len(vertices)), Surface(fine, triangles), edge, most_added=0.3
+    out, _, _, tips, _, _ = extrude_tips(
+        vertices, faces, Constraints.none(len(vertices)), ProjectionTarget(fine, triangles), edge, max_added=0.3
     )
     apart = np.linalg.norm(out[tips][:, None] - out[tips], axis=-1)[np.triu_indices(len(tips), 1)]
-    assert len(tips) > 2 and apart.min() > 0.7 * edge
+    assert len(tips) > 2
+    assert apart.min() > 0.7 * edge

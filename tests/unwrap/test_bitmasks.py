@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gdtool.geometry.uv_raster import owner_count
-from gdtool.unwrap.pack.bitmasks import Shapes, rim_of, turned, upright_box
-from gdtool.unwrap.pack.compact import Fine
+from gdtool.unwrap.pack.bitmasks import ChartMasks, Placement, orient_upright, outline_of, rotated_masks
+from gdtool.unwrap.pack.compact import FineGridCompactor
 
 RING = np.array([[0, 0], [9, 0], [9, 7], [0, 7], [2, 2], [7, 2], [7, 5], [2, 5.0]])
 RING_TRIANGLES = np.array([[0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]])
@@ -13,9 +13,9 @@ RING_TRIANGLES = np.array([[0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7]
 
 @pytest.mark.parametrize("gap", [0.0, 1.7])
 def test_a_mask_holds_all_that_the_chart_covers_and_the_gap_but_not_its_hole(gap):
-    rim = rim_of(RING, RING_TRIANGLES)
+    rim = outline_of(RING, RING_TRIANGLES)
     assert len(rim) == 8
-    masks, at = turned(rim, RING, 4.0, gap)
+    masks, at = rotated_masks(rim, RING, 4.0, gap)
     for mask, uv in zip(masks, at, strict=True):
         size = max(mask.shape)
         covered = owner_count(uv / size, RING_TRIANGLES, size)[: mask.shape[0], : mask.shape[1]] > 0
@@ -24,70 +24,73 @@ def test_a_mask_holds_all_that_the_chart_covers_and_the_gap_but_not_its_hole(gap
         assert mask.sum() <= (4 * 9 + gap + 3) * (4 * 7 + gap + 3) - (4 * 5 - gap - 3) * (4 * 3 - gap - 3)
         assert not mask[tuple(np.array(mask.shape) // 2)]
     # By half a cell: about as much as the chart has itself.
-    half = turned(rim, RING, 4.0, 0.0, 0.5)[0][0]
+    half = rotated_masks(rim, RING, 4.0, 0.0, 0.5)[0][0]
     assert half.sum() == pytest.approx(16 * (63 - 15), rel=0.02)
 
 
 def test_places_are_free_and_none_is_found_in_a_full_square():
-    rim = rim_of(RING, RING_TRIANGLES)
-    shapes = Shapes([(RING, rim)] * 4, 2.0, 0.0, 40)
+    rim = outline_of(RING, RING_TRIANGLES)
+    shapes = ChartMasks([(RING, rim)] * 4, 2.0, 0.0, 40)
     border, taken = shapes.border(40), 0
     for i in range(4):
-        place = shapes.placed(i, taken, border, 40, 0.5)
-        cells = shapes.cells(i, place)
-        assert not cells & taken and shapes.reach(i, place) <= 40
+        place = shapes.find_place(i, taken, border, 40, 0.5)
+        cells = shapes.cells_at(i, place)
+        assert not cells & taken
+        assert shapes.extent_at(i, place) <= 40
         taken |= cells
-    assert shapes.placed(0, (1 << 41 * 40) - 1, border, 40, 0.5) is None
+    assert shapes.find_place(0, (1 << 41 * 40) - 1, border, 40, 0.5) is None
 
 
 def test_a_chart_is_not_turned_onto_itself():
     square, oblong = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]), np.array([[0, 0], [3, 0], [3, 1], [0, 1.0]])
     wedge, triangles = np.array([[0, 0], [3, 0], [3, 1], [0, 2.0]]), np.array([[0, 1, 2], [0, 2, 3]])
-    shapes = Shapes([(uv, rim_of(uv, triangles)) for uv in (square, oblong, wedge)], 8.0, 1.5, 60)
+    shapes = ChartMasks([(uv, outline_of(uv, triangles)) for uv in (square, oblong, wedge)], 8.0, 1.5, 60)
     assert shapes._turns == [[0], [0, 1], [0, 1, 2, 3]]
-    taken = shapes.cells(2, shapes.placed(2, 0, shapes.border(60), 60, 0.5))
-    less = [shapes.placed(i, taken, shapes.border(60), 60, 0.5) for i in range(2)]
+    taken = shapes.cells_at(2, shapes.find_place(2, 0, shapes.border(60), 60, 0.5))
+    less = [shapes.find_place(i, taken, shapes.border(60), 60, 0.5) for i in range(2)]
     shapes._turns = [[0, 1, 2, 3]] * 3
-    assert less == [shapes.placed(i, taken, shapes.border(60), 60, 0.5) for i in range(2)]
+    assert less == [shapes.find_place(i, taken, shapes.border(60), 60, 0.5) for i in range(2)]
 
 
 def test_what_charts_leave_free_of_each_other_is_what_is_not_taken():
-    ring, sides = rim_of(RING, RING_TRIANGLES), np.random.default_rng(5).uniform(1, 9, (6, 2))
+    ring, sides = outline_of(RING, RING_TRIANGLES), np.random.default_rng(5).uniform(1, 9, (6, 2))
     square, triangles = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]), np.array([[0, 1, 2], [0, 2, 3]])
-    boxed = [(RING, ring)] * 2 + [(square * side, rim_of(square * side, triangles)) for side in sides]
-    shapes = Shapes(boxed, 2.0, 1.5, 44)
+    boxed = [(RING, ring)] * 2 + [(square * side, outline_of(square * side, triangles)) for side in sides]
+    shapes = ChartMasks(boxed, 2.0, 1.5, 44)
     border, taken, others = shapes.border(40), 0, []  # a smaller square than they are made for
     for i in range(8):
-        place = shapes.placed(i, taken, border, 40, 0.5)
-        assert shapes.placed(i, taken, border, 40, 0.5, others) == place is not None
+        place = shapes.find_place(i, taken, border, 40, 0.5)
+        assert shapes.find_place(i, taken, border, 40, 0.5, others) == place is not None
         free = [
-            not shapes.cells(i, (turn, x, y)) & taken
+            not shapes.cells_at(i, Placement(turn, x, y)) & taken
             for turn in range(4)
             for x in range(41 - shapes.shapes[i][turn][1])
             for y in range(41 - shapes.shapes[i][turn][0])
         ]
         hit = [
-            not shapes._hit(i, turn, others) >> y * shapes.stride + x & 1
+            not shapes._blocked_places(i, turn, others) >> y * shapes.stride + x & 1
             for turn in range(4)
             for x in range(41 - shapes.shapes[i][turn][1])
             for y in range(41 - shapes.shapes[i][turn][0])
         ]
         assert hit == free
         others.append((i, place))
-        taken |= shapes.cells(i, place)
+        taken |= shapes.cells_at(i, place)
 
 
 def test_a_layout_whose_charts_touch_is_moved_apart():
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
-    boxed = [(square, rim_of(square, triangles))] * 4
+    boxed = [(square, outline_of(square, triangles))] * 4
     gap, cells = 1 / 50, 10.4  # squares of 10.4 cells, at places 10 cells apart
-    shapes = Shapes(boxed, cells, 0.0, 40, 0.5)
-    places, scale = Fine(boxed, shapes, cells, [22], gap).settled([[(0, 0, 0), (0, 10, 0), (0, 0, 10), (0, 10, 10)]])
-    low, high = np.array([uv.min(0) for uv in places]), np.array([uv.max(0) for uv in places])
-    assert (
-        low.min() >= 0.4 * gap and high.max() <= 1 - 0.4 * gap and high - low == pytest.approx(np.full((4, 2), scale))
+    shapes = ChartMasks(boxed, cells, 0.0, 40, 0.5)
+    places, scale = FineGridCompactor(boxed, shapes, cells, [22], gap).compact(
+        [[Placement(0, 0, 0), Placement(0, 10, 0), Placement(0, 0, 10), Placement(0, 10, 10)]]
     )
+    low, high = np.array([uv.min(0) for uv in places]), np.array([uv.max(0) for uv in places])
+    assert low.min() >= 0.4 * gap
+    assert high.max() <= 1 - 0.4 * gap
+    assert high - low == pytest.approx(np.full((4, 2), scale))
     apart = np.maximum(low[:, None] - high[None], low[None] - high[:, None]).max(-1)
     assert apart[~np.eye(4, dtype=bool)].min() >= 0.99 * gap
     assert 4 * scale**2 > 0.85
@@ -95,7 +98,7 @@ def test_a_layout_whose_charts_touch_is_moved_apart():
 
 def test_upright_is_the_smallest_rectangle_with_its_longer_side_along_u():
     turn = np.array([[np.cos(1.1), -np.sin(1.1)], [np.sin(1.1), np.cos(1.1)]])
-    assert np.ptp(upright_box(RING @ turn), 0) == pytest.approx([9, 7], rel=1e-3)
+    assert np.ptp(orient_upright(RING @ turn), 0) == pytest.approx([9, 7], rel=1e-3)
 
 
 def test_no_orders_are_sought_for_a_grid_on_which_charts_do_not_come_apart(monkeypatch):
@@ -105,12 +108,15 @@ def test_no_orders_are_sought_for_a_grid_on_which_charts_do_not_come_apart(monke
     sides = np.random.default_rng(3).uniform(1, 5, (14, 2))
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
     charts = [(np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]) * side, triangles) for side in sides]
-    sought, improved = [], search._improved
-    monkeypatch.setattr(search, "_improved", lambda *given, **more: sought.append(given) or improved(*given, **more))
-    monkeypatch.setattr(Fine, "apart", lambda *given: None)
+    sought, improved = [], search._improve_layouts
+    monkeypatch.setattr(
+        search, "_improve_layouts", lambda *given, **more: sought.append(given) or improved(*given, **more)
+    )
+    monkeypatch.setattr(FineGridCompactor, "separate", lambda *given: None)
     places, _ = search.pack(charts, 0.002)
     shares = [given[0].shapes for given in sought]
-    assert len(sought) == 2 and shares[0] != shares[1]
+    assert len(sought) == 2
+    assert shares[0] != shares[1]
     assert (
         owner_count(np.concatenate(places), np.concatenate([triangles + 4 * i for i in range(14)]), 2048) <= 1
     ).all()

@@ -6,7 +6,7 @@ import trimesh
 from gdtool.geometry.topology import triangulated
 from gdtool.unwrap.parameterize import schedule
 from gdtool.unwrap.segment.charts import Adjacency
-from gdtool.unwrap.segment.merge import _brought_over, joined
+from gdtool.unwrap.segment.merge import _transfer_labels, merge_small_charts
 
 GOOD = 1.002
 
@@ -29,13 +29,13 @@ def proxy_of(vertices, faces):
 def test_a_strip_beside_a_sheet_joins_it():
     vertices, faces = sheet(110, bend=1.0)
     label = (np.arange(110 * 110) % 110 >= 108).astype(int)
-    assert (joined(vertices, faces, label, *proxy_of(*sheet(55, bend=1.0)), GOOD) == 0).all()
+    assert (merge_small_charts(vertices, faces, label, *proxy_of(*sheet(55, bend=1.0)), GOOD) == 0).all()
 
 
 def test_large_charts_stay_apart():
     vertices, faces = sheet(20)
     label = (np.arange(400) % 20 >= 10).astype(int)
-    assert (joined(vertices, faces, label, *proxy_of(vertices, faces), GOOD) == label).all()
+    assert (merge_small_charts(vertices, faces, label, *proxy_of(vertices, faces), GOOD) == label).all()
 
 
 def test_what_would_close_or_stretch_stays_apart():
@@ -43,7 +43,10 @@ def test_what_would_close_or_stretch_stays_apart():
     faces = np.concatenate([ball.faces, np.full((len(ball.faces), 1), -1)], 1)
     height = ball.triangles_center[:, 2]
     for label in ((height > 0.98).astype(int), np.where(height > 0.98, 2, (height < 0).astype(int))):
-        assert len(np.unique(joined(ball.vertices, faces, label, ball.vertices, ball.faces, GOOD))) == label.max() + 1
+        assert (
+            len(np.unique(merge_small_charts(ball.vertices, faces, label, ball.vertices, ball.faces, GOOD)))
+            == label.max() + 1
+        )
 
 
 def test_the_sides_of_a_thin_wall_keep_their_labels():
@@ -53,7 +56,7 @@ def test_the_sides_of_a_thin_wall_keep_their_labels():
     (one, up), (two, down) = sheet(7), sheet(7, height=0.002, down=True)
     proxy = proxy_of(np.concatenate([one, two]), np.concatenate([up, down + len(one)]))
     adjacency = Adjacency(proxy[0], np.concatenate([proxy[1], np.full((len(proxy[1]), 1), -1)], 1))
-    assert (_brought_over(vertices, faces, label, *proxy, adjacency) == np.repeat([0, 1], 98)).all()
+    assert (_transfer_labels(vertices, faces, label, *proxy, adjacency) == np.repeat([0, 1], 98)).all()
 
 
 def test_what_lay_flat_together_on_the_proxy_alone_comes_apart_again(monkeypatch):
@@ -63,21 +66,24 @@ def test_what_lay_flat_together_on_the_proxy_alone_comes_apart_again(monkeypatch
     ball.remove_unreferenced_vertices()
     faces = np.concatenate([ball.faces, np.full((len(ball.faces), 1), -1)], 1)
     label = (ball.triangles_center[:, 2] > 0.985).astype(int)
-    monkeypatch.setattr(schedule, "joined", lambda *given: np.zeros(len(faces), int))
-    monkeypatch.setattr(schedule, "_WHOLE", np.inf)
-    charts, _ = schedule.flatten_all(ball.vertices, faces, label, GOOD, 1.5, (ball.vertices, ball.faces))
+    monkeypatch.setattr(schedule, "merge_small_charts", lambda *given: np.zeros(len(faces), int))
+    monkeypatch.setattr(schedule, "_MAX_TOTAL_EXCESS", np.inf)
+    charts, _ = schedule.flatten_all(
+        ball.vertices, faces, label, schedule.FlattenLimits(GOOD, 1.5), (ball.vertices, ball.faces)
+    )
     owner = np.full(len(faces), -1)
     for i, (faces_idx, _, uv, _) in enumerate(charts):
         owner[faces_idx] = i
         assert np.isfinite(uv).all()
-    assert len(charts) == 2 and ((owner == owner[label.argmax()]) == (label == 1)).all()
+    assert len(charts) == 2
+    assert ((owner == owner[label.argmax()]) == (label == 1)).all()
 
 
 def test_a_chart_that_touches_itself_in_a_vertex_has_it_twice():
-    from gdtool.unwrap.segment.charts import own_corners
+    from gdtool.unwrap.segment.charts import chart_mesh
 
     vertices, faces = sheet(2)
     for own, count in (([0, 1], 6), ([0, 3], 8), ([0, 1, 3], 8), ([0, 1, 2, 3], 9)):
-        points, corners = own_corners(vertices, faces[own])
+        points, corners = chart_mesh(vertices, faces[own])
         assert len(points) == count
         np.testing.assert_array_equal(points[corners], vertices[faces[own]])

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from gdtool.geometry.topology import edges_of, triangulated
+from gdtool.unwrap.chart import Chart
 from gdtool.unwrap.parameterize import schedule
-from gdtool.unwrap.parameterize.flatten import lies_on_itself, overlapping, stretch
-from gdtool.unwrap.segment.charts import Adjacency, own_corners
-from gdtool.unwrap.segment.overlaps import onto_neighbours, peel
+from gdtool.unwrap.parameterize.flatten import overlapping_triangles, overlaps_itself, stretch
+from gdtool.unwrap.segment.charts import Adjacency, chart_mesh
+from gdtool.unwrap.segment.overlaps import OverlapPiece, give_to_neighbours, remove_overlaps
 from tests.unwrap.test_merge import GOOD, sheet
 
 
@@ -25,11 +26,11 @@ def spiral(turns, around=120, across=6):
 def test_the_end_that_lies_on_the_beginning_is_taken_off():
     vertices, faces, uv = spiral(1.05)
     triangles, face_idx = triangulated(faces)
-    assert 0 < overlapping(uv, triangles).mean() < 0.2
-    keep = peel(Adjacency(vertices, faces), np.arange(len(faces)), triangles, face_idx, uv)
+    assert 0 < overlapping_triangles(uv, triangles).mean() < 0.2
+    keep = remove_overlaps(Adjacency(vertices, faces), np.arange(len(faces)), triangles, face_idx, uv)
     # One of the two ends, not both; the rest lies apart.
     assert 0.9 < keep.mean() < 0.97
-    assert not overlapping(uv, triangles[keep[face_idx]]).any()
+    assert not overlapping_triangles(uv, triangles[keep[face_idx]]).any()
 
 
 def test_a_disk_whose_rim_does_not_cross_itself_lies_on_nothing():
@@ -37,7 +38,9 @@ def test_a_disk_whose_rim_does_not_cross_itself_lies_on_nothing():
         _, faces, uv = spiral(turns)
         triangles = triangulated(faces)[0].astype(np.int64)
         assert (
-            lies_on_itself(uv, triangles, edges_of(triangles), True) == overlapping(uv, triangles).any() == (turns > 1)
+            overlaps_itself(uv, triangles, edges_of(triangles), True)
+            == overlapping_triangles(uv, triangles).any()
+            == (turns > 1)
         )
 
 
@@ -54,24 +57,29 @@ def test_a_rim_that_crosses_itself_where_two_of_its_corners_coincide(past):
         uv = np.delete(uv, [1, 15], 0)
     i = np.arange(1, len(uv) - 1)
     triangles = np.stack([np.zeros_like(i), i, i + 1], -1)
-    assert lies_on_itself(uv, triangles, edges_of(triangles), True) == bool(past)
+    assert overlaps_itself(uv, triangles, edges_of(triangles), True) == bool(past)
 
 
 def test_what_lies_on_itself_by_half_is_not_peeled():
     vertices, faces, uv = spiral(1.6)
     triangles, face_idx = triangulated(faces)
-    assert peel(Adjacency(vertices, faces), np.arange(len(faces)), triangles, face_idx, uv) is None
+    assert remove_overlaps(Adjacency(vertices, faces), np.arange(len(faces)), triangles, face_idx, uv) is None
 
 
 def test_a_peeled_band_is_two_charts_and_not_many_halves():
     vertices, faces, _ = spiral(1.05)
     charts, cut = schedule.flatten_all(
-        vertices, faces, np.zeros(len(faces), int), GOOD, 1.5, (vertices, triangulated(faces)[0].astype(np.int64))
+        vertices,
+        faces,
+        np.zeros(len(faces), int),
+        schedule.FlattenLimits(GOOD, 1.5),
+        (vertices, triangulated(faces)[0].astype(np.int64)),
     )
-    assert len(charts) == 2 and cut == ["1 charts were cut: a chart overlaps itself"]
+    assert len(charts) == 2
+    assert cut == ["1 charts were cut: a chart overlaps itself"]
     assert sorted(np.concatenate([chart[0] for chart in charts])) == list(range(len(faces)))
     for _, _, uv, triangles in charts:
-        assert not overlapping(uv, triangles).any()
+        assert not overlapping_triangles(uv, triangles).any()
 
 
 def test_a_piece_goes_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
@@ -87,26 +95,28 @@ def test_a_piece_goes_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
             vertices,
             faces[faces_idx],
             np.zeros(len(faces_idx), int),
-            GOOD,
-            1.5,
+            schedule.FlattenLimits(GOOD, 1.5),
             (vertices, triangulated(faces[faces_idx])[0].astype(np.int64)),
         )[0][0]
 
     def left(home, beside=(dome, flat), good=GOOD):
-        charts = [(own, *chart(own)[1:]) for own in beside]
+        charts = [chart(own)._replace(faces_idx=own) for own in beside]
         return len(
-            onto_neighbours(Adjacency(vertices, faces), vertices, faces, charts, [(int(home[0]), piece)], good)
+            give_to_neighbours(
+                Adjacency(vertices, faces), vertices, faces, charts, [OverlapPiece(int(home[0]), piece)], good
+            )
         ), charts
 
     count, charts = left(piece)
-    assert (
-        not count and len(charts[0][0]) == len(dome) and sorted(charts[1][0]) == sorted(np.concatenate([flat, piece]))
-    )
+    assert not count
+    assert len(charts[0][0]) == len(dome)
+    assert sorted(charts[1][0]) == sorted(np.concatenate([flat, piece]))
     # What it came off does not get it back; with nothing flat beside it, it is left; so are all once enough has been
     # tried.
-    assert left(flat, [flat])[0] == 1 and left(dome, [flat])[0] == 0
+    assert left(flat, [flat])[0] == 1
+    assert left(dome, [flat])[0] == 0
     assert left(piece, [dome], 1 + 1e-9)[0] == 1
-    monkeypatch.setattr("gdtool.unwrap.segment.overlaps._WORK", -1)
+    monkeypatch.setattr("gdtool.unwrap.segment.overlaps._MAX_WORK", -1)
     assert left(piece)[0] == 1
 
 
@@ -115,12 +125,15 @@ def test_a_chart_much_larger_than_a_piece_stays_as_it_lies(columns, stays):
     vertices, faces = sheet(12, bend=1.0)
     column = np.arange(144) % 12
     piece, own = np.flatnonzero(column < columns), np.flatnonzero(column >= columns)
-    points, corners = own_corners(vertices, faces[own])
+    points, corners = chart_mesh(vertices, faces[own])
     # Bent and slanted: laid anew it would not come to lie so.
     lies = np.stack([np.arcsin(points[:, 0]), points[:, 1] + 0.01 * points[:, 0]], -1)
-    charts = [(own, corners, lies, triangulated(corners)[0])]
-    assert not onto_neighbours(Adjacency(vertices, faces), vertices, faces, charts, [(int(piece[0]), piece)], 1.01)
+    charts = [Chart(own, corners, lies, triangulated(corners)[0])]
+    assert not give_to_neighbours(
+        Adjacency(vertices, faces), vertices, faces, charts, [OverlapPiece(int(piece[0]), piece)], 1.01
+    )
     faces_idx, corners, uv, triangles = charts[0]
-    assert sorted(faces_idx) == list(range(144)) and not overlapping(uv, triangles).any()
+    assert sorted(faces_idx) == list(range(144))
+    assert not overlapping_triangles(uv, triangles).any()
     assert (uv[: len(lies)] == lies).all() == stays
-    assert stretch(own_corners(vertices, faces[faces_idx])[0], triangles, uv) < 1.02
+    assert stretch(chart_mesh(vertices, faces[faces_idx])[0], triangles, uv) < 1.02

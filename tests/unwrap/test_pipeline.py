@@ -9,11 +9,12 @@ from gdtool.core.child import ChildFailed
 from gdtool.geometry.topology import triangulated
 from gdtool.geometry.uv_raster import owner_count
 from gdtool.unwrap import pipeline
+from gdtool.unwrap.chart import Chart
 from gdtool.unwrap.pack import search
-from gdtool.unwrap.pack.bitmasks import upright_box
+from gdtool.unwrap.pack.bitmasks import orient_upright
 from gdtool.unwrap.pack.search import pack
-from gdtool.unwrap.parameterize.flatten import Flat, flatten, stretch
-from gdtool.unwrap.parameterize.schedule import flatten_all
+from gdtool.unwrap.parameterize.flatten import FlattenResult, flatten, stretch
+from gdtool.unwrap.parameterize.schedule import FlattenLimits, flatten_all
 from gdtool.unwrap.segment import charts as unwrap_charts
 from tests.bake.shapes import torus
 from tests.geometry.solids import cube
@@ -35,10 +36,14 @@ def box(n: int = 6):
 
 def checked(vertices, faces, result, size=512):
     """The figures, after what must always hold."""
-    assert np.isfinite(result.uv).all() and result.uv.min() >= 0 and result.uv.max() <= 1
-    assert ((result.face_uvs >= 0) == (faces >= 0)).all() and result.face_uvs.max() == len(result.uv) - 1
+    assert np.isfinite(result.uv).all()
+    assert result.uv.min() >= 0
+    assert result.uv.max() <= 1
+    assert ((result.face_uvs >= 0) == (faces >= 0)).all()
+    assert result.face_uvs.max() == len(result.uv) - 1
     figures = pipeline.figures(vertices, faces, result.uv, result.face_uvs, size)
-    assert figures["overlap"] == 0 and figures["mirrored"] == 0
+    assert figures["overlap"] == 0
+    assert figures["mirrored"] == 0
     return figures
 
 
@@ -46,7 +51,9 @@ def test_box_unfolds_without_stretch():
     vertices, faces = box()
     result = pipeline.unwrap(vertices, faces, SMALL)
     figures = checked(vertices, faces, result)
-    assert figures["charts"] <= 6 and figures["stretch"] == pytest.approx(1, abs=2e-3) and figures["coverage"] > 0.4
+    assert figures["charts"] <= 6
+    assert figures["stretch"] == pytest.approx(1, abs=2e-3)
+    assert figures["coverage"] > 0.4
     # Seams run along creases: the twelve edges and no more, sqrt(3) is the diagonal.
     assert figures["seam_length"] <= 12 / 3**0.5 + 1e-6
 
@@ -55,7 +62,9 @@ def test_torus_has_even_density_and_gap():
     vertices, faces, _ = torus(48, 24)
     result = pipeline.unwrap(vertices, faces, SMALL)
     figures = checked(vertices, faces, result)
-    assert figures["stretch"] < 1.1 and figures["area_distortion"] < 1.3 and figures["charts"] <= 16
+    assert figures["stretch"] < 1.1
+    assert figures["area_distortion"] < 1.3
+    assert figures["charts"] <= 16
     # Charts stay 4 texels of 512 apart: growing each by a texel and a half makes none meet.
     from scipy.ndimage import binary_dilation
 
@@ -91,9 +100,8 @@ def test_degenerate_and_turned_faces_survive():
     vertices = vertices.copy()
     vertices[faces[7, 1]] = vertices[faces[7, 0]]
     result = pipeline.unwrap(vertices, faces, SMALL)
-    assert (
-        np.isfinite(result.uv).all() and pipeline.figures(vertices, faces, result.uv, result.face_uvs)["overlap"] == 0
-    )
+    assert np.isfinite(result.uv).all()
+    assert pipeline.figures(vertices, faces, result.uv, result.face_uvs)["overlap"] == 0
 
 
 def test_dead_xatlas_leaves_box_projection(monkeypatch):
@@ -105,7 +113,8 @@ def test_dead_xatlas_leaves_box_projection(monkeypatch):
     vertices, faces, _ = torus(24, 12)
     result = pipeline.unwrap(vertices, faces, SMALL)
     checked(vertices, faces, result)
-    assert len(result.failed) >= 2 and "took longer" in result.failed[0]
+    assert len(result.failed) >= 2
+    assert "took longer" in result.failed[0]
 
 
 @pytest.mark.parametrize("seconds", [1e-3, 0.3])
@@ -113,14 +122,16 @@ def test_with_hardly_any_time_the_atlas_is_plain_and_valid(seconds):
     vertices, faces, _ = torus(96, 48)
     start = time.monotonic()
     result = pipeline.unwrap(vertices, faces, pipeline.Request(size=512, padding=4, seconds=seconds))
-    assert time.monotonic() - start < 20 and result.failed
+    assert time.monotonic() - start < 20
+    assert result.failed
     checked(vertices, faces, result)
 
 
 def test_what_is_left_when_the_time_is_over_goes_face_by_face():
     vertices, faces, _ = torus(24, 12)
-    charts, why = flatten_all(vertices, faces, np.zeros(len(faces), int), 1.002, 1.1, by=(0.0, 0.0))
-    assert len(charts) == len(faces) and why == ["1 charts were cut: a chart was left when the time was over"]
+    charts, why = flatten_all(vertices, faces, np.zeros(len(faces), int), FlattenLimits(1.002, 1.1, 0.0, 0.0))
+    assert len(charts) == len(faces)
+    assert why == ["1 charts were cut: a chart was left when the time was over"]
     result = pipeline.unwrap(vertices, faces, pipeline.Request(size=512, padding=4, seconds=1e-9))
     assert checked(vertices, faces, result)["charts"] == len(faces)
 
@@ -136,7 +147,8 @@ def test_what_the_conformal_map_refuses_starts_from_a_circle(monkeypatch):
     triangles = scipy.spatial.Delaunay(points).simplices.astype(np.int64)
     bowl = np.concatenate([points, ((points - 0.5) ** 2).sum(1, keepdims=True) * 2], 1)
     flat = flatten(bowl, triangles, 1.0001, 1.5)
-    assert flat.uv is not None and stretch(bowl, triangles, flat.uv) < 1.2
+    assert flat.uv is not None
+    assert stretch(bowl, triangles, flat.uv) < 1.2
 
 
 def test_charts_stay_whole_where_they_fill_the_square(monkeypatch):
@@ -151,17 +163,16 @@ def test_charts_stay_whole_where_they_fill_the_square(monkeypatch):
     vertices = np.concatenate([points + [0, 0, height] for height, (points, _) in enumerate(meshes)])
     faces = np.concatenate([own + 81 * k for k, (_, own) in enumerate(meshes)])
     found = pipeline.unwrap(vertices, faces, SMALL)
-    assert [what for what, _, _ in found.skipped] == ["cutting further for packing"] and found.skipped[0][2] > 0
+    assert [what for what, _, _ in found.skipped] == ["cutting further for packing"]
+    assert found.skipped[0][2] > 0
     monkeypatch.setattr(pipeline, "WELL_PACKED", 1.0)
     monkeypatch.setattr(search, "WELL_PACKED", 1.0)
-    monkeypatch.setattr(search, "_NEXT_GAINS", 1.0)
+    monkeypatch.setattr(search, "_MAX_STEP_GAIN", 1.0)
     other = pipeline.unwrap(vertices, faces, SMALL)
     few, many = checked(vertices, faces, found), checked(vertices, faces, other)
-    assert (
-        not other.skipped
-        and many["coverage"] < 1.1 * few["coverage"]
-        and many["stretch"] == pytest.approx(few["stretch"], abs=1e-3)
-    )
+    assert not other.skipped
+    assert many["coverage"] < 1.1 * few["coverage"]
+    assert many["stretch"] == pytest.approx(few["stretch"], abs=1e-3)
 
 
 def test_cylinder_side_is_developable():
@@ -171,7 +182,8 @@ def test_cylinder_side_is_developable():
     i = (np.arange(4)[:, None] * 25 + np.arange(24)).ravel()
     triangles = np.concatenate([np.stack([i, i + 1, i + 26], -1), np.stack([i, i + 26, i + 25], -1)])
     flat = flatten(vertices, triangles, 1.001, 1.05)
-    assert flat.reason == "" and stretch(vertices, triangles, flat.uv) < 1.001
+    assert flat.reason == ""
+    assert stretch(vertices, triangles, flat.uv) < 1.001
 
 
 def test_stretch_of_known_maps():
@@ -183,29 +195,31 @@ def test_stretch_of_known_maps():
 
 def test_closed_mesh_cannot_lie_flat():
     vertices, triangles = cube()
-    assert flatten(vertices, triangles, 1.001, 1.1) == Flat(None, "closed")
+    assert flatten(vertices, triangles, 1.001, 1.1) == FlattenResult(None, "closed")
 
 
 @pytest.mark.parametrize("holes", [1, 2, 5])
 def test_a_torus_with_holes_has_a_handle_and_a_bent_sheet_with_holes_lies_flat(holes):
     vertices, faces, _ = torus(24, 12)
-    assert flatten(vertices, np.delete(triangulated(faces)[0], 40 * np.arange(holes), 0), 1.001, 1.1) == Flat(
+    assert flatten(vertices, np.delete(triangulated(faces)[0], 40 * np.arange(holes), 0), 1.001, 1.1) == FlattenResult(
         None, "has a handle"
     )
     vertices, faces = sheet(20, bend=1.0)
     triangles = triangulated(np.delete(faces, 42 + 42 * np.arange(holes), 0))[0]
     flat = flatten(vertices, triangles, 1.001, 1.1)
-    assert flat.reason == "" and stretch(vertices, triangles, flat.uv) < 1.001
+    assert flat.reason == ""
+    assert stretch(vertices, triangles, flat.uv) < 1.001
 
 
 def test_four_squares_pack_tight_and_turned_ones_are_set_upright():
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
     turn = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
-    assert np.ptp(upright_box(square @ turn), 0) == pytest.approx([1, 1], abs=1e-3)
+    assert np.ptp(orient_upright(square @ turn), 0) == pytest.approx([1, 1], abs=1e-3)
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
     places, scale = pack([(square @ turn * s, triangles) for s in (1, 1, 1, 1)], 0.01)
     for uv in places:
-        assert uv.min() >= 0 and uv.max() <= 1
+        assert uv.min() >= 0
+        assert uv.max() <= 1
         assert np.linalg.det([uv[1] - uv[0], uv[3] - uv[0]]) > 0  # turned, never mirrored
         assert np.linalg.norm(uv[1] - uv[0]) == pytest.approx(scale)
     assert 4 * scale**2 > 0.8
@@ -225,12 +239,13 @@ def test_the_tips_of_slivers_stay_clear_of_the_others():
 def test_thousands_of_charts_go_on_shelves():
     triangle, faces = np.array([[0, 0], [1, 0], [0, 1.0]]), np.array([[0, 1, 2]])
     places, _ = pack([(triangle, faces)] * 2000, 0.002)
-    assert min(uv.min() for uv in places) >= 0 and max(uv.max() for uv in places) <= 1
+    assert min(uv.min() for uv in places) >= 0
+    assert max(uv.max() for uv in places) <= 1
 
 
 def test_hundreds_of_charts_fill_the_square_better_than_shelves_do():
     """Triangles of all sizes, whose bounding rectangles are half empty."""
-    from gdtool.unwrap.pack.search import _shelves
+    from gdtool.unwrap.pack.search import _shelf_pack
 
     rng = np.random.default_rng(0)
     charts = [
@@ -238,17 +253,19 @@ def test_hundreds_of_charts_fill_the_square_better_than_shelves_do():
     ]
     charts = [(uv if np.linalg.det([uv[1] - uv[0], uv[2] - uv[0]]) > 0 else uv[::-1], t) for uv, t in charts]
     places, scale = pack(charts, 1 / 512)
-    assert min(uv.min() for uv in places) >= 0 and max(uv.max() for uv in places) <= 1
+    assert min(uv.min() for uv in places) >= 0
+    assert max(uv.max() for uv in places) <= 1
     assert (owner_count(np.concatenate(places), np.arange(3 * len(charts)).reshape(-1, 3), 2048) <= 1).all()
-    assert scale**2 > 1.2 * _shelves([upright_box(uv) for uv, _ in charts], 1 / 512)[1] ** 2
+    assert scale**2 > 1.2 * _shelf_pack([orient_upright(uv) for uv, _ in charts], 1 / 512)[1] ** 2
 
 
 def test_a_rim_that_crosses_by_a_hair_is_found():
-    from gdtool.unwrap.parameterize.flatten import overlapping, rim_crossings
+    from gdtool.unwrap.parameterize.flatten import overlapping_triangles, rim_crossings
 
     square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     ends = np.array([[0, 1], [1, 2], [2, 3], [3, 0]])
-    assert not len(rim_crossings(square, ends)[0]) and rim_crossings(square[[0, 2, 1, 3]], ends)[0].tolist() == [0, 2]
+    assert not len(rim_crossings(square, ends)[0])
+    assert rim_crossings(square[[0, 2, 1, 3]], ends)[0].tolist() == [0, 2]
     # A strip of upright triangles bent almost into a ring: its ends pass each other by a millionth.
     for turn, crosses in ((2 * np.pi - 1e-6, False), (2 * np.pi + 1e-6, True)):
         angle = np.repeat(np.linspace(0, turn, 65), 2)
@@ -256,7 +273,7 @@ def test_a_rim_that_crosses_by_a_hair_is_found():
         uv = np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
         i = np.arange(64)[:, None] * 2
         strip = np.concatenate([i + [0, 1, 3], i + [0, 3, 2]])
-        assert overlapping(uv, strip).any() == crosses
+        assert overlapping_triangles(uv, strip).any() == crosses
 
 
 def ring_of_quads(around=96, across=10):
@@ -277,7 +294,7 @@ def test_a_ring_is_cut_into_arcs_that_keep_their_coordinates():
     from gdtool.unwrap.segment.straight_cuts import cut_to_pack
 
     vertices, quads, uv = ring_of_quads()
-    chart = (np.arange(len(quads)), quads, uv, triangulated(quads)[0])
+    chart = Chart(np.arange(len(quads)), quads, uv, triangulated(quads)[0])
     adjacency = Adjacency(vertices, quads)
     assert not list(cut_to_pack(adjacency, [chart], [1]))
     few, parts = cut_to_pack(adjacency, [chart], [2, 40])
@@ -291,7 +308,7 @@ def test_a_ring_is_cut_into_arcs_that_keep_their_coordinates():
     faces = np.stack([i, i + 1, i + 12, i + 11], -1)
     flat = np.concatenate([square, np.zeros((121, 1))], 1)
     assert not list(
-        cut_to_pack(Adjacency(flat, faces), [(np.arange(100), faces, square, triangulated(faces)[0])], [40])
+        cut_to_pack(Adjacency(flat, faces), [Chart(np.arange(100), faces, square, triangulated(faces)[0])], [40])
     )
 
 
@@ -306,20 +323,22 @@ def test_two_rings_fill_the_square_better_once_cut():
 
 
 def test_orders_are_not_searched_for_more_charts_where_few_fill_the_square():
-    from gdtool.unwrap.pack.search import WELL_PACKED, best_packed
+    from gdtool.unwrap.pack.search import WELL_PACKED, choose_cut
 
     def grid(n, sides):
         corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]) * sides
         return [(corners, np.array([[0, 1, 2], [0, 2, 3]]))] * n
 
     few, many, narrow = grid(4, (1, 1)), grid(16, (0.5, 0.5)), grid(2, (3.0, 0.1))
-    chosen, share, *_ = best_packed([few, many], 1 / 512)
-    assert chosen == 0 and share > WELL_PACKED
+    chosen, share, *_ = choose_cut([few, many], 1 / 512)
+    assert chosen == 0
+    assert share > WELL_PACKED
     # Where the first fills it badly, those that fill it are taken.
-    assert best_packed([narrow, many], 1 / 512)[0] == 1
+    assert choose_cut([narrow, many], 1 / 512)[0] == 1
     # Where it fills much less, the next ones are leapt over, though never the last.
     strips = grid(2, (3.0, 0.3))
-    assert best_packed([strips, few, many], 1 / 512)[::3] == (2, 1) and best_packed([strips, many], 1 / 512)[::3] == (
+    assert choose_cut([strips, few, many], 1 / 512)[::3] == (2, 1)
+    assert choose_cut([strips, many], 1 / 512)[::3] == (
         1,
         0,
     )
@@ -330,15 +349,14 @@ def test_ways_leapt_over_cost_no_coverage_and_a_seam_or_two(monkeypatch, around,
     """The tolerance of that skip: .02 of the square and eight charts, against every way to cut being packed."""
     vertices, faces, _ = torus(around, across, 0.35, minor)
     found = []
-    for gains in (search._NEXT_GAINS, np.inf):
-        monkeypatch.setattr(search, "_NEXT_GAINS", gains)
+    for gains in (search._MAX_STEP_GAIN, np.inf):
+        monkeypatch.setattr(search, "_MAX_STEP_GAIN", gains)
         laid = pipeline.unwrap(vertices, faces, pipeline.Request(size=1024, padding=4))
         leapt = [why for what, why, _ in laid.skipped if what.startswith("packing")]
-        assert len(leapt) == (gains < np.inf) and not laid.failed
+        assert len(leapt) == (gains < np.inf)
+        assert not laid.failed
         found.append(pipeline.figures(vertices, faces, laid.uv, laid.face_uvs))
     quick, whole = found
-    assert (
-        quick["coverage"] > whole["coverage"] - 0.02
-        and quick["charts"] <= whole["charts"] + 8
-        and quick["overlap"] == 0
-    )
+    assert quick["coverage"] > whole["coverage"] - 0.02
+    assert quick["charts"] <= whole["charts"] + 8
+    assert quick["overlap"] == 0

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from gdtool.unwrap.parameterize import schedule
-from gdtool.unwrap.parameterize.flatten import overlapping, stretch
+from gdtool.unwrap.parameterize.flatten import overlapping_triangles, stretch
 from gdtool.unwrap.pipeline import Request, figures, unwrap
 
 
@@ -30,15 +30,17 @@ def test_charts_that_stretch_most_are_cut_until_the_whole_stretches_little(monke
     vertices, faces, centre = ball()
     label = (centre[:, 2] > 0).astype(int)
     proxy = vertices, faces[:, :3]
-    monkeypatch.setattr(schedule, "joined", lambda *given: label)
-    charts, why = schedule.flatten_all(vertices, faces, label, 1.01, 1.5, proxy)
+    monkeypatch.setattr(schedule, "merge_small_charts", lambda *given: label)
+    charts, why = schedule.flatten_all(vertices, faces, label, schedule.FlattenLimits(1.01, 1.5), proxy)
     assert 1.002 < whole_stretch(vertices, faces, charts) < 1.014
-    assert 3 <= len(charts) <= 8 and any("stretches more than most" in line for line in why)
+    assert 3 <= len(charts) <= 8
+    assert any("stretches more than most" in line for line in why)
     assert sorted(np.concatenate([chart[0] for chart in charts])) == list(range(len(faces)))
-    assert not any(overlapping(uv, triangles.astype(np.int64)).any() for _, _, uv, triangles in charts)
-    monkeypatch.setattr(schedule, "_WHOLE", np.inf)
-    charts, _ = schedule.flatten_all(vertices, faces, label, 1.01, 1.5, proxy)
-    assert len(charts) == 2 and whole_stretch(vertices, faces, charts) > 1.02
+    assert not any(overlapping_triangles(uv, triangles.astype(np.int64)).any() for _, _, uv, triangles in charts)
+    monkeypatch.setattr(schedule, "_MAX_TOTAL_EXCESS", np.inf)
+    charts, _ = schedule.flatten_all(vertices, faces, label, schedule.FlattenLimits(1.01, 1.5), proxy)
+    assert len(charts) == 2
+    assert whole_stretch(vertices, faces, charts) > 1.02
 
 
 def test_charts_that_stretch_little_stay_whole():
@@ -55,10 +57,13 @@ def test_what_cannot_be_relieved_ends(monkeypatch):
     vertices, faces, centre = ball(3)
     crumpled = vertices * (1 + 0.5 * np.random.default_rng(0).random((len(vertices), 1)))
     label = (centre[:, 2] > 0).astype(int)
-    monkeypatch.setattr(schedule, "joined", lambda *given: label)
-    charts, why = schedule.flatten_all(crumpled, faces, label, 1.0000001, 1.1, (crumpled, faces[:, :3]))
+    monkeypatch.setattr(schedule, "merge_small_charts", lambda *given: label)
+    charts, why = schedule.flatten_all(
+        crumpled, faces, label, schedule.FlattenLimits(1.0000001, 1.1), (crumpled, faces[:, :3])
+    )
     cuts = [int(line.split()[0]) for line in why if "more than most" in line]
-    assert cuts and cuts[0] >= 16
+    assert cuts
+    assert cuts[0] >= 16
     assert sorted(np.concatenate([chart[0] for chart in charts])) == list(range(len(faces)))
 
 
@@ -70,8 +75,7 @@ def test_a_chart_is_cut_between_its_parts_and_without_any_through_the_middle():
     vertices = vertices * [2, 1, 1]
     adjacency, column = Adjacency(vertices, faces), np.arange(400) % 20
     for part, first in ((column >= 6, 6), (np.where(column < 12, 7, np.where(column < 15, 3, 5)), 12)):
-        one, other = schedule._halves(adjacency, part, np.arange(400))
-        assert {len(one), len(other)} == {20 * first, 400 - 20 * first} and (column[one] < first).all() != (
-            column[other] < first
-        ).all()
-    assert min(map(len, schedule._halves(adjacency, np.zeros(400, int), np.arange(400)))) > 150
+        one, other = schedule._split_set(adjacency, part, np.arange(400))
+        assert {len(one), len(other)} == {20 * first, 400 - 20 * first}
+        assert (column[one] < first).all() != (column[other] < first).all()
+    assert min(map(len, schedule._split_set(adjacency, np.zeros(400, int), np.arange(400)))) > 150

@@ -3,6 +3,7 @@
 import numpy as np
 
 from gdtool.geometry.topology import triangulated
+from gdtool.unwrap.chart import Chart
 from gdtool.unwrap.segment.charts import Adjacency
 from gdtool.unwrap.segment.straight_cuts import cut_to_pack
 
@@ -19,7 +20,7 @@ def plates(*cells):
         uv = np.stack([x.ravel(), y.ravel()], -1)
         used, local = np.unique(own, return_inverse=True)
         local = local.reshape(-1, 4)
-        charts.append((faces + np.arange(len(own)), local, uv[used], triangulated(local)[0]))
+        charts.append(Chart(faces + np.arange(len(own)), local, uv[used], triangulated(local)[0]))
         points.append(np.concatenate([uv, np.full((len(uv), 1), float(height))], 1))
         quads.append(own + vertices)
         vertices, faces = vertices + len(uv), faces + len(own)
@@ -36,7 +37,8 @@ def test_the_chart_whose_rectangle_is_emptiest_is_cut_first():
     adjacency, charts = plates(ell(10, 4), ell(30, 6), np.ones((12, 12), bool))
     first = next(cut_to_pack(adjacency, charts, [4]))
     sizes = sorted(len(chart[0]) for chart in first)
-    assert len(first) == 4 and {ell(10, 4).sum(), 144} <= set(sizes)
+    assert len(first) == 4
+    assert {ell(10, 4).sum(), 144} <= set(sizes)
     parts = [chart for chart in first if len(chart[0]) not in (ell(10, 4).sum(), 144)]
     # The two arms of the large one: their rectangles are full.
     assert all(np.prod(np.ptp(chart[2], 0)) < 1.2 * len(chart[0]) for chart in parts)
@@ -48,5 +50,6 @@ def test_crumbs_along_a_rough_rim_do_not_forbid_a_cut():
     mask[8, 9::2], mask[9::2, 8] = True, True
     adjacency, (chart,) = plates(mask)
     (parts,) = cut_to_pack(adjacency, [chart], [2])
-    assert len(parts) == 2 and min(len(part[0]) for part in parts) > 0.3 * mask.sum()
+    assert len(parts) == 2
+    assert min(len(part[0]) for part in parts) > 0.3 * mask.sum()
     assert sorted(np.concatenate([part[0] for part in parts])) == list(range(mask.sum()))

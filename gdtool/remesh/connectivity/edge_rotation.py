@@ -1,5 +1,4 @@
-"""Fewer irregular vertices in a quad mesh: pairs of a vertex of three and one of five edges led to one another, where
-they cancel."""
+"""Rotate edges so that pairs of irregular vertices (one of three edges, one of five) meet and cancel."""
 
 from __future__ import annotations
 
@@ -10,33 +9,37 @@ import numpy as np
 
 from gdtool.geometry.mesh_quality import valences
 
-_STEPS = 3, 6, 10  # rotations along one way, round by round of all pairs: the nearest come together first
-_FLAT_COSINE = 0.8  # between the normals of two quads whose edge may go: creases stay
+_MAX_STEPS = 3, 6, 10  # rotations in one direction, by round over all pairs: the nearest pairs meet first
+_FLAT_COSINE = 0.8  # least cosine between the normals of two quads whose edge may rotate: creases stay
 
 
 def cancel_pairs(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Quads (q, 4) of a manifold with as many faces and vertices, fewer of those of other than four edges.
+    """Cancel pairs of irregular vertices by rotating edges; the number of faces and vertices stays.
 
-    Such a pair moves on by the rotation of an edge, one way or the other, and leaves regular quads behind (Peng et al.
-    2011, Connectivity editing for quadrilateral meshes). Each is led both ways until a rotation beside it leaves less
-    that is irregular, or put back. Faces that do not all look the same way out are left as they are."""
+    faces (q, 4) of a manifold. The rotation of an edge moves such a pair on and leaves regular quads behind (Peng et
+    al. 2011, Connectivity editing for quadrilateral meshes). Each pair is moved both ways until a rotation beside it
+    leaves fewer irregular vertices; otherwise it is put back. Faces that are not consistently oriented are returned as
+    they are.
+    """
     valence, inner = valences(faces, len(vertices))
-    net = _Net(vertices, faces, valence, inner)
-    if not net.oriented():
+    mesh = _RotatableMesh(vertices, faces, valence, inner)
+    if not mesh.is_oriented():
         return faces
-    for steps in _STEPS:
-        for vertex in np.flatnonzero(inner & (np.array(net.valence) > 4)).tolist():
-            net.gain_beside(vertex)
-            way = 0
-            while net.valence[vertex] > 4 and net.lead(vertex, way, steps) is False:
-                way += 1
-    return np.array(net.faces, faces.dtype)
+    for steps in _MAX_STEPS:
+        for vertex in np.flatnonzero(inner & (np.array(mesh.valence) > 4)).tolist():
+            mesh.apply_gains(vertex)
+            direction = 0
+            while mesh.valence[vertex] > 4 and mesh.move_pair(vertex, direction, steps) is False:
+                direction += 1
+    return np.array(mesh.faces, faces.dtype)
 
 
 @dataclass(frozen=True)
-class _Turn:
-    """The edge `old` between two faces gives way to the edge `new` between two other corners of the hexagon around
-    it."""
+class _Rotation:
+    """The edge `old` between two faces is replaced by the edge `new` between two other corners of their hexagon.
+
+    before and after: the corners of the two faces.
+    """
 
     old: tuple[int, int]
     new: tuple[int, int]
@@ -44,12 +47,13 @@ class _Turn:
     before: tuple[tuple[int, ...], tuple[int, ...]]  # their corners
     after: tuple[tuple[int, ...], tuple[int, ...]]
 
-    def back(self) -> _Turn:
-        return _Turn(self.new, self.old, self.faces, self.after, self.before)
+    def inverse(self) -> _Rotation:
+        """Return the rotation that undoes this one."""
+        return _Rotation(self.new, self.old, self.faces, self.after, self.before)
 
 
-class _Net:
-    """Quads whose edges can be rotated."""
+class _RotatableMesh:
+    """Quads whose edges can be rotated, as Python lists: single rotations are quicker on them than on arrays."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, valence: np.ndarray, inner: np.ndarray):
         self.faces, self.valence, self._inner = (
@@ -58,63 +62,76 @@ class _Net:
             inner.tolist(),
         )
         self._points = vertices.tolist()
-        self._face_of: dict[tuple[int, int], int] = {}  # which face walks an edge in this direction
-        self._face_at = [0] * len(valence)  # one of those around each vertex
+        self._face_of: dict[tuple[int, int], int] = {}  # the face that traverses an edge in this direction
+        self._face_at = [0] * len(valence)  # one of the faces around each vertex
         for k in range(len(self.faces)):
             self._enter(k)
 
-    def oriented(self) -> bool:
-        """Whether no two faces walk an edge in the same direction."""
+    def is_oriented(self) -> bool:
+        """Whether no two faces traverse an edge in the same direction."""
         return len(self._face_of) == 4 * len(self.faces)
 
-    def gain_beside(self, *vertices: int) -> bool:
-        """Whether there were rotations of edges at vertices that leave less that is irregular; they are done."""
-        found = False
-        while better := next(
-            (one for vertex in vertices for other in self._neighbours(vertex) for one in self._turns(vertex, other)),
+    def apply_gains(self, *vertices: int) -> bool:
+        """Apply rotations at the vertices while any leaves fewer irregular vertices; return whether any did."""
+        any_applied = False
+        while rotation := next(
+            (
+                rotation_found
+                for vertex in vertices
+                for other in self._neighbours(vertex)
+                for rotation_found in self._rotations(vertex, other)
+            ),
             None,
         ):
-            self._apply(better)
-            found = True
-        return found
+            self._apply(rotation)
+            any_applied = True
+        return any_applied
 
-    def lead(self, vertex: int, way: int, steps: int) -> bool | None:
-        """Whether its pair was led that way until it gained; otherwise it is where it was. None where there is no such
-        way."""
-        path: list[_Turn] = []
+    def move_pair(self, vertex: int, direction: int, steps: int) -> bool | None:
+        """Move the pair at a vertex in one of its directions until it cancels with others.
+
+        Returns True where it did, False where it was put back, and None where there is no such direction.
+        """
+        path: list[_Rotation] = []
         for _ in range(steps):
-            ways = [turn for turn in self._neutral(vertex) if not path or set(turn.new) != set(path[-1].old)]
-            turn = next(iter(ways[0 if path else way :]), None)
-            if turn is None:
+            rotations = [
+                rotation
+                for rotation in self._neutral_rotations(vertex)
+                if not path or set(rotation.new) != set(path[-1].old)
+            ]
+            rotation = next(iter(rotations[0 if path else direction :]), None)
+            if rotation is None:
                 if not path:
                     return None
                 break
-            self._apply(turn)
-            path.append(turn)
-            if self.gain_beside(*turn.old, *turn.new):
+            self._apply(rotation)
+            path.append(rotation)
+            if self.apply_gains(*rotation.old, *rotation.new):
                 return True
-            vertex = max(turn.new, key=self.valence.__getitem__)
-        for turn in reversed(path):
-            self._apply(turn.back())
+            vertex = max(rotation.new, key=self.valence.__getitem__)
+        for rotation in reversed(path):
+            self._apply(rotation.inverse())
         return False
 
-    def _neutral(self, vertex: int) -> Iterator[_Turn]:
-        """Rotations of its edges that take one from it and give one to a vertex of three, and leave as much that is
-        irregular."""
+    def _neutral_rotations(self, vertex: int) -> Iterator[_Rotation]:
+        """Yield rotations that move an edge to a vertex of three and leave as many irregular vertices."""
         for other in self._neighbours(vertex):
-            yield from self._turns(vertex, other, neutral=True)
+            yield from self._rotations(vertex, other, neutral=True)
 
-    def _turns(self, p: int, q: int, neutral: bool = False) -> Iterator[_Turn]:
-        """The two rotations of an edge, those of them that leave quads of a manifold, no vertex of two edges, and less
-        that is irregular; or if neutral as much, and one edge more at a vertex of three."""
+    def _rotations(self, p: int, q: int, neutral: bool = False) -> Iterator[_Rotation]:
+        """Yield the rotations of an edge that keep the quads a manifold without vertices of two edges.
+
+        Only rotations that leave fewer irregular vertices; if neutral, those that leave as many and add an edge to a
+        vertex of three.
+        """
         valence, inner = self.valence, self._inner
         if valence[p] < 4 or valence[q] < 4 or not (inner[p] and inner[q]):
             return
-        fewer = (valence[p] > 4) + (valence[q] > 4)  # ends that will be less off four, and not more
+        fewer = (valence[p] > 4) + (valence[q] > 4)  # ends whose valence comes nearer to four
         if not fewer and not neutral:
-            return  # the others gain no more than these lose
-        one, two = self._face_of[p, q], self._face_of[q, p]
-        r, s, t, u = *self._after(one, q), *self._after(two, p)
+            return  # the other two corners gain no more than these lose
+        first, second = self._face_of[p, q], self._face_of[q, p]
+        r, s, t, u = *self._after(first, q), *self._after(second, p)
         for x, y in ((r, t), (s, u)):
             threes = (valence[x] < 4) + (valence[y] < 4)
             if not (
@@ -127,19 +144,19 @@ class _Net:
                 (x, y) in self._face_of
                 or (y, x) in self._face_of
                 or len({p, q, r, s, t, u}) < 6
-                or not self._flat(one, two)
+                or not self._flat(first, second)
             ):
                 continue
             after = ((r, s, p, t), (t, u, q, r)) if x == r else ((s, p, t, u), (u, q, r, s))
-            yield _Turn((p, q), (x, y), (one, two), (self.faces[one], self.faces[two]), after)
+            yield _Rotation((p, q), (x, y), (first, second), (self.faces[first], self.faces[second]), after)
 
-    def _flat(self, one: int, two: int) -> bool:
-        """Whether two faces do not turn at the edge between them."""
-        (a, b, c), (x, y, z) = self._normal(one), self._normal(two)
+    def _flat(self, first: int, second: int) -> bool:
+        """Whether two faces lie in about one plane, so that the edge between them is no crease."""
+        (a, b, c), (x, y, z) = self._normal(first), self._normal(second)
         return a * x + b * y + c * z > _FLAT_COSINE
 
     def _normal(self, face: int) -> tuple[float, float, float]:
-        """Unit normal: the diagonals' cross product."""
+        """Return the unit normal of a face: the cross product of its diagonals."""
         a, b, c, d = (self._points[corner] for corner in self.faces[face])
         ux, uy, uz, wx, wy, wz = c[0] - a[0], c[1] - a[1], c[2] - a[2], d[0] - b[0], d[1] - b[1], d[2] - b[2]
         x, y, z = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
@@ -147,13 +164,13 @@ class _Net:
         return x / length, y / length, z / length
 
     def _after(self, face: int, vertex: int) -> tuple[int, int]:
-        """The two corners that follow this one."""
+        """Return the two corners of a face that follow a vertex."""
         corners = self.faces[face]
         i = corners.index(vertex)
         return corners[(i + 1) % 4], corners[(i + 2) % 4]
 
     def _neighbours(self, vertex: int) -> list[int]:
-        """The other ends of the edges of an inner vertex."""
+        """Return the other ends of the edges of an inner vertex, in order."""
         out, face = [], self._face_at[vertex]
         while not out or face != self._face_at[vertex]:
             corners = self.faces[face]
@@ -161,17 +178,19 @@ class _Net:
             face = self._face_of[vertex, out[-1]]
         return out
 
-    def _apply(self, turn: _Turn) -> None:
-        p, q = turn.old
+    def _apply(self, rotation: _Rotation) -> None:
+        """Perform a rotation and update valences."""
+        p, q = rotation.old
         del self._face_of[p, q], self._face_of[q, p]
-        for face, quad in zip(turn.faces, turn.after, strict=True):
+        for face, quad in zip(rotation.faces, rotation.after, strict=True):
             self.faces[face] = quad
             self._enter(face)
-        for edge, change in ((turn.old, -1), (turn.new, 1)):
+        for edge, change in ((rotation.old, -1), (rotation.new, 1)):
             for vertex in edge:
                 self.valence[vertex] += change
 
     def _enter(self, face: int) -> None:
+        """Register the directed edges of a face."""
         corners = self.faces[face]
         for i in range(4):
             self._face_of[corners[i - 1], corners[i]] = face

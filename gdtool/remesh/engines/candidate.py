@@ -1,4 +1,4 @@
-"""One candidate: what an engine makes of a surface, mended and judged in a child, then drawn onto the surface."""
+"""Make one candidate: run an engine in a child, repair and judge its quads, then fit them to the surface."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gdtool.geometry.distance import by_place
 from gdtool.geometry.mesh_quality import scaled_jacobian, valences
 from gdtool.remesh.connectivity.edge_rotation import cancel_pairs
 from gdtool.remesh.connectivity.irregular_vertices import cancel_irregular
-from gdtool.remesh.engines.adapters import ENGINES, on_few
+from gdtool.remesh.engines.adapters import ENGINES, simplify_for_engine
 from gdtool.remesh.fit.feature_curves import Constraints
 from gdtool.remesh.fit.shaping import (
     CUT_OFF,
@@ -20,31 +20,41 @@ from gdtool.remesh.fit.shaping import (
     FAR_SUBDIVIDED,
     LEAVES_OUT,
     STICKS_OUT,
-    Outline,
-    drawn,
-    farthest,
-    fault_of,
-    left_out,
-    outlined,
-    sticks_out,
-    surface_of,
+    SnappedQuads,
+    fit_to_surface,
+    max_distance,
+    max_overshoot,
+    rejection_reason,
+    snap_to_features,
+    target_of_quads,
+    uncovered_shares,
 )
 from gdtool.remesh.fit.surface_projection import fill_holes, remove_doublets
-from gdtool.remesh.task import Part
+from gdtool.remesh.task import RemeshPatch
 
+# Verdicts of repair_and_judge() that later code tells apart; they stand in the manifest.
 LOST, ADDED, PIECES = "handles are lost", "handles are added", "pieces are lost or joined"
-_NEAR_EDGES, _LEAST_JACOBIAN = 0.75, 0.2  # nearer and squarer than this, a result is taken without a look at others
-_NEAR_OUTLINE = 0.9  # edge lengths: shaping hardly brings what is farther within _NEAR_EDGES
-_OUT_EDGES = 0.55  # what sticks out less is finer than a quad
-# Surface so far from an engine's quads is no matter of tips, and how much of it is too much.
-_BARE_EDGES, _BARE_SHARE = 2.0, 0.02
-_MENDINGS = 4  # rounds of filling holes and parting what meets at a vertex
+
+# A fitted result this near (edge lengths) and this square (worst scaled Jacobian) is taken without a look at others.
+_GOOD_DISTANCE_EDGES, _GOOD_JACOBIAN = 0.75, 0.2
+# Edge lengths: fitting hardly ever brings snapped quads that are farther than this within _GOOD_DISTANCE_EDGES.
+_PROMISING_EDGES = 0.9
+# Edge lengths: geometry that sticks out by less is finer than a quad, and may be lost.
+_OVERSHOOT_EDGES = 0.55
+# Edge lengths: surface farther than this from an engine's quads is too far for tip extrusion to bring back ...
+_UNCOVERED_EDGES = 2.0
+_MAX_UNCOVERED_SHARE = 0.02  # ... and this share of the area may lie that far away.
+_REPAIR_ROUNDS = 4  # of filling holes and splitting pinched vertices; each can cause the other
+_MIN_ENGINE_QUADS = 16  # fewer than these make the engines fail
 
 
 @dataclass(frozen=True)
-class Way:
-    """An engine, the subdivisions after it, factors on the count to try side by side, the crease angle that it is
-    told."""
+class EngineAttempt:
+    """One way to use an engine.
+
+    `factors` scale the quad count; one child process runs for each. `degrees` is the crease angle passed to the engine.
+    `subdivisions` regular subdivisions follow the engine, so it is asked for a quarter as many quads for each.
+    """
 
     engine: str
     subdivisions: int
@@ -53,130 +63,157 @@ class Way:
 
     @property
     def label(self) -> str:
+        """Name of the attempt in the manifest."""
         return (
             self.engine
             + (f", {self.subdivisions} subdivision" if self.subdivisions else "")
             + ("" if self.degrees else ", creases left out")
         )
 
-    def near(self, count: float) -> list[float]:
-        """Numbers to ask for side by side, as far from one another as the first, `count` in their middle."""
+    def counts_around(self, count: float) -> list[float]:
+        """Return the quad counts to request side by side: one per factor, with `count` as their mean."""
         middle = sum(self.factors) / len(self.factors)
         return [count * factor / middle for factor in self.factors]
 
     @property
-    def children(self) -> int:
-        """Quads of the engine's own for each in the end."""
+    def quads_per_engine_quad(self) -> int:
+        """Final quads for each quad of the engine."""
         return 4**self.subdivisions
 
 
 @dataclass
 class Candidate:
-    """What an engine made of `asked`, mended, what is wrong with it, and, once it was tried, drawn onto the surface."""
+    """An engine's repaired quads for one requested count, and what fitting them to the surface showed.
 
-    way: Way
-    asked: float
+    `fault` is the verdict on the quads as the engine left them, None where there is none. The fields from `snapped` on
+    are filled by snap() and fit().
+    """
+
+    attempt: EngineAttempt
+    requested: float
     fault: str | None
     vertices: np.ndarray
     quads: np.ndarray
-    outline: Outline | None = None
-    drawn: tuple[np.ndarray, np.ndarray, Constraints] | None = None
-    far: float = np.inf  # of the surface from the quads drawn, in edge lengths
-    least: float = -1.0  # their worst scaled Jacobian
-    wrong: str | None = None  # what of them does not do on the surface
-    passable: bool = False  # a subdivided one that is wrong: whether it would do without the subdivision
-    _astray: float | None = None
+    snapped: SnappedQuads | None = None
+    fitted: tuple[np.ndarray, np.ndarray, Constraints] | None = None
+    distance_edges: float = np.inf  # largest distance from the surface to the fitted quads, in edge lengths
+    min_jacobian: float = -1.0  # worst scaled Jacobian of the fitted quads
+    rejection: str | None = None  # why the fitted quads are not acceptable
+    acceptable_as_finer: bool = False  # rejected, but only by the stricter limits of subdivided results
+    _raw_distance_edges: float | None = None
 
     @property
     def count(self) -> int:
-        """Of the quads that it will have when it is subdivided."""
-        return len(self.quads) * self.way.children
+        """Number of quads after subdivision."""
+        return len(self.quads) * self.attempt.quads_per_engine_quad
 
-    def off(self, wanted: float) -> float:
+    def count_error(self, wanted: float) -> float:
+        """Return the relative error of the count, signed."""
         return self.count / wanted - 1
 
     def rank(self, wanted: float, tolerance: float) -> tuple:
-        """Smaller is better. tolerance: share of the quads wanted that there may be more or fewer."""
-        return self.fault is not None, max(abs(self.off(wanted)), tolerance), self._irregular()
+        """Return a sort key, smaller is better: faultless, then near the count, then few irregular vertices.
+
+        tolerance: relative errors of the count below this are equal.
+        """
+        return self.fault is not None, max(abs(self.count_error(wanted)), tolerance), self._irregular_count()
 
     @property
-    def bridged(self) -> bool:
-        """Whether it is closed and manifold, but a gap or tunnel was bridged or filled."""
+    def is_bridged(self) -> bool:
+        """Whether it is closed and manifold, but has a gap or tunnel bridged or filled."""
         return self.fault in (LOST, ADDED)
 
     @property
-    def good(self) -> bool:
-        """Whether it is taken without a look at others."""
-        return self.wrong is None and self.far < _NEAR_EDGES and self.least > _LEAST_JACOBIAN
+    def is_good(self) -> bool:
+        """Whether the fitted quads are taken without a look at other candidates."""
+        return (
+            self.rejection is None and self.distance_edges < _GOOD_DISTANCE_EDGES and self.min_jacobian > _GOOD_JACOBIAN
+        )
 
-    def usable(self, part: Part) -> bool:
-        """Without a fault, or with one that is finer than its quads."""
+    def is_usable(self, patch: RemeshPatch) -> bool:
+        """Whether it has no fault, or lost only handles that are finer than its quads."""
         return (
             self.fault is None
             or self.fault == LOST
-            and sticks_out(self.vertices, self.quads, part.surface) < 2 * _OUT_EDGES * part.edge
+            and max_overshoot(self.vertices, self.quads, patch.surface) < 2 * _OVERSHOOT_EDGES * patch.edge
         )
 
-    def leaves_out(self, part: Part) -> str | None:
-        """What is wrong with it before it is drawn, where it does without parts of the surface that drawing does not
-        bring back."""
-        bare = left_out(surface_of(self.vertices, self.quads), part.surface, (_BARE_EDGES * part.edge,))[0]
-        return f"{LEAVES_OUT} {bare:.1%} of the surface" if bare > _BARE_SHARE else None
+    def missing_surface(self, patch: RemeshPatch) -> str | None:
+        """Return a rejection reason where it leaves out surface that tip extrusion cannot bring back, else None."""
+        uncovered = uncovered_shares(
+            target_of_quads(self.vertices, self.quads), patch.surface, (_UNCOVERED_EDGES * patch.edge,)
+        )[0]
+        return f"{LEAVES_OUT} {uncovered:.1%} of the surface" if uncovered > _MAX_UNCOVERED_SHARE else None
 
-    def astray(self, part: Part) -> float:
-        """How far the surface is from it as the engine left it, in edge lengths."""
-        if self._astray is None:
-            self._astray = farthest(surface_of(self.vertices, self.quads), part.surface) / part.edge
-        return self._astray
+    def raw_distance(self, patch: RemeshPatch) -> float:
+        """Return the largest distance from the surface to the engine's quads, in edge lengths (computed once)."""
+        if self._raw_distance_edges is None:
+            self._raw_distance_edges = (
+                max_distance(target_of_quads(self.vertices, self.quads), patch.surface) / patch.edge
+            )
+        return self._raw_distance_edges
 
-    def trace(self, part: Part) -> None:
-        """Find its outline, once."""
-        if self.outline is None:
-            self.outline = outlined(
-                self.vertices, self.quads, part.surface, part.features, self.way.subdivisions, part.request
+    def snap(self, patch: RemeshPatch) -> None:
+        """Snap the quads to the features and extrude tips (once)."""
+        if self.snapped is None:
+            self.snapped = snap_to_features(
+                self.vertices, self.quads, patch.surface, patch.features, self.attempt.subdivisions, patch.request
             )
 
-    def promising(self, part: Part) -> bool:
-        """Whether its outline is so near to the surface that it can come out good."""
-        self.trace(part)
-        return self.outline.far < _NEAR_OUTLINE
+    def is_promising(self, patch: RemeshPatch) -> bool:
+        """Whether the snapped quads are near enough to the surface to become good."""
+        self.snap(patch)
+        return self.snapped.distance_edges < _PROMISING_EDGES
 
-    def draw(self, part: Part) -> None:
-        """Drawn onto the surface, and judged there, once."""
-        if self.drawn is not None:
+    def fit(self, patch: RemeshPatch) -> None:
+        """Fit the snapped quads to the surface and judge the result (once)."""
+        if self.fitted is not None:
             return
-        subdivisions, surface = self.way.subdivisions, part.surface
-        self.drawn = drawn(self.outline, surface, part.features, part.request)
-        vertices, quads, _ = self.drawn
-        self.least = float(scaled_jacobian(vertices, quads).min())
+        subdivisions, surface = self.attempt.subdivisions, patch.surface
+        self.fitted = fit_to_surface(self.snapped, surface, patch.features, patch.request)
+        vertices, quads, _ = self.fitted
+        self.min_jacobian = float(scaled_jacobian(vertices, quads).min())
         limits = (FAR_SUBDIVIDED, CUT_SUBDIVIDED) if subdivisions else (FAR_EDGES, CUT_OFF)
-        self.wrong, self.far = fault_of(vertices, quads, surface, part.edge, *limits)
-        if self.fault and (over := sticks_out(vertices, quads, surface) / part.edge) > _OUT_EDGES:
-            self.wrong = f"{STICKS_OUT} {over:.2g} edge lengths"  # else what is lost was finer than a quad
-        if self.wrong is None and subdivisions and self.least < part.request.least_jacobian:
-            self.wrong = f"has a quad of scaled Jacobian {self.least:.2g}"
-        # Else it is not shaped to its end.
-        if self.wrong and subdivisions and not self.fault and self.far <= FAR_SUBDIVIDED and not self.outline.hopeless:
-            self.passable = fault_of(vertices, quads, surface, part.edge, FAR_EDGES, CUT_OFF)[0] is None
+        self.rejection, self.distance_edges = rejection_reason(vertices, quads, surface, patch.edge, *limits)
+        # A lost handle whose bridge sticks out by less was finer than a quad.
+        if self.fault and (overshoot := max_overshoot(vertices, quads, surface) / patch.edge) > _OVERSHOOT_EDGES:
+            self.rejection = f"{STICKS_OUT} {overshoot:.2g} edge lengths"
+        if self.rejection is None and subdivisions and self.min_jacobian < patch.request.min_jacobian:
+            self.rejection = f"has a quad of scaled Jacobian {self.min_jacobian:.2g}"
+        # Fitting stops early beyond these limits, so such a result would not do as a finer one either.
+        if (
+            self.rejection
+            and subdivisions
+            and not self.fault
+            and self.distance_edges <= FAR_SUBDIVIDED
+            and not self.snapped.hopeless
+        ):
+            self.acceptable_as_finer = (
+                rejection_reason(vertices, quads, surface, patch.edge, FAR_EDGES, CUT_OFF)[0] is None
+            )
 
-    def _irregular(self) -> int:
+    def _irregular_count(self) -> int:
+        """Number of inner vertices without exactly four edges."""
         valence, inner = valences(self.quads, int(self.quads.max(initial=0)) + 1)
         return int((valence[inner] != 4).sum())
 
 
-def candidate(vertices: np.ndarray, faces: np.ndarray, way: Way, asked: float) -> Candidate:
-    """What the child runs."""
-    quads, wanted = max(int(asked / way.children), 16), topology.invariants(faces)
+def make_candidate(vertices: np.ndarray, faces: np.ndarray, attempt: EngineAttempt, requested: float) -> Candidate:
+    """Run an engine on triangles and judge its quads; this is the function that child processes run.
+
+    vertices (v, 3) in a unit box, faces (f, 3). requested: final quads, after subdivision.
+    """
+    quads = max(int(requested / attempt.quads_per_engine_quad), _MIN_ENGINE_QUADS)
+    wanted = topology.invariants(faces)
     mesh = vertices.astype(np.float32), faces.astype(np.int32)
-    if way.engine == "instant-meshes" and way.subdivisions:
-        mesh = on_few(*mesh, quads, wanted)
-    fault, *found = judged(*ENGINES[way.engine](*mesh, quads, way.degrees), wanted)
-    return Candidate(way, asked, fault, *_by_place(*found))
+    if attempt.engine == "instant-meshes" and attempt.subdivisions:
+        mesh = simplify_for_engine(*mesh, quads, wanted)
+    fault, *quad_mesh = repair_and_judge(*ENGINES[attempt.engine](*mesh, quads, attempt.degrees), wanted)
+    return Candidate(attempt, requested, fault, *_sort_spatially(*quad_mesh))
 
 
-def _by_place(vertices: np.ndarray, quads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same mesh, its vertices and quads in an order in which those near to one another follow one another: what
-    reads it finds them in the cache."""
+def _sort_spatially(vertices: np.ndarray, quads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Reorder vertices and quads so that neighbours in space are neighbours in memory; later reads hit the cache."""
     if not len(quads):
         return vertices, quads
     order = by_place(vertices)
@@ -185,11 +222,14 @@ def _by_place(vertices: np.ndarray, quads: np.ndarray) -> tuple[np.ndarray, np.n
     return vertices[order], number[quads[by_place(vertices[quads].mean(1))]]
 
 
-def judged(
+def repair_and_judge(
     quad_vertices: np.ndarray, quad_faces: np.ndarray, wanted: topology.Invariants
 ) -> tuple[str | None, np.ndarray, np.ndarray]:
-    """What is wrong with an engine's result for a surface of these invariants, or None, and the result without its
-    small defects."""
+    """Repair small defects of an engine's quads and compare their topology with the surface's.
+
+    quad_faces should be (q, 4); any shape and any indices are handled. wanted: invariants of the triangles that the
+    engine was given. Returns the fault or None, vertices (v, 3) and quads (q, 4).
+    """
     closed, _, pieces, euler_number = wanted
     if quad_faces.ndim != 2 or quad_faces.shape[1] != 4 or not len(quad_faces):
         return "no quads", quad_vertices, quad_faces
@@ -199,12 +239,12 @@ def judged(
     if not whole.any():
         return "no quads", quad_vertices, quad_faces
     quad_vertices, quad_faces = topology.compact(quad_vertices, quad_faces[whole])
-    for turn in range(_MENDINGS):
+    for turn in range(_REPAIR_ROUNDS):
         if turn and (not closed or topology.is_watertight(quad_faces)):
             break
         if closed:
             quad_vertices, quad_faces = fill_holes(quad_vertices, quad_faces)
-        # What parts where fans met at a vertex, and what lay in a hole as a piece of its own, leave holes to fill.
+        # Splitting pinched vertices and dropping crumbs open new holes, which the next round fills.
         quad_vertices, quad_faces = remove_doublets(*repair.one_vertex_per_fan(quad_vertices, quad_faces))
         quad_vertices, quad_faces = cancel_irregular(quad_vertices, quad_faces)
         quad_vertices, quad_faces = repair.without_crumbs(quad_vertices, quad_faces, pieces)
@@ -215,8 +255,9 @@ def judged(
     if not topology.is_manifold(quad_faces):
         return "not manifold", quad_vertices, quad_faces
     if topology.components(quad_faces)[0] != pieces:
-        return PIECES, quad_vertices, quad_faces  # what of it is kept is judged again, piece by piece
+        # Irregular vertices stay for now: the pieces that are kept are judged again one by one.
+        return PIECES, quad_vertices, quad_faces
     quad_faces = cancel_pairs(quad_vertices, quad_faces)
-    if closed and (more := topology.euler_number(quad_faces) - euler_number):
-        return LOST if more > 0 else ADDED, quad_vertices, quad_faces
+    if closed and (difference := topology.euler_number(quad_faces) - euler_number):
+        return LOST if difference > 0 else ADDED, quad_vertices, quad_faces
     return None, quad_vertices, quad_faces

@@ -1,255 +1,300 @@
-"""An engine's quads: candidates made in children in one way after the other, the best of them judged on the surface."""
+"""Search for an engine's quads: try engines and densities in order, and fit the best candidate to the surface."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
-
-import numpy as np
+from typing import NamedTuple
 
 from gdtool.core.child import ChildFailed, begin, prepare
 from gdtool.geometry.simplify import CHILD_MODULES
-from gdtool.remesh.engines.candidate import Candidate, Way, candidate
-from gdtool.remesh.fit.shaping import FAR_EDGES, TOO_COARSE, settled
-from gdtool.remesh.task import Part, Record, Request
+from gdtool.remesh.engines.candidate import Candidate, EngineAttempt, make_candidate
+from gdtool.remesh.fit.shaping import FAR_EDGES, TOO_COARSE, finalize
+from gdtool.remesh.task import QuadResult, Record, RemeshPatch, Request
 
-_AT_ONCE = 2  # candidates of the first way
-_TRIES, _MOST_MORE = 3, 2.0  # of one way, to come near enough to the count; times what was asked for before
-_MOST_TORN = 0.1  # of the quads may be missing from a result that another density may mend
-# Megabytes that an engine has, and more for each quad and triangle: several times what it needs, but for holes that
-# Instant Meshes fills for ever, with half a gigabyte a second.
-_MEMORY = 2000, 4e-3
-_FOR_A_HANDLE = 250  # quads: a coarser mesh subdivided to fewer loses some
-_MANY = 3000  # quads of a mesh that is tried coarser and subdivided
-# So far from the surface the best may not come out good: one at so many times its distance goes before it.
-_ASTRAY_EDGES, _NEARER = 1.75, 0.75
+_PARALLEL_CANDIDATES = 2  # children of the first attempt
+_MAX_ROUNDS = 3  # of one attempt, each with a corrected request, to come near enough to the count
+_MAX_GROWTH = 2.0  # a round requests at most this many times the count of the round before
+_MAX_TORN_SHARE = 0.1  # of the quads may be missing from a result that another density may repair
+# Megabytes of an engine's child, and more for each quad and triangle: several times what it needs. The limit is for
+# holes that Instant Meshes fills without end, half a gigabyte a second.
+_BASE_MEMORY_MB, _MEMORY_MB_PER_FACE = 2000, 4e-3
+# Quads: a coarser mesh subdivided to fewer for each handle loses some handles (benchmarks/remesh_nets.py).
+_MIN_QUADS_PER_HANDLE = 250
+_MIN_SUBDIVIDED_QUADS = 3000  # quads: smaller meshes are not tried coarser and subdivided
+# Edge lengths: with an engine's quads farther than this from the surface the best candidate is in doubt ...
+_DOUBTFUL_EDGES = 1.75
+_MUCH_NEARER = 0.75  # ... and one within this share of its distance goes before it.
 
-Found = tuple[np.ndarray, np.ndarray, str]  # vertices (v, 3), quads (q, 4), the way that they were made
 
+def _attempts(quads: int, request: Request) -> list[EngineAttempt]:
+    """List the attempts for this many quads, in order.
 
-def _ways(quads: int, request: Request) -> list[Way]:
-    """In the order to try.
-
-    A coarser mesh subdivided has a quarter of the irregular vertices; it fails where features, or walls, are finer than
-    its quads."""
+    A coarser mesh subdivided has a quarter of the irregular vertices. It fails where features or walls are finer than
+    the coarse quads. Where a seam of the engine's fields fails, it often holds at a slightly different density.
+    """
     engine = "instant-meshes" if request.engine == "auto" else request.engine
-    out = (
-        [Way(engine, 1, (0.985, 1.005), request.crease_degrees)]
-        if engine == "instant-meshes" and quads >= _MANY
+    attempts = (
+        [EngineAttempt(engine, 1, (0.985, 1.005), request.crease_degrees)]
+        if engine == "instant-meshes" and quads >= _MIN_SUBDIVIDED_QUADS
         else []
     )
-    # Where a seam of the engine's fields fails, it often holds at a slightly different density.
-    out += [
-        Way(engine, 0, (1.0,), request.crease_degrees),
-        Way(engine, 0, (1.02,), request.crease_degrees),
-        Way(engine, 0, (0.98,), 0.0),
+    attempts += [
+        EngineAttempt(engine, 0, (1.0,), request.crease_degrees),
+        EngineAttempt(engine, 0, (1.02,), request.crease_degrees),
+        EngineAttempt(engine, 0, (0.98,), 0.0),
     ]
-    return out + [Way("instant-meshes", 0, (1.0,), request.crease_degrees)] * (request.engine == "quadriflow")
+    if request.engine == "quadriflow":
+        attempts.append(EngineAttempt("instant-meshes", 0, (1.0,), request.crease_degrees))
+    return attempts
 
 
-def prepare_engines(quads: int, request: Request) -> None:
-    """Start the children of the first way now (core.child.prepare)."""
+def prepare_engines(request: Request) -> None:
+    """Start the children of the first attempt now, so that they import their modules meanwhile."""
     if request.engine != "split":
-        prepare(candidate, CHILD_MODULES, _AT_ONCE)
+        prepare(make_candidate, CHILD_MODULES, _PARALLEL_CANDIDATES)
 
 
-def _between(gave: list[tuple[float, int]], wanted: float) -> float | None:
-    """What to ask for where one number gave fewer quads than wanted and another more: a number between them. gave:
-    (asked, count) of each."""
-    fewer, more = [one for one in gave if one[1] < wanted], [one for one in gave if one[1] > wanted]
+class EngineAnswer(NamedTuple):
+    """What an engine made of a request: the count requested and the count received."""
+
+    requested: float
+    count: int
+
+
+def _interpolate_request(answers: list[EngineAnswer], wanted: float) -> float | None:
+    """Return a count to request between answers that were too few and too many; None without one of each."""
+    fewer = [answer for answer in answers if answer.count < wanted]
+    more = [answer for answer in answers if answer.count > wanted]
     if not fewer or not more:
         return None
-    (low, below), (high, above) = max(fewer, key=lambda one: one[1]), min(more, key=lambda one: one[1])
+    (low, below) = max(fewer, key=lambda answer: answer.count)
+    (high, above) = min(more, key=lambda answer: answer.count)
     return low + (high - low) * (wanted - below) / (above - below)
 
 
-class Trial:
-    """The ways tried on one part."""
+class EngineSearch:
+    """The attempts on one patch, with what they showed so far."""
 
-    def __init__(self, part: Part, record: Record):
-        self.part, self.record = part, record
-        self.whole: Candidate | None = None  # of several pieces what an engine made of all of them
-        self._several = part.pieces[0] > 1  # what fails together can go piece by piece
-        self._over = False
-        self._passable: Candidate | None = None
-        self._second_best: Candidate | None = None
-        self._given_up: set[str] = set()
+    def __init__(self, patch: RemeshPatch, record: Record):
+        self.patch, self.record = patch, record
+        self.whole: Candidate | None = None  # for several pieces: the last result for all of them together
+        self._has_pieces = patch.pieces[0] > 1  # pieces that fail together can go one by one
+        self._stopped = False
+        self._acceptable: Candidate | None = None  # a subdivided result that would do as a finer one
+        self._bridged: Candidate | None = None  # a result with a gap or tunnel bridged or filled
+        self._skipped_engines: set[str] = set()
 
-    def run(self) -> Found | None:
-        """The first way's quads that stand up to judgement, settled; None when none does."""
-        for way in _ways(self.part.quads, self.part.request):
-            if self.part.request.for_engines <= 0:
-                self.record.failed.append(f"{way.label}: not tried, the time is over")
-                self._over = True
-                return self._passed() or self._bridged()
-            if way.subdivisions and (why := self._hopeless()):
-                self.record.failed.append(f"{way.label}: not tried, {why}")
+    def run(self) -> QuadResult | None:
+        """Return the quads of the first attempt that pass judgement, finalized; None when none pass."""
+        for attempt in _attempts(self.patch.quads, self.patch.request):
+            if self.patch.request.engine_seconds_left <= 0:
+                self.record.failed.append(f"{attempt.label}: not tried, the time is over")
+                self._stopped = True
+                return self._finalize_acceptable() or self._finalize_bridged()
+            if attempt.subdivisions and (why := self._why_not_coarser()):
+                self.record.failed.append(f"{attempt.label}: not tried, {why}")
                 continue
-            tried = not way.subdivisions and self._passable is not None
-            if way.engine not in self._given_up and (found := self._by(way)) is not None:
-                return found
-            if self._over:
-                return self._passed()
-            if tried or self._second_best is not None:
+            # One attempt at full density is enough where there is something to fall back to.
+            is_last = not attempt.subdivisions and self._acceptable is not None
+            if attempt.engine not in self._skipped_engines and (result := self._try(attempt)) is not None:
+                return result
+            if self._stopped:
+                return self._finalize_acceptable()
+            if is_last or self._bridged is not None:
                 break  # what one density bridges, another does too
-        return self._passed() or self._bridged()
+        return self._finalize_acceptable() or self._finalize_bridged()
 
-    def _hopeless(self) -> str | None:
-        """What is known to be wrong with a coarser mesh subdivided before it is made."""
-        if self.part.quads < _FOR_A_HANDLE * self.part.handles:
-            return f"so few quads lose some of {self.part.handles} handles"
-        return "its quads are wider than the strips between creases" if self.part.narrow else None
+    def _why_not_coarser(self) -> str | None:
+        """Return why a coarser mesh subdivided is known to fail, else None."""
+        if self.patch.quads < _MIN_QUADS_PER_HANDLE * self.patch.handles:
+            return f"so few quads lose some of {self.patch.handles} handles"
+        return "its quads are wider than the strips between creases" if self.patch.has_narrow_strips else None
 
-    def _by(self, way: Way) -> Found | None:
-        quads = self.part.quads
-        # extra: quads of the tips that are drawn out of the engine's.
-        asked, extra = [quads * factor for factor in way.factors], 0
-        gave: list[tuple[float, int]] = []
-        for turn in range(_TRIES):
-            wanted = quads - extra
-            candidates = self._candidates(way, asked, wanted)
+    def _try(self, attempt: EngineAttempt) -> QuadResult | None:
+        """Request quads in up to _MAX_ROUNDS rounds, each with a corrected count, and fit the best to the surface."""
+        quads = self.patch.quads
+        requests = [quads * factor for factor in attempt.factors]
+        tip_quads = 0  # quads that tip extrusion adds to the engine's
+        answers: list[EngineAnswer] = []
+        for turn in range(_MAX_ROUNDS):
+            wanted = quads - tip_quads
+            candidates = self._candidates(attempt, requests, wanted)
             if not candidates:
                 return None
             best = candidates[0]
-            count, counted, usable = best.count, self.part.counted(best.count, wanted), best.usable(self.part)
-            together = self._several and not way.subdivisions
-            if together and len(best.quads):
+            count, has_count = best.count, self.patch.has_count(best.count, wanted)
+            usable = best.is_usable(self.patch)
+            is_together = self._has_pieces and not attempt.subdivisions
+            if is_together and len(best.quads):
                 self.whole = best
             if (
-                (together or usable and (self._several or not counted))
+                (is_together or usable and (self._has_pieces or not has_count))
                 and len(best.quads)
-                and (bare := best.leaves_out(self.part))
+                and (missing := best.missing_surface(self.patch))
             ):
-                return self._failed(way, bare)
-            if not counted and (usable or together):
-                if turn and count * _MOST_MORE < wanted:
-                    break  # small pieces are lost however many are asked for
-                gave += [(one.asked, one.count) for one in candidates if one.fault == best.fault]
-                asked = way.near(_between(gave, wanted) or best.asked * min(wanted / max(count, 1), _MOST_MORE))
+                return self._fail(attempt, missing)
+            if not has_count and (usable or is_together):
+                if turn and count * _MAX_GROWTH < wanted:
+                    break  # small pieces are lost however many quads are requested
+                answers += [
+                    EngineAnswer(candidate.requested, candidate.count)
+                    for candidate in candidates
+                    if candidate.fault == best.fault
+                ]
+                requests = attempt.counts_around(
+                    _interpolate_request(answers, wanted) or best.requested * min(wanted / max(count, 1), _MAX_GROWTH)
+                )
                 continue
-            if counted and best.bridged and not way.subdivisions:
-                self._second_best = best
+            if has_count and best.is_bridged and not attempt.subdivisions:
+                self._bridged = best
             if not usable:
-                return self._failed(way, best.fault, torn=best.off(wanted) < -_MOST_TORN)
-            like = [one for one in candidates if one.fault == best.fault]
-            if way.subdivisions and len(like) > 1:
-                like = self._nearer_first(like, wanted)
-                best = like[0]
-            taken = self._drawn(self._of_count(like, extra))
-            if taken is not None and taken.wrong is not None:
-                if taken.passable and self.part.counted(len(taken.drawn[1]), quads):
-                    self._passable = taken
-                return self._failed(way, f"{taken.fault}; {taken.wrong}" if taken.fault else taken.wrong)
-            taken, count = (best, len(best.outline.faces)) if taken is None else (taken, len(taken.drawn[1]))
-            if not self.part.counted(count, quads):
-                extra = count - taken.count
-                asked = way.near(taken.asked * (quads - extra) / taken.count)
+                return self._fail(attempt, best.fault, torn=best.count_error(wanted) < -_MAX_TORN_SHARE)
+            in_order = self._fit_order(attempt, candidates, wanted)
+            taken = self._fit_first_good(self._with_right_count(in_order, tip_quads))
+            if taken is not None and taken.rejection is not None:
+                return self._reject(taken)
+            if taken is None:  # the first was snapped, and does not have the count together with its tips
+                taken, count = in_order[0], len(in_order[0].snapped.faces)
+            else:
+                count = len(taken.fitted[1])
+            if not self.patch.has_count(count, quads):
+                tip_quads = count - taken.count
+                requests = attempt.counts_around(taken.requested * (quads - tip_quads) / taken.count)
                 continue
-            return self._settled(taken)
-        self.record.failed.append(f"{way.label}: gave {count} faces for {quads}")
-        if not way.subdivisions:
-            self._given_up.add(way.engine)
+            return self._finalized(taken)
+        self.record.failed.append(f"{attempt.label}: gave {count} faces for {quads}")
+        if not attempt.subdivisions:
+            self._skipped_engines.add(attempt.engine)
         return None
 
-    def _candidates(self, way: Way, asked: list[float], wanted: float) -> list[Candidate]:
-        """What comes of each number asked for, made side by side, the best first."""
-        part, request, start = self.part, self.part.request, time.perf_counter()
+    def _fit_order(self, attempt: EngineAttempt, candidates: list[Candidate], wanted: float) -> list[Candidate]:
+        """Return the candidates that share the fault of the best, in the order to fit them."""
+        alike = [candidate for candidate in candidates if candidate.fault == candidates[0].fault]
+        if attempt.subdivisions and len(alike) > 1:
+            alike = self._nearer_first(alike, wanted)
+        return alike
+
+    def _reject(self, taken: Candidate) -> None:
+        """Record why a fitted candidate is rejected; keep it where it would do as a finer result."""
+        if taken.acceptable_as_finer and self.patch.has_count(len(taken.fitted[1]), self.patch.quads):
+            self._acceptable = taken
+        self._fail(taken.attempt, f"{taken.fault}; {taken.rejection}" if taken.fault else taken.rejection)
+
+    def _candidates(self, attempt: EngineAttempt, requests: list[float], wanted: float) -> list[Candidate]:
+        """Run one child for each requested count, side by side, and return the candidates, best first."""
+        patch, request, start = self.patch, self.patch.request, time.perf_counter()
         running = [
             begin(
-                candidate,
-                part.vertices,
-                part.faces,
-                way,
+                make_candidate,
+                patch.vertices,
+                patch.faces,
+                attempt,
                 number,
-                seconds=request.for_a_run,
-                memory_mb=min(int(_MEMORY[0] + _MEMORY[1] * (number + len(part.faces))), request.memory_mb),
+                seconds=request.child_seconds,
+                memory_mb=min(
+                    int(_BASE_MEMORY_MB + _MEMORY_MB_PER_FACE * (number + len(patch.faces))), request.memory_mb
+                ),
             )
-            for number in asked
+            for number in requests
         ]
-        # Found out while the children work.
-        if way.subdivisions and part.thin:
+        # Computed while the children work.
+        if attempt.subdivisions and patch.has_thin_walls:
             for child in running:
                 child.kill()
-            self.record.failed.append(f"{way.label}: given up, walls are thinner than its quads")
+            self.record.failed.append(f"{attempt.label}: given up, walls are thinner than its quads")
             self.record.clock("engine", start)
             return []
-        _ = part.features, part.surface, part.fine()
-        out = []
+        _ = patch.features, patch.surface, patch.full_surface()
+        candidates = []
         for child in running:
             try:
-                out.append(child.result())
+                candidates.append(child.result())
             except ChildFailed as failure:
-                self.record.failed.append(f"{way.label}: {failure}")
+                self.record.failed.append(f"{attempt.label}: {failure}")
         self.record.clock("engine", start)
-        return sorted(out, key=lambda one: one.rank(wanted, part.tolerance))
+        return sorted(candidates, key=lambda candidate: candidate.rank(wanted, patch.tolerance))
 
     def _nearer_first(self, candidates: list[Candidate], wanted: float) -> list[Candidate]:
-        """The second before the first where the first is in doubt, and the second much nearer to the surface."""
+        """Swap the first two where the first is doubtful and the second much nearer to the surface."""
         first, second, *others = candidates
-        far = first.astray(self.part)
-        nearer = (
-            far > _ASTRAY_EDGES and self.part.counted(second.count, wanted) and second.astray(self.part) < _NEARER * far
+        distance = first.raw_distance(self.patch)
+        swap = (
+            distance > _DOUBTFUL_EDGES
+            and self.patch.has_count(second.count, wanted)
+            and second.raw_distance(self.patch) < _MUCH_NEARER * distance
         )
-        return [second, first, *others] if nearer else candidates
+        return [second, first, *others] if swap else candidates
 
-    def _of_count(self, candidates: list[Candidate], extra: int) -> Iterator[Candidate]:
-        """Those that have about as many quads as asked for once tips are drawn out of theirs, at the first `extra`
-        more, and those that are hopeless."""
-        quads = self.part.quads
-        for one in candidates:
-            if one is not candidates[0] and not self.part.counted(one.count + extra, quads):
+    def _with_right_count(self, candidates: list[Candidate], tip_quads: int) -> Iterator[Candidate]:
+        """Yield the candidates that have the wanted count together with their tips, and the hopeless ones.
+
+        tip_quads: the quads of tips to expect until a candidate is snapped.
+        """
+        quads = self.patch.quads
+        for candidate in candidates:
+            if candidate is not candidates[0] and not self.patch.has_count(candidate.count + tip_quads, quads):
                 continue
-            one.trace(self.part)
-            extra = len(one.outline.faces) - one.count
-            if one.outline.hopeless or self.part.counted(one.count + extra, quads):
-                yield one
+            candidate.snap(self.patch)
+            tip_quads = len(candidate.snapped.faces) - candidate.count
+            if candidate.snapped.hopeless or self.patch.has_count(candidate.count + tip_quads, quads):
+                yield candidate
 
-    def _drawn(self, candidates: Iterable[Candidate]) -> Candidate | None:
-        """The first that comes out good, those that do not promise to last; where none does the one that comes nearest
-        to the surface."""
+    def _fit_first_good(self, candidates: Iterable[Candidate]) -> Candidate | None:
+        """Fit candidates until one is good, promising ones first; where none is, return the nearest to the surface."""
         start, done = time.perf_counter(), []
-        for one in self._promising_first(candidates):
-            one.draw(self.part)
-            done.append(one)
-            if one.good or not one.way.subdivisions:
+        for candidate in self._promising_first(candidates):
+            candidate.fit(self.patch)
+            done.append(candidate)
+            if candidate.is_good or not candidate.attempt.subdivisions:
                 break
         self.record.clock("fit", start)
-        if not done or done[-1].good:
+        if not done or done[-1].is_good:
             return done[-1] if done else None
-        return min(done, key=lambda one: (one.wrong is not None, one.far - 2 * one.least))
+        return min(
+            done,
+            key=lambda candidate: (
+                candidate.rejection is not None,
+                candidate.distance_edges - 2 * candidate.min_jacobian,
+            ),
+        )
 
     def _promising_first(self, candidates: Iterable[Candidate]) -> Iterator[Candidate]:
+        """Yield promising candidates as they come, the others after them."""
         late = []
-        for one in candidates:
-            if one.promising(self.part):
-                yield one
+        for candidate in candidates:
+            if candidate.is_promising(self.patch):
+                yield candidate
             else:
-                late.append(one)
+                late.append(candidate)
         yield from late
 
-    def _settled(self, taken: Candidate) -> Found:
+    def _finalized(self, taken: Candidate) -> QuadResult:
+        """Return the finalized quads of a fitted candidate."""
         start = time.perf_counter()
-        found = settled(*taken.drawn, self.part.fine(), self.part.request)
+        vertices, quads = finalize(*taken.fitted, self.patch.full_surface(), self.patch.request)
         self.record.clock("fit", start)
-        return *found, f"{taken.way.label}, {taken.fault}" if taken.fault else taken.way.label
+        label = taken.attempt.label
+        return QuadResult(vertices, quads, f"{label}, {taken.fault}" if taken.fault else label)
 
-    def _failed(self, way: Way, fault: str, torn: bool = False) -> None:
-        self.record.failed.append(f"{way.label}: {fault}")
-        if not way.subdivisions:
-            self._over = self._several
-            # Another density mends a seam of the engine's fields, not a part that is too thin for so many quads.
-            if torn or fault.startswith(TOO_COARSE):
-                self._given_up.add(way.engine)
+    def _fail(self, attempt: EngineAttempt, reason: str, torn: bool = False) -> None:
+        """Record why an attempt failed, and skip the attempts that would fail for the same reason."""
+        self.record.failed.append(f"{attempt.label}: {reason}")
+        if not attempt.subdivisions:
+            self._stopped = self._has_pieces
+            # Another density repairs a seam of the engine's fields, not a part too thin for this many quads.
+            if torn or reason.startswith(TOO_COARSE):
+                self._skipped_engines.add(attempt.engine)
 
-    def _passed(self) -> Found | None:
-        """A subdivided result that is no worse than what is taken of a finer one: better than none."""
-        return None if self._passable is None else self._settled(self._passable)
+    def _finalize_acceptable(self) -> QuadResult | None:
+        """Return a subdivided result that passes the limits of a finer one, where there is one."""
+        return None if self._acceptable is None else self._finalized(self._acceptable)
 
-    def _bridged(self) -> Found | None:
-        """A gap or tunnel finer than the quads was bridged or filled: still better than no engine."""
-        best = self._second_best
+    def _finalize_bridged(self) -> QuadResult | None:
+        """Return a result with a gap or tunnel bridged that was finer than the quads: better than no engine."""
+        best = self._bridged
         if best is None:
             return None
-        if best.drawn is None:
-            self._drawn([best])
-        return self._settled(best) if best.far <= FAR_EDGES else None
+        if best.fitted is None:
+            self._fit_first_good([best])
+        return self._finalized(best) if best.distance_edges <= FAR_EDGES else None

@@ -1,34 +1,44 @@
-"""Quads where no engine's will do: of even triangles, or, where there are none, of the mesh's own."""
+"""Make the quads of a patch without an engine, and smooth them on its surface where that helps."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from gdtool.geometry.normals import face_normals
-from gdtool.remesh.fallback.pair_and_split import few_for_even, of_even, of_own, split_count
-from gdtool.remesh.fit.shaping import better, evened
-from gdtool.remesh.task import Part
+from gdtool.remesh.fallback.pair_and_split import (
+    quads_from_input,
+    quads_from_isotropic,
+    split_count,
+    too_few_for_isotropic,
+)
+from gdtool.remesh.fit.shaping import keep_better_vertices, smoothed
+from gdtool.remesh.task import RemeshPatch
 
 
-def split(part: Part) -> tuple[np.ndarray, np.ndarray]:
-    """Quads of any part (quad_split), evened out on its surface where that makes better ones."""
-    request, quads = part.request, len(part.cut[1]) if part.cut is not None else split_count(part.faces, part.quads)
-    # The surface and its features, those for the edge length of these quads.
-    edge = (face_normals(part.vertices, part.faces)[1].sum() / quads) ** 0.5
-    ground = Part(part.vertices, part.faces, quads, edge, request, lambda: part.surface)
-    ground.surface = part.surface
-    found = part.cut
-    if found is None and not few_for_even(part.faces, quads):
-        found = of_even(
-            part.vertices,
-            part.faces,
-            quads,
+def split(patch: RemeshPatch) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices and quads of any patch, from isotropic triangles or, where those fail, from its own triangles.
+
+    The quads are smoothed on the surface, each piece and each quad only where that makes it better.
+    """
+    request = patch.request
+    count = len(patch.input_quads[1]) if patch.input_quads is not None else split_count(patch.faces, patch.quads)
+    # The features are those for the edge length of these quads, which differs from the patch's.
+    edge = (face_normals(patch.vertices, patch.faces)[1].sum() / count) ** 0.5
+    ground = RemeshPatch(patch.vertices, patch.faces, count, edge, request, lambda: patch.surface)
+    ground.surface = patch.surface
+    mesh = patch.input_quads
+    if mesh is None and not too_few_for_isotropic(patch.faces, count):
+        mesh = quads_from_isotropic(
+            patch.vertices,
+            patch.faces,
+            count,
             request.crease_degrees,
-            request.for_the_rest,
+            request.fallback_seconds,
             request.memory_mb,
             lambda: ground.features,
         )
-    if found is None:
-        found = of_own(part.vertices, part.faces, quads, request.for_the_rest, lambda: ground.features)
-    traced, constraints = evened(*found, ground.surface, ground.features, request)
-    return better(*found, traced, constraints, part.surface, request, part.fine()), found[1]
+    if mesh is None:
+        mesh = quads_from_input(patch.vertices, patch.faces, count, request.fallback_seconds, lambda: ground.features)
+    moved, constraints = smoothed(*mesh, ground.surface, ground.features, request)
+    vertices = keep_better_vertices(*mesh, moved, constraints, patch.surface, request, patch.full_surface())
+    return vertices, mesh[1]

@@ -1,4 +1,4 @@
-"""Features that run across quads instead of along their edges: held to the quads' diagonals."""
+"""Handle features that run across quads: hold them to diagonals, and choose the diagonals that follow the surface."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ import numpy as np
 from gdtool.geometry.mesh_quality import columns_of
 from gdtool.geometry.topology import edges_of
 from gdtool.remesh.fit.feature_curves import Constraints, closest_on_segments
-from gdtool.remesh.fit.surface_projection import Surface
+from gdtool.remesh.fit.surface_projection import ProjectionTarget
 
-_FLAT = 1e-3  # a quad whose diagonals pass within this share of its size needs no choice
+_FLAT = 1e-3  # of a quad's size: where its diagonals pass nearer to each other, either will do
 
 
-def crossed(faces: np.ndarray, before: Constraints, after: Constraints) -> tuple[np.ndarray, np.ndarray]:
-    """Quads (k,) of faces (q, 4) that a feature now crosses from corner to corner, and its curve (k,).
+def quads_crossed_by_features(
+    faces: np.ndarray, before: Constraints, after: Constraints
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the quads (k,) of faces (q, 4) that a feature crosses from corner to corner, and its curve (k,).
 
-    before and after are the constraints around features.untied, which lets the corner between two others off their
-    curve: from there on the curve runs along the diagonal of the quad."""
+    before and after are the constraints around release_straight_corners. A corner released between two held ones leaves
+    a quad whose diagonal the curve follows.
+    """
     width = len(before.curve) + 1
     path = np.sort(before.path, 1)
     order = np.argsort(path[:, 0] * width + path[:, 1])
@@ -26,58 +29,63 @@ def crossed(faces: np.ndarray, before: Constraints, after: Constraints) -> tuple
     if not len(key):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     following = np.roll(faces, -1, 1)
-    asked = np.minimum(faces, following) * width + np.maximum(faces, following)
-    place = np.minimum(np.searchsorted(key, asked), len(key) - 1)
-    curve = np.where(key[place] == asked, before.path_curve[order][place], -1)  # of the edge that starts at each corner
-    let_off = (before.curve[faces] >= 0) & (after.curve[faces] < 0)
-    on = (after.curve >= 0) | after.fixed
-    found = (
-        let_off
+    edge_key = np.minimum(faces, following) * width + np.maximum(faces, following)
+    index = np.minimum(np.searchsorted(key, edge_key), len(key) - 1)
+    curve = np.where(key[index] == edge_key, before.path_curve[order][index], -1)  # of the edge from each corner on
+    was_released = (before.curve[faces] >= 0) & (after.curve[faces] < 0)
+    is_held = (after.curve >= 0) | after.fixed
+    is_crossed = (
+        was_released
         & (curve >= 0)
         & (curve == np.roll(curve, 1, 1))
-        & on[following]
-        & on[np.roll(faces, 1, 1)]
-        & ~on[np.roll(faces, 2, 1)]
+        & is_held[following]
+        & is_held[np.roll(faces, 1, 1)]
+        & ~is_held[np.roll(faces, 2, 1)]
     )
-    face_idx, corner = np.nonzero(found)
-    once = np.unique(face_idx, return_index=True)[1]
-    return face_idx[once], curve[face_idx[once], corner[once]]
+    face_idx, corner = np.nonzero(is_crossed)
+    first_of_face = np.unique(face_idx, return_index=True)[1]
+    return face_idx[first_of_face], curve[face_idx[first_of_face], corner[first_of_face]]
 
 
-def held_at_centres(
-    constraints: Constraints, first_centre: int, face_idx: np.ndarray, curve: np.ndarray
-) -> Constraints:
-    """Constraints of the subdivided mesh, the centres of those quads (k,) held to the curve (k,) that crosses them."""
-    held = constraints.curve.copy()
-    held[first_centre + face_idx] = curve
-    return replace(constraints, curve=held)
+def hold_centres(constraints: Constraints, first_centre: int, face_idx: np.ndarray, curve: np.ndarray) -> Constraints:
+    """Hold the centres of crossed quads (k,) to their curve (k,) in the constraints of the subdivided mesh.
+
+    first_centre: the vertex at the centre of face 0.
+    """
+    curve_of_vertex = constraints.curve.copy()
+    curve_of_vertex[first_centre + face_idx] = curve
+    return replace(constraints, curve=curve_of_vertex)
 
 
-def cut_along_features(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> np.ndarray:
-    """Faces (q, 4) whose first corner is chosen such that the diagonal from it, where they are cut in two, is the one
-    nearer to the surface. Bent quads across a crease then follow it."""
-    p = columns_of(vertices, faces)
-    middle = np.stack([(p[:, 0] + p[:, 2]) / 2, (p[:, 1] + p[:, 3]) / 2])
-    apart = np.sqrt(((middle[0] - middle[1]) ** 2).sum(0))
-    size = np.sqrt(((p[:, 0] - p[:, 2]) ** 2).sum(0))
-    bent = np.flatnonzero(apart > _FLAT * size)
+def choose_diagonals(vertices: np.ndarray, faces: np.ndarray, surface: ProjectionTarget) -> np.ndarray:
+    """Rotate the corners of faces (q, 4) so that the diagonal from the first corner is the one nearer to the surface.
+
+    Faces are cut in two along that diagonal, so bent quads across a crease then follow it.
+    """
+    columns = columns_of(vertices, faces)
+    middle = np.stack([(columns[:, 0] + columns[:, 2]) / 2, (columns[:, 1] + columns[:, 3]) / 2])
+    gap = np.sqrt(((middle[0] - middle[1]) ** 2).sum(0))
+    size = np.sqrt(((columns[:, 0] - columns[:, 2]) ** 2).sum(0))
+    bent = np.flatnonzero(gap > _FLAT * size)
     first, second = surface.closest(middle[:, :, bent].transpose(0, 2, 1).reshape(-1, 3))[0].reshape(2, -1)
-    turned = bent[second < first]
+    rotated = bent[second < first]
     out = faces.copy()
-    out[turned] = np.roll(faces[turned], -1, 1)
+    out[rotated] = np.roll(faces[rotated], -1, 1)
     return out
 
 
-def to_rim(vertices: np.ndarray, faces: np.ndarray, surface: Surface, reach: float) -> np.ndarray:
-    """Vertices (v, 3) with those on the boundary of the quads drawn to the boundary of the surface where it is within
-    `reach`."""
-    theirs = edges_of(surface.faces)
-    segments = theirs.ends[theirs.count == 1]
+def snap_boundary(vertices: np.ndarray, faces: np.ndarray, surface: ProjectionTarget, reach: float) -> np.ndarray:
+    """Move boundary vertices of the quads to the boundary of the surface where it is within `reach`.
+
+    Returns vertices (v, 3).
+    """
+    surface_edges = edges_of(surface.faces)
+    segments = surface_edges.ends[surface_edges.count == 1]
     if not len(segments):
         return vertices
-    mine = edges_of(faces)
-    rim = np.unique(mine.ends[mine.count == 1])
-    distance, _, point = closest_on_segments(vertices[rim], surface.vertices, segments)
+    quad_edges = edges_of(faces)
+    boundary = np.unique(quad_edges.ends[quad_edges.count == 1])
+    distance, _, point = closest_on_segments(vertices[boundary], surface.vertices, segments)
     out = vertices.copy()
-    out[rim[distance < reach]] = point[distance < reach]
+    out[boundary[distance < reach]] = point[distance < reach]
     return out

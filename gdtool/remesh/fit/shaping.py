@@ -1,5 +1,4 @@
-"""Quads drawn onto the surface that they stand for: to its creases and boundaries, evened out, unfolded; and how well
-they do."""
+"""Fit an engine's quads to the surface (snap, square up, untangle), and judge how well they represent it."""
 
 from __future__ import annotations
 
@@ -9,262 +8,291 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gdtool.geometry import topology
+from gdtool.geometry.distance import closest_points, sample_surface
 from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian
 from gdtool.geometry.topology import triangulated
-from gdtool.remesh.connectivity.diagonal_collapse import without_folded
-from gdtool.remesh.fit.feature_curves import Constraints, Features, trace, untied
-from gdtool.remesh.fit.feature_diagonals import crossed, cut_along_features, held_at_centres, to_rim
-from gdtool.remesh.fit.squaring import balance, ease, square_up
-from gdtool.remesh.fit.surface_projection import Surface, onto, relax, subdivide
-from gdtool.remesh.fit.tip_extrusion import draw_out
-from gdtool.remesh.fit.untangle import unfold
+from gdtool.remesh.connectivity.diagonal_collapse import collapse_folded_quads
+from gdtool.remesh.fit.feature_curves import Constraints, Features, release_straight_corners, trace_features
+from gdtool.remesh.fit.feature_diagonals import choose_diagonals, hold_centres, quads_crossed_by_features, snap_boundary
+from gdtool.remesh.fit.squaring import ReleaseOptions, balance_heights, release_and_smooth, square_up
+from gdtool.remesh.fit.surface_projection import ProjectionTarget, project, relax, subdivide
+from gdtool.remesh.fit.tip_extrusion import extrude_tips
+from gdtool.remesh.fit.untangle import untangle
 
 if TYPE_CHECKING:
     from gdtool.remesh.task import Request
 
-_NO_AREA = 1e-4  # squared edge lengths
-# Farther than this before it is shaped, or so much of its area cut off, a subdivided result is given up.
-_HOPELESS_EDGES, _HOPELESS_SHARE = 1.7, 0.02
-_RIM_EDGES = 2.0  # the engine ends its quads so near to a boundary of the surface
-# Edge lengths that a result may stray; of a subdivided one, after which others come.
+# Limits of an acceptable result: the largest distance (edge lengths), and the share of the area cut off. Paired
+# triangles keep edges better than that. Subdivided results have stricter limits, for finer attempts follow them.
 FAR_EDGES, FAR_SUBDIVIDED = 2.0, 1.0
-_LIKELY = 0.75  # of them: what strays less before it is shaped is not likely to stray more than it may afterwards
-_LOST_EDGES, _LOST_SHARE = 0.75, 0.003  # surface so far from the quads is lost on them, and how much of it may be
-_MOST_FOLDED = 0.01  # of the quads
-_CUT_EDGES = 0.25  # surface so far from the quads lies beyond an edge that they cut off
-# How much of it may, as paired triangles keep its edges; of a subdivided result, after which finer ones come.
 CUT_OFF, CUT_SUBDIVIDED = 0.0125, 0.005
+_CUT_EDGES = 0.25  # edge lengths: surface farther than this from the quads lies beyond an edge that they cut off
+_LOST_EDGES, _MAX_LOST_SHARE = 0.75, 0.003  # surface farther than this (edge lengths) is lost; how much of it may be
+_MAX_FOLDED_SHARE = 0.01  # of the quads
+
+# A subdivided result this far away before it is fitted (edge lengths), or with this share of its area cut off, is given
+# up: fitting brings it a third nearer at most.
+_HOPELESS_EDGES, _HOPELESS_SHARE = 1.7, 0.02
+_LIKELY_SHARE = 0.75  # of the limit: results nearer than this before fitting hardly ever end beyond it
+_BOUNDARY_EDGES = 2.0  # edge lengths: an engine's quads end this near to a boundary of the surface
+
+_FOLDED_JACOBIAN = 0.05  # scaled Jacobian below which a quad counts as folded
+_MAX_UNCOVERED_EDGES = 0.8  # edge lengths that a corner may be uncovered by, rather than leave quads folded
+_ABANDONED_EDGES = 0.25  # edge lengths: smoothing must not leave surface farther than this from the quads
+_MIN_AREA = 1e-4  # squared edge lengths: quads of less have no area
+_SURFACE_SAMPLES, _SHARE_SAMPLES = 20000, 10000
+
+# First words of the reasons of rejection_reason(); TOO_COARSE are those that no other density mends.
 TOO_COARSE = _STRAYS, LEAVES_OUT, STICKS_OUT, _CUTS_OFF = "strays", "leaves out", "sticks out", "cuts off"
-_MOST_BARE = 0.8  # edge lengths that a corner may be from quads, rather than that they stay folded
-_FOLDED, _LET_GO = 0.05, 0.25  # scaled Jacobian; edge lengths
 
 
 @dataclass(frozen=True)
-class Outline:
-    """An engine's quads drawn to the creases, subdivided and drawn out over tips, not evened out yet."""
+class SnappedQuads:
+    """An engine's quads snapped to the features, subdivided and extruded over tips, before they are smoothed.
 
-    vertices: np.ndarray  # (v, 3)
-    faces: np.ndarray  # (f, 4)
+    vertices (v, 3), faces (f, 4); tips (t,): vertices that have to stay; edge: about the edge length of the quads.
+    distance_edges: the largest distance from samples of the surface, and limit_edges: how far the fitted quads may
+    stray, both in edge lengths. hopeless: they are too far away for fitting to help.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
     constraints: Constraints
-    tips: np.ndarray  # vertices (t,) that are to stay
-    edge: float  # about its quads' edge length
-    far: float  # edge lengths that samples of the surface are from it at most
-    limit: float  # edge lengths that quads made of it may stray
-    hopeless: bool  # shaping brings it a third nearer at most, which does not do
+    tips: np.ndarray
+    edge: float
+    distance_edges: float
+    limit_edges: float
+    hopeless: bool
 
 
-def outlined(
-    vertices: np.ndarray, faces: np.ndarray, surface: Surface, features: Features, subdivisions: int, request: Request
-) -> Outline:
-    """The engine's quads drawn to creases, subdivided, and drawn out over tips."""
+def snap_to_features(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    surface: ProjectionTarget,
+    features: Features,
+    subdivisions: int,
+    request: Request,
+) -> SnappedQuads:
+    """Snap an engine's quads to creases and boundaries, subdivide them, and extrude tips that they cut short."""
     edge = (polygon_normals(vertices, faces)[1].sum() / len(faces)) ** 0.5
-    vertices, constraints = trace(to_rim(vertices, faces, surface, _RIM_EDGES * edge), faces, features, edge)
-    free = untied(vertices, faces, constraints)
-    (across, curve), constraints = crossed(faces, constraints, free), free
-    vertices = relax(
-        onto(vertices, surface, features, constraints), faces, surface, features, constraints, request.smooth_iterations
+    vertices, traced = trace_features(
+        snap_boundary(vertices, faces, surface, _BOUNDARY_EDGES * edge), faces, features, edge
     )
+    constraints = release_straight_corners(vertices, faces, traced)
+    crossed_quads, curve = quads_crossed_by_features(faces, traced, constraints)
+
+    def relaxed() -> np.ndarray:
+        projected = project(vertices, surface, features, constraints)
+        return relax(projected, faces, surface, features, constraints, request.smooth_iterations)
+
+    vertices = relaxed()
     for turn in range(subdivisions):
         count = len(faces)
         vertices, faces, constraints = subdivide(vertices, faces, constraints)
         if not turn:
-            constraints = held_at_centres(constraints, len(vertices) - count, across, curve)
-        vertices = relax(
-            onto(vertices, surface, features, constraints),
-            faces,
-            surface,
-            features,
-            constraints,
-            request.smooth_iterations,
-        )
+            constraints = hold_centres(constraints, len(vertices) - count, crossed_quads, curve)
+        vertices = relaxed()
     edge /= 2**subdivisions
-    if subdivisions:  # what ran across a quad has vertices nearer to it now
-        vertices, constraints = trace(vertices, faces, features, edge)
-    vertices, faces, constraints, tips, far, away = draw_out(vertices, faces, constraints, surface, edge)
+    if subdivisions:  # features that ran across a quad have vertices nearer to them now
+        vertices, constraints = trace_features(vertices, faces, features, edge)
+    vertices, faces, constraints, tips, distance, sample_distances = extrude_tips(
+        vertices, faces, constraints, surface, edge
+    )
     hopeless = subdivisions > 0 and (
-        far > _HOPELESS_EDGES * edge or (away > _CUT_EDGES * edge).mean() > _HOPELESS_SHARE
+        distance > _HOPELESS_EDGES * edge or (sample_distances > _CUT_EDGES * edge).mean() > _HOPELESS_SHARE
     )
-    return Outline(
-        vertices, faces, constraints, tips, edge, far / edge, FAR_SUBDIVIDED if subdivisions else FAR_EDGES, hopeless
-    )
+    limit = FAR_SUBDIVIDED if subdivisions else FAR_EDGES
+    return SnappedQuads(vertices, faces, constraints, tips, edge, distance / edge, limit, hopeless)
 
 
-def drawn(
-    outline: Outline, surface: Surface, features: Features, request: Request
+def fit_to_surface(
+    snapped: SnappedQuads, surface: ProjectionTarget, features: Features, request: Request
 ) -> tuple[np.ndarray, np.ndarray, Constraints]:
-    """An outline evened out on the surface, unfolded and without what stays folded, unless that is hopeless; what it is
-    held to."""
-    if outline.hopeless:
-        return outline.vertices, outline.faces, outline.constraints
-    faces = outline.faces
-    vertices, constraints = _squared(outline.vertices, faces, surface, features, outline.constraints, request)
+    """Smooth snapped quads on the surface, untangle them, and collapse those that stay folded.
+
+    Hopeless quads are returned as they are. Returns vertices, faces and the constraints that hold from then on.
+    """
+    if snapped.hopeless:
+        return snapped.vertices, snapped.faces, snapped.constraints
+    faces = snapped.faces
+    vertices, constraints = _square_twice(snapped.vertices, faces, surface, features, snapped.constraints, request)
     if (
-        outline.far > _LIKELY * outline.limit
-        and farthest(surface_of(vertices, faces), surface) > outline.limit * outline.edge
+        snapped.distance_edges > _LIKELY_SHARE * snapped.limit_edges
+        and max_distance(target_of_quads(vertices, faces), surface) > snapped.limit_edges * snapped.edge
     ):
-        return vertices, faces, constraints  # what unfolds quads brings them no nearer
-    vertices, constraints = _unfolded(vertices, faces, surface, features, constraints, outline.tips)
+        return vertices, faces, constraints  # rejected anyway: untangling brings quads no nearer
+    vertices, constraints = _untangle_and_release(vertices, faces, surface, features, constraints, snapped.tips)
     fixed = np.flatnonzero(constraints.fixed)
-    vertices, faces, constraints = without_folded(vertices, faces, surface, constraints)
-    if len(faces) < len(outline.faces):
-        vertices = unfold(vertices, faces, surface, features, constraints)
+    vertices, faces, constraints = collapse_folded_quads(vertices, faces, surface, constraints)
+    if len(faces) < len(snapped.faces):
+        vertices = untangle(vertices, faces, surface, features, constraints)
     if (scaled_jacobian(vertices, faces) <= 0).any():
-        # What was fixed is there still, in its order.
-        tips = np.flatnonzero(constraints.fixed)[np.isin(fixed, outline.tips)]
-        vertices, constraints = ease(
-            vertices, faces, surface, features, constraints, _FOLDED, tips=tips, most_bare=_MOST_BARE
+        # Collapsing keeps fixed vertices, in their order: so the tips are found again.
+        tips = np.flatnonzero(constraints.fixed)[np.isin(fixed, snapped.tips)]
+        options = ReleaseOptions(_FOLDED_JACOBIAN, _MAX_UNCOVERED_EDGES)
+        vertices, constraints = release_and_smooth(
+            vertices, faces, surface, features, constraints, tips=tips, options=options
         )
     return vertices, faces, constraints
 
 
-def settled(
-    vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, fine: Surface, request: Request
+def finalize(
+    vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, full_surface: ProjectionTarget, request: Request
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Quads balanced about the input as it was before it was simplified, and cut in two where they bend along it."""
+    """Balance fitted quads about the input as it was before simplification, and choose their diagonals along it."""
     if request.smooth_iterations:
-        vertices = balance(vertices, faces, fine, constraints)
-    return vertices, cut_along_features(vertices, faces, fine)
+        vertices = balance_heights(vertices, faces, full_surface, constraints)
+    return vertices, choose_diagonals(vertices, faces, full_surface)
 
 
-def _squared(
+def _square_twice(
     vertices: np.ndarray,
     faces: np.ndarray,
-    surface: Surface,
+    surface: ProjectionTarget,
     features: Features,
     constraints: Constraints,
     request: Request,
 ) -> tuple[np.ndarray, Constraints]:
-    """The quads squared up; what they are held to from then on."""
+    """Square up the quads, release straight corners, and square up again; return vertices and constraints."""
     vertices = square_up(vertices, faces, surface, features, constraints, request.smooth_iterations)
-    constraints = untied(vertices, faces, constraints)
+    constraints = release_straight_corners(vertices, faces, constraints)
     return square_up(vertices, faces, surface, features, constraints, 2 * request.smooth_iterations), constraints
 
 
-def _unfolded(
+def _untangle_and_release(
     vertices: np.ndarray,
     faces: np.ndarray,
-    surface: Surface,
+    surface: ProjectionTarget,
     features: Features,
     constraints: Constraints,
     tips: np.ndarray | None = None,
 ) -> tuple[np.ndarray, Constraints]:
-    """The few quads that stay folded or thin unfolded one vertex at a time; what they are held to from then on."""
-    vertices = unfold(vertices, faces, surface, features, constraints)
-    return ease(vertices, faces, surface, features, constraints, tips=tips)
+    """Untangle the few quads that stay folded or thin, releasing them from features where needed."""
+    vertices = untangle(vertices, faces, surface, features, constraints)
+    return release_and_smooth(vertices, faces, surface, features, constraints, tips=tips)
 
 
-def evened(
-    quad_vertices: np.ndarray, quad_faces: np.ndarray, surface: Surface, features: Features, request: Request
+def smoothed(
+    quad_vertices: np.ndarray,
+    quad_faces: np.ndarray,
+    surface: ProjectionTarget,
+    features: Features,
+    request: Request,
 ) -> tuple[np.ndarray, Constraints]:
-    """Vertices of quads of a surface evened out on it, whatever becomes of the quads, and what they are held to."""
+    """Snap quads to the features and smooth them on the surface, even where that makes some worse.
+
+    Returns vertices (v, 3) and constraints; keep_better_vertices() chooses between these vertices and the input's.
+    """
     edge = (polygon_normals(quad_vertices, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
-    traced, constraints = trace(quad_vertices, quad_faces, features, edge)
-    constraints = untied(traced, quad_faces, constraints)
-    traced = relax(
-        onto(traced, surface, features, constraints),
+    vertices, constraints = trace_features(quad_vertices, quad_faces, features, edge)
+    constraints = release_straight_corners(vertices, quad_faces, constraints)
+    vertices = relax(
+        project(vertices, surface, features, constraints),
         quad_faces,
         surface,
         features,
         constraints,
         request.smooth_iterations,
     )
-    traced, constraints = _squared(traced, quad_faces, surface, features, constraints, request)
-    return _unfolded(traced, quad_faces, surface, features, constraints)
+    vertices, constraints = _square_twice(vertices, quad_faces, surface, features, constraints, request)
+    return _untangle_and_release(vertices, quad_faces, surface, features, constraints)
 
 
-def better(
+def keep_better_vertices(
     quad_vertices: np.ndarray,
     quad_faces: np.ndarray,
-    traced: np.ndarray,
+    moved: np.ndarray,
     constraints: Constraints,
-    surface: Surface,
+    surface: ProjectionTarget,
     request: Request,
-    fine: Surface,
+    full_surface: ProjectionTarget,
 ) -> np.ndarray:
-    """Vertices of quads as they are or, balanced about the input before it was simplified, as evened() left them, each
-    piece and each quad where that makes it better."""
+    """Choose for each vertex its smoothed position or its original one, by piece and by quad.
+
+    moved (v, 3) and constraints are those of smoothed(). Smoothed positions are balanced about the full surface first.
+    """
     edge = (polygon_normals(quad_vertices, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
     if request.smooth_iterations:
-        traced = balance(traced, quad_faces, fine, constraints)
-    # Pieces that are a few quads wide fold and shrink when their vertices are evened out: they stay as they were split,
-    # and elsewhere the vertices of quads that folded or let go of a corner.
+        moved = balance_heights(moved, quad_faces, full_surface, constraints)
+    # Pieces a few quads wide fold and shrink when smoothed, so they keep their original vertices. Elsewhere the quads
+    # that folded, or left a corner of the surface uncovered, keep theirs.
     count, piece = topology.components(quad_faces)
-    split, evened = (scaled_jacobian(v, quad_faces) for v in (quad_vertices, traced))
-    worse = (np.bincount(piece, evened, count) < np.bincount(piece, split, count))[piece]
-    worse[_let_go(surface, quad_vertices, traced, quad_faces, _LET_GO * edge)] = True
+    original_quality, quality = (scaled_jacobian(v, quad_faces) for v in (quad_vertices, moved))
+    worse = (np.bincount(piece, quality, count) < np.bincount(piece, original_quality, count))[piece]
+    worse[_abandoning_faces(surface, quad_vertices, moved, quad_faces, _ABANDONED_EDGES * edge)] = True
     stays = np.zeros(len(quad_vertices), bool)
     while worse.any():
         stays[quad_faces[worse]] = True
-        evened = scaled_jacobian(np.where(stays[:, None], quad_vertices, traced), quad_faces)
-        worse = (evened < _FOLDED) & (split > evened) & ~stays[quad_faces].all(1)
-    # What has no area as it was split was better off evened out.
-    least = _NO_AREA * edge**2
-    flat = polygon_normals(np.where(stays[:, None], quad_vertices, traced), quad_faces)[1] < least
-    stays[quad_faces[flat & (polygon_normals(traced, quad_faces)[1] >= least)]] = False
-    return np.where(stays[:, None], quad_vertices, traced)
+        quality = scaled_jacobian(np.where(stays[:, None], quad_vertices, moved), quad_faces)
+        worse = (quality < _FOLDED_JACOBIAN) & (original_quality > quality) & ~stays[quad_faces].all(1)
+    # Quads without area in the original position are better off smoothed.
+    min_area = _MIN_AREA * edge**2
+    flat = polygon_normals(np.where(stays[:, None], quad_vertices, moved), quad_faces)[1] < min_area
+    stays[quad_faces[flat & (polygon_normals(moved, quad_faces)[1] >= min_area)]] = False
+    return np.where(stays[:, None], quad_vertices, moved)
 
 
-def _let_go(
-    surface: Surface, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, distance: float
+def _abandoning_faces(
+    surface: ProjectionTarget, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, distance: float
 ) -> np.ndarray:
-    """Faces (k,) that stood for surface farther than `distance` from them, and twice as far as before, once their
-    vertices moved."""
-    from gdtool.geometry.distance import closest_points, sample_surface
-
-    points = sample_surface(surface.vertices, surface.faces, 20000, np.random.default_rng(0))[0]
+    """Return the faces (k,) whose move leaves surface farther than `distance` from all quads, and twice as far."""
+    points = sample_surface(surface.vertices, surface.faces, _SURFACE_SAMPLES, np.random.default_rng(0))[0]
     triangles, face_idx = triangulated(faces)
-    (before, nearest), after = (
-        closest_points(points, vertices, triangles)[:2],
-        closest_points(points, moved, triangles)[0],
-    )
+    before, nearest = closest_points(points, vertices, triangles)[:2]
+    after = closest_points(points, moved, triangles)[0]
     return np.unique(face_idx[nearest[(after > distance) & (after > 2 * before)]])
 
 
-def fault_of(
-    vertices: np.ndarray, quads: np.ndarray, surface: Surface, edge: float, limit: float, most_cut: float
+def rejection_reason(
+    vertices: np.ndarray,
+    quads: np.ndarray,
+    surface: ProjectionTarget,
+    edge: float,
+    limit_edges: float,
+    max_cut_share: float,
 ) -> tuple[str | None, float]:
-    """What of finished quads does not do on the surface, or None, and how far they are from it, in edge lengths.
+    """Judge finished quads against the surface.
 
-    limit: edge lengths that they may stray. most_cut: share of the surface that may lie beyond an edge that they cut
-    off."""
-    mine = surface_of(vertices, quads)
-    if (far := farthest(mine, surface) / edge) > limit:
-        return f"{_STRAYS} {far:.2g} edge lengths from the surface", far
-    left, cut = left_out(mine, surface, (_LOST_EDGES * edge, _CUT_EDGES * edge))
-    if left > _LOST_SHARE:
-        return f"{LEAVES_OUT} {left:.1%} of the surface", far
-    if (over := sticks_out(vertices, quads, surface) / edge) > limit:
-        return f"{STICKS_OUT} {over:.2g} edge lengths", far
-    if (folded := float((scaled_jacobian(vertices, quads) <= 0).mean())) > _MOST_FOLDED:
-        return f"{folded:.1%} of the quads are folded", far
-    if cut > most_cut:
-        return f"{_CUTS_OFF} {cut:.1%} of the surface", far
-    return None, far
-
-
-def surface_of(vertices: np.ndarray, quads: np.ndarray) -> Surface:
-    """The surface of the triangles that quads are cut into."""
-    return Surface(vertices, triangulated(quads)[0])
+    limit_edges: how far they may stray, in edge lengths. max_cut_share: share of the surface that may lie beyond an
+    edge that they cut off. Returns the reason to reject them, None where they are acceptable, and their largest
+    distance from the surface in edge lengths.
+    """
+    quad_surface = target_of_quads(vertices, quads)
+    if (distance := max_distance(quad_surface, surface) / edge) > limit_edges:
+        return f"{_STRAYS} {distance:.2g} edge lengths from the surface", distance
+    lost, cut = uncovered_shares(quad_surface, surface, (_LOST_EDGES * edge, _CUT_EDGES * edge))
+    if lost > _MAX_LOST_SHARE:
+        return f"{LEAVES_OUT} {lost:.1%} of the surface", distance
+    if (overshoot := max_overshoot(vertices, quads, surface) / edge) > limit_edges:
+        return f"{STICKS_OUT} {overshoot:.2g} edge lengths", distance
+    if (folded := float((scaled_jacobian(vertices, quads) <= 0).mean())) > _MAX_FOLDED_SHARE:
+        return f"{folded:.1%} of the quads are folded", distance
+    if cut > max_cut_share:
+        return f"{_CUTS_OFF} {cut:.1%} of the surface", distance
+    return None, distance
 
 
-def farthest(quads: Surface, surface: Surface) -> float:
-    """How far the surface is from the quads at most: large where they are too coarse for a detail or leave out a
-    corner."""
-    step = max(len(surface.vertices) // 20000, 1)
+def target_of_quads(vertices: np.ndarray, quads: np.ndarray) -> ProjectionTarget:
+    """Return the surface of the triangles that quads are cut into."""
+    return ProjectionTarget(vertices, triangulated(quads)[0])
+
+
+def max_distance(quads: ProjectionTarget, surface: ProjectionTarget) -> float:
+    """Return the largest distance from the surface's vertices (at most about 20,000 of them) to the quads.
+
+    It is large where quads are too coarse for a detail, or leave out a corner.
+    """
+    step = max(len(surface.vertices) // _SURFACE_SAMPLES, 1)
     return float(quads.closest(surface.vertices[::step])[0].max())
 
 
-def sticks_out(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> float:
-    """How far the middle of a quad is from the surface at most: large where quads bridge a gap or stand away from
-    it."""
+def max_overshoot(vertices: np.ndarray, faces: np.ndarray, surface: ProjectionTarget) -> float:
+    """Return the largest distance from a quad's centre to the surface: large where quads bridge a gap."""
     return float(surface.closest(vertices[faces].mean(1))[0].max())
 
 
-def left_out(quads: Surface, surface: Surface, distances: tuple[float, ...]) -> list[float]:
-    """Shares of the surface's area that lie farther than each of `distances` from the quads: thin parts and rims that
-    they do without."""
-    from gdtool.geometry.distance import sample_surface
-
-    points = sample_surface(surface.vertices, surface.faces, 10000, np.random.default_rng(0))[0]
+def uncovered_shares(quads: ProjectionTarget, surface: ProjectionTarget, distances: tuple[float, ...]) -> list[float]:
+    """Return for each distance the share of the surface's area that lies farther from the quads."""
+    points = sample_surface(surface.vertices, surface.faces, _SHARE_SAMPLES, np.random.default_rng(0))[0]
     away = quads.closest(points)[0]
     return [float((away > distance).mean()) for distance in distances]

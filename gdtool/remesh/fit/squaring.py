@@ -1,7 +1,8 @@
-"""Quads made square where they are: each asks for the rectangle nearest to it, each vertex gives its quads their
-mean."""
+"""Make quads square on the surface: each quad asks for its nearest rectangle, and each vertex takes the mean."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,87 +11,120 @@ from gdtool.geometry.mesh_quality import columns_of, polygon_normals, scaled_jac
 from gdtool.geometry.topology import edges_of, triangulated
 from gdtool.geometry.vectors import cross, dot
 from gdtool.remesh.fit.feature_curves import Constraints, Features
-from gdtool.remesh.fit.surface_projection import Slide, Surface, normals_below, relax, still_vertices
-from gdtool.remesh.fit.untangle import unfold
+from gdtool.remesh.fit.surface_projection import (
+    ConstrainedProjector,
+    ProjectionTarget,
+    immovable_vertices,
+    relax,
+    surface_normals_below,
+)
+from gdtool.remesh.fit.untangle import untangle
 
 _SQUARE_SHARE = 0.4  # of the way from the nearest rectangle to the nearest square
-_POOR = 0.6  # quads with a smaller scaled Jacobian pull harder
-_NORMALS_EVERY = 6
-_THIN = 0.3  # quads of a smaller scaled Jacobian stay where they are balanced
-# More bad quads than these are given up after so many rounds in a row that leave most of them.
-_FEW_BAD, _MOST_IN_VAIN = 8, 2
-_MOST_LEFT = 0.75
+_POOR = 0.6  # scaled Jacobian below which quads pull harder
+_POOR_WEIGHT = 6  # extra weight of a quad, for each unit of Jacobian below _POOR
+_FOLDED = 0.2  # scaled Jacobian below which a quad counts as folded when rounds are compared
+_NORMALS_EVERY = 6  # rounds between two samplings of the surface's normals
+_THIN = 0.3  # scaled Jacobian below which balance_heights() does not make quads worse
+# Balanced quads run along the surface (cosine of the normals) and are low (heights, in edge lengths).
+_ALONG_COSINE, _MAX_HEIGHT = 0.9, 0.1
+# release_and_smooth() gives up after this many rounds in a row that leave most bad quads, unless these are few.
+_MAX_ROUNDS_IN_VAIN, _FEW_BAD = 2, 8
+_MOST_LEFT = 0.75  # share of the bad quads
+_RELEASE_ROUNDS = 6
+_MAX_REGION_SHARE, _MIN_REGION = 5, 2000  # faces worked on at once: one over the first of all, or the second
+
+
+@dataclass(frozen=True)
+class ReleaseOptions:
+    """Limits of release_and_smooth(): the scaled Jacobian that is good enough, and how bare corners may become.
+
+    max_uncovered_edges: edge lengths from a place where a vertex was to the quads once they have moved.
+    """
+
+    min_jacobian: float = 0.2
+    max_uncovered_edges: float = 0.5
 
 
 def square_up(
     vertices: np.ndarray,
     faces: np.ndarray,
-    surface: Surface,
+    surface: ProjectionTarget,
     features: Features,
     constraints: Constraints,
     iterations: int,
     strength: float = 1.2,
 ) -> np.ndarray:
-    """Vertices (v, 3) such that the quads (f, 4) have right angles, on the surface and on the feature curves.
+    """Move vertices so that the quads (f, 4) get right angles, on the surface and on the feature curves.
 
-    Shape projection (Bouaziz et al. 2012) onto rectangles in the plane of the surface below each quad. That plane says
-    which way round a quad goes, so folded quads are asked to turn over. The best vertices met are returned: fewest
-    folded quads first, then the largest mean Jacobian. strength: of the way that vertices go at once; beyond 1 ten
-    rounds do what takes fifteen at 0.8."""
+    Shape projection (Bouaziz et al. 2012) onto rectangles in the plane of the surface under each quad. That plane says
+    which way round a quad goes, so folded quads are asked to turn over. Returns the best vertices (v, 3) met: fewest
+    folded quads first, then the largest mean Jacobian. strength: over-relaxation; at 1.2 ten rounds do what takes
+    fifteen at 0.8.
+    """
     if not len(faces) or not iterations:
         return vertices
-    still = still_vertices(edges_of(faces), len(vertices), constraints)
-    flat = faces.T.ravel()
+    immovable = immovable_vertices(edges_of(faces), len(vertices), constraints)
+    flat_faces = faces.T.ravel()
     best, best_rank = vertices, None
-    slide = Slide(surface, features, constraints)
+    projector = ConstrainedProjector(surface, features, constraints)
     for turn in range(iterations + 1):
         if turn % _NORMALS_EVERY == 0:
-            normals = np.ascontiguousarray(normals_below(vertices, faces, surface).T)
+            normals = np.ascontiguousarray(surface_normals_below(vertices, faces, surface).T)
         p = columns_of(vertices, faces)
         quality = worst_jacobian(p, normals)
-        rank = (-int((quality < 0.2).sum()), float(quality.mean()))
+        rank = (-int((quality < _FOLDED).sum()), float(quality.mean()))
         if best_rank is None or rank > best_rank:
             best, best_rank = vertices, rank
         if turn == iterations:
             break
-        weight = 1 + 6 * np.clip(_POOR - quality, 0, 1)
-        asked = _rectangles(p, normals).reshape(3, -1)
-        shares = np.tile(weight, 4)
-        total = np.maximum(np.bincount(flat, shares, len(vertices)), 1e-300)
-        target = np.stack([np.bincount(flat, shares * asked[i], len(vertices)) for i in range(3)], -1) / total[:, None]
+        weight = 1 + _POOR_WEIGHT * np.clip(_POOR - quality, 0, 1)
+        wanted = _nearest_rectangles(p, normals).reshape(3, -1)
+        weights = np.tile(weight, 4)
+        total = np.maximum(np.bincount(flat_faces, weights, len(vertices)), 1e-300)
+        target = (
+            np.stack([np.bincount(flat_faces, weights * wanted[i], len(vertices)) for i in range(3)], -1)
+            / total[:, None]
+        )
         moved = vertices + strength * (target - vertices)
-        moved[still] = vertices[still]
-        vertices = slide.step(moved, vertices, turn == iterations - 1)
-    return best if best is slide.placed else slide.exact(best)
+        moved[immovable] = vertices[immovable]
+        vertices = projector.step(moved, vertices, turn == iterations - 1)
+    return best if best is projector.placed else projector.exact(best)
 
 
-def balance(vertices: np.ndarray, faces: np.ndarray, surface: Surface, constraints: Constraints) -> np.ndarray:
-    """Vertices moved off the surface by the mean height of it above their quads, so that as much of it lies above as
-    below.
+def balance_heights(
+    vertices: np.ndarray, faces: np.ndarray, surface: ProjectionTarget, constraints: Constraints
+) -> np.ndarray:
+    """Move vertices off the surface so that as much of it lies above their quads as below.
 
-    A quad whose corners lie on a curved surface lies beneath it everywhere: half of its error is that it does. Features
-    and boundaries stay where they are, and so do quads that do not run along the surface and thin ones that it would
-    make thinner."""
+    A quad whose corners lie on a curved surface lies beneath it everywhere, which is half of its error. Vertices move
+    by the mean height of the surface over their quads. Features and boundaries stay where they are. So do vertices of
+    quads that do not run along the surface, and of thin quads that would become thinner.
+    """
     edges = edges_of(faces)
-    free = (constraints.curve < 0) & ~still_vertices(edges, len(vertices), constraints)
+    free = (constraints.curve < 0) & ~immovable_vertices(edges, len(vertices), constraints)
     normals, area = polygon_normals(vertices, faces)
     corners = vertices[faces]
-    # Of the two triangles that the quad is cut into: centroids, and middles of the edges, which are those of the quads
-    # beside them too.
+    # Samples on the two triangles of each quad: their centroids, and midpoints of their edges. Midpoints of quad edges
+    # are shared with the neighbouring quads.
     a, b, c, d = (corners[:, i] for i in range(4))
     inner = np.concatenate([(a + b + c) / 3, (a + c + d) / 3, (a + c) / 2])
     samples = np.concatenate([inner, vertices[edges.ends].mean(1)])
     weight = np.array([3, 3, 2, 1, 1, 1, 1]) / 12
     _, face_idx, point = surface.closest(samples)
-    # (q, 7).
-    own = np.concatenate([np.arange(len(inner)).reshape(3, -1).T, len(inner) + edges.half_edge_idx.reshape(-1, 4)], 1)
-    height = np.einsum("qki,qi->qk", (point - samples).take(own, 0), normals)
-    along = np.einsum("qki,qi->qk", surface.normals[face_idx].take(own, 0), normals) > 0.9
-    mean = np.where(along.all(1) & (np.abs(height).max(1) < 0.1 * np.sqrt(area)), height @ weight, 0.0)
-    flat, shares = faces.ravel(), np.repeat(area, 4)
-    total = np.maximum(np.bincount(flat, shares, len(vertices)), 1e-300)
+    # (q, 7): the samples of each quad.
+    quad_samples = np.concatenate(
+        [np.arange(len(inner)).reshape(3, -1).T, len(inner) + edges.half_edge_idx.reshape(-1, 4)], 1
+    )
+    height = np.einsum("qki,qi->qk", (point - samples).take(quad_samples, 0), normals)
+    is_along = np.einsum("qki,qi->qk", surface.normals[face_idx].take(quad_samples, 0), normals) > _ALONG_COSINE
+    mean = np.where(is_along.all(1) & (np.abs(height).max(1) < _MAX_HEIGHT * np.sqrt(area)), height @ weight, 0.0)
+    flat_faces, weights = faces.ravel(), np.repeat(area, 4)
+    total = np.maximum(np.bincount(flat_faces, weights, len(vertices)), 1e-300)
     move = (
-        np.stack([np.bincount(flat, shares * np.repeat(mean * normals[:, i], 4), len(vertices)) for i in range(3)], -1)
+        np.stack(
+            [np.bincount(flat_faces, weights * np.repeat(mean * normals[:, i], 4), len(vertices)) for i in range(3)], -1
+        )
         / total[:, None]
     )
     out = np.where(free[:, None], vertices + move, vertices)
@@ -100,17 +134,19 @@ def balance(vertices: np.ndarray, faces: np.ndarray, surface: Surface, constrain
     return out
 
 
-def _rectangles(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """(3, 4, q) corners of the rectangle nearest to each quad with corners (3, 4, q), counter-clockwise about normals
-    (3, q)."""
+def _nearest_rectangles(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return (3, 4, q) corners of the rectangle nearest to each quad.
+
+    p (3, 4, q): corners of the quads; normals (3, q), about which the rectangles are counter-clockwise.
+    """
     centre = p.mean(1, keepdims=True)
     offset = p - centre
     x = offset[:, 0] - (offset[:, 0] * normals).sum(0) * normals
     length = np.sqrt((x * x).sum(0))
-    flat = length <= 1e-12
-    if flat.any():
+    degenerate = length <= 1e-12
+    if degenerate.any():
         aside = np.where(np.abs(normals[0]) < 0.9, np.array([[1.0], [0.0], [0.0]]), np.array([[0.0], [1.0], [0.0]]))
-        x = np.where(flat, cross(normals, aside), x)
+        x = np.where(degenerate, cross(normals, aside), x)
         length = np.sqrt((x * x).sum(0))
     x /= np.maximum(length, 1e-300)
     y = cross(normals, x)
@@ -118,90 +154,110 @@ def _rectangles(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
     z.real = dot(offset, x)
     z.imag = dot(offset, y)
     size = np.sqrt((z.real**2 + z.imag**2).mean(0))
-    # The nearest square; one that is folded has hardly any, so it gets the size it takes up.
+    # The nearest square. A folded quad has hardly any, so it gets the size it takes up.
     a = (z[0] - 1j * z[1] - z[2] + 1j * z[3]) / 4
     strength = np.abs(a)
     a = np.where(strength > 1e-9 * size, a / np.maximum(strength, 1e-300), 1) * np.maximum(strength, 0.5 * size)
-    # The nearest rectangle: diagonals of one length that keep their directions. A rectangle's corners lie opposite in
-    # pairs.
-    one, two = (z[0] - z[2]) / 2, (z[1] - z[3]) / 2
-    one_length, two_length = np.abs(one), np.abs(two)
-    half = (one_length + two_length) / 2
-    one, two = one / np.maximum(one_length, 1e-300), two / np.maximum(two_length, 1e-300)
-    upright = (np.conj(one) * two).imag > 0.5
-    first = np.where(upright, (1 - _SQUARE_SHARE) * one * half + _SQUARE_SHARE * a, a)
-    second = np.where(upright, (1 - _SQUARE_SHARE) * two * half + _SQUARE_SHARE * 1j * a, 1j * a)
+    # The nearest rectangle: both diagonals keep their directions and get the same length.
+    first_half, second_half = (z[0] - z[2]) / 2, (z[1] - z[3]) / 2
+    first_length, second_length = np.abs(first_half), np.abs(second_half)
+    half = (first_length + second_length) / 2
+    first_half, second_half = (
+        first_half / np.maximum(first_length, 1e-300),
+        second_half / np.maximum(second_length, 1e-300),
+    )
+    upright = (np.conj(first_half) * second_half).imag > 0.5
+    first = np.where(upright, (1 - _SQUARE_SHARE) * first_half * half + _SQUARE_SHARE * a, a)
+    second = np.where(upright, (1 - _SQUARE_SHARE) * second_half * half + _SQUARE_SHARE * 1j * a, 1j * a)
     first, second = (w.real * x + w.imag * y for w in (first, second))
     return centre + np.stack([first, second, -first, -second], 1)
 
 
-def ease(
+def release_and_smooth(
     vertices: np.ndarray,
     faces: np.ndarray,
-    surface: Surface,
+    surface: ProjectionTarget,
     features: Features,
     constraints: Constraints,
-    least: float = 0.2,
-    rounds: int = 6,
     tips: np.ndarray | None = None,
-    most_bare: float = 0.5,
+    options: ReleaseOptions = ReleaseOptions(),  # noqa: B008 - frozen
 ) -> tuple[np.ndarray, Constraints]:
-    """Surroundings of quads that stay worse than `least` let off their feature curves and evened out; what got better
-    is kept.
+    """Release the surroundings of bad quads from their feature curves and smooth them; keep what improves.
 
-    A path along a crease that winds cannot be straightened by moving vertices; here it is given up for a few quads.
-    Evened out, corners and tips of the surface shrink back: where that would leave them bare by more than most_bare
-    edge lengths, the vertices at corners stay. tips: vertices that stay anyway."""
+    A path along a winding crease cannot be straightened by moving vertices, so it is given up for a few quads.
+    Smoothing shrinks corners and tips of the surface: where it would uncover them by more than the options allow, the
+    vertices at corners stay. tips: vertices that stay in any case. Returns vertices and constraints.
+    """
     in_vain, left = 0, np.inf
-    for turn in range(rounds):
-        bad = scaled_jacobian(vertices, faces) < least
+    for turn in range(_RELEASE_ROUNDS):
+        bad = scaled_jacobian(vertices, faces) < options.min_jacobian
         in_vain, left = in_vain + 1 if bad.sum() > _MOST_LEFT * left else 0, bad.sum()
-        if not left or in_vain == _MOST_IN_VAIN and left > _FEW_BAD:
+        if not left or in_vain == _MAX_ROUNDS_IN_VAIN and left > _FEW_BAD:
             break
         near = np.zeros(len(vertices), bool)
         near[faces[bad]] = True
         for _ in range(1 + turn):
             near[faces[near[faces].any(1)]] = True
-        own = np.flatnonzero(near[faces].any(1))
-        if len(own) > max(len(faces) // 5, 2000):
+        region = np.flatnonzero(near[faces].any(1))
+        if len(region) > max(len(faces) // _MAX_REGION_SHARE, _MIN_REGION):
             break
         if tips is not None:
             near[tips] = False
-        used, local = np.unique(faces[own], return_inverse=True)
+        used, local = np.unique(faces[region], return_inverse=True)
         local = local.reshape(-1, 4)
         before = vertices[used]
-        mesh_rim = still_vertices(edges_of(faces), len(vertices), constraints) & ~constraints.fixed
-        for loose in (near, near & ~constraints.fixed):
-            # Off their curves inside; where they were at the rim.
-            mine = Constraints(
-                np.full(len(used), -1), (~loose | mesh_rim)[used], constraints.path[:0], constraints.path_curve[:0]
+        open_boundary = immovable_vertices(edges_of(faces), len(vertices), constraints) & ~constraints.fixed
+        for released in (near, near & ~constraints.fixed):
+            # Inside the region vertices are off their curves; on its rim they stay where they were.
+            local_constraints = Constraints(
+                np.full(len(used), -1),
+                (~released | open_boundary)[used],
+                constraints.path[:0],
+                constraints.path_curve[:0],
             )
-            trial = relax(before, local, surface, features, mine, 10 + 10 * turn)
-            trial = square_up(trial, local, surface, features, mine, 10)
-            trial = unfold(trial, local, surface, features, mine, most_visits=1500)
-            if _faults(scaled_jacobian(trial, local), least) >= _faults(scaled_jacobian(before, local), least):
+            trial = _smooth_region(before, local, surface, features, local_constraints, turn)
+            limit = options.min_jacobian
+            if _badness(scaled_jacobian(trial, local), limit) >= _badness(scaled_jacobian(before, local), limit):
                 break
-            if not _leaves_bare(before, trial, local, most_bare):
+            if not _uncovers_surface(before, trial, local, options.max_uncovered_edges):
                 vertices = vertices.copy()
                 vertices[used] = trial
-                kept = ~loose[constraints.path].any(1)
-                constraints = Constraints(
-                    np.where(loose, -1, constraints.curve),
-                    constraints.fixed & ~loose,
-                    constraints.path[kept],
-                    constraints.path_curve[kept],
-                )
+                constraints = _released(constraints, released)
                 break
     return vertices, constraints
 
 
-def _leaves_bare(before: np.ndarray, after: np.ndarray, faces: np.ndarray, most: float) -> bool:
-    """Whether some of the places of vertices (v, 3) are more than so many edge lengths from the quads (f, 4) once these
-    have moved."""
+def _smooth_region(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    surface: ProjectionTarget,
+    features: Features,
+    constraints: Constraints,
+    turn: int,
+) -> np.ndarray:
+    """Smooth, square up and untangle a small region, the more rounds the later the turn."""
+    vertices = relax(vertices, faces, surface, features, constraints, 10 + 10 * turn)
+    vertices = square_up(vertices, faces, surface, features, constraints, 10)
+    return untangle(vertices, faces, surface, features, constraints, max_visits=1500)
+
+
+def _released(constraints: Constraints, released: np.ndarray) -> Constraints:
+    """Return constraints without those of some vertices (v,) bool, and without the path edges at them."""
+    kept = ~released[constraints.path].any(1)
+    return Constraints(
+        np.where(released, -1, constraints.curve),
+        constraints.fixed & ~released,
+        constraints.path[kept],
+        constraints.path_curve[kept],
+    )
+
+
+def _uncovers_surface(before: np.ndarray, after: np.ndarray, faces: np.ndarray, most: float) -> bool:
+    """Whether moving vertices leaves a place where one was more than `most` edge lengths from the quads (f, 4)."""
     edge = (polygon_normals(before, faces)[1].sum() / len(faces)) ** 0.5
     return bool(closest_points(before, after, triangulated(faces)[0])[0].max() > most * edge)
 
 
-def _faults(jacobian: np.ndarray, least: float) -> tuple[int, int, float]:
-    """How bad quads of these scaled Jacobians are: those folded, those below `least`, the worst."""
-    return int((jacobian <= 0).sum()), int((jacobian < least).sum()), -float(jacobian.min())
+def _badness(jacobian: np.ndarray, limit: float) -> tuple[int, int, float]:
+    """Return a key to compare quads by, smaller is better: folded ones, those below `limit`, the worst."""
+    return int((jacobian <= 0).sum()), int((jacobian < limit).sum()), -float(jacobian.min())

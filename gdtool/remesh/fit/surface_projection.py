@@ -1,4 +1,4 @@
-"""Shaping of a quad mesh: regular subdivision, relaxing on the surface it stands for, holes and doublets."""
+"""Project quads onto a triangle mesh: subdivision, constrained smoothing, hole filling and doublet removal."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from gdtool.geometry.normals import face_normals
 from gdtool.geometry.topology import Edges, compact, corner_fans, edges_of
 from gdtool.remesh.fit.feature_curves import Constraints, Features, closest_on_segments
 
-_EXACT_EVERY = 5  # steps between two searches for the closest point; the others stay in its plane
-_BENT_COSINE = 0.97  # between a quad's normal and that of the surface below its centre
+_EXACT_EVERY = 5  # steps between two searches for the closest point
+_BENT_COSINE = 0.97  # between a quad's normal and the surface's, below which the surface bends under the quad
+_DOUBLET_ROUNDS = 8  # of removal; each can make new doublets
 
 
-class Surface(SearchTree):
-    """A triangle mesh that points are projected to, with the normals (f, 3) of its faces."""
+class ProjectionTarget(SearchTree):
+    """A triangle mesh to project points to, with its search tree and the normals (f, 3) of its faces."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
         super().__init__(vertices, faces)
@@ -25,17 +26,17 @@ class Surface(SearchTree):
 
 
 def subdivide(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints | None = None):
-    """Each face cut into one quad per corner: quads into four, triangles into three.
+    """Cut each face into one quad per corner: quads into four, triangles into three.
 
-    faces (f, 4), -1 as fourth corner of triangles. Returns vertices (edge midpoints and face centres added behind the
-    old ones), faces (4 q + 3 t, 4), and the constraints with the paths halved.
+    faces (f, 4), -1 as the fourth corner of triangles. Returns vertices (edge midpoints, then face centres, behind the
+    old ones), faces (4 q + 3 t, 4), and the constraints with every path edge halved (None without constraints).
     """
     edges = edges_of(faces)
     used = faces >= 0
     centre = np.where(used[..., None], vertices[np.where(used, faces, 0)], 0).sum(1) / used.sum(1)[:, None]
     v, e = len(vertices), len(edges.ends)
     out = np.concatenate([vertices, vertices[edges.ends].mean(1), centre])
-    # Half edges come in the order of used corners; the one before a corner is the previous of its face.
+    # Half edges come in the order of used corners; the edge before a corner is the previous one of its face.
     next_edge = np.full(faces.shape, -1, np.int64)
     next_edge[used] = edges.half_edge_idx
     previous_edge = np.roll(next_edge, 1, 1)
@@ -57,6 +58,7 @@ def subdivide(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints 
 
 
 def _average_matrix(pairs: np.ndarray, count: int):
+    """Return the sparse (count, count) matrix that averages the neighbours of each vertex; pairs (e, 2) are edges."""
     from scipy.sparse import coo_matrix, diags
 
     rows = np.concatenate([pairs[:, 0], pairs[:, 1]])
@@ -65,15 +67,21 @@ def _average_matrix(pairs: np.ndarray, count: int):
     return (diags(1 / np.maximum(np.asarray(matrix.sum(1)).ravel(), 1)) @ matrix).tocsr()
 
 
-def onto(vertices: np.ndarray, surface: Surface, features: Features, constraints: Constraints) -> np.ndarray:
-    """Vertices on the surface; those on a feature curve on that curve; fixed ones where they are."""
-    return Slide(surface, features, constraints).exact(vertices)
+def project(
+    vertices: np.ndarray, surface: ProjectionTarget, features: Features, constraints: Constraints
+) -> np.ndarray:
+    """Project vertices onto the surface; held ones onto their feature curve; fixed ones stay."""
+    return ConstrainedProjector(surface, features, constraints).exact(vertices)
 
 
-class Slide:
-    """Brings vertices that move in small steps back: exactly, or to the plane or line that they were on last."""
+class ConstrainedProjector:
+    """Projects vertices that move in small steps.
 
-    def __init__(self, surface: Surface, features: Features, constraints: Constraints):
+    Every few steps the closest point is searched; between them a vertex goes to the plane, or the line of its curve,
+    that it was projected to last.
+    """
+
+    def __init__(self, surface: ProjectionTarget, features: Features, constraints: Constraints):
         self._surface, self._points = surface, features.points
         self._free = np.flatnonzero((constraints.curve < 0) & ~constraints.fixed)
         held = np.flatnonzero(constraints.curve >= 0)
@@ -86,57 +94,60 @@ class Slide:
         ]
         self._normals: np.ndarray | None = None
         self._steps = 0
-        self.placed: np.ndarray | None = None  # what exact() gave last
+        self.placed: np.ndarray | None = None  # the last result of exact()
 
     def exact(self, vertices: np.ndarray) -> np.ndarray:
-        """Vertices on the surface; those on a feature curve on that curve; fixed ones where they are."""
+        """Project vertices (v, 3) to the closest points; held ones on their curve; fixed ones stay."""
         out = vertices.copy()
         _, face_idx, point = self._surface.closest(vertices[self._free])
         out[self._free] = point
         self._normals = self._surface.normals[face_idx]
-        held, ends = vertices[self._held], np.zeros((len(self._held), 2), np.int64)
-        for own, segments in self._curves:
-            _, segment, held[own] = closest_on_segments(held[own], self._points, segments)
-            ends[own] = segments[segment]
-        out[self._held] = held
+        on_curves, ends = vertices[self._held], np.zeros((len(self._held), 2), np.int64)
+        for index, segments in self._curves:
+            _, segment, on_curves[index] = closest_on_segments(on_curves[index], self._points, segments)
+            ends[index] = segments[segment]
+        out[self._held] = on_curves
         line = self._points[ends[:, 1]] - self._points[ends[:, 0]]
         self._lines = line / np.maximum(np.linalg.norm(line, axis=1), 1e-300)[:, None]
         self.placed = out
         return out
 
     def step(self, moved: np.ndarray, vertices: np.ndarray, last: bool) -> np.ndarray:
-        """Where `moved` (v, 3) goes that came from `vertices` on the surface; exact in the last step and every few."""
+        """Project vertices that moved from `vertices`, which lay on the surface, to `moved` (v, 3).
+
+        Exact in the last step and every few; approximate between.
+        """
         self._steps += 1
         if last or self._normals is None or self._steps % _EXACT_EVERY == 0:
             return self.exact(moved)
-        out, way = moved.copy(), moved - vertices
-        for own, direction, start, sign in (
+        out, movement = moved.copy(), moved - vertices
+        for index, direction, start, sign in (
             (self._free, self._normals, moved, -1),
             (self._held, self._lines, vertices, 1),
         ):
-            out[own] = start[own] + sign * np.einsum("ni,ni->n", way[own], direction)[:, None] * direction
+            out[index] = start[index] + sign * np.einsum("ni,ni->n", movement[index], direction)[:, None] * direction
         return out
 
 
 def relax(
     vertices: np.ndarray,
     faces: np.ndarray,
-    surface: Surface,
+    surface: ProjectionTarget,
     features: Features,
     constraints: Constraints,
     iterations: int,
     strength: float = 0.6,
 ) -> np.ndarray:
-    """Vertices evened out along the surface: each moves toward the mean of its neighbours and back onto the surface."""
+    """Smooth vertices along the surface: each moves toward the mean of its neighbours, and back onto the surface."""
     edges = edges_of(faces)
     average = _average_matrix(edges.ends, len(vertices))
     along = _average_matrix(constraints.path, len(vertices)) if len(constraints.path) else None
     held = (constraints.curve >= 0) & ~constraints.fixed
     if along is not None:
-        # Where a path breaks off its end would draw back, and leave the feature bare.
+        # The end of an open path would shrink back and uncover the feature: it is averaged as a free vertex.
         held &= np.diff(along.indptr) == 2
-    still = still_vertices(edges, len(vertices), constraints)
-    slide = Slide(surface, features, constraints)
+    still = immovable_vertices(edges, len(vertices), constraints)
+    slide = ConstrainedProjector(surface, features, constraints)
     for turn in range(iterations):
         target = average @ vertices
         if along is not None:
@@ -147,17 +158,21 @@ def relax(
     return vertices
 
 
-def still_vertices(edges: Edges, count: int, constraints: Constraints) -> np.ndarray:
-    """(v,) bool: of `count` vertices those that may not move: corners of features, and boundaries that no curve
-    leads."""
+def immovable_vertices(edges: Edges, count: int, constraints: Constraints) -> np.ndarray:
+    """Return (v,) bool: the vertices that may not move.
+
+    They are the fixed ones, and those on boundaries that no curve holds.
+    """
     boundary = np.zeros(count, bool)
     boundary[edges.ends[edges.count != 2].ravel()] = True
     return constraints.fixed | (boundary & (constraints.curve < 0))
 
 
-def normals_below(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> np.ndarray:
-    """(f, 3) unit normal of the surface under each quad: at its centre, of one beside which it is bent also half-way to
-    its corners."""
+def surface_normals_below(vertices: np.ndarray, faces: np.ndarray, surface: ProjectionTarget) -> np.ndarray:
+    """Return (f, 3) unit normals of the surface under each quad, sampled at its centre.
+
+    Where the surface bends away from the quad's own normal, points half-way to its corners are sampled too.
+    """
     corners = vertices[faces]
     centre = corners.mean(1, keepdims=True)
     below = surface.normals[surface.closest(centre[:, 0])[1]]
@@ -167,8 +182,8 @@ def normals_below(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> 
     return below / np.maximum(np.linalg.norm(below, axis=1), 1e-300)[:, None]
 
 
-class Lists:
-    """Lists of values (n,), each under its key (n,) of 0…count − 1, in their order: lists[key] is an array."""
+class GroupedLists:
+    """Values (n,) grouped by key (n,) in 0 ... count - 1, each group in the order given: lists[key] is an array."""
 
     def __init__(self, key: np.ndarray, value: np.ndarray, count: int):
         self.value = value[np.argsort(key, kind="stable")]
@@ -178,30 +193,29 @@ class Lists:
         return self.value[self.start[key] : self.start[key + 1]]
 
     def lengths(self, keys: np.ndarray) -> np.ndarray:
+        """Return the lengths of the lists of keys (k,)."""
         return self.start[keys + 1] - self.start[keys]
 
     def rows(self, keys: np.ndarray) -> np.ndarray:
-        """The lists of keys (k,), none of which is empty, as rows: short ones end in their last value again and
-        again."""
+        """Return the lists of keys (k,) as rows of one array; a short row repeats its last value. None may be empty."""
         length = self.lengths(keys)
         return self.value[self.start[keys][:, None] + np.minimum(np.arange(length.max()), length[:, None] - 1)]
 
 
-def incidence(faces: np.ndarray, count: int) -> Lists:
-    """The faces around each vertex."""
-    return Lists(faces.ravel(), np.arange(faces.size) // faces.shape[1], count)
+def faces_around_vertices(faces: np.ndarray, count: int) -> GroupedLists:
+    """Group the faces by vertex."""
+    return GroupedLists(faces.ravel(), np.arange(faces.size) // faces.shape[1], count)
 
 
-def neighbours(ends: np.ndarray, count: int) -> Lists:
-    """The vertices that edges (e, 2) join to each."""
-    return Lists(ends.T.ravel(), ends[:, ::-1].T.ravel(), count)
+def neighbours(ends: np.ndarray, count: int) -> GroupedLists:
+    """Group the vertices at the other ends of edges (e, 2) by vertex."""
+    return GroupedLists(ends.T.ravel(), ends[:, ::-1].T.ravel(), count)
 
 
 def fill_holes(vertices: np.ndarray, faces: np.ndarray, longest: int = 64) -> tuple[np.ndarray, np.ndarray]:
-    """Quads (f, 4) with boundary loops of an even number of edges, at most `longest`, closed by quads around a new
-    vertex.
+    """Close boundary loops with an even number of edges, at most `longest`, by quads around a new vertex.
 
-    Where two holes meet at a vertex, each is closed by itself.
+    Returns vertices and quads. Where two holes meet at a vertex, each is closed by itself.
     """
     edges = edges_of(faces)
     border = edges.count[edges.half_edge_idx] == 1
@@ -215,10 +229,10 @@ def fill_holes(vertices: np.ndarray, faces: np.ndarray, longest: int = 64) -> tu
         starts.setdefault(vertex, []).append(k)
     following = []
     for k, vertex in enumerate(half[:, 1].tolist()):
-        ways = starts.get(vertex, [])
-        if len(ways) == 2:  # a hole's border comes by one of the two fans and leaves by the other
-            ways = [on for on in ways if leaving[on] != arriving[k]]
-        following.append(ways[0] if len(ways) == 1 else None)  # where more holes meet, which way on is not said
+        choices = starts.get(vertex, [])
+        if len(choices) == 2:  # a hole's boundary arrives on one of the two fans and leaves on the other
+            choices = [on for on in choices if leaving[on] != arriving[k]]
+        following.append(choices[0] if len(choices) == 1 else None)  # where more holes meet, the way is ambiguous
     new_points, new_faces, seen = [], [], set()
     for start in range(len(half)):
         loop, k = [], start
@@ -228,7 +242,7 @@ def fill_holes(vertices: np.ndarray, faces: np.ndarray, longest: int = 64) -> tu
             k = following[k]
         if k != start or len(loop) % 2 or not 4 <= len(loop) <= longest or len(set(loop)) < len(loop):
             continue
-        loop = loop[::-1]  # the hole's faces walk its edges the other way
+        loop = loop[::-1]  # the new faces traverse the edges in the opposite direction
         if len(loop) == 4:
             new_faces.append(loop)
             continue
@@ -243,13 +257,13 @@ def fill_holes(vertices: np.ndarray, faces: np.ndarray, longest: int = 64) -> tu
 
 
 def remove_doublets(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Inner vertices of two edges removed, their two quads joined into one (Daniels et al. 2008, doublet collapse)."""
-    for _ in range(8):
+    """Remove inner vertices with two edges and join their two quads (Daniels et al. 2008, doublet collapse)."""
+    for _ in range(_DOUBLET_ROUNDS):
         valence, inner = valences(faces, len(vertices))
         doublets = np.flatnonzero(inner & (valence == 2))
         if not len(doublets):
             break
-        ring = incidence(faces, len(vertices))
+        ring = faces_around_vertices(faces, len(vertices))
         dead = np.zeros(len(faces), bool)
         faces = faces.copy()
         touched: set[int] = set()
@@ -257,12 +271,12 @@ def remove_doublets(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
             pair = ring[v]
             if len(pair) != 2 or set(faces[pair].ravel().tolist()) & touched:
                 continue
-            one, two = faces[pair[0]].tolist(), faces[pair[1]].tolist()
-            opposite = one[(one.index(v) + 2) % 4], two[(two.index(v) + 2) % 4]
+            first, second = faces[pair[0]].tolist(), faces[pair[1]].tolist()
+            opposite = first[(first.index(v) + 2) % 4], second[(second.index(v) + 2) % 4]
             if opposite[0] == opposite[1]:
                 continue
-            touched.update(one, two)
-            faces[pair[0], one.index(v)] = opposite[1]
+            touched.update(first, second)
+            faces[pair[0], first.index(v)] = opposite[1]
             dead[pair[1]] = True
         if not dead.any():
             break

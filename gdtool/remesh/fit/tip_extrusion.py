@@ -1,124 +1,142 @@
-"""Tips and rims that quads leave bare, drawn out of them: what is thinner than a quad an engine cuts short."""
+"""Extrude tips and rims of the surface that quads leave uncovered: engines cut short what is thinner than a quad."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from gdtool.geometry.distance import closest_points, sample_surface
 from gdtool.geometry.topology import components, edges_of, euler_number, triangulated
 from gdtool.remesh.fit.feature_curves import Constraints
-from gdtool.remesh.fit.surface_projection import Surface
+from gdtool.remesh.fit.surface_projection import ProjectionTarget
 
-# Edge lengths from the quads: what belongs to a tip, what is near enough, what makes one.
-_BARE, _CLOSE, _STRAYS = 0.5, 0.75, 1.0
-_TIP = 1.5  # edge lengths that a tip measures at most which one vertex reaches
-_STEP = 1.5  # edge lengths that a tip is drawn out at once
-_HELD = 0.75  # of the farthest that a vertex moves: those that move so far stay there
-_CROWDED = 0.75  # edge lengths from one that stays: others do not, for what lies between them would have no room
-_MOST_STEPS = 24
-_POINTS = 20000
+# All in edge lengths.
+_UNCOVERED = 0.5  # distance from the quads beyond which a sample belongs to a tip
+_CLOSE = 0.75  # a tip this near is finished
+_STRAYS = 1.0  # extrusion starts only where some sample is this far away
+_MAX_SINGLE_TIP = 1.5  # size of a tip that one vertex can reach
+_STEP = 1.5  # that a tip is extruded at once
+_MIN_SPACING = 0.75  # between fixed vertices: nearer ones leave no room for the quads between them
+
+_FIXED_SHARE = 0.75  # of the largest movement: vertices that move this far are fixed
+_MAX_STEPS = 24
+_SAMPLES = 20000  # points of the surface: half vertices, half spread over its area
 
 
-def draw_out(
+class ExtrudedQuads(NamedTuple):
+    """Quads extruded over the tips of a surface.
+
+    vertices (v, 3), faces (f, 4); tips (t,): the vertices at tips, fixed in the constraints. distance: the largest from
+    the surface to the quads before the last vertices moved. sample_distances (n,): those of samples spread over its
+    area.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    constraints: Constraints
+    tips: np.ndarray
+    distance: float
+    sample_distances: np.ndarray
+
+
+class _Tip(NamedTuple):
+    """Samples of the surface that the quads leave uncovered: points (n, 3), nearest quads (n,), distances (n,)."""
+
+    points: np.ndarray
+    quads: np.ndarray
+    distances: np.ndarray
+
+
+def extrude_tips(
     vertices: np.ndarray,
     faces: np.ndarray,
     constraints: Constraints,
-    surface: Surface,
+    surface: ProjectionTarget,
     edge: float,
-    most_added: float = 0.03,
-) -> tuple[np.ndarray, np.ndarray, Constraints, np.ndarray, float, np.ndarray]:
-    """Quads (f, 4) of mean edge length `edge` extruded over what of the surface strays from them, farthest first.
+    max_added: float = 0.03,
+) -> ExtrudedQuads:
+    """Extrude quads (f, 4) of mean edge length `edge` over the parts of the surface that stray from them.
 
-    The vertices (v, 3) nearest to a tip move along it, an edge or two at a time, with the quads around them, and a ring
-    of new quads follows each step, as one would model a horn by hand, until most_added of the quads are new: what needs
-    more is no matter of tips. A tip that is nearer than an edge takes one vertex and no ring. Closed and manifold as
-    before, of as many pieces and handles. Returns vertices, faces, constraints, in which the tips are fixed, the tips'
-    vertices (t,), how far the surface was from the quads at most before the last vertices moved, and how far samples
-    (n,) spread over its area were."""
-    step = max(len(surface.vertices) // _POINTS, 1)
+    The farthest tip goes first. The vertices nearest to it move along it, an edge or two at a time, with the quads
+    around them, and a ring of new quads follows each step, as one models a horn by hand. It ends when max_added of the
+    quads are new: surfaces that need more have other faults than tips. A tip nearer than an edge takes one vertex and
+    no ring. The quads stay closed and manifold as they were, with as many pieces and handles.
+    """
+    step = max(len(surface.vertices) // _SAMPLES, 1)
     points = samples = np.concatenate(
         [
             surface.vertices[::step],
-            sample_surface(surface.vertices, surface.faces, _POINTS // 2, np.random.default_rng(0))[0],
+            sample_surface(surface.vertices, surface.faces, _SAMPLES // 2, np.random.default_rng(0))[0],
         ]
     )
-    most, given = len(faces) * (1 + most_added), constraints
+    max_faces, input_constraints = len(faces) * (1 + max_added), constraints
     triangles, face_idx = triangulated(faces)
     away, nearest, _ = closest_points(points, vertices, triangles)
-    of_samples = away, face_idx[nearest]
-    for turn in range(_MOST_STEPS):
+    of_samples = away, face_idx[nearest]  # None once the quads have changed
+    for turn in range(_MAX_STEPS):
         if turn:
             triangles, face_idx = triangulated(faces)
-            away, nearest = _nearest(points, away, vertices, triangles)
-        bare = away > _BARE * edge  # all others will stay near
-        points, away, nearest = points[bare], away[bare], nearest[bare]
+            away, nearest = _nearest_within(points, away, vertices, triangles)
+        uncovered = away > _UNCOVERED * edge  # the other samples stay near
+        points, away, nearest = points[uncovered], away[uncovered], nearest[uncovered]
         if not len(points) or not turn and away.max() < _STRAYS * edge:
             break
         alive = np.ones(len(points), bool)
-        for tip in _apart(points, away, edge):
-            if away[tip].max() < _CLOSE * edge or len(faces) > most:
+        for tip in _group_tips(points, away, edge):
+            if away[tip].max() < _CLOSE * edge or len(faces) > max_faces:
                 break
-            found = _extruded(
-                vertices, faces, constraints, points[tip], face_idx[nearest[tip]], away[tip], surface, edge
-            )
-            if found is None:
+            samples_of_tip = _Tip(points[tip], face_idx[nearest[tip]], away[tip])
+            extruded = _extrude_tip(vertices, faces, constraints, samples_of_tip, surface, edge)
+            if extruded is None:
                 alive[tip] = False
             else:
-                vertices, faces, constraints = found
+                vertices, faces, constraints = extruded
                 of_samples = None
         points, away = points[alive], away[alive]
-        if not len(points) or len(faces) > most or away.max() < _CLOSE * edge:
+        if not len(points) or len(faces) > max_faces or away.max() < _CLOSE * edge:
             break
     if of_samples is None:
         triangles, face_idx = triangulated(faces)
         away, nearest, _ = closest_points(samples, vertices, triangles)
         of_samples = away, face_idx[nearest]
-    vertices, constraints = _reached(vertices, faces, constraints, samples, *of_samples, edge)
-    if constraints is not given:
-        constraints = _still_paths(constraints, faces)
-    before = np.concatenate([given.fixed, np.zeros(len(vertices) - len(given.fixed), bool)])
-    return (
-        vertices,
-        faces,
-        constraints,
-        np.flatnonzero(constraints.fixed & ~before),
-        float(of_samples[0].max()),
-        of_samples[0][-(_POINTS // 2) :],
-    )
+    away, nearest = of_samples
+    vertices, constraints = _move_to_near_tips(vertices, faces, constraints, _Tip(samples, nearest, away), edge)
+    if constraints is not input_constraints:
+        constraints = _remaining_paths(constraints, faces)
+    was_fixed = np.concatenate([input_constraints.fixed, np.zeros(len(vertices) - len(input_constraints.fixed), bool)])
+    tips = np.flatnonzero(constraints.fixed & ~was_fixed)
+    return ExtrudedQuads(vertices, faces, constraints, tips, float(away.max()), away[-(_SAMPLES // 2) :])
 
 
-def _reached(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    constraints: Constraints,
-    points: np.ndarray,
-    away: np.ndarray,
-    nearest: np.ndarray,
-    edge: float,
+def _move_to_near_tips(
+    vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, samples: _Tip, edge: float
 ) -> tuple[np.ndarray, Constraints]:
-    """Tips that end less than an edge from the quads: the nearest vertex moves there and stays.
-
-    points (n, 3) of the surface, how far each is `away` (n,), and the quad `nearest` (n,) to it.
-    """
-    bare = (away > _BARE * edge) & (away < _STRAYS * edge)
-    points, quads, away = points[bare], nearest[bare], away[bare]
+    """Move the nearest vertex to the end of each tip less than an edge away, and fix it there."""
+    near = (samples.distances > _UNCOVERED * edge) & (samples.distances < _STRAYS * edge)
+    points, quads, away = samples.points[near], samples.quads[near], samples.distances[near]
     if not len(points):
         return vertices, constraints
-    ends = [tip[away[tip].argmax()] for tip in _apart(points, away, edge) if np.ptp(points[tip], 0).max() < _TIP * edge]
+    ends = [
+        tip[away[tip].argmax()]
+        for tip in _group_tips(points, away, edge)
+        if np.ptp(points[tip], 0).max() < _MAX_SINGLE_TIP * edge
+    ]
     corner = faces[quads[ends], np.linalg.norm(vertices[faces[quads[ends]]] - points[ends][:, None], axis=-1).argmin(1)]
-    moved, first = np.unique(corner, return_index=True)  # the farthest comes first
+    moved, first = np.unique(corner, return_index=True)  # the farthest tip comes first
     out = vertices.copy()
     out[moved] = points[ends][first]
-    return out, _extended(constraints, len(vertices), moved, moved)
+    return out, _extend_constraints(constraints, len(vertices), moved, moved)
 
 
-def _nearest(
+def _nearest_within(
     points: np.ndarray, away: np.ndarray, vertices: np.ndarray, triangles: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How far points (n, 3) are from the triangles (t, 3), and the nearest of these, where most are about `away` (n,):
-    of few points only what is as near is searched."""
+    """Return distances (n,) from points (n, 3) to the triangles (t, 3), and the nearest triangles (n,).
+
+    away (n,): about what the distances will be. Few points are searched for among the triangles that near alone.
+    """
     from scipy.spatial import cKDTree
 
     corners = vertices[triangles]
@@ -127,14 +145,14 @@ def _nearest(
     near = np.isfinite(cKDTree(points).query(vertices, distance_upper_bound=reach + longest)[0])
     few = np.flatnonzero(near[triangles].any(1))
     if len(few):
-        found, nearest, _ = closest_points(points, vertices, triangles[few])
-        if found.max() <= reach:
-            return found, few[nearest]
+        distances, nearest, _ = closest_points(points, vertices, triangles[few])
+        if distances.max() <= reach:
+            return distances, few[nearest]
     return closest_points(points, vertices, triangles)[:2]
 
 
-def _apart(points: np.ndarray, away: np.ndarray, edge: float) -> list[np.ndarray]:
-    """Indices of the points of each tip, those that hang together; the tip that is farthest away first."""
+def _group_tips(points: np.ndarray, away: np.ndarray, edge: float) -> list[np.ndarray]:
+    """Group points that are connected by steps of an edge: the indices of each tip, the farthest tip first."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -147,30 +165,28 @@ def _apart(points: np.ndarray, away: np.ndarray, edge: float) -> list[np.ndarray
     return sorted(tips, key=lambda tip: -away[tip].max())
 
 
-def _extruded(
+def _extrude_tip(
     vertices: np.ndarray,
     faces: np.ndarray,
     constraints: Constraints,
-    points: np.ndarray,
-    quads: np.ndarray,
-    away: np.ndarray,
-    surface: Surface,
+    tip: _Tip,
+    surface: ProjectionTarget,
     edge: float,
 ) -> tuple[np.ndarray, np.ndarray, Constraints] | None:
-    """One tip drawn out: points (n, 3) of it, the quad (n,) nearest to each, and how far away (n,); None where no disc
-    of quads lies under it."""
-    corner = faces[quads, np.linalg.norm(vertices[faces[quads]] - points[:, None], axis=-1).argmin(1)]
-    # The farthest point within a step of each vertex, or the nearest where all are farther.
+    """Extrude the disc of quads under one tip toward it; None where no disc of quads lies under it."""
+    points, away = tip.points, tip.distances
+    corner = faces[tip.quads, np.linalg.norm(vertices[faces[tip.quads]] - points[:, None], axis=-1).argmin(1)]
+    # Each vertex aims at its farthest point within a step, or at its nearest where all are farther.
     order = np.argsort(np.where(away <= _STEP * edge, -away, away), kind="stable")
-    moving, first = np.unique(corner[order], return_index=True)
-    target = points[order[first]]
-    farthest = np.array([corner[order[0]]])
-    for cap, aim in ((moving, target), (farthest, points[order[:1]])):
+    cap, first = np.unique(corner[order], return_index=True)
+    aim = points[order[first]]
+    patch = np.isin(faces, cap).any(1)
+    loop = _disc_boundary(faces, patch, cap)
+    if loop is None:  # then the farthest vertex alone
+        cap, aim = np.array([corner[order[0]]]), points[order[:1]]
         patch = np.isin(faces, cap).any(1)
-        loop = _border(faces, patch, cap)
-        if loop is not None:
-            break
-    else:
+        loop = _disc_boundary(faces, patch, cap)
+    if loop is None:
         return None
     shift = np.zeros_like(vertices)
     shift[cap] = aim - vertices[cap]
@@ -190,26 +206,29 @@ def _extruded(
     faces = np.concatenate([np.where(patch[:, None], lifted[faces], faces), sides])
     vertices = np.concatenate([vertices, new])
     vertices[cap] = aim
-    held = [k for k in np.argsort(-length, kind="stable") if length[k] > _HELD * length.max()]
-    return vertices, faces, _extended(constraints, len(vertices), cap, cap[_sparse(aim, held, _CROWDED * edge)])
+    far_first = [k for k in np.argsort(-length, kind="stable") if length[k] > _FIXED_SHARE * length.max()]
+    fixed = cap[_spaced_out(aim, far_first, _MIN_SPACING * edge)]
+    return vertices, faces, _extend_constraints(constraints, len(vertices), cap, fixed)
 
 
-def _sparse(points: np.ndarray, order: list[int], distance: float) -> list[int]:
-    """Of the points (n, 3) in that order those that are farther than `distance` from all before them that are taken."""
-    out: list[int] = []
+def _spaced_out(points: np.ndarray, order: list[int], distance: float) -> list[int]:
+    """Choose points (n, 3) greedily in the given order, each farther than `distance` from those chosen before."""
+    chosen: list[int] = []
     for k in order:
-        if (np.linalg.norm(points[out] - points[k], axis=1) > distance).all():
-            out.append(k)
-    return out
+        if (np.linalg.norm(points[chosen] - points[k], axis=1) > distance).all():
+            chosen.append(k)
+    return chosen
 
 
-def _border(faces: np.ndarray, patch: np.ndarray, cap: np.ndarray) -> np.ndarray | None:
-    """The directed edges (n, 2) around a patch of the faces, in a row; None unless it is a disc that the vertices `cap`
-    alone lie inside."""
-    own = faces[patch]
-    edges = edges_of(own)
+def _disc_boundary(faces: np.ndarray, patch: np.ndarray, cap: np.ndarray) -> np.ndarray | None:
+    """Return the directed edges (n, 2) around a patch of faces (f,) bool, in order.
+
+    None unless the patch is a disc whose inner vertices are exactly `cap`.
+    """
+    patch_faces = faces[patch]
+    edges = edges_of(patch_faces)
     half = edges.half_ends[edges.count[edges.half_edge_idx] == 1]
-    # Inner edges of two quads, a rim that no vertex lies on twice, one piece without handles.
+    # Inner edges have two quads, the boundary passes no vertex twice and none of the cap.
     if (
         (edges.count > 2).any()
         or edges.turned.any()
@@ -217,7 +236,12 @@ def _border(faces: np.ndarray, patch: np.ndarray, cap: np.ndarray) -> np.ndarray
         or np.isin(half, cap).any()
     ):
         return None
-    if components(own)[0] != 1 or euler_number(own) != 1 or len(np.unique(own)) != len(half) + len(cap):
+    # One piece without handles.
+    if (
+        components(patch_faces)[0] != 1
+        or euler_number(patch_faces) != 1
+        or len(np.unique(patch_faces)) != len(half) + len(cap)
+    ):
         return None
     following = dict(half.tolist())
     loop = [int(half[0, 0])]
@@ -228,17 +252,16 @@ def _border(faces: np.ndarray, patch: np.ndarray, cap: np.ndarray) -> np.ndarray
     return np.stack([loop, np.roll(loop, -1)], -1) if len(loop) == len(half) else None
 
 
-def _extended(constraints: Constraints, count: int, moved: np.ndarray, fixed: np.ndarray) -> Constraints:
-    """The constraints for so many vertices, without what held those that moved, their paths as they were; `fixed` hold
-    still."""
-    curve, still = np.full(count, -1), np.zeros(count, bool)
-    curve[: len(constraints.curve)], still[: len(constraints.fixed)] = constraints.curve, constraints.fixed
-    curve[moved], still[moved], still[fixed] = -1, False, True
-    return replace(constraints, curve=curve, fixed=still)
+def _extend_constraints(constraints: Constraints, count: int, moved: np.ndarray, fixed: np.ndarray) -> Constraints:
+    """Extend constraints to `count` vertices: those that moved are released, `fixed` ones hold still; paths stay."""
+    curve, is_fixed = np.full(count, -1), np.zeros(count, bool)
+    curve[: len(constraints.curve)], is_fixed[: len(constraints.fixed)] = constraints.curve, constraints.fixed
+    curve[moved], is_fixed[moved], is_fixed[fixed] = -1, False, True
+    return replace(constraints, curve=curve, fixed=is_fixed)
 
 
-def _still_paths(constraints: Constraints, faces: np.ndarray) -> Constraints:
-    """Of the paths those edges that are still there, and still held at both ends."""
+def _remaining_paths(constraints: Constraints, faces: np.ndarray) -> Constraints:
+    """Drop path edges that are no edges of the faces any more, or are no longer held at both ends."""
     ends, path, width = edges_of(faces).ends, np.sort(constraints.path, 1), len(constraints.curve) + 1
     kept = np.isin(path[:, 0] * width + path[:, 1], ends[:, 0] * width + ends[:, 1]) & (
         constraints.curve[path] >= 0

@@ -1,4 +1,4 @@
-"""Charts into the unit square: each where it makes the filled part grow least, by raster, turned but never mirrored."""
+"""Pack charts into the unit square: search for the order that gives the smallest square; charts turn, never mirror."""
 
 from __future__ import annotations
 
@@ -9,191 +9,230 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gdtool.unwrap.pack.bitmasks import Shapes, rim_of, upright_box
-from gdtool.unwrap.pack.compact import ROUGH, Fine
+from gdtool.unwrap.pack.bitmasks import ChartMasks, OrientedChart, Placement, orient_upright, outline_of
+from gdtool.unwrap.pack.compact import ROUGH, FineGridCompactor
 
-# For up to so many charts: cells of the square's side in which orders are tried.
-_COARSE = ((48, 144), (160, 160), (4000, 320))
-_DENSITY = 0.66  # share of a square of so many cells that the charts would fill
-# Of a cell, that a chart has to take of it for the cell to count as its own: on the fine grid the rest finds room,
-# mostly; else the next.
-_OWN = 0.2, 0.1
-_LEAST = (0.45, 0.12)  # shares of the square that charts have to fill, first and at the very least
-_GROWS = 0.02  # of its side, that a square grows by where a chart finds no room
-_SETTLED = 4  # layouts that are tightened
-_GAIN, _GAIN_PER_CHART = 0.006, 0.0012
-WELL_PACKED = 0.67  # of the square, by a draft: charts that fill as much stay as they are
-_NEXT_GAINS = 0.09  # of the square, that cutting one step further gains at most, mostly
-_TRIES, _TRIES_OF_DRAFT = 3600, 150  # charts placed in search of better orders, at last and to tell ways to cut apart
-_CHAINS = 4  # of changes of orders
-_MOVES = 0.25  # by which some charts change their place in the order, typically, in units of its length
-_OFTEN = 20  # tries of a chain, from which on it is kept where two charts meet
-_MOST_BY_SEARCH = 160  # charts for which orders are searched
+# (up to this many charts, cells along the square's side): the resolution at which orders are tried.
+_COARSE_CELLS = ((48, 144), (160, 160), (4000, 320))
+_DENSITY = 0.66  # share of a square of that many cells that the charts would fill
+# Shares of a cell that a chart has to cover for the cell to count, tried in turn: the fine grid mostly finds room for
+# the rest.
+_CELL_SHARES = 0.2, 0.1
+_MIN_FILLED = (0.45, 0.12)  # shares of the square that charts have to fill, at first and at the very least
+_GROWTH = 0.02  # of its side, by which a square grows where a chart finds no room
+_COMPACTED = 4  # layouts that are compacted on the fine grid
+# Shares of the square that another way to cut has to gain, and more for each chart that it adds: seams cost that much.
+_MIN_GAIN, _MIN_GAIN_PER_CHART = 0.006, 0.0012
+WELL_PACKED = 0.67  # of the square, by a draft: charts that fill as much are not cut further
+_MAX_STEP_GAIN = 0.09  # of the square, that cutting one step further mostly gains at most
+# Charts placed while searching for better orders: for the result, and to compare ways to cut.
+_MAX_PLACED, _MAX_PLACED_DRAFT = 3600, 150
+_CHAINS = 4  # independent sequences of changes to an order
+_MOVE_SIGMA = 0.25  # standard deviation of a chart's move in the order, in units of its length
+_CACHE_AFTER = 20  # tries of a chain, from which on it pays to cache where two charts meet
+_CONTACT_FACTORS = [0.6, 1.0, 1.0, 1.6]  # by which the weight of contact changes at random
+_MIN_CONTACT, _MAX_CONTACT = 0.15, 2.0
+_MAX_SEARCHED = 160  # charts for which orders are searched
 
 
-class Layout(NamedTuple):
-    """Charts in a square of `side` cells: (turn, x, y) of each, the order they were placed in, the weight of
-    contact."""
+class PlacementOrder(NamedTuple):
+    """The order to place charts in, and the weight of contact with others against a low place."""
 
-    side: int
-    at: list[tuple[int, int, int]]
     order: list[int]
     contact: float
 
 
-def best_packed(
-    variants: Iterable[list[tuple[np.ndarray, np.ndarray]]], gap: float
-) -> tuple[int, float, list[tuple[list[int], float]], int]:
-    """Which of several ways to cut one surface into charts packs best, by a short search, the share of the square that
-    it fills (0, 0 where none can be told), the orders and weights of contact to pack it in, and how many ways it leapt
-    over.
+class Layout(NamedTuple):
+    """Charts in a square of `side` cells: the placement of each, the order they were placed in, weight of contact."""
 
-    variants: each cut a step further than the one before. The first that fills WELL_PACKED of the square will do, and
-    where one lacks several times _NEXT_GAINS of that, the next ones are leapt over. Else each later one has to gain
-    more than the seams it adds are worth, _GAIN of the square and _GAIN_PER_CHART for each chart."""
-    best, best_share, best_count, best_ways, leapt, leap = 0, 0.0, 0, [], 0, 0
-    known: dict[tuple[int, int], list] = {}
+    side: int
+    at: list[Placement]
+    order: list[int]
+    contact: float
+
+
+class BestCut(NamedTuple):
+    """The way to cut that packs best.
+
+    index: its number; share: of the square that it fills (0, 0 where none can be told); orders: to pack it in;
+    skipped: how many ways were passed over.
+    """
+
+    index: int
+    share: float
+    orders: list[PlacementOrder]
+    skipped: int
+
+
+def choose_cut(variants: Iterable[list[tuple[np.ndarray, np.ndarray]]], gap: float) -> BestCut:
+    """Choose the way to cut a surface into charts that packs best, by a short search.
+
+    variants: charts (uv, triangles), each variant cut a step further than the one before. The first that fills
+    WELL_PACKED of the square is taken. Where one lacks several times _MAX_STEP_GAIN of that, the next ones are passed
+    over. A later variant has to gain more than the seams it adds are worth.
+    """
+    best, best_count, skipped, skip = BestCut(0, 0.0, [], 0), 0, 0, 0
+    known: dict[tuple[int, int], _KnownChart] = {}
     numbered = enumerate(variants)
-    while ahead := list(islice(numbered, 1 + leap)):
+    while ahead := list(islice(numbered, 1 + skip)):
         i, charts = ahead[-1]
-        leapt, leap = leapt + len(ahead) - 1, 0
-        if not 1 < len(charts) <= _MOST_BY_SEARCH:
+        skipped, skip = skipped + len(ahead) - 1, 0
+        if not 1 < len(charts) <= _MAX_SEARCHED:
             continue
-        boxed, area = _boxed(charts, known)
-        cells, shapes, found = _drafted(boxed, area, gap, _OWN[0], [])
-        found = _improved(shapes, found, _TRIES_OF_DRAFT, np.inf)
-        share = _DENSITY * (cells / found[0].side) ** 2 if found else 0.0
-        leap = int((WELL_PACKED - share) / _NEXT_GAINS) if WELL_PACKED > share > 0 else 0
-        if share > best_share + (_GAIN + _GAIN_PER_CHART * (len(charts) - best_count) if best_share else 0.0):
-            best, best_share, best_count, best_ways = (
-                i,
-                share,
-                len(charts),
-                [(layout.order, layout.contact) for layout in found[:2]],
-            )
-        if best_share > WELL_PACKED:
+        oriented, area = _orient_charts(charts, known)
+        cells, masks, layouts = _draft_layouts(oriented, area, gap, _CELL_SHARES[0], [])
+        layouts = _improve_layouts(masks, layouts, _MAX_PLACED_DRAFT, np.inf)
+        share = _DENSITY * (cells / layouts[0].side) ** 2 if layouts else 0.0
+        skip = int((WELL_PACKED - share) / _MAX_STEP_GAIN) if WELL_PACKED > share > 0 else 0
+        needed = _MIN_GAIN + _MIN_GAIN_PER_CHART * (len(charts) - best_count) if best.share else 0.0
+        if share > best.share + needed:
+            orders = [PlacementOrder(layout.order, layout.contact) for layout in layouts[:2]]
+            best, best_count = BestCut(i, share, orders, 0), len(charts)
+        if best.share > WELL_PACKED:
             break
-    return best, best_share, best_ways, leapt
+    return best._replace(skipped=skipped)
 
 
 def pack(
     charts: list[tuple[np.ndarray, np.ndarray]],
     gap: float,
-    ways: list[tuple[list[int], float]] | None = None,
+    orders: list[PlacementOrder] | None = None,
     until: float = np.inf,
 ) -> tuple[list[np.ndarray], float]:
-    """Places for charts: their uv (v, 2) in [0, 1], v up, all at one scale, and that scale (uv per unit of surface).
+    """Pack charts into the smallest square: their uv (v, 2) in [0, 1], v up, and their scale (uv per unit of surface).
 
-    charts: uv at the scale of the surface and triangles of each. gap: smallest distance between charts, and half of it
-    to the border, in uv. Several orders and weights are tried on a coarse grid, the best of them tightened on a fine
-    one; the charts keep their resolution, what is sought is the smallest square that holds them. ways: best_packed's,
-    to start from. until: when to seek no longer, on the clock time.monotonic; where nothing is found by then the charts
-    stand in rows."""
+    charts: uv at the scale of the surface, and triangles. gap: smallest distance between charts, and half of it to the
+    border, in uv. Orders and weights are tried on a coarse grid, and the best layouts are compacted on a fine one.
+    orders: those of choose_cut(), to start from. until: when the search stops, on the clock time.monotonic; where
+    nothing is found by then the charts stand in rows.
+    """
     if time.monotonic() > until:
-        return _shelves([uv - uv.min(0) for uv, _ in charts], gap)
-    boxed, area = _boxed(charts)
+        return _shelf_pack([uv - uv.min(0) for uv, _ in charts], gap)
+    oriented, area = _orient_charts(charts)
     if len(charts) == 1:
-        scale = (1 - 2 * gap) / max(float(np.ptp(boxed[0][0], 0).max()), 1e-300)
-        return [boxed[0][0] * scale + gap], scale
-    if len(charts) > _COARSE[-1][0]:
-        return _shelves([uv for uv, _ in boxed], gap)
-    searched = len(charts) <= _MOST_BY_SEARCH
-    for share in (*_OWN, 0.0) if searched else (0.0,):
-        cells, shapes, found = _drafted(boxed, area, gap, share, (ways or []) if share == _OWN[0] else [], until)
+        scale = (1 - 2 * gap) / max(float(np.ptp(oriented[0].uv, 0).max()), 1e-300)
+        return [oriented[0].uv * scale + gap], scale
+    if len(charts) > _COARSE_CELLS[-1][0]:
+        return _shelf_pack([chart.uv for chart in oriented], gap)
+    is_searched = len(charts) <= _MAX_SEARCHED
+    for share in (*_CELL_SHARES, 0.0) if is_searched else (0.0,):
+        start_orders = (orders or []) if share == _CELL_SHARES[0] else []
+        cells, masks, layouts = _draft_layouts(oriented, area, gap, share, start_orders, until)
         cells_per_unit = cells * (_DENSITY / area) ** 0.5
-        if found and searched:
-            if (
-                share == _OWN[0]
-                and Fine(boxed, shapes, cells_per_unit, [found[0].side], gap, ROUGH).apart(found[0].at) is None
-            ):
-                continue  # one in the other, as arcs of rings are
-            found = _improved(shapes, found, _TRIES, until)
-            best = found[:_SETTLED]
-            packed = Fine(boxed, shapes, cells_per_unit, [one.side for one in best], gap).settled(
-                [one.at for one in best]
+        if layouts and is_searched:
+            if share == _CELL_SHARES[0]:
+                rough = FineGridCompactor(oriented, masks, cells_per_unit, [layouts[0].side], gap, ROUGH)
+                if rough.separate(layouts[0].at) is None:
+                    continue  # charts lie inside each other, as arcs of rings do
+            layouts = _improve_layouts(masks, layouts, _MAX_PLACED, until)
+            best = layouts[:_COMPACTED]
+            sides = [layout.side for layout in best]
+            packed = FineGridCompactor(oriented, masks, cells_per_unit, sides, gap).compact(
+                [layout.at for layout in best]
             )
             if packed:
                 return packed
-        if found and not share:  # nowhere too near another as it is
-            return [
-                (shapes.uv[i][turn] + [x, y]) / found[0].side for i, (turn, x, y) in enumerate(found[0].at)
-            ], cells_per_unit / found[0].side
-    return _shelves([uv for uv, _ in boxed], gap)
+        if layouts and not share:  # no chart is too near another as it is
+            layout = layouts[0]
+            uv = [(masks.uv[i][at.turn] + [at.x, at.y]) / layout.side for i, at in enumerate(layout.at)]
+            return uv, cells_per_unit / layout.side
+    return _shelf_pack([chart.uv for chart in oriented], gap)
 
 
-def _boxed(charts: list, known: dict[tuple[int, int], list] | None = None) -> tuple[list, float]:
-    """Charts set upright, with their outlines, and their area. known: of charts that come again, by the ids of their
-    arrays."""
-    known, found = {} if known is None else known, []
-    for chart in charts:
-        one = known.setdefault((id(chart[0]), id(chart[1])), [chart])
-        if len(one) == 1:
-            one += _upright(*chart)
-        found.append(one)
-    return [(uv, rim) for _, uv, rim, _ in found], max(sum(area for *_, area in found), 1e-300)
+class _KnownChart(NamedTuple):
+    """An oriented chart with its area, and the input, which is kept so that the ids of its arrays stay taken."""
+
+    source: tuple[np.ndarray, np.ndarray]
+    chart: OrientedChart
+    area: float
 
 
-def _upright(uv: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """A chart, triangles (t, 3), set upright, its outline and its area."""
-    uv = upright_box(uv)
-    (a, b), (c, d) = (uv[t[:, 1]] - uv[t[:, 0]]).T, (uv[t[:, 2]] - uv[t[:, 0]]).T
-    return uv, rim_of(uv, t), float(np.abs(a * d - b * c).sum()) / 2
+def _orient_charts(
+    charts: list[tuple[np.ndarray, np.ndarray]], known: dict[tuple[int, int], _KnownChart] | None = None
+) -> tuple[list[OrientedChart], float]:
+    """Orient charts (uv, triangles) upright, and return them with their total area.
+
+    known: caches charts that come again, by the ids of their arrays.
+    """
+    known, oriented = {} if known is None else known, []
+    for uv, triangles in charts:
+        key = id(uv), id(triangles)
+        if key not in known:
+            known[key] = _KnownChart((uv, triangles), *_oriented(uv, triangles))
+        oriented.append(known[key])
+    return [entry.chart for entry in oriented], max(sum(entry.area for entry in oriented), 1e-300)
 
 
-def _drafted(
-    boxed: list, area: float, gap: float, share: float, ways: list[tuple[list[int], float]], until: float = np.inf
-) -> tuple[int, Shapes | None, list[Layout]]:
-    """Cells of the side of a square that the charts fill to _DENSITY, the charts on that grid, and layouts of them,
-    best first: of a few orders, or of ways, orders with their weights of contact."""
-    cells = next(cells for most, cells in _COARSE if len(boxed) <= most)
-    shapes = None
-    for least in _LEAST:
+def _oriented(uv: np.ndarray, triangles: np.ndarray) -> tuple[OrientedChart, float]:
+    """Return a chart with triangles (t, 3) set upright, and its area."""
+    uv = orient_upright(uv)
+    (a, b) = (uv[triangles[:, 1]] - uv[triangles[:, 0]]).T
+    (c, d) = (uv[triangles[:, 2]] - uv[triangles[:, 0]]).T
+    return OrientedChart(uv, outline_of(uv, triangles)), float(np.abs(a * d - b * c).sum()) / 2
+
+
+def _draft_layouts(
+    charts: list[OrientedChart],
+    area: float,
+    gap: float,
+    share: float,
+    orders: list[PlacementOrder],
+    until: float = np.inf,
+) -> tuple[int, ChartMasks | None, list[Layout]]:
+    """Place the charts on a coarse grid in a few orders, or in the given ones.
+
+    share: of a cell that a chart has to cover for the cell to count. Returns the cells along the side of a square that
+    the charts fill to _DENSITY, their masks on that grid, and the layouts, best first.
+    """
+    cells = next(cells for most, cells in _COARSE_CELLS if len(charts) <= most)
+    masks = None
+    for least in _MIN_FILLED:
         most = int(cells * (_DENSITY / least) ** 0.5)
-        shapes = Shapes(boxed, cells * (_DENSITY / area) ** 0.5, gap * (cells if share else most), most, share)
-        found: list[Layout] = []
-        for order, contact in ways or _first_ways(shapes)[: 6 if len(boxed) <= _MOST_BY_SEARCH else 1]:
-            # Later ones have to do better, and the first has no room to grow beyond what it is asked for.
-            side, largest = (found[0].side - 1,) * 2 if found else (int(0.9 * cells), most)
-            layout = _placed(shapes, order, side, largest, contact, until)
+        masks = ChartMasks(charts, cells * (_DENSITY / area) ** 0.5, gap * (cells if share else most), most, share)
+        layouts: list[Layout] = []
+        for order in orders or _initial_orders(masks)[: 6 if len(charts) <= _MAX_SEARCHED else 1]:
+            # Later orders have to do better, so their square does not grow; the first starts small.
+            side, max_side = (layouts[0].side - 1,) * 2 if layouts else (int(0.9 * cells), most)
+            layout = _place_in_order(masks, order, side, max_side, until)
             if layout is not None:
-                found.insert(0, layout)
-        if found:
-            return cells, shapes, found
-    return cells, shapes, []
+                layouts.insert(0, layout)
+        if layouts:
+            return cells, masks, layouts
+    return cells, masks, []
 
 
-def _improved(shapes: Shapes, found: list[Layout], tries: int, until: float) -> list[Layout]:
-    """The layouts, and better ones, best first: of small changes of the best order, in several chains: each soon ends
-    where no small change helps. tries: charts placed."""
-    if not found or tries < _CHAINS * len(found[0].order):
-        return found
-    each = tries // len(found[0].order) // _CHAINS
-    numbers = sorted(range(_CHAINS), key=lambda number: number % 2)  # of layouts of one size the first chain's is taken
-    more = [layout for number in numbers for layout in _chain(shapes, found[0], each, number, until)]
-    return sorted(found + more, key=lambda layout: layout.side)
+def _improve_layouts(masks: ChartMasks, layouts: list[Layout], max_placed: int, until: float) -> list[Layout]:
+    """Return the layouts and better ones, best first, found by small changes of the best order.
+
+    Several chains are followed, because each soon ends where no small change helps. max_placed: charts placed in all.
+    """
+    if not layouts or max_placed < _CHAINS * len(layouts[0].order):
+        return layouts
+    tries = max_placed // len(layouts[0].order) // _CHAINS
+    seeds = sorted(range(_CHAINS), key=lambda seed: seed % 2)  # of layouts of one size the first chain's is taken
+    more = [layout for seed in seeds for layout in _improvement_chain(masks, layouts[0], tries, seed, until)]
+    return sorted(layouts + more, key=lambda layout: layout.side)
 
 
-def _chain(shapes: Shapes, best: Layout, tries: int, number: int, until: float) -> list[Layout]:
-    """Ever smaller layouts, found by changing the place of a few charts in the order of the best so far, again and
-    again."""
-    rng, found = np.random.default_rng(number), []  # the same for each mesh: results do not depend on chance
+def _improvement_chain(masks: ChartMasks, best: Layout, tries: int, seed: int, until: float) -> list[Layout]:
+    """Find ever smaller layouts by moving a few charts in the order of the best so far, again and again."""
+    rng, found = np.random.default_rng(seed), []  # fixed seeds: equal input gives equal output
     known: dict[tuple[int, float], dict] = {}
     for _ in range(tries):
         if time.monotonic() > until:
             break
-        place = np.argsort(best.order).astype(float)
-        moved = rng.integers(len(place), size=int(rng.integers(1, 4)))
-        place[moved] += rng.normal(0, _MOVES * len(place), len(moved))
-        contact = float(np.clip(best.contact * rng.choice([0.6, 1.0, 1.0, 1.6]), 0.15, 2.0))
-        layout = _placed(
-            shapes,
-            np.argsort(place, kind="stable").tolist(),
+        rank = np.argsort(best.order).astype(float)
+        moved = rng.integers(len(rank), size=int(rng.integers(1, 4)))
+        rank[moved] += rng.normal(0, _MOVE_SIGMA * len(rank), len(moved))
+        contact = float(np.clip(best.contact * rng.choice(_CONTACT_FACTORS), _MIN_CONTACT, _MAX_CONTACT))
+        layout = _place_in_order(
+            masks,
+            PlacementOrder(np.argsort(rank, kind="stable").tolist(), contact),
             best.side - 1,
             best.side - 1,
-            contact,
             until,
             known.setdefault((best.side, contact), {}),
-            tries >= _OFTEN,
+            tries >= _CACHE_AFTER,
         )
         if layout is not None:
             best = layout
@@ -201,66 +240,69 @@ def _chain(shapes: Shapes, best: Layout, tries: int, number: int, until: float) 
     return found
 
 
-def _placed(
-    shapes: Shapes,
-    order: list[int],
+def _place_in_order(
+    masks: ChartMasks,
+    order: PlacementOrder,
     side: int,
-    most: int,
-    contact: float,
+    max_side: int,
     until: float,
     known: dict | None = None,
-    often: bool = False,
+    caches_meetings: bool = False,
 ) -> Layout | None:
-    """Charts placed one by one in a square of `side` cells, which grows up to `most` where one finds no room; None
-    where that is not enough, or the time is over. known: {chart: (its place, known of those placed behind it)}, kept
-    between orders for one side and contact; often: these charts are placed so often that it is worth keeping where two
-    of them meet."""
-    taken, at, others = 0, [(0, 0, 0)] * len(order), []
-    border, after = shapes.border(side), {} if known is None else known
-    for i in order:
+    """Place charts one by one in a square of `side` cells, which grows up to max_side where one finds no room.
+
+    known: {chart: (its placement, known of the charts placed behind it)}, kept between orders for one side and weight
+    of contact. caches_meetings: charts are placed so often that it pays to cache where two of them meet. Returns None
+    where the square would grow too large, or the time is over.
+    """
+    taken, at, others = 0, [Placement(0, 0, 0)] * len(order.order), []
+    border, after = masks.border(side), {} if known is None else known
+    for i in order.order:
+        neighbours = others if caches_meetings else None
         if i not in after:
-            after[i] = shapes.placed(i, taken, border, side, contact, others if often else None), {}
+            after[i] = masks.find_place(i, taken, border, side, order.contact, neighbours), {}
         place, after = after[i]
         while place is None:
-            side += max(int(_GROWS * side), 1)
-            if side > most:
+            side += max(int(_GROWTH * side), 1)
+            if side > max_side:
                 return None
-            border = shapes.border(side)
-            place = shapes.placed(i, taken, border, side, contact, others if often else None)
+            border = masks.border(side)
+            place = masks.find_place(i, taken, border, side, order.contact, neighbours)
         if time.monotonic() > until:
             return None
         at[i] = place
         others.append((i, place))
-        taken |= shapes.cells(i, place)
-    return Layout(max(shapes.reach(i, place) for i, place in enumerate(at)), at, order, contact)
+        taken |= masks.cells_at(i, place)
+    used = max(masks.extent_at(i, place) for i, place in enumerate(at))
+    return Layout(used, at, order.order, order.contact)
 
 
-def _first_ways(shapes: Shapes) -> list[tuple[list[int], float]]:
-    """Orders to place the charts in, largest first, each with a weight of contact against height."""
-    shape = np.array([of_turn[0] for of_turn in shapes.shapes])
+def _initial_orders(masks: ChartMasks) -> list[PlacementOrder]:
+    """Return orders to place the charts in, largest first by area and by side, with several weights of contact."""
+    shape = np.array([of_turn[0] for of_turn in masks.shapes])
     return [
-        (np.argsort(-rank, kind="stable").tolist(), contact)
+        PlacementOrder(np.argsort(-rank, kind="stable").tolist(), contact)
         for contact in (0.5, 1.0, 0.3)
         for rank in (shape.prod(1), shape.max(1))
     ]
 
 
-def _shelves(boxed: list[np.ndarray], gap: float) -> tuple[list[np.ndarray], float]:
-    """Rows of bounding rectangles, for any number of charts, uv (v, 2) from the origin on."""
-    span = np.array([uv.max(0) for uv in boxed])
+def _shelf_pack(charts: list[np.ndarray], gap: float) -> tuple[list[np.ndarray], float]:
+    """Place the bounding rectangles of charts in rows; for any number of charts, uv (v, 2) from the origin on."""
+    span = np.array([uv.max(0) for uv in charts])
     order = np.argsort(-span[:, 1], kind="stable")
-    gap = min(gap, 0.2 / len(boxed) ** 0.5)
+    gap = min(gap, 0.2 / len(charts) ** 0.5)
     scale = (1.0 / max(float((span[:, 0] * span[:, 1]).sum()), 1e-300)) ** 0.5
     while True:
         x = y = row = 0.0
-        out: list[np.ndarray | None] = [None] * len(boxed)
+        out: list[np.ndarray | None] = [None] * len(charts)
         for i in order.tolist():
             w, h = span[i] * scale + gap
             if x + w > 1:
                 x, y, row = 0.0, y + row, 0.0
             if x + w > 1 or y + h > 1:
                 break
-            out[i] = boxed[i] * scale + np.array([x, y]) + gap / 2
+            out[i] = charts[i] * scale + np.array([x, y]) + gap / 2
             x, row = x + w, max(row, h)
         else:
             return out, scale

@@ -1,4 +1,4 @@
-"""Charts laid flat: conformal start, then as isometric as they go, never folded, never mirrored."""
+"""Flatten one chart: a conformal map first, then as isometric as possible; never folded, never mirrored."""
 
 from __future__ import annotations
 
@@ -11,105 +11,121 @@ from gdtool.geometry.normals import face_normals
 from gdtool.geometry.topology import Edges, edges_of, handles
 from gdtool.geometry.uv_raster import owned_texels, owner_count
 
-_SLIM_STEPS = (2, 2, 4, 6, 8)
-_RELIED_GAIN = 1.0  # of a round of steps, in units of what the round before it gained
+_SLIM_ITERATIONS = (2, 2, 4, 6, 8)  # by round; the stretch is measured after each
+_MIN_GAIN = 2e-4  # of stretch in a round, below which SLIM stops
+_EXPECTED_GAIN = 1.0  # of a round, in units of what the round before it gained
+_MIN_FACING_COSINE = 0.3  # between the mean normal and those of triangles that are seen along it
 
 
-class Flat(NamedTuple):
-    """uv (v, 2), or None and why the chart has to be cut; where it overlaps itself, `overlapped` (v, 2) shows how."""
+class FlattenResult(NamedTuple):
+    """uv (v, 2), or None and the reason why the chart has to be cut.
+
+    overlapped (v, 2): the coordinates of a chart that overlaps itself.
+    """
 
     uv: np.ndarray | None
     reason: str = ""
     overlapped: np.ndarray | None = None
 
 
-def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, max_stretch: float) -> Flat:
-    """One connected chart laid flat: uv (v, 2), v up, at the scale of the surface, or why it has to be cut.
+def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, max_stretch: float) -> FlattenResult:
+    """Flatten one connected chart to uv (v, 2), v up, at the scale of the surface.
 
     vertices (v, 3), triangles (t, 3), a manifold with boundary. Least-squares conformal map (Lévy et al. 2002), or
     Tutte's embedding where that folds, then SLIM (Rabinovich et al. 2017) on the symmetric Dirichlet energy until
-    good_stretch."""
+    good_stretch is reached. A chart beyond max_stretch has to be cut.
+    """
     edges = edges_of(triangles)
     border = edges.count == 1
     if not border.any():
-        return Flat(None, "closed")
-    surface, uv = Isometry(vertices, triangles), _seen(vertices, triangles)
+        return FlattenResult(None, "closed")
+    surface, uv = StretchMeasure(vertices, triangles), _view_along_normal(vertices, triangles)
     disk = is_disk(len(vertices), triangles, edges)
-    if uv is not None and surface.stretch(uv) < good_stretch and not lies_on_itself(uv, triangles, edges, disk):
-        return Flat(uv)
-    if not disk and edges.count.max() == 2 and handles(triangles, 1, edges):  # no part of the plane has any
-        return Flat(None, "has a handle")
+    if uv is not None and surface.stretch(uv) < good_stretch and not overlaps_itself(uv, triangles, edges, disk):
+        return FlattenResult(uv)
+    if not disk and edges.count.max() == 2 and handles(triangles, 1, edges):  # no part of the plane has one
+        return FlattenResult(None, "has a handle")
     uv = _conformal(vertices, triangles, edges.ends[border])
-    if uv is None or not upright(uv, triangles):
+    if uv is None or not is_unfolded(uv, triangles):
         if not disk:
-            return Flat(None, "folds, and is no disk")
+            return FlattenResult(None, "folds, and is no disk")
         uv = _tutte(vertices, triangles)
-        if uv is None or not upright(uv, triangles):
-            return Flat(None, "folds")
+        if uv is None or not is_unfolded(uv, triangles):
+            return FlattenResult(None, "folds")
     uv = _scaled(uv, triangles, surface.area)
     uv, reached = _isometric(vertices, triangles, uv, surface, good_stretch, max_stretch)
     if reached > max_stretch:
-        return Flat(None, "stretches")
-    return Flat(None, "overlaps itself", uv) if lies_on_itself(uv, triangles, edges, disk) else Flat(uv)
+        return FlattenResult(None, "stretches")
+    return (
+        FlattenResult(None, "overlaps itself", uv) if overlaps_itself(uv, triangles, edges, disk) else FlattenResult(uv)
+    )
 
 
 def is_disk(vertices: int, triangles: np.ndarray, edges: Edges) -> bool:
-    """Whether triangles (t, 3) of so many vertices, connected, with these edges, are a disk."""
+    """Whether connected triangles (t, 3) of so many vertices, with these edges, are a disk."""
     return vertices - len(edges.ends) + len(triangles) == 1 and edges.count.max() == 2
 
 
 def _areas(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return (t,) signed areas of triangles in uv (v, 2)."""
     a, b, c = (uv[triangles[:, i]] for i in range(3))
     return ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
 
 
-def upright(uv: np.ndarray, triangles: np.ndarray) -> bool:
-    """Whether all triangles (t, 3) in uv (v, 2) have an area and are counter-clockwise."""
+def is_unfolded(uv: np.ndarray, triangles: np.ndarray) -> bool:
+    """Whether all triangles (t, 3) in uv (v, 2) are counter-clockwise and have an area."""
     area = _areas(uv, triangles)
     return bool(np.isfinite(area).all() and (area > 1e-10 * max(area.max(initial=0), 1e-300)).all())
 
 
 def _scaled(uv: np.ndarray, triangles: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """uv (v, 2) about its centre, as large as the triangles (t, 3) are, area (t,)."""
+    """Centre uv (v, 2) and scale it so that its area is that of the triangles (t, 3), area (t,)."""
     return (uv - uv.mean(0)) * (area.sum() / max(_areas(uv, triangles).sum(), 1e-300)) ** 0.5
 
 
-def onto_plane(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
-    """The chart seen along its mean normal, when all of it faces that way and none lies on another: exact for flat
-    charts."""
-    uv = _seen(vertices, triangles)
-    return None if uv is None or overlapping(uv, triangles).any() else uv
+def project_to_plane(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
+    """Project a chart along its mean normal; exact for flat charts.
+
+    None unless all of it faces that way and nothing overlaps.
+    """
+    uv = _view_along_normal(vertices, triangles)
+    return None if uv is None or overlapping_triangles(uv, triangles).any() else uv
 
 
-def _seen(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
+def _view_along_normal(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
+    """Return the chart seen along its mean normal, at the scale of the surface; None where a triangle turns away."""
     normals, area = face_normals(vertices, triangles)
     mean = (normals * area[:, None]).sum(0)
     length = np.linalg.norm(mean)
     if length < 1e-12:
         return None
     mean /= length
-    if (normals @ mean)[area > 0].min() < 0.3:
+    if (normals @ mean)[area > 0].min() < _MIN_FACING_COSINE:
         return None
     x = np.cross([0.0, 1.0, 0.0] if abs(mean[1]) < 0.9 else [1.0, 0.0, 0.0], mean)
     x /= np.linalg.norm(x)
     uv = np.stack([vertices @ x, vertices @ np.cross(mean, x)], -1)
-    return _scaled(uv, triangles, area) if upright(uv, triangles) else None
+    return _scaled(uv, triangles, area) if is_unfolded(uv, triangles) else None
 
 
 def _conformal(vertices: np.ndarray, triangles: np.ndarray, border: np.ndarray) -> np.ndarray | None:
+    """Return the least-squares conformal map, None where it fails.
+
+    Two far vertices of the boundary, border (b, 2) edges, are pinned.
+    """
     igl = imported("igl")
     rim = np.unique(border)
-    one = rim[np.linalg.norm(vertices[rim] - vertices[rim].mean(0), axis=1).argmax()]
-    two = rim[np.linalg.norm(vertices[rim] - vertices[one], axis=1).argmax()]
-    if one == two:
+    first = rim[np.linalg.norm(vertices[rim] - vertices[rim].mean(0), axis=1).argmax()]
+    second = rim[np.linalg.norm(vertices[rim] - vertices[first], axis=1).argmax()]
+    if first == second:
         return None
-    length = float(np.linalg.norm(vertices[two] - vertices[one]))
+    length = float(np.linalg.norm(vertices[second] - vertices[first]))
     try:
         uv = np.asarray(
             igl.lscm(
                 np.ascontiguousarray(vertices),
                 np.ascontiguousarray(triangles, np.int64),
-                np.array([one, two], np.int64),
+                np.array([first, second], np.int64),
                 np.array([[0.0, 0.0], [length, 0.0]]),
             )[0]
         )
@@ -120,33 +136,37 @@ def _conformal(vertices: np.ndarray, triangles: np.ndarray, border: np.ndarray) 
     return uv * [1.0, -1.0] if _areas(uv, triangles).sum() < 0 else uv
 
 
-def conformal_from(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> np.ndarray | None:
-    """uv (v, 2) with what is not finite among the corners of triangles (t, 3) laid by the least-squares conformal map
-    that keeps the rest; None where less than two of these are given, or they have no area."""
+def extend_conformally(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> np.ndarray | None:
+    """Extend uv (v, 2) to its non-finite rows by the least-squares conformal map that keeps the finite ones.
+
+    Only the corners of triangles (t, 3) are filled. None where fewer than two of them are given, or they have no area.
+    """
     igl = imported("igl")
-    own, local = np.unique(triangles, return_inverse=True)
-    given = np.isfinite(uv[own, 0])
-    if given.sum() < 2:
+    used, local = np.unique(triangles, return_inverse=True)
+    is_given = np.isfinite(uv[used, 0])
+    if is_given.sum() < 2:
         return None
-    if not given.all():
+    if not is_given.all():
         try:
-            laid = np.asarray(
+            mapped = np.asarray(
                 igl.lscm(
-                    np.ascontiguousarray(vertices[own]),
+                    np.ascontiguousarray(vertices[used]),
                     np.ascontiguousarray(local.reshape(-1, 3), np.int64),
-                    np.flatnonzero(given),
-                    np.ascontiguousarray(uv[own[given]]),
+                    np.flatnonzero(is_given),
+                    np.ascontiguousarray(uv[used[is_given]]),
                 )[0]
             )
         except RuntimeError:  # as in _conformal()
             return None
         uv = uv.copy()
-        uv[own[~given]] = laid[~given]
+        uv[used[~is_given]] = mapped[~is_given]
     return uv
 
 
 def _tutte(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
-    """Uniform-weight embedding onto a circle (Tutte 1963): never folds."""
+    """Return the uniform-weight embedding onto a circle (Tutte 1963), which never folds; None unless it has one
+    boundary.
+    """
     from scipy.sparse import coo_matrix, diags
     from scipy.sparse.linalg import spsolve
 
@@ -176,16 +196,18 @@ def _isometric(
     vertices: np.ndarray,
     triangles: np.ndarray,
     uv: np.ndarray,
-    surface: Isometry,
+    surface: StretchMeasure,
     good_stretch: float,
     max_stretch: float,
 ) -> tuple[np.ndarray, float]:
-    """uv after SLIM, and its stretch: until good_stretch, until it gains little, or until it is clear that it will not
-    come to max_stretch."""
+    """Improve uv by SLIM; return the best uv and its stretch.
+
+    Stops at good_stretch, when it gains little, or when it is clear that max_stretch will not be reached.
+    """
     igl = imported("igl")
-    best, before = uv, surface.stretch(uv)
-    if before < good_stretch:
-        return best, before
+    best, reached = uv, surface.stretch(uv)
+    if reached < good_stretch:
+        return best, reached
     state = igl.slim_precompute(
         np.asfortranarray(vertices, np.float64),
         np.asfortranarray(triangles, np.int32),
@@ -195,19 +217,19 @@ def _isometric(
         np.zeros((0, 2), order="F"),
         0.0,
     )
-    for steps in _SLIM_STEPS:
-        found = np.asarray(igl.slim_solve(state, steps))[:, :2]
-        if not np.isfinite(found).all() or not upright(found, triangles):
+    for iterations in _SLIM_ITERATIONS:
+        mapped = np.asarray(igl.slim_solve(state, iterations))[:, :2]
+        if not np.isfinite(mapped).all() or not is_unfolded(mapped, triangles):
             break
-        best, last, before = _scaled(found, triangles, surface.area), before, surface.stretch(found)
-        gained = last - before
-        if before < good_stretch or gained < 2e-4 or before - _RELIED_GAIN * gained > max_stretch:
+        best, previous, reached = _scaled(mapped, triangles, surface.area), reached, surface.stretch(mapped)
+        gained = previous - reached
+        if reached < good_stretch or gained < _MIN_GAIN or reached - _EXPECTED_GAIN * gained > max_stretch:
             break
-    return best, before
+    return best, reached
 
 
 def singular_values(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(t, 2) singular values, larger first, of the map from uv to the surface, and the triangles' areas (t,)."""
+    """Return (t, 2) singular values, larger first, of the map from uv to the surface, and areas (t,)."""
     e1, e2 = (
         vertices[triangles[:, 1]] - vertices[triangles[:, 0]],
         vertices[triangles[:, 2]] - vertices[triangles[:, 0]],
@@ -224,25 +246,26 @@ def singular_values(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray)
 
 
 def stretch(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> float:
-    """L2 stretch (Sander et al. 2001), 1 for an isometry, at the scale where the areas agree."""
-    return Isometry(vertices, triangles).stretch(uv)
+    """Return the L2 stretch (Sander et al. 2001), 1 for an isometry, at the scale where the areas agree."""
+    return StretchMeasure(vertices, triangles).stretch(uv)
 
 
-class Isometry:
-    """How far maps of triangles (t, 3) of vertices (v, 3) to the plane are from one: what they all share is computed
-    once."""
+class StretchMeasure:
+    """Measures the stretch of maps of triangles (t, 3) to the plane; what all maps share is computed once."""
 
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
         self._abc = tuple(triangles.T)
         a, b, c = self._abc
-        one, two = (vertices[b] - vertices[a]).T, (vertices[c] - vertices[a]).T
-        self._metric = (one * one).sum(0), (one * two).sum(0), (two * two).sum(0)
-        normal = one[[1, 2, 0]] * two[[2, 0, 1]] - one[[2, 0, 1]] * two[[1, 2, 0]]
+        side_ab, side_ac = (vertices[b] - vertices[a]).T, (vertices[c] - vertices[a]).T
+        self._metric = (side_ab * side_ab).sum(0), (side_ab * side_ac).sum(0), (side_ac * side_ac).sum(0)
+        normal = side_ab[[1, 2, 0]] * side_ac[[2, 0, 1]] - side_ab[[2, 0, 1]] * side_ac[[1, 2, 0]]
         self.area = np.sqrt((normal * normal).sum(0)) / 2
 
     def squared(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(t,) mean square of the two singular values of the map from uv (v, 2) to each triangle, and its area in uv,
-        not negative."""
+        """Return (t,) the mean square of the two singular values of the map from uv (v, 2) to each triangle.
+
+        Also returns the triangles' areas (t,) in uv, not negative.
+        """
         a, b, c = self._abc
         (u, v), (s, t), (e, f, g) = (uv[b] - uv[a]).T, (uv[c] - uv[a]).T, self._metric
         flat = np.abs(u * t - v * s)
@@ -251,11 +274,11 @@ class Isometry:
         ), flat / 2
 
     def at_scale(self, uv: np.ndarray) -> float:
-        """L2 stretch where one unit of uv is one of the surface: below 1 where it lies larger."""
+        """Return the L2 stretch with one unit of uv as one of the surface: below 1 where uv is larger."""
         return float(np.sqrt((self.area * self.squared(uv)[0]).sum() / max(self.area.sum(), 1e-300)))
 
     def stretch(self, uv: np.ndarray) -> float:
-        """As stretch()."""
+        """Return the L2 stretch at the scale where the areas agree; infinite where nothing has an area."""
         square, flat = self.squared(uv)
         area, total = self.area, self.area.sum()
         use = (area > 1e-12 * total) & (flat > 1e-14 * max(flat.sum(), 1e-300))
@@ -264,9 +287,12 @@ class Isometry:
         return float(np.sqrt((area * square)[use].sum() * flat[use].sum()) / area[use].sum())
 
 
-def lies_on_itself(uv: np.ndarray, triangles: np.ndarray, edges: Edges, disk: bool) -> bool:
-    """overlapping().any(). What a rim winds around once lies on nothing: of a disk whose rim does not come to itself
-    that is all."""
+def overlaps_itself(uv: np.ndarray, triangles: np.ndarray, edges: Edges, disk: bool) -> bool:
+    """Whether some part of the chart lies on another; quicker than overlapping_triangles().
+
+    A disk whose boundary neither crosses nor touches itself overlaps nothing: its boundary winds around everything
+    once.
+    """
     if not np.ptp(uv, 0).max() > 0:
         return True
     rim = np.flatnonzero(edges.count[edges.half_edge_idx] == 1)
@@ -275,64 +301,71 @@ def lies_on_itself(uv: np.ndarray, triangles: np.ndarray, edges: Edges, disk: bo
 
 
 def _covered(uv: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
-    """A chart in the unit square, (v, 2), and how many of its triangles own each texel of a grid finer than they are,
-    size and (size, size)."""
+    """Rasterise a chart on a grid finer than its triangles.
+
+    Returns uv (v, 2) in the unit square, the grid's size, and (size, size) how many triangles own each texel.
+    """
     size = int(np.clip(10 * len(triangles) ** 0.5, 64, 512))
     at = (uv - uv.min(0)) / np.ptp(uv, 0).max()
     return at, size, owner_count(at, triangles, size)
 
 
-def overlapping(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """(t,) which triangles of a chart, all upright, lie on others of it: none, where it lies flat.
+def overlapping_triangles(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return (t,) bool: the triangles of an unfolded chart that lie on others of it.
 
-    Some do where its rim crosses itself, however little; a grid finer than its triangles finds what winds around twice.
+    The boundary of such a chart crosses itself, however little, or winds around some texels twice, which the grid
+    finds.
     """
-    found = np.zeros(len(triangles), bool)
+    overlaps = np.zeros(len(triangles), bool)
     if not np.ptp(uv, 0).max() > 0:
-        return ~found
+        return ~overlaps
     edges = edges_of(triangles)
     rim = np.flatnonzero(edges.count[edges.half_edge_idx] == 1)
-    found[edges.half_face[rim[rim_crossings(uv, edges.half_ends[rim])[0]]]] = True
+    overlaps[edges.half_face[rim[rim_crossings(uv, edges.half_ends[rim])[0]]]] = True
     at, size, count = _covered(uv, triangles)
     twice = count > 1
     if twice.any():
         for face_idx, row, column in owned_texels(at, triangles, size):
-            found[face_idx[twice[row, column]]] = True
-    return found
+            overlaps[face_idx[twice[row, column]]] = True
+    return overlaps
 
 
 def rim_crossings(uv: np.ndarray, ends: np.ndarray, at_once: int = 2_000_000) -> tuple[np.ndarray, bool]:
-    """(n,) the segments of (s, 2), ends in points uv (v, 2), that cross another with which they share no end; whether
-    any touch.
+    """Find boundary segments that cross another segment with which they share no end.
 
-    Sweep over u, exact to rounding. Where the ends of two lie in one place, as those of a cut do, they may cross there
-    or only touch."""
+    ends (s, 2) into points uv (v, 2). Sweep over u, exact to rounding; at_once bounds the pairs compared at a time.
+    Returns the crossing segments (n,), and whether any touch: where the ends of two lie in one place, as at a cut, they
+    may cross there or only touch.
+    """
     low, high = uv[ends].min(1), uv[ends].max(1)
     order = np.argsort(low[:, 0], kind="stable")
     ends, low, high = ends[order], low[order], high[order]
     # Each with those behind it in order that begin before it ends.
     number = np.searchsorted(low[:, 0], high[:, 0], "right") - np.arange(len(ends)) - 1
     total = np.cumsum(number)
-    start, found, touches = 0, [], False
+    start, crossings, touches = 0, [], False
     while start < len(ends):
         base = total[start - 1] if start else 0
         stop = max(start + 1, int(np.searchsorted(total, base + at_once, "right")))
-        one = np.repeat(np.arange(start, stop), number[start:stop])
-        two = (
-            one + 1 + np.arange(len(one)) - np.repeat(total[start:stop] - number[start:stop] - base, number[start:stop])
+        first = np.repeat(np.arange(start, stop), number[start:stop])
+        second = (
+            first
+            + 1
+            + np.arange(len(first))
+            - np.repeat(total[start:stop] - number[start:stop] - base, number[start:stop])
         )
-        near = (low[one, 1] <= high[two, 1]) & (low[two, 1] <= high[one, 1])
-        pair = np.stack([one[near], two[near]], -1)
+        near = (low[first, 1] <= high[second, 1]) & (low[second, 1] <= high[first, 1])
+        pair = np.stack([first[near], second[near]], -1)
         at = ends[pair]
         pair = pair[(at[:, 0, :, None] != at[:, 1, None, :]).all((1, 2))]
         (a, b), (c, d) = uv[ends[pair[:, 0]]].swapaxes(0, 1), uv[ends[pair[:, 1]]].swapaxes(0, 1)
-        one, other = _side(a, b, c) * _side(a, b, d), _side(c, d, a) * _side(c, d, b)
-        found.append(pair[(one < 0) & (other < 0)])
-        touches = touches or bool(((one <= 0) & (other <= 0) & (one * other == 0)).any())
+        first, cd_side = _orientation(a, b, c) * _orientation(a, b, d), _orientation(c, d, a) * _orientation(c, d, b)
+        crossings.append(pair[(first < 0) & (cd_side < 0)])
+        touches = touches or bool(((first <= 0) & (cd_side <= 0) & (first * cd_side == 0)).any())
         start = stop
-    return np.unique(order[np.concatenate(found).ravel()]) if found else np.zeros(0, np.int64), touches
+    return np.unique(order[np.concatenate(crossings).ravel()]) if crossings else np.zeros(0, np.int64), touches
 
 
-def _side(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """On which side of the line from a to b the point c lies, each (n, 2): -1, 0, 1."""
+def _orientation(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Return on which side of the line from a to b the point c lies, each (n, 2): -1, 0 or 1."""
     return np.sign((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])

@@ -1,12 +1,10 @@
-"""All charts laid flat: small ones joined, those that lie on themselves peeled, cut where that does not help or all of
-them stretch too much."""
+"""Flatten all charts of a mesh: merge small ones, remove overlaps, and cut what does not lie flat or stretches."""
 
 from __future__ import annotations
 
 import heapq
 import time
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,229 +12,248 @@ import numpy as np
 from gdtool.geometry.mesh_quality import polygon_normals
 from gdtool.geometry.repair import one_vertex_per_fan
 from gdtool.geometry.topology import triangulated
-from gdtool.unwrap.parameterize.flatten import Flat, flatten, onto_plane, stretch, upright
-from gdtool.unwrap.segment.charts import Adjacency, bisect, own_corners
-from gdtool.unwrap.segment.merge import joined, joined_stretch
-from gdtool.unwrap.segment.overlaps import onto_neighbours, peel
-from gdtool.unwrap.segment.straight_cuts import connected, part_of
+from gdtool.unwrap.chart import Chart
+from gdtool.unwrap.parameterize.flatten import FlattenResult, flatten, is_unfolded, project_to_plane, stretch
+from gdtool.unwrap.segment.charts import Adjacency, chart_mesh, split_in_half
+from gdtool.unwrap.segment.merge import merge_small_charts, merged_stretch_limit
+from gdtool.unwrap.segment.overlaps import OverlapPiece, give_to_neighbours, remove_overlaps
+from gdtool.unwrap.segment.straight_cuts import connected_masks, sub_chart
 
-_WHOLE = 1.4  # stretch of all charts together over 1, in units of what is good for one: with more the worst are cut
-_MOST_RELIEVED = 16, 0.5  # charts that are cut for that: so many, and this share of all
+# Excess over 1 of the stretch of all charts together, in units of a single chart's good excess: beyond it the charts
+# that stretch most are cut.
+_MAX_TOTAL_EXCESS = 1.4
+_MAX_CUT, _MAX_CUT_SHARE = 16, 0.5  # charts cut for that reason: a fixed number, and a share of all charts
 _LATE = "was left when the time was over"
 
 
-@dataclass
-class Laid:
-    """charts (faces_idx, corners (k, 4), uv (c, 2) v up, triangles), corners into uv; `off`: sets of faces taken off
-    them, each with a face of the chart that it came off; how many were cut for each reason."""
+@dataclass(frozen=True)
+class FlattenLimits:
+    """When a chart is good enough, when it is cut, and when simpler ways take over.
 
-    charts: list[tuple] = field(default_factory=list)
-    off: list[tuple[int, np.ndarray]] = field(default_factory=list)
+    good_stretch: L2 stretch at which flattening stops; max_stretch: beyond which a chart is cut. project_after: time
+    (time.monotonic) from which the remaining charts are only projected to a plane; single_after: time from which each
+    remaining face becomes a chart.
+    """
+
+    good_stretch: float
+    max_stretch: float
+    project_after: float = np.inf
+    single_after: float = np.inf
+
+
+@dataclass
+class ParameterizedCharts:
+    """Flat charts, the pieces removed from them, and how many charts were cut for each reason."""
+
+    charts: list[Chart] = field(default_factory=list)
+    removed: list[OverlapPiece] = field(default_factory=list)
     cut: Counter = field(default_factory=Counter)
 
-    def add(self, more: Laid) -> None:
-        self.charts += more.charts
-        self.off += more.off
-        self.cut += more.cut
+    def add(self, other: ParameterizedCharts) -> None:
+        """Append the charts, pieces and counts of another."""
+        self.charts += other.charts
+        self.removed += other.removed
+        self.cut += other.cut
 
     def reasons(self) -> list[str]:
+        """Return one sentence for each reason to cut charts."""
         return [f"{count} charts were cut: a chart {reason}" for reason, count in self.cut.items()]
+
+
+@dataclass(frozen=True)
+class ChartMesh:
+    """The mesh whose charts are flattened.
+
+    vertices (v, 3), one for each fan of faces; faces (f, 4). label (f,): the chart of each face before merging. part
+    (f,): faces that stay together where a chart is cut, if they can.
+    """
+
+    adjacency: Adjacency
+    vertices: np.ndarray
+    faces: np.ndarray
+    label: np.ndarray
+    part: np.ndarray
 
 
 def flatten_all(
     vertices: np.ndarray,
     faces: np.ndarray,
     label: np.ndarray,
-    good_stretch: float,
-    max_stretch: float,
+    limits: FlattenLimits,
     proxy: tuple[np.ndarray, np.ndarray] | None = None,
-    by: tuple[float, float] = (np.inf, np.inf),
     part: np.ndarray | None = None,
-) -> tuple[list, list[str]]:
-    """Each chart of faces (f, 4), label (f,), laid flat, and what was cut: Laid.charts and a line for each reason.
+) -> tuple[list[Chart], list[str]]:
+    """Flatten each chart of faces (f, 4) with label (f,); return the charts and a sentence for each reason to cut.
 
-    proxy, vertices and triangles: a coarse mesh of the surface, on which joining is tried. Without one nothing is
-    joined and charts are laid flat by projection alone, cut until that works. by: when, on the clock time.monotonic,
-    projection alone goes on with what is left, and when each face of that becomes a chart. part (f,): what stays
-    together where a chart is cut, if it can."""
-    adjacency, part = Adjacency(vertices, faces), label if part is None else part
-    vertices, faces = one_vertex_per_fan(vertices, faces)
-
-    def further(sets: list[np.ndarray], **how: bool) -> Laid:
-        return lay(adjacency, vertices, faces, label, part, sets, good_stretch, max_stretch, by, **how)
-
+    proxy: vertices and triangles of a coarse mesh of the surface, on which merging is tried. Without one nothing is
+    merged, and charts are only projected to a plane and cut until that works. part (f,): see ChartMesh.
+    """
+    adjacency = Adjacency(vertices, faces)
+    mesh = ChartMesh(adjacency, *one_vertex_per_fan(vertices, faces), label, label if part is None else part)
     if proxy is None:
-        laid = further(_sets(label), projected=True)
-        return laid.charts, laid.reasons()
-    joined_label = joined(vertices, faces, label, *proxy, good_stretch) if time.monotonic() < by[0] else label
-    laid = further(_sets(joined_label), peeling=True)
-    if time.monotonic() < by[0]:
-        laid.off = onto_neighbours(adjacency, vertices, faces, laid.charts, laid.off, good_stretch)
-    laid.add(further([faces_idx for _, faces_idx in laid.off]))
-    if time.monotonic() < by[0]:
-        _relieve(adjacency, vertices, faces, part, laid, further, good_stretch)
-    return laid.charts, laid.reasons()
+        flat = parameterize(mesh, _faces_by_label(label), limits, project_only=True)
+        return flat.charts, flat.reasons()
+    merged = label
+    if time.monotonic() < limits.project_after:
+        merged = merge_small_charts(mesh.vertices, mesh.faces, label, *proxy, limits.good_stretch)
+    flat = parameterize(mesh, _faces_by_label(merged), limits, removes_overlaps=True)
+    if time.monotonic() < limits.project_after:
+        flat.removed = give_to_neighbours(
+            adjacency, mesh.vertices, mesh.faces, flat.charts, flat.removed, limits.good_stretch
+        )
+    flat.add(parameterize(mesh, [piece.faces_idx for piece in flat.removed], limits))
+    if time.monotonic() < limits.project_after:
+        _cut_most_stretched(mesh, flat, limits)
+    return flat.charts, flat.reasons()
 
 
-def lay(
-    adjacency: Adjacency,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    label: np.ndarray,
-    part: np.ndarray,
+def parameterize(
+    mesh: ChartMesh,
     sets: list[np.ndarray],
-    good_stretch: float,
-    max_stretch: float,
-    by: tuple[float, float] = (np.inf, np.inf),
+    limits: FlattenLimits,
     *,
-    peeling: bool = False,
-    projected: bool = False,
-) -> Laid:
-    """Sets of faces laid flat, cut where they do not lie so; a set of several labels (f,), joined, may stretch less and
-    comes apart first.
+    removes_overlaps: bool = False,
+    project_only: bool = False,
+) -> ParameterizedCharts:
+    """Flatten sets of faces, and cut those that do not lie flat.
 
-    part, by: as flatten_all()'s. peeling: take off what lies on other parts of a chart, where that is little.
-    projected: by projection alone."""
-    laid, queue = Laid(), sets[::-1]
+    A merged set of several labels may stretch less than a single one, and is taken apart first. removes_overlaps: where
+    little of a chart lies on other parts of it, only that is removed. project_only: projection to a plane alone.
+    """
+    flat, queue = ParameterizedCharts(), sets[::-1]
     while queue:
         faces_idx, now = queue.pop(), time.monotonic()
-        if now > by[1]:
-            laid.cut[_LATE] += len(faces_idx) > 1
-            laid.charts += _face_by_face(vertices, faces, faces_idx)
+        if now > limits.single_after:
+            flat.cut[_LATE] += len(faces_idx) > 1
+            flat.charts += _one_chart_per_face(mesh.vertices, mesh.faces, faces_idx)
             continue
-        if now > by[0]:
-            peeling, projected = False, True
-        parts = _sets(label[faces_idx])
-        points, corners = own_corners(vertices, faces[faces_idx])
+        if now > limits.project_after:
+            removes_overlaps, project_only = False, True
+        labels = _faces_by_label(mesh.label[faces_idx])
+        points, corners = chart_mesh(mesh.vertices, mesh.faces[faces_idx])
         triangles, face_idx = triangulated(corners)
-        if projected:
-            flat = Flat(onto_plane(points, triangles), "is not flat")
-        else:
-            flat = flatten(
-                points,
-                triangles.astype(np.int64),
-                good_stretch,
-                max_stretch if len(parts) == 1 else joined_stretch(good_stretch),
-            )
-        uv = flat.uv
-        if uv is None and len(parts) > 1:  # joined on the proxy, and do not lie flat together here
-            queue.extend(faces_idx[part] for part in parts)
+        result = _flatten_set(points, triangles, limits, is_merged=len(labels) > 1, project_only=project_only)
+        uv = result.uv
+        if uv is None and len(labels) > 1:  # flat together on the proxy, but not here
+            queue.extend(faces_idx[part] for part in labels)
             continue
         if uv is None and len(faces_idx) == 1:
-            uv = _alone(points, corners[0])
+            uv = _square_or_triangle(points, corners[0])
         if uv is not None:
-            laid.charts.append((faces_idx, corners, uv, triangles))
+            flat.charts.append(Chart(faces_idx, corners, uv, triangles))
             continue
-        laid.cut[flat.reason] += 1
-        keep = (
-            peel(adjacency, faces_idx, triangles, face_idx, flat.overlapped)
-            if peeling and flat.overlapped is not None
-            else None
-        )
-        if keep is not None:
-            largest, *others = sorted(connected(adjacency, faces_idx, keep), key=np.count_nonzero, reverse=True)
-            laid.charts.append(part_of((faces_idx, corners, flat.overlapped, triangles), largest))
-            home = int(laid.charts[-1][0][0])
-            laid.off += [(home, faces_idx[part]) for part in others + connected(adjacency, faces_idx, ~keep)]
+        flat.cut[result.reason] += 1
+        keep = None
+        if removes_overlaps and result.overlapped is not None:
+            keep = remove_overlaps(mesh.adjacency, faces_idx, triangles, face_idx, result.overlapped)
+        if keep is None:
+            queue.extend(_split_set(mesh.adjacency, mesh.part, faces_idx))
             continue
-        queue.extend(_halves(adjacency, part, faces_idx))
-    return laid
+        connected = connected_masks(mesh.adjacency, faces_idx, keep)
+        largest, *others = sorted(connected, key=np.count_nonzero, reverse=True)
+        flat.charts.append(sub_chart(Chart(faces_idx, corners, result.overlapped, triangles), largest))
+        home = int(flat.charts[-1].faces_idx[0])
+        others += connected_masks(mesh.adjacency, faces_idx, ~keep)
+        flat.removed += [OverlapPiece(home, faces_idx[mask]) for mask in others]
+    return flat
 
 
-def _relieve(
-    adjacency: Adjacency,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    part: np.ndarray,
-    laid: Laid,
-    further: Callable[[list[np.ndarray]], Laid],
-    good_stretch: float,
-) -> None:
-    """The charts that make all of them together stretch too much cut, in place, those that weigh most first; further:
-    lays the parts.
+def _flatten_set(
+    points: np.ndarray, triangles: np.ndarray, limits: FlattenLimits, is_merged: bool, project_only: bool
+) -> FlattenResult:
+    """Flatten one set of triangles, by projection alone or within the stretch that it may have."""
+    if project_only:
+        return FlattenResult(project_to_plane(points, triangles), "is not flat")
+    max_stretch = merged_stretch_limit(limits.good_stretch) if is_merged else limits.max_stretch
+    return flatten(points, triangles.astype(np.int64), limits.good_stretch, max_stretch)
 
-    The square of the whole's stretch is the mean of the charts' squares by area: each is laid at the scale of the
-    surface."""
-    most = _MOST_RELIEVED[0] + int(_MOST_RELIEVED[1] * len(laid.charts))
-    allowed = ((1 + _WHOLE * (good_stretch - 1)) ** 2 - 1) * float(adjacency.area.sum())
 
-    def excess(chart: tuple) -> float:
-        faces_idx, corners, uv, triangles = chart
-        points = np.zeros((len(uv), 3))
-        used = corners >= 0
-        points[corners[used]] = vertices[faces[faces_idx][used]]
-        value = stretch(points, triangles.astype(np.int64), uv) ** 2 - 1
-        return float(adjacency.area[faces_idx].sum()) * value if np.isfinite(value) else 0.0
+def _excess(mesh: ChartMesh, chart: Chart) -> float:
+    """Return a chart's area times the excess of its squared stretch over 1."""
+    points = np.zeros((len(chart.uv), 3))
+    used = chart.corners >= 0
+    points[chart.corners[used]] = mesh.vertices[mesh.faces[chart.faces_idx][used]]
+    value = stretch(points, chart.triangles.astype(np.int64), chart.uv) ** 2 - 1
+    return float(mesh.adjacency.area[chart.faces_idx].sum()) * value if np.isfinite(value) else 0.0
 
-    values = [excess(chart) for chart in laid.charts]
+
+def _cut_most_stretched(mesh: ChartMesh, flat: ParameterizedCharts, limits: FlattenLimits) -> None:
+    """Cut the charts that make all charts together stretch too much, in place, the worst first.
+
+    The square of the stretch of the whole is the mean of the charts' squares by area, because each chart is at the
+    scale of the surface.
+    """
+    max_cut = _MAX_CUT + int(_MAX_CUT_SHARE * len(flat.charts))
+    allowed = ((1 + _MAX_TOTAL_EXCESS * (limits.good_stretch - 1)) ** 2 - 1) * float(mesh.adjacency.area.sum())
+    values = [_excess(mesh, chart) for chart in flat.charts]
     total, gone = sum(values), set()
-    queue = [(-value, i) for i, value in enumerate(values) if value > 0 and len(laid.charts[i][0]) > 1]
+    queue = [(-value, i) for i, value in enumerate(values) if value > 0 and len(flat.charts[i].faces_idx) > 1]
     heapq.heapify(queue)
-    while total > allowed and len(gone) < most and queue:
-        # At once all those that have to be cut even if the parts of the worse ones do not stretch at all.
+    while total > allowed and len(gone) < max_cut and queue:
+        # Cut at once all charts that have to be cut even if the parts of the worse ones do not stretch at all.
         worst, rest = [], total
-        while rest > allowed and len(gone) + len(worst) < most and queue:
+        while rest > allowed and len(gone) + len(worst) < max_cut and queue:
             worst.append(heapq.heappop(queue))
             rest += worst[-1][0]
         gone.update(i for _, i in worst)
-        halves = further([half for _, i in worst for half in _halves(adjacency, part, laid.charts[i][0])])
-        values = [excess(chart) for chart in halves.charts]
+        sets = [half for _, i in worst for half in _split_set(mesh.adjacency, mesh.part, flat.charts[i].faces_idx)]
+        halves = parameterize(mesh, sets, limits)
+        values = [_excess(mesh, chart) for chart in halves.charts]
         total = rest + sum(values)
         for i, value in enumerate(values):
-            if value > 0 and len(halves.charts[i][0]) > 1:
-                heapq.heappush(queue, (-value, len(laid.charts) + i))
-        laid.add(halves)
-        laid.cut["stretches more than most"] += len(worst)
-    laid.charts = [chart for i, chart in enumerate(laid.charts) if i not in gone]
+            if value > 0 and len(halves.charts[i].faces_idx) > 1:
+                heapq.heappush(queue, (-value, len(flat.charts) + i))
+        flat.add(halves)
+        flat.cut["stretches more than most"] += len(worst)
+    flat.charts = [chart for i, chart in enumerate(flat.charts) if i not in gone]
 
 
-def _halves(adjacency: Adjacency, part: np.ndarray, faces_idx: np.ndarray) -> list[np.ndarray]:
-    """Two or more connected sets of a chart's faces, cut between its parts, part (f,), where it has several: they begin
-    and end at creases."""
-    half, area = bisect(adjacency, faces_idx), adjacency.area[faces_idx]
+def _split_set(adjacency: Adjacency, part: np.ndarray, faces_idx: np.ndarray) -> list[np.ndarray]:
+    """Split a chart's faces into two or more connected sets, between its parts where it has several.
+
+    part (f,): seams between parts begin and end at creases.
+    """
+    half, area = split_in_half(adjacency, faces_idx), adjacency.area[faces_idx]
     if half.all() or not half.any():
         half = np.arange(len(faces_idx)) < len(faces_idx) // 2
     place = np.unique(part[faces_idx], return_inverse=True)[1]
     share = np.bincount(place, area * half) / np.maximum(np.bincount(place, area), 1e-300)
-    # Some on each side, unless their shares are equal.
+    # Whole parts go to the side that has most of them; the clip leaves some on each side unless all shares are equal.
     whole = (share > np.clip(0.5, share.min(), np.nextafter(share.max(), 0)))[place]
     half = half if whole.all() else whole
-    number = adjacency.pieces(faces_idx, half)
+    number = adjacency.connected_sets(faces_idx, half)
     return [faces_idx[number == n] for n in range(number.max() + 1)]
 
 
-def _sets(label: np.ndarray) -> list[np.ndarray]:
-    """The places of each label, in the labels' order."""
+def _faces_by_label(label: np.ndarray) -> list[np.ndarray]:
+    """Return the indices of each label, in the order of the labels."""
     order = np.argsort(label, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
 
 
-def _face_by_face(vertices: np.ndarray, faces: np.ndarray, faces_idx: np.ndarray) -> list[tuple]:
-    """A chart of each of some faces (k,), seen along its normal; where it folds so, a square or right triangle of its
-    size."""
-    own = faces[faces_idx]
-    corner = vertices[np.where(own < 0, own[:, :1], own)]
+def _one_chart_per_face(vertices: np.ndarray, faces: np.ndarray, faces_idx: np.ndarray) -> list[Chart]:
+    """Make each of some faces (k,) a chart, seen along its normal.
+
+    A face that folds this way becomes a square or right triangle of its size.
+    """
+    own_faces = faces[faces_idx]
+    corner = vertices[np.where(own_faces < 0, own_faces[:, :1], own_faces)]
     x = corner[:, 1] - corner[:, 0]
     x /= np.maximum(np.linalg.norm(x, axis=1), 1e-300)[:, None]
-    y = np.cross(polygon_normals(vertices, own)[0], x)
+    y = np.cross(polygon_normals(vertices, own_faces)[0], x)
     uv = np.stack([np.einsum("kcd,kd->kc", corner, x), np.einsum("kcd,kd->kc", corner, y)], -1)
     charts = []
-    for face, used, flat, points in zip(faces_idx.tolist(), own >= 0, uv, corner, strict=True):
+    for face, used, flat, points in zip(faces_idx.tolist(), own_faces >= 0, uv, corner, strict=True):
         corners = np.where(used, np.arange(4), -1)[None]
         flat, triangles = flat[used], triangulated(corners)[0]
-        charts.append(
-            (
-                np.array([face]),
-                corners,
-                flat if upright(flat, triangles) else _alone(points[used], corners[0]),
-                triangles,
-            )
-        )
+        if not is_unfolded(flat, triangles):
+            flat = _square_or_triangle(points[used], corners[0])
+        charts.append(Chart(np.array([face]), corners, flat, triangles))
     return charts
 
 
-def _alone(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """One face on its own that will not lie flat (no area, or folded): a square or right triangle of its size."""
+def _square_or_triangle(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Return a square or right triangle (c, 2) of the size of a face that has no area or folds."""
     used = corners[corners >= 0]
     size = max(float(np.ptp(points, 0).max()), 1e-6)
     uv = np.zeros((len(points), 2))

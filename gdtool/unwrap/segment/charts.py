@@ -1,9 +1,10 @@
-"""Which faces of a quad mesh share a chart: xatlas on a simplified proxy, brought back to whole quads and tidied."""
+"""Segment a quad mesh into charts: run xatlas on a simplified proxy, transfer its charts to whole quads, tidy them."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,15 +14,23 @@ from gdtool.geometry.mesh_quality import polygon_normals
 from gdtool.geometry.repair import one_vertex_per_fan
 from gdtool.geometry.topology import edges_of, triangulated
 
-_PROXY_TRIANGLES = 6000
-_CREASE_DEGREES = 30.0
-_SHORTEST = 0.05  # seconds of a child
-_SMALLEST_SHARE = 0.003  # of the area; a smaller chart joins a neighbour if it has one
+_PROXY_TRIANGLES = 6000  # xatlas' time grows faster than the triangles; this many show where charts end
+_CREASE_DEGREES = 30.0  # edges that turn by more are creases ...
+_CREASE_COST = 0.1  # ... where a seam costs this share of its length
+_MIN_CHILD_SECONDS, _CHILD_MEMORY_MB = 0.05, 8000
+_MIN_CHART_SHARE = 0.003  # of the area: a smaller chart merges with a neighbour if it has one
+_MIN_CHART_FACES = 8  # so does a chart of fewer faces, or of one in 64 of a small mesh
+# What a face adds to the vote for its own label, in typical edge costs: for its first label, and for one it took on.
+_FIRST_BONUS, _LATER_BONUS = 0.4, 0.1
+_MAX_MERGES = 20  # rounds of merging small charts
+_CREASE_FACTOR = 5.0  # times longer is the way across a crease, so that halves part there
 
 
 def run_xatlas(vertices: np.ndarray, triangles: np.ndarray, max_cost: float) -> np.ndarray:
-    """(t,) chart of each triangle, by xatlas; runs in a child, because xatlas can hang. Triangles it drops have chart
-    -1."""
+    """Return (t,) the chart of each triangle by xatlas, -1 for triangles that it drops.
+
+    Runs in a child process, because xatlas can hang.
+    """
     xatlas = imported("xatlas")
     charts = xatlas.ChartOptions()
     charts.max_cost = max_cost
@@ -37,8 +46,11 @@ def run_xatlas(vertices: np.ndarray, triangles: np.ndarray, max_cost: float) -> 
 
 
 class Adjacency:
-    """Faces (k, 2) that share an edge, with what a seam along that edge costs (k,): its length, a tenth of it on
-    creases."""
+    """Pairs of faces that share an edge, and what a seam along that edge costs.
+
+    pairs (k, 2); cost (k,): the edge's length, a tenth of it on creases; crease (k,) bool; ends (k, 2) the edge's
+    vertices. area (f,) and normals (f, 3) of the faces; count of the faces.
+    """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
         edges = edges_of(faces)
@@ -48,18 +60,18 @@ class Adjacency:
         cosine = (normals[self.pairs[:, 0]] * normals[self.pairs[:, 1]]).sum(1)
         length = np.linalg.norm(vertices[self.ends[:, 0]] - vertices[self.ends[:, 1]], axis=1)
         self.crease = cosine < np.cos(np.radians(_CREASE_DEGREES))
-        self.cost = length * np.where(self.crease, 0.1, 1.0) + 1e-12
+        self.cost = length * np.where(self.crease, _CREASE_COST, 1.0) + 1e-12
         self.normals, self.count = normals, len(faces)
-        # Where the two faces walk the edge in one direction (a turned face) a chart cannot go on.
-        turned = edges.turned[edge_idx]
-        order = np.argsort(self.pairs[~turned][:, 0], kind="stable")
+        # A chart cannot continue across an edge that its two faces traverse in the same direction (a flipped face).
+        rotated_masks = edges.turned[edge_idx]
+        order = np.argsort(self.pairs[~rotated_masks][:, 0], kind="stable")
         self.pairs, self.cost, self.crease, self.ends = (
-            x[~turned][order] for x in (self.pairs, self.cost, self.crease, self.ends)
+            x[~rotated_masks][order] for x in (self.pairs, self.cost, self.crease, self.ends)
         )
         self._begin = np.searchsorted(self.pairs[:, 0], np.arange(self.count + 1))
 
     def within(self, faces_idx: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (r,) of the pairs whose two faces are both among faces_idx (k,), and their places (r, 2) there."""
+        """Return the rows (r,) of pairs whose faces are both among faces_idx (k,), and their indices (r, 2) there."""
         first, number = self._begin[faces_idx], self._begin[faces_idx + 1] - self._begin[faces_idx]
         rows = np.repeat(first - np.cumsum(number) + number, number) + np.arange(number.sum())
         place = np.full(self.count, -1)
@@ -68,9 +80,11 @@ class Adjacency:
         inside = (pairs >= 0).all(1)
         return rows[inside], pairs[inside]
 
-    def pieces(self, faces_idx: np.ndarray, side: np.ndarray | None = None) -> np.ndarray:
-        """(k,) number, from 0 on, of the set that each of faces_idx (k,) is connected in, through faces of faces_idx
-        alone, and where there are sides (k,), of its own."""
+    def connected_sets(self, faces_idx: np.ndarray, side: np.ndarray | None = None) -> np.ndarray:
+        """Number the connected sets of faces_idx (k,), from 0 on; return (k,) the number of each face.
+
+        side (k,): faces of different sides are not connected.
+        """
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
 
@@ -81,9 +95,8 @@ class Adjacency:
             coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(faces_idx),) * 2), False
         )[1]
 
-    def connected(self, label: np.ndarray) -> np.ndarray:
-        """Labels (f,) such that each is one connected set of faces: sets of one label that do not touch get their
-        own."""
+    def connected_labels(self, label: np.ndarray) -> np.ndarray:
+        """Return labels (f,) in which each connected set of faces of one label has a label of its own."""
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
 
@@ -92,9 +105,12 @@ class Adjacency:
         graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (self.count, self.count))
         return connected_components(graph, False)[1].astype(np.int64)
 
-    def votes(self, label: np.ndarray, own: np.ndarray | float) -> np.ndarray:
-        """(f,) the label around each face whose edges cost most to cut; own (f,) is added to the label it has."""
-        # A face among its own votes for its own label, whatever that costs.
+    def votes(self, label: np.ndarray, bonus: np.ndarray | float) -> np.ndarray:
+        """Return (f,) the label around each face whose edges would cost most to cut.
+
+        bonus (f,): added to the label that the face has.
+        """
+        # Faces inside a label would vote for it, so only those at a border are counted.
         apart = label[self.pairs[:, 0]] != label[self.pairs[:, 1]]
         border = np.zeros(self.count, bool)
         border[self.pairs[apart].ravel()] = True
@@ -103,7 +119,7 @@ class Adjacency:
         face = np.concatenate([self.pairs[near[:, 0], 0], self.pairs[near[:, 1], 1], faces_idx])
         vote = np.concatenate([label[self.pairs[near[:, 0], 1]], label[self.pairs[near[:, 1], 0]], label[faces_idx]])
         weight = np.concatenate(
-            [self.cost[near[:, 0]], self.cost[near[:, 1]], np.broadcast_to(own, self.count)[faces_idx]]
+            [self.cost[near[:, 0]], self.cost[near[:, 1]], np.broadcast_to(bonus, self.count)[faces_idx]]
         )
         width = int(label.max()) + 1
         key, inverse = np.unique(face * width + vote, return_inverse=True)
@@ -114,14 +130,27 @@ class Adjacency:
         return out
 
 
+class Segmentation(NamedTuple):
+    """Charts of a mesh.
+
+    label (f,): the connected chart of each face; part (f,): the part of its chart, a candidate for cutting; proxy: the
+    coarse mesh (vertices, triangles) that charts were found on; failed: sentences on what failed on the way.
+    """
+
+    label: np.ndarray
+    part: np.ndarray
+    proxy: tuple[np.ndarray, np.ndarray]
+    failed: list[str]
+
+
 def find_charts(
     adjacency: Callable[[], Adjacency], vertices: np.ndarray, faces: np.ndarray, *, until: float, max_cost: float
-) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray], list[str]]:
-    """(f,) chart of each face, all connected, (f,) its part of that, the coarse mesh (vertices, triangles) they were
-    found on, and what failed on the way.
+) -> Segmentation:
+    """Segment faces (f, 4) into charts, with xatlas or, where it fails, by the box side that faces look at.
 
-    vertices (v, 3) in a unit box, faces (f, 4), adjacency gives theirs; until: when to have given up, on the clock
-    time.monotonic. Without xatlas' help the faces go by the box side they look at."""
+    vertices (v, 3) in a unit box. adjacency: returns that of the faces. until: when xatlas is given up, on the clock
+    time.monotonic. max_cost: xatlas' limit on the cost of a chart.
+    """
     from gdtool.geometry.distance import closest_points
     from gdtool.geometry.simplify import simplify
 
@@ -133,7 +162,7 @@ def find_charts(
         _PROXY_TRIANGLES,
         measured=False,
         meanwhile=adjacency,
-        seconds=max(until - time.monotonic(), _SHORTEST),
+        seconds=max(until - time.monotonic(), _MIN_CHILD_SECONDS),
     )
     if report["method"] == "vertex clustering":
         proxy_vertices, proxy = vertices, triangles
@@ -143,8 +172,8 @@ def find_charts(
             proxy_vertices.astype(np.float32),
             proxy.astype(np.int32),
             max_cost,
-            seconds=max(until - time.monotonic(), _SHORTEST),
-            memory_mb=8000,
+            seconds=max(until - time.monotonic(), _MIN_CHILD_SECONDS),
+            memory_mb=_CHILD_MEMORY_MB,
         )
         centre = vertices[np.where(faces < 0, faces[:, :1], faces)].mean(1)
         label = chart[closest_points(centre, proxy_vertices, proxy)[1]]
@@ -156,13 +185,13 @@ def find_charts(
         axis = np.abs(normals).argmax(1)
         label = axis * 2 + (normals[np.arange(len(faces)), axis] < 0)
     label = np.where(label < 0, label.max() + 1, label)
-    return *tidy(adjacency(), label), (proxy_vertices, proxy.astype(np.int64)), failed
+    return Segmentation(*tidy_labels(adjacency(), label), (proxy_vertices, proxy.astype(np.int64)), failed)
 
 
-def own_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A chart's own vertices, those where it touches itself doubled, and its faces (k, 3) or (k, 4) into them.
+def chart_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices of some faces alone, those where the chart touches itself doubled, and the faces into them.
 
-    In the whole mesh each vertex has one fan of faces: a chart has parts of it that do not touch, or all of it.
+    faces (k, 3) or (k, 4). In the whole mesh each vertex must have one fan of faces.
     """
     used, corners = faces >= 0, np.full(faces.shape, -1, np.int64)
     vertex = faces[used]
@@ -171,7 +200,7 @@ def own_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np
     new = first[vertex] == np.arange(len(vertex))
     corners[used] = (np.cumsum(new) - 1)[first[vertex]]
     points = vertices[vertex[new]]
-    # An open fan has a corner more than edges between them; sorted, such an edge comes twice.
+    # A vertex has one more corner than inner edges for each open fan. Sorted keys repeat for inner edges.
     following = np.roll(corners, -1, 1)
     if faces.shape[1] == 4:
         following[:, 2] = np.where(used[:, 3], following[:, 2], corners[:, 0])
@@ -187,25 +216,28 @@ def own_corners(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np
     return one_vertex_per_fan(points, corners) if several else (points, corners)
 
 
-def tidy(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """Labels with short, straight seams that prefer creases, without islands too small to be a chart; and what these
-    charts were made of: labels from when each island had joined one neighbour."""
+def tidy_labels(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> tuple[np.ndarray, np.ndarray]:
+    """Smooth the seams between labels, prefer creases, and merge islands too small for a chart.
+
+    Returns labels (f,), and the labels from when each island had merged with one neighbour: the parts that charts are
+    made of.
+    """
     first = label
     typical = np.median(adjacency.cost) if len(adjacency.cost) else 0.0
     parity = (np.arange(adjacency.count) * 2654435761 >> 7) % 2
     for turn in range(rounds):
         # Half of the faces at a time: neighbours that change at once would swap for ever.
-        voted = adjacency.votes(label, np.where(first == label, 0.4, 0.1) * typical)
+        voted = adjacency.votes(label, np.where(first == label, _FIRST_BONUS, _LATER_BONUS) * typical)
         changing = (voted != label) & (parity == turn % 2)
         if not (voted != label).any():
             break
         label = np.where(changing, voted, label)
-    label = adjacency.connected(label)
-    part, smallest = label, _SMALLEST_SHARE * adjacency.area.sum()
-    for turn in range(20):
+    label = adjacency.connected_labels(label)
+    part, smallest = label, _MIN_CHART_SHARE * adjacency.area.sum()
+    for turn in range(_MAX_MERGES):
         area = np.bincount(label, adjacency.area)
         faces = np.bincount(label)
-        small = (area < smallest) | (faces < min(8, adjacency.count // 64))
+        small = (area < smallest) | (faces < min(_MIN_CHART_FACES, adjacency.count // 64))
         # A small set goes whole to the neighbour with which it shares the most costly seam.
         a, b = label[adjacency.pairs].T
         apart = a != b
@@ -216,27 +248,28 @@ def tidy(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> tuple[np.
             break
         key, inverse = np.unique(pair[mine][:, 0] * len(area) + pair[mine][:, 1], return_inverse=True)
         total = np.bincount(inverse.ravel(), weight[mine])
-        onto = np.arange(len(area))
+        merged_into = np.arange(len(area))
         for k in np.argsort(total, kind="stable").tolist():
-            onto[key[k] // len(area)] = key[k] % len(area)
+            merged_into[key[k] // len(area)] = key[k] % len(area)
         # Two small neighbours must not swap: only toward the larger, or the lower number.
-        target = onto
+        target = merged_into
         swap = (target[target] == np.arange(len(area))) & (target > np.arange(len(area)))
-        onto = np.where(swap, np.arange(len(area)), target)
-        label = adjacency.connected(onto[label])
+        merged_into = np.where(swap, np.arange(len(area)), target)
+        label = adjacency.connected_labels(merged_into[label])
         part = label if turn == 0 else part
     return label, part
 
 
-def bisect(adjacency: Adjacency, faces_idx: np.ndarray) -> np.ndarray:
-    """(k,) bool: a split of a chart's faces (k,) in two connected halves, between two faces far from each other."""
+def split_in_half(adjacency: Adjacency, faces_idx: np.ndarray) -> np.ndarray:
+    """Split a chart's faces (k,) into two connected halves, between two faces far from each other; return (k,) bool."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
 
     inside, pairs = adjacency.within(faces_idx)
-    # Across a crease is far: halves part there when they can.
     size = np.sqrt(adjacency.area[faces_idx])
-    length = (size[pairs[:, 0]] + size[pairs[:, 1]]) / 2 * np.where(adjacency.crease[inside], 5.0, 1.0) + 1e-12
+    length = (size[pairs[:, 0]] + size[pairs[:, 1]]) / 2 * np.where(
+        adjacency.crease[inside], _CREASE_FACTOR, 1.0
+    ) + 1e-12
     a, b = pairs.T
     graph = coo_matrix(
         (np.concatenate([length, length]), (np.concatenate([a, b]), np.concatenate([b, a]))), (len(faces_idx),) * 2
@@ -246,7 +279,7 @@ def bisect(adjacency: Adjacency, faces_idx: np.ndarray) -> np.ndarray:
         distance = dijkstra(graph, indices=start)
         return int(np.where(np.isfinite(distance), distance, -1).argmax()), distance
 
-    one, _ = far_from(0)
-    two, from_one = far_from(one)
-    _, from_two = far_from(two)
-    return from_two < from_one
+    first, _ = far_from(0)
+    second, from_first = far_from(first)
+    _, from_second = far_from(second)
+    return from_second < from_first

@@ -1,4 +1,4 @@
-"""Small charts joined to neighbours that they lie flat with, tried on a coarse mesh of the surface."""
+"""Merge small charts with neighbours that they lie flat with; tried on a coarse proxy of the surface."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import numpy as np
 from gdtool.geometry.mesh_quality import polygon_normals
 from gdtool.geometry.repair import one_vertex_per_fan
 from gdtool.unwrap.parameterize.flatten import flatten
-from gdtool.unwrap.segment.charts import Adjacency, own_corners
+from gdtool.unwrap.segment.charts import Adjacency, chart_mesh
 
-_JOINS = 40  # attempts to join two charts
-_JOIN_SHARE = 0.02  # charts smaller than this share of the area are joined to others
+_MAX_ATTEMPTS = 40  # to merge two charts
+_SMALL_SHARE = 0.02  # of the area: charts smaller than this are merged
 
 
-def joined_stretch(good_stretch: float) -> float:
-    """What a chart made of two may stretch, where good_stretch is good for one."""
+def merged_stretch_limit(good_stretch: float) -> float:
+    """Return how much a chart merged from two may stretch, where good_stretch is good for one."""
     return 1 + 2 * (good_stretch - 1)
 
 
-def joined(
+def merge_small_charts(
     vertices: np.ndarray,
     faces: np.ndarray,
     label: np.ndarray,
@@ -26,43 +26,47 @@ def joined(
     proxy: np.ndarray,
     good_stretch: float,
 ) -> np.ndarray:
-    """Labels (f,) of faces (f, 4) with small charts joined to the neighbour with the longest common seam, where the two
-    lie flat together on the proxy, triangles (t, 3) of the same surface."""
+    """Merge small charts into the neighbour with the longest common seam, where the two lie flat together.
+
+    That is tried on the proxy, triangles (t, 3) of the same surface. Returns labels (f,) of faces (f, 4).
+    """
     proxy_vertices, proxy = one_vertex_per_fan(proxy_vertices, proxy)
     adjacency = Adjacency(proxy_vertices, np.concatenate([proxy, np.full((len(proxy), 1), -1)], 1))
-    place = _brought_over(vertices, faces, label, proxy_vertices, proxy, adjacency)
-    total, count, most = adjacency.area.sum(), int(label.max()) + 1, joined_stretch(good_stretch)
-    onto = np.arange(count)
+    proxy_label = _transfer_labels(vertices, faces, label, proxy_vertices, proxy, adjacency)
+    total, count, max_stretch = adjacency.area.sum(), int(label.max()) + 1, merged_stretch_limit(good_stretch)
+    merged_into = np.arange(count)
     tried: set[tuple[int, int]] = set()
-    for _ in range(_JOINS):
-        a, b = place[adjacency.pairs].T
-        apart = (a != b) & (a >= 0) & (b >= 0)
-        pair = np.sort(np.stack([a, b], -1)[apart], 1)
+    for _ in range(_MAX_ATTEMPTS):
+        a, b = proxy_label[adjacency.pairs].T
+        is_seam = (a != b) & (a >= 0) & (b >= 0)
+        pair = np.sort(np.stack([a, b], -1)[is_seam], 1)
         if not len(pair):
             break
         key, inverse = np.unique(pair[:, 0] * count + pair[:, 1], return_inverse=True)
         # Seams in the open count ten times those on creases (Adjacency.cost).
-        seam = np.bincount(inverse.ravel(), adjacency.cost[apart])
-        area = np.bincount(place[place >= 0], adjacency.area[place >= 0], count)
-        one, two = key // count, key % count
-        smaller = np.minimum(area[one], area[two])
-        worth = np.where(smaller < _JOIN_SHARE * total, seam / np.sqrt(smaller + 1e-300), 0)
-        for k in np.argsort(-worth, kind="stable").tolist():
-            if worth[k] > 0 and (int(one[k]), int(two[k])) not in tried:
+        seam = np.bincount(inverse.ravel(), adjacency.cost[is_seam])
+        area = np.bincount(proxy_label[proxy_label >= 0], adjacency.area[proxy_label >= 0], count)
+        first, second = key // count, key % count
+        smaller = np.minimum(area[first], area[second])
+        priority = np.where(smaller < _SMALL_SHARE * total, seam / np.sqrt(smaller + 1e-300), 0)
+        for k in np.argsort(-priority, kind="stable").tolist():
+            if priority[k] > 0 and (int(first[k]), int(second[k])) not in tried:
                 break
         else:
             break
-        i, j = int(one[k]), int(two[k])
+        i, j = int(first[k]), int(second[k])
         tried.add((i, j))
-        points, triangles = own_corners(proxy_vertices, proxy[(place == i) | (place == j)])
-        if flatten(points, triangles, most, most).uv is not None:  # better than good enough is not asked
-            place[place == j] = i
-            onto[onto == j] = i
+        points, triangles = chart_mesh(proxy_vertices, proxy[(proxy_label == i) | (proxy_label == j)])
+        if (
+            flatten(points, triangles, max_stretch, max_stretch).uv is not None
+        ):  # flattening may stop as soon as it is good enough
+            proxy_label[proxy_label == j] = i
+            merged_into[merged_into == j] = i
             tried = {pair for pair in tried if i not in pair and j not in pair}
-    return onto[label]
+    return merged_into[label]
 
 
-def _brought_over(
+def _transfer_labels(
     vertices: np.ndarray,
     faces: np.ndarray,
     label: np.ndarray,
@@ -70,18 +74,22 @@ def _brought_over(
     proxy: np.ndarray,
     adjacency: Adjacency,
 ) -> np.ndarray:
-    """(t,) label of the face nearest to each triangle of the proxy and facing like it; -1 beside each label's largest
-    piece."""
+    """Return (t,) the label of the nearest face that faces the same way, for each triangle of the proxy.
+
+    -1 outside each label's largest connected piece.
+    """
     from scipy.spatial import cKDTree
 
     normals, area = polygon_normals(vertices, faces)
-    # Opposite sides of a wall thinner than this are told apart by where they face.
-    reach = 2 * float(np.sqrt(area.mean()))
+    # Normals, weighted by this distance, tell the two sides of a thin wall apart.
+    normal_weight = 2 * float(np.sqrt(area.mean()))
     centres = vertices[np.where(faces < 0, faces[:, :1], faces)].mean(1)
-    tree = cKDTree(np.concatenate([centres, reach * normals], 1))
-    place = label[tree.query(np.concatenate([proxy_vertices[proxy].mean(1), reach * adjacency.normals], 1))[1]]
-    pieces = adjacency.connected(place)
+    tree = cKDTree(np.concatenate([centres, normal_weight * normals], 1))
+    proxy_label = label[
+        tree.query(np.concatenate([proxy_vertices[proxy].mean(1), normal_weight * adjacency.normals], 1))[1]
+    ]
+    pieces = adjacency.connected_labels(proxy_label)
     size = np.bincount(pieces, adjacency.area)
     largest = np.zeros(int(label.max()) + 1)
-    np.maximum.at(largest, place, size[pieces])
-    return np.where(size[pieces] < largest[place], -1, place)
+    np.maximum.at(largest, proxy_label, size[pieces])
+    return np.where(size[pieces] < largest[proxy_label], -1, proxy_label)

@@ -1,4 +1,4 @@
-"""Flat charts cut where that makes them pack better: rings into arcs, thin arms off."""
+"""Cut flat charts along straight lines where that makes them pack better: rings into arcs, thin arms off."""
 
 from __future__ import annotations
 
@@ -6,38 +6,41 @@ import heapq
 import itertools
 from collections.abc import Iterator
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from gdtool.geometry.topology import triangulated
+from gdtool.unwrap.chart import Chart
 from gdtool.unwrap.segment.charts import Adjacency
 
-_ANGLES = np.radians(np.arange(0, 180, 15.0))
-_OFFSETS = np.linspace(0.06, 0.94, 23)
-_WORTH = 0.003  # of all area, that rectangles around the charts have to lose for each chart that a cut adds
-_TRIED = 16  # lines, best first
-_SEEN = 1000  # faces of a chart that its rectangles are taken around
-_SMALLEST = 0.004  # of all area, that a part has to have
+_ANGLES = np.radians(np.arange(0, 180, 15.0))  # directions across the lines that are tried
+_OFFSETS = np.linspace(0.06, 0.94, 23)  # positions of the lines, in shares of the chart's span
+_MIN_GAIN = 0.003  # of all area, that rectangles around the charts have to lose for each chart that a cut adds
+_MAX_LINES = 16  # lines tried on the faces, best first
+_MAX_SAMPLES = 1000  # faces of a chart that its rectangles are taken around
+_MIN_PART = 0.004  # of all area, that a part has to have
 
 
-def cut_to_pack(adjacency: Adjacency, charts: list, counts: list[int]) -> Iterator[list]:
-    """Charts (faces_idx, corners, uv, triangles) with the ill-shaped ones cut along straight lines of their plane, as
-    far as the quads allow: for each of the rising counts a list of about so many charts, until no cut is worth it.
+def cut_to_pack(adjacency: Adjacency, charts: list[Chart], counts: list[int]) -> Iterator[list[Chart]]:
+    """Cut ill-shaped charts along straight lines of their plane, as far as the quads allow.
 
-    First come the cuts for which the smallest rectangles around the charts lose most, for each chart added. Texture
-    coordinates stay: parts of what is flat are flat."""
+    Yields for each of the rising counts a list of about that many charts, until no cut is worth it. First come the cuts
+    for which the smallest rectangles around the charts lose most area for each chart added. Texture coordinates stay:
+    parts of a flat chart are flat.
+    """
     total = float(adjacency.area.sum())
-    number = itertools.count()  # of equal ones the earlier
+    number = itertools.count()  # of equal cuts the earlier comes first
     whole, queue = [], []
 
-    def add(piece: _Piece) -> None:
-        if piece.rate < _WORTH * total:
+    def add(piece: _CutCandidate) -> None:
+        if piece.rate < _MIN_GAIN * total:
             whole.append(piece.chart)
         else:
             heapq.heappush(queue, (-piece.rate, next(number), piece))
 
     for chart in charts:
-        add(_Piece(adjacency, chart, _SMALLEST * total))
+        add(_CutCandidate(adjacency, chart, _MIN_PART * total))
     for count in counts:
         changed = False
         while queue and len(whole) + len(queue) < count:
@@ -45,76 +48,92 @@ def cut_to_pack(adjacency: Adjacency, charts: list, counts: list[int]) -> Iterat
                 add(part)
             changed = True
         if changed:
-            yield whole + [piece.chart for _, _, piece in sorted(queue, key=lambda one: one[1])]
+            yield whole + [piece.chart for _, _, piece in sorted(queue, key=lambda entry: entry[1])]
 
 
-class _Piece:
+class _CutCandidate:
     """A chart, and how it would be cut."""
 
-    def __init__(self, adjacency: Adjacency, chart: tuple, smallest: float):
+    def __init__(self, adjacency: Adjacency, chart: Chart, smallest: float):
         self._adjacency, self.chart, self._smallest = adjacency, chart, smallest
 
     @cached_property
-    def cut(self) -> tuple[float, list[_Piece]] | None:
-        """What the rectangles around its parts have less than its own, and these, two or three; None where no cut will
-        do."""
-        found = _halves(self._adjacency, self.chart, self._smallest)
-        return found and (
-            found[0],
-            [_Piece(self._adjacency, part_of(self.chart, half), self._smallest) for half in found[1]],
+    def cut(self) -> tuple[float, list[_CutCandidate]] | None:
+        """The best cut: the area that rectangles lose by it, and its two or three parts; None where no cut will do."""
+        best = _best_cut(self._adjacency, self.chart, self._smallest)
+        return best and (
+            best[0],
+            [_CutCandidate(self._adjacency, sub_chart(self.chart, half), self._smallest) for half in best[1]],
         )
 
     @cached_property
     def rate(self) -> float:
-        """The area that rectangles lose for each chart that is added, by this cut or by it and those of its parts: a
-        ring's halves save nothing, their halves do."""
+        """The area that rectangles lose for each chart added, by this cut, or by it and the cuts of its parts.
+
+        The halves of a ring save nothing, their halves do.
+        """
         if self.cut is None:
             return -np.inf
-        saved, added = self.cut[0], len(self.cut[1]) - 1
-        more = [part.cut for part in self.cut[1] if part.cut is not None and part.cut[0] > 0]
+        gained, charts_added = self.cut[0], len(self.cut[1]) - 1
+        further_cuts = [part.cut for part in self.cut[1] if part.cut is not None and part.cut[0] > 0]
         return max(
-            saved / added, (saved + sum(one for one, _ in more)) / (added + sum(len(parts) - 1 for _, parts in more))
+            gained / charts_added,
+            (gained + sum(gain for gain, _ in further_cuts))
+            / (charts_added + sum(len(parts) - 1 for _, parts in further_cuts)),
         )
 
 
-def _halves(adjacency: Adjacency, chart: tuple, smallest: float) -> tuple[float, list[np.ndarray]] | None:
-    """The area that rectangles lose by a cut of the chart, and masks (k,) of its faces, two or three, each connected;
-    None where none will do. Of straight lines the one is taken for which the rectangles are smallest."""
+class _Line(NamedTuple):
+    """A straight cut: area of the rectangles around both sides, distance of each face across it, and its offset."""
+
+    area: float
+    across: np.ndarray
+    offset: float
+
+
+def _best_cut(adjacency: Adjacency, chart: Chart, smallest: float) -> tuple[float, list[np.ndarray]] | None:
+    """Find the straight line for which the rectangles around the parts are smallest.
+
+    Returns the area that rectangles lose by the cut, and masks (k,) of the faces of its two or three connected parts;
+    None where no line leaves parts of at least `smallest`.
+    """
     faces_idx, corners, uv, _ = chart
     area = adjacency.area[faces_idx]
     if area.sum() < 2 * smallest:
         return None
     centre = uv[np.where(corners < 0, corners[:, :1], corners)].mean(1)
-    # Rectangles around the faces' centres: their rims lie half a face farther out.
+    # Rectangles are taken around face centres: the rim of a chart lies half a face farther out.
     rim = float(np.sqrt(area.mean()))
     across = np.stack([centre @ (np.cos(a), np.sin(a)) for a in _ANGLES])
-    sample = across[:, :: -(-len(area) // _SEEN)]
-    whole = float(_rectangles(np.ptp(sample, 1) + rim))
-    found = []
+    sample = across[:, :: -(-len(area) // _MAX_SAMPLES)]
+    whole = float(_rectangle_area(np.ptp(sample, 1) + rim))
+    lines: list[_Line] = []
     for row, seen in zip(across, sample, strict=True):
-        line = row.min() + _OFFSETS * np.ptp(row)
-        # Before each line.
-        covered = np.bincount(np.searchsorted(line, row, "right"), area, len(line) + 1).cumsum()[:-1]
+        offsets = row.min() + _OFFSETS * np.ptp(row)
+        area_before = np.bincount(np.searchsorted(offsets, row, "right"), area, len(offsets) + 1).cumsum()[:-1]
         order = np.argsort(seen, kind="stable")
-        count = np.searchsorted(seen[order], line, "left")
-        good = (count > 0) & (count < len(seen)) & (np.minimum(covered, area.sum() - covered) >= smallest)
+        count = np.searchsorted(seen[order], offsets, "left")
+        good = (count > 0) & (count < len(seen)) & (np.minimum(area_before, area.sum() - area_before) >= smallest)
         if good.any():
-            before, behind = _spans(sample.take(order, 1), count[good])
-            cost = _rectangles(before + rim) + _rectangles(behind + rim)
-            found += [(float(c), row, place) for c, place in zip(cost, line[good], strict=True)]
-    found.sort(key=lambda one: one[0])
+            before, behind = _prefix_suffix_spans(sample.take(order, 1), count[good])
+            cost = _rectangle_area(before + rim) + _rectangle_area(behind + rim)
+            lines += [_Line(float(c), row, offset) for c, offset in zip(cost, offsets[good], strict=True)]
+    lines.sort(key=lambda line: line.area)
     _, pairs = adjacency.within(faces_idx)
-    for cost, row, place in found[:_TRIED]:
-        number = _pieces(pairs, row < place, area, smallest)
-        # A line across a ring leaves two arcs on one side: three parts are well, crumbs are not.
+    for line in lines[:_MAX_LINES]:
+        number = _connected_sides(pairs, line.across < line.offset, area, smallest)
+        # A line across a ring leaves two arcs on one side: three parts are fine, crumbs are not.
         if 1 < number.max() + 1 <= 3 and np.bincount(number, area).min() >= smallest:
-            return whole - cost, [number == n for n in range(number.max() + 1)]
+            return whole - line.area, [number == n for n in range(number.max() + 1)]
     return None
 
 
-def _pieces(pairs: np.ndarray, half: np.ndarray, area: np.ndarray, smallest: float) -> np.ndarray:
-    """(k,) number, from 0 on, of the connected part of its side, half (k,) bool, that each face is in; pairs (r, 2) of
-    faces share an edge. Parts below `smallest`, which a line leaves along a rim that is not straight, change sides."""
+def _connected_sides(pairs: np.ndarray, half: np.ndarray, area: np.ndarray, smallest: float) -> np.ndarray:
+    """Return (k,) the connected part of its side that each face is in, numbered from 0 on.
+
+    half (k,) bool: the side; pairs (r, 2) of faces share an edge. Parts below `smallest`, which a line leaves along a
+    rim that is not straight, change sides.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -130,9 +149,10 @@ def _pieces(pairs: np.ndarray, half: np.ndarray, area: np.ndarray, smallest: flo
     return number
 
 
-def _spans(values: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far values (a, n) spread before each of the rising counts (c,), 0 < count < n, and from it on: (a, c)
-    both."""
+def _prefix_suffix_spans(values: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the spans of values (a, n) before each of the rising counts (c,), 0 < count < n, and from it on: (a, c)
+    each.
+    """
     first, at = np.unique(np.append(0, counts), return_inverse=True)
     high, low = np.maximum.reduceat(values, first, 1), np.minimum.reduceat(values, first, 1)
     before = np.maximum.accumulate(high, 1) - np.minimum.accumulate(low, 1)
@@ -140,24 +160,24 @@ def _spans(values: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return before[:, at[1:] - 1], behind[:, ::-1][:, at[1:]]
 
 
-def _rectangles(spans: np.ndarray) -> np.ndarray:
-    """Area of the smallest of the rectangles that have spans (angles, …) along _ANGLES."""
+def _rectangle_area(spans: np.ndarray) -> np.ndarray:
+    """Return the area of the smallest rectangle that has spans (angles, ...) along _ANGLES."""
     quarter = len(_ANGLES) // 2
     return (spans[:quarter] * spans[quarter:]).min(0)
 
 
-def connected(adjacency: Adjacency, faces_idx: np.ndarray, side: np.ndarray) -> list[np.ndarray]:
-    """The connected parts of a side (k,) of faces (k,), as masks (k,)."""
+def connected_masks(adjacency: Adjacency, faces_idx: np.ndarray, side: np.ndarray) -> list[np.ndarray]:
+    """Return the connected parts of a side (k,) bool of faces (k,), as masks (k,)."""
     number = np.full(len(side), -1)
-    number[side] = adjacency.pieces(faces_idx[side])
+    number[side] = adjacency.connected_sets(faces_idx[side])
     return [number == n for n in range(number.max() + 1)]
 
 
-def part_of(chart: tuple, half: np.ndarray) -> tuple:
-    """A chart (faces_idx, corners, uv, triangles) of some of its faces (k,) bool, which stay where they lie."""
+def sub_chart(chart: Chart, half: np.ndarray) -> Chart:
+    """Return the chart of some faces (k,) bool of a chart; their coordinates stay."""
     faces_idx, corners, uv, _ = chart
     used, local = np.unique(corners[half], return_inverse=True)
     local = local.reshape(-1, 4)
     if used[0] < 0:
         used, local = used[1:], local - 1
-    return faces_idx[half], local, uv[used], triangulated(local)[0]
+    return Chart(faces_idx[half], local, uv[used], triangulated(local)[0])

@@ -1,0 +1,167 @@
+"""Choose how the faces of a mesh are made: by decimation, or as quads of a count, within a distance, or mirrored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from gdtool.geometry import mesh_quality
+from gdtool.geometry.simplify import simplify
+from gdtool.geometry.topology import triangulated
+from gdtool.remesh.face_budget import coarsest_within
+from gdtool.remesh.limits import COUNT_TOLERANCE, QUADS_OF_A_PIECE, TRIANGLES_OF_A_PIECE
+from gdtool.remesh.pipeline import remesh
+from gdtool.remesh.symmetry import AXES, mirror_plane, remesh_mirrored
+from gdtool.remesh.task import Record, Request, count_reason
+
+PASSED_THROUGH = "passed through"  # the engine that the manifest names where nothing was remeshed
+_DISTANCE_SAMPLES = 20000  # points of each surface for the distances in the report
+
+Step = Callable[[str], AbstractContextManager]
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What a mesh is made for.
+
+    triangles: how many to decimate to, 0 for quads. max_deviation: distance from the surface within which the fewest
+    quads are sought, 0 for request.quads. symmetry: "none", "auto", or the axis across which halves are mirrored.
+    """
+
+    request: Request
+    triangles: int = 0
+    max_deviation: float = 0.0
+    symmetry: str = "none"
+
+
+@dataclass
+class MadeMesh:
+    """A mesh, the record of how it was made, sentences to warn of, and (what, why) of skipped work.
+
+    vertices (v, 3); faces (f, 4), -1 as a triangle's fourth corner.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    record: Record
+    warnings: list[str] = field(default_factory=list)
+    skipped: list[tuple[str, str]] = field(default_factory=list)
+
+
+def make_mesh(vertices: np.ndarray, faces: np.ndarray, goal: Goal, step: Step) -> MadeMesh:
+    """Make the faces of a clean triangle mesh, vertices (v, 3) in a unit box, faces (f, 3).
+
+    step: a context manager that times a named step.
+    """
+    return (_decimated if goal.triangles else _quads)(vertices, faces, goal, step)
+
+
+def passed_through(vertices: np.ndarray, quads: np.ndarray) -> MadeMesh:
+    """Return quads that are taken from the input as they are."""
+    return MadeMesh(vertices, quads, Record(engine=PASSED_THROUGH))
+
+
+def repair_warnings(repairs: dict[str, int | bool], closed: bool) -> list[str]:
+    """Return sentences on what repair.clean() repaired, and on an open surface."""
+    warnings = []
+    if repairs:
+        names = {name: name.replace("_", " ") for name in repairs}
+        counts = (
+            names[name] if isinstance(value, bool) else f"{value} {names[name]}" for name, value in repairs.items()
+        )
+        warnings.append("repaired " + ", ".join(counts))
+    if not closed:
+        warnings.append("the surface is open; its boundaries are kept")
+    return warnings
+
+
+def report_figures(made: MadeMesh, vertices: np.ndarray, faces: np.ndarray) -> dict:
+    """Return the report: the record's figures, topology, shape, and distances to the triangles that were remeshed."""
+    figures = (
+        made.record.figures
+        | mesh_quality.topology_figures(made.vertices, made.faces)
+        | mesh_quality.shape_figures(made.vertices, made.faces)
+    )
+    if made.record.engine != PASSED_THROUGH:
+        figures |= mesh_quality.distance_figures(
+            made.vertices,
+            triangulated(made.faces)[0],
+            vertices,
+            faces,
+            _DISTANCE_SAMPLES,
+            source=made.record.source,
+        )
+    return figures
+
+
+def count_warning(made: MadeMesh, faces: np.ndarray, goal: Goal) -> str | None:
+    """Return a sentence on why there are more or fewer faces than requested; None where the count is right.
+
+    faces (f, 3): the triangles that were remeshed. Fewer triangles than --triangles are right.
+    """
+    count = len(made.faces)
+    asked = goal.triangles or (count if goal.max_deviation else goal.request.quads)
+    if made.record.engine == PASSED_THROUGH or abs(count / asked - 1) <= COUNT_TOLERANCE:
+        return None
+    if goal.triangles and count <= asked:
+        return None
+    of_a_piece = TRIANGLES_OF_A_PIECE if goal.triangles else QUADS_OF_A_PIECE
+    why = count_reason(faces, count, asked, made.record.failed, of_a_piece)
+    return f"{count} faces, not the {asked} asked for: {why}"
+
+
+def _decimated(vertices: np.ndarray, faces: np.ndarray, goal: Goal, step: Step) -> MadeMesh:
+    """Decimate to goal.triangles triangles."""
+    with step("simplify"):
+        vertices, faces, _, report = simplify(vertices, faces, goal.triangles, seconds=goal.request.seconds, near=True)
+    record = Record(engine=report["method"], figures={"simplify_error": report["error"]})
+    corners = np.concatenate([faces, np.full((len(faces), 1), -1)], 1)
+    return MadeMesh(
+        vertices,
+        corners,
+        record,
+        [f"simplify: {report['failed']}"] if "failed" in report else [],
+        [("symmetry", "--triangles decimates the whole")] if goal.symmetry != "none" else [],
+    )
+
+
+def _quads(vertices: np.ndarray, faces: np.ndarray, goal: Goal, step: Step) -> MadeMesh:
+    """Make quads of the requested count, or the fewest within goal.max_deviation."""
+    make_quads, figures, skipped = _with_symmetry(vertices, faces, goal, step)
+    warnings = []
+    if goal.max_deviation:
+        vertices, quads, record, reached = coarsest_within(
+            vertices, faces, goal.request, goal.max_deviation, make_quads
+        )
+        if reached > goal.max_deviation:
+            warnings.append(
+                f"{reached:.2g} from the surface with {len(quads)} quads, farther than --max-deviation; "
+                "allow more --faces"
+            )
+    else:
+        vertices, quads, record = make_quads(vertices, faces, goal.request)
+    record.figures |= figures
+    return MadeMesh(vertices, quads, record, warnings, skipped)
+
+
+def _with_symmetry(
+    vertices: np.ndarray, faces: np.ndarray, goal: Goal, step: Step
+) -> tuple[Callable[..., tuple], dict[str, float | str], list[tuple[str, str]]]:
+    """Return the function that makes the quads, figures of the mirror plane, and what is skipped and why."""
+    if goal.symmetry == "none":
+        return remesh, {}, []
+    with step("find the mirror plane"):
+        axis, distances = mirror_plane(
+            vertices, faces, goal.request.quads, AXES if goal.symmetry == "auto" else goal.symmetry
+        )
+    figures = {f"mirror_{name}_deviation": value for name, value in distances.items()}
+    if axis is not None:
+        return partial(remesh_mirrored, axis=axis), figures, []
+    why = "no half is the other's mirror image: " + ", ".join(
+        f"{value:.2g} apart across {name}" for name, value in distances.items()
+    )
+    return remesh, figures | {"symmetry": "none"}, [("symmetry", why)]
