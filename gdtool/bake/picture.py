@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.cameras import Camera, project
-from gdtool.fields.views.prepared_view import bilinear
 from gdtool.images.detail import DARK, detail_gain
 from gdtool.images.metrics import resized
+from gdtool.images.sampling import bilinear
 
 MOST = 4.0  # as a factor, and one over it the least
 

@@ -12,11 +12,9 @@ import msgspec
 from msgspec import Meta
 
 from gdtool.cameras.camera import SIX_VIEWS
+from gdtool.core.kinds import DOMAINS
 from gdtool.core.names import text_fault
 
-# The order of the domains is the order of the one-hot switcher and of every (…, domain, view, …) axis; color is
-# primary.
-DOMAINS = ("color", "normal", "depth", "albedo", "roughness", "metallic")
 # Wonder3D's [elevation of the condition, view's elevation, view's azimuth] and our six labels, as sin and cos each.
 CLASS_WIDTH = 2 * (3 + len(DOMAINS))
 

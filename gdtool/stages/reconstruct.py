@@ -86,7 +86,7 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         SMALL,
         align_depth,
         finest_pixel,
-        fuse_within,
+        fuse_within_budget,
         grid_step,
         is_closed_manifold,
         prepare_all,
@@ -111,27 +111,27 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         depth = _depth(views, out)
         alike = ("albedo", "color") if "depth" in views.images else ("albedo", "color", "normal")
         colors = [views.images[domain] for domain in alike if domain in views.images]
-        sights, before, noise = align_depth(views.cameras, views.mask, depth, normal, step, clock, log.status, colors)
-        agreed = agreement(sights)
+        prepared, before, noise = align_depth(views.cameras, views.mask, depth, normal, step, clock, log.status, colors)
+        agreed = agreement(prepared)
         if agreed < LEAST_AGREEMENT:
             out.warn(
                 f"depth and normals do not fit together (a view confirms {agreed:.0%} of another's points); the silhouettes alone give the shape"
             )
-            sights, noise = prepare_all(views.cameras, views.mask, None, None), 0.0
-        outvoted = silhouettes_outvoted(sights)
+            prepared, noise = prepare_all(views.cameras, views.mask, None, None), 0.0
+        outvoted = silhouettes_outvoted(prepared)
         if noise == before and depth is not None:
             out.skip("alignment of depth", f"the views agree to {noise / step:.3f} of a grid step")
         if outvoted:
             out.warn(
-                f"the silhouettes contradict one another: up to {outvoted} of {len(sights)} are outvoted at a point"
+                f"the silhouettes contradict one another: up to {outvoted} of {len(prepared)} are outvoted at a point"
             )
     grow = SMALL * finest_pixel(views.cameras) if folder.content.picture else 0.0
     if not grow:
         out.skip("growth of the surface", "no model made the views of a picture")
     with out.step("fuse"):
         try:
-            shape, coarser = fuse_within(
-                sights, step, noise, outvoted, clock, normal is not None, grow, folder.content.picture
+            shape, coarser = fuse_within_budget(
+                prepared, step, noise, outvoted, clock, normal is not None, grow, folder.content.picture
             )
         except ValueError as error:
             raise InputError(folder.path, str(error), "give masks and cameras of one object") from None
@@ -143,7 +143,7 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
             else "there are none"
             if normal is None
             else "the silhouettes alone give the shape"
-            if all(sight.planes is None for sight in sights)
+            if all(prepared_view.planes is None for prepared_view in prepared)
             else "the views agree",
         )
     if not shape.restored:
@@ -160,7 +160,7 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
     _check_cameras(folder, views.cameras, shape.vertices)
     vertices, faces, figures, fit = shape.vertices, shape.faces, {}, None
     if options.method == "paper":
-        vertices, faces, figures, fit = _fit(views, sights, shape, options, out)
+        vertices, faces, figures, fit = _fit(views, prepared, shape, options, out)
     with out.step("materials"):
         normals = vertex_normals(vertices, faces)
         look = appearance(
@@ -215,16 +215,16 @@ def _clock(options: Options):
     return Clock(max(options.budget - AROUND, 1e-3) if options.budget and options.method == "grid" else 0.0)
 
 
-def _fit(views, sights, shape, options: Options, out: Output):
+def _fit(views, prepared, shape, options: Options, out: Output):
     """The paper's networks, started from the grid's shape, and the mesh of their surface.
 
-    sights: the aligned views. Where there are normals and no depth, theirs is what holds the surface in its place:
+    prepared: the aligned views. Where there are normals and no depth, theirs is what holds the surface in its place:
     normals alone let it drift."""
     from gdtool.fields.grid.fusion import is_closed_manifold
     from gdtool.fields.grid.refine import keep_pieces
     from gdtool.fields.neural.paper import PaperOptions, extract_network, fit_networks
 
-    images = _with_depth(views, sights)
+    images = _with_depth(views, prepared)
     volume = 0 if "depth" in images else options.steps // 3
     if not volume:
         out.skip("volume start", f"{'depth' if 'depth' in views.images else 'normal'} views say where the surface is")
@@ -259,14 +259,15 @@ def _fit(views, sights, shape, options: Options, out: Output):
     return vertices, faces, figures, fit
 
 
-def _with_depth(views, sights) -> dict:
+def _with_depth(views, prepared) -> dict:
     """The views' images, with the depth that the aligned views came to where there was none and normals gave it."""
     import numpy as np
 
     found = {
-        id(sight.camera): (sight.points - sight.camera.position) @ -sight.camera.backward
-        for sight in sights
-        if sight.points is not None
+        id(prepared_view.camera): (prepared_view.points - prepared_view.camera.position)
+        @ -prepared_view.camera.backward
+        for prepared_view in prepared
+        if prepared_view.points is not None
     }
     if "depth" in views.images or not found:
         return views.images

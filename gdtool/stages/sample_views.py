@@ -24,9 +24,9 @@ from msgspec import Meta
 
 from gdtool.core.ending import temporary_folder
 from gdtool.core.errors import InputError, ResourceError, UsageError
+from gdtool.core.kinds import DOMAINS
 from gdtool.core.stage import MOST_SEED, Inputs, Output, SecondInput, Stage, file_option
 
-EVERY = ("color", "normal", "depth", "albedo", "roughness", "metallic")
 FINEST = 8  # pixels of picture.png across one of a view
 
 
@@ -57,7 +57,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     ] = 0
     domains: Annotated[
         tuple[str, ...], Meta(description="Domains to write; color is made in any case, being the primary.")
-    ] = EVERY
+    ] = DOMAINS
     mask: file_option("Image that is bright where the subject is.") = None
     matting: file_option(
         "ONNX file of a network that cuts the subject out of any background: u2net.onnx, u2netp.onnx or silueta.onnx (needs gdtool[matting])."
@@ -116,7 +116,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         model = (wonder3d.load if wonder3d.recognises(folder) else load_model)(folder).to(out.device)
     config = model.config
     # Without --domains: all that the model has.
-    domains = config.domains if options.domains == EVERY else options.domains
+    domains = config.domains if options.domains == DOMAINS else options.domains
     unknown = [d for d in domains if d not in config.domains]
     if unknown or not domains:
         raise UsageError(

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.config import ABLATIONS, DOMAINS
+from gdtool.core.kinds import DOMAINS
+from gdtool.diffusion.config import ABLATIONS
 from gdtool.diffusion.inference.sampling import sample_images
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.model import Model

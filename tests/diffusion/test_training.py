@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.config import DOMAINS, PRESETS, Phase
+from gdtool.core.kinds import DOMAINS
+from gdtool.diffusion.config import PRESETS, Phase
 from gdtool.diffusion.data.objects import (
     LIGHTS,
     Objects,

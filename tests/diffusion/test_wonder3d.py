@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
+from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.checkpoint import wonder3d
-from gdtool.diffusion.config import DOMAINS, ModelConfig
+from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.network.attention import Layout, TransformerBlock
 from gdtool.diffusion.network.labels import class_labels
 from gdtool.diffusion.network.tensors import read_tensors
@@ -267,7 +268,7 @@ def test_guidance_is_the_step_from_nothing_to_the_condition(folder):
     label = model.labels[[0, 1]].flatten(0, 1)
     with torch.no_grad():
         e = [model.unet(noise, latent * on, torch.tensor([999]), label, context * on, layout) for on in (0.0, 1.0)]
-        a, s = model.signal[999], model.deviation[999]
+        a, s = model.alpha[999], model.sigma[999]
         clean = (noise - s * (e[0] + 3.0 * (e[1] - e[0]))) / a
         images = model.codec.decode(clean).unflatten(0, (2, 6))
     for j, domain in enumerate(("color", "normal")):

@@ -8,7 +8,7 @@ from gdtool.cameras.camera import SIX_VIEWS
 from gdtool.fields.grid.carve import hull_bounds
 from gdtool.fields.grid.fusion import depth_for, prepare_all
 from gdtool.fields.views import multiview_stereo
-from gdtool.fields.views.multiview_stereo import LITTLE, _passed, match_views, pixel_steps, slopes, stretched
+from gdtool.fields.views.multiview_stereo import LITTLE, _aggregate_rows, match_views, pixel_steps, slopes, stretched
 
 from .shapes import sphere, torus, two_balls, views_of
 
@@ -70,8 +70,8 @@ def test_slopes_are_a_planes_depth_from_pixel_to_pixel(camera):
 
 def test_trust_is_in_what_another_view_shows_too():
     cameras, images, mask = views_of(ball_before_a_wall, SIZE)
-    sights = prepare_all(cameras, mask, None, None)
-    matched = match_views(cameras, mask, images["normal"], {}, sights, hull_bounds(sights))
+    prepared = prepare_all(cameras, mask, None, None)
+    matched = match_views(cameras, mask, images["normal"], {}, prepared, hull_bounds(prepared))
     for view, shown, true in zip(matched, mask, images["depth"], strict=True):
         sure = (view.trust == 1) & (shown > 0.99)
         assert np.median(np.append(np.abs(view.depth - true)[sure], 0)) < 0.015  # a pixel
@@ -86,7 +86,7 @@ def test_costs_are_passed_along_planes():
     rng = np.random.default_rng(0)
     cost, slope = rng.uniform(0, 1, (1, 6, 9)).astype(np.float32), np.full((1, 6), 2.0)
     jump = rng.uniform(0.2, 1, (1, 6)).astype(np.float32)
-    found = _passed(cost, np.array([[1, 1, 1, 0, 1, 1]], bool), slope, jump, 1)[0]
+    found = _aggregate_rows(cost, np.array([[1, 1, 1, 0, 1, 1]], bool), slope, jump, 1)[0]
     wanted = cost[0].copy()
     for p in (1, 2, 5):  # pixel 3 shows nothing, so 4 starts anew
         for d in range(9):

@@ -50,8 +50,8 @@ def seen():
 
 def reconstruct(cameras, images, mask):
     step = grid_step(cameras, 0)
-    sights, _, noise = align_depth(cameras, mask, images["depth"], images["normal"], step)
-    return fuse_views(sights, step, noise, silhouettes_outvoted(sights))
+    prepared, _, noise = align_depth(cameras, mask, images["depth"], images["normal"], step)
+    return fuse_views(prepared, step, noise, silhouettes_outvoted(prepared))
 
 
 def check_whole(shape, reach=0.75):

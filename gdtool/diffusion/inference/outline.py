@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gdtool.cameras import Camera, project
-from gdtool.fields.views.prepared_view import backproject, bilinear
+from gdtool.cameras import Camera, backproject, project
+from gdtool.images.sampling import bilinear
 
 LEAST = 2  # pixels across: narrower is the outlines' own error
 BESIDE = 2  # pixels of what is shown anyhow that a part takes along, so that it is joined

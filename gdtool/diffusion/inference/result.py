@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from gdtool.cameras import Camera, project
+from gdtool.cameras import Camera, backproject, project
 from gdtool.diffusion.inference.familiarity import result_figures
 from gdtool.diffusion.inference.outline import draw_part, grown_masks, lost_part
 from gdtool.diffusion.inference.paint import repainted
 from gdtool.diffusion.network.encoding import coverage, decode
-from gdtool.fields.views.prepared_view import backproject
 from gdtool.folders.views import Views
 
 # The model's coverage at which outlines overlap the true ones most, at no cost in color; at one half they hold 4 % too

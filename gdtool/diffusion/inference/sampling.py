@@ -8,7 +8,7 @@ from contextlib import nullcontext
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.config import DOMAINS
+from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.encoding import BACKGROUND, MIRRORED_VIEW, encode_condition, mirrored
 from gdtool.diffusion.network.model import Model

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from gdtool.diffusion.config import DOMAINS
+from gdtool.core.kinds import DOMAINS
 
 
 def learned_position(count: int, width: int) -> nn.Parameter:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gdtool.cameras.camera import DISTANCE
-from gdtool.diffusion.config import DOMAINS
+from gdtool.core.kinds import DOMAINS
 
 SLAB = 0.75  # half the depth range that is encoded: a unit box turned about its vertical axis reaches 0.707
 BACKGROUND = {"white": 1.0, "grey": 0.0, "black": -1.0}

@@ -7,7 +7,8 @@ import math
 import torch
 
 from gdtool.cameras.camera import SIX_VIEWS
-from gdtool.diffusion.config import DOMAINS, ModelConfig
+from gdtool.core.kinds import DOMAINS
+from gdtool.diffusion.config import ModelConfig
 
 # Wonder3D's elevation and azimuth (radians) of each view relative to the picture's, as its pipeline has them, in half
 # precision.

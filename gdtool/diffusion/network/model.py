@@ -12,7 +12,7 @@ from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.codec import PatchCodec, make_codec
 from gdtool.diffusion.network.encoder import PatchEncoder, make_encoder
 from gdtool.diffusion.network.labels import class_labels
-from gdtool.diffusion.network.schedule import clean_from_prediction, input_scale, signal_and_noise
+from gdtool.diffusion.network.schedule import alpha_and_sigma, clean_from_prediction, input_scale
 from gdtool.diffusion.network.unet import UNet
 
 
@@ -26,9 +26,9 @@ class Model(nn.Module):
         self.codec = codec or make_codec(config)
         self.encoder = encoder or make_encoder(config)
         self.unet = UNet(config, self.codec.latent_channels, self.codec.condition_channels, self.codec.side)
-        signal, deviation = signal_and_noise(config)
-        self.register_buffer("signal", signal, persistent=False)
-        self.register_buffer("deviation", deviation, persistent=False)
+        alpha, sigma = alpha_and_sigma(config)
+        self.register_buffer("alpha", alpha, persistent=False)
+        self.register_buffer("sigma", sigma, persistent=False)
         self.register_buffer("labels", class_labels(config), persistent=False)
 
     def latent_shape(self, layout: Layout) -> tuple[int, int, int, int]:
@@ -53,8 +53,8 @@ class Model(nn.Module):
         """Signal and noise of each image, (n, 1, 1, 1)."""
         n = len(layout.domains) * layout.views
         return (
-            self.signal[t].repeat_interleave(n).view(-1, 1, 1, 1),
-            self.deviation[t].repeat_interleave(n).view(-1, 1, 1, 1),
+            self.alpha[t].repeat_interleave(n).view(-1, 1, 1, 1),
+            self.sigma[t].repeat_interleave(n).view(-1, 1, 1, 1),
         )
 
 

@@ -10,7 +10,7 @@ import torch
 from gdtool.diffusion.config import ModelConfig
 
 
-def signal_and_noise(config: ModelConfig) -> tuple[torch.Tensor, torch.Tensor]:
+def alpha_and_sigma(config: ModelConfig) -> tuple[torch.Tensor, torch.Tensor]:
     """a and s for every timestep, (timesteps,) float32 each; on the processor, also where a model is built on the meta
     device."""
     n = config.timesteps
@@ -62,15 +62,15 @@ def sample(
 
     denoise(x, timestep, step index) -> predicted x_0. scheduler: "ddim" (Song et al. 2021, deterministic) or "dpm",
     DPM-Solver++(2M) (Lu et al. 2022, algorithm 2)."""
-    signal, deviation = signal_and_noise(config)
+    alpha, sigma = alpha_and_sigma(config)
     steps_at = timesteps(config, steps)
     x, before, last_width = noise, None, math.inf
     for i, t in enumerate(steps_at):
         clean = denoise(x, t, i)
         if i == len(steps_at) - 1:
             return clean
-        a, s = float(signal[t]), float(deviation[t])
-        a_next, s_next = float(signal[steps_at[i + 1]]), float(deviation[steps_at[i + 1]])
+        a, s = float(alpha[t]), float(sigma[t])
+        a_next, s_next = float(alpha[steps_at[i + 1]]), float(sigma[steps_at[i + 1]])
         direction, width = clean, math.inf
         if a > 1e-6:
             width = math.log(a_next / s_next) - math.log(a / s)  # half log-SNR

@@ -13,7 +13,8 @@ import torch.nn.functional as F
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
-from gdtool.diffusion.config import CLASS_WIDTH, DOMAINS, ModelConfig
+from gdtool.core.kinds import DOMAINS
+from gdtool.diffusion.config import CLASS_WIDTH, ModelConfig
 from gdtool.diffusion.network.attention import Layout, RowAttention, Transformer
 from gdtool.diffusion.network.labels import WONDER3D_LABEL_WIDTH
 

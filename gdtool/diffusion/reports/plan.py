@@ -15,13 +15,14 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from gdtool.diffusion.config import DOMAINS, ModelConfig, Phase, TrainConfig
+from gdtool.core.kinds import DOMAINS
+from gdtool.diffusion.config import ModelConfig, Phase, TrainConfig
 from gdtool.diffusion.network import attention
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.codec import CHUNK, VaeCodec
 from gdtool.diffusion.network.encoding import PLANES
 from gdtool.diffusion.network.model import Model, parameter_count, structure
-from gdtool.diffusion.network.schedule import signal_and_noise
+from gdtool.diffusion.network.schedule import alpha_and_sigma
 from gdtool.diffusion.training.losses import LIT, rendering_error, view_directions
 
 # Dense bfloat16 peak in FLOP/s, memory in bytes, NVLink in bytes/s in one direction (NVIDIA's data sheets, SXM parts).
@@ -119,7 +120,7 @@ def _one_step(
         rgba = torch.zeros(objects, 4, config.image_size, config.image_size, dtype=dtype)
         context = torch.zeros(objects, 1, config.encoder_width, dtype=dtype)
         model.labels, t = model.labels.to(dtype), torch.zeros(objects, dtype=torch.long)
-        model.signal, model.deviation = model.signal.to(dtype), model.deviation.to(dtype)
+        model.alpha, model.sigma = model.alpha.to(dtype), model.sigma.to(dtype)
     # sinusoid() computes in float32, which the weights here are not: what it gives is cast
     hook = model.unet.time_embedding.register_forward_pre_hook(lambda module, args: (args[0].to(dtype),))
     with fused_attention() if fused else contextlib.nullcontext(), watch:
@@ -208,8 +209,8 @@ def rendering_share(config: ModelConfig, train: TrainConfig, domains: int) -> fl
     )
     if not lit or train.pbr_weight == 0:
         return 0.0
-    signal, deviation = signal_and_noise(config)
-    near = (signal / deviation).square() > train.pbr_snr
+    alpha, sigma = alpha_and_sigma(config)
+    near = (alpha / sigma).square() > train.pbr_snr
     return float(near.float().mean()) * (1 - train.pure_noise) + train.pure_noise * float(near[-1])
 
 

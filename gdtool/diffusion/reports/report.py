@@ -11,7 +11,8 @@ import msgspec
 import numpy as np
 import torch
 
-from gdtool.diffusion.config import DOMAINS, ModelConfig, TrainConfig
+from gdtool.core.kinds import DOMAINS
+from gdtool.diffusion.config import ModelConfig, TrainConfig
 from gdtool.diffusion.data.objects import Objects, from_bytes
 from gdtool.diffusion.inference.sampling import sample_images
 from gdtool.diffusion.network.encoding import BACKGROUND, encode

@@ -23,8 +23,9 @@ import numpy as np
 import torch
 
 from gdtool.core.errors import InputError
+from gdtool.core.kinds import DOMAINS
 from gdtool.core.reading import parse_json
-from gdtool.diffusion.config import DOMAINS, ModelConfig, Phase, TrainConfig
+from gdtool.diffusion.config import ModelConfig, Phase, TrainConfig
 from gdtool.diffusion.data.objects import Batch, Objects, draw, object_order
 from gdtool.diffusion.inference.sampling import precision_context
 from gdtool.diffusion.network.attention import Layout
@@ -154,11 +155,11 @@ def losses(
         predicted = model.predict_clean(noisy, condition, t, context, layout, step.views)
 
     counted, square = image_error(predicted, clean, b, step.domains, config, train)  # (b, d) each
-    weight = loss_weight(model.signal[t], model.deviation[t], train.snr_gamma, train.snr_floor)
+    weight = loss_weight(model.alpha[t], model.sigma[t], train.snr_gamma, train.snr_floor)
     total = (weight[:, None] * counted).mean()
     parts = {DOMAINS[i]: square[:, j].mean().detach() for j, i in enumerate(step.domains)}
 
-    snr = (model.signal[t] / model.deviation[t]).square()
+    snr = (model.alpha[t] / model.sigma[t]).square()
     near = torch.nonzero(snr > train.pbr_snr).flatten()
     if train.pbr_weight > 0 and len(near) and {1, 3, 4, 5} <= set(step.domains):
         # decoded and shaded: what light is computed from, of the objects that it is computed for

@@ -6,7 +6,8 @@ import numpy as np
 import torch
 
 from gdtool.cameras.camera import rig
-from gdtool.diffusion.config import DOMAINS, ModelConfig, TrainConfig
+from gdtool.core.kinds import DOMAINS
+from gdtool.diffusion.config import ModelConfig, TrainConfig
 from gdtool.diffusion.network.encoding import PLANES, SCALARS, decode
 
 SOFTNESS = 0.02  # of the absolute error: its gradient is continuous at 0

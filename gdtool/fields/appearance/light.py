@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.fields.appearance.materials import Observations, toward_camera
-from gdtool.fields.views.prepared_view import bilinear
+from gdtool.images.sampling import bilinear
 
 SAMPLES = 4000
 SHARPNESS = (4.0, 12.0)

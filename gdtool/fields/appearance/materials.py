@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.cameras import Camera, project
-from gdtool.fields.views.prepared_view import bilinear
+from gdtool.images.sampling import bilinear
 
 _SHARPEN = 4  # exponent of the cosine in a view's weight: the view that faces a point decides
 

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from gdtool.cameras import project
-from gdtool.fields.views.prepared_view import WEAK, Sight, hull_distance, pixel_footprint, tangent_distance
+from gdtool.fields.views.prepared_view import WEAK, PreparedView, hull_distance, pixel_footprint, tangent_distance
 from gdtool.geometry.grids import Grid, band_cells, dilate, fine_points, grid_over
 
 COARSE = 2  # fine steps a coarse step
@@ -22,7 +22,7 @@ _CHUNK = 1 << 16  # samples at a time: their arrays stay in the cache
 
 
 def combined_distance(
-    sights: list[Sight], points: np.ndarray, step: float, limit: float, noise: float = 0.0, outvoted: int = 0
+    views: list[PreparedView], points: np.ndarray, step: float, limit: float, noise: float = 0.0, outvoted: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Signed distance (n,) float32 of points (n, 3) by all views, clipped to +-limit, and how it was measured (n,)
     uint8.
@@ -35,16 +35,16 @@ def combined_distance(
     silhouettes may miss a point of the object.
     """
     out, measured = np.empty(len(points), np.float32), np.zeros(len(points), np.uint8)
-    deep = [s for s in sights if s.planes is not None]
+    deep = [s for s in views if s.planes is not None]
 
     def measure(start: int) -> None:
         part = points[start : start + _CHUNK]
-        hull = np.stack([hull_distance(sight, part) for sight in sights]).astype(np.float32)
+        hull = np.stack([hull_distance(view, part) for view in views]).astype(np.float32)
         ending = (np.abs(hull) < step).sum(0)
         value = _vote(hull, outvoted)
-        seen = np.where(2 * ending > len(sights), SMOOTHLY, UNSEEN)
+        seen = np.where(2 * ending > len(views), SMOOTHLY, UNSEEN)
         if deep:
-            found = [tangent_distance(sight, part) for sight in deep]
+            found = [tangent_distance(view, part) for view in deep]
             free = np.clip(np.stack([f[0] for f in found]), -limit, limit).astype(np.float32)
             weight = np.stack([f[1] for f in found]).astype(np.float32)
             smooth = np.stack([f[3] for f in found])
@@ -67,19 +67,21 @@ def combined_distance(
 def _nearest_surface(value: np.ndarray, weight: np.ndarray, blend: float, limit: float) -> np.ndarray:
     """Fuse distances value (k, n), unknown at -limit with weight 0, to (n,).
 
-    A weak distance (beside a jump in depth, where the pixel grid decides what is seen) carves only where no firm one
+    A weak distance (beside a jump in depth, where the pixel grid decides what is seen) carves only where no reliable one
     finds the surface close by.
     """
-    firm = weight > WEAK
-    free, near = value > 0, firm & (value > -limit / 2)
-    nearest_free = np.where(free & firm, value, np.inf).min(0)
-    nearest_firm = np.where(near, value, -np.inf).max(0)
+    reliable = weight > WEAK
+    free, near = value > 0, reliable & (value > -limit / 2)
+    nearest_free = np.where(free & reliable, value, np.inf).min(0)
+    nearest_reliable = np.where(near, value, -np.inf).max(0)
     nearest_weak = np.where(free, value, np.inf).min(0)
     reference = np.where(
         np.isfinite(nearest_free),
         nearest_free,
         np.where(
-            np.isfinite(nearest_firm), nearest_firm, np.where(np.isfinite(nearest_weak), nearest_weak, value.max(0))
+            np.isfinite(nearest_reliable),
+            nearest_reliable,
+            np.where(np.isfinite(nearest_weak), nearest_weak, value.max(0)),
         ),
     )
     share = weight * np.exp(-(((value - reference) / blend) ** 2)) + 1e-12
@@ -91,7 +93,7 @@ def _vote(hull: np.ndarray, outvoted: int) -> np.ndarray:
     return hull.max(0) if outvoted == 0 else -np.partition(-hull, outvoted, axis=0)[outvoted]
 
 
-def silhouettes_outvoted(sights: list[Sight], samples: int = 56, reach: float = 0.75) -> int:
+def silhouettes_outvoted(views: list[PreparedView], samples: int = 56, reach: float = 0.75) -> int:
     """How many silhouettes must be ignored at a point, at most, so that the common volume fills the masks.
 
     0 for views of one object. Views that contradict one another leave a volume that is empty or too thin; then the
@@ -99,24 +101,24 @@ def silhouettes_outvoted(sights: list[Sight], samples: int = 56, reach: float = 
     """
     axis = np.linspace(-reach, reach, samples)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    hull = np.stack([hull_distance(s, points) for s in sights]).astype(np.float32)
+    hull = np.stack([hull_distance(s, points) for s in views]).astype(np.float32)
     half_cell = 0.87 * 2 * reach / (samples - 1)
-    for outvoted in range(max(len(sights) // 2, 1)):
+    for outvoted in range(max(len(views) // 2, 1)):
         inside = points[_vote(hull, outvoted) < half_cell]
-        if len(inside) and np.median([_filled(s, inside, half_cell) for s in sights]) > 0.9:
+        if len(inside) and np.median([_filled(s, inside, half_cell) for s in views]) > 0.9:
             return outvoted
-    return max(len(sights) // 2 - 1, 0)
+    return max(len(views) // 2 - 1, 0)
 
 
-def _filled(sight: Sight, points: np.ndarray, radius: float) -> float:
+def _filled(view: PreparedView, points: np.ndarray, radius: float) -> float:
     """Share of a view's mask that points, each of the given world radius, cover."""
-    pixels, depth = project(sight.camera, points)
-    h, w = sight.mask.shape
+    pixels, depth = project(view.camera, points)
+    h, w = view.mask.shape
     hit = np.zeros((h, w), bool)
     inside = (pixels >= 0).all(1) & (pixels[:, 0] < w) & (pixels[:, 1] < h)
     hit[pixels[inside, 1].astype(int), pixels[inside, 0].astype(int)] = True
-    grown = dilate(hit, int(np.ceil(radius / float(np.median(pixel_footprint(sight.camera, depth))))))
-    shown = sight.mask > 0.5
+    grown = dilate(hit, int(np.ceil(radius / float(np.median(pixel_footprint(view.camera, depth))))))
+    shown = view.mask > 0.5
     return float(grown[shown].mean())
 
 
@@ -128,13 +130,13 @@ def _mean_surface(value: np.ndarray, weight: np.ndarray, limit: float) -> np.nda
 
 
 def hull_bounds(
-    sights: list[Sight], outvoted: int = 0, reach: float = 0.75, samples: int = 48
+    views: list[PreparedView], outvoted: int = 0, reach: float = 0.75, samples: int = 48
 ) -> tuple[np.ndarray, np.ndarray]:
     """Box (low, high) around the silhouettes' common cone, found on a coarse grid over [-reach, reach]^3."""
     step = 2 * reach / (samples - 1)
     axis = np.linspace(-reach, reach, samples)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    value = _vote(np.stack([hull_distance(s, points) for s in sights]), outvoted)
+    value = _vote(np.stack([hull_distance(s, points) for s in views]), outvoted)
     near = points[value < step]
     if len(near) == 0:
         return np.full(3, -0.5), np.full(3, 0.5)
@@ -142,23 +144,23 @@ def hull_bounds(
 
 
 def carve(
-    sights: list[Sight], step: float, noise: float = 0.0, outvoted: int = 0
+    views: list[PreparedView], step: float, noise: float = 0.0, outvoted: int = 0
 ) -> tuple[Grid, np.ndarray, np.ndarray]:
     """Grid, its signed distances (a, b, c) float32 and how each is known (a, b, c) uint8.
 
     Exact in a band around the surface and +-limit (3 steps, more with noise) elsewhere.
     """
     limit = max(3.0 * step, 3.0 * noise)
-    low, high = hull_bounds(sights, outvoted)
+    low, high = hull_bounds(views, outvoted)
     grid = grid_over(low, high, step, margin=2 * COARSE, multiple=COARSE)
     coarse_shape = tuple((n - 1) // COARSE + 1 for n in grid.shape)
     index = np.stack(np.meshgrid(*(np.arange(n) * COARSE for n in coarse_shape), indexing="ij"), -1).reshape(-1, 3)
-    coarse = combined_distance(sights, grid.points(index), step, limit, noise, outvoted)[0].reshape(coarse_shape)
+    coarse = combined_distance(views, grid.points(index), step, limit, noise, outvoted)[0].reshape(coarse_shape)
 
     touched = np.zeros(tuple(n - 1 for n in coarse_shape), bool)
-    for sight in sights:
-        if sight.points is not None:
-            seen = np.floor(grid.locate(sight.points[sight.weight > 0]) / COARSE).astype(int)
+    for view in views:
+        if view.points is not None:
+            seen = np.floor(grid.locate(view.points[view.weight > 0]) / COARSE).astype(int)
             seen = seen[((seen >= 0) & (seen < touched.shape)).all(1)]
             touched[tuple(seen.T)] = True
     fine = fine_points(dilate(band_cells(coarse < 0, touched), int(round(noise / step))), COARSE)
@@ -166,7 +168,7 @@ def carve(
     values = np.ascontiguousarray(values[: grid.shape[0], : grid.shape[1], : grid.shape[2]], np.float32)
     measured = np.zeros(grid.shape, np.uint8)
     values[fine], measured[fine] = combined_distance(
-        sights, grid.points(np.argwhere(fine)), step, limit, noise, outvoted
+        views, grid.points(np.argwhere(fine)), step, limit, noise, outvoted
     )
     return grid, values, measured
 

@@ -10,19 +10,26 @@ import numpy as np
 from gdtool.cameras import Camera
 from gdtool.fields.clock import Clock
 from gdtool.fields.grid.carve import carve, silhouettes_outvoted, smooth_unseen
-from gdtool.fields.grid.refine import FOLD_DEGREES, bumpiness, drop_debris, follow_normals, measured_planes, refine
-from gdtool.fields.grid.shown import restore_shown
-from gdtool.fields.grid.thin import near_points, restore_thin
-from gdtool.fields.views.depth_alignment import Corrections, corrections, disagreement, slope_rows
+from gdtool.fields.grid.picture_silhouette import restore_picture_silhouette
+from gdtool.fields.grid.refine import (
+    FOLD_DEGREES,
+    drop_debris,
+    fit_to_normals,
+    measured_planes,
+    normal_deviation_degrees,
+    refine,
+)
+from gdtool.fields.grid.thin_parts import restore_thin_parts, vertices_near
+from gdtool.fields.views.depth_alignment import Corrections, corrections, disagreement, slope_equations
 from gdtool.fields.views.photometric import Picture
 from gdtool.fields.views.prepared_view import (
     WEAK,
-    Sight,
+    PreparedView,
     free_distance,
+    grow_silhouette,
     hull_distance,
     pixel_footprint,
     prepare,
-    with_edge,
 )
 from gdtool.geometry.grids import edge_counts, extract
 from gdtool.geometry.normals import vertex_normals
@@ -71,7 +78,7 @@ class Shape:
 
 def prepare_all(
     cameras: list[Camera], mask: np.ndarray, depth: np.ndarray | None, normal: np.ndarray | None
-) -> list[Sight]:
+) -> list[PreparedView]:
     """Prepare every view that shows anything; views whose mask is empty are left out."""
     return [
         prepare(camera, mask[k], None if depth is None else depth[k], None if normal is None else normal[k])
@@ -98,9 +105,9 @@ def depth_for(
     from gdtool.fields.grid.carve import hull_bounds
     from gdtool.fields.views.normal_integration import depth_from_normals
 
-    sights = prepare_all(cameras, mask, None, None)
+    views = prepare_all(cameras, mask, None, None)
     return depth_from_normals(
-        cameras, mask, normal, alike or {}, sights, hull_bounds(sights, silhouettes_outvoted(sights))
+        cameras, mask, normal, alike or {}, views, hull_bounds(views, silhouettes_outvoted(views))
     )
 
 
@@ -113,60 +120,60 @@ def align_depth(
     clock: Clock | None = None,
     tell: Callable[[str], None] = _silent,
     colors: Sequence[np.ndarray] = (),
-) -> tuple[list[Sight], float, float]:
+) -> tuple[list[PreparedView], float, float]:
     """Prepared views whose surfaces were brought together where they disagree, the disagreement before and after.
 
     colors: images (k, h, w, 3), linear, of what looks alike from all sides. Views that agree to a tenth of a step at
     three quarters of their points are left as they are: of views that end at one another's silhouettes half may agree
     by that alone."""
-    sights = prepare_all(cameras, mask, depth, normal)
-    before = disagreement(sights)
-    if disagreement(sights, share=0.75) < 0.1 * step:
-        return sights, before, before
-    sights, after = bring_together(cameras, mask, depth, normal, sights, clock, tell, colors)
+    views = prepare_all(cameras, mask, depth, normal)
+    before = disagreement(views)
+    if disagreement(views, share=0.75) < 0.1 * step:
+        return views, before, before
+    views, after = align_views(cameras, mask, depth, normal, views, clock, tell, colors)
     # What the views got wrong in common is not seen in their disagreement.
-    return sights, before, max(after, LEAST_NOISE * step)
+    return views, before, max(after, LEAST_NOISE * step)
 
 
-def bring_together(
+def align_views(
     cameras: list[Camera],
     mask: np.ndarray,
     depth: np.ndarray,
     normal: np.ndarray | None,
-    sights: list[Sight],
+    views: list[PreparedView],
     clock: Clock | None = None,
     tell: Callable[[str], None] = _silent,
     colors: Sequence[np.ndarray] = (),
-) -> tuple[list[Sight], float]:
-    """Corrected views and their disagreement. sights: the views as they were given, prepared.
+) -> tuple[list[PreparedView], float]:
+    """Corrected views and their disagreement. views: the views as they were given, prepared.
 
     Rounds go on until the disagreement falls no more, or until half of the clock's time is spent; each leaves whole
     views.
     """
     clock = clock or Clock()
     kept = [k for k in range(len(cameras)) if (mask[k] > 0.5).any()]
-    slopes = [slope_rows(sight) for sight in sights]
-    found, after = Corrections.none(len(sights)), disagreement(sights)
+    slopes = [slope_equations(view) for view in views]
+    found, after = Corrections.none(len(views)), disagreement(views)
     for count, (reach, stiffness) in enumerate((*ROUNDS, *[ROUNDS[-1]] * MORE_ROUNDS), 1):
         pictures = [[Picture.of(cameras[k], stack[k], mask[k], reach) for k in kept] for stack in colors]
-        found = corrections(sights, slopes, found, reach, stiffness, pictures=pictures)
+        found = corrections(views, slopes, found, reach, stiffness, pictures=pictures)
         changed = np.array(depth)
         for place, k in enumerate(kept):
             changed[k] = np.where(depth[k] > 0, depth[k] + found.depth(place, mask[k].shape), 0)
-        sights = [
-            with_edge(sight, edge)
-            for sight, edge in zip(prepare_all(cameras, mask, changed, normal), found.edge, strict=True)
+        views = [
+            grow_silhouette(view, edge)
+            for view, edge in zip(prepare_all(cameras, mask, changed, normal), found.edge, strict=True)
         ]
-        previous, after = after, disagreement(sights)
+        previous, after = after, disagreement(views)
         tell(f"round {count}: views disagree by {after:.5f}, {previous:.5f} before")
         plateau = count >= len(ROUNDS) and after > (1 - PLATEAU) * previous
         if plateau or clock.left() < clock.spent():
             break
-    return sights, after
+    return views, after
 
 
-def fuse_within(
-    sights: list[Sight],
+def fuse_within_budget(
+    views: list[PreparedView],
     step: float,
     noise: float,
     outvoted: int,
@@ -177,24 +184,24 @@ def fuse_within(
 ) -> tuple[Shape, str]:
     """fuse_views at the finest step that the clock has time for, and what was left out for it ("" for nothing).
 
-    With an end in sight a draft is made first, which tells how quick the machine is and is the result when nothing
+    With an end in view a draft is made first, which tells how quick the machine is and is the result when nothing
     finer can be done in time."""
     if not clock.limited:
-        return fuse_views(sights, step, noise, outvoted, shaded, grow, known), ""
+        return fuse_views(views, step, noise, outvoted, shaded, grow, known), ""
     began = clock.spent()
-    draft = fuse_views(sights, DRAFT * step, noise, outvoted, shaded, grow, known)
+    draft = fuse_views(views, DRAFT * step, noise, outvoted, shaded, grow, known)
     seconds = clock.spent() - began
     for coarser in (1.0, 1.4):
         finer = DRAFT / coarser
         if seconds * (finer**FUSING + AFTER * finer**SURFACE) <= clock.left():
             return fuse_views(
-                sights, coarser * step, noise, outvoted, shaded, grow, known
+                views, coarser * step, noise, outvoted, shaded, grow, known
             ), "" if coarser == 1 else f"at {coarser} of its step"
     return draft, f"at {DRAFT:g} of its step"
 
 
 def fuse_views(
-    sights: list[Sight],
+    views: list[PreparedView],
     step: float,
     noise: float = 0.0,
     outvoted: int = 0,
@@ -210,35 +217,35 @@ def fuse_views(
     Raises ValueError when the silhouettes have no common volume.
     """
     noise = 0.0 if noise < 0.1 * step else min(noise, 2 * step)
-    grid, values, measured = carve(sights, step, noise, outvoted)
+    grid, values, measured = carve(views, step, noise, outvoted)
     carved, thin = values, np.zeros((0, 3))
     values = smooth_unseen(values, measured)
     if not noise and not outvoted:
-        values, thin = restore_thin(values, carved, grid, sights)
+        values, thin = restore_thin_parts(values, carved, grid, views)
     if noise:
         values = _smoothed(values, noise / step)
     values, restored = values - np.float32(grow), 0.0
-    for sight in sights:
-        if noise and sight.camera.name == known:
-            values, restored = restore_shown(values, grid, sights, sight)
+    for view in views:
+        if noise and view.camera.name == known:
+            values, restored = restore_picture_silhouette(values, grid, views, view)
     vertices, faces = extract(values, grid)
     if len(faces) == 0:
         raise ValueError("the silhouettes have no common volume")
     reach = 1.5 * step + noise
-    support = measured_planes(sights, vertices, vertex_normals(vertices, faces), reach)[2]
-    deep = any(s.planes is not None for s in sights)
+    support = measured_planes(views, vertices, vertex_normals(vertices, faces), reach)[2]
+    deep = any(s.planes is not None for s in views)
     vertices, faces, dropped = drop_debris(
         vertices, faces, support if deep else np.ones(len(vertices)), step, hollows=deep and not noise
     )
     if not noise and not outvoted:
         # A sheet's two sides would both be drawn onto its one measured surface.
-        moved = refine(vertices, faces, sights, step, reach=reach)
-        thickened = near_points(vertices, thin, 2 * step)
-        vertices, faces = with_creases(np.where(thickened[:, None], vertices, moved), faces, sights, thickened, step)
-    bumps = bumpiness(vertices, faces, sights, reach + noise) if noise and shaded else None
+        moved = refine(vertices, faces, views, step, reach=reach)
+        thickened = vertices_near(vertices, thin, 2 * step)
+        vertices, faces = sharpen_creases(np.where(thickened[:, None], vertices, moved), faces, views, thickened, step)
+    bumps = normal_deviation_degrees(vertices, faces, views, reach + noise) if noise and shaded else None
     if bumps is not None and bumps > BUMPY:
-        vertices = follow_normals(vertices, faces, sights, step, reach=reach + noise)
-    support = measured_planes(sights, vertices, vertex_normals(vertices, faces), reach)[2]
+        vertices = fit_to_normals(vertices, faces, views, step, reach=reach + noise)
+    support = measured_planes(views, vertices, vertex_normals(vertices, faces), reach)[2]
     return Shape(vertices, faces, support, step, dropped, bumps, restored)
 
 
@@ -251,8 +258,8 @@ def _smoothed(values: np.ndarray, noise: float) -> np.ndarray:
     return np.where(binary_dilation(more < 0, iterations=2), little, more)
 
 
-def with_creases(
-    vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], fixed: np.ndarray, step: float
+def sharpen_creases(
+    vertices: np.ndarray, faces: np.ndarray, views: list[PreparedView], fixed: np.ndarray, step: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """The closed mesh with the bevels that marching cubes leaves along sharp edges drawn out; as given where that opens
     it.
@@ -261,10 +268,10 @@ def with_creases(
     """
 
     def outside(points: np.ndarray) -> np.ndarray:
-        far = np.max([hull_distance(sight, points) for sight in sights], 0)
-        for sight in sights:
-            if sight.planes is not None:
-                distance, weight = free_distance(sight, points)
+        far = np.max([hull_distance(view, points) for view in views], 0)
+        for view in views:
+            if view.planes is not None:
+                distance, weight = free_distance(view, points)
                 far = np.maximum(far, np.where(weight > WEAK, distance, -np.inf))
         return far
 
@@ -276,7 +283,9 @@ def with_creases(
         sharp, sharp_faces, _ = restore_creases(vertices, faces, accept=accept)
         folded = folds(sharp, sharp_faces)
         fresh = (
-            near_points(vertices, folded, 2 * step) & ~near_points(vertices, folds(vertices, faces), 2 * step) & ~fixed
+            vertices_near(vertices, folded, 2 * step)
+            & ~vertices_near(vertices, folds(vertices, faces), 2 * step)
+            & ~fixed
         )
         if not fresh.any():
             break

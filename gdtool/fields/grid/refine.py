@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.fields.appearance.materials import neighbour_matrix
-from gdtool.fields.views.prepared_view import WEAK, Sight, hull_distance, tangent_distance
+from gdtool.fields.views.prepared_view import WEAK, PreparedView, hull_distance, tangent_distance
 from gdtool.geometry.grids import components, keep_faces, signed_volume
 from gdtool.geometry.normals import face_normals, vertex_normals
 from gdtool.geometry.topology import edges_of
@@ -16,7 +16,7 @@ _SEEN_FACES = 24  # faces that views measured, enough for a piece to be real
 _HOLLOW_FACES = 12  # and for a hollow, of which they see little through a mouth that the grid closes
 
 
-def measured_planes(sights: list[Sight], vertices: np.ndarray, normals: np.ndarray, reach: float):
+def measured_planes(views: list[PreparedView], vertices: np.ndarray, normals: np.ndarray, reach: float):
     """Quadratic data term of each vertex: matrix (v, 3, 3) and vector (v, 3) of sum w (n·u + s)^2, and sum w (v,).
 
     Planes farther than reach (world units) or turned away from the vertex's normal are another surface.
@@ -24,10 +24,10 @@ def measured_planes(sights: list[Sight], vertices: np.ndarray, normals: np.ndarr
     matrix = np.zeros((len(vertices), 3, 3), np.float32)
     vector = np.zeros((len(vertices), 3), np.float32)
     total = np.zeros(len(vertices), np.float32)
-    for sight in sights:
-        if sight.planes is None:
+    for view in views:
+        if view.planes is None:
             continue
-        distance, weight, normal, _ = tangent_distance(sight, vertices)
+        distance, weight, normal, _ = tangent_distance(view, vertices)
         same = (np.abs(distance) < reach) & (weight > WEAK) & ((normal * normals).sum(1) > 0.5)
         weight = np.where(same, weight, 0.0).astype(np.float32)
         distance = np.where(same, distance, 0.0).astype(np.float32)
@@ -40,7 +40,7 @@ def measured_planes(sights: list[Sight], vertices: np.ndarray, normals: np.ndarr
 def refine(
     vertices: np.ndarray,
     faces: np.ndarray,
-    sights: list[Sight],
+    views: list[PreparedView],
     step: float,
     *,
     reach: float,
@@ -57,7 +57,7 @@ def refine(
 
     umbrella, start = _umbrella(faces, len(vertices)), vertices
     for _ in range(rounds):
-        matrix, vector, total = measured_planes(sights, vertices, vertex_normals(vertices, faces), reach)
+        matrix, vector, total = measured_planes(views, vertices, vertex_normals(vertices, faces), reach)
         unseen = np.exp(-10.0 * total)
         bending = diags((smoothness + unseen).astype(np.float32))
         energy = (umbrella.T @ bending @ umbrella).tocsr().astype(np.float32)
@@ -71,13 +71,13 @@ def refine(
         move = conjugate_gradients(apply, right, diagonal, iterations)
         length = np.linalg.norm(move, axis=1, keepdims=True)
         vertices = vertices + move * np.minimum(1.0, step / np.maximum(length, 1e-12))
-    return _unfold(_inside_silhouettes(vertices, start, sights, 0.25 * step), start, faces)
+    return _undo_folds(_inside_silhouettes(vertices, start, views, 0.25 * step), start, faces)
 
 
-def follow_normals(
+def fit_to_normals(
     vertices: np.ndarray,
     faces: np.ndarray,
-    sights: list[Sight],
+    views: list[PreparedView],
     step: float,
     *,
     reach: float,
@@ -109,7 +109,7 @@ def follow_normals(
 
     for _ in range(rounds):
         own = vertex_normals(vertices, faces)
-        shown, trust = shown_normals(sights, vertices, own, reach)
+        shown, trust = measured_normals(views, vertices, own, reach)
         across = shown[a] + shown[b]
         across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
         along = vertices[a] - vertices[b]
@@ -134,11 +134,11 @@ def follow_normals(
             iterations,
         )
         vertices = vertices + np.clip(move, -step, step) * own
-    return _unfold(_inside_silhouettes(vertices, start, sights, 0.25 * step), start, faces)
+    return _undo_folds(_inside_silhouettes(vertices, start, views, 0.25 * step), start, faces)
 
 
-def shown_normals(
-    sights: list[Sight], vertices: np.ndarray, normals: np.ndarray, reach: float
+def measured_normals(
+    views: list[PreparedView], vertices: np.ndarray, normals: np.ndarray, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Unit normal (v, 3) that the views show at the vertices of a surface, and the trust in it (v,) in 0..1, 0 where
     none does.
@@ -146,20 +146,20 @@ def shown_normals(
     normals (v, 3): the surface's own; what a view shows farther than reach (world units) away, or turned away from
     them, is another surface."""
     total = np.zeros((len(vertices), 3))
-    for sight in sights:
-        if sight.planes is None:
+    for view in views:
+        if view.planes is None:
             continue
-        distance, weight, normal, _ = tangent_distance(sight, vertices)
+        distance, weight, normal, _ = tangent_distance(view, vertices)
         same = (np.abs(distance) < reach) & (weight > WEAK) & ((normal * normals).sum(1) > 0.3)
         total += np.where(same, weight, 0.0)[:, None] * normal
     length = np.linalg.norm(total, axis=1)
     return total / np.maximum(length, 1e-12)[:, None], np.clip(length / 0.1, 0, 1)
 
 
-def bumpiness(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], reach: float) -> float:
+def normal_deviation_degrees(vertices: np.ndarray, faces: np.ndarray, views: list[PreparedView], reach: float) -> float:
     """Median degrees between the normals of a surface and those that the views show there; 0 where they show none."""
     own = vertex_normals(vertices, faces)
-    shown, trust = shown_normals(sights, vertices, own, reach)
+    shown, trust = measured_normals(views, vertices, own, reach)
     cosine = np.einsum("vi,vi->v", shown, own)[trust > 0.5]
     return float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1)))) if len(cosine) else 0.0
 
@@ -193,12 +193,12 @@ def conjugate_gradients(apply, right: np.ndarray, diagonal: np.ndarray, iteratio
     return x
 
 
-def _inside_silhouettes(vertices: np.ndarray, start: np.ndarray, sights: list[Sight], slack: float) -> np.ndarray:
+def _inside_silhouettes(vertices: np.ndarray, start: np.ndarray, views: list[PreparedView], slack: float) -> np.ndarray:
     """Vertices that left a silhouette by more than slack, and farther than they began, go back along their way until
     they have not."""
     share = np.ones(len(vertices))
-    for sight in sights:
-        before, after = hull_distance(sight, start), hull_distance(sight, vertices)
+    for view in views:
+        before, after = hull_distance(view, start), hull_distance(view, vertices)
         limit = np.maximum(before, 0) + slack
         left = np.flatnonzero(after > limit)
         # Of one that began beyond the border of a picture that cuts the object no way is known: all of it.
@@ -208,7 +208,7 @@ def _inside_silhouettes(vertices: np.ndarray, start: np.ndarray, sights: list[Si
     return start + share[:, None] * (vertices - start)
 
 
-def _unfold(vertices: np.ndarray, start: np.ndarray, faces: np.ndarray, rounds: int = 8) -> np.ndarray:
+def _undo_folds(vertices: np.ndarray, start: np.ndarray, faces: np.ndarray, rounds: int = 8) -> np.ndarray:
     """Vertices of faces that turned over on the way from start, or folded onto a neighbour, go back half of their way,
     and those around them less of theirs, until none has."""
     before, _ = face_normals(start, faces)

@@ -13,8 +13,8 @@ from itertools import chain, combinations
 import numpy as np
 
 from gdtool.cameras import Camera, project, rays
-from gdtool.fields.views.photometric import Picture, color_rows
-from gdtool.fields.views.prepared_view import Sight, hull_distance, pixel_footprint, tangent_distance
+from gdtool.fields.views.photometric import Picture, color_equations
+from gdtool.fields.views.prepared_view import PreparedView, hull_distance, pixel_footprint, tangent_distance
 
 CONTROL = 15  # control points along a side of a view's correction
 LARGEST = 0.06  # world units: no correction is larger
@@ -28,37 +28,37 @@ WALL = 1.5  # pixels: what lies between surfaces that two views see from opposit
 RIM_COSINE = 0.15  # normals this square to an axis belong to the outline
 
 
-def disagreement(sights: list[Sight], reach: float = 0.06, stride: int = 3, share: float = 0.5) -> float:
+def disagreement(views: list[PreparedView], reach: float = 0.06, stride: int = 3, share: float = 0.5) -> float:
     """Median distance (world units) between one view's points and another's surface where both see the same part.
 
     share: of the points that lie nearer than what is returned, for another quantile. 0 when no two views have depth in
     common.
     """
-    gaps = [np.abs(m.distance) for m in _matches(sights, reach, stride)]
+    gaps = [np.abs(m.distance) for m in _matches(views, reach, stride)]
     gaps = np.concatenate(gaps) if gaps else np.zeros(0)
     return float(np.quantile(gaps, share)) if len(gaps) else 0.0
 
 
-def _sparse(sight: Sight, stride: int) -> np.ndarray:
+def _sparse(view: PreparedView, stride: int) -> np.ndarray:
     """(h, w) bool: every stride-th pixel along both axes that has a surface worth comparing."""
-    chosen = np.zeros(sight.mask.shape, bool)
+    chosen = np.zeros(view.mask.shape, bool)
     chosen[::stride, ::stride] = True
-    return chosen & (sight.weight > 0.1) & ~sight.broken
+    return chosen & (view.weight > 0.1) & ~view.depth_edge
 
 
-def agreement(sights: list[Sight], reach: float = 0.04, stride: int = 3) -> float:
+def agreement(views: list[PreparedView], reach: float = 0.04, stride: int = 3) -> float:
     """Share of the points that should be seen by another view, facing it, that it has within reach (world units).
 
     True views give 0.6 and more (the rest is occluded there), views of different things nearly 0. 1 when no view faces
     what another shows.
     """
     confirmed = asked = 0
-    for i, first in enumerate(sights):
+    for i, first in enumerate(views):
         if first.planes is None:
             continue
         chosen = _sparse(first, stride)
         points, normals = first.points[chosen].astype(np.float64), first.planes[chosen][:, :3]
-        for j, second in enumerate(sights):
+        for j, second in enumerate(views):
             facing = normals @ second.camera.backward > 0.5
             if i == j or second.planes is None or not facing.any():
                 continue
@@ -97,19 +97,19 @@ class _Match:
         self.normal, self.here, self.there = normal, here, there
 
 
-def _matches(sights: list[Sight], reach: float, stride: int, walls: float = 0.0):
+def _matches(views: list[PreparedView], reach: float, stride: int, walls: float = 0.0):
     """Pairs of views that see the same surface: same direction of normal and within reach of each other's plane.
 
     With walls, pairs that see the two sides of one wall and leave it thinner than so many pixels, or less than nothing;
     the distance is then how much it lacks."""
-    for i, first in enumerate(sights):
+    for i, first in enumerate(views):
         if first.planes is None:
             continue
         chosen = _sparse(first, stride)
         points = first.points[chosen].astype(np.float64)
         normals = first.planes[chosen][:, :3]
         own = first.weight[chosen]
-        for j, second in enumerate(sights):
+        for j, second in enumerate(views):
             if i == j or second.planes is None:
                 continue
             distance, weight, normal, _ = tangent_distance(second, points)
@@ -213,7 +213,7 @@ class _System:
 
 
 def corrections(
-    sights: list[Sight],
+    views: list[PreparedView],
     slopes: list[tuple],
     before: Corrections,
     reach: float,
@@ -225,29 +225,29 @@ def corrections(
 
     A point of one view, moved along its ray, lies on another view's plane, moved along its own, and has the color that
     the other shows there (pictures: of every view, once for each domain of colors); what two views see from opposite
-    sides keeps a thickness; the corrected depth rises as the normals say (slopes: see slope_rows, of the views as they
+    sides keeps a thickness; the corrected depth rises as the normals say (slopes: see slope_equations, of the views as they
     were given); what one view sees edge-on lies on its silhouette; two silhouettes reach equally far along the
     direction that both show at full length. Priors keep corrections small and smooth. What all views of a point get
     wrong in common the planes cannot tell, but all else can."""
-    system, size = _System(len(sights)), CONTROL * CONTROL
+    system, size = _System(len(views)), CONTROL * CONTROL
     total = 0.0
-    matches = list(_matches(sights, reach, stride))
+    matches = list(_matches(views, reach, stride))
     for m in matches:
         for of_view in pictures:
-            slope, difference, weight = color_rows(m.points, m.here, m.there, of_view[m.i], of_view[m.j], m.weight)
-            weights, places = _control_weights(m.here, sights[m.i].mask.shape)
+            slope, difference, weight = color_equations(m.points, m.here, m.there, of_view[m.i], of_view[m.j], m.weight)
+            weights, places = _control_weights(m.here, views[m.i].mask.shape)
             done = (before.control[m.i][places] * weights).sum(1)
             system.add(
                 weights * slope[:, None], system.of_view(m.i, places), slope * done - difference, COLORS**2 * weight
             )
-    for m in chain(matches, _matches(sights, reach, stride, WALL)):
+    for m in chain(matches, _matches(views, reach, stride, WALL)):
         weight = m.weight / (1 + (m.distance / (0.5 * reach)) ** 2) ** 2
         total += weight.sum()
-        w_here, c_here = _control_weights(m.here, sights[m.i].mask.shape)
-        w_there, c_there = _control_weights(m.there, sights[m.j].mask.shape)
+        w_here, c_here = _control_weights(m.here, views[m.i].mask.shape)
+        w_there, c_there = _control_weights(m.there, views[m.j].mask.shape)
         # More depth moves a point along the viewing direction, that is against `backward`.
-        slope_here = -(m.normal @ sights[m.i].camera.backward)[:, None]
-        slope_there = (m.normal @ sights[m.j].camera.backward)[:, None]
+        slope_here = -(m.normal @ views[m.i].camera.backward)[:, None]
+        slope_there = (m.normal @ views[m.j].camera.backward)[:, None]
         coefficients = np.concatenate([w_here * slope_here, w_there * slope_there], 1)
         places = np.concatenate([system.of_view(m.i, c_here), system.of_view(m.j, c_there)], 1)
         done = (before.control[m.i][c_here] * w_here).sum(1) * slope_here[:, 0] + (
@@ -256,29 +256,31 @@ def corrections(
         system.add(coefficients, places, done - m.distance, weight)
     if total == 0:
         return before
-    per_view = total / len(sights)
+    per_view = total / len(views)
     unit = PRIOR * per_view / size  # a control's prior: what a match of one view's average control counts, times PRIOR
     for k, (coefficients, places, target, weight) in enumerate(slopes):
         share = SLOPES * PRIOR * SLOPE_LENGTH**2 * per_view / max(weight.sum(), 1e-12)
         system.add(coefficients, system.of_view(k, places), target, share * weight)
-    _add_rims(system, sights, before, reach, per_view)
-    _add_extents(system, sights, before, per_view)
+    _add_rims(system, views, before, reach, per_view)
+    _add_extents(system, views, before, per_view)
     prior = np.zeros((system.unknowns, system.unknowns))
     bending = _bending()
     one = stiffness * PRIOR * bending.T @ bending * per_view / size + unit * np.eye(size)
-    for k, sight in enumerate(sights):
+    for k, view in enumerate(views):
         prior[k * size : (k + 1) * size, k * size : (k + 1) * size] = one
-        foot = float(np.median(pixel_footprint(sight.camera, np.linalg.norm(sight.camera.position))))
+        foot = float(np.median(pixel_footprint(view.camera, np.linalg.norm(view.camera.position))))
         prior[system.edge(k), system.edge(k)] = PRIOR * per_view * (PRIOR_SIZE / foot) ** 2
     return system.solve(prior)
 
 
-def slope_rows(sight: Sight, stride: int = 2, apart: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def slope_equations(
+    view: PreparedView, stride: int = 2, apart: int = 2
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """What the normals say of a view's depth correction: coefficients (n, 8) and control indices (n, 8) of its slope,
     the slope that fits (n,) and weights (n,). Across `apart` pixels, where the surface is smooth."""
-    h, w = sight.mask.shape
-    good = (sight.weight > 0.1) & ~sight.rough & ~sight.broken
-    normal, parts = sight.planes[..., :3], []
+    h, w = view.mask.shape
+    good = (view.weight > 0.1) & ~view.not_smooth & ~view.depth_edge
+    normal, parts = view.planes[..., :3], []
     for axis in (0, 1):
         ahead = [slice(None, -apart) if a == axis else slice(None) for a in (0, 1)]
         behind = [slice(apart, None) if a == axis else slice(None) for a in (0, 1)]
@@ -287,10 +289,10 @@ def slope_rows(sight: Sight, stride: int = 2, apart: int = 2) -> tuple[np.ndarra
         chosen = good[first] & good[second] & good[between]
         chosen[np.arange(chosen.shape[0]) % stride > 0] = False
         chosen[:, np.arange(chosen.shape[1]) % stride > 0] = False
-        step = (sight.points[second] - sight.points[first])[chosen].astype(np.float64)
+        step = (view.points[second] - view.points[first])[chosen].astype(np.float64)
         n = normal[between][chosen].astype(np.float64)
-        facing = n @ sight.camera.backward
-        across = np.linalg.norm(step - np.outer(step @ sight.camera.backward, sight.camera.backward), axis=1)
+        facing = n @ view.camera.backward
+        across = np.linalg.norm(step - np.outer(step @ view.camera.backward, view.camera.backward), axis=1)
         slope = (n * step).sum(1) / np.maximum(facing * across, 1e-9)
         keep = (np.abs(slope) < 0.5) & (facing > 0.3)
         row, column = (x[keep] for x in np.nonzero(chosen))
@@ -311,14 +313,14 @@ def slope_rows(sight: Sight, stride: int = 2, apart: int = 2) -> tuple[np.ndarra
     return tuple(np.concatenate(x) for x in zip(*parts, strict=True))
 
 
-def _add_rims(system: _System, sights: list[Sight], before: Corrections, reach: float, per_view: float) -> None:
+def _add_rims(system: _System, views: list[PreparedView], before: Corrections, reach: float, per_view: float) -> None:
     """Points whose normal is square to another view's axis and that lie at its silhouette's edge: they lie on it."""
-    for i, first in enumerate(sights):
+    for i, first in enumerate(views):
         if first.planes is None:
             continue
-        chosen = _sparse(first, 1) & ~first.rough
+        chosen = _sparse(first, 1) & ~first.not_smooth
         points, normals = first.points[chosen].astype(np.float64), first.planes[chosen][:, :3].astype(np.float64)
-        for j, second in enumerate(sights):
+        for j, second in enumerate(views):
             if i == j:
                 continue
             square = np.abs(normals @ second.camera.backward) < RIM_COSINE
@@ -341,17 +343,17 @@ def _add_rims(system: _System, sights: list[Sight], before: Corrections, reach: 
             system.add(coefficients, places, done - distance, weight * RIMS * per_view / max(len(p), 100))
 
 
-def _add_extents(system: _System, sights: list[Sight], before: Corrections, per_view: float) -> None:
+def _add_extents(system: _System, views: list[PreparedView], before: Corrections, per_view: float) -> None:
     """Along the direction square to both axes two orthographic silhouettes reach equally far."""
-    outlines = [_outline(s) for s in sights]
-    for i, j in combinations(range(len(sights)), 2):
+    outlines = [_outline(s) for s in views]
+    for i, j in combinations(range(len(views)), 2):
         if outlines[i] is None or outlines[j] is None:
             continue
-        along = np.cross(sights[i].camera.backward, sights[j].camera.backward)
+        along = np.cross(views[i].camera.backward, views[j].camera.backward)
         length = np.linalg.norm(along)
         if length < 0.1:  # nearly opposite: their silhouettes are one, mirrored; the others tie them
             continue
-        foot = sights[i].camera.pixel_size
+        foot = views[i].camera.pixel_size
         for sign in (1, -1):
             gap = (
                 float((outlines[i] @ along).max() - (outlines[j] @ along).max()) / length
@@ -368,15 +370,15 @@ def _add_extents(system: _System, sights: list[Sight], before: Corrections, per_
                 )
 
 
-def _outline(sight: Sight) -> np.ndarray | None:
+def _outline(view: PreparedView) -> np.ndarray | None:
     """World points (n, 3) of an orthographic silhouette's contour; None when it is cut off or perspective."""
     from skimage.measure import find_contours
 
-    if sight.cropped or sight.camera.projection != "orthographic":
+    if view.cropped or view.camera.projection != "orthographic":
         return None
-    lines = find_contours(-np.pad(sight.silhouette, 1, constant_values=1.0), 0.0)
+    lines = find_contours(-np.pad(view.silhouette, 1, constant_values=1.0), 0.0)
     if not lines:
         return None
     place = np.concatenate(lines) - 0.5
-    origins, _ = rays(sight.camera, place[:, ::-1])
+    origins, _ = rays(view.camera, place[:, ::-1])
     return origins

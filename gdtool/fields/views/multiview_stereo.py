@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.cameras import Camera, project, rays
-from gdtool.fields.views.prepared_view import Sight, bilinear, hull_distance, pixel_footprint
+from gdtool.fields.views.prepared_view import PreparedView, hull_distance, pixel_footprint
+from gdtool.images.sampling import bilinear
 
 SIZE = 128  # pixels: views are matched at about this size
 CANDIDATE = 0.9  # pixels of that size between depths that are tried
@@ -87,15 +88,15 @@ class _View:
 
     def __init__(self, camera: Camera, mask: np.ndarray, looks: np.ndarray, normal: np.ndarray, box: np.ndarray):
         self.camera, self.factor = camera, max(1, round(max(mask.shape) / SIZE))
-        self.mask = _shrunk(mask[..., None], self.factor)[..., 0]
+        self.mask = _block_means(mask[..., None], self.factor)[..., 0]
         cover = np.maximum(self.mask, 1e-3)[..., None]
-        self.looks = _shrunk(looks * mask[..., None], self.factor) / cover
+        self.looks = _block_means(looks * mask[..., None], self.factor) / cover
         self.shown = self.mask > LEAST_COVER
         h, w = self.shown.shape
         column, row = np.meshgrid((np.arange(w) + 0.5) * self.factor, (np.arange(h) + 0.5) * self.factor)
         origins, directions = rays(camera, np.stack([column, row], -1)[self.shown])
         self.origins, self.directions = origins, directions / -(directions @ camera.backward)[:, None]  # of unit depth
-        averaged = _shrunk(normal * mask[..., None], self.factor)[self.shown]
+        averaged = _block_means(normal * mask[..., None], self.factor)[self.shown]
         self.normal = averaged / np.maximum(np.linalg.norm(averaged, axis=-1, keepdims=True), 1e-9)
         self.own = self.looks[self.shown]
         depth = project(camera, box)[1]
@@ -120,7 +121,7 @@ class _View:
         return pixels / self.factor, depth
 
 
-def _shrunk(image: np.ndarray, factor: int) -> np.ndarray:
+def _block_means(image: np.ndarray, factor: int) -> np.ndarray:
     """Means (h / factor, w / factor, c) over blocks of image (h, w, c); beyond its border there is nothing."""
     h, w, c = image.shape
     padded = np.pad(image, ((0, -h % factor), (0, -w % factor), (0, 0)))
@@ -132,36 +133,41 @@ def match_views(
     mask: np.ndarray,
     normal: np.ndarray,
     alike: dict[str, np.ndarray],
-    sights: list[Sight],
+    silhouettes: list[PreparedView],
     box: tuple[np.ndarray, np.ndarray],
 ) -> list[Matched]:
     """Depth of every view from what the others show. mask (k, h, w), normal (k, h, w, 3).
 
-    alike: further images (k, h, w[, 3]) that NOISE names, linear. sights: the prepared views that show anything, for
+    alike: further images (k, h, w[, 3]) that NOISE names, linear. silhouettes: the prepared views that show anything, for
     their silhouettes; box: low and high corner of what they can hold. A view that shows nothing has depth 0."""
     corners = np.stack(np.meshgrid(*zip(*box, strict=True), indexing="ij"), -1).reshape(-1, 3)
-    looks = _looks({"normal": normal, **alike})
+    looks = _compared_features({"normal": normal, **alike})
     views = [_View(*given, corners) for given in zip(cameras, mask, looks, normal, strict=True)]
-    found = _sweep(views, sights, None, NEARER)
+    found = _sweep(views, silhouettes, None, NEARER)
     # Views that do not fit one another say less of where a point is, and the silhouettes more.
     doubt = max(1.0, _misfit(views, found) / FIT)
     if doubt > 1:
         for view in views:
             view.looks, view.own = view.looks / doubt**0.5, view.own / doubt**0.5
-        found = _sweep(views, sights, None, NEARER * doubt)
-    found = _sweep(views, sights, _known(views, found), NEARER * doubt)
+        found = _sweep(views, silhouettes, None, NEARER * doubt)
+    found = _sweep(views, silhouettes, _known_depths(views, found), NEARER * doubt)
     return [
         _full_size(view, depth, trust, own)
-        for view, depth, trust, own in zip(views, found, _confirmed(views, found), mask, strict=True)
+        for view, depth, trust, own in zip(views, found, _trust(views, found), mask, strict=True)
     ]
 
 
 def _sweep(
-    views: list[_View], sights: list[Sight], known: dict[int, tuple[np.ndarray, np.ndarray]] | None, nearer: float
+    views: list[_View],
+    silhouettes: list[PreparedView],
+    known: dict[int, tuple[np.ndarray, np.ndarray]] | None,
+    nearer: float,
 ) -> list[np.ndarray]:
-    """Stretched depth (n,) of every view's pixels; see _swept and _least."""
+    """Stretched depth (n,) of every view's pixels; see _sweep_costs and _best_depth."""
     return [
-        _least(_swept(view, [other for other in views if other is not view], sights, known, nearer), view)
+        _best_depth(
+            _sweep_costs(view, [other for other in views if other is not view], silhouettes, known, nearer), view
+        )
         for view in views
     ]
 
@@ -177,14 +183,14 @@ def _misfit(views: list[_View], found: list[np.ndarray]) -> float:
         points, best = view.points(np.nan_to_num(depth, nan=view.tried[0])), np.full(len(chosen), np.inf)
         for other in views:
             if other is not view:
-                difference = _compared(view, other, points, chosen)[0]
-                best = np.where(_facing(other, view)[chosen] > FACING, np.minimum(best, difference), best)
+                difference = _compare(view, other, points, chosen)[0]
+                best = np.where(_facing_cosine(other, view)[chosen] > FACING, np.minimum(best, difference), best)
         every.append(best[np.isfinite(best)])
     joined = np.concatenate(every)
     return float(np.median(joined)) if len(joined) else 0.0
 
 
-def _looks(images: dict[str, np.ndarray]) -> np.ndarray:
+def _compared_features(images: dict[str, np.ndarray]) -> np.ndarray:
     """What is compared (k, h, w, c), each channel in units of how far it usually differs."""
     from gdtool.images.color import srgb_from_linear
 
@@ -195,10 +201,10 @@ def _looks(images: dict[str, np.ndarray]) -> np.ndarray:
     return np.concatenate(parts, -1).astype(np.float32)
 
 
-def _swept(
+def _sweep_costs(
     view: _View,
     others: list[_View],
-    sights: list[Sight],
+    silhouettes: list[PreparedView],
     known: dict[int, tuple[np.ndarray, np.ndarray]] | None,
     nearer: float,
 ) -> np.ndarray:
@@ -207,11 +213,13 @@ def _swept(
     known: depth and trust (h, w) of the others by id, from an earlier sweep.
     """
     cost = np.full((len(view.own), len(view.tried)), NEVER, np.float32)
-    facing = np.stack([_facing(other, view) for other in others], 1) if others else np.zeros((len(view.own), 0))
+    facing = np.stack([_facing_cosine(other, view) for other in others], 1) if others else np.zeros((len(view.own), 0))
     entered = np.full(len(view.own), np.nan)
     for k, depth in enumerate(view.tried):
         points = view.points(depth)
-        allowed = np.flatnonzero(np.max([hull_distance(sight, points) for sight in sights], 0) < SLACK * view.pixel)
+        allowed = np.flatnonzero(
+            np.max([hull_distance(silhouette, points) for silhouette in silhouettes], 0) < SLACK * view.pixel
+        )
         if len(allowed) == 0:
             continue
         world = float(unstretched(view.camera, depth))
@@ -219,16 +227,18 @@ def _swept(
         behind = world - entered[allowed]
         hidden = np.full(len(allowed), HIDDEN)
         compared = [
-            (*_compared(view, other, points, allowed), cosine[allowed], other)
+            (*_compare(view, other, points, allowed), cosine[allowed], other)
             for other, cosine in zip(others, facing.T, strict=True)
         ]
         cost[allowed, k] = (
-            _unordered(compared, hidden) if known is None else _ordered(compared, hidden, known)
+            _cost_without_occlusion(compared, hidden)
+            if known is None
+            else _cost_with_occlusion(compared, hidden, known)
         ) + nearer * behind
     return cost
 
 
-def _facing(other: _View, view: _View) -> np.ndarray:
+def _facing_cosine(other: _View, view: _View) -> np.ndarray:
     """Cosine (n,) between the normals of view's pixels and the direction from about there to the other camera."""
     if other.camera.projection == "orthographic":
         return view.normal @ other.camera.backward
@@ -237,7 +247,7 @@ def _facing(other: _View, view: _View) -> np.ndarray:
     return (view.normal * toward).sum(1) / np.maximum(np.linalg.norm(toward, axis=1), 1e-9)
 
 
-def _compared(
+def _compare(
     view: _View, other: _View, points: np.ndarray, chosen: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What view shows at points[chosen] beside what the other shows there: difference (m,) in 0..1, pixels (m, 2),
@@ -248,7 +258,7 @@ def _compared(
     return np.where(bilinear(other.mask[..., None], pixels)[:, 0] < 0.5, 1.0, difference), pixels, depth
 
 
-def _unordered(compared: list, hidden: np.ndarray) -> np.ndarray:
+def _cost_without_occlusion(compared: list, hidden: np.ndarray) -> np.ndarray:
     """Cost (m,) when nothing is known of who hides whom: by the view that fits best, of three and more by the best
     two."""
     if not compared:
@@ -260,7 +270,9 @@ def _unordered(compared: list, hidden: np.ndarray) -> np.ndarray:
     return np.where(count > 0, best, hidden)
 
 
-def _ordered(compared: list, hidden: np.ndarray, known: dict[int, tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+def _cost_with_occlusion(
+    compared: list, hidden: np.ndarray, known: dict[int, tuple[np.ndarray, np.ndarray]]
+) -> np.ndarray:
     """Cost (m,) by the views whose own surface is met there; a point that would hide what another shows for sure costs
     most."""
     total, share, blocks = HIDDEN_SHARE * hidden, np.full(len(hidden), HIDDEN_SHARE), np.zeros(len(hidden))
@@ -276,7 +288,7 @@ def _ordered(compared: list, hidden: np.ndarray, known: dict[int, tuple[np.ndarr
     return np.maximum(total / share, blocks)
 
 
-def _least(cost: np.ndarray, view: _View) -> np.ndarray:
+def _best_depth(cost: np.ndarray, view: _View) -> np.ndarray:
     """Stretched depth (n,) of least cost, each pixel's and what its neighbours' planes ask for; NaN where all is ruled
     out."""
     right, down, facing = slopes(view.camera, view.normal, FACING, view.directions)
@@ -294,7 +306,7 @@ def _least(cost: np.ndarray, view: _View) -> np.ndarray:
             jump.transpose(turn[:2]),
         ]
         for way in (1, -1):
-            total += _passed(*(x[:, ::way] for x in along), way)[:, ::way].transpose(turn)
+            total += _aggregate_rows(*(x[:, ::way] for x in along), way)[:, ::way].transpose(turn)
     total = total[view.shown]
     best = np.clip(total.argmin(1), 1, total.shape[1] - 2)
     before, here, after = (total[np.arange(len(best)), best + i] for i in (-1, 0, 1))
@@ -302,7 +314,7 @@ def _least(cost: np.ndarray, view: _View) -> np.ndarray:
     return np.where((cost < NEVER).any(1), view.tried[0] + view.step * (best + part), np.nan)
 
 
-def _passed(cost: np.ndarray, shown: np.ndarray, slope: np.ndarray, jump: np.ndarray, way: int) -> np.ndarray:
+def _aggregate_rows(cost: np.ndarray, shown: np.ndarray, slope: np.ndarray, jump: np.ndarray, way: int) -> np.ndarray:
     """Cost (h, w, candidates) of every depth with the least that the pixels to its left add, along rows.
 
     slope (h, w): candidates that depth grows by over a pixel in the direction of way.
@@ -333,15 +345,15 @@ def _passed(cost: np.ndarray, shown: np.ndarray, slope: np.ndarray, jump: np.nda
     return out
 
 
-def _known(views: list[_View], found: list[np.ndarray]) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+def _known_depths(views: list[_View], found: list[np.ndarray]) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """Each view's depth (h, w), carried on beyond its outline, and the trust in it (h, w), by id."""
     return {
-        id(view): (_carried_on(view, unstretched(view.camera, depth))[0], view.image(trust))
-        for view, depth, trust in zip(views, found, _confirmed(views, found), strict=True)
+        id(view): (_extrapolate(view, unstretched(view.camera, depth))[0], view.image(trust))
+        for view, depth, trust in zip(views, found, _trust(views, found), strict=True)
     }
 
 
-def _carried_on(view: _View, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _extrapolate(view: _View, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """values (n,) as an image (h, w) that goes on with the nearest one where there is none, and where there are some
     (h, w)."""
     from scipy.ndimage import distance_transform_edt
@@ -353,10 +365,12 @@ def _carried_on(view: _View, values: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return image[tuple(distance_transform_edt(~held, return_distances=False, return_indices=True))], held
 
 
-def _confirmed(views: list[_View], found: list[np.ndarray]) -> list[np.ndarray]:
+def _trust(views: list[_View], found: list[np.ndarray]) -> list[np.ndarray]:
     """Trust (n,) in each view's depths: 1 where another view has the point, 0 where none, .1 where more would be hidden
     by it."""
-    surfaces = [_carried_on(view, unstretched(view.camera, depth))[0] for view, depth in zip(views, found, strict=True)]
+    surfaces = [
+        _extrapolate(view, unstretched(view.camera, depth))[0] for view, depth in zip(views, found, strict=True)
+    ]
     out = []
     for view, depth in zip(views, found, strict=True):
         points = view.points(np.nan_to_num(depth, nan=view.tried[0]))
@@ -364,7 +378,7 @@ def _confirmed(views: list[_View], found: list[np.ndarray]) -> list[np.ndarray]:
         for other, surface in zip(views, surfaces, strict=True):
             if other is view:
                 continue
-            cosine = _facing(other, view)
+            cosine = _facing_cosine(other, view)
             pixels, there = other.seen(points)
             beyond = bilinear(surface[..., None], pixels)[:, 0] - there
             seen = (cosine > FACING) & (bilinear(other.mask[..., None], pixels)[:, 0] > 0.5)
@@ -377,7 +391,7 @@ def _confirmed(views: list[_View], found: list[np.ndarray]) -> list[np.ndarray]:
 def _full_size(view: _View, depth: np.ndarray, trust: np.ndarray, mask: np.ndarray) -> Matched:
     """Depths (n,) and trust (n,) at the pixels of the view's own mask (h, w): each block's to all of its pixels."""
     h, w = mask.shape
-    carried, held = _carried_on(view, unstretched(view.camera, depth))
+    carried, held = _extrapolate(view, unstretched(view.camera, depth))
     blocks = np.ones((view.factor, view.factor))
     grown = np.kron(np.where(held.any(), carried, 0.0), blocks)[:h, :w]
     return Matched(np.where(mask > 0.5, grown, 0.0), np.kron(np.where(held, view.image(trust), 0.0), blocks)[:h, :w])

@@ -10,7 +10,7 @@ import numpy as np
 
 from gdtool.cameras import Camera, rays
 from gdtool.fields.views.multiview_stereo import Matched, match_views, pixel_steps, slopes, stretched, unstretched
-from gdtool.fields.views.prepared_view import Sight
+from gdtool.fields.views.prepared_view import PreparedView
 
 MIN_FACING = 0.15  # normals turned farther away say little about depth
 HOLD, LEAST_HOLD = 0.02, 1e-5  # weight of a matched depth against one pixel's slope, by its trust
@@ -82,7 +82,7 @@ def depth_from_normals(
     mask: np.ndarray,
     normal: np.ndarray,
     alike: dict[str, np.ndarray],
-    sights: list[Sight],
+    silhouettes: list[PreparedView],
     box: tuple[np.ndarray, np.ndarray],
 ) -> np.ndarray:
     """Depth (k, h, w) of all views from normals and silhouettes, and from further images that look alike from all
@@ -90,5 +90,5 @@ def depth_from_normals(
 
     See match_views for the arguments.
     """
-    matched = match_views(cameras, mask, normal, alike, sights, box)
+    matched = match_views(cameras, mask, normal, alike, silhouettes, box)
     return np.stack([integrate_normals(*view) for view in zip(cameras, mask, normal, matched, strict=True)])

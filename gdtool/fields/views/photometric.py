@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.cameras import Camera, project, rays
-from gdtool.fields.views.prepared_view import bilinear, pixel_footprint
+from gdtool.fields.views.prepared_view import pixel_footprint
+from gdtool.images.sampling import bilinear
 
 BLUR = 0.05  # of how far off surfaces may be: so far are colors blurred, or from afar their slopes would mislead
 LEAST_NOISE = 0.02  # linear: no views' colors are taken to agree better
@@ -37,7 +38,7 @@ class Picture:
         return cls(camera, color, across, down)
 
 
-def color_rows(
+def color_equations(
     points: np.ndarray, here: np.ndarray, there: np.ndarray, first: Picture, second: Picture, trust: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """How a view's depth has to change for its points to look like what another view shows at their places.

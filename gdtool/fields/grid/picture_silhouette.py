@@ -11,8 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from gdtool.cameras import project
-from gdtool.fields.views.prepared_view import Sight, bilinear, pixel_footprint
+from gdtool.fields.views.prepared_view import PreparedView, pixel_footprint
 from gdtool.geometry.grids import Grid, dilate
+from gdtool.images.sampling import bilinear
 
 LEAST = 8  # pixels that hang together; fewer are the outline's own error
 ACROSS, AWAY = 2, 2.5  # pixels, both ways and from what is there: what is narrower and nearer lies along an edge
@@ -24,41 +25,43 @@ SMOOTH = 1.0  # pixels: of the depths
 _CHUNK = 1 << 16
 
 
-def opposite(sights: Sequence[Sight], known: Sight) -> Sight | None:
+def opposite(views: Sequence[PreparedView], known: PreparedView) -> PreparedView | None:
     """The view that faces a view, both orthographic and of one size, so that one shows the other's outline mirrored;
     None where there is none."""
     facing = known.camera.world_from_camera[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
-    for sight in sights:
+    for view in views:
         if (
-            known.camera.projection == sight.camera.projection == "orthographic"
-            and known.mask.shape == sight.mask.shape
-            and known.camera.pixel_size == sight.camera.pixel_size
-            and np.allclose(sight.camera.world_from_camera[:3, :3], facing, atol=1e-6)
+            known.camera.projection == view.camera.projection == "orthographic"
+            and known.mask.shape == view.mask.shape
+            and known.camera.pixel_size == view.camera.pixel_size
+            and np.allclose(view.camera.world_from_camera[:3, :3], facing, atol=1e-6)
         ):
-            return sight
+            return view
     return None
 
 
-def lost_pixels(values: np.ndarray, grid: Grid, sight: Sight) -> np.ndarray:
+def missing_pixels(values: np.ndarray, grid: Grid, view: PreparedView) -> np.ndarray:
     """Pixels (h, w) bool of a view's mask behind which the grid of signed distances has no inside; without specks and
     edges."""
     from scipy.ndimage import binary_opening, distance_transform_edt, label
 
-    h, w = sight.mask.shape
+    h, w = view.mask.shape
     inside = np.argwhere(values < NEAR * grid.step)
-    pixels = np.floor(project(sight.camera, grid.points(inside))[0]).astype(np.int64)
+    pixels = np.floor(project(view.camera, grid.points(inside))[0]).astype(np.int64)
     pixels = pixels[((pixels >= 0) & (pixels < (w, h))).all(1)]
-    lost = sight.mask > 0.5
+    lost = view.mask > 0.5
     lost[pixels[:, 1], pixels[:, 0]] = False
     regions, count = label(lost, np.ones((3, 3)))
-    away = distance_transform_edt(lost | (sight.mask <= 0.5)) > AWAY
+    away = distance_transform_edt(lost | (view.mask <= 0.5)) > AWAY
     telling = lost & (away | binary_opening(lost, np.ones((ACROSS, ACROSS))))
     kept = np.bincount(regions.ravel(), telling.ravel(), count + 1) >= LEAST
     kept[0] = False
     return kept[regions]
 
 
-def restore_shown(values: np.ndarray, grid: Grid, sights: Sequence[Sight], known: Sight) -> tuple[np.ndarray, float]:
+def restore_picture_silhouette(
+    values: np.ndarray, grid: Grid, views: Sequence[PreparedView], known: PreparedView
+) -> tuple[np.ndarray, float]:
     """Signed distances (a, b, c) float32 with an inside behind all that the known view shows, and the share of its mask
     that had none.
 
@@ -66,13 +69,13 @@ def restore_shown(values: np.ndarray, grid: Grid, sights: Sequence[Sight], known
     part is as thick as it is wide, up to WIDEST pixels."""
     from scipy.ndimage import distance_transform_edt, maximum_filter
 
-    lost = lost_pixels(values, grid, known) if known.points is not None else np.zeros(known.mask.shape, bool)
+    lost = missing_pixels(values, grid, known) if known.points is not None else np.zeros(known.mask.shape, bool)
     if not lost.any():
         return values, 0.0
     camera, mask = known.camera, known.mask > 0.5
     zone = dilate(lost, BESIDE) & mask
     first = _depth(known, zone)
-    other = opposite(sights, known)
+    other = opposite(views, known)
     foot = pixel_footprint(camera, np.where(first > 0, first, 1.0))
     wide = np.minimum(distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1], WIDEST) * foot
     last = first + 2 * wide
@@ -102,12 +105,12 @@ def restore_shown(values: np.ndarray, grid: Grid, sights: Sequence[Sight], known
     return out, float(lost.sum() / mask.sum())
 
 
-def _depth(sight: Sight, zone: np.ndarray) -> np.ndarray:
+def _depth(view: PreparedView, zone: np.ndarray) -> np.ndarray:
     """Depth (h, w) along the axis of a view, aligned and smoothed, within the zone; 0 where it has none."""
     from scipy.ndimage import gaussian_filter
 
-    has = zone & (sight.weight > 0)
-    depth = (sight.points - sight.camera.position) @ -sight.camera.backward
+    has = zone & (view.weight > 0)
+    depth = (view.points - view.camera.position) @ -view.camera.backward
     total = gaussian_filter(has.astype(np.float64), SMOOTH)
     return np.where(
         zone & (total > 1e-3), gaussian_filter(np.where(has, depth, 0.0), SMOOTH) / np.maximum(total, 1e-3), 0.0

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.fields.views.prepared_view import WEAK, Sight, pixel_footprint
+from gdtool.fields.views.prepared_view import WEAK, PreparedView, pixel_footprint
 from gdtool.geometry.grids import Grid, sample_trilinear
 
 HALF_THICKNESS = 0.6  # steps: over half, so that a sheet between two layers of samples has one inside
@@ -17,8 +17,8 @@ _CHUNK = 4096  # points whose cubes of samples are held at once, some 35 KB each
 _REGION = 8  # pixels: fewer that touch are noise at an edge
 
 
-def lost_points(
-    values: np.ndarray, before: np.ndarray, grid: Grid, sights: list[Sight]
+def missing_points(
+    values: np.ndarray, before: np.ndarray, grid: Grid, views: list[PreparedView]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points (n, 3) that views see outside the grid's surface, their normals (n, 3) and pixel sizes on the surface
     (n,).
@@ -28,44 +28,44 @@ def lost_points(
     from scipy.ndimage import label
 
     points, normals, sizes = [], [], []
-    for sight in sights:
-        if sight.planes is None:
+    for view in views:
+        if view.planes is None:
             continue
         # The centre of a pixel that the silhouette cuts may lie beside the object.
-        sure = (sight.weight > WEAK) & (sight.mask > 0.95) & ~sight.broken
+        sure = (view.weight > WEAK) & (view.mask > 0.95) & ~view.depth_edge
         lost = np.zeros(sure.shape, bool)
-        inward = sight.points[sure] - _DEPTH * grid.step * sight.planes[sure][:, :3]
-        hollow = (sample_trilinear(before, grid.locate(inward)) > 0) & ~sight.rough[sure]
-        lost[sure] = hollow | (sample_trilinear(values, grid.locate(sight.points[sure])) > _LOST * grid.step)
+        inward = view.points[sure] - _DEPTH * grid.step * view.planes[sure][:, :3]
+        hollow = (sample_trilinear(before, grid.locate(inward)) > 0) & ~view.not_smooth[sure]
+        lost[sure] = hollow | (sample_trilinear(values, grid.locate(view.points[sure])) > _LOST * grid.step)
         regions, count = label(lost, np.ones((3, 3)))
         if count == 0:
             continue
         lost &= (np.bincount(regions.ravel()) >= _REGION)[regions]
-        normal = sight.planes[lost][:, :3]
-        points.append(sight.points[lost])
+        normal = view.planes[lost][:, :3]
+        points.append(view.points[lost])
         normals.append(normal)
-        distance = np.linalg.norm(sight.points[lost] - sight.camera.position, axis=1)
-        sizes.append(pixel_footprint(sight.camera, distance) / np.clip(normal @ sight.camera.backward, 0.35, 1.0))
+        distance = np.linalg.norm(view.points[lost] - view.camera.position, axis=1)
+        sizes.append(pixel_footprint(view.camera, distance) / np.clip(normal @ view.camera.backward, 0.35, 1.0))
     if not points:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
     return np.concatenate(points), np.concatenate(normals), np.concatenate(sizes)
 
 
-def restore_thin(
-    values: np.ndarray, before: np.ndarray, grid: Grid, sights: list[Sight]
+def restore_thin_parts(
+    values: np.ndarray, before: np.ndarray, grid: Grid, views: list[PreparedView]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Signed distances in which no seen region is lost, and the points (n, 3) of what was thickened.
 
     before: the distances before smoothing, which may still hold a part that smoothing took.
     """
-    points, _, _ = lost_points(values, before, grid, sights)
+    points, _, _ = missing_points(values, before, grid, views)
     if len(points) == 0:
         return values, points
     out = values.copy()
     for start in range(0, len(points), _CHUNK):
         around = _around(points[start : start + _CHUNK], grid, 2)[0].ravel()
         out.ravel()[around] = np.minimum(out.ravel()[around], before.ravel()[around])
-    points, normals, sizes = lost_points(out, before, grid, sights)
+    points, normals, sizes = missing_points(out, before, grid, views)
     for start in range(0, len(points), _CHUNK):
         part = slice(start, start + _CHUNK)
         index, place = _around(points[part], grid, 3)
@@ -87,7 +87,7 @@ def _around(points: np.ndarray, grid: Grid, reach: int) -> tuple[np.ndarray, np.
     return flat, grid.origin + grid.step * index
 
 
-def near_points(vertices: np.ndarray, points: np.ndarray, distance: float) -> np.ndarray:
+def vertices_near(vertices: np.ndarray, points: np.ndarray, distance: float) -> np.ndarray:
     """Which vertices (v,) lie within distance of any of the points."""
     from scipy.spatial import cKDTree
 
