@@ -133,7 +133,7 @@ def normals_beside(vertices: np.ndarray, faces: np.ndarray, views) -> float:
 def skips(views) -> list[dict]:
     """CPU seconds of the grid method with a step left out and done, and how far the result moves (world units)."""
     from gdtool.fields.grid.carve import carve, combined_distance
-    from gdtool.fields.grid.fusion import align_depth, align_views, grid_step, prepare_all
+    from gdtool.fields.grid.fusion import AlignmentOptions, align_depth, align_views, grid_step, prepare_all
     from gdtool.fields.views.depth_alignment import disagreement
 
     depth, normal, colors = (
@@ -149,12 +149,12 @@ def skips(views) -> list[dict]:
         return function(), time.process_time() - start
 
     (_, before, after), checked = timed(
-        lambda: align_depth(views.cameras, views.mask, depth, normal, step, colors=colors)
+        lambda: align_depth(views.cameras, views.mask, depth, normal, step, AlignmentOptions(colors=colors))
     )
     found = []
     if before == after:
         (moved, _), forced = timed(
-            lambda: align_views(views.cameras, views.mask, depth, normal, prepared, colors=colors)
+            lambda: align_views(views.cameras, views.mask, depth, normal, prepared, AlignmentOptions(colors=colors))
         )
         found.append(
             {

@@ -80,9 +80,11 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
 
 def _run(inputs: Inputs, options: Options, out: Output) -> None:
-    from gdtool.fields.appearance.appearance import appearance
+    from gdtool.fields.appearance.appearance import AppearanceOptions, appearance
     from gdtool.fields.grid.fusion import (
+        AlignmentOptions,
         BUMPY,
+        FusionOptions,
         SMALL,
         align_depth,
         finest_pixel,
@@ -111,7 +113,7 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         depth = _depth(views, out)
         alike = ("albedo", "color") if "depth" in views.images else ("albedo", "color", "normal")
         colors = [views.images[domain] for domain in alike if domain in views.images]
-        prepared, before, noise = align_depth(views.cameras, views.mask, depth, normal, step, clock, log.status, colors)
+        prepared, before, noise = align_depth(views.cameras, views.mask, depth, normal, step, AlignmentOptions(clock=clock, tell=log.status, colors=colors))
         agreed = agreement(prepared)
         if agreed < LEAST_AGREEMENT:
             out.warn(
@@ -130,9 +132,7 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         out.skip("growth of the surface", "no model made the views of a picture")
     with out.step("fuse"):
         try:
-            shape, coarser = fuse_within_budget(
-                prepared, step, noise, outvoted, clock, normal is not None, grow, folder.content.picture
-            )
+            shape, coarser = fuse_within_budget(prepared, step, options=FusionOptions(noise=noise, outvoted=outvoted, has_normals=normal is not None, grow=grow, picture_view=folder.content.picture), clock=clock)
         except ValueError as error:
             raise InputError(folder.path, str(error), "give masks and cameras of one object") from None
     if shape.bumps is None or shape.bumps <= BUMPY:
@@ -163,9 +163,7 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         vertices, faces, figures, fit = _fit(views, prepared, shape, options, out)
     with out.step("materials"):
         normals = vertex_normals(vertices, faces)
-        look = appearance(
-            views.cameras, views.mask, views.images, vertices, faces, normals, shape.step, views.light, options.seed
-        )
+        look = appearance(views.cameras, views.mask, views.images, vertices, faces, normals, AppearanceOptions(step=shape.step, light=views.light, seed=options.seed))
         for what, reason in look.skipped:
             out.skip(what, reason)
     if fit is not None:

@@ -73,7 +73,10 @@ def test_a_known_image_is_reached_exactly(scheduler):
 def gaussian_error(scheduler, steps):
     """Data N(0, 2²): E[x_0 | x] = a 4 x / (4 a² + s²); the exact flow maps noise z to 2 z."""
     a, s = (x.double() for x in alpha_and_sigma(SD))
-    denoise = lambda x, t, i: a[t] * 4 * x / (4 * a[t] ** 2 + s[t] ** 2)
+
+    def denoise(x, t, i):
+        return a[t] * 4 * x / (4 * a[t] ** 2 + s[t] ** 2)
+
     z = torch.ones(1, dtype=torch.float64)
     start = float((4 * a[-1] ** 2 + s[-1] ** 2).sqrt())  # the flow's own value at the last timestep, not quite 1
     return abs(float(sample(denoise, z * start, SD, steps, scheduler)) - 2.0)

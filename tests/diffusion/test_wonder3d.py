@@ -255,12 +255,12 @@ def test_without_joint_attention_an_image_gets_what_diffusers_gives_it(folder):
 
 def test_guidance_is_the_step_from_nothing_to_the_condition(folder):
     """One step at guidance 3, restated: without = zero embedding, zero latent, the same camera labels."""
-    from gdtool.diffusion.inference.sampling import sample_images
+    from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
     from gdtool.diffusion.network.encoding import encode_condition
 
     model = wonder3d.load(folder)
     rgba = torch.rand(1, 4, 64, 64) * 2 - 1
-    given = sample_images(model, rgba, domains=("color", "normal"), steps=1, guidance=3.0, seed=5)
+    given = sample_images(model, rgba, SamplingOptions(domains=("color", "normal"), steps=1, guidance=3.0, seed=5))
     layout, views = Layout(1, (0, 1), 6), torch.arange(6)
     noise = torch.randn(36, 4, 8, 8, generator=torch.Generator().manual_seed(5))[:12]
     white = encode_condition(rgba, torch.ones(1))

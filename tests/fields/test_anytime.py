@@ -6,6 +6,8 @@ import pytest
 from gdtool.fields.clock import Clock
 from gdtool.fields.grid import fusion
 from gdtool.fields.grid.fusion import (
+    AlignmentOptions,
+    FusionOptions,
     align_depth,
     align_views,
     fuse_views,
@@ -55,7 +57,7 @@ def test_rounds_end_at_a_plateau_and_each_says_the_error(ring, bent):
     told = []
     prepared = prepare_all(cameras, mask, bent, images["normal"])
     before = fusion.disagreement(prepared)
-    _, after = align_views(cameras, mask, bent, images["normal"], prepared, tell=told.append)
+    _, after = align_views(cameras, mask, bent, images["normal"], prepared, AlignmentOptions(tell=told.append))
     assert after < 0.5 * before
     assert len(fusion.ROUNDS) <= len(told) < len(fusion.ROUNDS) + fusion.MORE_ROUNDS
     assert f"{after:.5f}" in told[-1]
@@ -65,9 +67,11 @@ def test_no_time_at_all_gives_one_round_and_the_draft(ring, bent):
     cameras, images, mask = ring
     step, told = grid_step(cameras, 0), []
     clock = Clock(0.5, Ticking())
-    prepared, before, noise = align_depth(cameras, mask, bent, images["normal"], step, clock, told.append)
+    prepared, before, noise = align_depth(
+        cameras, mask, bent, images["normal"], step, AlignmentOptions(clock=clock, tell=told.append)
+    )
     assert len(told) == 1 and noise < before
-    shape, coarser = fuse_within_budget(prepared, step, noise, 0, clock)
+    shape, coarser = fuse_within_budget(prepared, step, options=FusionOptions(noise=noise, outvoted=0), clock=clock)
     assert coarser and shape.step == fusion.DRAFT * step and is_closed_manifold(shape.faces)
     assert np.abs(torus(shape.vertices)).mean() < 0.01
 
@@ -77,9 +81,13 @@ def test_the_finest_grid_that_there_is_time_for(ring):
     step = grid_step(cameras, 0)
     prepared = prepare_all(cameras, mask, images["depth"], images["normal"])
     steps = [
-        fuse_within_budget(prepared, step, 0.0, 0, Clock(budget, Ticking()))[0].step / step for budget in (5, 10, 60)
+        fuse_within_budget(
+            prepared, step, options=FusionOptions(noise=0.0, outvoted=0), clock=Clock(budget, Ticking())
+        )[0].step
+        / step
+        for budget in (5, 10, 60)
     ]
     assert steps == pytest.approx([2.0, 1.4, 1.0])
-    shape, coarser = fuse_within_budget(prepared, step, 0.0, 0, Clock())
+    shape, coarser = fuse_within_budget(prepared, step, options=FusionOptions(noise=0.0, outvoted=0), clock=Clock())
     whole = fuse_views(prepared, step)
     assert coarser == "" and (shape.vertices == whole.vertices).all() and (shape.faces == whole.faces).all()

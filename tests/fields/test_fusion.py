@@ -8,9 +8,10 @@ from gdtool.cameras import rig
 from gdtool.fields.grid.carve import silhouettes_outvoted
 from gdtool.fields.grid.fusion import (
     BUMPY,
+    FusionOptions,
     align_depth,
     depth_for,
-    folds,
+    fold_midpoints,
     fuse_views,
     grid_step,
     is_closed_manifold,
@@ -52,7 +53,7 @@ def reconstruct(cameras, images, mask, depth=True, normal=True):
     step = grid_step(cameras, 0)
     given = images["depth"] if depth else depth_for(cameras, mask, images["normal"]) if normal else None
     prepared, _, noise = align_depth(cameras, mask, given, images["normal"] if normal else None, step)
-    return fuse_views(prepared, step, noise, silhouettes_outvoted(prepared))
+    return fuse_views(prepared, step, FusionOptions(noise=noise, outvoted=silhouettes_outvoted(prepared)))
 
 
 # Pixels are 0.02 wide here: the bounds are a tenth of one on average, two at the worst.
@@ -89,7 +90,7 @@ def test_edges_are_drawn_out(monkeypatch):
 
     def missed():
         shape = fuse_views(prepared, step)
-        assert is_closed_manifold(shape.faces) and len(folds(shape.vertices, shape.faces)) == 0
+        assert is_closed_manifold(shape.faces) and len(fold_midpoints(shape.vertices, shape.faces)) == 0
         return np.array([closest_points(edge, shape.vertices, shape.faces)[0].mean() for edge in edges])
 
     sharp = missed()
@@ -206,7 +207,9 @@ def degrees_off(solid, vertices, faces):
 @pytest.mark.parametrize("solid", [sphere, torus])
 def test_bumps_that_the_normals_do_not_show_go(seen, solid):
     prepared, step, noise = bumpy(seen, solid.__name__)
-    rough, smooth = (fuse_views(prepared, step, noise, shaded=shaded) for shaded in (False, True))
+    rough, smooth = (
+        fuse_views(prepared, step, FusionOptions(noise=noise, has_normals=shaded)) for shaded in (False, True)
+    )
     assert rough.bumps is None and smooth.bumps > BUMPY and is_closed_manifold(smooth.faces)
     before, after = degrees_off(solid, rough.vertices, rough.faces), degrees_off(solid, smooth.vertices, smooth.faces)
     assert np.median(after) < 0.6 * np.median(before)
@@ -216,7 +219,7 @@ def test_bumps_that_the_normals_do_not_show_go(seen, solid):
 @pytest.mark.parametrize("solid", [sphere, torus])
 def test_a_surface_grows_by_as_much_as_it_is_asked_to(seen, solid):
     prepared, step, noise = bumpy(seen, solid.__name__)
-    plain, grown = (fuse_views(prepared, step, noise, grow=grow) for grow in (0.0, step / 2))
+    plain, grown = (fuse_views(prepared, step, FusionOptions(noise=noise, grow=grow)) for grow in (0.0, step / 2))
     assert np.mean(solid(grown.vertices)) - np.mean(solid(plain.vertices)) == pytest.approx(step / 2, rel=0.15)
     assert is_closed_manifold(grown.faces)
 
@@ -257,7 +260,7 @@ def test_a_thin_wall_that_two_views_turn_inside_out_has_no_hole():
         depth[k] += np.where(mask[k] > 0, bump, 0).astype(np.float32)
     step = grid_step(cameras, 0)
     prepared, _, noise = align_depth(cameras, mask, depth, images["normal"], step)
-    shape = fuse_views(prepared, step, noise)
+    shape = fuse_views(prepared, step, FusionOptions(noise=noise))
     assert is_closed_manifold(shape.faces) and components(shape.faces, len(shape.vertices)).max() == 0
     assert euler_number(shape.faces) == 2
 
@@ -343,7 +346,10 @@ def test_views_that_contradict_one_another_still_close(seen):
 
 def test_flat_card_and_empty_views_close():
     """A card a thirtieth of a pixel thick, edge-on in two views; one view shows nothing at all."""
-    card = lambda p: np.max(np.abs(p) - [0.5, 0.4, 0.0005], -1)
+
+    def card(p):
+        return np.max(np.abs(p) - [0.5, 0.4, 0.0005], -1)
+
     cameras, images, mask = views_of(card, 48)
     mask[4] = 0
     shape = reconstruct(cameras, images, mask)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.cameras import project
-from gdtool.fields.grid.fusion import align_depth, grid_step
+from gdtool.fields.grid.fusion import AlignmentOptions, align_depth, grid_step
 from gdtool.fields.views.photometric import Picture, color_equations
 
 from .shapes import sphere, views_of
@@ -70,7 +70,7 @@ def bent(ball):
 def off(ball, colors):
     """Mean error of the aligned views' points."""
     cameras, images, mask = ball
-    prepared = align_depth(cameras, mask, bent(ball), None, grid_step(cameras, 0), colors=colors)[0]
+    prepared = align_depth(cameras, mask, bent(ball), None, grid_step(cameras, 0), AlignmentOptions(colors=colors))[0]
     return float(np.mean([np.abs(sphere(s.points[s.weight > 0.3], 0.45)).mean() for s in prepared]))
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.fields.grid.fusion import fuse_views, grid_step, is_closed_manifold, prepare_all
+from gdtool.fields.grid.fusion import FusionOptions, fuse_views, grid_step, is_closed_manifold, prepare_all
 from gdtool.fields.grid.picture_silhouette import missing_pixels, opposite, restore_picture_silhouette
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import grid_over
@@ -44,7 +44,9 @@ def seen():
 
 def test_a_wing_that_the_other_views_look_through_is_there(seen):
     step = grid_step([prepared_view.camera for prepared_view in seen], 0)
-    without, found = (fuse_views(seen, step, 0.5 * step, known=known) for known in ("", "front"))
+    without, found = (
+        fuse_views(seen, step, FusionOptions(noise=0.5 * step, picture_view=known)) for known in ("", "front")
+    )
     assert without.restored == 0 and np.abs(without.vertices[:, 0]).max() < 0.3
     wing = found.vertices[np.abs(found.vertices[:, 0]) > 0.2]
     assert is_closed_manifold(found.faces) and 0.2 < found.restored < 0.8
@@ -58,7 +60,7 @@ def test_a_wing_that_the_other_views_look_through_is_there(seen):
 
 def test_views_that_agree_are_left_alone(seen):
     step = grid_step([prepared_view.camera for prepared_view in seen], 0)
-    one, two = (fuse_views(seen, step, 0.0, known=known) for known in ("", "front"))
+    one, two = (fuse_views(seen, step, FusionOptions(noise=0.0, picture_view=known)) for known in ("", "front"))
     assert two.restored == 0 and np.array_equal(one.vertices, two.vertices)
 
 

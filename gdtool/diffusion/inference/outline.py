@@ -1,10 +1,9 @@
-"""The picture's outline in the guessed views: what the picture shows and another view leaves no room for is drawn into
-it.
+"""Add parts that the picture shows, and that the sampled outlines leave no room for, to all views.
 
-Of the object's outline from the front everything is known; of the others a model makes a guess, from which thin parts
-(ribbons, arms, spires) fade first. A part of the picture behind which the other outlines have no common point is put
-where they come nearest to having one and where the front view's depth has it, as thick as it is wide up to a bound, and
-every view shows it there."""
+The object's outline from the front is known exactly. The others are guesses of the model, from which thin parts
+(ribbons, arms, spires) fade first. A lost part is put where the other outlines come nearest to having a common point
+and where the front view's depth has it. It is as thick as it is wide, up to a bound.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +27,11 @@ LEAST_FACING = 0.2  # cosine: what a view shows faces it
 
 @dataclass(frozen=True)
 class Part:
-    """Pixels (row, column) of the known view, each (n,), the depth of the part's middle behind them and half its
-    thickness there, world units; outward (n, 3): unit, to the nearest outline; lost (n,): where no other outline leaves
-    room."""
+    """Hold the n pixels of a lost part in the known view.
+
+    row, column (n,); middle (n,): depth of the part's middle behind them; half (n,): half its thickness there, world
+    units; outward (n, 3): unit vector toward the nearest outline; lost (n,): where no other outline leaves room.
+    """
 
     row: np.ndarray
     column: np.ndarray
@@ -43,9 +44,9 @@ class Part:
 def lost_part(
     soft: np.ndarray, mask: np.ndarray, cameras: list[Camera], known: int, depth: np.ndarray | None
 ) -> Part | None:
-    """What the mask of the known view shows and the other masks (k, h, w) leave no room for; None for nothing.
+    """Find what the known view's mask shows and the other masks (k, h, w) leave no room for; None for nothing.
 
-    soft (k, h, w): coverage as the model guessed it. depth (h, w): of the known view, where there is one.
+    soft (k, h, w): coverage as the model sampled it. depth (h, w): of the known view, where there is one.
     """
     from scipy.ndimage import binary_dilation, binary_opening, distance_transform_edt, gaussian_filter
 
@@ -88,7 +89,7 @@ def lost_part(
 
 
 def grown_masks(part: Part, mask: np.ndarray, cameras: list[Camera], known: int) -> np.ndarray:
-    """Masks (k, h, w) of which every one shows the part."""
+    """Add the part to every mask (k, h, w)."""
     out = mask.copy()
     for k in range(len(cameras)):
         if k != known:
@@ -98,10 +99,10 @@ def grown_masks(part: Part, mask: np.ndarray, cameras: list[Camera], known: int)
 
 
 def draw_part(part: Part, images: dict[str, np.ndarray], mask: np.ndarray, cameras: list[Camera], known: int) -> None:
-    """Put the part into the images (k, h, w[, c]) of all domains, in place: the known view's own values, at the depth
-    at which each view sees it, with the normals of a rod along the part.
+    """Draw the part into the images (k, h, w[, c]) of all domains, in place.
 
-    mask (k, h, w): before the part was drawn.
+    It has the known view's values, the depth at which each view sees it, and the normals of a rod along it. mask (k, h,
+    w): before the part was added.
     """
     own = {domain: image[known].copy() for domain, image in images.items()}
     for k in range(len(cameras)):
@@ -120,8 +121,10 @@ def draw_part(part: Part, images: dict[str, np.ndarray], mask: np.ndarray, camer
 
 
 def _shown(part: Part, shape: tuple[int, int], cameras: list[Camera], known: int, k: int) -> tuple[np.ndarray, ...]:
-    """Pixels (row, column) of view k in which the part is nearest to it; its depth there, its normal (n, 3), and which
-    of the part's pixels it is."""
+    """Find the pixels (row, column) of view k in which the part is nearest to it.
+
+    Also returns its depth there, its normal (n, 3), and the index of the part's pixel.
+    """
     camera = cameras[known]
     steps = np.linspace(-1.0, 1.0, 2 * int(np.ceil(part.half.max() / camera.pixel_size)) * PER_PIXEL + 1)
     start = backproject(camera, np.zeros(shape))[part.row, part.column]

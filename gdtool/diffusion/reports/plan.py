@@ -1,8 +1,8 @@
-"""What a training will cost before it is run: memory and FLOPs of a step, and the time on one and on eight GPUs.
+"""Predict the cost of a training: memory and FLOPs of a step, and the time on one and on eight GPUs.
 
-Nothing is tabled but the GPUs: the network is built on PyTorch's meta device (shapes without numbers), a step is run
-there forward and backward, FLOPs are counted by torch.utils.flop_counter and memory by following every storage. So are
-the VAE's encoding, its decoding for the loss by rendering, and CLIP; the shading itself is run on a few numbers.
+Only the GPUs' figures are tabled. The network is built on PyTorch's meta device (shapes without numbers) and a step is
+run there forward and backward. FLOPs are counted by torch.utils.flop_counter, memory by following every storage. The
+VAE's encoding and decoding and CLIP are counted likewise; the shading itself is run on a few numbers.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gdtool.diffusion.network.codec import CHUNK, VaeCodec
 from gdtool.diffusion.network.encoding import PLANES
 from gdtool.diffusion.network.model import Model, parameter_count, structure
 from gdtool.diffusion.network.schedule import alpha_and_sigma
-from gdtool.diffusion.training.losses import LIT, rendering_error, view_directions
+from gdtool.diffusion.training.losses import LIT, LitObject, rendering_error, view_directions
 
 # Dense bfloat16 peak in FLOP/s, memory in bytes, NVLink in bytes/s in one direction (NVIDIA's data sheets, SXM parts).
 GPUS = {"A100 80 GB": (312e12, 80e9, 300e9), "H100 80 GB": (989e12, 80e9, 450e9), "H200 141 GB": (989e12, 141e9, 450e9)}
@@ -35,7 +35,7 @@ GB = 1e9
 
 
 class LiveBytes(TorchDispatchMode):
-    """The most bytes that the results of operations, those of autograd among them, held at once."""
+    """Measure the peak of bytes held by results of operations, autograd's among them."""
 
     def __init__(self):
         super().__init__()
@@ -43,6 +43,7 @@ class LiveBytes(TorchDispatchMode):
         self.seen: dict[int, int] = {}
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        """Run an operation and count the storages that it makes."""
         out = function(*args, **(kwargs or {}))
         given = {x.untyped_storage()._cdata for x in _tensors(args)}
         for x in _tensors(out):
@@ -61,6 +62,7 @@ class LiveBytes(TorchDispatchMode):
 
 
 def _tensors(x):
+    """Yield the tensors in nested lists and tuples."""
     if isinstance(x, torch.Tensor):
         yield x
     elif isinstance(x, list | tuple):
@@ -70,7 +72,7 @@ def _tensors(x):
 
 @contextlib.contextmanager
 def fused_attention():
-    """Attention as GPUs compute it, without a matrix of weights in memory."""
+    """Replace attention by the GPUs' fused kernel, which holds no matrix of weights."""
     before = attention.attend
 
     def fused(q, k, v):
@@ -94,9 +96,9 @@ def step_cost(
     dtype=torch.bfloat16,
     device: str = "meta",
 ) -> dict[str, float]:
-    """FLOPs and peak bytes beyond the weights of one forward and backward pass over so many objects.
+    """Measure FLOPs and peak bytes beyond the weights of one forward and backward pass over so many objects.
 
-    fused: attention as on a GPU, else as attend() does it on this device. dtype: of what is computed.
+    fused: attention as on a GPU, else as attend() computes it on this device. dtype: of the computation.
     """
     # Two passes: the counter's own record of modules keeps tensors alive that checkpointing would have freed.
     counter, memory = FlopCounterMode(display=False), LiveBytes()
@@ -109,7 +111,7 @@ def step_cost(
 def _one_step(
     config: ModelConfig, domains: int, views: int, objects: int, fused: bool, dtype, device: str, watch
 ) -> Model:
-    """A forward and backward pass under `watch`; the model with its gradients."""
+    """Run a forward and backward pass under `watch`; returns the model with its gradients."""
     model = structure(config, device).to(dtype).train()
     layout = Layout(objects, tuple(range(len(DOMAINS)))[:domains], views)
     view_idx = torch.arange(views)
@@ -133,10 +135,10 @@ def _one_step(
 
 
 def frozen_cost(config: ModelConfig) -> dict[str, float] | None:
-    """What the frozen VAE and CLIP cost; None without diffusers.
+    """Measure the cost of the frozen VAE and CLIP; None without diffusers.
 
-    FLOPs: encode and decode per image (decode with what a gradient through it takes), object for CLIP. Bytes:
-    encode_bytes and decode_bytes at once (they do not grow with the batch), weights_bytes in float32.
+    FLOPs: encode and decode per image (decode including its gradient), object for CLIP. Bytes: encode_bytes and
+    decode_bytes at once (they do not grow with the batch), weights_bytes in float32.
     """
     cost = dict.fromkeys(("encode", "decode", "object", "encode_bytes", "decode_bytes", "weights_bytes"), 0.0)
     try:
@@ -160,8 +162,7 @@ def frozen_cost(config: ModelConfig) -> dict[str, float] | None:
 
 
 def frozen_part(config: ModelConfig, part: str) -> torch.nn.Module:
-    """The vae or image_encoder that a local config.pretrained describes, else Stable Diffusion Image Variations',
-    without numbers."""
+    """Build, without numbers, the vae or image_encoder of a local config.pretrained, else Image Variations'."""
     from diffusers import AutoencoderKL
     from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
@@ -193,7 +194,7 @@ def frozen_part(config: ModelConfig, part: str) -> torch.nn.Module:
 
 
 def _counted(call) -> tuple[float, float]:
-    """FLOPs and peak bytes of a call."""
+    """Measure FLOPs and peak bytes of a call."""
     counter, memory = FlopCounterMode(display=False), LiveBytes()
     with counter:
         call()
@@ -203,7 +204,7 @@ def _counted(call) -> tuple[float, float]:
 
 
 def rendering_share(config: ModelConfig, train: TrainConfig, domains: int) -> float:
-    """Of the objects of a step, how many the loss by rendering sees on average."""
+    """Compute the share of a step's objects that the rendering loss sees on average."""
     lit = {DOMAINS.index(d) for d in LIT} <= {DOMAINS.index(d) for d in config.domains} and domains == len(
         config.domains
     )
@@ -215,7 +216,7 @@ def rendering_share(config: ModelConfig, train: TrainConfig, domains: int) -> fl
 
 
 def shading_bytes(config: ModelConfig, train: TrainConfig, views: int) -> float:
-    """The most that the loss by rendering of one object holds, its decoded images among it."""
+    """Measure the peak bytes of the rendering loss of one object, its decoded images included."""
     shape = (len(LIT), views, 3, config.image_size, config.image_size)
     planes = torch.ones(views, PLANES["mask"].stop, *shape[-2:])
     lights = torch.tensor([[0.0, 0, 1, 1, 1, 1, 1]]).repeat(16, 1)
@@ -227,19 +228,18 @@ def shading_bytes(config: ModelConfig, train: TrainConfig, views: int) -> float:
             predicted,
             start,
             order,
-            planes,
-            lights,
-            view_directions(config)[:views],
-            train.pbr_pixels,
-            0.0,
-            torch.Generator(),
+            LitObject(planes=planes, lights=lights, views=view_directions(config)[:views], background=0.0),
+            pixels=train.pbr_pixels,
+            generator=torch.Generator(),
         ).backward()
     return float(memory.peak)
 
 
 def data_bytes(config: ModelConfig, domains: int, views: int) -> float:
-    """What one object of a step takes as data: its planes, their encoding, and clean, noise, noisy and condition
-    latents."""
+    """Compute the bytes of one object's data in a step.
+
+    These are its planes, their encoding, and the clean, noise, noisy and condition latents.
+    """
     codec = structure(config).codec
     pixels, latent = config.image_size**2, codec.side**2
     images = domains * views
@@ -251,7 +251,7 @@ def data_bytes(config: ModelConfig, domains: int, views: int) -> float:
 
 
 def plan_of(config: ModelConfig, train: TrainConfig) -> dict:
-    """The report of `gdtool train --plan`: weights, and for each phase FLOPs, memory and seconds of a step."""
+    """Build the report of `gdtool train --plan`: weights, and for each phase FLOPs, memory and seconds of a step."""
     weights = parameter_count(structure(config))
     frozen = frozen_cost(config)
     report: dict = {
@@ -290,10 +290,10 @@ def plan_of(config: ModelConfig, train: TrainConfig) -> dict:
 def phase_cost(
     config: ModelConfig, train: TrainConfig, phase: Phase, frozen: dict | None, weights: int, *, fused: bool = True
 ) -> dict:
-    """FLOPs of a step of a phase, averaged over the timesteps, and the most bytes that one holds.
+    """Compute FLOPs of a step of a phase, averaged over the timesteps, and its peak bytes.
 
-    The loss by rendering is decoded and held for as many objects as have little noise: on average in FLOPs, all in
-    bytes."""
+    The rendering loss applies to objects with little noise: their average number counts in FLOPs, all of them in bytes.
+    """
     domains, views = min(phase.domains, len(config.domains)), min(phase.views, len(config.views))
     batch = phase.batch or train.batch
     part = -(-batch // train.accumulate)
@@ -327,15 +327,17 @@ def phase_cost(
 
 
 def text_of(report: dict) -> str:
-    """The report as lines for a terminal."""
+    """Format the report as lines for a terminal."""
     lines = [
-        f"{report['weights'] / 1e6:.1f} million weights: {report['weights_bytes'] / GB:.2f} GB with gradients, moments and average",
+        f"{report['weights'] / 1e6:.1f} million weights: {report['weights_bytes'] / GB:.2f} GB "
+        "with gradients, moments and average",
         "",
         "phase  steps    batch  at once  domains x views  PFLOP/step  activations  memory",
     ]
     for i, p in enumerate(report["phases"], 1):
         lines.append(
-            f"{i:5d}  {p['steps']:<7d}  {p['batch']:5d}  {p['objects_at_once']:7d}  {p['domains']:7d} x {p['views']:<5d}  "
+            f"{i:5d}  {p['steps']:<7d}  {p['batch']:5d}  {p['objects_at_once']:7d}  "
+            f"{p['domains']:7d} x {p['views']:<5d}  "
             f"{p['flops_per_step'] / 1e15:10.4g}  {p['activation_bytes'] / GB:8.2f} GB  {p['bytes'] / GB:6.2f} GB"
         )
     lines += ["", f"estimated at {report['utilisation']:.0%} of the peak in bfloat16:"]

@@ -1,7 +1,7 @@
-"""The grid method's first half: prepared views to a grid of signed distances.
+"""Carve prepared views into a grid of signed distances: the first half of the grid method.
 
-What any view sees in front of its surface, or beside its silhouette, is outside; the rest is inside. So what no view
-sees (tops, bottoms, hollows) is closed at the largest extent that the views allow.
+Space that any view sees in front of its surface or beside its silhouette is outside; the rest is inside. Unseen parts
+(tops, bottoms, hollows) are therefore closed at the largest extent that the views allow.
 """
 
 from __future__ import annotations
@@ -24,20 +24,22 @@ _CHUNK = 1 << 16  # samples at a time: their arrays stay in the cache
 def combined_distance(
     views: list[PreparedView], points: np.ndarray, step: float, limit: float, noise: float = 0.0, outvoted: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distance (n,) float32 of points (n, 3) by all views, clipped to +-limit, and how it was measured (n,)
+    """Combine all views to a signed distance (n,) float32 of points (n, 3), clipped to +-limit, and its kind (n,)
     uint8.
 
-    Outside where any view sees free space. The magnitude is that of the nearest surface among the views that agree
-    with the sign; estimates within about a third of a step of it are averaged by their weights. With noise (world
-    units by which the views disagree) the mean of all views that see the surface decides instead. The silhouettes
-    bound the distance from below. Measured SMOOTHLY where a view sees one smooth surface, or where the silhouettes of
-    most views end (flat tops and bottoms); ROUGHLY where only a pixel at an edge tells; else UNSEEN. outvoted: how many
-    silhouettes may miss a point of the object.
+    A point is outside where any view sees free space. The magnitude is that of the nearest surface among the views that
+    agree with the sign; estimates within about a third of a step of it are averaged by weight. With noise (world units
+    by which the views disagree) the mean of all views that see the surface decides instead. The silhouettes bound the
+    distance from below. outvoted: how many silhouettes may miss a point of the object.
+
+    The kind is SMOOTHLY where a view sees one smooth surface or where the silhouettes of most views end (flat tops and
+    bottoms), ROUGHLY where only an edge pixel tells, and UNSEEN elsewhere.
     """
     out, measured = np.empty(len(points), np.float32), np.zeros(len(points), np.uint8)
     deep = [s for s in views if s.planes is not None]
 
     def measure(start: int) -> None:
+        """Fill one chunk of `out` and `measured`."""
         part = points[start : start + _CHUNK]
         hull = np.stack([hull_distance(view, part) for view in views]).astype(np.float32)
         ending = (np.abs(hull) < step).sum(0)
@@ -67,8 +69,8 @@ def combined_distance(
 def _nearest_surface(value: np.ndarray, weight: np.ndarray, blend: float, limit: float) -> np.ndarray:
     """Fuse distances value (k, n), unknown at -limit with weight 0, to (n,).
 
-    A weak distance (beside a jump in depth, where the pixel grid decides what is seen) carves only where no reliable one
-    finds the surface close by.
+    A weak distance (beside a jump in depth, where the pixel grid decides what is seen) carves only where no reliable
+    one finds the surface close by.
     """
     reliable = weight > WEAK
     free, near = value > 0, reliable & (value > -limit / 2)
@@ -89,15 +91,15 @@ def _nearest_surface(value: np.ndarray, weight: np.ndarray, blend: float, limit:
 
 
 def _vote(hull: np.ndarray, outvoted: int) -> np.ndarray:
-    """The largest distance (n,) of hull (k, n) after the outvoted largest ones."""
+    """Return the largest distance (n,) of hull (k, n) after dropping the `outvoted` largest ones."""
     return hull.max(0) if outvoted == 0 else -np.partition(-hull, outvoted, axis=0)[outvoted]
 
 
 def silhouettes_outvoted(views: list[PreparedView], samples: int = 56, reach: float = 0.75) -> int:
-    """How many silhouettes must be ignored at a point, at most, so that the common volume fills the masks.
+    """Find how many silhouettes must be ignored at a point, at most, so that the common volume fills the masks.
 
-    0 for views of one object. Views that contradict one another leave a volume that is empty or too thin; then the
-    point is kept that all but one, two, … of them allow, until nine tenths of the typical mask are filled.
+    0 for views of one object. Views that contradict one another leave a volume that is empty or too thin. Then a point
+    is kept that all but one, two, … of them allow, until nine tenths of the median mask are filled.
     """
     axis = np.linspace(-reach, reach, samples)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
@@ -111,7 +113,7 @@ def silhouettes_outvoted(views: list[PreparedView], samples: int = 56, reach: fl
 
 
 def _filled(view: PreparedView, points: np.ndarray, radius: float) -> float:
-    """Share of a view's mask that points, each of the given world radius, cover."""
+    """Measure the share of a view's mask that points, each of the given world radius, cover."""
     pixels, depth = project(view.camera, points)
     h, w = view.mask.shape
     hit = np.zeros((h, w), bool)
@@ -123,7 +125,7 @@ def _filled(view: PreparedView, points: np.ndarray, radius: float) -> float:
 
 
 def _mean_surface(value: np.ndarray, weight: np.ndarray, limit: float) -> np.ndarray:
-    """Weighted mean (n,) of the truncated distances value (k, n) of the views that do not look at something nearer."""
+    """Average (n,) the truncated distances value (k, n) of the views that do not see a nearer surface."""
     share = np.where(value > -limit, weight, 0.0)
     total = share.sum(0)
     return np.where(total > 1e-3, (share * value).sum(0) / np.maximum(total, 1e-3), value.max(0))
@@ -132,7 +134,7 @@ def _mean_surface(value: np.ndarray, weight: np.ndarray, limit: float) -> np.nda
 def hull_bounds(
     views: list[PreparedView], outvoted: int = 0, reach: float = 0.75, samples: int = 48
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Box (low, high) around the silhouettes' common cone, found on a coarse grid over [-reach, reach]^3."""
+    """Find the box (low, high) around the common cone of the silhouettes, on a coarse grid over [-reach, reach]^3."""
     step = 2 * reach / (samples - 1)
     axis = np.linspace(-reach, reach, samples)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
@@ -146,9 +148,9 @@ def hull_bounds(
 def carve(
     views: list[PreparedView], step: float, noise: float = 0.0, outvoted: int = 0
 ) -> tuple[Grid, np.ndarray, np.ndarray]:
-    """Grid, its signed distances (a, b, c) float32 and how each is known (a, b, c) uint8.
+    """Carve a grid; returns it, its signed distances (a, b, c) float32 and their kind (a, b, c) uint8.
 
-    Exact in a band around the surface and +-limit (3 steps, more with noise) elsewhere.
+    Distances are exact in a band around the surface and +-limit (3 steps, more with noise) elsewhere.
     """
     limit = max(3.0 * step, 3.0 * noise)
     low, high = hull_bounds(views, outvoted)
@@ -174,14 +176,15 @@ def carve(
 
 
 def smooth_unseen(values: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Signed distances with the unseen part smoothed: fins and ridges left by the edges of what views see go.
+    """Smooth the unseen part of the signed distances, which removes fins and ridges at the edges of the seen part.
 
-    What only edge pixels tell is smoothed by one step, since pixels decide it at random; smooth surfaces stay, and
-    nothing is filled that a view saw to be free (slits that smoothing would close).
+    Parts known from edge pixels alone are smoothed by one step, because the pixel grid decides them at random. Smooth
+    surfaces stay. Nothing is filled that a view saw to be free, such as a slit that smoothing would close.
     """
     from scipy.ndimage import gaussian_filter
 
     def loose(known: np.ndarray) -> np.ndarray:
+        """Return 1 far from known samples, falling to 0 beside them."""
         return np.clip(1.0 - 4.0 * gaussian_filter(known.astype(np.float32), 1.0, truncate=2.0), 0.0, 1.0)
 
     out = values + loose(measured == SMOOTHLY) * (gaussian_filter(values, 1.0, mode="nearest", truncate=2.5) - values)

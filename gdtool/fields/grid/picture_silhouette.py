@@ -1,8 +1,9 @@
-"""What the picture shows and the fused views lost: wings, chimneys, twigs that the other views look through.
+"""Restore parts that the picture shows and the fused views lost, such as wings, chimneys and twigs.
 
-Of views that a model made of one picture, that picture's outline alone is no guess. Each of its pixels has something
-behind it: where the views together leave nothing there, it is put between the depths that the picture's own view and
-the one that faces it have."""
+Among views that a model made of one picture, only that picture's outline is certain. Each of its pixels has an object
+behind it. Where the fused views leave nothing there, a slab is put between the depths of the picture's view and of the
+view that faces it.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +27,10 @@ _CHUNK = 1 << 16
 
 
 def opposite(views: Sequence[PreparedView], known: PreparedView) -> PreparedView | None:
-    """The view that faces a view, both orthographic and of one size, so that one shows the other's outline mirrored;
-    None where there is none."""
+    """Find the view that faces `known`, both orthographic and of one size, so that their outlines mirror one another.
+
+    None where there is none.
+    """
     facing = known.camera.world_from_camera[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
     for view in views:
         if (
@@ -41,8 +44,9 @@ def opposite(views: Sequence[PreparedView], known: PreparedView) -> PreparedView
 
 
 def missing_pixels(values: np.ndarray, grid: Grid, view: PreparedView) -> np.ndarray:
-    """Pixels (h, w) bool of a view's mask behind which the grid of signed distances has no inside; without specks and
-    edges."""
+    """Find the pixels (h, w) bool of a view's mask behind which the distance grid has no inside; specks and edges are
+    left out.
+    """
     from scipy.ndimage import binary_opening, distance_transform_edt, label
 
     h, w = view.mask.shape
@@ -62,11 +66,11 @@ def missing_pixels(values: np.ndarray, grid: Grid, view: PreparedView) -> np.nda
 def restore_picture_silhouette(
     values: np.ndarray, grid: Grid, views: Sequence[PreparedView], known: PreparedView
 ) -> tuple[np.ndarray, float]:
-    """Signed distances (a, b, c) float32 with an inside behind all that the known view shows, and the share of its mask
-    that had none.
+    """Add an inside behind every pixel of the known view's mask.
 
-    values: negative inside, the distances from which the surface will be taken. Without a view from the other side a
-    part is as thick as it is wide, up to WIDEST pixels."""
+    values: signed distances (a, b, c) float32, negative inside. Returns the new distances, and the share of the mask
+    that had no inside. Without a view from the other side a part is as thick as it is wide, up to WIDEST pixels.
+    """
     from scipy.ndimage import distance_transform_edt, maximum_filter
 
     lost = missing_pixels(values, grid, known) if known.points is not None else np.zeros(known.mask.shape, bool)
@@ -106,7 +110,7 @@ def restore_picture_silhouette(
 
 
 def _depth(view: PreparedView, zone: np.ndarray) -> np.ndarray:
-    """Depth (h, w) along the axis of a view, aligned and smoothed, within the zone; 0 where it has none."""
+    """Smooth a view's aligned depth (h, w) within the zone; 0 where it has none."""
     from scipy.ndimage import gaussian_filter
 
     has = zone & (view.weight > 0)

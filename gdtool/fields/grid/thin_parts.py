@@ -1,6 +1,6 @@
-"""Parts that a view sees and that the grid lost: sheets without thickness, blades and wires finer than its step.
+"""Restore thin parts that the grid lost: sheets without thickness, blades and wires finer than its step.
 
-Every pixel's point must lie on the result. Where it does not, the part gets the least thickness the grid can hold.
+Every pixel's point must lie on the result. Where it does not, the part gets the least thickness that the grid can hold.
 """
 
 from __future__ import annotations
@@ -20,10 +20,9 @@ _REGION = 8  # pixels: fewer that touch are noise at an edge
 def missing_points(
     values: np.ndarray, before: np.ndarray, grid: Grid, views: list[PreparedView]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (n, 3) that views see outside the grid's surface, their normals (n, 3) and pixel sizes on the surface
-    (n,).
+    """Find points (n, 3) that views see outside the grid's surface, their normals (n, 3) and pixel sizes (n,).
 
-    before: the distances before smoothing; a seen surface with no inside behind it there is a sheet.
+    before: the distances before smoothing. A seen surface with no inside behind it there is a sheet.
     """
     from scipy.ndimage import label
 
@@ -54,9 +53,9 @@ def missing_points(
 def restore_thin_parts(
     values: np.ndarray, before: np.ndarray, grid: Grid, views: list[PreparedView]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distances in which no seen region is lost, and the points (n, 3) of what was thickened.
+    """Add an inside where a seen region is lost; returns the signed distances and the thickened points (n, 3).
 
-    before: the distances before smoothing, which may still hold a part that smoothing took.
+    before: the distances before smoothing, which may still hold a part that smoothing removed.
     """
     points, _, _ = missing_points(values, before, grid, views)
     if len(points) == 0:
@@ -78,7 +77,7 @@ def restore_thin_parts(
 
 
 def _around(points: np.ndarray, grid: Grid, reach: int) -> tuple[np.ndarray, np.ndarray]:
-    """Flat indices (n, k) of the samples within a cube around each point, and their positions (n, k, 3)."""
+    """Return flat indices (n, k) of the samples in a cube around each point, and their positions (n, k, 3)."""
     steps = np.arange(-reach, reach + 1)
     cube = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
     index = np.rint(grid.locate(points)).astype(np.int64)[:, None] + cube
@@ -88,7 +87,7 @@ def _around(points: np.ndarray, grid: Grid, reach: int) -> tuple[np.ndarray, np.
 
 
 def vertices_near(vertices: np.ndarray, points: np.ndarray, distance: float) -> np.ndarray:
-    """Which vertices (v,) lie within distance of any of the points."""
+    """Tell which vertices (v,) lie within distance of any of the points."""
     from scipy.spatial import cKDTree
 
     if len(points) == 0:

@@ -1,10 +1,11 @@
-"""Depth of views that hold none: where along each pixel's ray the other views show the same thing.
+"""Estimate depth for views without a depth image, by matching each pixel's ray against the other views.
 
-A sweep along the rays with semi-global matching (Hirschmüller, "Stereo Processing by Semiglobal Matching and Mutual
-Information", 2008). What is compared looks alike from all sides: normals in world axes, albedo, roughness, metallic.
-The normals say two things more: how depth goes on from a pixel to the next, so that a slope is as smooth as a wall that
-faces the camera; and which views can see a point at all. The first sweep trusts the better half of these; the second
-one knows from the first which of them the point is hidden from, and whom it would hide."""
+A plane sweep along the rays with semi-global matching (Hirschmüller, "Stereo Processing by Semiglobal Matching and
+Mutual Information", 2008). The compared features do not depend on the viewing direction: normals in world axes, albedo,
+roughness, metallic. Normals help twice. They predict how depth changes from pixel to pixel, so that a slanted plane
+costs no more than one that faces the camera. They tell which views can see a point. The first sweep trusts the better
+half of those views; the second takes occlusion from the first sweep's depths.
+"""
 
 from __future__ import annotations
 
@@ -35,8 +36,7 @@ MOST = 512  # depths that are tried
 
 @dataclass(frozen=True)
 class Matched:
-    """Depth along the viewing axis (h, w), 0 where unknown, and the trust in it (h, w) in 0..1, at the view's own
-    size."""
+    """Hold a view's matched depth along the viewing axis (h, w), 0 where unknown, and its trust (h, w) in 0..1."""
 
     depth: np.ndarray
     trust: np.ndarray
@@ -45,11 +45,10 @@ class Matched:
 def slopes(
     camera: Camera, normal: np.ndarray, least: float, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How the depth of a plane with world normal (…, 3) grows over one pixel to the right and one down, and how it
-    faces the ray.
+    """Compute how the depth of planes with world normals (…, 3) grows over one pixel to the right and one down.
 
-    Depth as stretched() has it: what it grows by then hangs on the normal alone. directions (…, 3): of the rays. Planes
-    that face the ray less than least are taken to face it so much.
+    Returns the two slopes and the cosine between plane and ray. Depth is `stretched` depth, whose growth depends on the
+    normal alone. directions (…, 3): of the rays. Cosines below `least` are raised to it.
     """
     axes = camera.world_from_camera[:3, :3]
     right, down = pixel_steps(camera)
@@ -63,7 +62,7 @@ def slopes(
 
 
 def pixel_steps(camera: Camera) -> tuple[float, float]:
-    """What a pixel's width and height are in stretched depth."""
+    """Return a pixel's width and height in units of stretched depth."""
     return (
         (camera.pixel_size, camera.pixel_size)
         if camera.projection == "orthographic"
@@ -72,19 +71,20 @@ def pixel_steps(camera: Camera) -> tuple[float, float]:
 
 
 def stretched(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """Depth of an orthographic camera as it is, of a perspective one its logarithm: a plane's slope over the picture is
-    then the same at any distance."""
+    """Map depth to a scale on which a plane's slope over the picture is the same at any distance.
+
+    Orthographic depth stays as it is; perspective depth becomes its logarithm.
+    """
     return depth if camera.projection == "orthographic" else np.log(np.maximum(depth, 1e-9))
 
 
 def unstretched(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """The inverse of stretched()."""
+    """Invert `stretched`."""
     return depth if camera.projection == "orthographic" else np.exp(depth)
 
 
 class _View:
-    """A view at the size it is matched at: the n pixels that show something, their rays, what they show, depths to
-    try."""
+    """Hold a view at matching resolution: its n foreground pixels, their rays and features, and the depths to try."""
 
     def __init__(self, camera: Camera, mask: np.ndarray, looks: np.ndarray, normal: np.ndarray, box: np.ndarray):
         self.camera, self.factor = camera, max(1, round(max(mask.shape) / SIZE))
@@ -106,23 +106,23 @@ class _View:
         self.tried = low + self.step * np.arange(max(int(np.ceil((high - low) / self.step)) + 1, 3))
 
     def points(self, depth: np.ndarray) -> np.ndarray:
-        """World points (n, 3) at stretched depth, one number or (n,)."""
+        """Compute world points (n, 3) at a stretched depth, one number or (n,)."""
         return self.origins + self.directions * np.reshape(unstretched(self.camera, np.asarray(depth)), (-1, 1))
 
     def image(self, values: np.ndarray, fill: float = 0.0) -> np.ndarray:
-        """values (n,) where they belong in (h, w)."""
+        """Scatter values (n,) into an image (h, w) that holds `fill` elsewhere."""
         out = np.full(self.shown.shape, fill)
         out[self.shown] = values
         return out
 
     def seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where this view has points (m, 3): positions (m, 2) in its pixels, and depth (m,) along its axis."""
+        """Project points (m, 3): positions (m, 2) in this view's pixels, and depth (m,) along its axis."""
         pixels, depth = project(self.camera, points)
         return pixels / self.factor, depth
 
 
 def _block_means(image: np.ndarray, factor: int) -> np.ndarray:
-    """Means (h / factor, w / factor, c) over blocks of image (h, w, c); beyond its border there is nothing."""
+    """Average image (h, w, c) over blocks of factor x factor pixels, padding it with zeros."""
     h, w, c = image.shape
     padded = np.pad(image, ((0, -h % factor), (0, -w % factor), (0, 0)))
     return padded.reshape(-(-h // factor), factor, -(-w // factor), factor, c).mean((1, 3)).astype(np.float32)
@@ -136,10 +136,11 @@ def match_views(
     silhouettes: list[PreparedView],
     box: tuple[np.ndarray, np.ndarray],
 ) -> list[Matched]:
-    """Depth of every view from what the others show. mask (k, h, w), normal (k, h, w, 3).
+    """Estimate the depth of every view from the other views. mask (k, h, w), normal (k, h, w, 3).
 
-    alike: further images (k, h, w[, 3]) that NOISE names, linear. silhouettes: the prepared views that show anything, for
-    their silhouettes; box: low and high corner of what they can hold. A view that shows nothing has depth 0."""
+    alike: further images (k, h, w[, 3]) that NOISE names, linear. silhouettes: the prepared views that show anything.
+    box: low and high corner of their common volume. A view that shows nothing gets depth 0.
+    """
     corners = np.stack(np.meshgrid(*zip(*box, strict=True), indexing="ij"), -1).reshape(-1, 3)
     looks = _compared_features({"normal": normal, **alike})
     views = [_View(*given, corners) for given in zip(cameras, mask, looks, normal, strict=True)]
@@ -163,7 +164,7 @@ def _sweep(
     known: dict[int, tuple[np.ndarray, np.ndarray]] | None,
     nearer: float,
 ) -> list[np.ndarray]:
-    """Stretched depth (n,) of every view's pixels; see _sweep_costs and _best_depth."""
+    """Find the stretched depth (n,) of every view's pixels; see _sweep_costs and _best_depth."""
     return [
         _best_depth(
             _sweep_costs(view, [other for other in views if other is not view], silhouettes, known, nearer), view
@@ -173,9 +174,10 @@ def _sweep(
 
 
 def _misfit(views: list[_View], found: list[np.ndarray]) -> float:
-    """Median difference, in 0..1, to the view that fits best, of the pixels that another view can see.
+    """Measure the median feature difference, in 0..1, to the best fitting view, over the pixels that another view can
+    see.
 
-    True views come to .003 and less, views disturbed as benchmarks/perturbation.py does to .1, a model's to .7.
+    Consistent views give .003 and less, views disturbed as benchmarks/perturbation.py does .1, a model's views .7.
     """
     every = []
     for view, depth in zip(views, found, strict=True):
@@ -191,7 +193,7 @@ def _misfit(views: list[_View], found: list[np.ndarray]) -> float:
 
 
 def _compared_features(images: dict[str, np.ndarray]) -> np.ndarray:
-    """What is compared (k, h, w, c), each channel in units of how far it usually differs."""
+    """Stack the compared channels (k, h, w, c), each divided by its usual difference."""
     from gdtool.images.color import srgb_from_linear
 
     parts = []
@@ -208,9 +210,9 @@ def _sweep_costs(
     known: dict[int, tuple[np.ndarray, np.ndarray]] | None,
     nearer: float,
 ) -> np.ndarray:
-    """Cost (n, candidates) of every depth that is tried, NEVER where a silhouette rules it out.
+    """Compute the cost (n, candidates) of every candidate depth, NEVER where a silhouette rules it out.
 
-    known: depth and trust (h, w) of the others by id, from an earlier sweep.
+    known: depth and trust (h, w) of the other views by id, from an earlier sweep.
     """
     cost = np.full((len(view.own), len(view.tried)), NEVER, np.float32)
     facing = np.stack([_facing_cosine(other, view) for other in others], 1) if others else np.zeros((len(view.own), 0))
@@ -239,7 +241,7 @@ def _sweep_costs(
 
 
 def _facing_cosine(other: _View, view: _View) -> np.ndarray:
-    """Cosine (n,) between the normals of view's pixels and the direction from about there to the other camera."""
+    """Compute the cosine (n,) between the normals of `view`'s pixels and the direction to the other camera."""
     if other.camera.projection == "orthographic":
         return view.normal @ other.camera.backward
     middle = view.points(np.full(len(view.own), view.tried.mean()))
@@ -250,8 +252,10 @@ def _facing_cosine(other: _View, view: _View) -> np.ndarray:
 def _compare(
     view: _View, other: _View, points: np.ndarray, chosen: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What view shows at points[chosen] beside what the other shows there: difference (m,) in 0..1, pixels (m, 2),
-    depth (m,)."""
+    """Compare the features of view with those of `other` at points[chosen].
+
+    Returns the difference (m,) in 0..1 and the points' pixels (m, 2) and depth (m,) in the other view.
+    """
     pixels, depth = other.seen(points[chosen])
     gap = bilinear(other.looks, pixels) - view.own[chosen]
     difference = np.minimum(np.einsum("ij,ij->i", gap, gap) / WORST**2, 1.0)
@@ -259,8 +263,7 @@ def _compare(
 
 
 def _cost_without_occlusion(compared: list, hidden: np.ndarray) -> np.ndarray:
-    """Cost (m,) when nothing is known of who hides whom: by the view that fits best, of three and more by the best
-    two."""
+    """Compute the cost (m,) while occlusion is unknown: the best view's, or the best two's where three can see."""
     if not compared:
         return hidden
     each = np.stack([np.where(cosine > FACING, difference, np.inf) for difference, _, _, cosine, _ in compared])
@@ -273,8 +276,10 @@ def _cost_without_occlusion(compared: list, hidden: np.ndarray) -> np.ndarray:
 def _cost_with_occlusion(
     compared: list, hidden: np.ndarray, known: dict[int, tuple[np.ndarray, np.ndarray]]
 ) -> np.ndarray:
-    """Cost (m,) by the views whose own surface is met there; a point that would hide what another shows for sure costs
-    most."""
+    """Compute the cost (m,) from the views whose known surface is met at the point.
+
+    A point that would occlude a trusted surface of another view costs most.
+    """
     total, share, blocks = HIDDEN_SHARE * hidden, np.full(len(hidden), HIDDEN_SHARE), np.zeros(len(hidden))
     for difference, pixels, depth, cosine, other in compared:
         surface, trust = (bilinear(image[..., None], pixels)[:, 0] for image in known[id(other)])
@@ -289,8 +294,9 @@ def _cost_with_occlusion(
 
 
 def _best_depth(cost: np.ndarray, view: _View) -> np.ndarray:
-    """Stretched depth (n,) of least cost, each pixel's and what its neighbours' planes ask for; NaN where all is ruled
-    out."""
+    """Find the stretched depth (n,) of least cost after aggregation along rows and columns; NaN where all are ruled
+    out.
+    """
     right, down, facing = slopes(view.camera, view.normal, FACING, view.directions)
     scale = view.factor / view.step
     image = np.full((*view.shown.shape, cost.shape[1]), NEVER, np.float32)
@@ -315,9 +321,9 @@ def _best_depth(cost: np.ndarray, view: _View) -> np.ndarray:
 
 
 def _aggregate_rows(cost: np.ndarray, shown: np.ndarray, slope: np.ndarray, jump: np.ndarray, way: int) -> np.ndarray:
-    """Cost (h, w, candidates) of every depth with the least that the pixels to its left add, along rows.
+    """Add to the cost (h, w, candidates) of every depth the least cost of the pixels before it in its row.
 
-    slope (h, w): candidates that depth grows by over a pixel in the direction of way.
+    slope (h, w): candidates by which depth grows over a pixel in the given direction, 1 or -1.
     """
     out, last = cost.copy(), cost.shape[2] - 1
     every = np.arange(cost.shape[2])
@@ -346,7 +352,7 @@ def _aggregate_rows(cost: np.ndarray, shown: np.ndarray, slope: np.ndarray, jump
 
 
 def _known_depths(views: list[_View], found: list[np.ndarray]) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Each view's depth (h, w), carried on beyond its outline, and the trust in it (h, w), by id."""
+    """Return, by id, each view's depth (h, w), extrapolated beyond its outline, and the trust in it (h, w)."""
     return {
         id(view): (_extrapolate(view, unstretched(view.camera, depth))[0], view.image(trust))
         for view, depth, trust in zip(views, found, _trust(views, found), strict=True)
@@ -354,8 +360,7 @@ def _known_depths(views: list[_View], found: list[np.ndarray]) -> dict[int, tupl
 
 
 def _extrapolate(view: _View, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """values (n,) as an image (h, w) that goes on with the nearest one where there is none, and where there are some
-    (h, w)."""
+    """Extend values (n,) to an image (h, w) by the nearest known value; also returns where they were known (h, w)."""
     from scipy.ndimage import distance_transform_edt
 
     image = view.image(values, np.nan)
@@ -366,8 +371,10 @@ def _extrapolate(view: _View, values: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _trust(views: list[_View], found: list[np.ndarray]) -> list[np.ndarray]:
-    """Trust (n,) in each view's depths: 1 where another view has the point, 0 where none, .1 where more would be hidden
-    by it."""
+    """Compute the trust (n,) in each view's depths.
+
+    1 where another view confirms the point, 0 where none does, .1 where it would occlude more views than confirm it.
+    """
     surfaces = [
         _extrapolate(view, unstretched(view.camera, depth))[0] for view, depth in zip(views, found, strict=True)
     ]
@@ -389,7 +396,7 @@ def _trust(views: list[_View], found: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _full_size(view: _View, depth: np.ndarray, trust: np.ndarray, mask: np.ndarray) -> Matched:
-    """Depths (n,) and trust (n,) at the pixels of the view's own mask (h, w): each block's to all of its pixels."""
+    """Repeat depths (n,) and trust (n,) of each block over all of its pixels in the full mask (h, w)."""
     h, w = mask.shape
     carried, held = _extrapolate(view, unstretched(view.camera, depth))
     blocks = np.ones((view.factor, view.factor))

@@ -1,7 +1,7 @@
-"""Depth from normals: what a view's normals say about shape where there is no depth view.
+"""Integrate normals to depth for views without a depth image.
 
-Normals give the slope of the surface at every pixel, matching the views (stereo.py) roughly where it lies and where it
-breaks off. One robust least squares joins both.
+Normals give the slope at every pixel. Matching the views (multiview_stereo) tells roughly where the surface lies and
+where it breaks off. One robust least squares joins both.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _ASTRAY = 4.0  # pixels: likewise a matched depth
 def integrate_normals(
     camera: Camera, mask: np.ndarray, normal: np.ndarray, matched: Matched, rounds: int = 6
 ) -> np.ndarray:
-    """Depth (h, w), 0 outside the mask (h, w), from world normals (h, w, 3) and the depth that matching found.
+    """Compute depth (h, w), 0 outside the mask (h, w), from world normals (h, w, 3) and a matched depth.
 
-    Minimises the differences of neighbouring depths against the slopes and a pull to the matched depth, each counted
-    less the worse it fits: a step between two surfaces fits badly, and so does a mismatch.
+    Minimises the differences of neighbouring depths against the slopes, and a pull to the matched depth. Terms that fit
+    badly lose weight: a step between two surfaces fits badly, and so does a mismatch.
     """
     from scipy.sparse import coo_matrix, diags
     from scipy.sparse.linalg import cg
@@ -37,9 +37,10 @@ def integrate_normals(
     index = np.full(mask.shape, -1)
     index[inside] = np.arange(count)
     right, down, facing = slopes(camera, normal, MIN_FACING, rays(camera)[1])
+    pixel = pixel_steps(camera)[1]  # its height
     rows, columns, values, targets, trust = [], [], [], [], []
     size = 0
-    for axis, slope, pixel in zip((1, 0), (right, down), pixel_steps(camera), strict=True):
+    for axis, slope in ((1, right), (0, down)):
         ahead = np.roll(index, -1, axis)
         last = [slice(None), slice(None)]
         last[axis] = -1
@@ -85,8 +86,7 @@ def depth_from_normals(
     silhouettes: list[PreparedView],
     box: tuple[np.ndarray, np.ndarray],
 ) -> np.ndarray:
-    """Depth (k, h, w) of all views from normals and silhouettes, and from further images that look alike from all
-    sides.
+    """Compute the depth (k, h, w) of all views from normals, silhouettes and direction-independent images.
 
     See match_views for the arguments.
     """

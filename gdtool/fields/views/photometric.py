@@ -1,4 +1,4 @@
-"""What the colors say of how far away a view's surface is: a point looks alike in all views that see it."""
+"""Constrain depth by color: a point has the same color in all views that see it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _GAIN = 2.0  # one view is at most so many times as bright as another
 
 @dataclass(frozen=True)
 class Picture:
-    """A view's colors (h, w, 3), blurred inside its mask, and their slopes per pixel along x and y."""
+    """Hold a view's colors (h, w, 3), blurred inside its mask, and their slopes per pixel along x and y."""
 
     camera: Camera
     color: np.ndarray
@@ -27,7 +27,7 @@ class Picture:
 
     @classmethod
     def of(cls, camera: Camera, image: np.ndarray, mask: np.ndarray, reach: float) -> Picture:
-        """image (h, w, 3) linear, mask (h, w) coverage; reach: world units that surfaces may be off by."""
+        """Blur image (h, w, 3), linear, within mask (h, w). reach: world units by which surfaces may be off."""
         from scipy.ndimage import gaussian_filter
 
         pixels = BLUR * reach / float(pixel_footprint(camera, float(np.linalg.norm(camera.position))))
@@ -41,12 +41,13 @@ class Picture:
 def color_equations(
     points: np.ndarray, here: np.ndarray, there: np.ndarray, first: Picture, second: Picture, trust: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How a view's depth has to change for its points to look like what another view shows at their places.
+    """Linearise how a view's depth has to change for its points to have the colors that another view shows.
 
-    points (n, 3) that the first view shows at pixels here (n, 2) and that fall on pixels there (n, 2) of the second;
-    trust (n,). Returns the slope (n,) of the difference in color per world unit of the first view's depth, the
-    difference (n,) that it shall undo, and weights (n,): one over the variance that the two views' colors differ by,
-    less for outliers. Each channel of a view may be brighter or have an offset."""
+    points (n, 3): shown by the first view at pixels `here` (n, 2), projected to pixels `there` (n, 2) of the second.
+    trust (n,). Returns the slope (n,) of the color difference per world unit of the first view's depth, the difference
+    (n,) to remove, and weights (n,): one over the variance of the two views' color differences, less for outliers. Each
+    channel may have a gain and an offset between the views.
+    """
     own, shown = bilinear(first.color, here), bilinear(second.color, there)
     _, direction = rays(first.camera, here)
     farther = points + _STEP * direction / np.maximum(-(direction @ first.camera.backward), 1e-9)[:, None]
@@ -63,7 +64,7 @@ def color_equations(
 
 
 def _matched(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """x (n,) with the gain and offset that bring it nearest to y (n,)."""
+    """Apply to x (n,) the gain and offset that bring it nearest to y (n,)."""
     total = max(float(weight.sum()), 1e-12)
     from_x, from_y = x - (weight * x).sum() / total, y - (weight * y).sum() / total
     gain = (weight * from_x * from_y).sum() / max(float((weight * from_x**2).sum()), 1e-12)

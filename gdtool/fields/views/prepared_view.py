@@ -1,8 +1,8 @@
-"""What each view says about a point in space: how far it lies in front of the surface that the view sees.
+"""Evaluate, for one view, how far points lie in front of the surface that it sees.
 
-A view is prepared once (`prepare`) into small images: the tangent plane behind each pixel, how far a pixel is from a
-contour that hides something, and the signed distance to the silhouette. Then `free_distance` and `hull_distance`
-answer for any number of points. Positive means outside: a point that any view sees in free space is outside the object.
+`prepare` turns a view into small images once: the tangent plane behind each pixel, the distance to the next occluding
+contour, and the signed distance to the silhouette. `free_distance` and `hull_distance` then answer for any number of
+points. Positive means outside: a point that any view sees in free space is outside the object.
 """
 
 from __future__ import annotations
@@ -22,12 +22,17 @@ _FREE_SPACE_WEIGHT = 1e-4  # weight of a pixel whose depth fits no neighbour
 
 @dataclass(frozen=True)
 class PreparedView:
-    """One prepared view. Images are (h, w[, c]) float32; world units where not said otherwise.
+    """Hold one view's images (h, w[, c]), float32, in world units unless said otherwise.
 
-    planes: unit normal and offset of the tangent plane behind each pixel (n·x = offset); weight: trust in it, 0 where
-    there is no depth; not_smooth: pixels whose neighbourhood is no single smooth surface; depth_edge: pixels beside a jump in
-    depth; occluder_distance_px: distance to an occluding contour in pixels; silhouette: signed distance to the mask's edge in
-    pixels, negative inside; points (h, w, 3)."""
+    planes: unit normal and offset of the tangent plane behind each pixel (n·x = offset).
+    weight: confidence in the plane, 0 where there is no depth.
+    not_smooth: pixels whose neighbourhood is not one smooth surface.
+    depth_edge: pixels beside a jump in depth.
+    occluder_distance_px: distance in pixels to the nearest occluding contour, inf where there is none close by.
+    silhouette: signed distance in pixels to the mask's edge, negative inside.
+    points (h, w, 3): back-projected pixels.
+    cropped: whether the object runs over the picture's border.
+    """
 
     camera: Camera
     mask: np.ndarray
@@ -42,11 +47,11 @@ class PreparedView:
 
 
 def silhouette_distance(mask: np.ndarray) -> np.ndarray:
-    """Signed distance (h, w) in pixels to the edge of an antialiased mask (h, w) in 0..1, negative inside.
+    """Compute the signed distance (h, w) in pixels to the edge of an antialiased mask (h, w) in 0..1, negative inside.
 
-    The edge is where coverage, relative to the fullest pixel next to it, passes a half: so a line thinner than a
-    pixel keeps an inside. Near the edge the distance is exact to the sub-pixel contour; farther away it is the
-    distance transform's.
+    The edge is where coverage, relative to the fullest pixel next to it, passes one half, so that a line thinner than a
+    pixel keeps an inside. Within four pixels of the edge the distance is exact to the sub-pixel contour. Farther away
+    it is the distance transform's.
     """
     from scipy.ndimage import distance_transform_edt, maximum_filter
     from scipy.spatial import cKDTree
@@ -72,7 +77,7 @@ def silhouette_distance(mask: np.ndarray) -> np.ndarray:
 
 
 def normals_from_depth(points: np.ndarray, valid: np.ndarray, backward: np.ndarray) -> np.ndarray:
-    """Unit normals (h, w, 3) of back-projected points (h, w, 3), facing the camera; zero where nothing can be said.
+    """Compute unit normals (h, w, 3) of back-projected points (h, w, 3), facing the camera; zero where undefined.
 
     On each axis the shorter of the two one-sided differences is used, so that normals do not mix two surfaces.
     """
@@ -99,7 +104,7 @@ def normals_from_depth(points: np.ndarray, valid: np.ndarray, backward: np.ndarr
 
 
 def pixel_footprint(camera: Camera, depth) -> np.ndarray:
-    """World units a pixel covers at the given depth."""
+    """Return the world units that a pixel covers at the given depth."""
     if camera.projection == "orthographic":
         return np.full(np.shape(depth), camera.pixel_size)
     return np.asarray(depth) / camera.fx
@@ -108,10 +113,11 @@ def pixel_footprint(camera: Camera, depth) -> np.ndarray:
 def prepare(
     camera: Camera, mask: np.ndarray, depth: np.ndarray | None = None, normal: np.ndarray | None = None
 ) -> PreparedView:
-    """Prepare one view: mask (h, w) coverage, depth (h, w) along the axis and normal (h, w, 3) world, either optional.
+    """Prepare one view from its mask (h, w), depth (h, w) along the axis and world normals (h, w, 3), the last two
+    optional.
 
-    Pixels whose depth fits no neighbour (an average over an edge) tell only that the view before them is free. Without
-    normals they are taken from the depth.
+    A pixel whose depth fits no neighbour (an average over an edge) only tells that the view in front of it is free.
+    Without normals they are computed from the depth.
     """
     silhouette = silhouette_distance(mask)
     border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
@@ -158,8 +164,10 @@ def prepare(
 
 
 class _Shown:
-    """The n pixels of a view that show a surface, beside their neighbours: points and normals (h, w, 3), valid and foot
-    (h, w)."""
+    """Compare the n pixels that show a surface with their neighbours.
+
+    points and normals (h, w, 3), valid and foot (h, w).
+    """
 
     def __init__(self, points: np.ndarray, normal: np.ndarray, valid: np.ndarray, foot: np.ndarray):
         rim = [(OCCLUDER_REACH_PX,) * 2] * 2
@@ -174,14 +182,17 @@ class _Shown:
         self.point, self.normal = self.points[self.at], self.normals[self.at]
 
     def image(self, values: np.ndarray, fill) -> np.ndarray:
-        """values (n,) where they belong in (h, w)."""
+        """Scatter values (n,) into an image (h, w) that holds `fill` elsewhere."""
         out = np.full(self.valid.shape, fill, np.result_type(values, fill))
         out[self.valid] = values
         return out
 
     def gaps(self, shift: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Whether the neighbour shows something too (n,), its height over this pixel's plane, and this one's over the
-        neighbour's."""
+        """Compare each pixel with the neighbour at `shift` (rows, columns); three arrays (n,).
+
+        Returns whether the neighbour shows a surface, its height over this pixel's plane, and this pixel's height over
+        the neighbour's plane.
+        """
         beside = self.at + shift[0] * self.columns + shift[1]
         delta = self.points[beside] - self.point
         return (
@@ -191,9 +202,12 @@ class _Shown:
         )
 
     def judged(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(n,) each: which pixels' depth fits two neighbours and does not float between a nearer surface on one side
-        and a farther one on the other (an average over an edge), which lie amid one smooth surface, and which beside a
-        jump."""
+        """Classify the pixels: three bool arrays (n,), reliable, smooth and depth_edge.
+
+        A reliable pixel fits the depth of two neighbours and does not float between a nearer surface on one side and a
+        farther one on the other, as averages over an edge do. A smooth pixel lies within one surface. A depth edge lies
+        beside a jump.
+        """
         count = len(self.at)
         agree, smooth, depth_edge, flying = (
             np.zeros(count, int),
@@ -215,10 +229,9 @@ class _Shown:
         return (agree >= 2) & ~flying, smooth, depth_edge
 
     def occluder_distance_px(self, normal: np.ndarray, reliable: np.ndarray) -> np.ndarray:
-        """Pixels (n,) from each pixel to the nearest one whose surface stands in front of its plane (an occluding
-        contour).
+        """Compute the distance in pixels (n,) to the nearest pixel whose surface stands in front of this pixel's plane.
 
-        normal (n, 3): of the planes. What is not reliable (n,) hides nothing but what is not reliable either.
+        normal (n, 3): of the planes. An unreliable pixel (n,) occludes only other unreliable pixels.
         """
         may_occlude = self.inner.copy()
         may_occlude.ravel()[self.at] = reliable
@@ -237,11 +250,11 @@ class _Shown:
 
 
 def grow_silhouette(view: PreparedView, edge: float) -> PreparedView:
-    """The view with its silhouette grown all around by edge (world units at the origin's distance; negative shrinks
-    it).
+    """Return the view with its silhouette moved outward by `edge` (world units at the origin's distance; negative
+    shrinks it).
 
-    Pixels that it gains show nothing: that the view before them is free, as far as the nearest pixel's depth, is what
-    they tell."""
+    A gained pixel shows no surface. It tells that the view is free as far as the depth of the nearest pixel.
+    """
     from scipy.ndimage import distance_transform_edt
 
     foot = float(pixel_footprint(view.camera, float(np.linalg.norm(view.camera.position))))
@@ -264,8 +277,10 @@ def grow_silhouette(view: PreparedView, edge: float) -> PreparedView:
 
 
 def hull_distance(view: PreparedView, points: np.ndarray) -> np.ndarray:
-    """Signed distance (n,) of points (n, 3) to the view's silhouette cone, positive outside. A lower bound of the
-    object's."""
+    """Compute the signed distance (n,) of points (n, 3) to the view's silhouette cone, positive outside.
+
+    It is a lower bound of the distance to the object.
+    """
     pixels, depth = project(view.camera, points)
     value = bilinear(view.silhouette[..., None], pixels)[:, 0]
     h, w = view.mask.shape
@@ -278,18 +293,21 @@ def hull_distance(view: PreparedView, points: np.ndarray) -> np.ndarray:
 
 
 def free_distance(view: PreparedView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far points (n, 3) lie in front of the surface the view sees: distance (n,), -inf where unknown; weight (n,).
+    """Compute how far points (n, 3) lie in front of the surface that the view sees.
 
-    The distance is to the tangent planes behind the four pixels around the point, or to the nearest pixel's where
-    they belong to different surfaces.
+    Returns the distance (n,), -inf where unknown, and its weight (n,). The distance is to the tangent planes behind the
+    four pixels around the point, or to the nearest pixel's where these belong to different surfaces.
     """
     value, weight, _, _ = tangent_distance(view, points)
     return value, weight
 
 
 def tangent_distance(view: PreparedView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """free_distance, the unit normal (n, 3) of the plane it was measured to, and where the surface there is smooth
-    (n,)."""
+    """Measure points (n, 3) against the view's tangent planes.
+
+    Returns the distance and weight of `free_distance` (n,) each, the unit normal (n, 3) of the plane that was used, and
+    whether the surface there is smooth (n,).
+    """
     pixels, depth = project(view.camera, points)
     h, w = view.mask.shape
     column = np.clip(pixels[:, 0].astype(np.int64), 0, w - 1)
