@@ -41,6 +41,10 @@ class Objects:
         """Return the number of objects."""
         return len(self.planes)
 
+    def part(self, chosen: slice) -> Objects:
+        """Return the objects in a slice."""
+        return Objects(self.planes[chosen], self.conditions[chosen], self.lights[chosen], self.names[chosen])
+
 
 def to_bytes(x: np.ndarray) -> np.ndarray:
     """Quantise [-1, 1] to 0…254, with 0 exactly at 127."""
