@@ -14,8 +14,8 @@ from gdtool.core.errors import InputError
 from gdtool.core.stage import Output
 from gdtool.fields.clock import Clock
 from gdtool.fields.grid.fusion import (
-    BUMPY,
-    SMALL,
+    BUMPY_DEGREES,
+    SHRINKAGE_PX,
     AlignmentOptions,
     FusionOptions,
     Shape,
@@ -43,6 +43,7 @@ LEAST_AGREEMENT = 0.25
 LEAST_FITTING_NORMALS = 0.5
 STARTUP_SECONDS = 0.5  # of a budget: start-up and publication
 VOLUME_SHARE = 3  # without depth, one step of volume rendering for so many steps of each other phase
+SEEN_SUPPORT = 0.02  # weight of the views above which a vertex counts as seen
 MATERIALS = ("albedo", "roughness", "metallic")
 
 
@@ -127,7 +128,7 @@ def align(views: ViewImages, resolution: int, clock: Clock, out: Output) -> Alig
 
 def growth(views: ViewImages, out: Output) -> float:
     """Return the world units by which the surface of views that a model made of a picture is moved out."""
-    grow = SMALL * finest_pixel(views.cameras) if views.of_picture else 0.0
+    grow = SHRINKAGE_PX * finest_pixel(views.cameras) if views.of_picture else 0.0
     if not grow:
         out.skip("growth of the surface", "no model made the views of a picture")
     return grow
@@ -149,7 +150,7 @@ def fuse(views: ViewImages, aligned: AlignedViews, grow: float, picture_view: st
 
 def _tell_skipped(shape: Shape, aligned: AlignedViews, grow: float, out: Output) -> None:
     """Record which steps of the fusion were not needed, and why."""
-    if shape.bumps is None or shape.bumps <= BUMPY:
+    if shape.bumps is None or shape.bumps <= BUMPY_DEGREES:
         if shape.bumps is not None:
             reason = f"it is within {shape.bumps:.1f} degrees of them"
         elif not aligned.has_normals:
@@ -167,6 +168,21 @@ def _tell_skipped(shape: Shape, aligned: AlignedViews, grow: float, out: Output)
         else:
             reason = "the views agree"
         out.skip("parts that the picture alone shows", reason)
+
+
+def figures_of(aligned: AlignedViews, shape: Shape, grow: float) -> dict[str, float]:
+    """Return the report's figures of alignment and fusion."""
+    return {
+        "seen_share": float((shape.support > SEEN_SUPPORT).mean()),
+        "pieces_dropped": shape.dropped,
+        "grid_step": shape.step,
+        "disagreement_before": aligned.disagreement_before,
+        "disagreement": aligned.disagreement,
+        "grown": grow,
+        "restored_share": shape.restored,
+        "agreement": aligned.agreement,
+        "silhouettes_outvoted": aligned.outvoted,
+    }
 
 
 def check_cameras(path: Path, cameras: list[Camera], vertices: np.ndarray) -> None:

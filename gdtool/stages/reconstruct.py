@@ -140,15 +140,7 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         look.residual,
     )
     report = {
-        "seen_share": float((shape.support > 0.02).mean()),
-        "pieces_dropped": shape.dropped,
-        "grid_step": shape.step,
-        "disagreement_before": aligned.disagreement_before,
-        "disagreement": aligned.disagreement,
-        "grown": grow,
-        "restored_share": shape.restored,
-        "agreement": aligned.agreement,
-        "silhouettes_outvoted": aligned.outvoted,
+        **pipeline.figures_of(aligned, shape, grow),
         "mean_confidence": float(look.confidence.mean()),
         **look.figures,
         **mesh.figures,

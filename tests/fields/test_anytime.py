@@ -72,7 +72,7 @@ def test_no_time_at_all_gives_one_round_and_the_draft(ring, bent):
     )
     assert len(told) == 1 and noise < before
     shape, coarser = fuse_within_budget(prepared, step, options=FusionOptions(noise=noise, outvoted=0), clock=clock)
-    assert coarser and shape.step == fusion.DRAFT * step and is_closed_manifold(shape.faces)
+    assert coarser and shape.step == fusion.DRAFT_COARSENESS * step and is_closed_manifold(shape.faces)
     assert np.abs(torus(shape.vertices)).mean() < 0.01
 
 

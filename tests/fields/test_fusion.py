@@ -7,7 +7,7 @@ import trimesh
 from gdtool.cameras import rig
 from gdtool.fields.grid.carve import silhouettes_outvoted
 from gdtool.fields.grid.fusion import (
-    BUMPY,
+    BUMPY_DEGREES,
     FusionOptions,
     align_depth,
     depth_for,
@@ -210,7 +210,7 @@ def test_bumps_that_the_normals_do_not_show_go(seen, solid):
     rough, smooth = (
         fuse_views(prepared, step, FusionOptions(noise=noise, has_normals=shaded)) for shaded in (False, True)
     )
-    assert rough.bumps is None and smooth.bumps > BUMPY and is_closed_manifold(smooth.faces)
+    assert rough.bumps is None and smooth.bumps > BUMPY_DEGREES and is_closed_manifold(smooth.faces)
     before, after = degrees_off(solid, rough.vertices, rough.faces), degrees_off(solid, smooth.vertices, smooth.faces)
     assert np.median(after) < 0.6 * np.median(before)
     assert np.abs(solid(smooth.vertices)).mean() < np.abs(solid(rough.vertices)).mean() + 1e-4
@@ -231,7 +231,7 @@ def test_a_surface_that_fits_its_normals_hardly_follows_them(seen, solid):
     step = grid_step(cameras, 0)
     shape = reconstruct(cameras, images, mask)
     prepared = prepare_all(cameras, mask, images["depth"], images["normal"])
-    assert normal_deviation_degrees(shape.vertices, shape.faces, prepared, 2 * step) < BUMPY
+    assert normal_deviation_degrees(shape.vertices, shape.faces, prepared, 2 * step) < BUMPY_DEGREES
     moved = (
         np.linalg.norm(
             fit_to_normals(shape.vertices, shape.faces, prepared, step, reach=2 * step) - shape.vertices, axis=1

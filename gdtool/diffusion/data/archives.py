@@ -113,6 +113,7 @@ class _BoundedHeader(tarfile.TarInfo):
     """Refuse to read the extended parts of a header when they claim to be large."""
 
     def _proc_member(self, tar: tarfile.TarFile):
+        """Raise _LongHeader for a large extended header, else process it."""
         if self.type in _EXTENDED and self.size > MAX_HEADER_BYTES:
             raise _LongHeader(f"has an extended header of {self.size} bytes, more than {MAX_HEADER_BYTES}")
         return super()._proc_member(tar)

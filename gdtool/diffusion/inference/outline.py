@@ -14,15 +14,15 @@ import numpy as np
 from gdtool.cameras import Camera, backproject, project
 from gdtool.images.sampling import bilinear
 
-LEAST = 2  # pixels across: narrower is the outlines' own error
-BESIDE = 2  # pixels of what is shown anyhow that a part takes along, so that it is joined
-DEPTH_SIGMA = 0.08  # world units: of the front view's depth, against the other outlines
-FAINT = 0.02  # coverage that counts as none
-SMOOTH = 1.5  # pixels: of a part's place
-THIN, THICK = 1.0, 3.0  # pixels: half a part's thickness at least and at most
-RANGE = 0.75  # world units about the origin in which it is looked for
-PER_PIXEL = 2  # places a pixel
-LEAST_FACING = 0.2  # cosine: what a view shows faces it
+LEAST_WIDTH_PX = 2  # of a lost part; a narrower one is the outlines' error
+OVERLAP_PX = 2  # pixels of the existing object around a part that are drawn too, so that it is joined
+DEPTH_SIGMA = 0.08  # world units: standard deviation of the front view's depth
+FAINT = 0.02  # least coverage in a logarithm
+PLACE_BLUR_PX = 1.5  # Gaussian blur of a part's depth
+THIN, THICK = 1.0, 3.0  # pixels: least and most half thickness of a part
+RANGE = 0.75  # world units about the origin in which a part is looked for
+PER_PIXEL = 2  # candidate depths per pixel size
+LEAST_FACING = 0.2  # cosine: least facing of a normal that is drawn
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def lost_part(
     least, score = least.reshape(len(row), -1), score.reshape(len(row), -1)
     lost = np.zeros(shown.shape, bool)
     lost[row, column] = least.max(1) <= 0.5
-    lost = binary_opening(lost, np.ones((LEAST, LEAST)))
+    lost = binary_opening(lost, np.ones((LEAST_WIDTH_PX, LEAST_WIDTH_PX)))
     if not lost.any():
         return None
     within = distance_transform_edt(shown) - 0.5  # of a pixel's centre
@@ -77,9 +77,9 @@ def lost_part(
         score -= 0.5 * ((places - (depth + half)[row, column][:, None]) / DEPTH_SIGMA) ** 2
     place, certain = np.zeros(shown.shape), np.zeros(shown.shape)
     place[row, column], certain[row, column] = places[score.argmax(1)], 1.0
-    zone = binary_dilation(lost, iterations=BESIDE) & shown
-    weight = gaussian_filter(np.where(zone, certain, 0.0), SMOOTH)
-    middle = gaussian_filter(np.where(zone, place, 0.0), SMOOTH) / np.maximum(weight, 1e-9)
+    zone = binary_dilation(lost, iterations=OVERLAP_PX) & shown
+    weight = gaussian_filter(np.where(zone, certain, 0.0), PLACE_BLUR_PX)
+    middle = gaussian_filter(np.where(zone, place, 0.0), PLACE_BLUR_PX) / np.maximum(weight, 1e-9)
     at = np.nonzero(zone)
     down, right = np.gradient(gaussian_filter(within, 1.0))
     outward = down[at][:, None] * camera.world_from_camera[:3, 1] - right[at][:, None] * camera.world_from_camera[:3, 0]

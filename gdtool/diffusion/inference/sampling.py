@@ -10,6 +10,7 @@ import torch
 
 from gdtool.core.errors import InputError
 from gdtool.core.kinds import DOMAINS
+from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.encoding import BACKGROUND, MIRRORED_VIEW, encode_condition, mirrored
 from gdtool.diffusion.network.model import Model
@@ -58,19 +59,7 @@ def sample_images(
     on the batch nor on the domains.
     """
     config, device = model.config, rgba.device
-    can = (
-        config.codec == "patch"
-        and config.convention == "gdtool"
-        and all(MIRRORED_VIEW.get(name, name) in config.views for name in config.views)
-    )
-    mirror = config.sampling_mirrored and can if options.mirror is None else options.mirror
-    if mirror and not can:
-        raise InputError(
-            "mirror",
-            "only a model of the patch codec, in gdtool's convention, with views on both sides is sampled "
-            "with the mirrored picture",
-            "pass mirror=None",
-        )
+    mirror = _mirrors(config, options)
     rgba = torch.cat([rgba, rgba.flip(-1)]) if mirror else rgba
     b = len(rgba)
     wanted = [d for d in config.domains if d in options.domains]
@@ -132,3 +121,21 @@ def sample_images(
         latents, b = latents.chunk(2)[0], b // 2
     images = model.codec.decode(latents).unflatten(0, (b, len(indices), len(views)))
     return {d: images[:, j] for j, d in enumerate(wanted)}
+
+
+def _mirrors(config: ModelConfig, options: SamplingOptions) -> bool:
+    """Decide whether to average with the mirrored picture. Raises InputError where that is asked for and impossible."""
+    possible = (
+        config.codec == "patch"
+        and config.convention == "gdtool"
+        and all(MIRRORED_VIEW.get(name, name) in config.views for name in config.views)
+    )
+    mirror = config.sampling_mirrored and possible if options.mirror is None else options.mirror
+    if mirror and not possible:
+        raise InputError(
+            "mirror",
+            "only a model of the patch codec, in gdtool's convention, with views on both sides is sampled "
+            "with the mirrored picture",
+            "pass mirror=None",
+        )
+    return mirror

@@ -221,6 +221,7 @@ class UNet(nn.Module):
         """Run layer j of a block, checkpointed while training where the configuration asks for it."""
 
         def run(x, embedding, context):
+            """Run the layer's residual block and attentions."""
             x = block.resnets[j](x, embedding)
             if block.row_attentions:
                 x = block.row_attentions[j](x, layout)

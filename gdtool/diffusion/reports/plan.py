@@ -58,6 +58,7 @@ class LiveBytes(TorchDispatchMode):
         return out
 
     def _freed(self, key: int) -> None:
+        """Subtract a freed storage."""
         self.live -= self.seen.pop(key, 0)
 
 
@@ -76,6 +77,7 @@ def fused_attention():
     before = attention.attend
 
     def fused(q, k, v):
+        """Attend without a matrix of weights."""
         flat = (x.flatten(0, -4) for x in (q, k, v))
         return torch.ops.aten._scaled_dot_product_flash_attention(*flat)[0].view(*q.shape[:-1], v.shape[-1])
 
@@ -111,7 +113,10 @@ def step_cost(
 def _one_step(
     config: ModelConfig, domains: int, views: int, objects: int, fused: bool, dtype, device: str, watch
 ) -> Model:
-    """Run a forward and backward pass under `watch`; returns the model with its gradients."""
+    """Run a forward and backward pass under `watch`; returns the model with its gradients.
+
+    It has step_cost's parameters and one more, hence eight.
+    """
     model = structure(config, device).to(dtype).train()
     layout = Layout(objects, tuple(range(len(DOMAINS)))[:domains], views)
     view_idx = torch.arange(views)

@@ -24,6 +24,7 @@ class Events:
         self._open, self._folder, self._writer = SummaryWriter, folder, None
 
     def _at(self, step: int):
+        """Return the writer, opened at its first step."""
         # A resumed run goes over the steps since its checkpoint again: those of before are purged.
         if self._writer is None:
             self._writer = self._open(str(self._folder), purge_step=step, flush_secs=10)

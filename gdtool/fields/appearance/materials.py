@@ -9,7 +9,7 @@ import numpy as np
 from gdtool.cameras import Camera, project
 from gdtool.images.sampling import bilinear
 
-_SHARPEN = 4  # exponent of the cosine in a view's weight: the view that faces a point decides
+_SHARPEN = 4  # exponent of the cosine in a view's weight, so that the view that faces a point decides
 
 
 @dataclass(frozen=True)

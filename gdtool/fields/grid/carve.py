@@ -15,9 +15,9 @@ from gdtool.cameras import project
 from gdtool.fields.views.prepared_view import WEAK, PreparedView, hull_distance, pixel_footprint, tangent_distance
 from gdtool.geometry.grids import Grid, band_cells, dilate, fine_points, grid_over
 
-COARSE = 2  # fine steps a coarse step
+COARSE = 2  # fine grid steps in a coarse one
 UNSEEN, ROUGHLY, SMOOTHLY = 0, 1, 2  # how a sample of the grid is known
-SLACK = 0.5  # steps that noisy silhouettes cut too little
+SLACK = 0.5  # grid steps by which noisy silhouettes may carve too much
 _CHUNK = 1 << 16  # samples at a time: their arrays stay in the cache
 
 

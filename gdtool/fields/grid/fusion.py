@@ -35,25 +35,25 @@ from gdtool.geometry.grids import edge_counts, extract
 from gdtool.geometry.normals import vertex_normals
 from gdtool.geometry.sharpen import dihedral_degrees, restore_creases
 
-LEAST_NOISE = 0.3  # grid steps: of views that had to be brought together
-OVER_EDGE = 0.25  # steps that a sharp edge may stand out of what the views leave, whose pixels round it off
+LEAST_NOISE = 0.3  # grid steps: noise that is assumed of views that had to be aligned
+CREASE_MARGIN = 0.25  # grid steps by which a crease may leave the carved volume, whose edges pixels round off
 # Pixels by which the surface of views that a model made comes out too small: parts that they disagree about go, edges
 # first.
-SMALL = 0.2
-# Degrees between the surface of views that disagree and their normals: exact normals come to 3, a model's to 4 and
-# more.
-BUMPY = 3.5
-CREASE_ROUNDS = 4  # tries without what folded over
+SHRINKAGE_PX = 0.2
+# Degrees between the surface of views that disagree and their normals above which it is fitted to them. Exact normals
+# give 3, a model's 4 and more.
+BUMPY_DEGREES = 3.5
+CREASE_ROUNDS = 4  # attempts, each without the vertices that folded over in the last one
 MAX_SAMPLES = 320  # along the longest side: 33 million samples, 0.6 GB at the peak
-# Rounds of bringing views together: how far apart two surfaces may lie to be taken for one (world units), and how stiff
-# the corrections are. The last is repeated while the disagreement falls by PLATEAU of itself.
+# Rounds of alignment: how far apart two surfaces may lie to count as one (world units), and the stiffness of the
+# corrections. The last one is repeated, MORE_ROUNDS times at most, while the disagreement falls by PLATEAU of itself.
 ROUNDS = ((0.08, 4.0), (0.06, 1.0), (0.04, 0.3), (0.03, 0.3))
 MORE_ROUNDS, PLATEAU = 4, 0.05
-DRAFT = 2.0  # grid steps of the draft that is made first when time is short
-# What materials solved from color (the slowest way) and writing take of a draft's seconds at the same step. Fusing
-# grows with the step to the power -2.4 (the narrow band to -2, where the surface may lie to -3), the rest with the
-# number of vertices.
-AFTER, FUSING, SURFACE = 1.5, 2.4, 2.0
+DRAFT_COARSENESS = 2.0  # grid steps of the draft that is made first when time is limited
+# Predict the time of a finer fusion from a draft's, by the ratio of their steps. Fusing takes ratio^FUSION_POWER: the
+# narrow band grows with power 2, the region where the surface may lie with power 3. Materials solved from color (the
+# slowest way) and writing take AFTER_SHARE * ratio^SURFACE_POWER, like the number of vertices.
+AFTER_SHARE, FUSION_POWER, SURFACE_POWER = 1.5, 2.4, 2.0
 
 
 def _silent(text: str) -> None:
@@ -213,13 +213,13 @@ def fuse_within_budget(
     if not clock.limited:
         return fuse_views(views, step, options), ""
     began = clock.spent()
-    draft = fuse_views(views, DRAFT * step, options)
+    draft = fuse_views(views, DRAFT_COARSENESS * step, options)
     seconds = clock.spent() - began
     for coarser in (1.0, 1.4):
-        finer = DRAFT / coarser
-        if seconds * (finer**FUSING + AFTER * finer**SURFACE) <= clock.left():
+        finer = DRAFT_COARSENESS / coarser
+        if seconds * (finer**FUSION_POWER + AFTER_SHARE * finer**SURFACE_POWER) <= clock.left():
             return fuse_views(views, coarser * step, options), "" if coarser == 1 else f"at {coarser} of its step"
-    return draft, f"at {DRAFT:g} of its step"
+    return draft, f"at {DRAFT_COARSENESS:g} of its step"
 
 
 def fuse_views(views: list[PreparedView], step: float, options: FusionOptions = FusionOptions()) -> Shape:
@@ -252,7 +252,7 @@ def fuse_views(views: list[PreparedView], step: float, options: FusionOptions = 
         thickened = vertices_near(vertices, thin, 2 * step)
         vertices, faces = sharpen_creases(np.where(thickened[:, None], vertices, moved), faces, views, thickened, step)
     bumps = normal_deviation_degrees(vertices, faces, views, reach + noise) if noise and options.has_normals else None
-    if bumps is not None and bumps > BUMPY:
+    if bumps is not None and bumps > BUMPY_DEGREES:
         vertices = fit_to_normals(vertices, faces, views, step, reach=reach + noise)
     support = measured_planes(views, vertices, vertex_normals(vertices, faces), reach)[2]
     return Shape(vertices, faces, support, step, dropped, bumps, restored)
@@ -289,8 +289,8 @@ def sharpen_creases(
         return far
 
     def accept(idx: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Accept a vertex that is not fixed and moves no farther outside than it is, or than OVER_EDGE."""
-        return ~fixed[idx] & (outside(points) < np.maximum(outside(vertices[idx]), OVER_EDGE * step))
+        """Accept a vertex that is not fixed and moves no farther outside than it is, or than CREASE_MARGIN."""
+        return ~fixed[idx] & (outside(points) < np.maximum(outside(vertices[idx]), CREASE_MARGIN * step))
 
     fixed = fixed.copy()
     for _ in range(CREASE_ROUNDS):

@@ -10,15 +10,15 @@ from gdtool.geometry.grids import components, keep_faces, signed_volume
 from gdtool.geometry.normals import face_normals, vertex_normals
 from gdtool.geometry.topology import edges_of
 
-WAVELENGTH = 36.0  # steps: shorter bumps go where the normals show none
-FOLD_DEGREES = 150.0  # a fold's least angle between the normals of its sides
+WAVELENGTH = 36.0  # grid steps: shorter bumps are removed where the normals show none
+FOLD_DEGREES = 150.0  # least angle between the normals of a fold's sides
 # refine(): rounds in which the planes are looked up anew, weight of bending beside a fully seen vertex's planes, and
 # steps of conjugate gradients.
 REFINE_ROUNDS, REFINE_SMOOTHNESS, REFINE_ITERATIONS = 2, 0.2, 40
 # fit_to_normals(): likewise; the system is worse conditioned, so that it takes more steps.
 NORMAL_ROUNDS, NORMAL_BENDING, NORMAL_ITERATIONS = 3, 1.0, 300
-_SEEN_FACES = 24  # faces that views measured, enough for a piece to be real
-_HOLLOW_FACES = 12  # and for a hollow, of which they see little through a mouth that the grid closes
+_SEEN_FACES = 24  # measured faces that make a piece real
+_HOLLOW_FACES = 12  # measured faces that make a hollow real; views see little of it through its mouth
 
 
 def measured_planes(views: list[PreparedView], vertices: np.ndarray, normals: np.ndarray, reach: float):

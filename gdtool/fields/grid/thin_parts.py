@@ -10,11 +10,11 @@ import numpy as np
 from gdtool.fields.views.prepared_view import WEAK, PreparedView, pixel_footprint
 from gdtool.geometry.grids import Grid, sample_trilinear
 
-HALF_THICKNESS = 0.6  # steps: over half, so that a sheet between two layers of samples has one inside
-_LOST = 0.5  # steps outside the surface at which a point counts as lost
-_DEPTH = 0.8  # steps below a seen surface at which there has to be an inside
+HALF_THICKNESS = 0.6  # grid steps: over half, so that a sheet between two layers of samples has one inside
+_LOST = 0.5  # grid steps outside the surface at which a point counts as lost
+_DEPTH = 0.8  # grid steps below a seen surface at which there has to be an inside
 _CHUNK = 4096  # points whose cubes of samples are held at once, some 35 KB each
-_REGION = 8  # pixels: fewer that touch are noise at an edge
+_REGION = 8  # pixels of a connected region; a smaller one is noise at an edge
 
 
 def missing_points(

@@ -28,9 +28,9 @@ from gdtool.shading.bsdf.closed_form import shade
 from gdtool.shading.bsdf.sg import SphericalGaussians
 from gdtool.shading.sampling import fibonacci
 
-SAMPLES, NARROW = 64, 8  # along a ray, and between the crossing's two ends
-LIGHTS = 16
-DISTANCE_RATE = 2e-3  # of Adam, at its highest, while distances are fitted
+SAMPLES, NARROW = 64, 8  # samples along a ray, and between a crossing's two ends
+LIGHTS = 16  # lobes of the light
+DISTANCE_RATE = 2e-3  # highest learning rate of Adam while distances are fitted
 WEIGHTS = {"depth": 10.0, "normal": 1.0, "color": 1.0, "material": 1.0, "mask": 1.0, "eikonal": 0.1}
 
 

@@ -7,9 +7,9 @@ import math
 import torch
 from torch import Tensor, nn
 
-FREQUENCIES = 10
+FREQUENCIES = 10  # of the positional encoding
 ENCODED = 64  # 3 + 2 * 3 * 10 = 63, padded: K mod 32 != 0 leaks NaN across rows in oneDNN's bfloat16 (oneDNN#5717)
-WIDTH = 128
+WIDTH = 128  # of a hidden layer
 
 
 def encode(points: Tensor, frequencies: int = FREQUENCIES) -> Tensor:

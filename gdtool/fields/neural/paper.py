@@ -14,9 +14,9 @@ from gdtool.geometry.grids import band_cells, extract, fine_points, grid_over
 # World units around the first geometry in which a ray looks for the surface, and its samples there: by whether depth
 # shaped it (the views' own, or what their normals gave), or only silhouettes did.
 _MEASURED, _BOUNDED = (0.03, 24), (0.08, 64)
-POOL = 150_000  # points whose distances are known
-START_SHARE = 0.33  # of the budget, at most: the views are what is to be fitted
-HALF_SHARE = 0.6  # of the start, in bfloat16
+POOL = 150_000  # points with known distances that the SDF network is fitted to
+START_SHARE = 0.33  # most of the budget that fitting known distances may take
+HALF_SHARE = 0.6  # share of that fit that runs in bfloat16
 _RIM = 16  # pixels beside the silhouette whose rays must miss
 
 

@@ -17,16 +17,16 @@ from gdtool.cameras import Camera, project, rays
 from gdtool.fields.views.photometric import Picture, color_equations
 from gdtool.fields.views.prepared_view import PreparedView, hull_distance, pixel_footprint, tangent_distance
 
-CONTROL = 15  # control points along a side of a view's correction
-LARGEST = 0.06  # world units: no correction is larger
-PRIOR_SIZE = 0.01  # world units: how large a correction is expected to be
-PRIOR = 0.005  # what that expectation counts beside the matches
-SLOPE_LENGTH = 0.2  # world units over which normals go wrong by as much as depth does
-# What the other evidence counts; rims lie beside curved outlines, so they only settle silhouettes.
-SLOPES, RIMS, EXTENTS = 0.4, 0.01, 0.3
-COLORS = 0.002  # world units: a color as wrong as usual counts like a plane so far off
-WALL = 1.5  # pixels: what lies between surfaces that two views see from opposite sides is at least so thick
-RIM_COSINE = 0.15  # normals this square to an axis belong to the outline
+CONTROL_SIDE = 15  # control points along a side of a view's correction grid
+MOST_CORRECTION = 0.06  # world units: bound of a correction
+PRIOR_SIZE = 0.01  # world units: expected size of a correction
+PRIOR_WEIGHT = 0.005  # weight of that expectation, relative to the matches
+SLOPE_LENGTH = 0.2  # world units over which normals and depth are wrong by the same amount
+# Weights relative to the matches. Rims also lie beside curved outlines, so they count little.
+SLOPE_WEIGHT, RIM_WEIGHT, EXTENT_WEIGHT = 0.4, 0.01, 0.3
+COLOR_DISTANCE = 0.002  # world units: a usual color difference counts like a plane at this distance
+LEAST_WALL_PX = 1.5  # pixels: least thickness between surfaces that two views see from opposite sides
+RIM_COSINE = 0.15  # a normal with a smaller cosine to a view's axis belongs to its outline
 
 
 def disagreement(views: list[PreparedView], reach: float = 0.06, stride: int = 3, share: float = 0.5) -> float:
@@ -155,37 +155,37 @@ def _matches(views: list[PreparedView], reach: float, stride: int, walls: float 
 def _control_weights(pixels: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Compute bilinear weights (n, 4) and control indices (n, 4) of pixel positions (n, 2) in a view's control grid."""
     h, w = shape
-    x = np.clip(pixels[:, 0] / w, 0, 1) * (CONTROL - 1)
-    y = np.clip(pixels[:, 1] / h, 0, 1) * (CONTROL - 1)
-    column = np.minimum(x.astype(int), CONTROL - 2)
-    row = np.minimum(y.astype(int), CONTROL - 2)
+    x = np.clip(pixels[:, 0] / w, 0, 1) * (CONTROL_SIDE - 1)
+    y = np.clip(pixels[:, 1] / h, 0, 1) * (CONTROL_SIDE - 1)
+    column = np.minimum(x.astype(int), CONTROL_SIDE - 2)
+    row = np.minimum(y.astype(int), CONTROL_SIDE - 2)
     fx, fy = x - column, y - row
     weights = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy], 1)
-    corner = row * CONTROL + column
-    return weights, np.stack([corner, corner + 1, corner + CONTROL, corner + CONTROL + 1], 1)
+    corner = row * CONTROL_SIDE + column
+    return weights, np.stack([corner, corner + 1, corner + CONTROL_SIDE, corner + CONTROL_SIDE + 1], 1)
 
 
 def _bending() -> np.ndarray:
-    """Build second differences (r, CONTROL^2) of a control grid along both axes, in units of a tenth of its side,
+    """Build second differences (r, CONTROL_SIDE^2) of a control grid along both axes, in units of a tenth of its side,
     squared.
     """
     rows = []
-    for a in range(CONTROL):
-        for b in range(1, CONTROL - 1):
+    for a in range(CONTROL_SIDE):
+        for b in range(1, CONTROL_SIDE - 1):
             for place in ([(a, b - 1), (a, b), (a, b + 1)], [(b - 1, a), (b, a), (b + 1, a)]):
-                row = np.zeros((CONTROL, CONTROL))
+                row = np.zeros((CONTROL_SIDE, CONTROL_SIDE))
                 for (r, c), value in zip(place, (1, -2, 1), strict=True):
                     row[r, c] = value
                 rows.append(row.ravel())
-    return np.array(rows) * ((CONTROL - 1) / 10) ** 2
+    return np.array(rows) * ((CONTROL_SIDE - 1) / 10) ** 2
 
 
 @dataclass(frozen=True)
 class Corrections:
     """Hold the changes that bring the views together.
 
-    control (k, CONTROL^2): world units to add to each view's depth. edge (k,): world units by which each silhouette is
-    too small all around.
+    control (k, CONTROL_SIDE^2): world units to add to each view's depth. edge (k,): world units by which each
+    silhouette is too small all around.
     """
 
     control: np.ndarray
@@ -194,7 +194,7 @@ class Corrections:
     @classmethod
     def none(cls, count: int) -> Corrections:
         """Return zero corrections of `count` views."""
-        return cls(np.zeros((count, CONTROL * CONTROL)), np.zeros(count))
+        return cls(np.zeros((count, CONTROL_SIDE * CONTROL_SIDE)), np.zeros(count))
 
     def depth(self, k: int, shape: tuple[int, int]) -> np.ndarray:
         """Interpolate the image (h, w) to add to the depth of view k."""
@@ -202,14 +202,14 @@ class Corrections:
         x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
         weights, places = _control_weights(np.stack([x, y], -1).reshape(-1, 2), shape)
         image = (self.control[k][places] * weights).sum(1).reshape(h, w)
-        return np.clip(image, -LARGEST, LARGEST)
+        return np.clip(image, -MOST_CORRECTION, MOST_CORRECTION)
 
 
 class _System:
     """Collect weighted linear equations in the control values of all views and the offset of every silhouette."""
 
     def __init__(self, count: int):
-        self.count, self.unknowns = count, count * (CONTROL * CONTROL + 1)
+        self.count, self.unknowns = count, count * (CONTROL_SIDE * CONTROL_SIDE + 1)
         self.rows: list[Equations] = []
 
     def add(self, coefficients: np.ndarray, places: np.ndarray, target: np.ndarray, weight: np.ndarray) -> None:
@@ -218,11 +218,11 @@ class _System:
 
     def view_unknowns(self, k: int, control: np.ndarray) -> np.ndarray:
         """Return the indices of control values of view k among all unknowns."""
-        return control + k * CONTROL * CONTROL
+        return control + k * CONTROL_SIDE * CONTROL_SIDE
 
     def edge(self, k: int) -> int:
         """Return the index of the silhouette offset of view k among all unknowns."""
-        return self.count * CONTROL * CONTROL + k
+        return self.count * CONTROL_SIDE * CONTROL_SIDE + k
 
     def solve(self, prior: np.ndarray) -> Corrections:
         """Solve the normal equations with the quadratic prior (unknowns, unknowns)."""
@@ -238,7 +238,7 @@ class _System:
         vector = rows.T @ np.concatenate([np.sqrt(weight) * target for _, _, target, weight in self.rows])
         matrix = prior + (rows.T @ rows).toarray()
         solution = np.linalg.solve(matrix, vector)
-        size = self.count * CONTROL * CONTROL
+        size = self.count * CONTROL_SIDE * CONTROL_SIDE
         return Corrections(solution[:size].reshape(self.count, -1), solution[size:])
 
 
@@ -262,7 +262,7 @@ def corrections(
     corrections small and smooth. Plane distances cannot reveal an error that all views of a point share; the other
     equations can.
     """
-    system, size = _System(len(views)), CONTROL * CONTROL
+    system, size = _System(len(views)), CONTROL_SIDE * CONTROL_SIDE
     total = 0.0
     matches = list(_matches(views, reach, stride))
     for m in matches:
@@ -276,9 +276,9 @@ def corrections(
                 weights * slope[:, None],
                 system.view_unknowns(m.i, places),
                 slope * done - difference,
-                COLORS**2 * weight,
+                COLOR_DISTANCE**2 * weight,
             )
-    for m in chain(matches, _matches(views, reach, stride, WALL)):
+    for m in chain(matches, _matches(views, reach, stride, LEAST_WALL_PX)):
         weight = m.weight / (1 + (m.distance / (0.5 * reach)) ** 2) ** 2
         total += weight.sum()
         w_here, c_here = _control_weights(m.pixels_i, views[m.i].mask.shape)
@@ -295,19 +295,21 @@ def corrections(
     if total == 0:
         return before
     per_view = total / len(views)
-    unit = PRIOR * per_view / size  # a control's prior: what a match of one view's average control counts, times PRIOR
+    unit = (
+        PRIOR_WEIGHT * per_view / size
+    )  # a control's prior: what a match of one view's average control counts, times PRIOR_WEIGHT
     for k, (coefficients, places, target, weight) in enumerate(slopes):
-        share = SLOPES * PRIOR * SLOPE_LENGTH**2 * per_view / max(weight.sum(), 1e-12)
+        share = SLOPE_WEIGHT * PRIOR_WEIGHT * SLOPE_LENGTH**2 * per_view / max(weight.sum(), 1e-12)
         system.add(coefficients, system.view_unknowns(k, places), target, share * weight)
     _add_rims(system, views, before, reach, per_view)
     _add_extents(system, views, before, per_view)
     prior = np.zeros((system.unknowns, system.unknowns))
     bending = _bending()
-    view_prior = stiffness * PRIOR * bending.T @ bending * per_view / size + unit * np.eye(size)
+    view_prior = stiffness * PRIOR_WEIGHT * bending.T @ bending * per_view / size + unit * np.eye(size)
     for k, view in enumerate(views):
         prior[k * size : (k + 1) * size, k * size : (k + 1) * size] = view_prior
         foot = float(np.median(pixel_footprint(view.camera, np.linalg.norm(view.camera.position))))
-        prior[system.edge(k), system.edge(k)] = PRIOR * per_view * (PRIOR_SIZE / foot) ** 2
+        prior[system.edge(k), system.edge(k)] = PRIOR_WEIGHT * per_view * (PRIOR_SIZE / foot) ** 2
     return system.solve(prior)
 
 
@@ -379,7 +381,7 @@ def _add_rims(system: _System, views: list[PreparedView], before: Corrections, r
             places = np.concatenate([system.view_unknowns(i, control), np.full((len(p), 1), system.edge(j))], 1)
             done = (before.control[i][control] * weights).sum(1) * slope - before.edge[j]
             weight = 1 / (1 + (distance / (0.5 * reach)) ** 2) ** 2
-            system.add(coefficients, places, done - distance, weight * RIMS * per_view / max(len(p), 100))
+            system.add(coefficients, places, done - distance, weight * RIM_WEIGHT * per_view / max(len(p), 100))
 
 
 def _add_extents(system: _System, views: list[PreparedView], before: Corrections, per_view: float) -> None:
@@ -405,7 +407,7 @@ def _add_extents(system: _System, views: list[PreparedView], before: Corrections
                     coefficients,
                     places,
                     np.array([before.edge[i] - before.edge[j] - gap]),
-                    np.array([EXTENTS * per_view]),
+                    np.array([EXTENT_WEIGHT * per_view]),
                 )
 
 

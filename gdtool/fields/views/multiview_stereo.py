@@ -17,21 +17,24 @@ from gdtool.cameras import Camera, project, rays
 from gdtool.fields.views.prepared_view import PreparedView, hull_distance, pixel_footprint
 from gdtool.images.sampling import bilinear
 
-SIZE = 128  # pixels: views are matched at about this size
-CANDIDATE = 0.9  # pixels of that size between depths that are tried
-# How far values that belong together differ; colors as they are stored, in sRGB.
+MATCHING_SIZE = 128  # pixels of the longer side at which views are matched, about
+CANDIDATE_PX = 0.9  # pixels of that size between neighbouring candidate depths
+MOST_CANDIDATES = 512  # candidate depths
+# Usual difference of corresponding values; albedo in sRGB.
 NOISE = {"normal": 0.12, "albedo": 0.06, "roughness": 0.1, "metallic": 0.1}
-WORST = 3.0  # such differences: more says no more
-FACING = 0.12  # cosine: a point that is turned farther away is not seen well enough to compare
-SLACK = 1.5  # pixels that a silhouette may be off
-HIDDEN, HIDDEN_SHARE = 0.6, 0.15  # cost of what no other view shows, and what that counts beside a view that shows it
-FIT = 0.02  # misfit up to which views are taken to show one object
-NEARER = 0.05  # cost of a world unit behind the silhouettes' common volume: among depths that fit alike
-LITTLE, JUMP = 0.1, 0.6  # cost of a depth that leaves its neighbour's plane by one candidate, and by any number
-MET, AGREED = 2.0, 2.5  # pixels: so near is a point the one that another view shows (in the sweep; in the end)
-NEVER = 9.0  # cost of what is ruled out
-LEAST_COVER = 0.2  # of a block, for it to be matched
-MOST = 512  # depths that are tried
+SATURATION = 3.0  # usual differences at which the cost saturates
+LEAST_FACING = 0.12  # cosine between normal and ray below which a point is not compared
+SILHOUETTE_SLACK_PX = 1.5  # pixels by which a silhouette may be wrong
+HIDDEN_COST = 0.6  # cost of a point that no other view shows
+HIDDEN_WEIGHT = 0.15  # weight of that cost, relative to a view that shows the point
+CONSISTENT_MISFIT = 0.02  # misfit up to which the views count as consistent
+DEPTH_COST = 0.05  # cost of a world unit behind the common volume of the silhouettes; decides between equal depths
+STEP_COST = 0.1  # cost of leaving the neighbour's plane by one candidate
+JUMP_COST = 0.6  # cost of leaving it by any number of candidates
+ON_SURFACE_PX = 2.0  # pixels between a point and another view's surface up to which it is on it, while sweeping
+CONFIRMED_PX = 2.5  # the same, in the final confirmation
+EXCLUDED_COST = 9.0  # cost of an excluded depth
+LEAST_COVER = 0.2  # coverage of a block of pixels for it to be matched
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ class _View:
     """Hold a view at matching resolution: its n foreground pixels, their rays and features, and the depths to try."""
 
     def __init__(self, camera: Camera, mask: np.ndarray, looks: np.ndarray, normal: np.ndarray, box: np.ndarray):
-        self.camera, self.factor = camera, max(1, round(max(mask.shape) / SIZE))
+        self.camera, self.factor = camera, max(1, round(max(mask.shape) / MATCHING_SIZE))
         self.mask = _block_means(mask[..., None], self.factor)[..., 0]
         cover = np.maximum(self.mask, 1e-3)[..., None]
         self.looks = _block_means(looks * mask[..., None], self.factor) / cover
@@ -102,7 +105,7 @@ class _View:
         depth = project(camera, box)[1]
         self.pixel = self.factor * float(pixel_footprint(camera, max(float(np.median(depth)), 1e-6)))  # world units
         low, high = stretched(camera, np.maximum([depth.min(), depth.max()], camera.near / 2))
-        self.step = max(CANDIDATE * self.factor * min(pixel_steps(camera)), (high - low) / MOST)
+        self.step = max(CANDIDATE_PX * self.factor * min(pixel_steps(camera)), (high - low) / MOST_CANDIDATES)
         self.tried = low + self.step * np.arange(max(int(np.ceil((high - low) / self.step)) + 1, 3))
 
     def points(self, depth: np.ndarray) -> np.ndarray:
@@ -144,14 +147,14 @@ def match_views(
     corners = np.stack(np.meshgrid(*zip(*box, strict=True), indexing="ij"), -1).reshape(-1, 3)
     looks = _compared_features({"normal": normal, **alike})
     views = [_View(*given, corners) for given in zip(cameras, mask, looks, normal, strict=True)]
-    found = _sweep(views, silhouettes, None, NEARER)
+    found = _sweep(views, silhouettes, None, DEPTH_COST)
     # Views that do not fit one another say less of where a point is, and the silhouettes more.
-    doubt = max(1.0, _misfit(views, found) / FIT)
+    doubt = max(1.0, _misfit(views, found) / CONSISTENT_MISFIT)
     if doubt > 1:
         for view in views:
             view.looks, view.own = view.looks / doubt**0.5, view.own / doubt**0.5
-        found = _sweep(views, silhouettes, None, NEARER * doubt)
-    found = _sweep(views, silhouettes, _known_depths(views, found), NEARER * doubt)
+        found = _sweep(views, silhouettes, None, DEPTH_COST * doubt)
+    found = _sweep(views, silhouettes, _known_depths(views, found), DEPTH_COST * doubt)
     return [
         _full_size(view, depth, trust, own)
         for view, depth, trust, own in zip(views, found, _trust(views, found), mask, strict=True)
@@ -186,7 +189,7 @@ def _misfit(views: list[_View], found: list[np.ndarray]) -> float:
         for other in views:
             if other is not view:
                 difference = _compare(view, other, points, chosen)[0]
-                best = np.where(_facing_cosine(other, view)[chosen] > FACING, np.minimum(best, difference), best)
+                best = np.where(_facing_cosine(other, view)[chosen] > LEAST_FACING, np.minimum(best, difference), best)
         every.append(best[np.isfinite(best)])
     joined = np.concatenate(every)
     return float(np.median(joined)) if len(joined) else 0.0
@@ -210,24 +213,25 @@ def _sweep_costs(
     known: dict[int, tuple[np.ndarray, np.ndarray]] | None,
     nearer: float,
 ) -> np.ndarray:
-    """Compute the cost (n, candidates) of every candidate depth, NEVER where a silhouette rules it out.
+    """Compute the cost (n, candidates) of every candidate depth, EXCLUDED_COST where a silhouette rules it out.
 
     known: depth and trust (h, w) of the other views by id, from an earlier sweep.
     """
-    cost = np.full((len(view.own), len(view.tried)), NEVER, np.float32)
+    cost = np.full((len(view.own), len(view.tried)), EXCLUDED_COST, np.float32)
     facing = np.stack([_facing_cosine(other, view) for other in others], 1) if others else np.zeros((len(view.own), 0))
     entered = np.full(len(view.own), np.nan)
     for k, depth in enumerate(view.tried):
         points = view.points(depth)
         allowed = np.flatnonzero(
-            np.max([hull_distance(silhouette, points) for silhouette in silhouettes], 0) < SLACK * view.pixel
+            np.max([hull_distance(silhouette, points) for silhouette in silhouettes], 0)
+            < SILHOUETTE_SLACK_PX * view.pixel
         )
         if len(allowed) == 0:
             continue
         world = float(unstretched(view.camera, depth))
         entered[allowed] = np.fmin(entered[allowed], world)
         behind = world - entered[allowed]
-        hidden = np.full(len(allowed), HIDDEN)
+        hidden = np.full(len(allowed), HIDDEN_COST)
         compared = [
             (*_compare(view, other, points, allowed), cosine[allowed], other)
             for other, cosine in zip(others, facing.T, strict=True)
@@ -258,7 +262,7 @@ def _compare(
     """
     pixels, depth = other.seen(points[chosen])
     gap = bilinear(other.looks, pixels) - view.own[chosen]
-    difference = np.minimum(np.einsum("ij,ij->i", gap, gap) / WORST**2, 1.0)
+    difference = np.minimum(np.einsum("ij,ij->i", gap, gap) / SATURATION**2, 1.0)
     return np.where(bilinear(other.mask[..., None], pixels)[:, 0] < 0.5, 1.0, difference), pixels, depth
 
 
@@ -266,7 +270,7 @@ def _cost_without_occlusion(compared: list, hidden: np.ndarray) -> np.ndarray:
     """Compute the cost (m,) while occlusion is unknown: the best view's, or the best two's where three can see."""
     if not compared:
         return hidden
-    each = np.stack([np.where(cosine > FACING, difference, np.inf) for difference, _, _, cosine, _ in compared])
+    each = np.stack([np.where(cosine > LEAST_FACING, difference, np.inf) for difference, _, _, cosine, _ in compared])
     count = np.isfinite(each).sum(0)
     each = np.sort(each, 0)
     best = each[0] if len(each) < 2 else np.where(count >= 3, (each[0] + each[min(1, len(each) - 1)]) / 2, each[0])
@@ -280,13 +284,13 @@ def _cost_with_occlusion(
 
     A point that would occlude a trusted surface of another view costs most.
     """
-    total, share, blocks = HIDDEN_SHARE * hidden, np.full(len(hidden), HIDDEN_SHARE), np.zeros(len(hidden))
+    total, share, blocks = HIDDEN_WEIGHT * hidden, np.full(len(hidden), HIDDEN_WEIGHT), np.zeros(len(hidden))
     for difference, pixels, depth, cosine, other in compared:
         surface, trust = (bilinear(image[..., None], pixels)[:, 0] for image in known[id(other)])
-        reach = MET * other.pixel / np.maximum(cosine, 0.3)
+        reach = ON_SURFACE_PX * other.pixel / np.maximum(cosine, 0.3)
         covered = bilinear(other.mask[..., None], pixels)[:, 0] > 0.5
         weight = np.where(
-            (cosine > FACING) & covered & (np.abs(depth - surface) < reach), cosine * np.maximum(trust, 0.2), 0.0
+            (cosine > LEAST_FACING) & covered & (np.abs(depth - surface) < reach), cosine * np.maximum(trust, 0.2), 0.0
         )
         total, share = total + weight * difference, share + weight
         blocks = np.maximum(blocks, np.where(covered & (depth < surface - reach), trust, 0.0))
@@ -297,12 +301,12 @@ def _best_depth(cost: np.ndarray, view: _View) -> np.ndarray:
     """Find the stretched depth (n,) of least cost after aggregation along rows and columns; NaN where all are ruled
     out.
     """
-    right, down, facing = slopes(view.camera, view.normal, FACING, view.directions)
+    right, down, facing = slopes(view.camera, view.normal, LEAST_FACING, view.directions)
     scale = view.factor / view.step
-    image = np.full((*view.shown.shape, cost.shape[1]), NEVER, np.float32)
+    image = np.full((*view.shown.shape, cost.shape[1]), EXCLUDED_COST, np.float32)
     image[view.shown] = np.minimum(cost, 1.5)  # ruled out by one pixel, yet a neighbour's may go on there
     # A plane seen at a grazing angle may well end: leaving it costs less.
-    jump = view.image(JUMP * np.clip(facing / 0.5, 0.15, 1.0)).astype(np.float32)
+    jump = view.image(JUMP_COST * np.clip(facing / 0.5, 0.15, 1.0)).astype(np.float32)
     total = np.zeros_like(image)
     for slope, turn in ((right, (0, 1, 2)), (down, (1, 0, 2))):
         along = [
@@ -317,7 +321,7 @@ def _best_depth(cost: np.ndarray, view: _View) -> np.ndarray:
     best = np.clip(total.argmin(1), 1, total.shape[1] - 2)
     before, here, after = (total[np.arange(len(best)), best + i] for i in (-1, 0, 1))
     part = np.clip((before - after) / np.maximum(2 * (before - 2 * here + after), 1e-6), -0.5, 0.5)
-    return np.where((cost < NEVER).any(1), view.tried[0] + view.step * (best + part), np.nan)
+    return np.where((cost < EXCLUDED_COST).any(1), view.tried[0] + view.step * (best + part), np.nan)
 
 
 def _aggregate_rows(cost: np.ndarray, shown: np.ndarray, slope: np.ndarray, jump: np.ndarray, way: int) -> np.ndarray:
@@ -337,13 +341,14 @@ def _aggregate_rows(cost: np.ndarray, shown: np.ndarray, slope: np.ndarray, jump
             np.take_along_axis(previous, whole.clip(0, last), 1) * (1 - part)
             + np.take_along_axis(previous, (whole + 1).clip(0, last), 1) * part
         )
-        plane[(from_there < 0) | (from_there > last)] = NEVER
-        beside = np.full_like(plane, NEVER)
+        plane[(from_there < 0) | (from_there > last)] = EXCLUDED_COST
+        beside = np.full_like(plane, EXCLUDED_COST)
         beside[:, 1:] = plane[:, :-1]
         np.minimum(beside[:, :-1], plane[:, 1:], out=beside[:, :-1])
         added = (
             np.minimum(
-                np.minimum(plane, beside + LITTLE), lowest + np.minimum(jump[:, column], jump[:, column - 1])[:, None]
+                np.minimum(plane, beside + STEP_COST),
+                lowest + np.minimum(jump[:, column], jump[:, column - 1])[:, None],
             )
             - lowest
         )
@@ -388,9 +393,9 @@ def _trust(views: list[_View], found: list[np.ndarray]) -> list[np.ndarray]:
             cosine = _facing_cosine(other, view)
             pixels, there = other.seen(points)
             beyond = bilinear(surface[..., None], pixels)[:, 0] - there
-            seen = (cosine > FACING) & (bilinear(other.mask[..., None], pixels)[:, 0] > 0.5)
-            meeting += seen & (np.abs(beyond) < AGREED * other.pixel / np.maximum(cosine, 0.3))
-            hiding += seen & (beyond > 2 * AGREED * other.pixel)
+            seen = (cosine > LEAST_FACING) & (bilinear(other.mask[..., None], pixels)[:, 0] > 0.5)
+            meeting += seen & (np.abs(beyond) < CONFIRMED_PX * other.pixel / np.maximum(cosine, 0.3))
+            hiding += seen & (beyond > 2 * CONFIRMED_PX * other.pixel)
         out.append(np.where(np.isfinite(depth) & (meeting > 0), np.where(hiding > meeting, 0.1, 1.0), 0.0))
     return out
 

@@ -12,11 +12,14 @@ from gdtool.cameras import Camera, rays
 from gdtool.fields.views.multiview_stereo import Matched, match_views, pixel_steps, slopes, stretched, unstretched
 from gdtool.fields.views.prepared_view import PreparedView
 
-MIN_FACING = 0.15  # normals turned farther away say little about depth
-HOLD, LEAST_HOLD = 0.02, 1e-5  # weight of a matched depth against one pixel's slope, by its trust
-# pixels: a step in depth that is so far off the slope counts a quarter; at first, and then.
+MIN_FACING = 0.15  # cosine between normal and ray; normals turned farther away say little about depth
+MATCH_WEIGHT, LEAST_MATCH_WEIGHT = (
+    0.02,
+    1e-5,
+)  # weight of a trusted matched depth relative to a slope, and of any matched depth
+# Pixels by which a step in depth may miss the slope before it loses three quarters of its weight: first round, others.
 _FIRST_STEP, _STEP = 6.0, 2.0
-_ASTRAY = 4.0  # pixels: likewise a matched depth
+_MISMATCH = 4.0  # pixels: the same for a matched depth
 
 
 def integrate_normals(
@@ -58,12 +61,12 @@ def integrate_normals(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(size, count)
     ).tocsr()
     target, trust = np.concatenate(targets), np.concatenate(trust)
-    start, held = stretched(camera, matched.depth[inside]), HOLD * matched.trust[inside] + LEAST_HOLD
+    start, held = stretched(camera, matched.depth[inside]), MATCH_WEIGHT * matched.trust[inside] + LEAST_MATCH_WEIGHT
     depth = start.copy()
     for k in range(rounds):
         gap = (differences @ depth - target) / ((_STEP if k else _FIRST_STEP) * pixel)
         weight = trust / (1 + gap**2) ** 2
-        hold = held / (1 + ((depth - start) / (_ASTRAY * pixel)) ** 2) ** 2
+        hold = held / (1 + ((depth - start) / (_MISMATCH * pixel)) ** 2) ** 2
         system = differences.T @ diags(weight) @ differences + diags(hold)
         depth = cg(
             system,

@@ -10,10 +10,10 @@ from gdtool.cameras import Camera, project, rays
 from gdtool.fields.views.prepared_view import pixel_footprint
 from gdtool.images.sampling import bilinear
 
-BLUR = 0.05  # of how far off surfaces may be: so far are colors blurred, or from afar their slopes would mislead
-LEAST_NOISE = 0.02  # linear: no views' colors are taken to agree better
-_STEP = 1e-3  # world units, for the derivative of a projection
-_GAIN = 2.0  # one view is at most so many times as bright as another
+BLUR = 0.05  # blur of the colors per unit of surface error; sharper colors have misleading slopes at a distance
+LEAST_NOISE = 0.02  # linear color: least noise that is assumed between views
+_STEP = 1e-3  # world units: step of a projection's numerical derivative
+_GAIN = 2.0  # largest ratio of brightness between two views
 
 
 @dataclass(frozen=True)
