@@ -136,6 +136,6 @@ def test_views_that_do_not_fit_one_another_lean_on_the_silhouettes(monkeypatch):
         turned = np.cross(axis / np.linalg.norm(axis), normal[k]) * np.tan(np.radians(12)) + normal[k]
         normal[k] = turned / np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-9)
     leaning = error(images, mask, depth_for(cameras, mask, normal)).mean()
-    monkeypatch.setattr(multiview_stereo, "FIT", 1e9)
+    monkeypatch.setattr(multiview_stereo, "CONSISTENT_MISFIT", 1e9)
     trusting = error(images, mask, depth_for(cameras, mask, normal)).mean()
     assert leaning < 0.8 * trusting

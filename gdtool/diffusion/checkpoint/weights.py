@@ -102,11 +102,11 @@ def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
     conv_in grows by the condition's channels and class labels by the domains, both with zeros. Raises InputError for a
     tensor that is not known here or has another shape.
     """
-    own = unet.state_dict()
+    state = unet.state_dict()
     for name, tensor in tensors.items():
-        if name not in own:
+        if name not in state:
             raise InputError("pretrained weights", f"hold a tensor {name} that this network has not", OTHER_START)
-        target = own[name]
+        target = state[name]
         if name in ("conv_in.weight", "class_embedding.linear_1.weight") and tensor.shape[1] <= target.shape[1]:
             grown = torch.zeros_like(target)
             grown[:, : tensor.shape[1]] = tensor
@@ -117,6 +117,6 @@ def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
                 f"tensor {name} has shape {tuple(tensor.shape)}, needed is {tuple(target.shape)}",
                 OTHER_START,
             )
-        own[name] = tensor
-    unet.load_state_dict(own)
-    return sorted(set(own) - set(tensors))
+        state[name] = tensor
+    unet.load_state_dict(state)
+    return sorted(set(state) - set(tensors))

@@ -75,41 +75,41 @@ def renamed(name: str) -> str:
 def read_config(folder: Path, tensors: dict[str, torch.Tensor]) -> ModelConfig:
     """Derive the configuration from unet/config.json and scheduler/. Raises InputError for another structure."""
     path = folder / "unet" / "config.json"
-    own = _read(path, _UNet)
+    unet = _read(path, _UNet)
     scheduler = _read(folder / "scheduler" / "scheduler_config.json", _Scheduler)
     facts = {
-        "in_channels": (own.in_channels, 8),
-        "class_embed_type": (own.class_embed_type, "projection"),
-        "projection_class_embeddings_input_dim": (own.projection_class_embeddings_input_dim, WONDER3D_LABEL_WIDTH),
+        "in_channels": (unet.in_channels, 8),
+        "class_embed_type": (unet.class_embed_type, "projection"),
+        "projection_class_embeddings_input_dim": (unet.projection_class_embeddings_input_dim, WONDER3D_LABEL_WIDTH),
         "beta_schedule": (scheduler.beta_schedule, "scaled_linear"),
         "prediction_type": (scheduler.prediction_type, "epsilon"),
     }
-    for name, (found, wanted) in facts.items():
-        if found != wanted:
-            raise InputError(path, f"has {name} {found!r}, Wonder3D {wanted!r}", OTHER_FOLDER)
-    if not isinstance(own.attention_head_dim, int):
+    for name, (value, wanted) in facts.items():
+        if value != wanted:
+            raise InputError(path, f"has {name} {value!r}, Wonder3D {wanted!r}", OTHER_FOLDER)
+    if not isinstance(unet.attention_head_dim, int):
         raise InputError(path, "has another number of heads at each level", OTHER_FOLDER)
     return configured(
         {
-            "image_size": 8 * own.sample_size,
+            "image_size": 8 * unet.sample_size,
             "domains": ("color", "normal"),
             "codec": "vae",
             "condition_alpha": False,
             "mirror_back": False,
-            "channels": own.block_out_channels,
-            "attention_levels": ["CrossAttn" in kind for kind in own.down_block_types],
-            "layers_per_block": own.layers_per_block,
-            "heads": own.attention_head_dim,
-            "norm_groups": own.norm_num_groups,
+            "channels": unet.block_out_channels,
+            "attention_levels": ["CrossAttn" in kind for kind in unet.down_block_types],
+            "layers_per_block": unet.layers_per_block,
+            "heads": unet.attention_head_dim,
+            "norm_groups": unet.norm_num_groups,
             "feed_forward": 4,
             "time_scale_shift": False,
             "position_embedding": False,
             "condition_skip": False,
-            "multi_view": own.multiview_attention,
+            "multi_view": unet.multiview_attention,
             "cross_domain": "joint_last" if any(".attn_joint_last." in name for name in tensors) else "joint",
             "convention": "wonder3d",
             "encoder": "clip",
-            "encoder_width": own.cross_attention_dim,
+            "encoder_width": unet.cross_attention_dim,
             "prediction": "epsilon",
             "noise_schedule": "scaled_linear",
             "backgrounds": ("white",),

@@ -88,16 +88,16 @@ def decode_object(folder: Folder, config: ModelConfig) -> tuple[np.ndarray, np.n
             folder.path, f"lacks {', '.join(missing + lacking)}", "render it again with the default rig and all domains"
         )
     order = [views.names.index(name) for name in config.views]
-    size, own = config.image_size, views.mask.shape[-1]
-    if views.mask.shape[-2] != own or own % size:
+    size, rendered_size = config.image_size, views.mask.shape[-1]
+    if views.mask.shape[-2] != rendered_size or rendered_size % size:
         raise InputError(
             folder.path,
-            f"has views of {own} px, not a multiple of the model's {size}",
+            f"has views of {rendered_size} px, not a multiple of the model's {size}",
             f"run gdtool render-dataset --size {size}",
         )
     planes = planes_from_images({d: x[order] for d, x in views.images.items()}, views.mask[order])
     front = np.concatenate([views.images["color"][order[0]], views.mask[order[0]][..., None]], -1)
-    extent = bounding_side(front[..., 3]) / own
+    extent = bounding_side(front[..., 3]) / rendered_size
     conditions = [condition_plane(front)]
     for path in sorted(folder.path.glob("condition/*.png")):
         image = read_image(
@@ -198,16 +198,16 @@ def draw(
     for i, generator in zip(idx, generators, strict=True):
         tilted = generator.random() < train.tilted and objects.conditions.shape[1] > 1
         pick = int(generator.integers(1, objects.conditions.shape[1])) if tilted else 0
-        one = (
+        sample = (
             from_bytes(objects.planes[i]),
             from_bytes(objects.conditions[i, pick]),
             torch.from_numpy(np.array(objects.lights[i])),
         )
         if train.mirror and generator.random() < 0.5:
-            one = mirror(*one, config.views)
+            sample = mirror(*sample, config.views)
         if train.hue:
-            one = permute_colors(*one, generator.permutation(3))
-        for out, value in zip((planes, rgba, lights), one, strict=True):
+            sample = permute_colors(*sample, generator.permutation(3))
+        for out, value in zip((planes, rgba, lights), sample, strict=True):
             out.append(value)
     return Batch(torch.stack(planes), torch.stack(rgba), torch.stack(lights))
 

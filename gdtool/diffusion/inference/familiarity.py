@@ -68,23 +68,23 @@ def picture_figures(rgba: np.ndarray) -> dict[str, float]:
 
 def ranges(conditions) -> dict[str, PictureRange]:
     """Compute the range of each figure over an iterable of conditions (4, h, w)."""
-    every = [picture_figures(np.asarray(one, np.float32)) for one in conditions]
-    names = list(dict.fromkeys(name for one in every for name in one))
-    columns = {name: np.array([one[name] for one in every if name in one]) for name in names}
+    every = [picture_figures(np.asarray(figures, np.float32)) for figures in conditions]
+    names = list(dict.fromkeys(name for figures in every for name in figures))
+    columns = {name: np.array([figures[name] for figures in every if name in figures]) for name in names}
     return {name: PictureRange(*(float(np.quantile(x, q)) for q in (TAIL, 1 - TAIL))) for name, x in columns.items()}
 
 
 def unfamiliar(rgba: np.ndarray, known: dict[str, PictureRange]) -> list[str]:
     """Describe the figures of a condition that lie outside the training pictures' range; empty where none does."""
-    found = []
+    descriptions = []
     for name, value in picture_figures(rgba).items():
         if name not in known:
             continue
         low, high = known[name].low, known[name].high
         margin = MARGIN * (high - low)
         if not low - margin <= value <= high + margin:
-            found.append(f"{name} is {value:.3g}, in training {low:.3g} to {high:.3g}")
-    return found
+            descriptions.append(f"{name} is {value:.3g}, in training {low:.3g} to {high:.3g}")
+    return descriptions
 
 
 def result_figures(coverage: np.ndarray, front: int | None = None, alpha: np.ndarray | None = None) -> dict[str, float]:
@@ -112,7 +112,7 @@ def limits(results: list[dict[str, float]], alarms: float) -> dict[str, PictureR
 
     It is the lowest quantile at which at most the share `alarms` of these results leaves one of the ranges.
     """
-    columns = np.array([[one[name] for name in DOUBTS] for one in results])  # (n, figures)
+    columns = np.array([[figures[name] for name in DOUBTS] for figures in results])  # (n, figures)
     for quantile in np.linspace(1 - alarms, 1, 101):
         high = np.quantile(columns, quantile, axis=0)
         if (columns > high).any(1).mean() <= alarms:

@@ -104,7 +104,7 @@ def draw_part(part: Part, images: dict[str, np.ndarray], mask: np.ndarray, camer
     It has the known view's values, the depth at which each view sees it, and the normals of a rod along it. mask (k, h,
     w): before the part was added.
     """
-    own = {domain: image[known].copy() for domain, image in images.items()}
+    known_values = {domain: image[known].copy() for domain, image in images.items()}
     for k in range(len(cameras)):
         row, column, depth, normal, source = _shown(part, mask.shape[1:], cameras, known, k)
         put = part.lost[source] if k == known else mask[k][row, column] <= 0.5
@@ -116,7 +116,7 @@ def draw_part(part: Part, images: dict[str, np.ndarray], mask: np.ndarray, camer
             if domain == "depth":
                 image[k][row, column] = depth
             elif k != known:
-                drawn = normal if domain == "normal" else own[domain][part.row[source], part.column[source]]
+                drawn = normal if domain == "normal" else known_values[domain][part.row[source], part.column[source]]
                 image[k][row[fresh], column[fresh]] = drawn[fresh]
 
 

@@ -33,15 +33,17 @@ def repainted(
     (h, w): a metal's color is a reflection, so it is not used. Without normals light is taken to be smoother than the
     detail.
     """
-    seen, own = (np.log(np.clip(image, 0, None) + DARK, dtype=np.float64) for image in (color, albedo))
-    gain = np.clip((detail_gain(seen, own, mask) - LIGHT) / (PAINT - LIGHT), 0, 1)
+    log_color, log_albedo = (np.log(np.clip(image, 0, None) + DARK, dtype=np.float64) for image in (color, albedo))
+    gain = np.clip((detail_gain(log_color, log_albedo, mask) - LIGHT) / (PAINT - LIGHT), 0, 1)
     share = np.where(mask > 0, gain * gain * (3 - 2 * gain), 0) * (1 if metallic is None else 1 - metallic)
     if not share.any():
         return albedo, share
-    factor = own - seen
+    factor = log_albedo - log_color
     factor = (
         masked_mean(factor, mask, WIDTH / 2)
         if normal is None
         else guided(factor, normal.astype(np.float64), mask, WIDTH, LEAST)
     )
-    return np.clip(np.exp(own + share[..., None] * (seen + factor - own)) - DARK, 0, 1).astype(np.float32), share
+    return np.clip(np.exp(log_albedo + share[..., None] * (log_color + factor - log_albedo)) - DARK, 0, 1).astype(
+        np.float32
+    ), share

@@ -197,10 +197,10 @@ class TransformerBlock(nn.Module):
         """Map x (b d k, t, c), with context (b, m, context_width), to the same shape."""
         images, t, c = x.shape
         groups = layout.objects * len(layout.domains)
-        own = self.norm1(x)
+        tokens = self.norm1(x)
         if self.multi_view:  # keys and values of all views: the views' tokens are one sequence
-            own = own.reshape(groups, layout.views * t, c)
-        x = x + self.attn1(own).reshape(images, t, c)
+            tokens = tokens.reshape(groups, layout.views * t, c)
+        x = x + self.attn1(tokens).reshape(images, t, c)
         if self.attn_cross_domain is not None:
             x = x + self.attn_cross_domain(self.norm_cross_domain(x), layout)
         if self.joint == "mid":

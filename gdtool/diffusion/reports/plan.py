@@ -45,11 +45,11 @@ class LiveBytes(TorchDispatchMode):
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         """Run an operation and count the storages that it makes."""
         out = function(*args, **(kwargs or {}))
-        given = {x.untyped_storage()._cdata for x in _tensors(args)}
+        inputs = {x.untyped_storage()._cdata for x in _tensors(args)}
         for x in _tensors(out):
             storage = x.untyped_storage()
             key, size = storage._cdata, storage.nbytes()
-            if key in given or key in self.seen:  # a view, or written in place
+            if key in inputs or key in self.seen:  # a view, or written in place
                 continue
             self.seen[key] = size
             self.live += size
@@ -67,8 +67,8 @@ def _tensors(x):
     if isinstance(x, torch.Tensor):
         yield x
     elif isinstance(x, list | tuple):
-        for one in x:
-            yield from _tensors(one)
+        for item in x:
+            yield from _tensors(item)
 
 
 @contextlib.contextmanager
@@ -271,13 +271,13 @@ def plan_of(config: ModelConfig, train: TrainConfig) -> dict:
     done, hours = 0.0, {(gpu, n): 0.0 for gpu in GPUS for n in (1, 8)}
     for phase in train.phases:
         steps, done = round((phase.share - done) * train.steps), phase.share
-        own = phase_cost(config, train, phase, frozen, weights)
-        report["phases"].append({"steps": steps, **own})
+        cost = phase_cost(config, train, phase, frozen, weights)
+        report["phases"].append({"steps": steps, **cost})
         for gpu, (peak, _, link) in GPUS.items():
             for n in (1, 8):
                 # Ring all-reduce of float32 gradients.
                 exchange = 0.0 if n == 1 else 2 * (n - 1) / n * weights * 4 / link
-                hours[gpu, n] += steps * (own["flops_per_step"] / (n * peak * UTILISATION) + exchange) / 3600
+                hours[gpu, n] += steps * (cost["flops_per_step"] / (n * peak * UTILISATION) + exchange) / 3600
     for gpu, (_, capacity, _) in GPUS.items():
         # each part of a batch is split over the GPUs
         fits = {
@@ -303,31 +303,33 @@ def phase_cost(
     batch = phase.batch or train.batch
     part = -(-batch // train.accumulate)
     dtype = torch.bfloat16 if train.precision == "bfloat16" else torch.float32
-    one, two = (step_cost(config, domains, views, n, fused=fused, dtype=dtype) for n in (1, 2))
+    one_object, two_objects = (step_cost(config, domains, views, n, fused=fused, dtype=dtype) for n in (1, 2))
     # both are affine in the number of objects: measured at one and two, not assumed
-    flops, network = (one[key] + (two[key] - one[key]) * (part - 1) for key in ("flops", "bytes"))
+    flops, network = (one_object[key] + (two_objects[key] - one_object[key]) * (part - 1) for key in ("flops", "bytes"))
     share = rendering_share(config, train, domains)
     data = part * data_bytes(config, domains, views)
     rendering = part * shading_bytes(config, train, views) if share else 0.0
     conditions = 1 + (config.mirror_back and "back" in config.views)
-    own = frozen or dict.fromkeys(("encode", "decode", "object", "encode_bytes", "decode_bytes", "weights_bytes"), 0.0)
-    encoding = own["encode"] * (domains * views + conditions)
-    decoding = own["decode"] * share * len(LIT) * views
+    frozen_figures = frozen or dict.fromkeys(
+        ("encode", "decode", "object", "encode_bytes", "decode_bytes", "weights_bytes"), 0.0
+    )
+    encoding = frozen_figures["encode"] * (domains * views + conditions)
+    decoding = frozen_figures["decode"] * share * len(LIT) * views
     growing = data + network + rendering
-    held = max(data + own["encode_bytes"], growing + (own["decode_bytes"] if share else 0.0))
+    held = max(data + frozen_figures["encode_bytes"], growing + (frozen_figures["decode_bytes"] if share else 0.0))
     copies = weights * 2 if dtype == torch.bfloat16 else 0
     return {
         "domains": domains,
         "views": views,
         "batch": batch,
         "objects_at_once": part,
-        "flops_per_step": flops * batch / part + batch * (encoding + decoding + own["object"]),
+        "flops_per_step": flops * batch / part + batch * (encoding + decoding + frozen_figures["object"]),
         "vae_flops_per_step": batch * (encoding + decoding),
         "rendering_share": share,
         "rendering_bytes": rendering,
         "growing_bytes": growing,
         "activation_bytes": held,
-        "bytes": weights * BYTES_PER_WEIGHT + copies + own["weights_bytes"] + held,
+        "bytes": weights * BYTES_PER_WEIGHT + copies + frozen_figures["weights_bytes"] + held,
     }
 
 
@@ -347,10 +349,10 @@ def text_of(report: dict) -> str:
         )
     lines += ["", f"estimated at {report['utilisation']:.0%} of the peak in bfloat16:"]
     for gpu, row in report["hours"].items():
-        one, eight = (
+        one_gpu, eight_gpus = (
             f"{row[n]:8.1f} h{'' if row['fits'][n] else ' (does not fit: raise accumulate)'}" for n in ("1", "8")
         )
-        lines.append(f"{gpu:12s}  1 GPU {one}   8 GPUs {eight}")
+        lines.append(f"{gpu:12s}  1 GPU {one_gpu}   8 GPUs {eight_gpus}")
     if not report["frozen_parts_counted"]:
         lines.append("not counted: the frozen VAE and CLIP (pip install 'gdtool[hub]')")
     return "\n".join(lines)

@@ -27,7 +27,7 @@ def validation(state, objects: Objects, precision: str) -> tuple[np.ndarray, dic
     """
     model, config = state.model, state.model.config
     device = next(model.parameters()).device
-    own = {name: p.detach().clone() for name, p in model.named_parameters()}
+    current = {name: p.detach().clone() for name, p in model.named_parameters()}
     model.load_state_dict({**model.state_dict(), **state.average})
     model.eval()
     rows, errors = [], []
@@ -46,7 +46,7 @@ def validation(state, objects: Objects, precision: str) -> tuple[np.ndarray, dic
         shown = np.full((blocks[0].shape[0], config.image_size, 3), 0.5, np.float32)
         shown[: config.image_size] = (0.5 + 0.5 * rgba[0, :3].permute(1, 2, 0)).numpy()
         rows.append(np.concatenate([shown, *blocks], 1))
-    model.load_state_dict({**model.state_dict(), **own})
+    model.load_state_dict({**model.state_dict(), **current})
     model.train()
     psnr = -10 * torch.stack(errors).clamp(min=1e-10).log10().mean((0, 2))
     return np.clip(np.concatenate(rows, 0), 0, 1), dict(zip(config.domains, psnr.tolist(), strict=True))

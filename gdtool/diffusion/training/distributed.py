@@ -88,7 +88,8 @@ def total(figures: dict[str, float]) -> dict[str, float]:
     every: list = [None] * size()
     dist.all_gather_object(every, figures)
     return {
-        name: sum(one.get(name, 0.0) for one in every) for name in dict.fromkeys(name for one in every for name in one)
+        name: sum(summand.get(name, 0.0) for summand in every)
+        for name in dict.fromkeys(name for summand in every for name in summand)
     }
 
 
@@ -160,9 +161,9 @@ def gathered(state):
         return state
     from gdtool.diffusion.network.model import Model
 
-    own = dict(state.model.named_parameters())
-    average = {name: whole(x, own[name]) for name, x in state.average.items()}
-    weights = {name: whole(p.detach()) for name, p in own.items()}
+    parameters = dict(state.model.named_parameters())
+    average = {name: whole(x, parameters[name]) for name, x in state.average.items()}
+    weights = {name: whole(p.detach()) for name, p in parameters.items()}
     config = state.model.config
     encoder = state.model.encoder if config.encoder == "clip" else None  # frozen, and so not split
     model = Model(config, state.model.codec, encoder).to(next(iter(weights.values())).device).train()

@@ -108,13 +108,13 @@ def learning_rate(state: State, progress: float, train: TrainConfig) -> float:
 def choose(config: ModelConfig, phase: Phase, seed: int, step: int) -> Step:
     """Choose a step's domains and views; color always where it is primary and more than one domain is drawn."""
     choices = np.random.default_rng((seed, 2, step))
-    own = [DOMAINS.index(d) for d in config.domains]
-    if phase.domains >= len(own):
-        domains = tuple(own)
+    modelled = [DOMAINS.index(d) for d in config.domains]
+    if phase.domains >= len(modelled):
+        domains = tuple(modelled)
     elif phase.domains == 1 or config.cross_domain == "none":
-        domains = tuple(sorted(choices.permutation(own)[: phase.domains].tolist()))
+        domains = tuple(sorted(choices.permutation(modelled)[: phase.domains].tolist()))
     else:
-        domains = (0, *sorted(choices.permutation(own[1:])[: phase.domains - 1].tolist()))
+        domains = (0, *sorted(choices.permutation(modelled[1:])[: phase.domains - 1].tolist()))
     views = torch.from_numpy(np.sort(choices.permutation(len(config.views))[: phase.views]))
     return Step(domains, views, seed, step)
 
@@ -228,8 +228,8 @@ def train_step(
     state.step += 1
     keep = min(train.ema, (1 + state.step) / (10 + state.step))
     names = list(state.average)
-    own = {name: distributed.local(p) for name, p in state.model.named_parameters()}
-    torch._foreach_lerp_([state.average[n] for n in names], [own[n] for n in names], 1 - keep)
+    weights = {name: distributed.local(p) for name, p in state.model.named_parameters()}
+    torch._foreach_lerp_([state.average[n] for n in names], [weights[n] for n in names], 1 - keep)
     return {"step": state.step, "rate": rate, "norm": float(norm), "skipped": int(not finite), **sums}
 
 

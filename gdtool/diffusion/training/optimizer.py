@@ -37,17 +37,17 @@ class MuonAndAdam:
     @property
     def state(self) -> dict:
         """Map parameters to moments."""
-        own = {
+        matrix_state = {
             p: self.muon.state[flat]
             for p, flat in zip(self.matrices, self.flat, strict=True)
             if flat in self.muon.state
         }
-        return {**self.adam.state, **own}
+        return {**self.adam.state, **matrix_state}
 
     def restore(self, p: torch.Tensor, moments: dict[str, torch.Tensor]) -> None:
         """Put back a parameter's moments."""
-        for one, flat in zip(self.matrices, self.flat, strict=True):
-            if one is p:
+        for matrix, flat in zip(self.matrices, self.flat, strict=True):
+            if matrix is p:
                 self.muon.state[flat] = moments
                 return
         self.adam.state[p] = moments

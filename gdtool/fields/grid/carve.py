@@ -46,10 +46,10 @@ def combined_distance(
         value = _vote(hull, outvoted)
         seen = np.where(2 * ending > len(views), SMOOTHLY, UNSEEN)
         if deep:
-            found = [tangent_distance(view, part) for view in deep]
-            free = np.clip(np.stack([f[0] for f in found]), -limit, limit).astype(np.float32)
-            weight = np.stack([f[1] for f in found]).astype(np.float32)
-            smooth = np.stack([f[3] for f in found])
+            measurements = [tangent_distance(view, part) for view in deep]
+            free = np.clip(np.stack([f[0] for f in measurements]), -limit, limit).astype(np.float32)
+            weight = np.stack([f[1] for f in measurements]).astype(np.float32)
+            smooth = np.stack([f[3] for f in measurements])
             fused = _mean_surface(free, weight, limit) if noise else _nearest_surface(free, weight, step / 3, limit)
             # Noisy views have noisy masks, even after their edges were brought together.
             value = np.maximum(value - (SLACK * step if noise else 0.0), fused)

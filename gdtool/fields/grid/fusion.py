@@ -183,16 +183,16 @@ def align_views(
     clock = options.clock or Clock()
     kept = [k for k in range(len(cameras)) if (mask[k] > 0.5).any()]
     slopes = [slope_equations(view) for view in views]
-    found, after = Corrections.none(len(views)), disagreement(views)
+    solution, after = Corrections.none(len(views)), disagreement(views)
     for count, (reach, stiffness) in enumerate((*ROUNDS, *[ROUNDS[-1]] * MORE_ROUNDS), 1):
         pictures = [[Picture.of(cameras[k], stack[k], mask[k], reach) for k in kept] for stack in options.colors]
-        found = corrections(views, slopes, found, reach, stiffness, pictures=pictures)
+        solution = corrections(views, slopes, solution, reach, stiffness, pictures=pictures)
         changed = np.array(depth)
-        for place, k in enumerate(kept):
-            changed[k] = np.where(depth[k] > 0, depth[k] + found.depth(place, mask[k].shape), 0)
+        for index, k in enumerate(kept):
+            changed[k] = np.where(depth[k] > 0, depth[k] + solution.depth(index, mask[k].shape), 0)
         views = [
             grow_silhouette(view, edge)
-            for view, edge in zip(prepare_all(cameras, mask, changed, normal), found.edge, strict=True)
+            for view, edge in zip(prepare_all(cameras, mask, changed, normal), solution.edge, strict=True)
         ]
         previous, after = after, disagreement(views)
         options.tell(f"round {count}: views disagree by {after:.5f}, {previous:.5f} before")

@@ -161,9 +161,9 @@ def measured_normals(
 
 def normal_deviation_degrees(vertices: np.ndarray, faces: np.ndarray, views: list[PreparedView], reach: float) -> float:
     """Measure the median degrees between a surface's normals and the views' normals there; 0 where there are none."""
-    own = vertex_normals(vertices, faces)
-    shown, trust = measured_normals(views, vertices, own, reach)
-    cosine = np.einsum("vi,vi->v", shown, own)[trust > 0.5]
+    surface = vertex_normals(vertices, faces)
+    measured, trust = measured_normals(views, vertices, surface, reach)
+    cosine = np.einsum("vi,vi->v", measured, surface)[trust > 0.5]
     return float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1)))) if len(cosine) else 0.0
 
 

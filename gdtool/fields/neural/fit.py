@@ -138,8 +138,8 @@ def fit_distances(
         fit.sdf.show_frequencies(3 + (FREQUENCIES - 3) * 2 * progress)
         points, distances = sample(batch)
         with torch.autocast(device.type, torch.bfloat16, enabled=progress < half_share):
-            found = fit.sdf(points)
-        gap = (found.float() - distances).abs()
+            predicted = fit.sdf(points)
+        gap = (predicted.float() - distances).abs()
         # Far from the surface the sign and the rough size are enough.
         loss = (gap / (1 + 10 * distances.abs())).mean()
         optimiser.zero_grad()
@@ -168,7 +168,7 @@ def find_surface(
         share = torch.linspace(0, 1, samples, device=origins.device)
         t = near[:, None] + (far - near)[:, None] * share
         values = sdf(origins[:, None] + t[..., None] * directions[:, None])
-        found, idx = first_crossing(values)
+        crosses, idx = first_crossing(values)
         lowest = values.argmin(1, keepdim=True)
         closest = origins + t.gather(1, lowest) * directions
         i = idx[:, None]
@@ -188,7 +188,7 @@ def find_surface(
                 torch.where(ahead, value, f0),
                 torch.where(ahead, f1, value),
             )
-        return depth, found, closest
+        return depth, crosses, closest
 
 
 def volume_losses(fit: Fit, pixels: Pixels, chosen: Tensor) -> dict[str, Tensor]:
@@ -223,15 +223,15 @@ def surface_losses(
 ) -> dict[str, Tensor]:
     """Compute losses at explicit surface points, and of rays that hit outside the mask or miss inside it."""
     origins, directions, inside = pixels.origins[chosen], pixels.directions[chosen], pixels.inside[chosen]
-    depth, found, closest = find_surface(
+    depth, crosses, closest = find_surface(
         fit.sdf, RaySegments(origins, directions, pixels.near[chosen], pixels.far[chosen]), rule, samples=samples
     )
     losses: dict[str, Tensor] = {}
-    wrong = found != inside
+    wrong = crosses != inside
     if wrong.any():
         value = fit.sdf(closest[wrong]) * torch.where(inside[wrong], 1.0, -1.0)
         losses["mask"] = torch.nn.functional.softplus(50 * value).sum() / 50 / len(chosen) * 10
-    good = found & inside
+    good = crosses & inside
     if not good.any():
         return losses
     here = origins[good] + depth[good, None] * directions[good]

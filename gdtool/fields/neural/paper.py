@@ -88,14 +88,14 @@ def gather_pixels(
         hit = caster.first_hit(origins, directions)
         middle = -(origins * directions).sum(1)
         half = np.sqrt(np.maximum(radius**2 - ((origins + middle[:, None] * directions) ** 2).sum(1), 1e-4))
-        found = (hit.face_idx >= 0) & inside[chosen]
-        place = np.where(found, hit.distance, 0.0)
-        place[~found] = closest_approach(
-            origins[~found], directions[~found], (middle - half)[~found], (middle + half)[~found], vertices
+        hits = (hit.face_idx >= 0) & inside[chosen]
+        distance_along = np.where(hits, hit.distance, 0.0)
+        distance_along[~hits] = closest_approach(
+            origins[~hits], directions[~hits], (middle - half)[~hits], (middle + half)[~hits], vertices
         )
         # A ray that has to miss passes the surface at some distance: a wider part of it is watched.
-        around = np.where(found, reach, max(2 * reach, 0.06))
-        near, far = place - around, place + around
+        around = np.where(hits, reach, max(2 * reach, 0.06))
+        near, far = distance_along - around, distance_along + around
         row = {"origins": origins, "directions": directions, "inside": inside[chosen], "near": near, "far": far}
         for name, stack in images.items():
             value = stack[k][chosen]

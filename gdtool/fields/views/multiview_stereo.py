@@ -89,24 +89,28 @@ def unstretched(camera: Camera, depth: np.ndarray) -> np.ndarray:
 class _View:
     """Hold a view at matching resolution: its n foreground pixels, their rays and features, and the depths to try."""
 
-    def __init__(self, camera: Camera, mask: np.ndarray, looks: np.ndarray, normal: np.ndarray, box: np.ndarray):
+    def __init__(
+        self, camera: Camera, mask: np.ndarray, feature_image: np.ndarray, normal: np.ndarray, box: np.ndarray
+    ):
         self.camera, self.factor = camera, max(1, round(max(mask.shape) / MATCHING_SIZE))
         self.mask = _block_means(mask[..., None], self.factor)[..., 0]
         cover = np.maximum(self.mask, 1e-3)[..., None]
-        self.looks = _block_means(looks * mask[..., None], self.factor) / cover
-        self.shown = self.mask > LEAST_COVER
-        h, w = self.shown.shape
+        self.feature_image = _block_means(feature_image * mask[..., None], self.factor) / cover
+        self.foreground = self.mask > LEAST_COVER
+        h, w = self.foreground.shape
         column, row = np.meshgrid((np.arange(w) + 0.5) * self.factor, (np.arange(h) + 0.5) * self.factor)
-        origins, directions = rays(camera, np.stack([column, row], -1)[self.shown])
+        origins, directions = rays(camera, np.stack([column, row], -1)[self.foreground])
         self.origins, self.directions = origins, directions / -(directions @ camera.backward)[:, None]  # of unit depth
-        averaged = _block_means(normal * mask[..., None], self.factor)[self.shown]
+        averaged = _block_means(normal * mask[..., None], self.factor)[self.foreground]
         self.normal = averaged / np.maximum(np.linalg.norm(averaged, axis=-1, keepdims=True), 1e-9)
-        self.own = self.looks[self.shown]
+        self.features = self.feature_image[self.foreground]
         depth = project(camera, box)[1]
-        self.pixel = self.factor * float(pixel_footprint(camera, max(float(np.median(depth)), 1e-6)))  # world units
+        self.pixel_size = self.factor * float(
+            pixel_footprint(camera, max(float(np.median(depth)), 1e-6))
+        )  # world units
         low, high = stretched(camera, np.maximum([depth.min(), depth.max()], camera.near / 2))
         self.step = max(CANDIDATE_PX * self.factor * min(pixel_steps(camera)), (high - low) / MOST_CANDIDATES)
-        self.tried = low + self.step * np.arange(max(int(np.ceil((high - low) / self.step)) + 1, 3))
+        self.candidates = low + self.step * np.arange(max(int(np.ceil((high - low) / self.step)) + 1, 3))
 
     def points(self, depth: np.ndarray) -> np.ndarray:
         """Compute world points (n, 3) at a stretched depth, one number or (n,)."""
@@ -114,11 +118,11 @@ class _View:
 
     def image(self, values: np.ndarray, fill: float = 0.0) -> np.ndarray:
         """Scatter values (n,) into an image (h, w) that holds `fill` elsewhere."""
-        out = np.full(self.shown.shape, fill)
-        out[self.shown] = values
+        out = np.full(self.foreground.shape, fill)
+        out[self.foreground] = values
         return out
 
-    def seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def project_points(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project points (m, 3): positions (m, 2) in this view's pixels, and depth (m,) along its axis."""
         pixels, depth = project(self.camera, points)
         return pixels / self.factor, depth
@@ -146,18 +150,18 @@ def match_views(
     """
     corners = np.stack(np.meshgrid(*zip(*box, strict=True), indexing="ij"), -1).reshape(-1, 3)
     looks = _compared_features({"normal": normal, **alike})
-    views = [_View(*given, corners) for given in zip(cameras, mask, looks, normal, strict=True)]
-    found = _sweep(views, silhouettes, None, DEPTH_COST)
+    views = [_View(*view_input, corners) for view_input in zip(cameras, mask, looks, normal, strict=True)]
+    depths = _sweep(views, silhouettes, None, DEPTH_COST)
     # Views that do not fit one another say less of where a point is, and the silhouettes more.
-    doubt = max(1.0, _misfit(views, found) / CONSISTENT_MISFIT)
+    doubt = max(1.0, _misfit(views, depths) / CONSISTENT_MISFIT)
     if doubt > 1:
         for view in views:
-            view.looks, view.own = view.looks / doubt**0.5, view.own / doubt**0.5
-        found = _sweep(views, silhouettes, None, DEPTH_COST * doubt)
-    found = _sweep(views, silhouettes, _known_depths(views, found), DEPTH_COST * doubt)
+            view.feature_image, view.features = view.feature_image / doubt**0.5, view.features / doubt**0.5
+        depths = _sweep(views, silhouettes, None, DEPTH_COST * doubt)
+    depths = _sweep(views, silhouettes, _known_depths(views, depths), DEPTH_COST * doubt)
     return [
-        _full_size(view, depth, trust, own)
-        for view, depth, trust, own in zip(views, found, _trust(views, found), mask, strict=True)
+        _full_size(view, depth, trust, view_mask)
+        for view, depth, trust, view_mask in zip(views, depths, _trust(views, depths), mask, strict=True)
     ]
 
 
@@ -176,16 +180,16 @@ def _sweep(
     ]
 
 
-def _misfit(views: list[_View], found: list[np.ndarray]) -> float:
+def _misfit(views: list[_View], depths: list[np.ndarray]) -> float:
     """Measure the median feature difference, in 0..1, to the best fitting view, over the pixels that another view can
     see.
 
     Consistent views give .003 and less, views disturbed as benchmarks/perturbation.py does .1, a model's views .7.
     """
     every = []
-    for view, depth in zip(views, found, strict=True):
+    for view, depth in zip(views, depths, strict=True):
         chosen = np.flatnonzero(np.isfinite(depth))
-        points, best = view.points(np.nan_to_num(depth, nan=view.tried[0])), np.full(len(chosen), np.inf)
+        points, best = view.points(np.nan_to_num(depth, nan=view.candidates[0])), np.full(len(chosen), np.inf)
         for other in views:
             if other is not view:
                 difference = _compare(view, other, points, chosen)[0]
@@ -217,14 +221,16 @@ def _sweep_costs(
 
     known: depth and trust (h, w) of the other views by id, from an earlier sweep.
     """
-    cost = np.full((len(view.own), len(view.tried)), EXCLUDED_COST, np.float32)
-    facing = np.stack([_facing_cosine(other, view) for other in others], 1) if others else np.zeros((len(view.own), 0))
-    entered = np.full(len(view.own), np.nan)
-    for k, depth in enumerate(view.tried):
+    cost = np.full((len(view.features), len(view.candidates)), EXCLUDED_COST, np.float32)
+    facing = (
+        np.stack([_facing_cosine(other, view) for other in others], 1) if others else np.zeros((len(view.features), 0))
+    )
+    entered = np.full(len(view.features), np.nan)
+    for k, depth in enumerate(view.candidates):
         points = view.points(depth)
         allowed = np.flatnonzero(
             np.max([hull_distance(silhouette, points) for silhouette in silhouettes], 0)
-            < SILHOUETTE_SLACK_PX * view.pixel
+            < SILHOUETTE_SLACK_PX * view.pixel_size
         )
         if len(allowed) == 0:
             continue
@@ -248,7 +254,7 @@ def _facing_cosine(other: _View, view: _View) -> np.ndarray:
     """Compute the cosine (n,) between the normals of `view`'s pixels and the direction to the other camera."""
     if other.camera.projection == "orthographic":
         return view.normal @ other.camera.backward
-    middle = view.points(np.full(len(view.own), view.tried.mean()))
+    middle = view.points(np.full(len(view.features), view.candidates.mean()))
     toward = other.camera.position - middle
     return (view.normal * toward).sum(1) / np.maximum(np.linalg.norm(toward, axis=1), 1e-9)
 
@@ -260,8 +266,8 @@ def _compare(
 
     Returns the difference (m,) in 0..1 and the points' pixels (m, 2) and depth (m,) in the other view.
     """
-    pixels, depth = other.seen(points[chosen])
-    gap = bilinear(other.looks, pixels) - view.own[chosen]
+    pixels, depth = other.project_points(points[chosen])
+    gap = bilinear(other.feature_image, pixels) - view.features[chosen]
     difference = np.minimum(np.einsum("ij,ij->i", gap, gap) / SATURATION**2, 1.0)
     return np.where(bilinear(other.mask[..., None], pixels)[:, 0] < 0.5, 1.0, difference), pixels, depth
 
@@ -287,7 +293,7 @@ def _cost_with_occlusion(
     total, share, blocks = HIDDEN_WEIGHT * hidden, np.full(len(hidden), HIDDEN_WEIGHT), np.zeros(len(hidden))
     for difference, pixels, depth, cosine, other in compared:
         surface, trust = (bilinear(image[..., None], pixels)[:, 0] for image in known[id(other)])
-        reach = ON_SURFACE_PX * other.pixel / np.maximum(cosine, 0.3)
+        reach = ON_SURFACE_PX * other.pixel_size / np.maximum(cosine, 0.3)
         covered = bilinear(other.mask[..., None], pixels)[:, 0] > 0.5
         weight = np.where(
             (cosine > LEAST_FACING) & covered & (np.abs(depth - surface) < reach), cosine * np.maximum(trust, 0.2), 0.0
@@ -303,28 +309,30 @@ def _best_depth(cost: np.ndarray, view: _View) -> np.ndarray:
     """
     right, down, facing = slopes(view.camera, view.normal, LEAST_FACING, view.directions)
     scale = view.factor / view.step
-    image = np.full((*view.shown.shape, cost.shape[1]), EXCLUDED_COST, np.float32)
-    image[view.shown] = np.minimum(cost, 1.5)  # ruled out by one pixel, yet a neighbour's may go on there
+    image = np.full((*view.foreground.shape, cost.shape[1]), EXCLUDED_COST, np.float32)
+    image[view.foreground] = np.minimum(cost, 1.5)  # ruled out by one pixel, yet a neighbour's may go on there
     # A plane seen at a grazing angle may well end: leaving it costs less.
     jump = view.image(JUMP_COST * np.clip(facing / 0.5, 0.15, 1.0)).astype(np.float32)
     total = np.zeros_like(image)
     for slope, turn in ((right, (0, 1, 2)), (down, (1, 0, 2))):
         along = [
             image.transpose(turn),
-            view.shown.transpose(turn[:2]),
+            view.foreground.transpose(turn[:2]),
             view.image(slope * scale).transpose(turn[:2]),
             jump.transpose(turn[:2]),
         ]
-        for way in (1, -1):
-            total += _aggregate_rows(*(x[:, ::way] for x in along), way)[:, ::way].transpose(turn)
-    total = total[view.shown]
+        for direction in (1, -1):
+            total += _aggregate_rows(*(x[:, ::direction] for x in along), direction)[:, ::direction].transpose(turn)
+    total = total[view.foreground]
     best = np.clip(total.argmin(1), 1, total.shape[1] - 2)
     before, here, after = (total[np.arange(len(best)), best + i] for i in (-1, 0, 1))
     part = np.clip((before - after) / np.maximum(2 * (before - 2 * here + after), 1e-6), -0.5, 0.5)
-    return np.where((cost < EXCLUDED_COST).any(1), view.tried[0] + view.step * (best + part), np.nan)
+    return np.where((cost < EXCLUDED_COST).any(1), view.candidates[0] + view.step * (best + part), np.nan)
 
 
-def _aggregate_rows(cost: np.ndarray, shown: np.ndarray, slope: np.ndarray, jump: np.ndarray, way: int) -> np.ndarray:
+def _aggregate_rows(
+    cost: np.ndarray, shown: np.ndarray, slope: np.ndarray, jump: np.ndarray, direction: int
+) -> np.ndarray:
     """Add to the cost (h, w, candidates) of every depth the least cost of the pixels before it in its row.
 
     slope (h, w): candidates by which depth grows over a pixel in the given direction, 1 or -1.
@@ -334,7 +342,7 @@ def _aggregate_rows(cost: np.ndarray, shown: np.ndarray, slope: np.ndarray, jump
     for column in range(1, cost.shape[1]):
         previous = out[:, column - 1]
         lowest = previous.min(1, keepdims=True)
-        from_there = every - way * (slope[:, column] + slope[:, column - 1])[:, None] / 2
+        from_there = every - direction * (slope[:, column] + slope[:, column - 1])[:, None] / 2
         whole = np.floor(from_there).astype(np.int64)
         part = (from_there - whole).astype(np.float32)
         plane = (
@@ -356,11 +364,11 @@ def _aggregate_rows(cost: np.ndarray, shown: np.ndarray, slope: np.ndarray, jump
     return out
 
 
-def _known_depths(views: list[_View], found: list[np.ndarray]) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+def _known_depths(views: list[_View], depths: list[np.ndarray]) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """Return, by id, each view's depth (h, w), extrapolated beyond its outline, and the trust in it (h, w)."""
     return {
         id(view): (_extrapolate(view, unstretched(view.camera, depth))[0], view.image(trust))
-        for view, depth, trust in zip(views, found, _trust(views, found), strict=True)
+        for view, depth, trust in zip(views, depths, _trust(views, depths), strict=True)
     }
 
 
@@ -375,27 +383,27 @@ def _extrapolate(view: _View, values: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return image[tuple(distance_transform_edt(~held, return_distances=False, return_indices=True))], held
 
 
-def _trust(views: list[_View], found: list[np.ndarray]) -> list[np.ndarray]:
+def _trust(views: list[_View], depths: list[np.ndarray]) -> list[np.ndarray]:
     """Compute the trust (n,) in each view's depths.
 
     1 where another view confirms the point, 0 where none does, .1 where it would occlude more views than confirm it.
     """
     surfaces = [
-        _extrapolate(view, unstretched(view.camera, depth))[0] for view, depth in zip(views, found, strict=True)
+        _extrapolate(view, unstretched(view.camera, depth))[0] for view, depth in zip(views, depths, strict=True)
     ]
     out = []
-    for view, depth in zip(views, found, strict=True):
-        points = view.points(np.nan_to_num(depth, nan=view.tried[0]))
+    for view, depth in zip(views, depths, strict=True):
+        points = view.points(np.nan_to_num(depth, nan=view.candidates[0]))
         meeting, hiding = np.zeros(len(points)), np.zeros(len(points))
         for other, surface in zip(views, surfaces, strict=True):
             if other is view:
                 continue
             cosine = _facing_cosine(other, view)
-            pixels, there = other.seen(points)
+            pixels, there = other.project_points(points)
             beyond = bilinear(surface[..., None], pixels)[:, 0] - there
             seen = (cosine > LEAST_FACING) & (bilinear(other.mask[..., None], pixels)[:, 0] > 0.5)
-            meeting += seen & (np.abs(beyond) < CONFIRMED_PX * other.pixel / np.maximum(cosine, 0.3))
-            hiding += seen & (beyond > 2 * CONFIRMED_PX * other.pixel)
+            meeting += seen & (np.abs(beyond) < CONFIRMED_PX * other.pixel_size / np.maximum(cosine, 0.3))
+            hiding += seen & (beyond > 2 * CONFIRMED_PX * other.pixel_size)
         out.append(np.where(np.isfinite(depth) & (meeting > 0), np.where(hiding > meeting, 0.1, 1.0), 0.0))
     return out
 

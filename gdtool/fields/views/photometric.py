@@ -48,14 +48,16 @@ def color_equations(
     (n,) to remove, and weights (n,): one over the variance of the two views' color differences, less for outliers. Each
     channel may have a gain and an offset between the views.
     """
-    own, shown = bilinear(first.color, here), bilinear(second.color, there)
+    color_here, color_there = bilinear(first.color, here), bilinear(second.color, there)
     _, direction = rays(first.camera, here)
     farther = points + _STEP * direction / np.maximum(-(direction @ first.camera.backward), 1e-9)[:, None]
     moved = (project(second.camera, farther)[0] - there) / _STEP
     slope = bilinear(second.across, there) * moved[:, :1] + bilinear(second.down, there) * moved[:, 1:]
     weight = trust
     for _ in range(3):
-        difference = shown - np.stack([_matched(x, y, weight) for x, y in zip(own.T, shown.T, strict=True)], -1)
+        difference = color_there - np.stack(
+            [_matched(x, y, weight) for x, y in zip(color_here.T, color_there.T, strict=True)], -1
+        )
         # 1.5: from a median to a standard deviation.
         noise = max(1.5 * float(np.median(np.abs(difference))), LEAST_NOISE)
         weight = trust / (1 + (difference**2).mean(1) / (2 * noise) ** 2) ** 2
