@@ -67,7 +67,7 @@ def light_share(found: np.ndarray, true: np.ndarray, color: np.ndarray, weight: 
 
 def found_materials(way: str, views, surface, normals: np.ndarray, step: float):
     """The surface with the materials that way finds, and the processor's seconds it took."""
-    from gdtool.fields.appearance.appearance import appearance
+    from gdtool.fields.appearance.appearance import AppearanceOptions, appearance
 
     images, light = views.images, views.light
     if way != MATERIAL_VIEWS:
@@ -80,10 +80,7 @@ def found_materials(way: str, views, surface, normals: np.ndarray, step: float):
         surface.vertices,
         surface.faces,
         normals,
-        step,
-        light,
-        0,
-        "no visibility" not in way,
+        AppearanceOptions(step=step, light=light, seed=0, shadows="no visibility" not in way),
     )
     albedo = look.albedo if "PBR" in way or way == MATERIAL_VIEWS else fused_color(views, surface, normals, step)[0]
     seconds = time.process_time() - began

@@ -35,7 +35,7 @@ from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.diffusion.data.objects import decode_object
 from gdtool.diffusion.inference.familiarity import DOUBTS, FILE, doubts, limits, read_ranges, unfamiliar, write_ranges
 from gdtool.diffusion.inference.result import views_from_images
-from gdtool.diffusion.inference.sampling import sample_images
+from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
 from gdtool.diffusion.network.encoding import BACKGROUND
 from gdtool.folders.views import Views
 from gdtool.images.io import read_image
@@ -54,7 +54,7 @@ def result_of(model, condition: np.ndarray) -> tuple[Views, dict[str, float]]:
     config = model.config
     cameras = {camera.name: camera for camera in rig("six", config.image_size)}
     rgba = torch.from_numpy(np.ascontiguousarray(condition, np.float32))[None]
-    images = sample_images(model, rgba, domains=config.domains, steps=config.sampling_steps)
+    images = sample_images(model, rgba, SamplingOptions(domains=config.domains, steps=config.sampling_steps))
     return views_from_images(
         {d: x[0] for d, x in images.items()},
         [cameras[n] for n in config.views],

@@ -42,7 +42,7 @@ from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.diffusion.data.objects import decode_object
 from gdtool.diffusion.inference import familiarity
 from gdtool.diffusion.inference.result import views_from_images
-from gdtool.diffusion.inference.sampling import sample_images
+from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
 from gdtool.diffusion.network.encoding import BACKGROUND, encode
 from gdtool.folders.views import Views, read_views
 from gdtool.images.color import srgb_from_linear
@@ -146,10 +146,10 @@ def true_views(folder, size: int) -> Views:
 
 
 def sampled_views(model, rgba: torch.Tensor, seed: int, **setting) -> Views:
-    """What a model makes of one condition (1, 4, h, w); setting: of sample_images."""
+    """What a model makes of one condition (1, 4, h, w); setting: of SamplingOptions."""
     config = model.config
     cameras = {camera.name: camera for camera in rig("six", config.image_size)}
-    images = sample_images(model, rgba, seed=seed, **setting)
+    images = sample_images(model, rgba, SamplingOptions(seed=seed, **setting))
     return views_from_images(
         {d: x[0].float() for d, x in images.items()},
         [cameras[n] for n in config.views],

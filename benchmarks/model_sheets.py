@@ -22,7 +22,7 @@ from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.diffusion.data.framing import frame
 from gdtool.diffusion.data.objects import condition_plane, decode_object
 from gdtool.diffusion.inference.result import views_from_images
-from gdtool.diffusion.inference.sampling import sample_images
+from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
 from gdtool.diffusion.network.encoding import BACKGROUND, SLAB
 from gdtool.images.color import linear_from_srgb
 from gdtool.images.io import read_image, write_png
@@ -53,7 +53,7 @@ def block(model, condition: np.ndarray) -> np.ndarray:
     config, h = model.config, model.config.image_size
     cameras = {camera.name: camera for camera in rig("six", h)}
     rgba = torch.from_numpy(np.ascontiguousarray(condition, np.float32))[None]
-    sampled = sample_images(model, rgba, steps=config.sampling_steps)
+    sampled = sample_images(model, rgba, SamplingOptions(steps=config.sampling_steps))
     alpha = 0.5 + 0.5 * condition[3]
     views, _ = views_from_images(
         {d: x[0] for d, x in sampled.items()},

@@ -133,7 +133,7 @@ def normals_beside(vertices: np.ndarray, faces: np.ndarray, views) -> float:
 def skips(views) -> list[dict]:
     """CPU seconds of the grid method with a step left out and done, and how far the result moves (world units)."""
     from gdtool.fields.grid.carve import carve, combined_distance
-    from gdtool.fields.grid.fusion import align_depth, bring_together, grid_step, prepare_all
+    from gdtool.fields.grid.fusion import AlignmentOptions, align_depth, align_views, grid_step, prepare_all
     from gdtool.fields.views.depth_alignment import disagreement
 
     depth, normal, colors = (
@@ -142,19 +142,19 @@ def skips(views) -> list[dict]:
         [views.images[domain] for domain in ("albedo", "color")],
     )
     step = grid_step(views.cameras, 0)
-    sights = prepare_all(views.cameras, views.mask, depth, normal)
+    prepared = prepare_all(views.cameras, views.mask, depth, normal)
 
     def timed(function):
         start = time.process_time()
         return function(), time.process_time() - start
 
     (_, before, after), checked = timed(
-        lambda: align_depth(views.cameras, views.mask, depth, normal, step, colors=colors)
+        lambda: align_depth(views.cameras, views.mask, depth, normal, step, AlignmentOptions(colors=colors))
     )
     found = []
     if before == after:
         (moved, _), forced = timed(
-            lambda: bring_together(views.cameras, views.mask, depth, normal, sights, colors=colors)
+            lambda: align_views(views.cameras, views.mask, depth, normal, prepared, AlignmentOptions(colors=colors))
         )
         found.append(
             {
@@ -164,10 +164,10 @@ def skips(views) -> list[dict]:
                 "change": abs(disagreement(moved) - before),
             }
         )
-    (grid, values, _), band = timed(lambda: carve(sights, step))
+    (grid, values, _), band = timed(lambda: carve(prepared, step))
     limit = 3 * step
     points = np.stack(np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij"), -1).reshape(-1, 3)
-    (dense, _), whole = timed(lambda: combined_distance(sights, grid.points(points), step, limit))
+    (dense, _), whole = timed(lambda: combined_distance(prepared, grid.points(points), step, limit))
     found.append(
         {
             "what": "samples away from the surface",

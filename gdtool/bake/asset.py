@@ -5,31 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.bake.maps import Maps
-from gdtool.bake.target import Target
+from gdtool.bake.target import CornerNormals, SurfaceModes, Target
 from gdtool.folders.mesh import QuadMesh
 from gdtool.geometry.frames import transform_points
 from gdtool.geometry.tangents import weld
-
-
-class SurfaceModes(Protocol):
-    """How viewers show a surface; bake.origin.Origin is one."""
-
-    alpha_mode: str
-    alpha_cutoff: float
-    double_sided: bool
-
-
-class CornerNormals(NamedTuple):
-    """Shading normals of a quad mesh: idx (f, 4) into normals (n, 3); -1 for a triangle's fourth corner."""
-
-    idx: np.ndarray
-    normals: np.ndarray
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.cameras import Camera, project
-from gdtool.fields.views.prepared_view import bilinear
 from gdtool.images.detail import DARK, detail_gain
 from gdtool.images.metrics import resized
+from gdtool.images.sampling import bilinear
 
 MAX_FACTOR = 4.0  # largest factor on the albedo; the smallest is its inverse
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -50,6 +51,21 @@ def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_degrees: floa
     out = np.where(length > 1e-12, total / np.maximum(length, 1e-300), flat)
     out[np.linalg.norm(out, axis=1) < 0.5] = (0.0, 1.0, 0.0)
     return out.reshape(count, 3, 3)
+
+
+class SurfaceModes(Protocol):
+    """How viewers show a surface; bake.origin.Origin is one."""
+
+    alpha_mode: str
+    alpha_cutoff: float
+    double_sided: bool
+
+
+class CornerNormals(NamedTuple):
+    """Shading normals of a quad mesh: idx (f, 4) into normals (n, 3); -1 for a triangle's fourth corner."""
+
+    idx: np.ndarray
+    normals: np.ndarray
 
 
 @dataclass(frozen=True)

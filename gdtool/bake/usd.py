@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gdtool.bake.asset import CornerNormals, SurfaceModes
 from gdtool.bake.maps import Maps
+from gdtool.bake.target import CornerNormals, SurfaceModes
 from gdtool.core.errors import OutputError, ResourceError
 from gdtool.core.native import imported_if_installed
 from gdtool.folders.mesh import QuadMesh

@@ -1,5 +1,5 @@
 """Cameras: the six-view rig, orthographic and perspective projection."""
 
-from gdtool.cameras.camera import Camera, camera_at, look_at, project, rays, rig
+from gdtool.cameras.camera import Camera, backproject, camera_at, look_at, project, rays, rig
 
-__all__ = ["Camera", "camera_at", "look_at", "project", "rays", "rig"]
+__all__ = ["Camera", "backproject", "camera_at", "look_at", "project", "rays", "rig"]

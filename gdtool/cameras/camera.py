@@ -151,3 +151,13 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         x = camera.cx + camera.fx * local[:, 0] / safe
         y = camera.cy - camera.fy * local[:, 1] / safe
     return np.stack([x, y], -1), depth
+
+
+def backproject(camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """Compute the world points (h, w, 3) behind the pixels of a depth image (h, w).
+
+    Depth is measured along the viewing axis, in world units.
+    """
+    origins, directions = rays(camera)
+    cosine = -(directions @ camera.backward)
+    return origins + directions * (depth / cosine)[..., None]

@@ -1,0 +1,1 @@
+"""Provide the multi-view PBR diffusion model: configuration, network, data, training, inference and reports."""

@@ -1,7 +1,7 @@
-"""One readable configuration of the diffusion model and of its training: `paper` and `tiny` are the same code as
-`small`.
+"""Configure the diffusion model and its training; the presets `paper`, `small` and `tiny` run the same code.
 
-Everything a model folder needs to be rebuilt is ModelConfig (its config.json); everything a run needs is TrainConfig.
+ModelConfig holds everything that a model folder needs to be rebuilt (its config.json), TrainConfig everything that a
+run needs.
 """
 
 from __future__ import annotations
@@ -12,11 +12,9 @@ import msgspec
 from msgspec import Meta
 
 from gdtool.cameras.camera import SIX_VIEWS
+from gdtool.core.kinds import DOMAINS
 from gdtool.core.names import text_fault
 
-# The order of the domains is the order of the one-hot switcher and of every (…, domain, view, …) axis; color is
-# primary.
-DOMAINS = ("color", "normal", "depth", "albedo", "roughness", "metallic")
 # Wonder3D's [elevation of the condition, view's elevation, view's azimuth] and our six labels, as sin and cos each.
 CLASS_WIDTH = 2 * (3 + len(DOMAINS))
 
@@ -34,7 +32,7 @@ ENCODER_HEAD_WIDTH = 64  # channels of each attention head of the patch encoder
 
 
 class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Shape of the network, of its inputs and of its noise. Sizes in pixels unless said otherwise."""
+    """Describe the network, its inputs and its noise. Sizes in pixels unless said otherwise."""
 
     image_size: Pixels = 64
     views: Annotated[tuple[str, ...], Meta(min_length=1)] = (
@@ -102,7 +100,7 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 def _fault(config: ModelConfig) -> str | None:
-    """The first field that no network can be made of, with what it has to be; None where all fit."""
+    """Describe the first field of which no network can be made, and its bound; None where all fit."""
     known = [name for name, _ in SIX_VIEWS]
     for field, values, names in (("views", config.views, known), ("domains", config.domains, DOMAINS)):
         unknown = [value for value in values if value not in names]
@@ -122,7 +120,10 @@ def _fault(config: ModelConfig) -> str | None:
     if config.image_size % patch:
         return f"image_size is {config.image_size}, not a multiple of {field}"
     if (config.image_size // patch) % 2 ** (levels - 1):
-        return f"image_size / {field} is {config.image_size // patch}, which cannot be halved {levels - 1} times for {levels} levels of channels"
+        return (
+            f"image_size / {field} is {config.image_size // patch}, which cannot be halved {levels - 1} times "
+            f"for {levels} levels of channels"
+        )
     if config.channels[0] % 2:
         return f"channels[0] is {config.channels[0]}, which has to be even"
     for i, width in enumerate(config.channels):
@@ -137,12 +138,17 @@ def _fault(config: ModelConfig) -> str | None:
             return f"image_size is {config.image_size}, not a multiple of encoder_patch {config.encoder_patch}"
         heads = max(config.encoder_width // ENCODER_HEAD_WIDTH, 1)
         if config.encoder_width % heads:
-            return f"encoder_width is {config.encoder_width}, not a multiple of its {heads} heads of {ENCODER_HEAD_WIDTH} channels"
+            return (
+                f"encoder_width is {config.encoder_width}, not a multiple of its {heads} heads "
+                f"of {ENCODER_HEAD_WIDTH} channels"
+            )
     return None
 
 
 class Phase(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A part of the training: until `share` of it is over, each step sees so many domains and views of an object."""
+    """Describe a part of the training: until `share` of the run is over, each step sees `domains` and `views` of an
+    object.
+    """
 
     share: Share = 1.0
     domains: Annotated[int, Meta(ge=1, le=6)] = 6
@@ -152,7 +158,10 @@ class Phase(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How a model is trained; `steps` are optimiser steps, `batch` counts objects per step over all accumulations."""
+    """Describe how a model is trained.
+
+    `steps` are optimiser steps; `batch` counts objects per step over all accumulations.
+    """
 
     batch: Annotated[int, Meta(ge=1, le=1_000_000)] = 8
     accumulate: Annotated[int, Meta(ge=1, le=1_000_000)] = 1
@@ -218,13 +227,13 @@ PRESETS: dict[str, tuple[ModelConfig, TrainConfig]] = {
             phases=(Phase(share=0.5, domains=2, views=2), Phase(share=1.0)),
         ),
     ),
-    # what a laptop trains over lunch, and what the bundled model is While it is trained for minutes and not for days,
+    # what a laptop trains over lunch, and what the bundled model is. While it is trained for minutes and not for days,
     # its first prediction is its best (docs/benchmarks/model_quality.md).
     "small": (
         ModelConfig(sampling_steps=1, sampling_mirrored=True, row_attention=(True, False, False), noisy_input="shrunk"),
         TrainConfig(),
     ),
-    # METHOD section 1: Stable Diffusion Image Variations grown to six domains; 30,000 multi-view steps, then 20,000
+    # The paper's training: Stable Diffusion Image Variations grown to six domains; 30,000 multi-view steps, then 20,000
     # with attention across the domains, batch 512
     "paper": (
         ModelConfig(

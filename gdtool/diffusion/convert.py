@@ -1,7 +1,7 @@
-"""Pickled weights to safetensors, isolated: python -m gdtool.diffusion.convert FILE_OR_FOLDER …
+"""Convert pickled weights to safetensors: python -m gdtool.diffusion.convert FILE_OR_FOLDER …
 
-A pickle can run code. Here only tensors are rebuilt (torch.load with weights_only), in a child process with limits on
-time and memory whose one result is the safetensors file, written beside the pickle, which stays.
+A pickle can run code. Only tensors are rebuilt here (torch.load with weights_only), in a child process with limits on
+time and memory. Its one result is the safetensors file, written beside the pickle, which stays.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ NAMES = {"pytorch_model.bin": "model.safetensors"}  # transformers names the two
 
 
 def convert(source: str, target: str) -> int:
-    """Write the tensors of a pickle as safetensors; returns how many. Runs in the child."""
+    """Write the tensors of a pickle as safetensors and return their number. Runs in the child."""
     import torch
     from safetensors.torch import save_file
 
@@ -31,11 +31,12 @@ def convert(source: str, target: str) -> int:
 
 
 def partial_of(target: str | Path) -> Path:
-    """Where the child writes before the file is whole."""
+    """Return the path that the child writes to until the file is complete."""
     return Path(f"{target}.partial")
 
 
 def main(arguments: list[str]) -> int:
+    """Convert every pickle among files and folders; returns the exit code."""
     from gdtool.core.child import ChildFailed, call
 
     paths = [

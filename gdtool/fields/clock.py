@@ -1,4 +1,4 @@
-"""How much time is left: what makes a long computation stop while its result is whole."""
+"""Measure the time that is left, so that a long computation can stop with a complete result."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from collections.abc import Callable
 
 
 class Clock:
-    """Counts seconds since it was made. budget: seconds in all, 0 for no end; now: the clock behind it, in seconds."""
+    """Count seconds since construction.
+
+    budget: seconds in all, 0 for no limit. now: function that returns the current time in seconds.
+    """
 
     def __init__(self, budget: float = 0.0, now: Callable[[], float] = time.perf_counter):
         self.budget, self._now = budget, now
@@ -15,13 +18,13 @@ class Clock:
 
     @property
     def limited(self) -> bool:
-        """Whether there is an end."""
+        """Tell whether there is a time limit."""
         return self.budget > 0
 
     def spent(self) -> float:
-        """Seconds since the start."""
+        """Return the seconds since the start."""
         return self._now() - self._start
 
     def left(self) -> float:
-        """Seconds until the end, below 0 after it; infinite without one."""
+        """Return the seconds until the limit: negative after it, infinite without one."""
         return self.budget - self.spent() if self.limited else float("inf")

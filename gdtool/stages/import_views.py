@@ -142,12 +142,12 @@ def normalisation(cameras: list[Camera], mask: np.ndarray) -> np.ndarray | None:
         step[:3] /= reach
         step[:3, 3] = -center / reach
         cameras, total = [moved(camera, step) for camera in cameras], step @ total
-        sights = prepare_all(cameras, mask, None, None)
-        low, high = hull_bounds(sights, reach=1.0, samples=SAMPLES)
+        prepared = prepare_all(cameras, mask, None, None)
+        low, high = hull_bounds(prepared, reach=1.0, samples=SAMPLES)
         margin = 2.0 / (SAMPLES - 1)  # that hull_bounds leaves around what it found
         center = (low + high) / 2
         reach = float((high - low).max()) / 2
-        if max(hull_distance(sight, center[None])[0] for sight in sights) > reach:
+        if max(hull_distance(prepared_view, center[None])[0] for prepared_view in prepared) > reach:
             return None
     step = np.eye(4)
     step[:3] /= 2 * (reach - margin)

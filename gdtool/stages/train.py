@@ -18,8 +18,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from gdtool.core.errors import InputError, UsageError
-from gdtool.core.reading import read_json
+from gdtool.core.errors import UsageError
 from gdtool.core.stage import MOST_SEED, Inputs, Output, SecondInput, Stage, file_option
 
 MOST_STEPS = 10**9
@@ -28,6 +27,8 @@ HELD_OUT = 4  # objects, or all but one where there are no more
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of train."""
+
     preset: Annotated[Literal["small", "tiny", "paper"], Meta(description="Configuration to start from.")] = "small"
     ablation: Annotated[
         Literal["none", "no_cross_domain", "one_way", "two_way", "no_pbr", "color_normal"],
@@ -40,7 +41,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             Meta(
                 ge=16,
                 le=1024,
-                description="Width and height of a view in pixels, patches in proportion, so at the same cost; a smaller model of --start is grown to it.",
+                description="Width and height of a view in pixels, patches in proportion, so at the same cost; "
+                "a smaller model of --start is grown to it.",
             ),
         ]
         | None
@@ -74,7 +76,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     tensorboard: Annotated[
         bool,
         Meta(
-            description="Write TensorBoard's event files as well, into the run's workspace and the model (needs tensorboard)."
+            description="Write TensorBoard's event files as well, into the run's workspace and the model "
+            "(needs tensorboard)."
         ),
     ] = False
 
@@ -88,7 +91,9 @@ def check(inputs: Inputs, options: Options) -> None:
         early.require_package(
             "torch.utils.tensorboard", "--tensorboard", "pip install 'gdtool[tensorboard]', or leave it out"
         )
-    count = _object_count(inputs)
+    from gdtool.diffusion.data.sources import count_views_folders
+
+    count = count_views_folders(inputs.all)
     # Of fewer objects than the default holds out, one is left to train on: that is no mistake of the user's.
     if options.held_out >= count and options.held_out != HELD_OUT:
         raise UsageError(
@@ -100,166 +105,54 @@ def check(inputs: Inputs, options: Options) -> None:
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Train and write a model folder. Raises InputError for data or a configuration that does not fit."""
-    import shutil
-
     import torch
 
-    from gdtool.core.kinds import ModelContent
-    from gdtool.diffusion.checkpoint.weights import save_model
-    from gdtool.diffusion.data.objects import Objects, decode_dataset, from_bytes
-    from gdtool.diffusion.inference import familiarity
-    from gdtool.diffusion.network.model import parameter_count
-    from gdtool.diffusion.reports.curve import draw_curve
-    from gdtool.diffusion.reports.report import append_validation, card, validation
+    from gdtool.diffusion.data.objects import decode_dataset
+    from gdtool.diffusion.data.sources import count_views_folders, views_folders
+    from gdtool.diffusion.reports.record import Recorder, write_results
     from gdtool.diffusion.training import distributed
-    from gdtool.diffusion.training.tensorboard import Events
-    from gdtool.images.io import write_png
+    from gdtool.diffusion.training.loop import RunOptions
+    from gdtool.diffusion.training.worker import Order, execute
 
     torch.set_num_threads(out.threads)
     model_config, train_config = configured(options)
     start = inputs.second["start"]
     with out.step("decode"):
-        folders, count = _objects(inputs, out.workspace), _object_count(inputs)
+        folders, count = views_folders(inputs.all, out.workspace), count_views_folders(inputs.all)
         objects = decode_dataset(folders, count, model_config, out.workspace, warn=out.warn)
-    held = min(options.held_out, len(objects) - 1)
-    used = len(objects) - held
-    shown = Objects(objects.planes[used:], objects.conditions[used:], objects.lights[used:], objects.names[used:])
-    objects = Objects(objects.planes[:used], objects.conditions[:used], objects.lights[:used], objects.names[:used])
-    (out.workspace / "validation").mkdir(exist_ok=True)
-    events = Events(out.workspace / "tensorboard") if options.tensorboard else None
-
-    def validate(state) -> None:
-        if held:
-            grid, psnr = validation(state, shown, train_config.precision)
-            write_png(out.workspace / "validation" / f"step_{state.step:06d}.png", grid)
-            append_validation(out.workspace / "validation.csv", state.step, state.seconds, psnr)
-            if events is not None:
-                events.picture(state.step, grid)
-
+    used = len(objects) - min(options.held_out, len(objects) - 1)
+    shown, objects = objects.part(slice(used, None)), objects.part(slice(used))
+    recorder = Recorder(out.workspace, shown, train_config.precision, options.tensorboard)
     distributed.start()
-    order = {
-        "model": model_config,
-        "train": train_config,
-        "start": start and start.path,
-        "workspace": out.workspace.absolute(),
-        "used": used,
-        "seed": options.seed,
-        "minutes": options.minutes,
-        "checkpoint_every": options.checkpoint_every,
-        "device": out.device,
-    }
+    run_options = RunOptions(
+        options.seed, options.minutes, options.checkpoint_every, options.validate_every, out.device
+    )
+    workspace = out.workspace.absolute()
+    order = Order(model_config, train_config, start and start.path, workspace, used, run_options)
     distributed.send(order)
     with out.step("train"):
-        how = {} if events is None else {"log": events.scalars}
-        state = _train(
-            order,
-            objects,
-            validate_every=options.validate_every,
-            validate=validate,
-            warn=out.warn,
-            progress=out.progress,
-            **how,
-        )
+        state = execute(order, objects, recorder.observers(out))
     with out.step("validate"):
-        validate(state)
-    if events is not None:
-        events.close()
-        for file in sorted((out.workspace / "tensorboard").iterdir()):
-            shutil.copyfile(file, out.path(f"tensorboard/{file.name}"))
-    save_model(out.path, model_config, state.average)
-    shutil.copyfile(out.workspace / "loss.csv", out.path("loss.csv"))
-    write_png(out.path("loss.png"), draw_curve(out.workspace / "loss.csv"))
-    if held:
-        shutil.copyfile(out.workspace / "validation.csv", out.path("validation.csv"))
-    for picture in sorted((out.workspace / "validation").glob("*.png")):
-        shutil.copyfile(picture, out.path(f"validation/{picture.name}"))
-    every = range(0, used, max(used // 4000, 1))
-    pictures = (
-        from_bytes(objects.conditions[i, k]).numpy() for i in every for k in range(min(2, objects.conditions.shape[1]))
-    )
-    familiarity.write_ranges(out.path(familiarity.FILE), familiarity.ranges(pictures))
-    facts = {
-        "objects": used,
-        "steps": state.step,
-        "training_minutes": round(state.seconds / 60, 1),
-        "batch": train_config.batch,
-        "parameters": parameter_count(state.model),
-        "threads": out.threads,
-        "device": out.device,
-        "processes": distributed.size(),
-        "ablation": options.ablation,
-    }
-    out.path("card.md").write_text(card(options.preset, model_config, train_config, facts))
-    out.content = ModelContent(
-        preset=options.preset,
-        image_size=model_config.image_size,
-        domains=model_config.domains,
-        parameters=parameter_count(state.model),
-        steps=state.step,
-        report={k: v for k, v in facts.items() if k not in ("parameters", "steps", "threads")},
-    )
-
-
-def _train(order: dict, objects, **how):
-    """What every process does: the same model, the same data, its own part of each batch."""
-    import torch
-
-    from gdtool.diffusion.checkpoint.weights import check_shapes, load_model
-    from gdtool.diffusion.network.model import Model
-    from gdtool.diffusion.training.loop import run_training
-
-    torch.manual_seed(order["seed"])
-    model = Model(order["model"])
-    if order["start"] is not None:
-        from gdtool.diffusion.network.grow import grown
-
-        loaded = load_model(order["start"])
-        tensors = grown(loaded.state_dict(), loaded.config, order["model"])
-        check_shapes(order["start"], tensors, model.state_dict())
-        model.load_state_dict(tensors)
-    elif order["model"].codec == "vae":
-        from gdtool.diffusion.checkpoint.pretrained import start_from_pretrained
-
-        start_from_pretrained(model)
-    return run_training(
-        model,
-        objects,
-        order["train"],
-        order["workspace"],
-        seed=order["seed"],
-        minutes=order["minutes"],
-        checkpoint_every=order["checkpoint_every"],
-        device=order["device"],
-        **how,
-    )
+        recorder.validate(state)
+    write_results(out, recorder, state, objects, order, options.preset, options.ablation)
 
 
 def follow(threads: int) -> None:
-    """What a process of torchrun that is not the first does: wait for the first one's order, train with it, and end."""
-    import torch
+    """Train as a process of torchrun that is not the first: wait for the first one's order, follow it, and end."""
+    from gdtool.diffusion.training import worker
 
-    from gdtool.diffusion.data.objects import Objects, decode_dataset
-    from gdtool.diffusion.training import distributed
-
-    if threads:
-        torch.set_num_threads(threads)
-    order = distributed.receive()
-    if order is not None:
-        every = decode_dataset((), 0, order["model"], order["workspace"])
-        used = order["used"]
-        _train(order, Objects(every.planes[:used], every.conditions[:used], every.lights[:used], every.names[:used]))
-    distributed.leave()
+    worker.follow(threads)
 
 
 def dismiss() -> None:
-    """The first process of several, its work done, lets the others go, also where it had nothing to do, and ends."""
+    """End the first of several processes, its work done, and let the others go."""
     from gdtool.diffusion.training import distributed
 
     distributed.leave()
 
 
 def plan(options: Options, as_json: bool) -> str:
-    """What the training would cost, as text or as one JSON object."""
+    """Predict what the training would cost, as text or as one JSON object."""
     from gdtool.diffusion.reports.plan import plan_of, text_of
 
     report = plan_of(*configured(options))
@@ -267,74 +160,14 @@ def plan(options: Options, as_json: bool) -> str:
 
 
 def configured(options: Options):
-    """The preset with the changes of the ablation, of --config and of the flags. Raises InputError for a bad file."""
-    from pathlib import Path
+    """Return the preset with the changes of the ablation, of --config and of the flags. Raises InputError."""
+    from gdtool.diffusion.configure import configuration
 
-    from gdtool.diffusion.config import ABLATIONS, PRESETS
-
-    preset = PRESETS[options.preset]
-    parts = [msgspec.to_builtins(part) for part in preset]
-    for part, changes in zip(parts, ABLATIONS[options.ablation], strict=True):
-        part.update(changes)
-    if options.config is not None:
-        path = Path(options.config)
-        try:
-            changes = msgspec.convert(read_json(path), dict[Literal["model", "train"], dict])
-        except msgspec.ValidationError as error:
-            raise InputError(
-                path, str(error), 'write {"model": {...}, "train": {...}} with names and values of docs/training.md'
-            ) from None
-        for part, name in zip(parts, ("model", "train"), strict=True):
-            part.update(changes.get(name, {}))
-    flags = {"steps": options.steps, "batch": options.batch}
-    parts[1].update({name: value for name, value in flags.items() if value is not None})
-    if options.minutes is not None and options.steps is None:
-        parts[1]["steps"] = MOST_STEPS  # the minutes decide
-    try:
-        model, train = (msgspec.convert(part, type(own)) for part, own in zip(parts, preset, strict=True))
-    except msgspec.ValidationError as error:
-        raise InputError(
-            options.config or "configuration", str(error), "correct that value in the file of --config"
-        ) from None
-    if options.size is not None:
-        from gdtool.diffusion.network.grow import resized
-
-        model = resized(model, options.size)
-    return model, train
-
-
-def _objects(inputs: Inputs, workspace):
-    """The views folders among the sources, those of datasets and archives opened one by one."""
-    import itertools
-    from pathlib import Path
-
-    from gdtool.core.folder import dataset_objects
-
-    parts = []
-    for source in inputs.all:
-        if isinstance(source, Path):
-            from gdtool.diffusion.data.archives import views_of
-
-            parts.append(views_of(source, workspace))
-            continue
-        parts.append([source] if source.kind == "views" else dataset_objects(source))
-    return itertools.chain.from_iterable(parts)
-
-
-def _object_count(inputs: Inputs) -> int:
-    """How many views folders _objects() gives; of archives only the headers are read."""
-    from pathlib import Path
-
-    from gdtool.diffusion.data.archives import object_count
-
-    return sum(
-        object_count(source)
-        if isinstance(source, Path)
-        else 1
-        if source.kind == "views"
-        else len(source.content.objects)
-        for source in inputs.all
-    )
+    # Without --steps the minutes decide when the training ends.
+    steps = MOST_STEPS if options.minutes is not None and options.steps is None else options.steps
+    flags = {"steps": steps, "batch": options.batch}
+    values = {name: value for name, value in flags.items() if value is not None}
+    return configuration(options.preset, options.ablation, options.config, values, options.size)
 
 
 STAGE = Stage(

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.config import ABLATIONS, DOMAINS
-from gdtool.diffusion.inference.sampling import sample_images
+from gdtool.core.kinds import DOMAINS
+from gdtool.diffusion.config import ABLATIONS
+from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.model import Model
 from gdtool.stages.train import Options, configured
@@ -61,7 +62,7 @@ def test_which_image_reads_which(name):
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_each_samples_its_domains(name):
     model, train = model_of(name)
-    images = sample_images(model, torch.rand(1, 4, 16, 16), steps=1)
+    images = sample_images(model, torch.rand(1, 4, 16, 16), SamplingOptions(steps=1))
     assert tuple(images) == (("color", "normal") if name == "color_normal" else DOMAINS)
     assert all(bool(torch.isfinite(x).all()) and x.shape == (1, 6, 3, 16, 16) for x in images.values())
     assert (train.pbr_weight == 0) == (name in ("no_pbr", "color_normal"))

@@ -86,10 +86,10 @@ def test_only_what_the_rendering_loss_looks_at_is_decoded(monkeypatch, near):
     model, objects = Model(MODEL), spheres(2)
     train = msgspec.structs.replace(TRAIN, pure_noise=0.0)
     step = choose(MODEL, phase_at(1.0, train), 0, 0)
-    model.signal = torch.full_like(model.signal, 1e-3)
-    model.deviation = torch.ones_like(model.deviation)
+    model.alpha = torch.full_like(model.alpha, 1e-3)
+    model.sigma = torch.ones_like(model.sigma)
     choices, generators = zip(*(step.choices(place) for place in range(2)), strict=True)
-    model.signal[_timesteps(step)[:near]] = 3.0
+    model.alpha[_timesteps(step)[:near]] = 3.0
     losses(model, draw(objects, np.arange(2), MODEL, train, choices), step, list(generators), train)
     assert sum(counts) == near * 4 * len(step.views)
 

@@ -1,6 +1,7 @@
 """Two processes by torchrun are one process: the loss curve, the weights, a kill."""
 
 import csv
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +18,7 @@ from gdtool.diffusion.training import distributed
 from gdtool.diffusion.config import Phase
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.reports.report import append_validation, validation
-from gdtool.diffusion.training.loop import run_training
+from gdtool.diffusion.training.loop import Observers, RunOptions, run_training
 from tests.diffusion.test_training import MODEL, TRAIN, spheres
 
 torch.set_num_threads(1)
@@ -43,7 +44,9 @@ def validate(state):
     append_validation(workspace / "validation.csv", state.step, 0.0, validation(state, spheres(1), "float32")[1])
 
 try:
-    run_training(Model(MODEL), spheres(), train, workspace, seed=0, checkpoint_every=2, validate_every=3, validate=validate, progress=progress)
+    options = RunOptions(seed=0, checkpoint_every=2, validate_every=3)
+    observers = Observers(validate=validate, progress=progress)
+    run_training(Model(MODEL), spheres(), train, workspace, options, observers)
 except Stop:
     pass
 distributed.leave()
@@ -65,14 +68,14 @@ def run(tmp_path, name, processes, accumulate=1, shard=False, steps=99):
         text=True,
         timeout=300,
         env={
-            **__import__("os").environ,
+            **os.environ,
             "PYTHONPATH": root,
             "OMP_NUM_THREADS": "1",
             "GDTOOL_SHARD": "1" if shard else "0",
         },
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    rows = list(csv.DictReader(open(tmp_path / name / "loss.csv")))
+    rows = list(csv.DictReader((tmp_path / name / "loss.csv").read_text().splitlines()))
     return np.array([[float(row[c] or 0) for c in ("loss", "norm", "color")] for row in rows]), load_file(
         tmp_path / name / "checkpoint.safetensors"
     )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gdtool.diffusion.config import DOMAINS
+from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.data.framing import FRONT_EXTENT, frame, whole_frame
 from gdtool.diffusion.network.encoding import coverage, decode, encode, mirrored, planes_from_images
 from tests.diffusion.spheres import sphere_views
@@ -167,8 +167,8 @@ def test_views_from_opposite_sides_get_one_outline():
 
 def test_depth_stays_within_the_outlines_that_other_views_show():
     """Of a ball whose right side the model draws too far out and whose front too far in; what is right stays."""
+    from gdtool.cameras import backproject
     from gdtool.diffusion.inference.result import within_silhouettes
-    from gdtool.fields.views.prepared_view import backproject
     from tests.fields.shapes import sphere, views_of
 
     cameras, images, mask = views_of(lambda points: sphere(points, 0.4), 64)

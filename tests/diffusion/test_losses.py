@@ -6,7 +6,7 @@ import torch
 from gdtool.diffusion.config import PRESETS, TrainConfig
 from gdtool.diffusion.network.codec import make_codec
 from gdtool.diffusion.network.encoding import encode, planes_from_images
-from gdtool.diffusion.training.losses import image_error, linear, rendering_error, view_directions
+from gdtool.diffusion.training.losses import LitObject, image_error, linear, rendering_error, view_directions
 from gdtool.images.color import linear_from_srgb
 from tests.diffusion.spheres import LIGHT, sphere_views
 
@@ -24,7 +24,12 @@ def setting():
 
 def error(predicted, truth, planes, light, pixels=64):
     return rendering_error(
-        predicted, truth, ORDER, planes, light, view_directions(CONFIG), pixels, 0.0, torch.Generator().manual_seed(0)
+        predicted,
+        truth,
+        ORDER,
+        LitObject(planes=planes, lights=light, views=view_directions(CONFIG), background=0.0),
+        pixels=pixels,
+        generator=torch.Generator().manual_seed(0),
     )
 
 

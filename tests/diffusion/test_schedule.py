@@ -9,11 +9,11 @@ import torch
 from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.network.schedule import (
     DATA_VARIANCE,
+    alpha_and_sigma,
     clean_from_prediction,
     input_scale,
     loss_weight,
     sample,
-    signal_and_noise,
     timesteps,
 )
 
@@ -23,15 +23,15 @@ SD = msgspec.structs.replace(CONFIG, noise_schedule="scaled_linear")
 
 @pytest.mark.parametrize("config", [CONFIG, SD])
 def test_levels_are_on_the_unit_circle_and_fall(config):
-    a, s = signal_and_noise(config)
+    a, s = alpha_and_sigma(config)
     torch.testing.assert_close(a**2 + s**2, torch.ones(1000))
     assert (a[1:] < a[:-1]).all() and a[0] > 0.999
 
 
 def test_cosine_ends_in_pure_noise_and_stable_diffusion_does_not():
-    assert signal_and_noise(CONFIG)[0][-1] < 1e-6
+    assert alpha_and_sigma(CONFIG)[0][-1] < 1e-6
     # the published schedule's last cumulative product is 0.0047
-    assert float(signal_and_noise(SD)[0][-1] ** 2) == pytest.approx(0.00466, abs=2e-5)
+    assert float(alpha_and_sigma(SD)[0][-1] ** 2) == pytest.approx(0.00466, abs=2e-5)
 
 
 @pytest.mark.parametrize("prediction", ["x", "v", "epsilon"])
@@ -72,8 +72,11 @@ def test_a_known_image_is_reached_exactly(scheduler):
 
 def gaussian_error(scheduler, steps):
     """Data N(0, 2²): E[x_0 | x] = a 4 x / (4 a² + s²); the exact flow maps noise z to 2 z."""
-    a, s = (x.double() for x in signal_and_noise(SD))
-    denoise = lambda x, t, i: a[t] * 4 * x / (4 * a[t] ** 2 + s[t] ** 2)
+    a, s = (x.double() for x in alpha_and_sigma(SD))
+
+    def denoise(x, t, i):
+        return a[t] * 4 * x / (4 * a[t] ** 2 + s[t] ** 2)
+
     z = torch.ones(1, dtype=torch.float64)
     start = float((4 * a[-1] ** 2 + s[-1] ** 2).sqrt())  # the flow's own value at the last timestep, not quite 1
     return abs(float(sample(denoise, z * start, SD, steps, scheduler)) - 2.0)

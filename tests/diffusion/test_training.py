@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.config import DOMAINS, PRESETS, Phase
+from gdtool.core.kinds import DOMAINS
+from gdtool.diffusion.config import PRESETS, Phase
 from gdtool.diffusion.data.objects import (
     LIGHTS,
     Objects,
@@ -24,7 +25,16 @@ from gdtool.diffusion.network.labels import class_labels
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.training import loop as training
 from gdtool.diffusion.training import optimizer
-from gdtool.diffusion.training.loop import CHECKPOINT, choose, learning_rate, new_state, phase_at, run_training
+from gdtool.diffusion.training.loop import (
+    CHECKPOINT,
+    Observers,
+    RunOptions,
+    choose,
+    learning_rate,
+    new_state,
+    phase_at,
+    run_training,
+)
 from tests.diffusion.spheres import LIGHT, sphere_views
 
 MODEL, TRAIN = PRESETS["tiny"]
@@ -146,7 +156,12 @@ def train(workspace, steps, **changes):
 
     try:
         return run_training(
-            Model(MODEL), spheres(), options, workspace, seed=3, checkpoint_every=4, validate_every=1, validate=stop
+            Model(MODEL),
+            spheres(),
+            options,
+            workspace,
+            RunOptions(seed=3, checkpoint_every=4, validate_every=1),
+            observers=Observers(validate=stop),
         )
     except Stop:
         return stopped["state"]
@@ -162,7 +177,10 @@ def test_a_killed_run_resumes_bit_for_bit(tmp_path, precision):
         assert torch.equal(p, q), name
         assert torch.equal(whole.average[name], resumed.average[name]), name
     without_time = [
-        [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(open(tmp_path / w / "loss.csv"))]
+        [
+            {k: v for k, v in row.items() if k != "seconds"}
+            for row in csv.DictReader((tmp_path / w / "loss.csv").read_text().splitlines())
+        ]
         for w in "ab"
     ]
     assert without_time[0] == without_time[1] and len(without_time[0]) == 12
@@ -226,8 +244,8 @@ def test_training_lowers_the_error(tmp_path):
         phases=(Phase(learning_rate=3e-3),),
         precision="float32",
     )
-    state = run_training(Model(MODEL), spheres(), options, tmp_path, seed=0)
-    rows = list(csv.DictReader(open(tmp_path / "loss.csv")))
+    state = run_training(Model(MODEL), spheres(), options, tmp_path, RunOptions(seed=0))
+    rows = list(csv.DictReader((tmp_path / "loss.csv").read_text().splitlines()))
     first, last = (np.mean([float(r["loss"]) for r in part]) for part in (rows[:5], rows[-5:]))
     assert state.step == 60 and last < 0.5 * first
     assert all(float(rows[-1][d]) > 0 for d in DOMAINS)
@@ -248,12 +266,19 @@ def test_steps_that_are_not_finite_are_left_out_counted_and_told(tmp_path, monke
     poisoned(monkeypatch, lambda number: number in (1, 2, 5))
     said = []
     state = run_training(
-        Model(MODEL), spheres(), msgspec.structs.replace(TRAIN, steps=7), tmp_path, seed=0, warn=said.append
+        Model(MODEL),
+        spheres(),
+        msgspec.structs.replace(TRAIN, steps=7),
+        tmp_path,
+        RunOptions(seed=0),
+        observers=Observers(warn=said.append),
     )
     assert [line.split(" is left out")[0] for line in said] == ["step 2", "step 3", "step 6"] and "2 in a row" in said[
         1
     ]
-    assert [row["skipped"] for row in csv.DictReader(open(tmp_path / "loss.csv"))] == list("0110010")
+    assert [row["skipped"] for row in csv.DictReader((tmp_path / "loss.csv").read_text().splitlines())] == list(
+        "0110010"
+    )
     assert all(torch.isfinite(p).all() for p in state.model.parameters())
 
 
@@ -261,12 +286,16 @@ def test_a_lost_run_ends_with_finite_weights_in_its_checkpoint(tmp_path, monkeyp
     poisoned(monkeypatch, lambda number: number >= 4)
     with pytest.raises(InputError, match="not finite in 10 steps up to 14"):
         run_training(
-            Model(MODEL), spheres(), msgspec.structs.replace(TRAIN, steps=40), tmp_path, seed=0, checkpoint_every=4
+            Model(MODEL),
+            spheres(),
+            msgspec.structs.replace(TRAIN, steps=40),
+            tmp_path,
+            RunOptions(seed=0, checkpoint_every=4),
         )
     assert all(torch.isfinite(x).all() for x in training.read_tensors(tmp_path / CHECKPOINT)[0].values())
 
 
 def test_minutes_end_a_run(tmp_path):
     options = msgspec.structs.replace(TRAIN, steps=10**9, pbr_weight=0.0)
-    state = run_training(Model(MODEL), spheres(), options, tmp_path, seed=0, minutes=0.01)
+    state = run_training(Model(MODEL), spheres(), options, tmp_path, RunOptions(seed=0, minutes=0.01))
     assert 0.6 <= state.seconds < 60 and 1 <= state.step < 10**6  # on a busy machine one step may take seconds

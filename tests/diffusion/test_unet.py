@@ -7,7 +7,7 @@ import torch
 from gdtool.core.errors import InputError
 from gdtool.diffusion.checkpoint.weights import load_stable_diffusion
 from gdtool.diffusion.config import PRESETS
-from gdtool.diffusion.inference.sampling import sample_images
+from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.encoding import mirrored
 from gdtool.diffusion.network.model import Model
@@ -126,7 +126,7 @@ def test_an_untrained_x_model_shows_the_condition_as_front_color():
     model = Model(TINY).eval()
     rgba = torch.rand(1, 4, 16, 16) * 2 - 1
     rgba[:, 3] = 1.0
-    images = sample_images(model, rgba, steps=2)
+    images = sample_images(model, rgba, SamplingOptions(steps=2))
     torch.testing.assert_close(images["color"][0, 0], rgba[0, :3])
     assert float(images["albedo"].abs().max()) == 0.0
 
@@ -135,8 +135,8 @@ def test_an_untrained_x_model_shows_the_condition_as_front_color():
 def test_objects_of_a_batch_do_not_meet(guidance):
     model = tiny()
     rgba = torch.rand(2, 4, 16, 16) * 2 - 1
-    both = sample_images(model, rgba, steps=2, seed=4, guidance=guidance)
-    alone = sample_images(model, rgba[1:], steps=2, seed=4, guidance=guidance)
+    both = sample_images(model, rgba, SamplingOptions(steps=2, seed=4, guidance=guidance))
+    alone = sample_images(model, rgba[1:], SamplingOptions(steps=2, seed=4, guidance=guidance))
     for domain in both:
         torch.testing.assert_close(both[domain][1], alone[domain][0], rtol=1e-4, atol=1e-5)
 
@@ -146,13 +146,15 @@ def test_guidance_costs_and_acts_between_its_timesteps_alone(monkeypatch):
     rgba = torch.rand(1, 4, 16, 16) * 2 - 1
     whole = model.predict_clean
     monkeypatch.setattr(model, "predict_clean", lambda x, *rest: seen.append(len(x)) or whole(x, *rest))
-    plain, all_over = (sample_images(model, rgba, steps=4, seed=4, guidance=guidance) for guidance in (1.0, 2.5))
+    plain, all_over = (
+        sample_images(model, rgba, SamplingOptions(steps=4, seed=4, guidance=guidance)) for guidance in (1.0, 2.5)
+    )
     one = seen[0]
     assert seen == [one] * 4 + [2 * one] * 4
     seen.clear()
-    early = sample_images(model, rgba, steps=4, seed=4, guidance=2.5, guided_from=0.6)
+    early = sample_images(model, rgba, SamplingOptions(steps=4, seed=4, guidance=2.5, guided_from=0.6))
     assert seen == [2 * one] * 2 + [one] * 2
-    never = sample_images(model, rgba, steps=4, seed=4, guidance=2.5, guided_to=0.0, guided_from=1.0)
+    never = sample_images(model, rgba, SamplingOptions(steps=4, seed=4, guidance=2.5, guided_to=0.0, guided_from=1.0))
     for domain in plain:
         assert torch.equal(never[domain], plain[domain])
     assert not torch.allclose(early["color"][0, 1:], plain["color"][0, 1:]) and not torch.allclose(
@@ -166,33 +168,37 @@ def test_sampled_with_its_mirror_image_a_picture_gives_the_mirrored_views_of_the
     object is whole."""
     model = tiny(noisy_input="shrunk")
     rgba = torch.rand(2, 4, 16, 16) * 2 - 1
-    plain = sample_images(model, rgba, steps=1, guidance=guidance)
-    one, other = (sample_images(model, x, steps=1, guidance=guidance, mirror=True) for x in (rgba, rgba.flip(-1)))
+    plain = sample_images(model, rgba, SamplingOptions(steps=1, guidance=guidance))
+    one, other = (
+        sample_images(model, x, SamplingOptions(steps=1, guidance=guidance, mirror=True)) for x in (rgba, rgba.flip(-1))
+    )
     whole, turned, apart = (torch.stack([of[d] for d in TINY.domains], 1) for of in (one, other, plain))
     torch.testing.assert_close(mirrored(turned, tuple(range(6)), TINY.views), whole, rtol=1e-4, atol=1e-4)
     assert float((apart - whole).abs().mean()) > 1e-3  # the network itself knows of no mirror
-    two = sample_images(model, rgba[1:], steps=2, seed=4, guidance=guidance, mirror=True)
-    both = sample_images(model, rgba, steps=2, seed=4, guidance=guidance, mirror=True)
+    two = sample_images(model, rgba[1:], SamplingOptions(steps=2, seed=4, guidance=guidance, mirror=True))
+    both = sample_images(model, rgba, SamplingOptions(steps=2, seed=4, guidance=guidance, mirror=True))
     for domain in both:
         torch.testing.assert_close(both[domain][1], two[domain][0], rtol=1e-4, atol=1e-5)
 
 
 def test_only_a_model_of_pixels_is_sampled_with_the_mirror_image():
     with pytest.raises(InputError, match="mirror"):
-        sample_images(tiny(convention="wonder3d"), torch.rand(1, 4, 16, 16), steps=1, mirror=True)
+        sample_images(tiny(convention="wonder3d"), torch.rand(1, 4, 16, 16), SamplingOptions(steps=1, mirror=True))
     half = tiny(sampling_mirrored=True, views=("front", "right"))
     with pytest.raises(InputError, match="both sides"):
-        sample_images(half, torch.rand(1, 4, 16, 16), steps=1, mirror=True)
+        sample_images(half, torch.rand(1, 4, 16, 16), SamplingOptions(steps=1, mirror=True))
     # The preset asks, the model cannot.
-    assert sample_images(half, torch.rand(1, 4, 16, 16), steps=1)["color"].shape[1] == 2
+    assert sample_images(half, torch.rand(1, 4, 16, 16), SamplingOptions(steps=1))["color"].shape[1] == 2
 
 
 def test_domains_that_are_not_asked_for_are_not_computed():
     model = tiny()
     rgba = torch.rand(1, 4, 16, 16)
-    assert set(sample_images(model, rgba, steps=1, domains=("depth",))) == {"color", "depth"}
+    assert set(sample_images(model, rgba, SamplingOptions(steps=1, domains=("depth",)))) == {"color", "depth"}
     alone = tiny(cross_domain="none")
-    subset, whole = (sample_images(alone, rgba, steps=2, domains=d) for d in (("depth",), TINY.domains))
+    subset, whole = (
+        sample_images(alone, rgba, SamplingOptions(steps=2, domains=d)) for d in (("depth",), TINY.domains)
+    )
     assert set(subset) == {"depth"}
     torch.testing.assert_close(subset["depth"], whole["depth"], rtol=1e-4, atol=1e-5)
 
@@ -200,6 +206,6 @@ def test_domains_that_are_not_asked_for_are_not_computed():
 def test_bfloat16_stays_near_float32():
     model = tiny()
     rgba = torch.rand(1, 4, 16, 16)
-    a, b = (sample_images(model, rgba, steps=2, precision=p) for p in ("float32", "bfloat16"))
+    a, b = (sample_images(model, rgba, SamplingOptions(steps=2, precision=p)) for p in ("float32", "bfloat16"))
     for domain in a:
         assert float((a[domain] - b[domain]).abs().mean()) < 2e-2

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
+from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.checkpoint import wonder3d
-from gdtool.diffusion.config import DOMAINS, ModelConfig
+from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.network.attention import Layout, TransformerBlock
 from gdtool.diffusion.network.labels import class_labels
 from gdtool.diffusion.network.tensors import read_tensors
@@ -254,12 +255,12 @@ def test_without_joint_attention_an_image_gets_what_diffusers_gives_it(folder):
 
 def test_guidance_is_the_step_from_nothing_to_the_condition(folder):
     """One step at guidance 3, restated: without = zero embedding, zero latent, the same camera labels."""
-    from gdtool.diffusion.inference.sampling import sample_images
+    from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
     from gdtool.diffusion.network.encoding import encode_condition
 
     model = wonder3d.load(folder)
     rgba = torch.rand(1, 4, 64, 64) * 2 - 1
-    given = sample_images(model, rgba, domains=("color", "normal"), steps=1, guidance=3.0, seed=5)
+    given = sample_images(model, rgba, SamplingOptions(domains=("color", "normal"), steps=1, guidance=3.0, seed=5))
     layout, views = Layout(1, (0, 1), 6), torch.arange(6)
     noise = torch.randn(36, 4, 8, 8, generator=torch.Generator().manual_seed(5))[:12]
     white = encode_condition(rgba, torch.ones(1))
@@ -267,7 +268,7 @@ def test_guidance_is_the_step_from_nothing_to_the_condition(folder):
     label = model.labels[[0, 1]].flatten(0, 1)
     with torch.no_grad():
         e = [model.unet(noise, latent * on, torch.tensor([999]), label, context * on, layout) for on in (0.0, 1.0)]
-        a, s = model.signal[999], model.deviation[999]
+        a, s = model.alpha[999], model.sigma[999]
         clean = (noise - s * (e[0] + 3.0 * (e[1] - e[0]))) / a
         images = model.codec.decode(clean).unflatten(0, (2, 6))
     for j, domain in enumerate(("color", "normal")):

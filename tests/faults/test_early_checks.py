@@ -190,14 +190,16 @@ def test_a_wrong_training_configuration_is_refused(tmp_path, content, fact):
 
 
 def test_a_compiled_network_is_kept_out_of_tmpdir(monkeypatch, tmp_path):
+    from gdtool.diffusion.inference.compiled import compiler_cache
+
     monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    with sample_views._compiler_cache():
+    with compiler_cache():
         assert os.environ["TORCHINDUCTOR_CACHE_DIR"] == str(tmp_path / "cache/gdtool/torchinductor")
     assert "TORCHINDUCTOR_CACHE_DIR" not in os.environ
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    with sample_views._compiler_cache():
+    with compiler_cache():
         place = os.environ["TORCHINDUCTOR_CACHE_DIR"]
         assert Path(place).is_dir()
     assert not Path(place).exists()

@@ -122,7 +122,7 @@ def test_a_subject_at_the_border_is_told(gdtool, tmp_path, tiny_model):  # noqa:
 def test_names_of_every_kind(tmp_path, tiny_model, name):  # noqa: F811
     """Not UTF-8, spaces, brackets, a leading dash: as an argument and in the output's name on stdout."""
     path = os.fsencode(tmp_path) + b"/" + name
-    with open(path, "wb") as file:
+    with open(path, "wb") as file:  # noqa: PTH123 - a name of bytes
         file.write(png(SIZE, SIZE, RGBA, 8, scanlines(ball())))
     command = [
         sys.executable,

@@ -61,9 +61,14 @@ def views_of(distance, size=96, samples=2, cameras=None):
                 normal = gradient(distance, points)
                 albedo, roughness, metallic = material(points)
                 color = albedo * (0.25 + 0.75 * np.clip(normal @ LIGHT, 0, 1))[..., None]
-                for name, value in dict(
-                    color=color, normal=normal, depth=depth, albedo=albedo, roughness=roughness, metallic=metallic
-                ).items():
+                for name, value in {
+                    "color": color,
+                    "normal": normal,
+                    "depth": depth,
+                    "albedo": albedo,
+                    "roughness": roughness,
+                    "metallic": metallic,
+                }.items():
                     total[name] = total.get(name, 0) + np.where(hit if value.ndim == 2 else hit[..., None], value, 0)
                 cover += hit
         for name, value in total.items():

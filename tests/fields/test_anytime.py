@@ -6,10 +6,12 @@ import pytest
 from gdtool.fields.clock import Clock
 from gdtool.fields.grid import fusion
 from gdtool.fields.grid.fusion import (
+    AlignmentOptions,
+    FusionOptions,
     align_depth,
-    bring_together,
+    align_views,
     fuse_views,
-    fuse_within,
+    fuse_within_budget,
     grid_step,
     is_closed_manifold,
     prepare_all,
@@ -53,9 +55,9 @@ def test_clock():
 def test_rounds_end_at_a_plateau_and_each_says_the_error(ring, bent):
     cameras, images, mask = ring
     told = []
-    sights = prepare_all(cameras, mask, bent, images["normal"])
-    before = fusion.disagreement(sights)
-    _, after = bring_together(cameras, mask, bent, images["normal"], sights, tell=told.append)
+    prepared = prepare_all(cameras, mask, bent, images["normal"])
+    before = fusion.disagreement(prepared)
+    _, after = align_views(cameras, mask, bent, images["normal"], prepared, AlignmentOptions(tell=told.append))
     assert after < 0.5 * before
     assert len(fusion.ROUNDS) <= len(told) < len(fusion.ROUNDS) + fusion.MORE_ROUNDS
     assert f"{after:.5f}" in told[-1]
@@ -65,19 +67,27 @@ def test_no_time_at_all_gives_one_round_and_the_draft(ring, bent):
     cameras, images, mask = ring
     step, told = grid_step(cameras, 0), []
     clock = Clock(0.5, Ticking())
-    sights, before, noise = align_depth(cameras, mask, bent, images["normal"], step, clock, told.append)
+    prepared, before, noise = align_depth(
+        cameras, mask, bent, images["normal"], step, AlignmentOptions(clock=clock, tell=told.append)
+    )
     assert len(told) == 1 and noise < before
-    shape, coarser = fuse_within(sights, step, noise, 0, clock)
-    assert coarser and shape.step == fusion.DRAFT * step and is_closed_manifold(shape.faces)
+    shape, coarser = fuse_within_budget(prepared, step, options=FusionOptions(noise=noise, outvoted=0), clock=clock)
+    assert coarser and shape.step == fusion.DRAFT_COARSENESS * step and is_closed_manifold(shape.faces)
     assert np.abs(torus(shape.vertices)).mean() < 0.01
 
 
 def test_the_finest_grid_that_there_is_time_for(ring):
     cameras, images, mask = ring
     step = grid_step(cameras, 0)
-    sights = prepare_all(cameras, mask, images["depth"], images["normal"])
-    steps = [fuse_within(sights, step, 0.0, 0, Clock(budget, Ticking()))[0].step / step for budget in (5, 10, 60)]
+    prepared = prepare_all(cameras, mask, images["depth"], images["normal"])
+    steps = [
+        fuse_within_budget(
+            prepared, step, options=FusionOptions(noise=0.0, outvoted=0), clock=Clock(budget, Ticking())
+        )[0].step
+        / step
+        for budget in (5, 10, 60)
+    ]
     assert steps == pytest.approx([2.0, 1.4, 1.0])
-    shape, coarser = fuse_within(sights, step, 0.0, 0, Clock())
-    whole = fuse_views(sights, step)
+    shape, coarser = fuse_within_budget(prepared, step, options=FusionOptions(noise=0.0, outvoted=0), clock=Clock())
+    whole = fuse_views(prepared, step)
     assert coarser == "" and (shape.vertices == whole.vertices).all() and (shape.faces == whole.faces).all()

@@ -5,6 +5,8 @@ import pytest
 import torch
 
 from gdtool.fields.appearance.light import (
+    ColorSamples,
+    ShadedPoints,
     Visibility,
     fit_amplitudes,
     materials_from_color,
@@ -41,7 +43,9 @@ def test_light_of_known_materials_is_recovered():
     view = np.where((normals * view).sum(1, keepdims=True) < 0, -view, view)
     albedo, roughness, metallic = np.full((3000, 3), 0.6), np.full(3000, 0.5), np.zeros(3000)
     color = lit(normals, view, albedo, roughness, metallic, LIGHT)
-    found, residual = recover_light(normals, view, color, albedo, roughness, metallic, unoccluded(normals))
+    found, residual = recover_light(
+        ShadedPoints(normals, view, albedo, roughness, metallic, unoccluded(normals)), color
+    )
     assert residual < 0.01
     again = lit(normals, view, albedo, roughness, metallic, found)
     assert np.abs(again - color).mean() < 0.01 * color.mean()
@@ -135,8 +139,8 @@ def test_shadow_stays_out_of_the_albedo():
     )
     uneven = []
     for visible in (seen, unoccluded(normals)):
-        albedo = materials_from_color(normals, color, np.ones(2000), visible, (np.arange(2000), normals, color), LIGHT)[
-            0
-        ]
+        albedo = materials_from_color(
+            normals, color, np.ones(2000), visible, ColorSamples(np.arange(2000), normals, color), LIGHT
+        )[0]
         uneven.append(float(albedo.std() / albedo.mean()))
     assert uneven[0] < 0.1 and uneven[1] > 2 * uneven[0]

@@ -7,25 +7,32 @@ import trimesh
 from gdtool.cameras import rig
 from gdtool.fields.grid.carve import silhouettes_outvoted
 from gdtool.fields.grid.fusion import (
-    BUMPY,
+    BUMPY_DEGREES,
+    FusionOptions,
     align_depth,
     depth_for,
-    folds,
+    fold_midpoints,
     fuse_views,
     grid_step,
     is_closed_manifold,
     prepare_all,
 )
-from gdtool.fields.grid.refine import _inside_silhouettes, bumpiness, drop_debris, follow_normals, refine
+from gdtool.fields.grid.refine import _inside_silhouettes, drop_debris, fit_to_normals, normal_deviation_degrees, refine
 from gdtool.fields.views.depth_alignment import (
     Corrections,
     agreement,
     corrections,
     disagreement,
     normals_fit_depth,
-    slope_rows,
+    slope_equations,
 )
-from gdtool.fields.views.prepared_view import free_distance, hull_distance, prepare, silhouette_distance, with_edge
+from gdtool.fields.views.prepared_view import (
+    free_distance,
+    grow_silhouette,
+    hull_distance,
+    prepare,
+    silhouette_distance,
+)
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import components, signed_volume
 from gdtool.geometry.metrics import inside
@@ -45,8 +52,8 @@ def seen():
 def reconstruct(cameras, images, mask, depth=True, normal=True):
     step = grid_step(cameras, 0)
     given = images["depth"] if depth else depth_for(cameras, mask, images["normal"]) if normal else None
-    sights, _, noise = align_depth(cameras, mask, given, images["normal"] if normal else None, step)
-    return fuse_views(sights, step, noise, silhouettes_outvoted(sights))
+    prepared, _, noise = align_depth(cameras, mask, given, images["normal"] if normal else None, step)
+    return fuse_views(prepared, step, FusionOptions(noise=noise, outvoted=silhouettes_outvoted(prepared)))
 
 
 # Pixels are 0.02 wide here: the bounds are a tenth of one on average, two at the worst.
@@ -72,7 +79,7 @@ def test_edges_are_drawn_out(monkeypatch):
     """Of a cube turned away from the grid: marching cubes alone takes a bevel a cell wide off every edge."""
     turn = np.linalg.qr(np.array([[0.8, 0.3, -0.5], [-0.2, 0.9, 0.4], [0.6, -0.1, 0.8]]))[0]
     cameras, images, mask = views_of(lambda points: cube(points @ turn, 0.3), SIZE)
-    sights, step = prepare_all(cameras, mask, images["depth"], images["normal"]), grid_step(cameras, 0)
+    prepared, step = prepare_all(cameras, mask, images["depth"], images["normal"]), grid_step(cameras, 0)
     along = np.linspace(-0.25, 0.25, 41)
     edges = [
         np.insert(np.full((41, 2), (a, b)), axis, along, 1) @ turn.T
@@ -82,12 +89,12 @@ def test_edges_are_drawn_out(monkeypatch):
     ]
 
     def missed():
-        shape = fuse_views(sights, step)
-        assert is_closed_manifold(shape.faces) and len(folds(shape.vertices, shape.faces)) == 0
+        shape = fuse_views(prepared, step)
+        assert is_closed_manifold(shape.faces) and len(fold_midpoints(shape.vertices, shape.faces)) == 0
         return np.array([closest_points(edge, shape.vertices, shape.faces)[0].mean() for edge in edges])
 
     sharp = missed()
-    monkeypatch.setattr("gdtool.fields.grid.fusion.with_creases", lambda vertices, faces, *_: (vertices, faces))
+    monkeypatch.setattr("gdtool.fields.grid.fusion.sharpen_creases", lambda vertices, faces, *_: (vertices, faces))
     blunt = missed()
     assert (sharp < blunt).all() and sharp.mean() < 0.85 * blunt.mean()
 
@@ -118,11 +125,11 @@ def test_what_leaves_a_silhouette_goes_back_as_far_as_it_must():
     camera = rig("six", SIZE)[0]
     mask = np.zeros((SIZE, SIZE), np.float32)
     mask[:, : SIZE // 2] = 1
-    sight = prepare(camera, mask)
+    prepared_view = prepare(camera, mask)
     at = np.array([1.0, 0.0, 0.0])  # to the right of the front view
     start, end = np.array([-0.2, 0.1, 3.0])[:, None] * at, np.array([0.3, 0.1, 0.3])[:, None] * at
-    found = _inside_silhouettes(end, start, [sight], 0.01)
-    assert sight.cropped and np.isfinite(found).all()
+    found = _inside_silhouettes(end, start, [prepared_view], 0.01)
+    assert prepared_view.cropped and np.isfinite(found).all()
     assert np.allclose(found @ at, [0.01, 0.1, 3.0], atol=2e-3)
 
 
@@ -161,10 +168,10 @@ def test_alignment_undoes_a_shift_of_depth(seen):
     cameras, images, mask = seen["torus"]
     depth = images["depth"].copy()
     depth[0][mask[0] > 0] += 0.02
-    sights = prepare_all(cameras, mask, depth, images["normal"])
+    prepared = prepare_all(cameras, mask, depth, images["normal"])
     clean = disagreement(prepare_all(cameras, mask, images["depth"], images["normal"]))
-    assert disagreement(sights) > 5 * clean
-    found = corrections(sights, [slope_rows(s) for s in sights], Corrections.none(len(sights)), 0.08, 2.0)
+    assert disagreement(prepared) > 5 * clean
+    found = corrections(prepared, [slope_equations(s) for s in prepared], Corrections.none(len(prepared)), 0.08, 2.0)
     assert found.depth(0, mask[0].shape)[mask[0] > 0.99].mean() < -0.008
     after = align_depth(cameras, mask, depth, images["normal"], grid_step(cameras, 0))
     assert after[2] < 0.4 * after[1]
@@ -175,7 +182,7 @@ def test_views_of_which_only_some_agree_are_brought_together(seen):
     cameras, images, mask = seen["sphere"]
     step, k, depth = grid_step(cameras, 0), [camera.name for camera in cameras].index("right"), images["depth"].copy()
     depth[k] += np.where(mask[k] > 0, step, 0).astype(np.float32)
-    sights, before, noise = align_depth(cameras, mask, depth, images["normal"], step)
+    prepared, before, noise = align_depth(cameras, mask, depth, images["normal"], step)
     assert before < 0.1 * step < 0.2 * step < noise
     exact = align_depth(cameras, mask, images["depth"], images["normal"], step)
     assert exact[1] == exact[2] < 0.1 * step
@@ -188,8 +195,8 @@ def bumpy(seen, name):
     waves = np.stack([0.02 * np.sin(0.6 * x + k) * np.sin(0.5 * y - 2 * k) for k in range(6)])
     depth = np.where(images["depth"] > 0, images["depth"] + waves, 0).astype(np.float32)
     step = grid_step(cameras, 0)
-    sights, _, noise = align_depth(cameras, mask, depth, images["normal"], step)
-    return sights, step, noise
+    prepared, _, noise = align_depth(cameras, mask, depth, images["normal"], step)
+    return prepared, step, noise
 
 
 def degrees_off(solid, vertices, faces):
@@ -199,9 +206,11 @@ def degrees_off(solid, vertices, faces):
 
 @pytest.mark.parametrize("solid", [sphere, torus])
 def test_bumps_that_the_normals_do_not_show_go(seen, solid):
-    sights, step, noise = bumpy(seen, solid.__name__)
-    rough, smooth = (fuse_views(sights, step, noise, shaded=shaded) for shaded in (False, True))
-    assert rough.bumps is None and smooth.bumps > BUMPY and is_closed_manifold(smooth.faces)
+    prepared, step, noise = bumpy(seen, solid.__name__)
+    rough, smooth = (
+        fuse_views(prepared, step, FusionOptions(noise=noise, has_normals=shaded)) for shaded in (False, True)
+    )
+    assert rough.bumps is None and smooth.bumps > BUMPY_DEGREES and is_closed_manifold(smooth.faces)
     before, after = degrees_off(solid, rough.vertices, rough.faces), degrees_off(solid, smooth.vertices, smooth.faces)
     assert np.median(after) < 0.6 * np.median(before)
     assert np.abs(solid(smooth.vertices)).mean() < np.abs(solid(rough.vertices)).mean() + 1e-4
@@ -209,8 +218,8 @@ def test_bumps_that_the_normals_do_not_show_go(seen, solid):
 
 @pytest.mark.parametrize("solid", [sphere, torus])
 def test_a_surface_grows_by_as_much_as_it_is_asked_to(seen, solid):
-    sights, step, noise = bumpy(seen, solid.__name__)
-    plain, grown = (fuse_views(sights, step, noise, grow=grow) for grow in (0.0, step / 2))
+    prepared, step, noise = bumpy(seen, solid.__name__)
+    plain, grown = (fuse_views(prepared, step, FusionOptions(noise=noise, grow=grow)) for grow in (0.0, step / 2))
     assert np.mean(solid(grown.vertices)) - np.mean(solid(plain.vertices)) == pytest.approx(step / 2, rel=0.15)
     assert is_closed_manifold(grown.faces)
 
@@ -221,11 +230,11 @@ def test_a_surface_that_fits_its_normals_hardly_follows_them(seen, solid):
     cameras, images, mask = seen[solid.__name__]
     step = grid_step(cameras, 0)
     shape = reconstruct(cameras, images, mask)
-    sights = prepare_all(cameras, mask, images["depth"], images["normal"])
-    assert bumpiness(shape.vertices, shape.faces, sights, 2 * step) < BUMPY
+    prepared = prepare_all(cameras, mask, images["depth"], images["normal"])
+    assert normal_deviation_degrees(shape.vertices, shape.faces, prepared, 2 * step) < BUMPY_DEGREES
     moved = (
         np.linalg.norm(
-            follow_normals(shape.vertices, shape.faces, sights, step, reach=2 * step) - shape.vertices, axis=1
+            fit_to_normals(shape.vertices, shape.faces, prepared, step, reach=2 * step) - shape.vertices, axis=1
         )
         / step
     )
@@ -250,8 +259,8 @@ def test_a_thin_wall_that_two_views_turn_inside_out_has_no_hole():
         k = names.index(name)
         depth[k] += np.where(mask[k] > 0, bump, 0).astype(np.float32)
     step = grid_step(cameras, 0)
-    sights, _, noise = align_depth(cameras, mask, depth, images["normal"], step)
-    shape = fuse_views(sights, step, noise)
+    prepared, _, noise = align_depth(cameras, mask, depth, images["normal"], step)
+    shape = fuse_views(prepared, step, FusionOptions(noise=noise))
     assert is_closed_manifold(shape.faces) and components(shape.faces, len(shape.vertices)).max() == 0
     assert euler_number(shape.faces) == 2
 
@@ -263,19 +272,19 @@ def test_what_a_grown_silhouette_gains_is_free_as_far_as_beside_it(seen):
     small[4:-4, 4:-4] = mask[0][4:-4, 4:-4] * (
         np.hypot(*(np.indices(small.shape[:2])[:, 4:-4, 4:-4] - SIZE / 2 + 0.5)) < 0.3 / pixel
     )
-    sight = prepare(cameras[0], small, np.where(small > 0, images["depth"][0], 0), images["normal"][0])
-    grown = with_edge(sight, edge)
+    prepared_view = prepare(cameras[0], small, np.where(small > 0, images["depth"][0], 0), images["normal"][0])
+    grown = grow_silhouette(prepared_view, edge)
     rim, beyond = np.array([[0.3 + pixel, 0, 0.6]]), np.array([[0.3 + 6 * pixel, 0, 0.6]])
-    assert hull_distance(grown, rim) < 0 < hull_distance(sight, rim)
-    assert not np.isfinite(free_distance(sight, rim)[0]) and free_distance(grown, rim)[0] == pytest.approx(
+    assert hull_distance(grown, rim) < 0 < hull_distance(prepared_view, rim)
+    assert not np.isfinite(free_distance(prepared_view, rim)[0]) and free_distance(grown, rim)[0] == pytest.approx(
         [0.1], abs=2e-3
     )
     assert free_distance(grown, rim)[1] < 1e-3  # a bound: no surface of its own
     assert not np.isfinite(free_distance(grown, beyond)[0])
     # Nothing is gained by one that shrinks, and what was seen is seen as before.
     inner = np.array([[0.1, 0.05, 0.6]])
-    assert np.array_equal(with_edge(sight, -edge).weight, sight.weight)
-    assert free_distance(grown, inner)[0] == free_distance(sight, inner)[0]
+    assert np.array_equal(grow_silhouette(prepared_view, -edge).weight, prepared_view.weight)
+    assert free_distance(grown, inner)[0] == free_distance(prepared_view, inner)[0]
 
 
 @pytest.mark.parametrize("seen_vertices, hollows, left", [(40, True, 2), (40, False, 1), (1, True, 1)])
@@ -301,9 +310,9 @@ def test_silhouettes_that_were_grown_or_shrunk_are_found_out(seen):
     wrong = np.stack([(maximum_filter if g > 0 else minimum_filter)(m, 3) for g, m in zip(grown, mask, strict=True)])
     bend = np.stack([0.01 * np.sin(np.arange(SIZE) / 9 + k) for k in range(6)])[:, None, :]
     depth = np.where(images["depth"] > 0, images["depth"] + bend, 0).astype(np.float32)
-    sights = prepare_all(cameras, wrong, depth, images["normal"])
-    slopes, found = [slope_rows(s) for s in sights], Corrections.none(6)
-    found = corrections(sights, slopes, found, 0.08, 1.0)
+    prepared = prepare_all(cameras, wrong, depth, images["normal"])
+    slopes, found = [slope_equations(s) for s in prepared], Corrections.none(6)
+    found = corrections(prepared, slopes, found, 0.08, 1.0)
     pixel = cameras[0].pixel_size
     # What all have in common stays open to within a part of a pixel; the difference is two pixels.
     assert np.abs(found.edge / pixel + grown).max() < 0.5
@@ -313,13 +322,13 @@ def test_silhouettes_that_were_grown_or_shrunk_are_found_out(seen):
 def test_slopes_say_how_the_depth_bends(seen):
     cameras, images, mask = seen["sphere"]
     ramp = 0.02 * np.linspace(-1, 1, SIZE)[None, :]
-    sight = prepare_all(
+    prepared_view = prepare_all(
         cameras[:1],
         mask[:1],
         np.where(mask[:1] > 0, images["depth"][:1] + ramp, 0).astype(np.float32),
         images["normal"][:1],
     )[0]
-    _, _, slope, weight = slope_rows(sight)
+    _, _, slope, weight = slope_equations(prepared_view)
     # Down the rows first, then along them.
     across = np.average(slope[: len(slope) // 2], weights=weight[: len(slope) // 2])
     along = np.average(slope[len(slope) // 2 :], weights=weight[len(slope) // 2 :])
@@ -337,7 +346,10 @@ def test_views_that_contradict_one_another_still_close(seen):
 
 def test_flat_card_and_empty_views_close():
     """A card a thirtieth of a pixel thick, edge-on in two views; one view shows nothing at all."""
-    card = lambda p: np.max(np.abs(p) - [0.5, 0.4, 0.0005], -1)
+
+    def card(p):
+        return np.max(np.abs(p) - [0.5, 0.4, 0.0005], -1)
+
     cameras, images, mask = views_of(card, 48)
     mask[4] = 0
     shape = reconstruct(cameras, images, mask)

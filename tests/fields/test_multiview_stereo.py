@@ -8,11 +8,11 @@ from gdtool.cameras.camera import SIX_VIEWS
 from gdtool.fields.grid.carve import hull_bounds
 from gdtool.fields.grid.fusion import depth_for, prepare_all
 from gdtool.fields.views import multiview_stereo
-from gdtool.fields.views.multiview_stereo import LITTLE, _passed, match_views, pixel_steps, slopes, stretched
+from gdtool.fields.views.multiview_stereo import STEP_COST, _aggregate_rows, match_views, pixel_steps, slopes, stretched
 
 from .shapes import sphere, torus, two_balls, views_of
 
-SIZE = 96
+MATCHING_SIZE = 96
 
 
 def ball_before_a_wall(points):
@@ -22,7 +22,7 @@ def ball_before_a_wall(points):
     return np.minimum(box, sphere(points - [0.05, 0, 0.2], 0.15))
 
 
-def perspective(size=SIZE):
+def perspective(size=MATCHING_SIZE):
     return [camera_at(azimuth, name=name, size=size, fov_degrees=45) for name, azimuth in SIX_VIEWS]
 
 
@@ -31,11 +31,11 @@ def error(images, mask, depth):
     return np.abs(depth - images["depth"])[mask > 0.99]
 
 
-@pytest.mark.parametrize("cameras", [rig("six", SIZE), perspective()], ids=["orthographic", "perspective"])
+@pytest.mark.parametrize("cameras", [rig("six", MATCHING_SIZE), perspective()], ids=["orthographic", "perspective"])
 @pytest.mark.parametrize("solid, bound", [(torus, 0.003), (ball_before_a_wall, 0.015)])
 def test_depth_is_found_from_normals_and_albedo(solid, bound, cameras):
     """Pixels are 0.015 wide, the ball is 0.24 before the wall."""
-    cameras, images, mask = views_of(solid, SIZE, cameras=cameras)
+    cameras, images, mask = views_of(solid, MATCHING_SIZE, cameras=cameras)
     assert error(images, mask, depth_for(cameras, mask, images["normal"], {"albedo": images["albedo"]})).mean() < bound
 
 
@@ -48,7 +48,7 @@ def test_what_looks_alike_helps_where_normals_do_not():
         solid = np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0)
         return np.maximum(solid, -(np.linalg.norm(np.maximum(hole, 0), axis=-1) + np.minimum(hole.max(-1), 0)))
 
-    cameras, images, mask = views_of(box, SIZE)
+    cameras, images, mask = views_of(box, MATCHING_SIZE)
     plain = error(images, mask, depth_for(cameras, mask, images["normal"])).mean()
     told = error(images, mask, depth_for(cameras, mask, images["normal"], {"albedo": images["albedo"]})).mean()
     assert told < 0.7 * plain
@@ -69,9 +69,9 @@ def test_slopes_are_a_planes_depth_from_pixel_to_pixel(camera):
 
 
 def test_trust_is_in_what_another_view_shows_too():
-    cameras, images, mask = views_of(ball_before_a_wall, SIZE)
-    sights = prepare_all(cameras, mask, None, None)
-    matched = match_views(cameras, mask, images["normal"], {}, sights, hull_bounds(sights))
+    cameras, images, mask = views_of(ball_before_a_wall, MATCHING_SIZE)
+    prepared = prepare_all(cameras, mask, None, None)
+    matched = match_views(cameras, mask, images["normal"], {}, prepared, hull_bounds(prepared))
     for view, shown, true in zip(matched, mask, images["depth"], strict=True):
         sure = (view.trust == 1) & (shown > 0.99)
         assert np.median(np.append(np.abs(view.depth - true)[sure], 0)) < 0.015  # a pixel
@@ -86,18 +86,18 @@ def test_costs_are_passed_along_planes():
     rng = np.random.default_rng(0)
     cost, slope = rng.uniform(0, 1, (1, 6, 9)).astype(np.float32), np.full((1, 6), 2.0)
     jump = rng.uniform(0.2, 1, (1, 6)).astype(np.float32)
-    found = _passed(cost, np.array([[1, 1, 1, 0, 1, 1]], bool), slope, jump, 1)[0]
+    found = _aggregate_rows(cost, np.array([[1, 1, 1, 0, 1, 1]], bool), slope, jump, 1)[0]
     wanted = cost[0].copy()
     for p in (1, 2, 5):  # pixel 3 shows nothing, so 4 starts anew
         for d in range(9):
             reached = [wanted[p - 1].min() + min(jump[0, p], jump[0, p - 1])]
-            reached += [wanted[p - 1, d - 2 + k] + LITTLE * abs(k) for k in (-1, 0, 1) if 0 <= d - 2 + k < 9]
+            reached += [wanted[p - 1, d - 2 + k] + STEP_COST * abs(k) for k in (-1, 0, 1) if 0 <= d - 2 + k < 9]
             wanted[p, d] += min(reached) - wanted[p - 1].min()
     assert np.allclose(found[[0, 1, 2, 4, 5]], wanted[[0, 1, 2, 4, 5]], atol=1e-5)
 
 
 def test_one_view_alone_is_bounded_by_its_silhouette():
-    cameras, images, mask = views_of(sphere, SIZE)
+    cameras, images, mask = views_of(sphere, MATCHING_SIZE)
     depth = depth_for(cameras[:1], mask[:1], images["normal"][:1])
     assert np.isfinite(depth).all() and (depth[0][mask[0] > 0.5] > 0).all()
     inside = mask[0] > 0.99
@@ -106,7 +106,7 @@ def test_one_view_alone_is_bounded_by_its_silhouette():
 
 
 def test_views_that_show_nothing_have_no_depth():
-    cameras, images, mask = views_of(sphere, SIZE)
+    cameras, images, mask = views_of(sphere, MATCHING_SIZE)
     mask = mask.copy()
     mask[2] = 0
     depth = depth_for(cameras, mask, images["normal"])
@@ -115,7 +115,7 @@ def test_views_that_show_nothing_have_no_depth():
 
 @pytest.mark.parametrize("lie", ["other sides", "noise", "nothing"])
 def test_normals_that_lie_still_leave_depths_within_the_silhouettes(lie):
-    cameras, images, mask = views_of(torus, SIZE)
+    cameras, images, mask = views_of(torus, MATCHING_SIZE)
     normal = {
         "other sides": images["normal"][[0, 5, 4, 3, 2, 1]],
         "nothing": np.zeros_like(images["normal"]),
@@ -129,13 +129,13 @@ def test_normals_that_lie_still_leave_depths_within_the_silhouettes(lie):
 
 def test_views_that_do_not_fit_one_another_lean_on_the_silhouettes(monkeypatch):
     """Normals of each view turned by another 12 degrees; two balls fill their silhouettes, so these are right."""
-    cameras, images, mask = views_of(two_balls, SIZE)
+    cameras, images, mask = views_of(two_balls, MATCHING_SIZE)
     rng, normal = np.random.default_rng(0), images["normal"].copy()
     for k in range(len(cameras)):
         axis = rng.standard_normal(3)
         turned = np.cross(axis / np.linalg.norm(axis), normal[k]) * np.tan(np.radians(12)) + normal[k]
         normal[k] = turned / np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-9)
     leaning = error(images, mask, depth_for(cameras, mask, normal)).mean()
-    monkeypatch.setattr(multiview_stereo, "FIT", 1e9)
+    monkeypatch.setattr(multiview_stereo, "CONSISTENT_MISFIT", 1e9)
     trusting = error(images, mask, depth_for(cameras, mask, normal)).mean()
     assert leaning < 0.8 * trusting

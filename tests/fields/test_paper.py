@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from gdtool.fields.neural.fit import Pixels, fit_distances, one_cycle, start, train
+from gdtool.fields.neural.fit import Pixels, Schedule, fit_distances, one_cycle, start, train
 from gdtool.fields.neural.networks import FREQUENCIES, SdfNetwork
 from gdtool.fields.neural.paper import closest_approach
 
@@ -101,12 +101,7 @@ def test_volume_start_and_surface_steps_follow_one_another_without_depth():
     done = train(
         fit,
         pixels,
-        volume_steps=3,
-        surface_steps=4,
-        batch=64,
-        seed=0,
-        rule="secant",
-        brdf="gltf",
+        Schedule(volume_steps=3, surface_steps=4, batch=64, seed=0, rule="secant", brdf="gltf"),
         track=lambda n, _: range(n),
         spent=lambda: 0.0,
     )

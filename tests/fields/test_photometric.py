@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gdtool.cameras import project
-from gdtool.fields.grid.fusion import align_depth, grid_step
-from gdtool.fields.views.photometric import Picture, color_rows
+from gdtool.fields.grid.fusion import AlignmentOptions, align_depth, grid_step
+from gdtool.fields.views.photometric import Picture, color_equations
 
 from .shapes import sphere, views_of
 
@@ -25,7 +25,7 @@ def ball():
 
 
 def rows(ball, error, gain=1.0, offset=0.0):
-    """color_rows of the front view's points, `error` too far away, against front_right."""
+    """color_equations of the front view's points, `error` too far away, against front_right."""
     cameras, images, mask = ball
     names = [camera.name for camera in cameras]
     first, second = names.index("front"), names.index("front_right")
@@ -42,7 +42,7 @@ def rows(ball, error, gain=1.0, offset=0.0):
     seen = (mask[first] > 0.99) & (normal @ cameras[first].backward > 0.5) & (normal @ cameras[second].backward > 0.5)
     points = (0.45 * normal - error * cameras[first].backward)[seen].astype(np.float64)
     here = np.argwhere(seen)[:, ::-1] + 0.5
-    return color_rows(points, here, project(cameras[second], points)[0], *pictures, np.ones(len(points)))
+    return color_equations(points, here, project(cameras[second], points)[0], *pictures, np.ones(len(points)))
 
 
 @pytest.mark.parametrize("error", [0.004, -0.004])
@@ -70,8 +70,8 @@ def bent(ball):
 def off(ball, colors):
     """Mean error of the aligned views' points."""
     cameras, images, mask = ball
-    sights = align_depth(cameras, mask, bent(ball), None, grid_step(cameras, 0), colors=colors)[0]
-    return float(np.mean([np.abs(sphere(s.points[s.weight > 0.3], 0.45)).mean() for s in sights]))
+    prepared = align_depth(cameras, mask, bent(ball), None, grid_step(cameras, 0), AlignmentOptions(colors=colors))[0]
+    return float(np.mean([np.abs(sphere(s.points[s.weight > 0.3], 0.45)).mean() for s in prepared]))
 
 
 def test_colors_find_what_the_views_get_wrong_together(ball):

@@ -83,7 +83,9 @@ def test_secant_is_exact_on_a_plane_and_second_order_on_a_sphere():
     errors = []
     for width in (0.08, 0.04):
         # A ray past a sphere's centre at distance 0.3, radius 0.5: it enters at t = 0.6 (0.4 before the middle, at 1).
-        f = lambda t: torch.sqrt((t - 1) ** 2 + 0.09) - 0.5
+        def f(t):
+            return torch.sqrt((t - 1) ** 2 + 0.09) - 0.5
+
         a, b = (
             torch.tensor([0.6 - 0.3 * width], dtype=torch.float64),
             torch.tensor([0.6 + 0.7 * width], dtype=torch.float64),
@@ -93,7 +95,7 @@ def test_secant_is_exact_on_a_plane_and_second_order_on_a_sphere():
 
 
 def test_median_of_cdf_is_biased_at_low_sharpness_and_close_at_high():
-    """METHOD.md section 2: it misses by up to 0.37 of the interval at s = 20 and 0.02 at s = 300."""
+    """The median of the CDF misses by up to 0.37 of the interval at s = 20 and 0.02 at s = 300."""
     worst = {}
     width = 3 / 64
     for sharpness in (20.0, 300.0):

@@ -15,7 +15,7 @@ import pytest
 from gdtool.cameras import rays, rig
 from gdtool.core.folder import open_folder
 from gdtool.fields.grid.carve import silhouettes_outvoted
-from gdtool.fields.grid.fusion import align_depth, fuse_views, grid_step, is_closed_manifold
+from gdtool.fields.grid.fusion import FusionOptions, align_depth, fuse_views, grid_step, is_closed_manifold
 from gdtool.folders.surface import read_surface
 from gdtool.folders.views import Views
 from gdtool.geometry.distance import closest_points
@@ -50,8 +50,8 @@ def seen():
 
 def reconstruct(cameras, images, mask):
     step = grid_step(cameras, 0)
-    sights, _, noise = align_depth(cameras, mask, images["depth"], images["normal"], step)
-    return fuse_views(sights, step, noise, silhouettes_outvoted(sights))
+    prepared, _, noise = align_depth(cameras, mask, images["depth"], images["normal"], step)
+    return fuse_views(prepared, step, FusionOptions(noise=noise, outvoted=silhouettes_outvoted(prepared)))
 
 
 def check_whole(shape, reach=0.75):

@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SENTENCES = Path(__file__).with_suffix(".tsv")
 SECONDS = 900  # for one command, on a busy machine
 # Fields of a manifest or a report that tell how a run went.
-TIMES = re.compile(r"seconds|finished|peak_memory|_mb$|per_second")
+TIMES = re.compile(r"seconds|minutes|finished|peak_memory|_mb$|per_second")
 # Fields that follow from others: the files themselves are compared, and a sentence in a source's manifest enters the
 # digests of all that is made from it.
 NOT_COMPARED = ("run", "tool_version", "stage_version", "key", "digest", "sha256")

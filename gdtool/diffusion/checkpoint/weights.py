@@ -1,4 +1,4 @@
-"""Model folders on disk: config.json and model.safetensors. Nothing is ever unpickled."""
+"""Read and write model folders: config.json and model.safetensors. Nothing is ever unpickled."""
 
 from __future__ import annotations
 
@@ -45,15 +45,14 @@ def check_shapes(path: Path, tensors: dict[str, torch.Tensor], wanted: dict[str,
 
 
 def read_config(path: Path) -> ModelConfig:
-    """The configuration in a model folder's config.json. Raises InputError that names the field, and what it has to
-    be."""
+    """Read a model folder's config.json. Raises InputError that names the wrong field and its bound."""
     if not path.exists():
         raise InputError(path, "does not exist", NO_MODEL)
     return configured(read_json(path), path)
 
 
 def configured(fields: object, subject: object) -> ModelConfig:
-    """A ModelConfig of parsed JSON. Raises InputError that names subject, the field and its bound."""
+    """Convert parsed JSON to a ModelConfig. Raises InputError that names subject, the field and its bound."""
     try:
         return msgspec.convert(fields, ModelConfig)
     except msgspec.ValidationError as error:
@@ -63,10 +62,9 @@ def configured(fields: object, subject: object) -> ModelConfig:
 
 
 def require_room(config: ModelConfig, bytes_per_weight: int, subject: object) -> Model:
-    """The network's structure without numbers. Raises ResourceError where its weights would take more memory than there
-    is.
+    """Build the network's structure without numbers. Raises ResourceError where its weights would not fit in memory.
 
-    bytes_per_weight: what is held for each weight, for example BYTES_TO_LOAD.
+    bytes_per_weight: bytes held for each weight, for example BYTES_TO_LOAD.
     """
     shape = structure(config)
     weights = parameter_count(shape)
@@ -75,10 +73,11 @@ def require_room(config: ModelConfig, bytes_per_weight: int, subject: object) ->
 
 
 def load_model(folder: Path) -> Model:
-    """The Model of a folder, in evaluation mode, float32.
+    """Load the Model of a folder, in evaluation mode, float32.
 
-    Raises InputError for what is wrong with its files, ResourceError where it does not fit in memory. Nothing of the
-    size of its weights is allocated before the configuration and the weights are known to fit one another."""
+    Raises InputError for damaged or mismatched files, ResourceError where it does not fit in memory. Nothing of the
+    size of its weights is allocated before the configuration and the weights are known to fit one another.
+    """
     config = read_config(folder / "config.json")
     wanted = require_room(config, BYTES_TO_LOAD, folder).state_dict()
     tensors, _ = read_tensors(folder / WEIGHTS)
@@ -98,16 +97,16 @@ def save_model(path_of, config: ModelConfig, tensors: dict[str, torch.Tensor]) -
 
 
 def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
-    """Start a UNet from Stable Diffusion's weights (diffusers names): conv_in grows by the condition's channels, class
-    labels by the domains, both with zeros. Returns the names that stay as initialised (the parts that are new).
+    """Start a UNet from Stable Diffusion's weights (diffusers names); returns the names that keep their initial values.
 
-    Raises InputError for a tensor that is not known here or has another shape.
+    conv_in grows by the condition's channels and class labels by the domains, both with zeros. Raises InputError for a
+    tensor that is not known here or has another shape.
     """
-    own = unet.state_dict()
+    state = unet.state_dict()
     for name, tensor in tensors.items():
-        if name not in own:
+        if name not in state:
             raise InputError("pretrained weights", f"hold a tensor {name} that this network has not", OTHER_START)
-        target = own[name]
+        target = state[name]
         if name in ("conv_in.weight", "class_embedding.linear_1.weight") and tensor.shape[1] <= target.shape[1]:
             grown = torch.zeros_like(target)
             grown[:, : tensor.shape[1]] = tensor
@@ -118,6 +117,6 @@ def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
                 f"tensor {name} has shape {tuple(tensor.shape)}, needed is {tuple(target.shape)}",
                 OTHER_START,
             )
-        own[name] = tensor
-    unet.load_state_dict(own)
-    return sorted(set(own) - set(tensors))
+        state[name] = tensor
+    unet.load_state_dict(state)
+    return sorted(set(state) - set(tensors))

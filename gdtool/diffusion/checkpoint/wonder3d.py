@@ -1,8 +1,9 @@
-"""Wonder3D v1 (Long et al. 2023, flamehaze1115/wonder3d-v1.0): its published folder as a model of ours.
+"""Load a published Wonder3D v1 folder (Long et al. 2023, flamehaze1115/wonder3d-v1.0) as a Model.
 
-unet/ vae/ image_encoder/ scheduler/ of diffusers. The network is Stable Diffusion's with attn_joint_mid in each block;
-normal and color, six views, white background, the picture's subject over 192 of 256 pixels. Facts from the repository
-xxlong0/Wonder3D (mvdiffusion/models/transformer_mv2d.py, data/single_image_dataset.py, pipelines/).
+The folder holds unet/ vae/ image_encoder/ scheduler/ of diffusers. The network is Stable Diffusion's with
+attn_joint_mid in each block. It makes normal and color in six views over white; the picture's subject fills 192 of 256
+pixels. Facts are from the repository xxlong0/Wonder3D (mvdiffusion/models/transformer_mv2d.py,
+data/single_image_dataset.py, pipelines/).
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ OTHER_FOLDER = "give a Wonder3D v1 folder, or a model folder of gdtool train"
 
 
 class _UNet(msgspec.Struct):
-    """What is read of unet/config.json; diffusers' defaults."""
+    """Hold the fields that are read from unet/config.json, with diffusers' defaults."""
 
     block_out_channels: tuple[int, ...] = ()
     down_block_types: tuple[str, ...] = ()
@@ -53,61 +54,62 @@ class _UNet(msgspec.Struct):
 
 
 class _Scheduler(msgspec.Struct):
-    """What is read of scheduler/scheduler_config.json."""
+    """Hold the fields that are read from scheduler/scheduler_config.json."""
 
     beta_schedule: str | None = None
     prediction_type: str = "epsilon"
 
 
 def recognises(folder: Path) -> bool:
+    """Tell whether a folder has the layout of a diffusers pipeline."""
     return (folder / "unet" / "config.json").is_file()
 
 
 def renamed(name: str) -> str:
-    """A key of the published weights, older spellings included, as ours."""
+    """Translate a key of the published weights, older spellings included, to this network's."""
     for old, new in LEGACY:
         name = name.replace(old, new)
     return name
 
 
 def read_config(folder: Path, tensors: dict[str, torch.Tensor]) -> ModelConfig:
-    """The configuration that unet/config.json and scheduler/ describe. Raises InputError for another structure."""
+    """Derive the configuration from unet/config.json and scheduler/. Raises InputError for another structure."""
     path = folder / "unet" / "config.json"
-    own = _read(path, _UNet)
+    unet = _read(path, _UNet)
     scheduler = _read(folder / "scheduler" / "scheduler_config.json", _Scheduler)
     facts = {
-        "in_channels": (own.in_channels, 8),
-        "class_embed_type": (own.class_embed_type, "projection"),
-        "projection_class_embeddings_input_dim": (own.projection_class_embeddings_input_dim, WONDER3D_LABEL_WIDTH),
+        "in_channels": (unet.in_channels, 8),
+        "class_embed_type": (unet.class_embed_type, "projection"),
+        "projection_class_embeddings_input_dim": (unet.projection_class_embeddings_input_dim, WONDER3D_LABEL_WIDTH),
         "beta_schedule": (scheduler.beta_schedule, "scaled_linear"),
         "prediction_type": (scheduler.prediction_type, "epsilon"),
     }
-    for name, (found, wanted) in facts.items():
-        if found != wanted:
-            raise InputError(path, f"has {name} {found!r}, Wonder3D {wanted!r}", OTHER_FOLDER)
-    if not isinstance(own.attention_head_dim, int):
+    for name, (value, wanted) in facts.items():
+        if value != wanted:
+            raise InputError(path, f"has {name} {value!r}, Wonder3D {wanted!r}", OTHER_FOLDER)
+    if not isinstance(unet.attention_head_dim, int):
         raise InputError(path, "has another number of heads at each level", OTHER_FOLDER)
     return configured(
         {
-            "image_size": 8 * own.sample_size,
+            "image_size": 8 * unet.sample_size,
             "domains": ("color", "normal"),
             "codec": "vae",
             "condition_alpha": False,
             "mirror_back": False,
-            "channels": own.block_out_channels,
-            "attention_levels": ["CrossAttn" in kind for kind in own.down_block_types],
-            "layers_per_block": own.layers_per_block,
-            "heads": own.attention_head_dim,
-            "norm_groups": own.norm_num_groups,
+            "channels": unet.block_out_channels,
+            "attention_levels": ["CrossAttn" in kind for kind in unet.down_block_types],
+            "layers_per_block": unet.layers_per_block,
+            "heads": unet.attention_head_dim,
+            "norm_groups": unet.norm_num_groups,
             "feed_forward": 4,
             "time_scale_shift": False,
             "position_embedding": False,
             "condition_skip": False,
-            "multi_view": own.multiview_attention,
+            "multi_view": unet.multiview_attention,
             "cross_domain": "joint_last" if any(".attn_joint_last." in name for name in tensors) else "joint",
             "convention": "wonder3d",
             "encoder": "clip",
-            "encoder_width": own.cross_attention_dim,
+            "encoder_width": unet.cross_attention_dim,
             "prediction": "epsilon",
             "noise_schedule": "scaled_linear",
             "backgrounds": ("white",),
@@ -118,12 +120,14 @@ def read_config(folder: Path, tensors: dict[str, torch.Tensor]) -> ModelConfig:
 
 
 def load(folder: Path):
-    """The Model of a published folder, in evaluation mode, float32. Every tensor is used, and none is missing, else
-    InputError."""
+    """Load a published folder as a Model, in evaluation mode, float32. Raises InputError for a missing or unused
+    tensor.
+    """
     if _read(folder / "unet" / "config.json", _UNet).in_channels == 4:
         raise InputError(
             folder,
-            "is a Stable Diffusion that makes single pictures, such as Image Variations: a training starts from it, it has no views",
+            "is a Stable Diffusion that makes single pictures, such as Image Variations: a training starts from it, "
+            "it has no views",
             "give a model folder of gdtool train, or Wonder3D's; gdtool train --preset paper trains one from it",
         )
     if not (folder / UNET).is_file() and not list((folder / "unet").glob("*.bin")):
@@ -146,10 +150,11 @@ def load(folder: Path):
 
 
 def premultiplied_normals(x: torch.Tensor) -> torch.Tensor:
-    """Normals (…, 3, h, w) in [-1, 1] over white -> times coverage, as our models give them.
+    """Convert normals (…, 3, h, w) in [-1, 1] over white to normals times coverage, the encoding of gdtool's models.
 
-    Coverage m leaves m |n - 1| of the distance to white, at least 0.73 m for a unit normal n: what is nearer is an
-    edge."""
+    Coverage m leaves m |n - 1| of the distance to white, at least 0.73 m for a unit normal n: a value nearer to white
+    is an edge.
+    """
     m = ((x - 1).norm(dim=-3, keepdim=True) / NEAREST_NORMAL).clamp(0, 1)
     n = (x - (1 - m)) / m.clamp_min(1e-3)
     return m * n / n.norm(dim=-3, keepdim=True).clamp_min(1e-6)
@@ -159,7 +164,7 @@ _Typed = TypeVar("_Typed")
 
 
 def _read(path: Path, kind: type[_Typed]) -> _Typed:
-    """A JSON file of a type. Raises InputError that names the field where it is another."""
+    """Read a JSON file of a type. Raises InputError that names the field where it does not fit."""
     if not path.exists():
         raise InputError(path, "does not exist", "copy the whole folder")
     try:

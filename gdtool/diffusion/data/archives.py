@@ -1,13 +1,13 @@
-"""Views folders in .tar files, read one object at a time: training data that travels as a few large files.
+"""Read views folders from .tar files, one object at a time: training data that travels as a few large files.
 
-Two namings: plain, as `tar cf shard-0.tar cat.asset/views dog.asset/views` makes it; and WebDataset's, where the files
-of an object share a key and stand together: KEY.manifest.json, KEY.color.front.png for color/front.png, and so on.
+Two namings are read. Plain is what `tar cf shard-0.tar cat.asset/views dog.asset/views` makes. In WebDataset's, the
+files of an object share a key and stand together: KEY.manifest.json, KEY.color.front.png for color/front.png, and so
+on.
 """
 
 from __future__ import annotations
 
 import lzma
-import os
 import shutil
 import tarfile
 import tempfile
@@ -45,7 +45,7 @@ _BLOCK = 1 << 20  # bytes copied at a time
 
 
 def placed(member: str) -> tuple[str, str]:
-    """A member's object and its path inside the object's views folder."""
+    """Split a member's name into its object and its path inside the object's views folder."""
     path = PurePosixPath(member)
     key, _, extension = path.name.partition(".")
     if "." in extension:  # WebDataset: KEY.manifest.json, KEY.color.front.png
@@ -56,10 +56,11 @@ def placed(member: str) -> tuple[str, str]:
 
 
 def object_count(archive: Path) -> int:
-    """How many views folders a .tar holds; reads its headers only.
+    """Count the views folders in a .tar by reading its headers.
 
-    Raises InputError for what is no whole tar of regular files with names that stay inside, ResourceError for more
-    members or bytes than the limits above."""
+    Raises InputError unless it is a whole tar of regular files with names that stay inside, ResourceError for more
+    members or bytes than the limits above.
+    """
     with _opened_tar(archive) as tar:
         count = sum(placed(member.name)[1] == MANIFEST for member in _members(archive, tar))
     if not count:
@@ -68,9 +69,9 @@ def object_count(archive: Path) -> int:
 
 
 def views_of(archive: Path, workspace: Path) -> Iterator[Folder]:
-    """The views folders of a .tar in their order, each unpacked under workspace and removed again.
+    """Unpack the views folders of a .tar one after another under workspace, removing each again.
 
-    An object's members must stand together, as tar and WebDataset write them. Each header is judged before its content
+    An object's members must stand together, as tar and WebDataset write them. Each header is checked before its content
     is unpacked. Raises InputError and ResourceError as object_count(), OutputError where workspace cannot be written.
     """
     root = Path(tempfile.mkdtemp(dir=workspace, prefix="unpacked-"))
@@ -89,7 +90,8 @@ def views_of(archive: Path, workspace: Path) -> Iterator[Folder]:
                 if count > MAX_OBJECT_MEMBERS or size > MAX_OBJECT_BYTES:
                     raise ResourceError(
                         archive,
-                        f"would unpack more than {MAX_OBJECT_MEMBERS:,} files or {MAX_OBJECT_BYTES >> 30} GiB for {shown(name)}",
+                        f"would unpack more than {MAX_OBJECT_MEMBERS:,} files or {MAX_OBJECT_BYTES >> 30} GiB "
+                        f"for {shown(name)}",
                         "render fewer or smaller views of one object",
                     )
                 target = path_inside(_place(root, name, archive), relative, archive, "member", byte_escapes=True)
@@ -101,14 +103,17 @@ def views_of(archive: Path, workspace: Path) -> Iterator[Folder]:
 
 
 class _LongHeader(Exception):
-    """An extended header claims more than MAX_HEADER_BYTES; no error of tarfile's, which it would take for another
-    format."""
+    """An extended header claims more than MAX_HEADER_BYTES.
+
+    Not one of tarfile's errors, which tarfile would take for another format.
+    """
 
 
 class _BoundedHeader(tarfile.TarInfo):
-    """A header whose extended parts are not read when they claim to be large."""
+    """Refuse to read the extended parts of a header when they claim to be large."""
 
     def _proc_member(self, tar: tarfile.TarFile):
+        """Raise _LongHeader for a large extended header, else process it."""
         if self.type in _EXTENDED and self.size > MAX_HEADER_BYTES:
             raise _LongHeader(f"has an extended header of {self.size} bytes, more than {MAX_HEADER_BYTES}")
         return super()._proc_member(tar)
@@ -116,21 +121,22 @@ class _BoundedHeader(tarfile.TarInfo):
 
 @contextmanager
 def _opened_tar(archive: Path) -> Iterator[tarfile.TarFile]:
+    """Open a tar for reading. Raises InputError where it is none."""
     require_regular_file(archive)
     try:
-        file = open(archive, "rb")
+        file = archive.open("rb")
     except OSError as error:
         raise from_os_error(error, archive) from None
     with file:
         with _malformed(archive):
-            tar = tarfile.open(fileobj=file, tarinfo=_BoundedHeader)
+            tar = tarfile.open(fileobj=file, tarinfo=_BoundedHeader)  # noqa: SIM115 - closed by `with tar` below
         with tar:
             yield tar
 
 
 @contextmanager
 def _malformed(archive: Path) -> Iterator[None]:
-    """What tarfile and the decompressors raise for bytes that are no tar becomes one InputError."""
+    """Convert what tarfile and the decompressors raise for bytes that are no tar to one InputError."""
     try:
         yield
     except _LongHeader as error:
@@ -152,9 +158,8 @@ def _malformed(archive: Path) -> Iterator[None]:
 
 
 def _members(archive: Path, tar: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
-    """The regular files of an archive, each judged by its header: its name, its kind, and what it adds to the
-    limits."""
-    packed, count, size = max(os.stat(archive).st_size, 1), 0, 0
+    """Yield the regular files of an archive after checking each header: its name, its kind, and the limits."""
+    packed, count, size = max(archive.stat().st_size, 1), 0, 0
     while True:
         with _malformed(archive):
             member = tar.next()
@@ -181,9 +186,12 @@ def _members(archive: Path, tar: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
 
 
 def _unpack(archive: Path, tar: tarfile.TarFile, member: tarfile.TarInfo, target: Path) -> None:
+    """Copy a member's bytes to target. Raises InputError for a truncated archive, OutputError where target cannot be
+    written.
+    """
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        out = open(target, "wb")
+        out = target.open("wb")
     except OSError as error:
         if isinstance(error, (FileExistsError, NotADirectoryError, IsADirectoryError)):
             raise InputError(archive, f"holds {shown(member.name)} both as a file and as a folder", _PACK) from None
@@ -205,8 +213,7 @@ def _unpack(archive: Path, tar: tarfile.TarFile, member: tarfile.TarInfo, target
 
 
 def _place(root: Path, name: str, archive: Path) -> Path:
-    """The folder under root that an object is unpacked into: called by its name, which data.py takes for the
-    object's."""
+    """Return the folder under root that an object is unpacked into; data/objects.py takes its name for the object's."""
     safe = archive.stem if name == "." else name.replace("/", "_").replace("..", "_")
     fault = name_fault(safe, byte_escapes=True)
     if fault:
@@ -215,6 +222,7 @@ def _place(root: Path, name: str, archive: Path) -> Path:
 
 
 def _opened(archive: Path, root: Path, name: str) -> Folder:
+    """Open an unpacked views folder. Raises InputError where its manifest is missing."""
     folder = _place(root, name, archive)
     if not (folder / MANIFEST).is_file():
         raise InputError(

@@ -1,4 +1,4 @@
-"""Cropping and centring a picture the way the rig's front camera frames an object."""
+"""Crop and centre a picture the way the rig's front camera frames an object."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FRONT_EXTENT = 0.5 / HALF_WIDTH
 
 
 def framed_side(image: np.ndarray, extent: float = FRONT_EXTENT) -> float:
-    """Side, in the picture's pixels, of the square that frame() takes of it."""
+    """Return the side, in the picture's pixels, of the square that frame() cuts out."""
     rows, columns = np.nonzero(image[..., 3] > 0.5)
     return float(max(np.ptp(rows), np.ptp(columns)) + 1) / extent
 
@@ -30,7 +30,9 @@ def frame(image: np.ndarray, size: int, extent: float = FRONT_EXTENT) -> np.ndar
 
 
 def whole_frame(image: np.ndarray, size: int) -> np.ndarray:
-    """The whole picture (h, w, 4), padded to a square with transparency, at size: nothing is cropped or centred."""
+    """Resample the whole picture (h, w, 4), padded to a square with transparency, to `size`, without cropping or
+    centring.
+    """
     h, w = image.shape[:2]
     side = max(h, w)
     square = np.zeros((side, side, 4), np.float32)
@@ -40,8 +42,7 @@ def whole_frame(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def _resample(image: np.ndarray, x0: float, y0: float, side: float, size: int) -> np.ndarray:
-    """The square of the picture with corner (x0, y0) and the given side, in pixels, at (size, size); outside:
-    transparent."""
+    """Resample a square of the picture, corner (x0, y0) and side in pixels, to (size, size); outside is transparent."""
     import torch
     import torch.nn.functional as F
 

@@ -1,4 +1,4 @@
-"""Training data: views folders decoded once into memory-mapped arrays, and the batches drawn from them.
+"""Decode views folders once into memory-mapped arrays, and draw training batches from them.
 
 Every choice of a step comes from a generator seeded by (seed, step), so a resumed run sees what an unbroken one would.
 """
@@ -6,7 +6,6 @@ Every choice of a step comes from a generator seeded by (seed, step), so a resum
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,8 +26,11 @@ LIGHTS = 16
 
 @dataclass(frozen=True)
 class Objects:
-    """Decoded objects. planes (n, k, 13, h, w) uint8; conditions (n, c, 4, h, w) uint8, the front view first; 127 is 0
-    in both. lights (n, 16, 7) float32: axis, sharpness, amplitude."""
+    """Hold decoded objects.
+
+    planes (n, k, 13, h, w) uint8; conditions (n, c, 4, h, w) uint8, the front view first; 127 is 0 in both. lights
+    (n, 16, 7) float32: axis, sharpness, amplitude.
+    """
 
     planes: np.ndarray
     conditions: np.ndarray
@@ -36,20 +38,26 @@ class Objects:
     names: tuple[str, ...]
 
     def __len__(self) -> int:
+        """Return the number of objects."""
         return len(self.planes)
+
+    def part(self, chosen: slice) -> Objects:
+        """Return the objects in a slice."""
+        return Objects(self.planes[chosen], self.conditions[chosen], self.lights[chosen], self.names[chosen])
 
 
 def to_bytes(x: np.ndarray) -> np.ndarray:
-    """[-1, 1] -> 0…254, 0 exactly at 127."""
+    """Quantise [-1, 1] to 0…254, with 0 exactly at 127."""
     return np.round((np.clip(x, -1, 1) + 1) * 127).astype(np.uint8)
 
 
 def from_bytes(x: np.ndarray) -> torch.Tensor:
+    """Convert bytes 0…254 back to [-1, 1]."""
     return torch.from_numpy(np.array(x)).float() / 127 - 1  # a copy: memory maps are read-only
 
 
 def shrink(image: np.ndarray, size: int) -> np.ndarray:
-    """Box filter of (…, h, w) down to (…, size, size); the values must be premultiplied."""
+    """Box-filter (…, h, w) down to (…, size, size); the values must be premultiplied."""
     if image.shape[-1] == size:
         return image
     factor = image.shape[-1] // size
@@ -57,7 +65,7 @@ def shrink(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def condition_plane(image: np.ndarray) -> np.ndarray:
-    """A condition image (h, w, 4), linear color and straight alpha in [0, 1] -> (4, h, w) premultiplied encoded."""
+    """Encode a condition image (h, w, 4), linear color and straight alpha in [0, 1], as (4, h, w), premultiplied."""
     from gdtool.images.color import srgb_from_linear
 
     alpha = image[..., 3]
@@ -66,7 +74,7 @@ def condition_plane(image: np.ndarray) -> np.ndarray:
 
 
 def decode_object(folder: Folder, config: ModelConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One object as (planes (k, 13, h, w), conditions (c, 4, h, w), light (16, 7)), premultiplied and encoded."""
+    """Decode one object to premultiplied planes (k, 13, h, w), conditions (c, 4, h, w) and light (16, 7)."""
     from gdtool.diffusion.data.framing import frame
     from gdtool.folders.views import read_views
     from gdtool.images.color import linear_from_srgb
@@ -80,16 +88,16 @@ def decode_object(folder: Folder, config: ModelConfig) -> tuple[np.ndarray, np.n
             folder.path, f"lacks {', '.join(missing + lacking)}", "render it again with the default rig and all domains"
         )
     order = [views.names.index(name) for name in config.views]
-    size, own = config.image_size, views.mask.shape[-1]
-    if views.mask.shape[-2] != own or own % size:
+    size, rendered_size = config.image_size, views.mask.shape[-1]
+    if views.mask.shape[-2] != rendered_size or rendered_size % size:
         raise InputError(
             folder.path,
-            f"has views of {own} px, not a multiple of the model's {size}",
+            f"has views of {rendered_size} px, not a multiple of the model's {size}",
             f"run gdtool render-dataset --size {size}",
         )
     planes = planes_from_images({d: x[order] for d, x in views.images.items()}, views.mask[order])
     front = np.concatenate([views.images["color"][order[0]], views.mask[order[0]][..., None]], -1)
-    extent = bounding_side(front[..., 3]) / own
+    extent = bounding_side(front[..., 3]) / rendered_size
     conditions = [condition_plane(front)]
     for path in sorted(folder.path.glob("condition/*.png")):
         image = read_image(
@@ -112,7 +120,7 @@ def decode_object(folder: Folder, config: ModelConfig) -> tuple[np.ndarray, np.n
 
 
 def bounding_side(alpha: np.ndarray) -> float:
-    """Longest side in pixels of the bounding box of alpha (h, w) > 0.5."""
+    """Return the longest side in pixels of the bounding box of alpha (h, w) > 0.5."""
     rows, columns = np.nonzero(alpha > 0.5)
     return float(max(np.ptp(rows), np.ptp(columns)) + 1) if len(rows) else float(alpha.shape[0])
 
@@ -153,7 +161,7 @@ def decode_dataset(
             array.flush()
         part = names_file.with_suffix(".part")
         part.write_text(json.dumps(names))
-        os.replace(part, names_file)  # a killed run leaves no half of it
+        part.replace(names_file)  # a killed run leaves no half of it
     names = read_json(names_file)
     if not names:
         raise InputError("dataset", "has no object that can be trained on", "render it with gdtool render-dataset")
@@ -163,7 +171,7 @@ def decode_dataset(
 
 @dataclass(frozen=True)
 class Batch:
-    """What a step sees: planes (b, k, 13, h, w), condition (b, 4, h, w), lights (b, 16, 7); no background yet."""
+    """Hold a step's inputs: planes (b, k, 13, h, w), condition (b, 4, h, w), lights (b, 16, 7); no background yet."""
 
     planes: torch.Tensor
     condition: torch.Tensor
@@ -171,7 +179,7 @@ class Batch:
 
 
 def object_order(count: int, step: int, batch: int, seed: int) -> np.ndarray:
-    """Indices of a step's objects: a new permutation each pass over the data."""
+    """Return the indices of a step's objects: a new permutation each pass over the data."""
     positions = step * batch + np.arange(batch)
     epochs = positions // count
     orders = {epoch: np.random.default_rng((seed, 1, int(epoch))).permutation(count) for epoch in np.unique(epochs)}
@@ -185,28 +193,27 @@ def draw(
     train: TrainConfig,
     generators: Sequence[np.random.Generator],
 ) -> Batch:
-    """Batch of the objects idx with random condition images, mirrored and with permuted color channels; a generator
-    each."""
+    """Draw a batch of the objects idx: random condition images, mirroring and permuted colors, a generator each."""
     planes, rgba, lights = [], [], []
     for i, generator in zip(idx, generators, strict=True):
         tilted = generator.random() < train.tilted and objects.conditions.shape[1] > 1
         pick = int(generator.integers(1, objects.conditions.shape[1])) if tilted else 0
-        one = (
+        sample = (
             from_bytes(objects.planes[i]),
             from_bytes(objects.conditions[i, pick]),
             torch.from_numpy(np.array(objects.lights[i])),
         )
         if train.mirror and generator.random() < 0.5:
-            one = mirror(*one, config.views)
+            sample = mirror(*sample, config.views)
         if train.hue:
-            one = permute_colors(*one, generator.permutation(3))
-        for out, value in zip((planes, rgba, lights), one, strict=True):
+            sample = permute_colors(*sample, generator.permutation(3))
+        for out, value in zip((planes, rgba, lights), sample, strict=True):
             out.append(value)
     return Batch(torch.stack(planes), torch.stack(rgba), torch.stack(lights))
 
 
 def mirror(planes, rgba, light, views: tuple[str, ...]):
-    """The mirror image of an object about its x = 0 plane: views swap sides, x of normals and lights turns round."""
+    """Mirror an object about its x = 0 plane: views swap sides, x of normals and lights changes sign."""
     order = mirrored_order(views)
     planes = planes[order].flip(-1)
     x = PLANES["normal"].start
@@ -217,8 +224,10 @@ def mirror(planes, rgba, light, views: tuple[str, ...]):
 
 
 def permute_colors(planes, rgba, light, order):
-    """Permute red, green and blue of color, albedo, condition and light: light transport is the same for each
-    channel."""
+    """Permute red, green and blue of color, albedo, condition and light.
+
+    Light transport is the same for each channel, so the result is a valid object.
+    """
     planes, rgba, light = planes.clone(), rgba.clone(), light.clone()
     for domain in ("color", "albedo"):
         start = PLANES[domain].start
@@ -229,5 +238,5 @@ def permute_colors(planes, rgba, light, order):
 
 
 def to_tensor_condition(image: np.ndarray) -> torch.Tensor:
-    """condition_plane of one framed image (h, w, 4) linear, as a batch of one."""
+    """Encode one framed image (h, w, 4), linear, as a batch of one."""
     return torch.from_numpy(condition_plane(image)).unsqueeze(0)

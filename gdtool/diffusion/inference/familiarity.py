@@ -1,11 +1,12 @@
-"""Whether a model knows what a framed picture shows: plain figures of the picture against their range over the training
-pictures, and figures of what the model made of it against what is usual.
+"""Warn of pictures unlike the training data, and of results that the model is unsure of.
 
-The image encoder's own features do not tell (photographs of anything lie among the training objects, whose own tail
-reaches far further), so the picture's figures are ones that a user can read and act upon. They seldom tell either: how
-unsure a model is shows in its result (docs/benchmarks/model_doubt.md). One step of sampling answers with the middle of
-all outlines it holds possible, and that is a blur; and it may lose parts, whose rows the picture fills and the other
-views do not."""
+Figures of the picture are compared with their range over the training pictures, and figures of the result with their
+usual values. The image encoder's features do not tell: photographs of anything lie among the training objects, whose
+tail reaches far further. So the picture's figures are ones that a user can read and act upon. They seldom tell either;
+a model's uncertainty shows in its result (docs/benchmarks/model_doubt.md). One step of sampling gives the mean of all
+outlines that the model holds possible, which is a blur. It may also lose parts; then the picture fills rows of the
+frame that the other views leave empty.
+"""
 
 from __future__ import annotations
 
@@ -20,19 +21,20 @@ MARGIN = 0.1  # of the range, added at each end
 # Figures of a result (result_figures) and what one of them, and the usual most of it, says to the user.
 DOUBTS = {
     "outline_blur": "their outlines are blurred over {:.1f} pixels, {:.1f} at most is usual",
-    "row_mismatch": "they begin or end at another height than the picture, in {:.1%} of the frame, {:.1%} at most is usual",
+    "row_mismatch": "they begin or end at another height than the picture, in {:.1%} of the frame, "
+    "{:.1%} at most is usual",
 }
 
 
 class PictureRange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Least and greatest of a figure over the training pictures, their tails left out."""
+    """Hold the least and greatest of a figure over the training pictures, their tails left out."""
 
     low: float
     high: float
 
 
 def picture_figures(rgba: np.ndarray) -> dict[str, float]:
-    """Figures of a condition (4, h, w): premultiplied encoded color and coverage in [-1, 1] (data.condition_plane)."""
+    """Compute the figures of a condition (4, h, w): premultiplied encoded color and coverage in [-1, 1]."""
     alpha = 0.5 + 0.5 * rgba[3]
     inside = alpha > 0.5
     if not inside.any():
@@ -65,34 +67,37 @@ def picture_figures(rgba: np.ndarray) -> dict[str, float]:
 
 
 def ranges(conditions) -> dict[str, PictureRange]:
-    """The range of each figure over an iterable of conditions (4, h, w)."""
-    every = [picture_figures(np.asarray(one, np.float32)) for one in conditions]
-    names = list(dict.fromkeys(name for one in every for name in one))
-    columns = {name: np.array([one[name] for one in every if name in one]) for name in names}
+    """Compute the range of each figure over an iterable of conditions (4, h, w)."""
+    every = [picture_figures(np.asarray(figures, np.float32)) for figures in conditions]
+    names = list(dict.fromkeys(name for figures in every for name in figures))
+    columns = {name: np.array([figures[name] for figures in every if name in figures]) for name in names}
     return {name: PictureRange(*(float(np.quantile(x, q)) for q in (TAIL, 1 - TAIL))) for name, x in columns.items()}
 
 
 def unfamiliar(rgba: np.ndarray, known: dict[str, PictureRange]) -> list[str]:
-    """What of a condition lies outside the training pictures' range, in words; empty where nothing does."""
-    found = []
+    """Describe the figures of a condition that lie outside the training pictures' range; empty where none does."""
+    descriptions = []
     for name, value in picture_figures(rgba).items():
         if name not in known:
             continue
         low, high = known[name].low, known[name].high
         margin = MARGIN * (high - low)
         if not low - margin <= value <= high + margin:
-            found.append(f"{name} is {value:.3g}, in training {low:.3g} to {high:.3g}")
-    return found
+            descriptions.append(f"{name} is {value:.3g}, in training {low:.3g} to {high:.3g}")
+    return descriptions
 
 
 def result_figures(coverage: np.ndarray, front: int | None = None, alpha: np.ndarray | None = None) -> dict[str, float]:
-    """How unsure a model was of the views that the picture does not show: the figures in DOUBTS.
+    """Measure how unsure a model was of the views that the picture does not show: the figures in DOUBTS.
 
-    coverage (k, h, w) in [0, 1], as the model made it; front: the view whose silhouette the picture's coverage alpha
-    (h, w) is, without it all views count, and only outline_blur is told. outline_blur: width in pixels of the ramp from
-    0 to 1 across the outlines, over which m (1 - m) adds up to a sixth of the width; their length is counted along rows
-    and columns. row_mismatch: views side by side, upright and orthographic, fill the same rows; how far each row's
-    greatest coverage is from that of the picture's row, mean over all rows of the frame."""
+    coverage (k, h, w) in [0, 1], as the model made it. front: index of the view whose silhouette is the picture's
+    coverage alpha (h, w); without it all views count, and only outline_blur is returned.
+
+    outline_blur: width in pixels of the ramp from 0 to 1 across the outlines. A linear ramp's m (1 - m) adds up to a
+    sixth of its width; the outlines' length is counted along rows and columns. row_mismatch: upright orthographic views
+    side by side fill the same rows. It is the difference between each row's greatest coverage and that of the picture's
+    row, mean over all rows of the frame.
+    """
     unseen = np.asarray([view for k, view in enumerate(coverage) if k != front], np.float64)
     inside = unseen > 0.5
     length = sum(int(np.diff(inside, axis=a).sum()) for a in (1, 2))
@@ -103,9 +108,11 @@ def result_figures(coverage: np.ndarray, front: int | None = None, alpha: np.nda
 
 
 def limits(results: list[dict[str, float]], alarms: float) -> dict[str, PictureRange]:
-    """Ranges of a result's figures, all up to one quantile: the lowest at which at most the share `alarms` of these
-    results leaves one of them."""
-    columns = np.array([[one[name] for name in DOUBTS] for one in results])  # (n, figures)
+    """Compute ranges of the result's figures up to a common quantile.
+
+    It is the lowest quantile at which at most the share `alarms` of these results leaves one of the ranges.
+    """
+    columns = np.array([[figures[name] for name in DOUBTS] for figures in results])  # (n, figures)
     for quantile in np.linspace(1 - alarms, 1, 101):
         high = np.quantile(columns, quantile, axis=0)
         if (columns > high).any(1).mean() <= alarms:
@@ -114,7 +121,7 @@ def limits(results: list[dict[str, float]], alarms: float) -> dict[str, PictureR
 
 
 def doubts(result: dict[str, float], known: dict[str, PictureRange]) -> list[str]:
-    """What of a result's figures lies above the usual, in words; empty where nothing does."""
+    """Describe the figures of a result that lie above the usual; empty where none does."""
     return [
         words.format(result[name], known[name].high)
         for name, words in DOUBTS.items()
@@ -123,12 +130,12 @@ def doubts(result: dict[str, float], known: dict[str, PictureRange]) -> list[str
 
 
 def write_ranges(path: Path, known: dict[str, PictureRange]) -> None:
+    """Write ranges as JSON."""
     path.write_bytes(msgspec.json.format(msgspec.json.encode(known), indent=1) + b"\n")
 
 
 def read_ranges(folder: Path) -> dict[str, PictureRange]:
-    """What a model folder says of its training pictures; nothing for one that does not. Raises InputError when
-    damaged."""
+    """Read a model folder's ranges; empty where it has none. Raises InputError when damaged."""
     from gdtool.core.errors import InputError
     from gdtool.core.reading import read_json
 

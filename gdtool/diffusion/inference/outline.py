@@ -1,10 +1,9 @@
-"""The picture's outline in the guessed views: what the picture shows and another view leaves no room for is drawn into
-it.
+"""Add parts that the picture shows, and that the sampled outlines leave no room for, to all views.
 
-Of the object's outline from the front everything is known; of the others a model makes a guess, from which thin parts
-(ribbons, arms, spires) fade first. A part of the picture behind which the other outlines have no common point is put
-where they come nearest to having one and where the front view's depth has it, as thick as it is wide up to a bound, and
-every view shows it there."""
+The object's outline from the front is known exactly. The others are guesses of the model, from which thin parts
+(ribbons, arms, spires) fade first. A lost part is put where the other outlines come nearest to having a common point
+and where the front view's depth has it. It is as thick as it is wide, up to a bound.
+"""
 
 from __future__ import annotations
 
@@ -12,25 +11,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gdtool.cameras import Camera, project
-from gdtool.fields.views.prepared_view import backproject, bilinear
+from gdtool.cameras import Camera, backproject, project
+from gdtool.images.sampling import bilinear
 
-LEAST = 2  # pixels across: narrower is the outlines' own error
-BESIDE = 2  # pixels of what is shown anyhow that a part takes along, so that it is joined
-DEPTH_SIGMA = 0.08  # world units: of the front view's depth, against the other outlines
-FAINT = 0.02  # coverage that counts as none
-SMOOTH = 1.5  # pixels: of a part's place
-THIN, THICK = 1.0, 3.0  # pixels: half a part's thickness at least and at most
-RANGE = 0.75  # world units about the origin in which it is looked for
-PER_PIXEL = 2  # places a pixel
-LEAST_FACING = 0.2  # cosine: what a view shows faces it
+LEAST_WIDTH_PX = 2  # of a lost part; a narrower one is the outlines' error
+OVERLAP_PX = 2  # pixels of the existing object around a part that are drawn too, so that it is joined
+DEPTH_SIGMA = 0.08  # world units: standard deviation of the front view's depth
+FAINT = 0.02  # least coverage in a logarithm
+PLACE_BLUR_PX = 1.5  # Gaussian blur of a part's depth
+THIN, THICK = 1.0, 3.0  # pixels: least and most half thickness of a part
+RANGE = 0.75  # world units about the origin in which a part is looked for
+PER_PIXEL = 2  # candidate depths per pixel size
+LEAST_FACING = 0.2  # cosine: least facing of a normal that is drawn
 
 
 @dataclass(frozen=True)
 class Part:
-    """Pixels (row, column) of the known view, each (n,), the depth of the part's middle behind them and half its
-    thickness there, world units; outward (n, 3): unit, to the nearest outline; lost (n,): where no other outline leaves
-    room."""
+    """Hold the n pixels of a lost part in the known view.
+
+    row, column (n,); middle (n,): depth of the part's middle behind them; half (n,): half its thickness there, world
+    units; outward (n, 3): unit vector toward the nearest outline; lost (n,): where no other outline leaves room.
+    """
 
     row: np.ndarray
     column: np.ndarray
@@ -43,9 +44,9 @@ class Part:
 def lost_part(
     soft: np.ndarray, mask: np.ndarray, cameras: list[Camera], known: int, depth: np.ndarray | None
 ) -> Part | None:
-    """What the mask of the known view shows and the other masks (k, h, w) leave no room for; None for nothing.
+    """Find what the known view's mask shows and the other masks (k, h, w) leave no room for; None for nothing.
 
-    soft (k, h, w): coverage as the model guessed it. depth (h, w): of the known view, where there is one.
+    soft (k, h, w): coverage as the model sampled it. depth (h, w): of the known view, where there is one.
     """
     from scipy.ndimage import binary_dilation, binary_opening, distance_transform_edt, gaussian_filter
 
@@ -67,7 +68,7 @@ def lost_part(
     least, score = least.reshape(len(row), -1), score.reshape(len(row), -1)
     lost = np.zeros(shown.shape, bool)
     lost[row, column] = least.max(1) <= 0.5
-    lost = binary_opening(lost, np.ones((LEAST, LEAST)))
+    lost = binary_opening(lost, np.ones((LEAST_WIDTH_PX, LEAST_WIDTH_PX)))
     if not lost.any():
         return None
     within = distance_transform_edt(shown) - 0.5  # of a pixel's centre
@@ -76,9 +77,9 @@ def lost_part(
         score -= 0.5 * ((places - (depth + half)[row, column][:, None]) / DEPTH_SIGMA) ** 2
     place, certain = np.zeros(shown.shape), np.zeros(shown.shape)
     place[row, column], certain[row, column] = places[score.argmax(1)], 1.0
-    zone = binary_dilation(lost, iterations=BESIDE) & shown
-    weight = gaussian_filter(np.where(zone, certain, 0.0), SMOOTH)
-    middle = gaussian_filter(np.where(zone, place, 0.0), SMOOTH) / np.maximum(weight, 1e-9)
+    zone = binary_dilation(lost, iterations=OVERLAP_PX) & shown
+    weight = gaussian_filter(np.where(zone, certain, 0.0), PLACE_BLUR_PX)
+    middle = gaussian_filter(np.where(zone, place, 0.0), PLACE_BLUR_PX) / np.maximum(weight, 1e-9)
     at = np.nonzero(zone)
     down, right = np.gradient(gaussian_filter(within, 1.0))
     outward = down[at][:, None] * camera.world_from_camera[:3, 1] - right[at][:, None] * camera.world_from_camera[:3, 0]
@@ -88,7 +89,7 @@ def lost_part(
 
 
 def grown_masks(part: Part, mask: np.ndarray, cameras: list[Camera], known: int) -> np.ndarray:
-    """Masks (k, h, w) of which every one shows the part."""
+    """Add the part to every mask (k, h, w)."""
     out = mask.copy()
     for k in range(len(cameras)):
         if k != known:
@@ -98,12 +99,12 @@ def grown_masks(part: Part, mask: np.ndarray, cameras: list[Camera], known: int)
 
 
 def draw_part(part: Part, images: dict[str, np.ndarray], mask: np.ndarray, cameras: list[Camera], known: int) -> None:
-    """Put the part into the images (k, h, w[, c]) of all domains, in place: the known view's own values, at the depth
-    at which each view sees it, with the normals of a rod along the part.
+    """Draw the part into the images (k, h, w[, c]) of all domains, in place.
 
-    mask (k, h, w): before the part was drawn.
+    It has the known view's values, the depth at which each view sees it, and the normals of a rod along it. mask (k, h,
+    w): before the part was added.
     """
-    own = {domain: image[known].copy() for domain, image in images.items()}
+    known_values = {domain: image[known].copy() for domain, image in images.items()}
     for k in range(len(cameras)):
         row, column, depth, normal, source = _shown(part, mask.shape[1:], cameras, known, k)
         put = part.lost[source] if k == known else mask[k][row, column] <= 0.5
@@ -115,13 +116,15 @@ def draw_part(part: Part, images: dict[str, np.ndarray], mask: np.ndarray, camer
             if domain == "depth":
                 image[k][row, column] = depth
             elif k != known:
-                drawn = normal if domain == "normal" else own[domain][part.row[source], part.column[source]]
+                drawn = normal if domain == "normal" else known_values[domain][part.row[source], part.column[source]]
                 image[k][row[fresh], column[fresh]] = drawn[fresh]
 
 
 def _shown(part: Part, shape: tuple[int, int], cameras: list[Camera], known: int, k: int) -> tuple[np.ndarray, ...]:
-    """Pixels (row, column) of view k in which the part is nearest to it; its depth there, its normal (n, 3), and which
-    of the part's pixels it is."""
+    """Find the pixels (row, column) of view k in which the part is nearest to it.
+
+    Also returns its depth there, its normal (n, 3), and the index of the part's pixel.
+    """
     camera = cameras[known]
     steps = np.linspace(-1.0, 1.0, 2 * int(np.ceil(part.half.max() / camera.pixel_size)) * PER_PIXEL + 1)
     start = backproject(camera, np.zeros(shape))[part.row, part.column]

@@ -1,16 +1,15 @@
-"""Sampled images as a views folder's content."""
+"""Convert sampled images to a views folder's content."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 
-from gdtool.cameras import Camera, project
+from gdtool.cameras import Camera, backproject, project
 from gdtool.diffusion.inference.familiarity import result_figures
 from gdtool.diffusion.inference.outline import draw_part, grown_masks, lost_part
 from gdtool.diffusion.inference.paint import repainted
 from gdtool.diffusion.network.encoding import coverage, decode
-from gdtool.fields.views.prepared_view import backproject
 from gdtool.folders.views import Views
 
 # The model's coverage at which outlines overlap the true ones most, at no cost in color; at one half they hold 4 % too
@@ -22,23 +21,25 @@ DECIDED = 4
 
 
 def sharpen(mask: torch.Tensor) -> torch.Tensor:
-    """A model's coverage is soft where it is unsure of the outline; a real outline is a pixel wide: twice the slope
-    there."""
+    """Double the slope of a model's coverage at the outline.
+
+    It is soft where the model is unsure of the outline; a real outline is a pixel wide.
+    """
     return ((mask - OUTLINE) * 2 + 0.5).clamp(0, 1)
 
 
 def decided(metallic: torch.Tensor) -> torch.Tensor:
-    """Metallic in [0, 1] nearer to 0 or 1, whichever it was nearer to: the odds to the power DECIDED.
+    """Push metallic in [0, 1] toward 0 or 1, whichever is nearer: the odds to the power DECIDED.
 
-    A material is a metal or is none; what a model puts between says how sure it is, and is nearest on average at
-    neither."""
+    A material is a metal or is none. A model's value in between says how sure it is, and is on average nearest at
+    neither.
+    """
     yes, no = metallic**DECIDED, (1 - metallic) ** DECIDED
     return yes / (yes + no)
 
 
 def tied(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
-    """Coverage (k, h, w), where two orthographic cameras face one another the mean of both: they see one outline,
-    mirrored."""
+    """Average the coverage (k, h, w) of orthographic cameras that face one another: they see one outline, mirrored."""
     out, facing = soft.clone(), np.diag([-1.0, 1.0, -1.0])  # the other's axes, as seen from a camera
     for k, camera in enumerate(cameras):
         for other, opposite in enumerate(cameras):
@@ -50,11 +51,11 @@ def tied(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
 
 
 def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera]) -> np.ndarray:
-    """Depth (k, h, w) with no point farther out than the outline of any other view, coverage (k, h, w), in that point's
-    row.
+    """Move depth (k, h, w) so that no point lies beyond the outline of another view, coverage (k, h, w), in its row.
 
-    A point is moved along its ray, within the camera's range. Of orthographic cameras of one size that stand upright
-    side by side, whose rows are at one height: one view's rays run along another's rows."""
+    A point is moved along its ray, within the camera's range. Only pairs of upright orthographic cameras of one size
+    take part, whose rows are at one height: one view's rays run along the other's rows.
+    """
     out, (height, width) = depth.astype(np.float64), mask.shape[1:]
     for k, camera in enumerate(cameras):
         inside = mask[k] > 0.5
@@ -84,8 +85,9 @@ def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera
 
 
 def _begin(mask: np.ndarray) -> np.ndarray:
-    """Column (h,) at which each row's coverage (h, w) first passes one half, between the centres of two pixels; 0 where
-    it never does."""
+    """Find the column (h,) at which each row's coverage (h, w) first passes one half, between pixel centres; 0 where
+    never.
+    """
     row, first = np.arange(len(mask)), (mask > 0.5).argmax(1)
     inner, outer = mask[row, first], np.where(first > 0, mask[row, first - 1], 0.0)
     return np.where(inner > 0.5, first + 0.5 - (inner - 0.5) / np.maximum(inner - outer, 1e-6), 0.0)
@@ -98,13 +100,14 @@ def views_from_images(
     domains: tuple[str, ...],
     picture_alpha: np.ndarray | None = None,
 ) -> tuple[Views, dict[str, float]]:
-    """Encoded images (k, 3, h, w) of one object -> Views of the asked domains with one mask per view, shared by all,
-    and a report: drawn_share of the picture that the other views left no room for (outline.py), and they show now;
-    painted_share of it whose albedo was given the picture's contrast (paint.py); and how unsure the model was of the
-    other views, outline_blur in pixels and row_mismatch (familiarity.result_figures).
+    """Convert encoded images (k, 3, h, w) of one object to Views of the asked domains, with one mask per view, and a
+    report.
 
-    picture_alpha (h, w): coverage of the framed picture. It is the front view's silhouette, and mirrored the back's
-    (both orthographic), so neither is guessed; the front color, nearly the picture itself, is divided by it.
+    picture_alpha (h, w): coverage of the framed picture. It is the front view's silhouette and, mirrored, the back's
+    (both orthographic), so neither is guessed. The front color, nearly the picture itself, is divided by it.
+
+    The report: drawn_share of the picture that the other views had no room for (outline.py); painted_share whose albedo
+    got the picture's contrast (paint.py); outline_blur in pixels and row_mismatch (familiarity.result_figures).
     """
     from gdtool.images.color import linear_from_srgb
 

@@ -12,12 +12,14 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from gdtool.diffusion.config import DOMAINS
+from gdtool.core.kinds import DOMAINS
 
 
 def learned_position(count: int, width: int) -> nn.Parameter:
-    """(count, width), to begin with noise. Not drawn on the meta device: that alone would load PyTorch's compiler, a
-    second."""
+    """Create a position embedding (count, width) that starts as noise.
+
+    On the meta device no noise is drawn: that alone would load PyTorch's compiler, a second.
+    """
     shape = torch.empty(count, width)
     return nn.Parameter(shape if shape.is_meta else 0.1 * torch.randn(count, width))
 
@@ -32,6 +34,7 @@ class Layout:
 
     @property
     def images(self) -> int:
+        """Return the number of images."""
         return self.objects * len(self.domains) * self.views
 
 
@@ -45,7 +48,7 @@ def attend(q: torch.Tensor, k: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
 
 
 class Attention(nn.Module):
-    """Multi-head attention; context (…, tokens, context_width), None: the queries' own tokens."""
+    """Multi-head attention; context (…, tokens, context_width), None: the queries' input tokens."""
 
     def __init__(self, width: int, heads: int, context_width: int | None = None):
         super().__init__()
@@ -56,24 +59,26 @@ class Attention(nn.Module):
         self.to_out = nn.ModuleList([nn.Linear(width, width)])
 
     def split(self, x: torch.Tensor) -> torch.Tensor:
-        """(n, t, c) -> (n, heads, t, c / heads)"""
+        """Split heads: (n, t, c) -> (n, heads, t, c / heads)."""
         return x.unflatten(-1, (self.heads, -1)).transpose(-2, -3)
 
     def join(self, x: torch.Tensor) -> torch.Tensor:
+        """Join heads: (n, heads, t, c / heads) -> (n, t, c)."""
         return x.transpose(-2, -3).flatten(-2)
 
     def forward(self, x: torch.Tensor, context: torch.Tensor | None = None) -> torch.Tensor:
+        """Attend from x (…, t, c) to context (…, m, context_width)."""
         context = x if context is None else context
         out = attend(self.split(self.to_q(x)), self.split(self.to_k(context)), self.split(self.to_v(context)))
         return self.to_out[0](self.join(out))
 
 
 class CrossDomainAttention(Attention):
-    """A star around color: color's queries read each other domain of the same view, their answers are fused by one
-    layer; in the two-way star the other domains' queries also read color.
+    """Star-shaped attention around color.
 
-    The output projection starts at zero, so a pretrained network starts unchanged. With color queries only (one way)
-    the other domains never hear of color.
+    Color's queries read each other domain of the same view, and one layer fuses the answers. In the two-way star the
+    other domains' queries also read color; in the one-way star they get nothing. The output projection starts at zero,
+    so a pretrained network starts unchanged.
     """
 
     def __init__(self, width: int, heads: int, two_way: bool):
@@ -85,7 +90,7 @@ class CrossDomainAttention(Attention):
         nn.init.zeros_(self.to_out[0].bias)
 
     def forward(self, x: torch.Tensor, layout: Layout) -> torch.Tensor:
-        """x (b d k, t, c) -> the same shape, to be added to x. Without color, or with color alone: zeros."""
+        """Map x (b d k, t, c) to a residual of the same shape. Without color, or with color alone: zeros."""
         others = [i for i, domain in enumerate(layout.domains) if domain != 0]
         if 0 not in layout.domains or not others:
             return torch.zeros_like(x)
@@ -120,15 +125,17 @@ class CrossDomainAttention(Attention):
 
 
 class JointAttention(Attention):
-    """Wonder3D's: the tokens of all domains of a view are one sequence. Starts as (nearly) nothing: no weights in
-    to_out."""
+    """Wonder3D's attention: the tokens of all domains of a view are one sequence.
+
+    to_out starts without weights, so that the layer starts as (nearly) nothing.
+    """
 
     def __init__(self, width: int, heads: int):
         super().__init__(width, heads)
         nn.init.zeros_(self.to_out[0].weight)
 
     def forward(self, x: torch.Tensor, layout: Layout) -> torch.Tensor:
-        """x (b d k, t, c) -> the same shape, to be added to x."""
+        """Map x (b d k, t, c) to a residual of the same shape."""
         t, c = x.shape[1:]
         sets = x.view(layout.objects, len(layout.domains), layout.views, t, c).transpose(1, 2)
         out = super().forward(sets.reshape(layout.objects * layout.views, -1, c))
@@ -143,22 +150,27 @@ class GatedLinear(nn.Module):
         self.proj = nn.Linear(width, 2 * inner)
 
     def forward(self, x):
+        """Map (…, width) to (…, inner)."""
         value, gate = self.proj(x).chunk(2, -1)
         return value * F.gelu(gate)
 
 
 class FeedForward(nn.Module):
+    """Gated feed-forward layer of a transformer block, with diffusers' key names."""
+
     def __init__(self, width: int, factor: int):
         super().__init__()
         self.net = nn.ModuleList([GatedLinear(width, factor * width), nn.Identity(), nn.Linear(factor * width, width)])
 
     def forward(self, x):
+        """Map (…, width) to (…, width)."""
         return self.net[2](self.net[0](x))
 
 
 class TransformerBlock(nn.Module):
-    """Self-attention over all views of a domain, the star across domains, attention to the image's embedding,
-    feed-forward."""
+    """Self-attention over all views of a domain, attention across domains, attention to the image's embedding,
+    feed-forward.
+    """
 
     def __init__(
         self, width: int, heads: int, context_width: int, feed_forward: int, multi_view: bool, cross_domain: str
@@ -182,13 +194,13 @@ class TransformerBlock(nn.Module):
         self.ff = FeedForward(width, feed_forward)
 
     def forward(self, x: torch.Tensor, context: torch.Tensor, layout: Layout) -> torch.Tensor:
-        """x (b d k, t, c), context (b, m, context_width)."""
+        """Map x (b d k, t, c), with context (b, m, context_width), to the same shape."""
         images, t, c = x.shape
         groups = layout.objects * len(layout.domains)
-        own = self.norm1(x)
+        tokens = self.norm1(x)
         if self.multi_view:  # keys and values of all views: the views' tokens are one sequence
-            own = own.reshape(groups, layout.views * t, c)
-        x = x + self.attn1(own).reshape(images, t, c)
+            tokens = tokens.reshape(groups, layout.views * t, c)
+        x = x + self.attn1(tokens).reshape(images, t, c)
         if self.attn_cross_domain is not None:
             x = x + self.attn_cross_domain(self.norm_cross_domain(x), layout)
         if self.joint == "mid":
@@ -214,6 +226,7 @@ class Transformer(nn.Module):
         self.proj_out = nn.Conv2d(width, width, 1)
 
     def forward(self, x: torch.Tensor, context: torch.Tensor, layout: Layout) -> torch.Tensor:
+        """Map features x (n, c, h, w) to the same shape."""
         n, c, h, w = x.shape
         tokens = self.proj_in(self.norm(x)).flatten(2).transpose(1, 2)
         if self.position is not None:
@@ -239,7 +252,7 @@ class RowAttention(nn.Module):
         nn.init.zeros_(self.attn.to_out[0].bias)
 
     def forward(self, x: torch.Tensor, layout: Layout) -> torch.Tensor:
-        """x (b d k, c, h, w) -> the same shape."""
+        """Map x (b d k, c, h, w) to the same shape."""
         n, c, h, w = x.shape
         tokens = self.norm(x).permute(0, 2, 3, 1) + self.position.to(x.dtype)  # (n, h, w, c)
         groups = layout.objects * len(layout.domains)

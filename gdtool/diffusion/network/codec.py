@@ -1,4 +1,4 @@
-"""From encoded images to what is denoised, and back: pixels folded into channels, or Stable Diffusion's VAE."""
+"""Convert encoded images to the latents that are denoised, and back: pixel patches, or Stable Diffusion's VAE."""
 
 from __future__ import annotations
 
@@ -27,22 +27,24 @@ class PatchCodec:
         self.alpha = config.condition_alpha
 
     def encode(self, images: torch.Tensor) -> torch.Tensor:
-        """(n, 3, h, w) in [-1, 1] -> (n, 3 p², h / p, w / p)"""
+        """Fold patches into channels: (n, 3, h, w) in [-1, 1] -> (n, 3 p², h / p, w / p)."""
         return F.pixel_unshuffle(images, self.patch)
 
     def encode_condition(self, rgba: torch.Tensor) -> torch.Tensor:
-        """(n, 4, h, w) -> (n, condition_channels, h / p, w / p), the color's channels first."""
+        """Fold patches of (n, 4, h, w) into (n, condition_channels, h / p, w / p), the color's channels first."""
         return F.pixel_unshuffle(rgba if self.alpha else rgba[:, :3], self.patch)
 
     def decode(self, latents: torch.Tensor) -> torch.Tensor:
+        """Unfold (n, 3 p², h / p, w / p) -> (n, 3, h, w)."""
         return F.pixel_shuffle(latents, self.patch)
 
 
 class VaeCodec:
     """Stable Diffusion's autoencoder (diffusers), frozen: factor 8, 4 channels, the mode times the scaling factor.
 
-    It follows its input's device and takes CHUNK images at a time; where a gradient goes through decode(), each chunk
-    is computed again for it, so that only one chunk's activations are held."""
+    It follows its input's device and takes CHUNK images at a time. Where a gradient goes through decode(), each chunk
+    is recomputed in the backward pass, so that only one chunk's activations are held.
+    """
 
     latent_channels = condition_channels = 4
 
@@ -59,26 +61,28 @@ class VaeCodec:
         self.vae = vae.requires_grad_(False).eval()
 
     def encode(self, images: torch.Tensor) -> torch.Tensor:
-        """(n, 3, h, w) in [-1, 1] -> (n, 4, h / 8, w / 8)"""
+        """Encode (n, 3, h, w) in [-1, 1] -> (n, 4, h / 8, w / 8)."""
         vae = self.vae.to(images.device)
         with torch.no_grad():
             return in_chunks(lambda x: vae.encode(x).latent_dist.mode() * vae.config.scaling_factor, images)
 
     def encode_condition(self, rgba: torch.Tensor) -> torch.Tensor:
+        """Encode the color of (n, 4, h, w)."""
         return self.encode(rgba[:, :3])
 
     def decode(self, latents: torch.Tensor) -> torch.Tensor:
-        """(n, 4, h / 8, w / 8) -> (n, 3, h, w); differentiable."""
+        """Decode (n, 4, h / 8, w / 8) -> (n, 3, h, w); differentiable."""
         vae = self.vae.to(latents.device)
         return in_chunks(lambda x: vae.decode(x / vae.config.scaling_factor).sample, latents)
 
 
 def in_chunks(function: Callable[[torch.Tensor], torch.Tensor], x: torch.Tensor) -> torch.Tensor:
-    """function of x, CHUNK of its first axis at a time; with a gradient, computed again chunk by chunk."""
+    """Apply function to CHUNK rows of x at a time; with a gradient, each chunk is recomputed in the backward pass."""
     if torch.is_grad_enabled() and x.requires_grad:
         return torch.cat([checkpoint(function, part, use_reentrant=False) for part in x.split(CHUNK)])
     return torch.cat([function(part) for part in x.split(CHUNK)])
 
 
 def make_codec(config: ModelConfig) -> PatchCodec | VaeCodec:
+    """Create the configuration's codec."""
     return VaeCodec(config) if config.codec == "vae" else PatchCodec(config)

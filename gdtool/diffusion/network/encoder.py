@@ -1,4 +1,4 @@
-"""The image encoder: tokens that every view and domain attends to."""
+"""Encode the condition image to tokens that every view and domain attends to."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from gdtool.diffusion.network.tensors import pretrained_part
 
 
 class EncoderLayer(nn.Module):
+    """Pre-norm transformer layer."""
+
     def __init__(self, width: int, heads: int):
         super().__init__()
         self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
@@ -21,12 +23,13 @@ class EncoderLayer(nn.Module):
         self.ff = FeedForward(width, 2)
 
     def forward(self, x):
+        """Map tokens (b, t, width) to the same shape."""
         x = x + self.attn(self.norm1(x))
         return x + self.ff(self.norm2(x))
 
 
 class PatchEncoder(nn.Module):
-    """A small transformer over the condition's patches, learned with the rest: (b, 4, h, w) -> (b, tokens, width).
+    """Small transformer over the condition's patches, trained with the rest.
 
     It runs once per object, not once per image, so depth is cheap here.
     """
@@ -43,6 +46,7 @@ class PatchEncoder(nn.Module):
         self.norm = nn.LayerNorm(width)
 
     def forward(self, rgba):
+        """Map rgba (b, 4, h, w) to tokens (b, tokens, width)."""
         x = self.embed(F.pixel_unshuffle(rgba, self.patch).flatten(2).transpose(1, 2)) + self.position
         for layer in self.layers:
             x = layer(x)
@@ -50,9 +54,10 @@ class PatchEncoder(nn.Module):
 
 
 class ClipEncoder(nn.Module):
-    """CLIP ViT-L/14's projected embedding as one 768-wide token, frozen, as Stable Diffusion Image Variations has it.
+    """CLIP ViT-L/14's projected embedding as one 768-wide token, frozen, as in Stable Diffusion Image Variations.
 
-    Its model card resizes tensors, bicubic without antialiasing; Wonder3D has CLIP's own processor do it, with.
+    Image Variations' model card resizes tensors bicubically without antialiasing. Wonder3D uses CLIP's processor, with
+    it.
     """
 
     # mean and deviation of CLIP's training images (openai/clip-vit-large-patch14, preprocessor_config.json)
@@ -75,6 +80,7 @@ class ClipEncoder(nn.Module):
         self.frozen = [clip.requires_grad_(False).eval()]
 
     def forward(self, rgba):
+        """Map rgba (b, 4, h, w) in [-1, 1] to one token (b, 1, 768)."""
         clip = self.frozen[0].to(rgba.device)
         image = F.interpolate(0.5 + 0.5 * rgba[:, :3], size=(224, 224), mode="bicubic", antialias=self.antialias)
         image = image.clamp(0, 1) if self.antialias else image  # as pictures of 8 bits are
@@ -84,4 +90,5 @@ class ClipEncoder(nn.Module):
 
 
 def make_encoder(config: ModelConfig) -> nn.Module:
+    """Create the configuration's encoder."""
     return ClipEncoder(config) if config.encoder == "clip" else PatchEncoder(config)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gdtool.cameras.camera import DISTANCE
-from gdtool.diffusion.config import DOMAINS
+from gdtool.core.kinds import DOMAINS
 
 SLAB = 0.75  # half the depth range that is encoded: a unit box turned about its vertical axis reaches 0.707
 BACKGROUND = {"white": 1.0, "grey": 0.0, "black": -1.0}
@@ -34,7 +34,7 @@ MIRRORED_VIEW = {"front_right": "front_left", "front_left": "front_right", "righ
 
 
 def planes_from_images(images: dict[str, np.ndarray], mask: np.ndarray) -> np.ndarray:
-    """Domain images (k, h, w[, 3]) of a views folder and mask (k, h, w) -> premultiplied planes (k, 13, h, w) in [-1,
+    """Convert a views folder's images (k, h, w[, 3]) and mask (k, h, w) to premultiplied planes (k, 13, h, w) in [-1,
     1].
 
     color and albedo linear, normal unit, depth in world units. Coverage m is stored as 2m - 1.
@@ -61,7 +61,10 @@ def planes_from_images(images: dict[str, np.ndarray], mask: np.ndarray) -> np.nd
 
 
 def encode(planes: torch.Tensor, domains: tuple[int, ...], background: torch.Tensor) -> torch.Tensor:
-    """planes (b, k, 13, h, w), domains as indices, background (b,) encoded -> (b, d, k, 3, h, w) in [-1, 1]."""
+    """Encode planes (b, k, 13, h, w) over background (b,), encoded, to images (b, d, k, 3, h, w) in [-1, 1].
+
+    domains: indices into DOMAINS.
+    """
     mask = planes[:, :, PLANES["mask"]]
     behind = (0.5 - 0.5 * mask) * background[:, None, None, None, None]
     out = []
@@ -77,12 +80,12 @@ def encode(planes: torch.Tensor, domains: tuple[int, ...], background: torch.Ten
 
 
 def mirrored_order(views: tuple[str, ...]) -> list[int]:
-    """Where in views the one is that, flipped, shows the object's mirror image about x = 0 as each of them sees it."""
+    """Return, for each view, the index of the view that, flipped, shows the object mirrored about x = 0."""
     return [views.index(MIRRORED_VIEW.get(name, name)) for name in views]
 
 
 def mirrored(images: torch.Tensor, domains: tuple[int, ...], views: tuple[str, ...]) -> torch.Tensor:
-    """Encoded images (b, d, k, 3, h, w) of the objects' mirror images about x = 0; its own inverse."""
+    """Mirror encoded images (b, d, k, 3, h, w) of the objects about x = 0; its own inverse."""
     images = images[:, :, mirrored_order(views)].flip(-1)
     for j, i in enumerate(domains):
         if DOMAINS[i] == "normal":
@@ -91,17 +94,16 @@ def mirrored(images: torch.Tensor, domains: tuple[int, ...], views: tuple[str, .
 
 
 def encode_condition(rgba: torch.Tensor, background: torch.Tensor) -> torch.Tensor:
-    """rgba (b, 4, h, w): premultiplied encoded color and coverage as 2m - 1 -> the same with color over the
-    background."""
+    """Put premultiplied encoded color of rgba (b, 4, h, w) over the background; coverage stays 2m - 1."""
     behind = (0.5 - 0.5 * rgba[:, 3:]) * background[:, None, None, None]
     return torch.cat([rgba[:, :3] + behind, rgba[:, 3:]], 1)
 
 
 def coverage(images: dict[str, torch.Tensor], background: float) -> torch.Tensor:
-    """Coverage (…, h, w) in [0, 1] that the encoded domain images (…, 3, h, w) agree on.
+    """Compute the coverage (…, h, w) in [0, 1] on which the encoded domain images (…, 3, h, w) agree.
 
-    From the scalar domains where there is one, else from the normals' length, else from how far color stands off the
-    background (which a subject of the background's own color defeats).
+    From the scalar domains where there is one, else from the normals' length, else from how far color differs from the
+    background (which fails for a subject of the background's color).
     """
     votes = [0.5 + 0.5 * images[d][..., 2, :, :] for d in SCALARS if d in images]
     if "normal" in images:
@@ -113,10 +115,11 @@ def coverage(images: dict[str, torch.Tensor], background: float) -> torch.Tensor
 
 
 def decode(images: dict[str, torch.Tensor], mask: torch.Tensor, background: float) -> dict[str, torch.Tensor]:
-    """Encoded images (…, 3, h, w) -> values inside the mask, whose coverage (…, h, w) they are divided by.
+    """Decode encoded images (…, 3, h, w) to values, divided by the mask's coverage (…, h, w).
 
     color, albedo sRGB (…, 3, h, w) in [0, 1]; normal unit; depth in world units (…, h, w); roughness, metallic (…, h,
-    w). Differentiable in images."""
+    w). Differentiable in images.
+    """
     m = mask.clamp_min(0.1)
     out = {}
     for domain, x in images.items():

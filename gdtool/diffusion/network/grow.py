@@ -1,9 +1,10 @@
-"""A larger model from a smaller one: the same network over patches of as many more pixels.
+"""Grow a model to larger images: the same network over patches of proportionally more pixels.
 
-A model with the patch codec sees image_size / patch tokens a side. Twice the size with twice the patch is as many
-tokens, so the same network at the same cost a step; only the layers that touch pixels have other shapes. They are made
-so that the grown model, shown the small one's inputs with each pixel as a square of equal ones, predicts what the small
-one predicts, each pixel a square."""
+A model with the patch codec sees image_size / patch tokens a side. Twice the size with twice the patch gives as many
+tokens, so the same network at the same cost a step. Only the layers that read or write pixels change shape. Shown the
+small model's inputs, each pixel repeated to a square, the grown model predicts what the small one predicts, repeated
+likewise.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +18,10 @@ from gdtool.diffusion.config import ModelConfig
 
 
 def resized(config: ModelConfig, size: int) -> ModelConfig:
-    """The configuration at another image size (pixels), with patches that keep the number of tokens. Raises
-    InputError."""
+    """Return the configuration at another image size (pixels), with patches that keep the number of tokens.
+
+    Raises InputError.
+    """
     if size % config.image_size and config.image_size % size:
         raise InputError(
             "size",
@@ -46,18 +49,19 @@ def resized(config: ModelConfig, size: int) -> ModelConfig:
 
 
 def grown(tensors: dict[str, torch.Tensor], small: ModelConfig, large: ModelConfig) -> dict[str, torch.Tensor]:
-    """Weights of `large` from those of `small`, whose configuration it is at a multiple of its size; both unchanged if
-    equal.
+    """Convert the weights of `small` to those of `large`, the same configuration at a multiple of its size.
 
-    What reads pixels is shared out among the pixels of each square, what writes them is repeated. Raises InputError
-    when the two are not the same network."""
+    Weights that read pixels are divided among the pixels of each square; weights that write them are repeated.
+    Unchanged where the sizes are equal. Raises InputError when the two are not the same network.
+    """
     if small.image_size == large.image_size:
         return tensors
     if small.codec != "patch" or large.image_size % small.image_size or resized(small, large.image_size) != large:
         raise InputError(
             "start",
             f"is a model of {small.image_size} px that cannot be grown to {large.image_size} px",
-            "start from a model of the patch codec that differs in nothing but a size which is a whole number of times smaller",
+            "start from a model of the patch codec that differs in nothing but a size which is a whole number of "
+            "times smaller",
         )
     factor = large.image_size // small.image_size
     out = dict(tensors)
@@ -71,7 +75,6 @@ def grown(tensors: dict[str, torch.Tensor], small: ModelConfig, large: ModelConf
 
 
 def _squares(weight: torch.Tensor, dim: int, patch: int, factor: int) -> torch.Tensor:
-    """Repeat each pixel of the patches that lie folded in weight's dimension dim (c p², as pixel_unshuffle folds) to a
-    square."""
+    """Repeat each pixel of patches folded into weight's dimension dim (c p², as pixel_unshuffle folds) to a square."""
     pixels = weight.unflatten(dim, (-1, patch, patch))
     return pixels.repeat_interleave(factor, dim + 1).repeat_interleave(factor, dim + 2).flatten(dim, dim + 2)

@@ -1,4 +1,4 @@
-"""The labels that tell the network which domain and which view an image is."""
+"""Compute the class labels that tell the network which domain and which view an image is."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import math
 import torch
 
 from gdtool.cameras.camera import SIX_VIEWS
-from gdtool.diffusion.config import DOMAINS, ModelConfig
+from gdtool.core.kinds import DOMAINS
+from gdtool.diffusion.config import ModelConfig
 
 # Wonder3D's elevation and azimuth (radians) of each view relative to the picture's, as its pipeline has them, in half
 # precision.
@@ -25,10 +26,11 @@ WONDER3D_LABEL_WIDTH = 10  # sin and cos of [elevation of the condition, elevati
 
 
 def class_labels(config: ModelConfig) -> torch.Tensor:
-    """(domains, views, CLASS_WIDTH): sines, then cosines of [elevation of the condition, elevation and azimuth of the
-    view relative to it (radians), one-hot domain].
+    """Compute labels (domains, views, CLASS_WIDTH): sines, then cosines of the raw values.
 
-    The elevation of a photograph is not known when sampling, so it is 0 in training as well and the network infers it.
+    Raw values are [elevation of the condition, elevation and azimuth of the view relative to it (radians), one-hot
+    domain]. The elevation of a photograph is not known when sampling, so it is 0 in training as well and the network
+    infers it.
     """
     if config.convention == "wonder3d":
         return _wonder3d_labels(config)
@@ -42,7 +44,7 @@ def class_labels(config: ModelConfig) -> torch.Tensor:
 
 
 def _wonder3d_labels(config: ModelConfig) -> torch.Tensor:
-    """(domains, views, 10): sines, then cosines. Domains that it has not get the switch (0, 0)."""
+    """Compute labels (domains, views, 10): sines, then cosines. Domains unknown to Wonder3D get the switch (0, 0)."""
     raw = torch.tensor(
         [
             [[0.0, ELEVATION[view], AZIMUTH[view], *SWITCH.get(domain, (0.0, 0.0))] for view in config.views]

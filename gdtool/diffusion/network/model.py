@@ -1,4 +1,4 @@
-"""The whole model: network, image encoder and codec, and the labels that tell an image which domain and view it is."""
+"""Assemble the model: network, image encoder, codec, noise schedule and labels."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.codec import PatchCodec, make_codec
 from gdtool.diffusion.network.encoder import PatchEncoder, make_encoder
 from gdtool.diffusion.network.labels import class_labels
-from gdtool.diffusion.network.schedule import clean_from_prediction, input_scale, signal_and_noise
+from gdtool.diffusion.network.schedule import alpha_and_sigma, clean_from_prediction, input_scale
 from gdtool.diffusion.network.unet import UNet
 
 
 class Model(nn.Module):
-    """Everything with weights that a model folder holds (a VAE and CLIP are loaded from where the configuration
-    says)."""
+    """Hold everything with weights in a model folder; a VAE and CLIP are loaded from where the configuration says."""
 
     def __init__(self, config: ModelConfig, codec=None, encoder=None):
         super().__init__()
@@ -26,16 +25,19 @@ class Model(nn.Module):
         self.codec = codec or make_codec(config)
         self.encoder = encoder or make_encoder(config)
         self.unet = UNet(config, self.codec.latent_channels, self.codec.condition_channels, self.codec.side)
-        signal, deviation = signal_and_noise(config)
-        self.register_buffer("signal", signal, persistent=False)
-        self.register_buffer("deviation", deviation, persistent=False)
+        alpha, sigma = alpha_and_sigma(config)
+        self.register_buffer("alpha", alpha, persistent=False)
+        self.register_buffer("sigma", sigma, persistent=False)
         self.register_buffer("labels", class_labels(config), persistent=False)
 
     def latent_shape(self, layout: Layout) -> tuple[int, int, int, int]:
+        """Return the latents' shape (n, c, h, w) for a layout."""
         return (layout.images, self.codec.latent_channels, self.codec.side, self.codec.side)
 
     def condition_latents(self, rgba: torch.Tensor, layout: Layout, view_idx: torch.Tensor) -> torch.Tensor:
-        """rgba (b, 4, h, w) encoded condition -> one latent per image, (n, e, h, w); from behind its mirror image."""
+        """Encode the condition rgba (b, 4, h, w) to one latent per image, (n, e, h, w); the back view gets its mirror
+        image.
+        """
         latent = self.codec.encode_condition(rgba)
         back = [self.config.mirror_back and self.config.views[k] == "back" for k in view_idx.tolist()]
         mirrored = self.codec.encode_condition(rgba.flip(-1)) if any(back) else latent
@@ -43,27 +45,30 @@ class Model(nn.Module):
         return per_view.unsqueeze(1).expand(-1, len(layout.domains), *per_view.shape[1:]).flatten(0, 2)
 
     def predict_clean(self, noisy, condition, t, context, layout: Layout, view_idx: torch.Tensor) -> torch.Tensor:
-        """Predicted x_0 (n, c, h, w), float32. t (b,): all images of an object share their timestep."""
+        """Predict x_0 (n, c, h, w), float32. t (b,): all images of an object share their timestep."""
         label = self.labels[list(layout.domains)][:, view_idx].flatten(0, 1).repeat(layout.objects, 1)
         a, s = self.levels(t, layout)
         out = self.unet(noisy * input_scale(self.config, a, s), condition, t, label, context, layout, view_idx).float()
         return clean_from_prediction(self.config, out, noisy, a, s)
 
     def levels(self, t: torch.Tensor, layout: Layout) -> tuple[torch.Tensor, torch.Tensor]:
-        """Signal and noise of each image, (n, 1, 1, 1)."""
+        """Return alpha and sigma of each image, (n, 1, 1, 1)."""
         n = len(layout.domains) * layout.views
         return (
-            self.signal[t].repeat_interleave(n).view(-1, 1, 1, 1),
-            self.deviation[t].repeat_interleave(n).view(-1, 1, 1, 1),
+            self.alpha[t].repeat_interleave(n).view(-1, 1, 1, 1),
+            self.sigma[t].repeat_interleave(n).view(-1, 1, 1, 1),
         )
 
 
 def parameter_count(model: nn.Module) -> int:
+    """Count the parameters."""
     return sum(p.numel() for p in model.parameters())
 
 
 def structure(config: ModelConfig, device: str = "meta") -> Model:
-    """The model's trained parts on a device; what is frozen and loaded (VAE, CLIP) is stood in for by its shapes."""
+    """Build the model's trained parts on a device; the frozen, loaded parts (VAE, CLIP) are represented by their
+    shapes.
+    """
     with torch.device(device):
         if config.codec == "vae":
             codec = SimpleNamespace(side=config.image_size // 8, latent_channels=4, condition_channels=4)

@@ -1,4 +1,4 @@
-"""Noise: x_t = a_t x_0 + s_t e with a² + s² = 1, what a prediction says about x_0, and samplers apart from models."""
+"""Define the noise x_t = alpha_t x_0 + sigma_t e with alpha² + sigma² = 1, predictions of x_0, and samplers."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import torch
 from gdtool.diffusion.config import ModelConfig
 
 
-def signal_and_noise(config: ModelConfig) -> tuple[torch.Tensor, torch.Tensor]:
-    """a and s for every timestep, (timesteps,) float32 each; on the processor, also where a model is built on the meta
-    device."""
+def alpha_and_sigma(config: ModelConfig) -> tuple[torch.Tensor, torch.Tensor]:
+    """Compute alpha and sigma for every timestep, (timesteps,) float32 each; on the CPU, even for a model on the meta
+    device.
+    """
     n = config.timesteps
     if config.noise_schedule == "scaled_linear":  # Stable Diffusion 1
         beta = torch.linspace(0.00085**0.5, 0.012**0.5, n, dtype=torch.float64, device="cpu") ** 2
@@ -23,7 +24,10 @@ def signal_and_noise(config: ModelConfig) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def clean_from_prediction(config: ModelConfig, prediction, noisy, a, s):
-    """x_0 from what the network predicts; a, s broadcast against noisy. epsilon at a = 0 says nothing: clamped."""
+    """Compute x_0 from the network's prediction; alpha and sigma broadcast against noisy.
+
+    An epsilon prediction at alpha = 0 says nothing about x_0, so alpha is clamped.
+    """
     if config.prediction == "x":
         return prediction
     if config.prediction == "v":  # v = a e - s x_0
@@ -35,19 +39,19 @@ DATA_VARIANCE = 0.25  # of encoded images (most pixels are background), as in Ka
 
 
 def input_scale(config: ModelConfig, a, s):
-    """Factor on x_t before the network: 1, or for "shrunk" that of the best linear estimate of x_0 from x_t."""
+    """Return the factor on the network's input x_t: 1, or for "shrunk" that of the best linear estimate of x_0."""
     if config.noisy_input == "unit":
         return 1.0
     return a * DATA_VARIANCE / (a * a * DATA_VARIANCE + s * s)
 
 
 def loss_weight(a: torch.Tensor, s: torch.Tensor, gamma: float, floor: float) -> torch.Tensor:
-    """Weight of the error of x_0: min-SNR (Hang et al. 2023) from above, floor from below."""
+    """Weight the error of x_0: min-SNR (Hang et al. 2023) from above, `floor` from below."""
     return (a * a / (s * s).clamp_min(1e-8)).clamp(max=gamma).clamp(min=floor)
 
 
 def timesteps(config: ModelConfig, steps: int) -> list[int]:
-    """Decreasing timesteps that start at the last one ("trailing", Lin et al. 2024)."""
+    """Return decreasing timesteps that start at the last one ("trailing", Lin et al. 2024)."""
     return [max(round(config.timesteps * (1 - i / steps)) - 1, 0) for i in range(steps)]
 
 
@@ -62,15 +66,15 @@ def sample(
 
     denoise(x, timestep, step index) -> predicted x_0. scheduler: "ddim" (Song et al. 2021, deterministic) or "dpm",
     DPM-Solver++(2M) (Lu et al. 2022, algorithm 2)."""
-    signal, deviation = signal_and_noise(config)
+    alpha, sigma = alpha_and_sigma(config)
     steps_at = timesteps(config, steps)
     x, before, last_width = noise, None, math.inf
     for i, t in enumerate(steps_at):
         clean = denoise(x, t, i)
         if i == len(steps_at) - 1:
             return clean
-        a, s = float(signal[t]), float(deviation[t])
-        a_next, s_next = float(signal[steps_at[i + 1]]), float(deviation[steps_at[i + 1]])
+        a, s = float(alpha[t]), float(sigma[t])
+        a_next, s_next = float(alpha[steps_at[i + 1]]), float(sigma[steps_at[i + 1]])
         direction, width = clean, math.inf
         if a > 1e-6:
             width = math.log(a_next / s_next) - math.log(a / s)  # half log-SNR

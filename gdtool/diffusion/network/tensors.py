@@ -1,4 +1,4 @@
-"""Tensors from safetensors files: checked, and never unpickled."""
+"""Read tensors from safetensors files: checked, and never unpickled."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ NO_MODEL = "give a model folder that gdtool train has written"
 
 
 def read_tensors(path: Path, cure: str = NO_MODEL) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    """Tensors and metadata of a safetensors file.
+    """Read the tensors and metadata of a safetensors file.
 
-    Raises InputError, with the cure where it is not there, when it is no regular file, is damaged or holds NaN or
-    infinity; ResourceError when it is larger than the memory."""
+    Raises InputError, with the cure where it does not exist, when it is no regular file, is damaged or holds NaN or
+    infinity; ResourceError when it is larger than the memory.
+    """
     from safetensors import SafetensorError, safe_open
 
     if not path.exists():
@@ -38,7 +39,7 @@ def read_tensors(path: Path, cure: str = NO_MODEL) -> tuple[dict[str, torch.Tens
     try:
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - the handle is no dict
     except (SafetensorError, OSError) as error:
         raise InputError(path, f"is not a whole safetensors file ({error})", "copy or train it again") from None
     for name, tensor in tensors.items():
@@ -54,8 +55,10 @@ def read_tensors(path: Path, cure: str = NO_MODEL) -> tuple[dict[str, torch.Tens
 
 
 def pretrained_part(config: ModelConfig, part: str) -> Path:
-    """The folder unet, vae or image_encoder of config.pretrained, a local folder or a hub id. Raises ResourceError
-    without huggingface_hub for a hub id, InputError where it has no safetensors."""
+    """Find the folder unet, vae or image_encoder of config.pretrained, a local folder or a hub id.
+
+    Raises ResourceError for a hub id without huggingface_hub, InputError where the folder has no safetensors.
+    """
     folder = Path(hub_folder(config.pretrained, config.revision))
     if not list((folder / part).glob("*.safetensors")):
         if folder == Path(config.pretrained):
@@ -74,8 +77,7 @@ def pretrained_part(config: ModelConfig, part: str) -> Path:
 
 
 def require_weights_fit(size: int, subject: object, what: str) -> None:
-    """Raise ResourceError when size bytes are more than all the memory that this process may have: what takes less may
-    still fit."""
+    """Raise ResourceError when `size` bytes are more than all the memory that this process may have."""
     most = memory.most_held() / memory.SHARE
     if size > most:
         raise ResourceError(

@@ -1,7 +1,7 @@
-"""The denoising network: Stable Diffusion's UNet, its transformers reading across views and domains.
+"""Define the denoising network: Stable Diffusion's UNet, with transformers that read across views and domains.
 
-Key names and arithmetic are those of diffusers' UNet2DConditionModel (version 1 family), own code because importing
-diffusers takes three seconds and its blocks do not know which images belong to one object.
+Key names and arithmetic are those of diffusers' UNet2DConditionModel (version 1 family). The code is not diffusers',
+because importing that takes three seconds and its blocks do not know which images belong to one object.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ import torch.nn.functional as F
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
-from gdtool.diffusion.config import CLASS_WIDTH, DOMAINS, ModelConfig
+from gdtool.core.kinds import DOMAINS
+from gdtool.diffusion.config import CLASS_WIDTH, ModelConfig
 from gdtool.diffusion.network.attention import Layout, RowAttention, Transformer
 from gdtool.diffusion.network.labels import WONDER3D_LABEL_WIDTH
 
 
 def sinusoid(t: torch.Tensor, width: int) -> torch.Tensor:
-    """(n,) timesteps -> (n, width): cosines, then sines, frequencies 10000^(-i / (width / 2))."""
+    """Embed timesteps (n,) as (n, width): cosines, then sines, frequencies 10000^(-i / (width / 2))."""
     half = width // 2
     frequency = torch.exp(-math.log(10000.0) * torch.arange(half, device=t.device, dtype=torch.float32) / half)
     angle = t.float()[:, None] * frequency
@@ -27,16 +28,21 @@ def sinusoid(t: torch.Tensor, width: int) -> torch.Tensor:
 
 
 class Embedding(nn.Module):
+    """Two-layer embedding of timesteps or class labels."""
+
     def __init__(self, inputs: int, width: int):
         super().__init__()
         self.linear_1 = nn.Linear(inputs, width)
         self.linear_2 = nn.Linear(width, width)
 
     def forward(self, x):
+        """Map (n, inputs) to (n, width)."""
         return self.linear_2(F.silu(self.linear_1(x)))
 
 
 class Resnet(nn.Module):
+    """Residual block of two convolutions, modulated by the embedding."""
+
     def __init__(self, inputs: int, outputs: int, embedding: int, groups: int, scale_shift: bool):
         super().__init__()
         self.norm1 = nn.GroupNorm(groups, inputs)
@@ -48,6 +54,7 @@ class Resnet(nn.Module):
         self.scale_shift = scale_shift
 
     def forward(self, x, embedding):
+        """Map x (n, inputs, h, w) with embedding (n, e) to (n, outputs, h, w)."""
         h = self.conv1(F.silu(self.norm1(x)))
         e = self.time_emb_proj(F.silu(embedding))[:, :, None, None]
         if self.scale_shift:
@@ -60,26 +67,33 @@ class Resnet(nn.Module):
 
 
 class Downsample(nn.Module):
+    """Halve the resolution by a strided convolution."""
+
     def __init__(self, width: int):
         super().__init__()
         self.conv = nn.Conv2d(width, width, 3, stride=2, padding=1)
 
     def forward(self, x):
+        """Map (n, c, h, w) to (n, c, h / 2, w / 2)."""
         return self.conv(x)
 
 
 class Upsample(nn.Module):
+    """Double the resolution by repetition and a convolution."""
+
     def __init__(self, width: int):
         super().__init__()
         self.conv = nn.Conv2d(width, width, 3, padding=1)
 
     def forward(self, x):
+        """Map (n, c, h, w) to (n, c, 2 h, 2 w)."""
         return self.conv(F.interpolate(x, scale_factor=2.0, mode="nearest"))
 
 
 class Block(nn.Module):
-    """Residual blocks with attention along rows and a transformer after each (or neither), then a change of resolution
-    (or none)."""
+    """Residual blocks, each followed by optional row attention and an optional transformer, then an optional
+    resampling.
+    """
 
     def __init__(
         self,
@@ -122,11 +136,7 @@ class Block(nn.Module):
 
 
 class UNet(nn.Module):
-    """Predicts, for every image of an object, what config.prediction says.
-
-    forward: noisy (n, c, h, w) latents and condition (n, e, h, w) latents, n = layout.images in the order (object,
-    domain, view); timestep (b,); label (n, CLASS_WIDTH); context (b, m, encoder_width) -> (n, c, h, w).
-    """
+    """Predict config.prediction for every image of an object."""
 
     def __init__(self, config: ModelConfig, latent_channels: int, condition_channels: int, side: int):
         super().__init__()
@@ -138,7 +148,7 @@ class UNet(nn.Module):
         self.class_embedding = Embedding(
             WONDER3D_LABEL_WIDTH if config.convention == "wonder3d" else CLASS_WIDTH, embedding
         )
-        common = dict(config=config, embedding=embedding)
+        common = {"config": config, "embedding": embedding}
         last = len(widths) - 1
         self.down_blocks, skips, previous = nn.ModuleList(), [width0], width0
         sides = [side >> i for i in range(len(widths))]
@@ -175,6 +185,11 @@ class UNet(nn.Module):
             nn.init.zeros_(self.conv_out.bias)
 
     def forward(self, noisy, condition, timestep, label, context, layout: Layout, view_idx=None):
+        """Predict (n, c, h, w) from latents noisy (n, c, h, w) and condition (n, e, h, w).
+
+        n = layout.images in the order (object, domain, view); timestep (b,); label (n, CLASS_WIDTH); context (b, m,
+        encoder_width). The arguments are those of diffusers' UNet, hence eight of them.
+        """
         per_object = len(layout.domains) * layout.views
         embedding = self.time_embedding(sinusoid(timestep, self.config.channels[0]))
         embedding = embedding.repeat_interleave(per_object, 0) + self.class_embedding(label)
@@ -203,7 +218,10 @@ class UNet(nn.Module):
         return out
 
     def _layer(self, block, j, x, embedding, context, layout):
+        """Run layer j of a block, checkpointed while training where the configuration asks for it."""
+
         def run(x, embedding, context):
+            """Run the layer's residual block and attentions."""
             x = block.resnets[j](x, embedding)
             if block.row_attentions:
                 x = block.row_attentions[j](x, layout)

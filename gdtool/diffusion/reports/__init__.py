@@ -1,0 +1,1 @@
+"""Report on models: model card, loss curve, validation images, cost plan and consistency figures."""

@@ -1,7 +1,7 @@
-"""Whether the views of one object fit one another: figures that need no truth.
+"""Measure whether the views of one object fit one another, without ground truth.
 
-Each domain says something that another one says too: the maps, lit, are the color; depth's slopes are the normals; a
-point seen by two cameras is one point.
+The domains overlap: the lit maps are the color, depth's slopes are the normals, and a point seen by two cameras is one
+point.
 """
 
 from __future__ import annotations
@@ -17,8 +17,11 @@ SEEN = 0.1  # a point this far behind what another view sees is hidden from it, 
 
 
 def consistency(views: Views) -> dict[str, float]:
-    """rerendered_psnr (dB), slope_degrees (median), reprojection_depth (median, world units), reprojection_share (of
-    points within 0.02)."""
+    """Compute rerendered_psnr (dB), slope_degrees (median), reprojection_depth (median, world units) and
+    reprojection_share.
+
+    The last is the share of points within 0.02.
+    """
     distance, share = reprojection(views)
     return {
         "rerendered_psnr": rerendered_psnr(views),
@@ -35,7 +38,7 @@ def rerendered_psnr(views: Views, count: int = 4000, seed: int = 0) -> float:
     figure is taken at other pixels. Closed form: shadows and reflections of the object in itself count as error."""
     import torch
 
-    from gdtool.fields.appearance.light import recover_light, unoccluded
+    from gdtool.fields.appearance.light import ShadedPoints, recover_light, unoccluded
     from gdtool.images.color import srgb_from_linear
     from gdtool.images.metrics import psnr
     from gdtool.shading.bsdf.closed_form import shade
@@ -54,19 +57,18 @@ def rerendered_psnr(views: Views, count: int = 4000, seed: int = 0) -> float:
     }
     toward = toward[inside][rows].astype(np.float32)
     fit, test = slice(0, len(rows) // 2), slice(len(rows) // 2, None)
-    args = [pick["normal"], toward, pick["color"], pick["albedo"], pick["roughness"], pick["metallic"]]
-    light, _ = recover_light(*(x[fit] for x in args), unoccluded(pick["normal"][fit]))
+    surface = [pick["normal"], toward, pick["albedo"], pick["roughness"], pick["metallic"]]
+    points = ShadedPoints(*(values[fit] for values in surface), unoccluded(pick["normal"][fit]))
+    light, _ = recover_light(points, pick["color"][fit])
     lobes = SphericalGaussians(
         *(torch.tensor(np.array(light[name]), dtype=torch.float32) for name in ("axes", "sharpness", "amplitudes"))
     )
-    n, v, c, a, r, m = (torch.from_numpy(x[test]) for x in args)
-    rendered = shade(n, v, a, r, m, lobes).clamp(0, 1).numpy()
-    return psnr(srgb_from_linear(rendered)[None], srgb_from_linear(np.clip(c.numpy(), 0, 1))[None])
+    rendered = shade(*(torch.from_numpy(values[test]) for values in surface), lobes).clamp(0, 1).numpy()
+    return psnr(srgb_from_linear(rendered)[None], srgb_from_linear(np.clip(pick["color"][test], 0, 1))[None])
 
 
 def slope_degrees(views: Views) -> float:
-    """Median angle in degrees between the normal and what depth's central differences make it, away from depth's
-    edges."""
+    """Measure the median degrees between the normals and depth's central differences, away from depth's edges."""
     angles = []
     for k, camera in enumerate(views.cameras):
         points = _points(camera, views.images["depth"][k])
@@ -85,12 +87,11 @@ def slope_degrees(views: Views) -> float:
 
 
 def reprojection(views: Views) -> tuple[float, float]:
-    """Points of each view seen by another: median distance along its axis to what it sees there, and the share within
-    0.02.
+    """Reproject each view's points into the others: median distance along the axis, and share within 0.02.
 
-    A point is left out where it lies behind the other view's surface by more than SEEN: hidden. One that falls on the
-    other view's background, or in front of its surface, is a contradiction: it counts with its distance, background as
-    SEEN."""
+    A point is left out where it lies behind the other view's surface by more than SEEN: it is hidden. A point on the
+    other view's background counts as SEEN; one in front of its surface counts with its distance.
+    """
     distances = []
     for i, camera in enumerate(views.cameras):
         inside = views.mask[i] > INSIDE
@@ -112,6 +113,6 @@ def reprojection(views: Views) -> tuple[float, float]:
 
 
 def _points(camera, depth: np.ndarray) -> np.ndarray:
-    """(h, w) depth along an orthographic camera's axis -> world points (h, w, 3)."""
+    """Convert depth (h, w) along an orthographic camera's axis to world points (h, w, 3)."""
     origins, directions = rays(camera)
     return origins + depth[..., None] * directions

@@ -1,4 +1,4 @@
-"""A loss curve without a plotting library: CSV to PNG."""
+"""Draw a loss curve from CSV to an image without a plotting library."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 
 def draw_curve(csv_path: Path, column: str = "loss", width: int = 640, height: int = 360) -> np.ndarray:
-    """Picture (height, width, 3) uint8 of a column of the CSV over its first column, logarithmic upward.
+    """Draw a column of the CSV over its first column, logarithmically, as (height, width, 3) uint8.
 
     Grey horizontal lines are powers of two, the light line single values, the dark line their running mean.
     """
-    with open(csv_path, newline="") as file:
+    with csv_path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     picture = np.full((height, width, 3), 255, np.uint8)
     values = np.array([float(row[column]) for row in rows if row[column]])
@@ -27,6 +27,7 @@ def draw_curve(csv_path: Path, column: str = "loss", width: int = 640, height: i
         smooth[i] = 0.95 * smooth[i - 1] + 0.05 * level[i]
 
     def row_of(y):
+        """Map log2 values to rows of the picture."""
         return np.clip(((high - y) / (high - low) * (height - 20) + 10).astype(int), 0, height - 1)
 
     for y in np.arange(low, high + 1):

@@ -1,8 +1,8 @@
-"""What a training will cost before it is run: memory and FLOPs of a step, and the time on one and on eight GPUs.
+"""Predict the cost of a training: memory and FLOPs of a step, and the time on one and on eight GPUs.
 
-Nothing is tabled but the GPUs: the network is built on PyTorch's meta device (shapes without numbers), a step is run
-there forward and backward, FLOPs are counted by torch.utils.flop_counter and memory by following every storage. So are
-the VAE's encoding, its decoding for the loss by rendering, and CLIP; the shading itself is run on a few numbers.
+Only the GPUs' figures are tabled. The network is built on PyTorch's meta device (shapes without numbers) and a step is
+run there forward and backward. FLOPs are counted by torch.utils.flop_counter, memory by following every storage. The
+VAE's encoding and decoding and CLIP are counted likewise; the shading itself is run on a few numbers.
 """
 
 from __future__ import annotations
@@ -15,14 +15,15 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from gdtool.diffusion.config import DOMAINS, ModelConfig, Phase, TrainConfig
+from gdtool.core.kinds import DOMAINS
+from gdtool.diffusion.config import ModelConfig, Phase, TrainConfig
 from gdtool.diffusion.network import attention
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.codec import CHUNK, VaeCodec
 from gdtool.diffusion.network.encoding import PLANES
 from gdtool.diffusion.network.model import Model, parameter_count, structure
-from gdtool.diffusion.network.schedule import signal_and_noise
-from gdtool.diffusion.training.losses import LIT, rendering_error, view_directions
+from gdtool.diffusion.network.schedule import alpha_and_sigma
+from gdtool.diffusion.training.losses import LIT, LitObject, rendering_error, view_directions
 
 # Dense bfloat16 peak in FLOP/s, memory in bytes, NVLink in bytes/s in one direction (NVIDIA's data sheets, SXM parts).
 GPUS = {"A100 80 GB": (312e12, 80e9, 300e9), "H100 80 GB": (989e12, 80e9, 450e9), "H200 141 GB": (989e12, 141e9, 450e9)}
@@ -34,7 +35,7 @@ GB = 1e9
 
 
 class LiveBytes(TorchDispatchMode):
-    """The most bytes that the results of operations, those of autograd among them, held at once."""
+    """Measure the peak of bytes held by results of operations, autograd's among them."""
 
     def __init__(self):
         super().__init__()
@@ -42,12 +43,13 @@ class LiveBytes(TorchDispatchMode):
         self.seen: dict[int, int] = {}
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        """Run an operation and count the storages that it makes."""
         out = function(*args, **(kwargs or {}))
-        given = {x.untyped_storage()._cdata for x in _tensors(args)}
+        inputs = {x.untyped_storage()._cdata for x in _tensors(args)}
         for x in _tensors(out):
             storage = x.untyped_storage()
             key, size = storage._cdata, storage.nbytes()
-            if key in given or key in self.seen:  # a view, or written in place
+            if key in inputs or key in self.seen:  # a view, or written in place
                 continue
             self.seen[key] = size
             self.live += size
@@ -56,23 +58,26 @@ class LiveBytes(TorchDispatchMode):
         return out
 
     def _freed(self, key: int) -> None:
+        """Subtract a freed storage."""
         self.live -= self.seen.pop(key, 0)
 
 
 def _tensors(x):
+    """Yield the tensors in nested lists and tuples."""
     if isinstance(x, torch.Tensor):
         yield x
     elif isinstance(x, list | tuple):
-        for one in x:
-            yield from _tensors(one)
+        for item in x:
+            yield from _tensors(item)
 
 
 @contextlib.contextmanager
 def fused_attention():
-    """Attention as GPUs compute it, without a matrix of weights in memory."""
+    """Replace attention by the GPUs' fused kernel, which holds no matrix of weights."""
     before = attention.attend
 
     def fused(q, k, v):
+        """Attend without a matrix of weights."""
         flat = (x.flatten(0, -4) for x in (q, k, v))
         return torch.ops.aten._scaled_dot_product_flash_attention(*flat)[0].view(*q.shape[:-1], v.shape[-1])
 
@@ -93,9 +98,9 @@ def step_cost(
     dtype=torch.bfloat16,
     device: str = "meta",
 ) -> dict[str, float]:
-    """FLOPs and peak bytes beyond the weights of one forward and backward pass over so many objects.
+    """Measure FLOPs and peak bytes beyond the weights of one forward and backward pass over so many objects.
 
-    fused: attention as on a GPU, else as attend() does it on this device. dtype: of what is computed.
+    fused: attention as on a GPU, else as attend() computes it on this device. dtype: of the computation.
     """
     # Two passes: the counter's own record of modules keeps tensors alive that checkpointing would have freed.
     counter, memory = FlopCounterMode(display=False), LiveBytes()
@@ -108,7 +113,10 @@ def step_cost(
 def _one_step(
     config: ModelConfig, domains: int, views: int, objects: int, fused: bool, dtype, device: str, watch
 ) -> Model:
-    """A forward and backward pass under `watch`; the model with its gradients."""
+    """Run a forward and backward pass under `watch`; returns the model with its gradients.
+
+    It has step_cost's parameters and one more, hence eight.
+    """
     model = structure(config, device).to(dtype).train()
     layout = Layout(objects, tuple(range(len(DOMAINS)))[:domains], views)
     view_idx = torch.arange(views)
@@ -119,7 +127,7 @@ def _one_step(
         rgba = torch.zeros(objects, 4, config.image_size, config.image_size, dtype=dtype)
         context = torch.zeros(objects, 1, config.encoder_width, dtype=dtype)
         model.labels, t = model.labels.to(dtype), torch.zeros(objects, dtype=torch.long)
-        model.signal, model.deviation = model.signal.to(dtype), model.deviation.to(dtype)
+        model.alpha, model.sigma = model.alpha.to(dtype), model.sigma.to(dtype)
     # sinusoid() computes in float32, which the weights here are not: what it gives is cast
     hook = model.unet.time_embedding.register_forward_pre_hook(lambda module, args: (args[0].to(dtype),))
     with fused_attention() if fused else contextlib.nullcontext(), watch:
@@ -132,10 +140,10 @@ def _one_step(
 
 
 def frozen_cost(config: ModelConfig) -> dict[str, float] | None:
-    """What the frozen VAE and CLIP cost; None without diffusers.
+    """Measure the cost of the frozen VAE and CLIP; None without diffusers.
 
-    FLOPs: encode and decode per image (decode with what a gradient through it takes), object for CLIP. Bytes:
-    encode_bytes and decode_bytes at once (they do not grow with the batch), weights_bytes in float32.
+    FLOPs: encode and decode per image (decode including its gradient), object for CLIP. Bytes: encode_bytes and
+    decode_bytes at once (they do not grow with the batch), weights_bytes in float32.
     """
     cost = dict.fromkeys(("encode", "decode", "object", "encode_bytes", "decode_bytes", "weights_bytes"), 0.0)
     try:
@@ -159,8 +167,7 @@ def frozen_cost(config: ModelConfig) -> dict[str, float] | None:
 
 
 def frozen_part(config: ModelConfig, part: str) -> torch.nn.Module:
-    """The vae or image_encoder that a local config.pretrained describes, else Stable Diffusion Image Variations',
-    without numbers."""
+    """Build, without numbers, the vae or image_encoder of a local config.pretrained, else Image Variations'."""
     from diffusers import AutoencoderKL
     from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
@@ -192,7 +199,7 @@ def frozen_part(config: ModelConfig, part: str) -> torch.nn.Module:
 
 
 def _counted(call) -> tuple[float, float]:
-    """FLOPs and peak bytes of a call."""
+    """Measure FLOPs and peak bytes of a call."""
     counter, memory = FlopCounterMode(display=False), LiveBytes()
     with counter:
         call()
@@ -202,19 +209,19 @@ def _counted(call) -> tuple[float, float]:
 
 
 def rendering_share(config: ModelConfig, train: TrainConfig, domains: int) -> float:
-    """Of the objects of a step, how many the loss by rendering sees on average."""
+    """Compute the share of a step's objects that the rendering loss sees on average."""
     lit = {DOMAINS.index(d) for d in LIT} <= {DOMAINS.index(d) for d in config.domains} and domains == len(
         config.domains
     )
     if not lit or train.pbr_weight == 0:
         return 0.0
-    signal, deviation = signal_and_noise(config)
-    near = (signal / deviation).square() > train.pbr_snr
+    alpha, sigma = alpha_and_sigma(config)
+    near = (alpha / sigma).square() > train.pbr_snr
     return float(near.float().mean()) * (1 - train.pure_noise) + train.pure_noise * float(near[-1])
 
 
 def shading_bytes(config: ModelConfig, train: TrainConfig, views: int) -> float:
-    """The most that the loss by rendering of one object holds, its decoded images among it."""
+    """Measure the peak bytes of the rendering loss of one object, its decoded images included."""
     shape = (len(LIT), views, 3, config.image_size, config.image_size)
     planes = torch.ones(views, PLANES["mask"].stop, *shape[-2:])
     lights = torch.tensor([[0.0, 0, 1, 1, 1, 1, 1]]).repeat(16, 1)
@@ -226,19 +233,18 @@ def shading_bytes(config: ModelConfig, train: TrainConfig, views: int) -> float:
             predicted,
             start,
             order,
-            planes,
-            lights,
-            view_directions(config)[:views],
-            train.pbr_pixels,
-            0.0,
-            torch.Generator(),
+            LitObject(planes=planes, lights=lights, views=view_directions(config)[:views], background=0.0),
+            pixels=train.pbr_pixels,
+            generator=torch.Generator(),
         ).backward()
     return float(memory.peak)
 
 
 def data_bytes(config: ModelConfig, domains: int, views: int) -> float:
-    """What one object of a step takes as data: its planes, their encoding, and clean, noise, noisy and condition
-    latents."""
+    """Compute the bytes of one object's data in a step.
+
+    These are its planes, their encoding, and the clean, noise, noisy and condition latents.
+    """
     codec = structure(config).codec
     pixels, latent = config.image_size**2, codec.side**2
     images = domains * views
@@ -250,7 +256,7 @@ def data_bytes(config: ModelConfig, domains: int, views: int) -> float:
 
 
 def plan_of(config: ModelConfig, train: TrainConfig) -> dict:
-    """The report of `gdtool train --plan`: weights, and for each phase FLOPs, memory and seconds of a step."""
+    """Build the report of `gdtool train --plan`: weights, and for each phase FLOPs, memory and seconds of a step."""
     weights = parameter_count(structure(config))
     frozen = frozen_cost(config)
     report: dict = {
@@ -265,13 +271,13 @@ def plan_of(config: ModelConfig, train: TrainConfig) -> dict:
     done, hours = 0.0, {(gpu, n): 0.0 for gpu in GPUS for n in (1, 8)}
     for phase in train.phases:
         steps, done = round((phase.share - done) * train.steps), phase.share
-        own = phase_cost(config, train, phase, frozen, weights)
-        report["phases"].append({"steps": steps, **own})
+        cost = phase_cost(config, train, phase, frozen, weights)
+        report["phases"].append({"steps": steps, **cost})
         for gpu, (peak, _, link) in GPUS.items():
             for n in (1, 8):
                 # Ring all-reduce of float32 gradients.
                 exchange = 0.0 if n == 1 else 2 * (n - 1) / n * weights * 4 / link
-                hours[gpu, n] += steps * (own["flops_per_step"] / (n * peak * UTILISATION) + exchange) / 3600
+                hours[gpu, n] += steps * (cost["flops_per_step"] / (n * peak * UTILISATION) + exchange) / 3600
     for gpu, (_, capacity, _) in GPUS.items():
         # each part of a batch is split over the GPUs
         fits = {
@@ -289,60 +295,64 @@ def plan_of(config: ModelConfig, train: TrainConfig) -> dict:
 def phase_cost(
     config: ModelConfig, train: TrainConfig, phase: Phase, frozen: dict | None, weights: int, *, fused: bool = True
 ) -> dict:
-    """FLOPs of a step of a phase, averaged over the timesteps, and the most bytes that one holds.
+    """Compute FLOPs of a step of a phase, averaged over the timesteps, and its peak bytes.
 
-    The loss by rendering is decoded and held for as many objects as have little noise: on average in FLOPs, all in
-    bytes."""
+    The rendering loss applies to objects with little noise: their average number counts in FLOPs, all of them in bytes.
+    """
     domains, views = min(phase.domains, len(config.domains)), min(phase.views, len(config.views))
     batch = phase.batch or train.batch
     part = -(-batch // train.accumulate)
     dtype = torch.bfloat16 if train.precision == "bfloat16" else torch.float32
-    one, two = (step_cost(config, domains, views, n, fused=fused, dtype=dtype) for n in (1, 2))
+    one_object, two_objects = (step_cost(config, domains, views, n, fused=fused, dtype=dtype) for n in (1, 2))
     # both are affine in the number of objects: measured at one and two, not assumed
-    flops, network = (one[key] + (two[key] - one[key]) * (part - 1) for key in ("flops", "bytes"))
+    flops, network = (one_object[key] + (two_objects[key] - one_object[key]) * (part - 1) for key in ("flops", "bytes"))
     share = rendering_share(config, train, domains)
     data = part * data_bytes(config, domains, views)
     rendering = part * shading_bytes(config, train, views) if share else 0.0
     conditions = 1 + (config.mirror_back and "back" in config.views)
-    own = frozen or dict.fromkeys(("encode", "decode", "object", "encode_bytes", "decode_bytes", "weights_bytes"), 0.0)
-    encoding = own["encode"] * (domains * views + conditions)
-    decoding = own["decode"] * share * len(LIT) * views
+    frozen_figures = frozen or dict.fromkeys(
+        ("encode", "decode", "object", "encode_bytes", "decode_bytes", "weights_bytes"), 0.0
+    )
+    encoding = frozen_figures["encode"] * (domains * views + conditions)
+    decoding = frozen_figures["decode"] * share * len(LIT) * views
     growing = data + network + rendering
-    held = max(data + own["encode_bytes"], growing + (own["decode_bytes"] if share else 0.0))
+    held = max(data + frozen_figures["encode_bytes"], growing + (frozen_figures["decode_bytes"] if share else 0.0))
     copies = weights * 2 if dtype == torch.bfloat16 else 0
     return {
         "domains": domains,
         "views": views,
         "batch": batch,
         "objects_at_once": part,
-        "flops_per_step": flops * batch / part + batch * (encoding + decoding + own["object"]),
+        "flops_per_step": flops * batch / part + batch * (encoding + decoding + frozen_figures["object"]),
         "vae_flops_per_step": batch * (encoding + decoding),
         "rendering_share": share,
         "rendering_bytes": rendering,
         "growing_bytes": growing,
         "activation_bytes": held,
-        "bytes": weights * BYTES_PER_WEIGHT + copies + own["weights_bytes"] + held,
+        "bytes": weights * BYTES_PER_WEIGHT + copies + frozen_figures["weights_bytes"] + held,
     }
 
 
 def text_of(report: dict) -> str:
-    """The report as lines for a terminal."""
+    """Format the report as lines for a terminal."""
     lines = [
-        f"{report['weights'] / 1e6:.1f} million weights: {report['weights_bytes'] / GB:.2f} GB with gradients, moments and average",
+        f"{report['weights'] / 1e6:.1f} million weights: {report['weights_bytes'] / GB:.2f} GB "
+        "with gradients, moments and average",
         "",
         "phase  steps    batch  at once  domains x views  PFLOP/step  activations  memory",
     ]
     for i, p in enumerate(report["phases"], 1):
         lines.append(
-            f"{i:5d}  {p['steps']:<7d}  {p['batch']:5d}  {p['objects_at_once']:7d}  {p['domains']:7d} x {p['views']:<5d}  "
+            f"{i:5d}  {p['steps']:<7d}  {p['batch']:5d}  {p['objects_at_once']:7d}  "
+            f"{p['domains']:7d} x {p['views']:<5d}  "
             f"{p['flops_per_step'] / 1e15:10.4g}  {p['activation_bytes'] / GB:8.2f} GB  {p['bytes'] / GB:6.2f} GB"
         )
     lines += ["", f"estimated at {report['utilisation']:.0%} of the peak in bfloat16:"]
     for gpu, row in report["hours"].items():
-        one, eight = (
+        one_gpu, eight_gpus = (
             f"{row[n]:8.1f} h{'' if row['fits'][n] else ' (does not fit: raise accumulate)'}" for n in ("1", "8")
         )
-        lines.append(f"{gpu:12s}  1 GPU {one}   8 GPUs {eight}")
+        lines.append(f"{gpu:12s}  1 GPU {one_gpu}   8 GPUs {eight_gpus}")
     if not report["frozen_parts_counted"]:
         lines.append("not counted: the frozen VAE and CLIP (pip install 'gdtool[hub]')")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""What a training run shows of itself: validation images and the model card."""
+"""Write a training run's validation images, validation.csv and model card."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ import msgspec
 import numpy as np
 import torch
 
-from gdtool.diffusion.config import DOMAINS, ModelConfig, TrainConfig
+from gdtool.core.kinds import DOMAINS
+from gdtool.diffusion.config import ModelConfig, TrainConfig
 from gdtool.diffusion.data.objects import Objects, from_bytes
-from gdtool.diffusion.inference.sampling import sample_images
+from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
 from gdtool.diffusion.network.encoding import BACKGROUND, encode
 
 
 def validation(state, objects: Objects, precision: str) -> tuple[np.ndarray, dict[str, float]]:
-    """A picture (h, w, 3) in [0, 1] and the PSNR in dB of each domain.
+    """Sample validation objects: a picture (h, w, 3) in [0, 1] and the PSNR in dB of each domain.
 
     The picture has a row per domain for each object: the condition, the true views and the sampled ones. PSNR is of the
-    encoded images, as the network has them (0 is grey), over all views but the front one, mean over views and objects.
-    Sampled in as many steps as the model asks for, four at most, by the averaged weights.
+    encoded images (0 is grey), over all views but the front one, mean over views and objects. Sampled by the averaged
+    weights in as many steps as the model asks for, four at most.
     """
     model, config = state.model, state.model.config
     device = next(model.parameters()).device
-    own = {name: p.detach().clone() for name, p in model.named_parameters()}
+    current = {name: p.detach().clone() for name, p in model.named_parameters()}
     model.load_state_dict({**model.state_dict(), **state.average})
     model.eval()
     rows, errors = [], []
@@ -35,7 +36,9 @@ def validation(state, objects: Objects, precision: str) -> tuple[np.ndarray, dic
     background = BACKGROUND[config.backgrounds[0]]
     for i in range(len(objects)):
         rgba = from_bytes(objects.conditions[i, i % objects.conditions.shape[1]])[None]
-        images = sample_images(model, rgba.to(device), steps=min(config.sampling_steps, 4), seed=i, precision=precision)
+        images = sample_images(
+            model, rgba.to(device), SamplingOptions(steps=min(config.sampling_steps, 4), seed=i, precision=precision)
+        )
         truth = encode(from_bytes(objects.planes[i])[None], indices, torch.tensor([background]))[0]
         sampled = torch.stack([images[d][0].float().cpu() for d in config.domains])
         errors.append(((sampled - truth)[:, unseen] / 2).square().mean((2, 3, 4)))
@@ -43,20 +46,22 @@ def validation(state, objects: Objects, precision: str) -> tuple[np.ndarray, dic
         shown = np.full((blocks[0].shape[0], config.image_size, 3), 0.5, np.float32)
         shown[: config.image_size] = (0.5 + 0.5 * rgba[0, :3].permute(1, 2, 0)).numpy()
         rows.append(np.concatenate([shown, *blocks], 1))
-    model.load_state_dict({**model.state_dict(), **own})
+    model.load_state_dict({**model.state_dict(), **current})
     model.train()
     psnr = -10 * torch.stack(errors).clamp(min=1e-10).log10().mean((0, 2))
     return np.clip(np.concatenate(rows, 0), 0, 1), dict(zip(config.domains, psnr.tolist(), strict=True))
 
 
 def append_validation(path: Path, step: int, seconds: float, psnr: dict[str, float]) -> None:
-    """Add a row to validation.csv, in place of those of this step and later ones: a resumed run writes them again."""
+    """Add a row to validation.csv; rows of this step and later ones are dropped, because a resumed run writes them
+    again.
+    """
     head = ["step", "seconds", *psnr]
     kept = []
     if path.is_file():
-        with open(path, newline="") as file:
+        with path.open(newline="") as file:
             kept = [row for row in csv.DictReader(file) if int(row["step"]) < step]
-    with open(path, "w", newline="") as file:
+    with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, head)
         writer.writeheader()
         writer.writerows(kept)
@@ -66,30 +71,27 @@ def append_validation(path: Path, step: int, seconds: float, psnr: dict[str, flo
 
 
 def _tile(images: torch.Tensor) -> np.ndarray:
-    """(d, k, 3, h, w) in [-1, 1] -> (d h, k w, 3) in [0, 1]"""
+    """Arrange (d, k, 3, h, w) in [-1, 1] as a picture (d h, k w, 3) in [0, 1]."""
     d, k, c, h, w = images.shape
     return (0.5 + 0.5 * images).permute(0, 3, 1, 4, 2).reshape(d * h, k * w, c).numpy()
 
 
 def machine() -> str:
-    model = (
-        next(
-            (line.split(":", 1)[1].strip() for line in open("/proc/cpuinfo") if line.startswith("model name")),
-            platform.processor(),
-        )
-        if os.path.exists("/proc/cpuinfo")
-        else platform.processor()
-    )
-    return f"{model}, {os.cpu_count()} cores"
+    """Name the processor and count its cores."""
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text().splitlines() if information.exists() else []
+    model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
+    return f"{model or platform.processor()}, {os.cpu_count()} cores"
 
 
 def card(preset: str, model: ModelConfig, train: TrainConfig, facts: dict) -> str:
-    """Model card in Markdown: what it is, what it was trained on and how, and the whole configuration."""
+    """Write the model card in Markdown: purpose, training data and procedure, and the whole configuration."""
     configuration = msgspec.json.format(msgspec.json.encode({"model": model, "train": train}), indent=1).decode()
     table = "\n".join(f"| {name.replace('_', ' ')} | {value} |" for name, value in facts.items())
     return f"""# Multi-view PBR diffusion model, preset {preset}
 
-One picture to {len(model.views)} orthographic views of {model.image_size} x {model.image_size} pixels in {len(model.domains)} domains
+One picture to {len(model.views)} orthographic views of {model.image_size} x {model.image_size} pixels in \
+{len(model.domains)} domains
 ({", ".join(model.domains)}). Trained by `gdtool train`; load it with `gdtool sample-views --model`.
 
 | | |
@@ -97,7 +99,8 @@ One picture to {len(model.views)} orthographic views of {model.image_size} x {mo
 {table}
 | machine | {machine()} |
 
-Weights are the exponential average, stored in half precision. `python benchmarks/model_quality.py --install` measures the
+Weights are the exponential average, stored in half precision. `python benchmarks/model_quality.py --install` \
+measures the
 model on held-out objects, adds the table below and makes it the bundled one.
 
 ## Configuration

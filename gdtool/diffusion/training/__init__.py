@@ -1,0 +1,1 @@
+"""Train the model: loop, losses, optimisers, distribution over processes and logs."""

@@ -1,10 +1,10 @@
-"""Several processes, started by torchrun: who does which part of a batch, and what they agree on.
+"""Split training over several processes that torchrun starts.
 
     torchrun --nproc_per_node 8 -m -- gdtool train objects --preset paper --device cuda -o my-model
 
-PyTorch's own engine does the work: DistributedDataParallel, or with GDTOOL_SHARD=1 fully_shard (FSDP2), which splits
-weights, gradients and moments. With one process every function here is the identity. The first process alone runs the
-stage and writes; the others follow() it and see the same data through the memory-mapped arrays in its workspace.
+PyTorch's DistributedDataParallel does the work, or with GDTOOL_SHARD=1 fully_shard (FSDP2), which splits weights,
+gradients and moments. With one process every function here is the identity. The first process alone runs the stage and
+writes. The others follow() it and see the same data through the memory-mapped arrays in its workspace.
 """
 
 from __future__ import annotations
@@ -27,10 +27,12 @@ PATIENCE = timedelta(days=2)
 
 
 def size() -> int:
+    """Return the number of processes."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
 def rank() -> int:
+    """Return this process's number; 0 is the first."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 
@@ -43,17 +45,18 @@ def start() -> None:
 
 
 def send(order: Any) -> None:
-    """The first process tells the others what to run; None: nothing."""
+    """Send an order from the first process to the others; None for no work."""
     if size() > 1:
         dist.broadcast_object_list([order], src=0)
 
 
 def leave() -> None:
-    """End this process, and as the first one the others, whether they were given work or wait for it still. With one
-    process nothing; with several it does not return.
+    """End this process, and as the first one the others, whether they have work or still wait. Does nothing in a single
+    process; does not return in one of several.
 
-    It leaves without the interpreter's own end: DDP keeps the group's threads alive, and one of them that lets go of
-    its last tensor while the interpreter ends aborts the process (pytorch/pytorch#179291; seen once in 40 runs)."""
+    It skips the interpreter's shutdown: DDP keeps the group's threads alive, and one of them that drops its last tensor
+    during shutdown aborts the process (pytorch/pytorch#179291; seen once in 40 runs).
+    """
     if int(os.environ.get("WORLD_SIZE", "1")) < 2:
         return
     if not dist.is_initialized():
@@ -66,7 +69,7 @@ def leave() -> None:
 
 
 def receive() -> Any:
-    """What the first process sends."""
+    """Wait for the first process's order."""
     start()
     order = [None]
     dist.broadcast_object_list(order, src=0)
@@ -74,23 +77,24 @@ def receive() -> Any:
 
 
 def share_of(part: np.ndarray) -> np.ndarray:
-    """This process's part of an array."""
+    """Return this process's part of an array."""
     return np.array_split(part, size())[rank()]
 
 
 def total(figures: dict[str, float]) -> dict[str, float]:
-    """Sums over all processes; they may know different names."""
+    """Sum figures by name over all processes; they may have different names."""
     if size() == 1:
         return figures
     every: list = [None] * size()
     dist.all_gather_object(every, figures)
     return {
-        name: sum(one.get(name, 0.0) for one in every) for name in dict.fromkeys(name for one in every for name in one)
+        name: sum(summand.get(name, 0.0) for summand in every)
+        for name in dict.fromkeys(name for summand in every for name in summand)
     }
 
 
 def wrap(objective: nn.Module) -> nn.Module:
-    """objective for all processes: DDP, or its model's layers sharded by FSDP2. As it is with one process."""
+    """Wrap the objective for all processes: DDP, or its model's layers sharded by FSDP2; unchanged with one process."""
     if size() == 1:
         return objective
     if os.environ.get("GDTOOL_SHARD") == "1":
@@ -108,18 +112,19 @@ def wrap(objective: nn.Module) -> nn.Module:
 
 
 def synchronised(objective: nn.Module, last: bool):
-    """Gradients are exchanged after the last part of a batch only."""
+    """Return a context in which gradients are exchanged only after the last part of a batch."""
     if isinstance(objective, nn.parallel.DistributedDataParallel) and not last:
         return objective.no_sync()
     return contextlib.nullcontext()
 
 
 def is_sharded(model: nn.Module) -> bool:
+    """Tell whether FSDP2 has split the model's parameters."""
     return any(hasattr(p, "full_tensor") for p in model.parameters())
 
 
 def local(x: torch.Tensor, whole: bool = False) -> torch.Tensor:
-    """This process's part of a tensor (whole: all of it), without its history."""
+    """Return this process's part of a tensor (whole: all of it), detached."""
     x = x.detach()
     if not hasattr(x, "to_local"):
         return x
@@ -127,8 +132,10 @@ def local(x: torch.Tensor, whole: bool = False) -> torch.Tensor:
 
 
 def whole(x: torch.Tensor, like: torch.Tensor | None = None) -> torch.Tensor:
-    """All of a tensor of which each process holds a part, itself or as its local part (then like says how it is
-    split)."""
+    """Gather a tensor that is split over processes.
+
+    x is a DTensor, or the local part of one that is split as `like` is.
+    """
     if like is not None and hasattr(like, "full_tensor") and not hasattr(x, "full_tensor"):
         from torch.distributed.tensor import DTensor
 
@@ -137,7 +144,7 @@ def whole(x: torch.Tensor, like: torch.Tensor | None = None) -> torch.Tensor:
 
 
 def sharded(x: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
-    """A whole tensor as `like` is split."""
+    """Split a whole tensor as `like` is split."""
     if not hasattr(like, "full_tensor"):
         return x
     from torch.distributed.tensor import distribute_tensor
@@ -146,15 +153,17 @@ def sharded(x: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
 
 
 def gathered(state):
-    """state with whole weights and averages, for writing and for validation; every process takes part. state stays as
-    it is."""
+    """Return state with gathered weights and averages, for writing and validation; every process takes part.
+
+    state itself is not changed.
+    """
     if not is_sharded(state.model):
         return state
     from gdtool.diffusion.network.model import Model
 
-    own = dict(state.model.named_parameters())
-    average = {name: whole(x, own[name]) for name, x in state.average.items()}
-    weights = {name: whole(p.detach()) for name, p in own.items()}
+    parameters = dict(state.model.named_parameters())
+    average = {name: whole(x, parameters[name]) for name, x in state.average.items()}
+    weights = {name: whole(p.detach()) for name, p in parameters.items()}
     config = state.model.config
     encoder = state.model.encoder if config.encoder == "clip" else None  # frozen, and so not split
     model = Model(config, state.model.codec, encoder).to(next(iter(weights.values())).device).train()

@@ -1,9 +1,9 @@
-"""The training loop, top to bottom: draw, noise, predict, compare, step, average, write down.
+"""Run the training loop: draw, add noise, predict, compare, step, average, log.
 
-A run is a pure function of data, configuration and seed: each step's choices come from (seed, step) and those of each
-of its objects from (seed, step, place in the batch), so that it does not matter how a batch is split over accumulations
-and processes; a checkpoint holds all else (weights, their average, the optimiser's moments), so that a resumed run is
-bit for bit the unbroken one. Several processes: torchrun starts them, distributed.py holds what they do differently.
+A run is a pure function of data, configuration and seed. Each step's choices come from (seed, step) and those of each
+of its objects from (seed, step, place in the batch), so that the split of a batch over accumulations and processes does
+not matter. A checkpoint holds the rest (weights, their average, the optimiser's moments), so that a resumed run equals
+the unbroken one bit for bit. distributed.py holds what several processes do differently.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ import numpy as np
 import torch
 
 from gdtool.core.errors import InputError
+from gdtool.core.kinds import DOMAINS
 from gdtool.core.reading import parse_json
-from gdtool.diffusion.config import DOMAINS, ModelConfig, Phase, TrainConfig
+from gdtool.diffusion.config import ModelConfig, Phase, TrainConfig
 from gdtool.diffusion.data.objects import Batch, Objects, draw, object_order
 from gdtool.diffusion.inference.sampling import precision_context
 from gdtool.diffusion.network.attention import Layout
@@ -33,7 +34,7 @@ from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.network.schedule import loss_weight
 from gdtool.diffusion.network.tensors import read_tensors
 from gdtool.diffusion.training import distributed
-from gdtool.diffusion.training.losses import LIT, image_error, rendering_error, view_directions
+from gdtool.diffusion.training.losses import LIT, LitObject, image_error, rendering_error, view_directions
 from gdtool.diffusion.training.optimizer import MOMENTS, make_optimizer, restore_moments
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -42,7 +43,7 @@ MOST_SKIPPED = 10  # steps in a row with a gradient that is not finite: the run 
 
 @dataclass
 class State:
-    """Everything that changes while training."""
+    """Hold everything that changes while training."""
 
     model: Model
     optimizer: Any  # torch.optim.Optimizer, or what is as one: optimizer.py
@@ -55,7 +56,7 @@ class State:
 
 @dataclass(frozen=True)
 class Step:
-    """The random choices of one step that all its objects share, and what its objects draw theirs from."""
+    """Hold the random choices of one step that all its objects share, and the seeds of each object's."""
 
     domains: tuple[int, ...]
     views: torch.Tensor
@@ -63,24 +64,25 @@ class Step:
     number: int
 
     def choices(self, place: int) -> tuple[np.random.Generator, torch.Generator]:
-        """The generators of the object at this place of the step's batch."""
+        """Return the generators of the object at this place of the step's batch."""
         choices = np.random.default_rng((self.seed, 3, self.number, place))
         return choices, torch.Generator().manual_seed(int(choices.integers(2**62)))
 
 
 class Objective(torch.nn.Module):
-    """losses() as a module: what DDP and FSDP wrap, so that their hooks see the forward pass."""
+    """Wrap losses() as a module, so that the hooks of DDP and FSDP see the forward pass."""
 
     def __init__(self, model: Model, train: TrainConfig):
         super().__init__()
         self.model, self.train_config = model, train
 
     def forward(self, batch: Batch, step: Step, generators: list[torch.Generator]) -> dict[str, torch.Tensor]:
+        """Compute the losses of a micro-batch by name."""
         return losses(self.model, batch, step, generators, self.train_config)
 
 
 def new_state(model: Model, train: TrainConfig) -> State:
-    """The state before the first step; wrapped for all processes."""
+    """Create the state before the first step; wrapped for all processes."""
     objective = distributed.wrap(Objective(model, train))
     optimizer = make_optimizer(model, train)
     average = {name: distributed.local(p).clone() for name, p in model.named_parameters()}
@@ -88,29 +90,31 @@ def new_state(model: Model, train: TrainConfig) -> State:
 
 
 def progress_of(state: State, train: TrainConfig, minutes: float | None) -> float:
-    """How much of the run is over, 0…1: by steps, or by minutes where those are given and sooner spent."""
+    """Return the share of the run that is over, 0…1: by steps, or by minutes where those are given and spent sooner."""
     return min(max(state.step / train.steps, state.seconds / 60 / minutes if minutes else 0.0), 1.0)
 
 
 def phase_at(progress: float, train: TrainConfig) -> Phase:
+    """Return the phase at this progress."""
     return next((phase for phase in train.phases if progress < phase.share), train.phases[-1])
 
 
 def learning_rate(state: State, progress: float, train: TrainConfig) -> float:
+    """Return the learning rate: warm-up, the phase's rate, and cosine decay where configured."""
     rate = phase_at(progress, train).learning_rate * min((state.step + 1) / train.warmup, 1.0)
     return rate * (0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * progress))) if train.decay else rate
 
 
 def choose(config: ModelConfig, phase: Phase, seed: int, step: int) -> Step:
-    """Which domains and views a step sees: color always where it is primary and more than one domain is drawn."""
+    """Choose a step's domains and views; color always where it is primary and more than one domain is drawn."""
     choices = np.random.default_rng((seed, 2, step))
-    own = [DOMAINS.index(d) for d in config.domains]
-    if phase.domains >= len(own):
-        domains = tuple(own)
+    modelled = [DOMAINS.index(d) for d in config.domains]
+    if phase.domains >= len(modelled):
+        domains = tuple(modelled)
     elif phase.domains == 1 or config.cross_domain == "none":
-        domains = tuple(sorted(choices.permutation(own)[: phase.domains].tolist()))
+        domains = tuple(sorted(choices.permutation(modelled)[: phase.domains].tolist()))
     else:
-        domains = (0, *sorted(choices.permutation(own[1:])[: phase.domains - 1].tolist()))
+        domains = (0, *sorted(choices.permutation(modelled[1:])[: phase.domains - 1].tolist()))
     views = torch.from_numpy(np.sort(choices.permutation(len(config.views))[: phase.views]))
     return Step(domains, views, seed, step)
 
@@ -118,9 +122,9 @@ def choose(config: ModelConfig, phase: Phase, seed: int, step: int) -> Step:
 def losses(
     model: Model, batch: Batch, step: Step, generators: list[torch.Generator], train: TrainConfig
 ) -> dict[str, torch.Tensor]:
-    """The objective of one micro-batch and its parts by name; every figure is a mean over its objects.
+    """Compute the objective of one micro-batch and its parts by name; every figure is a mean over its objects.
 
-    generators: one for each object, from which all that is random about it comes.
+    generators: one for each object, the source of all that is random about it.
     """
     config, b, device = model.config, len(batch.planes), batch.planes.device
     layout = Layout(b, step.domains, len(step.views))
@@ -154,11 +158,11 @@ def losses(
         predicted = model.predict_clean(noisy, condition, t, context, layout, step.views)
 
     counted, square = image_error(predicted, clean, b, step.domains, config, train)  # (b, d) each
-    weight = loss_weight(model.signal[t], model.deviation[t], train.snr_gamma, train.snr_floor)
+    weight = loss_weight(model.alpha[t], model.sigma[t], train.snr_gamma, train.snr_floor)
     total = (weight[:, None] * counted).mean()
     parts = {DOMAINS[i]: square[:, j].mean().detach() for j, i in enumerate(step.domains)}
 
-    snr = (model.signal[t] / model.deviation[t]).square()
+    snr = (model.alpha[t] / model.sigma[t]).square()
     near = torch.nonzero(snr > train.pbr_snr).flatten()
     if train.pbr_weight > 0 and len(near) and {1, 3, 4, 5} <= set(step.domains):
         # decoded and shaded: what light is computed from, of the objects that it is computed for
@@ -173,12 +177,9 @@ def losses(
                 images,
                 truth[i][lit],
                 order,
-                planes[i],
-                batch.lights[i],
-                directions,
-                train.pbr_pixels,
-                float(background[i]),
-                generators[i],
+                LitObject(planes=planes[i], lights=batch.lights[i], views=directions, background=float(background[i])),
+                pixels=train.pbr_pixels,
+                generator=generators[i],
             )
             rendered.append(snr[i].clamp(max=train.snr_gamma) * error)
         parts["rendering"] = (torch.stack(rendered).sum() / b).detach()
@@ -189,7 +190,7 @@ def losses(
 def train_step(
     state: State, objects: Objects, train: TrainConfig, seed: int, minutes: float | None, device: str
 ) -> dict[str, float]:
-    """One optimiser step over the phase's objects in `accumulate` parts; updates state."""
+    """Take one optimiser step over the phase's objects in `accumulate` parts; updates state."""
     config, progress = state.model.config, progress_of(state, train, minutes)
     phase = phase_at(progress, train)
     step = choose(config, phase, seed, state.step)
@@ -227,8 +228,8 @@ def train_step(
     state.step += 1
     keep = min(train.ema, (1 + state.step) / (10 + state.step))
     names = list(state.average)
-    own = {name: distributed.local(p) for name, p in state.model.named_parameters()}
-    torch._foreach_lerp_([state.average[n] for n in names], [own[n] for n in names], 1 - keep)
+    weights = {name: distributed.local(p) for name, p in state.model.named_parameters()}
+    torch._foreach_lerp_([state.average[n] for n in names], [weights[n] for n in names], 1 - keep)
     return {"step": state.step, "rate": rate, "norm": float(norm), "skipped": int(not finite), **sums}
 
 
@@ -248,11 +249,11 @@ def save_checkpoint(state: State, workspace: Path, identity: str) -> None:
     record = json.dumps({"step": state.step, "seconds": state.seconds, "identity": identity})
     partial = workspace / f".{CHECKPOINT}.partial"
     save_file(tensors, str(partial), metadata={"state": record})
-    os.replace(partial, workspace / CHECKPOINT)
+    partial.replace(workspace / CHECKPOINT)
 
 
 def load_checkpoint(state: State, workspace: Path, identity: str) -> bool:
-    """Bring state to the workspace's checkpoint, if there is one. Raises InputError when it belongs to another run."""
+    """Restore state from the workspace's checkpoint, if any. Raises InputError when it belongs to another run."""
     path = workspace / CHECKPOINT
     if not path.is_file():
         return False
@@ -281,7 +282,7 @@ def load_checkpoint(state: State, workspace: Path, identity: str) -> bool:
 
 
 def _record(metadata: dict[str, str], path: Path) -> dict[str, Any]:
-    """The step, seconds and identity in a checkpoint's metadata. Raises InputError where they are not there."""
+    """Parse the step, seconds and identity in a checkpoint's metadata. Raises InputError where they are missing."""
     try:
         return msgspec.to_builtins(msgspec.convert(parse_json(metadata.get("state", ""), path), _Record))
     except msgspec.ValidationError as error:
@@ -291,9 +292,32 @@ def _record(metadata: dict[str, str], path: Path) -> dict[str, Any]:
 
 
 class _Record(msgspec.Struct, forbid_unknown_fields=True):
+    """Describe a checkpoint's metadata."""
+
     step: Annotated[int, msgspec.Meta(ge=0)]
     seconds: Annotated[float, msgspec.Meta(ge=0)]
     identity: str
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Set a run: seed, limit in minutes, steps between checkpoints and between validations, device."""
+
+    seed: int
+    minutes: float | None = None
+    checkpoint_every: int = 200
+    validate_every: int = 1000
+    device: str = "cpu"
+
+
+@dataclass(frozen=True)
+class Observers:
+    """Hold the functions that a run reports to: validation, warnings, log rows and a progress bar."""
+
+    validate: Callable[[State], None] = lambda state: None
+    warn: Callable[[str], None] = lambda message: None
+    log: Callable[[dict], None] = lambda record: None
+    progress: Callable = lambda iterable, total, label: iterable
 
 
 def run_training(
@@ -301,51 +325,42 @@ def run_training(
     objects: Objects,
     train: TrainConfig,
     workspace: Path,
-    *,
-    seed: int,
-    minutes: float | None = None,
-    checkpoint_every: int = 200,
-    validate_every: int = 1000,
-    validate: Callable[[State], None] = lambda state: None,
-    device: str = "cpu",
-    warn: Callable[[str], None] = lambda message: None,
-    log: Callable[[dict], None] = lambda record: None,
-    progress=lambda iterable, total, label: iterable,
+    options: RunOptions,
+    observers: Observers = Observers(),
 ) -> State:
-    """Train until the steps or the minutes are spent; resumes from workspace. The first process writes
-    workspace/loss.csv, and gives each of its rows to log.
+    """Train until the steps or the minutes are spent, resuming from workspace.
 
-    Raises InputError when MOST_SKIPPED steps in a row had a gradient that is not finite; before that warns of each.
+    The first process writes workspace/loss.csv and passes each of its rows to log. Raises InputError when MOST_SKIPPED
+    steps in a row had a gradient that is not finite; before that it warns of each.
     """
-    identity = msgspec.json.encode([model.config, train, seed, len(objects)]).decode()
-    torch.manual_seed(seed)
-    state = new_state(model.to(device).train(), train)
-    state.average = {name: x.to(device) for name, x in state.average.items()}
+    identity = msgspec.json.encode([model.config, train, options.seed, len(objects)]).decode()
+    torch.manual_seed(options.seed)
+    state = new_state(model.to(options.device).train(), train)
+    state.average = {name: x.to(options.device) for name, x in state.average.items()}
     resumed = load_checkpoint(state, workspace, identity)
     log_path = workspace / "loss.csv"
-    with open(
-        log_path if distributed.rank() == 0 else os.devnull, "r+" if resumed and log_path.is_file() else "w", newline=""
-    ) as file:
+    target = log_path if distributed.rank() == 0 else Path(os.devnull)
+    with target.open("r+" if resumed and log_path.is_file() else "w", newline="") as file:
         writer = _continued(file, state.step if resumed else 0, model.config.domains)
-        bar = iter(progress(range(state.step, train.steps), train.steps, "training"))
-        while progress_of(state, train, minutes) < 1:
+        bar = iter(observers.progress(range(state.step, train.steps), train.steps, "training"))
+        while progress_of(state, train, options.minutes) < 1:
             start = time.perf_counter()
-            record = train_step(state, objects, train, seed, minutes, device)
+            record = train_step(state, objects, train, options.seed, options.minutes, options.device)
             state.seconds += distributed.total({"s": time.perf_counter() - start})["s"] / distributed.size()
             writer.writerow(
                 {k: (f"{v:.6g}" if isinstance(v, float) else v) for k, v in record.items()}
                 | {"seconds": f"{state.seconds:.1f}"}
             )
             file.flush()
-            log(record)
-            _tell_skipped(state, warn)
+            observers.log(record)
+            _tell_skipped(state, observers.warn)
             next(bar, None)
-            if state.step % checkpoint_every == 0:
+            if state.step % options.checkpoint_every == 0:
                 save_checkpoint(state, workspace, identity)
-            if state.step % validate_every == 0:
+            if state.step % options.validate_every == 0:
                 whole = distributed.gathered(state)
                 if distributed.rank() == 0:
-                    validate(whole)
+                    observers.validate(whole)
         for _ in bar:
             break
     save_checkpoint(state, workspace, identity)
@@ -353,6 +368,7 @@ def run_training(
 
 
 def _tell_skipped(state: State, warn: Callable[[str], None]) -> None:
+    """Warn of a skipped step. Raises InputError after MOST_SKIPPED in a row."""
     if state.skipped >= MOST_SKIPPED:
         raise InputError(
             "training",
@@ -364,7 +380,7 @@ def _tell_skipped(state: State, warn: Callable[[str], None]) -> None:
 
 
 def _continued(file, step: int, domains: tuple[str, ...]) -> csv.DictWriter:
-    """A writer of the log that keeps the rows up to step; rows after a checkpoint will be written again."""
+    """Create a writer of the log that keeps the rows up to step; rows after a checkpoint will be written again."""
     columns = ["step", "seconds", "loss", "rate", "norm", "skipped", *domains, "rendering"]
     kept = [row for row in csv.DictReader(file) if int(row["step"]) <= step] if step else []
     file.seek(0)

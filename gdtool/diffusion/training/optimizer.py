@@ -1,4 +1,4 @@
-"""AdamW for all weights, or Muon for the matrices inside the network and AdamW for the rest."""
+"""Create the optimiser: AdamW for all weights, or Muon for inner matrices and AdamW for the rest."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ SMALLEST = 32  # rows and columns below which a matrix is left to AdamW
 
 
 class MuonAndAdam:
-    """torch.optim.Muon (Jordan et al. 2024) and AdamW as one optimiser; a convolution is the matrix (outputs, inputs ·
-    taps).
+    """Combine torch.optim.Muon (Jordan et al. 2024) and AdamW in one optimiser.
 
-    Muon's step is scaled to AdamW's usual size, so both go by one learning rate. state maps the network's own
-    parameters to their moments, as every optimiser's does.
+    A convolution is the matrix (outputs, inputs · taps). Muon's step is scaled to AdamW's usual size, so one learning
+    rate serves both. state maps the network's parameters to their moments, as every optimiser's does.
     """
 
     def __init__(self, matrices: list, rest: list[dict], train: TrainConfig):
@@ -37,34 +36,40 @@ class MuonAndAdam:
 
     @property
     def state(self) -> dict:
-        own = {
+        """Map parameters to moments."""
+        matrix_state = {
             p: self.muon.state[flat]
             for p, flat in zip(self.matrices, self.flat, strict=True)
             if flat in self.muon.state
         }
-        return {**self.adam.state, **own}
+        return {**self.adam.state, **matrix_state}
 
     def restore(self, p: torch.Tensor, moments: dict[str, torch.Tensor]) -> None:
-        for one, flat in zip(self.matrices, self.flat, strict=True):
-            if one is p:
+        """Put back a parameter's moments."""
+        for matrix, flat in zip(self.matrices, self.flat, strict=True):
+            if matrix is p:
                 self.muon.state[flat] = moments
                 return
         self.adam.state[p] = moments
 
     def step(self) -> None:
+        """Take one step of both optimisers."""
         for p, flat in zip(self.matrices, self.flat, strict=True):
             flat.grad = None if p.grad is None else p.grad.reshape(flat.shape)
         self.muon.step()
         self.adam.step()
 
     def zero_grad(self, set_to_none: bool = True) -> None:
+        """Clear all gradients."""
         for p in (*self.matrices, *self.flat):
             p.grad = None
         self.adam.zero_grad(set_to_none=set_to_none)
 
 
 def make_optimizer(model: torch.nn.Module, train: TrainConfig):
-    """The configuration's optimiser: matrices decay, vectors do not; the class embedding has its own learning rate."""
+    """Create the configured optimiser: matrices decay, vectors do not; the class embedding has a separate learning
+    rate.
+    """
     groups: dict[tuple[bool, float], list] = {}
     matrices = []
     for name, p in model.named_parameters():
@@ -94,7 +99,7 @@ def make_optimizer(model: torch.nn.Module, train: TrainConfig):
 
 
 def restore_moments(optimizer, p: torch.Tensor, moments: dict[str, torch.Tensor]) -> None:
-    """Put a parameter's moments, as `optimizer.state[p]` had them, back."""
+    """Put back a parameter's moments, as they were in `optimizer.state[p]`."""
     if isinstance(optimizer, MuonAndAdam):
         optimizer.restore(p, moments)
     else:

@@ -1,5 +1,4 @@
-"""A training's figures and validation pictures as TensorBoard's event files, for those who watch several runs at
-once."""
+"""Write a training's figures and validation pictures as TensorBoard event files."""
 
 from __future__ import annotations
 
@@ -13,8 +12,7 @@ if TYPE_CHECKING:
 
 
 class Events:
-    """Event files in a folder, written from the first record on. Raises ResourceError without the package
-    tensorboard."""
+    """Write event files to a folder, from the first record on. Raises ResourceError without the package tensorboard."""
 
     def __init__(self, folder: Path):
         try:
@@ -26,22 +24,24 @@ class Events:
         self._open, self._folder, self._writer = SummaryWriter, folder, None
 
     def _at(self, step: int):
+        """Return the writer, opened at its first step."""
         # A resumed run goes over the steps since its checkpoint again: those of before are purged.
         if self._writer is None:
             self._writer = self._open(str(self._folder), purge_step=step, flush_secs=10)
         return self._writer
 
     def scalars(self, record: dict[str, float | int]) -> None:
-        """The numbers of a step's record, under their names in loss.csv."""
+        """Add the numbers of a step's record, under their names in loss.csv."""
         step = int(record["step"])
         for name, value in record.items():
             if name != "step":
                 self._at(step).add_scalar(name, value, step)
 
     def picture(self, step: int, grid: np.ndarray) -> None:
-        """A validation picture (h, w, 3) uint8."""
+        """Add a validation picture (h, w, 3) uint8."""
         self._at(step).add_image("validation", grid, step, dataformats="HWC")
 
     def close(self) -> None:
+        """Close the files."""
         if self._writer is not None:
             self._writer.close()

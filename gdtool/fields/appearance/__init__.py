@@ -1,0 +1,1 @@
+"""Fuse materials on the vertices of a surface and recover the light that explains its color."""

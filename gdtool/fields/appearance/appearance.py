@@ -1,4 +1,4 @@
-"""Materials, confidence and light of a reconstructed surface, from whatever the views hold."""
+"""Compute materials, confidence and light of a reconstructed surface from whatever domains the views hold."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ import numpy as np
 from gdtool.fields.appearance.materials import confidence, fuse, observe, spread
 
 MATERIALS = ("albedo", "roughness", "metallic")
+LEAST_SAMPLES = 64  # pixels of color below which no light is solved for
 
 
 @dataclass
 class Appearance:
-    """albedo (v, 3), roughness, metallic, confidence (v,); views (v,) uint8 and residual (v,) as of a Surface; light:
-    record of light.json or None; figures; what was skipped."""
+    """Hold what was found at the v vertices, and the light.
+
+    albedo (v, 3), roughness, metallic, confidence (v,); views (v,) uint8 and residual (v,) as in a Surface; light:
+    record of light.json or None; figures by name; skipped: pairs of a step and the reason it was skipped.
+    """
 
     albedo: np.ndarray
     roughness: np.ndarray
@@ -27,6 +31,20 @@ class Appearance:
     skipped: list[tuple[str, str]] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class AppearanceOptions:
+    """Set how materials and light are found.
+
+    step: world units between the vertices, about. light: record of a known light, if any. shadows: whether the surface
+    occludes the light in the explanation of color.
+    """
+
+    step: float
+    light: dict | None = None
+    seed: int = 0
+    shadows: bool = True
+
+
 def appearance(
     cameras,
     mask: np.ndarray,
@@ -34,16 +52,11 @@ def appearance(
     vertices: np.ndarray,
     faces: np.ndarray,
     normals: np.ndarray,
-    step: float,
-    light: dict | None,
-    seed: int,
-    shadows: bool = True,
+    options: AppearanceOptions,
 ) -> Appearance:
-    """Fuse the material views; recover the light from color; take from color what no material view gives.
-
-    shadows: whether color is explained with what the surface hides from the light, or as if nothing were hidden.
-    """
+    """Fuse the material views; recover the light from color; solve for materials without a view from color."""
     from gdtool.fields.appearance.light import (
+        ShadedPoints,
         color_samples,
         materials_from_color,
         recover_light,
@@ -51,8 +64,8 @@ def appearance(
         visibility,
     )
 
-    rng = np.random.default_rng(seed)
-    seen = observe(cameras, mask, vertices, faces, normals, 0.5 * step)
+    rng = np.random.default_rng(options.seed)
+    seen = observe(cameras, mask, vertices, faces, normals, 0.5 * options.step)
     weight = seen.weight.sum(0)
     out = Appearance(
         np.full((len(vertices), 3), 0.5, np.float32),
@@ -78,26 +91,24 @@ def appearance(
         out.skipped.append(("light", "there is no color to recover it from"))
         return out
     samples = color_samples(cameras, images["color"], mask, seen, vertices, rng)
-    if len(samples[0]) < 64:
+    if len(samples.vertex) < LEAST_SAMPLES:
         out.skipped.append(("light", "too few pixels of color are seen and not clipped"))
         out.albedo = fused.get("color", out.albedo)
         return out
-    reaches = visibility(vertices, faces, normals, 0.5 * step, rng) if shadows else unoccluded(normals)
+    reaches = visibility(vertices, faces, normals, 0.5 * options.step, rng) if options.shadows else unoccluded(normals)
     if "albedo" in fused:
-        vertex, view, color = samples
-        out.light, residual = recover_light(
-            normals[vertex],
-            view,
-            color,
-            out.albedo[vertex],
-            out.roughness[vertex],
-            out.metallic[vertex],
-            reaches.at(vertex),
-            light,
+        points = ShadedPoints(
+            normals[samples.vertex],
+            samples.view,
+            out.albedo[samples.vertex],
+            out.roughness[samples.vertex],
+            out.metallic[samples.vertex],
+            reaches.at(samples.vertex),
         )
+        out.light, residual = recover_light(points, samples.color, options.light)
     else:
         albedo, roughness, metallic, out.light, residual = materials_from_color(
-            normals, fused["color"], weight, reaches, samples, light
+            normals, fused["color"], weight, reaches, samples, options.light
         )
         out.albedo = spread(albedo, weight, faces)
         # A roughness or metallic view, where there is one, says more than the single number found.

@@ -1,25 +1,58 @@
-"""The light recovered from color views, and materials from color where no material view is at hand.
+"""Recover the light from color views, and materials from color where there is no material view.
 
-Closed-form color is linear in the lobes' amplitudes, so with the materials known the light is one non-negative least
-squares. With nothing but color, light and albedo are known up to a scale: what the normals explain goes to the light,
-what is left to the albedo, and occlusion (a few rays against the surface) keeps shadow out of it.
+Closed-form color is linear in the lobes' amplitudes. With known materials the light is therefore one non-negative least
+squares. With color alone, light and albedo are known up to a scale: color that the normals explain goes to the light,
+the rest to the albedo. Occlusion (a few rays against the surface) keeps shadow out of the albedo.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from gdtool.fields.appearance.materials import Observations, toward_camera
-from gdtool.fields.views.prepared_view import bilinear
+from gdtool.images.sampling import bilinear
 
-SAMPLES = 4000
-SHARPNESS = (4.0, 12.0)
-_CLIPPED = 0.97
-LEAST_VISIBLE = 0.05  # light that bounces into the deepest hollow
-_PRIOR = 0.25  # rays
+SAMPLES = 4000  # pixels of color that the light is solved from
+SHARPNESS = (4.0, 12.0)  # of the lobes that are tried
+_CLIPPED = 0.97  # linear color; brighter pixels may be clipped
+# Roughness and metallic that are tried, and the relative residual by which a metal has to fit better.
+MATERIAL_TRIALS = ((0.25, 0.0), (0.5, 0.0), (0.8, 0.0), (0.3, 1.0), (0.6, 1.0))
+METAL_PENALTY = 0.03
+LEAST_VISIBLE = 0.05  # share of all light that bounces into the deepest hollow
+_PRIOR = 0.25  # rays: weight of the share of all light in a lobe's share
 MEAN_ALBEDO = 0.45  # light and albedo are only known up to a factor; this is where it is put
+
+
+class ShadedPoints(NamedTuple):
+    """Points to shade: normals, view (toward the camera), albedo (n, 3); roughness, metallic (n,)."""
+
+    normals: np.ndarray
+    view: np.ndarray
+    albedo: np.ndarray
+    roughness: np.ndarray
+    metallic: np.ndarray
+    visibility: Visibility
+
+
+class ColorSamples(NamedTuple):
+    """Pixels of color: index of the vertex (n,), direction to the camera (n, 3), linear color (n, 3)."""
+
+    vertex: np.ndarray
+    view: np.ndarray
+    color: np.ndarray
+
+
+class ColorMaterials(NamedTuple):
+    """Materials found from color: albedo (v, 3), one roughness and metallic, the light's record and its residual."""
+
+    albedo: np.ndarray
+    roughness: float
+    metallic: float
+    light: dict
+    residual: float
 
 
 def color_samples(
@@ -30,10 +63,10 @@ def color_samples(
     vertices: np.ndarray,
     rng: np.random.Generator,
     count: int = SAMPLES,
-):
-    """Pairs of a vertex and a view that sees it well: vertex (n,), direction to the camera (n, 3), color (n, 3) linear.
+) -> ColorSamples:
+    """Sample pairs of a vertex and a view that sees it well.
 
-    Clipped colors are left out: they say only "at least".
+    Clipped colors are left out, because they are only lower bounds.
     """
     vertex, view, value = [], [], []
     for k, camera in enumerate(cameras):
@@ -48,34 +81,33 @@ def color_samples(
     vertex, view, value = (np.concatenate(x) for x in (vertex, view, value))
     good = np.flatnonzero(value.max(1) < _CLIPPED)
     pick = good if len(good) <= count else rng.choice(good, count, replace=False)
-    return vertex[pick], view[pick], value[pick]
+    return ColorSamples(vertex[pick], view[pick], value[pick])
 
 
-def _response(normals, view, albedo, roughness, metallic, axes, sharpness, seen: Visibility) -> np.ndarray:
-    """Color (n, 3, k) of n points under each lobe alone, white and of amplitude 1, as far as its light arrives."""
+def _response(points: ShadedPoints, axes: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
+    """Compute the color (n, 3, k) of n points under each lobe alone, white and of amplitude 1, times its visibility."""
     import torch
 
     from gdtool.shading.bsdf.closed_form import shade
     from gdtool.shading.bsdf.sg import SphericalGaussians
 
     def tensor(x):
+        """Convert to float32."""
         return torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)
 
     out = []
     with torch.no_grad():
         for axis, width in zip(axes, sharpness, strict=True):
             lobe = SphericalGaussians(tensor(axis[None]), tensor([width]), torch.ones(1, 3))
-            out.append(
-                shade(tensor(normals), tensor(view), tensor(albedo), tensor(roughness), tensor(metallic), lobe).numpy()
-            )
-    return np.stack(out, -1) * seen.of_lobes(axes, sharpness)[:, None]
+            out.append(shade(*(tensor(values) for values in points[:5]), lobe).numpy())
+    return np.stack(out, -1) * points.visibility.of_lobes(axes, sharpness)[:, None]
 
 
 def fit_amplitudes(response: np.ndarray, color: np.ndarray, rounds: int = 4) -> tuple[np.ndarray, float]:
-    """Non-negative amplitudes (k, 3) for color (n, 3), and the mean relative residual.
+    """Solve for non-negative amplitudes (k, 3) that explain color (n, 3); also returns the mean relative residual.
 
-    Reweighted each round by the residual's size, twice as hard where the picture is darker than the light says: those
-    points lie in shadow, which the closed form does not have.
+    Each round reweights by the size of the residual, twice as hard where the picture is darker than the light predicts:
+    such points lie in shadow, which the closed form lacks.
     """
     from scipy.optimize import nnls
 
@@ -95,12 +127,12 @@ def fit_amplitudes(response: np.ndarray, color: np.ndarray, rounds: int = 4) -> 
     return amplitudes, float(np.abs(residual).mean())
 
 
-def recover_light(
-    normals, view, color, albedo, roughness, metallic, seen: Visibility, known: dict | None = None
-) -> tuple[dict, float]:
-    """A record of light.json that explains color (n, 3) of points with known materials, and its relative residual.
+def recover_light(points: ShadedPoints, color: np.ndarray, known: dict | None = None) -> tuple[dict, float]:
+    """Find the light that explains the color (n, 3) of points with known materials: a record of light.json and its
+    residual.
 
-    known: a light whose axes and sharpness to keep. Else sixteen lobes spread evenly, of the sharpness that fits best.
+    known: a light whose axes and sharpness to keep. Without one, sixteen evenly spread lobes of the best fitting
+    sharpness are used. The residual is relative to the mean color.
     """
     from gdtool.shading.sampling import fibonacci
 
@@ -110,9 +142,7 @@ def recover_light(
         shapes = [(fibonacci(16), np.full(16, width)) for width in SHARPNESS]
     best = None
     for axes, sharpness in shapes:
-        amplitudes, residual = fit_amplitudes(
-            _response(normals, view, albedo, roughness, metallic, axes, sharpness, seen), color
-        )
+        amplitudes, residual = fit_amplitudes(_response(points, axes, sharpness), color)
         if best is None or residual < best[1]:
             best = (
                 {
@@ -128,18 +158,20 @@ def recover_light(
 
 @dataclass(frozen=True)
 class Visibility:
-    """What the surface leaves open: directions (v, r, 3) over each vertex' hemisphere, by the cosine; open (v, r)
-    bool."""
+    """Hold which directions each vertex sees unoccluded.
+
+    directions (v, r, 3): cosine-weighted over each vertex's hemisphere. open (v, r) bool.
+    """
 
     directions: np.ndarray
     open: np.ndarray
 
     def at(self, vertex: np.ndarray) -> Visibility:
-        """That of the vertices of these indices."""
+        """Select the vertices of these indices."""
         return Visibility(self.directions[vertex], self.open[vertex])
 
     def of_lobes(self, axes: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
-        """Share (v, k) of each lobe's light that arrives; of a lobe behind the horizon, of all light."""
+        """Compute the share (v, k) of each lobe's light that arrives; behind the horizon, the share of all light."""
         share = self.open.mean(1, keepdims=True) + np.zeros((1, len(axes)))
         for k, (axis, width) in enumerate(zip(axes, sharpness, strict=True)):
             weight = np.exp(width * (self.directions @ np.asarray(axis, np.float32) - 1))
@@ -157,7 +189,7 @@ def visibility(
     rng: np.random.Generator,
     rays: int = 16,
 ) -> Visibility:
-    """Which of rays directions from each vertex meet the surface again; offset: world units they start off it."""
+    """Trace `rays` directions from each vertex against the surface. offset: world units by which rays start off it."""
     from gdtool.geometry.rays import RayCaster
 
     caster = RayCaster(vertices, faces)
@@ -181,17 +213,22 @@ def visibility(
 
 
 def unoccluded(normals: np.ndarray) -> Visibility:
-    """That of points (v, 3) that nothing hides: all light arrives."""
+    """Build the visibility of points with normals (v, 3) that nothing occludes."""
     return Visibility(np.asarray(normals, np.float32)[:, None], np.ones((len(normals), 1), bool))
 
 
 def materials_from_color(
-    normals: np.ndarray, color: np.ndarray, weight: np.ndarray, seen: Visibility, samples, light: dict | None
-) -> tuple[np.ndarray, float, float, dict, float]:
-    """Albedo (v, 3), one roughness, one metallic, the light and its residual, from fused color (v, 3) alone.
+    normals: np.ndarray,
+    color: np.ndarray,
+    weight: np.ndarray,
+    seen: Visibility,
+    samples: ColorSamples,
+    light: dict | None,
+) -> ColorMaterials:
+    """Solve for materials and light from fused color (v, 3) alone.
 
-    samples: what color_samples gave. light: a known light; without one it is what explains the color of an object of
-    one grey albedo best. Roughness and metallic are single numbers: the pair whose highlights fit the views best.
+    light: a known light. Without one, the light is used that best explains the color of an object of one grey albedo.
+    Roughness and metallic are single numbers: the pair whose highlights fit the views best.
     """
     import torch
 
@@ -200,38 +237,37 @@ def materials_from_color(
 
     vertex, view, value = samples
     grey = np.full((len(vertex), 3), MEAN_ALBEDO)
-    shaded = seen.at(vertex)
-    best = None
-    for roughness, metallic in ((0.25, 0.0), (0.5, 0.0), (0.8, 0.0), (0.3, 1.0), (0.6, 1.0)):
-        fixed = (np.full(len(vertex), roughness), np.full(len(vertex), metallic), shaded)
-        found, residual = (
-            (light, 0.0) if light is not None else recover_light(normals[vertex], view, value, grey, *fixed)
+    best, best_score, visible = None, np.inf, seen.at(vertex)
+    for roughness, metallic in MATERIAL_TRIALS:
+        points = ShadedPoints(
+            normals[vertex],
+            view,
+            grey,
+            np.full(len(vertex), roughness),
+            np.full(len(vertex), metallic),
+            visible,
         )
-        if light is not None:
-            lit = _response(
-                normals[vertex],
-                view,
-                grey,
-                *fixed[:2],
-                np.asarray(light["axes"]),
-                np.asarray(light["sharpness"]),
-                shaded,
-            )
+        if light is None:
+            candidate, residual = recover_light(points, value)
+        else:
+            candidate = light
+            lit = _response(points, np.asarray(light["axes"]), np.asarray(light["sharpness"]))
             lit = np.einsum("nck,kc->nc", lit, np.asarray(light["amplitudes"]))
             residual = float(np.abs(lit / max(lit.mean(), 1e-9) - value / max(value.mean(), 1e-9)).mean())
-        # Metal needs to pay its way: most things are not.
-        if best is None or residual + 0.03 * metallic < best[0]:
-            best = (residual + 0.03 * metallic, roughness, metallic, found, residual)
-    _, roughness, metallic, found, residual = best
+        # Most things are no metal: metal has to fit clearly better.
+        score = residual + METAL_PENALTY * metallic
+        if best is None or score < best_score:
+            best_score, best = score, (roughness, metallic, candidate, residual)
+    roughness, metallic, best_light, residual = best
     count = len(normals)
     unit_color, base = np.zeros((count, 3)), np.zeros((count, 3))
-    arrives = seen.of_lobes(np.asarray(found["axes"]), np.asarray(found["sharpness"]))
+    arrives = seen.of_lobes(np.asarray(best_light["axes"]), np.asarray(best_light["sharpness"]))
     n = torch.as_tensor(np.ascontiguousarray(normals), dtype=torch.float32)
     white, black, rough = torch.ones(count, 3), torch.zeros(count, 3), torch.full((count,), roughness)
     with torch.no_grad():
-        for k in range(len(found["axes"])):
+        for k in range(len(best_light["axes"])):
             lobe = SphericalGaussians.from_record(
-                {name: found[name][k : k + 1] for name in ("axes", "sharpness", "amplitudes")}
+                {name: best_light[name][k : k + 1] for name in ("axes", "sharpness", "amplitudes")}
             )
             diffuse, specular = shade_parts(n, n, white, rough, torch.full((count,), metallic), lobe)
             unit_color += (specular if metallic else diffuse).numpy() * arrives[:, k : k + 1]
@@ -241,4 +277,4 @@ def materials_from_color(
     albedo = np.maximum(color - base, 0.1 * color) / np.maximum(unit_color, floor)
     if light is None:
         albedo *= MEAN_ALBEDO / max(float(np.average(albedo.mean(1), weights=weight + 1e-9)), 1e-6)
-    return np.clip(albedo, 0.02, 0.95), roughness, metallic, found, residual
+    return ColorMaterials(np.clip(albedo, 0.02, 0.95), roughness, metallic, best_light, residual)

@@ -1,4 +1,4 @@
-"""Materials on a surface's vertices, fused from the views that see them."""
+"""Fuse materials on a surface's vertices from the views that see them."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.cameras import Camera, project
-from gdtool.fields.views.prepared_view import bilinear
+from gdtool.images.sampling import bilinear
 
-_SHARPEN = 4  # exponent of the cosine in a view's weight: the view that faces a point decides
+_SHARPEN = 4  # exponent of the cosine in a view's weight, so that the view that faces a point decides
 
 
 @dataclass(frozen=True)
 class Observations:
-    """What k views see of v vertices: weight (k, v), 0 where hidden; pixels (k, v, 2) as (x, y)."""
+    """Hold how k views see v vertices: weight (k, v), 0 where hidden, and pixels (k, v, 2) as (x, y)."""
 
     weight: np.ndarray
     pixels: np.ndarray
 
 
 def toward_camera(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Unit directions (n, 3) from points to the camera."""
+    """Compute unit directions (n, 3) from points to the camera."""
     if camera.projection == "orthographic":
         return np.broadcast_to(camera.backward, points.shape)
     direction = camera.position - points
@@ -31,9 +31,9 @@ def toward_camera(camera: Camera, points: np.ndarray) -> np.ndarray:
 def observe(
     cameras: list[Camera], mask: np.ndarray, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, offset: float
 ) -> Observations:
-    """Which views (mask (k, h, w)) see which vertices, by rays against the surface itself.
+    """Find which views (mask (k, h, w)) see which vertices, by rays against the surface.
 
-    offset: world units a ray starts off the surface, along the normal and toward the camera. The weight is the
+    offset: world units by which a ray starts off the surface, along the normal and toward the camera. The weight is the
     cosine to a power, less beside the silhouette, where pixels average over the edge.
     """
     from scipy.ndimage import minimum_filter
@@ -62,10 +62,10 @@ def observe(
 def fuse(
     images: np.ndarray, mask: np.ndarray, seen: Observations, sigma: float = 0.05
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One value a vertex from k views: images (k, h, w, c) -> value (v, c), total weight (v,), residual (v,).
+    """Fuse images (k, h, w, c) to one value a vertex: value (v, c), total weight (v,), residual (v,).
 
     A weighted mean, reweighted twice by each view's distance from it (Geman-McClure of scale sigma), so that a view
-    that disagrees with the others loses. Values where nothing is seen are 0. residual: the weighted mean distance.
+    that disagrees with the others loses. Unseen vertices get 0. The residual is the weighted mean distance.
     """
     samples = []
     for image, cover, pixels in zip(images, mask, seen.pixels, strict=True):
@@ -86,7 +86,7 @@ def fuse(
 
 
 def neighbour_matrix(faces: np.ndarray, count: int):
-    """Symmetric sparse adjacency (count, count) of a mesh's vertices, ones."""
+    """Build the symmetric sparse adjacency (count, count) of a mesh's vertices, with ones."""
     from scipy.sparse import coo_matrix
 
     rows = faces[:, [0, 1, 2]].ravel()
@@ -99,7 +99,7 @@ def neighbour_matrix(faces: np.ndarray, count: int):
 
 
 def spread(values: np.ndarray, weight: np.ndarray, faces: np.ndarray, strength: float = 1e-2) -> np.ndarray:
-    """values (v, c) diffused over the mesh into vertices of little weight (v,), others nearly kept.
+    """Diffuse values (v, c) over the mesh into vertices of little weight (v,), nearly keeping the others.
 
     Solves (W + s L) x = W v + tiny pull to the weighted mean, L the graph Laplacian, by conjugate gradients, starting
     from a coarse-to-fine fill so that few iterations do.
@@ -123,7 +123,7 @@ def spread(values: np.ndarray, weight: np.ndarray, faces: np.ndarray, strength: 
 
 
 def _flood(values, known, graph, degree, mean) -> np.ndarray:
-    """Unknown values from the mean of known neighbours, ring by ring."""
+    """Fill unknown values with the mean of their known neighbours, ring by ring."""
     out = np.where(known[:, None], values, 0.0).astype(np.float64)
     known = known.copy()
     while not known.all():
@@ -139,5 +139,5 @@ def _flood(values, known, graph, degree, mean) -> np.ndarray:
 
 
 def confidence(weight: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """(v,) in [0, 1]: grows with the weight of the views that see a vertex, falls with their disagreement."""
+    """Compute confidence (v,) in [0, 1]: it grows with the weight of the views and falls with their disagreement."""
     return ((1 - np.exp(-4 * weight)) * np.exp(-residual / 0.1)).astype(np.float32)

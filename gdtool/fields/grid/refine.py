@@ -1,33 +1,38 @@
-"""The grid method's second half: move the extracted mesh onto what the views measured, and smooth what none sees."""
+"""Move the extracted mesh onto the measured planes and smooth its unseen parts: the second half of the grid method."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from gdtool.fields.appearance.materials import neighbour_matrix
-from gdtool.fields.views.prepared_view import WEAK, Sight, hull_distance, tangent_distance
+from gdtool.fields.views.prepared_view import WEAK, PreparedView, hull_distance, tangent_distance
 from gdtool.geometry.grids import components, keep_faces, signed_volume
 from gdtool.geometry.normals import face_normals, vertex_normals
 from gdtool.geometry.topology import edges_of
 
-WAVELENGTH = 36.0  # steps: shorter bumps go where the normals show none
-FOLD_DEGREES = 150.0  # a fold's least angle between the normals of its sides
-_SEEN_FACES = 24  # faces that views measured, enough for a piece to be real
-_HOLLOW_FACES = 12  # and for a hollow, of which they see little through a mouth that the grid closes
+WAVELENGTH = 36.0  # grid steps: shorter bumps are removed where the normals show none
+FOLD_DEGREES = 150.0  # least angle between the normals of a fold's sides
+# refine(): rounds in which the planes are looked up anew, weight of bending beside a fully seen vertex's planes, and
+# steps of conjugate gradients.
+REFINE_ROUNDS, REFINE_SMOOTHNESS, REFINE_ITERATIONS = 2, 0.2, 40
+# fit_to_normals(): likewise; the system is worse conditioned, so that it takes more steps.
+NORMAL_ROUNDS, NORMAL_BENDING, NORMAL_ITERATIONS = 3, 1.0, 300
+_SEEN_FACES = 24  # measured faces that make a piece real
+_HOLLOW_FACES = 12  # measured faces that make a hollow real; views see little of it through its mouth
 
 
-def measured_planes(sights: list[Sight], vertices: np.ndarray, normals: np.ndarray, reach: float):
-    """Quadratic data term of each vertex: matrix (v, 3, 3) and vector (v, 3) of sum w (n·u + s)^2, and sum w (v,).
+def measured_planes(views: list[PreparedView], vertices: np.ndarray, normals: np.ndarray, reach: float):
+    """Compute each vertex's quadratic data term sum w (n·u + s)^2: matrix (v, 3, 3), vector (v, 3) and sum w (v,).
 
-    Planes farther than reach (world units) or turned away from the vertex's normal are another surface.
+    Planes farther than reach (world units) or turned away from the vertex's normal belong to another surface.
     """
     matrix = np.zeros((len(vertices), 3, 3), np.float32)
     vector = np.zeros((len(vertices), 3), np.float32)
     total = np.zeros(len(vertices), np.float32)
-    for sight in sights:
-        if sight.planes is None:
+    for view in views:
+        if view.planes is None:
             continue
-        distance, weight, normal, _ = tangent_distance(sight, vertices)
+        distance, weight, normal, _ = tangent_distance(view, vertices)
         same = (np.abs(distance) < reach) & (weight > WEAK) & ((normal * normals).sum(1) > 0.5)
         weight = np.where(same, weight, 0.0).astype(np.float32)
         distance = np.where(same, distance, 0.0).astype(np.float32)
@@ -40,59 +45,56 @@ def measured_planes(sights: list[Sight], vertices: np.ndarray, normals: np.ndarr
 def refine(
     vertices: np.ndarray,
     faces: np.ndarray,
-    sights: list[Sight],
+    views: list[PreparedView],
     step: float,
     *,
     reach: float,
-    rounds: int = 2,
-    smoothness: float = 0.2,
-    iterations: int = 40,
 ) -> np.ndarray:
-    """New positions (v, 3): least squares of distances to the measured planes and of the umbrella Laplacian.
+    """Move vertices to new positions (v, 3): least squares of distances to measured planes and of the umbrella
+    Laplacian.
 
-    Seen vertices follow the planes; unseen ones minimise bending, held where the carving put them and inside
-    the silhouettes.
+    Seen vertices follow the planes. Unseen ones minimise bending, held close to where carving put them and inside the
+    silhouettes.
     """
     from scipy.sparse import diags
 
     umbrella, start = _umbrella(faces, len(vertices)), vertices
-    for _ in range(rounds):
-        matrix, vector, total = measured_planes(sights, vertices, vertex_normals(vertices, faces), reach)
+    for _ in range(REFINE_ROUNDS):
+        matrix, vector, total = measured_planes(views, vertices, vertex_normals(vertices, faces), reach)
         unseen = np.exp(-10.0 * total)
-        bending = diags((smoothness + unseen).astype(np.float32))
+        bending = diags((REFINE_SMOOTHNESS + unseen).astype(np.float32))
         energy = (umbrella.T @ bending @ umbrella).tocsr().astype(np.float32)
         hold = (0.003 + 0.2 * unseen)[:, None].astype(np.float32)
 
         def apply(u, matrix=matrix, energy=energy, hold=hold):
+            """Multiply moves u (v, 3) by the system's matrix."""
             return np.einsum("vij,vj->vi", matrix, u) + energy @ u + hold * u
 
         right = vector - energy @ vertices.astype(np.float32) + hold * (start - vertices).astype(np.float32)
         diagonal = np.einsum("vii->vi", matrix) + energy.diagonal()[:, None] + hold
-        move = conjugate_gradients(apply, right, diagonal, iterations)
+        move = conjugate_gradients(apply, right, diagonal, REFINE_ITERATIONS)
         length = np.linalg.norm(move, axis=1, keepdims=True)
         vertices = vertices + move * np.minimum(1.0, step / np.maximum(length, 1e-12))
-    return _unfold(_inside_silhouettes(vertices, start, sights, 0.25 * step), start, faces)
+    return _undo_folds(_inside_silhouettes(vertices, start, views, 0.25 * step), start, faces)
 
 
-def follow_normals(
+def fit_to_normals(
     vertices: np.ndarray,
     faces: np.ndarray,
-    sights: list[Sight],
+    views: list[PreparedView],
     step: float,
     *,
     reach: float,
-    rounds: int = 3,
-    bending: float = 1.0,
-    iterations: int = 300,
 ) -> np.ndarray:
-    """New positions (v, 3) of a surface fused from views that disagree: where it lies it says itself, what form it has
-    their normals.
+    """Move vertices to new positions (v, 3): keep the place of a surface fused from disagreeing views, take its
+    normals' shape.
 
     Depths that differ a little from view to view leave bumps, which are low and steep; the normals show none. Every
-    vertex moves along its own normal, so that edges come to lie across the normals shown there, and is held where it
-    was (Nehab et al., "Efficiently Combining Positions and Normals for Precise 3D Geometry", 2005): bumps shorter than
-    about WAVELENGTH go. What no view shows moves along with what is around it. reach: how far off a view's surface may
-    be (world units)."""
+    vertex moves along its normal, so that edges come to lie across the measured normals, and is held where it was
+    (Nehab et al., "Efficiently Combining Positions and Normals for Precise 3D Geometry", 2005). Bumps shorter than
+    about WAVELENGTH go. Unseen vertices move along with their neighbours. reach: how far off a view's surface may be
+    (world units).
+    """
     from scipy.sparse import csr_array, diags_array
 
     start, ends = vertices, edges_of(faces).ends
@@ -107,60 +109,61 @@ def follow_normals(
             (len(ends), len(vertices)),
         )
 
-    for _ in range(rounds):
-        own = vertex_normals(vertices, faces)
-        shown, trust = shown_normals(sights, vertices, own, reach)
-        across = shown[a] + shown[b]
+    for _ in range(NORMAL_ROUNDS):
+        surface = vertex_normals(vertices, faces)
+        measured, trust = measured_normals(views, vertices, surface, reach)
+        across = measured[a] + measured[b]
         across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
         along = vertices[a] - vertices[b]
         stiff = 1 / np.maximum(np.linalg.norm(along, axis=1) / step, 0.1)
         known = stiff * np.minimum(trust[a], trust[b])
-        slant = differences(np.einsum("ei,ei->e", across, own[a]), np.einsum("ei,ei->e", across, own[b]))
+        slant = differences(np.einsum("ei,ei->e", across, surface[a]), np.einsum("ei,ei->e", across, surface[b]))
         level = differences(np.ones(len(ends)), np.ones(len(ends)))
         matrix = (
             slant.T @ diags_array(known) @ slant
             + level.T @ diags_array(stiff - known) @ level
-            + bending * umbrella.T @ umbrella
+            + NORMAL_BENDING * umbrella.T @ umbrella
         )
         right = (
             -slant.T @ (known * np.einsum("ei,ei->e", across, along))
-            - bending * umbrella.T @ np.einsum("vi,vi->v", own, umbrella @ vertices)
-            - hold * np.einsum("vi,vi->v", own, vertices - start)
+            - NORMAL_BENDING * umbrella.T @ np.einsum("vi,vi->v", surface, umbrella @ vertices)
+            - hold * np.einsum("vi,vi->v", surface, vertices - start)
         )
         move = conjugate_gradients(
             lambda u, matrix=matrix: matrix @ u + hold * u,
             right[:, None],
             (matrix.diagonal() + hold)[:, None],
-            iterations,
+            NORMAL_ITERATIONS,
         )
-        vertices = vertices + np.clip(move, -step, step) * own
-    return _unfold(_inside_silhouettes(vertices, start, sights, 0.25 * step), start, faces)
+        vertices = vertices + np.clip(move, -step, step) * surface
+    return _undo_folds(_inside_silhouettes(vertices, start, views, 0.25 * step), start, faces)
 
 
-def shown_normals(
-    sights: list[Sight], vertices: np.ndarray, normals: np.ndarray, reach: float
+def measured_normals(
+    views: list[PreparedView], vertices: np.ndarray, normals: np.ndarray, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normal (v, 3) that the views show at the vertices of a surface, and the trust in it (v,) in 0..1, 0 where
-    none does.
+    """Average the views' normals at vertices: unit normals (v, 3) and their trust (v,) in 0..1, 0 where no view has
+    one.
 
-    normals (v, 3): the surface's own; what a view shows farther than reach (world units) away, or turned away from
-    them, is another surface."""
+    normals (v, 3): of the surface. A view's surface farther than reach (world units) away, or turned away from them, is
+    another surface.
+    """
     total = np.zeros((len(vertices), 3))
-    for sight in sights:
-        if sight.planes is None:
+    for view in views:
+        if view.planes is None:
             continue
-        distance, weight, normal, _ = tangent_distance(sight, vertices)
+        distance, weight, normal, _ = tangent_distance(view, vertices)
         same = (np.abs(distance) < reach) & (weight > WEAK) & ((normal * normals).sum(1) > 0.3)
         total += np.where(same, weight, 0.0)[:, None] * normal
     length = np.linalg.norm(total, axis=1)
     return total / np.maximum(length, 1e-12)[:, None], np.clip(length / 0.1, 0, 1)
 
 
-def bumpiness(vertices: np.ndarray, faces: np.ndarray, sights: list[Sight], reach: float) -> float:
-    """Median degrees between the normals of a surface and those that the views show there; 0 where they show none."""
-    own = vertex_normals(vertices, faces)
-    shown, trust = shown_normals(sights, vertices, own, reach)
-    cosine = np.einsum("vi,vi->v", shown, own)[trust > 0.5]
+def normal_deviation_degrees(vertices: np.ndarray, faces: np.ndarray, views: list[PreparedView], reach: float) -> float:
+    """Measure the median degrees between a surface's normals and the views' normals there; 0 where there are none."""
+    surface = vertex_normals(vertices, faces)
+    measured, trust = measured_normals(views, vertices, surface, reach)
+    cosine = np.einsum("vi,vi->v", measured, surface)[trust > 0.5]
     return float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1)))) if len(cosine) else 0.0
 
 
@@ -193,12 +196,11 @@ def conjugate_gradients(apply, right: np.ndarray, diagonal: np.ndarray, iteratio
     return x
 
 
-def _inside_silhouettes(vertices: np.ndarray, start: np.ndarray, sights: list[Sight], slack: float) -> np.ndarray:
-    """Vertices that left a silhouette by more than slack, and farther than they began, go back along their way until
-    they have not."""
+def _inside_silhouettes(vertices: np.ndarray, start: np.ndarray, views: list[PreparedView], slack: float) -> np.ndarray:
+    """Move vertices that left a silhouette by more than slack, and farther than at the start, back along their way."""
     share = np.ones(len(vertices))
-    for sight in sights:
-        before, after = hull_distance(sight, start), hull_distance(sight, vertices)
+    for view in views:
+        before, after = hull_distance(view, start), hull_distance(view, vertices)
         limit = np.maximum(before, 0) + slack
         left = np.flatnonzero(after > limit)
         # Of one that began beyond the border of a picture that cuts the object no way is known: all of it.
@@ -208,9 +210,12 @@ def _inside_silhouettes(vertices: np.ndarray, start: np.ndarray, sights: list[Si
     return start + share[:, None] * (vertices - start)
 
 
-def _unfold(vertices: np.ndarray, start: np.ndarray, faces: np.ndarray, rounds: int = 8) -> np.ndarray:
-    """Vertices of faces that turned over on the way from start, or folded onto a neighbour, go back half of their way,
-    and those around them less of theirs, until none has."""
+def _undo_folds(vertices: np.ndarray, start: np.ndarray, faces: np.ndarray, rounds: int = 8) -> np.ndarray:
+    """Move vertices of faces that turned over or folded onto a neighbour back half of their way, until no such face is
+    left.
+
+    The vertices around them go back less.
+    """
     before, _ = face_normals(start, faces)
     beside = edges_of(faces).face_pairs()[1]
     folded_before = _folded(before, beside)
@@ -233,17 +238,18 @@ def _unfold(vertices: np.ndarray, start: np.ndarray, faces: np.ndarray, rounds: 
 
 
 def _folded(normals: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """Which of the pairs of neighbouring faces (k, 2) lie back to back."""
+    """Tell which pairs of neighbouring faces (k, 2) lie back to back."""
     return np.einsum("ij,ij->i", normals[beside[:, 0]], normals[beside[:, 1]]) < np.cos(np.radians(FOLD_DEGREES))
 
 
 def drop_debris(
     vertices: np.ndarray, faces: np.ndarray, support: np.ndarray, step: float, hollows: bool = False
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """The mesh without inner bubbles and without pieces that are tiny or that no view supports (v,): and how many went.
+    """Remove bubbles, tiny pieces and pieces without support (v,) from views; also returns the number removed.
 
-    The largest piece always stays. hollows: an inner wall that views saw stays too (of views that agree: others see
-    through walls)."""
+    The largest piece always stays. hollows: keep an inner wall that views saw. Use it for views that agree only: others
+    see through walls.
+    """
     labels, volume = _pieces(vertices, faces)
     held = np.bincount(labels, support[faces].mean(1) > 0.02)
     # Of a plate seen edge-on only the rim has support: a few faces say that it is there.
@@ -259,14 +265,14 @@ def drop_debris(
 def keep_pieces(
     vertices: np.ndarray, faces: np.ndarray, step: float, share: float = 0.01
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The pieces that hold more than share of the largest one's volume, and no bubbles."""
+    """Keep the pieces with more than `share` of the largest one's volume; bubbles go."""
     labels, volume = _pieces(vertices, faces)
     vertices, faces, _ = keep_faces(vertices, faces, (volume > max(share * volume.max(), (2 * step) ** 3))[labels])
     return vertices, faces
 
 
 def _pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Label (f,) of the piece of each face, and each piece's signed volume."""
+    """Label the connected piece of each face (f,) and compute each piece's signed volume."""
     labels = components(faces, len(vertices))
     order = np.argsort(labels, kind="stable")
     bounds = np.searchsorted(labels[order], np.arange(int(labels.max()) + 2))

@@ -1,7 +1,7 @@
-"""The paper's method: fit the SDF and material networks to views, from the geometry that the views carry.
+"""Fit the SDF and material networks to views, starting from the geometry that the views carry: the paper's method.
 
-Order: fit the SDF network to the carved grid; a NeuS-style volume start where no depth pins the surface down; then
-explicit surface points. Whatever the views hold is used, whatever they do not is left out.
+Phases: fit the SDF network to the carved grid; train by NeuS volume rendering where no depth pins the surface down;
+train at explicit surface points. Every domain that the views hold is used; no domain is required.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,17 +28,18 @@ from gdtool.shading.bsdf.closed_form import shade
 from gdtool.shading.bsdf.sg import SphericalGaussians
 from gdtool.shading.sampling import fibonacci
 
-SAMPLES, NARROW = 64, 8  # along a ray, and between the crossing's two ends
-LIGHTS = 16
-DISTANCE_RATE = 2e-3  # of Adam, at its highest, while distances are fitted
+SAMPLES, NARROW = 64, 8  # samples along a ray, and between a crossing's two ends
+LIGHTS = 16  # lobes of the light
+DISTANCE_RATE = 2e-3  # highest learning rate of Adam while distances are fitted
 WEIGHTS = {"depth": 10.0, "normal": 1.0, "color": 1.0, "material": 1.0, "mask": 1.0, "eikonal": 0.1}
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """Rays of all views with what they show. origins, directions (n, 3); inside (n,) bool; values: domain to (n[, c]).
+    """Hold the rays of all views and the values at their pixels.
 
-    Pixels that the silhouette cuts are left out. near, far (n,): where the ray may meet the surface.
+    origins, directions (n, 3); inside (n,) bool; values: domain to (n[, c]). near, far (n,): where the ray may meet the
+    surface. Pixels that the silhouette cuts are left out.
     """
 
     origins: Tensor
@@ -50,7 +52,7 @@ class Pixels:
 
 @dataclass
 class Fit:
-    """The two networks, the light's raw parameters, and the losses by name at the end of each phase."""
+    """Hold the two networks, the light's raw parameters, and the losses by name at intervals of the training."""
 
     sdf: SdfNetwork
     material: MaterialNetwork
@@ -59,7 +61,7 @@ class Fit:
     history: list[dict[str, float]] = field(default_factory=list)
 
     def lights(self) -> SphericalGaussians:
-        """Sixteen lobes spread evenly; amplitudes softplus of the parameters."""
+        """Return sixteen evenly spread lobes, with amplitudes softplus of the parameters."""
         axes = torch.as_tensor(fibonacci(LIGHTS), dtype=self.light.dtype, device=self.light.device)
         return SphericalGaussians(
             axes,
@@ -68,8 +70,33 @@ class Fit:
         )
 
 
+@dataclass(frozen=True)
+class Schedule:
+    """Set the length and the variant of `train`.
+
+    rule: see find_surface. brdf: see closed_form.shade. samples: along a ray.
+    """
+
+    volume_steps: int
+    surface_steps: int
+    batch: int
+    seed: int
+    rule: str
+    brdf: str
+    samples: int = SAMPLES
+
+
+class RaySegments(NamedTuple):
+    """Rays between two depths: origins, directions (n, 3), near, far (n,)."""
+
+    origins: Tensor
+    directions: Tensor
+    near: Tensor
+    far: Tensor
+
+
 def start(seed: int, device: str) -> Fit:
-    """Fresh networks; the same seed gives the same weights on every device."""
+    """Create fresh networks; the same seed gives the same weights on every device."""
     torch.manual_seed(seed)
     sdf, material = SdfNetwork().to(device), MaterialNetwork().to(device)
     light = torch.full((LIGHTS, 3), 0.0, device=device, requires_grad=True)
@@ -77,7 +104,7 @@ def start(seed: int, device: str) -> Fit:
 
 
 def one_cycle(progress: float, warm: float = 0.1) -> float:
-    """Factor of the learning rate: up in a line to 1 at warm, then down to 0 at progress 1 along a cosine."""
+    """Return the factor of the learning rate: linear to 1 at `warm`, then a cosine down to 0 at progress 1."""
     if progress < warm:
         return max(progress / warm, 0.01)
     return 0.5 * (1 + math.cos(math.pi * min((progress - warm) / (1 - warm), 1.0)))
@@ -92,13 +119,13 @@ def fit_distances(
     spent: Callable[[], float],
     half_share: float = 0.0,
 ) -> float:
-    """Fit the SDF network to known distances: sample(n) gives points (n, 3) and distances (n,). Returns the last mean
-    error.
+    """Fit the SDF network to known distances; returns the running mean of the absolute error.
 
-    spent() is the share of the time that is gone: the schedule follows it where it is ahead of the steps, so that it
-    ends with a small rate whatever the machine. half_share: of the schedule, with layers in bfloat16; their last digit
-    is a few thousandths of the object, so the rest has to be float32. Frequencies are let in one by one over the first
-    half."""
+    sample(n) gives points (n, 3) and distances (n,). spent() is the share of the time that is gone. The schedule
+    follows it where it is ahead of the steps, so that the rate is small at the end on any machine. half_share: share of
+    the schedule with layers in bfloat16. Its last digit is a few thousandths of the object, so the rest has to be
+    float32. Frequencies are let in one by one over the first half.
+    """
     device = fit.light.device
     optimiser = torch.optim.Adam(fit.sdf.parameters(), lr=0.0)
     error = 0.0
@@ -111,8 +138,8 @@ def fit_distances(
         fit.sdf.show_frequencies(3 + (FREQUENCIES - 3) * 2 * progress)
         points, distances = sample(batch)
         with torch.autocast(device.type, torch.bfloat16, enabled=progress < half_share):
-            found = fit.sdf(points)
-        gap = (found.float() - distances).abs()
+            predicted = fit.sdf(points)
+        gap = (predicted.float() - distances).abs()
         # Far from the surface the sign and the rough size are enough.
         loss = (gap / (1 + 10 * distances.abs())).mean()
         optimiser.zero_grad()
@@ -126,23 +153,22 @@ def fit_distances(
 
 def find_surface(
     sdf: SdfNetwork,
-    origins: Tensor,
-    directions: Tensor,
-    near: Tensor,
-    far: Tensor,
+    segments: RaySegments,
     rule: str = "secant",
     sharpness: float = 300.0,
     samples: int = SAMPLES,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Depth along rays (n,) of the first crossing, whether there is one (n,), and the point of least distance (n, 3).
+    """Find where rays first enter the surface.
 
-    rule: "median" of the CDF of eight samples between the crossing's ends, or "secant" through them.
+    Returns the depth (n,) along the ray, whether there is a crossing (n,), and the sample of least distance (n, 3).
+    rule: "median" of the CDF of NARROW samples between the crossing's ends, or "secant" through them.
     """
+    origins, directions, near, far = segments
     with torch.no_grad():
         share = torch.linspace(0, 1, samples, device=origins.device)
         t = near[:, None] + (far - near)[:, None] * share
         values = sdf(origins[:, None] + t[..., None] * directions[:, None])
-        found, idx = first_crossing(values)
+        crosses, idx = first_crossing(values)
         lowest = values.argmin(1, keepdim=True)
         closest = origins + t.gather(1, lowest) * directions
         i = idx[:, None]
@@ -162,11 +188,11 @@ def find_surface(
                 torch.where(ahead, value, f0),
                 torch.where(ahead, f1, value),
             )
-        return depth, found, closest
+        return depth, crosses, closest
 
 
 def volume_losses(fit: Fit, pixels: Pixels, chosen: Tensor) -> dict[str, Tensor]:
-    """NeuS-style losses of rays: opacity against the mask, expected normal, depth and material against the views."""
+    """Compute NeuS losses of rays: opacity against the mask, expected normal and depth against the views."""
     origins, directions = pixels.origins[chosen], pixels.directions[chosen]
     near, far, inside = pixels.near[chosen], pixels.far[chosen], pixels.inside[chosen].float()
     t = (
@@ -195,17 +221,17 @@ def volume_losses(fit: Fit, pixels: Pixels, chosen: Tensor) -> dict[str, Tensor]
 def surface_losses(
     fit: Fit, pixels: Pixels, chosen: Tensor, rule: str, brdf: str, samples: int = SAMPLES
 ) -> dict[str, Tensor]:
-    """Losses at explicit surface points, and of rays that hit where the mask is empty or miss where it is full."""
+    """Compute losses at explicit surface points, and of rays that hit outside the mask or miss inside it."""
     origins, directions, inside = pixels.origins[chosen], pixels.directions[chosen], pixels.inside[chosen]
-    depth, found, closest = find_surface(
-        fit.sdf, origins, directions, pixels.near[chosen], pixels.far[chosen], rule, samples=samples
+    depth, crosses, closest = find_surface(
+        fit.sdf, RaySegments(origins, directions, pixels.near[chosen], pixels.far[chosen]), rule, samples=samples
     )
     losses: dict[str, Tensor] = {}
-    wrong = found != inside
+    wrong = crosses != inside
     if wrong.any():
         value = fit.sdf(closest[wrong]) * torch.where(inside[wrong], 1.0, -1.0)
         losses["mask"] = torch.nn.functional.softplus(50 * value).sum() / 50 / len(chosen) * 10
-    good = found & inside
+    good = crosses & inside
     if not good.any():
         return losses
     here = origins[good] + depth[good, None] * directions[good]
@@ -242,27 +268,16 @@ def surface_losses(
 
 
 def tone(radiance: Tensor) -> Tensor:
-    """Radiance compressed as the eye does, so that highlights do not rule the loss."""
+    """Compress radiance by a gamma of 2.2, so that highlights do not dominate the loss."""
     return (radiance.clamp_min(0) + 1e-3).pow(1 / 2.2)
 
 
-def train(
-    fit: Fit,
-    pixels: Pixels,
-    *,
-    volume_steps: int,
-    surface_steps: int,
-    batch: int,
-    seed: int,
-    rule: str,
-    brdf: str,
-    track,
-    spent: Callable[[], float],
-    samples: int = SAMPLES,
-) -> int:
-    """Volume start, then explicit surface; returns the steps done. spent(): share of the time that is gone, as in
-    fit_distances."""
-    generator = torch.Generator().manual_seed(seed)
+def train(fit: Fit, pixels: Pixels, schedule: Schedule, track: Callable, spent: Callable[[], float]) -> int:
+    """Train both networks: a volume phase, then an explicit surface phase; returns the number of steps done.
+
+    spent(): share of the time that is gone, as in fit_distances.
+    """
+    generator = torch.Generator().manual_seed(schedule.seed)
     device = fit.light.device
     parameters = [
         {"params": fit.sdf.parameters(), "lr": 2e-4},
@@ -272,7 +287,7 @@ def train(
     ]
     optimiser = torch.optim.Adam(parameters)
     highest = [group["lr"] for group in parameters]
-    steps = volume_steps + surface_steps
+    steps = schedule.volume_steps + schedule.surface_steps
 
     hits, misses = (torch.nonzero(x)[:, 0].cpu() for x in (pixels.inside, ~pixels.inside))
     done, gone = 0, spent()
@@ -284,14 +299,18 @@ def train(
         # Adam's first steps move every weight by the full rate: without a warm-up they undo the fitted start.
         for group, rate in zip(optimiser.param_groups, highest, strict=True):
             group["lr"] = rate * min(1.0, (k + 1) / 30) * max(one_cycle(progress, 0.0), 0.02)
-        volume = progress < volume_steps / steps
-        size = batch // 4 if volume else batch
+        volume = progress < schedule.volume_steps / steps
+        size = schedule.batch // 4 if volume else schedule.batch
         share = size * 3 // 4 if len(misses) else size
         pick = hits[torch.randint(len(hits), (share,), generator=generator)]
         if len(misses):
             pick = torch.cat([pick, misses[torch.randint(len(misses), (size - share,), generator=generator)]])
         pick = pick.to(device)
-        losses = volume_losses(fit, pixels, pick) if volume else surface_losses(fit, pixels, pick, rule, brdf, samples)
+        losses = (
+            volume_losses(fit, pixels, pick)
+            if volume
+            else surface_losses(fit, pixels, pick, schedule.rule, schedule.brdf, schedule.samples)
+        )
         if not volume:
             around = (torch.rand(size // 4, 3, generator=generator) * 1.1 - 0.55).to(device)
             losses["eikonal"] = (

@@ -1,4 +1,4 @@
-"""The paper's two fields: a signed distance network and a material network over an encoded position."""
+"""Define the paper's two fields: a signed distance network and a material network over an encoded position."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import math
 import torch
 from torch import Tensor, nn
 
-FREQUENCIES = 10
+FREQUENCIES = 10  # of the positional encoding
 ENCODED = 64  # 3 + 2 * 3 * 10 = 63, padded: K mod 32 != 0 leaks NaN across rows in oneDNN's bfloat16 (oneDNN#5717)
-WIDTH = 128
+WIDTH = 128  # of a hidden layer
 
 
 def encode(points: Tensor, frequencies: int = FREQUENCIES) -> Tensor:
@@ -71,14 +71,14 @@ class SdfNetwork(nn.Module):
         return self.last(x)[..., 0]
 
     def show_frequencies(self, count: float) -> None:
-        """Let the first count frequencies of the encoding through, the next one in part, and no other."""
+        """Let the first `count` frequencies of the encoding through, the next one in part, and no other."""
         share = (count - torch.arange(FREQUENCIES, device=self.window.device)).clamp(0, 1).repeat_interleave(3)
         self.window[3 : 3 + 6 * FREQUENCIES] = torch.cat([share, share])
 
     def turn_outward(self) -> bool:
-        """Change the sign of a field that is negative on the box of side 2 around the object; says whether it was.
+        """Flip the sign of a field that is negative on the box of side 2 around the object; returns whether it did.
 
-        Fitting alone gets a field that starts inside out around only slowly: every value has to pass through zero.
+        Fitting corrects an inverted field only slowly, because every value has to pass through zero.
         """
         corners = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * 3)
         corners = corners[corners.abs().amax(1) > 0].to(self.window.device)
@@ -90,7 +90,7 @@ class SdfNetwork(nn.Module):
         return turned
 
     def with_gradient(self, points: Tensor, create_graph: bool = True) -> tuple[Tensor, Tensor]:
-        """Signed distance (...) and its gradient (..., 3)."""
+        """Compute the signed distance (...) and its gradient (..., 3)."""
         with torch.enable_grad():
             points = points.detach().requires_grad_(True)
             value = self(points)
@@ -108,7 +108,7 @@ class MaterialNetwork(nn.Module):
         self.last = nn.Linear(width, 6)
 
     def forward(self, points: Tensor) -> Tensor:
-        """(..., 6) at points (..., 3)."""
+        """Compute the six material channels (..., 6) in 0..1 at points (..., 3)."""
         x = encode(points)
         for layer in self.hidden:
             x = torch.relu(layer(x))

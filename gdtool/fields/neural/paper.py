@@ -1,4 +1,4 @@
-"""The paper's method around its networks: what they start from, which rays they see, and the mesh they end as."""
+"""Run the paper's method around its networks: initial distances, rays, the extracted mesh and the saved files."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from gdtool.geometry.grids import band_cells, extract, fine_points, grid_over
 # World units around the first geometry in which a ray looks for the surface, and its samples there: by whether depth
 # shaped it (the views' own, or what their normals gave), or only silhouettes did.
 _MEASURED, _BOUNDED = (0.03, 24), (0.08, 64)
-POOL = 150_000  # points whose distances are known
-START_SHARE = 0.33  # of the budget, at most: the views are what is to be fitted
-HALF_SHARE = 0.6  # of the start, in bfloat16
+POOL = 150_000  # points with known distances that the SDF network is fitted to
+START_SHARE = 0.33  # most of the budget that fitting known distances may take
+HALF_SHARE = 0.6  # share of that fit that runs in bfloat16
 _RIM = 16  # pixels beside the silhouette whose rays must miss
 
 
 @dataclass(frozen=True)
 class PaperOptions:
-    """How long and how. steps of the three phases; rule "median" or "secant"; budget in seconds, 0: none.
+    """Set the length and the variant of a fit.
 
-    precision "bfloat16": of the networks' layers while distances are first fitted.
+    The steps are of the three phases. rule: "median" or "secant". budget: seconds, 0 for no limit. precision:
+    "bfloat16" applies to the networks' layers while distances are first fitted.
     """
 
     distance_steps: int = 400
@@ -42,8 +43,9 @@ class PaperOptions:
 def distance_pool(
     vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (count, 3) and their signed distances (count,) to a closed mesh: most near it, the rest anywhere in the
-    box."""
+    """Sample points (count, 3) and their signed distances (count,) to a closed mesh: three quarters near it, the rest
+    in the box.
+    """
     from gdtool.geometry.distance import closest_points, sample_surface, winding_number
 
     near = sample_surface(vertices, faces, count * 3 // 4, rng)[0]
@@ -66,7 +68,7 @@ def gather_pixels(
     device: str,
     reach: float,
 ):
-    """Pixels of all views for networks_fit: those fully inside, and those outside near the silhouette."""
+    """Collect the rays of pixels fully inside the silhouettes, or outside but close to them, as `fit.Pixels`."""
     import torch
     from scipy.ndimage import distance_transform_edt
 
@@ -86,14 +88,14 @@ def gather_pixels(
         hit = caster.first_hit(origins, directions)
         middle = -(origins * directions).sum(1)
         half = np.sqrt(np.maximum(radius**2 - ((origins + middle[:, None] * directions) ** 2).sum(1), 1e-4))
-        found = (hit.face_idx >= 0) & inside[chosen]
-        place = np.where(found, hit.distance, 0.0)
-        place[~found] = closest_approach(
-            origins[~found], directions[~found], (middle - half)[~found], (middle + half)[~found], vertices
+        hits = (hit.face_idx >= 0) & inside[chosen]
+        distance_along = np.where(hits, hit.distance, 0.0)
+        distance_along[~hits] = closest_approach(
+            origins[~hits], directions[~hits], (middle - half)[~hits], (middle + half)[~hits], vertices
         )
         # A ray that has to miss passes the surface at some distance: a wider part of it is watched.
-        around = np.where(found, reach, max(2 * reach, 0.06))
-        near, far = place - around, place + around
+        around = np.where(hits, reach, max(2 * reach, 0.06))
+        near, far = distance_along - around, distance_along + around
         row = {"origins": origins, "directions": directions, "inside": inside[chosen], "near": near, "far": far}
         for name, stack in images.items():
             value = stack[k][chosen]
@@ -119,8 +121,9 @@ def closest_approach(
     vertices: np.ndarray,
     samples: int = 32,
 ) -> np.ndarray:
-    """Where along rays (n, 3) between near and far (n,) one of samples points is nearest to a vertex: distances
-    (n,)."""
+    """Find where rays (n, 3) pass nearest to a vertex, among `samples` points between near and far (n,); distances
+    (n,).
+    """
     from scipy.spatial import cKDTree
 
     share = (np.arange(samples) + 0.5) / samples
@@ -131,7 +134,7 @@ def closest_approach(
 
 
 def evaluate_sdf(sdf, points: np.ndarray, device: str, chunk: int = 1 << 17) -> np.ndarray:
-    """Network distances (n,) float32 at points (n, 3)."""
+    """Evaluate the network's distances (n,) float32 at points (n, 3), in chunks."""
     import torch
 
     out = np.empty(len(points), np.float32)
@@ -143,7 +146,7 @@ def evaluate_sdf(sdf, points: np.ndarray, device: str, chunk: int = 1 << 17) -> 
 
 
 def extract_network(sdf, step: float, device: str) -> tuple[np.ndarray, np.ndarray]:
-    """Closed mesh of the network's zero set in the box, sampled every step where a coarse pass finds it."""
+    """Extract the closed mesh of the network's zero set in the box, sampled every step where a coarse pass finds it."""
     factor = 4
     grid = grid_over(np.full(3, -0.56), np.full(3, 0.56), step, margin=2, multiple=factor)
     coarse_shape = tuple((n - 1) // factor + 1 for n in grid.shape)
@@ -163,7 +166,7 @@ def extract_network(sdf, step: float, device: str) -> tuple[np.ndarray, np.ndarr
 
 
 def network_materials(material, points: np.ndarray, device: str) -> dict[str, np.ndarray]:
-    """albedo (n, 3), roughness (n, 1), metallic (n, 1) of the material network at points (n, 3)."""
+    """Evaluate albedo (n, 3), roughness (n, 1) and metallic (n, 1) of the material network at points (n, 3)."""
     import torch
 
     out = []
@@ -189,11 +192,11 @@ def fit_networks(
 ):
     """Fit both networks to the views, starting from a closed mesh. track(count, label) iterates with progress.
 
-    Returns the Fit and a dict of figures (errors, steps done, whether the budget ended it).
+    Returns the Fit and a dict of figures (errors, steps done).
     """
     import torch
 
-    from gdtool.fields.neural.fit import fit_distances, start, train
+    from gdtool.fields.neural.fit import Schedule, fit_distances, start, train
 
     rng = np.random.default_rng(options.seed)
     began = time.monotonic()
@@ -202,10 +205,12 @@ def fit_networks(
     points, distances = (torch.as_tensor(x, dtype=torch.float32, device=options.device) for x in pool)
 
     def sample(n: int):
+        """Draw n points and distances of the pool."""
         pick = torch.as_tensor(rng.integers(0, len(points), n), device=options.device)
         return points[pick], distances[pick]
 
     def spent(share: float) -> float:
+        """Return how much of this share of the budget is gone."""
         return (time.monotonic() - began) / (share * options.budget) if options.budget else 0.0
 
     error = fit_distances(
@@ -222,15 +227,17 @@ def fit_networks(
     done = train(
         fit,
         pixels,
-        volume_steps=options.volume_steps,
-        surface_steps=options.surface_steps,
-        batch=options.batch,
-        seed=options.seed,
-        rule=options.rule,
-        brdf=options.brdf,
+        Schedule(
+            volume_steps=options.volume_steps,
+            surface_steps=options.surface_steps,
+            batch=options.batch,
+            seed=options.seed,
+            rule=options.rule,
+            brdf=options.brdf,
+            samples=samples,
+        ),
         track=track,
         spent=lambda: spent(1.0),
-        samples=samples,
     )
     figures = {"distance_error": error, "steps": done}
     if fit.history:
@@ -239,7 +246,7 @@ def fit_networks(
 
 
 def light_record(fit) -> dict:
-    """The fitted light as a record of light.json."""
+    """Convert the fitted light to a record of light.json."""
     lights = fit.lights()
     return {
         "kind": "spherical_gaussians",
@@ -250,7 +257,7 @@ def light_record(fit) -> dict:
 
 
 def save_field(path, fit) -> None:
-    """Both networks as one safetensors file: names "sdf.…" and "material.…", float32."""
+    """Write both networks to one safetensors file: names "sdf.…" and "material.…", float32."""
     from safetensors.torch import save_file
 
     tensors = {f"sdf.{k}": v for k, v in fit.sdf.state_dict().items()} | {

@@ -1,6 +1,6 @@
-"""From samples along a ray to a point on the surface: NeuS weights, first crossings, roots, implicit gradients.
+"""Find surface points from samples along a ray: NeuS weights, first crossings, roots and implicit gradients.
 
-METHOD.md section 2 and 3 say why each form is the way it is.
+Each docstring says why its formula is evaluated in that form.
 """
 
 from __future__ import annotations

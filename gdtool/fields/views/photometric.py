@@ -1,4 +1,4 @@
-"""What the colors say of how far away a view's surface is: a point looks alike in all views that see it."""
+"""Constrain depth by color: a point has the same color in all views that see it."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.cameras import Camera, project, rays
-from gdtool.fields.views.prepared_view import bilinear, pixel_footprint
+from gdtool.fields.views.prepared_view import pixel_footprint
+from gdtool.images.sampling import bilinear
 
-BLUR = 0.05  # of how far off surfaces may be: so far are colors blurred, or from afar their slopes would mislead
-LEAST_NOISE = 0.02  # linear: no views' colors are taken to agree better
-_STEP = 1e-3  # world units, for the derivative of a projection
-_GAIN = 2.0  # one view is at most so many times as bright as another
+BLUR = 0.05  # blur of the colors per unit of surface error; sharper colors have misleading slopes at a distance
+LEAST_NOISE = 0.02  # linear color: least noise that is assumed between views
+_STEP = 1e-3  # world units: step of a projection's numerical derivative
+_GAIN = 2.0  # largest ratio of brightness between two views
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A view's colors (h, w, 3), blurred inside its mask, and their slopes per pixel along x and y."""
+    """Hold a view's colors (h, w, 3), blurred inside its mask, and their slopes per pixel along x and y."""
 
     camera: Camera
     color: np.ndarray
@@ -26,7 +27,7 @@ class Picture:
 
     @classmethod
     def of(cls, camera: Camera, image: np.ndarray, mask: np.ndarray, reach: float) -> Picture:
-        """image (h, w, 3) linear, mask (h, w) coverage; reach: world units that surfaces may be off by."""
+        """Blur image (h, w, 3), linear, within mask (h, w). reach: world units by which surfaces may be off."""
         from scipy.ndimage import gaussian_filter
 
         pixels = BLUR * reach / float(pixel_footprint(camera, float(np.linalg.norm(camera.position))))
@@ -37,23 +38,26 @@ class Picture:
         return cls(camera, color, across, down)
 
 
-def color_rows(
+def color_equations(
     points: np.ndarray, here: np.ndarray, there: np.ndarray, first: Picture, second: Picture, trust: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How a view's depth has to change for its points to look like what another view shows at their places.
+    """Linearise how a view's depth has to change for its points to have the colors that another view shows.
 
-    points (n, 3) that the first view shows at pixels here (n, 2) and that fall on pixels there (n, 2) of the second;
-    trust (n,). Returns the slope (n,) of the difference in color per world unit of the first view's depth, the
-    difference (n,) that it shall undo, and weights (n,): one over the variance that the two views' colors differ by,
-    less for outliers. Each channel of a view may be brighter or have an offset."""
-    own, shown = bilinear(first.color, here), bilinear(second.color, there)
+    points (n, 3): shown by the first view at pixels `here` (n, 2), projected to pixels `there` (n, 2) of the second.
+    trust (n,). Returns the slope (n,) of the color difference per world unit of the first view's depth, the difference
+    (n,) to remove, and weights (n,): one over the variance of the two views' color differences, less for outliers. Each
+    channel may have a gain and an offset between the views.
+    """
+    color_here, color_there = bilinear(first.color, here), bilinear(second.color, there)
     _, direction = rays(first.camera, here)
     farther = points + _STEP * direction / np.maximum(-(direction @ first.camera.backward), 1e-9)[:, None]
     moved = (project(second.camera, farther)[0] - there) / _STEP
     slope = bilinear(second.across, there) * moved[:, :1] + bilinear(second.down, there) * moved[:, 1:]
     weight = trust
     for _ in range(3):
-        difference = shown - np.stack([_matched(x, y, weight) for x, y in zip(own.T, shown.T, strict=True)], -1)
+        difference = color_there - np.stack(
+            [_matched(x, y, weight) for x, y in zip(color_here.T, color_there.T, strict=True)], -1
+        )
         # 1.5: from a median to a standard deviation.
         noise = max(1.5 * float(np.median(np.abs(difference))), LEAST_NOISE)
         weight = trust / (1 + (difference**2).mean(1) / (2 * noise) ** 2) ** 2
@@ -62,7 +66,7 @@ def color_rows(
 
 
 def _matched(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """x (n,) with the gain and offset that bring it nearest to y (n,)."""
+    """Apply to x (n,) the gain and offset that bring it nearest to y (n,)."""
     total = max(float(weight.sum()), 1e-12)
     from_x, from_y = x - (weight * x).sum() / total, y - (weight * y).sum() / total
     gain = (weight * from_x * from_y).sum() / max(float((weight * from_x**2).sum()), 1e-12)

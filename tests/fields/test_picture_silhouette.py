@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from gdtool.fields.grid.fusion import fuse_views, grid_step, is_closed_manifold, prepare_all
-from gdtool.fields.grid.shown import lost_pixels, opposite, restore_shown
+from gdtool.fields.grid.fusion import FusionOptions, fuse_views, grid_step, is_closed_manifold, prepare_all
+from gdtool.fields.grid.picture_silhouette import missing_pixels, opposite, restore_picture_silhouette
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import grid_over
 
@@ -43,8 +43,10 @@ def seen():
 
 
 def test_a_wing_that_the_other_views_look_through_is_there(seen):
-    step = grid_step([sight.camera for sight in seen], 0)
-    without, found = (fuse_views(seen, step, 0.5 * step, known=known) for known in ("", "front"))
+    step = grid_step([prepared_view.camera for prepared_view in seen], 0)
+    without, found = (
+        fuse_views(seen, step, FusionOptions(noise=0.5 * step, picture_view=known)) for known in ("", "front")
+    )
     assert without.restored == 0 and np.abs(without.vertices[:, 0]).max() < 0.3
     wing = found.vertices[np.abs(found.vertices[:, 0]) > 0.2]
     assert is_closed_manifold(found.faces) and 0.2 < found.restored < 0.8
@@ -57,20 +59,20 @@ def test_a_wing_that_the_other_views_look_through_is_there(seen):
 
 
 def test_views_that_agree_are_left_alone(seen):
-    step = grid_step([sight.camera for sight in seen], 0)
-    one, two = (fuse_views(seen, step, 0.0, known=known) for known in ("", "front"))
+    step = grid_step([prepared_view.camera for prepared_view in seen], 0)
+    one, two = (fuse_views(seen, step, FusionOptions(noise=0.0, picture_view=known)) for known in ("", "front"))
     assert two.restored == 0 and np.array_equal(one.vertices, two.vertices)
 
 
 def test_without_a_view_from_behind_a_part_is_as_thick_as_wide(seen):
-    front = next(sight for sight in seen if sight.camera.name == "front")
+    front = next(prepared_view for prepared_view in seen if prepared_view.camera.name == "front")
     assert opposite(seen, front).camera.name == "back" and opposite([front], front) is None
     grid = grid_over(np.full(3, -0.45), np.full(3, 0.45), 0.01, margin=2)
     index = np.argwhere(np.ones(grid.shape, bool))
     values = body(grid.points(index)).reshape(grid.shape).astype(np.float32)
-    lost = lost_pixels(values, grid, front)
+    lost = missing_pixels(values, grid, front)
     assert lost.sum() == pytest.approx(2 * 0.28 * 2 * HIGH / front.camera.pixel_size**2, rel=0.15)
-    alone, share = restore_shown(values, grid, [front], front)
+    alone, share = restore_picture_silhouette(values, grid, [front], front)
     assert share == pytest.approx(lost.sum() / (front.mask > 0.5).sum())
     wing = grid.points(index[(alone < 0).ravel() & (np.abs(grid.points(index)[:, 0]) > 0.2)])
     # Thin, where its front edge is seen.
@@ -78,7 +80,7 @@ def test_without_a_view_from_behind_a_part_is_as_thick_as_wide(seen):
     assert (alone <= values).all()
     # What is there needs nothing, and a view without depth says nothing of where.
     whole = plane(grid.points(index)).reshape(grid.shape).astype(np.float32)
-    same, share = restore_shown(whole, grid, seen, front)
+    same, share = restore_picture_silhouette(whole, grid, seen, front)
     assert share == 0 and same is whole
     blind = prepare_all([front.camera], front.mask[None], None, None)[0]
-    assert restore_shown(values, grid, [blind], blind) == (values, 0.0)
+    assert restore_picture_silhouette(values, grid, [blind], blind) == (values, 0.0)

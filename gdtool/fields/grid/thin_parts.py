@@ -1,71 +1,70 @@
-"""Parts that a view sees and that the grid lost: sheets without thickness, blades and wires finer than its step.
+"""Restore thin parts that the grid lost: sheets without thickness, blades and wires finer than its step.
 
-Every pixel's point must lie on the result. Where it does not, the part gets the least thickness the grid can hold.
+Every pixel's point must lie on the result. Where it does not, the part gets the least thickness that the grid can hold.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from gdtool.fields.views.prepared_view import WEAK, Sight, pixel_footprint
+from gdtool.fields.views.prepared_view import WEAK, PreparedView, pixel_footprint
 from gdtool.geometry.grids import Grid, sample_trilinear
 
-HALF_THICKNESS = 0.6  # steps: over half, so that a sheet between two layers of samples has one inside
-_LOST = 0.5  # steps outside the surface at which a point counts as lost
-_DEPTH = 0.8  # steps below a seen surface at which there has to be an inside
+HALF_THICKNESS = 0.6  # grid steps: over half, so that a sheet between two layers of samples has one inside
+_LOST = 0.5  # grid steps outside the surface at which a point counts as lost
+_DEPTH = 0.8  # grid steps below a seen surface at which there has to be an inside
 _CHUNK = 4096  # points whose cubes of samples are held at once, some 35 KB each
-_REGION = 8  # pixels: fewer that touch are noise at an edge
+_REGION = 8  # pixels of a connected region; a smaller one is noise at an edge
 
 
-def lost_points(
-    values: np.ndarray, before: np.ndarray, grid: Grid, sights: list[Sight]
+def missing_points(
+    values: np.ndarray, before: np.ndarray, grid: Grid, views: list[PreparedView]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (n, 3) that views see outside the grid's surface, their normals (n, 3) and pixel sizes on the surface
-    (n,).
+    """Find points (n, 3) that views see outside the grid's surface, their normals (n, 3) and pixel sizes (n,).
 
-    before: the distances before smoothing; a seen surface with no inside behind it there is a sheet.
+    before: the distances before smoothing. A seen surface with no inside behind it there is a sheet.
     """
     from scipy.ndimage import label
 
     points, normals, sizes = [], [], []
-    for sight in sights:
-        if sight.planes is None:
+    for view in views:
+        if view.planes is None:
             continue
         # The centre of a pixel that the silhouette cuts may lie beside the object.
-        sure = (sight.weight > WEAK) & (sight.mask > 0.95) & ~sight.broken
+        sure = (view.weight > WEAK) & (view.mask > 0.95) & ~view.depth_edge
         lost = np.zeros(sure.shape, bool)
-        inward = sight.points[sure] - _DEPTH * grid.step * sight.planes[sure][:, :3]
-        hollow = (sample_trilinear(before, grid.locate(inward)) > 0) & ~sight.rough[sure]
-        lost[sure] = hollow | (sample_trilinear(values, grid.locate(sight.points[sure])) > _LOST * grid.step)
+        inward = view.points[sure] - _DEPTH * grid.step * view.planes[sure][:, :3]
+        hollow = (sample_trilinear(before, grid.locate(inward)) > 0) & ~view.not_smooth[sure]
+        lost[sure] = hollow | (sample_trilinear(values, grid.locate(view.points[sure])) > _LOST * grid.step)
         regions, count = label(lost, np.ones((3, 3)))
         if count == 0:
             continue
         lost &= (np.bincount(regions.ravel()) >= _REGION)[regions]
-        normal = sight.planes[lost][:, :3]
-        points.append(sight.points[lost])
+        normal = view.planes[lost][:, :3]
+        points.append(view.points[lost])
         normals.append(normal)
-        distance = np.linalg.norm(sight.points[lost] - sight.camera.position, axis=1)
-        sizes.append(pixel_footprint(sight.camera, distance) / np.clip(normal @ sight.camera.backward, 0.35, 1.0))
+        distance = np.linalg.norm(view.points[lost] - view.camera.position, axis=1)
+        sizes.append(pixel_footprint(view.camera, distance) / np.clip(normal @ view.camera.backward, 0.35, 1.0))
     if not points:
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
     return np.concatenate(points), np.concatenate(normals), np.concatenate(sizes)
 
 
-def restore_thin(
-    values: np.ndarray, before: np.ndarray, grid: Grid, sights: list[Sight]
+def restore_thin_parts(
+    values: np.ndarray, before: np.ndarray, grid: Grid, views: list[PreparedView]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distances in which no seen region is lost, and the points (n, 3) of what was thickened.
+    """Add an inside where a seen region is lost; returns the signed distances and the thickened points (n, 3).
 
-    before: the distances before smoothing, which may still hold a part that smoothing took.
+    before: the distances before smoothing, which may still hold a part that smoothing removed.
     """
-    points, _, _ = lost_points(values, before, grid, sights)
+    points, _, _ = missing_points(values, before, grid, views)
     if len(points) == 0:
         return values, points
     out = values.copy()
     for start in range(0, len(points), _CHUNK):
         around = _around(points[start : start + _CHUNK], grid, 2)[0].ravel()
         out.ravel()[around] = np.minimum(out.ravel()[around], before.ravel()[around])
-    points, normals, sizes = lost_points(out, before, grid, sights)
+    points, normals, sizes = missing_points(out, before, grid, views)
     for start in range(0, len(points), _CHUNK):
         part = slice(start, start + _CHUNK)
         index, place = _around(points[part], grid, 3)
@@ -78,7 +77,7 @@ def restore_thin(
 
 
 def _around(points: np.ndarray, grid: Grid, reach: int) -> tuple[np.ndarray, np.ndarray]:
-    """Flat indices (n, k) of the samples within a cube around each point, and their positions (n, k, 3)."""
+    """Return flat indices (n, k) of the samples in a cube around each point, and their positions (n, k, 3)."""
     steps = np.arange(-reach, reach + 1)
     cube = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
     index = np.rint(grid.locate(points)).astype(np.int64)[:, None] + cube
@@ -87,8 +86,8 @@ def _around(points: np.ndarray, grid: Grid, reach: int) -> tuple[np.ndarray, np.
     return flat, grid.origin + grid.step * index
 
 
-def near_points(vertices: np.ndarray, points: np.ndarray, distance: float) -> np.ndarray:
-    """Which vertices (v,) lie within distance of any of the points."""
+def vertices_near(vertices: np.ndarray, points: np.ndarray, distance: float) -> np.ndarray:
+    """Tell which vertices (v,) lie within distance of any of the points."""
     from scipy.spatial import cKDTree
 
     if len(points) == 0:

@@ -1,0 +1,45 @@
+"""Combine a preset with an ablation, a configuration file and single values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from gdtool.core.errors import InputError
+from gdtool.core.reading import read_json
+from gdtool.diffusion.config import ABLATIONS, PRESETS, ModelConfig, TrainConfig
+
+
+def configuration(
+    preset: str, ablation: str, file: str | None, values: Mapping[str, int], size: int | None
+) -> tuple[ModelConfig, TrainConfig]:
+    """Return the preset with the changes of the ablation, then of the file, then of values, resized.
+
+    file: path of JSON {"model": {...}, "train": {...}}. values: of TrainConfig. Raises InputError for a bad file.
+    """
+    parts = [msgspec.to_builtins(part) for part in PRESETS[preset]]
+    for part, changes in zip(parts, ABLATIONS[ablation], strict=True):
+        part.update(changes)
+    if file is not None:
+        path = Path(file)
+        try:
+            changes = msgspec.convert(read_json(path), dict[Literal["model", "train"], dict])
+        except msgspec.ValidationError as error:
+            raise InputError(
+                path, str(error), 'write {"model": {...}, "train": {...}} with names and values of docs/training.md'
+            ) from None
+        for part, name in zip(parts, ("model", "train"), strict=True):
+            part.update(changes.get(name, {}))
+    parts[1].update(values)
+    try:
+        model, train = msgspec.convert(parts[0], ModelConfig), msgspec.convert(parts[1], TrainConfig)
+    except msgspec.ValidationError as error:
+        raise InputError(file or "configuration", str(error), "correct that value in the file of --config") from None
+    if size is not None:
+        from gdtool.diffusion.network.grow import resized
+
+        model = resized(model, size)
+    return model, train

@@ -1,0 +1,94 @@
+"""Read a picture, cut its subject out and frame it as the model's condition."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gdtool.core.errors import InputError
+from gdtool.diffusion.data.framing import FRONT_EXTENT, frame, framed_side, whole_frame
+from gdtool.images.color import linear_from_srgb, srgb_from_linear
+from gdtool.images.io import read_image
+from gdtool.images.mask import foreground
+
+LEAST_PIXELS = 32  # along the picture's shorter side: less shows the model nothing
+FINEST = 8  # pixels of picture.png across one of a view
+
+
+@dataclass(frozen=True)
+class PictureOptions:
+    """Set how a picture becomes a condition.
+
+    mask: path of an image that is bright where the subject is. matting: path of an ONNX network. crop: centre and scale
+    the subject as in training, else keep the picture's framing. extent: longest side of the framed subject as a share
+    of the image. size: pixels of the condition.
+    """
+
+    mask: str | None
+    matting: str | None
+    crop: bool
+    extent: float
+    size: int
+
+
+def wrong_size(mask: str, size: tuple[int, int], wanted: tuple[int, int]) -> InputError:
+    """Describe a mask whose size (width, height) is not the picture's."""
+    return InputError(
+        mask, f"is {size[0]}x{size[1]}, the image {wanted[0]}x{wanted[1]}", f"scale it to {wanted[0]}x{wanted[1]}"
+    )
+
+
+def condition_of(
+    path: Path, name: str, options: PictureOptions, warn: Callable[[str], None]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Frame the picture: (size, size, 4), linear color and straight alpha, and the same at the picture's resolution.
+
+    The second is a whole number of times finer, FINEST at most. Raises InputError without a usable subject.
+    """
+    image = read_image(path)
+    if min(image.shape[:2]) < LEAST_PIXELS:
+        raise InputError(
+            path,
+            f"is {image.shape[1]}x{image.shape[0]} pixels; the model needs {LEAST_PIXELS} at least",
+            "give a larger picture",
+        )
+    mask = read_image(Path(options.mask)) if options.mask is not None else None
+    if mask is not None and mask.shape[:2] != image.shape[:2]:
+        raise wrong_size(options.mask, mask.shape[1::-1], image.shape[1::-1])
+    alpha = foreground(image, mask, path, warn, options.matting)
+    if not (alpha > 0.5).any():
+        raise InputError(path, "shows no subject: its mask is empty", "give one with --mask")
+    edge = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
+    if options.crop and (edge > 0.5).any():
+        warn(f"{name}: the subject touches the border of the picture and may be cut off")
+    linear = image.dtype.kind == "f"
+    color = (
+        image[..., :3]
+        if image.ndim == 3 and image.shape[2] >= 3
+        else np.repeat(image.reshape(*image.shape[:2], -1)[..., :1], 3, -1)
+    )
+    if not linear:
+        color = linear_from_srgb(color.astype(np.float32) / np.iinfo(image.dtype).max)
+    rgba = np.concatenate([color, alpha[..., None]], -1).astype(np.float32)
+    size, extent = options.size, options.extent
+    finer = (framed_side(rgba, extent) if options.crop else max(rgba.shape[:2])) / size
+    condition, picture = (
+        frame(rgba, side, extent) if options.crop else whole_frame(rgba, side)
+        for side in (size, size * min(max(round(finer), 1), FINEST))
+    )
+    return condition, picture
+
+
+def extent_of(convention: str) -> float:
+    """Return the longest side of the framed subject, as a share of the image, that a model was trained with."""
+    from gdtool.diffusion.checkpoint import wonder3d
+
+    return wonder3d.EXTENT if convention == "wonder3d" else FRONT_EXTENT
+
+
+def encoded_rgba(image: np.ndarray) -> np.ndarray:
+    """Encode linear color to sRGB in (h, w, 4), clipped to [0, 1]; alpha stays linear."""
+    return np.concatenate([srgb_from_linear(np.clip(image[..., :3], 0, 1)), np.clip(image[..., 3:], 0, 1)], -1)

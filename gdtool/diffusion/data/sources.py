@@ -1,0 +1,33 @@
+"""Open the views folders among a training's sources: folders, datasets and archives."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from gdtool.core.folder import Folder, dataset_objects
+from gdtool.diffusion.data.archives import object_count, views_of
+
+
+def views_folders(sources: Iterable[Folder | Path], workspace: Path) -> Iterator[Folder]:
+    """Yield the views folders of folders, datasets and archives; an archive's are unpacked under workspace."""
+    parts = []
+    for source in sources:
+        if isinstance(source, Path):
+            parts.append(views_of(source, workspace))
+        else:
+            parts.append([source] if source.kind == "views" else dataset_objects(source))
+    return itertools.chain.from_iterable(parts)
+
+
+def count_views_folders(sources: Iterable[Folder | Path]) -> int:
+    """Count what views_folders() yields; of archives only the headers are read."""
+    return sum(_count(source) for source in sources)
+
+
+def _count(source: Folder | Path) -> int:
+    """Count the views folders of one source."""
+    if isinstance(source, Path):
+        return object_count(source)
+    return 1 if source.kind == "views" else len(source.content.objects)

@@ -1,0 +1,59 @@
+"""Run a training in each of its processes: the first one's order, and the work that all do alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from gdtool.diffusion.checkpoint.weights import check_shapes, load_model
+from gdtool.diffusion.config import ModelConfig, TrainConfig
+from gdtool.diffusion.data.objects import Objects, decode_dataset
+from gdtool.diffusion.network.model import Model
+from gdtool.diffusion.training import distributed
+from gdtool.diffusion.training.loop import Observers, RunOptions, State, run_training
+
+
+@dataclass(frozen=True)
+class Order:
+    """Tell all processes what to train.
+
+    start: model folder whose weights to start from, if any. used: number of objects that are trained on.
+    """
+
+    model: ModelConfig
+    train: TrainConfig
+    start: Path | None
+    workspace: Path
+    used: int
+    run: RunOptions
+
+
+def execute(order: Order, objects: Objects, observers: Observers | None = None) -> State:
+    """Train with the same model and data in every process, each with its part of each batch."""
+    torch.manual_seed(order.run.seed)
+    model = Model(order.model)
+    if order.start is not None:
+        from gdtool.diffusion.network.grow import grown
+
+        loaded = load_model(order.start)
+        tensors = grown(loaded.state_dict(), loaded.config, order.model)
+        check_shapes(order.start, tensors, model.state_dict())
+        model.load_state_dict(tensors)
+    elif order.model.codec == "vae":
+        from gdtool.diffusion.checkpoint.pretrained import start_from_pretrained
+
+        start_from_pretrained(model)
+    return run_training(model, objects, order.train, order.workspace, order.run, observers or Observers())
+
+
+def follow(threads: int) -> None:
+    """Wait for the first process's order, train with it, and end: what every other process of torchrun does."""
+    if threads:
+        torch.set_num_threads(threads)
+    order = distributed.receive()
+    if order is not None:
+        every = decode_dataset((), 0, order.model, order.workspace)
+        execute(order, every.part(slice(order.used)))
+    distributed.leave()
