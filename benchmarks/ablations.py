@@ -127,11 +127,13 @@ def markdown(record: dict) -> str:
         [
             "# What supervision by rendering and attention across the domains are worth",
             "",
-            f"{record['steps']} steps of training at {SIZE} px over {record['objects']} objects, seeds {', '.join(next(iter(runs.values()), {}))}; "
+            f"{record['steps']} steps of training at {SIZE} px over {record['objects']} objects, seeds "
+            f"{', '.join(next(iter(runs.values()), {}))}; "
             f"{record['held_out']} held-out objects, on {machine()}. Mean ± standard deviation over the seeds.",
             "",
             *lines,
-            "Higher is better for PSNR, lower for the others. Re-rendered PSNR, slopes and reprojection need no truth: they say how the "
+            "Higher is better for PSNR, lower for the others. Re-rendered PSNR, slopes and reprojection need no "
+            "truth: they say how the "
             "sampled domains and views fit one another.",
             "",
         ]

@@ -252,12 +252,16 @@ def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
         f"- {row['model']}: {row[what]}" for row in rows.rows for what in ("failed", "peer failed") if what in row
     )
     head = (
-        f"# Finished asset\n\n`python benchmarks/asset.py`, {machine()}. {note}\n\n`gdtool bake --size 2048 --lods 4 --source-frame` of the model's quad mesh: "
-        f"seconds and memory of the whole command; masked PSNR of lit pictures against the model's, mean of {VIEWS} views under "
+        f"# Finished asset\n\n`python benchmarks/asset.py`, {machine()}. {note}\n\n`gdtool bake --size 2048 --lods 4 "
+        f"--source-frame` of the model's quad mesh: "
+        f"seconds and memory of the whole command; masked PSNR of lit pictures against the model's, mean of {VIEWS} "
+        f"views under "
         f"{', '.join(LIGHTS)}, and the worst; floor: the model against itself "
-        f"with four times the samples, one view, under the light where they differ most (below {QUIET:g} dB all get more); the buffers' errors; shape: how far 99 % "
+        f"with four times the samples, one view, under the light where they differ most (below {QUIET:g} dB all get "
+        f"more); the buffers' errors; shape: how far 99 % "
         "of the model's surface lie from the quad mesh, and "
-        "how far the coarsest level (an eighth) slid on its maps, shares of the extent; gdtool's pictures of the asset against Blender's and "
+        "how far the coarsest level (an eighth) slid on its maps, shares of the extent; gdtool's pictures of the "
+        "asset against Blender's and "
         "three.js'.\n\n"
     )
     (out / "asset.md").write_text(

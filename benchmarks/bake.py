@@ -1,7 +1,8 @@
 """Time and memory against error of bake, beside Blender's Cycles in the same run, on the peers' bake case and public
 models.
 
-    python benchmarks/bake.py [MODEL_OR_FOLDER ...] [--peers-python PATH] [-o docs/benchmarks] [--minutes 12] [--sizes 1024,2048,4096]
+    python benchmarks/bake.py [MODEL_OR_FOLDER ...] [--peers-python PATH] [-o docs/benchmarks] [--minutes 12] \
+        [--sizes 1024,2048,4096]
 
 Writes bake.md, bake.json and bake.jpg (the maps side by side) row by row: killed, or out of --minutes, it goes on where
 it was. Models that have neither a texture nor colors are left out; those that cannot be remeshed are named. The sizes
@@ -231,9 +232,11 @@ def write(out: Path, rows: Rows, complete: bool, kept: Path, note: str) -> None:
     )
     failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows.rows if "failed" in row)
     head = (
-        f"# Bake\n\n`python benchmarks/bake.py`, {machine()}. {note}\n\nbake: rasterising, reading, gutters and storing; seconds of the wall and of the "
+        f"# Bake\n\n`python benchmarks/bake.py`, {machine()}. {note}\n\nbake: rasterising, reading, gutters and "
+        f"storing; seconds of the wall and of the "
         "processor. Errors before storing, and after 8 bits. seam: how much more the two sides of seams "
-        "differ than in the model, over the same at other edges, or over 1 where those differ less. rim: the base color along the charts' rims in the mip level of "
+        "differ than in the model, over the same at other edges, or over 1 where those differ less. rim: the base "
+        "color along the charts' rims in the mip level of "
         f"{MIP} texels, against each chart alone.\n\n"
     )
     (out / "bake.md").write_text(

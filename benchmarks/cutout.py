@@ -45,8 +45,10 @@ def markdown(rows: list[dict]) -> str:
             "# Subjects on busy backgrounds",
             "",
             f"{len(rows)} pictures with known alpha over photographed environments, on {machine()}.",
-            f"Accepted (the two frames agree by {cutout.AGREEMENT} or more): {len(accepted)}, mean overlap with the truth "
-            f"{np.mean([r['overlap'] for r in accepted]) if accepted else float('nan'):.3f}, below 0.9 in {sum(r['overlap'] < 0.9 for r in accepted)}. "
+            f"Accepted (the two frames agree by {cutout.AGREEMENT} or more): {len(accepted)}, mean overlap with the "
+            f"truth "
+            f"{np.mean([r['overlap'] for r in accepted]) if accepted else float('nan'):.3f}, below 0.9 in "
+            f"{sum(r['overlap'] < 0.9 for r in accepted)}. "
             f"Refused though good: {sum(r['agreement'] < cutout.AGREEMENT for r in good)}.",
             "",
             table(

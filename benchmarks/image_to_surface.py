@@ -72,11 +72,13 @@ def markdown(rows: list[dict]) -> str:
         [
             "# One picture to a surface",
             "",
-            f"Held-out procedural objects, the picture is the front view, on {machine()}; mean (median). IoU of closed truths only.",
+            f"Held-out procedural objects, the picture is the front view, on {machine()}; mean (median). IoU of "
+            f"closed truths only.",
             "",
             table(["from", "objects", *(key.replace("_", " ") for key in KEYS)], lines),
             "",
-            "Distances in the surface protocol are in units of the object's largest extent; the paper's own figures, on other objects and in "
+            "Distances in the surface protocol are in units of the object's largest extent; the paper's own figures, "
+            "on other objects and in "
             "the syncdreamer protocol, are 0.0231 and 0.5779.",
             "",
         ]

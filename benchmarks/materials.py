@@ -149,8 +149,10 @@ def markdown(rows: list[dict], size: int, remark: str) -> str:
     parts = [
         "# Materials of reconstructed surfaces",
         f"By `make bench-materials`, on {machine()}, views of {size}². {remark}",
-        "At held-out cameras, relit by a held-out light. *Scaled*: after one factor per channel, which color alone cannot tell. *Light in albedo*: "
-        "correlation of the albedo's error with the shading that the views show. *s*: processor seconds of the materials alone.",
+        "At held-out cameras, relit by a held-out light. *Scaled*: after one factor per channel, which color alone "
+        "cannot tell. *Light in albedo*: "
+        "correlation of the albedo's error with the shading that the views show. *s*: processor seconds of the "
+        "materials alone.",
         f"## Median of {len(names)} objects",
         table(
             ["from", *(title for _, title in FIGURES)],

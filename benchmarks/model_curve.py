@@ -25,8 +25,10 @@ from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.diffusion.data.objects import decode_object
 
 NOTE = (
-    "Minutes are of the clock, of runs on one core or two, alone or beside other work, as the card says; the first rows are at 64 px, where views are "
-    "easier to match. The line in the picture goes through all of them and is drawn on to ten times the training: what a faster machine would add "
+    "Minutes are of the clock, of runs on one core or two, alone or beside other work, as the card says; the first "
+    "rows are at 64 px, where views are "
+    "easier to match. The line in the picture goes through all of them and is drawn on to ten times the training: "
+    "what a faster machine would add "
     "is an estimate by it, not a measurement."
 )
 SHOWN = (
@@ -103,7 +105,10 @@ def main() -> None:
         "--after",
         type=float,
         metavar="MINUTES",
-        help="the model went on from one of so many minutes that is not here any more: its row, and those before, are kept",
+        help=(
+            "the model went on from one of so many minutes that is not here any more: its row, and those before, are "
+            "kept"
+        ),
     )
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/benchmarks"))
     arguments = parser.parse_args()
@@ -121,7 +126,8 @@ def main() -> None:
         [
             "# Quality against minutes of training",
             "",
-            f"{len(folders)} held-out objects, one step of sampling of the picture alone, trained and measured on {machine()}.",
+            f"{len(folders)} held-out objects, one step of sampling of the picture alone, trained and measured on "
+            f"{machine()}.",
             "",
             table(["minutes", "px", *(key.replace("_", " ") for key in SHOWN)], rows),
             "",

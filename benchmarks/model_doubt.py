@@ -1,8 +1,10 @@
 r"""Whether the warnings of sample-views tell which pictures a model does badly, and the limits above which it warns.
 
     DOMAINS=color,normal,depth,albedo,roughness,metallic
-    gdtool render-dataset procedural:950000..950299 --size 128 --samples 4 --light-samples 4 --domains $DOMAINS -o validation
-    python benchmarks/model_doubt.py held_out --model my-model --calibrate validation --real real --photographs $ASSETS/images -o docs/benchmarks
+    gdtool render-dataset procedural:950000..950299 --size 128 --samples 4 --light-samples 4 --domains $DOMAINS -o \
+        validation
+    python benchmarks/model_doubt.py held_out --model my-model --calibrate validation --real real --photographs \
+        $ASSETS/images -o docs/benchmarks
 
 held_out and real are those of benchmarks/model_quality.py; photographs are pictures with alpha, whose truth nobody
 knows. --calibrate: objects that the model was neither trained nor is measured on. The limits that one in twenty of them
@@ -118,7 +120,8 @@ def tables(held: list[dict], real: list[dict], photographs: list[dict], known: d
     for name in DOUBTS:
         values, own, others = (np.array([one["report"][name] for one in rows]) for rows in (both, held, photographs))
         cells = [
-            f"{spearmanr(values, e, nan_policy='omit')[0]:.2f}, {spearmanr(own, e[: len(held)], nan_policy='omit')[0]:.2f}"
+            f"{spearmanr(values, e, nan_policy='omit')[0]:.2f}, "
+            f"{spearmanr(own, e[: len(held)], nan_policy='omit')[0]:.2f}"
             for e in error.values()
         ]
         cells += [f"{higher(own, x):.2f}" for x in (values[len(held) :], others)]

@@ -4,11 +4,13 @@ r"""How good a model is on objects it was not trained on, beside two baselines; 
     python benchmarks/model_quality.py held_out --model my-model --train objects -o docs/benchmarks --install
     gdtool render-dataset $ASSETS/glb/*.glb $ASSETS/gltf/*/*.gltf $(find $ASSETS/gso -name '*.obj' | grep -v _col) \
         --size 128 --samples 8 --light-samples 4 --condition-views 3 -o real
-    python benchmarks/model_quality.py real --train objects --steps 1 --name model_quality_real --objects "real models" -o docs/benchmarks
+    python benchmarks/model_quality.py real --train objects --steps 1 --name model_quality_real --objects "real \
+        models" -o docs/benchmarks
     gdtool render-dataset procedural:900000..900099 --turn 45 --size 128 --condition-views 3 -o turned
     python benchmarks/model_quality.py turned --steps 1 --name model_quality_turned -o docs/benchmarks
     gdtool render-dataset procedural:900100..900399 --size 128 --condition-views 3 -o more
-    python benchmarks/model_quality.py held_out more --train objects --steps 1 --name model_quality_400 -o docs/benchmarks
+    python benchmarks/model_quality.py held_out more --train objects --steps 1 --name model_quality_400 -o \
+        docs/benchmarks
 
 --install puts the model, with the table in its card, where the package finds its bundled model.
 
@@ -195,8 +197,10 @@ def report(means: dict[str, dict[str, float]], count: int, size: int, objects: s
     own = next(iter(means.values()))
     lines += [
         "",
-        f'By the paper\'s protocol, which takes the front view in ("six"), color has {own["color_psnr_six"]:.2f} dB and SSIM '
-        f"{own['color_ssim_six']:.3f}; the paper has 27.93 dB and 0.937, on other objects, with a model a hundred times as large.",
+        f'By the paper\'s protocol, which takes the front view in ("six"), color has {own["color_psnr_six"]:.2f} dB '
+        f"and SSIM "
+        f"{own['color_ssim_six']:.3f}; the paper has 27.93 dB and 0.937, on other objects, with a model a hundred "
+        f"times as large.",
     ]
     behind = [
         f"{key.replace('_', ' ')} ({own[key]:.3f} against {means[name][key]:.3f} of the {name})"

@@ -134,7 +134,8 @@ def main() -> None:
             [
                 "# What the bundled model makes of twelve pictures and of twelve held-out objects",
                 "",
-                "A block a picture: as the model is shown it, then its six views in color, normal, depth, albedo, roughness and metallic.",
+                "A block a picture: as the model is shown it, then its six views in color, normal, depth, albedo, "
+                "roughness and metallic.",
                 "",
                 "![twelve pictures](model_pictures.jpg)",
                 "",

@@ -1,8 +1,11 @@
 r"""What the picture that views were made of adds to the albedo that is baked from them.
 
-    gdtool render-dataset $ASSETS/glb/{Barrel,BoxTextured,CesiumMilkTruck,ExplodingBarrel,Fox,egyptian_cat,seagulf,target,house}.glb \
-        $ASSETS/gltf/{painted_wooden_stool_1k,sofa_03_1k,tea_set_01_1k,wooden_table_02_1k}/*.gltf $ASSETS/gso/aloha/*/meshes/model.obj \
-        $ASSETS/gso/vima/{bull_figure,toy_train}.obj --size 512 --samples 4 --light-samples 4 --domains color,albedo -o out/fine
+    gdtool render-dataset \
+        $ASSETS/glb/{Barrel,BoxTextured,CesiumMilkTruck,ExplodingBarrel,Fox,egyptian_cat,seagulf,target,house}.glb \
+        $ASSETS/gltf/{painted_wooden_stool_1k,sofa_03_1k,tea_set_01_1k,wooden_table_02_1k}/*.gltf \
+            $ASSETS/gso/aloha/*/meshes/model.obj \
+        $ASSETS/gso/vima/{bull_figure,toy_train}.obj --size 512 --samples 4 --light-samples 4 --domains \
+            color,albedo -o out/fine
     python benchmarks/picture.py out/fine -o docs/benchmarks
 
 Each object's front view in 512 px is the picture and the truth. The albedo at the model's size, the bundled model's and
@@ -110,8 +113,10 @@ def main() -> None:
         [
             "# What the picture adds to the views",
             "",
-            f"By `benchmarks/picture.py`, {machine()}: albedo of the front view in {shown.shape[1]} px, made from {size} px; PSNR in dB where the object "
-            "covers the pixel / SSIM over white. A true albedo of one color is exact as it is (100 dB), and stays so: its gain is 0.",
+            f"By `benchmarks/picture.py`, {machine()}: albedo of the front view in {shown.shape[1]} px, made from "
+            f"{size} px; PSNR in dB where the object "
+            "covers the pixel / SSIM over white. A true albedo of one color is exact as it is (100 dB), and stays "
+            "so: its gain is 0.",
             "",
             table(["", *(f"{whose}, {way}" for whose in ("model", "true") for way in WAYS)], lines),
             "",

@@ -161,8 +161,10 @@ def markdown(records: list[dict], remark: str = "") -> str:
         "# Pipeline: time against error",
         "",
         f"By `make bench` on {machine()}. Medians over the sources; peak memory is the largest process's.",
-        "Distance is the mean of both directions to the true surface, largest extent 1; seen: over what the six views see;",
-        "pictures are compared inside the object. The whole's errors are the baked asset's. `docs/metrics.md` defines each figure.",
+        "Distance is the mean of both directions to the true surface, largest extent 1; seen: over what the six "
+        "views see;",
+        "pictures are compared inside the object. The whole's errors are the baked asset's. `docs/metrics.md` "
+        "defines each figure.",
         remark,
         "",
     ]
@@ -224,7 +226,7 @@ def plot(records: list[dict], path: Path) -> None:
     ]
     figure, axes = plt.subplots(1, len(panels), figsize=(14, 4), layout="constrained")
     rows = summary(records)
-    for axis, (name, label, logarithmic) in zip(axes, panels):
+    for axis, (name, label, logarithmic) in zip(axes, panels, strict=True):
         for color, way in (("tab:blue", "model"), ("tab:orange", "image")):
             points = [
                 (r["stages"]["whole"]["seconds"], r["stages"]["whole"][name])
@@ -238,7 +240,7 @@ def plot(records: list[dict], path: Path) -> None:
             ]
             if not middle:
                 continue
-            axis.scatter(*zip(*points), s=10, alpha=0.4, color=color)
+            axis.scatter(*zip(*points, strict=True), s=10, alpha=0.4, color=color)
             axis.plot([m[0] for m in middle], [m[1] for m in middle], "o-", color=color, label=f"{way} to asset")
             for seconds, value, quality in middle:
                 axis.annotate(quality, (seconds, value), textcoords="offset points", xytext=(5, 5), fontsize=8)

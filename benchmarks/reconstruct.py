@@ -3,7 +3,8 @@
     python benchmarks/reconstruct.py                    public models in --assets and procedural ones: an hour
     python benchmarks/reconstruct.py --all              every model with five seeds at three wavelengths: hours
     python benchmarks/reconstruct.py --models DIR --limit 12 --procedural 0
-    python benchmarks/reconstruct.py --sheet /tmp/objects.png --only bunny,spot --cases clean --budgets '' -o /tmp/report
+    python benchmarks/reconstruct.py --sheet /tmp/objects.png --only bunny,spot --cases clean --budgets '' -o \
+        /tmp/report
     python benchmarks/reconstruct.py --assets none --procedural 1 --size 128 --budgets 2,5 -o /tmp/report
 
 Every model is rendered by `gdtool render-dataset`; the disturbed views are benchmarks/perturbation.py's. Ours runs by
@@ -248,7 +249,7 @@ class Bench:
         self.head["complete"] = complete
         beside = self.path.with_suffix(".part")
         beside.write_text(json.dumps(self.head | {"records": self.records}, indent=1) + "\n")
-        os.replace(beside, self.path)
+        beside.replace(self.path)
         (self.given.output / "reconstruct.md").write_text(markdown(self.records, self.given, self.head["remark"]))
 
 

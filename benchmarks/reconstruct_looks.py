@@ -118,7 +118,7 @@ def sheet(folder: Path, heads: list[str], path: Path, done: bool) -> None:
     kept = sorted((folder / "reconstruct_pictures").glob("*.npz"))
     for file in kept:
         with np.load(file) as row:
-            rows[str(row["label"])] = [row[str(i)] if str(i) in row else None for i in range(len(heads))]
+            rows[str(row["label"])] = [row.get(str(i)) for i in range(len(heads))]
     if rows:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_png(path, contact_sheet(list(rows.values()), heads, list(rows)))

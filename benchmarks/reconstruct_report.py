@@ -206,7 +206,8 @@ def verdict(records: list[dict]) -> str:
             if value is not None:
                 least = name in ("iou", "albedo_psnr")
                 lines.append(
-                    f"- {case}: {'largest' if name == 'peak_mb' else 'median'} {name} {number(value)}, wanted {'≥' if least else '≤'} {limit:g}: "
+                    f"- {case}: {'largest' if name == 'peak_mb' else 'median'} {name} {number(value)}, wanted "
+                    f"{'≥' if least else '≤'} {limit:g}: "
                     + ("holds" if (value >= limit if least else value <= limit) else "**missed**")
                 )
     papers = [r for r in records if r["method"] == PAPER]
@@ -214,7 +215,8 @@ def verdict(records: list[dict]) -> str:
         value = middle(papers, name)
         if value is not None:
             lines.append(
-                f"- the paper's method without depth: median {name} {number(value)}, wanted ≤ {limit:g}: {'holds' if value <= limit else '**missed**'}"
+                f"- the paper's method without depth: median {name} {number(value)}, wanted ≤ {limit:g}: "
+                f"{'holds' if value <= limit else '**missed**'}"
             )
     return "\n".join(lines)
 
@@ -225,11 +227,14 @@ def markdown(records: list[dict], given: argparse.Namespace, remark: str) -> str
     parts = [
         "# Reconstruction: six views to a surface",
         "",
-        f"By `benchmarks/reconstruct.py` on {machine()}; {count} models, views of {given.size}², {len(disturbed)} disturbances (seed, and "
+        f"By `benchmarks/reconstruct.py` on {machine()}; {count} models, views of {given.size}², {len(disturbed)} "
+        f"disturbances (seed, and "
         f"wavelength as a share of the picture). Medians. {remark}",
         "",
-        "Chamfer: point to surface, mean of both directions, largest extent of the truth 1. IoU: closed truths only. Seen: where one of the six",
-        "views looks. Seconds of ours hold start-up, reading and writing; a peer's are its algorithm alone. Tie: within half a",
+        "Chamfer: point to surface, mean of both directions, largest extent of the truth 1. IoU: closed truths only. "
+        "Seen: where one of the six",
+        "views looks. Seconds of ours hold start-up, reading and writing; a peer's are its algorithm alone. Tie: "
+        "within half a",
         "percent, by which another seed of the samples moves a distance.",
         "",
         verdict(records),

@@ -1,7 +1,8 @@
 """Time against error of remesh, its knobs swept, beside the engines alone, from marching-cubes meshes of a million
 faces.
 
-    python benchmarks/remesh.py [MODEL_OR_FOLDER ...] [-o docs/benchmarks] [--faces 20000] [--input 1000000] [--peers-python PYTHON]
+    python benchmarks/remesh.py [MODEL_OR_FOLDER ...] [-o docs/benchmarks] [--faces 20000] [--input 1000000] \
+        [--peers-python PYTHON]
 
 Writes remesh.md, remesh.json, remesh.png and the wireframes remesh_sheet.png, row by row: killed, it goes on where it
 was. The knobs are swept on the solids of --sweep, pyQuadriFlow runs on the models of --slow-on; everything else, with
@@ -214,7 +215,8 @@ def main() -> None:
         failed = "\n".join(f"- {row['model']}, {row['way']}: {row['failed']}" for row in rows.rows if "failed" in row)
         head = (
             f"# Remesh: {asked.faces} quads from {asked.input} triangles\n\n"
-            f"`make bench-assets`, {machine()}. {note}\n\nSeconds of {'; '.join(REPEATED)} are the least of {asked.runs} runs, the others' of one.\n\n"
+            f"`make bench-assets`, {machine()}. {note}\n\nSeconds of {'; '.join(REPEATED)} are the least of "
+            f"{asked.runs} runs, the others' of one.\n\n"
         )
         foot = f"\nFailed:\n\n{failed}\n" if failed else ""
         (asked.out / "remesh.md").write_text(

@@ -1,7 +1,8 @@
 """How much of remesh's figures is the luck of the last digits: the same fine mesh, moved by a ten-millionth of its
 size, again and again.
 
-    python benchmarks/remesh_draws.py [MODEL_OR_FOLDER ...] [-o docs/benchmarks] [--solids part] [--draws 8] [--faces 20000]
+    python benchmarks/remesh_draws.py [MODEL_OR_FOLDER ...] [-o docs/benchmarks] [--solids part] [--draws 8] \
+        [--faces 20000]
 
 Writes remesh_draws.md and remesh_draws.json, row by row: killed, it goes on where it was. Draw 0 is the mesh as it is.
 Figures are those of remesh.py."""
@@ -85,7 +86,8 @@ def main() -> None:
                 )
         text = table(("model", "of its draws", *SUMMED), sums) + "\n\n" + text
         (asked.out / "remesh_draws.md").write_text(
-            f"# Remesh, input by input: {asked.faces} quads from {asked.input} triangles moved by {_NOISE:g} of their size\n\n"
+            f"# Remesh, input by input: {asked.faces} quads from {asked.input} triangles moved by {_NOISE:g} of "
+            f"their size\n\n"
             f"`python benchmarks/remesh_draws.py`, {machine()}. {note}\n\n{text}\n"
         )
         return text

@@ -127,9 +127,13 @@ def main() -> None:
     own = [row for row in rows.rows if row["way"] == "ours" and "quads" in row]
     fields = sum("pair and split" not in row["as"] for row in own)
     text = (
-        f"# Remesh on models as they come\n\nBy `benchmarks/remesh_models.py` on {machine()}, {given.faces} quads asked for. {head}\n\n"
+        f"# Remesh on models as they come\n\nBy `benchmarks/remesh_models.py` on {machine()}, {given.faces} quads "
+        f"asked for. {head}\n\n"
         + table(COLUMNS, [[number(row.get(name)) for name in COLUMNS] for row in rows.rows])
-        + f"\n\nOf {len(own)} models {fields} are field-aligned quads all over; {len(own) - fields} have parts of paired triangles, cut in quads.\n"
+        + (
+            f"\n\nOf {len(own)} models {fields} are field-aligned quads all over; {len(own) - fields} have parts of "
+            f"paired triangles, cut in quads.\n"
+        )
     )
     (given.out / "remesh_models.md").write_text(text)
 

@@ -129,7 +129,8 @@ def main() -> None:
         note = [f"Without {' and '.join(missing)}."] if missing else []
         findings = [
             *note,
-            f"Model {asked.model} ({scene['faces']} triangles) under {asked.env}, {len(asked.views.split(','))} views of {asked.size}²; errors of {asked.scored}.",
+            f"Model {asked.model} ({scene['faces']} triangles) under {asked.env}, {len(asked.views.split(','))} "
+            f"views of {asked.size}²; errors of {asked.scored}.",
             "",
             *comparison(rows, "worst buffer", 45, ["gdtool buffers"], ["Cycles buffers"]),
             *comparison(rows, "worst buffer", 45, ["gdtool buffers"], ["Cycles buffers and color"]),

@@ -5,7 +5,8 @@
 Every model under the given folders (or files) that has metallic-roughness textures, or every one with --all, goes
 through
 
-    gdtool render-dataset M | gdtool reconstruct | gdtool remesh --faces 20000 | gdtool unwrap | gdtool bake --size 2048 | gdtool relight
+    gdtool render-dataset M | gdtool reconstruct | gdtool remesh --faces 20000 | gdtool unwrap | gdtool bake --size \
+        2048 | gdtool relight
 
 and the asset is measured against the model by `gdtool evaluate`. A stage that fails is named in the table.
 """
@@ -134,12 +135,14 @@ def report(records: list[dict], remark: str = "") -> str:
         [
             "# Round trip: model to asset, against the model",
             "",
-            f"By `benchmarks/roundtrip.py` on {machine()}. Distances: mean of both directions, largest extent of the truth 1.",
+            f"By `benchmarks/roundtrip.py` on {machine()}. Distances: mean of both directions, largest extent of the "
+            f"truth 1.",
             remark,
             "",
             table(head, rows),
             "",
-            f"Of {count} models: {near} within {SEEN_LIMIT} seen and {WHOLE_LIMIT} whole, {closed} closed, {colored} with albedo ≥ {ALBEDO_LIMIT:.0f} dB, "
+            f"Of {count} models: {near} within {SEEN_LIMIT} seen and {WHOLE_LIMIT} whole, {closed} closed, {colored} "
+            f"with albedo ≥ {ALBEDO_LIMIT:.0f} dB, "
             f"{sum(map(passes, records))} all of it.",
             "",
         ]
@@ -161,8 +164,10 @@ def main() -> None:
             records.append(roundtrip(model, place, given.relight))
         asset = records[-1].get("asset", {})
         say(
-            f"{records[-1]['model']}: seen {number(asset.get('seen_distance'))}, whole {number(asset.get('surface_distance'))}, albedo "
-            f"{number(asset.get('albedo_psnr_masked'))} dB, {records[-1]['seconds']:.0f} s {records[-1].get('failed', '')}"
+            f"{records[-1]['model']}: seen {number(asset.get('seen_distance'))}, whole "
+            f"{number(asset.get('surface_distance'))}, albedo "
+            f"{number(asset.get('albedo_psnr_masked'))} dB, {records[-1]['seconds']:.0f} s "
+            f"{records[-1].get('failed', '')}"
         )
         if given.output:
             given.output.write_text(report(records, remark))

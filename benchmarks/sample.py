@@ -116,8 +116,10 @@ def markdown(record: dict) -> str:
         [
             "# Sampling: time against error",
             "",
-            f"{len(agreement['true'])} held-out objects of `procedural:900000` and on, {record['image_size']} px, two threads, on {machine()}. {record['remark']}",
-            f"Start-up (imports, weights) {start['start_up_seconds']:.1f} s, the whole command on one picture {start['whole_seconds']:.1f} s and {start['peak_mb']:.0f} MB.",
+            f"{len(agreement['true'])} held-out objects of `procedural:900000` and on, {record['image_size']} px, "
+            f"two threads, on {machine()}. {record['remark']}",
+            f"Start-up (imports, weights) {start['start_up_seconds']:.1f} s, the whole command on one picture "
+            f"{start['whole_seconds']:.1f} s and {start['peak_mb']:.0f} MB.",
             "",
             table(["sampler", *(name.replace("_", " ") for name in SHOWN)], rows),
             "",

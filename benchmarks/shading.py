@@ -12,7 +12,6 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, field
-from glob import glob
 from pathlib import Path
 
 import numpy as np
@@ -64,14 +63,14 @@ def peers_environment() -> dict[str, str]:
     out = dict(os.environ)
     if "DRJIT_LIBLLVM_PATH" not in out:
         places = (
-            "/usr/lib/llvm-*/lib/libLLVM*.so*",
-            "/usr/lib/*/libLLVM*.so*",
-            os.path.expanduser("~/.rustup/toolchains/stable*/lib/libLLVM.so*"),
+            (Path("/usr/lib"), "llvm-*/lib/libLLVM*.so*"),
+            (Path("/usr/lib"), "*/libLLVM*.so*"),
+            (Path.home(), ".rustup/toolchains/stable*/lib/libLLVM.so*"),
         )
         found = {
-            path: int("".join(c for c in path.split("libLLVM")[1].lstrip("-.so")[:2] if c.isdigit()) or 0)
-            for place in places
-            for path in glob(place)
+            str(path): int("".join(c for c in path.name.split("libLLVM")[1].lstrip("-.so")[:2] if c.isdigit()) or 0)
+            for place, pattern in places
+            for path in place.glob(pattern)
         }
         if found:
             out["DRJIT_LIBLLVM_PATH"] = max(found, key=found.get)
@@ -238,7 +237,8 @@ def comparison(rows: list[dict], quality: str, decibels: float, ours: list[str],
                 )
                 at, inside = found[method]
                 lines.append(
-                    f"* {quality} at {decibels:g} dB, {seconds}: {method} {at:.2f}{'' if inside else ' (extrapolated)'}; {parts}: "
+                    f"* {quality} at {decibels:g} dB, {seconds}: {method} "
+                    f"{at:.2f}{'' if inside else ' (extrapolated)'}; {parts}: "
                     f"**{at / min(theirs):.2f}** of the better."
                 )
     return lines
@@ -294,8 +294,12 @@ def write(
 def errors_text() -> str:
     """How the figures are to be read."""
     return (
-        "PSNR of the pictures as stored (sRGB; normals halved) against a converged reference of the same renderer with other random "
-        "numbers. `color` is the whole picture with the black around the object, the others are wholly covered pixels. All use a box "
-        "pixel filter and direct light only. Seconds are each renderer's own work, without imports and reading files; Mitsuba's without "
-        "building its scene and with its kernels loaded, Cycles' with writing its files; `cpu s` is summed over threads."
+        "PSNR of the pictures as stored (sRGB; normals halved) against a converged reference of the same renderer "
+        "with other random "
+        "numbers. `color` is the whole picture with the black around the object, the others are wholly covered "
+        "pixels. All use a box "
+        "pixel filter and direct light only. Seconds are each renderer's own work, without imports and reading "
+        "files; Mitsuba's without "
+        "building its scene and with its kernels loaded, Cycles' with writing its files; `cpu s` is summed over "
+        "threads."
     )

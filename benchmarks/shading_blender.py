@@ -1,7 +1,8 @@
 """Views by Blender's Cycles (the bpy module) for benchmarks/render.py and relight.py: prints its seconds, writes its
 images.
 
-  PEERS_PYTHON benchmarks/shading_blender.py MODEL.glb LIGHT.exr OUT.npz --views front,right --size 512 --samples 16 --light
+  PEERS_PYTHON benchmarks/shading_blender.py MODEL.glb LIGHT.exr OUT.npz --views front,right --size 512 --samples \
+      16 --light
 
 Box filter, direct light only, no adaptive sampling. Buffers come as AOVs and the normal pass of the one picture,
 without light when --light is left out: the cheapest way there is. Cycles' depth is not antialiased, so it is not
@@ -14,6 +15,7 @@ import json
 import os
 import tempfile
 import time
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -44,12 +46,12 @@ def prepared(asked: argparse.Namespace):
     background = next(n for n in nodes.nodes if n.type == "BACKGROUND")
     if asked.light:
         image = nodes.nodes.new("ShaderNodeTexEnvironment")
-        image.image = bpy.data.images.load(os.path.abspath(asked.env))
+        image.image = bpy.data.images.load(str(Path(asked.env).absolute()))
         image.image.colorspace_settings.name = "Linear Rec.709"
         nodes.links.new(image.outputs[0], background.inputs[0])
     else:
         background.inputs[1].default_value = 0.0
-    bpy.ops.import_scene.gltf(filepath=os.path.abspath(asked.model))
+    bpy.ops.import_scene.gltf(filepath=str(Path(asked.model).absolute()))
     objects = [o for o in scene.objects if o.type == "MESH" and not o.hide_render]
     bpy.context.view_layer.update()
     points = np.array([tuple(o.matrix_world @ v.co) for o in objects for v in o.data.vertices])
@@ -137,7 +139,7 @@ def main() -> None:
             angle = np.radians(float(azimuth))
             at = Vector((np.sin(angle), -np.cos(angle), 0)) * 3
             camera.location, camera.rotation_euler = at, at.to_track_quat("Z", "Y").to_euler()
-            scene.render.filepath = os.path.join(place, f"{name}.exr")
+            scene.render.filepath = str(Path(place, f"{name}.exr"))
             bpy.ops.render.render(write_still=True)
             files.append(scene.render.filepath)
         seconds = {"wall s": time.perf_counter() - wall, "cpu s": time.process_time() - processor}

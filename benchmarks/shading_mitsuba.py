@@ -12,6 +12,7 @@ import json
 import os
 import tempfile
 import time
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -41,7 +42,7 @@ def mesh(scene: dict, key: str, place: str) -> dict:
             fields[name] = np.ravel(array).astype(np.float32)
     fields["faces"] = np.ravel(faces).astype(np.uint32)
     fields.update()
-    path = os.path.join(place, f"{key}.ply")
+    path = str(Path(place, f"{key}.ply"))
     made.write_ply(path)
     color = {"type": "mesh_attribute", "name": "vertex_color"} if len(colors) else value(scene, f"{key}_base_color")
     bsdf = {

@@ -115,7 +115,8 @@ def report(state: dict) -> str:
         "",
         f"`make bench-throughput`: {state['machine']}. {state['busy']}".rstrip(),
         "",
-        "Start-up (about two seconds) is in every row. per_core_minute is by the clock, per_cpu_minute by the processor time taken.",
+        "Start-up (about two seconds) is in every row. per_core_minute is by the clock, per_cpu_minute by the "
+        "processor time taken.",
         "",
         f"## More cores: procedural objects, `{' '.join(TYPICAL)}`",
         "",
