@@ -286,7 +286,7 @@ def stage_command(stage: Stage, help: str) -> click.Command:
             dry_run=values["dry_run"],
             force=values["force"],
             threads=values["threads"],
-            device=values["device"],
+            device=values.get("device", "cpu"),
             shard=shard,
             ray=values.get("ray"),
         )
@@ -341,14 +341,11 @@ def stage_command(stage: Stage, help: str) -> click.Command:
         click.Option(["-f", "--force"], is_flag=True, help="Run even when up to date."),
         click.Option(["--json", "as_json"], is_flag=True, help="Print one JSON object per source."),
         click.Option(["--threads"], type=IntegerRange(0, MOST_THREADS), default=0, help="Threads; 0: all cores."),
-        click.Option(
-            ["--device"],
-            type=click.Choice(["cpu", "cuda"]),
-            default="cpu",
-            show_default=True,
-            help="Where networks run.",
-        ),
     ]
+    if stage.networks:
+        devices = click.Choice(["cpu", "cuda"])
+        text = "Where networks run."
+        params.append(click.Option(["--device"], type=devices, default="cpu", show_default=True, help=text))
     params.append(click.Option(["--log-file"], type=TEXT, metavar="PATH", help=LOG_FILE_HELP))
     params += [click.Option(list(flags), is_flag=True, help=text) for flags, text in VERBOSITY.items()]
     return click.Command(stage.name, callback=invoke, params=params, help=help)

@@ -64,7 +64,8 @@ class Stage:
     gathers: all sources go into one run (train). dataset: several results share a root with an index. check(inputs,
     options) is called before any work: it raises a GdtoolError for what the run would find out only later (a file that
     an option names, a package that it needs), and takes no time. checkpoint: the file of the workspace that a later run
-    goes on from; without it a failed run leaves no workspace."""
+    goes on from; without it a failed run leaves no workspace. networks: it runs neural networks, so that its command
+    takes --device."""
 
     name: str
     version: int
@@ -77,6 +78,7 @@ class Stage:
     dataset: bool = False
     check: Callable[[Inputs, Any], None] | None = None
     checkpoint: str = ""
+    networks: bool = False
 
     def second(self, flag: str) -> SecondInput:
         """Return the declaration of a second input."""

@@ -211,6 +211,7 @@ STAGE = Stage(
     name="bake",
     version=13,
     reads=("atlas", "mesh-file"),
+    networks=True,
     writes="asset",
     Options=Options,
     run=run,

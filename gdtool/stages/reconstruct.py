@@ -157,4 +157,13 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         )
 
 
-STAGE = Stage(name="reconstruct", version=18, reads=("views",), writes="surface", Options=Options, run=run, check=check)
+STAGE = Stage(
+    name="reconstruct",
+    version=18,
+    reads=("views",),
+    writes="surface",
+    Options=Options,
+    run=run,
+    check=check,
+    networks=True,
+)

@@ -183,6 +183,7 @@ STAGE = Stage(
     name="sample-views",
     version=12,
     reads=("image-file",),
+    networks=True,
     writes="views",
     Options=Options,
     run=run,

@@ -174,6 +174,7 @@ STAGE = Stage(
     name="train",
     version=3,
     reads=("dataset", "views", "archive-file"),
+    networks=True,
     writes="model",
     Options=Options,
     run=run,

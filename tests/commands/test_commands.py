@@ -57,6 +57,11 @@ def test_what_all_stages_take(name):
     assert wanted <= set(options_of(name))
 
 
+@pytest.mark.parametrize("name", STAGES)
+def test_a_device_is_chosen_where_networks_run(name):
+    assert ("--device" in options_of(name)) == (name in ("train", "sample-views", "reconstruct", "bake"))
+
+
 @pytest.mark.parametrize("name", REPORTS)
 def test_what_all_reports_take(name):
     assert {"--json", "--log-file", "-q", "-v", "--debug"} <= set(options_of(name))

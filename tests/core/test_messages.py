@@ -35,6 +35,7 @@ OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9]*(?:-[a-z0-9]+)*")
 # Options that a message may name though not every command that reaches its module has them: by file and function.
 EXCEPTIONS: dict[tuple[str, str], tuple[set[str], str]] = {
     ("gdtool/core/cluster.py", "_connected"): ({"--ray"}, "called where --ray was given, by the commands that have it"),
+    ("gdtool/stages/early.py", "require_device"): ({"--device"}, "called by the commands whose stage runs networks"),
     ("gdtool/stages/early.py", "require_fov"): ({"--fov"}, "called by the stages that have --fov"),
     ("commands/_common.py", "shard_of"): ({"--shard"}, "called where --shard was given, by the commands that have it"),
 }

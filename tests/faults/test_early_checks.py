@@ -66,7 +66,7 @@ def files(tmp_path):
         ("render-dataset cube.obj --light nothing.exr", 3, "nothing.exr: does not exist"),
         ("render-dataset cube.obj --domains colour", 2, "choose from color"),
         ("remesh cube.obj --quad-size 1e-300", 2, "is smaller than 1e-05"),
-        ("remesh cube.obj --device cuda", 5, "gdtool: --device cuda: is not there; use --device cpu"),
+        ("bake cube.obj --device cuda", 5, "gdtool: --device cuda: is not there; use --device cpu"),
         ("bake cube.obj --model nothing.glb", 3, "nothing.glb: does not exist; check the path that --model gives"),
         ("bake cube.obj --model notes.txt", 3, "notes.txt: is no model file by its ending"),
         ("bake cube.obj", 3, "name one with --surface or --model"),
