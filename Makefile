@@ -45,7 +45,7 @@ fuzz: venv
 	$(BIN)/python -m tests.faults.fuzz_commands 7
 
 bench: venv
-	$(BIN)/python benchmarks/pipeline.py
+	$(BIN)/python -m benchmarks.pipeline.sweep
 
 # Remesh and unwrap beside their peers, over solids and the models in $(MESHES), bake and the finished asset over the textured models
 # in $(TEXTURED); with PEERS_PYTHON, a Python that has bpy, beside Blender, with pyQuadriFlow (the extra quadriflow) beside that as well.
@@ -59,23 +59,23 @@ MESHES ?= $(if $(ASSETS),$(wildcard $(foreach name,bunny/bunny wingnut/wingnut t
 TEXTURED ?= $(if $(ASSETS),$(wildcard $(ASSETS)/glb $(ASSETS)/gltf))
 PEERS_PYTHON ?=
 bench-assets: venv
-	$(BIN)/python benchmarks/remesh.py $(MESHES) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
-	$(BIN)/python benchmarks/remesh_draws.py
-	$(BIN)/python benchmarks/remesh_nets.py
-	$(BIN)/python benchmarks/remesh_models.py $(MESHES) $(TEXTURED)
-	$(BIN)/python benchmarks/unwrap.py $(MESHES) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
-	$(BIN)/python benchmarks/bake.py $(TEXTURED) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
-	$(BIN)/python benchmarks/asset.py $(TEXTURED) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
+	$(BIN)/python -m benchmarks.remesh.sweep $(MESHES) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
+	$(BIN)/python -m benchmarks.remesh.repeatability
+	$(BIN)/python -m benchmarks.remesh.nets
+	$(BIN)/python -m benchmarks.remesh.models $(MESHES) $(TEXTURED)
+	$(BIN)/python -m benchmarks.unwrap.sweep $(MESHES) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
+	$(BIN)/python -m benchmarks.bake.sweep $(TEXTURED) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
+	$(BIN)/python -m benchmarks.bake.asset $(TEXTURED) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
 
 # Materials of reconstructed surfaces, from material views and from color alone, with and without visibility.
 bench-materials: venv
-	$(BIN)/python benchmarks/materials.py $(ARGS)
+	$(BIN)/python -m benchmarks.reconstruct.materials $(ARGS)
 
 # Reconstruction beside its peers, on the public models in $(ASSETS) (where it is set) and procedural objects: an hour
 # on two quiet cores, begun for a quarter of it each time: it goes on where it was. ARGS=--all for every disturbance and budget of
 # every model (hours), ARGS="--models DIR" for models of your own.
 bench-reconstruct: venv
-	$(BIN)/python benchmarks/reconstruct.py $(if $(ASSETS),--assets $(ASSETS)) $(ARGS)
+	$(BIN)/python -m benchmarks.reconstruct.sweep $(if $(ASSETS),--assets $(ASSETS)) $(ARGS)
 
 # Time against error of rendering and relighting; set MODEL (textured), ENV (lat-long) and PEERS_PYTHON, a Python that can
 # import bpy, mitsuba or both (and OpenImageIO). A quarter of an hour each on two cores with both peers.
@@ -83,31 +83,31 @@ MODEL ?= procedural:3
 ENV ?= mid
 
 bench-render: venv
-	$(BIN)/python benchmarks/render.py $(MODEL) $(ENV) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
+	$(BIN)/python -m benchmarks.render_dataset.sweep $(MODEL) $(ENV) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
 
 bench-relight: venv
-	$(BIN)/python benchmarks/relight.py $(MODEL) $(ENV) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
+	$(BIN)/python -m benchmarks.relight.sweep $(MODEL) $(ENV) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON))
 
 # MODELS (files) under LIGHTS (by commas) as gdtool and the peers render them, side by side, in out/sheets, to look at.
 bench-sheets: venv
-	$(BIN)/python benchmarks/contact_sheets.py $(or $(MODELS),procedural:1 procedural:2 procedural:3) --lights $(or $(LIGHTS),dark,mid,bright) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON)) -o out/sheets
+	$(BIN)/python -m benchmarks.relight.contact_sheets $(or $(MODELS),procedural:1 procedural:2 procedural:3) --lights $(or $(LIGHTS),dark,mid,bright) $(if $(PEERS_PYTHON),--peers-python $(PEERS_PYTHON)) -o out/sheets
 
 # Time against error of sampling the bundled model (SAMPLED: another), and its consistency: ten minutes on two quiet cores.
 bench-sample: venv
-	OMP_WAIT_POLICY=PASSIVE $(BIN)/python benchmarks/sample.py $(if $(SAMPLED),--model $(SAMPLED))
+	OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m benchmarks.sample_views.sweep $(if $(SAMPLED),--model $(SAMPLED))
 
 # GrabCut on pictures laid over photographed environments: two minutes.
 bench-cutout: venv
-	$(if $(ASSETS),$(BIN)/python benchmarks/cutout.py $(ASSETS)/images $(ASSETS)/hdr,@echo "skipped: set ASSETS to a folder with images/ and hdr/")
+	$(if $(ASSETS),$(BIN)/python -m benchmarks.sample_views.cutout $(ASSETS)/images $(ASSETS)/hdr,@echo "skipped: set ASSETS to a folder with images/ and hdr/")
 
 # What the picture adds to the albedo of the views: MODELS (textured files) in 512 px, half a minute each.
 bench-picture: venv
 	$(BIN)/gdtool render-dataset $(or $(MODELS),procedural:3000000..3000003) --size 512 --samples 4 --light-samples 4 --domains color,albedo -o out/fine
-	$(BIN)/python benchmarks/picture.py out/fine -o docs/benchmarks
+	$(BIN)/python -m benchmarks.sample_views.picture_detail out/fine -o docs/benchmarks
 
 # Objects per core-minute of render-dataset, by cores and by objects; goes on where it was.
 bench-throughput: venv
-	$(BIN)/python benchmarks/throughput.py
+	$(BIN)/python -m benchmarks.render_dataset.throughput
 
 docs-check: venv
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python tests/tools/docs_check.py
@@ -144,27 +144,27 @@ data: venv
 
 model: data
 	$(BIN)/gdtool train $(DATA)/objects --minutes $(MINUTES) -o $(DATA)/small
-	$(BIN)/gdtool train $(DATA)/objects --start $(DATA)/small --size 128 --config benchmarks/model_training.json --steps $(STEPS) -o $(DATA)/middle
-	$(BIN)/gdtool train $(DATA)/objects --start $(DATA)/middle --size 128 --config benchmarks/model_finish.json --minutes $(FINISH) -o $(DATA)/finished
-	$(BIN)/gdtool train $(DATA)/objects --start $(DATA)/finished --size 128 --config benchmarks/model_geometry.json --minutes $(GEOMETRY) -o $(DATA)/one
-	$(BIN)/gdtool train $(DATA)/objects --start $(DATA)/one --size 128 --config benchmarks/model_geometry.json --minutes $(GEOMETRY) --seed 1 -o $(DATA)/other
-	$(BIN)/python benchmarks/model_mean.py $(DATA)/one $(DATA)/other -o $(DATA)/mean
-	$(BIN)/gdtool train $(DATA)/new $(DATA)/new_turned --start $(DATA)/mean --size 128 --config benchmarks/model_geometry.json --minutes $(LAST) --seed 2 -o $(DATA)/last
-	$(BIN)/python benchmarks/model_mean.py $(DATA)/mean $(DATA)/last -o $(DATA)/model
-	$(BIN)/python benchmarks/model_doubt.py $(DATA)/held_out --model $(DATA)/model --calibrate $(DATA)/validation $(if $(ASSETS),--photographs $(ASSETS)/images) -o docs/benchmarks
-	$(BIN)/python benchmarks/model_quality.py $(DATA)/held_out --model $(DATA)/model --train $(DATA)/objects $(DATA)/new $(DATA)/new_turned -o docs/benchmarks --install
-	$(BIN)/python benchmarks/model_quality.py $(DATA)/turned --steps 1 --name model_quality_turned -o docs/benchmarks
-	$(BIN)/python benchmarks/model_curve.py $(DATA)/held_out --model $(DATA)/model
-	$(BIN)/python benchmarks/model_sheets.py $(DATA)/held_out $(if $(ASSETS),$(ASSETS)/images)
+	$(BIN)/gdtool train $(DATA)/objects --start $(DATA)/small --size 128 --config benchmarks/train/training.json --steps $(STEPS) -o $(DATA)/middle
+	$(BIN)/gdtool train $(DATA)/objects --start $(DATA)/middle --size 128 --config benchmarks/train/finish.json --minutes $(FINISH) -o $(DATA)/finished
+	$(BIN)/gdtool train $(DATA)/objects --start $(DATA)/finished --size 128 --config benchmarks/train/geometry.json --minutes $(GEOMETRY) -o $(DATA)/one
+	$(BIN)/gdtool train $(DATA)/objects --start $(DATA)/one --size 128 --config benchmarks/train/geometry.json --minutes $(GEOMETRY) --seed 1 -o $(DATA)/other
+	$(BIN)/python -m benchmarks.train.mean_weights $(DATA)/one $(DATA)/other -o $(DATA)/mean
+	$(BIN)/gdtool train $(DATA)/new $(DATA)/new_turned --start $(DATA)/mean --size 128 --config benchmarks/train/geometry.json --minutes $(LAST) --seed 2 -o $(DATA)/last
+	$(BIN)/python -m benchmarks.train.mean_weights $(DATA)/mean $(DATA)/last -o $(DATA)/model
+	$(BIN)/python -m benchmarks.sample_views.doubt $(DATA)/held_out --model $(DATA)/model --calibrate $(DATA)/validation $(if $(ASSETS),--photographs $(ASSETS)/images) -o docs/benchmarks
+	$(BIN)/python -m benchmarks.train.quality $(DATA)/held_out --model $(DATA)/model --train $(DATA)/objects $(DATA)/new $(DATA)/new_turned -o docs/benchmarks --install
+	$(BIN)/python -m benchmarks.train.quality $(DATA)/turned --steps 1 --name model_quality_turned -o docs/benchmarks
+	$(BIN)/python -m benchmarks.train.curve $(DATA)/held_out --model $(DATA)/model
+	$(BIN)/python -m benchmarks.sample_views.sheets $(DATA)/held_out $(if $(ASSETS),$(ASSETS)/images)
 
 # The bundled model beside the nearest training object on four times as many held-out objects, its surfaces of them, and what
 # the parts of the method are worth: nine small trainings, an hour or two.
 bench-model: data
 	$(RENDER) --samples 8 procedural:900100..$(MORE) -o $(DATA)/more
-	$(BIN)/python benchmarks/model_quality.py $(DATA)/held_out $(DATA)/more --train $(DATA)/objects $(DATA)/new --steps 1 --name model_quality_400 -o docs/benchmarks
-	$(BIN)/python benchmarks/image_to_surface.py $(DATA)/held_out --train $(DATA)/objects $(DATA)/new
+	$(BIN)/python -m benchmarks.train.quality $(DATA)/held_out $(DATA)/more --train $(DATA)/objects $(DATA)/new --steps 1 --name model_quality_400 -o docs/benchmarks
+	$(BIN)/python -m benchmarks.pipeline.image_to_surface $(DATA)/held_out --train $(DATA)/objects $(DATA)/new
 	$(RENDER) --size 64 --samples 4 procedural:0..799 -o $(DATA)/small_objects
-	$(BIN)/python benchmarks/ablations.py $(DATA)/small_objects --held-out $(DATA)/held_out
+	$(BIN)/python -m benchmarks.train.ablations $(DATA)/small_objects --held-out $(DATA)/held_out
 
 # The JSON Schemas from the types that decode the manifests; a test compares.
 schemas: venv

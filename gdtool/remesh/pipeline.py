@@ -30,7 +30,7 @@ from gdtool.remesh.spacing import separate_pieces
 from gdtool.remesh.task import QuadResult, Record, RemeshPatch, Request
 
 _PIECE_GAP_EDGES = 8.0  # edge lengths between separated pieces: no step looks at the surface farther away than this
-_MIN_QUADS_PER_HANDLE = 100  # with fewer, engines lose some handles (benchmarks/remesh_nets.py)
+_MIN_QUADS_PER_HANDLE = 100  # with fewer, engines lose some handles (benchmarks/remesh/nets.py)
 # Times the noise that keeps triangles of one size: it moves few corners farther than this off the surface, so what is
 # farther was moved on purpose, to a restored crease.
 _NOISE_REACH = 3.0

@@ -1,22 +1,17 @@
 """The maps as they are stored, eight bits and gutters, against an analytic material: their error, and their seams."""
 
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from benchmarks.bake.score import Seams
 from gdtool.bake.maps import make_maps
 from gdtool.bake.pipeline import BakeOptions, bake, vertex_lookup
 from gdtool.bake.reproject import Source, vertex_reach
 from gdtool.bake.target import Target, points_at, texels_of
 from gdtool.images.color import srgb_from_linear
 from tests.bake.shapes import albedo_of, psnr, torus, triangles_of, unwrapped
-
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-
-from bake_score import Seams  # noqa: E402
 
 SIZE = 1024
 

@@ -1,14 +1,9 @@
-"""benchmarks/model_quality.py: how one way's lead over another is told."""
-
-import sys
-from pathlib import Path
+"""benchmarks/train/quality.py: how one way's lead over another is told."""
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-
-from model_quality import leads  # noqa: E402  (benchmarks/model_quality.py)
+from benchmarks.train.quality import leads
 
 
 def test_small_errors_and_large_psnr_are_ahead():

@@ -8,12 +8,9 @@ from pathlib import Path
 
 import pytest
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-sys.path.append(str(BENCHMARKS))
-
-import measure  # noqa: E402
-import pipeline  # noqa: E402
-import roundtrip  # noqa: E402
+from benchmarks.common import measure
+from benchmarks.pipeline import roundtrip
+from benchmarks.pipeline import sweep as pipeline
 
 STAND_IN = """#!{python}
 import json, sys, time

@@ -1,21 +1,18 @@
 """The reconstruction benchmark's own arithmetic: the disturbance, the peers, the tables."""
 
-import sys
 from argparse import Namespace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks.reconstruct import (
+    peers,
+    perturbation,
+)
+from benchmarks.reconstruct import report as reconstruct_report
+from benchmarks.reconstruct import sweep as reconstruct
 from gdtool.folders.views import Views
 from tests.fields.shapes import sphere, views_of
-
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-
-import peers  # noqa: E402
-import perturbation  # noqa: E402
-import reconstruct  # noqa: E402
-import reconstruct_report  # noqa: E402
 
 
 @pytest.fixture(scope="module")

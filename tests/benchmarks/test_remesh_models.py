@@ -2,11 +2,8 @@
 not stop the rest."""
 
 import sys
-from pathlib import Path
 
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-
-import remesh_models  # noqa: E402
+from benchmarks.remesh import models as remesh_models
 
 
 def test_without_models_what_was_measured_stays(tmp_path, monkeypatch, capsys):

@@ -1,14 +1,9 @@
 """The throughput benchmark's arithmetic and what it would run; the runs are `make bench-throughput`."""
 
-import sys
-from pathlib import Path
-
 import pytest
 
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-
-import throughput  # noqa: E402
-from measure import Cost  # noqa: E402
+from benchmarks.common.measure import Cost
+from benchmarks.render_dataset import throughput
 
 
 def test_rates_are_by_the_clock_and_by_processor_time():

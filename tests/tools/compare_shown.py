@@ -1,8 +1,9 @@
 """An asset as three.js and Blender show it, against gdtool: python compare_shown.py ASSET.glb [--peers-python PATH]
 
 Runs the show_in_* scripts of this folder and prints the PSNR in dB over the pixels that both pictures cover in full: of
-the base color without light, and in three.js of the asset lit by an environment (benchmarks/asset.py has Blender's).
-three.js needs what show_in_three.mjs says; Blender a Python that has bpy. What is not there is named and left out."""
+the base color without light, and in three.js of the asset lit by an environment (benchmarks/bake/asset.py has
+Blender's). three.js needs what show_in_three.mjs says; Blender a Python that has bpy. What is not there is
+named and left out."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ One picture to {len(model.views)} orthographic views of {model.image_size} x {mo
 {table}
 | machine | {machine()} |
 
-Weights are the exponential average, stored in half precision. `python benchmarks/model_quality.py --install` \
+Weights are the exponential average, stored in half precision. `python -m benchmarks.train.quality --install` \
 measures the
 model on held-out objects, adds the table below and makes it the bundled one.
 

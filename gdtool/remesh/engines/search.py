@@ -19,7 +19,7 @@ _MAX_TORN_SHARE = 0.1  # of the quads may be missing from a result that another 
 # Megabytes of an engine's child, and more for each quad and triangle: several times what it needs. The limit is for
 # holes that Instant Meshes fills without end, half a gigabyte a second.
 _BASE_MEMORY_MB, _MEMORY_MB_PER_FACE = 2000, 4e-3
-# Quads: a coarser mesh subdivided to fewer for each handle loses some handles (benchmarks/remesh_nets.py).
+# Quads: a coarser mesh subdivided to fewer for each handle loses some handles (benchmarks/remesh/nets.py).
 _MIN_QUADS_PER_HANDLE = 250
 _MIN_SUBDIVIDED_QUADS = 3000  # quads: smaller meshes are not tried coarser and subdivided
 # Edge lengths: with an engine's quads farther than this from the surface the best candidate is in doubt ...

@@ -23,7 +23,7 @@ from gdtool.remesh.limits import QUADS_OF_A_PIECE
 
 _QUADS_PER_TRIANGLE = 2.25  # that pair_and_split makes, where most triangles find a partner
 _COUNT_TOLERANCE = 0.03  # relative error of the number of triangles, or quads, at which no further try is made
-# Isotropic triangles: with fewer, some handles or pieces are lost (benchmarks/remesh_nets.py).
+# Isotropic triangles: with fewer, some handles or pieces are lost (benchmarks/remesh/nets.py).
 _MIN_TRIANGLES_PER_HANDLE, _MIN_TRIANGLES_PER_PIECE = 80, 12
 _MAX_LENGTHS = 4  # edge lengths tried for isotropic triangles
 # A try must leave at most this share of the error of log(count); otherwise creases fix the count, and tries end.

@@ -1,0 +1,1 @@
+"""Shared by the benchmarks: timing of commands, resumable rows, test meshes, wireframes."""

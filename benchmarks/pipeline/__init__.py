@@ -1,0 +1,1 @@
+"""Benchmarks of the whole chain: image to asset, model to asset, and back."""

@@ -1,0 +1,1 @@
+"""Benchmarks of reconstruct: surfaces and materials from exact and from disturbed views."""

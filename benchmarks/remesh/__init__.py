@@ -1,0 +1,1 @@
+"""Benchmarks of remesh: solids, real models, nets of many handles, and how far a result varies."""

@@ -1,0 +1,1 @@
+"""Benchmarks of sample-views: sampler settings, cutting out, detail of the picture, warnings."""
