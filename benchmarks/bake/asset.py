@@ -38,7 +38,6 @@ QUIET, MOST = 40.0, 16  # dB: pictures whose noise is more get four times the sa
 PEER_VIEWS = "front_right,back"
 RENDER = ROOT / "benchmarks/common/render"
 PEER = RENDER / "in_blender.py"
-OWN = RENDER / "in_gdtool.py"
 TOOLS = ROOT / "tests/tools"
 LABELS = ["charts", *(f"{what}, {light}" for light in LIGHTS for what in ("source", "asset")), "asset", "in Blender"]
 COLUMNS = (
@@ -153,7 +152,8 @@ def beside_blender(
         ],
         [
             sys.executable,
-            OWN,
+            "-m",
+            "benchmarks.common.render.in_gdtool",
             scene["model"],
             "mid",
             folder / "own.npz",

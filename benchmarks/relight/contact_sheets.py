@@ -30,7 +30,8 @@ def pictures(model: str, light: str, place: Path, size: int, view: str, python: 
         commands = {
             "gdtool": (
                 sys.executable,
-                str(HERE / "in_gdtool.py"),
+                "-m",
+                "benchmarks.common.render.in_gdtool",
                 model,
                 light,
                 str(done["gdtool"]),

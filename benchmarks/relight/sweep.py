@@ -27,7 +27,8 @@ def main() -> None:
     scene = exported(asked.model, asked.env, asked.output / ".relight")
     own = (
         sys.executable,
-        str(HERE / "in_gdtool.py"),
+        "-m",
+        "benchmarks.common.render.in_gdtool",
         asked.model,
         asked.env,
         "{out}",

@@ -24,7 +24,16 @@ def main() -> None:
     parser.add_argument("--scored", default="front_right", help="views that errors are taken of")
     asked = parser.parse_args()
     scene = exported(asked.model, asked.env, asked.output / ".render")
-    own = (sys.executable, str(HERE / "in_gdtool.py"), asked.model, asked.env, "{out}", "--size", str(asked.size))
+    own = (
+        sys.executable,
+        "-m",
+        "benchmarks.common.render.in_gdtool",
+        asked.model,
+        asked.env,
+        "{out}",
+        "--size",
+        str(asked.size),
+    )
     references, jobs = {}, []
 
     def views(of: str, azimuths: bool = False) -> tuple[str, ...]:

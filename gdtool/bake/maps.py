@@ -20,7 +20,7 @@ CONSTANT_RANGE = 1.5 / 255
 # A normal map is flat when 99.5 % of it lies within this angle of straight up: 8 bits store normals to 0.4 degrees.
 FLAT_DEGREES = 1.0
 _ROWS_AT_ONCE = 64  # few enough that intermediate rows stay in the cache
-# Bytes of memory per texel of a bake, measured by benchmarks/bake/sweep.py at 2048 and 4096 on an atlas that is 72 % full.
+# Bytes of memory per texel of a bake: benchmarks/bake/sweep.py at 2048 and 4096, on an atlas that is 72 % full.
 BYTES_PER_TEXEL = 130
 HEIGHT_BITS = 16  # a step of 8 bits is a visible terrace
 

@@ -184,7 +184,8 @@ def _misfit(views: list[_View], depths: list[np.ndarray]) -> float:
     """Measure the median feature difference, in 0..1, to the best fitting view, over the pixels that another view can
     see.
 
-    Consistent views give .003 and less, views disturbed by benchmarks/reconstruct/perturbation.py .1, a model's views .7.
+    Consistent views give .003 and less, views disturbed by
+    benchmarks/reconstruct/perturbation.py .1, a model's views .7.
     """
     every = []
     for view, depth in zip(views, depths, strict=True):
