@@ -1,4 +1,4 @@
-"""Pictures of quad meshes with their edges, for contact sheets."""
+"""Pictures of quad meshes with their edges."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-_SHOWN = 1.2  # of the half width of the model: with more of it the quads cannot be told apart
+ZOOMED = 1.2  # half widths of the model: the middle only, since with more of it the quads cannot be told apart
 
 
-def wireframe(vertices: np.ndarray, faces: np.ndarray, size: int = 420) -> np.ndarray:
-    """(size, size, 3) in [0, 1]: the middle of the mesh from front right and above, its edges drawn; faces (f, 4)."""
+def wireframe(vertices: np.ndarray, faces: np.ndarray, size: int = 420, half_widths: float = ZOOMED) -> np.ndarray:
+    """Picture (size, size, 3) in [0, 1] of a mesh with its edges, from front right and above.
+
+    vertices (v, 3), faces (f, 4); half_widths: width of the picture in half widths of the model.
+    """
     from gdtool.geometry.mesh_quality import polygon_normals
     from gdtool.geometry.rays import RayCaster
     from gdtool.geometry.topology import triangulated
@@ -22,7 +25,7 @@ def wireframe(vertices: np.ndarray, faces: np.ndarray, size: int = 420) -> np.nd
     right /= np.linalg.norm(right)
     up = np.cross(back, right)
     middle, size = size, 2 * size  # four rays a pixel
-    scale = _SHOWN * max(np.abs((vertices - centre) @ right).max(), np.abs((vertices - centre) @ up).max())
+    scale = half_widths * max(np.abs((vertices - centre) @ right).max(), np.abs((vertices - centre) @ up).max())
     line = ((np.arange(size) + 0.5) / size - 0.5) * scale
     origins = centre + back * diagonal + (line[None, :, None] * right - line[:, None, None] * up)
     triangles, face_idx = triangulated(faces)
