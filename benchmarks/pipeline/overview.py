@@ -3,8 +3,8 @@
     python -m benchmarks.pipeline.overview MODEL PICTURE [-o docs/overview.jpg]
 
 First row: a model through remesh, unwrap and bake. Second row: one picture through sample-views, reconstruct, remesh,
-unwrap and bake. All commands at their
-defaults but for `remesh --faces 4000`, whose quads can be told apart at this size. Prints the seconds of each row. About three minutes on two cores.
+unwrap and bake. All commands at their defaults, but for `remesh --faces 4000`, whose quads can be told apart at this
+size. Prints the seconds of each row. Two minutes on two cores.
 """
 
 from __future__ import annotations
