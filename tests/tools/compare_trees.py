@@ -1,10 +1,12 @@
-"""Run every command of two versions of gdtool on the same sources and compare what they write, byte by byte.
+r"""Run every command of two versions of gdtool on the same sources and compare what they write, byte by byte.
 
-    python -m tests.tools.compare_trees BASE [--tree PATH] [--assets ASSETS] [--work DIR] [--only NAME ...]
+    python -m tests.tools.compare_trees BASE [--tree PATH] [--python PATH] [--assets ASSETS] \
+        [--work DIR] [--only NAME ...]
 
-BASE is a commit, or the root of a checkout; PATH the checkout to compare with it (default: this one). Both run under
-this interpreter. ASSETS is a folder of real models (its mesh/ and glb/ are read); without it their cases are left out,
-and the last line says so. DIR keeps the results of BASE for the next comparison. Exits with 1 when anything differs.
+BASE is a commit, or the root of a checkout; --tree the checkout to compare with it (default: this one). Both run under
+this interpreter, unless --python names another for the tree: one with other versions of the dependencies. ASSETS is a
+folder of real models (its mesh/ and glb/ are read); without it their cases are left out, and the last line says so.
+DIR keeps the results of BASE for the next comparison. Exits with 1 when anything differs.
 
 What may differ: how a run went (`run` and `saved_seconds` in a manifest, seconds in reports), the version of gdtool,
 and sentences, as far as compare_trees.tsv says which sentence replaces which."""
@@ -305,22 +307,24 @@ def importable(tree: Path, folder: Path) -> Path:
     return folder
 
 
-def gdtool(site: Path, folder: Path, words: tuple[str, ...]) -> subprocess.CompletedProcess:
+def gdtool(
+    site: Path, folder: Path, words: tuple[str, ...], python: str = sys.executable
+) -> subprocess.CompletedProcess:
     """Run the gdtool that is imported from a folder, in another."""
     env = {**os.environ, "PYTHONPATH": str(site), "COLUMNS": "80"}
     return subprocess.run(
-        [sys.executable, "-m", "gdtool", *words], cwd=folder, env=env, capture_output=True, text=True, timeout=SECONDS
+        [python, "-m", "gdtool", *words], cwd=folder, env=env, capture_output=True, text=True, timeout=SECONDS
     )
 
 
-def run_all(site: Path, folder: Path, chosen: list[Case]) -> None:
+def run_all(site: Path, folder: Path, chosen: list[Case], python: str) -> None:
     """Run the cases in a folder that holds the sources; what was run already is not run again."""
     for number, case in enumerate(chosen):
         told = folder / f"{case.name}.stdout"
         if told.exists():
             continue
         words = case.words if case.words[0] in ("evaluate", "validate") else (*case.words, "-o", case.name)
-        done = gdtool(site, folder, words)
+        done = gdtool(site, folder, words, python)
         (folder / f"{case.name}.stderr").write_text(done.stderr)
         told.write_text(f"exit code {done.returncode}\n{done.stdout}")
         print(
@@ -482,6 +486,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("base")
     parser.add_argument("--tree", type=Path, default=ROOT)
+    parser.add_argument("--python", default=sys.executable, help="interpreter of the tree's runs")
     parser.add_argument("--assets", type=Path)
     parser.add_argument("--work", type=Path)
     parser.add_argument(
@@ -515,8 +520,8 @@ def main() -> int:
                         shutil.copy(path, (folder / "assets" / needed).parent)
     if options.only:
         chosen = _with_what_they_read(chosen, options.only)
-    for site, folder in zip(sites, (before, after), strict=True):
-        run_all(site, folder, chosen)
+    run_all(sites[0], before, chosen, sys.executable)
+    run_all(sites[1], after, chosen, options.python)
     comparison = Comparison(before, after, Sentences(SENTENCES))
     for case in chosen:
         comparison.case(case)
