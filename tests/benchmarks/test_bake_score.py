@@ -52,17 +52,21 @@ def perfect(case):
 def test_a_perfect_bake_scores_so_and_errors_are_found(case):
     truth, maps = Truth(case), perfect(case)
     good = scored(truth, maps)
-    assert good["albedo dB"] > 45 and good["roughness dB"] == 120 and good["normal deg"] < 0.1 and good["missed"] == 0
-    assert 0.8 < good["seam albedo"] < 1.2 and good["seam roughness"] == pytest.approx(1)
+    assert good["albedo dB"] > 45
+    assert good["roughness dB"] == 120
+    assert good["normal deg"] < 0.1
+    assert good["missed"] == 0
+    assert 0.8 < good["seam albedo"] < 1.2
+    assert good["seam roughness"] == pytest.approx(1)
     bad = {name: image.copy() for name, image in maps.items()}
     bad["albedo"][:, SIZE // 2 :] += 0.1
     bad["roughness"] += 0.1
     bad["normal"][...] = (0.5 + 0.5 * np.sin(0.1), 0.5, 0.5 + 0.5 * np.cos(0.1))
     worse = scored(truth, bad)
-    assert worse["seam albedo"] > 3 and worse["albedo dB"] < 26
-    assert worse["roughness dB"] == pytest.approx(20) and worse["normal deg"] == pytest.approx(
-        np.degrees(0.1), rel=0.01
-    )
+    assert worse["seam albedo"] > 3
+    assert worse["albedo dB"] < 26
+    assert worse["roughness dB"] == pytest.approx(20)
+    assert worse["normal deg"] == pytest.approx(np.degrees(0.1), rel=0.01)
     assert worse["seam roughness"] == pytest.approx(1)
 
 

@@ -65,7 +65,9 @@ def test_the_mean_of_two_models_validates(gdtool, trained, tmp_path):
 
 def test_models_of_other_shapes_are_refused(trained, tmp_path):
     result = mean(trained("one", 1), trained("wide", 1, encoder_width=32), output=tmp_path / "both")
-    assert result.returncode != 0 and "other weights" in result.stderr and not (tmp_path / "both").exists()
+    assert result.returncode != 0
+    assert "other weights" in result.stderr
+    assert not (tmp_path / "both").exists()
 
 
 @pytest.mark.slow

@@ -31,9 +31,8 @@ def test_the_disturbance_has_the_size_it_says(ball):
     angle = np.degrees(np.arccos(np.clip((found.images["normal"] * ball.images["normal"]).sum(-1)[inner], -1, 1)))
     assert 3 < np.sqrt((angle**2).mean()) < 7
     assert np.allclose(np.linalg.norm(found.images["normal"][inner], axis=-1), 1, atol=1e-4)
-    assert (found.images["depth"] == again.images["depth"]).all() and (
-        found.images["depth"] != other.images["depth"]
-    ).any()
+    assert (found.images["depth"] == again.images["depth"]).all()
+    assert (found.images["depth"] != other.images["depth"]).any()
     for k in range(6):  # a pixel more or less on both sides
         assert abs((found.mask[k, 32] > 0.5).sum() - (ball.mask[k, 32] > 0.5).sum()) == 2
     assert (found.images["depth"][found.mask > 0.5] > 0.5).all()  # a grown mask's new pixels have values
@@ -73,7 +72,8 @@ def test_report_names_what_is_missed_and_who_is_better(tmp_path):
     text = reconstruct.markdown(records, Namespace(size=64, seeds=1, wavelengths=[0.125]), "")
     assert "clean: median distance 0.0005, wanted ≤ 0.0007: holds" in text
     assert "perturbed: median distance 0.009, wanted ≤ 0.0022: **missed**" in text
-    assert text.count("| yes |") == 1 and text.count("| NO |") == 1
+    assert text.count("| yes |") == 1
+    assert text.count("| NO |") == 1
     reconstruct.plot(records, tmp_path / "plot.png")
     assert (tmp_path / "plot.png").stat().st_size > 1000
 
@@ -97,8 +97,10 @@ def test_a_budget_is_held_against_the_peers_that_were_done_by_then():
     )
     text = reconstruct_report.by_budget(rows)
     first, second = (next(line for line in text.splitlines() if f"clean, {b} s" in line) for b in (5, 10))
-    assert "carved hull" in first and "| yes |" in first
-    assert "slow peer" in second and "| NO |" in second
+    assert "carved hull" in first
+    assert "| yes |" in first
+    assert "slow peer" in second
+    assert "| NO |" in second
 
 
 def test_skips_say_what_they_save():
@@ -122,7 +124,8 @@ def test_rows_that_were_measured_are_not_measured_again(tmp_path):
     bench.save()
     again = reconstruct.Bench(given)
     assert not again.has("dog", "clean", "gdtool")
-    assert again.has("cat", "clean", "gdtool") and not again.has("cat", "clean", "carved hull")
+    assert again.has("cat", "clean", "gdtool")
+    assert not again.has("cat", "clean", "carved hull")
     # Of other views.
     assert not reconstruct.Bench(Namespace(output=tmp_path, size=128, options=[], fresh=False)).records
     again.save(complete=True)

@@ -11,6 +11,7 @@ def test_without_models_what_was_measured_stays(tmp_path, monkeypatch, capsys):
     before.write_text("measured before")
     monkeypatch.setattr(sys, "argv", ["remesh_models.py", "-o", str(tmp_path)])
     remesh_models.main()
-    assert before.read_text() == "measured before" and list(tmp_path.iterdir()) == [before]
+    assert before.read_text() == "measured before"
+    assert list(tmp_path.iterdir()) == [before]
     out = capsys.readouterr()
     assert "no models are named" in out.out + out.err

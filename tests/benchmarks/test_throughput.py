@@ -10,7 +10,8 @@ def test_rates_are_by_the_clock_and_by_processor_time():
     costs = [Cost(30.0, 400.0, "", 20.0), Cost(60.0, 300.0, "", 40.0)]  # two at once: the later one ends the run
     row = throughput.row_of("shards", 2, 24, costs)
     assert (row["seconds"], row["cpu"], row["peak_mb"]) == (60.0, 60.0, 400.0)
-    assert row["per_core_minute"] == pytest.approx(12) and row["per_cpu_minute"] == pytest.approx(24)
+    assert row["per_core_minute"] == pytest.approx(12)
+    assert row["per_cpu_minute"] == pytest.approx(24)
     # The workers' processor time is not the command's: no figure rather than a wrong one.
     assert throughput.row_of("ray", 2, 24, costs)["per_cpu_minute"] is None
 
@@ -32,4 +33,6 @@ def test_the_page_has_a_row_for_every_run():
         )
     }
     page = throughput.report({"machine": "m", "busy": "", "ray": True, "rows": rows})
-    assert page.count("\n| threads") == 2 and page.count("\n| ray") == 1 and "1000" in page
+    assert page.count("\n| threads") == 2
+    assert page.count("\n| ray") == 1
+    assert "1000" in page

@@ -37,7 +37,8 @@ def test_an_archive_gives_the_folders_it_was_made_of(tmp_path, webdataset):
         from gdtool.core.folder import open_folder
 
         a, b = read_views(folder), read_views(open_folder(original))
-        assert all(np.array_equal(a.images[d], b.images[d]) for d in b.images) and len(b.images) == 6
+        assert all(np.array_equal(a.images[d], b.images[d]) for d in b.images)
+        assert len(b.images) == 6
         assert len(list((tmp_path / "work").glob("*/*"))) == 1  # one object at a time is on the disk
     assert not list((tmp_path / "work").iterdir())
 

@@ -84,7 +84,8 @@ def test_star_stays_in_its_view_and_object():
     changed[0] += 1.0  # object 0, color, view 0
     moved = (star(x, layout) - star(changed, layout)).abs().amax((1, 2)).view(2, 2, 2)
     assert (moved[0, :, 0] > 1e-6).all()
-    assert (moved[0, :, 1] == 0).all() and (moved[1] == 0).all()
+    assert (moved[0, :, 1] == 0).all()
+    assert (moved[1] == 0).all()
 
 
 @pytest.mark.parametrize("domains", [(0,), (1, 2)])
@@ -128,4 +129,5 @@ def test_row_attention_starts_as_nothing_and_reads_the_same_row_of_its_domains_v
     changed[1, :, 2, 3] += 1.0  # color, view 1, row 2
     moved = (network(x, layout) - network(changed, layout)).abs().amax(1)  # (images, rows, columns)
     assert (moved[:3, 2] > 0).all()
-    assert (moved[:3, [0, 1, 3, 4]] == 0).all() and (moved[3:] == 0).all()
+    assert (moved[:3, [0, 1, 3, 4]] == 0).all()
+    assert (moved[3:] == 0).all()

@@ -75,7 +75,8 @@ def test_the_vae_follows_its_input(monkeypatch):
     moved = []
     monkeypatch.setattr(vae, "to", lambda device: moved.append(torch.device(device).type) or StandInVae().to(device))
     out = codec.encode(torch.zeros(1, 3, 16, 16, device="meta"))
-    assert moved == ["meta"] and out.device.type == "meta"
+    assert moved == ["meta"]
+    assert out.device.type == "meta"
 
 
 @pytest.mark.parametrize("near", [0, 1, 2])

@@ -67,7 +67,8 @@ def disc(size=200, radius=30, centre=(70, 120)):
 def test_framing_centres_and_scales():
     out = frame(disc(), 64)
     rows, columns = np.nonzero(out[..., 3] > 0.5)
-    assert abs(rows.mean() - 31.5) < 0.3 and abs(columns.mean() - 31.5) < 0.3
+    assert abs(rows.mean() - 31.5) < 0.3
+    assert abs(columns.mean() - 31.5) < 0.3
     assert abs((np.ptp(rows) + 1) - FRONT_EXTENT * 64) <= 1.5
     np.testing.assert_allclose(
         out[out[..., 3] > 0.1][:, :3], np.broadcast_to([0.2, 0.4, 0.6], (int((out[..., 3] > 0.1).sum()), 3)), atol=1e-4
@@ -85,7 +86,9 @@ def test_framing_a_framed_front_view_changes_nothing():
 def test_whole_frame_pads_to_a_square():
     image = np.ones((20, 40, 4), np.float32)
     out = whole_frame(image, 40)
-    assert out[:10, :, 3].max() < 1e-5 and out[30:, :, 3].max() < 1e-5 and out[12:28, :, 3].min() > 0.99
+    assert out[:10, :, 3].max() < 1e-5
+    assert out[30:, :, 3].max() < 1e-5
+    assert out[12:28, :, 3].min() > 0.99
 
 
 def test_the_pictures_silhouette_is_the_front_views_and_mirrored_the_backs(sphere):
@@ -103,12 +106,10 @@ def test_the_pictures_silhouette_is_the_front_views_and_mirrored_the_backs(spher
     # The slanted shape is taller than the sphere: the others show what goes beyond it, and are as they were elsewhere.
     right, guessed = out.mask[names.index("right")], views.mask[names.index("right")]
     changed = np.abs(right - guessed) > 1e-6
-    assert (
-        report["drawn_share"] > 0.1
-        and (right[changed] == 1).all()
-        and changed[guessed.max(1) == 0].any()
-        and changed[guessed > 0.5].sum() == 0
-    )
+    assert report["drawn_share"] > 0.1
+    assert (right[changed] == 1).all()
+    assert changed[guessed.max(1) == 0].any()
+    assert changed[guessed > 0.5].sum() == 0
     assert all(np.isfinite(image).all() for image in out.images.values())
     assert (out.images["depth"][names.index("front")][alpha == 0] == 0).all()
 
@@ -131,10 +132,14 @@ def test_what_is_nearly_metal_is_metal_and_edges_stay_soft():
 
     given = torch.linspace(0, 1, 101, dtype=torch.float64)
     out = decided(given)
-    assert out[0] == 0 and out[50] == 0.5 and out[100] == 1
+    assert out[0] == 0
+    assert out[50] == 0.5
+    assert out[100] == 1
     assert (out.diff() > 0).all()
     torch.testing.assert_close(out, 1 - out.flip(0))  # metal and no metal weigh the same
-    assert out[20] < 0.01 and out[80] > 0.99 and out[40] > 0.1
+    assert out[20] < 0.01
+    assert out[80] > 0.99
+    assert out[40] > 0.1
 
 
 def test_only_metallic_is_decided(sphere):
@@ -175,7 +180,8 @@ def test_depth_stays_within_the_outlines_that_other_views_show():
     pixel = cameras[0].pixel_size
     moved = np.abs(within_silhouettes(images["depth"], mask, cameras) - images["depth"])[mask > 0.99]
     # At the poles rows are as wide as the square root of their height.
-    assert moved.max() < 3 * pixel and moved.mean() < 0.2 * pixel
+    assert moved.max() < 3 * pixel
+    assert moved.mean() < 0.2 * pixel
     names = [camera.name for camera in cameras]
     wrong = images["depth"].copy()
     wrong[names.index("right")] -= 0.1 * (mask[names.index("right")] > 0.5)
@@ -187,7 +193,8 @@ def test_depth_stays_within_the_outlines_that_other_views_show():
         before = backproject(cameras[k], wrong[k].astype(float))[mask[k] > 0.99]
         # Within the ball's width in every row that the others show, though the ray alone would allow more.
         reach = np.hypot(points[:, 0], points[:, 2]) - np.sqrt(np.maximum(0.4**2 - points[:, 1] ** 2, 0))
-        assert reach.max() < 0.1 * 0.4 + 2 * pixel and (np.hypot(before[:, 0], before[:, 2]) > 0.45).any()
+        assert reach.max() < 0.1 * 0.4 + 2 * pixel
+        assert (np.hypot(before[:, 0], before[:, 2]) > 0.45).any()
     others = [k for k, name in enumerate(names) if name not in ("right", "front")]
     np.testing.assert_allclose(
         found[others][mask[others] > 0.99], images["depth"][others][mask[others] > 0.99], atol=3 * pixel
@@ -200,7 +207,8 @@ def test_depth_stays_within_the_outlines_that_other_views_show():
     elsewhere[1::2, :, :2] = 1
     found = within_silhouettes(images["depth"], elsewhere, cameras)
     inside = elsewhere > 0.5
-    assert found[inside].min() >= cameras[0].near and found[inside].max() <= cameras[0].far
+    assert found[inside].min() >= cameras[0].near
+    assert found[inside].max() <= cameras[0].far
 
 
 def test_an_outline_between_pixels_keeps_depth_to_a_fraction_of_one():

@@ -71,9 +71,8 @@ def test_the_blur_of_outlines_is_the_width_of_their_ramps(width):
 def test_the_picture_s_own_view_is_no_doubt():
     views = np.stack([ramped(12), ramped(2), ramped(2)])
     shown = result_figures(views, 0, ramped(1))
-    assert shown["outline_blur"] == pytest.approx(result_figures(views[1:])["outline_blur"]) and shown[
-        "row_mismatch"
-    ] == pytest.approx(0, abs=1e-6)
+    assert shown["outline_blur"] == pytest.approx(result_figures(views[1:])["outline_blur"])
+    assert shown["row_mismatch"] == pytest.approx(0, abs=1e-6)
 
 
 def test_rows_that_the_other_views_leave_empty_are_counted():

@@ -66,9 +66,11 @@ def test_every_view_shows_the_part_as_the_known_one_has_it(seen):
         np.testing.assert_array_equal(wrong[domain][shown], before[domain][shown])
     post = (mask[right] > 0.9) & (known[right] <= 0.5) & (grown_masks(part, known, cameras, front)[right] > 0.5)
     off = wrong["depth"][right] - images["depth"][right]
-    assert post.sum() > 40 and np.abs(off[post]).mean() < 2 * cameras[0].pixel_size
+    assert post.sum() > 40
+    assert np.abs(off[post]).mean() < 2 * cameras[0].pixel_size
     cosine = (wrong["normal"][right] * images["normal"][right]).sum(-1)[post]
-    assert np.median(cosine) > 0.7 and (wrong["normal"][right] @ cameras[right].backward)[post].min() > 0
+    assert np.median(cosine) > 0.7
+    assert (wrong["normal"][right] @ cameras[right].backward)[post].min() > 0
     np.testing.assert_allclose(np.linalg.norm(wrong["normal"][right][post], axis=-1), 1, atol=1e-5)
     assert np.abs(wrong["albedo"][right] - images["albedo"][right])[post].mean() < 0.1
 

@@ -81,5 +81,7 @@ def test_black_white_and_empty_pictures_stay_finite(ball):
     mask, normal, _ = ball
     for color in (0.0, 1.0, 50.0):
         found, _ = repainted(np.full((SIZE, SIZE, 3), 0.5), np.full((SIZE, SIZE, 3), color), mask, normal)
-        assert np.isfinite(found).all() and (found >= 0).all() and (found <= 1).all()
+        assert np.isfinite(found).all()
+        assert (found >= 0).all()
+        assert (found <= 1).all()
     assert repainted(painted(), painted(), np.zeros_like(mask), normal)[1].max() == 0

@@ -141,8 +141,10 @@ def test_a_plan_adds_up():
         phases=(Phase(share=0.5, domains=1, views=2), Phase(domains=6, views=6)),
     )
     plan = plan_of(CONFIG, train)
-    assert plan["weights"] == parameter_count(Model(CONFIG)) and plan["weights_bytes"] == 20 * plan["weights"]
-    assert [p["steps"] for p in plan["phases"]] == [5, 5] and plan["phases"][1]["objects_at_once"] == 2
+    assert plan["weights"] == parameter_count(Model(CONFIG))
+    assert plan["weights_bytes"] == 20 * plan["weights"]
+    assert [p["steps"] for p in plan["phases"]] == [5, 5]
+    assert plan["phases"][1]["objects_at_once"] == 2
     assert plan["phases"][1]["flops_per_step"] > 10 * plan["phases"][0]["flops_per_step"]
     hours = plan["hours"]["H100 80 GB"]
     total = sum(p["steps"] * p["flops_per_step"] for p in plan["phases"])
@@ -154,4 +156,5 @@ def test_the_command_needs_no_data(gdtool):
     result = gdtool("train", "--plan", "--preset", "tiny", "--json")
     assert result.returncode == 0, result.stderr
     plan = msgspec.json.decode(result.stdout)
-    assert plan["weights"] > 1000 and set(plan["hours"]["A100 80 GB"]) == {"1", "8", "fits"}
+    assert plan["weights"] > 1000
+    assert set(plan["hours"]["A100 80 GB"]) == {"1", "8", "fits"}

@@ -25,7 +25,8 @@ SD = msgspec.structs.replace(CONFIG, noise_schedule="scaled_linear")
 def test_levels_are_on_the_unit_circle_and_fall(config):
     a, s = alpha_and_sigma(config)
     torch.testing.assert_close(a**2 + s**2, torch.ones(1000))
-    assert (a[1:] < a[:-1]).all() and a[0] > 0.999
+    assert (a[1:] < a[:-1]).all()
+    assert a[0] > 0.999
 
 
 def test_cosine_ends_in_pure_noise_and_stable_diffusion_does_not():
@@ -48,7 +49,8 @@ def test_the_shrunk_input_is_the_best_linear_estimate():
     clean = torch.randn(100_000, generator=generator, dtype=torch.float64) * DATA_VARIANCE**0.5
     noisy = 0.6 * clean + 0.8 * torch.randn(100_000, generator=generator, dtype=torch.float64)
     assert input_scale(config, 0.6, 0.8) == pytest.approx(float((clean * noisy).sum() / noisy.square().sum()), rel=0.02)
-    assert input_scale(config, 0.0, 1.0) == 0 and input_scale(CONFIG, 0.0, 1.0) == 1
+    assert input_scale(config, 0.0, 1.0) == 0
+    assert input_scale(CONFIG, 0.0, 1.0) == 1
 
 
 def test_min_snr_weight():

@@ -77,7 +77,8 @@ def test_mirroring_swaps_sides_and_is_its_own_inverse():
     assert albedo[left, 0].max() > 0.2 > albedo[right, 0].max()
     # normals still point toward the camera that sees them
     x = once[0][right, PLANES["normal"].start]
-    assert x.min() >= 0 and x.max() > 0.9
+    assert x.min() >= 0
+    assert x.max() > 0.9
 
 
 def test_permuted_colors_permute_the_light_as_well():
@@ -105,7 +106,9 @@ def test_each_pass_shows_each_object_once():
 def test_steps_see_color_and_as_many_domains_and_views_as_the_phase_says():
     for step in range(5):
         drawn = choose(MODEL, Phase(domains=3, views=2), 0, step)
-        assert drawn.domains[0] == 0 and len(set(drawn.domains)) == 3 and len(drawn.views.unique()) == 2
+        assert drawn.domains[0] == 0
+        assert len(set(drawn.domains)) == 3
+        assert len(drawn.views.unique()) == 2
     assert choose(MODEL, Phase(), 0, 0).domains == tuple(range(6))
 
 
@@ -123,11 +126,9 @@ def test_phases_and_rate_follow_progress():
     train = msgspec.structs.replace(
         TRAIN, phases=(Phase(share=0.5, learning_rate=1.0), Phase(share=1.0, learning_rate=0.1)), warmup=10
     )
-    assert (
-        phase_at(0.49, train).learning_rate == 1.0
-        and phase_at(0.5, train).learning_rate == 0.1
-        and phase_at(1.0, train).learning_rate == 0.1
-    )
+    assert phase_at(0.49, train).learning_rate == 1.0
+    assert phase_at(0.5, train).learning_rate == 0.1
+    assert phase_at(1.0, train).learning_rate == 0.1
     state = new_state(Model(MODEL), train)
     assert learning_rate(state, 0.0, train) == pytest.approx(0.1)
     state.step = 100
@@ -183,7 +184,8 @@ def test_a_killed_run_resumes_bit_for_bit(tmp_path, precision):
         ]
         for w in "ab"
     ]
-    assert without_time[0] == without_time[1] and len(without_time[0]) == 12
+    assert without_time[0] == without_time[1]
+    assert len(without_time[0]) == 12
 
 
 def test_a_killed_run_with_muon_resumes_bit_for_bit(tmp_path, monkeypatch):
@@ -216,7 +218,8 @@ def test_muon_moves_a_matrix_alike_in_all_its_directions(monkeypatch):
     own.step()
     given, moved = (torch.linalg.svdvals(x.flatten(1)) for x in (p.grad, p.detach() - before))
     middle = len(given) // 2
-    assert given[0] / given[middle] > 20 and moved[0] / moved[middle] < 3  # Newton-Schulz brings singular values near 1
+    assert given[0] / given[middle] > 20
+    assert moved[0] / moved[middle] < 3  # Newton-Schulz brings singular values near 1
 
 
 def test_a_checkpoint_of_another_configuration_is_refused(tmp_path):
@@ -247,7 +250,8 @@ def test_training_lowers_the_error(tmp_path):
     state = run_training(Model(MODEL), spheres(), options, tmp_path, RunOptions(seed=0))
     rows = list(csv.DictReader((tmp_path / "loss.csv").read_text().splitlines()))
     first, last = (np.mean([float(r["loss"]) for r in part]) for part in (rows[:5], rows[-5:]))
-    assert state.step == 60 and last < 0.5 * first
+    assert state.step == 60
+    assert last < 0.5 * first
     assert all(float(rows[-1][d]) > 0 for d in DOMAINS)
 
 
@@ -273,9 +277,8 @@ def test_steps_that_are_not_finite_are_left_out_counted_and_told(tmp_path, monke
         RunOptions(seed=0),
         observers=Observers(warn=said.append),
     )
-    assert [line.split(" is left out")[0] for line in said] == ["step 2", "step 3", "step 6"] and "2 in a row" in said[
-        1
-    ]
+    assert [line.split(" is left out")[0] for line in said] == ["step 2", "step 3", "step 6"]
+    assert "2 in a row" in said[1]
     assert [row["skipped"] for row in csv.DictReader((tmp_path / "loss.csv").read_text().splitlines())] == list(
         "0110010"
     )
@@ -298,4 +301,5 @@ def test_a_lost_run_ends_with_finite_weights_in_its_checkpoint(tmp_path, monkeyp
 def test_minutes_end_a_run(tmp_path):
     options = msgspec.structs.replace(TRAIN, steps=10**9, pbr_weight=0.0)
     state = run_training(Model(MODEL), spheres(), options, tmp_path, RunOptions(seed=0, minutes=0.01))
-    assert 0.6 <= state.seconds < 60 and 1 <= state.step < 10**6  # on a busy machine one step may take seconds
+    assert 0.6 <= state.seconds < 60
+    assert 1 <= state.step < 10**6  # on a busy machine one step may take seconds

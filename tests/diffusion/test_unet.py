@@ -157,9 +157,8 @@ def test_guidance_costs_and_acts_between_its_timesteps_alone(monkeypatch):
     never = sample_images(model, rgba, SamplingOptions(steps=4, seed=4, guidance=2.5, guided_to=0.0, guided_from=1.0))
     for domain in plain:
         assert torch.equal(never[domain], plain[domain])
-    assert not torch.allclose(early["color"][0, 1:], plain["color"][0, 1:]) and not torch.allclose(
-        early["color"][0, 1:], all_over["color"][0, 1:]
-    )
+    assert not torch.allclose(early["color"][0, 1:], plain["color"][0, 1:])
+    assert not torch.allclose(early["color"][0, 1:], all_over["color"][0, 1:])
 
 
 @pytest.mark.parametrize("guidance", [1.0, 2.5])

@@ -149,9 +149,8 @@ def test_a_pickle_is_refused_and_the_line_it_names_converts_it(tmp_path):
     done = subprocess.run([sys.executable, *command[1:]], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     read, _ = read_tensors(tmp_path / "diffusion_pytorch_model.safetensors")
-    assert read.keys() == tensors.keys() and all(
-        torch.equal(read[k], tensors[k]) and read[k].dtype == tensors[k].dtype for k in read
-    )
+    assert read.keys() == tensors.keys()
+    assert all(torch.equal(read[k], tensors[k]) and read[k].dtype == tensors[k].dtype for k in read)
 
 
 class Evil:
@@ -169,8 +168,10 @@ def test_a_pickle_that_runs_code_is_not_run(tmp_path):
             text=True,
             cwd=tmp_path,
         )
-        assert done.returncode == 3 and "Traceback" not in done.stderr
-        assert not (tmp_path / "was_here").exists() and not (tmp_path / f"{name}.safetensors").exists()
+        assert done.returncode == 3
+        assert "Traceback" not in done.stderr
+        assert not (tmp_path / "was_here").exists()
+        assert not (tmp_path / f"{name}.safetensors").exists()
 
 
 @pytest.fixture(scope="module")
@@ -226,9 +227,11 @@ def test_every_key_is_used_and_none_is_missing(folder):
     model = wonder3d.load(folder)
     stored, _ = read_tensors(folder / wonder3d.UNET)
     own = model.unet.state_dict()
-    assert own.keys() == stored.keys() and len([k for k in own if "joint_mid" in k]) == 16 * 7
+    assert own.keys() == stored.keys()
+    assert len([k for k in own if "joint_mid" in k]) == 16 * 7
     assert all(torch.equal(own[k], stored[k]) for k in own)
-    assert model.config.cross_domain == "joint" and model.config.image_size == 64
+    assert model.config.cross_domain == "joint"
+    assert model.config.image_size == 64
 
 
 def test_without_joint_attention_an_image_gets_what_diffusers_gives_it(folder):
@@ -286,7 +289,8 @@ def test_color_and_normal_come_out_by_command(folder, gdtool, tmp_path):
     result = gdtool("sample-views", "x.png", "--model", folder, "--steps", 2, "-o", "views")
     assert result.returncode == 0, result.stderr
     views = read_views(open_folder(tmp_path / "views"))
-    assert set(views.images) == {"color", "normal"} and views.cameras[0].half_width == pytest.approx(0.675)
+    assert set(views.images) == {"color", "normal"}
+    assert views.cameras[0].half_width == pytest.approx(0.675)
     assert gdtool("validate", "views").returncode == 0
 
 
@@ -301,8 +305,6 @@ def test_a_folder_with_pickles_is_refused_by_command(folder, gdtool, tmp_path):
 
     write_png(tmp_path / "x.png", image)
     result = gdtool("sample-views", "x.png", "--model", "w", "-o", "views")
-    assert (
-        result.returncode == 3
-        and "python -m gdtool.diffusion.convert" in result.stderr
-        and "Traceback" not in result.stderr
-    )
+    assert result.returncode == 3
+    assert "python -m gdtool.diffusion.convert" in result.stderr
+    assert "Traceback" not in result.stderr

@@ -18,7 +18,8 @@ def test_the_demo_image_is_the_demo_object_from_the_front(monkeypatch):
     import make_demo_image as script
 
     image = read_image(EXAMPLES / "demo.png")
-    assert image.shape == (script.SIZE, script.SIZE, 4) and image.dtype == np.uint8
+    assert image.shape == (script.SIZE, script.SIZE, 4)
+    assert image.dtype == np.uint8
     camera = camera_at(0.0, script.ELEVATION, name="photograph", size=128, **script.LENS)
     buffers = render_buffers(load_scene(f"procedural:{script.SEED}"), camera, samples=4)
     small = (image / 255.0).reshape(128, script.SIZE // 128, 128, script.SIZE // 128, 4).mean((1, 3))

@@ -65,7 +65,8 @@ def test_images_and_models_become_assets_in_parallel(folder):
     work, run = folder
     result, calls = run("-j3")
     assert result.returncode == 0, result.stderr
-    assert stages(calls, "cat.") == stages(calls, "owl.") == FROM_IMAGE and stages(calls, "chair.") == FROM_MODEL
+    assert stages(calls, "cat.") == stages(calls, "owl.") == FROM_IMAGE
+    assert stages(calls, "chair.") == FROM_MODEL
     assert all((work / f"{name}.asset" / "asset" / "manifest.json").is_file() for name in ("cat", "owl", "chair"))
 
 
@@ -73,17 +74,21 @@ def test_running_again_runs_nothing(folder):
     _, run = folder
     run("-j3")
     result, calls = run("-j3")
-    assert result.returncode == 0 and calls == []
+    assert result.returncode == 0
+    assert calls == []
 
 
 def test_a_failed_stage_is_resumed_where_it_stopped(folder):
     work, run = folder
     result, calls = run("-k", fail="remesh --quiet --threads 1 -o owl.asset")
     assert result.returncode == 2
-    assert stages(calls, "owl.") == FROM_IMAGE[:3] and stages(calls, "cat.") == FROM_IMAGE
+    assert stages(calls, "owl.") == FROM_IMAGE[:3]
+    assert stages(calls, "cat.") == FROM_IMAGE
     assert (work / "owl.asset" / "surface" / "manifest.json").is_file()
     result, calls = run()
-    assert result.returncode == 0 and stages(calls, "owl.") == FROM_IMAGE[2:] and stages(calls, "cat.") == []
+    assert result.returncode == 0
+    assert stages(calls, "owl.") == FROM_IMAGE[2:]
+    assert stages(calls, "cat.") == []
 
 
 @pytest.mark.parametrize(
@@ -108,7 +113,8 @@ def test_sources_elsewhere_options_and_single_targets(folder, tmp_path):
     other = tmp_path / "other"
     other.mkdir()
     result, calls = run(f"SOURCES={work}", "REMESH=--faces 5000", "cat.asset/renders/manifest.json", cwd=other)
-    assert result.returncode == 0 and [call.split()[0] for call in calls] == [*FROM_IMAGE, "relight"]
+    assert result.returncode == 0
+    assert [call.split()[0] for call in calls] == [*FROM_IMAGE, "relight"]
     assert "remesh --faces 5000 --quiet" in calls[2]
     assert not (other / "owl.asset").exists()
 
@@ -116,7 +122,8 @@ def test_sources_elsewhere_options_and_single_targets(folder, tmp_path):
 def test_reports_hold_the_error_of_each_model(folder):
     work, run = folder
     result, calls = run("reports")
-    assert result.returncode == 0 and calls[-1] == "evaluate chair.asset/asset --reference chair.glb --json"
+    assert result.returncode == 0
+    assert calls[-1] == "evaluate chair.asset/asset --reference chair.glb --json"
     assert (work / "chair.asset" / "report.json").read_text() == '{"distance": 0.001}\n'
     assert not (work / "cat.asset").exists()
 

@@ -48,8 +48,12 @@ class Ticking:
 def test_clock():
     ticking = Ticking()
     clock = Clock(3.0, ticking)
-    assert clock.limited and clock.left() == 2.0 and clock.spent() == 2.0 and clock.left() == 0.0
-    assert Clock().left() == float("inf") and not Clock().limited
+    assert clock.limited
+    assert clock.left() == 2.0
+    assert clock.spent() == 2.0
+    assert clock.left() == 0.0
+    assert Clock().left() == float("inf")
+    assert not Clock().limited
 
 
 def test_rounds_end_at_a_plateau_and_each_says_the_error(ring, bent):
@@ -70,9 +74,12 @@ def test_no_time_at_all_gives_one_round_and_the_draft(ring, bent):
     prepared, before, noise = align_depth(
         cameras, mask, bent, images["normal"], step, AlignmentOptions(clock=clock, tell=told.append)
     )
-    assert len(told) == 1 and noise < before
+    assert len(told) == 1
+    assert noise < before
     shape, coarser = fuse_within_budget(prepared, step, options=FusionOptions(noise=noise, outvoted=0), clock=clock)
-    assert coarser and shape.step == fusion.DRAFT_COARSENESS * step and is_closed_manifold(shape.faces)
+    assert coarser
+    assert shape.step == fusion.DRAFT_COARSENESS * step
+    assert is_closed_manifold(shape.faces)
     assert np.abs(torus(shape.vertices)).mean() < 0.01
 
 
@@ -90,4 +97,6 @@ def test_the_finest_grid_that_there_is_time_for(ring):
     assert steps == pytest.approx([2.0, 1.4, 1.0])
     shape, coarser = fuse_within_budget(prepared, step, options=FusionOptions(noise=0.0, outvoted=0), clock=Clock())
     whole = fuse_views(prepared, step)
-    assert coarser == "" and (shape.vertices == whole.vertices).all() and (shape.faces == whole.faces).all()
+    assert coarser == ""
+    assert (shape.vertices == whole.vertices).all()
+    assert (shape.faces == whole.faces).all()

@@ -77,7 +77,8 @@ def test_one_wrong_view_loses_against_three():
     seen = Observations(np.ones((4, 5), np.float32), np.full((4, 5, 2), 2.0))
     value, weight, residual = fuse(images, np.ones((4, 4, 4), np.float32), seen)
     assert value[:, 0] == pytest.approx(np.full(5, 0.5), abs=0.02)
-    assert weight == pytest.approx(np.full(5, 4.0)) and (residual > 0.05).all()
+    assert weight == pytest.approx(np.full(5, 4.0))
+    assert (residual > 0.05).all()
 
 
 def test_spread_fills_the_unseen_and_keeps_the_seen():
@@ -89,13 +90,16 @@ def test_spread_fills_the_unseen_and_keeps_the_seen():
     weight = np.zeros(2 * n)
     values[[n - 1, 2 * n - 1]], weight[[0, n, n - 1, 2 * n - 1]] = 1.0, 1.0
     out = spread(values, weight, faces)[:, 0]
-    assert abs(out[0]) < 0.02 and abs(out[n - 1] - 1) < 0.02
+    assert abs(out[0]) < 0.02
+    assert abs(out[n - 1] - 1) < 0.02
     assert out[:n] == pytest.approx(np.linspace(0, 1, n), abs=0.08)
 
 
 def test_confidence_grows_with_views_and_falls_with_their_quarrel():
     c = confidence(np.array([0.0, 0.2, 2.0, 2.0]), np.array([0.0, 0.0, 0.0, 0.2]))
-    assert c[0] == 0 and c[0] < c[1] < c[2] <= 1 and c[3] < 0.2
+    assert c[0] == 0
+    assert c[0] < c[1] < c[2] <= 1
+    assert c[3] < 0.2
 
 
 def test_a_wall_hides_the_light_behind_it_alone():
@@ -110,7 +114,8 @@ def test_a_wall_hides_the_light_behind_it_alone():
     seen = visibility(mesh, faces, normals, 1e-3, np.random.default_rng(0), rays=64).at(np.array([8, 9]))
     axes = np.array([[-0.8, 0.6, 0.0], [0.8, 0.6, 0.0], [0.0, 1.0, 0.0]])
     share = seen.of_lobes(axes, np.full(3, 12.0))
-    assert (share[:, 0] < 0.15).all() and (share[:, 1] > 0.95).all()
+    assert (share[:, 0] < 0.15).all()
+    assert (share[:, 1] > 0.95).all()
     assert share[:, 2] == pytest.approx(0.5, abs=0.15)
     assert unoccluded(normals).of_lobes(axes, np.full(3, 12.0)) == pytest.approx(1.0)
 
@@ -143,4 +148,5 @@ def test_shadow_stays_out_of_the_albedo():
             normals, color, np.ones(2000), visible, ColorSamples(np.arange(2000), normals, color), LIGHT
         )[0]
         uneven.append(float(albedo.std() / albedo.mean()))
-    assert uneven[0] < 0.1 and uneven[1] > 2 * uneven[0]
+    assert uneven[0] < 0.1
+    assert uneven[1] > 2 * uneven[0]

@@ -62,7 +62,8 @@ def test_all_domains_meet_the_analytic_surface(seen, solid, volume):
     shape = reconstruct(*seen[solid.__name__])
     error = np.abs(solid(shape.vertices))
     assert is_closed_manifold(shape.faces)
-    assert error.mean() < 0.002 and error.max() < 0.04
+    assert error.mean() < 0.002
+    assert error.max() < 0.04
     assert signed_volume(shape.vertices, shape.faces) == pytest.approx(volume, rel=0.02)  # positive: wound outward
 
 
@@ -90,13 +91,15 @@ def test_edges_are_drawn_out(monkeypatch):
 
     def missed():
         shape = fuse_views(prepared, step)
-        assert is_closed_manifold(shape.faces) and len(fold_midpoints(shape.vertices, shape.faces)) == 0
+        assert is_closed_manifold(shape.faces)
+        assert len(fold_midpoints(shape.vertices, shape.faces)) == 0
         return np.array([closest_points(edge, shape.vertices, shape.faces)[0].mean() for edge in edges])
 
     sharp = missed()
     monkeypatch.setattr("gdtool.fields.grid.fusion.sharpen_creases", lambda vertices, faces, *_: (vertices, faces))
     blunt = missed()
-    assert (sharp < blunt).all() and sharp.mean() < 0.85 * blunt.mean()
+    assert (sharp < blunt).all()
+    assert sharp.mean() < 0.85 * blunt.mean()
 
 
 def box(points, centre, half):
@@ -129,7 +132,8 @@ def test_what_leaves_a_silhouette_goes_back_as_far_as_it_must():
     at = np.array([1.0, 0.0, 0.0])  # to the right of the front view
     start, end = np.array([-0.2, 0.1, 3.0])[:, None] * at, np.array([0.3, 0.1, 0.3])[:, None] * at
     found = _inside_silhouettes(end, start, [prepared_view], 0.01)
-    assert prepared_view.cropped and np.isfinite(found).all()
+    assert prepared_view.cropped
+    assert np.isfinite(found).all()
     assert np.allclose(found @ at, [0.01, 0.1, 3.0], atol=2e-3)
 
 
@@ -160,7 +164,8 @@ def test_views_measure_distances_from_both_sides(seen):
     front = prepare_all(cameras, mask, images["depth"], images["normal"])[0]
     points = np.array([[0, 0, 0.55], [0, 0, 0.45], [0.1, 0.1, 0.5]])
     value, weight = free_distance(front, points)
-    assert value == pytest.approx(sphere(points), abs=2e-3) and (weight > 0.5).all()
+    assert value == pytest.approx(sphere(points), abs=2e-3)
+    assert (weight > 0.5).all()
     assert hull_distance(front, np.array([[0.6, 0, 0], [0, 0.4, 0]])) == pytest.approx([0.1, -0.1], abs=2e-3)
 
 
@@ -210,7 +215,9 @@ def test_bumps_that_the_normals_do_not_show_go(seen, solid):
     rough, smooth = (
         fuse_views(prepared, step, FusionOptions(noise=noise, has_normals=shaded)) for shaded in (False, True)
     )
-    assert rough.bumps is None and smooth.bumps > BUMPY_DEGREES and is_closed_manifold(smooth.faces)
+    assert rough.bumps is None
+    assert smooth.bumps > BUMPY_DEGREES
+    assert is_closed_manifold(smooth.faces)
     before, after = degrees_off(solid, rough.vertices, rough.faces), degrees_off(solid, smooth.vertices, smooth.faces)
     assert np.median(after) < 0.6 * np.median(before)
     assert np.abs(solid(smooth.vertices)).mean() < np.abs(solid(rough.vertices)).mean() + 1e-4
@@ -238,7 +245,8 @@ def test_a_surface_that_fits_its_normals_hardly_follows_them(seen, solid):
         )
         / step
     )
-    assert moved.mean() < 0.05 and np.quantile(moved, 0.9) < 0.1
+    assert moved.mean() < 0.05
+    assert np.quantile(moved, 0.9) < 0.1
 
 
 def test_a_thin_wall_that_two_views_turn_inside_out_has_no_hole():
@@ -261,7 +269,8 @@ def test_a_thin_wall_that_two_views_turn_inside_out_has_no_hole():
     step = grid_step(cameras, 0)
     prepared, _, noise = align_depth(cameras, mask, depth, images["normal"], step)
     shape = fuse_views(prepared, step, FusionOptions(noise=noise))
-    assert is_closed_manifold(shape.faces) and components(shape.faces, len(shape.vertices)).max() == 0
+    assert is_closed_manifold(shape.faces)
+    assert components(shape.faces, len(shape.vertices)).max() == 0
     assert euler_number(shape.faces) == 2
 
 
@@ -276,9 +285,8 @@ def test_what_a_grown_silhouette_gains_is_free_as_far_as_beside_it(seen):
     grown = grow_silhouette(prepared_view, edge)
     rim, beyond = np.array([[0.3 + pixel, 0, 0.6]]), np.array([[0.3 + 6 * pixel, 0, 0.6]])
     assert hull_distance(grown, rim) < 0 < hull_distance(prepared_view, rim)
-    assert not np.isfinite(free_distance(prepared_view, rim)[0]) and free_distance(grown, rim)[0] == pytest.approx(
-        [0.1], abs=2e-3
-    )
+    assert not np.isfinite(free_distance(prepared_view, rim)[0])
+    assert free_distance(grown, rim)[0] == pytest.approx([0.1], abs=2e-3)
     assert free_distance(grown, rim)[1] < 1e-3  # a bound: no surface of its own
     assert not np.isfinite(free_distance(grown, beyond)[0])
     # Nothing is gained by one that shrinks, and what was seen is seen as before.
@@ -298,7 +306,8 @@ def test_a_hollow_stays_where_views_see_into_it(seen_vertices, hollows, left):
     support = np.where(inner, 0.0, 1.0)
     support[np.flatnonzero(inner)[:seen_vertices]] = 1.0
     vertices, faces, dropped = drop_debris(vertices, faces, support, 0.02, hollows)
-    assert components(faces, len(vertices)).max() + 1 == left and dropped == 2 - left
+    assert components(faces, len(vertices)).max() + 1 == left
+    assert dropped == 2 - left
 
 
 def test_silhouettes_that_were_grown_or_shrunk_are_found_out(seen):
@@ -332,7 +341,8 @@ def test_slopes_say_how_the_depth_bends(seen):
     # Down the rows first, then along them.
     across = np.average(slope[: len(slope) // 2], weights=weight[: len(slope) // 2])
     along = np.average(slope[len(slope) // 2 :], weights=weight[len(slope) // 2 :])
-    assert abs(across) < 0.004 and along == pytest.approx(-0.04 / (SIZE * cameras[0].pixel_size), abs=0.006)
+    assert abs(across) < 0.004
+    assert along == pytest.approx(-0.04 / (SIZE * cameras[0].pixel_size), abs=0.006)
 
 
 def test_views_that_contradict_one_another_still_close(seen):
@@ -340,7 +350,8 @@ def test_views_that_contradict_one_another_still_close(seen):
     kinds = ["sphere", "torus", "two_balls", "cube", "torus", "two_balls"]
     images = {n: np.stack([seen[kind][1][n][k] for k, kind in enumerate(kinds)]) for n in ("depth", "normal")}
     shape = reconstruct(cameras, images, np.stack([seen[kind][2][k] for k, kind in enumerate(kinds)]))
-    assert is_closed_manifold(shape.faces) and np.isfinite(shape.vertices).all()
+    assert is_closed_manifold(shape.faces)
+    assert np.isfinite(shape.vertices).all()
     assert signed_volume(shape.vertices, shape.faces) > 0.01
 
 
@@ -354,7 +365,8 @@ def test_flat_card_and_empty_views_close():
     mask[4] = 0
     shape = reconstruct(cameras, images, mask)
     assert is_closed_manifold(shape.faces)
-    assert np.ptp(shape.vertices[:, 0]) > 0.95 and np.ptp(shape.vertices[:, 1]) > 0.75
+    assert np.ptp(shape.vertices[:, 0]) > 0.95
+    assert np.ptp(shape.vertices[:, 1]) > 0.75
     # As thin as the grid can hold, and without a hole.
     assert np.abs(shape.vertices[:, 2]).max() < 1.2 * shape.step
     assert len(shape.vertices) - len(shape.faces) // 2 == 2
@@ -386,4 +398,5 @@ def test_what_no_view_sees_stays_where_the_carving_put_it():
     move = np.linalg.norm(
         refine(np.asarray(cube.vertices), np.asarray(cube.faces), [], cell, reach=0.1) - cube.vertices, axis=1
     )
-    assert 0 < move.max() < 0.8 * cell and move.mean() < 0.08 * cell
+    assert 0 < move.max() < 0.8 * cell
+    assert move.mean() < 0.08 * cell

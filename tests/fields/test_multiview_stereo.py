@@ -99,7 +99,8 @@ def test_costs_are_passed_along_planes():
 def test_one_view_alone_is_bounded_by_its_silhouette():
     cameras, images, mask = views_of(sphere, MATCHING_SIZE)
     depth = depth_for(cameras[:1], mask[:1], images["normal"][:1])
-    assert np.isfinite(depth).all() and (depth[0][mask[0] > 0.5] > 0).all()
+    assert np.isfinite(depth).all()
+    assert (depth[0][mask[0] > 0.5] > 0).all()
     inside = mask[0] > 0.99
     off = (depth[0] - images["depth"][0])[inside]
     assert np.abs(off - np.median(off)).mean() < 0.01  # the form; how far away it is nothing tells
@@ -110,7 +111,8 @@ def test_views_that_show_nothing_have_no_depth():
     mask = mask.copy()
     mask[2] = 0
     depth = depth_for(cameras, mask, images["normal"])
-    assert (depth[2] == 0).all() and error(images, mask, depth).mean() < 0.008
+    assert (depth[2] == 0).all()
+    assert error(images, mask, depth).mean() < 0.008
 
 
 @pytest.mark.parametrize("lie", ["other sides", "noise", "nothing"])
@@ -123,7 +125,8 @@ def test_normals_that_lie_still_leave_depths_within_the_silhouettes(lie):
     }[lie]
     depth = depth_for(cameras, mask, normal)
     inside = mask > 0.5
-    assert np.isfinite(depth).all() and (depth[~inside] == 0).all()
+    assert np.isfinite(depth).all()
+    assert (depth[~inside] == 0).all()
     assert ((depth[inside] > 1) & (depth[inside] < 3)).all()
 
 

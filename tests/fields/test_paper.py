@@ -39,7 +39,8 @@ def test_a_field_that_starts_inside_out_ends_as_the_other_does():
     fit, values = fitted(inside_out=True)
     assert values.abs().mean() < 0.01
     with torch.no_grad():
-        assert fit.sdf(torch.zeros(1, 3)) < -0.1 and fit.sdf(torch.full((1, 3), 0.5)) > 0.3
+        assert fit.sdf(torch.zeros(1, 3)) < -0.1
+        assert fit.sdf(torch.full((1, 3), 0.5)) > 0.3
 
 
 def test_bfloat16_layers_agree_with_float32():
@@ -61,9 +62,12 @@ def test_a_spent_budget_ends_the_schedule_at_a_small_rate():
         return seen[-1]
 
     fit, values = fitted(steps=10_000, spent=spent)
-    assert len(seen) == 11 and torch.isfinite(values).all()
+    assert len(seen) == 11
+    assert torch.isfinite(values).all()
     assert torch.equal(fit.sdf.window, torch.ones_like(fit.sdf.window))
-    assert one_cycle(0.0) < 0.02 and one_cycle(0.1) == 1.0 and one_cycle(1.0) == pytest.approx(0.0, abs=1e-9)
+    assert one_cycle(0.0) < 0.02
+    assert one_cycle(0.1) == 1.0
+    assert one_cycle(1.0) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_only_the_first_frequencies_are_let_through():
@@ -79,7 +83,8 @@ def test_networks_run_wherever_their_parameters_are():
     """Shapes and devices without arithmetic: a tensor made on the processor by mistake would raise."""
     sdf = SdfNetwork().to("meta")
     value, gradient = sdf.with_gradient(torch.empty(7, 3, device="meta"))
-    assert value.device.type == gradient.device.type == "meta" and gradient.shape == (7, 3)
+    assert value.device.type == gradient.device.type == "meta"
+    assert gradient.shape == (7, 3)
     sdf.show_frequencies(4)
     assert sdf.window.device.type == "meta"
 
@@ -105,6 +110,7 @@ def test_volume_start_and_surface_steps_follow_one_another_without_depth():
         track=lambda n, _: range(n),
         spent=lambda: 0.0,
     )
-    assert done == 7 and {"mask", "normal", "eikonal"} <= set(fit.history[0])
+    assert done == 7
+    assert {"mask", "normal", "eikonal"} <= set(fit.history[0])
     with torch.no_grad():
         assert fit.sdf(on_sphere()).abs().mean() < 0.03

@@ -47,9 +47,11 @@ def test_a_wing_that_the_other_views_look_through_is_there(seen):
     without, found = (
         fuse_views(seen, step, FusionOptions(noise=0.5 * step, picture_view=known)) for known in ("", "front")
     )
-    assert without.restored == 0 and np.abs(without.vertices[:, 0]).max() < 0.3
+    assert without.restored == 0
+    assert np.abs(without.vertices[:, 0]).max() < 0.3
     wing = found.vertices[np.abs(found.vertices[:, 0]) > 0.2]
-    assert is_closed_manifold(found.faces) and 0.2 < found.restored < 0.8
+    assert is_closed_manifold(found.faces)
+    assert 0.2 < found.restored < 0.8
     assert np.abs(wing[:, 0]).max() == pytest.approx(0.4, abs=0.02)
     assert np.abs(wing[:, 1]).max() == pytest.approx(HIGH, abs=0.015)  # a pixel
     assert np.abs(wing[:, 2]).max() == pytest.approx(CHORD, abs=0.02)
@@ -61,12 +63,14 @@ def test_a_wing_that_the_other_views_look_through_is_there(seen):
 def test_views_that_agree_are_left_alone(seen):
     step = grid_step([prepared_view.camera for prepared_view in seen], 0)
     one, two = (fuse_views(seen, step, FusionOptions(noise=0.0, picture_view=known)) for known in ("", "front"))
-    assert two.restored == 0 and np.array_equal(one.vertices, two.vertices)
+    assert two.restored == 0
+    assert np.array_equal(one.vertices, two.vertices)
 
 
 def test_without_a_view_from_behind_a_part_is_as_thick_as_wide(seen):
     front = next(prepared_view for prepared_view in seen if prepared_view.camera.name == "front")
-    assert opposite(seen, front).camera.name == "back" and opposite([front], front) is None
+    assert opposite(seen, front).camera.name == "back"
+    assert opposite([front], front) is None
     grid = grid_over(np.full(3, -0.45), np.full(3, 0.45), 0.01, margin=2)
     index = np.argwhere(np.ones(grid.shape, bool))
     values = body(grid.points(index)).reshape(grid.shape).astype(np.float32)
@@ -76,11 +80,13 @@ def test_without_a_view_from_behind_a_part_is_as_thick_as_wide(seen):
     assert share == pytest.approx(lost.sum() / (front.mask > 0.5).sum())
     wing = grid.points(index[(alone < 0).ravel() & (np.abs(grid.points(index)[:, 0]) > 0.2)])
     # Thin, where its front edge is seen.
-    assert np.ptp(wing[:, 2]) < 0.08 and wing[:, 2].max() == pytest.approx(CHORD, abs=0.03)
+    assert np.ptp(wing[:, 2]) < 0.08
+    assert wing[:, 2].max() == pytest.approx(CHORD, abs=0.03)
     assert (alone <= values).all()
     # What is there needs nothing, and a view without depth says nothing of where.
     whole = plane(grid.points(index)).reshape(grid.shape).astype(np.float32)
     same, share = restore_picture_silhouette(whole, grid, seen, front)
-    assert share == 0 and same is whole
+    assert share == 0
+    assert same is whole
     blind = prepare_all([front.camera], front.mask[None], None, None)[0]
     assert restore_picture_silhouette(values, grid, [blind], blind) == (values, 0.0)

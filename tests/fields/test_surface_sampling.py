@@ -142,11 +142,14 @@ def test_sdf_network_starts_as_a_sphere():
     points = points / points.norm(dim=-1, keepdim=True) * torch.linspace(0.1, 1.0, 2000)[:, None]
     value, gradient = network.with_gradient(points, create_graph=False)
     assert (value - (points.norm(dim=-1) - 0.4)).abs().mean() < 0.15
-    assert (value[points.norm(dim=-1) < 0.15] < 0).all() and (value[points.norm(dim=-1) > 0.9] > 0).all()
+    assert (value[points.norm(dim=-1) < 0.15] < 0).all()
+    assert (value[points.norm(dim=-1) > 0.9] > 0).all()
     assert ((gradient * points).sum(-1) > 0).all()
 
 
 def test_material_network_stays_in_range():
     torch.manual_seed(0)
     out = MaterialNetwork()(torch.randn(100, 3) * 3).detach()
-    assert out.shape == (100, 6) and float(out.min()) >= 0 and float(out.max()) <= 1
+    assert out.shape == (100, 6)
+    assert float(out.min()) >= 0
+    assert float(out.max()) <= 1

@@ -59,7 +59,9 @@ def test_neus_alpha_gradcheck():
 @given(st.lists(st.floats(-1, 1, width=32), min_size=2, max_size=64), st.floats(1, 1e6))
 def test_neus_weights_are_shares_of_one(values, sharpness):
     weights = ss.neus_weights(torch.tensor([values]), sharpness)
-    assert torch.isfinite(weights).all() and (weights >= 0).all() and float(weights.sum()) <= 1 + 1e-5
+    assert torch.isfinite(weights).all()
+    assert (weights >= 0).all()
+    assert float(weights.sum()) <= 1 + 1e-5
 
 
 def brute_force_crossing(values: list[float]) -> int | None:
@@ -134,7 +136,8 @@ def check_encoding(values: np.ndarray) -> None:
     """Against sin and cos of π 2^k x in 40 digits, of the float32 that is encoded."""
     points = torch.tensor(values, dtype=torch.float32)[:, None].expand(-1, 3)
     got = encode(points).double().numpy()
-    assert got.shape[1] == ENCODED and not got[:, 3 + 6 * FREQUENCIES :].any()
+    assert got.shape[1] == ENCODED
+    assert not got[:, 3 + 6 * FREQUENCIES :].any()
     with mpmath.workdps(40):
         for row, x in zip(got, points[:, 0].double().numpy(), strict=True):
             for k in range(FREQUENCIES):

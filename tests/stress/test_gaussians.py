@@ -58,7 +58,10 @@ def check_product(p1: torch.Tensor, s1: float, p2: torch.Tensor, s2: float) -> N
     axis, sharpness, exponent = (x.double().numpy() for x in sg.product(p1, a, p2, b))
     direction, length, drop = product_of_lobes(p1.double().numpy(), a, p2.double().numpy(), b)
     total, length, drop = float(a) + float(b), float(length), float(drop)
-    assert np.isfinite(axis).all() and math.isfinite(sharpness) and exponent <= 0 and np.linalg.norm(axis) < 1 + 1e-6
+    assert np.isfinite(axis).all()
+    assert math.isfinite(sharpness)
+    assert exponent <= 0
+    assert np.linalg.norm(axis) < 1 + 1e-6
     assert abs(sharpness - length) <= 2e-6 * max(total, 1e-20), (s1, s2)
     # The amplitude exp(exponent), relative while float32 can hold it, where its logarithm is
     # moderate.
@@ -89,7 +92,8 @@ def test_product_of_antipodal_equal_lobes_is_flat():
     p = torch.tensor([0.0, 0.0, 1.0])
     for s in (1e-8, 1.0, 1e4, 1e10):
         _, sharpness, exponent = sg.product(p, torch.tensor(s), -p, torch.tensor(s))
-        assert float(sharpness) <= 2e-6 * s and float(exponent) == pytest.approx(-2 * s, rel=1e-6)
+        assert float(sharpness) <= 2e-6 * s
+        assert float(exponent) == pytest.approx(-2 * s, rel=1e-6)
 
 
 def check_integrals(value: float, angles: np.ndarray) -> None:
@@ -98,8 +102,10 @@ def check_integrals(value: float, angles: np.ndarray) -> None:
     exact, half = ring_integrals(float(s[0]), cosine.double().numpy())
     peak = ring_integrals(float(s[0]), np.array([1.0]))[0][0]
     got, got_half = sg.cosine_integral(s, cosine).double().numpy(), sg.hemisphere_integral(s, cosine).double().numpy()
-    assert (got >= 0).all() and np.abs(got - exact).max() <= 2e-3 * peak, value
-    assert (got_half >= 0).all() and np.abs(got_half - half).max() <= 5e-3 * sphere_integral(float(s[0])), value
+    assert (got >= 0).all(), value
+    assert np.abs(got - exact).max() <= 2e-3 * peak, value
+    assert (got_half >= 0).all(), value
+    assert np.abs(got_half - half).max() <= 5e-3 * sphere_integral(float(s[0])), value
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-8, 1e-3, 0.1, 0.499, 0.501, 1.0, 3.0, 10.0, 30.0, 1e3, 1e6, 1e10])
@@ -120,7 +126,8 @@ def test_rounding_of_hemisphere_and_cosine(value):
     for function in (sg.cosine_integral, sg.hemisphere_integral):
         low = function(torch.tensor(value, dtype=torch.float32), c).double()
         high = function(torch.tensor(float(np.float32(value)), dtype=torch.float64), c.double())
-        assert torch.isfinite(low).all() and (low >= 0).all()
+        assert torch.isfinite(low).all()
+        assert (low >= 0).all()
         assert float((low - high).abs().max() / high.max()) <= 5e-7
 
 
@@ -138,7 +145,8 @@ def test_cosine_integral_grows_with_the_cosine(value, one, two):
     low, high = sorted((one, two))
     s = torch.tensor(value)
     at_low, at_high, peak = (float(sg.cosine_integral(s, torch.tensor(x))) for x in (low, high, 1.0))
-    assert 0 <= at_low <= at_high + 1e-6 * peak and at_high <= peak * (1 + 1e-6)
+    assert 0 <= at_low <= at_high + 1e-6 * peak
+    assert at_high <= peak * (1 + 1e-6)
 
 
 @pytest.mark.parametrize("value", [1.0, 1e2, 1e4, 1e6, 1e7, 1e10])

@@ -87,4 +87,5 @@ def test_the_test_finds_a_bias_of_two_percent():
     reference = picture(renderer, environment, 99, 256)
     spread = 0.25 * draws.std(0, ddof=1)
     assert z_test(draws * 1.02, reference, 0 * spread) < 1e-3
-    assert math.isfinite(z_test(draws, reference, spread)) and z_test(draws, reference, spread) > SIGNIFICANCE
+    assert math.isfinite(z_test(draws, reference, spread))
+    assert z_test(draws, reference, spread) > SIGNIFICANCE

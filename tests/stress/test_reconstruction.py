@@ -51,7 +51,8 @@ def reconstruct(cameras, images, mask):
 
 
 def check_whole(shape, reach=0.75):
-    assert np.isfinite(shape.vertices).all() and np.abs(shape.vertices).max() < reach
+    assert np.isfinite(shape.vertices).all()
+    assert np.abs(shape.vertices).max() < reach
     assert is_closed_manifold(shape.faces)
     assert signed_volume(shape.vertices, shape.faces) > 0
 
@@ -77,7 +78,8 @@ def test_symmetric_solids_stay_symmetric(seen, name):
     """The rig is its own mirror image, left and right."""
     shape = reconstruct(*seen[name])
     apart = closest_points(shape.vertices[::10] * [-1, 1, 1], shape.vertices, shape.faces)[0]
-    assert apart.mean() < 0.02 * shape.step and np.quantile(apart, 0.99) < 0.3 * shape.step
+    assert apart.mean() < 0.02 * shape.step
+    assert np.quantile(apart, 0.99) < 0.3 * shape.step
 
 
 @pytest.mark.parametrize("missing", range(6))
@@ -152,7 +154,8 @@ def test_the_largest_views_fit_into_memory(tmp_path):
     assert process.returncode == 0
     assert used.ru_maxrss / 1024 <= MEMORY_MB
     surface = read_surface(open_folder(folder.parent / "surface"))
-    assert is_closed_manifold(surface.faces) and np.abs(sphere(surface.vertices)).mean() < 5e-4
+    assert is_closed_manifold(surface.faces)
+    assert np.abs(sphere(surface.vertices)).mean() < 5e-4
 
 
 def check_disturbed(seen, seeds, most=0.015):
@@ -204,7 +207,9 @@ def test_materials_at_their_ends(gdtool, tmp_path, seen, albedo, roughness, meta
     sure = surface.confidence > 0.5
     assert sure.any()
     for found, true in ((surface.albedo, albedo), (surface.roughness, roughness), (surface.metallic, metallic)):
-        assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1
+        assert np.isfinite(found).all()
+        assert found.min() >= 0
+        assert found.max() <= 1
         assert np.abs(found[sure] - true).mean() < 0.03
 
 
@@ -215,6 +220,7 @@ def test_hardly_any_time(gdtool, tmp_path, seen, budget):
     done = gdtool("reconstruct", folder, "--budget", budget)
     assert done.returncode == 0, done.stderr
     surface = read_surface(open_folder(folder.parent / "surface"))
-    assert is_closed_manifold(surface.faces) and np.abs(torus(surface.vertices)).mean() < 0.005
+    assert is_closed_manifold(surface.faces)
+    assert np.abs(torus(surface.vertices)).mean() < 0.005
     skipped = [s["what"] for s in json.loads((folder.parent / "surface" / "manifest.json").read_text())["skipped"]]
     assert budget > 1 or "the whole grid" in skipped

@@ -39,7 +39,8 @@ def test_fresnel():
         start = torch.tensor([f0])
         value = models.fresnel(start, cosines())
         exact = models.fresnel(start.double(), cosines().double().clamp_max(1))
-        assert float(value.min()) >= float(start) and float(value.max()) <= 1
+        assert float(value.min()) >= float(start)
+        assert float(value.max()) <= 1
         # Below a dielectric's 0.04 the value goes to 0 with the fifth power of what is left of 1 − c: on the scale of
         # f0's range.
         assert float((value.double() - exact).abs().max()) <= 2 * ULP
@@ -53,7 +54,8 @@ def test_visibility(kind):
     for r in (0.0, 1e-12, 0.045, 0.1, 0.3, 0.7, 1.0):
         roughness = torch.tensor(r)
         value = models.visibility(kind, roughness, light, v)
-        assert torch.isfinite(value).all() and (value > 0).all()
+        assert torch.isfinite(value).all()
+        assert (value > 0).all()
         alpha = models.alpha_of(roughness)
         if kind == "gltf":
             exact = models.visibility_gltf(alpha.double(), light.double(), v.double())
@@ -253,7 +255,8 @@ def lobes(scene) -> SphericalGaussians:
 def test_light_adds_up(scene):
     g = lobes(scene)
     whole = lit(scene)
-    assert torch.isfinite(whole).all() and (whole >= 0).all()
+    assert torch.isfinite(whole).all()
+    assert (whole >= 0).all()
     parts = sum(
         lit(scene, SphericalGaussians(g.axes[i : i + 1], g.sharpness[i : i + 1], g.amplitudes[i : i + 1]))
         for i in range(3)
@@ -340,7 +343,8 @@ def test_finite_and_never_negative_with_finite_gradients_at_every_adversary(kind
         )
     ]
     value = shade(*tensors[:5], SphericalGaussians(*tensors[5:]), kind)
-    assert torch.isfinite(value).all() and (value >= 0).all()
+    assert torch.isfinite(value).all()
+    assert (value >= 0).all()
     value.sum().backward()
     for name, t in zip(
         ("normal", "view", "albedo", "roughness", "metallic", "axis", "sharpness", "amplitude"), tensors, strict=True

@@ -95,7 +95,9 @@ def test_lookups_stay_within_the_texture_whatever_the_coordinates(wrap, filterin
         )
     )
     value = reader.read(np.stack([u, v], 1))
-    assert np.isfinite(value).all() and value.min() >= 40 / 255 - 1e-6 and value.max() <= 200 / 255 + 1e-6
+    assert np.isfinite(value).all()
+    assert value.min() >= 40 / 255 - 1e-6
+    assert value.max() <= 200 / 255 + 1e-6
 
 
 def test_frames_are_unit_square_and_handed():
@@ -141,7 +143,8 @@ def test_tangents_without_texture_area():
     uv = rng.random((33, 2))
     uv[:15] = 0.25
     out = corner_tangents(vertices, faces, normals, uv, faces).astype(np.float64)
-    assert np.isfinite(out).all() and set(np.unique(out[..., 3])) <= {-1.0, 1.0}
+    assert np.isfinite(out).all()
+    assert set(np.unique(out[..., 3])) <= {-1.0, 1.0}
     assert np.abs(np.linalg.norm(out[..., :3], axis=-1) - 1).max() <= 1e-6
     assert np.abs((out[..., :3] * normals[faces]).sum(-1)).max() <= 1e-6
 
@@ -193,7 +196,8 @@ def test_sixteen_bit_normals_and_depths():
     for bits in (8, 16):
         back = decode_normal(quantise(encode_normal(n), bits).astype(np.float64) / (2**bits - 1))
         worst[bits] = np.degrees(2 * np.arcsin(0.5 * np.linalg.norm(back - n, axis=1))).max()
-    assert worst[8] < 0.45 and worst[16] < 0.0018
+    assert worst[8] < 0.45
+    assert worst[16] < 0.0018
 
 
 def test_srgb_against_forty_digits():
