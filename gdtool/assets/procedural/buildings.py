@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from gdtool.assets.procedural import finishes, solids, tiles
 from gdtool.assets.procedural.assembly import Assembly
+from gdtool.assets.procedural.finishes import Finish
 from gdtool.assets.procedural.parts import (
     Part,
     ball,
@@ -42,18 +45,26 @@ def hip(width: float, height: float, depth: float, overhang: float = 0.05, top: 
     return loft(profile, rectangle(width + 2 * overhang, depth + 2 * overhang), boxed=True)
 
 
-def window(
-    a: Assembly, x: float, y: float, z: float, width: float, height: float, frame, pane, turn: float = 0.0
-) -> None:
-    """Frame and pane, proud of a wall that faces +Z, then turned about y."""
-    a.add(box(width, height, 0.05, 0.01, 3).moved(x, y, z).turned("y", turn), frame)
+class Window(NamedTuple):
+    """A window of four panes: size, and finishes of frame and panes."""
+
+    width: float
+    height: float
+    frame: Finish
+    pane: Finish
+
+
+def add_window(a: Assembly, window: Window, x: float, y: float, z: float, turn: float = 0.0) -> None:
+    """Add a window centred at (x, y, z) in front of a wall that faces +Z, turned about y by `turn` degrees with it."""
+    width, height = window.width, window.height
+    a.add(box(width, height, 0.05, 0.01, 3).moved(x, y, z).turned("y", turn), window.frame)
     for sx in (-1, 1):
         for sy in (-1, 1):
             a.add(
                 box(width * 0.38, height * 0.38, 0.05, 0.008, 2)
                 .moved(x + sx * width * 0.22, y + sy * height * 0.22, z + 0.012)
                 .turned("y", turn),
-                pane,
+                window.pane,
             )
 
 
@@ -87,16 +98,17 @@ def house(rng) -> Assembly:
     a.add(box(0.22, 0.36, 0.06, 0.01).moved(door, 0.18, depth / 2), frame)
     a.add(box(0.17, 0.32, 0.06, 0.01).moved(door, 0.16, depth / 2 + 0.015), tiles.pick(rng, "paint"))
     a.add(ball(0.018, count=12).moved(door + 0.06, 0.16, depth / 2 + 0.05), finishes.metal(rng))
+    front, side = Window(0.18, 0.2, frame, pane), Window(0.16, 0.2, frame, pane)
     count = max(2, int(width / 0.36))
     for level in range(storeys):
         for x in (np.arange(count) - (count - 1) / 2) * (width / count):
             y = 0.26 + 0.42 * level
             if level or abs(x - door) > 0.22:
-                window(a, x, y, depth / 2, 0.18, 0.2, frame, pane)
-            window(a, x, y, depth / 2, 0.18, 0.2, frame, pane, 180)
+                add_window(a, front, x, y, depth / 2)
+            add_window(a, front, x, y, depth / 2, 180)
         for x in (-depth * 0.22, depth * 0.22):
             for turn in (90, -90):
-                window(a, x, 0.26 + 0.42 * level, width / 2, 0.16, 0.2, frame, pane, turn)
+                add_window(a, side, x, 0.26 + 0.42 * level, width / 2, turn)
     if rng.uniform() < 0.6 and kind < 3:
         a.add(
             box(0.13, pitch * 0.8 + 0.2, 0.13, 0.01).moved(width * 0.25, tall + pitch * 0.55, -depth * 0.2),

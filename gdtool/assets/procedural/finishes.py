@@ -9,6 +9,7 @@ from __future__ import annotations
 import colorsys
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -160,23 +161,39 @@ def glossy(rng, color=None) -> Finish:
 # --- lookup tables over solid fields ----------------------------------------------------------------------------------
 
 
+class _Substance(NamedTuple):
+    """Linear colour (3,), roughness and metallic."""
+
+    color: np.ndarray
+    roughness: float
+    metallic: float = 0.0
+
+
+class _Layer(NamedTuple):
+    """A substance from `start` on, in [0, 1] of a lookup table's first axis."""
+
+    start: float
+    substance: _Substance
+
+
 def _table(
     name: str,
-    layers: list[tuple[float, np.ndarray, float, float]],
+    layers: list[_Layer],
     softness: float = 0.01,
     speckle: float = 0.25,
     wrap: str = "clamp",
 ) -> Material:
-    """Return a lookup image over (pattern, dirt): layers (start in [0, 1], linear colour, roughness, metallic) along u.
+    """Make a lookup image over (pattern, dirt): the layers follow each other along u.
 
-    v darkens and roughens from 0 to 1 by `speckle`.
+    softness: half the width of u in which a layer replaces the one before. Along v, which is dirt, the colour darkens
+    and the roughness grows by `speckle`.
     """
     u, v = patterns.tile_grid(256)
     u, v = u[:64], (v[:64] * 4)
-    value = np.broadcast_to(np.r_[layers[0][1], layers[0][2], layers[0][3]], (*u.shape, 5))
-    for start, color, roughness, metallic in layers[1:]:
+    value = np.broadcast_to(np.r_[layers[0].substance], (*u.shape, 5))
+    for start, substance in layers[1:]:
         weight = patterns.smoothstep(start - softness, start + softness, u)[..., None]
-        value = value * (1 - weight) + np.r_[color, roughness, metallic] * weight
+        value = value * (1 - weight) + np.r_[substance] * weight
     color = value[..., :3] * (1 + speckle * (0.5 - v))[..., None]
     roughness = np.clip(value[..., 3] + speckle * 0.5 * (v - 0.5), 0.04, 1)
     return _material(name, np.clip(color, 0, 1), value[..., 4], roughness, 1, wrap)
@@ -198,11 +215,12 @@ def _field(
     return apply
 
 
-def _surface_pair(rng, color) -> tuple[float, float, np.ndarray]:
-    """(roughness, metallic, colour) of a dielectric, seldom a metal."""
+def _any_substance(rng, color) -> _Substance:
+    """Draw a dielectric of a colour, or (15 %) a metal."""
     if rng.uniform() < 0.15:
-        return rng.uniform(0.15, 0.5), 1.0, any_metal(rng)
-    return rng.uniform(0.15, 0.9), 0.0, color
+        roughness = rng.uniform(0.15, 0.5)
+        return _Substance(any_metal(rng), roughness, 1.0)
+    return _Substance(color, rng.uniform(0.15, 0.9))
 
 
 def banded(rng, color=None, axis=None, frequency=None) -> Finish:
@@ -210,12 +228,12 @@ def banded(rng, color=None, axis=None, frequency=None) -> Finish:
     color = any_color(rng) if color is None else color
     direction = np.eye(3)[rng.choice(3, p=[0.2, 0.6, 0.2]) if axis is None else axis] + rng.normal(0, 0.02, 3)
     frequency = rng.uniform(1.5, 7) if frequency is None else frequency
-    first = _surface_pair(rng, color)
-    second = _surface_pair(rng, any_color(rng))
-    layers = [(0, first[2], first[0], first[1]), (rng.uniform(0.35, 0.75), second[2], second[0], second[1])]
+    first = _any_substance(rng, color)
+    second = _any_substance(rng, any_color(rng))
+    layers = [_Layer(0, first), _Layer(rng.uniform(0.35, 0.75), second)]
     if rng.uniform() < 0.4:
-        third = _surface_pair(rng, any_color(rng))
-        layers.append((rng.uniform(0.8, 0.92), third[2], third[0], third[1]))
+        third = _any_substance(rng, any_color(rng))
+        layers.append(_Layer(rng.uniform(0.8, 0.92), third))
     wobble, size = patterns.noise_field(rng, 2.0, 1.0), rng.choice([0.0, 0.08, 0.3])
     shift = rng.uniform()
     return _field(
@@ -234,7 +252,9 @@ def gradient(rng, color=None, direction=None) -> Finish:
     axis = np.array([0.0, 1.0, 0.0]) if direction is None else np.asarray(direction, float)
     roughness = rng.uniform(0.15, 0.8)
     material = _table(
-        "gradient", [(0, color, roughness, 0.0), (rng.uniform(0.3, 0.7), other, roughness, 0.0)], rng.uniform(0.2, 0.6)
+        "gradient",
+        [_Layer(0, _Substance(color, roughness)), _Layer(rng.uniform(0.3, 0.7), _Substance(other, roughness))],
+        rng.uniform(0.2, 0.6),
     )
     wobble = patterns.noise_field(rng, 2.0, 1.0)
     return _field("gradient", material, lambda s: 0.5 + product(s.points, axis) + 0.04 * wobble(s.points), _dirt(rng))
@@ -246,9 +266,9 @@ def marble(rng, color=None) -> Finish:
     vein = any_metal(rng) if (gilded := rng.uniform() < 0.25) else near_color(rng, color, 1.0)
     roughness = rng.uniform(0.08, 0.35)
     layers = [
-        (0, vein, rng.uniform(0.15, 0.4), float(gilded)),
-        (rng.uniform(0.05, 0.15), near_color(rng, color, 0.3), roughness, 0.0),
-        (0.55, color, roughness, 0.0),
+        _Layer(0, _Substance(vein, rng.uniform(0.15, 0.4), float(gilded))),
+        _Layer(rng.uniform(0.05, 0.15), _Substance(near_color(rng, color, 0.3), roughness)),
+        _Layer(0.55, _Substance(color, roughness)),
     ]
     field = patterns.noise_field(rng, rng.uniform(1.2, 2.5), 2.0)
     return _field("marble", _table("marble", layers, 0.04), lambda s: np.abs(field(s.points)) * 0.8, _dirt(rng))
@@ -257,11 +277,11 @@ def marble(rng, color=None) -> Finish:
 def blotched(rng, color=None, other=None) -> Finish:
     """Two colours in irregular patches: cows, camouflage, corroded paint."""
     color = any_color(rng) if color is None else color
-    first, second = _surface_pair(rng, color), _surface_pair(rng, any_color(rng) if other is None else other)
+    first, second = _any_substance(rng, color), _any_substance(rng, any_color(rng) if other is None else other)
     level = rng.uniform(0.45, 0.65)
-    layers = [(0, first[2], first[0], first[1]), (level, second[2], second[0], second[1])]
+    layers = [_Layer(0, first), _Layer(level, second)]
     if rng.uniform() < 0.4:
-        layers.append((level + 0.12, near_color(rng, second[2], 0.5), second[0], second[1]))
+        layers.append(_Layer(level + 0.12, second._replace(color=near_color(rng, second.color, 0.5))))
     field = patterns.noise_field(rng, rng.uniform(1.2, 4), 1.0)
     return _field("patches", _table("patches", layers, 0.012), lambda s: 0.5 + 0.2 * field(s.points), _dirt(rng))
 
@@ -269,11 +289,11 @@ def blotched(rng, color=None, other=None) -> Finish:
 def spotted(rng, color=None, other=None) -> Finish:
     """Round spots around random sites."""
     color, other = any_color(rng) if color is None else color, any_color(rng) if other is None else other
-    first, second = _surface_pair(rng, color), _surface_pair(rng, other)
+    first, second = _any_substance(rng, color), _any_substance(rng, other)
     count = int(rng.integers(60, 260))
     radius = 0.62 * count ** (-1 / 3) * rng.uniform(0.5, 0.8)
     field = patterns.cell_field(rng, count)
-    material = _table("spots", [(0, second[2], second[0], second[1]), (0.5, first[2], first[0], first[1])], 0.03)
+    material = _table("spots", [_Layer(0, second), _Layer(0.5, first)], 0.03)
     return _field("spots", material, lambda s: 0.5 * field(s.points)[:, 0] / radius, _dirt(rng))
 
 
@@ -283,7 +303,9 @@ def crackled(rng, color=None, other=None) -> Finish:
     joint = near_color(rng, color, 1.0) if other is None else other
     field, width = patterns.cell_field(rng, int(rng.integers(40, 260))), rng.uniform(0.02, 0.05)
     roughness = rng.uniform(0.2, 0.8)
-    material = _table("cells", [(0, joint, rng.uniform(0.3, 0.95), 0.0), (0.5, color, roughness, 0.0)], 0.06)
+    material = _table(
+        "cells", [_Layer(0, _Substance(joint, rng.uniform(0.3, 0.95))), _Layer(0.5, _Substance(color, roughness))], 0.06
+    )
 
     def pattern(s):
         near = field(s.points)
@@ -295,10 +317,10 @@ def crackled(rng, color=None, other=None) -> Finish:
 def chequered(rng, color=None) -> Finish:
     """Return a checkerboard in the first UV set."""
     color = any_color(rng) if color is None else color
-    first, second = _surface_pair(rng, color), _surface_pair(rng, any_color(rng))
+    first, second = _any_substance(rng, color), _any_substance(rng, any_color(rng))
     u, v = patterns.tile_grid(64)
     odd = ((u < 0.5) ^ (v < 0.5))[..., None]
-    value = np.where(odd, np.r_[first[2], first[0], first[1]], np.r_[second[2], second[0], second[1]])
+    value = np.where(odd, np.r_[first], np.r_[second])
     material = _material("checks", value[..., :3], value[..., 4], value[..., 3], 0, "repeat")
     tiles = rng.uniform(1.5, 5)
     return lambda shape: Look(material, None, tiles)
@@ -308,7 +330,13 @@ def wooden(rng, color=None) -> Finish:
     """Rings of a trunk cut by the surface."""
     color = hsv(rng.uniform(0.04, 0.11), rng.uniform(0.35, 0.75), rng.uniform(0.35, 0.85)) if color is None else color
     dark, roughness = color * rng.uniform(0.35, 0.7), rng.uniform(0.3, 0.8)
-    material = _table("wood", [(0, color, roughness, 0.0), (0.55, dark, roughness + 0.1, 0.0)], 0.4, 0.2, wrap="mirror")
+    material = _table(
+        "wood",
+        [_Layer(0, _Substance(color, roughness)), _Layer(0.55, _Substance(dark, roughness + 0.1))],
+        0.4,
+        0.2,
+        wrap="mirror",
+    )
     axis = int(rng.choice(3, p=[0.35, 0.45, 0.2]))
     across = [i for i in range(3) if i != axis]
     center, rings = rng.uniform(-0.6, 0.6, 2), rng.uniform(9, 22)
@@ -326,7 +354,11 @@ def worn_paint(rng, color=None) -> Finish:
     """Paint that is gone on outer edges and in scratches, metal beneath."""
     color, bare = any_color(rng) if color is None else color, any_metal(rng)
     roughness = rng.uniform(0.2, 0.6)
-    layers = [(0, color, roughness, 0.0), (0.58, color * 0.5, 0.8, 0.0), (0.63, bare, rng.uniform(0.25, 0.5), 1.0)]
+    layers = [
+        _Layer(0, _Substance(color, roughness)),
+        _Layer(0.58, _Substance(color * 0.5, 0.8)),
+        _Layer(0.63, _Substance(bare, rng.uniform(0.25, 0.5), 1.0)),
+    ]
     chips, fine, amount = (
         patterns.noise_field(rng, 3.0, 3.0),
         patterns.noise_field(rng, 14.0, 1.0),
@@ -346,7 +378,11 @@ def rusty(rng, color=None) -> Finish:
     rust = hsv(rng.uniform(0.03, 0.08), rng.uniform(0.6, 0.85), rng.uniform(0.3, 0.6))
     if rng.uniform() < 0.2:  # copper's green instead
         bare, rust = np.array(METALS["copper"]), hsv(rng.uniform(0.4, 0.47), 0.4, rng.uniform(0.5, 0.7))
-    layers = [(0, bare, rng.uniform(0.2, 0.45), 1.0), (0.5, rust * 0.6, 0.8, 0.3), (0.6, rust, 0.92, 0.0)]
+    layers = [
+        _Layer(0, _Substance(bare, rng.uniform(0.2, 0.45), 1.0)),
+        _Layer(0.5, _Substance(rust * 0.6, 0.8, 0.3)),
+        _Layer(0.6, _Substance(rust, 0.92)),
+    ]
     field, amount = patterns.noise_field(rng, 2.0, 3.0), rng.uniform(0.25, 0.6)
     return _field(
         "rust",
@@ -363,7 +399,11 @@ def topped(rng, color=None, top=None) -> Finish:
         (hsv(0.6, 0.03, 0.95) if rng.uniform() < 0.4 else hsv(rng.uniform(0.2, 0.35), 0.6, 0.5)) if top is None else top
     )
     field = patterns.noise_field(rng, 4.0, 1.5)
-    material = _table("topped", [(0, color, rng.uniform(0.4, 0.9), 0.0), (0.7, top, rng.uniform(0.7, 0.95), 0.0)], 0.04)
+    material = _table(
+        "topped",
+        [_Layer(0, _Substance(color, rng.uniform(0.4, 0.9))), _Layer(0.7, _Substance(top, rng.uniform(0.7, 0.95)))],
+        0.04,
+    )
     return _field("topped", material, lambda s: 0.4 + 0.4 * s.normals[:, 1] + 0.06 * field(s.points), _dirt(rng))
 
 
@@ -374,7 +414,11 @@ def gazing(rng, direction: np.ndarray, iris=None, white=None) -> Finish:
     white = np.array([0.9, 0.9, 0.87]) if white is None else white
     black = np.array([0.01, 0.01, 0.012])
     pupil = rng.uniform(0.3, 0.55)
-    layers = [(0, black, 0.08, 0.0), (pupil, iris, 0.12, 0.0), (pupil + rng.uniform(0.15, 0.35), white, 0.15, 0.0)]
+    layers = [
+        _Layer(0, _Substance(black, 0.08)),
+        _Layer(pupil, _Substance(iris, 0.12)),
+        _Layer(pupil + rng.uniform(0.15, 0.35), _Substance(white, 0.15)),
+    ]
     material = _table("eye", layers, 0.02, speckle=0.0)
     direction = np.asarray(direction, float) / np.linalg.norm(direction)
 

@@ -9,6 +9,7 @@ from gdtool.assets.procedural import finishes, solids, tiles
 from gdtool.assets.procedural.assembly import Assembly
 from gdtool.assets.procedural.buildings import gable
 from gdtool.assets.procedural.parts import (
+    Part,
     ball,
     box,
     circle,
@@ -22,7 +23,7 @@ from gdtool.assets.procedural.parts import (
 )
 
 
-def _leg(rng, height: float, size: float):
+def _leg(rng, height: float, size: float) -> Part:
     kind = rng.integers(3)
     if kind == 0:
         return box(size, height, size, 0.01, 3).moved(y=height / 2)
@@ -95,6 +96,12 @@ def table(rng) -> Assembly:
     return a
 
 
+def _cushion(width: float, height: float, depth: float, rounding: float) -> Part:
+    """Make a block about the origin with edges rounded by `rounding`, less where the block is thin."""
+    radius = min(rounding, 0.45 * min(width, height, depth))
+    return solids.polygonised(solids.block((0, 0, 0), (width / 2, height / 2, depth / 2), radius), 30)
+
+
 def sofa(rng) -> Assembly:
     """Return a sofa: cushions, arms, back."""
     a, cloth, wood = Assembly(), tiles.pick(rng, "cloth"), tiles.pick(rng, "wood")
@@ -102,24 +109,15 @@ def sofa(rng) -> Assembly:
     cushion = cloth if rng.uniform() < 0.5 else tiles.pick(rng, "cloth")
     rounding = rng.uniform(0.04, 0.1)
 
-    def soft(width, height, depth, x, y, z, finish, pair=False):
-        part = solids.polygonised(
-            solids.block(
-                (0, 0, 0), (width / 2, height / 2, depth / 2), min(rounding, 0.45 * min(width, height, depth))
-            ),
-            30,
-        )
-        (a.add_pair if pair else a.add)(part.moved(x, y, z), finish)
-
-    soft(w, 0.22, d, 0, 0.2, 0, cloth)
-    soft(w, rng.uniform(0.5, 0.7), 0.2, 0, 0.45, -d / 2 + 0.05, cloth)
-    soft(0.18, 0.4, d, w / 2, 0.3, 0, cloth, True)
+    a.add(_cushion(w, 0.22, d, rounding).moved(0, 0.2, 0), cloth)
+    a.add(_cushion(w, rng.uniform(0.5, 0.7), 0.2, rounding).moved(0, 0.45, -d / 2 + 0.05), cloth)
+    a.add_pair(_cushion(0.18, 0.4, d, rounding).moved(w / 2, 0.3, 0), cloth)
     count = max(1, round(w / 0.6))
     for k in range(count):
         x = (k - (count - 1) / 2) * (w - 0.18) / count
-        soft((w - 0.2) / count, 0.14, d * 0.85, x, 0.36, 0.06, cushion)
+        a.add(_cushion((w - 0.2) / count, 0.14, d * 0.85, rounding).moved(x, 0.36, 0.06), cushion)
         if rng.uniform() < 0.4:
-            soft(0.26, 0.26, 0.1, x, 0.55, -0.08, tiles.pick(rng, "cloth"))
+            a.add(_cushion(0.26, 0.26, 0.1, rounding).moved(x, 0.55, -0.08), tiles.pick(rng, "cloth"))
     for z in (d / 2 - 0.06, -d / 2 + 0.06):
         a.add_pair(cylinder(0.035, 0.12, count=16).moved(w / 2 - 0.05, 0.05, z), wood)
     return a

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -53,7 +54,16 @@ def tile_noise(
     return image / max(image.std(), 1e-12)
 
 
-def tile_cells(rng: np.random.Generator, size: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+class TileCells(NamedTuple):
+    """Voronoi cells of a tile, each (size, size): distances to the nearest and second nearest site, and the index of
+    the nearest."""
+
+    nearest: np.ndarray
+    second: np.ndarray
+    site: np.ndarray
+
+
+def tile_cells(rng: np.random.Generator, size: int, count: int) -> TileCells:
     """Tiling Voronoi cells: distance to the nearest and to the second nearest site, index of the nearest (size,
     size)."""
     from scipy.spatial import cKDTree
@@ -61,7 +71,7 @@ def tile_cells(rng: np.random.Generator, size: int, count: int) -> tuple[np.ndar
     u, v = tile_grid(size)
     sites = rng.uniform(0, 1, (count, 2)) % 1.0
     distance, index = cKDTree(sites, boxsize=1).query(np.stack([u, v], -1).reshape(-1, 2), k=2)
-    return distance[:, 0].reshape(size, size), distance[:, 1].reshape(size, size), index[:, 0].reshape(size, size)
+    return TileCells(*(column.reshape(size, size) for column in (distance[:, 0], distance[:, 1], index[:, 0])))
 
 
 def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:

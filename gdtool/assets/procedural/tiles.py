@@ -107,7 +107,7 @@ def tartan(rng, color=None) -> Finish:
 def hammered(rng, color=None) -> Finish:
     """Metal with dents."""
     color = any_metal(rng) if color is None else color
-    near, _, _ = patterns.tile_cells(rng, SIZE, int(rng.integers(40, 160)))
+    near = patterns.tile_cells(rng, SIZE, int(rng.integers(40, 160))).nearest
     roughness = rng.uniform(0.15, 0.4) + 0.04 * patterns.tile_noise(rng, SIZE, 4, 60)
     return _tiled(
         "hammered",
@@ -136,8 +136,8 @@ def grained(rng, color=None) -> Finish:
     """Leather, plaster, bread crust, felt, rock: bumps with darker pits."""
     color = any_color(rng) if color is None else color
     if rng.uniform() < 0.5:
-        near, second, _ = patterns.tile_cells(rng, SIZE, int(rng.integers(150, 700)))
-        height = patterns.smoothstep(0, 0.03, second - near)
+        cells = patterns.tile_cells(rng, SIZE, int(rng.integers(150, 700)))
+        height = patterns.smoothstep(0, 0.03, cells.second - cells.nearest)
         strength = 0.004
     else:
         height = 0.5 + 0.2 * patterns.tile_noise(rng, SIZE, 3, 100, rng.uniform(1.0, 2.0))
@@ -157,9 +157,9 @@ def dotted(rng, color=None) -> Finish:
         weight = 1 - patterns.smoothstep(-0.02, 0.02, distance - rng.uniform(0.15, 0.28))
         image = _mix(color, other, weight)
     else:
-        near, second, index = patterns.tile_cells(rng, SIZE, 90)
-        chips = np.array([any_color(rng) for _ in range(4)])[index % 4]
-        weight = patterns.smoothstep(0.015, 0.025, second - near) * (index % 3 > 0)
+        cells = patterns.tile_cells(rng, SIZE, 90)
+        chips = np.array([any_color(rng) for _ in range(4)])[cells.site % 4]
+        weight = patterns.smoothstep(0.015, 0.025, cells.second - cells.nearest) * (cells.site % 3 > 0)
         image = _mix(color, chips, weight)
     roughness = np.clip(rng.uniform(0.1, 0.6) + 0.2 * weight * rng.uniform(-1, 1), 0.05, 1)
     return _tiled("dots", image, 0.0, roughness, None, 0, rng.uniform(1, 2.5))
