@@ -50,11 +50,11 @@ def load_scene(source: str | Path) -> Scene:
         "simplify it or split it into several files",
     )
     if suffix in (".glb", ".gltf"):
-        from gdtool.assets.gltf_read import read_gltf as read
+        from gdtool.assets.gltf.read import read_gltf as read
     elif suffix == ".obj":
-        from gdtool.assets.obj_read import read_obj as read
+        from gdtool.assets.obj.read import read_obj as read
     else:
-        from gdtool.assets.scan_read import read_scan as read
+        from gdtool.assets.ply_stl.read import read_ply_or_stl as read
     return _checked(read(path), path)
 
 

@@ -202,7 +202,7 @@ def write_models(
     path(file name) says where. The coarser levels refer to the maps' files instead of holding them. Returns the file
     name of each map.
     """
-    from gdtool.assets.gltf_write import write_glb
+    from gdtool.assets.gltf.write import write_glb
     from gdtool.bake.maps import contact_sheet_of
     from gdtool.images.io import encode_pngs, write_png
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gdtool.assets.gltf_read import read_gltf
+from gdtool.assets.gltf.read import read_gltf
 from tests.assets.gltf_files import quad, with_textures
 
 

@@ -4,7 +4,7 @@ import json
 import numpy as np
 import pytest
 
-from gdtool.assets.gltf_read import read_gltf
+from gdtool.assets.gltf.read import read_gltf
 from gdtool.assets.load import load_scene
 from gdtool.assets.scene import DEFAULT_MATERIAL
 from gdtool.core.errors import InputError, ResourceError

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gdtool.assets.gltf_read import read_gltf
+from gdtool.assets.gltf.read import read_gltf
 from gdtool.cameras import camera_at
 from gdtool.core.errors import InputError
 from gdtool.shading.lights.environment import Environment

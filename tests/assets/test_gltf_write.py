@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gdtool.assets.gltf_read import read_gltf
-from gdtool.assets.gltf_write import glb_bytes, write_glb
+from gdtool.assets.gltf.read import read_gltf
+from gdtool.assets.gltf.write import glb_bytes, write_glb
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.core.errors import OutputError
 

@@ -3,8 +3,8 @@ import struct
 import numpy as np
 import pytest
 
-from gdtool.assets import scan_read
 from gdtool.assets.load import load_scene
+from gdtool.assets.ply_stl import read as ply_stl_read
 from gdtool.core.errors import InputError
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
@@ -102,10 +102,10 @@ def binary(order: str = "<", colors: bool = False, wide: bool = False, faces: np
 def test_plain_binary_files_are_read_as_trimesh_reads_them(tmp_path, monkeypatch, name, content):
     (tmp_path / name).write_bytes(content)
     with monkeypatch.context() as patch:
-        patch.setattr(scan_read, "_by_trimesh", None)  # not needed
+        patch.setattr(ply_stl_read, "_by_trimesh", None)  # not needed
         ours = load_scene(tmp_path / name)
     for plain in ("_plain_ply", "_plain_stl"):
-        monkeypatch.setattr(scan_read, plain, lambda data: None)
+        monkeypatch.setattr(ply_stl_read, plain, lambda data: None)
     true = load_scene(tmp_path / name)
     assert (
         ours.notes == true.notes and ours.materials == true.materials and (name == "x.stl" or true.normals is not None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gdtool.assets.gltf_read import read_gltf
+from gdtool.assets.gltf.read import read_gltf
 from gdtool.core.errors import InputError
 from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder
 

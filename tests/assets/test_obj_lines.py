@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gdtool.assets import obj_lines
+from gdtool.assets.obj import lines as obj_lines
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 FULL = SQUARE + "vt 0 0\nvt 1 0\nvt 1 1\nvn 0 0 1\n"

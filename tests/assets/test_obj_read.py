@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from gdtool.assets.load import load_scene
-from gdtool.assets.obj_read import read_obj
-from gdtool.assets.polygons import triangulate
+from gdtool.assets.obj.polygons import triangulate
+from gdtool.assets.obj.read import read_obj
 from gdtool.core.errors import InputError
 from gdtool.images.io import write_png
 

@@ -11,7 +11,7 @@ sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from bake_cases import Case  # noqa: E402
 from bake_score import Truth, scored  # noqa: E402
 
-from gdtool.assets.gltf_write import write_glb  # noqa: E402
+from gdtool.assets.gltf.write import write_glb  # noqa: E402
 from gdtool.assets.scene import Material, Scene, Texture  # noqa: E402
 from gdtool.images.color import linear_from_srgb  # noqa: E402
 

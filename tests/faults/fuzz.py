@@ -67,11 +67,11 @@ def read_quads(path: Path) -> None:
 
 
 def read_points(path: Path) -> None:
-    from gdtool.assets.ply import binary_ply
+    from gdtool.assets.ply_stl.binary_ply import read_binary_ply
     from gdtool.core.errors import InputError
 
     try:
-        binary_ply(path.read_bytes())
+        read_binary_ply(path.read_bytes())
     except ValueError as error:
         raise InputError(path, str(error), "export it again") from None
 
@@ -106,7 +106,7 @@ def picture_seed(name: str) -> bytes:
 
 
 def glb_seed() -> bytes:
-    from gdtool.assets.gltf_write import glb_bytes
+    from gdtool.assets.gltf.write import glb_bytes
     from gdtool.assets.scene import Material, Scene, Texture
 
     image = np.full((4, 4, 3), 200, np.uint8)

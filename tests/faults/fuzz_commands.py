@@ -147,7 +147,7 @@ LEFT_OUT = {
 
 def make_pool(pool: Path) -> None:
     """Small sources, and a result of every stage made from them by the command line."""
-    from gdtool.assets.gltf_write import glb_bytes
+    from gdtool.assets.gltf.write import glb_bytes
     from gdtool.assets.scene import Material, Scene, Texture
     from gdtool.images.io import write_exr, write_png
     from tests.faults.files import CUBE, QUADS, quad_cube

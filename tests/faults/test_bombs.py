@@ -13,8 +13,10 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from gdtool.assets import gltf_geometry, gltf_read
-from gdtool.assets.gltf_document import GltfFile
+from gdtool.assets.gltf.document import GltfFile
+from gdtool.assets.gltf.geometry_size import predicted_geometry
+from gdtool.assets.gltf.nodes import visible_nodes
+from gdtool.assets.gltf.read import read_gltf
 from gdtool.assets.load import load_scene
 from gdtool.core import memory
 from gdtool.core.errors import InputError, ResourceError
@@ -92,10 +94,10 @@ def instances(side, count, normals="all", skin=False):
 def test_the_geometry_of_a_gltf_takes_what_is_predicted(tmp_path, side, count, normals, skin):
     path = instances(side, count, normals, skin).write(tmp_path / "x.glb")
     file = GltfFile(path)
-    found = gltf_geometry.predicted_geometry(file, gltf_read._visible(file))
+    found = predicted_geometry(file, visible_nodes(file))
     del file
     tracemalloc.start()
-    scene = gltf_read.read_gltf(path)
+    scene = read_gltf(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert found.faces == len(scene.faces) and found.parts == count

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gdtool.assets.ply import binary_ply, columns
+from gdtool.assets.ply_stl.binary_ply import columns, read_binary_ply
 from gdtool.assets.scene import DEFAULT_MATERIAL, Scene
 from gdtool.core.errors import InputError
 from gdtool.core.reading import bytes_of
@@ -29,7 +29,7 @@ class _Scan:
     notes: tuple[str, ...] = ()
 
 
-def read_scan(path: str | Path) -> Scene:
+def read_ply_or_stl(path: str | Path) -> Scene:
     """Read a .ply or .stl: vertices, faces, and of PLY normals and vertex colours (taken as sRGB).
 
     The material is DEFAULT_MATERIAL (a dielectric of roughness 0.5), white under vertex colours. STL's vertices, which
@@ -93,7 +93,7 @@ def _plain_ply(data: bytes) -> _Scan | None:
     """Return a binary PLY of triangles whose vertices have places, normals and 8-bit colours, if not more; None for
     others."""
     try:
-        records, faces = binary_ply(data)
+        records, faces = read_binary_ply(data)
     except ValueError:
         return None
     kinds = {name: records.dtype[name] for name in records.dtype.names}

@@ -26,7 +26,7 @@ _TYPES = {
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-def binary_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+def read_binary_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Return records of the vertices (v,) and triangles (f, 3), in the file's own types, of a PLY's bytes.
 
     Raises ValueError with what keeps the file from being one vertex element of numbers and then one face element of

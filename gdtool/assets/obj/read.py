@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gdtool.assets.obj_lines import read_lines
-from gdtool.assets.obj_materials import obj_materials
-from gdtool.assets.polygons import triangulate
+from gdtool.assets.obj.lines import read_lines
+from gdtool.assets.obj.materials import obj_materials
+from gdtool.assets.obj.polygons import triangulate
 from gdtool.assets.scene import Scene
 from gdtool.core.errors import InputError
 from gdtool.geometry.rows import unique_rows
