@@ -56,7 +56,7 @@ def test_ply_with_colours_and_normals(tmp_path):
     assert scene.materials[0].base_color == (1, 1, 1, 1)
 
 
-def test_plain_ply(tmp_path):
+def testread_plain_ply(tmp_path):
     (tmp_path / "x.ply").write_text(ply())
     scene = load_scene(tmp_path / "x.ply")
     assert scene.colors is None and scene.normals is None and any("roughness 0.5" in note for note in scene.notes)
@@ -102,9 +102,9 @@ def binary(order: str = "<", colors: bool = False, wide: bool = False, faces: np
 def test_plain_binary_files_are_read_as_trimesh_reads_them(tmp_path, monkeypatch, name, content):
     (tmp_path / name).write_bytes(content)
     with monkeypatch.context() as patch:
-        patch.setattr(ply_stl_read, "_by_trimesh", None)  # not needed
+        patch.setattr(ply_stl_read, "read_with_trimesh", None)  # not needed
         ours = load_scene(tmp_path / name)
-    for plain in ("_plain_ply", "_plain_stl"):
+    for plain in ("read_plain_ply", "read_plain_stl"):
         monkeypatch.setattr(ply_stl_read, plain, lambda data: None)
     true = load_scene(tmp_path / name)
     assert (

@@ -38,9 +38,9 @@ def same(one: obj_lines.ObjLines, two: obj_lines.ObjLines) -> bool:
         SQUARE + "f 1 2 3 4 1 2\n",
     ],
 )
-def test_alike_lines_are_taken_at_once(text):
-    found = obj_lines._at_once(text.encode())
-    one = obj_lines._one_by_one(text, Path("x.obj"))
+def test_alike_lines_are_takenparse_uniform(text):
+    found = obj_lines.parse_uniform(text.encode())
+    one = obj_lines.parse_each(text, Path("x.obj"))
     nan = np.isnan(one.vertices)
     assert found is not None and np.array_equal(np.isnan(found.vertices), nan)
     for lines in (found, one):
@@ -63,10 +63,10 @@ def test_alike_lines_are_taken_at_once(text):
         SQUARE + "v 1_0 0 0\nf 1 2 3\n",
     ],
 )
-def test_unlike_lines_are_taken_one_by_one(text, tmp_path):
-    assert obj_lines._at_once(text.encode()) is None
+def test_unlike_lines_are_takenparse_each(text, tmp_path):
+    assert obj_lines.parse_uniform(text.encode()) is None
     (tmp_path / "x.obj").write_bytes(text.encode())
-    assert same(obj_lines.read_lines(tmp_path / "x.obj"), obj_lines._one_by_one(text, tmp_path / "x.obj"))
+    assert same(obj_lines.read_lines(tmp_path / "x.obj"), obj_lines.parse_each(text, tmp_path / "x.obj"))
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_unlike_lines_are_taken_one_by_one(text, tmp_path):
     ],
 )
 def test_wrong_lines_are_left_to_the_one_that_can_tell(text):
-    assert obj_lines._at_once(text.encode()) is None
+    assert obj_lines.parse_uniform(text.encode()) is None
 
 
 def test_random_files_are_read_alike():
@@ -116,8 +116,8 @@ def test_random_files_are_read_alike():
                 str(rng.choice(["", "# c", " ", "v 1 2", "f 1 2", "f 1 2 3", "vn 1 0 0 "])),
             )
         text = "\n".join(lines)
-        found = obj_lines._at_once(text.encode())
+        found = obj_lines.parse_uniform(text.encode())
         at_once += found is not None
         if found is not None:
-            assert same(found, obj_lines._one_by_one(text, Path("x.obj"))), text
+            assert same(found, obj_lines.parse_each(text, Path("x.obj"))), text
     assert at_once > 100

@@ -49,9 +49,9 @@ def glb_bytes(scene: Scene, extras: dict[str, Any] | None = None, made: dict[int
     builder = GlbBuilder(made or {})
     uv_slots = [i for i, uv in enumerate(scene.uvs) if uv is not None]
     primitives = []
-    for index in np.unique(scene.material_idx):
+    for index in np.unique(scene.face_materials):
         material = scene.materials[index]
-        faces = scene.faces[scene.material_idx == index]
+        faces = scene.faces[scene.face_materials == index]
         used, local, tangents = _split(scene, material, faces, uv_slots)
         primitives.append(
             {
