@@ -21,7 +21,7 @@ from gdtool.assets.procedural.parts import (
 )
 
 
-def csg(rng) -> Assembly:
+def csg(rng: np.random.Generator) -> Assembly:
     """Mirror-symmetric unions, differences and intersections of blocks, rods, balls and rings."""
 
     def primitive(spread):
@@ -54,7 +54,7 @@ def csg(rng) -> Assembly:
     return a
 
 
-def supershape(rng) -> Assembly:
+def supershape(rng: np.random.Generator) -> Assembly:
     """Gielis' superformula in two angles."""
 
     def radius(angle, m, n1, n2, n3):
@@ -83,7 +83,7 @@ def supershape(rng) -> Assembly:
     return a
 
 
-def knot(rng) -> Assembly:
+def knot(rng: np.random.Generator) -> Assembly:
     """Torus knots, rings, springs, pretzels on an optional stand."""
     a, t = Assembly(), 2 * np.pi * np.arange(220) / 220
     p, q = [(1, 0), (2, 3), (3, 2), (2, 5), (1, 4), (3, 4)][rng.integers(6)]
@@ -99,7 +99,7 @@ def knot(rng) -> Assembly:
     return a
 
 
-def gear(rng) -> Assembly:
+def gear(rng: np.random.Generator) -> Assembly:
     """Gears, stars and cogs standing up, with hub and pins."""
     a, teeth, depth = Assembly(), int(rng.integers(5, 18)), rng.uniform(0.1, 0.4)
     k = np.arange(teeth * 8) % 8
@@ -120,7 +120,7 @@ def gear(rng) -> Assembly:
     return a
 
 
-def prism(rng) -> Assembly:
+def prism(rng: np.random.Generator) -> Assembly:
     """Return a twisted or tapered prism over a random symmetric polygon, perhaps stacked."""
     a, y = Assembly(), 0.0
     for _ in range(int(rng.integers(1, 4))):
@@ -137,7 +137,7 @@ def prism(rng) -> Assembly:
     return a
 
 
-def stack(rng) -> Assembly:
+def stack(rng: np.random.Generator) -> Assembly:
     """Return a symmetric sculpture of a few plain primitives."""
     a, y = Assembly(), 0.0
     for _ in range(int(rng.integers(2, 6))):
@@ -167,7 +167,7 @@ def stack(rng) -> Assembly:
     return a
 
 
-def blob(rng) -> Assembly:
+def blob(rng: np.random.Generator) -> Assembly:
     """Return a mirror-symmetric smooth blend of balls and limbs with bumps."""
     a = Assembly()
     shapes = [solids.ellipsoid((0, 0, 0), rng.uniform(0.25, 0.45, 3))]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gdtool.assets.procedural import finishes, solids, tiles
+from gdtool.assets.procedural import colors, finishes, solids, tiles
 from gdtool.assets.procedural.assembly import Assembly
 from gdtool.assets.procedural.finishes import Finish
 from gdtool.assets.procedural.parts import (
@@ -68,7 +68,7 @@ def add_window(a: Assembly, window: Window, x: float, y: float, z: float, turn: 
             )
 
 
-def house(rng) -> Assembly:
+def house(rng: np.random.Generator) -> Assembly:
     """Return a house: walls, roof, door, windows, perhaps a chimney."""
     a = Assembly()
     width, depth, storeys = rng.uniform(0.7, 1.3), rng.uniform(0.6, 1.2), int(rng.integers(1, 4))
@@ -76,9 +76,9 @@ def house(rng) -> Assembly:
     wall, roof, frame = tiles.pick(rng, "wall"), tiles.pick(rng, "roof"), tiles.pick(rng, "wood")
     pane = finishes.glossy(
         rng,
-        finishes.hsv(rng.uniform(0.5, 0.62), rng.uniform(0.1, 0.5), rng.uniform(0.15, 0.8))
+        colors.hsv(rng.uniform(0.5, 0.62), rng.uniform(0.1, 0.5), rng.uniform(0.15, 0.8))
         if rng.uniform() < 0.8
-        else finishes.hsv(0.13, 0.6, 1),
+        else colors.hsv(0.13, 0.6, 1),
     )
     a.add(box(width, tall, depth, 0.015, 8).moved(y=tall / 2), wall)
     pitch = rng.uniform(0.25, 0.7) * width
@@ -122,7 +122,7 @@ def house(rng) -> Assembly:
             box(width * rng.uniform(1.2, 1.7), 0.05, depth * rng.uniform(1.3, 1.7)).moved(y=-0.02),
             tiles.pick(rng, "stone")
             if rng.uniform() < 0.5
-            else finishes.matte(rng, finishes.hsv(rng.uniform(0.2, 0.35), 0.6, 0.5)),
+            else finishes.matte(rng, colors.hsv(rng.uniform(0.2, 0.35), 0.6, 0.5)),
         )
     return a
 
@@ -132,7 +132,7 @@ def _crenels(a: Assembly, r: float, y: float, count: int, size: float, finish) -
         a.add(box(size, size, size * 0.7, 0.008, 2).moved(y=y, z=r).turned("y", 360 * k / count), finish)
 
 
-def castle(rng) -> Assembly:
+def castle(rng: np.random.Generator) -> Assembly:
     """Return a castle: walls, towers, a gate."""
     a = Assembly()
     half, wall_h = rng.uniform(0.5, 0.8), rng.uniform(0.35, 0.6)
@@ -179,7 +179,7 @@ def castle(rng) -> Assembly:
     a.add(hip(2 * keep, keep * rng.uniform(0.8, 1.6), 2 * keep, 0.06).moved(0, keep_h, -half * 0.25), roof)
     a.add(box(0.28, wall_h * 0.75, 0.16, 0.01).moved(0, wall_h * 0.37, half), wood)
     a.add(cylinder(0.14, 0.17).turned("x", 90).moved(0, wall_h * 0.72, half), wood)
-    dark = finishes.matte(rng, finishes.hsv(0.1, 0.4, 0.08))
+    dark = finishes.matte(rng, colors.hsv(0.1, 0.4, 0.08))
     for y in np.linspace(keep_h * 0.62, keep_h * 0.88, 2):
         for x in (-0.4, 0, 0.4):
             a.add(box(0.07, 0.14, 0.04, 0.01, 2).moved(x * keep, y, keep - half * 0.25), dark)
@@ -190,12 +190,12 @@ def castle(rng) -> Assembly:
     if rng.uniform() < 0.5:
         a.add(
             cylinder(half * 1.65, 0.1, count=48).moved(y=-0.04),
-            finishes.matte(rng, finishes.hsv(rng.uniform(0.1, 0.35), 0.5, 0.5)),
+            finishes.matte(rng, colors.hsv(rng.uniform(0.1, 0.35), 0.5, 0.5)),
         )
     return a
 
 
-def tower(rng) -> Assembly:
+def tower(rng: np.random.Generator) -> Assembly:
     """Lighthouse, windmill, water tower, rook or pagoda."""
     a, height = Assembly(), rng.uniform(1.1, 1.7)
     wall, roof = tiles.pick(rng, "wall"), tiles.pick(rng, "roof")
@@ -208,7 +208,7 @@ def tower(rng) -> Assembly:
             a.add(loft(flare, rectangle(w, w), boxed=True).moved(y=y), roof)
             a.add(
                 box(0.14, 0.18, 0.04, 0.01, 2).moved(0, y + 0.1, w * 0.4),
-                finishes.plastic(rng, finishes.hsv(0.05, 0.7, 0.3)),
+                finishes.plastic(rng, colors.hsv(0.05, 0.7, 0.3)),
             )
             y, w = y + 0.36, w * 0.84
         a.add(cone(0.06, 0.3, 16).moved(y=y), finishes.metal(rng))
@@ -217,7 +217,7 @@ def tower(rng) -> Assembly:
         wall
         if rng.uniform() < 0.5
         else finishes.banded(
-            np.random.default_rng(rng.integers(2**32)), finishes.hsv(rng.uniform(), 0.8, 0.7), axis=1, frequency=2.5
+            np.random.default_rng(rng.integers(2**32)), colors.hsv(rng.uniform(), 0.8, 0.7), axis=1, frequency=2.5
         )
     )
     outline = circle(48) if rng.uniform() < 0.7 else subdivided(circle(8), 5)
@@ -228,7 +228,7 @@ def tower(rng) -> Assembly:
     a.add(cylinder(top * 1.4, 0.07, count=40).moved(y=height), tiles.pick(rng, "metal"))
     a.add(
         cylinder(top * 0.8, 0.24, count=40).moved(y=height + 0.14),
-        finishes.glossy(rng, finishes.hsv(0.13, rng.uniform(0.1, 0.6), 0.95)),
+        finishes.glossy(rng, colors.hsv(0.13, rng.uniform(0.1, 0.6), 0.95)),
     )
     cap = refined(
         [
@@ -252,7 +252,7 @@ def tower(rng) -> Assembly:
             box(0.09, 0.13, 0.06, 0.01, 2)
             .moved(0, y, np.interp(y, [0.1, height], [r, top]))
             .turned("y", [0, 35, -35][k]),
-            finishes.glossy(rng, finishes.hsv(0.6, 0.3, 0.15)),
+            finishes.glossy(rng, colors.hsv(0.6, 0.3, 0.15)),
         )
     if rng.uniform() < 0.35:
         sail, pole, tilt = tiles.pick(rng, "cloth"), tiles.pick(rng, "wood"), rng.uniform(0, 90)
@@ -275,7 +275,7 @@ def tower(rng) -> Assembly:
     return a
 
 
-def pyramid(rng) -> Assembly:
+def pyramid(rng: np.random.Generator) -> Assembly:
     """Return a stepped pyramid with stairs and a temple on top, or a smooth one."""
     a, stone = Assembly(), tiles.pick(rng, "stone")
     other = stone if rng.uniform() < 0.5 else tiles.pick(rng, "stone")
@@ -304,13 +304,11 @@ def pyramid(rng) -> Assembly:
             )
     a.add(box(shrink * 1.3, 0.28, shrink * 1.2, 0.01).moved(y=y + 0.14), stone)
     a.add(box(shrink * 1.6, 0.07, shrink * 1.5, 0.01).moved(y=y + 0.3), other)
-    a.add(
-        box(0.14, 0.2, 0.1, 0.005).moved(0, y + 0.1, shrink * 0.58), finishes.matte(rng, finishes.hsv(0.1, 0.3, 0.07))
-    )
+    a.add(box(0.14, 0.2, 0.1, 0.005).moved(0, y + 0.1, shrink * 0.58), finishes.matte(rng, colors.hsv(0.1, 0.3, 0.07)))
     return a
 
 
-def temple(rng) -> Assembly:
+def temple(rng: np.random.Generator) -> Assembly:
     """Columns on a stepped base under a pediment, or a domed hall."""
     a, stone, roof = Assembly(), tiles.pick(rng, "stone"), tiles.pick(rng, "roof")
     width, depth, tall = rng.uniform(1.0, 1.4), rng.uniform(0.7, 1.3), rng.uniform(0.5, 0.8)

@@ -3,109 +3,26 @@
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
 
 import numpy as np
 
-from gdtool.assets.procedural import finishes, solids, tiles
+from gdtool.assets.procedural import colors, finishes, solids, tiles
 from gdtool.assets.procedural.assembly import Assembly
-from gdtool.assets.procedural.finishes import Finish, hsv
+from gdtool.assets.procedural.colors import hsv
+from gdtool.assets.procedural.figures import figure
+from gdtool.assets.procedural.heads import dress_head, ears, eyes, face, fur_color, horns
 from gdtool.assets.procedural.parts import (
-    Part,
     ball,
     circle,
     cone,
-    cylinder,
     extrusion,
     loft,
-    refined,
     subdivided,
     tube,
 )
 
-BLACK = np.array([0.012, 0.011, 0.011])
 
-
-def fur_color(rng) -> np.ndarray:
-    """Animal coats mostly, sometimes a toy's colour."""
-    return (
-        finishes.any_color(rng)
-        if rng.uniform() < 0.35
-        else hsv(rng.uniform(0.02, 0.12), rng.uniform(0.05, 0.75), rng.uniform(0.2, 1.0) ** 0.7)
-    )
-
-
-def eyes(a: Assembly, rng, x: float, y: float, z: float, size: float, outward: float = 0.25) -> None:
-    """Add a pair of eyes at +-x, bead-like or with iris."""
-    style = rng.uniform()
-    finish = finishes.glossy(rng, BLACK) if style < 0.4 else finishes.gazing(rng, np.array([outward, 0.0, 1.0]))
-    a.add_pair(ball(size, size * rng.uniform(0.9, 1.2), size * 0.8, 20).moved(x, y, z), finish)
-
-
-def face(a: Assembly, rng, center, r: float, coat, snout: float) -> None:
-    """Eyes, a muzzle of relative length `snout` and a nose on a head of radius r at center."""
-    x, y, z = center
-    size = r * rng.uniform(0.14, 0.28)
-    height = rng.uniform(0.1, 0.3)
-    depth = np.sqrt(max(1 - 0.42**2 - height**2, 0.1)) * r
-    eyes(a, rng, x + 0.42 * r, y + height * r, z + depth * 0.93, size)
-    muzzle = tiles.pick(rng, "fur", finishes.near_color(rng, fur_color(rng), 0.3)) if rng.uniform() < 0.5 else coat
-    if snout > 0.05:
-        a.add(ball(r * 0.42, r * 0.34, r * (0.3 + snout), 24).moved(x, y - 0.22 * r, z + 0.75 * r), muzzle)
-    tip = z + r * (1.02 + snout if snout > 0.05 else 0.98)
-    a.add(
-        ball(r * 0.13, r * 0.1, r * 0.1, 16).moved(x, y - 0.12 * r, tip),
-        finishes.glossy(rng, BLACK if rng.uniform() < 0.7 else hsv(0.97, 0.5, 0.7)),
-    )
-
-
-def ears(a: Assembly, rng, center, r: float, coat) -> None:
-    """Add a pair of ears about a head."""
-    x, y, z = center
-    kind = rng.integers(5)
-    if kind == 0:  # pointed
-        part = (
-            cone(r * rng.uniform(0.28, 0.42), r * rng.uniform(0.6, 1.0), 20)
-            .scaled(1, 1, 0.55)
-            .turned("z", -22)
-            .moved(x + 0.5 * r, y + 0.62 * r, z)
-        )
-    elif kind == 1:  # round
-        size = r * rng.uniform(0.28, 0.42)
-        part = ball(size, size, size * 0.45, 22).moved(x + 0.68 * r, y + 0.68 * r, z)
-    elif kind == 2:  # long upright
-        part = (
-            ball(r * 0.2, r * rng.uniform(0.7, 1.2), r * 0.12, 22)
-            .turned("z", -rng.uniform(5, 25))
-            .moved(x + 0.4 * r, y + 1.5 * r, z)
-        )
-    elif kind == 3:  # hanging
-        part = (
-            ball(r * 0.16, r * rng.uniform(0.45, 0.7), r * 0.3, 22).turned("z", 12).moved(x + 0.98 * r, y - 0.02 * r, z)
-        )
-    else:  # wide, elephant
-        part = ball(r * 0.75, r * 0.85, r * 0.12, 26).turned("y", 25).moved(x + 1.25 * r, y + 0.1 * r, z - 0.15 * r)
-    a.add_pair(part, coat)
-
-
-def horns(a: Assembly, rng, center, r: float) -> None:
-    """Add a pair of horns to a head."""
-    x, y, z = center
-    finish = (
-        finishes.matte(rng, hsv(0.11, rng.uniform(0.1, 0.4), rng.uniform(0.3, 0.9)))
-        if rng.uniform() < 0.7
-        else tiles.pick(rng, "metal")
-    )
-    if rng.uniform() < 0.25:
-        a.add(cone(r * 0.12, r * 0.9, 20).turned("x", 25).moved(x, y + 0.8 * r, z + 0.4 * r), finish)
-        return
-    t = np.linspace(0, 1, 14)
-    curl = rng.uniform(-0.5, 0.8)
-    path = np.stack([x + r * (0.4 + 0.5 * t), y + r * (0.75 + 0.8 * t - 0.2 * t**2), z + r * curl * t**2], -1)
-    a.add_pair(tube(path, r * 0.16 * (1 - 0.85 * t)), finish)
-
-
-def quadruped(rng) -> Assembly:
+def quadruped(rng: np.random.Generator) -> Assembly:
     """Cat to elephant: body along z, four legs, neck, head, tail; one blended solid."""
     a = Assembly()
     length, girth = rng.uniform(0.3, 0.6), rng.uniform(0.2, 0.36)
@@ -184,7 +101,7 @@ def quadruped(rng) -> Assembly:
     return a
 
 
-def sitting(rng) -> Assembly:
+def sitting(rng: np.random.Generator) -> Assembly:
     """Return a sitting cat, dog, bear or owl-like toy: pear body, big head, paws in front."""
     a = Assembly()
     coat, r, girth = tiles.pick(rng, "fur", fur_color(rng)), rng.uniform(0.3, 0.45), rng.uniform(0.32, 0.5)
@@ -219,13 +136,13 @@ def sitting(rng) -> Assembly:
     if rng.uniform() < 0.5:
         a.add(
             ball(girth * 0.55, 0.3, 0.2, 26).moved(0, 0.02, girth * 0.62),
-            tiles.pick(rng, "fur", finishes.near_color(rng, fur_color(rng), 0.4)),
+            tiles.pick(rng, "fur", colors.near_color(rng, fur_color(rng), 0.4)),
         )
     dress_head(a, rng, head, r, 0.3)
     return a
 
 
-def bird(rng) -> Assembly:
+def bird(rng: np.random.Generator) -> Assembly:
     """Owl, penguin, chick, parrot: egg body, wings at the sides, beak, feet."""
     a = Assembly()
     coat, girth, tall = tiles.pick(rng, "fur", fur_color(rng)), rng.uniform(0.32, 0.48), rng.uniform(0.45, 0.65)
@@ -245,7 +162,7 @@ def bird(rng) -> Assembly:
     a.add(solids.polygonised(solids.blended(body, 0.1), 52), coat)
     a.add(
         ball(girth * 0.72, tall * 0.72, girth * 0.5, 30).moved(0, -tall * 0.1, girth * 0.47),
-        tiles.pick(rng, "fur", finishes.near_color(rng, hsv(0.1, 0.2, 0.9), 0.3)),
+        tiles.pick(rng, "fur", colors.near_color(rng, hsv(0.1, 0.2, 0.9), 0.3)),
     )
     wing = coat if rng.uniform() < 0.4 else tiles.pick(rng, "fur", fur_color(rng))
     a.add_pair(
@@ -272,164 +189,11 @@ def bird(rng) -> Assembly:
     return a
 
 
-def dress_head(a: Assembly, rng, head, r: float, chance: float) -> None:
-    """Perhaps a hat: pointed, top hat, crown, bobble, bow or scarf."""
-    if rng.uniform() > chance:
-        return
-    x, y, z = head
-    kind, finish = rng.integers(5), tiles.pick(rng, "cloth")
-    if kind == 0:
-        a.add(cone(r * 0.7, r * 1.5, 32).moved(x, y + r * 0.7, z), finish)
-        a.add(ball(r * 0.18, count=20).moved(x, y + r * 2.2, z), tiles.pick(rng, "cloth"))
-    elif kind == 1:
-        a.add(cylinder(r * 0.62, r * 0.9).moved(x, y + r * 1.2, z), finish)
-        a.add(cylinder(r * 1.1, r * 0.1).moved(x, y + r * 0.8, z), finish)
-    elif kind == 2:
-        gold = finishes.metal(rng)
-        a.add(cylinder(r * 0.6, r * 0.3, top_radius=r * 0.66).moved(x, y + r * 0.95, z), gold)
-        for k in range(6):
-            w = 2 * np.pi * k / 6 + np.pi / 6
-            a.add(
-                cone(r * 0.16, r * 0.4, 12).moved(x + r * 0.52 * np.cos(w), y + r * 1.05, z + r * 0.52 * np.sin(w)),
-                gold,
-            )
-    elif kind == 3:
-        half = refined([(0, 0), (1.04, 0), (1.0, 0.35), (0.75, 0.75), (0.4, 0.95), (0, 1.0)], 0.1)
-        a.add(loft(half, circle(40)).scaled(r, r * 0.85, r).moved(x, y + 0.32 * r, z), finish)
-    else:
-        w = 2 * np.pi * np.arange(40) / 40
-        a.add(
-            tube(
-                np.stack([x + r * 0.85 * np.cos(w), np.full(40, y - r * 0.85), z + r * 0.85 * np.sin(w)], -1),
-                r * 0.2,
-                closed=True,
-            ),
-            finish,
-        )
-
-
-class _Build(NamedTuple):
-    """Measures of a standing figure: head radius, half widths of hips and shoulders, half depth of the chest, and
-    lengths of leg and torso."""
-
-    head: float
-    hips: float
-    shoulder: float
-    leg: float
-    torso: float
-    depth: float
-
-
-class _Clothes(NamedTuple):
-    """Finishes of a standing figure."""
-
-    skin: Finish
-    shirt: Finish
-    trousers: Finish
-    shoe: Finish
-
-
-def figure(rng) -> Assembly:
-    """Make a standing person, robot, gnome or toy snowman of separate body parts."""
-    a = Assembly()
-    r, hips, shoulder = rng.uniform(0.16, 0.34), rng.uniform(0.14, 0.26), rng.uniform(0.2, 0.34)
-    leg, torso = rng.uniform(0.25, 0.6), rng.uniform(0.35, 0.6)
-    skin = finishes.plastic(
-        rng,
-        hsv(rng.uniform(0.04, 0.09), rng.uniform(0.25, 0.6), rng.uniform(0.35, 0.95))
-        if rng.uniform() < 0.75
-        else finishes.any_color(rng),
-    )
-    shirt, trousers, shoe = tiles.pick(rng, "cloth"), tiles.pick(rng, "cloth"), tiles.pick(rng, "paint")
-    build = _Build(r, hips, shoulder, leg, torso, shoulder * rng.uniform(0.5, 0.75))
-    if robot := rng.uniform() < 0.3:
-        skin, shirt, trousers = (tiles.pick(rng, "paint") for _ in range(3))
-    clothes = _Clothes(skin, shirt, trousers, shoe)
-    a.add(_chest(build, robot), clothes.shirt)
-    _limbs(a, rng, build, clothes)
-    if robot:
-        _robot_head(a, rng, build, clothes.skin)
-    else:
-        _human_head(a, rng, build, clothes.skin)
-    return a
-
-
-def _chest(build: _Build, robot: bool) -> Part:
-    if robot:
-        chest = solids.block(
-            (0, build.leg + build.torso / 2, 0), (build.shoulder, build.torso / 2 + 0.02, build.depth), 0.05
-        )
-    else:
-        belly = (build.hips * 1.2, build.torso * 0.35, build.depth)
-        ribs = (build.shoulder, build.torso * 0.36, build.depth)
-        chest = solids.blended(
-            [
-                solids.ellipsoid((0, build.leg + build.torso * 0.25, 0), belly),
-                solids.ellipsoid((0, build.leg + build.torso * 0.7, 0), ribs),
-            ],
-            0.1,
-        )
-    return solids.polygonised(chest, 40)
-
-
-def _limbs(a: Assembly, rng, build: _Build, clothes: _Clothes) -> None:
-    """Add arms in a random pose, hands, legs and shoes."""
-    pose, bend = rng.uniform(-15, 75) * (1 if rng.uniform() < 0.6 else 0.3), rng.uniform(-0.15, 0.3)
-    reach = build.leg * 0.5 + build.torso * 0.6
-    sx, sy = build.shoulder * 0.95, build.leg + build.torso * 0.85
-    w = np.radians(pose)
-    elbow = (sx + reach * 0.5 * np.cos(np.radians(70) - w), sy - reach * 0.5 * np.sin(np.radians(70) - w), 0.02)
-    hand = (
-        elbow[0] + reach * 0.4 * np.cos(np.radians(75) - w),
-        elbow[1] - reach * 0.4 * np.sin(np.radians(75) - w),
-        bend,
-    )
-    arm = np.array([(sx * 0.9, sy, 0), elbow, hand])
-    a.add_pair(tube(arm, np.array([0.085, 0.075, 0.065]), outline=circle(20)), clothes.shirt)
-    a.add_pair(ball(0.085, count=20).moved(*hand), clothes.skin)
-    hips, leg = build.hips, build.leg
-    thigh = np.array([(hips * 0.6, leg * 1.1, 0), (hips * 0.7, leg * 0.5, 0.02), (hips * 0.75, 0.06, 0)])
-    a.add_pair(tube(thigh, np.array([0.12, 0.1, 0.09]), outline=circle(20)), clothes.trousers)
-    a.add_pair(ball(0.11, 0.075, 0.17, 22).moved(hips * 0.78, 0.03, 0.06), clothes.shoe)
-
-
-def _robot_head(a: Assembly, rng, build: _Build, skin: Finish) -> None:
-    """Add a box with eyes, a slot for a mouth and an antenna."""
-    r, y = build.head, build.leg + build.torso + build.head * 0.95
-    a.add(solids.polygonised(solids.block((0.0, y, 0.0), (r * 1.05, r * 0.85, r * 0.9), 0.05), 32), skin)
-    eyes(a, rng, r * 0.45, y + r * 0.1, r * 0.85, r * 0.22, 0.0)
-    a.add(
-        cylinder(r * 0.5, r * 0.1).turned("x", 90).scaled(1, 0.4, 1).moved(0, y - r * 0.4, r * 0.88),
-        finishes.metal(rng),
-    )
-    a.add(cylinder(0.02, r * 0.6).moved(0, y + r * 1.1, 0), finishes.metal(rng))
-    a.add(ball(0.05, count=16).moved(0, y + r * 1.4, 0), finishes.glossy(rng))
-
-
-def _human_head(a: Assembly, rng, build: _Build, skin: Finish) -> None:
-    """Add a head with eyes, nose and mouth, and perhaps hair, a beard and a hat."""
-    r, y = build.head, build.leg + build.torso + build.head * 0.95
-    a.add(ball(r, r * rng.uniform(0.95, 1.15), r * 0.95, 36).moved(0.0, y, 0.0), skin)
-    eyes(a, rng, r * 0.36, y + r * 0.12, r * 0.85, r * rng.uniform(0.1, 0.18), 0.1)
-    a.add(ball(r * 0.12, r * 0.14, r * 0.18, 16).moved(0, y - r * 0.1, r * 0.95), skin)
-    t = np.linspace(-0.8, 0.8, 12)
-    mouth = np.stack(
-        [r * 0.4 * t, y - r * (0.5 - 0.12 * t**2), r * np.sqrt(np.maximum(0.86 - 0.45 * t**2, 0.3)) * 0.93], -1
-    )
-    a.add(tube(mouth, r * 0.045, outline=circle(8)), finishes.plastic(rng, hsv(0.98, 0.7, 0.5)))
-    hair = tiles.pick(rng, "fur", hsv(rng.uniform(0.03, 0.12), rng.uniform(0.2, 0.8), rng.uniform(0.08, 0.8)))
-    if rng.uniform() < 0.75:
-        a.add(ball(r * 1.06, r * 1.0, r * 0.95, 30).moved(0, y + r * 0.2, -r * 0.18), hair)
-    if rng.uniform() < 0.25:
-        a.add(ball(r * 0.6, r * 0.6, r * 0.35, 24).moved(0, y - r * 0.75, r * 0.55), hair)
-    dress_head(a, rng, (0.0, y, 0.0), r, 0.6)
-
-
-def fish(rng) -> Assembly:
+def fish(rng: np.random.Generator) -> Assembly:
     """Return a fish: body, fins, tail, eyes."""
     a = Assembly()
     tall, wide = rng.uniform(0.25, 0.5), rng.uniform(0.14, 0.3)
-    coat, fin = tiles.pick(rng, "fur", finishes.any_color(rng)), tiles.pick(rng, "skin")
+    coat, fin = tiles.pick(rng, "fur", colors.any_color(rng)), tiles.pick(rng, "skin")
     body = solids.blended(
         [solids.ellipsoid((0, 0, 0.1), (wide, tall, 0.6)), solids.limb((0, 0, -0.2), (0, 0, -0.75), tall * 0.45, 0.06)],
         0.15,
@@ -443,7 +207,7 @@ def fish(rng) -> Assembly:
     return a
 
 
-def turtle(rng) -> Assembly:
+def turtle(rng: np.random.Generator) -> Assembly:
     """Turtle, beetle or crab: a domed shell on a flat body with six or four limbs."""
     a = Assembly()
     dome, wide = rng.uniform(0.25, 0.5), rng.uniform(0.4, 0.55)
@@ -477,10 +241,10 @@ def turtle(rng) -> Assembly:
     return a
 
 
-def dragon(rng) -> Assembly:
+def dragon(rng: np.random.Generator) -> Assembly:
     """Upright or crouched, long neck and tail, wings, spikes along the back, horns."""
     a = Assembly()
-    coat = tiles.pick(rng, "fur", finishes.any_color(rng))
+    coat = tiles.pick(rng, "fur", colors.any_color(rng))
     r, lift = rng.uniform(0.17, 0.26), rng.uniform(0.25, 0.6)
     head = (0.0, 0.45 + lift, 0.5)
     spine = np.array(

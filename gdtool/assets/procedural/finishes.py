@@ -6,7 +6,6 @@ A finish is chosen first, with its random parameters, and applied when the objec
 
 from __future__ import annotations
 
-import colorsys
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,23 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from gdtool.assets.procedural import patterns
+from gdtool.assets.procedural.colors import METALS, any_color, any_metal, hsv, near_color
 from gdtool.assets.procedural.parts import product
 from gdtool.assets.scene import Material, Texture
-
-# Normal-incidence reflectance of metals, linear: measured optical constants as tabulated at physicallybased.info
-METALS = {
-    "gold": (1.0, 0.77, 0.31),
-    "silver": (0.96, 0.95, 0.92),
-    "copper": (0.93, 0.61, 0.49),
-    "brass": (0.89, 0.74, 0.42),
-    "bronze": (0.71, 0.53, 0.34),
-    "aluminium": (0.91, 0.91, 0.92),
-    "iron": (0.53, 0.51, 0.49),
-    "chrome": (0.64, 0.65, 0.66),
-    "titanium": (0.54, 0.50, 0.45),
-    "nickel": (0.70, 0.64, 0.56),
-    "steel": (0.60, 0.60, 0.62),
-}
 
 
 @dataclass(frozen=True)
@@ -56,50 +41,13 @@ class Look:
 Finish = Callable[[Shape], Look]
 
 
-def hsv(hue: float, saturation: float, value: float) -> np.ndarray:
-    """sRGB colour (3,) as picked by eye, returned linear."""
-    srgb = np.array(colorsys.hsv_to_rgb(hue % 1.0, float(np.clip(saturation, 0, 1)), float(np.clip(value, 0, 1))))
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-
-
-def any_color(rng: np.random.Generator) -> np.ndarray:
-    """Return a linear colour as things have: vivid, muted, pastel, earth, grey, dark or white."""
-    kind = rng.choice(7, p=[0.26, 0.2, 0.13, 0.18, 0.08, 0.07, 0.08])
-    hue = rng.uniform()
-    if kind == 0:
-        # No neon greens.
-        return hsv(hue, rng.uniform(0.65, 0.92), rng.uniform(0.6, 0.95) * (0.75 if 0.2 < hue < 0.48 else 1.0))
-    if kind == 1:
-        return hsv(hue, rng.uniform(0.3, 0.6), rng.uniform(0.4, 0.8))
-    if kind == 2:
-        return hsv(hue, rng.uniform(0.12, 0.35), rng.uniform(0.85, 0.97))
-    if kind == 3:
-        return hsv(rng.uniform(0.02, 0.13), rng.uniform(0.35, 0.75), rng.uniform(0.3, 0.8))
-    if kind == 4:
-        return hsv(hue, rng.uniform(0, 0.08), rng.uniform(0.3, 0.75))
-    if kind == 5:
-        return hsv(hue, rng.uniform(0, 0.6), rng.uniform(0.1, 0.25))
-    return hsv(rng.uniform(0.05, 0.18), rng.uniform(0.0, 0.12), rng.uniform(0.88, 0.97))
-
-
-def near_color(rng: np.random.Generator, color: np.ndarray, amount: float = 0.5) -> np.ndarray:
-    """Return a darker or lighter relative of a linear colour."""
-    factor = np.exp(rng.normal(0, amount))
-    return np.clip(color * factor * np.exp(rng.normal(0, 0.15 * amount, 3)), 0.01, 0.95)
-
-
-def any_metal(rng: np.random.Generator) -> np.ndarray:
-    """Return the linear reflectance of a metal, chosen at random."""
-    return np.array(METALS[list(METALS)[rng.integers(len(METALS))]])
-
-
 def _srgb8(color: np.ndarray) -> np.ndarray:
     c = np.clip(color, 0, 1)
     srgb = np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
     return np.round(srgb * 255).astype(np.uint8)
 
 
-def _material(
+def textured_material(
     name: str,
     color: np.ndarray,
     metallic: np.ndarray,
@@ -138,22 +86,22 @@ def plain(color: np.ndarray, roughness: float, metallic: float = 0.0, name: str 
     return lambda shape: Look(material)
 
 
-def plastic(rng, color=None) -> Finish:
+def plastic(rng: np.random.Generator, color=None) -> Finish:
     """Return a smooth dielectric finish."""
     return plain(any_color(rng) if color is None else color, rng.uniform(0.2, 0.6), name="plastic")
 
 
-def metal(rng, color=None) -> Finish:
+def metal(rng: np.random.Generator, color=None) -> Finish:
     """Return a metallic finish."""
     return plain(any_metal(rng) if color is None else color, rng.uniform(0.12, 0.55), 1.0, name="metal")
 
 
-def matte(rng, color=None) -> Finish:
+def matte(rng: np.random.Generator, color=None) -> Finish:
     """Return a rough dielectric finish."""
     return plain(any_color(rng) if color is None else color, rng.uniform(0.65, 0.98), name="matte")
 
 
-def glossy(rng, color=None) -> Finish:
+def glossy(rng: np.random.Generator, color=None) -> Finish:
     """Return a polished dielectric finish."""
     return plain(any_color(rng) if color is None else color, rng.uniform(0.06, 0.22), name="glossy")
 
@@ -196,7 +144,7 @@ def _table(
         value = value * (1 - weight) + np.r_[substance] * weight
     color = value[..., :3] * (1 + speckle * (0.5 - v))[..., None]
     roughness = np.clip(value[..., 3] + speckle * 0.5 * (v - 0.5), 0.04, 1)
-    return _material(name, np.clip(color, 0, 1), value[..., 4], roughness, 1, wrap)
+    return textured_material(name, np.clip(color, 0, 1), value[..., 4], roughness, 1, wrap)
 
 
 def _dirt(rng: np.random.Generator) -> Callable:
@@ -215,7 +163,7 @@ def _field(
     return apply
 
 
-def _any_substance(rng, color) -> _Substance:
+def _any_substance(rng: np.random.Generator, color) -> _Substance:
     """Draw a dielectric of a colour, or (15 %) a metal."""
     if rng.uniform() < 0.15:
         roughness = rng.uniform(0.15, 0.5)
@@ -223,7 +171,7 @@ def _any_substance(rng, color) -> _Substance:
     return _Substance(color, rng.uniform(0.15, 0.9))
 
 
-def banded(rng, color=None, axis=None, frequency=None) -> Finish:
+def banded(rng: np.random.Generator, color=None, axis=None, frequency=None) -> Finish:
     """Stripes across a direction, two or three colours."""
     color = any_color(rng) if color is None else color
     direction = np.eye(3)[rng.choice(3, p=[0.2, 0.6, 0.2]) if axis is None else axis] + rng.normal(0, 0.02, 3)
@@ -245,7 +193,7 @@ def banded(rng, color=None, axis=None, frequency=None) -> Finish:
     )
 
 
-def gradient(rng, color=None, direction=None) -> Finish:
+def gradient(rng: np.random.Generator, color=None, direction=None) -> Finish:
     """Return a smooth change of colour along a direction, by default upward."""
     color = any_color(rng) if color is None else color
     other = near_color(rng, any_color(rng) if rng.uniform() < 0.5 else color, 0.6)
@@ -260,7 +208,7 @@ def gradient(rng, color=None, direction=None) -> Finish:
     return _field("gradient", material, lambda s: 0.5 + product(s.points, axis) + 0.04 * wobble(s.points), _dirt(rng))
 
 
-def marble(rng, color=None) -> Finish:
+def marble(rng: np.random.Generator, color=None) -> Finish:
     """Veins: distance from the zero set of a warped noise."""
     color = any_color(rng) if color is None else color
     vein = any_metal(rng) if (gilded := rng.uniform() < 0.25) else near_color(rng, color, 1.0)
@@ -274,7 +222,7 @@ def marble(rng, color=None) -> Finish:
     return _field("marble", _table("marble", layers, 0.04), lambda s: np.abs(field(s.points)) * 0.8, _dirt(rng))
 
 
-def blotched(rng, color=None, other=None) -> Finish:
+def blotched(rng: np.random.Generator, color=None, other=None) -> Finish:
     """Two colours in irregular patches: cows, camouflage, corroded paint."""
     color = any_color(rng) if color is None else color
     first, second = _any_substance(rng, color), _any_substance(rng, any_color(rng) if other is None else other)
@@ -286,7 +234,7 @@ def blotched(rng, color=None, other=None) -> Finish:
     return _field("patches", _table("patches", layers, 0.012), lambda s: 0.5 + 0.2 * field(s.points), _dirt(rng))
 
 
-def spotted(rng, color=None, other=None) -> Finish:
+def spotted(rng: np.random.Generator, color=None, other=None) -> Finish:
     """Round spots around random sites."""
     color, other = any_color(rng) if color is None else color, any_color(rng) if other is None else other
     first, second = _any_substance(rng, color), _any_substance(rng, other)
@@ -297,7 +245,7 @@ def spotted(rng, color=None, other=None) -> Finish:
     return _field("spots", material, lambda s: 0.5 * field(s.points)[:, 0] / radius, _dirt(rng))
 
 
-def crackled(rng, color=None, other=None) -> Finish:
+def crackled(rng: np.random.Generator, color=None, other=None) -> Finish:
     """Cells with joints between them: giraffe, dry earth, crackle glaze, leaded glass."""
     color = any_color(rng) if color is None else color
     joint = near_color(rng, color, 1.0) if other is None else other
@@ -314,19 +262,19 @@ def crackled(rng, color=None, other=None) -> Finish:
     return _field("cells", material, pattern, _dirt(rng))
 
 
-def chequered(rng, color=None) -> Finish:
+def chequered(rng: np.random.Generator, color=None) -> Finish:
     """Return a checkerboard in the first UV set."""
     color = any_color(rng) if color is None else color
     first, second = _any_substance(rng, color), _any_substance(rng, any_color(rng))
     u, v = patterns.tile_grid(64)
     odd = ((u < 0.5) ^ (v < 0.5))[..., None]
     value = np.where(odd, np.r_[first], np.r_[second])
-    material = _material("checks", value[..., :3], value[..., 4], value[..., 3], 0, "repeat")
+    material = textured_material("checks", value[..., :3], value[..., 4], value[..., 3], 0, "repeat")
     tiles = rng.uniform(1.5, 5)
     return lambda shape: Look(material, None, tiles)
 
 
-def wooden(rng, color=None) -> Finish:
+def wooden(rng: np.random.Generator, color=None) -> Finish:
     """Rings of a trunk cut by the surface."""
     color = hsv(rng.uniform(0.04, 0.11), rng.uniform(0.35, 0.75), rng.uniform(0.35, 0.85)) if color is None else color
     dark, roughness = color * rng.uniform(0.35, 0.7), rng.uniform(0.3, 0.8)
@@ -350,7 +298,7 @@ def wooden(rng, color=None) -> Finish:
     return _field("wood", material, pattern, _dirt(rng), clip=False)
 
 
-def worn_paint(rng, color=None) -> Finish:
+def worn_paint(rng: np.random.Generator, color=None) -> Finish:
     """Paint that is gone on outer edges and in scratches, metal beneath."""
     color, bare = any_color(rng) if color is None else color, any_metal(rng)
     roughness = rng.uniform(0.2, 0.6)
@@ -372,7 +320,7 @@ def worn_paint(rng, color=None) -> Finish:
     )
 
 
-def rusty(rng, color=None) -> Finish:
+def rusty(rng: np.random.Generator, color=None) -> Finish:
     """Metal that rusts from below and in patches."""
     bare = any_metal(rng) if color is None else color
     rust = hsv(rng.uniform(0.03, 0.08), rng.uniform(0.6, 0.85), rng.uniform(0.3, 0.6))
@@ -392,7 +340,7 @@ def rusty(rng, color=None) -> Finish:
     )
 
 
-def topped(rng, color=None, top=None) -> Finish:
+def topped(rng: np.random.Generator, color=None, top=None) -> Finish:
     """Something on all that faces up: snow, moss, icing, dust."""
     color = any_color(rng) if color is None else color
     top = (
@@ -407,7 +355,7 @@ def topped(rng, color=None, top=None) -> Finish:
     return _field("topped", material, lambda s: 0.4 + 0.4 * s.normals[:, 1] + 0.06 * field(s.points), _dirt(rng))
 
 
-def gazing(rng, direction: np.ndarray, iris=None, white=None) -> Finish:
+def gazing(rng: np.random.Generator, direction: np.ndarray, iris=None, white=None) -> Finish:
     """Return an eyeball: black pupil, coloured iris, white, by the angle between the normal and `direction` (right
     eye's, x >= 0)."""
     iris = any_color(rng) if iris is None else iris

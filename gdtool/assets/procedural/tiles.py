@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.assets.procedural import finishes, patterns
-from gdtool.assets.procedural.finishes import Finish, Look, any_color, any_metal, hsv, near_color
+from gdtool.assets.procedural.colors import any_color, any_metal, hsv, near_color
+from gdtool.assets.procedural.finishes import Finish, Look
 
 SIZE = 256
 
@@ -13,7 +14,7 @@ SIZE = 256
 def _tiled(name: str, color, metallic, roughness, height, strength: float, tiles: float) -> Finish:
     normal = None if height is None else patterns.normal_from_height(height, strength)
     roughness = np.broadcast_to(np.clip(roughness, 0.04, 1), (SIZE, SIZE))
-    material = finishes._material(name, np.clip(color, 0, 1), metallic, roughness, 0, "repeat", normal)
+    material = finishes.textured_material(name, np.clip(color, 0, 1), metallic, roughness, 0, "repeat", normal)
     return lambda shape: Look(material, None, tiles)
 
 
@@ -21,7 +22,7 @@ def _mix(a, b, weight: np.ndarray) -> np.ndarray:
     return np.asarray(a) * (1 - weight[..., None]) + np.asarray(b) * weight[..., None]
 
 
-def bricks(rng, color=None) -> Finish:
+def bricks(rng: np.random.Generator, color=None) -> Finish:
     """Bricks, ashlar or tiles with joints."""
     color = hsv(rng.uniform(0.0, 0.1), rng.uniform(0.1, 0.7), rng.uniform(0.35, 0.8)) if color is None else color
     rows, columns = [(6, 3), (8, 4), (4, 4), (5, 3)][rng.integers(4)]
@@ -37,7 +38,7 @@ def bricks(rng, color=None) -> Finish:
     )
 
 
-def planks(rng, color=None) -> Finish:
+def planks(rng: np.random.Generator, color=None) -> Finish:
     """Boards side by side with grain along u or v."""
     color = hsv(rng.uniform(0.04, 0.11), rng.uniform(0.3, 0.7), rng.uniform(0.3, 0.8)) if color is None else color
     height, shade = patterns.brick_cells(rng, SIZE, int(rng.integers(3, 7)), 1, 0.015, rng.uniform(0.2, 0.8), 0.03)
@@ -50,7 +51,7 @@ def planks(rng, color=None) -> Finish:
     return _tiled("planks", image, 0.0, roughness, relief, 0.012, rng.uniform(1.0, 2.5))
 
 
-def shingles(rng, color=None) -> Finish:
+def shingles(rng: np.random.Generator, color=None) -> Finish:
     """Overlapping rounded tiles: roofs, scales, feathers."""
     color = any_color(rng) if color is None else color
     rows = 2 * int(rng.integers(3, 6))
@@ -72,7 +73,7 @@ def shingles(rng, color=None) -> Finish:
     )
 
 
-def woven(rng, color=None) -> Finish:
+def woven(rng: np.random.Generator, color=None) -> Finish:
     """Cloth, wicker or carbon fibre: threads over and under."""
     color = any_color(rng) if color is None else color
     other = near_color(rng, color, 0.4) if rng.uniform() < 0.6 else any_color(rng)
@@ -89,7 +90,7 @@ def woven(rng, color=None) -> Finish:
     )
 
 
-def tartan(rng, color=None) -> Finish:
+def tartan(rng: np.random.Generator, color=None) -> Finish:
     """Crossing stripes of cloth or paper."""
     color = any_color(rng) if color is None else color
     u, v = patterns.tile_grid(SIZE)
@@ -104,7 +105,7 @@ def tartan(rng, color=None) -> Finish:
     )
 
 
-def hammered(rng, color=None) -> Finish:
+def hammered(rng: np.random.Generator, color=None) -> Finish:
     """Metal with dents."""
     color = any_metal(rng) if color is None else color
     near = patterns.tile_cells(rng, SIZE, int(rng.integers(40, 160))).nearest
@@ -120,7 +121,7 @@ def hammered(rng, color=None) -> Finish:
     )
 
 
-def brushed(rng, color=None) -> Finish:
+def brushed(rng: np.random.Generator, color=None) -> Finish:
     """Metal or lacquer with directional streaks, scratches and smudges."""
     is_metal = rng.uniform() < 0.7
     color = (any_metal(rng) if is_metal else any_color(rng)) if color is None else color
@@ -132,7 +133,7 @@ def brushed(rng, color=None) -> Finish:
     return _tiled("brushed", image, float(is_metal), roughness, -scratches + 0.1 * streaks, 0.002, rng.uniform(0.8, 2))
 
 
-def grained(rng, color=None) -> Finish:
+def grained(rng: np.random.Generator, color=None) -> Finish:
     """Leather, plaster, bread crust, felt, rock: bumps with darker pits."""
     color = any_color(rng) if color is None else color
     if rng.uniform() < 0.5:
@@ -147,7 +148,7 @@ def grained(rng, color=None) -> Finish:
     return _tiled("grained", image, 0.0, rng.uniform(0.5, 0.95) - 0.1 * height, height, strength, rng.uniform(0.8, 2))
 
 
-def dotted(rng, color=None) -> Finish:
+def dotted(rng: np.random.Generator, color=None) -> Finish:
     """Polka dots or a terrazzo of chips."""
     color, other = any_color(rng) if color is None else color, any_color(rng)
     if rng.uniform() < 0.5:

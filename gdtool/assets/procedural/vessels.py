@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.assets.procedural import finishes, tiles
+from gdtool.assets.procedural import colors, finishes, tiles
 from gdtool.assets.procedural.assembly import Assembly
 from gdtool.assets.procedural.parts import Part, ball, circle, cylinder, loft, refined, smooth_curve, tube
 
@@ -21,7 +21,7 @@ def walled(outer: np.ndarray, thickness: float, segments: int = 48, outline: np.
     return loft(profile, circle(segments) if outline is None else outline)
 
 
-def _outline(rng, plain_share: float = 0.6) -> np.ndarray:
+def _outline(rng: np.random.Generator, plain_share: float = 0.6) -> np.ndarray:
     if rng.uniform() < plain_share:
         return circle(48)
     lobes, depth = int(rng.integers(4, 13)), rng.uniform(0.02, 0.1)
@@ -30,7 +30,9 @@ def _outline(rng, plain_share: float = 0.6) -> np.ndarray:
     return circle(96) * (1 - depth + depth * wave)[:, None]
 
 
-def body_curve(rng, height: float, foot: float, belly: float, neck: float, rim: float, count: int = 28) -> np.ndarray:
+def body_curve(
+    rng: np.random.Generator, height: float, foot: float, belly: float, neck: float, rim: float, count: int = 28
+) -> np.ndarray:
     """Return a random vessel contour (count, 2) through foot, belly, neck and rim radii."""
     where = np.sort(rng.uniform([0.2, 0.65], [0.5, 0.88]))
     curve = smooth_curve(
@@ -39,7 +41,7 @@ def body_curve(rng, height: float, foot: float, belly: float, neck: float, rim: 
     return np.vstack([(0, 0), (foot * 0.92, 0), curve])
 
 
-def _handle(rng, start, end, bulge: float, radius: float) -> Part:
+def _handle(rng: np.random.Generator, start, end, bulge: float, radius: float) -> Part:
     start, end = np.asarray(start, float), np.asarray(end, float)
     t = np.linspace(0, 1, 22)
     out = np.sin(np.pi * t) ** rng.uniform(0.5, 1.0)
@@ -48,7 +50,7 @@ def _handle(rng, start, end, bulge: float, radius: float) -> Part:
     return tube(path, radius, outline=outline)
 
 
-def vase(rng) -> Assembly:
+def vase(rng: np.random.Generator) -> Assembly:
     """Return a vase: a turned profile, perhaps with a pattern."""
     a, height = Assembly(), rng.uniform(0.9, 1.8)
     curve = body_curve(
@@ -78,7 +80,7 @@ def vase(rng) -> Assembly:
     return a
 
 
-def bottle(rng) -> Assembly:
+def bottle(rng: np.random.Generator) -> Assembly:
     """Return a bottle with a cap."""
     a, height, r = Assembly(), rng.uniform(1.2, 1.9), rng.uniform(0.22, 0.42)
     neck, shoulder = r * rng.uniform(0.25, 0.5), rng.uniform(0.5, 0.7)
@@ -102,7 +104,7 @@ def bottle(rng) -> Assembly:
     return a
 
 
-def cup(rng) -> Assembly:
+def cup(rng: np.random.Generator) -> Assembly:
     """Return a cup with a handle."""
     a, height = Assembly(), rng.uniform(0.7, 1.2)
     rim = rng.uniform(0.35, 0.5)
@@ -131,7 +133,7 @@ def cup(rng) -> Assembly:
         inner = np.interp(height * 0.85, curve[2:, 1], curve[2:, 0]) - 0.03
         a.add(
             cylinder(inner, 0.03, count=48).moved(y=height * 0.85),
-            finishes.glossy(rng, finishes.hsv(rng.uniform(0.03, 0.12), 0.7, rng.uniform(0.15, 0.8))),
+            finishes.glossy(rng, colors.hsv(rng.uniform(0.03, 0.12), 0.7, rng.uniform(0.15, 0.8))),
         )
     if rng.uniform() < 0.3:
         r = rim * 1.7
@@ -145,7 +147,7 @@ def cup(rng) -> Assembly:
     return a
 
 
-def teapot(rng) -> Assembly:
+def teapot(rng: np.random.Generator) -> Assembly:
     """Spout to one side and handle to the other, or bail handle over the top (kettle)."""
     a = Assembly()
     height, r = rng.uniform(0.6, 1.0), rng.uniform(0.45, 0.6)
@@ -202,7 +204,7 @@ def teapot(rng) -> Assembly:
     return a
 
 
-def bowl(rng) -> Assembly:
+def bowl(rng: np.random.Generator) -> Assembly:
     """Return a bowl, perhaps with fruit."""
     a, height, rim = Assembly(), rng.uniform(0.25, 0.6), rng.uniform(0.5, 0.7)
     foot = rim * rng.uniform(0.3, 0.6)
@@ -211,7 +213,7 @@ def bowl(rng) -> Assembly:
     )
     a.add(walled(curve, 0.04, outline=_outline(rng)), tiles.pick(rng, "ceramic" if rng.uniform() < 0.6 else "any"))
     fruit = [
-        tiles.pick(rng, "skin", finishes.hsv(h, 0.85, 0.85))
+        tiles.pick(rng, "skin", colors.hsv(h, 0.85, 0.85))
         for h in rng.choice([0.0, 0.02, 0.09, 0.15, 0.25, 0.3, 0.8], 3)
     ]
     for _ in range(int(rng.integers(0, 8))):
@@ -224,7 +226,7 @@ def bowl(rng) -> Assembly:
     return a
 
 
-def goblet(rng) -> Assembly:
+def goblet(rng: np.random.Generator) -> Assembly:
     """Return a goblet: bowl, stem, foot."""
     a, height = Assembly(), rng.uniform(1.2, 1.8)
     base, stem, rim = rng.uniform(0.3, 0.42), rng.uniform(0.04, 0.09), rng.uniform(0.28, 0.45)
@@ -250,7 +252,7 @@ def goblet(rng) -> Assembly:
     return a
 
 
-def lamp(rng) -> Assembly:
+def lamp(rng: np.random.Generator) -> Assembly:
     """Return a lamp: foot, stem, shade."""
     a, stem = Assembly(), rng.uniform(0.7, 1.2)
     finish = tiles.pick(rng, "metal" if rng.uniform() < 0.5 else "ceramic")
@@ -264,12 +266,12 @@ def lamp(rng) -> Assembly:
     return a
 
 
-def candle(rng) -> Assembly:
+def candle(rng: np.random.Generator) -> Assembly:
     """Return a candle on a holder."""
     a, count = Assembly(), int(rng.choice([1, 1, 3]))
     stand = tiles.pick(rng, "metal")
-    wax = finishes.plastic(rng, finishes.any_color(rng))
-    flame = finishes.glossy(rng, finishes.hsv(0.1, 0.8, 1.0))
+    wax = finishes.plastic(rng, colors.any_color(rng))
+    flame = finishes.glossy(rng, colors.hsv(0.1, 0.8, 1.0))
     for i in range(count):
         x = (i - (count - 1) / 2) * 0.45
         y = 0.5 + (0.15 if count == 3 and i == 1 else 0.0)
@@ -307,7 +309,7 @@ def candle(rng) -> Assembly:
     return a
 
 
-def barrel(rng) -> Assembly:
+def barrel(rng: np.random.Generator) -> Assembly:
     """Return a barrel, drum, jar or tin: bulging body, hoops, a lid."""
     a, height, r = Assembly(), rng.uniform(0.9, 1.4), rng.uniform(0.35, 0.5)
     bulge = r * rng.uniform(1.0, 1.25)
