@@ -6,8 +6,9 @@ import base64
 import binascii
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import unquote, unquote_to_bytes
 
 import msgspec
@@ -43,7 +44,8 @@ COPY = "copy or download it again"
 SIMPLIFY = "export it with fewer faces or fewer instances"
 
 
-class _Elements(NamedTuple):
+@dataclass(frozen=True)
+class _Elements:
     """Where equally spaced elements lie: buffer view, byte offset, byte stride (None: packed), count, type, shape."""
 
     view: int
@@ -241,14 +243,14 @@ class GltfFile:
 
     def _strided(self, elements: _Elements, index: int) -> np.ndarray:
         """View equally spaced elements of a buffer view as an array (count, *shape); index: of the accessor."""
-        view, offset, stride, count, dtype, shape = elements
-        content = self.view(view)
+        offset, count, dtype, shape = elements.offset, elements.count, elements.dtype, elements.shape
+        content = self.view(elements.view)
         rows = shape[0] if len(shape) == 2 else 1
         # The columns of matrices begin at multiples of four bytes (glTF 2.0 specification, section 3.6.2.4).
         column = (shape[-1] if shape else 1) * dtype.itemsize
         column_stride = -(-column // 4) * 4 if rows > 1 else column
         size = column_stride * rows
-        stride = stride or size
+        stride = elements.stride or size
         if stride < size:
             raise self.refuse(f"accessor {index} has elements of {size} bytes, {stride} apart", EXPORT)
         if offset + stride * (count - 1) + size > len(content):

@@ -7,8 +7,7 @@ colour and metallic are chosen so that diffuse and specular reflection keep thei
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,7 +22,8 @@ _CONVERTED_BYTES = 2 * 2 * 8 + 7
 _ROWS_AT_ONCE = 64  # converted in float32; a map of 4096² pixels at once would take gigabytes
 
 
-class SpecularGlossinessMaterial(NamedTuple):
+@dataclass(frozen=True)
+class SpecularGlossinessMaterial:
     """A material to convert: what both models share, the extension's record and textures, and the file's index."""
 
     material: Material
@@ -38,14 +38,14 @@ def convert(file: GltfFile, source: SpecularGlossinessMaterial) -> Material:
 
     Raises InputError where the two textures are looked up differently, ResourceError for maps that are too large.
     """
-    material, record, diffuse_texture, specular_texture, _ = source
-    if specular_texture is None:
+    record, diffuse_texture = source.record, source.diffuse_texture
+    if source.specular_texture is None:
         diffuse, specular = np.array(record.diffuse_factor[:3]), np.array(record.specular_factor)
         metallic = _metallic(diffuse, specular)
         if diffuse_texture is None or metallic == 0:
             red, green, blue = _base_color(diffuse, specular, metallic)
             return replace(
-                material,
+                source.material,
                 base_color=clipped_rgba(red, green, blue, record.diffuse_factor[3]),
                 metallic=float(metallic),
                 roughness=clipped(1 - record.glossiness_factor),

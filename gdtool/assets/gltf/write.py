@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -52,11 +52,11 @@ def glb_bytes(scene: Scene, extras: dict[str, Any] | None = None, made: dict[int
     for index in np.unique(scene.face_materials):
         material = scene.materials[index]
         faces = scene.faces[scene.face_materials == index]
-        used, local, tangents = _split(scene, material, faces, uv_slots)
+        vertices = _primitive_vertices(scene, material, faces, uv_slots)
         primitives.append(
             {
-                "attributes": _attributes(builder, scene, used, tangents, uv_slots),
-                "indices": builder.accessor(local.reshape(-1), "SCALAR", ELEMENT_ARRAY_BUFFER),
+                "attributes": _attributes(builder, scene, vertices, uv_slots),
+                "indices": builder.accessor(vertices.corners.reshape(-1), "SCALAR", ELEMENT_ARRAY_BUFFER),
                 "material": builder.unique("materials", _material(builder, material, uv_slots)),
             }
         )
@@ -83,55 +83,62 @@ def _check(scene: Scene) -> None:
             raise ValueError("uvs of the scene to write are not finite")
 
 
-def _split(
-    scene: Scene, material: Material, faces: np.ndarray, uv_slots: list[int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """List the vertices (n,) of a primitive, its corners (f, 3) or (3f,) as indices into them, and tangents (n, 4).
+class _PrimitiveVertices(NamedTuple):
+    """List the scene's vertices (n,) that a primitive uses, its corners as indices into them, and tangents (n, 4).
 
     Tangents are None where the material needs none. A vertex is listed more than once where the tangents of its faces
     differ.
     """
+
+    used: np.ndarray
+    corners: np.ndarray
+    tangents: np.ndarray | None
+
+
+def _primitive_vertices(scene: Scene, material: Material, faces: np.ndarray, uv_slots: list[int]) -> _PrimitiveVertices:
+    """Choose the vertices of the primitive of some faces (f, 3), and compute tangents where its material needs them."""
     used, local = np.unique(faces, return_inverse=True)
     if material.normal_texture is None or scene.normals is None:
-        return used, local, None
+        return _PrimitiveVertices(used, local, None)
     normals = _unit_normals(scene)
     if scene.tangents is not None:
-        return used, local, _unit_tangents(scene.tangents[used], normals[used])
-    if material.normal_texture.uv_set not in uv_slots:
-        return used, local, None
+        return _PrimitiveVertices(used, local, _unit_tangents(scene.tangents[used], normals[used]))
+    uv_set = material.normal_texture.uv_set
+    uv = scene.uvs[uv_set] if uv_set in uv_slots else None
+    if uv is None:
+        return _PrimitiveVertices(used, local, None)
     from gdtool.geometry.tangents import corner_tangents, weld
 
-    tangents = corner_tangents(
-        scene.vertices, faces, normals, scene.uvs[material.normal_texture.uv_set], faces
-    ).reshape(-1, 4)
+    tangents = corner_tangents(scene.vertices, faces, normals, uv, faces).reshape(-1, 4)
     corner = faces.reshape(-1, 1)
     split = weld(corner // 4096, corner % 4096, tangents)  # weld compares float32, which is not exact for large indices
     first = np.unique(split, return_index=True)[1]
     used = corner[first, 0]
-    return used, split, _unit_tangents(tangents[first], normals[used])
+    return _PrimitiveVertices(used, split, _unit_tangents(tangents[first], normals[used]))
 
 
-def _attributes(
-    builder: GlbBuilder, scene: Scene, used: np.ndarray, tangents: np.ndarray | None, uv_slots: list[int]
-) -> dict[str, int]:
+def _attributes(builder: GlbBuilder, scene: Scene, vertices: _PrimitiveVertices, uv_slots: list[int]) -> dict[str, int]:
     """Add the vertex attributes of a primitive and return their accessors by name."""
-    out = {
+    used = vertices.used
+    accessors = {
         "POSITION": builder.accessor(np.asarray(scene.vertices, np.float32)[used], "VEC3", ARRAY_BUFFER, bounds=True)
     }
     if scene.normals is not None:
         normals = _unit_normals(scene)[used]
-        out["NORMAL"] = builder.accessor(normals.astype(np.float32), "VEC3", ARRAY_BUFFER)
-        if tangents is not None:
-            out["TANGENT"] = builder.accessor(tangents, "VEC4", ARRAY_BUFFER)
+        accessors["NORMAL"] = builder.accessor(normals.astype(np.float32), "VEC3", ARRAY_BUFFER)
+        if vertices.tangents is not None:
+            accessors["TANGENT"] = builder.accessor(vertices.tangents, "VEC4", ARRAY_BUFFER)
     for slot, index in enumerate(uv_slots):
-        out[f"TEXCOORD_{slot}"] = builder.accessor(np.asarray(scene.uvs[index], np.float32)[used], "VEC2", ARRAY_BUFFER)
+        accessors[f"TEXCOORD_{slot}"] = builder.accessor(
+            np.asarray(scene.uvs[index], np.float32)[used], "VEC2", ARRAY_BUFFER
+        )
     if scene.colors is not None:
         colors = np.clip(scene.colors, 0, 1).astype(np.float32)
         opaque = scene.colors.shape[1] == 3 or bool((colors[:, 3] == 1).all())
-        out["COLOR_0"] = builder.accessor(
+        accessors["COLOR_0"] = builder.accessor(
             colors[used][:, :3] if opaque else colors[used], "VEC3" if opaque else "VEC4", ARRAY_BUFFER
         )
-    return out
+    return accessors
 
 
 def _unit_normals(scene: Scene) -> np.ndarray:

@@ -233,7 +233,7 @@ def _parsed(text: np.ndarray, kind: type, count: int) -> np.ndarray:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
-            numbers = np.fromstring(text.tobytes(), kind, sep=" ")
+            numbers: np.ndarray = np.fromstring(text.tobytes(), kind, sep=" ")
         except (DeprecationWarning, ValueError):
             raise _NotUniformError from None
     if len(numbers) != count:

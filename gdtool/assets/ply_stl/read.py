@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -123,7 +124,7 @@ def read_with_trimesh(data: bytes, kind: str, path: Path) -> _RawMesh:
     import trimesh
 
     try:
-        mesh = trimesh.load(io.BytesIO(data), file_type=kind, process=False, force="mesh")
+        mesh: Any = trimesh.load(io.BytesIO(data), file_type=kind, process=False, force="mesh")
     except Exception as error:  # malformed bytes make the parsers raise anything
         raise InputError(
             path,

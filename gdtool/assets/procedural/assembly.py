@@ -1,4 +1,4 @@
-"""An object in the making: parts with their finishes, joined into one normalised glTF scene."""
+"""Collect the parts of an object with their finishes, and join them into one normalised scene."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def convexity(points: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.
     share = np.bincount(weld, minlength=count)
     position = np.stack([np.bincount(weld, points[:, k], count) / share for k in range(3)], -1)
     normal = np.stack([np.bincount(weld, normals[:, k], count) for k in range(3)], -1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     edges = weld[np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])]
     a, b = edges[:, 0], edges[:, 1]
     step = position[b] - position[a]

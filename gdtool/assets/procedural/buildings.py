@@ -1,4 +1,4 @@
-"""Houses, castles, towers, pyramids, temples; the entrance faces +Z."""
+"""Make buildings, their entrance toward +Z: houses, castles, towers, pyramids, temples."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ from gdtool.assets.procedural.parts import (
 
 
 def gable(width: float, height: float, depth: float, overhang: float = 0.0, power: float = 1.0) -> Part:
-    """Return a roof with its ridge along z, from y = 0 to `height`."""
+    """Make a gable roof with its ridge along z, from y = 0 to `height`.
+
+    overhang: how far it reaches beyond width and depth on each side. power: 1 for straight slopes, else curved ones.
+    """
     w = width / 2 + overhang
     slope = np.stack([w * (1 - (t := np.linspace(0, 1, 6))), height * t**power], -1)
     outline = np.vstack(
@@ -40,7 +43,7 @@ def gable(width: float, height: float, depth: float, overhang: float = 0.0, powe
 
 
 def hip(width: float, height: float, depth: float, overhang: float = 0.05, top: float = 0.02) -> Part:
-    """Return a four-sided pointed roof from y = 0 to `height`."""
+    """Make a roof with four slopes, from y = 0 to `height`; top: the share of its width that is left at the top."""
     profile = refined([(0, 0), (1, 0), (1, 0.02), (top, height), (0, height)], 0.1)
     return loft(profile, rectangle(width + 2 * overhang, depth + 2 * overhang), boxed=True)
 
@@ -69,7 +72,7 @@ def add_window(a: Assembly, window: Window, x: float, y: float, z: float, turn: 
 
 
 def house(rng: np.random.Generator) -> Assembly:
-    """Return a house: walls, roof, door, windows, perhaps a chimney."""
+    """Make a house: walls, roof, door, windows, perhaps a chimney, a porch and a lawn."""
     a = Assembly()
     width, depth, storeys = rng.uniform(0.7, 1.3), rng.uniform(0.6, 1.2), int(rng.integers(1, 4))
     tall = 0.42 * storeys + rng.uniform(0, 0.2)
@@ -127,13 +130,8 @@ def house(rng: np.random.Generator) -> Assembly:
     return a
 
 
-def _crenels(a: Assembly, r: float, y: float, count: int, size: float, finish) -> None:
-    for k in range(count):
-        a.add(box(size, size, size * 0.7, 0.008, 2).moved(y=y, z=r).turned("y", 360 * k / count), finish)
-
-
 def castle(rng: np.random.Generator) -> Assembly:
-    """Return a castle: walls, towers, a gate."""
+    """Make a castle: walls, four corner towers, a keep, a gate."""
     a = Assembly()
     half, wall_h = rng.uniform(0.5, 0.8), rng.uniform(0.35, 0.6)
     stone, roof, wood = tiles.pick(rng, "wall"), tiles.pick(rng, "roof"), tiles.pick(rng, "wood")
@@ -196,7 +194,7 @@ def castle(rng: np.random.Generator) -> Assembly:
 
 
 def tower(rng: np.random.Generator) -> Assembly:
-    """Lighthouse, windmill, water tower, rook or pagoda."""
+    """Make a pagoda, or a round tower with a gallery: lighthouse, windmill, water tower."""
     a, height = Assembly(), rng.uniform(1.1, 1.7)
     wall, roof = tiles.pick(rng, "wall"), tiles.pick(rng, "roof")
     r, top = rng.uniform(0.28, 0.4), rng.uniform(0.18, 0.26)
@@ -250,7 +248,7 @@ def tower(rng: np.random.Generator) -> Assembly:
     for k, y in enumerate(np.linspace(0.5, height * 0.85, 3)):
         a.add(
             box(0.09, 0.13, 0.06, 0.01, 2)
-            .moved(0, y, np.interp(y, [0.1, height], [r, top]))
+            .moved(0, y, float(np.interp(y, [0.1, height], [r, top])))
             .turned("y", [0, 35, -35][k]),
             finishes.glossy(rng, colors.hsv(0.6, 0.3, 0.15)),
         )
@@ -276,7 +274,7 @@ def tower(rng: np.random.Generator) -> Assembly:
 
 
 def pyramid(rng: np.random.Generator) -> Assembly:
-    """Return a stepped pyramid with stairs and a temple on top, or a smooth one."""
+    """Make a stepped pyramid with stairs and a temple on top, or a smooth pyramid."""
     a, stone = Assembly(), tiles.pick(rng, "stone")
     other = stone if rng.uniform() < 0.5 else tiles.pick(rng, "stone")
     if rng.uniform() < 0.25:
@@ -309,7 +307,7 @@ def pyramid(rng: np.random.Generator) -> Assembly:
 
 
 def temple(rng: np.random.Generator) -> Assembly:
-    """Columns on a stepped base under a pediment, or a domed hall."""
+    """Make a hall with columns on a stepped base, under a gable roof or a dome."""
     a, stone, roof = Assembly(), tiles.pick(rng, "stone"), tiles.pick(rng, "roof")
     width, depth, tall = rng.uniform(1.0, 1.4), rng.uniform(0.7, 1.3), rng.uniform(0.5, 0.8)
     for k in range(3):

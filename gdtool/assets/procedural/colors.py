@@ -23,13 +23,13 @@ METALS = {
 
 
 def hsv(hue: float, saturation: float, value: float) -> np.ndarray:
-    """sRGB colour (3,) as picked by eye, returned linear."""
+    """Convert a colour picked by eye, as sRGB hue, saturation and value in [0, 1], to linear RGB (3,)."""
     srgb = np.array(colorsys.hsv_to_rgb(hue % 1.0, float(np.clip(saturation, 0, 1)), float(np.clip(value, 0, 1))))
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def any_color(rng: np.random.Generator) -> np.ndarray:
-    """Return a linear colour as things have: vivid, muted, pastel, earth, grey, dark or white."""
+    """Draw a linear colour as objects have it: vivid, muted, pastel, earthy, grey, dark or off-white."""
     kind = rng.choice(7, p=[0.26, 0.2, 0.13, 0.18, 0.08, 0.07, 0.08])
     hue = rng.uniform()
     if kind == 0:
@@ -49,13 +49,13 @@ def any_color(rng: np.random.Generator) -> np.ndarray:
 
 
 def near_color(rng: np.random.Generator, color: np.ndarray, amount: float = 0.5) -> np.ndarray:
-    """Return a darker or lighter relative of a linear colour."""
+    """Draw a darker or lighter variant of a linear colour; amount: the standard deviation of its logarithm."""
     factor = np.exp(rng.normal(0, amount))
     return np.clip(color * factor * np.exp(rng.normal(0, 0.15 * amount, 3)), 0.01, 0.95)
 
 
 def any_metal(rng: np.random.Generator) -> np.ndarray:
-    """Return the linear reflectance of a metal, chosen at random."""
+    """Draw the linear reflectance (3,) of a metal."""
     return np.array(METALS[list(METALS)[rng.integers(len(METALS))]])
 
 

@@ -1,4 +1,4 @@
-"""Living things with a face toward +Z: four-legged animals, birds, standing figures, fish, turtles, dragons."""
+"""Make creatures with a face toward +Z: four-legged animals, birds, fish, turtles, dragons."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from gdtool.assets.procedural.colors import hsv
 from gdtool.assets.procedural.figures import figure
 from gdtool.assets.procedural.heads import dress_head, ears, eyes, face, fur_color, horns
 from gdtool.assets.procedural.parts import (
+    Part,
     ball,
     circle,
     cone,
@@ -23,7 +24,7 @@ from gdtool.assets.procedural.parts import (
 
 
 def quadruped(rng: np.random.Generator) -> Assembly:
-    """Cat to elephant: body along z, four legs, neck, head, tail; one blended solid."""
+    """Make a four-legged animal, from cat to elephant: body along z, legs, neck, head and tail in one blended solid."""
     a = Assembly()
     length, girth = rng.uniform(0.3, 0.6), rng.uniform(0.2, 0.36)
     leg, foot = rng.uniform(0.15, 0.55), girth * rng.uniform(0.22, 0.45)
@@ -102,7 +103,7 @@ def quadruped(rng: np.random.Generator) -> Assembly:
 
 
 def sitting(rng: np.random.Generator) -> Assembly:
-    """Return a sitting cat, dog, bear or owl-like toy: pear body, big head, paws in front."""
+    """Make a sitting toy cat, dog or bear: pear-shaped body, big head, paws in front."""
     a = Assembly()
     coat, r, girth = tiles.pick(rng, "fur", fur_color(rng)), rng.uniform(0.3, 0.45), rng.uniform(0.32, 0.5)
     head = (0.0, 0.42 + r * 0.75, 0.08)
@@ -143,7 +144,7 @@ def sitting(rng: np.random.Generator) -> Assembly:
 
 
 def bird(rng: np.random.Generator) -> Assembly:
-    """Owl, penguin, chick, parrot: egg body, wings at the sides, beak, feet."""
+    """Make an owl, penguin, chick or parrot: egg-shaped body, wings at its sides, beak, feet."""
     a = Assembly()
     coat, girth, tall = tiles.pick(rng, "fur", fur_color(rng)), rng.uniform(0.32, 0.48), rng.uniform(0.45, 0.65)
     separate = rng.uniform() < 0.5
@@ -190,7 +191,7 @@ def bird(rng: np.random.Generator) -> Assembly:
 
 
 def fish(rng: np.random.Generator) -> Assembly:
-    """Return a fish: body, fins, tail, eyes."""
+    """Make a fish: body, fins, tail, eyes."""
     a = Assembly()
     tall, wide = rng.uniform(0.25, 0.5), rng.uniform(0.14, 0.3)
     coat, fin = tiles.pick(rng, "fur", colors.any_color(rng)), tiles.pick(rng, "skin")
@@ -208,7 +209,7 @@ def fish(rng: np.random.Generator) -> Assembly:
 
 
 def turtle(rng: np.random.Generator) -> Assembly:
-    """Turtle, beetle or crab: a domed shell on a flat body with six or four limbs."""
+    """Make a turtle, beetle or crab: a domed shell on a flat body with four or six limbs."""
     a = Assembly()
     dome, wide = rng.uniform(0.25, 0.5), rng.uniform(0.4, 0.55)
     shell = (
@@ -242,7 +243,7 @@ def turtle(rng: np.random.Generator) -> Assembly:
 
 
 def dragon(rng: np.random.Generator) -> Assembly:
-    """Upright or crouched, long neck and tail, wings, spikes along the back, horns."""
+    """Make a dragon: long neck and tail, wings, spikes along the back, horns."""
     a = Assembly()
     coat = tiles.pick(rng, "fur", colors.any_color(rng))
     r, lift = rng.uniform(0.17, 0.26), rng.uniform(0.25, 0.6)
@@ -297,7 +298,8 @@ def dragon(rng: np.random.Generator) -> Assembly:
     middle = np.array([0.42 * span, 0.35 * rise])
     fold, lean = rng.uniform(-10, 35), rng.uniform(-25, 15)
 
-    def unfolded(part):
+    def unfolded(part: Part) -> Part:
+        """Place a part of the wing, which is modelled flat, at the shoulder."""
         return part.turned("x", lean).turned("y", fold).moved(0.16, 0.2, -0.05)
 
     skin = (
@@ -305,9 +307,15 @@ def dragon(rng: np.random.Generator) -> Assembly:
     )
     a.add_pair(unfolded(skin.moved(*middle)), wing)
     wrist = np.array([0.45 * span, 0.97 * rise])
-    for start, end, thick in (((0.0, 0.08), wrist, 0.05), *((wrist, tip, 0.032) for tip in fingers[1:])):
+
+    def bone(start: np.ndarray, end: np.ndarray, radius: float) -> Part:
+        """Make a tapering bone of the wing between two points (2,)."""
         path = np.c_[np.linspace(start, end, 4), np.zeros(4)]
-        a.add_pair(unfolded(tube(path, np.linspace(thick, 0.6 * thick, 4), outline=circle(10))), coat)
+        return unfolded(tube(path, np.linspace(radius, 0.6 * radius, 4), outline=circle(10)))
+
+    a.add_pair(bone(np.array([0.0, 0.08]), wrist, 0.05), coat)
+    for tip in fingers[1:]:
+        a.add_pair(bone(wrist, tip, 0.032), coat)
     eyes(a, rng, r * 0.6, head[1] + r * 0.35, head[2] + r * 0.6, r * 0.2, 0.6)
     horns(a, rng, (head[0], head[1], head[2] - 0.3 * r), r)
     return a

@@ -15,8 +15,10 @@ from gdtool.assets.procedural.parts import Part, ball, circle, cylinder, tube
 
 
 class _Build(NamedTuple):
-    """Measures of a standing figure: head radius, half widths of hips and shoulders, half depth of the chest, and
-    lengths of leg and torso."""
+    """Hold the measures of a figure.
+
+    head: radius. hips, shoulder: half widths. depth: half depth of the chest. leg, torso: lengths.
+    """
 
     head: float
     hips: float
@@ -27,7 +29,7 @@ class _Build(NamedTuple):
 
 
 class _Clothes(NamedTuple):
-    """Finishes of a standing figure."""
+    """Hold the finishes of a figure."""
 
     skin: Finish
     shirt: Finish
@@ -61,6 +63,7 @@ def figure(rng: np.random.Generator) -> Assembly:
 
 
 def _chest(build: _Build, robot: bool) -> Part:
+    """Make the torso: a rounded block for a robot, else blended belly and chest."""
     if robot:
         chest = solids.block(
             (0, build.leg + build.torso / 2, 0), (build.shoulder, build.torso / 2 + 0.02, build.depth), 0.05

@@ -1,8 +1,10 @@
-"""What a part is made of: factors only, lookup tables over a solid field, or tiled images with a normal map.
+"""Define finishes: what a part is made of, as plain factors, tiled images, or lookup tables over a solid field.
 
-A finish is chosen first, with its random parameters, and applied when the object's shape is known: it is a function of
-`Shape` that returns a `Look`. A field finish stores its pattern as texture coordinates into a small lookup image
-(second UV set), so a threshold in the image is a crisp line on the surface however coarse the mesh is."""
+A finish is drawn first, with its random parameters, and applied once the object's shape is known: it is a function of
+`Shape` that returns a `Look`. Finishes of tiled images use the first UV set. A finish of a solid field, such as wood or
+marble, stores its pattern in the second UV set, as coordinates into a small lookup image. A threshold in that image is
+then a crisp line on the surface, however coarse the mesh is.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +17,15 @@ import numpy as np
 from gdtool.assets.procedural import patterns
 from gdtool.assets.procedural.colors import METALS, any_color, any_metal, hsv, near_color
 from gdtool.assets.procedural.parts import product
-from gdtool.assets.scene import Material, Texture
+from gdtool.assets.scene import Material, Texture, Wrap
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Where a finish goes, in the normalised object: points (v, 3), normals (v, 3), convexity (v,): > 0 on outer
-    edges."""
+    """Hold the surface that a finish is applied to, in the normalised object: points (v, 3), normals (v, 3).
+
+    convexity() computes (v,), positive on outward edges; see assembly.convexity.
+    """
 
     points: np.ndarray
     normals: np.ndarray
@@ -30,8 +34,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Look:
-    """A material, texture coordinates (v, 2) of its second UV set (None: unused) and tiles per unit length of the
-    first."""
+    """Hold a finish's result: a material, its second UV set (v, 2) or None, and tiles per unit length of the first."""
 
     material: Material
     field_uv: np.ndarray | None = None
@@ -42,6 +45,7 @@ Finish = Callable[[Shape], Look]
 
 
 def _srgb8(color: np.ndarray) -> np.ndarray:
+    """Encode linear colours as 8-bit sRGB."""
     c = np.clip(color, 0, 1)
     srgb = np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
     return np.round(srgb * 255).astype(np.uint8)
@@ -53,16 +57,19 @@ def textured_material(
     metallic: np.ndarray,
     roughness: np.ndarray,
     uv_set: int,
-    wrap: str,
+    wrap: Wrap,
     normal: np.ndarray | None = None,
 ) -> Material:
-    """Textured material from linear colour (h, w, 3), metallic and roughness (h, w) in [0, 1]; base_color may be a
-    constant."""
+    """Make a material of maps: linear colour (h, w, 3) or (3,), metallic and roughness (h, w), perhaps a normal map.
+
+    Metallic may be a constant. Values are clipped to [0, 1] and stored with 8 bits.
+    """
     shape = roughness.shape
     orm = np.stack([np.ones(shape), roughness, np.broadcast_to(metallic, shape)], -1)
     orm = np.round(np.clip(orm, 0, 1) * 255).astype(np.uint8)
 
     def texture(image, encoding):
+        """Make a texture of an image in the material's UV set."""
         return Texture(image, encoding, uv_set=uv_set, wrap_u=wrap, wrap_v=wrap)
 
     return Material(
@@ -80,29 +87,29 @@ def textured_material(
 
 
 def plain(color: np.ndarray, roughness: float, metallic: float = 0.0, name: str = "plain") -> Finish:
-    """One linear colour, roughness and metallic."""
+    """Make a finish of one linear colour, roughness and metallic."""
     r, g, b = (float(c) for c in np.clip(color, 0, 1))
     material = Material(name=name, base_color=(r, g, b, 1.0), metallic=float(metallic), roughness=float(roughness))
     return lambda shape: Look(material)
 
 
 def plastic(rng: np.random.Generator, color=None) -> Finish:
-    """Return a smooth dielectric finish."""
+    """Draw a fairly smooth dielectric finish."""
     return plain(any_color(rng) if color is None else color, rng.uniform(0.2, 0.6), name="plastic")
 
 
 def metal(rng: np.random.Generator, color=None) -> Finish:
-    """Return a metallic finish."""
+    """Draw a metallic finish."""
     return plain(any_metal(rng) if color is None else color, rng.uniform(0.12, 0.55), 1.0, name="metal")
 
 
 def matte(rng: np.random.Generator, color=None) -> Finish:
-    """Return a rough dielectric finish."""
+    """Draw a rough dielectric finish."""
     return plain(any_color(rng) if color is None else color, rng.uniform(0.65, 0.98), name="matte")
 
 
 def glossy(rng: np.random.Generator, color=None) -> Finish:
-    """Return a polished dielectric finish."""
+    """Draw a polished dielectric finish."""
     return plain(any_color(rng) if color is None else color, rng.uniform(0.06, 0.22), name="glossy")
 
 
@@ -110,7 +117,7 @@ def glossy(rng: np.random.Generator, color=None) -> Finish:
 
 
 class _Substance(NamedTuple):
-    """Linear colour (3,), roughness and metallic."""
+    """Hold a material of one kind: linear colour (3,), roughness, metallic."""
 
     color: np.ndarray
     roughness: float
@@ -118,7 +125,7 @@ class _Substance(NamedTuple):
 
 
 class _Layer(NamedTuple):
-    """A substance from `start` on, in [0, 1] of a lookup table's first axis."""
+    """Hold a substance and the place in [0, 1] of a lookup table's first axis from which it is used."""
 
     start: float
     substance: _Substance
@@ -129,7 +136,7 @@ def _table(
     layers: list[_Layer],
     softness: float = 0.01,
     speckle: float = 0.25,
-    wrap: str = "clamp",
+    wrap: Wrap = "clamp",
 ) -> Material:
     """Make a lookup image over (pattern, dirt): the layers follow each other along u.
 
@@ -148,6 +155,7 @@ def _table(
 
 
 def _dirt(rng: np.random.Generator) -> Callable:
+    """Draw a smooth field in [0, 1] over points (n, 3): how dirty the surface is."""
     field = patterns.noise_field(rng, rng.uniform(2, 6), 2.5)
     return lambda points: np.clip(0.5 + 0.22 * field(points), 0.01, 0.99)
 
@@ -155,7 +163,13 @@ def _dirt(rng: np.random.Generator) -> Callable:
 def _field(
     name: str, material: Material, pattern: Callable[[Shape], np.ndarray], dirt: Callable, clip: bool = True
 ) -> Finish:
+    """Make a finish that looks its material up by a pattern along u and by dirt along v.
+
+    clip: keep u inside the image; without it u repeats, for materials whose texture does.
+    """
+
     def apply(shape: Shape) -> Look:
+        """Evaluate pattern and dirt at the vertices."""
         u = np.asarray(pattern(shape), float)
         u = np.clip(u, 0.004, 0.996) if clip else np.clip(u, -30, 30)
         return Look(material, np.stack([u, dirt(shape.points)], -1))
@@ -172,7 +186,7 @@ def _any_substance(rng: np.random.Generator, color) -> _Substance:
 
 
 def banded(rng: np.random.Generator, color=None, axis=None, frequency=None) -> Finish:
-    """Stripes across a direction, two or three colours."""
+    """Draw stripes across an axis, in two or three substances."""
     color = any_color(rng) if color is None else color
     direction = np.eye(3)[rng.choice(3, p=[0.2, 0.6, 0.2]) if axis is None else axis] + rng.normal(0, 0.02, 3)
     frequency = rng.uniform(1.5, 7) if frequency is None else frequency
@@ -194,7 +208,7 @@ def banded(rng: np.random.Generator, color=None, axis=None, frequency=None) -> F
 
 
 def gradient(rng: np.random.Generator, color=None, direction=None) -> Finish:
-    """Return a smooth change of colour along a direction, by default upward."""
+    """Draw a smooth change of colour along a direction, by default upward."""
     color = any_color(rng) if color is None else color
     other = near_color(rng, any_color(rng) if rng.uniform() < 0.5 else color, 0.6)
     axis = np.array([0.0, 1.0, 0.0]) if direction is None else np.asarray(direction, float)
@@ -209,7 +223,7 @@ def gradient(rng: np.random.Generator, color=None, direction=None) -> Finish:
 
 
 def marble(rng: np.random.Generator, color=None) -> Finish:
-    """Veins: distance from the zero set of a warped noise."""
+    """Draw marble: veins along the zero set of a noise field."""
     color = any_color(rng) if color is None else color
     vein = any_metal(rng) if (gilded := rng.uniform() < 0.25) else near_color(rng, color, 1.0)
     roughness = rng.uniform(0.08, 0.35)
@@ -223,7 +237,7 @@ def marble(rng: np.random.Generator, color=None) -> Finish:
 
 
 def blotched(rng: np.random.Generator, color=None, other=None) -> Finish:
-    """Two colours in irregular patches: cows, camouflage, corroded paint."""
+    """Draw irregular patches of two or three substances: cows, camouflage, corroded paint."""
     color = any_color(rng) if color is None else color
     first, second = _any_substance(rng, color), _any_substance(rng, any_color(rng) if other is None else other)
     level = rng.uniform(0.45, 0.65)
@@ -235,7 +249,7 @@ def blotched(rng: np.random.Generator, color=None, other=None) -> Finish:
 
 
 def spotted(rng: np.random.Generator, color=None, other=None) -> Finish:
-    """Round spots around random sites."""
+    """Draw round spots around random sites."""
     color, other = any_color(rng) if color is None else color, any_color(rng) if other is None else other
     first, second = _any_substance(rng, color), _any_substance(rng, other)
     count = int(rng.integers(60, 260))
@@ -246,7 +260,7 @@ def spotted(rng: np.random.Generator, color=None, other=None) -> Finish:
 
 
 def crackled(rng: np.random.Generator, color=None, other=None) -> Finish:
-    """Cells with joints between them: giraffe, dry earth, crackle glaze, leaded glass."""
+    """Draw cells with joints between them: giraffe, dry earth, crackle glaze, leaded glass."""
     color = any_color(rng) if color is None else color
     joint = near_color(rng, color, 1.0) if other is None else other
     field, width = patterns.cell_field(rng, int(rng.integers(40, 260))), rng.uniform(0.02, 0.05)
@@ -256,6 +270,7 @@ def crackled(rng: np.random.Generator, color=None, other=None) -> Finish:
     )
 
     def pattern(s):
+        """Measure the distance to the joint between the two nearest sites."""
         near = field(s.points)
         return 0.5 * (near[:, 1] - near[:, 0]) / width
 
@@ -263,7 +278,7 @@ def crackled(rng: np.random.Generator, color=None, other=None) -> Finish:
 
 
 def chequered(rng: np.random.Generator, color=None) -> Finish:
-    """Return a checkerboard in the first UV set."""
+    """Draw a chequerboard in the first UV set."""
     color = any_color(rng) if color is None else color
     first, second = _any_substance(rng, color), _any_substance(rng, any_color(rng))
     u, v = patterns.tile_grid(64)
@@ -275,7 +290,7 @@ def chequered(rng: np.random.Generator, color=None) -> Finish:
 
 
 def wooden(rng: np.random.Generator, color=None) -> Finish:
-    """Rings of a trunk cut by the surface."""
+    """Draw wood: the rings of a trunk, cut by the surface."""
     color = hsv(rng.uniform(0.04, 0.11), rng.uniform(0.35, 0.75), rng.uniform(0.35, 0.85)) if color is None else color
     dark, roughness = color * rng.uniform(0.35, 0.7), rng.uniform(0.3, 0.8)
     material = _table(
@@ -292,6 +307,7 @@ def wooden(rng: np.random.Generator, color=None) -> Finish:
     field = patterns.noise_field(rng, 2.5, 2.0)
 
     def pattern(s):
+        """Measure the distance from the trunk's axis, wobbling, in rings."""
         radius = np.hypot(s.points[:, across[0]] - center[0], s.points[:, across[1]] - center[1])
         return rings * radius + 0.5 * field(s.points * squeeze)
 
@@ -299,7 +315,7 @@ def wooden(rng: np.random.Generator, color=None) -> Finish:
 
 
 def worn_paint(rng: np.random.Generator, color=None) -> Finish:
-    """Paint that is gone on outer edges and in scratches, metal beneath."""
+    """Draw paint that is gone on outward edges and in scratches, with metal beneath."""
     color, bare = any_color(rng) if color is None else color, any_metal(rng)
     roughness = rng.uniform(0.2, 0.6)
     layers = [
@@ -321,7 +337,7 @@ def worn_paint(rng: np.random.Generator, color=None) -> Finish:
 
 
 def rusty(rng: np.random.Generator, color=None) -> Finish:
-    """Metal that rusts from below and in patches."""
+    """Draw metal that rusts in patches and from below, or copper with verdigris."""
     bare = any_metal(rng) if color is None else color
     rust = hsv(rng.uniform(0.03, 0.08), rng.uniform(0.6, 0.85), rng.uniform(0.3, 0.6))
     if rng.uniform() < 0.2:  # copper's green instead
@@ -341,7 +357,7 @@ def rusty(rng: np.random.Generator, color=None) -> Finish:
 
 
 def topped(rng: np.random.Generator, color=None, top=None) -> Finish:
-    """Something on all that faces up: snow, moss, icing, dust."""
+    """Draw a layer on all that faces up: snow, moss, icing, dust."""
     color = any_color(rng) if color is None else color
     top = (
         (hsv(0.6, 0.03, 0.95) if rng.uniform() < 0.4 else hsv(rng.uniform(0.2, 0.35), 0.6, 0.5)) if top is None else top
@@ -356,8 +372,11 @@ def topped(rng: np.random.Generator, color=None, top=None) -> Finish:
 
 
 def gazing(rng: np.random.Generator, direction: np.ndarray, iris=None, white=None) -> Finish:
-    """Return an eyeball: black pupil, coloured iris, white, by the angle between the normal and `direction` (right
-    eye's, x >= 0)."""
+    """Draw the finish of a pair of eyeballs that look along `direction`: black pupil, coloured iris, white.
+
+    The ring is chosen by the angle between normal and direction. direction is the right eye's (x >= 0); the left eye
+    mirrors it.
+    """
     iris = any_color(rng) if iris is None else iris
     white = np.array([0.9, 0.9, 0.87]) if white is None else white
     black = np.array([0.01, 0.01, 0.012])
@@ -371,6 +390,7 @@ def gazing(rng: np.random.Generator, direction: np.ndarray, iris=None, white=Non
     direction = np.asarray(direction, float) / np.linalg.norm(direction)
 
     def apply(shape: Shape) -> Look:
+        """Evaluate the angle to the gaze at the vertices."""
         sign = np.where(shape.points[:, 0] < 0, -1.0, 1.0)[:, None]  # the left eye is the mirror image of the right one
         toward = product(shape.normals * np.concatenate([sign, np.ones((len(sign), 2))], 1), direction)
         angle = np.degrees(np.arccos(np.clip(toward, -1, 1))) / 90.0

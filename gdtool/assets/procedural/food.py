@@ -19,7 +19,7 @@ from gdtool.assets.procedural.parts import (
 
 
 def bread(rng: np.random.Generator) -> Assembly:
-    """Loaf, bun, croissant or toast with a browned top."""
+    """Make a loaf, a slice of toast or a seeded bun with a browned crust."""
     a = Assembly()
     crust = hsv(rng.uniform(0.06, 0.09), rng.uniform(0.55, 0.8), rng.uniform(0.45, 0.75))
     finish = (
@@ -46,7 +46,7 @@ def bread(rng: np.random.Generator) -> Assembly:
                 loaf, solids.turned(solids.ellipsoid((x, 0.34, 0), (0.05, 0.1, 0.26)), "y", 25, (x, 0, 0)), 0.04
             )
         bump = patterns.noise_field(rng, 1.5, 1.5)
-        a.add(solids.polygonised(lambda p: loaf(p) + np.float32(0.012) * bump(p), 60), finish)
+        a.add(solids.polygonised(_bumpy(loaf, bump, 0.012), 60), finish)
     elif kind == 1:
         w, h, half = rng.uniform(0.42, 0.58), rng.uniform(0.4, 0.6), rng.uniform(0.08, 0.2)
         ear = rng.uniform(0.18, 0.3)
@@ -81,7 +81,7 @@ def bread(rng: np.random.Generator) -> Assembly:
 
 
 def fruit(rng: np.random.Generator) -> Assembly:
-    """Apple, pear, pumpkin, pepper, tomato, orange: a lobed lathe with stalk and leaf."""
+    """Make an apple, pear, pumpkin, pepper, tomato or orange: a lathed body with lobes, a stalk and leaves."""
     a = Assembly()
     lobes, depth = int(rng.integers(3, 11)), rng.choice([0.0, 0.0, 0.06, 0.12])
     angle = 2 * np.pi * np.arange(96) / 96
@@ -131,7 +131,7 @@ def fruit(rng: np.random.Generator) -> Assembly:
 
 
 def chili(rng: np.random.Generator) -> Assembly:
-    """Long tapering curved things: chili, carrot, banana, cucumber, sausage; one or a few."""
+    """Make one to three long, tapering, curved things: chili, carrot, banana, cucumber."""
     a = Assembly()
     color = hsv(rng.choice([0.0, 0.0, 0.06, 0.14, 0.3]), rng.uniform(0.75, 0.95), rng.uniform(0.55, 0.9))
     skin, green = (
@@ -162,7 +162,7 @@ def chili(rng: np.random.Generator) -> Assembly:
 
 
 def cake(rng: np.random.Generator) -> Assembly:
-    """Layered cake, cupcake or pudding with icing, cherries and candles."""
+    """Make a layered cake, cupcake or pudding with icing, cherries and perhaps candles."""
     a, y, r = Assembly(), 0.0, rng.uniform(0.5, 0.65)
     icing, dough = (
         tiles.pick(rng, "skin"),
@@ -209,8 +209,13 @@ def cake(rng: np.random.Generator) -> Assembly:
     return a
 
 
+def _bumpy(shape: solids.Distance, bump: solids.Distance, amount: float) -> solids.Distance:
+    """Displace the surface of a shape by a noise field."""
+    return lambda points: shape(points) + np.float32(amount) * bump(points)
+
+
 def icecream(rng: np.random.Generator) -> Assembly:
-    """Return an ice cream: scoops on a cone."""
+    """Make scoops of ice cream in a cone."""
     a, tall = Assembly(), rng.uniform(0.7, 1.0)
     wafer = tiles.woven(rng, hsv(0.09, 0.6, 0.8))
     r = rng.uniform(0.26, 0.34)
@@ -239,7 +244,7 @@ def icecream(rng: np.random.Generator) -> Assembly:
             [solids.ellipsoid((0, 0, 0), (s, s * 0.9, s)), solids.ring((0, -0.35 * s, 0), s * 0.9, s * 0.2)], 0.05
         )
         a.add(
-            solids.polygonised(lambda p, b=bump, f=scoop: f(p) + np.float32(0.012) * b(p), 36).moved(y=y + s * 0.4),
+            solids.polygonised(_bumpy(scoop, bump, 0.012), 36).moved(y=y + s * 0.4),
             tiles.pick(rng, "skin"),
         )
         y += s * 1.15
@@ -249,7 +254,7 @@ def icecream(rng: np.random.Generator) -> Assembly:
 
 
 def burger(rng: np.random.Generator) -> Assembly:
-    """Stacked rounds: burger, pancakes, sandwich; or a doughnut."""
+    """Make a doughnut, or a burger or sandwich of stacked layers."""
     a, y = Assembly(), 0.0
     if rng.uniform() < 0.35:
         w = 2 * np.pi * np.arange(60) / 60
@@ -258,6 +263,7 @@ def burger(rng: np.random.Generator) -> Assembly:
         a.add(tube(ring, thick, closed=True, outline=circle(28)), finishes.matte(rng, hsv(0.085, 0.6, 0.75)))
 
         def below_edge(p):
+            """Measure the height above the wavy lower edge of the icing."""
             # On strided columns numpy's arctan2 picks its code by where the memory lies, and the last bit with it
             # (numpy 1.26)
             x, y, z = np.ascontiguousarray(p.T)

@@ -10,6 +10,7 @@ from gdtool.assets.procedural.parts import Part, ball, box, circle, cylinder, lo
 
 
 def _leg(rng: np.random.Generator, height: float, size: float) -> Part:
+    """Make a square, tapered or turned leg that stands at the origin."""
     kind = rng.integers(3)
     if kind == 0:
         return box(size, height, size, 0.01, 3).moved(y=height / 2)
@@ -21,7 +22,7 @@ def _leg(rng: np.random.Generator, height: float, size: float) -> Part:
 
 
 def chair(rng: np.random.Generator) -> Assembly:
-    """Return a chair: seat, legs, back."""
+    """Make a chair: legs, seat, back, perhaps arms."""
     a = Assembly()
     wood, seat = (
         tiles.pick(rng, ["wood", "paint", "metal"][rng.integers(3)]),
@@ -52,7 +53,7 @@ def chair(rng: np.random.Generator) -> Assembly:
 
 
 def table(rng: np.random.Generator) -> Assembly:
-    """Return a table: a top on legs or a foot."""
+    """Make a table on four legs or one foot, perhaps with things on it."""
     a, wood = Assembly(), tiles.pick(rng, "wood" if rng.uniform() < 0.6 else "any")
     top = wood if rng.uniform() < 0.5 else tiles.pick(rng, "any")
     height, thick = rng.uniform(0.4, 0.8), rng.uniform(0.04, 0.09)
@@ -89,7 +90,7 @@ def _cushion(width: float, height: float, depth: float, rounding: float) -> Part
 
 
 def sofa(rng: np.random.Generator) -> Assembly:
-    """Return a sofa: cushions, arms, back."""
+    """Make a sofa: cushions, arms, back, perhaps pillows."""
     a, cloth, wood = Assembly(), tiles.pick(rng, "cloth"), tiles.pick(rng, "wood")
     w, d = rng.uniform(0.7, 1.6), rng.uniform(0.55, 0.75)
     cushion = cloth if rng.uniform() < 0.5 else tiles.pick(rng, "cloth")
@@ -110,7 +111,7 @@ def sofa(rng: np.random.Generator) -> Assembly:
 
 
 def bed(rng: np.random.Generator) -> Assembly:
-    """Return a bed: frame, mattress, pillows."""
+    """Make a bed: frame, mattress, blanket, pillows."""
     a, wood, sheet = Assembly(), tiles.pick(rng, "wood"), tiles.pick(rng, "cloth")
     w, d = rng.uniform(0.6, 0.95), rng.uniform(1.0, 1.3)
     a.add(box(w, 0.16, d, 0.02).moved(y=0.2), wood)
@@ -127,7 +128,7 @@ def bed(rng: np.random.Generator) -> Assembly:
 
 
 def shelf(rng: np.random.Generator) -> Assembly:
-    """Bookcase or chest of drawers."""
+    """Make a bookcase with books, or a chest of drawers."""
     a, wood = Assembly(), tiles.pick(rng, "wood")
     w, h, d, rows = rng.uniform(0.6, 1.0), rng.uniform(0.7, 1.4), rng.uniform(0.25, 0.45), int(rng.integers(2, 6))
     a.add_pair(box(0.05, h, d, 0.008).moved(w / 2, h / 2, 0), wood)

@@ -13,7 +13,7 @@ BLACK = np.array([0.012, 0.011, 0.011])
 
 
 def fur_color(rng: np.random.Generator) -> np.ndarray:
-    """Animal coats mostly, sometimes a toy's colour."""
+    """Draw the colour of an animal's coat, in a third of cases any colour, as toys have."""
     return (
         colors.any_color(rng)
         if rng.uniform() < 0.35
@@ -24,14 +24,14 @@ def fur_color(rng: np.random.Generator) -> np.ndarray:
 def eyes(
     a: Assembly, rng: np.random.Generator, x: float, y: float, z: float, size: float, outward: float = 0.25
 ) -> None:
-    """Add a pair of eyes at +-x, bead-like or with iris."""
+    """Add a pair of eyes at +x and -x: black beads, or eyeballs that look `outward` from +Z."""
     style = rng.uniform()
     finish = finishes.glossy(rng, BLACK) if style < 0.4 else finishes.gazing(rng, np.array([outward, 0.0, 1.0]))
     a.add_pair(ball(size, size * rng.uniform(0.9, 1.2), size * 0.8, 20).moved(x, y, z), finish)
 
 
 def face(a: Assembly, rng: np.random.Generator, center, r: float, coat, snout: float) -> None:
-    """Eyes, a muzzle of relative length `snout` and a nose on a head of radius r at center."""
+    """Add eyes, a muzzle of length `snout` relative to r, and a nose to a head of radius r at `center`."""
     x, y, z = center
     size = r * rng.uniform(0.14, 0.28)
     height = rng.uniform(0.1, 0.3)
@@ -48,7 +48,7 @@ def face(a: Assembly, rng: np.random.Generator, center, r: float, coat, snout: f
 
 
 def ears(a: Assembly, rng: np.random.Generator, center, r: float, coat) -> None:
-    """Add a pair of ears about a head."""
+    """Add a pair of pointed, round, long, hanging or wide ears to a head of radius r at `center`."""
     x, y, z = center
     kind = rng.integers(5)
     if kind == 0:  # pointed
@@ -77,7 +77,7 @@ def ears(a: Assembly, rng: np.random.Generator, center, r: float, coat) -> None:
 
 
 def horns(a: Assembly, rng: np.random.Generator, center, r: float) -> None:
-    """Add a pair of horns to a head."""
+    """Add a pair of curved horns, or one straight horn, to a head of radius r at `center`."""
     x, y, z = center
     finish = (
         finishes.matte(rng, hsv(0.11, rng.uniform(0.1, 0.4), rng.uniform(0.3, 0.9)))
@@ -94,7 +94,7 @@ def horns(a: Assembly, rng: np.random.Generator, center, r: float) -> None:
 
 
 def dress_head(a: Assembly, rng: np.random.Generator, head, r: float, chance: float) -> None:
-    """Perhaps a hat: pointed, top hat, crown, bobble, bow or scarf."""
+    """Add a pointed hat, a top hat, a crown, a cap or a scarf with probability `chance`."""
     if rng.uniform() > chance:
         return
     x, y, z = head
@@ -118,10 +118,10 @@ def dress_head(a: Assembly, rng: np.random.Generator, head, r: float, chance: fl
         half = refined([(0, 0), (1.04, 0), (1.0, 0.35), (0.75, 0.75), (0.4, 0.95), (0, 1.0)], 0.1)
         a.add(loft(half, circle(40)).scaled(r, r * 0.85, r).moved(x, y + 0.32 * r, z), finish)
     else:
-        w = 2 * np.pi * np.arange(40) / 40
+        angle = 2 * np.pi * np.arange(40) / 40
         a.add(
             tube(
-                np.stack([x + r * 0.85 * np.cos(w), np.full(40, y - r * 0.85), z + r * 0.85 * np.sin(w)], -1),
+                np.stack([x + r * 0.85 * np.cos(angle), np.full(40, y - r * 0.85), z + r * 0.85 * np.sin(angle)], -1),
                 r * 0.2,
                 closed=True,
             ),

@@ -1,5 +1,4 @@
-"""Furniture, containers and tools: chairs, tables, sofas, beds, shelves, chests, cartons, books, clocks,
-extinguishers."""
+"""Make containers and tools: chests, cartons, books, extinguishers, clocks, tools."""
 
 from __future__ import annotations
 
@@ -24,7 +23,7 @@ from gdtool.assets.procedural.parts import (
 
 
 def chest(rng: np.random.Generator) -> Assembly:
-    """Box, crate, treasure chest, gift, suitcase."""
+    """Make a crate, treasure chest, gift, suitcase or cardboard box."""
     a = Assembly()
     w, h, d = rng.uniform(0.7, 1.2), rng.uniform(0.45, 0.9), rng.uniform(0.5, 0.9)
     kind, finish = rng.integers(5), tiles.pick(rng, ["wood", "any", "cloth", "paint"][rng.integers(4)])
@@ -53,15 +52,15 @@ def chest(rng: np.random.Generator) -> Assembly:
             .moved(w / 2, h, 0)
         )
         a.add(lid, finish)
-        for x in (-w * 0.35, 0, w * 0.35):
+        for hoop in (-w * 0.35, 0, w * 0.35):
             a.add(
                 loft(refined([(0, 0), (1, 0), (1, 1), (0, 1)], 0.3), circle(40), boxed=True)
                 .scaled(d / 2 + 0.015, 0.07, d / 2 + 0.015)
                 .turned("z", 90)
-                .moved(x + 0.035, h, 0),
+                .moved(hoop + 0.035, h, 0),
                 trim,
             )
-            a.add(box(0.07, h, d + 0.03, 0.006).moved(x, h / 2 + 0.01, 0), trim)
+            a.add(box(0.07, h, d + 0.03, 0.006).moved(hoop, h / 2 + 0.01, 0), trim)
         a.add(box(0.16, 0.18, 0.07, 0.02).moved(0, h, d / 2 + 0.02), finishes.metal(rng))
     elif kind == 2:  # gift with ribbon and bow
         a.add(box(w + 0.02, h + 0.02, 0.12, 0.01).moved(y=h / 2), trim)
@@ -96,7 +95,7 @@ def chest(rng: np.random.Generator) -> Assembly:
 
 
 def carton(rng: np.random.Generator) -> Assembly:
-    """Milk carton: a box with a gable, a fin and a cap; printed sides."""
+    """Make a milk carton: a box with printed sides, a gable top and perhaps a cap."""
     a, paper = Assembly(), tiles.pick(rng, "any")
     w, h = rng.uniform(0.45, 0.65), rng.uniform(0.7, 1.1)
     a.add(box(w, h, w, 0.012, 10).moved(y=h / 2), paper)
@@ -114,7 +113,7 @@ def carton(rng: np.random.Generator) -> Assembly:
 
 
 def books(rng: np.random.Generator) -> Assembly:
-    """Return a stack or row of books."""
+    """Make a stack of one to five books."""
     a, y = Assembly(), 0.0
     for _ in range(int(rng.integers(1, 6))):
         w, d, thick, turn = rng.uniform(0.6, 0.9), rng.uniform(0.8, 1.1), rng.uniform(0.09, 0.25), rng.normal(0, 12)
@@ -132,7 +131,7 @@ def books(rng: np.random.Generator) -> Assembly:
 
 
 def extinguisher(rng: np.random.Generator) -> Assembly:
-    """Bottle with valve, lever, hose and label: an extinguisher, flask or gas bottle."""
+    """Make a fire extinguisher or gas bottle: body, valve, lever, hose, label."""
     a, h, r = Assembly(), rng.uniform(1.0, 1.4), rng.uniform(0.24, 0.34)
     body = tiles.pick(rng, "paint", colors.hsv(rng.choice([0.0, 0.0, 0.1, 0.35, 0.6]), 0.85, 0.75))
     t = np.linspace(0, np.pi / 2, 10)
@@ -161,7 +160,7 @@ def extinguisher(rng: np.random.Generator) -> Assembly:
 
 
 def clock(rng: np.random.Generator) -> Assembly:
-    """Alarm clock, mirror or camera-like round front on a case."""
+    """Make an alarm clock or wall clock: a round face on a case."""
     a, r = Assembly(), rng.uniform(0.4, 0.55)
     case, rim = tiles.pick(rng, "paint"), tiles.pick(rng, "metal")
     depth = rng.uniform(0.2, 0.4)
@@ -207,7 +206,7 @@ def clock(rng: np.random.Generator) -> Assembly:
 
 
 def tool(rng: np.random.Generator) -> Assembly:
-    """Hammer, sword, axe, brush or spoon, standing upright."""
+    """Make a hammer, sword, axe or spoon that stands upright."""
     a, handle, head = Assembly(), tiles.pick(rng, "wood"), tiles.pick(rng, "metal")
     length, kind = rng.uniform(0.9, 1.3), rng.integers(4)
     t = np.linspace(0, 1, 14)

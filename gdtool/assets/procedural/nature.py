@@ -1,5 +1,4 @@
-"""Food and plants: mushrooms, bread, fruit, peppers, cakes, ice cream, burgers, doughnuts, trees, cacti, potted plants,
-rocks."""
+"""Make plants and rocks: mushrooms, trees, potted plants, boulders, crystals. The family includes food.py."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ from gdtool.assets.procedural.parts import (
 
 
 def mushroom(rng: np.random.Generator) -> Assembly:
-    """One or several; sometimes a house with door and windows."""
+    """Make one to three mushrooms; the first may be a house with door and windows."""
     a = Assembly()
     count = int(rng.choice([1, 1, 2, 3]))
     cap = (
@@ -75,7 +74,7 @@ def mushroom(rng: np.random.Generator) -> Assembly:
 
 
 def tree(rng: np.random.Generator) -> Assembly:
-    """Conifer, leafy tree, palm."""
+    """Make a conifer, a leafy tree or a palm."""
     a, bark, leaf = (
         Assembly(),
         tiles.pick(rng, "wood", hsv(0.07, 0.5, rng.uniform(0.2, 0.5))),
@@ -127,7 +126,7 @@ def tree(rng: np.random.Generator) -> Assembly:
 
 
 def potted(rng: np.random.Generator) -> Assembly:
-    """Return a pot with cactus, flowers or leaves."""
+    """Make a pot with a cactus, flowers or leaves."""
     a, r, h = Assembly(), rng.uniform(0.24, 0.36), rng.uniform(0.3, 0.5)
     pot = tiles.pick(rng, "ceramic", hsv(0.05, 0.65, 0.7) if rng.uniform() < 0.4 else None)
     a.add(
@@ -190,7 +189,7 @@ def potted(rng: np.random.Generator) -> Assembly:
 
 
 def rock(rng: np.random.Generator) -> Assembly:
-    """Return a boulder, gem or crystal cluster."""
+    """Make a boulder or a cluster of crystals."""
     a = Assembly()
     if rng.uniform() < 0.5:
         bump, cuts = patterns.noise_field(rng, 0.7, 3.0), rng.normal(size=(9, 3))

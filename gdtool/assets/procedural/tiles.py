@@ -1,4 +1,4 @@
-"""Finishes of tiled images on the first UV set, most with a normal map, and the choice of a finish by theme."""
+"""Define finishes of tiled images on the first UV set, most with a normal map, and draw finishes by theme."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ SIZE = 256
 
 
 def _tiled(name: str, color, metallic, roughness, height, strength: float, tiles: float) -> Finish:
+    """Make a finish of tiling maps; strength: the range of heights in units of a tile's side; tiles per unit length."""
     normal = None if height is None else patterns.normal_from_height(height, strength)
     roughness = np.broadcast_to(np.clip(roughness, 0.04, 1), (SIZE, SIZE))
     material = finishes.textured_material(name, np.clip(color, 0, 1), metallic, roughness, 0, "repeat", normal)
@@ -19,11 +20,12 @@ def _tiled(name: str, color, metallic, roughness, height, strength: float, tiles
 
 
 def _mix(a, b, weight: np.ndarray) -> np.ndarray:
+    """Blend two colours or images by a weight (h, w)."""
     return np.asarray(a) * (1 - weight[..., None]) + np.asarray(b) * weight[..., None]
 
 
 def bricks(rng: np.random.Generator, color=None) -> Finish:
-    """Bricks, ashlar or tiles with joints."""
+    """Draw bricks, ashlar or tiles with joints."""
     color = hsv(rng.uniform(0.0, 0.1), rng.uniform(0.1, 0.7), rng.uniform(0.35, 0.8)) if color is None else color
     rows, columns = [(6, 3), (8, 4), (4, 4), (5, 3)][rng.integers(4)]
     shift = 0.0 if rows == columns else 0.5
@@ -39,7 +41,7 @@ def bricks(rng: np.random.Generator, color=None) -> Finish:
 
 
 def planks(rng: np.random.Generator, color=None) -> Finish:
-    """Boards side by side with grain along u or v."""
+    """Draw boards side by side, their grain along u or v."""
     color = hsv(rng.uniform(0.04, 0.11), rng.uniform(0.3, 0.7), rng.uniform(0.3, 0.8)) if color is None else color
     height, shade = patterns.brick_cells(rng, SIZE, int(rng.integers(3, 7)), 1, 0.015, rng.uniform(0.2, 0.8), 0.03)
     grain = patterns.tile_noise(rng, SIZE, 3, 120, 1.0, stretch=9)
@@ -52,7 +54,7 @@ def planks(rng: np.random.Generator, color=None) -> Finish:
 
 
 def shingles(rng: np.random.Generator, color=None) -> Finish:
-    """Overlapping rounded tiles: roofs, scales, feathers."""
+    """Draw overlapping rounded tiles: roofs, scales, feathers."""
     color = any_color(rng) if color is None else color
     rows = 2 * int(rng.integers(3, 6))
     columns = rows // 2 + int(rng.integers(0, 3))
@@ -74,7 +76,7 @@ def shingles(rng: np.random.Generator, color=None) -> Finish:
 
 
 def woven(rng: np.random.Generator, color=None) -> Finish:
-    """Cloth, wicker or carbon fibre: threads over and under."""
+    """Draw cloth, wicker or carbon fibre: threads that pass over and under each other."""
     color = any_color(rng) if color is None else color
     other = near_color(rng, color, 0.4) if rng.uniform() < 0.6 else any_color(rng)
     count = 2 * int(rng.integers(5, 14))
@@ -91,7 +93,7 @@ def woven(rng: np.random.Generator, color=None) -> Finish:
 
 
 def tartan(rng: np.random.Generator, color=None) -> Finish:
-    """Crossing stripes of cloth or paper."""
+    """Draw the crossing stripes of cloth or paper."""
     color = any_color(rng) if color is None else color
     u, v = patterns.tile_grid(SIZE)
     image = np.broadcast_to(color, (SIZE, SIZE, 3)).copy()
@@ -106,7 +108,7 @@ def tartan(rng: np.random.Generator, color=None) -> Finish:
 
 
 def hammered(rng: np.random.Generator, color=None) -> Finish:
-    """Metal with dents."""
+    """Draw metal with dents."""
     color = any_metal(rng) if color is None else color
     near = patterns.tile_cells(rng, SIZE, int(rng.integers(40, 160))).nearest
     roughness = rng.uniform(0.15, 0.4) + 0.04 * patterns.tile_noise(rng, SIZE, 4, 60)
@@ -122,7 +124,7 @@ def hammered(rng: np.random.Generator, color=None) -> Finish:
 
 
 def brushed(rng: np.random.Generator, color=None) -> Finish:
-    """Metal or lacquer with directional streaks, scratches and smudges."""
+    """Draw metal or lacquer with directional streaks, scratches and smudges."""
     is_metal = rng.uniform() < 0.7
     color = (any_metal(rng) if is_metal else any_color(rng)) if color is None else color
     streaks = patterns.tile_noise(rng, SIZE, 4, 128, 0.6, stretch=12)
@@ -134,7 +136,7 @@ def brushed(rng: np.random.Generator, color=None) -> Finish:
 
 
 def grained(rng: np.random.Generator, color=None) -> Finish:
-    """Leather, plaster, bread crust, felt, rock: bumps with darker pits."""
+    """Draw leather, plaster, crust, felt or rock: bumps with darker pits."""
     color = any_color(rng) if color is None else color
     if rng.uniform() < 0.5:
         cells = patterns.tile_cells(rng, SIZE, int(rng.integers(150, 700)))
@@ -149,7 +151,7 @@ def grained(rng: np.random.Generator, color=None) -> Finish:
 
 
 def dotted(rng: np.random.Generator, color=None) -> Finish:
-    """Polka dots or a terrazzo of chips."""
+    """Draw polka dots or a terrazzo of chips."""
     color, other = any_color(rng) if color is None else color, any_color(rng)
     if rng.uniform() < 0.5:
         count = int(rng.integers(2, 6))
@@ -160,7 +162,8 @@ def dotted(rng: np.random.Generator, color=None) -> Finish:
     else:
         cells = patterns.tile_cells(rng, SIZE, 90)
         chips = np.array([any_color(rng) for _ in range(4)])[cells.site % 4]
-        weight = patterns.smoothstep(0.015, 0.025, cells.second - cells.nearest) * (cells.site % 3 > 0)
+        is_chip = (cells.site % 3 > 0).astype(float)
+        weight = patterns.smoothstep(0.015, 0.025, cells.second - cells.nearest) * is_chip
         image = _mix(color, chips, weight)
     roughness = np.clip(rng.uniform(0.1, 0.6) + 0.2 * weight * rng.uniform(-1, 1), 0.05, 1)
     return _tiled("dots", image, 0.0, roughness, None, 0, rng.uniform(1, 2.5))
@@ -244,7 +247,10 @@ THEMES = {
 
 
 def pick(rng: np.random.Generator, theme: str = "any", color: np.ndarray | None = None) -> Finish:
-    """Return a finish of the theme with its own random stream, so that its details do not shift later choices."""
+    """Draw a finish of a theme, in the given colour if any; metals keep a metal's colour.
+
+    The finish gets a random stream of its own, so that its details do not change what is drawn after it.
+    """
     choices = THEMES[theme]
     chosen = choices[rng.integers(len(choices))]
     own = np.random.default_rng(rng.integers(2**62))

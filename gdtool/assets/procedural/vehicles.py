@@ -1,4 +1,4 @@
-"""Toy vehicles that drive toward +Z: cars, trucks, trains, boats, aeroplanes, rockets."""
+"""Make toy vehicles that drive toward +Z: cars, trucks, trains, boats, aeroplanes, rockets."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gdtool.assets.procedural.parts import ball, box, circle, cone, cylinder, lo
 
 
 def wheels(a: Assembly, rng: np.random.Generator, x: float, y: float, zs, r: float, width: float) -> None:
-    """Add a pair of wheels at each of the places zs along a vehicle."""
+    """Add a pair of wheels of radius r at +x and -x for each z in zs."""
     tire, hub = finishes.matte(rng, np.full(3, rng.uniform(0.01, 0.06))), finishes.metal(rng)
     t = np.linspace(-np.pi / 2, np.pi / 2, 9)
     profile = np.vstack(
@@ -28,7 +28,7 @@ def wheels(a: Assembly, rng: np.random.Generator, x: float, y: float, zs, r: flo
 
 
 def car(rng: np.random.Generator) -> Assembly:
-    """Return a car: body, cabin, windows, wheels."""
+    """Make a car: body, cabin, windows, wheels."""
     a = Assembly()
     w, length, r = rng.uniform(0.26, 0.36), rng.uniform(0.6, 0.85), rng.uniform(0.13, 0.19)
     low, cab = rng.uniform(0.16, 0.26), rng.uniform(0.15, 0.28)
@@ -61,7 +61,7 @@ def car(rng: np.random.Generator) -> Assembly:
 
 
 def truck(rng: np.random.Generator) -> Assembly:
-    """Return a truck: cabin, load, wheels."""
+    """Make a truck: cabin, wheels, and a box, a tank or an open bed with a load."""
     a = Assembly()
     w, cab, bed, r = rng.uniform(0.26, 0.34), rng.uniform(0.35, 0.5), rng.uniform(0.7, 1.1), rng.uniform(0.13, 0.18)
     paint, dark = tiles.pick(rng, "paint"), finishes.plastic(rng, np.full(3, 0.03))
@@ -105,7 +105,7 @@ def truck(rng: np.random.Generator) -> Assembly:
 
 
 def train(rng: np.random.Generator) -> Assembly:
-    """Return a steam engine: boiler, chimney, domes, cabin, cow-catcher."""
+    """Make a steam engine: boiler, chimney, domes, cabin, cow-catcher."""
     a, paint, metal = Assembly(), tiles.pick(rng, "paint"), tiles.pick(rng, "metal")
     r, length = rng.uniform(0.2, 0.28), rng.uniform(0.8, 1.1)
     a.add(cylinder(r, length, 0.03, 44).turned("x", 90).moved(0, 0.32, 0.15), paint)
@@ -131,7 +131,7 @@ def train(rng: np.random.Generator) -> Assembly:
 
 
 def boat(rng: np.random.Generator) -> Assembly:
-    """Return a boat: hull, deck, cabin or mast."""
+    """Make a sailing boat, or a steamer with cabins and funnels."""
     a, hull = Assembly(), tiles.pick(rng, "paint" if rng.uniform() < 0.6 else "wood")
     w, length, tall = rng.uniform(0.25, 0.38), rng.uniform(0.7, 0.9), rng.uniform(0.25, 0.35)
     body = solids.common(
@@ -173,7 +173,7 @@ def boat(rng: np.random.Generator) -> Assembly:
 
 
 def aeroplane(rng: np.random.Generator) -> Assembly:
-    """Return an aeroplane: fuselage, wings, tail."""
+    """Make an aeroplane with propellers or jets: fuselage, wings, tail, perhaps wheels."""
     a, paint, wing = Assembly(), tiles.pick(rng, "paint"), tiles.pick(rng, "paint")
     r, span, sweep = rng.uniform(0.11, 0.18), rng.uniform(0.7, 1.0), rng.uniform(0, 30)
     knots = [(0.02, -0.95), (r * 0.5, -0.6), (r, -0.1), (r, 0.45), (r * 0.7, 0.7), (0.03, 0.85)]
@@ -199,7 +199,7 @@ def aeroplane(rng: np.random.Generator) -> Assembly:
 
 
 def rocket(rng: np.random.Generator) -> Assembly:
-    """Return a rocket: body, nose, fins."""
+    """Make a rocket: body, nose, fins, a porthole."""
     a, paint, fin = Assembly(), tiles.pick(rng, "paint"), tiles.pick(rng, "paint")
     r, tall = rng.uniform(0.2, 0.32), rng.uniform(1.3, 1.7)
     curve = smooth_curve([(r * 0.7, 0.0), (r, tall * 0.35), (r * 0.85, tall * 0.65), (0.02, tall)], 36)
@@ -217,10 +217,10 @@ def rocket(rng: np.random.Generator) -> Assembly:
             fin,
         )
     y = tall * 0.55
-    at = np.interp(y, curve[:, 1], curve[:, 0])
-    a.add(cylinder(0.13, 0.08, 0.02, 32).turned("x", 90).moved(0, y, at - 0.01), finishes.metal(rng))
+    hull = float(np.interp(y, curve[:, 1], curve[:, 0]))  # its radius at the porthole
+    a.add(cylinder(0.13, 0.08, 0.02, 32).turned("x", 90).moved(0, y, hull - 0.01), finishes.metal(rng))
     a.add(
-        cylinder(0.095, 0.08, 0.02, 32).turned("x", 90).moved(0, y, at + 0.01),
+        cylinder(0.095, 0.08, 0.02, 32).turned("x", 90).moved(0, y, hull + 0.01),
         finishes.glossy(rng, colors.hsv(0.56, 0.5, 0.3)),
     )
     a.add(

@@ -1,4 +1,4 @@
-"""Turned and poured things: vases, bottles, cups, teapots, bowls, goblets, lamps, candles, jars, pots."""
+"""Make vessels and other turned objects: vases, bottles, cups, teapots, bowls, goblets, lamps, candles, barrels."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from gdtool.assets.procedural.parts import Part, ball, circle, cylinder, loft, r
 
 
 def walled(outer: np.ndarray, thickness: float, segments: int = 48, outline: np.ndarray | None = None) -> Part:
-    """Return an open vessel: outer profile rows (radius, height) from the foot's axis to the rim, returned inside at
-    `thickness`."""
+    """Make an open vessel with a wall.
+
+    outer: its outer profile (k, 2) of radius and height, from the axis at the foot to the rim; the inner profile runs
+    back at a distance of `thickness`. outline: the cross section for `loft`, a circle of `segments` points by default.
+    """
     outer = np.asarray(outer, float)
     inner = outer[outer[:, 1] > outer[0, 1] + 1.5 * thickness]
     inner = np.stack([np.maximum(inner[:, 0] - thickness, 0.01), inner[:, 1]], -1)
@@ -22,6 +25,7 @@ def walled(outer: np.ndarray, thickness: float, segments: int = 48, outline: np.
 
 
 def _outline(rng: np.random.Generator, plain_share: float = 0.6) -> np.ndarray:
+    """Draw a cross section for `loft`: a circle with probability `plain_share`, else one with lobes."""
     if rng.uniform() < plain_share:
         return circle(48)
     lobes, depth = int(rng.integers(4, 13)), rng.uniform(0.02, 0.1)
@@ -33,7 +37,7 @@ def _outline(rng: np.random.Generator, plain_share: float = 0.6) -> np.ndarray:
 def body_curve(
     rng: np.random.Generator, height: float, foot: float, belly: float, neck: float, rim: float, count: int = 28
 ) -> np.ndarray:
-    """Return a random vessel contour (count, 2) through foot, belly, neck and rim radii."""
+    """Draw a vessel's contour (2 + count, 2) of radius and height, through radii of foot, belly, neck and rim."""
     where = np.sort(rng.uniform([0.2, 0.65], [0.5, 0.88]))
     curve = smooth_curve(
         [(foot, 0.02 * height), (belly, where[0] * height), (neck, where[1] * height), (rim, height)], count
@@ -42,6 +46,7 @@ def body_curve(
 
 
 def _handle(rng: np.random.Generator, start, end, bulge: float, radius: float) -> Part:
+    """Make a handle between two points that bulges by `bulge` in x."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     t = np.linspace(0, 1, 22)
     out = np.sin(np.pi * t) ** rng.uniform(0.5, 1.0)
@@ -51,7 +56,7 @@ def _handle(rng: np.random.Generator, start, end, bulge: float, radius: float) -
 
 
 def vase(rng: np.random.Generator) -> Assembly:
-    """Return a vase: a turned profile, perhaps with a pattern."""
+    """Make a vase, perhaps with handles and metal rims."""
     a, height = Assembly(), rng.uniform(0.9, 1.8)
     curve = body_curve(
         rng, height, rng.uniform(0.15, 0.35), rng.uniform(0.3, 0.6), rng.uniform(0.1, 0.3), rng.uniform(0.15, 0.42)
@@ -81,7 +86,7 @@ def vase(rng: np.random.Generator) -> Assembly:
 
 
 def bottle(rng: np.random.Generator) -> Assembly:
-    """Return a bottle with a cap."""
+    """Make a bottle with a cap, perhaps with a label."""
     a, height, r = Assembly(), rng.uniform(1.2, 1.9), rng.uniform(0.22, 0.42)
     neck, shoulder = r * rng.uniform(0.25, 0.5), rng.uniform(0.5, 0.7)
     knots = [
@@ -105,7 +110,7 @@ def bottle(rng: np.random.Generator) -> Assembly:
 
 
 def cup(rng: np.random.Generator) -> Assembly:
-    """Return a cup with a handle."""
+    """Make a cup with a handle, perhaps with a drink and a saucer."""
     a, height = Assembly(), rng.uniform(0.7, 1.2)
     rim = rng.uniform(0.35, 0.5)
     foot = rim * rng.uniform(0.55, 1.0)
@@ -130,7 +135,7 @@ def cup(rng: np.random.Generator) -> Assembly:
         handle,
     )
     if rng.uniform() < 0.6:
-        inner = np.interp(height * 0.85, curve[2:, 1], curve[2:, 0]) - 0.03
+        inner = float(np.interp(height * 0.85, curve[2:, 1], curve[2:, 0])) - 0.03
         a.add(
             cylinder(inner, 0.03, count=48).moved(y=height * 0.85),
             finishes.glossy(rng, colors.hsv(rng.uniform(0.03, 0.12), 0.7, rng.uniform(0.15, 0.8))),
@@ -148,7 +153,7 @@ def cup(rng: np.random.Generator) -> Assembly:
 
 
 def teapot(rng: np.random.Generator) -> Assembly:
-    """Spout to one side and handle to the other, or bail handle over the top (kettle)."""
+    """Make a teapot with spout and handle, or a kettle with its handle over the top."""
     a = Assembly()
     height, r = rng.uniform(0.6, 1.0), rng.uniform(0.45, 0.6)
     top = r * rng.uniform(0.4, 0.7)
@@ -205,7 +210,7 @@ def teapot(rng: np.random.Generator) -> Assembly:
 
 
 def bowl(rng: np.random.Generator) -> Assembly:
-    """Return a bowl, perhaps with fruit."""
+    """Make a bowl, perhaps with fruit."""
     a, height, rim = Assembly(), rng.uniform(0.25, 0.6), rng.uniform(0.5, 0.7)
     foot = rim * rng.uniform(0.3, 0.6)
     curve = np.vstack(
@@ -227,7 +232,7 @@ def bowl(rng: np.random.Generator) -> Assembly:
 
 
 def goblet(rng: np.random.Generator) -> Assembly:
-    """Return a goblet: bowl, stem, foot."""
+    """Make a goblet: foot, stem, bowl."""
     a, height = Assembly(), rng.uniform(1.2, 1.8)
     base, stem, rim = rng.uniform(0.3, 0.42), rng.uniform(0.04, 0.09), rng.uniform(0.28, 0.45)
     knot = rng.uniform(0.35, 0.5) * height
@@ -253,7 +258,7 @@ def goblet(rng: np.random.Generator) -> Assembly:
 
 
 def lamp(rng: np.random.Generator) -> Assembly:
-    """Return a lamp: foot, stem, shade."""
+    """Make a table lamp: foot, stem, shade."""
     a, stem = Assembly(), rng.uniform(0.7, 1.2)
     finish = tiles.pick(rng, "metal" if rng.uniform() < 0.5 else "ceramic")
     belly = rng.uniform(0.08, 0.35)
@@ -267,7 +272,7 @@ def lamp(rng: np.random.Generator) -> Assembly:
 
 
 def candle(rng: np.random.Generator) -> Assembly:
-    """Return a candle on a holder."""
+    """Make one candle or three on a stand."""
     a, count = Assembly(), int(rng.choice([1, 1, 3]))
     stand = tiles.pick(rng, "metal")
     wax = finishes.plastic(rng, colors.any_color(rng))
@@ -310,7 +315,7 @@ def candle(rng: np.random.Generator) -> Assembly:
 
 
 def barrel(rng: np.random.Generator) -> Assembly:
-    """Return a barrel, drum, jar or tin: bulging body, hoops, a lid."""
+    """Make a barrel, drum, jar or tin: a bulging body with hoops, perhaps a lid."""
     a, height, r = Assembly(), rng.uniform(0.9, 1.4), rng.uniform(0.35, 0.5)
     bulge = r * rng.uniform(1.0, 1.25)
     theme = ["wood", "paint", "ceramic", "metal"][rng.integers(4)]
@@ -336,9 +341,10 @@ def barrel(rng: np.random.Generator) -> Assembly:
         tiles.pick(rng, theme),
     )
     hoop = tiles.pick(rng, "metal")
-    for share in ([0.12, 0.3, 0.7, 0.88], [0.2, 0.8], [0.33, 0.66], [])[rng.integers(4)]:
-        at = np.interp(share * height, curve[:, 1], curve[:, 0]) + 0.012
-        profile = [(0, -0.035), (at, -0.035), (at, 0.035), (0, 0.035)]
+    shares: tuple[list[float], ...] = ([0.12, 0.3, 0.7, 0.88], [0.2, 0.8], [0.33, 0.66], [])
+    for share in shares[rng.integers(4)]:
+        radius = float(np.interp(share * height, curve[:, 1], curve[:, 0])) + 0.012
+        profile = [(0, -0.035), (radius, -0.035), (radius, 0.035), (0, 0.035)]
         a.add(loft(refined(profile, 0.08), circle(48)).moved(y=share * height), hoop)
     if rng.uniform() < 0.4:
         a.add(
