@@ -80,5 +80,9 @@ def test_refused_in_one_line(gdtool, tmp_path, tiny_model, damage, word):  # noq
     write_png(tmp_path / "ball.png", ball() / 255)
     done = gdtool("sample-views", "ball.png", "--model", "model", "--steps", 1, "-q")
     told = lines_of(done.stderr)
-    assert done.returncode == 3 and len(told) == 1 and "model" in told[0] and word in told[0], done.stderr
-    assert not (tmp_path / "trap-sprung").exists() and not (tmp_path / "ball.asset/views").exists()
+    assert done.returncode == 3, done.stderr
+    assert len(told) == 1, done.stderr
+    assert "model" in told[0], done.stderr
+    assert word in told[0], done.stderr
+    assert not (tmp_path / "trap-sprung").exists()
+    assert not (tmp_path / "ball.asset/views").exists()

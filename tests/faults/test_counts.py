@@ -38,7 +38,9 @@ def test_a_count_that_is_missed_says_why(gdtool_here, tmp_path, mesh, options, r
     done = gdtool_here("remesh", "x.obj", *options, "-o", "out")
     assert done.returncode == 0, done.stderr
     said = [line for line in warnings_of(tmp_path / "out") if "asked for: " in line]
-    assert len(said) == 1 and reason in said[0] and said[0] in done.stderr, done.stderr
+    assert len(said) == 1, done.stderr
+    assert reason in said[0], done.stderr
+    assert said[0] in done.stderr, done.stderr
 
 
 def test_a_reason_follows_from_what_the_mesh_is():
@@ -62,7 +64,8 @@ def test_internal_shells_are_told_with_their_share(gdtool_here, tmp_path, argume
     done = gdtool_here(*arguments, "-o", "out")
     assert done.returncode == 0, done.stderr
     told = [line for line in warnings_of(tmp_path / "out") if "inside another" in line]
-    assert len(told) == 1 and "1 closed body lies inside another, with 50.0% of the faces" in told[0]
+    assert len(told) == 1
+    assert "1 closed body lies inside another, with 50.0% of the faces" in told[0]
 
 
 def test_one_body_has_no_internal_shell(gdtool_here, tmp_path):

@@ -93,8 +93,12 @@ def test_what_lies_only_at_the_end(gdtool_here, no_work, files, monkeypatch, lin
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     before = sorted(files.iterdir())
     done = gdtool_here(*line.split(), "-o", "out")
-    assert done.returncode == code and words in done.stderr and done.stdout == "", done.stderr
-    assert len(lines_of(done.stderr)) == 1 and sorted(files.iterdir()) == before and leftovers(files) == []
+    assert done.returncode == code, done.stderr
+    assert words in done.stderr, done.stderr
+    assert done.stdout == "", done.stderr
+    assert len(lines_of(done.stderr)) == 1
+    assert sorted(files.iterdir()) == before
+    assert leftovers(files) == []
 
 
 def test_lights_that_are_there_pass(files):
@@ -129,9 +133,10 @@ def test_packages_that_an_option_needs(gdtool_here, no_work, files, monkeypatch,
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     monkeypatch.setitem(sys.modules, module, None)
     done = gdtool_here(*line.split(), "-o", "out")
-    assert (
-        done.returncode == 5 and cure in done.stderr and len(lines_of(done.stderr)) == 1 and leftovers(files) == []
-    ), done.stderr
+    assert done.returncode == 5, done.stderr
+    assert cure in done.stderr, done.stderr
+    assert len(lines_of(done.stderr)) == 1, done.stderr
+    assert leftovers(files) == [], done.stderr
 
 
 def test_a_package_whose_library_is_missing_names_the_library(monkeypatch):
@@ -186,7 +191,8 @@ def test_a_wrong_training_configuration_is_refused(tmp_path, content, fact):
     given = dataset(9)
     with pytest.raises(Exception, match=fact) as caught:
         train.check(Inputs(given, "x", {"start": None}, (given,)), train.Options(config="c.json"))
-    assert caught.value.exit_code == 3 and caught.value.cure
+    assert caught.value.exit_code == 3
+    assert caught.value.cure
 
 
 def test_a_compiled_network_is_kept_out_of_tmpdir(monkeypatch, tmp_path):

@@ -137,7 +137,9 @@ class OutOfMemoryError(RuntimeError):
 )
 def test_what_was_raised_has_its_code(error, kind, words):
     found = from_exception(error, "subject")
-    assert type(found) is kind and found.cure and len(str(found).splitlines()) == 1
+    assert type(found) is kind
+    assert found.cure
+    assert len(str(found).splitlines()) == 1
     with pytest.raises(kind, match=words):
         raise found
     assert str(pickle.loads(pickle.dumps(found))) == str(found)
@@ -159,11 +161,12 @@ def test_the_command_line_catches_all(monkeypatch, capsys, raised, code, debug):
     with pytest.raises(SystemExit) as ended:
         _common.guarded(command)
     told = capsys.readouterr().err
-    assert ended.value.code == code and ("Traceback" in told) == debug
+    assert ended.value.code == code
+    assert ("Traceback" in told) == debug
     last = told.splitlines()[-1]
-    assert (
-        last.startswith("gdtool: ") and not last.startswith("gdtool: gdtool") and (debug or len(told.splitlines()) == 1)
-    )
+    assert last.startswith("gdtool: ")
+    assert not last.startswith("gdtool: gdtool")
+    assert debug or len(told.splitlines()) == 1
     assert ("internal error" in last) == (code == 1)
 
 
@@ -180,11 +183,13 @@ def test_one_source_that_fails_unexpectedly_does_not_stop_the_rest(monkeypatch, 
     with pytest.raises(SystemExit) as ended:
         _common.guarded(_common.stage_command(dataclasses.replace(toy.STAGE, run=run), "Toy."))
     out, told = capsys.readouterr()
-    assert ended.value.code == 1 and out.split() == ["a.asset/renders", "c.asset/renders"]
+    assert ended.value.code == 1
+    assert out.split() == ["a.asset/renders", "c.asset/renders"]
     assert lines_of(told) == [
         "gdtool: b.png: internal error (ZeroDivisionError: by); run it again with --debug to see where, and report that"
     ]
-    assert leftovers(tmp_path) == [] and not (tmp_path / "b.asset").exists()
+    assert leftovers(tmp_path) == []
+    assert not (tmp_path / "b.asset").exists()
 
 
 @pytest.mark.parametrize("name", ["a\nb", "a\r\x1b[2J", "a\x85b\u2028c"], ids=ascii)
@@ -193,7 +198,8 @@ def test_what_is_printed_is_one_line_whatever_a_name_holds(capsys, monkeypatch, 
     _common.report(InputError(name, f"is {name}", "mend it"))
     log.say(f"  {name}")
     told = capsys.readouterr().err
-    assert len(told.splitlines()) == 2 and "\x1b" not in told
+    assert len(told.splitlines()) == 2
+    assert "\x1b" not in told
     assert log.printable("caf\udce9 é 日本") == "caf\ufffd é 日本"
 
 
@@ -218,12 +224,15 @@ def test_every_signal_that_ends_cleans_up(tmp_path, pictures, number):
     process.send_signal(number)
     before = time.monotonic()
     out, told = process.communicate()
-    assert process.returncode == 128 + number and out == "" and time.monotonic() - before < 2
+    assert process.returncode == 128 + number
+    assert out == ""
+    assert time.monotonic() - before < 2
     # Who sets a limit of processor time may not know that it was met.
     assert [line for line in lines_of(told) if "running toy" not in line] == (
         ["gdtool: the limit of processor time is reached; raise it (ulimit -t)"] if number == signal.SIGXCPU else []
     )
-    assert leftovers(tmp_path) == [] and not (tmp_path / "a.asset").exists()
+    assert leftovers(tmp_path) == []
+    assert not (tmp_path / "a.asset").exists()
 
 
 def test_a_hard_limit_of_processor_time_leaves_time_to_clean_up(tmp_path, pictures):
@@ -233,7 +242,9 @@ def test_a_hard_limit_of_processor_time_leaves_time_to_clean_up(tmp_path, pictur
 
     process = start([*RUNS, "busy", "a.png", "-q"], preexec_fn=limited)
     told = process.communicate()[1]
-    assert process.returncode == 128 + signal.SIGXCPU and len(lines_of(told)) == 1 and leftovers(tmp_path) == [], told
+    assert process.returncode == 128 + signal.SIGXCPU, told
+    assert len(lines_of(told)) == 1, told
+    assert leftovers(tmp_path) == [], told
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="asks /proc which signals are handled")
@@ -247,11 +258,9 @@ def test_ctrl_c_while_it_starts_is_quiet(tmp_path, pictures, delay):
     out, told = process.communicate()
     if process.returncode == 3:  # a.png is no picture: on a quick machine it had said so
         return
-    assert (
-        process.returncode == 130
-        and out == ""
-        and [line for line in told.splitlines() if "running sample-views" not in line] == []
-    ), told
+    assert process.returncode == 130, told
+    assert out == "", told
+    assert [line for line in told.splitlines() if "running sample-views" not in line] == [], told
     assert leftovers(tmp_path) == []
 
 
@@ -265,8 +274,12 @@ def test_what_does_not_return_to_python_is_ended_all_the_same(tmp_path, pictures
     process.send_signal(signal.SIGTERM)
     before = time.monotonic()
     out, told = process.communicate()
-    assert process.returncode == 143 and out == "" and told == "" and time.monotonic() - before < 2.2
-    assert leftovers(tmp_path) == [] and not (tmp_path / "a.asset").exists()
+    assert process.returncode == 143
+    assert out == ""
+    assert told == ""
+    assert time.monotonic() - before < 2.2
+    assert leftovers(tmp_path) == []
+    assert not (tmp_path / "a.asset").exists()
 
 
 def test_signals_that_the_caller_ignores_stay_ignored(tmp_path, pictures):
@@ -277,7 +290,8 @@ def test_signals_that_the_caller_ignores_stay_ignored(tmp_path, pictures):
     )
     until(lambda: list(tmp_path.glob("a.asset/.renders.*.partial")), process)
     process.send_signal(signal.SIGHUP)
-    assert process.communicate() == ("a.asset/renders\n", "") and process.returncode == 0
+    assert process.communicate() == ("a.asset/renders\n", "")
+    assert process.returncode == 0
 
 
 # Time limits.
@@ -292,7 +306,8 @@ def test_a_time_limit_ends_a_step_of_python_with_its_error():
                 time.sleep(0.01)
         except Exception:  # a fallback
             time.sleep(60)
-    assert caught.value is late and time.monotonic() - before < 2
+    assert caught.value is late
+    assert time.monotonic() - before < 2
     with ending.time_limit(0.2, late):
         pass
     time.sleep(0.3)  # it does not ring any more
@@ -301,10 +316,11 @@ def test_a_time_limit_ends_a_step_of_python_with_its_error():
 def test_a_time_limit_ends_a_native_call_with_its_error(tmp_path, pictures):
     process = start([*RUNS, "late", "a.png", "-q"])
     out, told = process.communicate(timeout=20)
-    assert (
-        process.returncode == 5 and out == "" and told == "gdtool: a: is not done after 0.3 s; raise --seconds to 1\n"
-    )
-    assert leftovers(tmp_path) == [] and not (tmp_path / "a.asset").exists()
+    assert process.returncode == 5
+    assert out == ""
+    assert told == "gdtool: a: is not done after 0.3 s; raise --seconds to 1\n"
+    assert leftovers(tmp_path) == []
+    assert not (tmp_path / "a.asset").exists()
 
 
 def test_a_stage_with_seconds_ends_by_twice_of_them_and_5():
@@ -326,8 +342,11 @@ def test_more_quads_than_the_time_allows_are_refused_at_once(gdtool_here, tmp_pa
     quad_cube(tmp_path / "cube.obj", 4)
     begin = time.monotonic()
     done = gdtool_here("remesh", "cube.obj", "--faces", 2_000_000, "--seconds", 10, "-q")
-    assert done.returncode == 5 and "raise --seconds to 220" in done.stderr and len(lines_of(done.stderr)) == 1
-    assert time.monotonic() - begin < 10 and leftovers(tmp_path) == []
+    assert done.returncode == 5
+    assert "raise --seconds to 220" in done.stderr
+    assert len(lines_of(done.stderr)) == 1
+    assert time.monotonic() - begin < 10
+    assert leftovers(tmp_path) == []
 
 
 # Standard streams, the environment, plugins.
@@ -340,38 +359,47 @@ def test_closed_streams_do_not_matter(tmp_path, pictures, closed):
         ["bash", "-c", f"{' '.join(TOY)} a.png {closed}"], capture_output=True, text=True, env=ELSEWHERE
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout == ("" if ">&-" in closed.split() else "a.asset/renders\n") and "Traceback" not in done.stderr
-    assert (tmp_path / "a.asset/renders/000.png").read_bytes() == b"a" and leftovers(tmp_path) == []
+    assert done.stdout == ("" if ">&-" in closed.split() else "a.asset/renders\n")
+    assert "Traceback" not in done.stderr
+    assert (tmp_path / "a.asset/renders/000.png").read_bytes() == b"a"
+    assert leftovers(tmp_path) == []
     helped = subprocess.run(
         ["bash", "-c", f"{' '.join(GDTOOL)} remesh --help {closed}"], capture_output=True, text=True, env=ELSEWHERE
     )
-    assert helped.returncode == 0 and helped.stderr == ""
+    assert helped.returncode == 0
+    assert helped.stderr == ""
 
 
 def test_a_full_stdout_is_told(tmp_path, pictures):
     for command in (f"{' '.join(TOY)} a.png -q", f"{' '.join(GDTOOL)} --help"):
         done = subprocess.run(["bash", "-c", f"{command} >/dev/full"], capture_output=True, text=True, env=ELSEWHERE)
-        assert done.returncode == 4 and len(lines_of(done.stderr)) == 1 and "no space left" in done.stderr, done.stderr
+        assert done.returncode == 4, done.stderr
+        assert len(lines_of(done.stderr)) == 1, done.stderr
+        assert "no space left" in done.stderr, done.stderr
 
 
 def test_without_docstrings(gdtool, tmp_path, pictures):
     """python -OO drops them, and asserts with them."""
     for arguments in (["--help"], ["remesh", "--help"], ["validate", "--help"], ["train", "--help"]):
         plain, stripped = gdtool(*arguments), gdtool(*arguments, env={"PYTHONOPTIMIZE": "2"})
-        assert stripped.returncode == 0 and stripped.stdout == plain.stdout and stripped.stderr == ""
+        assert stripped.returncode == 0
+        assert stripped.stdout == plain.stdout
+        assert stripped.stderr == ""
     (tmp_path / "box.obj").write_text(
         "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1\n"
         "f 1 4 3 2\nf 5 6 7 8\nf 1 2 6 5\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8\n"
     )
     done = gdtool("remesh", "box.obj", "--faces", "96", "--engine", "split", "-q", env={"PYTHONOPTIMIZE": "2"})
-    assert done.returncode == 0 and done.stderr == "", done.stderr
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "", done.stderr
 
 
 def test_a_umask_never_closes_a_result_to_its_own_user(tmp_path, pictures):
     done = subprocess.run(
         [*TOY, "a.png", "-q"], capture_output=True, text=True, env=ELSEWHERE, preexec_fn=lambda: os.umask(0o777)
     )
-    assert done.returncode == 0 and leftovers(tmp_path) == [], done.stderr
+    assert done.returncode == 0, done.stderr
+    assert leftovers(tmp_path) == [], done.stderr
     for path, mode in (
         ("a.asset", 0o700),
         ("a.asset/renders", 0o700),
@@ -393,9 +421,12 @@ class Plugin:
 def test_a_plugin_that_cannot_be_imported_is_told_and_the_rest_works(gdtool_here, monkeypatch):
     monkeypatch.setattr(_group, "_plugins", lambda: {"broken": Plugin()})
     helped = gdtool_here("--help")
-    assert helped.returncode == 0 and "broken" in helped.stdout and "remesh" in helped.stdout
+    assert helped.returncode == 0
+    assert "broken" in helped.stdout
+    assert "remesh" in helped.stdout
     done = gdtool_here("broken", "x")
-    assert done.returncode == 5 and lines_of(done.stderr) == [
+    assert done.returncode == 5
+    assert lines_of(done.stderr) == [
         "gdtool: plugin broken: cannot be loaded (ValueError: at import); pip uninstall odd_package, or install a "
         "release of it that works with this gdtool"
     ]
@@ -411,20 +442,17 @@ def test_a_workspace_stays_only_where_a_run_can_go_on_from_it(tmp_path, pictures
     monkeypatch.setattr(log, "level", log.NORMAL)
     settings = runner.Settings()
     (failed,) = runner.run_all(toy_runs.stage("lost"), ("a.png",), toy.Options(), {}, settings)
-    assert (
-        "internal error (ValueError: before" in str(failed)
-        and leftovers(tmp_path) == []
-        and "goes on from it" not in capsys.readouterr().err
-    )
+    assert "internal error (ValueError: before" in str(failed)
+    assert leftovers(tmp_path) == []
+    assert "goes on from it" not in capsys.readouterr().err
     (failed,) = runner.run_all(toy_runs.stage("resumable"), ("a.png",), toy.Options(), {}, settings)
     (kept,) = tmp_path.glob("a.asset/.renders.*.work")
     told = capsys.readouterr().err
-    assert (
-        "internal error (ValueError: after" in str(failed)
-        and f"is kept in {kept.relative_to(tmp_path)}; the same command goes on from it" in told
-    )
+    assert "internal error (ValueError: after" in str(failed)
+    assert f"is kept in {kept.relative_to(tmp_path)}; the same command goes on from it" in told
     (done,) = runner.run_all(toy_runs.stage("resumable"), ("a.png",), toy.Options(), {}, settings)
-    assert done.status == "done" and leftovers(tmp_path) == []
+    assert done.status == "done"
+    assert leftovers(tmp_path) == []
 
 
 def test_train_keeps_the_file_that_it_resumes_from():

@@ -103,8 +103,11 @@ def test_each_is_refused_in_one_line(gdtool, good, damaged, tmp_path, command):
     told = lines_of(done.stderr)
     for name, (_, fact) in DAMAGE.items():
         about = [line for line in told if f"{name}.asset/views" in line]
-        assert len(about) == 1 and fact in about[0], (name, about, done.stderr)
-    assert done.returncode == 3 and done.stdout == "" and leftovers(tmp_path) == []
+        assert len(about) == 1, (name, about, done.stderr)
+        assert fact in about[0], (name, about, done.stderr)
+    assert done.returncode == 3
+    assert done.stdout == ""
+    assert leftovers(tmp_path) == []
     assert not list(tmp_path.glob("*.asset/surface"))
 
 
@@ -117,7 +120,9 @@ def test_the_wrong_kind_names_the_stage_that_makes_the_right_one(gdtool, good):
     ):
         done = gdtool(command, good)
         (told,) = lines_of(done.stderr)
-        assert done.returncode == 3 and "holds views" in told and cure in told, told
+        assert done.returncode == 3, told
+        assert "holds views" in told, told
+        assert cure in told, told
 
 
 def test_a_camera_inside_the_object(gdtool, good, tmp_path):
@@ -132,4 +137,6 @@ def test_a_camera_inside_the_object(gdtool, good, tmp_path):
     camera(move)(tmp_path / "in.asset/views")
     done = gdtool("reconstruct", "in.asset/views")
     (told,) = lines_of(done.stderr)
-    assert done.returncode == 3 and "camera" in told and not (tmp_path / "in.asset/surface").exists()
+    assert done.returncode == 3
+    assert "camera" in told
+    assert not (tmp_path / "in.asset/surface").exists()

@@ -71,9 +71,12 @@ def test_each_is_refused_in_one_line(gdtool, tmp_path, tiny_model):  # noqa: F81
     told = lines_of(done.stderr)
     for name, (_, word) in cases.items():
         about = [line for line in told if line.removeprefix("gdtool: ").startswith(name)]
-        assert len(about) == 1 and word in about[0], (name, about, done.stderr)
-    assert done.returncode == 1 and done.stdout == ""  # all failed, but not of one kind
-    assert leftovers(tmp_path) == [] and not list(tmp_path.glob("*.asset/*"))
+        assert len(about) == 1, (name, about, done.stderr)
+        assert word in about[0], (name, about, done.stderr)
+    assert done.returncode == 1  # all failed, but not of one kind
+    assert done.stdout == ""
+    assert leftovers(tmp_path) == []
+    assert not list(tmp_path.glob("*.asset/*"))
     three = [name for name, (code, _) in cases.items() if code == 3]
     assert gdtool("sample-views", *three[:2], "--model", tiny_model, "-q").returncode == 3
     assert gdtool("sample-views", "wide.png", "bomb.png", "--model", tiny_model, "-q").returncode == 5
@@ -103,7 +106,8 @@ def test_each_spelling_of_one_picture_is_the_same_picture(gdtool, tmp_path, tiny
     write(tmp_path / "grey_rgba.png", png(SIZE, SIZE, RGBA, 8, scanlines(grey[..., [0, 0, 0, 1]])))
     names = ("plain", "interlaced", "sixteen", "few", "palette", "grey", "grey_rgba")
     done = gdtool("sample-views", *(f"{name}.png" for name in names), "--model", tiny_model, "--steps", 1, "-q")
-    assert done.returncode == 0 and len(done.stdout.splitlines()) == len(names), done.stderr
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.splitlines()) == len(names), done.stderr
     seen = {name: read_image(tmp_path / f"{name}.asset/views/condition/000.png") for name in names}
     for one, other in (("plain", "interlaced"), ("plain", "sixteen"), ("few", "palette"), ("grey", "grey_rgba")):
         assert np.array_equal(seen[one], seen[other]), (one, other)
@@ -115,7 +119,9 @@ def test_a_subject_at_the_border_is_told(gdtool, tmp_path, tiny_model):  # noqa:
     picture[10:40, 20:] = (0.8, 0.3, 0.2, 1)
     write_png(tmp_path / "border.png", picture)
     done = gdtool("sample-views", "border.png", "--model", tiny_model, "--steps", 1)
-    assert done.returncode == 0 and "warning: " in done.stderr and "border" in done.stderr.replace("border.", "")
+    assert done.returncode == 0
+    assert "warning: " in done.stderr
+    assert "border" in done.stderr.replace("border.", "")
 
 
 @pytest.mark.parametrize("name", [b"caf\xe9.png", "貓 *.png".encode(), b"-x [1].png"])

@@ -33,9 +33,8 @@ def test_a_failed_allocation_of_torch_says_how_much_it_asked_for():
     with pytest.raises(RuntimeError) as refused:
         torch.empty(2**44)
     told = from_exception(refused.value, "x")
-    assert isinstance(told, ResourceError) and str(told).startswith(
-        "x: ran out of memory (it asked for 65536.00 GiB); "
-    )
+    assert isinstance(told, ResourceError)
+    assert str(told).startswith("x: ran out of memory (it asked for 65536.00 GiB); ")
 
 
 def test_a_library_that_finds_no_room_is_not_taken_for_one_that_is_missing():
@@ -72,9 +71,8 @@ def test_embree_is_not_started_where_it_would_crash():
     """Without the question in front of it this is a segmentation fault."""
     code = "from gdtool.geometry.rays import RayCaster\nRayCaster(numpy.eye(3), numpy.array([[0, 1, 2]]))"
     done = limited(code, 60)
-    assert done.returncode == 1 and "MemoryError: unable to allocate 0.19 GiB for rays at 1 faces" in done.stderr, (
-        done.stderr
-    )
+    assert done.returncode == 1, done.stderr
+    assert "MemoryError: unable to allocate 0.19 GiB for rays at 1 faces" in done.stderr, done.stderr
     assert limited(code, 1000).returncode == 0
 
 
@@ -120,7 +118,8 @@ def test_a_failed_collapse_leaves_no_temporary_folder(monkeypatch, tmp_path, who
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
     monkeypatch.setattr(lods, "call", lambda *given, **_: call(*given, **fault))
     coarse, why = lods.coarser(whole, 6)
-    assert coarse is None and told in why
+    assert coarse is None
+    assert told in why
     assert not list((tmp_path / "temporary").iterdir())
 
 
@@ -128,4 +127,5 @@ def test_children_that_fail_are_gone():
     running = child.begin(wait_in_a_folder, None, seconds=0.3)
     with pytest.raises(ChildFailed, match="took longer than 0.3 s"):
         running.result()
-    assert running._process.returncode is not None and running._process.returncode < 0
+    assert running._process.returncode is not None
+    assert running._process.returncode < 0

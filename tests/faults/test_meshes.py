@@ -86,9 +86,13 @@ def test_each_is_refused_in_one_line(gdtool, faulty, tmp_path, command):
     for name in [*faulty, "missing.obj"]:
         about = [line for line in told if line.removeprefix("gdtool: ").startswith(name)]
         fact = REFUSED[name][1] if name in REFUSED else "does not exist"
-        assert len(about) == 1 and fact in about[0], (name, about, done.stderr)
-    assert done.returncode == 3 and done.stdout == "" and len(told) == len(REFUSED) + 1
-    assert leftovers(tmp_path) == [] and not list(tmp_path.glob("*.asset/*"))
+        assert len(about) == 1, (name, about, done.stderr)
+        assert fact in about[0], (name, about, done.stderr)
+    assert done.returncode == 3
+    assert done.stdout == ""
+    assert len(told) == len(REFUSED) + 1
+    assert leftovers(tmp_path) == []
+    assert not list(tmp_path.glob("*.asset/*"))
 
 
 def closed():
@@ -116,7 +120,8 @@ def test_what_can_be_repaired_is_repaired_with_a_warning(gdtool, tmp_path):
     for name, (points, triangles) in cases.items():
         (tmp_path / f"{name}.obj").write_text(obj(points, triangles))
     done = gdtool("remesh", *(f"{name}.obj" for name in cases), "--engine", "split", "--faces", 400)
-    assert lines_of(done.stderr) == [] and done.returncode == 0, done.stderr
+    assert lines_of(done.stderr) == [], done.stderr
+    assert done.returncode == 0, done.stderr
     for name in ("double", "wing", "mixed", "open"):
         assert f"warning: {name}: " in done.stderr, name
     for name in cases:

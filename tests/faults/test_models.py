@@ -79,7 +79,8 @@ BAD_FIELDS = [
 def test_a_field_that_no_network_can_be_made_of_is_named_with_its_bound(tmp_path, change, told):
     with pytest.raises(InputError, match=told) as refused:
         read_config(write(tmp_path / "config.json", **change))
-    assert refused.value.subject == str(tmp_path / "config.json") and refused.value.cure
+    assert refused.value.subject == str(tmp_path / "config.json")
+    assert refused.value.cure
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,8 @@ def feed(monkeypatch, content):
 
 @by_option(NUMBERS)
 def test_every_number_has_two_finite_bounds(name, param):
-    assert param.type.min is not None and param.type.max is not None, f"{name} {param.opts[0]}: give it ge and le"
+    assert param.type.min is not None, f"{name} {param.opts[0]}: give it ge and le"
+    assert param.type.max is not None, f"{name} {param.opts[0]}: give it ge and le"
     for text in ("nan", "inf", "-inf", "1e400", "1" + 30 * "0", "9" * 5000):
         with pytest.raises(click.BadParameter):
             converted(name, param, text)
@@ -88,7 +89,8 @@ def test_no_string_holds_a_control_character(name, param):
 def test_generated_objects_have_64_bit_seeds_in_order(text, fact):
     with pytest.raises(UsageError, match=fact) as caught:
         next(sources.incoming(("procedural:1", text)))  # told before the first one is worked on
-    assert caught.value.cure and len(str(caught.value)) < 400
+    assert caught.value.cure
+    assert len(str(caught.value)) < 400
     assert list(sources.incoming(("procedural:2..4", f"procedural:{2**63 - 1}"))) == [
         "procedural:2",
         "procedural:3",
@@ -124,7 +126,9 @@ def test_lines_of_stdin_that_name_no_source(monkeypatch, line):
     assert next(stream) == "first"
     with pytest.raises(UsageError) as caught:
         next(stream)
-    assert caught.value.cure and len(str(caught.value)) < 400 and len(str(caught.value).splitlines()) == 1
+    assert caught.value.cure
+    assert len(str(caught.value)) < 400
+    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_lines_of_stdin_that_name_one(monkeypatch):
@@ -164,5 +168,8 @@ def test_nothing_from_a_pipe_points_at_the_command_before_it(monkeypatch):
 )
 def test_a_wrong_command_line_is_one_line_and_exits_2(gdtool_here, arguments, tmp_path):
     done = gdtool_here(*arguments)
-    assert done.returncode == 2 and done.stdout == "" and len(done.stderr.splitlines()) == 1, done.stderr
-    assert done.stderr.startswith("gdtool") and list(tmp_path.iterdir()) == []
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == "", done.stderr
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert done.stderr.startswith("gdtool")
+    assert list(tmp_path.iterdir()) == []

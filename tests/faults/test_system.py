@@ -52,10 +52,13 @@ def test_a_full_disk_exits_4_and_keeps_the_old_result(tmp_path, cube):
     before = tree(tmp_path / "out")
     process = start(cube, "-o", "out", preexec_fn=small_files)
     out, errors = process.communicate()
-    assert process.returncode == 4 and out == "", errors
+    assert process.returncode == 4, errors
+    assert out == "", errors
     (told,) = lines_of(errors)
-    assert "too large" in told and "; " in told
-    assert tree(tmp_path / "out") == before and leftovers(tmp_path) == []
+    assert "too large" in told
+    assert "; " in told
+    assert tree(tmp_path / "out") == before
+    assert leftovers(tmp_path) == []
 
 
 @pytest.mark.parametrize(
@@ -78,7 +81,9 @@ def test_a_full_disk_of_every_writer(tmp_path, cube, command):
     if command[0] == "evaluate":
         assert done.returncode == 0, done.stderr
     else:
-        assert done.returncode == 4 and len(lines_of(done.stderr)) == 1 and leftovers(tmp_path) == [], done.stderr
+        assert done.returncode == 4, done.stderr
+        assert len(lines_of(done.stderr)) == 1, done.stderr
+        assert leftovers(tmp_path) == [], done.stderr
         assert not (tmp_path / "cube.asset/views").exists()
 
 
@@ -88,21 +93,25 @@ def test_places_that_cannot_be_written(tmp_path, cube):
     for output, code in (("file", 2), ("file/below", 4)):
         process = start(cube, "-o", output, "-q")
         errors = process.communicate()[1]
-        assert process.returncode == code and len(lines_of(errors)) == 1, errors
+        assert process.returncode == code, errors
+        assert len(lines_of(errors)) == 1, errors
     assert (tmp_path / "file").read_text() == "mine"
     done = subprocess.run([*REMESH, cube, "-o", "/proc/gdtool", "-q"], capture_output=True, text=True)
-    assert done.returncode == 4 and len(lines_of(done.stderr)) == 1, done.stderr
+    assert done.returncode == 4, done.stderr
+    assert len(lines_of(done.stderr)) == 1, done.stderr
     if os.geteuid():
         (tmp_path / "locked").mkdir(mode=0o500)
         done = subprocess.run([*REMESH, cube, "-o", "locked/out", "-q"], capture_output=True, text=True)
-        assert done.returncode == 4 and "permission" in done.stderr, done.stderr
+        assert done.returncode == 4, done.stderr
+        assert "permission" in done.stderr, done.stderr
 
 
 def test_output_that_is_the_input(tmp_path, cube, gdtool):
     assert gdtool("remesh", cube, "--faces", FACES, "-q").returncode == 0
     before = tree(tmp_path / "cube.asset/mesh")
     done = gdtool("unwrap", "cube.asset/mesh", "-o", "cube.asset/mesh", "-q")
-    assert done.returncode == 2 and "both source and output" in done.stderr
+    assert done.returncode == 2
+    assert "both source and output" in done.stderr
     assert tree(tmp_path / "cube.asset/mesh") == before
 
 
@@ -114,10 +123,13 @@ def test_stopped_then_completed(tmp_path, cube, sign, code):
         time.sleep(0.005)
     process.send_signal(sign)
     errors = process.communicate()[1]
-    assert process.returncode == code and lines_of(errors) == [], errors
-    assert leftovers(tmp_path) == [] and not (tmp_path / "cube.asset/mesh").exists()
+    assert process.returncode == code, errors
+    assert lines_of(errors) == [], errors
+    assert leftovers(tmp_path) == []
+    assert not (tmp_path / "cube.asset/mesh").exists()
     process = start(cube, "-q")
-    assert process.communicate()[0] == "cube.asset/mesh\n" and process.returncode == 0
+    assert process.communicate()[0] == "cube.asset/mesh\n"
+    assert process.returncode == 0
 
 
 def test_killed_at_exact_and_random_moments():
@@ -153,13 +165,17 @@ def test_empty_stdin_fails_the_pipe(gdtool):
         "validate",
     ):
         done = gdtool(command)
-        assert done.returncode == 2 and len(lines_of(done.stderr)) == 1 and done.stdout == "", command
+        assert done.returncode == 2, command
+        assert len(lines_of(done.stderr)) == 1, command
+        assert done.stdout == "", command
     pipe = (
         f"{sys.executable} -m gdtool reconstruct nothing | {sys.executable} -m gdtool remesh | {sys.executable} -m "
         f"gdtool unwrap"
     )
     done = subprocess.run(["bash", "-c", pipe], capture_output=True, text=True)
-    assert done.returncode == 2 and done.stdout == "" and "Traceback" not in done.stderr
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert "Traceback" not in done.stderr
 
 
 def test_a_reader_that_leaves(tmp_path, cube):
@@ -171,17 +187,22 @@ def test_a_reader_that_leaves(tmp_path, cube):
     done = subprocess.run(["bash", "-c", pipe], capture_output=True, text=True)
     first, code = done.stdout.split()
     # When head is slow to leave, all four lines fit into the pipe: then nothing broke.
-    assert first == "c0.asset/mesh" and code in ("141", "0") and done.stderr == "", done.stderr
+    assert first == "c0.asset/mesh", done.stderr
+    assert code in ("141", "0"), done.stderr
+    assert done.stderr == "", done.stderr
     process = start("c3.obj", cube, "--force", "-q")
     process.stdout.readline()
     process.stdout.close()
-    assert process.wait() == 141 and process.stderr.read() == "" and leftovers(tmp_path) == []
+    assert process.wait() == 141
+    assert process.stderr.read() == ""
+    assert leftovers(tmp_path) == []
 
 
 def test_no_home_no_tmp_no_user(tmp_path, cube):
     bare = {"PATH": os.environ.get("PATH", ""), "OMP_NUM_THREADS": "1"}
     done = subprocess.run([*REMESH, cube], capture_output=True, text=True, env=bare)
-    assert done.returncode == 0 and done.stdout == "cube.asset/mesh\n", done.stderr
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "cube.asset/mesh\n", done.stderr
     done = subprocess.run(
         [sys.executable, "-m", "gdtool", "render-dataset", cube, "--size", "32", "--domains", "normal", "-o", "views"],
         capture_output=True,
@@ -214,4 +235,6 @@ def test_too_little_memory_exits_5(tmp_path, cube):
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
         env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
     )
-    assert done.returncode == 5 and "Traceback" not in done.stderr and "memory" in done.stderr, done.stderr
+    assert done.returncode == 5, done.stderr
+    assert "Traceback" not in done.stderr, done.stderr
+    assert "memory" in done.stderr, done.stderr
