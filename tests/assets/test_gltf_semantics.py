@@ -112,7 +112,7 @@ def centred(builder) -> object:
 
 @pytest.mark.parametrize("azimuth", [0.0, 80.0])
 def test_specular_zero_reflects_nothing_also_at_grazing_angles(tmp_path, azimuth):
-    """specularFactor scales f90 too. At 0 a white surface is a Lambert surface: 1 under uniform light at every angle."""
+    """specularFactor scales f90 too: at 0 a white surface is a Lambert surface, 1 under uniform light at any angle."""
     material = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 0.3}}
     brightness = []
     for specular in (0.0, 1.0):
@@ -200,7 +200,7 @@ def test_samplers_wrap_each_axis_by_its_own_mode(tmp_path, wrap, at, axis):
 
 
 def test_filters_blend_linear_values_or_take_the_nearest_texel(tmp_path):
-    """A quarter of the way from a black to a white texel: nearest gives black, linear a quarter of white in linear light."""
+    """Look up a quarter of the way from a black to a white texel: linear filtering blends in linear light."""
     pixels = np.zeros((1, 2, 3), np.uint8)
     pixels[0, 1] = 255
     values = {}
@@ -217,7 +217,7 @@ def test_filters_blend_linear_values_or_take_the_nearest_texel(tmp_path):
 
 
 def test_small_renders_read_coarser_mip_levels_of_odd_sizes(tmp_path):
-    """Render a fine chequerboard with dozens of texels a sample: grey by its mip levels, where the finest is black or white."""
+    """Render a fine chequerboard, dozens of texels a sample: its coarser levels are grey, the finest black or white."""
     checker = (np.indices((301, 299)).sum(0) % 2 * 255).astype(np.uint8)[..., None].repeat(3, 2)
     builder = with_textures(color=checker)
     builder.document["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]

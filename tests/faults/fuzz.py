@@ -1,9 +1,10 @@
-"""Readers against damaged files: whatever the bytes, they answer with a value or with an error of ours (`make fuzz`).
+"""Fuzz the readers with damaged files: each must return a value or raise one of gdtool's errors (`make fuzz`).
 
     python -m tests.faults.fuzz [MINUTES] [READER ...]
 
-Prints what every reader did, and writes each file that made one do anything else to tests/faults/crashes/, where
-tests/faults/test_fuzz.py reads it again ever after. Each reader runs in a child, which a crash may take with it.
+Prints how many files each reader read and refused. A file that makes one do anything else is written to
+tests/faults/crashes/, where tests/faults/test_fuzz.py reads it from then on. Each reader runs in a child process, so
+that a crash ends only that.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ SLOW_SECONDS = 20.0  # a file of a few kilobytes that takes longer is a hang
 
 
 def mutated(content: bytes, rng: np.random.Generator) -> bytes:
-    """A few bytes changed, numbers put to their limits, pieces cut, doubled or moved."""
+    """Change a few bytes, set numbers to their limits, or cut, duplicate or move pieces."""
     out = bytearray(content)
     for _ in range(int(rng.integers(1, 6))):
         if not out:
@@ -179,7 +180,7 @@ READERS: dict[str, tuple[str, Callable[[Path], None], Callable[[], bytes]]] = {
 
 
 def attempt(name: str, path: Path) -> str:
-    """What a reader did with a file: "read", "refused", or the exception that is a bug of ours."""
+    """Read a file and tell what happened: "read", "refused", or the exception that is a bug."""
     try:
         READERS[name][1](path)
     except GdtoolError:
@@ -190,7 +191,7 @@ def attempt(name: str, path: Path) -> str:
 
 
 def child(name: str, seed: int, seconds: float, rounds: int, folder: str) -> None:
-    """Mutate and read, in this process. The file at work lies in folder, so that the parent finds it after a crash."""
+    """Mutate and read files in this process; `folder` holds the current one, for the parent to find after a crash."""
     rng = np.random.default_rng(seed)
     suffix, _, make = READERS[name]
     good = make()
@@ -212,7 +213,7 @@ def child(name: str, seed: int, seconds: float, rounds: int, folder: str) -> Non
 
 
 def fuzz(name: str, seed: int, seconds: float, rounds: int = 10**9) -> tuple[str, bytes | None]:
-    """What became of one child, and the file that broke it or None."""
+    """Run a child process; return what became of it, and the file that broke it or None."""
     with tempfile.TemporaryDirectory() as folder:
         command = [
             sys.executable,

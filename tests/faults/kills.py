@@ -1,12 +1,12 @@
-"""Kill a run at sixty-one moments; whatever the moment, the output is the old result or the new one, whole (part of
-`make fuzz`).
+"""Kill a run at sixty-one moments: the output must be the old result or the new one, whole (part of `make fuzz`).
 
     python -m tests.faults.kills [RANDOM] [EXACT] [SEED]
 
-RANDOM kills come at random times of a run, EXACT ones just before a chosen operation on the file system: the run's
-first and last, and others spread over what it does to the output's folder (making, writing, renaming, removing), the
-manifest and the swap among them. After each kill the output opens, nothing beside it has changed, and at the end an
-undisturbed run gives the same files as one that was never killed."""
+RANDOM kills come at random times. EXACT kills come just before a chosen operation on the file system: the first, the
+last, and others spread over making, writing, renaming and removing what belongs to the output, the manifest and the
+swap among them. After each kill the output must open and nothing beside it may have changed. At the end an undisturbed
+run must give the same files as one that was never killed.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +28,7 @@ EVENTS = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.chmod", "os.utim
 
 
 def watched(act) -> None:
-    """Call act(what) before each operation on the file system that touches an output in the working folder, and before
-    the swap."""
+    """Call act(operation) before each operation on the file system that touches an output, and before the swap."""
     here = Path.cwd()
 
     def hook(event: str, arguments: tuple) -> None:
@@ -58,8 +57,7 @@ def watched(act) -> None:
 
 
 def inside(stop_before: int) -> None:
-    """What the killed process runs: gdtool, until operation number stop_before (counted from 0); -1: to its end,
-    telling the operations."""
+    """Run gdtool, and kill this process before operation `stop_before`; with -1, only print the operations."""
     count = 0
 
     def act(what: str) -> None:
@@ -95,8 +93,7 @@ def start(folder: Path, stop_before: int | None = None) -> subprocess.Popen:
 
 
 def spread(operations: list[str], count: int) -> list[int]:
-    """`count` operations to stop before: the first, the last, all around the manifest and the swap, and others evenly
-    between them."""
+    """Choose `count` operations to stop before: first, last, those near the manifest and the swap, others evenly."""
     important = [
         i for i, what in enumerate(operations) if "manifest.json" in what or what.startswith(("swap", "os.rename"))
     ]
@@ -110,7 +107,7 @@ def spread(operations: list[str], count: int) -> list[int]:
 
 
 def main(random_kills: int = 50, exact_kills: int = 11, seed: int = 0) -> int:
-    """Run the loop; the number of kills after which something was wrong."""
+    """Run all kills; returns how many left something wrong."""
     wrong = 0
     with tempfile.TemporaryDirectory(prefix="gdtool-kills-") as top:
         folder = Path(top)

@@ -1,4 +1,4 @@
-"""What a run would need only at its end is checked before any work: nothing is written, nothing waits."""
+"""Check before any work what a run would need only at its end."""
 
 import dataclasses
 import importlib
@@ -20,7 +20,7 @@ from tests.faults.files import leftovers, lines_of, quad_cube
 
 @pytest.fixture
 def no_work(monkeypatch):
-    """No stage may begin to work."""
+    """Fail the test if a stage begins to work."""
     for stage in (bake, relight, remesh, render_dataset, sample_views, train):
 
         def run(*_):
@@ -37,6 +37,7 @@ def no_work(monkeypatch):
 
 @pytest.fixture
 def files(tmp_path):
+    """Make the sources and options' files in the working folder."""
     quad_cube(tmp_path / "cube.obj", 4)
     write_png(tmp_path / "ball.png", np.full((64, 64, 4), 200, np.uint8))
     write_png(tmp_path / "small.png", np.full((32, 40), 255, np.uint8))
@@ -87,7 +88,9 @@ def files(tmp_path):
     ],
     ids=lambda value: value if isinstance(value, str) and " " in value and ":" not in value else "",
 )
-def test_what_lies_only_at_the_end(gdtool_here, no_work, files, monkeypatch, line, code, words):
+def test_options_used_only_at_the_end_are_checked_before_any_work(
+    gdtool_here, no_work, files, monkeypatch, line, code, words
+):
     import torch
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -101,7 +104,7 @@ def test_what_lies_only_at_the_end(gdtool_here, no_work, files, monkeypatch, lin
     assert leftovers(files) == []
 
 
-def test_lights_that_are_there_pass(files):
+def test_existing_environments_pass_the_early_check(files):
     for value in ("dark", "mid", "bright", "random:7", f"random:{2**63 - 1}", "light.exr"):
         early.require_environment("--env", value, ("dark", "mid", "bright"))
     with pytest.raises(Exception, match="black everywhere"):
@@ -129,7 +132,9 @@ def test_lights_that_are_there_pass(files):
         ),
     ],
 )
-def test_packages_that_an_option_needs(gdtool_here, no_work, files, monkeypatch, line, module, cure):
+def test_a_package_that_an_option_needs_is_checked_before_any_work(
+    gdtool_here, no_work, files, monkeypatch, line, module, cure
+):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     monkeypatch.setitem(sys.modules, module, None)
     done = gdtool_here(*line.split(), "-o", "out")
@@ -149,6 +154,7 @@ def test_a_package_whose_library_is_missing_names_the_library(monkeypatch):
 
 
 def dataset(count):
+    """Make a stand-in for a dataset of `count` objects."""
     return types.SimpleNamespace(kind="dataset", content=types.SimpleNamespace(objects=[None] * count))
 
 
@@ -195,7 +201,7 @@ def test_a_wrong_training_configuration_is_refused(tmp_path, content, fact):
     assert caught.value.cure
 
 
-def test_a_compiled_network_is_kept_out_of_tmpdir(monkeypatch, tmp_path):
+def test_the_cache_of_compiled_networks_is_outside_tmpdir(monkeypatch, tmp_path):
     from gdtool.diffusion.inference.compiled import compiler_cache
 
     monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR", raising=False)

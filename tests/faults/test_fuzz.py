@@ -1,5 +1,7 @@
-"""A few hundred damaged files for every reader, the same each time, and all that once broke one (`make fuzz` looks for
-more)."""
+"""Read a few hundred damaged files, always the same, with every reader, and all that once crashed one.
+
+`make fuzz` looks for more.
+"""
 
 import pytest
 
@@ -13,5 +15,5 @@ def test_damaged_files_are_read_or_refused(name):
 
 
 @pytest.mark.parametrize("path", sorted(CRASHES.glob("*-*")), ids=lambda p: p.name)
-def test_files_that_once_broke_a_reader(path):
+def test_files_that_once_crashed_a_reader_are_read_or_refused(path):
     assert attempt(path.name.split("-")[0], path) in ("read", "refused")
