@@ -91,7 +91,7 @@ def test_ior_and_specular_set_the_reflectance_at_normal_incidence(tmp_path):
     assert float(out["f90"][0]) == 0.5
 
 
-def seen(scene, *, azimuth=0.0, elevation=0.0, size=32, light=1.0, samples=16) -> dict[str, np.ndarray]:
+def rendered(scene, *, azimuth=0.0, elevation=0.0, size=32, light=1.0, samples=16) -> dict[str, np.ndarray]:
     """Render a view of a scene under a uniform light, without shadows."""
     renderer = Renderer(scene, 1)
     direct = DirectLight(
@@ -118,7 +118,7 @@ def test_specular_zero_reflects_nothing_also_at_grazing_angles(tmp_path, azimuth
     for specular in (0.0, 1.0):
         builder = centred(quad(**material, extensions={"KHR_materials_specular": {"specularFactor": specular}}))
         builder.document["extensionsUsed"] = ["KHR_materials_specular"]
-        images = seen(read_gltf(builder.write(tmp_path / "a.glb")), azimuth=azimuth, samples=64)
+        images = rendered(read_gltf(builder.write(tmp_path / "a.glb")), azimuth=azimuth, samples=64)
         brightness.append(images["color"][images["mask"] == 1].mean())
     assert brightness[0] == pytest.approx(1.0, abs=5e-3)
     if azimuth:
@@ -132,7 +132,7 @@ def test_an_unlit_material_shows_its_base_color_under_any_light(tmp_path):
     builder.document["extensionsUsed"] = ["KHR_materials_unlit"]
     scene = read_gltf(builder.write(tmp_path / "a.glb"))
     for light in (0.0, 7.0):
-        images = seen(scene, light=light)
+        images = rendered(scene, light=light)
         np.testing.assert_allclose(
             images["color"][images["mask"] == 1],
             np.broadcast_to([0.25, 0.5, 1], ((images["mask"] == 1).sum(), 3)),
@@ -151,7 +151,7 @@ def test_emission_is_factor_times_texture_times_strength(tmp_path):
             "pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1]},
         }
     ]
-    images = seen(read_gltf(centred(builder).write(tmp_path / "a.glb")), light=0.0)
+    images = rendered(read_gltf(centred(builder).write(tmp_path / "a.glb")), light=0.0)
     linear = ((188 / 255 + 0.055) / 1.055) ** 2.4
     np.testing.assert_allclose(images["color"][images["mask"] == 1].mean(0), [4 * linear, 2 * linear, 0], rtol=1e-4)
 

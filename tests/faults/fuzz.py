@@ -230,13 +230,13 @@ def fuzz(name: str, seed: int, seconds: float, rounds: int = 10**9) -> tuple[str
             done = subprocess.run(
                 command, capture_output=True, text=True, timeout=seconds + 120, cwd=Path(__file__).parents[2]
             )
-            said, code = (done.stdout + done.stderr[-400:]).strip(), done.returncode
+            outcome, code = (done.stdout + done.stderr[-400:]).strip(), done.returncode
         except subprocess.TimeoutExpired:
-            said, code = "hangs", -1
+            outcome, code = "hangs", -1
         if code == 0:
-            return said, None
+            return outcome, None
         file = Path(folder, name + READERS[name][0])
-        return f"exit {code}: {said}", file.read_bytes() if file.exists() else b""
+        return f"exit {code}: {outcome}", file.read_bytes() if file.exists() else b""
 
 
 def main(arguments: list[str]) -> int:
@@ -247,8 +247,8 @@ def main(arguments: list[str]) -> int:
         end = time.monotonic() + 60 * minutes / len(names)
         seed = time.time_ns() + i
         while time.monotonic() < end:
-            said, file = fuzz(name, seed, end - time.monotonic())
-            print(f"{name}: {said}", flush=True)
+            outcome, file = fuzz(name, seed, end - time.monotonic())
+            print(f"{name}: {outcome}", flush=True)
             if file is not None:
                 CRASHES.mkdir(exist_ok=True)
                 (CRASHES / f"{name}-{seed}{READERS[name][0]}").write_bytes(file)

@@ -213,10 +213,16 @@ def damage_json(value: Any, rng: np.random.Generator) -> Any:
     places = []
     waiting: list[Any] = [value]
     while waiting:
-        one = waiting.pop()
-        items = one.items() if isinstance(one, dict) else enumerate(one) if isinstance(one, list) else ()
+        container = waiting.pop()
+        items = (
+            container.items()
+            if isinstance(container, dict)
+            else enumerate(container)
+            if isinstance(container, list)
+            else ()
+        )
         for key, inner in list(items):
-            places.append((one, key))
+            places.append((container, key))
             waiting.append(inner)
     if not places:
         return ODD_VALUES[int(rng.integers(len(ODD_VALUES)))]
@@ -347,9 +353,9 @@ def case(rng: np.random.Generator, folder: Path) -> tuple[list[str], bytes]:
     ]
     if name in ("evaluate", "validate"):
         words = words[:-2]
-    given = b"".join(os.fsencode(source) + b"\n" for source in sources) if through_stdin else b""
+    stdin = b"".join(os.fsencode(source) + b"\n" for source in sources) if through_stdin else b""
     words += [] if through_stdin else ["--", *sources]
-    return [word.replace("\0", "") for word in words], given
+    return [word.replace("\0", "") for word in words], stdin
 
 
 def state(folder: Path) -> dict[str, str]:
@@ -363,13 +369,13 @@ def state(folder: Path) -> dict[str, str]:
     return out
 
 
-def run_case(words: list[str], given: bytes, folder: Path) -> tuple[int, str, str]:
+def run_case(words: list[str], stdin: bytes, folder: Path) -> tuple[int, str, str]:
     """Run a command in a fork of this process, which has imported what commands need.
 
     Returns exit code (124 where it did not end in time), stdout and stderr.
     """
     files = [tempfile.TemporaryFile() for _ in range(3)]  # noqa: SIM115 - closed at the end
-    files[0].write(given)
+    files[0].write(stdin)
     files[0].seek(0)
     pid = os.fork()
     if not pid:
@@ -429,11 +435,11 @@ def broken_rules(words: list[str], code: int, out: str, err: str, folder: Path, 
     several = [line for line in err.splitlines() if line and not KNOWN_LINE.match(line)]
     if several:
         rules.append(f"wrote lines that are no message: {several[:3]}")
-    told = [line for line in err.splitlines() if line.startswith("gdtool")]
-    if code and not told and words[0] != "validate":
-        rules.append("failed without a word")
-    if len(told) > 12:
-        rules.append(f"{len(told)} lines of errors")
+    errors = [line for line in err.splitlines() if line.startswith("gdtool")]
+    if code and not errors and words[0] != "validate":
+        rules.append("failed without a message")
+    if len(errors) > 12:
+        rules.append(f"{len(errors)} lines of errors")
     paths = []
     if words[0] not in ("evaluate", "validate") and "--plan" not in words:
         for line in out.splitlines():
@@ -493,14 +499,14 @@ def main(arguments: list[str]) -> int:
             (top_path / "outside/secret.txt").write_text("not to be touched")
             for _ in range(int(rng.choice([0, 0, 1, 1, 2, 3]))):
                 damage(folder, rng)
-            words, given = case(rng, folder)
+            words, stdin = case(rng, folder)
             before = state(top_path / "outside")
-            code, out, err = run_case(words, given, folder)
+            code, out, err = run_case(words, stdin, folder)
             codes[code] = codes.get(code, 0) + 1
             rules = broken_rules(words, code, out, err, folder, before)
             if rules:
                 broken += 1
-                print(f"seed {seed}: gdtool {' '.join(map(ascii, words))}" + (f" < {given!r}" if given else ""))
+                print(f"seed {seed}: gdtool {' '.join(map(ascii, words))}" + (f" < {stdin!r}" if stdin else ""))
                 print("".join(f"  {rule}\n" for rule in rules) + f"  exit {code}, said: {err[-600:]!r}", flush=True)
             shutil.rmtree(top_path / "outside")
             count, seed = count + 1, seed + 1

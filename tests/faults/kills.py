@@ -99,9 +99,9 @@ def spread(operations: list[str], count: int) -> list[int]:
     ]
     chosen = list(dict.fromkeys([0, len(operations) - 1, *important]))[:count]
     even = (round(k * (len(operations) - 1) / max(count - 1, 1)) for k in range(count))
-    for one in even:
-        if len(chosen) < count and one not in chosen:
-            chosen.append(one)
+    for operation in even:
+        if len(chosen) < count and operation not in chosen:
+            chosen.append(operation)
     rest = (i for i in range(len(operations)) if i not in chosen)
     return sorted(chosen + [i for i, _ in zip(rest, range(count - len(chosen)), strict=False)])
 
@@ -124,10 +124,10 @@ def main(random_kills: int = 50, exact_kills: int = 11, seed: int = 0) -> int:
         (folder / ".out.v2.000000000000.work/checkpoint").write_text("another output's")
         begin = time.perf_counter()
         process = start(folder, -1)
-        _, told = process.communicate()
+        _, errors = process.communicate()
         usual = time.perf_counter() - begin
-        assert process.returncode == 0, told
-        operations = [line.removeprefix("operation ") for line in told.splitlines() if line.startswith("operation ")]
+        assert process.returncode == 0, errors
+        operations = [line.removeprefix("operation ") for line in errors.splitlines() if line.startswith("operation ")]
         new = open_folder(folder / "out").manifest.digest
         assert old != new
         rng = random.Random(seed)
@@ -159,10 +159,10 @@ def main(random_kills: int = 50, exact_kills: int = 11, seed: int = 0) -> int:
             wrong += bool(faults)
             print(f"killed {name}: " + ("; ".join(faults) or "whole"), flush=True)
         process = start(folder)
-        _, told = process.communicate()
+        _, errors = process.communicate()
         left = [path for path in leftovers(folder) if ".out.v2." not in path]
         if process.returncode or open_folder(folder / "out").manifest.digest != new or left:
-            print(f"the run after the kills: exit {process.returncode}, left {left}, {told}")
+            print(f"the run after the kills: exit {process.returncode}, left {left}, {errors}")
             wrong += 1
     print(f"{len(moments)} kills, {wrong} with a fault")
     return wrong

@@ -88,10 +88,10 @@ def test_a_damaged_model_folder_is_refused_in_one_line(gdtool, tmp_path, tiny_mo
     write_manifest(tmp_path / "model")
     write_png(tmp_path / "ball.png", ball() / 255)
     done = gdtool("sample-views", "ball.png", "--model", "model", "--steps", 1, "-q")
-    told = lines_of(done.stderr)
+    errors = lines_of(done.stderr)
     assert done.returncode == 3, done.stderr
-    assert len(told) == 1, done.stderr
-    assert "model" in told[0], done.stderr
-    assert word in told[0], done.stderr
+    assert len(errors) == 1, done.stderr
+    assert "model" in errors[0], done.stderr
+    assert word in errors[0], done.stderr
     assert not (tmp_path / "trap-sprung").exists()
     assert not (tmp_path / "ball.asset/views").exists()

@@ -169,8 +169,8 @@ def dataset(count):
     ],
 )
 def test_holding_out_all_objects_is_refused(count, options, fine):
-    given = dataset(count)
-    inputs = Inputs(given, "x", {"start": None}, (given,))
+    source = dataset(count)
+    inputs = Inputs(source, "x", {"start": None}, (source,))
     if fine:
         train.check(inputs, train.Options(**options))
     else:
@@ -194,9 +194,9 @@ def test_holding_out_all_objects_is_refused(count, options, fine):
 )
 def test_a_wrong_training_configuration_is_refused(tmp_path, content, fact):
     (tmp_path / "c.json").write_text(content)
-    given = dataset(9)
+    source = dataset(9)
     with pytest.raises(Exception, match=fact) as caught:
-        train.check(Inputs(given, "x", {"start": None}, (given,)), train.Options(config="c.json"))
+        train.check(Inputs(source, "x", {"start": None}, (source,)), train.Options(config="c.json"))
     assert caught.value.exit_code == 3
     assert caught.value.cure
 

@@ -167,13 +167,13 @@ def test_any_exception_of_a_command_becomes_one_line(monkeypatch, capsys, raised
     monkeypatch.setattr(sys, "argv", ["gdtool", *(["--debug"] if debug else [])])
     with pytest.raises(SystemExit) as ended:
         _common.guarded(command)
-    told = capsys.readouterr().err
+    errors = capsys.readouterr().err
     assert ended.value.code == code
-    assert ("Traceback" in told) == debug
-    last = told.splitlines()[-1]
+    assert ("Traceback" in errors) == debug
+    last = errors.splitlines()[-1]
     assert last.startswith("gdtool: ")
     assert not last.startswith("gdtool: gdtool")
-    assert debug or len(told.splitlines()) == 1
+    assert debug or len(errors.splitlines()) == 1
     assert ("internal error" in last) == (code == 1)
 
 
@@ -189,10 +189,10 @@ def test_an_unexpected_failure_of_one_source_does_not_stop_the_others(monkeypatc
     monkeypatch.setattr(sys, "argv", ["gdtool", *pictures, "-q"])
     with pytest.raises(SystemExit) as ended:
         _common.guarded(_common.stage_command(dataclasses.replace(toy.STAGE, run=run), "Toy."))
-    out, told = capsys.readouterr()
+    out, errors = capsys.readouterr()
     assert ended.value.code == 1
     assert out.split() == ["a.asset/renders", "c.asset/renders"]
-    assert lines_of(told) == [
+    assert lines_of(errors) == [
         "gdtool: b.png: internal error (ZeroDivisionError: by); run it again with --debug to see where, and report that"
     ]
     assert leftovers(tmp_path) == []
@@ -204,9 +204,9 @@ def test_messages_are_one_line_whatever_characters_a_name_has(capsys, monkeypatc
     monkeypatch.setattr(log, "level", log.NORMAL)
     _common.report(InputError(name, f"is {name}", "mend it"))
     log.say(f"  {name}")
-    told = capsys.readouterr().err
-    assert len(told.splitlines()) == 2
-    assert "\x1b" not in told
+    errors = capsys.readouterr().err
+    assert len(errors.splitlines()) == 2
+    assert "\x1b" not in errors
     assert log.printable("caf\udce9 é 日本") == "caf\ufffd é 日本"
 
 
@@ -230,11 +230,11 @@ def test_every_terminating_signal_cleans_up(tmp_path, pictures, number):
     process = start([*TOY, "a.png", "--repeat", "9999", "--pause", "0.01"])
     wait_until(lambda: list(tmp_path.glob("a.asset/.renders.*.partial/005.png")), process)
     process.send_signal(number)
-    out, told = process.communicate(timeout=HANG_SECONDS)
+    out, errors = process.communicate(timeout=HANG_SECONDS)
     assert process.returncode == 128 + number
     assert out == ""
     # Only a limit of processor time is reported: the user may not know that it was reached.
-    assert [line for line in lines_of(told) if "running toy" not in line] == (
+    assert [line for line in lines_of(errors) if "running toy" not in line] == (
         ["gdtool: the limit of processor time is reached; raise it (ulimit -t)"] if number == signal.SIGXCPU else []
     )
     assert leftovers(tmp_path) == []
@@ -247,10 +247,10 @@ def test_a_hard_cpu_limit_leaves_time_to_clean_up(tmp_path, pictures):
         resource.setrlimit(resource.RLIMIT_CPU, (3, 3))
 
     process = start([*RUNS, "busy", "a.png", "-q"], preexec_fn=limited)
-    told = process.communicate(timeout=HANG_SECONDS)[1]
-    assert process.returncode == 128 + signal.SIGXCPU, told
-    assert len(lines_of(told)) == 1, told
-    assert leftovers(tmp_path) == [], told
+    errors = process.communicate(timeout=HANG_SECONDS)[1]
+    assert process.returncode == 128 + signal.SIGXCPU, errors
+    assert len(lines_of(errors)) == 1, errors
+    assert leftovers(tmp_path) == [], errors
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="asks /proc which signals are handled")
@@ -261,12 +261,12 @@ def test_ctrl_c_during_start_up_is_quiet(tmp_path, pictures, delay):
     wait_until(lambda: handles_signals(process), process)
     time.sleep(delay)
     process.send_signal(signal.SIGINT)
-    out, told = process.communicate()
+    out, errors = process.communicate()
     if process.returncode == 3:  # on a fast machine the run has already ended: a.png is no picture
         return
-    assert process.returncode == 130, told
-    assert out == "", told
-    assert [line for line in told.splitlines() if "running sample-views" not in line] == [], told
+    assert process.returncode == 130, errors
+    assert out == "", errors
+    assert [line for line in errors.splitlines() if "running sample-views" not in line] == [], errors
     assert leftovers(tmp_path) == []
 
 
@@ -277,10 +277,10 @@ def test_a_signal_ends_a_run_blocked_in_native_code(tmp_path, pictures, run):
     wait_until(lambda: list(tmp_path.glob("a.asset/.renders.*.partial/half.png")), process)
     time.sleep(0.2)
     process.send_signal(signal.SIGTERM)
-    out, told = process.communicate(timeout=HANG_SECONDS)
+    out, errors = process.communicate(timeout=HANG_SECONDS)
     assert process.returncode == 143
     assert out == ""
-    assert told == ""
+    assert errors == ""
     assert leftovers(tmp_path) == []
     assert not (tmp_path / "a.asset").exists()
 
@@ -331,10 +331,10 @@ def test_a_time_limit_in_python_code_raises_its_error_past_fallbacks():
 
 def test_a_time_limit_in_native_code_ends_the_process_with_its_error(tmp_path, pictures):
     process = start([*RUNS, "late", "a.png", "-q"])
-    out, told = process.communicate(timeout=20)
+    out, errors = process.communicate(timeout=20)
     assert process.returncode == 5
     assert out == ""
-    assert told == "gdtool: a: is not done after 0.3 s; raise --seconds to 1\n"
+    assert errors == "gdtool: a: is not done after 0.3 s; raise --seconds to 1\n"
     assert leftovers(tmp_path) == []
     assert not (tmp_path / "a.asset").exists()
 
@@ -461,9 +461,9 @@ def test_a_workspace_is_kept_only_where_a_run_can_resume_from_it(tmp_path, pictu
     assert "goes on from it" not in capsys.readouterr().err
     (failed,) = runner.run_all(toy_runs.stage("resumable"), ("a.png",), toy.Options(), {}, settings)
     (kept,) = tmp_path.glob("a.asset/.renders.*.work")
-    told = capsys.readouterr().err
+    errors = capsys.readouterr().err
     assert "internal error (ValueError: after" in str(failed)
-    assert f"is kept in {kept.relative_to(tmp_path)}; the same command goes on from it" in told
+    assert f"is kept in {kept.relative_to(tmp_path)}; the same command goes on from it" in errors
     (done,) = runner.run_all(toy_runs.stage("resumable"), ("a.png",), toy.Options(), {}, settings)
     assert done.status == "done"
     assert leftovers(tmp_path) == []

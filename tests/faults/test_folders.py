@@ -111,9 +111,9 @@ def damaged(good, tmp_path):
 def test_each_damaged_folder_is_refused_in_one_line(gdtool, good, damaged, tmp_path, command):
     extra = ("--reference", good) if command == "evaluate" else ()
     done = gdtool(command, *damaged, *extra, "-q")
-    told = lines_of(done.stderr)
+    errors = lines_of(done.stderr)
     for name, (_, fact) in DAMAGE.items():
-        about = [line for line in told if f"{name}.asset/views" in line]
+        about = [line for line in errors if f"{name}.asset/views" in line]
         assert len(about) == 1, (name, about, done.stderr)
         assert fact in about[0], (name, about, done.stderr)
     assert done.returncode == 3
@@ -130,10 +130,10 @@ def test_a_folder_of_the_wrong_kind_names_the_stage_that_makes_the_right_one(gdt
         ("relight", "gdtool bake"),
     ):
         done = gdtool(command, good)
-        (told,) = lines_of(done.stderr)
-        assert done.returncode == 3, told
-        assert "holds views" in told, told
-        assert cure in told, told
+        (error,) = lines_of(done.stderr)
+        assert done.returncode == 3, error
+        assert "holds views" in error, error
+        assert cure in error, error
 
 
 def test_views_from_inside_the_object_are_refused(gdtool, good, tmp_path):
@@ -141,13 +141,13 @@ def test_views_from_inside_the_object_are_refused(gdtool, good, tmp_path):
     shutil.copytree(good, tmp_path / "in.asset/views")
 
     def move(cameras):
-        for one in cameras:
+        for camera_record in cameras:
             for i in (3, 7, 11):
-                one["world_from_camera"][i] = 0.0
+                camera_record["world_from_camera"][i] = 0.0
 
     camera(move)(tmp_path / "in.asset/views")
     done = gdtool("reconstruct", "in.asset/views")
-    (told,) = lines_of(done.stderr)
+    (error,) = lines_of(done.stderr)
     assert done.returncode == 3
-    assert "camera" in told
+    assert "camera" in error
     assert not (tmp_path / "in.asset/surface").exists()

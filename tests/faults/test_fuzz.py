@@ -10,8 +10,8 @@ from tests.faults.fuzz import CRASHES, READERS, attempt, fuzz
 
 @pytest.mark.parametrize("name", READERS)
 def test_damaged_files_are_read_or_refused(name):
-    said, file = fuzz(name, seed=1, seconds=60, rounds=300)
-    assert file is None, said
+    outcome, file = fuzz(name, seed=1, seconds=60, rounds=300)
+    assert file is None, outcome
 
 
 @pytest.mark.parametrize("path", sorted(CRASHES.glob("*-*")), ids=lambda p: p.name)

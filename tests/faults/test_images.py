@@ -69,9 +69,9 @@ def refused(folder) -> dict[str, tuple[int, str]]:
 def test_each_faulty_picture_is_refused_in_one_line(gdtool, tmp_path, tiny_model):  # noqa: F811
     cases = refused(tmp_path)
     done = gdtool("sample-views", *cases, "--model", tiny_model, "--steps", 1, "-q")
-    told = lines_of(done.stderr)
+    errors = lines_of(done.stderr)
     for name, (_, word) in cases.items():
-        about = [line for line in told if line.removeprefix("gdtool: ").startswith(name)]
+        about = [line for line in errors if line.removeprefix("gdtool: ").startswith(name)]
         assert len(about) == 1, (name, about, done.stderr)
         assert word in about[0], (name, about, done.stderr)
     assert done.returncode == 1  # all failed, but not of one kind
@@ -109,10 +109,10 @@ def test_one_picture_in_every_png_encoding_gives_the_same_pixels(gdtool, tmp_pat
     done = gdtool("sample-views", *(f"{name}.png" for name in names), "--model", tiny_model, "--steps", 1, "-q")
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.splitlines()) == len(names), done.stderr
-    seen = {name: read_image(tmp_path / f"{name}.asset/views/condition/000.png") for name in names}
-    for one, other in (("plain", "interlaced"), ("plain", "sixteen"), ("few", "palette"), ("grey", "grey_rgba")):
-        assert np.array_equal(seen[one], seen[other]), (one, other)
-    assert seen["plain"][..., 3].any()
+    condition = {name: read_image(tmp_path / f"{name}.asset/views/condition/000.png") for name in names}
+    for first, second in (("plain", "interlaced"), ("plain", "sixteen"), ("few", "palette"), ("grey", "grey_rgba")):
+        assert np.array_equal(condition[first], condition[second]), (first, second)
+    assert condition["plain"][..., 3].any()
 
 
 def test_a_subject_cut_by_the_border_gives_a_warning(gdtool, tmp_path, tiny_model):  # noqa: F811

@@ -31,9 +31,9 @@ def test_a_failed_torch_allocation_reports_its_size():
 
     with pytest.raises(RuntimeError) as refused:
         torch.empty(2**44)
-    told = from_exception(refused.value, "x")
-    assert isinstance(told, ResourceError)
-    assert str(told).startswith("x: ran out of memory (it asked for 65536.00 GiB); ")
+    error = from_exception(refused.value, "x")
+    assert isinstance(error, ResourceError)
+    assert str(error).startswith("x: ran out of memory (it asked for 65536.00 GiB); ")
 
 
 def test_a_library_that_does_not_fit_in_memory_is_not_reported_as_missing():
@@ -103,22 +103,22 @@ def whole():
 
 
 @pytest.mark.parametrize(
-    "fault, told",
+    "limits, reason",
     [
         ({"seconds": 0.01, "memory_mb": 8000}, "took longer than 0.01 s"),
         ({"seconds": 60, "memory_mb": 1}, "needs more than 1 MB"),
     ],
     ids=["time", "memory"],
 )
-def test_a_killed_simplification_leaves_no_temporary_folder(monkeypatch, tmp_path, whole, fault, told):
+def test_a_killed_simplification_leaves_no_temporary_folder(monkeypatch, tmp_path, whole, limits, reason):
     """The child that makes coarser levels of detail works on files; killed, it cannot remove them itself."""
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
-    monkeypatch.setattr(lods, "call", lambda *given, **_: call(*given, **fault))
+    monkeypatch.setattr(lods, "call", lambda *arguments, **_: call(*arguments, **limits))
     coarse, why = lods.coarser(whole, 6)
     assert coarse is None
-    assert told in why
+    assert reason in why
     assert not list((tmp_path / "temporary").iterdir())
 
 

@@ -84,15 +84,15 @@ def faulty(tmp_path):
 )
 def test_each_faulty_model_is_refused_in_one_line(gdtool, faulty, tmp_path, command):
     done = gdtool(*command, *faulty, "missing.obj", "-q")
-    told = lines_of(done.stderr)
+    errors = lines_of(done.stderr)
     for name in [*faulty, "missing.obj"]:
-        about = [line for line in told if line.removeprefix("gdtool: ").startswith(name)]
+        about = [line for line in errors if line.removeprefix("gdtool: ").startswith(name)]
         fact = REFUSED[name][1] if name in REFUSED else "does not exist"
         assert len(about) == 1, (name, about, done.stderr)
         assert fact in about[0], (name, about, done.stderr)
     assert done.returncode == 3
     assert done.stdout == ""
-    assert len(told) == len(REFUSED) + 1
+    assert len(errors) == len(REFUSED) + 1
     assert leftovers(tmp_path) == []
     assert not list(tmp_path.glob("*.asset/*"))
 

@@ -39,10 +39,10 @@ def test_a_warning_says_why_a_face_count_was_missed(gdtool_here, tmp_path, mesh,
     write_obj(tmp_path / "x.obj", *mesh)
     done = gdtool_here("remesh", "x.obj", *options, "-o", "out")
     assert done.returncode == 0, done.stderr
-    said = [line for line in warnings_of(tmp_path / "out") if "asked for: " in line]
-    assert len(said) == 1, done.stderr
-    assert reason in said[0], done.stderr
-    assert said[0] in done.stderr, done.stderr
+    warnings = [line for line in warnings_of(tmp_path / "out") if "asked for: " in line]
+    assert len(warnings) == 1, done.stderr
+    assert reason in warnings[0], done.stderr
+    assert warnings[0] in done.stderr, done.stderr
 
 
 def test_the_reason_for_a_missed_count_follows_from_the_topology():
@@ -65,9 +65,9 @@ def test_a_warning_tells_the_share_of_faces_of_internal_shells(gdtool_here, tmp_
     write_obj(tmp_path / "x.obj", *joined((outer, faces), (0.4 * inner, others)))
     done = gdtool_here(*arguments, "-o", "out")
     assert done.returncode == 0, done.stderr
-    told = [line for line in warnings_of(tmp_path / "out") if "inside another" in line]
-    assert len(told) == 1
-    assert "1 closed body lies inside another, with 50.0% of the faces" in told[0]
+    warnings = [line for line in warnings_of(tmp_path / "out") if "inside another" in line]
+    assert len(warnings) == 1
+    assert "1 closed body lies inside another, with 50.0% of the faces" in warnings[0]
 
 
 def test_a_single_body_gives_no_warning_of_internal_shells(gdtool_here, tmp_path):

@@ -75,16 +75,16 @@ BAD_FIELDS = [
 ]
 
 
-@pytest.mark.parametrize("change, told", BAD_FIELDS, ids=lambda x: json.dumps(x) if isinstance(x, dict) else "")
-def test_an_invalid_field_of_a_configuration_is_named_with_its_bound(tmp_path, change, told):
-    with pytest.raises(InputError, match=told) as refused:
+@pytest.mark.parametrize("change, message", BAD_FIELDS, ids=lambda x: json.dumps(x) if isinstance(x, dict) else "")
+def test_an_invalid_field_of_a_configuration_is_named_with_its_bound(tmp_path, change, message):
+    with pytest.raises(InputError, match=message) as refused:
         read_config(write(tmp_path / "config.json", **change))
     assert refused.value.subject == str(tmp_path / "config.json")
     assert refused.value.cure
 
 
 @pytest.mark.parametrize(
-    "text, told",
+    "text, message",
     [
         ("[]", "Expected `object`"),
         ("{", "is not JSON"),
@@ -94,9 +94,9 @@ def test_an_invalid_field_of_a_configuration_is_named_with_its_bound(tmp_path, c
         ('{"patch": NaN}', "NaN"),
     ],
 )
-def test_a_configuration_that_is_no_valid_json_object_is_refused(tmp_path, text, told):
+def test_a_configuration_that_is_no_valid_json_object_is_refused(tmp_path, text, message):
     (tmp_path / "config.json").write_text(text)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         read_config(tmp_path / "config.json")
 
 

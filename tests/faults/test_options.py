@@ -59,12 +59,12 @@ def test_every_number_has_two_finite_bounds(name, param):
 def test_option_structs_have_the_bounds_of_the_command_line(name):
     """Options may also be built from a manifest or in a test."""
     struct = importlib.import_module("gdtool.stages." + name.replace("-", "_")).Options
-    given = {field.name: field.default for field in msgspec.structs.fields(struct)}
+    defaults = {field.name: field.default for field in msgspec.structs.fields(struct)}
     for field in msgspec.structs.fields(struct):
         if isinstance(field.default, float):
             for wrong in (float("nan"), float("inf"), -1e30, 1e30):
                 with pytest.raises(UsageError):
-                    build_options(struct, given | {field.name: wrong})
+                    build_options(struct, defaults | {field.name: wrong})
 
 
 @by_option(STRINGS)

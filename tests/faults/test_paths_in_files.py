@@ -240,8 +240,8 @@ def test_an_archive_writes_nothing_outside_the_workspace(tmp_path, name):
     work.mkdir(parents=True)
     content = encode_png(RED)
     with tarfile.open(archive, "w", format=tarfile.PAX_FORMAT) as tar:
-        for one in ("a.asset/views/manifest.json", name):
-            member = tarfile.TarInfo(one)
+        for member_name in ("a.asset/views/manifest.json", name):
+            member = tarfile.TarInfo(member_name)
             member.size = len(content)
             tar.addfile(member, io.BytesIO(content))
     before = sorted(tmp_path.rglob("*"))

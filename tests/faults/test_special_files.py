@@ -51,8 +51,8 @@ def special(path, kind):
         path.symlink_to("/dev/zero")
         yield
     else:
-        with socket.socket(socket.AF_UNIX) as one:
-            one.bind(os.path.relpath(path))  # an address has a hundred characters at most
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(os.path.relpath(path))  # an address has a hundred characters at most
             yield
 
 

@@ -50,16 +50,16 @@ def small_files():
 
 def test_a_full_disk_exits_4_and_keeps_the_old_result(tmp_path, cube):
     quad_cube(tmp_path / "old.obj", 4)
-    made = subprocess.run([*REMESH[:-1], "96", "old.obj", "-o", "out", "-q"], capture_output=True, text=True)
-    assert made.returncode == 0, made.stderr
+    old = subprocess.run([*REMESH[:-1], "96", "old.obj", "-o", "out", "-q"], capture_output=True, text=True)
+    assert old.returncode == 0, old.stderr
     before = tree(tmp_path / "out")
     process = start(cube, "-o", "out", preexec_fn=small_files)
     out, errors = process.communicate()
     assert process.returncode == 4, errors
     assert out == "", errors
-    (told,) = lines_of(errors)
-    assert "too large" in told
-    assert "; " in told
+    (error,) = lines_of(errors)
+    assert "too large" in error
+    assert "; " in error
     assert tree(tmp_path / "out") == before
     assert leftovers(tmp_path) == []
 

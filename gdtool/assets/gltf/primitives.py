@@ -12,12 +12,12 @@ from gdtool.assets.gltf.schema import Primitive
 from gdtool.geometry.topology import repeats
 
 _UV_SET = re.compile(r"TEXCOORD_[0-9]{1,3}")
-_MAX_UV_SETS = 32  # files with a higher number have made it up; each set below it costs an array
+_MAX_UV_SETS = 32  # a higher number is a fault of the file, and each set below it would cost an array
 
 
 @dataclass
 class MeshPart:
-    """One primitive under one node. Arrays as in Scene, None where the file has none; material is the file's index."""
+    """Hold one primitive under one node: arrays as in Scene, None where the file has none, and its material's index."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -176,7 +176,7 @@ def _check_finite(file: GltfFile, part: MeshPart, subject: str) -> None:
 
 
 def placed(part: MeshPart, matrix: np.ndarray) -> MeshPart:
-    """Transform a part, which is changed, by one matrix (4, 4) or one per vertex (v, 4, 4).
+    """Transform a part in place by one matrix (4, 4), or by one for each vertex (v, 4, 4), and return it.
 
     A mirroring matrix reverses the faces' winding and the handedness of the tangents.
     """

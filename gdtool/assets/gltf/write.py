@@ -11,11 +11,11 @@ from gdtool.assets.gltf.builder import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, GlbBu
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.core.errors import OutputError, from_os_error
 
-_MIN_LENGTH = 1e-6  # of a normal or tangent in the scene's units; a shorter one has no usable direction
+_MIN_LENGTH = 1e-6  # of a normal or tangent, which should be 1; a shorter one has no usable direction
 
 
 def write_glb(
-    path: str | Path, scene: Scene, extras: dict[str, Any] | None = None, made: dict[int, str | bytes] | None = None
+    path: str | Path, scene: Scene, extras: dict[str, Any] | None = None, pngs: dict[int, str | bytes] | None = None
 ) -> None:
     """Write a .glb with one node, one mesh and a primitive for each material in use.
 
@@ -24,12 +24,12 @@ def write_glb(
     metallic-roughness can be one image. Colour textures are stored as sRGB and the others as linear, as the format
     demands. Tangents are written where the material has a normal map: the scene's, else MikkTSpace's.
 
-    extras: written to asset.extras. made: by the id of an image array, its PNG where there is one already. Bytes are
+    extras: written to asset.extras. pngs: by the id of an image array, its PNG where there is one already. Bytes are
     embedded; a name is that of a file beside the .glb, which is then referred to.
 
     Raises OutputError, and ResourceError beyond 4 GiB.
     """
-    content = glb_bytes(scene, extras, made)
+    content = glb_bytes(scene, extras, pngs)
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -43,10 +43,10 @@ def write_glb(
         )
 
 
-def glb_bytes(scene: Scene, extras: dict[str, Any] | None = None, made: dict[int, str | bytes] | None = None) -> bytes:
+def glb_bytes(scene: Scene, extras: dict[str, Any] | None = None, pngs: dict[int, str | bytes] | None = None) -> bytes:
     """Make the content of the file that write_glb writes."""
     _check(scene)
-    builder = GlbBuilder(made or {})
+    builder = GlbBuilder(pngs or {})
     uv_slots = [i for i, uv in enumerate(scene.uvs) if uv is not None]
     primitives = []
     for index in np.unique(scene.face_materials):

@@ -54,7 +54,10 @@ def quadruped(rng: np.random.Generator) -> Assembly:
     ]
     body.append(solids.both_sides(solids.blended(knees + paws, 0.04)))
     t = np.linspace(0, 1, 6)
-    lift, thick = rng.uniform(-0.5, 0.8), max(foot * rng.uniform(0.3, 0.8), 0.045)  # thinner falls between the cells
+    lift, thick = (
+        rng.uniform(-0.5, 0.8),
+        max(foot * rng.uniform(0.3, 0.8), 0.045),
+    )  # a thinner tail is missed by the grid
     tail = np.stack([0 * t, girth * 0.3 + lift * t**1.5, -length * 1.05 - rng.uniform(0.15, 0.5) * t], -1)
     body.append(solids.chain(tail, thick * (1.2 - 0.5 * t)))
     trunk = rng.uniform() < 0.18
@@ -293,7 +296,7 @@ def dragon(rng: np.random.Generator) -> Assembly:
     wing, span, rise = tiles.pick(rng, "skin"), rng.uniform(0.6, 0.95), rng.uniform(0.3, 0.6)
     fingers = np.array([(0.45, 1.0), (1.0, 0.62), (0.9, 0.0), (0.5, -0.18)]) * np.array([span, rise])
     rim = [(0.0, 0.1), tuple(fingers[0])]
-    for start, end in itertools.pairwise(fingers):  # the skin sags between the fingers
+    for start, end in itertools.pairwise(fingers):  # the membrane sags between the fingers
         rim += [tuple(0.82 * (start + end) / 2 + 0.18 * np.array([0.4 * span, 0.3 * rise])), tuple(end)]
     middle = np.array([0.42 * span, 0.35 * rise])
     fold, lean = rng.uniform(-10, 35), rng.uniform(-25, 15)

@@ -340,7 +340,7 @@ def rusty(rng: np.random.Generator, color=None) -> Finish:
     """Draw metal that rusts in patches and from below, or copper with verdigris."""
     bare = any_metal(rng) if color is None else color
     rust = hsv(rng.uniform(0.03, 0.08), rng.uniform(0.6, 0.85), rng.uniform(0.3, 0.6))
-    if rng.uniform() < 0.2:  # copper's green instead
+    if rng.uniform() < 0.2:  # verdigris on copper
         bare, rust = np.array(METALS["copper"]), hsv(rng.uniform(0.4, 0.47), 0.4, rng.uniform(0.5, 0.7))
     layers = [
         _Layer(0, _Substance(bare, rng.uniform(0.2, 0.45), 1.0)),

@@ -264,8 +264,7 @@ def burger(rng: np.random.Generator) -> Assembly:
 
         def below_edge(p):
             """Measure the height above the wavy lower edge of the icing."""
-            # On strided columns numpy's arctan2 picks its code by where the memory lies, and the last bit with it
-            # (numpy 1.26)
+            # Contiguous, because on strided columns the last bit of numpy 1.26's arctan2 depends on memory alignment.
             x, y, z = np.ascontiguousarray(p.T)
             return y - 0.02 - 0.03 * np.sin(7 * np.arctan2(z, x))
 

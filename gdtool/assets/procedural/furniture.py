@@ -70,7 +70,7 @@ def table(rng: np.random.Generator) -> Assembly:
             a.add_pair(part.moved(w / 2 - size, 0, z), wood)
         if rng.uniform() < 0.5:
             a.add(box(w * 0.85, 0.12, d * 0.85, 0.01).moved(y=height - 0.08), wood)
-    for _ in range(int(rng.integers(0, 3))):  # something on it
+    for _ in range(int(rng.integers(0, 3))):  # things on the table
         x, z = rng.uniform(-0.22, 0.22, 2)
         if rng.uniform() < 0.5:
             a.add(

@@ -51,27 +51,27 @@ def ears(a: Assembly, rng: np.random.Generator, center, r: float, coat) -> None:
     """Add a pair of pointed, round, long, hanging or wide ears to a head of radius r at `center`."""
     x, y, z = center
     kind = rng.integers(5)
-    if kind == 0:  # pointed
+    if kind == 0:  # pointed, as a cat's
         part = (
             cone(r * rng.uniform(0.28, 0.42), r * rng.uniform(0.6, 1.0), 20)
             .scaled(1, 1, 0.55)
             .turned("z", -22)
             .moved(x + 0.5 * r, y + 0.62 * r, z)
         )
-    elif kind == 1:  # round
+    elif kind == 1:  # round, as a bear's
         size = r * rng.uniform(0.28, 0.42)
         part = ball(size, size, size * 0.45, 22).moved(x + 0.68 * r, y + 0.68 * r, z)
-    elif kind == 2:  # long upright
+    elif kind == 2:  # long and upright, as a rabbit's
         part = (
             ball(r * 0.2, r * rng.uniform(0.7, 1.2), r * 0.12, 22)
             .turned("z", -rng.uniform(5, 25))
             .moved(x + 0.4 * r, y + 1.5 * r, z)
         )
-    elif kind == 3:  # hanging
+    elif kind == 3:  # hanging, as a dog's
         part = (
             ball(r * 0.16, r * rng.uniform(0.45, 0.7), r * 0.3, 22).turned("z", 12).moved(x + 0.98 * r, y - 0.02 * r, z)
         )
-    else:  # wide, elephant
+    else:  # wide, as an elephant's
         part = ball(r * 0.75, r * 0.85, r * 0.12, 26).turned("y", 25).moved(x + 1.25 * r, y + 0.1 * r, z - 0.15 * r)
     a.add_pair(part, coat)
 

@@ -129,7 +129,9 @@ def grid_part(points: np.ndarray, closed: bool = False, crease_degrees: float = 
         if not closed and pole[row]:
             strip = by_row[side][0 if row == 0 else -1]
             total = strip.sum(axis=0)
-            if np.linalg.norm(total) > 0.7 * np.linalg.norm(strip, axis=1).sum():  # a pointed tip keeps its own normals
+            if (
+                np.linalg.norm(total) > 0.7 * np.linalg.norm(strip, axis=1).sum()
+            ):  # a pointed tip keeps separate normals
                 strip[:] = total
     keep_left, keep_right = ~sharp_column[:-1, None], ~sharp_column[1:, None]
 
@@ -335,7 +337,7 @@ def tube(path: np.ndarray, radius: float | np.ndarray, closed: bool = False, out
         side = unit(side - tangent * (side @ tangent))
         transported.append(side)
     sides = np.array(transported)
-    if closed:  # spread the frame's holonomy over the loop so that the ends meet
+    if closed:  # the frame returns rotated to the start; spread that angle over the loop so that the ends meet
         last = unit(sides[-1] - tangents[0] * (sides[-1] @ tangents[0]))
         angle = np.arctan2(np.cross(sides[0], last) @ tangents[0], sides[0] @ last)
         share = -angle * np.arange(len(path)) / len(path)

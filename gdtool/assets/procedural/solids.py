@@ -165,8 +165,10 @@ def polygonised(shape: Distance, resolution: int = 52, reach: float = 1.6) -> Pa
     high = np.array([axes[i][inside[:, i].max()] for i in range(3)]) + coarse
     step = float((high - low).max() - 2 * coarse) / resolution
     axes = _axes(low, high, step)
-    values = np.pad(_sampled(shape, axes), 1, constant_values=step)  # closed even where the box cuts the shape
-    values = np.where(np.abs(values) < 0.01 * step, np.float32(0.01 * step), values)  # keeps vertices apart: no slivers
+    # The padding closes the surface where the box cuts the shape.
+    values = np.pad(_sampled(shape, axes), 1, constant_values=step)
+    # Values near zero would place several vertices in one point and make slivers.
+    values = np.where(np.abs(values) < 0.01 * step, np.float32(0.01 * step), values)
     cells, faces, _, _ = marching_cubes(values, 0.0, allow_degenerate=True)
     vertices = (cells - 1) * step + np.array([a[0] for a in axes])
     offsets = 0.35 * step * np.eye(3, dtype=np.float32)

@@ -253,7 +253,7 @@ def pick(rng: np.random.Generator, theme: str = "any", color: np.ndarray | None 
     """
     choices = THEMES[theme]
     chosen = choices[rng.integers(len(choices))]
-    own = np.random.default_rng(rng.integers(2**62))
+    stream = np.random.default_rng(rng.integers(2**62))
     if color is not None and chosen in (finishes.metal, hammered, finishes.rusty):
         color = None  # a metal has a metal's colour
-    return chosen(own, color)
+    return chosen(stream, color)

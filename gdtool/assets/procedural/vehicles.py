@@ -43,7 +43,7 @@ def car(rng: np.random.Generator) -> Assembly:
     for z in (length * 0.6, -length * 0.6):
         shell = solids.carved(shell, solids.rod((0, -low, z), r * 1.15, 2.0, "x"), 0.02)
     a.add(solids.polygonised(shell, 64), paint)
-    # a slightly smaller cabin that sticks out along z and x only: windows
+    # The windows are boxes lower than the cabin that reach beyond it in z or in x.
     for half in ((w * 0.7, cab * 0.5, length * 0.62), (w * 0.97, cab * 0.5, length * 0.36)):
         a.add(solids.polygonised(solids.block((0, low + cab * 0.75, shift), half, 0.07), 34), glass)
     wheels(a, rng, w * 0.95, -low, (length * 0.6, -length * 0.6), r, rng.uniform(0.1, 0.15))

@@ -148,9 +148,9 @@ def test_an_unknown_kind_is_named():
 
 
 def test_thirty_seeds_give_varied_kinds_and_materials():
-    made = [scene_of(seed) for seed in SEEDS]
-    names = {scene.name.rsplit("-", 1)[1] for scene in made}
-    materials = [material for scene in made for material in scene.materials]
+    scenes = [scene_of(seed) for seed in SEEDS]
+    names = {scene.name.rsplit("-", 1)[1] for scene in scenes}
+    materials = [material for scene in scenes for material in scene.materials]
     roughness = [m.metallic_roughness_texture is not None for m in materials]
     assert len(names) >= 12
     assert any(m.metallic == 1 and m.metallic_roughness_texture is None for m in materials)
