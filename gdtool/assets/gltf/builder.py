@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ class GlbBuilder:
     .glb.
     """
 
-    def __init__(self, pngs: dict[int, str | bytes]) -> None:
+    def __init__(self, pngs: Mapping[int, str | bytes]) -> None:
         self._pngs = pngs
         self.json: dict[str, Any] = {"asset": {"version": "2.0", "generator": f"gdtool {__version__}"}, "scene": 0}
         self.binary = bytearray()

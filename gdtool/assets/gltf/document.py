@@ -35,8 +35,8 @@ SUPPORTED = {
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _SHAPES = {"SCALAR": (), "VEC2": (2,), "VEC3": (3,), "VEC4": (4,), "MAT2": (2, 2), "MAT3": (3, 3), "MAT4": (4, 4)}
 _FLOAT32 = 5126  # componentType
-# Bytes that an object of the JSON takes once it is decoded. Measured on the worst case: a node of three characters, with
-# the matrix that is computed for it.
+# Bytes that an object of the JSON takes once it is decoded. Measured on the worst case: a node of three characters,
+# with the matrix that is computed for it.
 _OBJECT_BYTES = 600
 
 EXPORT = "export it again as glTF 2.0"
@@ -218,7 +218,7 @@ class GltfFile:
         return content[offset : offset + length]
 
     def check_memory(self, size: int, what: str, cure: str) -> None:
-        """Raise ResourceError where `size` bytes are more than one input may take; what names their use in the message."""
+        """Raise ResourceError where `size` bytes are more than one input may take; what tells their use."""
         require_memory(size, self.path, what, cure)
 
     def accessor(self, index: int) -> tuple[np.ndarray, Accessor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ _MIN_LENGTH = 1e-6  # of a normal or tangent, which should be 1; a shorter one h
 
 
 def write_glb(
-    path: str | Path, scene: Scene, extras: dict[str, Any] | None = None, pngs: dict[int, str | bytes] | None = None
+    path: str | Path, scene: Scene, extras: dict[str, Any] | None = None, pngs: Mapping[int, str | bytes] | None = None
 ) -> None:
     """Write a .glb with one node, one mesh and a primitive for each material in use.
 
@@ -43,7 +44,9 @@ def write_glb(
         )
 
 
-def glb_bytes(scene: Scene, extras: dict[str, Any] | None = None, pngs: dict[int, str | bytes] | None = None) -> bytes:
+def glb_bytes(
+    scene: Scene, extras: dict[str, Any] | None = None, pngs: Mapping[int, str | bytes] | None = None
+) -> bytes:
     """Make the content of the file that write_glb writes."""
     _check(scene)
     builder = GlbBuilder(pngs or {})

@@ -24,7 +24,7 @@ from gdtool.assets.procedural.parts import (
 def csg(rng: np.random.Generator) -> Assembly:
     """Combine blocks, rods, balls and rings, mirrored in x, by union, difference and intersection."""
 
-    def primitive(spread):
+    def primitive(spread: float) -> solids.Distance:
         """Draw a primitive whose centre lies within `spread` of the origin in each axis."""
         c = rng.uniform(-spread, spread, 3)
         kind = rng.integers(4)
@@ -58,7 +58,7 @@ def csg(rng: np.random.Generator) -> Assembly:
 def supershape(rng: np.random.Generator) -> Assembly:
     """Make a closed surface from Gielis' superformula in two angles, perhaps on a base."""
 
-    def radius(angle, m, n1, n2, n3):
+    def radius(angle: np.ndarray, m: int, n1: float, n2: float, n3: float) -> np.ndarray:
         """Evaluate the superformula."""
         return (np.abs(np.cos(m * angle / 4)) ** n2 + np.abs(np.sin(m * angle / 4)) ** n3) ** (-1 / n1)
 

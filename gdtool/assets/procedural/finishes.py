@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from gdtool.assets.procedural import patterns
 from gdtool.assets.procedural.colors import METALS, any_color, any_metal, hsv, near_color
 from gdtool.assets.procedural.parts import product
+from gdtool.assets.procedural.patterns import Field
 from gdtool.assets.scene import Material, Texture, Wrap
 
 
@@ -54,7 +55,7 @@ def _srgb8(color: np.ndarray) -> np.ndarray:
 def textured_material(
     name: str,
     color: np.ndarray,
-    metallic: np.ndarray,
+    metallic: np.ndarray | float,
     roughness: np.ndarray,
     uv_set: int,
     wrap: Wrap,
@@ -68,7 +69,7 @@ def textured_material(
     orm = np.stack([np.ones(shape), roughness, np.broadcast_to(metallic, shape)], -1)
     orm = np.round(np.clip(orm, 0, 1) * 255).astype(np.uint8)
 
-    def texture(image, encoding):
+    def texture(image: np.ndarray, encoding: Literal["srgb", "linear"]) -> Texture:
         """Make a texture of an image in the material's UV set."""
         return Texture(image, encoding, uv_set=uv_set, wrap_u=wrap, wrap_v=wrap)
 
@@ -93,22 +94,22 @@ def plain(color: np.ndarray, roughness: float, metallic: float = 0.0, name: str 
     return lambda shape: Look(material)
 
 
-def plastic(rng: np.random.Generator, color=None) -> Finish:
+def plastic(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw a fairly smooth dielectric finish."""
     return plain(any_color(rng) if color is None else color, rng.uniform(0.2, 0.6), name="plastic")
 
 
-def metal(rng: np.random.Generator, color=None) -> Finish:
+def metal(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw a metallic finish."""
     return plain(any_metal(rng) if color is None else color, rng.uniform(0.12, 0.55), 1.0, name="metal")
 
 
-def matte(rng: np.random.Generator, color=None) -> Finish:
+def matte(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw a rough dielectric finish."""
     return plain(any_color(rng) if color is None else color, rng.uniform(0.65, 0.98), name="matte")
 
 
-def glossy(rng: np.random.Generator, color=None) -> Finish:
+def glossy(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw a polished dielectric finish."""
     return plain(any_color(rng) if color is None else color, rng.uniform(0.06, 0.22), name="glossy")
 
@@ -154,14 +155,14 @@ def _table(
     return textured_material(name, np.clip(color, 0, 1), value[..., 4], roughness, 1, wrap)
 
 
-def _dirt(rng: np.random.Generator) -> Callable:
+def _dirt(rng: np.random.Generator) -> Field:
     """Draw a smooth field in [0, 1] over points (n, 3): how dirty the surface is."""
     field = patterns.noise_field(rng, rng.uniform(2, 6), 2.5)
     return lambda points: np.clip(0.5 + 0.22 * field(points), 0.01, 0.99)
 
 
 def _field(
-    name: str, material: Material, pattern: Callable[[Shape], np.ndarray], dirt: Callable, clip: bool = True
+    name: str, material: Material, pattern: Callable[[Shape], np.ndarray], dirt: Field, clip: bool = True
 ) -> Finish:
     """Make a finish that looks its material up by a pattern along u and by dirt along v.
 
@@ -177,7 +178,7 @@ def _field(
     return apply
 
 
-def _any_substance(rng: np.random.Generator, color) -> _Substance:
+def _any_substance(rng: np.random.Generator, color: np.ndarray) -> _Substance:
     """Draw a dielectric of a colour, or (15 %) a metal."""
     if rng.uniform() < 0.15:
         roughness = rng.uniform(0.15, 0.5)
@@ -185,7 +186,9 @@ def _any_substance(rng: np.random.Generator, color) -> _Substance:
     return _Substance(color, rng.uniform(0.15, 0.9))
 
 
-def banded(rng: np.random.Generator, color=None, axis=None, frequency=None) -> Finish:
+def banded(
+    rng: np.random.Generator, color: np.ndarray | None = None, axis: int | None = None, frequency: float | None = None
+) -> Finish:
     """Draw stripes across an axis, in two or three substances."""
     color = any_color(rng) if color is None else color
     direction = np.eye(3)[rng.choice(3, p=[0.2, 0.6, 0.2]) if axis is None else axis] + rng.normal(0, 0.02, 3)
@@ -207,7 +210,7 @@ def banded(rng: np.random.Generator, color=None, axis=None, frequency=None) -> F
     )
 
 
-def gradient(rng: np.random.Generator, color=None, direction=None) -> Finish:
+def gradient(rng: np.random.Generator, color: np.ndarray | None = None, direction: np.ndarray | None = None) -> Finish:
     """Draw a smooth change of colour along a direction, by default upward."""
     color = any_color(rng) if color is None else color
     other = near_color(rng, any_color(rng) if rng.uniform() < 0.5 else color, 0.6)
@@ -222,7 +225,7 @@ def gradient(rng: np.random.Generator, color=None, direction=None) -> Finish:
     return _field("gradient", material, lambda s: 0.5 + product(s.points, axis) + 0.04 * wobble(s.points), _dirt(rng))
 
 
-def marble(rng: np.random.Generator, color=None) -> Finish:
+def marble(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw marble: veins along the zero set of a noise field."""
     color = any_color(rng) if color is None else color
     vein = any_metal(rng) if (gilded := rng.uniform() < 0.25) else near_color(rng, color, 1.0)
@@ -236,7 +239,7 @@ def marble(rng: np.random.Generator, color=None) -> Finish:
     return _field("marble", _table("marble", layers, 0.04), lambda s: np.abs(field(s.points)) * 0.8, _dirt(rng))
 
 
-def blotched(rng: np.random.Generator, color=None, other=None) -> Finish:
+def blotched(rng: np.random.Generator, color: np.ndarray | None = None, other: np.ndarray | None = None) -> Finish:
     """Draw irregular patches of two or three substances: cows, camouflage, corroded paint."""
     color = any_color(rng) if color is None else color
     first, second = _any_substance(rng, color), _any_substance(rng, any_color(rng) if other is None else other)
@@ -248,7 +251,7 @@ def blotched(rng: np.random.Generator, color=None, other=None) -> Finish:
     return _field("patches", _table("patches", layers, 0.012), lambda s: 0.5 + 0.2 * field(s.points), _dirt(rng))
 
 
-def spotted(rng: np.random.Generator, color=None, other=None) -> Finish:
+def spotted(rng: np.random.Generator, color: np.ndarray | None = None, other: np.ndarray | None = None) -> Finish:
     """Draw round spots around random sites."""
     color, other = any_color(rng) if color is None else color, any_color(rng) if other is None else other
     first, second = _any_substance(rng, color), _any_substance(rng, other)
@@ -259,7 +262,7 @@ def spotted(rng: np.random.Generator, color=None, other=None) -> Finish:
     return _field("spots", material, lambda s: 0.5 * field(s.points)[:, 0] / radius, _dirt(rng))
 
 
-def crackled(rng: np.random.Generator, color=None, other=None) -> Finish:
+def crackled(rng: np.random.Generator, color: np.ndarray | None = None, other: np.ndarray | None = None) -> Finish:
     """Draw cells with joints between them: giraffe, dry earth, crackle glaze, leaded glass."""
     color = any_color(rng) if color is None else color
     joint = near_color(rng, color, 1.0) if other is None else other
@@ -269,7 +272,7 @@ def crackled(rng: np.random.Generator, color=None, other=None) -> Finish:
         "cells", [_Layer(0, _Substance(joint, rng.uniform(0.3, 0.95))), _Layer(0.5, _Substance(color, roughness))], 0.06
     )
 
-    def pattern(s):
+    def pattern(s: Shape) -> np.ndarray:
         """Measure the distance to the joint between the two nearest sites."""
         near = field(s.points)
         return 0.5 * (near[:, 1] - near[:, 0]) / width
@@ -277,7 +280,7 @@ def crackled(rng: np.random.Generator, color=None, other=None) -> Finish:
     return _field("cells", material, pattern, _dirt(rng))
 
 
-def chequered(rng: np.random.Generator, color=None) -> Finish:
+def chequered(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw a chequerboard in the first UV set."""
     color = any_color(rng) if color is None else color
     first, second = _any_substance(rng, color), _any_substance(rng, any_color(rng))
@@ -289,7 +292,7 @@ def chequered(rng: np.random.Generator, color=None) -> Finish:
     return lambda shape: Look(material, None, tiles)
 
 
-def wooden(rng: np.random.Generator, color=None) -> Finish:
+def wooden(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw wood: the rings of a trunk, cut by the surface."""
     color = hsv(rng.uniform(0.04, 0.11), rng.uniform(0.35, 0.75), rng.uniform(0.35, 0.85)) if color is None else color
     dark, roughness = color * rng.uniform(0.35, 0.7), rng.uniform(0.3, 0.8)
@@ -306,7 +309,7 @@ def wooden(rng: np.random.Generator, color=None) -> Finish:
     squeeze = np.where(np.arange(3) == axis, 0.25, 1.0)
     field = patterns.noise_field(rng, 2.5, 2.0)
 
-    def pattern(s):
+    def pattern(s: Shape) -> np.ndarray:
         """Measure the distance from the trunk's axis, wobbling, in rings."""
         radius = np.hypot(s.points[:, across[0]] - center[0], s.points[:, across[1]] - center[1])
         return rings * radius + 0.5 * field(s.points * squeeze)
@@ -314,7 +317,7 @@ def wooden(rng: np.random.Generator, color=None) -> Finish:
     return _field("wood", material, pattern, _dirt(rng), clip=False)
 
 
-def worn_paint(rng: np.random.Generator, color=None) -> Finish:
+def worn_paint(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw paint that is gone on outward edges and in scratches, with metal beneath."""
     color, bare = any_color(rng) if color is None else color, any_metal(rng)
     roughness = rng.uniform(0.2, 0.6)
@@ -336,7 +339,7 @@ def worn_paint(rng: np.random.Generator, color=None) -> Finish:
     )
 
 
-def rusty(rng: np.random.Generator, color=None) -> Finish:
+def rusty(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw metal that rusts in patches and from below, or copper with verdigris."""
     bare = any_metal(rng) if color is None else color
     rust = hsv(rng.uniform(0.03, 0.08), rng.uniform(0.6, 0.85), rng.uniform(0.3, 0.6))
@@ -356,7 +359,7 @@ def rusty(rng: np.random.Generator, color=None) -> Finish:
     )
 
 
-def topped(rng: np.random.Generator, color=None, top=None) -> Finish:
+def topped(rng: np.random.Generator, color: np.ndarray | None = None, top: np.ndarray | None = None) -> Finish:
     """Draw a layer on all that faces up: snow, moss, icing, dust."""
     color = any_color(rng) if color is None else color
     top = (
@@ -371,7 +374,9 @@ def topped(rng: np.random.Generator, color=None, top=None) -> Finish:
     return _field("topped", material, lambda s: 0.4 + 0.4 * s.normals[:, 1] + 0.06 * field(s.points), _dirt(rng))
 
 
-def gazing(rng: np.random.Generator, direction: np.ndarray, iris=None, white=None) -> Finish:
+def gazing(
+    rng: np.random.Generator, direction: np.ndarray, iris: np.ndarray | None = None, white: np.ndarray | None = None
+) -> Finish:
     """Draw the finish of a pair of eyeballs that look along `direction`: black pupil, coloured iris, white.
 
     The ring is chosen by the angle between normal and direction. direction is the right eye's (x >= 0); the left eye

@@ -262,7 +262,7 @@ def burger(rng: np.random.Generator) -> Assembly:
         ring = np.stack([0.4 * np.cos(w), 0 * w, 0.4 * np.sin(w)], -1)
         a.add(tube(ring, thick, closed=True, outline=circle(28)), finishes.matte(rng, hsv(0.085, 0.6, 0.75)))
 
-        def below_edge(p):
+        def below_edge(p: np.ndarray) -> np.ndarray:
             """Measure the height above the wavy lower edge of the icing."""
             # Contiguous, because on strided columns the last bit of numpy 1.26's arctan2 depends on memory alignment.
             x, y, z = np.ascontiguousarray(p.T)

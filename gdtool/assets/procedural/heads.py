@@ -7,8 +7,10 @@ import numpy as np
 from gdtool.assets.procedural import colors, finishes, tiles
 from gdtool.assets.procedural.assembly import Assembly
 from gdtool.assets.procedural.colors import hsv
+from gdtool.assets.procedural.finishes import Finish
 from gdtool.assets.procedural.parts import ball, circle, cone, cylinder, loft, refined, tube
 
+Place = tuple[float, float, float]
 BLACK = np.array([0.012, 0.011, 0.011])
 
 
@@ -30,7 +32,7 @@ def eyes(
     a.add_pair(ball(size, size * rng.uniform(0.9, 1.2), size * 0.8, 20).moved(x, y, z), finish)
 
 
-def face(a: Assembly, rng: np.random.Generator, center, r: float, coat, snout: float) -> None:
+def face(a: Assembly, rng: np.random.Generator, center: Place, r: float, coat: Finish, snout: float) -> None:
     """Add eyes, a muzzle of length `snout` relative to r, and a nose to a head of radius r at `center`."""
     x, y, z = center
     size = r * rng.uniform(0.14, 0.28)
@@ -47,7 +49,7 @@ def face(a: Assembly, rng: np.random.Generator, center, r: float, coat, snout: f
     )
 
 
-def ears(a: Assembly, rng: np.random.Generator, center, r: float, coat) -> None:
+def ears(a: Assembly, rng: np.random.Generator, center: Place, r: float, coat: Finish) -> None:
     """Add a pair of pointed, round, long, hanging or wide ears to a head of radius r at `center`."""
     x, y, z = center
     kind = rng.integers(5)
@@ -76,7 +78,7 @@ def ears(a: Assembly, rng: np.random.Generator, center, r: float, coat) -> None:
     a.add_pair(part, coat)
 
 
-def horns(a: Assembly, rng: np.random.Generator, center, r: float) -> None:
+def horns(a: Assembly, rng: np.random.Generator, center: Place, r: float) -> None:
     """Add a pair of curved horns, or one straight horn, to a head of radius r at `center`."""
     x, y, z = center
     finish = (
@@ -93,11 +95,11 @@ def horns(a: Assembly, rng: np.random.Generator, center, r: float) -> None:
     a.add_pair(tube(path, r * 0.16 * (1 - 0.85 * t)), finish)
 
 
-def dress_head(a: Assembly, rng: np.random.Generator, head, r: float, chance: float) -> None:
+def dress_head(a: Assembly, rng: np.random.Generator, center: Place, r: float, chance: float) -> None:
     """Add a pointed hat, a top hat, a crown, a cap or a scarf with probability `chance`."""
     if rng.uniform() > chance:
         return
-    x, y, z = head
+    x, y, z = center
     kind, finish = rng.integers(5), tiles.pick(rng, "cloth")
     if kind == 0:
         a.add(cone(r * 0.7, r * 1.5, 32).moved(x, y + r * 0.7, z), finish)

@@ -9,8 +9,10 @@ import numpy as np
 
 from gdtool.assets.procedural.parts import product
 
+Field = Callable[[np.ndarray], np.ndarray]  # a function of points (n, 3)
 
-def noise_field(rng: np.random.Generator, frequency: float, octaves: float = 2.0, waves: int = 28) -> Callable:
+
+def noise_field(rng: np.random.Generator, frequency: float, octaves: float = 2.0, waves: int = 28) -> Field:
     """Draw a smooth random function of points (n, 3), of about unit variance: a sum of `waves` sines.
 
     Their frequencies, in cycles per unit length, lie within `octaves` above `frequency`; higher ones are weaker in
@@ -26,7 +28,7 @@ def noise_field(rng: np.random.Generator, frequency: float, octaves: float = 2.0
     return lambda points: product(np.sin(product(points.astype(np.float32), vectors) + phase), weight)
 
 
-def cell_field(rng: np.random.Generator, count: int) -> Callable:
+def cell_field(rng: np.random.Generator, count: int) -> Field:
     """Draw random sites in the unit box; returns a function of points (n, 3): distances (n, 2) to the nearest two."""
     from scipy.spatial import cKDTree
 

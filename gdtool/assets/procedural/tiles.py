@@ -8,10 +8,18 @@ from gdtool.assets.procedural import finishes, patterns
 from gdtool.assets.procedural.colors import any_color, any_metal, hsv, near_color
 from gdtool.assets.procedural.finishes import Finish, Look
 
-SIZE = 256
+SIZE = 256  # pixels along a side of a tile
 
 
-def _tiled(name: str, color, metallic, roughness, height, strength: float, tiles: float) -> Finish:
+def _tiled(
+    name: str,
+    color: np.ndarray,
+    metallic: float,
+    roughness: np.ndarray,
+    height: np.ndarray | None,
+    strength: float,
+    tiles: float,
+) -> Finish:
     """Make a finish of tiling maps; strength: the range of heights in units of a tile's side; tiles per unit length."""
     normal = None if height is None else patterns.normal_from_height(height, strength)
     roughness = np.broadcast_to(np.clip(roughness, 0.04, 1), (SIZE, SIZE))
@@ -19,12 +27,12 @@ def _tiled(name: str, color, metallic, roughness, height, strength: float, tiles
     return lambda shape: Look(material, None, tiles)
 
 
-def _mix(a, b, weight: np.ndarray) -> np.ndarray:
+def _mix(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Blend two colours or images by a weight (h, w)."""
     return np.asarray(a) * (1 - weight[..., None]) + np.asarray(b) * weight[..., None]
 
 
-def bricks(rng: np.random.Generator, color=None) -> Finish:
+def bricks(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw bricks, ashlar or tiles with joints."""
     color = hsv(rng.uniform(0.0, 0.1), rng.uniform(0.1, 0.7), rng.uniform(0.35, 0.8)) if color is None else color
     rows, columns = [(6, 3), (8, 4), (4, 4), (5, 3)][rng.integers(4)]
@@ -40,7 +48,7 @@ def bricks(rng: np.random.Generator, color=None) -> Finish:
     )
 
 
-def planks(rng: np.random.Generator, color=None) -> Finish:
+def planks(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw boards side by side, their grain along u or v."""
     color = hsv(rng.uniform(0.04, 0.11), rng.uniform(0.3, 0.7), rng.uniform(0.3, 0.8)) if color is None else color
     height, shade = patterns.brick_cells(rng, SIZE, int(rng.integers(3, 7)), 1, 0.015, rng.uniform(0.2, 0.8), 0.03)
@@ -53,7 +61,7 @@ def planks(rng: np.random.Generator, color=None) -> Finish:
     return _tiled("planks", image, 0.0, roughness, relief, 0.012, rng.uniform(1.0, 2.5))
 
 
-def shingles(rng: np.random.Generator, color=None) -> Finish:
+def shingles(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw overlapping rounded tiles: roofs, scales, feathers."""
     color = any_color(rng) if color is None else color
     rows = 2 * int(rng.integers(3, 6))
@@ -75,7 +83,7 @@ def shingles(rng: np.random.Generator, color=None) -> Finish:
     )
 
 
-def woven(rng: np.random.Generator, color=None) -> Finish:
+def woven(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw cloth, wicker or carbon fibre: threads that pass over and under each other."""
     color = any_color(rng) if color is None else color
     other = near_color(rng, color, 0.4) if rng.uniform() < 0.6 else any_color(rng)
@@ -92,7 +100,7 @@ def woven(rng: np.random.Generator, color=None) -> Finish:
     )
 
 
-def tartan(rng: np.random.Generator, color=None) -> Finish:
+def tartan(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw the crossing stripes of cloth or paper."""
     color = any_color(rng) if color is None else color
     u, v = patterns.tile_grid(SIZE)
@@ -107,7 +115,7 @@ def tartan(rng: np.random.Generator, color=None) -> Finish:
     )
 
 
-def hammered(rng: np.random.Generator, color=None) -> Finish:
+def hammered(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw metal with dents."""
     color = any_metal(rng) if color is None else color
     near = patterns.tile_cells(rng, SIZE, int(rng.integers(40, 160))).nearest
@@ -123,7 +131,7 @@ def hammered(rng: np.random.Generator, color=None) -> Finish:
     )
 
 
-def brushed(rng: np.random.Generator, color=None) -> Finish:
+def brushed(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw metal or lacquer with directional streaks, scratches and smudges."""
     is_metal = rng.uniform() < 0.7
     color = (any_metal(rng) if is_metal else any_color(rng)) if color is None else color
@@ -135,7 +143,7 @@ def brushed(rng: np.random.Generator, color=None) -> Finish:
     return _tiled("brushed", image, float(is_metal), roughness, -scratches + 0.1 * streaks, 0.002, rng.uniform(0.8, 2))
 
 
-def grained(rng: np.random.Generator, color=None) -> Finish:
+def grained(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw leather, plaster, crust, felt or rock: bumps with darker pits."""
     color = any_color(rng) if color is None else color
     if rng.uniform() < 0.5:
@@ -150,7 +158,7 @@ def grained(rng: np.random.Generator, color=None) -> Finish:
     return _tiled("grained", image, 0.0, rng.uniform(0.5, 0.95) - 0.1 * height, height, strength, rng.uniform(0.8, 2))
 
 
-def dotted(rng: np.random.Generator, color=None) -> Finish:
+def dotted(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
     """Draw polka dots or a terrazzo of chips."""
     color, other = any_color(rng) if color is None else color, any_color(rng)
     if rng.uniform() < 0.5:

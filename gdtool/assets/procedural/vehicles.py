@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from gdtool.assets.procedural import colors, finishes, solids, tiles
@@ -9,7 +11,9 @@ from gdtool.assets.procedural.assembly import Assembly
 from gdtool.assets.procedural.parts import ball, box, circle, cone, cylinder, loft, refined, smooth_curve
 
 
-def wheels(a: Assembly, rng: np.random.Generator, x: float, y: float, zs, r: float, width: float) -> None:
+def wheels(
+    a: Assembly, rng: np.random.Generator, x: float, y: float, zs: Sequence[float], r: float, width: float
+) -> None:
     """Add a pair of wheels of radius r at +x and -x for each z in zs."""
     tire, hub = finishes.matte(rng, np.full(3, rng.uniform(0.01, 0.06))), finishes.metal(rng)
     t = np.linspace(-np.pi / 2, np.pi / 2, 9)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gdtool.assets.procedural import colors, finishes, tiles
 from gdtool.assets.procedural.assembly import Assembly
@@ -45,12 +46,12 @@ def body_curve(
     return np.vstack([(0, 0), (foot * 0.92, 0), curve])
 
 
-def _handle(rng: np.random.Generator, start, end, bulge: float, radius: float) -> Part:
+def _handle(rng: np.random.Generator, start: ArrayLike, end: ArrayLike, bulge: float, radius: float) -> Part:
     """Make a handle between two points that bulges by `bulge` in x."""
-    start, end = np.asarray(start, float), np.asarray(end, float)
+    first, last = np.asarray(start, float), np.asarray(end, float)
     t = np.linspace(0, 1, 22)
     out = np.sin(np.pi * t) ** rng.uniform(0.5, 1.0)
-    path = start + (end - start) * t[:, None] + np.array([bulge, 0, 0]) * out[:, None]
+    path = first + (last - first) * t[:, None] + np.array([bulge, 0, 0]) * out[:, None]
     outline = circle(14) * np.array([1.0, rng.uniform(0.8, 1.8)])
     return tube(path, radius, outline=outline)
 
@@ -66,7 +67,7 @@ def vase(rng: np.random.Generator) -> Assembly:
     a.add(part, finish)
     if rng.uniform() < 0.35:
         y0, y1 = height * rng.uniform(0.4, 0.55), height * rng.uniform(0.75, 0.95)
-        r0, r1 = (np.interp(y, curve[2:, 1], curve[2:, 0]) - 0.02 for y in (y0, y1))
+        r0, r1 = (float(np.interp(y, curve[2:, 1], curve[2:, 0])) - 0.02 for y in (y0, y1))
         a.add_pair(_handle(rng, (r0, y0, 0), (r1, y1, 0), rng.uniform(0.1, 0.25), 0.035), finish)
     if rng.uniform() < 0.4:
         trim = tiles.pick(rng, "metal")
