@@ -475,6 +475,7 @@ def broken_rules(words: list[str], code: int, out: str, err: str, folder: Path, 
 
 
 def main(arguments: list[str]) -> int:
+    """Run cases until the time is over; returns 1 when a rule was broken."""
     if arguments[:1] == ["--pool"]:
         make_pool(Path(arguments[1]))
         return 0

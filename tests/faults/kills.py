@@ -42,18 +42,18 @@ def watched(act) -> None:
             act(f"{event} {name}")
 
     sys.addaudithook(hook)
-    # The swap of two folders is a call into the C library, of which audit hooks do not hear.
+    # The swap of two folders is a call into the C library, which audit hooks do not see.
     from gdtool.core import publish
 
     swap = publish._exchange
 
-    def told_swap(a: Path, b: Path) -> bool:
+    def watched_swap(a: Path, b: Path) -> bool:
         act(f"swap {a} {b}")
         done = swap(a, b)
         act(f"swapped {a} {b}")
         return done
 
-    publish._exchange = told_swap
+    publish._exchange = watched_swap
 
 
 def inside(stop_before: int) -> None:
@@ -76,6 +76,7 @@ def inside(stop_before: int) -> None:
 
 
 def start(folder: Path, stop_before: int | None = None) -> subprocess.Popen:
+    """Start the run, to its end or to be killed before an operation."""
     words = (
         ["-m", "gdtool", *COMMAND]
         if stop_before is None
