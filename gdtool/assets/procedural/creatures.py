@@ -1,4 +1,4 @@
-"""Make creatures with a face toward +Z: four-legged animals, birds, fish, turtles, dragons."""
+"""Make creatures with a face toward +Z: four-legged animals, birds, fish, turtles, dragons; figures.py adds people."""
 
 from __future__ import annotations
 

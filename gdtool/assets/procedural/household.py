@@ -1,4 +1,4 @@
-"""Make containers and tools: chests, cartons, books, extinguishers, clocks, tools."""
+"""Make containers and tools: chests, cartons, books, extinguishers, clocks, tools. The family includes furniture.py."""
 
 from __future__ import annotations
 
