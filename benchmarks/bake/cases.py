@@ -100,7 +100,7 @@ def quads_for(scene, quads: int = QUADS) -> dict[str, np.ndarray]:
 
 def case_of(source: str | Path, kept: Path) -> Case:
     """The part, or a model file in a unit box; made where it is not kept yet."""
-    from gdtool.assets.gltf_write import write_glb
+    from gdtool.assets.gltf.write import write_glb
     from gdtool.assets.load import load_scene
     from gdtool.stages import remesh, unwrap
 

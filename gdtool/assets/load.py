@@ -1,4 +1,4 @@
-"""One door to every model that gdtool reads."""
+"""Read a model of any format that gdtool knows, and check it."""
 
 from __future__ import annotations
 
@@ -13,19 +13,21 @@ from gdtool.core.memory import require_memory
 from gdtool.core.reading import require_regular_file
 from gdtool.geometry.vectors import cross, dot
 
-_CHUNK = 2**14  # faces at a time: what they need in between stays in the cache
+_CHUNK = 2**14  # faces checked at once: their temporary arrays fit the processor's cache
 _MAX_SEED_DIGITS = 19  # of a 64-bit integer
-# Bytes that a byte of the file takes while it is read, with its arrays: measured on grids of 90,000 vertices, as text
-# where that is more. glTF counts its geometry from its JSON, OBJ in obj_lines.
+_MAX_EXTENT = 1e100  # in the file's units; products of larger coordinates overflow float64
+_MIN_AREA_SQUARED = 1e-32  # of (twice a face's area)², in a unit box: below it the area is rounding error
+# Peak bytes of reading for each byte of the file, arrays included: measured on grids of 90,000 vertices, as text where
+# that takes more. glTF and OBJ are predicted by their own readers (gltf/geometry_size.py, obj/lines.py).
 _HELD_PER_BYTE = {".ply": 17, ".stl": 8}
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 
 
 def load_scene(source: str | Path) -> Scene:
-    """Read a model: .glb, .gltf, .obj (with .mtl), .ply, .stl, or the generated object that "procedural:SEED" names.
+    """Read a model: .glb, .gltf, .obj (with .mtl), .ply or .stl, or generate the object of "procedural:SEED".
 
-    The scene has faces, finite coordinates, indices in range, and is no point. Raises InputError, OutputError,
-    ResourceError.
+    The scene has at least one face with an area, finite coordinates, and indices in range. Raises InputError,
+    OutputError, ResourceError.
     """
     if isinstance(source, str) and source.startswith("procedural:"):
         from gdtool.assets.procedural import generate
@@ -50,17 +52,19 @@ def load_scene(source: str | Path) -> Scene:
         "simplify it or split it into several files",
     )
     if suffix in (".glb", ".gltf"):
-        from gdtool.assets.gltf_read import read_gltf as read
+        from gdtool.assets.gltf.read import read_gltf as read
     elif suffix == ".obj":
-        from gdtool.assets.obj_read import read_obj as read
+        from gdtool.assets.obj.read import read_obj as read
     else:
-        from gdtool.assets.scan_read import read_scan as read
+        from gdtool.assets.ply_stl.read import read_ply_or_stl as read
     return _checked(read(path), path)
 
 
 def _checked(scene: Scene, path: Path) -> Scene:
-    """Return the scene without faces of which two corners coincide; those whose three lie on a line stay, being seams
-    that keep a mesh closed. Raises InputError for what no stage can work on."""
+    """Remove faces with two coincident corners, and mend normals. Raises InputError for what no stage can work on.
+
+    Faces whose three distinct corners lie on a line stay: they close the mesh where edges meet in a T.
+    """
     if not len(scene.faces):
         raise InputError(path, "has no faces", "export the model with its faces")
     if scene.faces.min() < 0 or scene.faces.max() >= len(scene.vertices):
@@ -69,9 +73,9 @@ def _checked(scene: Scene, path: Path) -> Scene:
             f"a face refers to a vertex out of range (there are {len(scene.vertices)})",
             "export it again with all its vertices",
         )
-    named = np.zeros(len(scene.vertices), bool)
-    named[scene.faces] = True
-    used = scene.vertices[named]
+    is_used = np.zeros(len(scene.vertices), bool)
+    is_used[scene.faces] = True
+    used = scene.vertices[is_used]
     if not np.isfinite(used).all():
         raise InputError(
             path,
@@ -80,7 +84,7 @@ def _checked(scene: Scene, path: Path) -> Scene:
         )
     low, high = used.min(0), used.max(0)
     extent = float((high - low).max())
-    if not np.isfinite(extent) or extent > 1e100:
+    if not np.isfinite(extent) or extent > _MAX_EXTENT:
         raise InputError(path, f"is {extent:.3g} units large", "scale it down")
     if extent == 0:
         raise InputError(
@@ -93,27 +97,30 @@ def _checked(scene: Scene, path: Path) -> Scene:
         scene = replace(
             scene,
             faces=scene.faces[~empty],
-            material_idx=scene.material_idx[~empty],
+            material_idx=scene.face_materials[~empty],
             notes=(*scene.notes, f"{int(empty.sum())} faces with two corners in one place are left out"),
         )
     return _with_sound_normals(scene)
 
 
 def _degenerate(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Which faces (f,) have two corners in one place, and whether any has an area; vertices (v, 3) fill a unit box."""
-    rows = np.ascontiguousarray(vertices.T)  # several times faster than corners of (f, 3, 3)
+    """Find the faces (f,) with two corners in one place, and whether any face has an area.
+
+    vertices (v, 3) fill a unit box.
+    """
+    rows = np.ascontiguousarray(vertices.T)  # several times faster than an array of corners (f, 3, 3)
     empty, has_area = np.empty(len(faces), bool), False
     for i in range(0, len(faces), _CHUNK):
         a, b, c = (rows.take(corner, 1) for corner in np.ascontiguousarray(faces[i : i + _CHUNK].T))
         empty[i : i + _CHUNK] = (a == b).all(0) | (b == c).all(0) | (c == a).all(0)
         if not has_area:
             normal = cross(b - a, c - a)
-            has_area = bool((dot(normal, normal) > 1e-32).any())
+            has_area = bool((dot(normal, normal) > _MIN_AREA_SQUARED).any())
     return empty, has_area
 
 
 def _with_sound_normals(scene: Scene) -> Scene:
-    """Return the scene with the faces' own normals where a given one has no length."""
+    """Replace vertex normals shorter than 0.5, which should be unit vectors, by those of the faces."""
     if scene.normals is None:
         return scene
     bad = np.linalg.norm(scene.normals, axis=1) < 0.5

@@ -1,4 +1,4 @@
-"""The triangle scene with glTF 2.0 materials that every reader returns and every writer takes."""
+"""Define the triangle scene with glTF 2.0 materials that every reader returns and every writer takes."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ Filter = Literal["linear", "nearest"]
 
 @dataclass(frozen=True)
 class Texture:
-    """An image and how glTF 2.0 says to look it up.
+    """Hold an image and how to look it up, in the terms of glTF 2.0.
 
-    image: (h, w, c) uint8, uint16 or float32, row 0 at the top, c = 1..4, straight alpha.
-    encoding: "srgb" when the three colour channels are sRGB-encoded (alpha never is), else "linear".
-    uv' = offset + rotate(scale * uv), KHR_texture_transform; rotation in radians, counter-clockwise.
+    image: (h, w, c) uint8, uint16 or float32, row 0 at the top, c = 1 to 4, alpha not premultiplied.
+    encoding: "srgb" where the colour channels are sRGB-encoded (alpha never is), else "linear".
+    uv_set: index into Scene.uvs. offset, rotation (radians, counter-clockwise) and scale are those of
+    KHR_texture_transform: uv' = offset + rotate(scale * uv).
     """
 
     image: np.ndarray
@@ -33,10 +34,10 @@ class Texture:
 
 @dataclass(frozen=True)
 class Material:
-    """glTF 2.0 metallic-roughness material. Colours are linear, factors in [0, 1] (emissive may exceed 1).
+    """Hold a glTF 2.0 metallic-roughness material. Colours are linear; factors lie in [0, 1], emissive may exceed 1.
 
-    Channels: base_color_texture RGBA, metallic_roughness_texture G = roughness, B = metallic, normal_texture tangent
-    space +Y up, occlusion_texture R, emissive_texture RGB.
+    Channels: RGBA of base_color_texture; roughness in G and metallic in B of metallic_roughness_texture; tangent-space
+    normals with +Y up in normal_texture; R of occlusion_texture; RGB of emissive_texture. Textures multiply factors.
     """
 
     name: str = "material"
@@ -59,19 +60,19 @@ class Material:
     emissive_texture: Texture | None = None
 
 
-# What a face without a material is made of: glTF's default is a rough metal, which no such file means.
+# Stands in for a missing material. glTF's default is a rough metal, which is not what such files look like elsewhere.
 DEFAULT_MATERIAL = Material(name="default", base_color=(0.8, 0.8, 0.8, 1.0), metallic=0.0, roughness=0.5)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Triangles in one right-handed, Y-up frame, all node transforms applied.
+    """Hold triangles in one right-handed, Y-up frame, all node transforms applied.
 
     vertices (v, 3) float64; faces (f, 3) int32, counter-clockwise seen from outside.
-    normals (v, 3) unit or None (then flat); tangents (v, 4) with handedness in w, or None.
-    uvs: one (v, 2) float64 array per set, (0, 0) at the image's top left; a set may be None.
-    colors (v, 4) linear, or None. material_idx (f,) int32 into materials.
-    notes: what a reader ignored or repaired, one line each.
+    normals (v, 3), unit vectors; None means flat shading. tangents (v, 4), handedness in w, or None.
+    uvs: an array (v, 2) float64 for each UV set, (0, 0) at the image's top left; a set may be None.
+    colors (v, 4), linear, or None. material_idx (f,) int32 into materials; zeros where None is given.
+    notes: what a reader ignored or repaired, a line each.
     """
 
     vertices: np.ndarray
@@ -85,6 +86,12 @@ class Scene:
     name: str = "object"
     notes: tuple[str, ...] = field(default=())
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.material_idx is None:
             object.__setattr__(self, "material_idx", np.zeros(len(self.faces), np.int32))
+
+    @property
+    def face_materials(self) -> np.ndarray:
+        """Return material_idx (f,), which is never None once the scene is made."""
+        assert self.material_idx is not None
+        return self.material_idx

@@ -202,7 +202,7 @@ def write_models(
     path(file name) says where. The coarser levels refer to the maps' files instead of holding them. Returns the file
     name of each map.
     """
-    from gdtool.assets.gltf_write import write_glb
+    from gdtool.assets.gltf.write import write_glb
     from gdtool.bake.maps import contact_sheet_of
     from gdtool.images.io import encode_pngs, write_png
 
@@ -214,11 +214,11 @@ def write_models(
     write_glb(
         path("asset.glb"),
         scene_of(meshes.target, maps, material, options.name),
-        made={id(images[name]): content for name, content in encoded.items()},
+        pngs={id(images[name]): content for name, content in encoded.items()},
     )
     beside = _write_maps(path, maps, images, encoded, options.convention, bool(meshes.levels))
     for k, level in enumerate(meshes.levels, 1):
-        write_glb(path(f"asset_lod{k}.glb"), scene_of(level, maps, material, options.name), made=beside)
+        write_glb(path(f"asset_lod{k}.glb"), scene_of(level, maps, material, options.name), pngs=beside)
     files = {name: f"{name}.png" for name in images}
     for name, image in maps.extra.items():
         files[name] = f"{name}.png"

@@ -52,7 +52,7 @@ def read_obj(path: Path) -> QuadMesh:
 
     Polygons of more corners are cut into quads and a triangle. Raises InputError for what is not so.
     """
-    from gdtool.assets.obj_lines import read_lines
+    from gdtool.assets.obj.lines import read_lines
 
     lines = read_lines(path)
     points, coordinates = lines.vertices, lines.uvs * (1, -1) + (0, 1)

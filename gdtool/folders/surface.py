@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gdtool.assets.ply import binary_ply, columns
+from gdtool.assets.ply_stl.binary_ply import columns, read_binary_ply
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
 from gdtool.core.kinds import IDENTITY, SurfaceContent
@@ -118,7 +118,7 @@ def read_surface(folder: Folder) -> Surface:
 
     path = folder.file("surface.ply")
     try:
-        vertex, faces = binary_ply(bytes_of(path))
+        vertex, faces = read_binary_ply(bytes_of(path))
     except ValueError as error:
         raise InputError(path, str(error), "write it as schemas/surface.md says") from None
     names = vertex.dtype.names or ()

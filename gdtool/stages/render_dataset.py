@@ -151,7 +151,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             _write_conditions(out, renderer, lamps.direct, options, rng)
     with out.step("write"):
         if generated:
-            from gdtool.assets.gltf_write import write_glb
+            from gdtool.assets.gltf.write import write_glb
 
             write_glb(out.path("source.glb"), scene)
         write_views(

@@ -1,4 +1,4 @@
-"""Small glTF files made in code."""
+"""Build small glTF files in code."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ QUAD_FACES = np.array([0, 1, 2, 0, 2, 3], np.uint16)
 
 
 class Builder:
-    """A document and its one buffer; add() returns accessor indices."""
+    """Build a glTF document and its one buffer; `document` may be edited before it is written."""
 
     def __init__(self) -> None:
         self.document: dict[str, Any] = {
@@ -35,6 +35,7 @@ class Builder:
         self.binary = b""
 
     def view(self, content: bytes, **extra: Any) -> int:
+        """Append bytes as a buffer view and return its index."""
         self.binary += b"\0" * (-len(self.binary) % 4)
         self.document["bufferViews"].append(
             {"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(content), **extra}
@@ -43,6 +44,7 @@ class Builder:
         return len(self.document["bufferViews"]) - 1
 
     def add(self, array: np.ndarray, **extra: Any) -> int:
+        """Append an array as an accessor and return its index."""
         stride = {}
         stored = array
         # Rows of vertex attributes begin at multiples of four.
@@ -64,24 +66,27 @@ class Builder:
         return len(self.document["accessors"]) - 1
 
     def primitive(self, attributes: dict[str, int], indices: int | None = None, **extra: Any) -> None:
+        """Append a primitive, of accessor indices, to the first mesh."""
         item = {"attributes": attributes, **extra}
         if indices is not None:
             item["indices"] = indices
         self.document["meshes"][0]["primitives"].append(item)
 
     def glb(self) -> bytes:
+        """Assemble the GLB."""
         document = copy.deepcopy(self.document)
         if self.binary:
             document["buffers"] = [{"byteLength": len(self.binary)}]
         return pack(json.dumps(document).encode(), self.binary)
 
     def write(self, path: Path) -> Path:
+        """Write the GLB to a path, which is returned."""
         path.write_bytes(self.glb())
         return path
 
 
 def pack(text: bytes, binary: bytes) -> bytes:
-    """A GLB of a JSON and a binary chunk."""
+    """Assemble a GLB of a JSON and a binary chunk."""
     text += b" " * (-len(text) % 4)
     binary += b"\0" * (-len(binary) % 4)
     total = 12 + 8 + len(text) + (8 + len(binary) if binary else 0)
@@ -90,7 +95,7 @@ def pack(text: bytes, binary: bytes) -> bytes:
 
 
 def quad(**material: Any) -> Builder:
-    """A unit square facing +Z with normals and texture coordinates, and a material where one is given."""
+    """Build a unit square facing +Z with normals and texture coordinates, and a material of the given properties."""
     builder = Builder()
     attributes = {
         "POSITION": builder.add(QUAD),
@@ -106,7 +111,7 @@ def quad(**material: Any) -> Builder:
 
 
 def with_textures(**textures: np.ndarray) -> Builder:
-    """A quad with a material `m` whose images are embedded; texture i is named by keyword order."""
+    """Build a quad with a material `m` and embedded images; texture i is the i-th keyword argument."""
     builder = quad(name="m")
     views = [builder.view(encode_png(image)) for image in textures.values()]
     builder.document["images"] = [{"bufferView": view, "mimeType": "image/png"} for view in views]

@@ -1,4 +1,4 @@
-"""Whatever bytes a file holds, its reader answers with the scene or with one of gdtool's own one-line errors."""
+"""Read damaged files: each reader returns a scene or an image, or raises one of gdtool's one-line errors."""
 
 import random
 import struct
@@ -19,6 +19,7 @@ OBJ = (
 
 
 def textured_quad() -> bytes:
+    """Make a GLB with an embedded texture."""
     builder = quad(pbrMetallicRoughness={"baseColorTexture": {"index": 0}}, normalTexture={"index": 0})
     builder.document["images"] = [{"bufferView": builder.view(encode_png(np.zeros((4, 4, 3))))}]
     builder.document["textures"] = [{"source": 0}]
@@ -26,11 +27,13 @@ def textured_quad() -> bytes:
 
 
 def exr(tmp_path) -> bytes:
+    """Make an EXR image."""
     write_exr(tmp_path / "whole.exr", np.random.default_rng(0).random((24, 24, 3)))
     return (tmp_path / "whole.exr").read_bytes()
 
 
 def damaged(whole: bytes, rng: random.Random) -> bytes:
+    """Flip, insert or delete a few bytes of a file, or cut it short."""
     out = bytearray(whole)
     for _ in range(rng.choice([1, 1, 2, 4])):
         if not out:
@@ -75,6 +78,7 @@ def test_a_damaged_file_is_read_or_refused(tmp_path, kind, capfd):
             read(path)
         except GdtoolError as error:
             refused += 1
-            assert "\n" not in str(error) and str(path) in str(error)
+            assert "\n" not in str(error)
+            assert str(path) in str(error)
     assert refused > 30  # the damage does reach the reader
     assert capfd.readouterr().err == ""

@@ -1,12 +1,12 @@
-"""Materials of glTF files: factors, maps, extensions."""
+"""Read materials of glTF files: factors, textures, extensions."""
 
 import numpy as np
 
-from gdtool.assets.gltf_read import read_gltf
+from gdtool.assets.gltf.read import read_gltf
 from tests.assets.gltf_files import quad, with_textures
 
 
-def test_material_with_everything(tmp_path):
+def test_every_material_property_is_read(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (4, 4, 4), np.uint8)
     builder = with_textures(color=pixels, orm=pixels[..., :3], grey=pixels[..., :1])
     builder.document["extensionsUsed"] = [
@@ -66,19 +66,22 @@ def test_material_with_everything(tmp_path):
         1.3,
         0.5,
     )
-    assert m.emissive == (4, 2, 0) and m.normal_scale == 0.5 and m.occlusion_strength == 0.75
+    assert m.emissive == (4, 2, 0)
+    assert m.normal_scale == 0.5
+    assert m.occlusion_strength == 0.75
     t = m.base_color_texture
     assert (t.encoding, t.offset, t.rotation, t.scale) == ("srgb", (0.5, 0.25), 1.5, (2, 3))
     assert (t.wrap_u, t.wrap_v, t.filter) == ("clamp", "mirror", "nearest")
     np.testing.assert_array_equal(t.image, pixels)
-    assert m.metallic_roughness_texture.encoding == "linear" and m.metallic_roughness_texture.wrap_u == "repeat"
+    assert m.metallic_roughness_texture.encoding == "linear"
+    assert m.metallic_roughness_texture.wrap_u == "repeat"
     assert m.occlusion_texture.image is m.metallic_roughness_texture.image
     # Grey is grey in all colours.
     np.testing.assert_array_equal(m.normal_texture.image, np.repeat(pixels[..., :1], 3, -1))
     assert any("KHR_materials_clearcoat" in note for note in scene.notes)
 
 
-def test_defaults_of_a_bare_material(tmp_path):
+def test_an_empty_material_has_the_defaults_of_the_format(tmp_path):
     m = read_gltf(quad(name="bare").write(tmp_path / "a.glb")).materials[0]
     assert (m.base_color, m.metallic, m.roughness, m.alpha_mode, m.double_sided) == (
         (1, 1, 1, 1),
@@ -89,7 +92,7 @@ def test_defaults_of_a_bare_material(tmp_path):
     )
 
 
-def test_specular_glossiness_becomes_what_it_was(tmp_path):
+def test_specular_glossiness_factors_become_the_same_dielectric_or_metal(tmp_path):
     builder = quad(
         extensions={
             "KHR_materials_pbrSpecularGlossiness": {
@@ -112,7 +115,7 @@ def test_specular_glossiness_becomes_what_it_was(tmp_path):
     np.testing.assert_allclose([metal.metallic, metal.roughness], [1, 0.5], atol=0.01)
 
 
-def test_specular_glossiness_maps(tmp_path):
+def test_specular_glossiness_maps_are_converted_pixel_by_pixel(tmp_path):
     diffuse = np.zeros((2, 2, 4), np.uint8)
     diffuse[0] = (188, 120, 60, 255)
     diffuse[1] = (0, 0, 0, 255)

@@ -1,10 +1,12 @@
+"""Read the geometry of glTF files: buffers, accessors, nodes, skins, compression."""
+
 import base64
 import json
 
 import numpy as np
 import pytest
 
-from gdtool.assets.gltf_read import read_gltf
+from gdtool.assets.gltf.read import read_gltf
 from gdtool.assets.load import load_scene
 from gdtool.assets.scene import DEFAULT_MATERIAL
 from gdtool.core.errors import InputError, ResourceError
@@ -13,26 +15,24 @@ from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad
 
 
 def area_vector(scene) -> np.ndarray:
-    """Sum of the faces' area vectors: which way, and how much, a flat shape faces."""
+    """Sum the area vectors of the faces: the direction a flat shape faces, times its area."""
     a, b, c = (scene.vertices[scene.faces[:, i]] for i in range(3))
     return np.cross(b - a, c - a).sum(0) / 2
 
 
-def test_quad(tmp_path):
+def test_a_quad_is_read_with_its_attributes(tmp_path):
     scene = read_gltf(quad().write(tmp_path / "quad.glb"))
     np.testing.assert_array_equal(scene.vertices, QUAD)
     np.testing.assert_array_equal(scene.faces.ravel(), QUAD_FACES)
     np.testing.assert_allclose(scene.normals, [[0, 0, 1]] * 4)
     np.testing.assert_allclose(scene.uvs[0], [[0, 1], [1, 1], [1, 0], [0, 0]])
-    assert (
-        scene.materials == (DEFAULT_MATERIAL,)
-        and scene.name == "quad"
-        and scene.colors is None
-        and scene.tangents is None
-    )
+    assert scene.materials == (DEFAULT_MATERIAL,)
+    assert scene.name == "quad"
+    assert scene.colors is None
+    assert scene.tangents is None
 
 
-def test_external_and_data_uris_equal_the_binary_chunk(tmp_path):
+def test_buffers_in_files_and_data_uris_equal_the_binary_chunk(tmp_path):
     builder = quad()
     truth = read_gltf(builder.write(tmp_path / "a.glb"))
     for uri in (
@@ -59,7 +59,7 @@ def test_external_and_data_uris_equal_the_binary_chunk(tmp_path):
         "data:application/octet-stream;base64,***",
     ],
 )
-def test_uris_that_are_not_relative_are_refused(tmp_path, uri):
+def test_absolute_missing_and_malformed_buffer_uris_are_refused(tmp_path, uri):
     builder = quad()
     document = {**builder.document, "buffers": [{"byteLength": len(builder.binary), "uri": uri}]}
     (tmp_path / "a.gltf").write_text(json.dumps(document))
@@ -67,7 +67,7 @@ def test_uris_that_are_not_relative_are_refused(tmp_path, uri):
         read_gltf(tmp_path / "a.gltf")
 
 
-def test_sparse_overrides(tmp_path):
+def test_a_sparse_accessor_replaces_the_elements_it_lists(tmp_path):
     builder = quad()
     where, values = (
         builder.view(np.uint16([1, 3]).tobytes()),
@@ -85,7 +85,7 @@ def test_sparse_overrides(tmp_path):
         read_gltf(builder.write(tmp_path / "a.glb"))
 
 
-def test_sparse_over_nothing_starts_from_zeros(tmp_path):
+def test_a_sparse_accessor_without_a_buffer_view_starts_from_zeros(tmp_path):
     builder = quad()
     where, values = builder.view(np.uint8([1, 2]).tobytes()), builder.view(np.float32([[1, 0, 0], [1, 1, 0]]).tobytes())
     record = builder.document["accessors"][0]
@@ -98,7 +98,7 @@ def test_sparse_over_nothing_starts_from_zeros(tmp_path):
     np.testing.assert_array_equal(read_gltf(builder.write(tmp_path / "a.glb")).vertices[:3], QUAD[:3])
 
 
-def test_quantised_positions_are_numbers_and_normalised_are_fractions(tmp_path):
+def test_quantised_positions_are_integers_and_normalised_attributes_fractions(tmp_path):
     builder = Builder()
     builder.document |= {"extensionsRequired": ["KHR_mesh_quantization"], "extensionsUsed": ["KHR_mesh_quantization"]}
     builder.document["nodes"][0]["scale"] = [0.001, 0.001, 0.001]
@@ -114,7 +114,7 @@ def test_quantised_positions_are_numbers_and_normalised_are_fractions(tmp_path):
     np.testing.assert_allclose(scene.normals, [[0, 0, 1]] * 4)
 
 
-def test_the_lowest_signed_byte_is_minus_one(tmp_path):
+def test_the_lowest_normalised_signed_byte_is_minus_one(tmp_path):
     builder = Builder()
     builder.primitive({"POSITION": builder.add(np.int8([[-128, 0, 0], [127, 0, 0], [0, 127, 0]]), normalized=True)})
     np.testing.assert_allclose(
@@ -122,7 +122,7 @@ def test_the_lowest_signed_byte_is_minus_one(tmp_path):
     )
 
 
-def test_interleaved_attributes(tmp_path):
+def test_interleaved_attributes_are_read(tmp_path):
     builder = Builder()
     rows = np.concatenate([QUAD, np.tile(np.float32([0, 0, 1]), (4, 1)), QUAD[:, :2]], 1)
     view = builder.view(rows.tobytes(), byteStride=32)
@@ -139,7 +139,7 @@ def test_interleaved_attributes(tmp_path):
 @pytest.mark.parametrize(
     ("mode", "indices"), [(4, [0, 1, 2, 0, 2, 3]), (5, [0, 1, 3, 2]), (6, [0, 1, 2, 3]), (5, [0, 1, 3, 2, 2])]
 )
-def test_lists_strips_and_fans_face_one_way(tmp_path, mode, indices):
+def test_triangle_lists_strips_and_fans_have_one_winding(tmp_path, mode, indices):
     builder = Builder()
     builder.primitive({"POSITION": builder.add(QUAD)}, builder.add(np.array(indices, np.uint8)), mode=mode)
     scene = read_gltf(builder.write(tmp_path / "a.glb"))
@@ -147,7 +147,7 @@ def test_lists_strips_and_fans_face_one_way(tmp_path, mode, indices):
     assert len(scene.faces) == 2
 
 
-def test_no_indices(tmp_path):
+def test_a_primitive_without_indices_uses_its_vertices_in_order(tmp_path):
     builder = Builder()
     builder.primitive({"POSITION": builder.add(QUAD[[0, 1, 2, 0, 2, 3]])})
     np.testing.assert_allclose(area_vector(read_gltf(builder.write(tmp_path / "a.glb"))), [0, 0, 1])
@@ -157,10 +157,11 @@ def test_points_and_lines_are_left_out_and_noted(tmp_path):
     builder = quad()
     builder.primitive({"POSITION": builder.add(QUAD)}, mode=1)
     scene = read_gltf(builder.write(tmp_path / "a.glb"))
-    assert len(scene.faces) == 2 and any("lines" in note for note in scene.notes)
+    assert len(scene.faces) == 2
+    assert any("lines" in note for note in scene.notes)
 
 
-def test_node_hierarchy(tmp_path):
+def test_transforms_of_nested_nodes_are_applied(tmp_path):
     builder = quad()
     half = np.sqrt(0.5)
     builder.document["nodes"] = [
@@ -177,7 +178,7 @@ def test_node_hierarchy(tmp_path):
     np.testing.assert_allclose(read_gltf(builder.write(tmp_path / "b.glb")).vertices, scene.vertices, atol=1e-12)
 
 
-def test_a_mirroring_node_turns_the_winding_and_keeps_the_bitangent(tmp_path):
+def test_a_mirroring_node_reverses_the_winding_and_keeps_the_bitangent(tmp_path):
     builder = quad(normalTexture={"index": 0})
     builder.document["images"] = [{"bufferView": builder.view(encode_png(np.full((2, 2, 3), 0.5)))}]
     builder.document["textures"] = [{"source": 0}]
@@ -193,7 +194,7 @@ def test_a_mirroring_node_turns_the_winding_and_keeps_the_bitangent(tmp_path):
     np.testing.assert_allclose(bitangent, [[0, 1, 0]] * 4)
 
 
-def test_uneven_scale_keeps_normals_upright(tmp_path):
+def test_normals_stay_perpendicular_under_non_uniform_scale(tmp_path):
     builder = Builder()
     slope = np.float32([[0, 1, 0], [1, 0, 0], [0, 1, 1]])
     normal = np.tile(np.float32([1, 1, 0]) / np.float32(np.sqrt(2)), (3, 1))
@@ -205,7 +206,7 @@ def test_uneven_scale_keeps_normals_upright(tmp_path):
     np.testing.assert_allclose(np.linalg.norm(scene.normals, axis=1), 1)
 
 
-def test_skins_stand_as_their_joints_do(tmp_path):
+def test_a_skinned_mesh_follows_its_joints(tmp_path):
     builder = quad()
     weights, joints = np.zeros((4, 4), np.float32), np.zeros((4, 4), np.uint8)
     weights[:, 0], joints[2:, 0] = 1, 1  # the upper edge follows the second joint
@@ -228,7 +229,7 @@ def test_skins_stand_as_their_joints_do(tmp_path):
         read_gltf(builder.write(tmp_path / "a.glb"))
 
 
-def test_morph_targets_at_their_default_weight(tmp_path):
+def test_morph_targets_are_added_at_their_default_weights(tmp_path):
     builder = quad()
     builder.document["meshes"][0]["primitives"][0]["targets"] = [
         {"POSITION": builder.add(np.tile(np.float32([0, 0, 4]), (4, 1)))}
@@ -239,7 +240,7 @@ def test_morph_targets_at_their_default_weight(tmp_path):
     np.testing.assert_allclose(read_gltf(builder.write(tmp_path / "a.glb")).vertices[:, 2], 2)
 
 
-def test_primitives_with_and_without(tmp_path):
+def test_attributes_that_only_some_primitives_have_are_filled_in(tmp_path):
     builder = quad(name="red", pbrMetallicRoughness={"baseColorFactor": [1, 0, 0, 1]})
     colors = np.uint8([[255, 0, 0], [0, 255, 0], [0, 0, 255], [51, 51, 51]])
     builder.primitive(
@@ -263,7 +264,7 @@ def test_primitives_with_and_without(tmp_path):
     np.testing.assert_allclose(corner[3, 2], [0.2, 0.2, 0.2, 1])
 
 
-def test_shared_buffers_bring_only_their_vertices(tmp_path):
+def test_only_the_vertices_that_a_primitive_uses_are_read(tmp_path):
     builder = Builder()
     positions = builder.add(np.random.default_rng(0).random((1000, 3)).astype(np.float32))
     for k in range(3):
@@ -271,7 +272,7 @@ def test_shared_buffers_bring_only_their_vertices(tmp_path):
     assert len(read_gltf(builder.write(tmp_path / "a.glb")).vertices) == 9
 
 
-def test_draco(tmp_path):
+def test_draco_primitives_are_decoded_and_damaged_ones_refused(tmp_path):
     codec = pytest.importorskip("DracoPy")
     builder = Builder()
     builder.document |= {
@@ -293,7 +294,7 @@ def test_draco(tmp_path):
         read_gltf(builder.write(tmp_path / "b.glb"))
 
 
-def test_draco_without_its_package(tmp_path, monkeypatch):
+def test_draco_without_its_package_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "DracoPy", None)
     builder = Builder()
     builder.document["accessors"] = [{"componentType": 5126, "count": 4, "type": "VEC3"}]
@@ -307,7 +308,7 @@ def test_draco_without_its_package(tmp_path, monkeypatch):
         read_gltf(builder.write(tmp_path / "a.glb"))
 
 
-def test_meshopt_without_its_package(tmp_path, monkeypatch):
+def test_meshopt_without_its_package_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "meshopt", None)
     builder = quad()
     builder.document["bufferViews"][0]["extensions"] = {

@@ -1,4 +1,4 @@
-"""What is wrong with a glTF file is named, with the file."""
+"""Refuse faulty glTF files with a line that names the file and the fault."""
 
 import numpy as np
 import pytest
@@ -9,13 +9,15 @@ from tests.assets.gltf_files import QUAD, Builder, pack, quad, with_textures
 
 
 def edited(change) -> bytes:
-    """A quad whose document `change` has edited."""
+    """Make the GLB of a quad after a change to its document."""
     builder = quad(name="m")
     change(builder)
     return builder.glb()
 
 
 def set_in(*path, value):
+    """Make a change that sets a value in the document."""
+
     def change(builder: Builder) -> None:
         item = builder.document
         for key in path[:-1]:
@@ -26,16 +28,19 @@ def set_in(*path, value):
 
 
 def nan_vertex(builder: Builder) -> None:
-    bad = QUAD.copy()
-    bad[2, 1] = np.nan
-    builder.document["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = builder.add(bad)
+    """Replace the positions by some with NaN."""
+    positions = QUAD.copy()
+    positions[2, 1] = np.nan
+    builder.document["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = builder.add(positions)
 
 
 def vertex_count(builder: Builder) -> None:
+    """Give the mesh fewer normals than positions."""
     builder.document["meshes"][0]["primitives"][0]["attributes"]["NORMAL"] = builder.add(QUAD[:3])
 
 
 def index_out_of_range(builder: Builder) -> None:
+    """Let a face refer to a vertex that does not exist."""
     builder.document["meshes"][0]["primitives"][0]["indices"] = builder.add(np.uint16([0, 1, 4]))
 
 
@@ -74,15 +79,16 @@ def index_out_of_range(builder: Builder) -> None:
         (b"\xff\xfe{}", "is not glTF"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path, content, fact):
+def test_a_fault_is_named_in_one_line_with_the_file(tmp_path, content, fact):
     path = tmp_path / "x.glb"
     path.write_bytes(content)
     with pytest.raises(InputError, match=fact) as caught:
         load_scene(path)
-    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
-def test_an_accessor_beyond_memory_is_a_resource_error(tmp_path):
+def test_an_accessor_larger_than_the_memory_is_a_resource_error(tmp_path):
     builder = quad()
     del builder.document["accessors"][0]["bufferView"]
     builder.document["accessors"][0]["count"] = 2**31
@@ -91,14 +97,14 @@ def test_an_accessor_beyond_memory_is_a_resource_error(tmp_path):
         load_scene(builder.write(tmp_path / "x.glb"))
 
 
-def test_texture_coordinates_that_no_mesh_has(tmp_path):
+def test_a_texture_of_a_uv_set_that_no_mesh_has_is_refused(tmp_path):
     builder = with_textures(color=np.zeros((2, 2, 3), np.uint8))
     builder.document["materials"][0]["pbrMetallicRoughness"] = {"baseColorTexture": {"index": 0, "texCoord": 3}}
     with pytest.raises(InputError, match="texture coordinates 3"):
         load_scene(builder.write(tmp_path / "x.glb"))
 
 
-def test_a_broken_texture_is_named(tmp_path):
+def test_an_image_that_does_not_decode_is_named(tmp_path):
     builder = quad(pbrMetallicRoughness={"baseColorTexture": {"index": 0}})
     builder.document["images"] = [
         {"bufferView": builder.view(b"no picture here, just words of text"), "mimeType": "image/png"}

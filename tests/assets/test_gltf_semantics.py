@@ -1,12 +1,11 @@
-"""What glTF's fields mean once a file is looked up: transforms, second UV set, vertex colours, both sides, ior and
-specular."""
+"""Render glTF files: texture transforms, UV sets, vertex colours, both sides, index of refraction, specular."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from gdtool.assets.gltf_read import read_gltf
+from gdtool.assets.gltf.read import read_gltf
 from gdtool.cameras import camera_at
 from gdtool.core.errors import InputError
 from gdtool.shading.lights.environment import Environment
@@ -20,7 +19,7 @@ PIXELS = np.arange(4 * 4 * 3, dtype=np.uint8).reshape(4, 4, 3) * 5
 
 
 def textured(tmp_path, uv, info, **material):
-    """A quad all of whose corners have one place on a nearest-filtered picture of known texels, in both UV sets."""
+    """Look up the base colour of a quad whose corners all have the given coordinates, one pair for each UV set."""
     builder = with_textures(color=PIXELS)
     builder.document["extensionsUsed"] = ["KHR_texture_transform"]
     builder.document["samplers"] = [{"magFilter": 9728, "minFilter": 9728}]
@@ -34,6 +33,7 @@ def textured(tmp_path, uv, info, **material):
 
 
 def texel(row: int, column: int) -> np.ndarray:
+    """Return a texel of PIXELS as linear colour."""
     from gdtool.images.color import linear_from_srgb
 
     return linear_from_srgb(PIXELS[row, column])
@@ -50,12 +50,12 @@ def texel(row: int, column: int) -> np.ndarray:
         ({"offset": [0.5, 0], "rotation": -np.pi / 2, "scale": [1, 3]}, (0, 0)),
     ],
 )
-def test_texture_transforms_place_the_lookup(tmp_path, transform, at):
-    got = textured(tmp_path, [(0.125, 0.125)], {"extensions": {"KHR_texture_transform": transform}})
-    np.testing.assert_allclose(got, texel(*at), atol=1e-6)
+def test_texture_transforms_move_the_lookup(tmp_path, transform, at):
+    albedo = textured(tmp_path, [(0.125, 0.125)], {"extensions": {"KHR_texture_transform": transform}})
+    np.testing.assert_allclose(albedo, texel(*at), atol=1e-6)
 
 
-def test_the_second_uv_set_by_the_field_and_by_the_extension(tmp_path):
+def test_a_texture_uses_the_uv_set_of_its_field_or_extension(tmp_path):
     sets = [(0.125, 0.125), (0.625, 0.875)]
     np.testing.assert_allclose(textured(tmp_path, sets, {"texCoord": 1}), texel(3, 2), atol=1e-6)
     # The extension's texCoord overrides the field's.
@@ -72,8 +72,9 @@ def test_vertex_colours_multiply_the_base_color(tmp_path):
 
 
 @pytest.mark.parametrize("double_sided", [False, True])
-def test_both_sides_are_seen_with_normals_toward_the_eye(tmp_path, double_sided):
-    assert QUAD.shape == (4, 3) and len(QUAD_FACES) == 6
+def test_both_sides_are_rendered_with_normals_toward_the_camera(tmp_path, double_sided):
+    assert QUAD.shape == (4, 3)
+    assert len(QUAD_FACES) == 6
     scene = read_gltf(quad(doubleSided=double_sided).write(tmp_path / "a.glb"))
     for azimuth, z in ((0.0, 1.0), (180.0, -1.0)):
         out = render_buffers(scene, camera_at(azimuth, 0.0, name="v", size=32), 4)
@@ -86,11 +87,12 @@ def test_ior_and_specular_set_the_reflectance_at_normal_incidence(tmp_path):
     builder.document["extensionsUsed"] = ["KHR_materials_ior", "KHR_materials_specular"]
     scene = read_gltf(builder.write(tmp_path / "a.glb"))
     out = surface_attributes(scene, *CORNER)
-    assert float(out["f0"][0]) == pytest.approx(0.5 * (1 / 3) ** 2) and float(out["f90"][0]) == 0.5
+    assert float(out["f0"][0]) == pytest.approx(0.5 * (1 / 3) ** 2)
+    assert float(out["f90"][0]) == 0.5
 
 
-def seen(scene, *, azimuth=0.0, elevation=0.0, size=32, light=1.0, samples=16) -> dict[str, np.ndarray]:
-    """A view of the scene under a uniform light, without shadows."""
+def rendered(scene, *, azimuth=0.0, elevation=0.0, size=32, light=1.0, samples=16) -> dict[str, np.ndarray]:
+    """Render a view of a scene under a uniform light, without shadows."""
     renderer = Renderer(scene, 1)
     direct = DirectLight(
         renderer,
@@ -103,35 +105,34 @@ def seen(scene, *, azimuth=0.0, elevation=0.0, size=32, light=1.0, samples=16) -
 
 
 def centred(builder) -> object:
-    """The quad about the origin."""
+    """Build the quad centred at the origin."""
     builder.document["nodes"] = [{"mesh": 0, "translation": [-0.5, -0.5, 0]}]
     return builder
 
 
 @pytest.mark.parametrize("azimuth", [0.0, 80.0])
 def test_specular_zero_reflects_nothing_also_at_grazing_angles(tmp_path, azimuth):
-    """KHR_materials_specular scales f90 too: a white one is then a plain Lambert surface, 1 in a furnace at every
-    angle."""
+    """specularFactor scales f90 too: at 0 a white surface is a Lambert surface, 1 under uniform light at any angle."""
     material = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 0.3}}
-    got = []
+    brightness = []
     for specular in (0.0, 1.0):
         builder = centred(quad(**material, extensions={"KHR_materials_specular": {"specularFactor": specular}}))
         builder.document["extensionsUsed"] = ["KHR_materials_specular"]
-        images = seen(read_gltf(builder.write(tmp_path / "a.glb")), azimuth=azimuth, samples=64)
-        got.append(images["color"][images["mask"] == 1].mean())
-    assert got[0] == pytest.approx(1.0, abs=5e-3)
+        images = rendered(read_gltf(builder.write(tmp_path / "a.glb")), azimuth=azimuth, samples=64)
+        brightness.append(images["color"][images["mask"] == 1].mean())
+    assert brightness[0] == pytest.approx(1.0, abs=5e-3)
     if azimuth:
-        assert got[1] > got[0] + 0.05  # the model is not energy-conserving at grazing angles
+        assert brightness[1] > brightness[0] + 0.05  # the model is not energy-conserving at grazing angles
 
 
-def test_unlit_shows_its_base_color_whatever_the_light(tmp_path):
+def test_an_unlit_material_shows_its_base_color_under_any_light(tmp_path):
     builder = centred(
         quad(pbrMetallicRoughness={"baseColorFactor": [0.25, 0.5, 1, 1]}, extensions={"KHR_materials_unlit": {}})
     )
     builder.document["extensionsUsed"] = ["KHR_materials_unlit"]
     scene = read_gltf(builder.write(tmp_path / "a.glb"))
     for light in (0.0, 7.0):
-        images = seen(scene, light=light)
+        images = rendered(scene, light=light)
         np.testing.assert_allclose(
             images["color"][images["mask"] == 1],
             np.broadcast_to([0.25, 0.5, 1], ((images["mask"] == 1).sum(), 3)),
@@ -150,7 +151,7 @@ def test_emission_is_factor_times_texture_times_strength(tmp_path):
             "pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1]},
         }
     ]
-    images = seen(read_gltf(centred(builder).write(tmp_path / "a.glb")), light=0.0)
+    images = rendered(read_gltf(centred(builder).write(tmp_path / "a.glb")), light=0.0)
     linear = ((188 / 255 + 0.055) / 1.055) ** 2.4
     np.testing.assert_allclose(images["color"][images["mask"] == 1].mean(0), [4 * linear, 2 * linear, 0], rtol=1e-4)
 
@@ -160,7 +161,7 @@ def test_emission_is_factor_times_texture_times_strength(tmp_path):
     [("OPAQUE", 0.1, 1), ("MASK", 0.3, 1), ("MASK", 0.2, 0), ("BLEND", 0.6, 1), ("BLEND", 0.4, 0)],
 )
 def test_alpha_of_factor_texture_and_vertices_multiplies(tmp_path, mode, alpha, visible):
-    """Cutoff 0.25 for MASK; BLEND is seen from one half on; alpha is never sRGB."""
+    """MASK is visible from its cutoff of 0.25 on, BLEND from 0.5 on. Alpha is never decoded as sRGB."""
     pixels = np.full((2, 2, 4), 255, np.uint8)
     pixels[..., 3] = 204  # 0.8
     builder = with_textures(color=pixels)
@@ -183,8 +184,8 @@ def test_alpha_of_factor_texture_and_vertices_multiplies(tmp_path, mode, alpha, 
 
 @pytest.mark.parametrize("wrap, at", [(10497, 1), (33071, 3), (33648, 2)])
 @pytest.mark.parametrize("axis", [0, 1])
-def test_samplers_wrap_each_axis(tmp_path, wrap, at, axis):
-    """1.375 of a four-texel row: the second again, the last for clamping, the third coming back for mirroring."""
+def test_samplers_wrap_each_axis_by_its_own_mode(tmp_path, wrap, at, axis):
+    """At 1.375 of a row of four texels: repeating reads texel 1, clamping texel 3, mirroring texel 2."""
     builder = with_textures(color=PIXELS)
     builder.document["samplers"] = [{"magFilter": 9728, "wrapS" if axis == 0 else "wrapT": wrap}]
     builder.document["textures"][0]["sampler"] = 0
@@ -194,16 +195,15 @@ def test_samplers_wrap_each_axis(tmp_path, wrap, at, axis):
     builder.document["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = builder.add(
         np.tile(np.float32(place), (4, 1))
     )
-    got = surface_attributes(read_gltf(builder.write(tmp_path / "a.glb")), *CORNER)["albedo"][0]
-    np.testing.assert_allclose(got, texel(*((0, at) if axis == 0 else (at, 0))), atol=1e-6)
+    albedo = surface_attributes(read_gltf(builder.write(tmp_path / "a.glb")), *CORNER)["albedo"][0]
+    np.testing.assert_allclose(albedo, texel(*((0, at) if axis == 0 else (at, 0))), atol=1e-6)
 
 
-def test_filters_blend_linear_values_or_take_the_nearest(tmp_path):
-    """Between the texels 0 and 255, a quarter of the way: nearest gives black, linear a quarter of white, in linear
-    light."""
+def test_filters_blend_linear_values_or_take_the_nearest_texel(tmp_path):
+    """Look up a quarter of the way from a black to a white texel: linear filtering blends in linear light."""
     pixels = np.zeros((1, 2, 3), np.uint8)
     pixels[0, 1] = 255
-    got = {}
+    values = {}
     for name, code in (("nearest", 9728), ("linear", 9729)):
         builder = with_textures(color=pixels)
         builder.document["samplers"] = [{"magFilter": code, "wrapS": 33071}]
@@ -212,13 +212,12 @@ def test_filters_blend_linear_values_or_take_the_nearest(tmp_path):
         builder.document["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"] = builder.add(
             np.tile(np.float32([0.375, 0.5]), (4, 1))
         )
-        got[name] = float(surface_attributes(read_gltf(builder.write(tmp_path / "a.glb")), *CORNER)["albedo"][0, 0])
-    assert got == {"nearest": 0.0, "linear": pytest.approx(0.25, abs=1e-6)}
+        values[name] = float(surface_attributes(read_gltf(builder.write(tmp_path / "a.glb")), *CORNER)["albedo"][0, 0])
+    assert values == {"nearest": 0.0, "linear": pytest.approx(0.25, abs=1e-6)}
 
 
-def test_small_pictures_read_coarser_levels_of_any_size(tmp_path):
-    """A fine checker of odd size, a sample to dozens of texels: grey by its levels, where the finest alone would be
-    black or white."""
+def test_small_renders_read_coarser_mip_levels_of_odd_sizes(tmp_path):
+    """Render a fine chequerboard, dozens of texels a sample: its coarser levels are grey, the finest black or white."""
     checker = (np.indices((301, 299)).sum(0) % 2 * 255).astype(np.uint8)[..., None].repeat(3, 2)
     builder = with_textures(color=checker)
     builder.document["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]
@@ -226,12 +225,12 @@ def test_small_pictures_read_coarser_levels_of_any_size(tmp_path):
         read_gltf(centred(builder).write(tmp_path / "a.glb")), camera_at(0.0, 0.0, name="v", size=16), 4
     )
     inside = images["albedo"][images["mask"] == 1]
-    assert len(inside) > 80 and np.abs(inside - 0.5).max() < 0.02
+    assert len(inside) > 80
+    assert np.abs(inside - 0.5).max() < 0.02
 
 
-def test_quantised_attributes_by_their_extension(tmp_path):
-    """KHR_mesh_quantization: bytes and shorts for every attribute, normalised or not, and a node that undoes the
-    scale."""
+def test_every_attribute_may_be_quantised(tmp_path):
+    """KHR_mesh_quantization allows bytes and shorts, normalised or not; a node's scale undoes that of the positions."""
     plain = read_gltf(quad(name="m").write(tmp_path / "a.glb"))
     builder = Builder()
     builder.document |= {
@@ -256,7 +255,7 @@ def test_quantised_attributes_by_their_extension(tmp_path):
     np.testing.assert_array_equal(scene.faces, plain.faces)
 
 
-def test_optional_extensions_are_listed_and_required_ones_refused_each_by_name(tmp_path):
+def test_unknown_optional_extensions_are_noted_and_required_ones_refused(tmp_path):
     names = ["KHR_materials_transmission", "MY_own_thing"]
     builder = quad()
     builder.document["extensionsUsed"] = names

@@ -1,3 +1,5 @@
+"""Write scenes as GLB."""
+
 import json
 import os
 import shutil
@@ -9,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gdtool.assets.gltf_read import read_gltf
-from gdtool.assets.gltf_write import glb_bytes, write_glb
+from gdtool.assets.gltf.read import read_gltf
+from gdtool.assets.gltf.write import glb_bytes, write_glb
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.core.errors import OutputError
 
@@ -18,11 +20,12 @@ TOOLS = Path(__file__).parents[1] / "tools"
 
 
 def pixels(channels: int, seed: int = 0) -> np.ndarray:
+    """Make a random image of 8 x 8 pixels."""
     return np.random.default_rng(seed).integers(0, 256, (8, 8, channels), np.uint8)
 
 
 def full_scene() -> Scene:
-    """Two squares, two materials, everything that a Scene can hold."""
+    """Make two squares with two materials that use everything a Scene can hold."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
     vertices = np.concatenate([corners, corners + (2, 0, 0)])
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
@@ -70,11 +73,12 @@ def full_scene() -> Scene:
 
 
 def document_of(content: bytes) -> dict:
+    """Decode the JSON of a GLB."""
     length = struct.unpack_from("<I", content, 12)[0]
     return json.loads(content[20 : 20 + length])
 
 
-def test_what_is_written_is_read_again(tmp_path):
+def test_a_written_scene_is_read_back(tmp_path):
     scene = full_scene()
     write_glb(tmp_path / "both.glb", scene)
     back = read_gltf(tmp_path / "both.glb")
@@ -116,11 +120,11 @@ def test_what_is_written_is_read_again(tmp_path):
     assert painted.emissive_texture.uv_set == 1
 
 
-def test_same_scene_same_bytes():
+def test_the_same_scene_gives_the_same_bytes():
     assert glb_bytes(full_scene()) == glb_bytes(full_scene())
 
 
-def test_factors_are_explicit_and_shared_maps_are_one_image():
+def test_factors_are_always_written_and_shared_maps_once():
     document = document_of(glb_bytes(full_scene(), extras={"by": "a test"}))
     for material in document["materials"]:
         assert {"metallicFactor", "roughnessFactor", "baseColorFactor"} <= material["pbrMetallicRoughness"].keys()
@@ -136,7 +140,7 @@ def test_factors_are_explicit_and_shared_maps_are_one_image():
     }
 
 
-def test_colours_are_stored_as_the_format_says():
+def test_colour_textures_are_stored_as_srgb_once():
     linear = np.full((2, 2, 4), 0.5)
     scene = replace(full_scene(), materials=(Material(base_color_texture=Texture(linear, "linear")),) * 3)
     back = document_of(glb_bytes(scene))
@@ -151,7 +155,7 @@ def test_colours_are_stored_as_the_format_says():
     )
 
 
-def test_tangents_are_made_where_a_normal_map_needs_them(tmp_path):
+def test_tangents_are_computed_for_normal_maps(tmp_path):
     scene = replace(full_scene(), tangents=None)
     write_glb(tmp_path / "a.glb", scene)
     back = read_gltf(tmp_path / "a.glb")
@@ -161,7 +165,7 @@ def test_tangents_are_made_where_a_normal_map_needs_them(tmp_path):
     np.testing.assert_allclose(corner[:, 3], -1)
 
 
-def test_normals_without_length_are_replaced(tmp_path):
+def test_a_zero_normal_is_replaced(tmp_path):
     scene = full_scene()
     normals = scene.normals.copy()
     normals[0] = 0
@@ -169,7 +173,7 @@ def test_normals_without_length_are_replaced(tmp_path):
     np.testing.assert_allclose(np.linalg.norm(read_gltf(tmp_path / "a.glb").normals, axis=1), 1)
 
 
-def test_many_vertices_take_wide_indices(tmp_path):
+def test_more_than_65535_vertices_take_32_bit_indices(tmp_path):
     side = 300
     y, x = np.mgrid[:side, :side]
     vertices = np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3).astype(float)
@@ -189,20 +193,20 @@ def test_many_vertices_take_wide_indices(tmp_path):
         {"colors": np.full((8, 4), np.inf)},
     ],
 )
-def test_broken_scenes_are_not_written(tmp_path, broken):
+def test_invalid_scenes_are_refused_and_write_nothing(tmp_path, broken):
     with pytest.raises(ValueError):
         write_glb(tmp_path / "a.glb", replace(full_scene(), **broken))
     assert not (tmp_path / "a.glb").exists()
 
 
-def test_a_place_that_cannot_be_written(tmp_path):
+def test_a_path_that_cannot_be_written_is_an_output_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError):
         write_glb(tmp_path / "file" / "a.glb", full_scene())
 
 
 def validator_path() -> str | None:
-    """NODE_PATH under which gltf-validator is installed, or None."""
+    """Find the NODE_PATH under which gltf-validator is installed; None without it."""
     places = [
         TOOLS / "node_modules",
         TOOLS.parents[1] / "node_modules",
@@ -216,7 +220,7 @@ def validator_path() -> str | None:
     reason="needs node and the npm package gltf-validator (npm install in tests/tools)",
 )
 @pytest.mark.parametrize("tangents", [True, False])
-def test_the_khronos_validator_finds_nothing(tmp_path, tangents):
+def test_the_khronos_validator_finds_no_error_or_warning(tmp_path, tangents):
     scene = full_scene() if tangents else replace(full_scene(), tangents=None)
     write_glb(tmp_path / "a.glb", scene)
     done = subprocess.run(
@@ -227,4 +231,5 @@ def test_the_khronos_validator_finds_nothing(tmp_path, tangents):
     )
     report = json.loads(done.stdout)
     serious = [m for m in report["messages"] if m["severity"] < 2]
-    assert done.returncode == 0 and serious == []
+    assert done.returncode == 0
+    assert serious == []

@@ -1,10 +1,12 @@
+"""Read PLY and STL files, and check models of every format."""
+
 import struct
 
 import numpy as np
 import pytest
 
-from gdtool.assets import scan_read
 from gdtool.assets.load import load_scene
+from gdtool.assets.ply_stl import read as ply_stl_read
 from gdtool.core.errors import InputError
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
@@ -12,16 +14,19 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 
 
 def volume(scene) -> float:
+    """Compute the volume inside the faces."""
     a, b, c = (scene.vertices[scene.faces[:, i]] for i in range(3))
     return float((a * np.cross(b, c)).sum() / 6)
 
 
 def stl(faces: np.ndarray) -> bytes:
+    """Make a binary STL of faces of the tetrahedron."""
     rows = b"".join(struct.pack("<3f", 0, 0, 0) + CORNERS[face].tobytes() + b"\0\0" for face in faces)
     return b"\0" * 80 + struct.pack("<I", len(faces)) + rows
 
 
 def ply(extra: str = "", rows: list[str] | None = None) -> str:
+    """Make an ASCII PLY of the tetrahedron; extra: further property lines, rows: the vertex lines."""
     rows = rows or [" ".join(map(str, p)) for p in CORNERS]
     faces = "\n".join("3 " + " ".join(map(str, face)) for face in FACES)
     return (
@@ -35,14 +40,16 @@ def ply(extra: str = "", rows: list[str] | None = None) -> str:
     )
 
 
-def test_stl_is_welded(tmp_path):
+def test_equal_vertices_of_an_stl_are_welded(tmp_path):
     (tmp_path / "x.STL").write_bytes(stl(FACES))
     scene = load_scene(tmp_path / "x.STL")
-    assert len(scene.vertices) == 4 and volume(scene) == pytest.approx(1 / 6)
-    assert scene.materials[0].roughness == 0.5 and scene.materials[0].metallic == 0
+    assert len(scene.vertices) == 4
+    assert volume(scene) == pytest.approx(1 / 6)
+    assert scene.materials[0].roughness == 0.5
+    assert scene.materials[0].metallic == 0
 
 
-def test_ply_with_colours_and_normals(tmp_path):
+def test_an_ascii_ply_is_read_with_colours_and_normals(tmp_path):
     extra = (
         "property float nx\nproperty float ny\nproperty float nz\nproperty uchar red\nproperty uchar green\nproperty "
         "uchar blue\n"
@@ -56,14 +63,16 @@ def test_ply_with_colours_and_normals(tmp_path):
     assert scene.materials[0].base_color == (1, 1, 1, 1)
 
 
-def test_plain_ply(tmp_path):
+def test_an_ascii_ply_without_colours_gets_the_default_material(tmp_path):
     (tmp_path / "x.ply").write_text(ply())
     scene = load_scene(tmp_path / "x.ply")
-    assert scene.colors is None and scene.normals is None and any("roughness 0.5" in note for note in scene.notes)
+    assert scene.colors is None
+    assert scene.normals is None
+    assert any("roughness 0.5" in note for note in scene.notes)
 
 
 def binary(order: str = "<", colors: bool = False, wide: bool = False, faces: np.ndarray = FACES) -> bytes:
-    """A binary PLY; normals of no unit length."""
+    """Make a binary PLY of the tetrahedron with normals that are not unit vectors."""
     kind, place = ("double", order + "f8") if wide else ("float", order + "f4")
     names = ["x", "y", "z", "nx", "ny", "nz"]
     vertex = np.empty(
@@ -99,20 +108,25 @@ def binary(order: str = "<", colors: bool = False, wide: bool = False, faces: np
     ],
     ids=["little", "big", "colors", "double", "stl"],
 )
-def test_plain_binary_files_are_read_as_trimesh_reads_them(tmp_path, monkeypatch, name, content):
+def test_binary_files_read_directly_equal_those_read_with_trimesh(tmp_path, monkeypatch, name, content):
     (tmp_path / name).write_bytes(content)
     with monkeypatch.context() as patch:
-        patch.setattr(scan_read, "_by_trimesh", None)  # not needed
-        ours = load_scene(tmp_path / name)
-    for plain in ("_plain_ply", "_plain_stl"):
-        monkeypatch.setattr(scan_read, plain, lambda data: None)
-    true = load_scene(tmp_path / name)
-    assert (
-        ours.notes == true.notes and ours.materials == true.materials and (name == "x.stl" or true.normals is not None)
-    )
+        patch.setattr(ply_stl_read, "read_with_trimesh", None)  # must not be called
+        direct = load_scene(tmp_path / name)
+    for reader in ("read_plain_ply", "read_plain_stl"):
+        monkeypatch.setattr(ply_stl_read, reader, lambda data: None)
+    by_trimesh = load_scene(tmp_path / name)
+    assert direct.notes == by_trimesh.notes
+    assert direct.materials == by_trimesh.materials
+    if name == "x.ply":
+        assert by_trimesh.normals is not None
     for key in ("vertices", "faces", "normals", "colors"):
-        one, two = getattr(ours, key), getattr(true, key)
-        assert one is two is None or one.dtype == two.dtype and np.array_equal(one, two)
+        ours, theirs = getattr(direct, key), getattr(by_trimesh, key)
+        if theirs is None:
+            assert ours is None, key
+        else:
+            assert ours.dtype == theirs.dtype, key
+            np.testing.assert_array_equal(ours, theirs, key)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +134,7 @@ def test_plain_binary_files_are_read_as_trimesh_reads_them(tmp_path, monkeypatch
     [(binary()[:-1], "PLY"), (binary() + b"x", "PLY"), (binary(faces=FACES + 1), "out of range")],
     ids=["cut", "more", "index"],
 )
-def test_binary_files_that_are_not_what_they_say_are_refused(tmp_path, content, fact):
+def test_binary_plys_of_wrong_length_or_index_are_refused(tmp_path, content, fact):
     (tmp_path / "x.ply").write_bytes(content)
     with pytest.raises(InputError, match=fact):
         load_scene(tmp_path / "x.ply")
@@ -140,56 +154,57 @@ def test_binary_files_that_are_not_what_they_say_are_refused(tmp_path, content, 
     ],
     ids=["empty", "cut", "no triangles", "header", "no ply", "index", "nan", "unknown"],
 )
-def test_what_is_wrong_is_named(tmp_path, name, content, fact):
+def test_a_fault_is_named_in_one_line_with_the_file(tmp_path, name, content, fact):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=fact) as caught:
         load_scene(tmp_path / name)
-    assert name in str(caught.value) and "\n" not in str(caught.value)
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
-def test_missing_and_folder(tmp_path):
+def test_a_missing_file_and_a_folder_are_refused(tmp_path):
     (tmp_path / "d.glb").mkdir()
     for name, fact in (("none.ply", "does not exist"), ("none.glb", "does not exist"), ("d.glb", "is a folder")):
         with pytest.raises(InputError, match=fact):
             load_scene(tmp_path / name)
 
 
-def test_faces_with_coinciding_corners_are_left_out_and_flat_seams_keep_a_body_closed(tmp_path):
+def test_faces_with_coincident_corners_are_removed_and_collinear_ones_stay(tmp_path):
     from gdtool.geometry.metrics import is_closed
 
-    # a tetrahedron with a vertex in the middle of edge 1-2, which only one of the edge's two faces uses
+    # A tetrahedron with a vertex (5) in the middle of edge 1-2, which only one of the edge's two faces uses. Face 1 2 5
+    # has no area but closes the mesh. Vertices 2 and 6 coincide.
     faces = ["1 5 4", "5 2 4", "1 3 2", "2 3 4", "1 4 3", "1 2 5"]
     vertices = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nv .5 0 0\nv 1 0 0\n"
     (tmp_path / "x.obj").write_text(vertices + "".join(f"f {face}\n" for face in [*faces, "2 6 4"]))
     scene = load_scene(tmp_path / "x.obj")
-    assert len(scene.faces) == len(scene.material_idx) == 6 and any(
-        "two corners in one place" in note for note in scene.notes
-    )
-    assert is_closed(scene.vertices, scene.faces) and not is_closed(scene.vertices, scene.faces[:-1])
+    assert len(scene.faces) == len(scene.material_idx) == 6
+    assert any("two corners in one place" in note for note in scene.notes)
+    assert is_closed(scene.vertices, scene.faces)
+    assert not is_closed(scene.vertices, scene.faces[:-1])
 
 
-def test_normals_without_a_direction_are_the_faces_own(tmp_path):
+def test_zero_normals_are_replaced_by_those_of_the_faces(tmp_path):
     (tmp_path / "x.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 0\nvn 0 0 3\nf 1//1 2//2 3//2\n")
     scene = load_scene(tmp_path / "x.obj")
     np.testing.assert_allclose(scene.normals, [[0, 0, 1]] * 3)
     assert any("without a direction" in note for note in scene.notes)
 
 
-def test_textures_without_coordinates_are_left_out(tmp_path):
+def test_textures_of_a_mesh_without_texture_coordinates_are_left_out(tmp_path):
     from gdtool.images.io import write_png
 
     write_png(tmp_path / "c.png", np.ones((4, 4, 3)))
     (tmp_path / "x.mtl").write_text("newmtl a\nmap_Kd c.png\n")
     (tmp_path / "x.obj").write_text("mtllib x.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     scene = load_scene(tmp_path / "x.obj")
-    assert scene.materials[0].base_color_texture is None and any(
-        "no texture coordinates" in note for note in scene.notes
-    )
+    assert scene.materials[0].base_color_texture is None
+    assert any("no texture coordinates" in note for note in scene.notes)
 
 
-def test_procedural_objects_by_their_seed():
-    one, again = load_scene("procedural:7"), load_scene("procedural:7")
-    assert one.name == "procedural-000007"
-    np.testing.assert_array_equal(one.vertices, again.vertices)
+def test_procedural_objects_are_named_by_their_seed():
+    first, second = load_scene("procedural:7"), load_scene("procedural:7")
+    assert first.name == "procedural-000007"
+    np.testing.assert_array_equal(first.vertices, second.vertices)
     with pytest.raises(InputError, match="name it like procedural:7"):
         load_scene("procedural:seven")

@@ -1,11 +1,11 @@
-"""EXT_meshopt_compression by the package meshopt, which also packs here."""
+"""Decode EXT_meshopt_compression; the package meshopt also encodes the files."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from gdtool.assets.gltf_read import read_gltf
+from gdtool.assets.gltf.read import read_gltf
 from gdtool.core.errors import InputError
 from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder
 
@@ -13,7 +13,7 @@ meshopt = pytest.importorskip("meshopt", reason="the extra codecs is not install
 
 
 def packed(builder: Builder, content: bytes, count: int, stride: int, mode: str, accessor: dict, **extra) -> int:
-    """An accessor over a compressed view."""
+    """Append a compressed buffer view with an accessor and return the accessor's index."""
     source = builder.view(content)
     where = builder.document["bufferViews"][source]
     extension = {
@@ -35,6 +35,7 @@ def packed(builder: Builder, content: bytes, count: int, stride: int, mode: str,
 
 
 def scene_of(tmp_path, index_type=np.uint32, mode="TRIANGLES", normals=None):
+    """Read a quad whose positions, indices and perhaps normals are compressed."""
     builder = Builder()
     builder.document |= {
         "extensionsUsed": ["EXT_meshopt_compression"],
@@ -72,7 +73,7 @@ def scene_of(tmp_path, index_type=np.uint32, mode="TRIANGLES", normals=None):
 
 @pytest.mark.parametrize("index_type", [np.uint16, np.uint32])
 @pytest.mark.parametrize("mode", ["TRIANGLES", "INDICES"])
-def test_vertices_and_indices(tmp_path, index_type, mode):
+def test_vertices_and_indices_are_decoded(tmp_path, index_type, mode):
     scene = scene_of(tmp_path, index_type, mode)
     np.testing.assert_array_equal(scene.vertices, QUAD)
     corners = scene.vertices[scene.faces]  # the codec may turn a face about its corners
@@ -80,15 +81,15 @@ def test_vertices_and_indices(tmp_path, index_type, mode):
     assert sorted(map(sorted, scene.faces.tolist())) == [[0, 1, 2], [0, 2, 3]]
 
 
-def test_octahedral_normals(tmp_path):
-    """Stored x, y and one; the filter makes z of what is left."""
+def test_octahedral_normals_are_decoded(tmp_path):
+    """The file stores x, y and 1 in 8 bits; the decoder computes z."""
     stored = np.array([[0, 0, 127, 0], [127, 0, 127, 0], [0, -127, 127, 0], [0, 0, 127, 0]], np.int8)
     scene = scene_of(tmp_path, normals=stored)
     np.testing.assert_allclose(scene.normals, [[0, 0, 1], [1, 0, 0], [0, -1, 0], [0, 0, 1]], atol=1e-6)
 
 
-def test_exponents(tmp_path):
-    """A float as a 24-bit whole number and an 8-bit exponent of two: 4 · 2⁻² is 1."""
+def test_exponential_floats_are_decoded(tmp_path):
+    """A float is stored as a 24-bit integer and an 8-bit exponent of two: 4 · 2⁻² is 1."""
     stored = ((QUAD * 4).astype(np.int64) | (0x100 - 2) << 24).astype(np.uint32)
     builder = Builder()
     content = meshopt.encode_vertex_buffer_level(stored, 2, 0)
@@ -103,7 +104,7 @@ def test_exponents(tmp_path):
     np.testing.assert_array_equal(read_gltf(builder.write(tmp_path / "a.glb")).vertices, QUAD)
 
 
-def test_a_damaged_stream_is_named(tmp_path, monkeypatch):
+def test_a_damaged_stream_is_refused(tmp_path, monkeypatch):
     good = meshopt.encode_vertex_buffer_level
     monkeypatch.setattr(meshopt, "encode_vertex_buffer_level", lambda *a: good(*a)[:6])
     with pytest.raises(InputError, match="meshopt stream"):

@@ -1,22 +1,23 @@
-"""Lines of an OBJ taken at once say what they say one by one."""
+"""Parse OBJ files: lines of a kind parsed together give the arrays of lines parsed one by one."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gdtool.assets import obj_lines
+from gdtool.assets.obj import lines as obj_lines
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 FULL = SQUARE + "vt 0 0\nvt 1 0\nvt 1 1\nvn 0 0 1\n"
 
 
-def same(one: obj_lines.ObjLines, two: obj_lines.ObjLines) -> bool:
+def same(a: obj_lines.ObjLines, b: obj_lines.ObjLines) -> bool:
+    """Tell whether two results are equal, types included."""
     arrays = ("vertices", "colors", "uvs", "normals", "corners", "sizes", "groups")
     return all(
-        np.array_equal(getattr(one, name), getattr(two, name)) and getattr(one, name).dtype == getattr(two, name).dtype
+        np.array_equal(getattr(a, name), getattr(b, name)) and getattr(a, name).dtype == getattr(b, name).dtype
         for name in arrays
-    ) and (one.names, one.libraries) == (two.names, two.libraries)
+    ) and (a.names, a.libraries) == (b.names, b.libraries)
 
 
 @pytest.mark.parametrize(
@@ -38,14 +39,16 @@ def same(one: obj_lines.ObjLines, two: obj_lines.ObjLines) -> bool:
         SQUARE + "f 1 2 3 4 1 2\n",
     ],
 )
-def test_alike_lines_are_taken_at_once(text):
-    found = obj_lines._at_once(text.encode())
-    one = obj_lines._one_by_one(text, Path("x.obj"))
-    nan = np.isnan(one.vertices)
-    assert found is not None and np.array_equal(np.isnan(found.vertices), nan)
-    for lines in (found, one):
-        lines.vertices[nan] = 0
-    assert same(found, one) and np.array_equal(np.signbit(found.vertices), np.signbit(one.vertices))
+def test_uniform_lines_parsed_together_equal_lines_parsed_one_by_one(text):
+    together = obj_lines.parse_uniform(text.encode())
+    singly = obj_lines.parse_each(text, Path("x.obj"))
+    nan = np.isnan(singly.vertices)
+    assert together is not None
+    assert np.array_equal(np.isnan(together.vertices), nan)
+    for lines in (together, singly):
+        lines.vertices[nan] = 0  # NaN is not equal to itself
+    assert same(together, singly)
+    assert np.array_equal(np.signbit(together.vertices), np.signbit(singly.vertices))
 
 
 @pytest.mark.parametrize(
@@ -63,10 +66,10 @@ def test_alike_lines_are_taken_at_once(text):
         SQUARE + "v 1_0 0 0\nf 1 2 3\n",
     ],
 )
-def test_unlike_lines_are_taken_one_by_one(text, tmp_path):
-    assert obj_lines._at_once(text.encode()) is None
+def test_lines_of_different_form_are_parsed_one_by_one(text, tmp_path):
+    assert obj_lines.parse_uniform(text.encode()) is None
     (tmp_path / "x.obj").write_bytes(text.encode())
-    assert same(obj_lines.read_lines(tmp_path / "x.obj"), obj_lines._one_by_one(text, tmp_path / "x.obj"))
+    assert same(obj_lines.read_lines(tmp_path / "x.obj"), obj_lines.parse_each(text, tmp_path / "x.obj"))
 
 
 @pytest.mark.parametrize(
@@ -86,13 +89,13 @@ def test_unlike_lines_are_taken_one_by_one(text, tmp_path):
         SQUARE + "f 99999999999999999999 1 2\n",
     ],
 )
-def test_wrong_lines_are_left_to_the_one_that_can_tell(text):
-    assert obj_lines._at_once(text.encode()) is None
+def test_malformed_lines_are_left_to_the_parser_that_names_them(text):
+    assert obj_lines.parse_uniform(text.encode()) is None
 
 
-def test_random_files_are_read_alike():
+def test_both_parsers_agree_on_random_files():
     rng = np.random.default_rng(5)
-    at_once = 0
+    uniform = 0
     for _ in range(200):
         points = rng.integers(3, 9)
         lines = [
@@ -116,8 +119,8 @@ def test_random_files_are_read_alike():
                 str(rng.choice(["", "# c", " ", "v 1 2", "f 1 2", "f 1 2 3", "vn 1 0 0 "])),
             )
         text = "\n".join(lines)
-        found = obj_lines._at_once(text.encode())
-        at_once += found is not None
-        if found is not None:
-            assert same(found, obj_lines._one_by_one(text, Path("x.obj"))), text
-    assert at_once > 100
+        together = obj_lines.parse_uniform(text.encode())
+        if together is not None:
+            uniform += 1
+            assert same(together, obj_lines.parse_each(text, Path("x.obj"))), text
+    assert uniform > 100  # most files are uniform

@@ -1,9 +1,11 @@
+"""Read OBJ files with their MTL materials."""
+
 import numpy as np
 import pytest
 
 from gdtool.assets.load import load_scene
-from gdtool.assets.obj_read import read_obj
-from gdtool.assets.polygons import triangulate
+from gdtool.assets.obj.polygons import triangulate
+from gdtool.assets.obj.read import read_obj
 from gdtool.core.errors import InputError
 from gdtool.images.io import write_png
 
@@ -11,6 +13,7 @@ SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 
 
 def read(tmp_path, text: str, library: str | None = None):
+    """Read an OBJ of the given text, with an MTL library where one is given."""
     (tmp_path / "x.obj").write_text(text)
     if library is not None:
         (tmp_path / "x.mtl").write_text(library)
@@ -18,18 +21,21 @@ def read(tmp_path, text: str, library: str | None = None):
 
 
 def area_vector(scene) -> np.ndarray:
+    """Sum the area vectors of the faces."""
     a, b, c = (scene.vertices[scene.faces[:, i]] for i in range(3))
     return np.cross(b - a, c - a).sum(0) / 2
 
 
 @pytest.mark.parametrize("face", ["f 1 2 3 4", "f -4 -3 -2 -1", "f 1 2 3\nf 1 3 4", "f 1 2 \\\n3 4"])
-def test_one_square_in_many_spellings(tmp_path, face):
+def test_one_square_in_four_notations_is_the_same_square(tmp_path, face):
     scene = read(tmp_path, SQUARE + face + "\n")
     np.testing.assert_allclose(area_vector(scene), [0, 0, 1])
-    assert len(scene.faces) == 2 and scene.normals is None and scene.materials[0].roughness == 0.5
+    assert len(scene.faces) == 2
+    assert scene.normals is None
+    assert scene.materials[0].roughness == 0.5
 
 
-def test_texture_coordinates_turn_downward_and_corners_split(tmp_path):
+def test_texture_coordinates_are_flipped_and_split_vertices(tmp_path):
     scene = read(
         tmp_path, SQUARE + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvn 0 0 2\nf 1/1/1 2/2/1 3/3/1\nf 1/4/1 3/3/1 4/4/1\n"
     )
@@ -38,7 +44,7 @@ def test_texture_coordinates_turn_downward_and_corners_split(tmp_path):
     assert len(scene.vertices) == 5  # vertex 1 has two texture coordinates
 
 
-def test_vertex_colours_are_srgb(tmp_path):
+def test_vertex_colours_are_decoded_from_srgb(tmp_path):
     text = "v 0 0 0 1 0 0\nv 1 0 0 0 0.5 0\nv 0 1 0 0 0 1\nf 1 2 3\n"
     scene = read(tmp_path, text)
     np.testing.assert_allclose(scene.colors, [[1, 0, 0, 1], [0, 0.2140411, 0, 1], [0, 0, 1, 1]], atol=1e-6)
@@ -47,7 +53,7 @@ def test_vertex_colours_are_srgb(tmp_path):
     np.testing.assert_allclose(scene.colors[1], [0, 0.2140411, 0, 1], atol=1e-6)
 
 
-def test_concave_polygons_keep_their_area(tmp_path):
+def test_concave_polygons_are_triangulated_without_flipped_faces(tmp_path):
     # an L of six corners, area 3, from every first corner; and an arrow-shaped quad, area 1
     ring = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]], float)
     for turn in range(6):
@@ -64,15 +70,17 @@ def test_concave_polygons_keep_their_area(tmp_path):
         triangles, owner = triangulate(points, corners, sizes)
         a, b, c = (points[triangles[:, i]] for i in range(3))
         cross = np.cross(b - a, c - a)[:, 2]
-        assert (cross > 0).all() and np.isclose(cross.sum() / 2, 1) and (owner == 0).all()
+        assert (cross > 0).all()
+        assert np.isclose(cross.sum() / 2, 1)
+        assert (owner == 0).all()
 
 
 MATERIALS = SQUARE + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nmtllib x.mtl\nusemtl a\nf 1/1 2/2 3/3 4/4\n"
 
 
-def test_material_numbers_and_their_defaults(tmp_path):
-    one = read(tmp_path, MATERIALS, "newmtl a\nKd 0.1 0.2 0.3\nd 0.5\nPr 0.7\nPm 0.9\nKe 2 1 0\n").materials[0]
-    assert (one.base_color, one.roughness, one.metallic, one.alpha_mode, one.emissive) == (
+def test_material_statements_become_metallic_roughness(tmp_path):
+    full = read(tmp_path, MATERIALS, "newmtl a\nKd 0.1 0.2 0.3\nd 0.5\nPr 0.7\nPm 0.9\nKe 2 1 0\n").materials[0]
+    assert (full.base_color, full.roughness, full.metallic, full.alpha_mode, full.emissive) == (
         (0.1, 0.2, 0.3, 0.5),
         0.7,
         0.9,
@@ -80,12 +88,14 @@ def test_material_numbers_and_their_defaults(tmp_path):
         (2, 1, 0),
     )
     shiny = read(tmp_path, MATERIALS, "newmtl a\nKd 1 1 1\nKs 0.5 0.5 0.5\nNs 198\n").materials[0]
-    assert shiny.roughness == pytest.approx(0.01**0.25) and shiny.metallic == 0 and shiny.alpha_mode == "OPAQUE"
+    assert shiny.roughness == pytest.approx(0.01**0.25)
+    assert shiny.metallic == 0
+    assert shiny.alpha_mode == "OPAQUE"
     dull = read(tmp_path, MATERIALS, "newmtl a\nKd 1 1 1\nKs 0 0 0\nNs 198\n").materials[0]
     assert dull.roughness == 0.5
 
 
-def test_maps(tmp_path):
+def test_texture_statements_become_maps(tmp_path):
     rng = np.random.default_rng(0)
     color, orm = rng.integers(0, 256, (8, 8, 3), np.uint8), rng.integers(0, 256, (4, 4, 3), np.uint8)
     rough = rng.integers(0, 256, (8, 8, 1), np.uint8)
@@ -99,28 +109,31 @@ def test_maps(tmp_path):
         "map_Bump -bm 1 flat.png\n",
     ).materials[0]
     np.testing.assert_array_equal(m.base_color_texture.image, color)
-    assert (
-        m.base_color_texture.encoding == "srgb" and m.base_color == (1, 1, 1, 1) and (m.roughness, m.metallic) == (1, 1)
-    )
+    assert m.base_color_texture.encoding == "srgb"
+    assert m.base_color == (1, 1, 1, 1)
+    assert (m.roughness, m.metallic) == (1, 1)
     packed = m.metallic_roughness_texture.image
     np.testing.assert_array_equal(packed[..., 1], rough[..., 0])
     np.testing.assert_array_equal(packed[..., 2], np.repeat(np.repeat(orm[..., 2], 2, 0), 2, 1))
     np.testing.assert_array_equal(m.normal_texture.image, flat)
     height = read(tmp_path, MATERIALS, "newmtl a\nmap_Bump my color.png\n")
-    assert height.materials[0].normal_texture is None and any("height map" in note for note in height.notes)
+    assert height.materials[0].normal_texture is None
+    assert any("height map" in note for note in height.notes)
 
 
-def test_what_is_missing_is_noted(tmp_path):
+def test_missing_libraries_materials_and_textures_are_noted(tmp_path):
     assert any("x.mtl is missing" in note for note in read(tmp_path, MATERIALS).notes)
     assert any("'a' is not defined" in note for note in read(tmp_path, MATERIALS, "newmtl b\n").notes)
     scene = read(tmp_path, MATERIALS, "newmtl a\nmap_Kd none.png\n")
-    assert any("none.png" in note for note in scene.notes) and scene.materials[0].base_color_texture is None
+    assert any("none.png" in note for note in scene.notes)
+    assert scene.materials[0].base_color_texture is None
 
 
-def test_faces_keep_their_materials(tmp_path):
+def test_faces_keep_their_materials_and_unused_ones_are_left_out(tmp_path):
     text = SQUARE + "mtllib x.mtl\nusemtl b\nf 1 2 3 4\nusemtl a\nf 1 2 3\nusemtl unused\n"
     scene = read(tmp_path, text, "newmtl a\nPr 0.1\nnewmtl b\nPr 0.2\nnewmtl unused\n")
-    assert [scene.materials[i].roughness for i in scene.material_idx] == [0.2, 0.2, 0.1] and len(scene.materials) == 2
+    assert [scene.materials[i].roughness for i in scene.material_idx] == [0.2, 0.2, 0.1]
+    assert len(scene.materials) == 2
 
 
 @pytest.mark.parametrize(
@@ -140,17 +153,17 @@ def test_faces_keep_their_materials(tmp_path):
         ("v 5 5 5\nv 5 5 5\nv 5 5 5\nf 1 2 3\n", "one point"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path, text, fact):
+def test_a_fault_is_named_with_its_line(tmp_path, text, fact):
     with pytest.raises(InputError, match=fact):
         read(tmp_path, text)
 
 
 @pytest.mark.parametrize("scale", [1e20, 1e-20])
-def test_extreme_coordinates_are_read(tmp_path, scale):
+def test_very_large_and_small_coordinates_are_read(tmp_path, scale):
     text = "".join(f"v {x * scale!r} {y * scale!r} 0\n" for x, y in ((0, 0), (1, 0), (1, 1))) + "f 1 2 3\n"
     np.testing.assert_allclose(area_vector(read(tmp_path, text)) / scale**2, [0, 0, 0.5])
 
 
-def test_missing_file(tmp_path):
+def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(InputError, match="does not exist"):
         read_obj(tmp_path / "none.obj")

@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.bake.cases import Case
 from benchmarks.bake.score import Truth, scored
-from gdtool.assets.gltf_write import write_glb
+from gdtool.assets.gltf.write import write_glb
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.images.color import linear_from_srgb
 

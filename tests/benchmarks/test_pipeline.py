@@ -117,7 +117,7 @@ def test_roundtrip_counts_what_passes():
 
 
 def test_roundtrip_takes_models_with_metallic_roughness_textures(tmp_path):
-    from gdtool.assets.gltf_write import write_glb
+    from gdtool.assets.gltf.write import write_glb
     from gdtool.assets.procedural import generate
 
     textured = next(

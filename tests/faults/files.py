@@ -1,4 +1,4 @@
-"""Files that a user's machine may hold, made in code."""
+"""Make files for the tests, and read what runs leave."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ QUADS = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4,
 
 
 def quad_cube(path: Path, cells: int) -> Path:
-    """A closed cube of 6 cells² quads as .obj: remesh passes it through when that is what it is asked for."""
+    """Write a closed cube of 6 cells² quads as .obj; remesh copies it when asked for that many faces."""
     index: dict[tuple[int, int, int], int] = {}
     quads = []
     for axis in range(3):
@@ -33,11 +33,11 @@ def quad_cube(path: Path, cells: int) -> Path:
 
 
 def lines_of(stderr: str) -> list[str]:
-    """The error lines; there is never a traceback."""
+    """Return the error lines of stderr; fails on a traceback."""
     assert "Traceback" not in stderr, stderr
     return [line for line in stderr.splitlines() if line.startswith("gdtool: ")]
 
 
 def leftovers(folder: Path) -> list[str]:
-    """What runs leave behind when they must not: partial folders, workspaces, locks."""
+    """List what runs must not leave behind: partial folders, workspaces, locks."""
     return sorted(str(p) for p in folder.rglob(".*") if p.suffix in (".partial", ".work", ".lock", ".old"))

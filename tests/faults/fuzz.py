@@ -1,9 +1,10 @@
-"""Readers against damaged files: whatever the bytes, they answer with a value or with an error of ours (`make fuzz`).
+"""Fuzz the readers with damaged files: each must return a value or raise one of gdtool's errors (`make fuzz`).
 
     python -m tests.faults.fuzz [MINUTES] [READER ...]
 
-Prints what every reader did, and writes each file that made one do anything else to tests/faults/crashes/, where
-tests/faults/test_fuzz.py reads it again ever after. Each reader runs in a child, which a crash may take with it.
+Prints how many files each reader read and refused. A file that makes one do anything else is written to
+tests/faults/crashes/, where tests/faults/test_fuzz.py reads it from then on. Each reader runs in a child process, so
+that a crash ends only that.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,7 +26,7 @@ SLOW_SECONDS = 20.0  # a file of a few kilobytes that takes longer is a hang
 
 
 def mutated(content: bytes, rng: np.random.Generator) -> bytes:
-    """A few bytes changed, numbers put to their limits, pieces cut, doubled or moved."""
+    """Change a few bytes, set numbers to their limits, or cut, duplicate or move pieces."""
     out = bytearray(content)
     for _ in range(int(rng.integers(1, 6))):
         if not out:
@@ -49,34 +51,39 @@ def mutated(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def read_picture(path: Path) -> None:
+    """Read an image."""
     from gdtool.images.io import read_image
 
     read_image(path)
 
 
 def read_model(path: Path) -> None:
+    """Read a model."""
     from gdtool.assets.load import load_scene
 
     load_scene(path)
 
 
 def read_quads(path: Path) -> None:
+    """Read a mesh folder's OBJ."""
     from gdtool.folders.mesh import read_obj
 
     read_obj(path)
 
 
 def read_points(path: Path) -> None:
-    from gdtool.assets.ply import binary_ply
+    """Read a surface folder's PLY."""
+    from gdtool.assets.ply_stl.binary_ply import read_binary_ply
     from gdtool.core.errors import InputError
 
     try:
-        binary_ply(path.read_bytes())
+        read_binary_ply(path.read_bytes())
     except ValueError as error:
         raise InputError(path, str(error), "export it again") from None
 
 
 def read_record(path: Path) -> None:
+    """Read a manifest."""
     from gdtool.core.manifest import decode
     from gdtool.core.reading import read_json
 
@@ -84,18 +91,21 @@ def read_record(path: Path) -> None:
 
 
 def read_cameras(path: Path) -> None:
+    """Read cameras."""
     from gdtool.folders.records import read_cameras
 
     read_cameras(path)
 
 
 def read_weights(path: Path) -> None:
+    """Read a network's weights."""
     from gdtool.diffusion.network.tensors import read_tensors
 
     read_tensors(path)
 
 
 def picture_seed(name: str) -> bytes:
+    """Make an image; the name's suffix chooses its format."""
     from gdtool.images.io import write_exr, write_png
 
     with tempfile.TemporaryDirectory() as folder:
@@ -106,7 +116,8 @@ def picture_seed(name: str) -> bytes:
 
 
 def glb_seed() -> bytes:
-    from gdtool.assets.gltf_write import glb_bytes
+    """Make a triangle with a texture."""
+    from gdtool.assets.gltf.write import glb_bytes
     from gdtool.assets.scene import Material, Scene, Texture
 
     image = np.full((4, 4, 3), 200, np.uint8)
@@ -121,6 +132,7 @@ def glb_seed() -> bytes:
 
 
 def text_seed(kind: str) -> bytes:
+    """Make an OBJ, a manifest (json) or a cameras.json (cameras)."""
     from gdtool.cameras import rig
     from gdtool.core.kinds import MeshContent
     from gdtool.core.manifest import FileEntry, InputEntry, Manifest, encode
@@ -149,6 +161,7 @@ def text_seed(kind: str) -> bytes:
 
 
 def ply_seed() -> bytes:
+    """Make a binary PLY of a triangle."""
     vertex = np.eye(3, dtype="<f4").tobytes()
     face = b"\3" + np.array([0, 1, 2], "<i4").tobytes()
     header = (
@@ -158,43 +171,50 @@ def ply_seed() -> bytes:
 
 
 def weights_seed() -> bytes:
+    """Make a safetensors file."""
     from safetensors.numpy import save
 
     return save({"a.weight": np.ones((2, 3), np.float32), "b.bias": np.zeros(4, np.float32)})
 
 
-# Name: file suffix, what reads it, a good file.
-READERS: dict[str, tuple[str, Callable[[Path], None], Callable[[], bytes]]] = {
-    "png": (".png", read_picture, lambda: picture_seed("x.png")),
-    "exr": (".exr", read_picture, lambda: picture_seed("x.exr")),
-    "glb": (".glb", read_model, glb_seed),
-    "obj": (".obj", read_model, lambda: text_seed("obj")),
-    "ply": (".ply", read_model, ply_seed),
-    "quads": (".obj", read_quads, lambda: text_seed("obj")),
-    "surface": (".ply", read_points, ply_seed),
-    "manifest": (".json", read_record, lambda: text_seed("json")),
-    "cameras": (".json", read_cameras, lambda: text_seed("cameras")),
-    "weights": (".safetensors", read_weights, weights_seed),
+class Reader(NamedTuple):
+    """A file suffix, the function that reads such a file, and one that makes a valid one."""
+
+    suffix: str
+    read: Callable[[Path], None]
+    make: Callable[[], bytes]
+
+
+READERS = {
+    "png": Reader(".png", read_picture, lambda: picture_seed("x.png")),
+    "exr": Reader(".exr", read_picture, lambda: picture_seed("x.exr")),
+    "glb": Reader(".glb", read_model, glb_seed),
+    "obj": Reader(".obj", read_model, lambda: text_seed("obj")),
+    "ply": Reader(".ply", read_model, ply_seed),
+    "quads": Reader(".obj", read_quads, lambda: text_seed("obj")),
+    "surface": Reader(".ply", read_points, ply_seed),
+    "manifest": Reader(".json", read_record, lambda: text_seed("json")),
+    "cameras": Reader(".json", read_cameras, lambda: text_seed("cameras")),
+    "weights": Reader(".safetensors", read_weights, weights_seed),
 }
 
 
 def attempt(name: str, path: Path) -> str:
-    """What a reader did with a file: "read", "refused", or the exception that is a bug of ours."""
+    """Read a file and tell what happened: "read", "refused", or the exception that is a bug."""
     try:
-        READERS[name][1](path)
+        READERS[name].read(path)
     except GdtoolError:
         return "refused"
-    except Exception as error:  # the very thing that is looked for
+    except Exception as error:  # the bugs that fuzzing looks for
         return f"{type(error).__name__}: {error}"
     return "read"
 
 
 def child(name: str, seed: int, seconds: float, rounds: int, folder: str) -> None:
-    """Mutate and read, in this process. The file at work lies in folder, so that the parent finds it after a crash."""
+    """Mutate and read files in this process; `folder` holds the current one, for the parent to find after a crash."""
     rng = np.random.default_rng(seed)
-    suffix, _, make = READERS[name]
-    good = make()
-    path = Path(folder, name + suffix)
+    good = READERS[name].make()
+    path = Path(folder, name + READERS[name].suffix)
     path.write_bytes(good)
     assert attempt(name, path) == "read", f"{name}: the good file is not read: {attempt(name, path)}"
     end, count = time.monotonic() + seconds, {"read": 0, "refused": 0}
@@ -212,7 +232,7 @@ def child(name: str, seed: int, seconds: float, rounds: int, folder: str) -> Non
 
 
 def fuzz(name: str, seed: int, seconds: float, rounds: int = 10**9) -> tuple[str, bytes | None]:
-    """What became of one child, and the file that broke it or None."""
+    """Run a child process; return what became of it, and the file that broke it or None."""
     with tempfile.TemporaryDirectory() as folder:
         command = [
             sys.executable,
@@ -229,16 +249,17 @@ def fuzz(name: str, seed: int, seconds: float, rounds: int = 10**9) -> tuple[str
             done = subprocess.run(
                 command, capture_output=True, text=True, timeout=seconds + 120, cwd=Path(__file__).parents[2]
             )
-            said, code = (done.stdout + done.stderr[-400:]).strip(), done.returncode
+            outcome, code = (done.stdout + done.stderr[-400:]).strip(), done.returncode
         except subprocess.TimeoutExpired:
-            said, code = "hangs", -1
+            outcome, code = "hangs", -1
         if code == 0:
-            return said, None
-        file = Path(folder, name + READERS[name][0])
-        return f"exit {code}: {said}", file.read_bytes() if file.exists() else b""
+            return outcome, None
+        file = Path(folder, name + READERS[name].suffix)
+        return f"exit {code}: {outcome}", file.read_bytes() if file.exists() else b""
 
 
 def main(arguments: list[str]) -> int:
+    """Fuzz the readers in turn; returns 1 when a file broke one."""
     minutes = float(arguments[0]) if arguments else 10.0
     names = arguments[1:] or list(READERS)
     broken = 0
@@ -246,11 +267,11 @@ def main(arguments: list[str]) -> int:
         end = time.monotonic() + 60 * minutes / len(names)
         seed = time.time_ns() + i
         while time.monotonic() < end:
-            said, file = fuzz(name, seed, end - time.monotonic())
-            print(f"{name}: {said}", flush=True)
+            outcome, file = fuzz(name, seed, end - time.monotonic())
+            print(f"{name}: {outcome}", flush=True)
             if file is not None:
                 CRASHES.mkdir(exist_ok=True)
-                (CRASHES / f"{name}-{seed}{READERS[name][0]}").write_bytes(file)
+                (CRASHES / f"{name}-{seed}{READERS[name].suffix}").write_bytes(file)
                 broken += 1
             seed += 1
     return 1 if broken else 0

@@ -1,12 +1,16 @@
-"""The whole command line against damaged folders, odd options and outputs that are somebody's (part of `make fuzz`).
+"""Fuzz the command line: damaged folders, random options, outputs that belong to the user (part of `make fuzz`).
 
     python -m tests.faults.fuzz_commands [MINUTES] [SEED]
 
-Each case is a copy of a small working folder (models, pictures, a result of every stage), damaged in up to three
-places, on which one command runs with random sources, options and outputs. It must end in time, with a documented exit
-code, one line an error and no traceback; print nothing but paths; publish only folders that validate; leave nothing
-behind; and change nothing that it did not make. A case that breaks a rule is printed with its seed, which makes it
-again: `python -m tests.faults.fuzz_commands 0 SEED`."""
+Each case is a copy of a small working folder with models, pictures and a result of every stage. Up to three places in
+it are damaged; then one command runs with random sources, options and outputs. The run must
+
+- end in time, with a documented exit code, one line for each error and no traceback;
+- print nothing but paths, and publish only folders that validate;
+- leave nothing behind, and change nothing that it did not make.
+
+A case that breaks a rule is printed with its seed; `python -m tests.faults.fuzz_commands 0 SEED` repeats it.
+"""
 
 from __future__ import annotations
 
@@ -146,8 +150,8 @@ LEFT_OUT = {
 
 
 def make_pool(pool: Path) -> None:
-    """Small sources, and a result of every stage made from them by the command line."""
-    from gdtool.assets.gltf_write import glb_bytes
+    """Make small sources, and a result of every stage from them by the command line."""
+    from gdtool.assets.gltf.write import glb_bytes
     from gdtool.assets.scene import Material, Scene, Texture
     from gdtool.images.io import write_exr, write_png
     from tests.faults.files import CUBE, QUADS, quad_cube
@@ -205,14 +209,20 @@ def make_pool(pool: Path) -> None:
 
 
 def damage_json(value: Any, rng: np.random.Generator) -> Any:
-    """The value with one entry somewhere in it replaced, removed, doubled or renamed."""
+    """Replace, remove, duplicate or rename one entry somewhere in a JSON value."""
     places = []
     waiting: list[Any] = [value]
     while waiting:
-        one = waiting.pop()
-        items = one.items() if isinstance(one, dict) else enumerate(one) if isinstance(one, list) else ()
+        container = waiting.pop()
+        items = (
+            container.items()
+            if isinstance(container, dict)
+            else enumerate(container)
+            if isinstance(container, list)
+            else ()
+        )
         for key, inner in list(items):
-            places.append((one, key))
+            places.append((container, key))
             waiting.append(inner)
     if not places:
         return ODD_VALUES[int(rng.integers(len(ODD_VALUES)))]
@@ -228,7 +238,7 @@ def damage_json(value: Any, rng: np.random.Generator) -> Any:
 
 
 def damage(folder: Path, rng: np.random.Generator) -> None:
-    """Change one file: its bytes, its JSON, or what stands at its place (a link, a FIFO, a folder, nothing)."""
+    """Damage one file: its bytes, its JSON, or the file itself (replaced by a link, a FIFO, a folder or nothing)."""
     files = sorted(path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
     path = files[int(rng.integers(len(files)))]
     kind = rng.integers(10)
@@ -249,7 +259,7 @@ def damage(folder: Path, rng: np.random.Generator) -> None:
 
 
 def options_of(command: click.Command, rng: np.random.Generator, places: list[str]) -> list[str]:
-    """Up to three random options with good, bounding or odd values."""
+    """Draw up to three options with valid, extreme or invalid values."""
     known = [
         option for option in command.params if isinstance(option, click.Option) and not set(option.opts) & LEFT_OUT
     ]
@@ -276,7 +286,7 @@ def options_of(command: click.Command, rng: np.random.Generator, places: list[st
 
 
 def case(rng: np.random.Generator, folder: Path) -> tuple[list[str], bytes]:
-    """Arguments and stdin of one run in folder."""
+    """Draw the arguments and stdin of one run in `folder`."""
     from gdtool.commands import COMMANDS
     from gdtool.commands._group import cli
 
@@ -343,13 +353,13 @@ def case(rng: np.random.Generator, folder: Path) -> tuple[list[str], bytes]:
     ]
     if name in ("evaluate", "validate"):
         words = words[:-2]
-    given = b"".join(os.fsencode(source) + b"\n" for source in sources) if through_stdin else b""
+    stdin = b"".join(os.fsencode(source) + b"\n" for source in sources) if through_stdin else b""
     words += [] if through_stdin else ["--", *sources]
-    return [word.replace("\0", "") for word in words], given
+    return [word.replace("\0", "") for word in words], stdin
 
 
 def state(folder: Path) -> dict[str, str]:
-    """Each file below a folder with its digest, each link with its target."""
+    """Record each file below a folder by its digest and each link by its target."""
     out = {}
     for path in sorted(folder.rglob("*")):
         if path.is_symlink():
@@ -359,11 +369,13 @@ def state(folder: Path) -> dict[str, str]:
     return out
 
 
-def run_case(words: list[str], given: bytes, folder: Path) -> tuple[int, str, str]:
-    """Exit code (124: it did not end in time), stdout and stderr of the command, in a copy of this process: it has
-    imported what commands need."""
+def run_case(words: list[str], stdin: bytes, folder: Path) -> tuple[int, str, str]:
+    """Run a command in a fork of this process, which has imported what commands need.
+
+    Returns exit code (124 where it did not end in time), stdout and stderr.
+    """
     files = [tempfile.TemporaryFile() for _ in range(3)]  # noqa: SIM115 - closed at the end
-    files[0].write(given)
+    files[0].write(stdin)
     files[0].seek(0)
     pid = os.fork()
     if not pid:
@@ -412,7 +424,7 @@ def run_case(words: list[str], given: bytes, folder: Path) -> tuple[int, str, st
 
 
 def broken_rules(words: list[str], code: int, out: str, err: str, folder: Path, before: dict[str, str]) -> list[str]:
-    """What the run did that no run may do."""
+    """List the rules that a run broke."""
     rules = []
     if code == 124:
         return [f"did not end within {SECONDS:g} s"]
@@ -423,11 +435,11 @@ def broken_rules(words: list[str], code: int, out: str, err: str, folder: Path, 
     several = [line for line in err.splitlines() if line and not KNOWN_LINE.match(line)]
     if several:
         rules.append(f"wrote lines that are no message: {several[:3]}")
-    told = [line for line in err.splitlines() if line.startswith("gdtool")]
-    if code and not told and words[0] != "validate":
-        rules.append("failed without a word")
-    if len(told) > 12:
-        rules.append(f"{len(told)} lines of errors")
+    errors = [line for line in err.splitlines() if line.startswith("gdtool")]
+    if code and not errors and words[0] != "validate":
+        rules.append("failed without a message")
+    if len(errors) > 12:
+        rules.append(f"{len(errors)} lines of errors")
     paths = []
     if words[0] not in ("evaluate", "validate") and "--plan" not in words:
         for line in out.splitlines():
@@ -463,6 +475,7 @@ def broken_rules(words: list[str], code: int, out: str, err: str, folder: Path, 
 
 
 def main(arguments: list[str]) -> int:
+    """Run cases until the time is over; returns 1 when a rule was broken."""
     if arguments[:1] == ["--pool"]:
         make_pool(Path(arguments[1]))
         return 0
@@ -487,14 +500,14 @@ def main(arguments: list[str]) -> int:
             (top_path / "outside/secret.txt").write_text("not to be touched")
             for _ in range(int(rng.choice([0, 0, 1, 1, 2, 3]))):
                 damage(folder, rng)
-            words, given = case(rng, folder)
+            words, stdin = case(rng, folder)
             before = state(top_path / "outside")
-            code, out, err = run_case(words, given, folder)
+            code, out, err = run_case(words, stdin, folder)
             codes[code] = codes.get(code, 0) + 1
             rules = broken_rules(words, code, out, err, folder, before)
             if rules:
                 broken += 1
-                print(f"seed {seed}: gdtool {' '.join(map(ascii, words))}" + (f" < {given!r}" if given else ""))
+                print(f"seed {seed}: gdtool {' '.join(map(ascii, words))}" + (f" < {stdin!r}" if stdin else ""))
                 print("".join(f"  {rule}\n" for rule in rules) + f"  exit {code}, said: {err[-600:]!r}", flush=True)
             shutil.rmtree(top_path / "outside")
             count, seed = count + 1, seed + 1

@@ -1,12 +1,12 @@
-"""Kill a run at sixty-one moments; whatever the moment, the output is the old result or the new one, whole (part of
-`make fuzz`).
+"""Kill a run at sixty-one moments: the output must be the old result or the new one, whole (part of `make fuzz`).
 
     python -m tests.faults.kills [RANDOM] [EXACT] [SEED]
 
-RANDOM kills come at random times of a run, EXACT ones just before a chosen operation on the file system: the run's
-first and last, and others spread over what it does to the output's folder (making, writing, renaming, removing), the
-manifest and the swap among them. After each kill the output opens, nothing beside it has changed, and at the end an
-undisturbed run gives the same files as one that was never killed."""
+RANDOM kills come at random times. EXACT kills come just before a chosen operation on the file system: the first, the
+last, and others spread over making, writing, renaming and removing what belongs to the output, the manifest and the
+swap among them. After each kill the output must open and nothing beside it may have changed. At the end an undisturbed
+run must give the same files as one that was never killed.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +28,7 @@ EVENTS = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.chmod", "os.utim
 
 
 def watched(act) -> None:
-    """Call act(what) before each operation on the file system that touches an output in the working folder, and before
-    the swap."""
+    """Call act(operation) before each operation on the file system that touches an output, and before the swap."""
     here = Path.cwd()
 
     def hook(event: str, arguments: tuple) -> None:
@@ -43,23 +42,22 @@ def watched(act) -> None:
             act(f"{event} {name}")
 
     sys.addaudithook(hook)
-    # The swap of two folders is a call into the C library, of which audit hooks do not hear.
+    # The swap of two folders is a call into the C library, which audit hooks do not see.
     from gdtool.core import publish
 
     swap = publish._exchange
 
-    def told_swap(a: Path, b: Path) -> bool:
+    def watched_swap(a: Path, b: Path) -> bool:
         act(f"swap {a} {b}")
         done = swap(a, b)
         act(f"swapped {a} {b}")
         return done
 
-    publish._exchange = told_swap
+    publish._exchange = watched_swap
 
 
 def inside(stop_before: int) -> None:
-    """What the killed process runs: gdtool, until operation number stop_before (counted from 0); -1: to its end,
-    telling the operations."""
+    """Run gdtool, and kill this process before operation `stop_before`; with -1, only print the operations."""
     count = 0
 
     def act(what: str) -> None:
@@ -78,6 +76,7 @@ def inside(stop_before: int) -> None:
 
 
 def start(folder: Path, stop_before: int | None = None) -> subprocess.Popen:
+    """Start the run, to its end or to be killed before an operation."""
     words = (
         ["-m", "gdtool", *COMMAND]
         if stop_before is None
@@ -95,22 +94,21 @@ def start(folder: Path, stop_before: int | None = None) -> subprocess.Popen:
 
 
 def spread(operations: list[str], count: int) -> list[int]:
-    """`count` operations to stop before: the first, the last, all around the manifest and the swap, and others evenly
-    between them."""
+    """Choose `count` operations to stop before: first, last, those near the manifest and the swap, others evenly."""
     important = [
         i for i, what in enumerate(operations) if "manifest.json" in what or what.startswith(("swap", "os.rename"))
     ]
     chosen = list(dict.fromkeys([0, len(operations) - 1, *important]))[:count]
     even = (round(k * (len(operations) - 1) / max(count - 1, 1)) for k in range(count))
-    for one in even:
-        if len(chosen) < count and one not in chosen:
-            chosen.append(one)
+    for operation in even:
+        if len(chosen) < count and operation not in chosen:
+            chosen.append(operation)
     rest = (i for i in range(len(operations)) if i not in chosen)
     return sorted(chosen + [i for i, _ in zip(rest, range(count - len(chosen)), strict=False)])
 
 
 def main(random_kills: int = 50, exact_kills: int = 11, seed: int = 0) -> int:
-    """Run the loop; the number of kills after which something was wrong."""
+    """Run all kills; returns how many left something wrong."""
     wrong = 0
     with tempfile.TemporaryDirectory(prefix="gdtool-kills-") as top:
         folder = Path(top)
@@ -127,10 +125,10 @@ def main(random_kills: int = 50, exact_kills: int = 11, seed: int = 0) -> int:
         (folder / ".out.v2.000000000000.work/checkpoint").write_text("another output's")
         begin = time.perf_counter()
         process = start(folder, -1)
-        _, told = process.communicate()
+        _, errors = process.communicate()
         usual = time.perf_counter() - begin
-        assert process.returncode == 0, told
-        operations = [line.removeprefix("operation ") for line in told.splitlines() if line.startswith("operation ")]
+        assert process.returncode == 0, errors
+        operations = [line.removeprefix("operation ") for line in errors.splitlines() if line.startswith("operation ")]
         new = open_folder(folder / "out").manifest.digest
         assert old != new
         rng = random.Random(seed)
@@ -162,10 +160,10 @@ def main(random_kills: int = 50, exact_kills: int = 11, seed: int = 0) -> int:
             wrong += bool(faults)
             print(f"killed {name}: " + ("; ".join(faults) or "whole"), flush=True)
         process = start(folder)
-        _, told = process.communicate()
+        _, errors = process.communicate()
         left = [path for path in leftovers(folder) if ".out.v2." not in path]
         if process.returncode or open_folder(folder / "out").manifest.digest != new or left:
-            print(f"the run after the kills: exit {process.returncode}, left {left}, {told}")
+            print(f"the run after the kills: exit {process.returncode}, left {left}, {errors}")
             wrong += 1
     print(f"{len(moments)} kills, {wrong} with a fault")
     return wrong

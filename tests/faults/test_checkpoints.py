@@ -1,4 +1,4 @@
-"""Model folders that are damaged, or not ours: refused before anything of them is run."""
+"""Refuse damaged and foreign model folders before any code in them could run."""
 
 import json
 import pickle
@@ -15,6 +15,8 @@ from tests.stages.test_sample_views import tiny_model, write_manifest  # noqa: F
 
 
 class Trap:
+    """Create a folder when it is unpickled."""
+
     def __reduce__(self):
         import os
 
@@ -22,24 +24,29 @@ class Trap:
 
 
 def weights(folder):
+    """Find the safetensors file of a model folder."""
     return next(folder.glob("*.safetensors"))
 
 
 def as_pickle(folder):
+    """Replace the weights by a pickle."""
     weights(folder).write_bytes(pickle.dumps(Trap()))
 
 
 def only_pickle(folder):
+    """Leave only a pickle."""
     (folder / "model.bin").write_bytes(pickle.dumps(Trap()))
     weights(folder).unlink()
 
 
 def truncated(folder):
+    """Cut the weights short."""
     path = weights(folder)
     path.write_bytes(path.read_bytes()[:-100])
 
 
 def overlapping(folder):
+    """Let two tensors share bytes."""
     path = weights(folder)
     content = path.read_bytes()
     size = struct.unpack("<Q", content[:8])[0]
@@ -52,6 +59,8 @@ def overlapping(folder):
 
 
 def changed(change):
+    """Make a damage that changes one tensor."""
+
     def damage(folder):
         tensors = load_file(weights(folder))
         name = sorted(tensors)[0]
@@ -73,12 +82,16 @@ def changed(change):
     ],
     ids=["pickle", "only pickle", "truncated", "overlapping", "nan", "shape"],
 )
-def test_refused_in_one_line(gdtool, tmp_path, tiny_model, damage, word):  # noqa: F811
+def test_a_damaged_model_folder_is_refused_in_one_line(gdtool, tmp_path, tiny_model, damage, word):  # noqa: F811
     shutil.copytree(tiny_model, tmp_path / "model")
     damage(tmp_path / "model")
     write_manifest(tmp_path / "model")
     write_png(tmp_path / "ball.png", ball() / 255)
     done = gdtool("sample-views", "ball.png", "--model", "model", "--steps", 1, "-q")
-    told = lines_of(done.stderr)
-    assert done.returncode == 3 and len(told) == 1 and "model" in told[0] and word in told[0], done.stderr
-    assert not (tmp_path / "trap-sprung").exists() and not (tmp_path / "ball.asset/views").exists()
+    errors = lines_of(done.stderr)
+    assert done.returncode == 3, done.stderr
+    assert len(errors) == 1, done.stderr
+    assert "model" in errors[0], done.stderr
+    assert word in errors[0], done.stderr
+    assert not (tmp_path / "trap-sprung").exists()
+    assert not (tmp_path / "ball.asset/views").exists()

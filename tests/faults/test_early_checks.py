@@ -1,4 +1,4 @@
-"""What a run would need only at its end is checked before any work: nothing is written, nothing waits."""
+"""Check before any work what a run would need only at its end."""
 
 import dataclasses
 import importlib
@@ -20,7 +20,7 @@ from tests.faults.files import leftovers, lines_of, quad_cube
 
 @pytest.fixture
 def no_work(monkeypatch):
-    """No stage may begin to work."""
+    """Fail the test if a stage begins to work."""
     for stage in (bake, relight, remesh, render_dataset, sample_views, train):
 
         def run(*_):
@@ -37,6 +37,7 @@ def no_work(monkeypatch):
 
 @pytest.fixture
 def files(tmp_path):
+    """Make the sources and options' files in the working folder."""
     quad_cube(tmp_path / "cube.obj", 4)
     write_png(tmp_path / "ball.png", np.full((64, 64, 4), 200, np.uint8))
     write_png(tmp_path / "small.png", np.full((32, 40), 255, np.uint8))
@@ -87,17 +88,23 @@ def files(tmp_path):
     ],
     ids=lambda value: value if isinstance(value, str) and " " in value and ":" not in value else "",
 )
-def test_what_lies_only_at_the_end(gdtool_here, no_work, files, monkeypatch, line, code, words):
+def test_options_used_only_at_the_end_are_checked_before_any_work(
+    gdtool_here, no_work, files, monkeypatch, line, code, words
+):
     import torch
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     before = sorted(files.iterdir())
     done = gdtool_here(*line.split(), "-o", "out")
-    assert done.returncode == code and words in done.stderr and done.stdout == "", done.stderr
-    assert len(lines_of(done.stderr)) == 1 and sorted(files.iterdir()) == before and leftovers(files) == []
+    assert done.returncode == code, done.stderr
+    assert words in done.stderr, done.stderr
+    assert done.stdout == "", done.stderr
+    assert len(lines_of(done.stderr)) == 1
+    assert sorted(files.iterdir()) == before
+    assert leftovers(files) == []
 
 
-def test_lights_that_are_there_pass(files):
+def test_existing_environments_pass_the_early_check(files):
     for value in ("dark", "mid", "bright", "random:7", f"random:{2**63 - 1}", "light.exr"):
         early.require_environment("--env", value, ("dark", "mid", "bright"))
     with pytest.raises(Exception, match="black everywhere"):
@@ -125,13 +132,16 @@ def test_lights_that_are_there_pass(files):
         ),
     ],
 )
-def test_packages_that_an_option_needs(gdtool_here, no_work, files, monkeypatch, line, module, cure):
+def test_a_package_that_an_option_needs_is_checked_before_any_work(
+    gdtool_here, no_work, files, monkeypatch, line, module, cure
+):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     monkeypatch.setitem(sys.modules, module, None)
     done = gdtool_here(*line.split(), "-o", "out")
-    assert (
-        done.returncode == 5 and cure in done.stderr and len(lines_of(done.stderr)) == 1 and leftovers(files) == []
-    ), done.stderr
+    assert done.returncode == 5, done.stderr
+    assert cure in done.stderr, done.stderr
+    assert len(lines_of(done.stderr)) == 1, done.stderr
+    assert leftovers(files) == [], done.stderr
 
 
 def test_a_package_whose_library_is_missing_names_the_library(monkeypatch):
@@ -144,6 +154,7 @@ def test_a_package_whose_library_is_missing_names_the_library(monkeypatch):
 
 
 def dataset(count):
+    """Make a stand-in for a dataset of `count` objects."""
     return types.SimpleNamespace(kind="dataset", content=types.SimpleNamespace(objects=[None] * count))
 
 
@@ -158,8 +169,8 @@ def dataset(count):
     ],
 )
 def test_holding_out_all_objects_is_refused(count, options, fine):
-    given = dataset(count)
-    inputs = Inputs(given, "x", {"start": None}, (given,))
+    source = dataset(count)
+    inputs = Inputs(source, "x", {"start": None}, (source,))
     if fine:
         train.check(inputs, train.Options(**options))
     else:
@@ -183,13 +194,14 @@ def test_holding_out_all_objects_is_refused(count, options, fine):
 )
 def test_a_wrong_training_configuration_is_refused(tmp_path, content, fact):
     (tmp_path / "c.json").write_text(content)
-    given = dataset(9)
+    source = dataset(9)
     with pytest.raises(Exception, match=fact) as caught:
-        train.check(Inputs(given, "x", {"start": None}, (given,)), train.Options(config="c.json"))
-    assert caught.value.exit_code == 3 and caught.value.cure
+        train.check(Inputs(source, "x", {"start": None}, (source,)), train.Options(config="c.json"))
+    assert caught.value.exit_code == 3
+    assert caught.value.cure
 
 
-def test_a_compiled_network_is_kept_out_of_tmpdir(monkeypatch, tmp_path):
+def test_the_cache_of_compiled_networks_is_outside_tmpdir(monkeypatch, tmp_path):
     from gdtool.diffusion.inference.compiled import compiler_cache
 
     monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR", raising=False)

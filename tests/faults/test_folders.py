@@ -1,4 +1,4 @@
-"""Folders that another program, a half-done copy or an edit has left: refused in one line by whoever reads them."""
+"""Refuse folders that another program, an interrupted copy or an edit has left, in one line."""
 
 import json
 import shutil
@@ -12,22 +12,26 @@ from tests.fields.shapes import torus, views_folder, views_of
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory):
+    """Make a valid views folder."""
     return views_folder(tmp_path_factory.mktemp("good") / "ring.asset" / "views", *views_of(torus, 32)).absolute()
 
 
 def edit(path, change):
+    """Change the JSON of a file."""
     raw = json.loads(path.read_text())
     change(raw)
     path.write_text(json.dumps(raw))
 
 
 def resealed(folder):
-    """The manifest lists the files as they are now: as a program that writes its own folders would have it."""
+    """List the files in the manifest as they are now, as a program that writes its own folders would."""
     entries = [{"path": f.path, "size": f.size, "sha256": f.sha256} for f in list_files(folder)]
     edit(folder / MANIFEST, lambda m: m.update(files=entries))
 
 
 def camera(change):
+    """Make a damage that changes the cameras and lists the new file."""
+
     def damage(folder):
         edit(folder / "cameras.json", lambda c: change(c["cameras"]))
         resealed(folder)
@@ -36,10 +40,13 @@ def camera(change):
 
 
 def manifest(change):
+    """Make a damage that changes the manifest."""
     return lambda folder: edit(folder / MANIFEST, change)
 
 
 def text(old, new):
+    """Make a damage that replaces text of the manifest."""
+
     def damage(folder):
         path = folder / MANIFEST
         assert old in path.read_text()
@@ -49,16 +56,19 @@ def text(old, new):
 
 
 def outside(folder):
+    """Replace a mask by a link to a file outside the folder."""
     link = folder / "mask/front.png"
     shutil.move(link, folder.parent / "elsewhere.png")
     link.symlink_to(folder.parent / "elsewhere.png")
 
 
 def stretched(cameras):
+    """Make a camera's matrix not rigid."""
     cameras[0]["world_from_camera"][0] *= 2
 
 
 def other_size(cameras):
+    """Give one view another size than the others."""
     cameras[2].update(width=64, height=64)
 
 
@@ -90,6 +100,7 @@ DAMAGE = {
 
 @pytest.fixture
 def damaged(good, tmp_path):
+    """Make a copy of the good folder for each damage."""
     for name, (damage, _) in DAMAGE.items():
         shutil.copytree(good, tmp_path / f"{name}.asset/views")
         damage(tmp_path / f"{name}.asset/views")
@@ -97,18 +108,21 @@ def damaged(good, tmp_path):
 
 
 @pytest.mark.parametrize("command", ["reconstruct", "validate", "evaluate"])
-def test_each_is_refused_in_one_line(gdtool, good, damaged, tmp_path, command):
+def test_each_damaged_folder_is_refused_in_one_line(gdtool, good, damaged, tmp_path, command):
     extra = ("--reference", good) if command == "evaluate" else ()
     done = gdtool(command, *damaged, *extra, "-q")
-    told = lines_of(done.stderr)
+    errors = lines_of(done.stderr)
     for name, (_, fact) in DAMAGE.items():
-        about = [line for line in told if f"{name}.asset/views" in line]
-        assert len(about) == 1 and fact in about[0], (name, about, done.stderr)
-    assert done.returncode == 3 and done.stdout == "" and leftovers(tmp_path) == []
+        about = [line for line in errors if f"{name}.asset/views" in line]
+        assert len(about) == 1, (name, about, done.stderr)
+        assert fact in about[0], (name, about, done.stderr)
+    assert done.returncode == 3
+    assert done.stdout == ""
+    assert leftovers(tmp_path) == []
     assert not list(tmp_path.glob("*.asset/surface"))
 
 
-def test_the_wrong_kind_names_the_stage_that_makes_the_right_one(gdtool, good):
+def test_a_folder_of_the_wrong_kind_names_the_stage_that_makes_the_right_one(gdtool, good):
     for command, cure in (
         ("remesh", "gdtool reconstruct"),
         ("unwrap", "gdtool remesh"),
@@ -116,20 +130,24 @@ def test_the_wrong_kind_names_the_stage_that_makes_the_right_one(gdtool, good):
         ("relight", "gdtool bake"),
     ):
         done = gdtool(command, good)
-        (told,) = lines_of(done.stderr)
-        assert done.returncode == 3 and "holds views" in told and cure in told, told
+        (error,) = lines_of(done.stderr)
+        assert done.returncode == 3, error
+        assert "holds views" in error, error
+        assert cure in error, error
 
 
-def test_a_camera_inside_the_object(gdtool, good, tmp_path):
-    """Depth there is negative or nothing: whoever says so, it is no crash and no empty surface."""
+def test_views_from_inside_the_object_are_refused(gdtool, good, tmp_path):
+    """Depths there are negative or missing; the result must not be a crash or an empty surface."""
     shutil.copytree(good, tmp_path / "in.asset/views")
 
     def move(cameras):
-        for one in cameras:
+        for camera_record in cameras:
             for i in (3, 7, 11):
-                one["world_from_camera"][i] = 0.0
+                camera_record["world_from_camera"][i] = 0.0
 
     camera(move)(tmp_path / "in.asset/views")
     done = gdtool("reconstruct", "in.asset/views")
-    (told,) = lines_of(done.stderr)
-    assert done.returncode == 3 and "camera" in told and not (tmp_path / "in.asset/surface").exists()
+    (error,) = lines_of(done.stderr)
+    assert done.returncode == 3
+    assert "camera" in error
+    assert not (tmp_path / "in.asset/surface").exists()

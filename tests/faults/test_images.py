@@ -1,4 +1,4 @@
-"""Pictures as they come: refused in one line that names the file and the fact, or taken for what they show."""
+"""Read pictures of all kinds: refuse them in one line with the file and the fact, or use them correctly."""
 
 import os
 import struct
@@ -18,7 +18,7 @@ SIZE = 48
 
 
 def ball() -> np.ndarray:
-    """(48, 48, 4) uint8: a shaded disc, away from the border, on nothing."""
+    """Make a shaded disc (48, 48, 4) uint8 on a transparent background, away from the border."""
     y, x = np.mgrid[:SIZE, :SIZE]
     inside = (x - 22) ** 2 + (y - 25) ** 2 < 15**2
     return (np.stack([60 + 3 * x, 200 - 2 * y, 90 + 0 * x, np.full_like(x, 255)], -1) * inside[..., None]).astype(
@@ -27,12 +27,13 @@ def ball() -> np.ndarray:
 
 
 def write(path, content: bytes):
+    """Write a file and return its name."""
     path.write_bytes(content)
     return path.name
 
 
 def refused(folder) -> dict[str, tuple[int, str]]:
-    """File name to the exit code and a word of the message."""
+    """Write faulty pictures; returns the exit code and a word of the message by file name."""
     whole = png(SIZE, SIZE, RGBA, 8, scanlines(ball()))
     write(folder / "empty.png", b"")
     write(folder / "text.png", b"a text")
@@ -65,21 +66,24 @@ def refused(folder) -> dict[str, tuple[int, str]]:
     }
 
 
-def test_each_is_refused_in_one_line(gdtool, tmp_path, tiny_model):  # noqa: F811
+def test_each_faulty_picture_is_refused_in_one_line(gdtool, tmp_path, tiny_model):  # noqa: F811
     cases = refused(tmp_path)
     done = gdtool("sample-views", *cases, "--model", tiny_model, "--steps", 1, "-q")
-    told = lines_of(done.stderr)
+    errors = lines_of(done.stderr)
     for name, (_, word) in cases.items():
-        about = [line for line in told if line.removeprefix("gdtool: ").startswith(name)]
-        assert len(about) == 1 and word in about[0], (name, about, done.stderr)
-    assert done.returncode == 1 and done.stdout == ""  # all failed, but not of one kind
-    assert leftovers(tmp_path) == [] and not list(tmp_path.glob("*.asset/*"))
+        about = [line for line in errors if line.removeprefix("gdtool: ").startswith(name)]
+        assert len(about) == 1, (name, about, done.stderr)
+        assert word in about[0], (name, about, done.stderr)
+    assert done.returncode == 1  # all failed, but not of one kind
+    assert done.stdout == ""
+    assert leftovers(tmp_path) == []
+    assert not list(tmp_path.glob("*.asset/*"))
     three = [name for name, (code, _) in cases.items() if code == 3]
     assert gdtool("sample-views", *three[:2], "--model", tiny_model, "-q").returncode == 3
     assert gdtool("sample-views", "wide.png", "bomb.png", "--model", tiny_model, "-q").returncode == 5
 
 
-def test_each_spelling_of_one_picture_is_the_same_picture(gdtool, tmp_path, tiny_model):  # noqa: F811
+def test_one_picture_in_every_png_encoding_gives_the_same_pixels(gdtool, tmp_path, tiny_model):  # noqa: F811
     picture = ball()
     write(tmp_path / "plain.png", png(SIZE, SIZE, RGBA, 8, scanlines(picture)))
     write(tmp_path / "interlaced.png", png(SIZE, SIZE, RGBA, 8, adam7(picture), interlaced=True))
@@ -103,24 +107,27 @@ def test_each_spelling_of_one_picture_is_the_same_picture(gdtool, tmp_path, tiny
     write(tmp_path / "grey_rgba.png", png(SIZE, SIZE, RGBA, 8, scanlines(grey[..., [0, 0, 0, 1]])))
     names = ("plain", "interlaced", "sixteen", "few", "palette", "grey", "grey_rgba")
     done = gdtool("sample-views", *(f"{name}.png" for name in names), "--model", tiny_model, "--steps", 1, "-q")
-    assert done.returncode == 0 and len(done.stdout.splitlines()) == len(names), done.stderr
-    seen = {name: read_image(tmp_path / f"{name}.asset/views/condition/000.png") for name in names}
-    for one, other in (("plain", "interlaced"), ("plain", "sixteen"), ("few", "palette"), ("grey", "grey_rgba")):
-        assert np.array_equal(seen[one], seen[other]), (one, other)
-    assert seen["plain"][..., 3].any()
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.splitlines()) == len(names), done.stderr
+    condition = {name: read_image(tmp_path / f"{name}.asset/views/condition/000.png") for name in names}
+    for first, second in (("plain", "interlaced"), ("plain", "sixteen"), ("few", "palette"), ("grey", "grey_rgba")):
+        assert np.array_equal(condition[first], condition[second]), (first, second)
+    assert condition["plain"][..., 3].any()
 
 
-def test_a_subject_at_the_border_is_told(gdtool, tmp_path, tiny_model):  # noqa: F811
+def test_a_subject_cut_by_the_border_gives_a_warning(gdtool, tmp_path, tiny_model):  # noqa: F811
     picture = np.zeros((SIZE, SIZE, 4))
     picture[10:40, 20:] = (0.8, 0.3, 0.2, 1)
     write_png(tmp_path / "border.png", picture)
     done = gdtool("sample-views", "border.png", "--model", tiny_model, "--steps", 1)
-    assert done.returncode == 0 and "warning: " in done.stderr and "border" in done.stderr.replace("border.", "")
+    assert done.returncode == 0
+    assert "warning: " in done.stderr
+    assert "border" in done.stderr.replace("border.", "")
 
 
 @pytest.mark.parametrize("name", [b"caf\xe9.png", "貓 *.png".encode(), b"-x [1].png"])
-def test_names_of_every_kind(tmp_path, tiny_model, name):  # noqa: F811
-    """Not UTF-8, spaces, brackets, a leading dash: as an argument and in the output's name on stdout."""
+def test_file_names_of_any_characters_work(tmp_path, tiny_model, name):  # noqa: F811
+    """Names that are not UTF-8, with spaces, brackets or a leading dash, as argument and in the output's name."""
     path = os.fsencode(tmp_path) + b"/" + name
     with open(path, "wb") as file:  # noqa: PTH123 - a name of bytes
         file.write(png(SIZE, SIZE, RGBA, 8, scanlines(ball())))

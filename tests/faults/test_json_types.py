@@ -1,4 +1,4 @@
-"""JSON inside inputs with other types, deeper, longer or stranger than it can be: one InputError with the place."""
+"""Refuse JSON of wrong types, too deep or too long, with one InputError that names the place."""
 
 import json
 
@@ -51,19 +51,17 @@ def test_a_gltf_of_wrong_types_is_refused_with_the_place(tmp_path, part):
     path.write_text(GLTF % part)
     with pytest.raises(InputError, match=DOCUMENTS[part]) as caught:
         load_scene(path)
-    assert (
-        caught.value.subject == str(path)
-        and caught.value.cure
-        and len(str(caught.value)) < 400
-        and "\n" not in str(caught.value)
-    )
+    assert caught.value.subject == str(path)
+    assert caught.value.cure
+    assert len(str(caught.value)) < 400
+    assert "\n" not in str(caught.value)
     assert referred_files(path) == []  # what the digest asks does not fail
 
 
 @pytest.mark.parametrize(
     "name", [f"TEXCOORD_{LONG}", "TEXCOORD_²", "TEXCOORD_\n"], ids=["long", "superscript", "line break"]
 )
-def test_an_odd_attribute_name_is_no_set_of_coordinates(tmp_path, name):
+def test_a_malformed_attribute_name_is_no_uv_set(tmp_path, name):
     from tests.assets.gltf_files import quad
 
     builder = quad()
@@ -73,7 +71,7 @@ def test_an_odd_attribute_name_is_no_set_of_coordinates(tmp_path, name):
 
 
 @pytest.mark.parametrize("seed", [LONG, "²", "-1", "1.5", ""])
-def test_a_seed_is_a_bounded_number(seed):
+def test_a_procedural_seed_must_be_a_64_bit_number(seed):
     with pytest.raises(InputError, match="procedural:SEED"):
         load_scene(f"procedural:{seed}")
 
@@ -111,7 +109,7 @@ LAST = [0, 0, 0, 1]
         ("file_path", None),
     ],
 )
-def test_a_number_of_transforms_json_that_cannot_be_meant_is_named(tmp_path, key, value):
+def test_an_invalid_value_of_transforms_json_is_named(tmp_path, key, value):
     write_png(tmp_path / "a.png", np.pad(np.full((2, 2, 4), 0.5), ((1, 1), (1, 1), (0, 0))))
     record = INTRINSICS | {"frames": [FRAME]}
     assert len(read_transforms(tmp_path, record)) == 1
@@ -121,10 +119,12 @@ def test_a_number_of_transforms_json_that_cannot_be_meant_is_named(tmp_path, key
         record[key] = value
     with pytest.raises(InputError, match=key) as caught:
         read_transforms(tmp_path, record)
-    assert caught.value.subject == str(tmp_path / "transforms.json") and caught.value.cure
+    assert caught.value.subject == str(tmp_path / "transforms.json")
+    assert caught.value.cure
 
 
 def read_transforms(folder, record):
+    """Write a transforms.json and read its cameras."""
     (folder / "transforms.json").write_text(json.dumps(record))
     return nerf.read(folder).cameras
 
@@ -146,7 +146,7 @@ def read_transforms(folder, record):
     ],
     ids=lambda text: text[:30],
 )
-def test_a_transforms_json_of_another_form_is_refused(tmp_path, text):
+def test_a_transforms_json_of_another_structure_is_refused(tmp_path, text):
     (tmp_path / "transforms.json").write_text(text)
     with pytest.raises(InputError, match="transforms.json"):
         nerf.read(tmp_path)
@@ -179,14 +179,15 @@ CAMERA = {
         ("projection", 1),
     ],
 )
-def test_a_value_of_cameras_json_that_cannot_be_meant_is_named(tmp_path, key, value):
+def test_an_invalid_value_of_cameras_json_is_named(tmp_path, key, value):
     path = tmp_path / "cameras.json"
     path.write_text(json.dumps({"cameras": [CAMERA]}))
     assert len(read_cameras(path)) == 1
     path.write_text(json.dumps({"cameras": [CAMERA | {key: value}]}))
     with pytest.raises(InputError) as caught:
         read_cameras(path)
-    assert caught.value.cure and (key in caught.value.fact or "camera" in caught.value.fact)
+    assert caught.value.cure
+    assert key in caught.value.fact or "camera" in caught.value.fact
 
 
 @pytest.mark.parametrize(
@@ -200,7 +201,7 @@ def test_a_value_of_cameras_json_that_cannot_be_meant_is_named(tmp_path, key, va
         '{"axes": [[0, 0, 1e999]], "sharpness": [1], "amplitudes": [[1, 1, 1]]}',
     ],
 )
-def test_a_light_json_of_another_form_is_refused(tmp_path, text):
+def test_a_light_json_of_another_structure_is_refused(tmp_path, text):
     (tmp_path / "light.json").write_text(text)
     with pytest.raises(InputError, match="light.json") as caught:
         read_record(tmp_path / "light.json")

@@ -1,5 +1,4 @@
-"""Memory that runs out, in this process and in children: exit code 5 with what was asked for, and nothing left
-behind."""
+"""Run out of memory in this process and in children: exit code 5 with the size asked for, nothing left behind."""
 
 import os
 import resource
@@ -21,24 +20,23 @@ from tests.bake.test_lods import target
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits on the address space are Linux's")
 
 
-def test_a_failed_allocation_of_numpy_says_how_much_it_asked_for():
+def test_a_failed_numpy_allocation_reports_its_size():
     with pytest.raises(MemoryError) as refused:
         np.ones(2**44)
     assert str(from_exception(refused.value, "x")).startswith("x: ran out of memory (it asked for 128 TiB); ")
 
 
-def test_a_failed_allocation_of_torch_says_how_much_it_asked_for():
+def test_a_failed_torch_allocation_reports_its_size():
     import torch
 
     with pytest.raises(RuntimeError) as refused:
         torch.empty(2**44)
-    told = from_exception(refused.value, "x")
-    assert isinstance(told, ResourceError) and str(told).startswith(
-        "x: ran out of memory (it asked for 65536.00 GiB); "
-    )
+    error = from_exception(refused.value, "x")
+    assert isinstance(error, ResourceError)
+    assert str(error).startswith("x: ran out of memory (it asked for 65536.00 GiB); ")
 
 
-def test_a_library_that_finds_no_room_is_not_taken_for_one_that_is_missing():
+def test_a_library_that_does_not_fit_in_memory_is_not_reported_as_missing():
     fault = ImportError("libembree4.so.4: failed to map segment from shared object", name="embreex")
     assert (
         str(from_exception(fault, "x"))
@@ -49,7 +47,7 @@ def test_a_library_that_finds_no_room_is_not_taken_for_one_that_is_missing():
 
 
 def limited(code, megabytes):
-    """Run code in a Python of its own whose address space grows by no more than that."""
+    """Run code in a new Python whose address space may grow by only so many megabytes."""
     before = (
         "import resource; used = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize();"
         f"resource.setrlimit(resource.RLIMIT_AS, (used + {megabytes} * 2**20,) * 2)\n"
@@ -68,64 +66,65 @@ def limited(code, megabytes):
     )
 
 
-def test_embree_is_not_started_where_it_would_crash():
-    """Without the question in front of it this is a segmentation fault."""
+def test_embree_is_not_started_under_a_limit_that_would_crash_it():
+    """Embree would end the process with a segmentation fault."""
     code = "from gdtool.geometry.rays import RayCaster\nRayCaster(numpy.eye(3), numpy.array([[0, 1, 2]]))"
     done = limited(code, 60)
-    assert done.returncode == 1 and "MemoryError: unable to allocate 0.19 GiB for rays at 1 faces" in done.stderr, (
-        done.stderr
-    )
+    assert done.returncode == 1, done.stderr
+    assert "MemoryError: unable to allocate 0.19 GiB for rays at 1 faces" in done.stderr, done.stderr
     assert limited(code, 1000).returncode == 0
 
 
-def test_without_a_limit_there_is_nothing_to_ask():
+def test_without_an_address_space_limit_any_size_passes():
     assert resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY
     require_address_space(2**60, "anything")
 
 
 def grow_beyond_the_limit():
-    """What a child runs: it allocates until it may not."""
+    """Allocate memory until that fails; run in a child."""
     return [bytearray(2**24) for _ in range(10_000)][0]
 
 
 def wait_in_a_folder(folder):
-    """What a child runs: a temporary folder of its own, and no end."""
+    """Make a temporary folder and wait in it; run in a child."""
     with tempfile.TemporaryDirectory(dir=folder):
         time.sleep(60)
 
 
-def test_a_child_that_meets_its_limit_says_so():
+def test_a_child_process_beyond_its_memory_limit_is_reported():
     with pytest.raises(ChildFailed, match="needs more than 200 MB"):
         call(grow_beyond_the_limit, seconds=30, memory_mb=200)
 
 
 @pytest.fixture(scope="module")
 def whole():
-    """A mesh with texture coordinates."""
+    """Make a mesh with texture coordinates."""
     return target()
 
 
 @pytest.mark.parametrize(
-    "fault, told",
+    "limits, reason",
     [
         ({"seconds": 0.01, "memory_mb": 8000}, "took longer than 0.01 s"),
         ({"seconds": 60, "memory_mb": 1}, "needs more than 1 MB"),
     ],
     ids=["time", "memory"],
 )
-def test_a_failed_collapse_leaves_no_temporary_folder(monkeypatch, tmp_path, whole, fault, told):
-    """The child that makes coarser levels works on files; one that is killed cannot remove them itself."""
+def test_a_killed_simplification_leaves_no_temporary_folder(monkeypatch, tmp_path, whole, limits, reason):
+    """The child that makes coarser levels of detail works on files; killed, it cannot remove them itself."""
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
-    monkeypatch.setattr(lods, "call", lambda *given, **_: call(*given, **fault))
+    monkeypatch.setattr(lods, "call", lambda *arguments, **_: call(*arguments, **limits))
     coarse, why = lods.coarser(whole, 6)
-    assert coarse is None and told in why
+    assert coarse is None
+    assert reason in why
     assert not list((tmp_path / "temporary").iterdir())
 
 
-def test_children_that_fail_are_gone():
+def test_a_failed_child_process_is_killed_and_reaped():
     running = child.begin(wait_in_a_folder, None, seconds=0.3)
     with pytest.raises(ChildFailed, match="took longer than 0.3 s"):
         running.result()
-    assert running._process.returncode is not None and running._process.returncode < 0
+    assert running._process.returncode is not None
+    assert running._process.returncode < 0

@@ -1,5 +1,4 @@
-"""Meshes and glTF files as they come: refused in one line that names the file and the fact, or repaired with a
-warning."""
+"""Read faulty models: refuse them in one line with the file and the fact, or repair them with a warning."""
 
 import json
 
@@ -15,12 +14,14 @@ TRIANGLES = np.concatenate([QUADS[:, :3], QUADS[:, [0, 2, 3]]])
 
 
 def obj(vertices, faces) -> str:
+    """Write OBJ text."""
     return "".join("v {!r} {!r} {!r}\n".format(*map(float, p)) for p in vertices) + "".join(
         "f " + " ".join(str(i + 1) for i in f) + "\n" for f in faces
     )
 
 
 def glb(**document) -> bytes:
+    """Make the GLB of a quad with changes to its document."""
     builder = Builder()
     builder.primitive({"POSITION": builder.add(QUAD)}, builder.add(QUAD_FACES))
     builder.document |= document
@@ -72,6 +73,7 @@ REFUSED = {
 
 @pytest.fixture
 def faulty(tmp_path):
+    """Write the files of REFUSED; returns their names."""
     for name, (content, _) in REFUSED.items():
         (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     return list(REFUSED)
@@ -80,26 +82,30 @@ def faulty(tmp_path):
 @pytest.mark.parametrize(
     "command", [("remesh", "--faces", 100), ("render-dataset", "--size", 16, "--domains", "normal")], ids=lambda c: c[0]
 )
-def test_each_is_refused_in_one_line(gdtool, faulty, tmp_path, command):
+def test_each_faulty_model_is_refused_in_one_line(gdtool, faulty, tmp_path, command):
     done = gdtool(*command, *faulty, "missing.obj", "-q")
-    told = lines_of(done.stderr)
+    errors = lines_of(done.stderr)
     for name in [*faulty, "missing.obj"]:
-        about = [line for line in told if line.removeprefix("gdtool: ").startswith(name)]
+        about = [line for line in errors if line.removeprefix("gdtool: ").startswith(name)]
         fact = REFUSED[name][1] if name in REFUSED else "does not exist"
-        assert len(about) == 1 and fact in about[0], (name, about, done.stderr)
-    assert done.returncode == 3 and done.stdout == "" and len(told) == len(REFUSED) + 1
-    assert leftovers(tmp_path) == [] and not list(tmp_path.glob("*.asset/*"))
+        assert len(about) == 1, (name, about, done.stderr)
+        assert fact in about[0], (name, about, done.stderr)
+    assert done.returncode == 3
+    assert done.stdout == ""
+    assert len(errors) == len(REFUSED) + 1
+    assert leftovers(tmp_path) == []
+    assert not list(tmp_path.glob("*.asset/*"))
 
 
 def closed():
-    """A finely cut cube with something wrong: enough faces that an engine has something to do."""
+    """Make a cube of enough triangles for a remeshing engine to work on."""
     import trimesh
 
     mesh = trimesh.creation.box((1, 1, 1)).subdivide().subdivide().subdivide()
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-def test_what_can_be_repaired_is_repaired_with_a_warning(gdtool, tmp_path):
+def test_repairable_meshes_are_repaired_with_a_warning(gdtool, tmp_path):
     vertices, faces = closed()
     far = np.concatenate([vertices, 0.4 * vertices])
     wing = np.concatenate([vertices, [[2.0, 0, 0]]])
@@ -116,7 +122,8 @@ def test_what_can_be_repaired_is_repaired_with_a_warning(gdtool, tmp_path):
     for name, (points, triangles) in cases.items():
         (tmp_path / f"{name}.obj").write_text(obj(points, triangles))
     done = gdtool("remesh", *(f"{name}.obj" for name in cases), "--engine", "split", "--faces", 400)
-    assert lines_of(done.stderr) == [] and done.returncode == 0, done.stderr
+    assert lines_of(done.stderr) == [], done.stderr
+    assert done.returncode == 0, done.stderr
     for name in ("double", "wing", "mixed", "open"):
         assert f"warning: {name}: " in done.stderr, name
     for name in cases:

@@ -1,5 +1,4 @@
-"""Model folders whose configuration no network can be made of, or whose files are not what they have to be: one line,
-nothing allocated."""
+"""Refuse model folders with invalid configurations or files in one line, before memory is allocated."""
 
 import json
 import os
@@ -27,13 +26,14 @@ TINY = PRESETS["tiny"][0]
 
 @pytest.fixture
 def folder(tmp_path):
-    """A whole model folder of the smallest configuration."""
+    """Make a valid model folder of the smallest configuration."""
     (tmp_path / "model").mkdir()
     save_model(lambda name: tmp_path / "model" / name, TINY, Model(TINY).state_dict())
     return tmp_path / "model"
 
 
 def write(path, **changes):
+    """Write a configuration with changes."""
     path.write_text(json.dumps(msgspec.to_builtins(TINY) | changes))
     return path
 
@@ -75,15 +75,16 @@ BAD_FIELDS = [
 ]
 
 
-@pytest.mark.parametrize("change, told", BAD_FIELDS, ids=lambda x: json.dumps(x) if isinstance(x, dict) else "")
-def test_a_field_that_no_network_can_be_made_of_is_named_with_its_bound(tmp_path, change, told):
-    with pytest.raises(InputError, match=told) as refused:
+@pytest.mark.parametrize("change, message", BAD_FIELDS, ids=lambda x: json.dumps(x) if isinstance(x, dict) else "")
+def test_an_invalid_field_of_a_configuration_is_named_with_its_bound(tmp_path, change, message):
+    with pytest.raises(InputError, match=message) as refused:
         read_config(write(tmp_path / "config.json", **change))
-    assert refused.value.subject == str(tmp_path / "config.json") and refused.value.cure
+    assert refused.value.subject == str(tmp_path / "config.json")
+    assert refused.value.cure
 
 
 @pytest.mark.parametrize(
-    "text, told",
+    "text, message",
     [
         ("[]", "Expected `object`"),
         ("{", "is not JSON"),
@@ -93,9 +94,9 @@ def test_a_field_that_no_network_can_be_made_of_is_named_with_its_bound(tmp_path
         ('{"patch": NaN}', "NaN"),
     ],
 )
-def test_a_configuration_that_is_no_object_of_bounded_values_is_refused(tmp_path, text, told):
+def test_a_configuration_that_is_no_valid_json_object_is_refused(tmp_path, text, message):
     (tmp_path / "config.json").write_text(text)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         read_config(tmp_path / "config.json")
 
 
@@ -116,13 +117,13 @@ def test_every_preset_is_within_the_bounds(config):
         {"model": {"patch": 3}},
     ],
 )
-def test_train_refuses_such_a_configuration_of_its_own(tmp_path, changes):
+def test_train_refuses_invalid_changes_to_its_configuration(tmp_path, changes):
     (tmp_path / "changes.json").write_text(json.dumps(changes))
     with pytest.raises(InputError, match="changes.json"):
         configured(Options(config=str(tmp_path / "changes.json")))
 
 
-def test_a_size_that_leaves_no_network_is_refused():
+def test_an_image_size_that_the_network_cannot_have_is_refused():
     with pytest.raises(InputError, match="size: 8 does not fit the configuration: .*; give a multiple of 32"):
         resized(msgspec.structs.replace(TINY, codec="vae", encoder="clip"), 8)
 
@@ -135,14 +136,14 @@ def test_a_network_larger_than_the_memory_is_refused_with_the_prediction(folder)
         load_model(folder)
 
 
-def test_the_memory_that_is_left_decides(folder, monkeypatch):
+def test_a_network_is_refused_when_too_little_memory_is_left(folder, monkeypatch):
     load_model(folder)
     monkeypatch.setattr(memory, "most_held", lambda: 2**20)
     with pytest.raises(ResourceError, match="million weights would take"):
         load_model(folder)
 
 
-def test_weights_of_another_network_are_told_before_it_is_made(folder, monkeypatch):
+def test_weights_of_another_network_are_refused_before_it_is_built(folder, monkeypatch):
     write(folder / "config.json", channels=[16, 256])
     monkeypatch.setattr(torch.nn.Module, "load_state_dict", None)
     with pytest.raises(
@@ -152,13 +153,13 @@ def test_weights_of_another_network_are_told_before_it_is_made(folder, monkeypat
         load_model(folder)
 
 
-def test_weights_that_are_no_floating_point_numbers_are_refused(folder):
+def test_integer_weights_are_refused(folder):
     changed(lambda x: x.astype("int64"))(folder)
     with pytest.raises(InputError, match="holds int64, no floating-point numbers"):
         load_model(folder)
 
 
-def test_nan_is_found_in_eight_bits_as_well(tmp_path):
+def test_nan_is_found_in_8_bit_weights(tmp_path):
     save_file({"x": torch.tensor([1.0, float("nan")]).to(torch.float8_e4m3fn)}, tmp_path / "x.safetensors")
     with pytest.raises(InputError, match="tensor x holds NaN"):
         read_tensors(tmp_path / "x.safetensors")
@@ -170,7 +171,7 @@ def test_nan_is_found_in_eight_bits_as_well(tmp_path):
     [os.mkfifo, lambda path: path.symlink_to("/dev/zero"), lambda path: path.mkdir()],
     ids=["fifo", "device", "folder"],
 )
-def test_what_is_no_regular_file_is_refused_at_once(folder, name, make):
+def test_files_of_a_model_that_are_not_regular_are_refused(folder, name, make):
     (folder / name).unlink(missing_ok=True)
     make(folder / name)
     with pytest.raises(InputError, match=f"{name}: is a .*, not a file"):
@@ -178,7 +179,7 @@ def test_what_is_no_regular_file_is_refused_at_once(folder, name, make):
 
 
 @pytest.mark.parametrize("content", ['{"a": 5}', '{"a": {"low": 0}}', '{"a": {"low": "x", "high": 1}}', "[]"])
-def test_ranges_of_another_type_are_refused(folder, content):
+def test_malformed_ranges_of_training_pictures_are_refused(folder, content):
     (folder / "pictures.json").write_text(content)
     with pytest.raises(InputError, match="pictures.json"):
         read_ranges(folder)
@@ -215,7 +216,7 @@ UNET = {
     ],
     ids=lambda x: json.dumps(x),
 )
-def test_a_field_of_wonder3d_is_named(tmp_path, change):
+def test_an_invalid_wonder3d_configuration_names_its_file(tmp_path, change):
     for name, content in (
         ("unet/config.json", UNET | change),
         ("scheduler/scheduler_config.json", {"beta_schedule": "scaled_linear"}),
@@ -226,7 +227,7 @@ def test_a_field_of_wonder3d_is_named(tmp_path, change):
         wonder3d.read_config(tmp_path, {})
 
 
-def test_a_checkpoint_without_its_record_is_refused(tmp_path):
+def test_a_checkpoint_without_a_valid_record_is_refused(tmp_path):
     for metadata in (
         {},
         {"state": "{}"},

@@ -1,4 +1,4 @@
-"""Native packages that do not load: the command ends and says what to install, it never goes on with a worse result."""
+"""Handle native packages that do not load: say what to install, and never go on with a worse result."""
 
 import sys
 
@@ -29,9 +29,10 @@ TRIANGLE = np.eye(3), np.array([[0, 1, 2]])
 
 @pytest.fixture
 def broken(tmp_path, monkeypatch):
-    """broken(module, text): what imports the module gets ImportError(text), in this process and in children."""
+    """Return put(module, text), which makes imports of a module raise ImportError(text), in children too."""
 
     def put(module, text=NO_LIBRARY):
+        """Put a package in the import path that raises when it is imported."""
         package = tmp_path / "broken" / module
         package.mkdir(parents=True)
         (package / "__init__.py").write_text(f"raise ImportError({text!r})\n")
@@ -67,7 +68,7 @@ USES = {
 
 
 @pytest.mark.parametrize("module", USES)
-def test_a_missing_shared_library_is_told_with_the_package_that_brings_it(broken, module):
+def test_a_missing_shared_library_names_the_system_package_to_install(broken, module):
     broken(module)
     for use in USES[module]:
         with pytest.raises(
@@ -76,7 +77,7 @@ def test_a_missing_shared_library_is_told_with_the_package_that_brings_it(broken
             use()
 
 
-def test_a_library_of_unknown_origin_is_named(broken):
+def test_a_missing_library_of_unknown_package_is_named(broken):
     broken("igl", "libodd.so.7: cannot open shared object file: No such file or directory")
     with pytest.raises(
         ResourceError,
@@ -85,13 +86,13 @@ def test_a_library_of_unknown_origin_is_named(broken):
         imported("igl")
 
 
-def test_a_package_that_is_not_installed_is_told_with_the_line_that_installs_it():
+def test_a_missing_python_package_names_the_command_to_install_it():
     with pytest.raises(ResourceError, match="^no_such_package: is not installed; pip install no_such_package$"):
         imported("no_such_package.part")
     assert imported_if_installed("no_such_package.part") is None
 
 
-def test_a_package_that_cannot_be_loaded_is_not_taken_for_one_that_is_not_installed(broken):
+def test_a_package_that_fails_to_load_is_not_reported_as_missing(broken):
     broken("fcpw", "numpy.core.multiarray failed to import\nmore lines")
     with pytest.raises(
         ResourceError,
@@ -110,15 +111,16 @@ def test_quadriflow_without_its_package_is_an_error(monkeypatch):
 @pytest.mark.parametrize(
     "module, engine", [("pymeshlab", "split"), ("pynanoinstantmeshes", "auto"), ("fast_simplification", "auto")]
 )
-def test_remesh_falls_back_from_no_missing_library(broken, module, engine):
+def test_remesh_does_not_fall_back_when_a_library_is_missing(broken, module, engine):
     broken(module)
     with pytest.raises(ResourceError, match=f"libGL.so.1: is not installed, and {module} needs it"):
         remesh(*sphere(24), Request(quads=3000, engine=engine))
 
 
-def test_remesh_ends_with_exit_code_5(broken, gdtool_here, tmp_path):
+def test_remesh_exits_5_when_a_library_is_missing(broken, gdtool_here, tmp_path):
     broken("pymeshlab")
     quad_cube(tmp_path / "cube.obj", 20)
     done = gdtool_here("remesh", "cube.obj", "--faces", 1000, "--engine", "split", "-o", "out")
-    assert done.returncode == 5 and "apt install libgl1" in done.stderr, done.stderr
+    assert done.returncode == 5, done.stderr
+    assert "apt install libgl1" in done.stderr, done.stderr
     assert not (tmp_path / "out").exists()

@@ -1,4 +1,4 @@
-"""What comes in by the command line and stdin is bounded there: numbers, strings, generated objects."""
+"""Bound what comes in by the command line and stdin: numbers, strings, generated objects."""
 
 import importlib
 import io
@@ -30,20 +30,24 @@ STRINGS = [
 
 
 def by_option(pairs):
+    """Parametrize a test by options."""
     return pytest.mark.parametrize("name, param", pairs, ids=[f"{name}-{param.name}" for name, param in pairs])
 
 
 def converted(name, param, text):
+    """Convert text as the option's type does."""
     return param.type_cast_value(click.Context(MODULES[name].command), (text,) if param.nargs == -1 else text)
 
 
 def feed(monkeypatch, content):
+    """Replace stdin."""
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
 
 
 @by_option(NUMBERS)
 def test_every_number_has_two_finite_bounds(name, param):
-    assert param.type.min is not None and param.type.max is not None, f"{name} {param.opts[0]}: give it ge and le"
+    assert param.type.min is not None, f"{name} {param.opts[0]}: give it ge and le"
+    assert param.type.max is not None, f"{name} {param.opts[0]}: give it ge and le"
     for text in ("nan", "inf", "-inf", "1e400", "1" + 30 * "0", "9" * 5000):
         with pytest.raises(click.BadParameter):
             converted(name, param, text)
@@ -52,19 +56,19 @@ def test_every_number_has_two_finite_bounds(name, param):
 
 
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name != "validate"])
-def test_the_types_refuse_what_the_command_line_refuses(name):
-    """Options that are built from something else than a command line (a manifest, a test) have the same bounds."""
+def test_option_structs_have_the_bounds_of_the_command_line(name):
+    """Options may also be built from a manifest or in a test."""
     struct = importlib.import_module("gdtool.stages." + name.replace("-", "_")).Options
-    given = {field.name: field.default for field in msgspec.structs.fields(struct)}
+    defaults = {field.name: field.default for field in msgspec.structs.fields(struct)}
     for field in msgspec.structs.fields(struct):
         if isinstance(field.default, float):
             for wrong in (float("nan"), float("inf"), -1e30, 1e30):
                 with pytest.raises(UsageError):
-                    build_options(struct, given | {field.name: wrong})
+                    build_options(struct, defaults | {field.name: wrong})
 
 
 @by_option(STRINGS)
-def test_no_string_holds_a_control_character(name, param):
+def test_strings_with_control_characters_are_refused(name, param):
     for text in ("a\nb", "a\0b", "a\x1bb", "a\x85b", "a\ud800b"):
         with pytest.raises(click.BadParameter) as caught:
             converted(name, param, text)
@@ -85,10 +89,11 @@ def test_no_string_holds_a_control_character(name, param):
         ("procedural:", "is not procedural:SEED"),
     ],
 )
-def test_generated_objects_have_64_bit_seeds_in_order(text, fact):
+def test_ranges_of_procedural_seeds_are_ascending_64_bit_numbers(text, fact):
     with pytest.raises(UsageError, match=fact) as caught:
         next(sources.incoming(("procedural:1", text)))  # told before the first one is worked on
-    assert caught.value.cure and len(str(caught.value)) < 400
+    assert caught.value.cure
+    assert len(str(caught.value)) < 400
     assert list(sources.incoming(("procedural:2..4", f"procedural:{2**63 - 1}"))) == [
         "procedural:2",
         "procedural:3",
@@ -118,16 +123,18 @@ def test_generated_objects_have_64_bit_seeds_in_order(text, fact):
     ],
     ids=lambda line: line[:24],
 )
-def test_lines_of_stdin_that_name_no_source(monkeypatch, line):
+def test_malformed_lines_of_stdin_are_refused(monkeypatch, line):
     feed(monkeypatch, b"first\n" + line + b"\n")
     stream = sources.incoming(())
     assert next(stream) == "first"
     with pytest.raises(UsageError) as caught:
         next(stream)
-    assert caught.value.cure and len(str(caught.value)) < 400 and len(str(caught.value).splitlines()) == 1
+    assert caught.value.cure
+    assert len(str(caught.value)) < 400
+    assert len(str(caught.value).splitlines()) == 1
 
 
-def test_lines_of_stdin_that_name_one(monkeypatch):
+def test_lines_of_stdin_name_sources_as_paths_or_json(monkeypatch):
     feed(
         monkeypatch,
         b'caf\xe9.obj\r\n{"folder": "a/b", "seconds": 1.5}\n{"folder": null}\n\n{"folder": "\\udce9"}\nlast',
@@ -135,7 +142,7 @@ def test_lines_of_stdin_that_name_one(monkeypatch):
     assert list(sources.incoming(())) == ["caf\udce9.obj", "a/b", "\udce9", "last"]
 
 
-def test_nothing_from_a_pipe_points_at_the_command_before_it(monkeypatch):
+def test_an_empty_pipe_blames_the_command_before_it(monkeypatch):
     feed(monkeypatch, b"")
     with pytest.raises(
         UsageError, match="gave no sources; the command before the pipe has failed or printed nothing: see its message"
@@ -162,7 +169,10 @@ def test_nothing_from_a_pipe_points_at_the_command_before_it(monkeypatch):
     ],
     ids=lambda a: " ".join(a)[:40],
 )
-def test_a_wrong_command_line_is_one_line_and_exits_2(gdtool_here, arguments, tmp_path):
+def test_a_wrong_command_line_gives_one_line_and_exits_2(gdtool_here, arguments, tmp_path):
     done = gdtool_here(*arguments)
-    assert done.returncode == 2 and done.stdout == "" and len(done.stderr.splitlines()) == 1, done.stderr
-    assert done.stderr.startswith("gdtool") and list(tmp_path.iterdir()) == []
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == "", done.stderr
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert done.stderr.startswith("gdtool")
+    assert list(tmp_path.iterdir()) == []

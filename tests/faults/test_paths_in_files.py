@@ -1,4 +1,4 @@
-"""Names inside files lead to no file outside the folder that they belong to, however they are written."""
+"""Keep names inside files from leading to files outside the folder that they belong to."""
 
 import io
 import json
@@ -25,8 +25,7 @@ RED, BLUE = (np.full((2, 2, 3), color, np.uint8) for color in ((255, 0, 0), (0, 
 
 @pytest.fixture
 def model_folder(tmp_path):
-    """deep/inside/model, with a picture, a buffer and a library in tmp_path, two folders above any place a model may
-    name."""
+    """Make an empty folder two levels below a picture, a buffer and a library that no model in it may read."""
     write_png(tmp_path / "secret.png", RED)
     (tmp_path / "secret.bin").write_bytes(QUAD.tobytes() + QUAD_FACES.tobytes())
     (tmp_path / "secret.mtl").write_text("newmtl m\nKd 1 0 0\n")
@@ -36,7 +35,7 @@ def model_folder(tmp_path):
 
 
 def gltf(folder, buffer="m.bin", image=None):
-    """model.gltf whose buffer and, where given, image are in files of these URIs."""
+    """Write a model.gltf whose buffer and, where given, image have these URIs."""
     builder = Builder()
     extra = {}
     if image is not None:
@@ -56,6 +55,7 @@ def gltf(folder, buffer="m.bin", image=None):
 
 
 def outside_uris(target):
+    """Write a path to a file outside the folder in twelve ways."""
     path = str(target)
     return [
         path,
@@ -80,10 +80,12 @@ def test_a_gltf_reads_nothing_outside_its_folder(model_folder, tmp_path, kind, n
     path = gltf(model_folder, **{kind: outside_uris(target)[number]})
     with pytest.raises(InputError) as caught:
         load_scene(path)
-    assert caught.value.cure and "exist" not in caught.value.fact and "\n" not in str(caught.value)
+    assert caught.value.cure
+    assert "exist" not in caught.value.fact
+    assert "\n" not in str(caught.value)
 
 
-def test_a_gltf_reads_no_link_that_leaves_its_folder(model_folder, tmp_path):
+def test_a_gltf_follows_no_link_out_of_its_folder(model_folder, tmp_path):
     (model_folder / "t.png").symlink_to(tmp_path / "secret.png")
     with pytest.raises(InputError, match="link that leaves"):
         load_scene(gltf(model_folder, image="t.png"))
@@ -95,13 +97,14 @@ def test_a_gltf_reads_no_link_that_leaves_its_folder(model_folder, tmp_path):
 @pytest.mark.parametrize(
     "uri", ["maps/a b.png", "maps/a%20b.png", "./maps/a%20b.png", "maps/../maps/a%20b.png", "maps%5Ca%20b.png"]
 )
-def test_a_gltf_reads_what_lies_in_its_folder(model_folder, uri):
+def test_a_gltf_reads_images_inside_its_folder(model_folder, uri):
     write_png(model_folder / "maps" / "a b.png", BLUE)
     scene = load_scene(gltf(model_folder, image=uri))
     assert np.array_equal(scene.materials[0].base_color_texture.image, BLUE)
 
 
 def obj(folder, library="m.mtl", texture=None):
+    """Write a model.obj with an .mtl, naming these files."""
     (folder / "model.obj").write_text(f"mtllib {library}\n{FACE}")
     (folder / "m.mtl").write_text("newmtl m\n" + (f"map_Kd {texture}\n" if texture is not None else ""))
     return folder / "model.obj"
@@ -120,7 +123,8 @@ def obj(folder, library="m.mtl", texture=None):
 def test_an_mtl_reads_nothing_two_folders_above_the_model(model_folder, texture):
     with pytest.raises(InputError) as caught:
         load_scene(obj(model_folder, texture=texture))
-    assert caught.value.subject.endswith("m.mtl") and caught.value.cure
+    assert caught.value.subject.endswith("m.mtl")
+    assert caught.value.cure
 
 
 def test_an_obj_reads_no_library_two_folders_above_itself(model_folder):
@@ -128,13 +132,13 @@ def test_an_obj_reads_no_library_two_folders_above_itself(model_folder):
         load_scene(obj(model_folder, library="../../../secret.mtl"))
 
 
-def test_an_mtl_reads_no_link_that_leaves(model_folder, tmp_path):
+def test_an_mtl_follows_no_link_out_of_its_folder(model_folder, tmp_path):
     (model_folder / "t.png").symlink_to(tmp_path / "secret.png")
     with pytest.raises(InputError, match="link that leaves"):
         load_scene(obj(model_folder, texture="t.png"))
 
 
-def test_an_absolute_name_of_an_mtl_stands_for_its_last_part_beside_the_model(model_folder, tmp_path):
+def test_an_absolute_texture_path_of_an_mtl_is_searched_beside_the_model(model_folder, tmp_path):
     path = obj(model_folder, texture=tmp_path / "secret.png")
     assert any("secret.png" in note for note in load_scene(path).notes)
     write_png(model_folder / "secret.png", BLUE)
@@ -162,7 +166,7 @@ def test_a_texture_without_a_name_is_noted(model_folder, texture):
     assert any("texture" in note and "left out" in note for note in scene.notes)
 
 
-def test_a_digest_follows_the_files_that_are_read_and_no_others(model_folder, tmp_path):
+def test_a_digest_depends_on_exactly_the_files_that_are_read(model_folder, tmp_path):
     for make, names in (
         (gltf, {"image": "../../../secret.png"}),
         (obj, {"texture": tmp_path / "secret.png"}),
@@ -184,17 +188,18 @@ def test_a_digest_follows_the_files_that_are_read_and_no_others(model_folder, tm
 
 
 @pytest.mark.parametrize("name", ["../../../secret", "%2e%2e/" * 3 + "secret", "/etc/hostname", "a\0b"])
-def test_transforms_json_names_no_picture_outside_its_folder(model_folder, name):
+def test_transforms_json_reads_no_picture_outside_its_folder(model_folder, name):
     (model_folder / "transforms.json").write_text(
         json.dumps({"camera_angle_x": 1.0, "frames": [{"file_path": name, "transform_matrix": np.eye(4).tolist()}]})
     )
     with pytest.raises(InputError) as caught:
         nerf.read(model_folder)
-    assert caught.value.subject.endswith("transforms.json") and "exist" not in caught.value.fact
+    assert caught.value.subject.endswith("transforms.json")
+    assert "exist" not in caught.value.fact
 
 
 @pytest.mark.parametrize("name", ["..", "../../secret", "a/b", "x" * 300])
-def test_cameras_json_names_no_picture_outside_its_folder(model_folder, name):
+def test_cameras_json_reads_no_picture_outside_its_folder(model_folder, name):
     camera = {
         "name": name,
         "projection": "orthographic",
@@ -210,8 +215,8 @@ def test_cameras_json_names_no_picture_outside_its_folder(model_folder, name):
         plain.read(model_folder)
 
 
-def test_a_picture_of_a_views_folder_is_no_link_that_leaves_it(tmp_path):
-    """Also where the manifest does not list the file."""
+def test_a_views_folder_follows_no_link_out_of_it(tmp_path):
+    """Also for files that the manifest does not list."""
     path = views_folder(tmp_path / "a.asset" / "views", *seen(torus, 16))
     (path / "color").rename(tmp_path / "elsewhere")
     (path / "color").symlink_to(tmp_path / "elsewhere")
@@ -235,8 +240,8 @@ def test_an_archive_writes_nothing_outside_the_workspace(tmp_path, name):
     work.mkdir(parents=True)
     content = encode_png(RED)
     with tarfile.open(archive, "w", format=tarfile.PAX_FORMAT) as tar:
-        for one in ("a.asset/views/manifest.json", name):
-            member = tarfile.TarInfo(one)
+        for member_name in ("a.asset/views/manifest.json", name):
+            member = tarfile.TarInfo(member_name)
             member.size = len(content)
             tar.addfile(member, io.BytesIO(content))
     before = sorted(tmp_path.rglob("*"))
@@ -246,12 +251,13 @@ def test_an_archive_writes_nothing_outside_the_workspace(tmp_path, name):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_texture_of_a_glb_is_read_from_within(tmp_path):
+def test_an_embedded_texture_of_a_glb_is_read(tmp_path):
     scene = load_scene(_with_color(tmp_path))
     assert np.array_equal(scene.materials[0].base_color_texture.image, BLUE)
 
 
 def _with_color(tmp_path):
+    """Write a GLB with an embedded texture."""
     builder = with_textures(color=BLUE)
     builder.document["materials"][0]["pbrMetallicRoughness"] = {"baseColorTexture": {"index": 0}}
     return builder.write(tmp_path / "x.glb")

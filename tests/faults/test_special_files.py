@@ -1,4 +1,4 @@
-"""FIFOs, devices and sockets are no inputs: each reader refuses them at once, where reading one may never end."""
+"""Refuse FIFOs, devices and sockets as inputs, without opening them: reading one may never end."""
 
 import contextlib
 import json
@@ -29,7 +29,7 @@ SECONDS = 10  # a reader that has opened a FIFO waits for ever
 
 @pytest.fixture(autouse=True)
 def ends():
-    """A test that hangs fails."""
+    """Fail a test that hangs."""
 
     def late(*_):
         raise TimeoutError(f"still reading after {SECONDS} s")
@@ -43,7 +43,7 @@ def ends():
 
 @contextlib.contextmanager
 def special(path, kind):
-    """A FIFO, a link to an endless device, or a socket at path."""
+    """Put a FIFO, a link to an endless device, or a socket at a path."""
     if kind == "a FIFO":
         os.mkfifo(path)
         yield
@@ -51,8 +51,8 @@ def special(path, kind):
         path.symlink_to("/dev/zero")
         yield
     else:
-        with socket.socket(socket.AF_UNIX) as one:
-            one.bind(os.path.relpath(path))  # an address has a hundred characters at most
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(os.path.relpath(path))  # an address has a hundred characters at most
             yield
 
 
@@ -73,14 +73,14 @@ READERS = {
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", READERS)
-def test_no_reader_opens_one(tmp_path, kind, name):
+def test_readers_refuse_special_files_without_opening_them(tmp_path, kind, name):
     with special(tmp_path / name, kind), pytest.raises(InputError, match=f"is {kind}, not a file") as caught:
         READERS[name](tmp_path / name)
     assert caught.value.cure
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_digest_opens_one(tmp_path, kind):
+def test_digests_do_not_open_special_files(tmp_path, kind):
     for name in ("m.gltf", "m.obj"):
         with special(tmp_path / name, kind):
             digest(tmp_path / name)
@@ -88,7 +88,7 @@ def test_no_digest_opens_one(tmp_path, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["model.bin", "m.mtl", "t.png", "textures/t.png", "image.png"])
-def test_none_beside_a_model_is_opened(tmp_path, kind, name):
+def test_special_files_that_a_model_refers_to_are_refused(tmp_path, kind, name):
     if name == "model.bin":
         path = gltf(tmp_path, buffer=name)
     elif name == "image.png":
@@ -104,7 +104,7 @@ def test_none_beside_a_model_is_opened(tmp_path, kind, name):
 
 
 @pytest.mark.parametrize("name", ["color/front.png", "mask/front.png", "cameras.json", "depth/front.exr"])
-def test_none_in_a_views_folder_is_opened(tmp_path, name):
+def test_special_files_in_a_views_folder_are_refused(tmp_path, name):
     folder = views_folder(tmp_path / "a.asset" / "views", *views_of(torus, 16))
     (folder / name).unlink()
     os.mkfifo(folder / name)
@@ -112,7 +112,7 @@ def test_none_in_a_views_folder_is_opened(tmp_path, name):
         read_views(open_folder(folder, check=False))
 
 
-def test_none_that_an_adapter_finds_is_opened(tmp_path):
+def test_special_files_in_folders_of_other_programs_are_refused(tmp_path):
     cameras, *_ = views_of(torus, 16)
     for name, read in (("plain", plain.read), ("nerf", nerf.read)):
         folder = tmp_path / name

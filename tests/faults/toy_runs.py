@@ -1,4 +1,4 @@
-"""The toy stage with another run: `python -m tests.faults.toy_runs RUN ARGUMENTS`."""
+"""Run the toy stage with another function: `python -m tests.faults.toy_runs FUNCTION ARGUMENTS`."""
 
 import ctypes
 import dataclasses
@@ -11,14 +11,14 @@ from tests.core import toy
 
 
 def busy(inputs, options, out):
-    """Computes without end."""
+    """Compute without end."""
     out.path("half.png").write_bytes(b"half")
     while True:
         pass
 
 
 def native(inputs, options, out):
-    """Waits without end in a native call that no signal interrupts, with a half-written result and a workspace."""
+    """Wait without end in a native call that no signal interrupts, after writing half a result and a workspace."""
     out.path("half.png").write_bytes(b"half")
     (out.workspace / "cache").write_bytes(b"cache")
     libc, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(64)  # all zeros: an open mutex
@@ -27,13 +27,13 @@ def native(inputs, options, out):
 
 
 def late(inputs, options, out):
-    """native() under a time limit."""
+    """Run native() under a time limit."""
     with ending.time_limit(0.3, ResourceError(inputs.name, "is not done after 0.3 s", "raise --seconds to 1")):
         native(inputs, options, out)
 
 
 def pooled(inputs, options, out):
-    """Waits for a thread of a pool, which is not told to end."""
+    """Wait without end for a thread of a pool."""
     from concurrent.futures import ThreadPoolExecutor
 
     out.path("half.png").write_bytes(b"half")
@@ -42,7 +42,7 @@ def pooled(inputs, options, out):
 
 
 def resumable(inputs, options, out):
-    """Goes on from its checkpoint, and fails the first time after it."""
+    """Resume from a checkpoint; without one, write it and fail."""
     checkpoint = out.workspace / "checkpoint"
     if not checkpoint.exists():
         checkpoint.write_bytes(b"half")
@@ -51,13 +51,13 @@ def resumable(inputs, options, out):
 
 
 def lost(inputs, options, out):
-    """Fails before it has a checkpoint."""
+    """Fail before there is a checkpoint."""
     (out.workspace / "decoded").write_bytes(b"cache")
     raise ValueError("before the checkpoint")
 
 
 def stage(name):
-    """The toy stage that runs the function of this name."""
+    """Make the toy stage that runs the function of a name."""
     return dataclasses.replace(toy.STAGE, run=globals()[name], checkpoint="checkpoint")
 
 

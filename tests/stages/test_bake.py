@@ -317,7 +317,7 @@ def test_size_follows_the_detail_of_the_source(gdtool, chain, tmp_path):
 def test_emission_comes_along(gdtool, chain, tmp_path):
     from dataclasses import replace
 
-    from gdtool.assets.gltf_write import write_glb
+    from gdtool.assets.gltf.write import write_glb
     from gdtool.assets.load import load_scene
     from gdtool.assets.scene import Texture
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gdtool.assets.gltf_write import write_glb
+from gdtool.assets.gltf.write import write_glb
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.core.folder import open_folder
 from gdtool.folders.mesh import QuadMesh, write_obj

@@ -152,7 +152,7 @@ def test_reference_by_name_in_each_form(chain, tmp_path):
 
 def test_views_that_carry_their_model_are_a_reference(chain, tmp_path):
     """source.glb stands in the frame of the views."""
-    from gdtool.assets.gltf_write import write_glb
+    from gdtool.assets.gltf.write import write_glb
     from gdtool.assets.scene import Scene
 
     vertices, faces = egg()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gdtool.assets.gltf_write import glb_bytes
+from gdtool.assets.gltf.write import glb_bytes
 from gdtool.assets.scene import Material, Scene
 from gdtool.core.errors import InputError
 from gdtool.core.folder import dataset_objects, open_folder

@@ -11,7 +11,7 @@ import sys
 
 import numpy as np
 
-from gdtool.assets.gltf_write import write_glb
+from gdtool.assets.gltf.write import write_glb
 from gdtool.assets.scene import Material, Scene, Texture
 
 _CORNERS = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], float)

@@ -86,7 +86,7 @@ def for_mitsuba(scene: Scene) -> dict[str, np.ndarray]:
 
 def exported(model: str, env: str, folder: Path, seed: int = 0) -> dict[str, str]:
     """Paths of the model, the light and the scene that the peers read, written where needed."""
-    from gdtool.assets.gltf_write import write_glb
+    from gdtool.assets.gltf.write import write_glb
     from gdtool.assets.load import load_scene
     from gdtool.cameras import rig
     from gdtool.images.io import write_exr

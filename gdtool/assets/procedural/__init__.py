@@ -1,16 +1,22 @@
-"""Seeded procedural objects with PBR materials, for training, tests and demonstrations: the same seed, the same object.
+"""Generate seeded objects with PBR materials for training, tests and demonstrations: the same seed, the same object.
 
     from gdtool.assets.procedural import generate
     scene = generate(7)
 
-Every part is a closed surface wound outward; the front (a face, an entrance, a bonnet) looks toward +Z and most objects
-are mirror-symmetric in x, as what people photograph is. The two UV sets are explained in finishes.py."""
+Every part is a closed surface with outward winding. The front (a face, an entrance, a bonnet) looks toward +Z. Most
+objects are mirror-symmetric in x, like most things that people photograph. finishes.py explains the two UV sets.
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+
+    from gdtool.assets.procedural.assembly import Assembly
     from gdtool.assets.scene import Scene
 
 VERSION = 1  # rises when any seed's object changes: the version is part of every random stream
@@ -27,21 +33,22 @@ FAMILY_WEIGHTS = {
 
 
 def kinds() -> dict[str, list[str]]:
-    """Family name -> names of its object kinds."""
+    """List the names of the object kinds of each family."""
     return {family: list(_family(family)) for family in FAMILY_WEIGHTS}
 
 
-def _family(name: str) -> dict:
+def _family(name: str) -> dict[str, Callable[[np.random.Generator], Assembly]]:
+    """Load the functions of a family, by the name of the kind that each makes."""
     from importlib import import_module
 
     return import_module(f"gdtool.assets.procedural.{name}").KINDS
 
 
 def generate(seed: int, kind: str | None = None) -> Scene:
-    """Return the object of a seed (>= 0); `kind` (see `kinds()`) forces what it is. Raises ValueError for an unknown
-    kind.
+    """Generate the object of a seed (>= 0); `kind`, one of `kinds()`, forces what it is.
 
-    The scene is normalised (bounding box centred, longest side 1), about 2,000 to 40,000 faces.
+    The scene is normalised: its bounding box is centred at the origin and its longest side is 1. It has about 2,000 to
+    40,000 faces. Raises ValueError for an unknown kind.
     """
     import numpy as np
 
@@ -52,11 +59,9 @@ def generate(seed: int, kind: str | None = None) -> Scene:
     makers = _family(family)
     chosen = list(makers)[rng.integers(len(makers))]
     if kind is not None:
-        family = next((name for name in names if kind in _family(name)), None)
-        if family is None:
-            raise ValueError(
-                f"no procedural kind {kind!r}; there are {', '.join(k for name in names for k in _family(name))}"
-            )
+        makers = {name: make for family in names for name, make in _family(family).items()}
+        if kind not in makers:
+            raise ValueError(f"no procedural kind {kind!r}; there are {', '.join(makers)}")
         chosen = kind
-    assembly = _family(family)[chosen](rng)
+    assembly = makers[chosen](rng)
     return assembly.scene(f"procedural-{seed}-{chosen}")

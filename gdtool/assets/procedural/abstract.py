@@ -1,4 +1,4 @@
-"""Shapes without a name: CSG solids, supershapes, knots, gears, twisted prisms, stacked primitives, blobs."""
+"""Make abstract shapes: CSG solids, supershapes, knots, gears, prisms, stacked primitives, blobs."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ from gdtool.assets.procedural.parts import (
 )
 
 
-def csg(rng) -> Assembly:
-    """Mirror-symmetric unions, differences and intersections of blocks, rods, balls and rings."""
+def csg(rng: np.random.Generator) -> Assembly:
+    """Combine blocks, rods, balls and rings, mirrored in x, by union, difference and intersection."""
 
-    def primitive(spread):
+    def primitive(spread: float) -> solids.Distance:
+        """Draw a primitive whose centre lies within `spread` of the origin in each axis."""
         c = rng.uniform(-spread, spread, 3)
         kind = rng.integers(4)
         if kind == 0:
@@ -54,10 +55,11 @@ def csg(rng) -> Assembly:
     return a
 
 
-def supershape(rng) -> Assembly:
-    """Gielis' superformula in two angles."""
+def supershape(rng: np.random.Generator) -> Assembly:
+    """Make a closed surface from Gielis' superformula in two angles, perhaps on a base."""
 
-    def radius(angle, m, n1, n2, n3):
+    def radius(angle: np.ndarray, m: int, n1: float, n2: float, n3: float) -> np.ndarray:
+        """Evaluate the superformula."""
         return (np.abs(np.cos(m * angle / 4)) ** n2 + np.abs(np.sin(m * angle / 4)) ** n3) ** (-1 / n1)
 
     a = Assembly()
@@ -83,8 +85,8 @@ def supershape(rng) -> Assembly:
     return a
 
 
-def knot(rng) -> Assembly:
-    """Torus knots, rings, springs, pretzels on an optional stand."""
+def knot(rng: np.random.Generator) -> Assembly:
+    """Make a tube along a torus knot or ring, perhaps with a ball in its middle."""
     a, t = Assembly(), 2 * np.pi * np.arange(220) / 220
     p, q = [(1, 0), (2, 3), (3, 2), (2, 5), (1, 4), (3, 4)][rng.integers(6)]
     r = 0.45 + rng.uniform(0.12, 0.25) * np.cos(q * t)
@@ -99,8 +101,8 @@ def knot(rng) -> Assembly:
     return a
 
 
-def gear(rng) -> Assembly:
-    """Gears, stars and cogs standing up, with hub and pins."""
+def gear(rng: np.random.Generator) -> Assembly:
+    """Make a gear, star or cog that stands up, with a hub and pins."""
     a, teeth, depth = Assembly(), int(rng.integers(5, 18)), rng.uniform(0.1, 0.4)
     k = np.arange(teeth * 8) % 8
     step = (
@@ -120,8 +122,8 @@ def gear(rng) -> Assembly:
     return a
 
 
-def prism(rng) -> Assembly:
-    """Return a twisted or tapered prism over a random symmetric polygon, perhaps stacked."""
+def prism(rng: np.random.Generator) -> Assembly:
+    """Make a twisted or tapered prism over a random symmetric polygon, or a stack of up to three."""
     a, y = Assembly(), 0.0
     for _ in range(int(rng.integers(1, 4))):
         sides = int(rng.integers(3, 9))
@@ -137,13 +139,13 @@ def prism(rng) -> Assembly:
     return a
 
 
-def stack(rng) -> Assembly:
-    """Return a symmetric sculpture of a few plain primitives."""
+def stack(rng: np.random.Generator) -> Assembly:
+    """Make a symmetric sculpture of two to five primitives."""
     a, y = Assembly(), 0.0
     for _ in range(int(rng.integers(2, 6))):
         s, finish = rng.uniform(0.2, 0.5), tiles.pick(rng)
         kind, turn = rng.integers(5), rng.choice([0, 0, 45])
-        part, tall = [
+        make, tall = [
             (lambda s: box(1.4 * s, 1.1 * s, 1.4 * s, 0.03, 10), 1.1 * s),
             (lambda s: ball(s, count=36), 2 * s),
             (lambda s: cylinder(s, s, count=44), s),
@@ -158,7 +160,7 @@ def stack(rng) -> Assembly:
                 0.6 * s,
             ),
         ][kind]
-        part = part(s).turned("y", turn).moved(y=y + tall / 2)
+        part = make(s).turned("y", turn).moved(y=y + tall / 2)
         if rng.uniform() < 0.35:
             a.add_pair(part.moved(s * rng.uniform(1.0, 1.5)), finish)
         else:
@@ -167,8 +169,8 @@ def stack(rng) -> Assembly:
     return a
 
 
-def blob(rng) -> Assembly:
-    """Return a mirror-symmetric smooth blend of balls and limbs with bumps."""
+def blob(rng: np.random.Generator) -> Assembly:
+    """Make a mirror-symmetric smooth blend of balls and limbs, perhaps with bumps."""
     a = Assembly()
     shapes = [solids.ellipsoid((0, 0, 0), rng.uniform(0.25, 0.45, 3))]
     for _ in range(int(rng.integers(2, 7))):

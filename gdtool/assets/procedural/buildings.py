@@ -1,11 +1,14 @@
-"""Houses, castles, towers, pyramids, temples; the entrance faces +Z."""
+"""Make buildings, their entrance toward +Z: houses, castles, towers, pyramids, temples."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from gdtool.assets.procedural import finishes, solids, tiles
+from gdtool.assets.procedural import colors, finishes, solids, tiles
 from gdtool.assets.procedural.assembly import Assembly
+from gdtool.assets.procedural.finishes import Finish
 from gdtool.assets.procedural.parts import (
     Part,
     ball,
@@ -22,7 +25,10 @@ from gdtool.assets.procedural.parts import (
 
 
 def gable(width: float, height: float, depth: float, overhang: float = 0.0, power: float = 1.0) -> Part:
-    """Return a roof with its ridge along z, from y = 0 to `height`."""
+    """Make a gable roof with its ridge along z, from y = 0 to `height`.
+
+    overhang: how far it reaches beyond width and depth on each side. power: 1 for straight slopes, else curved ones.
+    """
     w = width / 2 + overhang
     slope = np.stack([w * (1 - (t := np.linspace(0, 1, 6))), height * t**power], -1)
     outline = np.vstack(
@@ -37,37 +43,45 @@ def gable(width: float, height: float, depth: float, overhang: float = 0.0, powe
 
 
 def hip(width: float, height: float, depth: float, overhang: float = 0.05, top: float = 0.02) -> Part:
-    """Return a four-sided pointed roof from y = 0 to `height`."""
+    """Make a roof with four slopes, from y = 0 to `height`; top: the share of its width that is left at the top."""
     profile = refined([(0, 0), (1, 0), (1, 0.02), (top, height), (0, height)], 0.1)
     return loft(profile, rectangle(width + 2 * overhang, depth + 2 * overhang), boxed=True)
 
 
-def window(
-    a: Assembly, x: float, y: float, z: float, width: float, height: float, frame, pane, turn: float = 0.0
-) -> None:
-    """Frame and pane, proud of a wall that faces +Z, then turned about y."""
-    a.add(box(width, height, 0.05, 0.01, 3).moved(x, y, z).turned("y", turn), frame)
+class Window(NamedTuple):
+    """A window of four panes: size, and finishes of frame and panes."""
+
+    width: float
+    height: float
+    frame: Finish
+    pane: Finish
+
+
+def add_window(a: Assembly, window: Window, x: float, y: float, z: float, turn: float = 0.0) -> None:
+    """Add a window centred at (x, y, z) in front of a wall that faces +Z, turned about y by `turn` degrees with it."""
+    width, height = window.width, window.height
+    a.add(box(width, height, 0.05, 0.01, 3).moved(x, y, z).turned("y", turn), window.frame)
     for sx in (-1, 1):
         for sy in (-1, 1):
             a.add(
                 box(width * 0.38, height * 0.38, 0.05, 0.008, 2)
                 .moved(x + sx * width * 0.22, y + sy * height * 0.22, z + 0.012)
                 .turned("y", turn),
-                pane,
+                window.pane,
             )
 
 
-def house(rng) -> Assembly:
-    """Return a house: walls, roof, door, windows, perhaps a chimney."""
+def house(rng: np.random.Generator) -> Assembly:
+    """Make a house: walls, roof, door, windows, perhaps a chimney, a porch and a lawn."""
     a = Assembly()
     width, depth, storeys = rng.uniform(0.7, 1.3), rng.uniform(0.6, 1.2), int(rng.integers(1, 4))
     tall = 0.42 * storeys + rng.uniform(0, 0.2)
     wall, roof, frame = tiles.pick(rng, "wall"), tiles.pick(rng, "roof"), tiles.pick(rng, "wood")
     pane = finishes.glossy(
         rng,
-        finishes.hsv(rng.uniform(0.5, 0.62), rng.uniform(0.1, 0.5), rng.uniform(0.15, 0.8))
+        colors.hsv(rng.uniform(0.5, 0.62), rng.uniform(0.1, 0.5), rng.uniform(0.15, 0.8))
         if rng.uniform() < 0.8
-        else finishes.hsv(0.13, 0.6, 1),
+        else colors.hsv(0.13, 0.6, 1),
     )
     a.add(box(width, tall, depth, 0.015, 8).moved(y=tall / 2), wall)
     pitch = rng.uniform(0.25, 0.7) * width
@@ -87,16 +101,17 @@ def house(rng) -> Assembly:
     a.add(box(0.22, 0.36, 0.06, 0.01).moved(door, 0.18, depth / 2), frame)
     a.add(box(0.17, 0.32, 0.06, 0.01).moved(door, 0.16, depth / 2 + 0.015), tiles.pick(rng, "paint"))
     a.add(ball(0.018, count=12).moved(door + 0.06, 0.16, depth / 2 + 0.05), finishes.metal(rng))
+    front, side = Window(0.18, 0.2, frame, pane), Window(0.16, 0.2, frame, pane)
     count = max(2, int(width / 0.36))
     for level in range(storeys):
         for x in (np.arange(count) - (count - 1) / 2) * (width / count):
             y = 0.26 + 0.42 * level
             if level or abs(x - door) > 0.22:
-                window(a, x, y, depth / 2, 0.18, 0.2, frame, pane)
-            window(a, x, y, depth / 2, 0.18, 0.2, frame, pane, 180)
+                add_window(a, front, x, y, depth / 2)
+            add_window(a, front, x, y, depth / 2, 180)
         for x in (-depth * 0.22, depth * 0.22):
             for turn in (90, -90):
-                window(a, x, 0.26 + 0.42 * level, width / 2, 0.16, 0.2, frame, pane, turn)
+                add_window(a, side, x, 0.26 + 0.42 * level, width / 2, turn)
     if rng.uniform() < 0.6 and kind < 3:
         a.add(
             box(0.13, pitch * 0.8 + 0.2, 0.13, 0.01).moved(width * 0.25, tall + pitch * 0.55, -depth * 0.2),
@@ -110,18 +125,13 @@ def house(rng) -> Assembly:
             box(width * rng.uniform(1.2, 1.7), 0.05, depth * rng.uniform(1.3, 1.7)).moved(y=-0.02),
             tiles.pick(rng, "stone")
             if rng.uniform() < 0.5
-            else finishes.matte(rng, finishes.hsv(rng.uniform(0.2, 0.35), 0.6, 0.5)),
+            else finishes.matte(rng, colors.hsv(rng.uniform(0.2, 0.35), 0.6, 0.5)),
         )
     return a
 
 
-def _crenels(a: Assembly, r: float, y: float, count: int, size: float, finish) -> None:
-    for k in range(count):
-        a.add(box(size, size, size * 0.7, 0.008, 2).moved(y=y, z=r).turned("y", 360 * k / count), finish)
-
-
-def castle(rng) -> Assembly:
-    """Return a castle: walls, towers, a gate."""
+def castle(rng: np.random.Generator) -> Assembly:
+    """Make a castle: walls, four corner towers, a keep, a gate."""
     a = Assembly()
     half, wall_h = rng.uniform(0.5, 0.8), rng.uniform(0.35, 0.6)
     stone, roof, wood = tiles.pick(rng, "wall"), tiles.pick(rng, "roof"), tiles.pick(rng, "wood")
@@ -167,7 +177,7 @@ def castle(rng) -> Assembly:
     a.add(hip(2 * keep, keep * rng.uniform(0.8, 1.6), 2 * keep, 0.06).moved(0, keep_h, -half * 0.25), roof)
     a.add(box(0.28, wall_h * 0.75, 0.16, 0.01).moved(0, wall_h * 0.37, half), wood)
     a.add(cylinder(0.14, 0.17).turned("x", 90).moved(0, wall_h * 0.72, half), wood)
-    dark = finishes.matte(rng, finishes.hsv(0.1, 0.4, 0.08))
+    dark = finishes.matte(rng, colors.hsv(0.1, 0.4, 0.08))
     for y in np.linspace(keep_h * 0.62, keep_h * 0.88, 2):
         for x in (-0.4, 0, 0.4):
             a.add(box(0.07, 0.14, 0.04, 0.01, 2).moved(x * keep, y, keep - half * 0.25), dark)
@@ -178,13 +188,13 @@ def castle(rng) -> Assembly:
     if rng.uniform() < 0.5:
         a.add(
             cylinder(half * 1.65, 0.1, count=48).moved(y=-0.04),
-            finishes.matte(rng, finishes.hsv(rng.uniform(0.1, 0.35), 0.5, 0.5)),
+            finishes.matte(rng, colors.hsv(rng.uniform(0.1, 0.35), 0.5, 0.5)),
         )
     return a
 
 
-def tower(rng) -> Assembly:
-    """Lighthouse, windmill, water tower, rook or pagoda."""
+def tower(rng: np.random.Generator) -> Assembly:
+    """Make a pagoda, or a round tower with a gallery: lighthouse, windmill, water tower."""
     a, height = Assembly(), rng.uniform(1.1, 1.7)
     wall, roof = tiles.pick(rng, "wall"), tiles.pick(rng, "roof")
     r, top = rng.uniform(0.28, 0.4), rng.uniform(0.18, 0.26)
@@ -196,7 +206,7 @@ def tower(rng) -> Assembly:
             a.add(loft(flare, rectangle(w, w), boxed=True).moved(y=y), roof)
             a.add(
                 box(0.14, 0.18, 0.04, 0.01, 2).moved(0, y + 0.1, w * 0.4),
-                finishes.plastic(rng, finishes.hsv(0.05, 0.7, 0.3)),
+                finishes.plastic(rng, colors.hsv(0.05, 0.7, 0.3)),
             )
             y, w = y + 0.36, w * 0.84
         a.add(cone(0.06, 0.3, 16).moved(y=y), finishes.metal(rng))
@@ -205,7 +215,7 @@ def tower(rng) -> Assembly:
         wall
         if rng.uniform() < 0.5
         else finishes.banded(
-            np.random.default_rng(rng.integers(2**32)), finishes.hsv(rng.uniform(), 0.8, 0.7), axis=1, frequency=2.5
+            np.random.default_rng(rng.integers(2**32)), colors.hsv(rng.uniform(), 0.8, 0.7), axis=1, frequency=2.5
         )
     )
     outline = circle(48) if rng.uniform() < 0.7 else subdivided(circle(8), 5)
@@ -216,7 +226,7 @@ def tower(rng) -> Assembly:
     a.add(cylinder(top * 1.4, 0.07, count=40).moved(y=height), tiles.pick(rng, "metal"))
     a.add(
         cylinder(top * 0.8, 0.24, count=40).moved(y=height + 0.14),
-        finishes.glossy(rng, finishes.hsv(0.13, rng.uniform(0.1, 0.6), 0.95)),
+        finishes.glossy(rng, colors.hsv(0.13, rng.uniform(0.1, 0.6), 0.95)),
     )
     cap = refined(
         [
@@ -238,9 +248,9 @@ def tower(rng) -> Assembly:
     for k, y in enumerate(np.linspace(0.5, height * 0.85, 3)):
         a.add(
             box(0.09, 0.13, 0.06, 0.01, 2)
-            .moved(0, y, np.interp(y, [0.1, height], [r, top]))
+            .moved(0, y, float(np.interp(y, [0.1, height], [r, top])))
             .turned("y", [0, 35, -35][k]),
-            finishes.glossy(rng, finishes.hsv(0.6, 0.3, 0.15)),
+            finishes.glossy(rng, colors.hsv(0.6, 0.3, 0.15)),
         )
     if rng.uniform() < 0.35:
         sail, pole, tilt = tiles.pick(rng, "cloth"), tiles.pick(rng, "wood"), rng.uniform(0, 90)
@@ -263,8 +273,8 @@ def tower(rng) -> Assembly:
     return a
 
 
-def pyramid(rng) -> Assembly:
-    """Return a stepped pyramid with stairs and a temple on top, or a smooth one."""
+def pyramid(rng: np.random.Generator) -> Assembly:
+    """Make a stepped pyramid with stairs and a temple on top, or a smooth pyramid."""
     a, stone = Assembly(), tiles.pick(rng, "stone")
     other = stone if rng.uniform() < 0.5 else tiles.pick(rng, "stone")
     if rng.uniform() < 0.25:
@@ -292,14 +302,12 @@ def pyramid(rng) -> Assembly:
             )
     a.add(box(shrink * 1.3, 0.28, shrink * 1.2, 0.01).moved(y=y + 0.14), stone)
     a.add(box(shrink * 1.6, 0.07, shrink * 1.5, 0.01).moved(y=y + 0.3), other)
-    a.add(
-        box(0.14, 0.2, 0.1, 0.005).moved(0, y + 0.1, shrink * 0.58), finishes.matte(rng, finishes.hsv(0.1, 0.3, 0.07))
-    )
+    a.add(box(0.14, 0.2, 0.1, 0.005).moved(0, y + 0.1, shrink * 0.58), finishes.matte(rng, colors.hsv(0.1, 0.3, 0.07)))
     return a
 
 
-def temple(rng) -> Assembly:
-    """Columns on a stepped base under a pediment, or a domed hall."""
+def temple(rng: np.random.Generator) -> Assembly:
+    """Make a hall with columns on a stepped base, under a gable roof or a dome."""
     a, stone, roof = Assembly(), tiles.pick(rng, "stone"), tiles.pick(rng, "roof")
     width, depth, tall = rng.uniform(1.0, 1.4), rng.uniform(0.7, 1.3), rng.uniform(0.5, 0.8)
     for k in range(3):

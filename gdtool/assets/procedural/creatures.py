@@ -1,4 +1,4 @@
-"""Living things with a face toward +Z: four-legged animals, birds, standing figures, fish, turtles, dragons."""
+"""Make creatures with a face toward +Z: four-legged animals, birds, fish, turtles, dragons; figures.py adds people."""
 
 from __future__ import annotations
 
@@ -6,95 +6,25 @@ import itertools
 
 import numpy as np
 
-from gdtool.assets.procedural import finishes, solids, tiles
+from gdtool.assets.procedural import colors, finishes, solids, tiles
 from gdtool.assets.procedural.assembly import Assembly
-from gdtool.assets.procedural.finishes import hsv
-from gdtool.assets.procedural.parts import ball, circle, cone, cylinder, extrusion, loft, refined, subdivided, tube
-
-BLACK = np.array([0.012, 0.011, 0.011])
-
-
-def fur_color(rng) -> np.ndarray:
-    """Animal coats mostly, sometimes a toy's colour."""
-    return (
-        finishes.any_color(rng)
-        if rng.uniform() < 0.35
-        else hsv(rng.uniform(0.02, 0.12), rng.uniform(0.05, 0.75), rng.uniform(0.2, 1.0) ** 0.7)
-    )
-
-
-def eyes(a: Assembly, rng, x: float, y: float, z: float, size: float, outward: float = 0.25) -> None:
-    """Add a pair of eyes at +-x, bead-like or with iris."""
-    style = rng.uniform()
-    finish = finishes.glossy(rng, BLACK) if style < 0.4 else finishes.gazing(rng, np.array([outward, 0.0, 1.0]))
-    a.add_pair(ball(size, size * rng.uniform(0.9, 1.2), size * 0.8, 20).moved(x, y, z), finish)
+from gdtool.assets.procedural.colors import hsv
+from gdtool.assets.procedural.figures import figure
+from gdtool.assets.procedural.heads import dress_head, ears, eyes, face, fur_color, horns
+from gdtool.assets.procedural.parts import (
+    Part,
+    ball,
+    circle,
+    cone,
+    extrusion,
+    loft,
+    subdivided,
+    tube,
+)
 
 
-def face(a: Assembly, rng, center, r: float, coat, snout: float) -> None:
-    """Eyes, a muzzle of relative length `snout` and a nose on a head of radius r at center."""
-    x, y, z = center
-    size = r * rng.uniform(0.14, 0.28)
-    height = rng.uniform(0.1, 0.3)
-    depth = np.sqrt(max(1 - 0.42**2 - height**2, 0.1)) * r
-    eyes(a, rng, x + 0.42 * r, y + height * r, z + depth * 0.93, size)
-    muzzle = tiles.pick(rng, "fur", finishes.near_color(rng, fur_color(rng), 0.3)) if rng.uniform() < 0.5 else coat
-    if snout > 0.05:
-        a.add(ball(r * 0.42, r * 0.34, r * (0.3 + snout), 24).moved(x, y - 0.22 * r, z + 0.75 * r), muzzle)
-    tip = z + r * (1.02 + snout if snout > 0.05 else 0.98)
-    a.add(
-        ball(r * 0.13, r * 0.1, r * 0.1, 16).moved(x, y - 0.12 * r, tip),
-        finishes.glossy(rng, BLACK if rng.uniform() < 0.7 else hsv(0.97, 0.5, 0.7)),
-    )
-
-
-def ears(a: Assembly, rng, center, r: float, coat) -> None:
-    """Add a pair of ears about a head."""
-    x, y, z = center
-    kind = rng.integers(5)
-    if kind == 0:  # pointed
-        part = (
-            cone(r * rng.uniform(0.28, 0.42), r * rng.uniform(0.6, 1.0), 20)
-            .scaled(1, 1, 0.55)
-            .turned("z", -22)
-            .moved(x + 0.5 * r, y + 0.62 * r, z)
-        )
-    elif kind == 1:  # round
-        size = r * rng.uniform(0.28, 0.42)
-        part = ball(size, size, size * 0.45, 22).moved(x + 0.68 * r, y + 0.68 * r, z)
-    elif kind == 2:  # long upright
-        part = (
-            ball(r * 0.2, r * rng.uniform(0.7, 1.2), r * 0.12, 22)
-            .turned("z", -rng.uniform(5, 25))
-            .moved(x + 0.4 * r, y + 1.5 * r, z)
-        )
-    elif kind == 3:  # hanging
-        part = (
-            ball(r * 0.16, r * rng.uniform(0.45, 0.7), r * 0.3, 22).turned("z", 12).moved(x + 0.98 * r, y - 0.02 * r, z)
-        )
-    else:  # wide, elephant
-        part = ball(r * 0.75, r * 0.85, r * 0.12, 26).turned("y", 25).moved(x + 1.25 * r, y + 0.1 * r, z - 0.15 * r)
-    a.add_pair(part, coat)
-
-
-def horns(a: Assembly, rng, center, r: float) -> None:
-    """Add a pair of horns to a head."""
-    x, y, z = center
-    finish = (
-        finishes.matte(rng, hsv(0.11, rng.uniform(0.1, 0.4), rng.uniform(0.3, 0.9)))
-        if rng.uniform() < 0.7
-        else tiles.pick(rng, "metal")
-    )
-    if rng.uniform() < 0.25:
-        a.add(cone(r * 0.12, r * 0.9, 20).turned("x", 25).moved(x, y + 0.8 * r, z + 0.4 * r), finish)
-        return
-    t = np.linspace(0, 1, 14)
-    curl = rng.uniform(-0.5, 0.8)
-    path = np.stack([x + r * (0.4 + 0.5 * t), y + r * (0.75 + 0.8 * t - 0.2 * t**2), z + r * curl * t**2], -1)
-    a.add_pair(tube(path, r * 0.16 * (1 - 0.85 * t)), finish)
-
-
-def quadruped(rng) -> Assembly:
-    """Cat to elephant: body along z, four legs, neck, head, tail; one blended solid."""
+def quadruped(rng: np.random.Generator) -> Assembly:
+    """Make a four-legged animal, from cat to elephant: body along z, legs, neck, head and tail in one blended solid."""
     a = Assembly()
     length, girth = rng.uniform(0.3, 0.6), rng.uniform(0.2, 0.36)
     leg, foot = rng.uniform(0.15, 0.55), girth * rng.uniform(0.22, 0.45)
@@ -124,7 +54,10 @@ def quadruped(rng) -> Assembly:
     ]
     body.append(solids.both_sides(solids.blended(knees + paws, 0.04)))
     t = np.linspace(0, 1, 6)
-    lift, thick = rng.uniform(-0.5, 0.8), max(foot * rng.uniform(0.3, 0.8), 0.045)  # thinner falls between the cells
+    lift, thick = (
+        rng.uniform(-0.5, 0.8),
+        max(foot * rng.uniform(0.3, 0.8), 0.045),
+    )  # a thinner tail is missed by the grid
     tail = np.stack([0 * t, girth * 0.3 + lift * t**1.5, -length * 1.05 - rng.uniform(0.15, 0.5) * t], -1)
     body.append(solids.chain(tail, thick * (1.2 - 0.5 * t)))
     trunk = rng.uniform() < 0.18
@@ -172,8 +105,8 @@ def quadruped(rng) -> Assembly:
     return a
 
 
-def sitting(rng) -> Assembly:
-    """Return a sitting cat, dog, bear or owl-like toy: pear body, big head, paws in front."""
+def sitting(rng: np.random.Generator) -> Assembly:
+    """Make a sitting toy cat, dog or bear: pear-shaped body, big head, paws in front."""
     a = Assembly()
     coat, r, girth = tiles.pick(rng, "fur", fur_color(rng)), rng.uniform(0.3, 0.45), rng.uniform(0.32, 0.5)
     head = (0.0, 0.42 + r * 0.75, 0.08)
@@ -207,14 +140,14 @@ def sitting(rng) -> Assembly:
     if rng.uniform() < 0.5:
         a.add(
             ball(girth * 0.55, 0.3, 0.2, 26).moved(0, 0.02, girth * 0.62),
-            tiles.pick(rng, "fur", finishes.near_color(rng, fur_color(rng), 0.4)),
+            tiles.pick(rng, "fur", colors.near_color(rng, fur_color(rng), 0.4)),
         )
     dress_head(a, rng, head, r, 0.3)
     return a
 
 
-def bird(rng) -> Assembly:
-    """Owl, penguin, chick, parrot: egg body, wings at the sides, beak, feet."""
+def bird(rng: np.random.Generator) -> Assembly:
+    """Make an owl, penguin, chick or parrot: egg-shaped body, wings at its sides, beak, feet."""
     a = Assembly()
     coat, girth, tall = tiles.pick(rng, "fur", fur_color(rng)), rng.uniform(0.32, 0.48), rng.uniform(0.45, 0.65)
     separate = rng.uniform() < 0.5
@@ -233,7 +166,7 @@ def bird(rng) -> Assembly:
     a.add(solids.polygonised(solids.blended(body, 0.1), 52), coat)
     a.add(
         ball(girth * 0.72, tall * 0.72, girth * 0.5, 30).moved(0, -tall * 0.1, girth * 0.47),
-        tiles.pick(rng, "fur", finishes.near_color(rng, hsv(0.1, 0.2, 0.9), 0.3)),
+        tiles.pick(rng, "fur", colors.near_color(rng, hsv(0.1, 0.2, 0.9), 0.3)),
     )
     wing = coat if rng.uniform() < 0.4 else tiles.pick(rng, "fur", fur_color(rng))
     a.add_pair(
@@ -260,134 +193,11 @@ def bird(rng) -> Assembly:
     return a
 
 
-def dress_head(a: Assembly, rng, head, r: float, chance: float) -> None:
-    """Perhaps a hat: pointed, top hat, crown, bobble, bow or scarf."""
-    if rng.uniform() > chance:
-        return
-    x, y, z = head
-    kind, finish = rng.integers(5), tiles.pick(rng, "cloth")
-    if kind == 0:
-        a.add(cone(r * 0.7, r * 1.5, 32).moved(x, y + r * 0.7, z), finish)
-        a.add(ball(r * 0.18, count=20).moved(x, y + r * 2.2, z), tiles.pick(rng, "cloth"))
-    elif kind == 1:
-        a.add(cylinder(r * 0.62, r * 0.9).moved(x, y + r * 1.2, z), finish)
-        a.add(cylinder(r * 1.1, r * 0.1).moved(x, y + r * 0.8, z), finish)
-    elif kind == 2:
-        gold = finishes.metal(rng)
-        a.add(cylinder(r * 0.6, r * 0.3, top_radius=r * 0.66).moved(x, y + r * 0.95, z), gold)
-        for k in range(6):
-            w = 2 * np.pi * k / 6 + np.pi / 6
-            a.add(
-                cone(r * 0.16, r * 0.4, 12).moved(x + r * 0.52 * np.cos(w), y + r * 1.05, z + r * 0.52 * np.sin(w)),
-                gold,
-            )
-    elif kind == 3:
-        half = refined([(0, 0), (1.04, 0), (1.0, 0.35), (0.75, 0.75), (0.4, 0.95), (0, 1.0)], 0.1)
-        a.add(loft(half, circle(40)).scaled(r, r * 0.85, r).moved(x, y + 0.32 * r, z), finish)
-    else:
-        w = 2 * np.pi * np.arange(40) / 40
-        a.add(
-            tube(
-                np.stack([x + r * 0.85 * np.cos(w), np.full(40, y - r * 0.85), z + r * 0.85 * np.sin(w)], -1),
-                r * 0.2,
-                closed=True,
-            ),
-            finish,
-        )
-
-
-def figure(rng) -> Assembly:
-    """Return a standing person, robot, gnome or snowman-like toy of separate body parts."""
-    a = Assembly()
-    r, hips, shoulder = rng.uniform(0.16, 0.34), rng.uniform(0.14, 0.26), rng.uniform(0.2, 0.34)
-    leg, torso = rng.uniform(0.25, 0.6), rng.uniform(0.35, 0.6)
-    skin = finishes.plastic(
-        rng,
-        hsv(rng.uniform(0.04, 0.09), rng.uniform(0.25, 0.6), rng.uniform(0.35, 0.95))
-        if rng.uniform() < 0.75
-        else finishes.any_color(rng),
-    )
-    shirt, trousers, shoe = tiles.pick(rng, "cloth"), tiles.pick(rng, "cloth"), tiles.pick(rng, "paint")
-    head = (0.0, leg + torso + r * 0.95, 0.0)
-    depth = shoulder * rng.uniform(0.5, 0.75)
-    if robot := rng.uniform() < 0.3:
-        skin, shirt, trousers = (tiles.pick(rng, "paint") for _ in range(3))
-        chest = solids.block((0, leg + torso / 2, 0), (shoulder, torso / 2 + 0.02, depth), 0.05)
-    else:
-        chest = solids.blended(
-            [
-                solids.ellipsoid((0, leg + torso * 0.25, 0), (hips * 1.2, torso * 0.35, depth)),
-                solids.ellipsoid((0, leg + torso * 0.7, 0), (shoulder, torso * 0.36, depth)),
-            ],
-            0.1,
-        )
-    a.add(solids.polygonised(chest, 40), shirt)
-    pose, bend = rng.uniform(-15, 75) * (1 if rng.uniform() < 0.6 else 0.3), rng.uniform(-0.15, 0.3)
-    reach = leg * 0.5 + torso * 0.6
-    sx, sy = shoulder * 0.95, leg + torso * 0.85
-    w = np.radians(pose)
-    elbow = (sx + reach * 0.5 * np.cos(np.radians(70) - w), sy - reach * 0.5 * np.sin(np.radians(70) - w), 0.02)
-    hand = (
-        elbow[0] + reach * 0.4 * np.cos(np.radians(75) - w),
-        elbow[1] - reach * 0.4 * np.sin(np.radians(75) - w),
-        bend,
-    )
-    a.add_pair(
-        tube(np.array([(sx * 0.9, sy, 0), elbow, hand]), np.array([0.085, 0.075, 0.065]), outline=circle(20)), shirt
-    )
-    a.add_pair(ball(0.085, count=20).moved(*hand), skin)
-    a.add_pair(
-        tube(
-            np.array([(hips * 0.6, leg * 1.1, 0), (hips * 0.7, leg * 0.5, 0.02), (hips * 0.75, 0.06, 0)]),
-            np.array([0.12, 0.1, 0.09]),
-            outline=circle(20),
-        ),
-        trousers,
-    )
-    a.add_pair(ball(0.11, 0.075, 0.17, 22).moved(hips * 0.78, 0.03, 0.06), shoe)
-    if robot:
-        a.add(solids.polygonised(solids.block(head, (r * 1.05, r * 0.85, r * 0.9), 0.05), 32), skin)
-        eyes(a, rng, r * 0.45, head[1] + r * 0.1, r * 0.85, r * 0.22, 0.0)
-        a.add(
-            cylinder(r * 0.5, r * 0.1).turned("x", 90).scaled(1, 0.4, 1).moved(0, head[1] - r * 0.4, r * 0.88),
-            finishes.metal(rng),
-        )
-        a.add(cylinder(0.02, r * 0.6).moved(0, head[1] + r * 1.1, 0), finishes.metal(rng))
-        a.add(ball(0.05, count=16).moved(0, head[1] + r * 1.4, 0), finishes.glossy(rng))
-        return a
-    a.add(ball(r, r * rng.uniform(0.95, 1.15), r * 0.95, 36).moved(*head), skin)
-    eyes(a, rng, r * 0.36, head[1] + r * 0.12, r * 0.85, r * rng.uniform(0.1, 0.18), 0.1)
-    a.add(ball(r * 0.12, r * 0.14, r * 0.18, 16).moved(0, head[1] - r * 0.1, r * 0.95), skin)
-    t = np.linspace(-0.8, 0.8, 12)
-    a.add(
-        tube(
-            np.stack(
-                [
-                    r * 0.4 * t,
-                    head[1] - r * (0.5 - 0.12 * t**2),
-                    r * np.sqrt(np.maximum(0.86 - 0.45 * t**2, 0.3)) * 0.93,
-                ],
-                -1,
-            ),
-            r * 0.045,
-            outline=circle(8),
-        ),
-        finishes.plastic(rng, hsv(0.98, 0.7, 0.5)),
-    )
-    hair = tiles.pick(rng, "fur", hsv(rng.uniform(0.03, 0.12), rng.uniform(0.2, 0.8), rng.uniform(0.08, 0.8)))
-    if rng.uniform() < 0.75:
-        a.add(ball(r * 1.06, r * 1.0, r * 0.95, 30).moved(0, head[1] + r * 0.2, -r * 0.18), hair)
-    if rng.uniform() < 0.25:
-        a.add(ball(r * 0.6, r * 0.6, r * 0.35, 24).moved(0, head[1] - r * 0.75, r * 0.55), hair)
-    dress_head(a, rng, head, r, 0.6)
-    return a
-
-
-def fish(rng) -> Assembly:
-    """Return a fish: body, fins, tail, eyes."""
+def fish(rng: np.random.Generator) -> Assembly:
+    """Make a fish: body, fins, tail, eyes."""
     a = Assembly()
     tall, wide = rng.uniform(0.25, 0.5), rng.uniform(0.14, 0.3)
-    coat, fin = tiles.pick(rng, "fur", finishes.any_color(rng)), tiles.pick(rng, "skin")
+    coat, fin = tiles.pick(rng, "fur", colors.any_color(rng)), tiles.pick(rng, "skin")
     body = solids.blended(
         [solids.ellipsoid((0, 0, 0.1), (wide, tall, 0.6)), solids.limb((0, 0, -0.2), (0, 0, -0.75), tall * 0.45, 0.06)],
         0.15,
@@ -401,8 +211,8 @@ def fish(rng) -> Assembly:
     return a
 
 
-def turtle(rng) -> Assembly:
-    """Turtle, beetle or crab: a domed shell on a flat body with six or four limbs."""
+def turtle(rng: np.random.Generator) -> Assembly:
+    """Make a turtle, beetle or crab: a domed shell on a flat body with four or six limbs."""
     a = Assembly()
     dome, wide = rng.uniform(0.25, 0.5), rng.uniform(0.4, 0.55)
     shell = (
@@ -435,10 +245,10 @@ def turtle(rng) -> Assembly:
     return a
 
 
-def dragon(rng) -> Assembly:
-    """Upright or crouched, long neck and tail, wings, spikes along the back, horns."""
+def dragon(rng: np.random.Generator) -> Assembly:
+    """Make a dragon: long neck and tail, wings, spikes along the back, horns."""
     a = Assembly()
-    coat = tiles.pick(rng, "fur", finishes.any_color(rng))
+    coat = tiles.pick(rng, "fur", colors.any_color(rng))
     r, lift = rng.uniform(0.17, 0.26), rng.uniform(0.25, 0.6)
     head = (0.0, 0.45 + lift, 0.5)
     spine = np.array(
@@ -486,12 +296,13 @@ def dragon(rng) -> Assembly:
     wing, span, rise = tiles.pick(rng, "skin"), rng.uniform(0.6, 0.95), rng.uniform(0.3, 0.6)
     fingers = np.array([(0.45, 1.0), (1.0, 0.62), (0.9, 0.0), (0.5, -0.18)]) * np.array([span, rise])
     rim = [(0.0, 0.1), tuple(fingers[0])]
-    for start, end in itertools.pairwise(fingers):  # the skin sags between the fingers
+    for start, end in itertools.pairwise(fingers):  # the membrane sags between the fingers
         rim += [tuple(0.82 * (start + end) / 2 + 0.18 * np.array([0.4 * span, 0.3 * rise])), tuple(end)]
     middle = np.array([0.42 * span, 0.35 * rise])
     fold, lean = rng.uniform(-10, 35), rng.uniform(-25, 15)
 
-    def unfolded(part):
+    def unfolded(part: Part) -> Part:
+        """Place a part of the wing, which is modelled flat, at the shoulder."""
         return part.turned("x", lean).turned("y", fold).moved(0.16, 0.2, -0.05)
 
     skin = (
@@ -499,9 +310,15 @@ def dragon(rng) -> Assembly:
     )
     a.add_pair(unfolded(skin.moved(*middle)), wing)
     wrist = np.array([0.45 * span, 0.97 * rise])
-    for start, end, thick in (((0.0, 0.08), wrist, 0.05), *((wrist, tip, 0.032) for tip in fingers[1:])):
+
+    def bone(start: np.ndarray, end: np.ndarray, radius: float) -> Part:
+        """Make a tapering bone of the wing between two points (2,)."""
         path = np.c_[np.linspace(start, end, 4), np.zeros(4)]
-        a.add_pair(unfolded(tube(path, np.linspace(thick, 0.6 * thick, 4), outline=circle(10))), coat)
+        return unfolded(tube(path, np.linspace(radius, 0.6 * radius, 4), outline=circle(10)))
+
+    a.add_pair(bone(np.array([0.0, 0.08]), wrist, 0.05), coat)
+    for tip in fingers[1:]:
+        a.add_pair(bone(wrist, tip, 0.032), coat)
     eyes(a, rng, r * 0.6, head[1] + r * 0.35, head[2] + r * 0.6, r * 0.2, 0.6)
     horns(a, rng, (head[0], head[1], head[2] - 0.3 * r), r)
     return a

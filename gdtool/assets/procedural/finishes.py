@@ -1,41 +1,32 @@
-"""What a part is made of: factors only, lookup tables over a solid field, or tiled images with a normal map.
+"""Define finishes: what a part is made of, as plain factors, tiled images, or lookup tables over a solid field.
 
-A finish is chosen first, with its random parameters, and applied when the object's shape is known: it is a function of
-`Shape` that returns a `Look`. A field finish stores its pattern as texture coordinates into a small lookup image
-(second UV set), so a threshold in the image is a crisp line on the surface however coarse the mesh is."""
+A finish is drawn first, with its random parameters, and applied once the object's shape is known: it is a function of
+`Shape` that returns a `Look`. Finishes of tiled images use the first UV set. A finish of a solid field, such as wood or
+marble, stores its pattern in the second UV set, as coordinates into a small lookup image. A threshold in that image is
+then a crisp line on the surface, however coarse the mesh is.
+"""
 
 from __future__ import annotations
 
-import colorsys
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from gdtool.assets.procedural import patterns
+from gdtool.assets.procedural.colors import METALS, any_color, any_metal, hsv, near_color
 from gdtool.assets.procedural.parts import product
-from gdtool.assets.scene import Material, Texture
-
-# Normal-incidence reflectance of metals, linear: measured optical constants as tabulated at physicallybased.info
-METALS = {
-    "gold": (1.0, 0.77, 0.31),
-    "silver": (0.96, 0.95, 0.92),
-    "copper": (0.93, 0.61, 0.49),
-    "brass": (0.89, 0.74, 0.42),
-    "bronze": (0.71, 0.53, 0.34),
-    "aluminium": (0.91, 0.91, 0.92),
-    "iron": (0.53, 0.51, 0.49),
-    "chrome": (0.64, 0.65, 0.66),
-    "titanium": (0.54, 0.50, 0.45),
-    "nickel": (0.70, 0.64, 0.56),
-    "steel": (0.60, 0.60, 0.62),
-}
+from gdtool.assets.procedural.patterns import Field
+from gdtool.assets.scene import Material, Texture, Wrap
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Where a finish goes, in the normalised object: points (v, 3), normals (v, 3), convexity (v,): > 0 on outer
-    edges."""
+    """Hold the surface that a finish is applied to, in the normalised object: points (v, 3), normals (v, 3).
+
+    convexity() computes (v,), positive on outward edges; see assembly.convexity.
+    """
 
     points: np.ndarray
     normals: np.ndarray
@@ -44,8 +35,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Look:
-    """A material, texture coordinates (v, 2) of its second UV set (None: unused) and tiles per unit length of the
-    first."""
+    """Hold a finish's result: a material, its second UV set (v, 2) or None, and tiles per unit length of the first."""
 
     material: Material
     field_uv: np.ndarray | None = None
@@ -55,65 +45,32 @@ class Look:
 Finish = Callable[[Shape], Look]
 
 
-def hsv(hue: float, saturation: float, value: float) -> np.ndarray:
-    """sRGB colour (3,) as picked by eye, returned linear."""
-    srgb = np.array(colorsys.hsv_to_rgb(hue % 1.0, float(np.clip(saturation, 0, 1)), float(np.clip(value, 0, 1))))
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-
-
-def any_color(rng: np.random.Generator) -> np.ndarray:
-    """Return a linear colour as things have: vivid, muted, pastel, earth, grey, dark or white."""
-    kind = rng.choice(7, p=[0.26, 0.2, 0.13, 0.18, 0.08, 0.07, 0.08])
-    hue = rng.uniform()
-    if kind == 0:
-        # No neon greens.
-        return hsv(hue, rng.uniform(0.65, 0.92), rng.uniform(0.6, 0.95) * (0.75 if 0.2 < hue < 0.48 else 1.0))
-    if kind == 1:
-        return hsv(hue, rng.uniform(0.3, 0.6), rng.uniform(0.4, 0.8))
-    if kind == 2:
-        return hsv(hue, rng.uniform(0.12, 0.35), rng.uniform(0.85, 0.97))
-    if kind == 3:
-        return hsv(rng.uniform(0.02, 0.13), rng.uniform(0.35, 0.75), rng.uniform(0.3, 0.8))
-    if kind == 4:
-        return hsv(hue, rng.uniform(0, 0.08), rng.uniform(0.3, 0.75))
-    if kind == 5:
-        return hsv(hue, rng.uniform(0, 0.6), rng.uniform(0.1, 0.25))
-    return hsv(rng.uniform(0.05, 0.18), rng.uniform(0.0, 0.12), rng.uniform(0.88, 0.97))
-
-
-def near_color(rng: np.random.Generator, color: np.ndarray, amount: float = 0.5) -> np.ndarray:
-    """Return a darker or lighter relative of a linear colour."""
-    factor = np.exp(rng.normal(0, amount))
-    return np.clip(color * factor * np.exp(rng.normal(0, 0.15 * amount, 3)), 0.01, 0.95)
-
-
-def any_metal(rng: np.random.Generator) -> np.ndarray:
-    """Return the linear reflectance of a metal, chosen at random."""
-    return np.array(METALS[list(METALS)[rng.integers(len(METALS))]])
-
-
 def _srgb8(color: np.ndarray) -> np.ndarray:
+    """Encode linear colours as 8-bit sRGB."""
     c = np.clip(color, 0, 1)
     srgb = np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
     return np.round(srgb * 255).astype(np.uint8)
 
 
-def _material(
+def textured_material(
     name: str,
     color: np.ndarray,
-    metallic: np.ndarray,
+    metallic: np.ndarray | float,
     roughness: np.ndarray,
     uv_set: int,
-    wrap: str,
+    wrap: Wrap,
     normal: np.ndarray | None = None,
 ) -> Material:
-    """Textured material from linear colour (h, w, 3), metallic and roughness (h, w) in [0, 1]; base_color may be a
-    constant."""
+    """Make a material of maps: linear colour (h, w, 3) or (3,), metallic and roughness (h, w), perhaps a normal map.
+
+    Metallic may be a constant. Values are clipped to [0, 1] and stored with 8 bits.
+    """
     shape = roughness.shape
     orm = np.stack([np.ones(shape), roughness, np.broadcast_to(metallic, shape)], -1)
     orm = np.round(np.clip(orm, 0, 1) * 255).astype(np.uint8)
 
-    def texture(image, encoding):
+    def texture(image: np.ndarray, encoding: Literal["srgb", "linear"]) -> Texture:
+        """Make a texture of an image in the material's UV set."""
         return Texture(image, encoding, uv_set=uv_set, wrap_u=wrap, wrap_v=wrap)
 
     return Material(
@@ -131,66 +88,89 @@ def _material(
 
 
 def plain(color: np.ndarray, roughness: float, metallic: float = 0.0, name: str = "plain") -> Finish:
-    """One linear colour, roughness and metallic."""
+    """Make a finish of one linear colour, roughness and metallic."""
     r, g, b = (float(c) for c in np.clip(color, 0, 1))
     material = Material(name=name, base_color=(r, g, b, 1.0), metallic=float(metallic), roughness=float(roughness))
     return lambda shape: Look(material)
 
 
-def plastic(rng, color=None) -> Finish:
-    """Return a smooth dielectric finish."""
+def plastic(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw a fairly smooth dielectric finish."""
     return plain(any_color(rng) if color is None else color, rng.uniform(0.2, 0.6), name="plastic")
 
 
-def metal(rng, color=None) -> Finish:
-    """Return a metallic finish."""
+def metal(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw a metallic finish."""
     return plain(any_metal(rng) if color is None else color, rng.uniform(0.12, 0.55), 1.0, name="metal")
 
 
-def matte(rng, color=None) -> Finish:
-    """Return a rough dielectric finish."""
+def matte(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw a rough dielectric finish."""
     return plain(any_color(rng) if color is None else color, rng.uniform(0.65, 0.98), name="matte")
 
 
-def glossy(rng, color=None) -> Finish:
-    """Return a polished dielectric finish."""
+def glossy(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw a polished dielectric finish."""
     return plain(any_color(rng) if color is None else color, rng.uniform(0.06, 0.22), name="glossy")
 
 
 # --- lookup tables over solid fields ----------------------------------------------------------------------------------
 
 
+class _Substance(NamedTuple):
+    """Hold a material of one kind: linear colour (3,), roughness, metallic."""
+
+    color: np.ndarray
+    roughness: float
+    metallic: float = 0.0
+
+
+class _Layer(NamedTuple):
+    """Hold a substance and the place in [0, 1] of a lookup table's first axis from which it is used."""
+
+    start: float
+    substance: _Substance
+
+
 def _table(
     name: str,
-    layers: list[tuple[float, np.ndarray, float, float]],
+    layers: list[_Layer],
     softness: float = 0.01,
     speckle: float = 0.25,
-    wrap: str = "clamp",
+    wrap: Wrap = "clamp",
 ) -> Material:
-    """Return a lookup image over (pattern, dirt): layers (start in [0, 1], linear colour, roughness, metallic) along u.
+    """Make a lookup image over (pattern, dirt): the layers follow each other along u.
 
-    v darkens and roughens from 0 to 1 by `speckle`.
+    softness: half the width of u in which a layer replaces the one before. Along v, which is dirt, the colour darkens
+    and the roughness grows by `speckle`.
     """
     u, v = patterns.tile_grid(256)
     u, v = u[:64], (v[:64] * 4)
-    value = np.broadcast_to(np.r_[layers[0][1], layers[0][2], layers[0][3]], (*u.shape, 5))
-    for start, color, roughness, metallic in layers[1:]:
+    value = np.broadcast_to(np.r_[layers[0].substance], (*u.shape, 5))
+    for start, substance in layers[1:]:
         weight = patterns.smoothstep(start - softness, start + softness, u)[..., None]
-        value = value * (1 - weight) + np.r_[color, roughness, metallic] * weight
+        value = value * (1 - weight) + np.r_[substance] * weight
     color = value[..., :3] * (1 + speckle * (0.5 - v))[..., None]
     roughness = np.clip(value[..., 3] + speckle * 0.5 * (v - 0.5), 0.04, 1)
-    return _material(name, np.clip(color, 0, 1), value[..., 4], roughness, 1, wrap)
+    return textured_material(name, np.clip(color, 0, 1), value[..., 4], roughness, 1, wrap)
 
 
-def _dirt(rng: np.random.Generator) -> Callable:
+def _dirt(rng: np.random.Generator) -> Field:
+    """Draw a smooth field in [0, 1] over points (n, 3): how dirty the surface is."""
     field = patterns.noise_field(rng, rng.uniform(2, 6), 2.5)
     return lambda points: np.clip(0.5 + 0.22 * field(points), 0.01, 0.99)
 
 
 def _field(
-    name: str, material: Material, pattern: Callable[[Shape], np.ndarray], dirt: Callable, clip: bool = True
+    name: str, material: Material, pattern: Callable[[Shape], np.ndarray], dirt: Field, clip: bool = True
 ) -> Finish:
+    """Make a finish that looks its material up by a pattern along u and by dirt along v.
+
+    clip: keep u inside the image; without it u repeats, for materials whose texture does.
+    """
+
     def apply(shape: Shape) -> Look:
+        """Evaluate pattern and dirt at the vertices."""
         u = np.asarray(pattern(shape), float)
         u = np.clip(u, 0.004, 0.996) if clip else np.clip(u, -30, 30)
         return Look(material, np.stack([u, dirt(shape.points)], -1))
@@ -198,24 +178,27 @@ def _field(
     return apply
 
 
-def _surface_pair(rng, color) -> tuple[float, float, np.ndarray]:
-    """(roughness, metallic, colour) of a dielectric, seldom a metal."""
+def _any_substance(rng: np.random.Generator, color: np.ndarray) -> _Substance:
+    """Draw a dielectric of a colour, or (15 %) a metal."""
     if rng.uniform() < 0.15:
-        return rng.uniform(0.15, 0.5), 1.0, any_metal(rng)
-    return rng.uniform(0.15, 0.9), 0.0, color
+        roughness = rng.uniform(0.15, 0.5)
+        return _Substance(any_metal(rng), roughness, 1.0)
+    return _Substance(color, rng.uniform(0.15, 0.9))
 
 
-def banded(rng, color=None, axis=None, frequency=None) -> Finish:
-    """Stripes across a direction, two or three colours."""
+def banded(
+    rng: np.random.Generator, color: np.ndarray | None = None, axis: int | None = None, frequency: float | None = None
+) -> Finish:
+    """Draw stripes across an axis, in two or three substances."""
     color = any_color(rng) if color is None else color
     direction = np.eye(3)[rng.choice(3, p=[0.2, 0.6, 0.2]) if axis is None else axis] + rng.normal(0, 0.02, 3)
     frequency = rng.uniform(1.5, 7) if frequency is None else frequency
-    first = _surface_pair(rng, color)
-    second = _surface_pair(rng, any_color(rng))
-    layers = [(0, first[2], first[0], first[1]), (rng.uniform(0.35, 0.75), second[2], second[0], second[1])]
+    first = _any_substance(rng, color)
+    second = _any_substance(rng, any_color(rng))
+    layers = [_Layer(0, first), _Layer(rng.uniform(0.35, 0.75), second)]
     if rng.uniform() < 0.4:
-        third = _surface_pair(rng, any_color(rng))
-        layers.append((rng.uniform(0.8, 0.92), third[2], third[0], third[1]))
+        third = _any_substance(rng, any_color(rng))
+        layers.append(_Layer(rng.uniform(0.8, 0.92), third))
     wobble, size = patterns.noise_field(rng, 2.0, 1.0), rng.choice([0.0, 0.08, 0.3])
     shift = rng.uniform()
     return _field(
@@ -227,106 +210,122 @@ def banded(rng, color=None, axis=None, frequency=None) -> Finish:
     )
 
 
-def gradient(rng, color=None, direction=None) -> Finish:
-    """Return a smooth change of colour along a direction, by default upward."""
+def gradient(rng: np.random.Generator, color: np.ndarray | None = None, direction: np.ndarray | None = None) -> Finish:
+    """Draw a smooth change of colour along a direction, by default upward."""
     color = any_color(rng) if color is None else color
     other = near_color(rng, any_color(rng) if rng.uniform() < 0.5 else color, 0.6)
     axis = np.array([0.0, 1.0, 0.0]) if direction is None else np.asarray(direction, float)
     roughness = rng.uniform(0.15, 0.8)
     material = _table(
-        "gradient", [(0, color, roughness, 0.0), (rng.uniform(0.3, 0.7), other, roughness, 0.0)], rng.uniform(0.2, 0.6)
+        "gradient",
+        [_Layer(0, _Substance(color, roughness)), _Layer(rng.uniform(0.3, 0.7), _Substance(other, roughness))],
+        rng.uniform(0.2, 0.6),
     )
     wobble = patterns.noise_field(rng, 2.0, 1.0)
     return _field("gradient", material, lambda s: 0.5 + product(s.points, axis) + 0.04 * wobble(s.points), _dirt(rng))
 
 
-def marble(rng, color=None) -> Finish:
-    """Veins: distance from the zero set of a warped noise."""
+def marble(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw marble: veins along the zero set of a noise field."""
     color = any_color(rng) if color is None else color
     vein = any_metal(rng) if (gilded := rng.uniform() < 0.25) else near_color(rng, color, 1.0)
     roughness = rng.uniform(0.08, 0.35)
     layers = [
-        (0, vein, rng.uniform(0.15, 0.4), float(gilded)),
-        (rng.uniform(0.05, 0.15), near_color(rng, color, 0.3), roughness, 0.0),
-        (0.55, color, roughness, 0.0),
+        _Layer(0, _Substance(vein, rng.uniform(0.15, 0.4), float(gilded))),
+        _Layer(rng.uniform(0.05, 0.15), _Substance(near_color(rng, color, 0.3), roughness)),
+        _Layer(0.55, _Substance(color, roughness)),
     ]
     field = patterns.noise_field(rng, rng.uniform(1.2, 2.5), 2.0)
     return _field("marble", _table("marble", layers, 0.04), lambda s: np.abs(field(s.points)) * 0.8, _dirt(rng))
 
 
-def blotched(rng, color=None, other=None) -> Finish:
-    """Two colours in irregular patches: cows, camouflage, corroded paint."""
+def blotched(rng: np.random.Generator, color: np.ndarray | None = None, other: np.ndarray | None = None) -> Finish:
+    """Draw irregular patches of two or three substances: cows, camouflage, corroded paint."""
     color = any_color(rng) if color is None else color
-    first, second = _surface_pair(rng, color), _surface_pair(rng, any_color(rng) if other is None else other)
+    first, second = _any_substance(rng, color), _any_substance(rng, any_color(rng) if other is None else other)
     level = rng.uniform(0.45, 0.65)
-    layers = [(0, first[2], first[0], first[1]), (level, second[2], second[0], second[1])]
+    layers = [_Layer(0, first), _Layer(level, second)]
     if rng.uniform() < 0.4:
-        layers.append((level + 0.12, near_color(rng, second[2], 0.5), second[0], second[1]))
+        layers.append(_Layer(level + 0.12, second._replace(color=near_color(rng, second.color, 0.5))))
     field = patterns.noise_field(rng, rng.uniform(1.2, 4), 1.0)
     return _field("patches", _table("patches", layers, 0.012), lambda s: 0.5 + 0.2 * field(s.points), _dirt(rng))
 
 
-def spotted(rng, color=None, other=None) -> Finish:
-    """Round spots around random sites."""
+def spotted(rng: np.random.Generator, color: np.ndarray | None = None, other: np.ndarray | None = None) -> Finish:
+    """Draw round spots around random sites."""
     color, other = any_color(rng) if color is None else color, any_color(rng) if other is None else other
-    first, second = _surface_pair(rng, color), _surface_pair(rng, other)
+    first, second = _any_substance(rng, color), _any_substance(rng, other)
     count = int(rng.integers(60, 260))
     radius = 0.62 * count ** (-1 / 3) * rng.uniform(0.5, 0.8)
     field = patterns.cell_field(rng, count)
-    material = _table("spots", [(0, second[2], second[0], second[1]), (0.5, first[2], first[0], first[1])], 0.03)
+    material = _table("spots", [_Layer(0, second), _Layer(0.5, first)], 0.03)
     return _field("spots", material, lambda s: 0.5 * field(s.points)[:, 0] / radius, _dirt(rng))
 
 
-def crackled(rng, color=None, other=None) -> Finish:
-    """Cells with joints between them: giraffe, dry earth, crackle glaze, leaded glass."""
+def crackled(rng: np.random.Generator, color: np.ndarray | None = None, other: np.ndarray | None = None) -> Finish:
+    """Draw cells with joints between them: giraffe, dry earth, crackle glaze, leaded glass."""
     color = any_color(rng) if color is None else color
     joint = near_color(rng, color, 1.0) if other is None else other
     field, width = patterns.cell_field(rng, int(rng.integers(40, 260))), rng.uniform(0.02, 0.05)
     roughness = rng.uniform(0.2, 0.8)
-    material = _table("cells", [(0, joint, rng.uniform(0.3, 0.95), 0.0), (0.5, color, roughness, 0.0)], 0.06)
+    material = _table(
+        "cells", [_Layer(0, _Substance(joint, rng.uniform(0.3, 0.95))), _Layer(0.5, _Substance(color, roughness))], 0.06
+    )
 
-    def pattern(s):
+    def pattern(s: Shape) -> np.ndarray:
+        """Measure the distance to the joint between the two nearest sites."""
         near = field(s.points)
         return 0.5 * (near[:, 1] - near[:, 0]) / width
 
     return _field("cells", material, pattern, _dirt(rng))
 
 
-def chequered(rng, color=None) -> Finish:
-    """Return a checkerboard in the first UV set."""
+def chequered(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw a chequerboard in the first UV set."""
     color = any_color(rng) if color is None else color
-    first, second = _surface_pair(rng, color), _surface_pair(rng, any_color(rng))
+    first, second = _any_substance(rng, color), _any_substance(rng, any_color(rng))
     u, v = patterns.tile_grid(64)
     odd = ((u < 0.5) ^ (v < 0.5))[..., None]
-    value = np.where(odd, np.r_[first[2], first[0], first[1]], np.r_[second[2], second[0], second[1]])
-    material = _material("checks", value[..., :3], value[..., 4], value[..., 3], 0, "repeat")
+    value = np.where(odd, np.r_[first], np.r_[second])
+    material = textured_material("checks", value[..., :3], value[..., 4], value[..., 3], 0, "repeat")
     tiles = rng.uniform(1.5, 5)
     return lambda shape: Look(material, None, tiles)
 
 
-def wooden(rng, color=None) -> Finish:
-    """Rings of a trunk cut by the surface."""
+def wooden(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw wood: the rings of a trunk, cut by the surface."""
     color = hsv(rng.uniform(0.04, 0.11), rng.uniform(0.35, 0.75), rng.uniform(0.35, 0.85)) if color is None else color
     dark, roughness = color * rng.uniform(0.35, 0.7), rng.uniform(0.3, 0.8)
-    material = _table("wood", [(0, color, roughness, 0.0), (0.55, dark, roughness + 0.1, 0.0)], 0.4, 0.2, wrap="mirror")
+    material = _table(
+        "wood",
+        [_Layer(0, _Substance(color, roughness)), _Layer(0.55, _Substance(dark, roughness + 0.1))],
+        0.4,
+        0.2,
+        wrap="mirror",
+    )
     axis = int(rng.choice(3, p=[0.35, 0.45, 0.2]))
     across = [i for i in range(3) if i != axis]
     center, rings = rng.uniform(-0.6, 0.6, 2), rng.uniform(9, 22)
     squeeze = np.where(np.arange(3) == axis, 0.25, 1.0)
     field = patterns.noise_field(rng, 2.5, 2.0)
 
-    def pattern(s):
+    def pattern(s: Shape) -> np.ndarray:
+        """Measure the distance from the trunk's axis, wobbling, in rings."""
         radius = np.hypot(s.points[:, across[0]] - center[0], s.points[:, across[1]] - center[1])
         return rings * radius + 0.5 * field(s.points * squeeze)
 
     return _field("wood", material, pattern, _dirt(rng), clip=False)
 
 
-def worn_paint(rng, color=None) -> Finish:
-    """Paint that is gone on outer edges and in scratches, metal beneath."""
+def worn_paint(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw paint that is gone on outward edges and in scratches, with metal beneath."""
     color, bare = any_color(rng) if color is None else color, any_metal(rng)
     roughness = rng.uniform(0.2, 0.6)
-    layers = [(0, color, roughness, 0.0), (0.58, color * 0.5, 0.8, 0.0), (0.63, bare, rng.uniform(0.25, 0.5), 1.0)]
+    layers = [
+        _Layer(0, _Substance(color, roughness)),
+        _Layer(0.58, _Substance(color * 0.5, 0.8)),
+        _Layer(0.63, _Substance(bare, rng.uniform(0.25, 0.5), 1.0)),
+    ]
     chips, fine, amount = (
         patterns.noise_field(rng, 3.0, 3.0),
         patterns.noise_field(rng, 14.0, 1.0),
@@ -340,13 +339,17 @@ def worn_paint(rng, color=None) -> Finish:
     )
 
 
-def rusty(rng, color=None) -> Finish:
-    """Metal that rusts from below and in patches."""
+def rusty(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw metal that rusts in patches and from below, or copper with verdigris."""
     bare = any_metal(rng) if color is None else color
     rust = hsv(rng.uniform(0.03, 0.08), rng.uniform(0.6, 0.85), rng.uniform(0.3, 0.6))
-    if rng.uniform() < 0.2:  # copper's green instead
+    if rng.uniform() < 0.2:  # verdigris on copper
         bare, rust = np.array(METALS["copper"]), hsv(rng.uniform(0.4, 0.47), 0.4, rng.uniform(0.5, 0.7))
-    layers = [(0, bare, rng.uniform(0.2, 0.45), 1.0), (0.5, rust * 0.6, 0.8, 0.3), (0.6, rust, 0.92, 0.0)]
+    layers = [
+        _Layer(0, _Substance(bare, rng.uniform(0.2, 0.45), 1.0)),
+        _Layer(0.5, _Substance(rust * 0.6, 0.8, 0.3)),
+        _Layer(0.6, _Substance(rust, 0.92)),
+    ]
     field, amount = patterns.noise_field(rng, 2.0, 3.0), rng.uniform(0.25, 0.6)
     return _field(
         "rust",
@@ -356,29 +359,43 @@ def rusty(rng, color=None) -> Finish:
     )
 
 
-def topped(rng, color=None, top=None) -> Finish:
-    """Something on all that faces up: snow, moss, icing, dust."""
+def topped(rng: np.random.Generator, color: np.ndarray | None = None, top: np.ndarray | None = None) -> Finish:
+    """Draw a layer on all that faces up: snow, moss, icing, dust."""
     color = any_color(rng) if color is None else color
     top = (
         (hsv(0.6, 0.03, 0.95) if rng.uniform() < 0.4 else hsv(rng.uniform(0.2, 0.35), 0.6, 0.5)) if top is None else top
     )
     field = patterns.noise_field(rng, 4.0, 1.5)
-    material = _table("topped", [(0, color, rng.uniform(0.4, 0.9), 0.0), (0.7, top, rng.uniform(0.7, 0.95), 0.0)], 0.04)
+    material = _table(
+        "topped",
+        [_Layer(0, _Substance(color, rng.uniform(0.4, 0.9))), _Layer(0.7, _Substance(top, rng.uniform(0.7, 0.95)))],
+        0.04,
+    )
     return _field("topped", material, lambda s: 0.4 + 0.4 * s.normals[:, 1] + 0.06 * field(s.points), _dirt(rng))
 
 
-def gazing(rng, direction: np.ndarray, iris=None, white=None) -> Finish:
-    """Return an eyeball: black pupil, coloured iris, white, by the angle between the normal and `direction` (right
-    eye's, x >= 0)."""
+def gazing(
+    rng: np.random.Generator, direction: np.ndarray, iris: np.ndarray | None = None, white: np.ndarray | None = None
+) -> Finish:
+    """Draw the finish of a pair of eyeballs that look along `direction`: black pupil, coloured iris, white.
+
+    The ring is chosen by the angle between normal and direction. direction is the right eye's (x >= 0); the left eye
+    mirrors it.
+    """
     iris = any_color(rng) if iris is None else iris
     white = np.array([0.9, 0.9, 0.87]) if white is None else white
     black = np.array([0.01, 0.01, 0.012])
     pupil = rng.uniform(0.3, 0.55)
-    layers = [(0, black, 0.08, 0.0), (pupil, iris, 0.12, 0.0), (pupil + rng.uniform(0.15, 0.35), white, 0.15, 0.0)]
+    layers = [
+        _Layer(0, _Substance(black, 0.08)),
+        _Layer(pupil, _Substance(iris, 0.12)),
+        _Layer(pupil + rng.uniform(0.15, 0.35), _Substance(white, 0.15)),
+    ]
     material = _table("eye", layers, 0.02, speckle=0.0)
     direction = np.asarray(direction, float) / np.linalg.norm(direction)
 
     def apply(shape: Shape) -> Look:
+        """Evaluate the angle to the gaze at the vertices."""
         sign = np.where(shape.points[:, 0] < 0, -1.0, 1.0)[:, None]  # the left eye is the mirror image of the right one
         toward = product(shape.normals * np.concatenate([sign, np.ones((len(sign), 2))], 1), direction)
         angle = np.degrees(np.arccos(np.clip(toward, -1, 1))) / 90.0

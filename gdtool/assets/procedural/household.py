@@ -1,13 +1,13 @@
-"""Furniture, containers and tools: chairs, tables, sofas, beds, shelves, chests, cartons, books, clocks,
-extinguishers."""
+"""Make containers and tools: chests, cartons, books, extinguishers, clocks, tools. The family includes furniture.py."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from gdtool.assets.procedural import finishes, solids, tiles
+from gdtool.assets.procedural import colors, finishes, solids, tiles
 from gdtool.assets.procedural.assembly import Assembly
 from gdtool.assets.procedural.buildings import gable
+from gdtool.assets.procedural.furniture import bed, chair, shelf, sofa, table
 from gdtool.assets.procedural.parts import (
     ball,
     box,
@@ -22,157 +22,8 @@ from gdtool.assets.procedural.parts import (
 )
 
 
-def _leg(rng, height: float, size: float):
-    kind = rng.integers(3)
-    if kind == 0:
-        return box(size, height, size, 0.01, 3).moved(y=height / 2)
-    if kind == 1:
-        return cylinder(size * 0.45, height, top_radius=size * 0.7, count=24).moved(y=height / 2)
-    t = np.linspace(0, 1, 16)
-    radius = size * (0.45 + 0.2 * np.cos(rng.integers(2, 5) * np.pi * t))
-    return loft(np.vstack([(0, 0), np.stack([radius, t * height], -1), (0, height)]), circle(24))
-
-
-def chair(rng) -> Assembly:
-    """Return a chair: seat, legs, back."""
-    a = Assembly()
-    wood, seat = (
-        tiles.pick(rng, ["wood", "paint", "metal"][rng.integers(3)]),
-        tiles.pick(rng, "cloth" if rng.uniform() < 0.5 else "wood"),
-    )
-    w, d, leg, size = rng.uniform(0.5, 0.65), rng.uniform(0.48, 0.6), rng.uniform(0.4, 0.6), rng.uniform(0.045, 0.08)
-    part = _leg(rng, leg, size)
-    for z in (d / 2 - size, -d / 2 + size):
-        a.add_pair(part.moved(w / 2 - size, 0, z), wood)
-    thick = rng.uniform(0.05, 0.14)
-    a.add(box(w, thick, d, 0.03).moved(y=leg + thick / 2 - 0.01), seat)
-    back, y = rng.uniform(0.45, 0.8), leg + thick
-    a.add_pair(box(size, back, size, 0.01).moved(w / 2 - size, y + back / 2 - 0.02, -d / 2 + size), wood)
-    kind = rng.integers(3)
-    if kind == 0:
-        a.add(box(w * 0.9, back * 0.75, 0.06, 0.025).moved(0, y + back * 0.58, -d / 2 + size), seat)
-    elif kind == 1:
-        for k in range(int(rng.integers(2, 5))):
-            a.add(box(w * 0.85, 0.08, 0.035, 0.01).moved(0, y + back * (0.92 - 0.25 * k), -d / 2 + size), wood)
-    else:
-        a.add(box(w * 0.95, 0.1, 0.05, 0.01).moved(0, y + back * 0.95, -d / 2 + size), wood)
-        for x in np.linspace(-0.3, 0.3, int(rng.integers(3, 7))):
-            a.add(cylinder(0.018, back, count=14).moved(x * w, y + back * 0.45, -d / 2 + size), wood)
-    if rng.uniform() < 0.35:
-        a.add_pair(box(size, 0.05, d * 0.9, 0.01).moved(w / 2, y + 0.24, 0), wood)
-        a.add_pair(cylinder(size * 0.35, 0.26, count=16).moved(w / 2, y + 0.1, d / 2 - size), wood)
-    return a
-
-
-def table(rng) -> Assembly:
-    """Return a table: a top on legs or a foot."""
-    a, wood = Assembly(), tiles.pick(rng, "wood" if rng.uniform() < 0.6 else "any")
-    top = wood if rng.uniform() < 0.5 else tiles.pick(rng, "any")
-    height, thick = rng.uniform(0.4, 0.8), rng.uniform(0.04, 0.09)
-    if rng.uniform() < 0.4:
-        r = rng.uniform(0.4, 0.6)
-        a.add(cylinder(r, thick, count=56).moved(y=height), top)
-        a.add(cylinder(0.05, height, top_radius=0.08).moved(y=height / 2), wood)
-        a.add(loft(refined([(0, 0), (r * 0.6, 0), (r * 0.6, 0.03), (0.08, 0.09), (0, 0.12)], 0.06), circle(40)), wood)
-    else:
-        w, d, size = rng.uniform(0.8, 1.3), rng.uniform(0.5, 0.8), rng.uniform(0.05, 0.1)
-        a.add(box(w, thick, d, 0.015, 10).moved(y=height), top)
-        part = _leg(rng, height, size)
-        for z in (d / 2 - size, -d / 2 + size):
-            a.add_pair(part.moved(w / 2 - size, 0, z), wood)
-        if rng.uniform() < 0.5:
-            a.add(box(w * 0.85, 0.12, d * 0.85, 0.01).moved(y=height - 0.08), wood)
-    for _ in range(int(rng.integers(0, 3))):  # something on it
-        x, z = rng.uniform(-0.22, 0.22, 2)
-        if rng.uniform() < 0.5:
-            a.add(
-                ball(rng.uniform(0.05, 0.1), count=22).moved(x, height + thick / 2 + 0.06, z), tiles.pick(rng, "skin")
-            )
-        else:
-            a.add(
-                cylinder(0.06, 0.2, top_radius=0.08).moved(x, height + thick / 2 + 0.1, z), tiles.pick(rng, "ceramic")
-            )
-    return a
-
-
-def sofa(rng) -> Assembly:
-    """Return a sofa: cushions, arms, back."""
-    a, cloth, wood = Assembly(), tiles.pick(rng, "cloth"), tiles.pick(rng, "wood")
-    w, d = rng.uniform(0.7, 1.6), rng.uniform(0.55, 0.75)
-    cushion = cloth if rng.uniform() < 0.5 else tiles.pick(rng, "cloth")
-    rounding = rng.uniform(0.04, 0.1)
-
-    def soft(width, height, depth, x, y, z, finish, pair=False):
-        part = solids.polygonised(
-            solids.block(
-                (0, 0, 0), (width / 2, height / 2, depth / 2), min(rounding, 0.45 * min(width, height, depth))
-            ),
-            30,
-        )
-        (a.add_pair if pair else a.add)(part.moved(x, y, z), finish)
-
-    soft(w, 0.22, d, 0, 0.2, 0, cloth)
-    soft(w, rng.uniform(0.5, 0.7), 0.2, 0, 0.45, -d / 2 + 0.05, cloth)
-    soft(0.18, 0.4, d, w / 2, 0.3, 0, cloth, True)
-    count = max(1, round(w / 0.6))
-    for k in range(count):
-        x = (k - (count - 1) / 2) * (w - 0.18) / count
-        soft((w - 0.2) / count, 0.14, d * 0.85, x, 0.36, 0.06, cushion)
-        if rng.uniform() < 0.4:
-            soft(0.26, 0.26, 0.1, x, 0.55, -0.08, tiles.pick(rng, "cloth"))
-    for z in (d / 2 - 0.06, -d / 2 + 0.06):
-        a.add_pair(cylinder(0.035, 0.12, count=16).moved(w / 2 - 0.05, 0.05, z), wood)
-    return a
-
-
-def bed(rng) -> Assembly:
-    """Return a bed: frame, mattress, pillows."""
-    a, wood, sheet = Assembly(), tiles.pick(rng, "wood"), tiles.pick(rng, "cloth")
-    w, d = rng.uniform(0.6, 0.95), rng.uniform(1.0, 1.3)
-    a.add(box(w, 0.16, d, 0.02).moved(y=0.2), wood)
-    a.add(box(w, rng.uniform(0.5, 0.7), 0.07, 0.02).moved(0, 0.35, -d / 2), wood)
-    a.add(box(w, rng.uniform(0.25, 0.4), 0.07, 0.02).moved(0, 0.2, d / 2), wood)
-    a.add(
-        solids.polygonised(solids.block((0, 0.32, 0), (w * 0.47, 0.09, d * 0.48), 0.05), 40),
-        finishes.matte(rng, finishes.hsv(0.1, 0.05, 0.9)),
-    )
-    a.add(solids.polygonised(solids.block((0, 0.34, d * 0.14), (w * 0.5, 0.1, d * 0.34), 0.06), 40), sheet)
-    for x in [-0.22, 0.22] if w > 0.75 else [0]:
-        a.add(ball(0.17, 0.06, 0.12, 26).moved(x, 0.44, -d * 0.34), tiles.pick(rng, "cloth"))
-    return a
-
-
-def shelf(rng) -> Assembly:
-    """Bookcase or chest of drawers."""
-    a, wood = Assembly(), tiles.pick(rng, "wood")
-    w, h, d, rows = rng.uniform(0.6, 1.0), rng.uniform(0.7, 1.4), rng.uniform(0.25, 0.45), int(rng.integers(2, 6))
-    a.add_pair(box(0.05, h, d, 0.008).moved(w / 2, h / 2, 0), wood)
-    a.add(box(w, h, 0.04, 0.008, 8).moved(0, h / 2, -d / 2 + 0.02), wood)
-    for k in range(rows + 1):
-        a.add(box(w, 0.045, d, 0.008).moved(0, h * k / rows, 0), wood)
-    drawers, knob = rng.uniform() < 0.5, finishes.metal(rng)
-    paint = wood if rng.uniform() < 0.4 else tiles.pick(rng, "paint")
-    spines = [tiles.pick(rng, "cloth") for _ in range(4)]
-    for k in range(rows):
-        y, tall = h * (k + 0.5) / rows, h / rows
-        if drawers:
-            a.add(box(w * 0.9, tall * 0.82, d, 0.01).moved(0, y, 0.03), paint)
-            a.add_pair(ball(0.028, count=14).moved(w * 0.2, y, d / 2 + 0.05), knob)
-            continue
-        x = -w / 2 + 0.04
-        while x < w / 2 - 0.12:
-            thick, high = rng.uniform(0.04, 0.09), tall * rng.uniform(0.55, 0.85)
-            if rng.uniform() < 0.85:
-                a.add(
-                    box(thick, high, d * 0.7, 0.006, 2).moved(x + thick / 2, h * k / rows + 0.02 + high / 2, 0.03),
-                    spines[rng.integers(4)],
-                )
-            x += thick + 0.005
-    return a
-
-
-def chest(rng) -> Assembly:
-    """Box, crate, treasure chest, gift, suitcase."""
+def chest(rng: np.random.Generator) -> Assembly:
+    """Make a crate, treasure chest, gift, suitcase or cardboard box."""
     a = Assembly()
     w, h, d = rng.uniform(0.7, 1.2), rng.uniform(0.45, 0.9), rng.uniform(0.5, 0.9)
     kind, finish = rng.integers(5), tiles.pick(rng, ["wood", "any", "cloth", "paint"][rng.integers(4)])
@@ -201,15 +52,15 @@ def chest(rng) -> Assembly:
             .moved(w / 2, h, 0)
         )
         a.add(lid, finish)
-        for x in (-w * 0.35, 0, w * 0.35):
+        for hoop in (-w * 0.35, 0, w * 0.35):
             a.add(
                 loft(refined([(0, 0), (1, 0), (1, 1), (0, 1)], 0.3), circle(40), boxed=True)
                 .scaled(d / 2 + 0.015, 0.07, d / 2 + 0.015)
                 .turned("z", 90)
-                .moved(x + 0.035, h, 0),
+                .moved(hoop + 0.035, h, 0),
                 trim,
             )
-            a.add(box(0.07, h, d + 0.03, 0.006).moved(x, h / 2 + 0.01, 0), trim)
+            a.add(box(0.07, h, d + 0.03, 0.006).moved(hoop, h / 2 + 0.01, 0), trim)
         a.add(box(0.16, 0.18, 0.07, 0.02).moved(0, h, d / 2 + 0.02), finishes.metal(rng))
     elif kind == 2:  # gift with ribbon and bow
         a.add(box(w + 0.02, h + 0.02, 0.12, 0.01).moved(y=h / 2), trim)
@@ -243,8 +94,8 @@ def chest(rng) -> Assembly:
     return a
 
 
-def carton(rng) -> Assembly:
-    """Milk carton: a box with a gable, a fin and a cap; printed sides."""
+def carton(rng: np.random.Generator) -> Assembly:
+    """Make a milk carton: a box with printed sides, a gable top and perhaps a cap."""
     a, paper = Assembly(), tiles.pick(rng, "any")
     w, h = rng.uniform(0.45, 0.65), rng.uniform(0.7, 1.1)
     a.add(box(w, h, w, 0.012, 10).moved(y=h / 2), paper)
@@ -261,12 +112,12 @@ def carton(rng) -> Assembly:
     return a
 
 
-def books(rng) -> Assembly:
-    """Return a stack or row of books."""
+def books(rng: np.random.Generator) -> Assembly:
+    """Make a stack of one to five books."""
     a, y = Assembly(), 0.0
     for _ in range(int(rng.integers(1, 6))):
         w, d, thick, turn = rng.uniform(0.6, 0.9), rng.uniform(0.8, 1.1), rng.uniform(0.09, 0.25), rng.normal(0, 12)
-        cover, page = tiles.pick(rng, "cloth"), finishes.matte(rng, finishes.hsv(0.12, 0.12, 0.92))
+        cover, page = tiles.pick(rng, "cloth"), finishes.matte(rng, colors.hsv(0.12, 0.12, 0.92))
         for part, finish in (
             (box(w, 0.03, d, 0.008).moved(y=thick), cover),
             (box(w, 0.03, d, 0.008), cover),
@@ -279,10 +130,10 @@ def books(rng) -> Assembly:
     return a
 
 
-def extinguisher(rng) -> Assembly:
-    """Bottle with valve, lever, hose and label: an extinguisher, flask or gas bottle."""
+def extinguisher(rng: np.random.Generator) -> Assembly:
+    """Make a fire extinguisher or gas bottle: body, valve, lever, hose, label."""
     a, h, r = Assembly(), rng.uniform(1.0, 1.4), rng.uniform(0.24, 0.34)
-    body = tiles.pick(rng, "paint", finishes.hsv(rng.choice([0.0, 0.0, 0.1, 0.35, 0.6]), 0.85, 0.75))
+    body = tiles.pick(rng, "paint", colors.hsv(rng.choice([0.0, 0.0, 0.1, 0.35, 0.6]), 0.85, 0.75))
     t = np.linspace(0, np.pi / 2, 10)
     curve = np.vstack(
         [
@@ -308,8 +159,8 @@ def extinguisher(rng) -> Assembly:
     return a
 
 
-def clock(rng) -> Assembly:
-    """Alarm clock, mirror or camera-like round front on a case."""
+def clock(rng: np.random.Generator) -> Assembly:
+    """Make an alarm clock or wall clock: a round face on a case."""
     a, r = Assembly(), rng.uniform(0.4, 0.55)
     case, rim = tiles.pick(rng, "paint"), tiles.pick(rng, "metal")
     depth = rng.uniform(0.2, 0.4)
@@ -319,7 +170,7 @@ def clock(rng) -> Assembly:
         a.add(box(2.3 * r, 2.3 * r, depth, 0.06).moved(y=r), case)
     a.add(
         cylinder(r * 0.88, 0.06, 0.01, 56).turned("x", 90).moved(0, r, depth / 2),
-        finishes.matte(rng, finishes.hsv(0.12, rng.uniform(0, 0.2), rng.uniform(0.75, 0.97))),
+        finishes.matte(rng, colors.hsv(0.12, rng.uniform(0, 0.2), rng.uniform(0.75, 0.97))),
     )
     w = 2 * np.pi * np.arange(56) / 56
     a.add(
@@ -354,8 +205,8 @@ def clock(rng) -> Assembly:
     return a
 
 
-def tool(rng) -> Assembly:
-    """Hammer, sword, axe, brush or spoon, standing upright."""
+def tool(rng: np.random.Generator) -> Assembly:
+    """Make a hammer, sword, axe or spoon that stands upright."""
     a, handle, head = Assembly(), tiles.pick(rng, "wood"), tiles.pick(rng, "metal")
     length, kind = rng.uniform(0.9, 1.3), rng.integers(4)
     t = np.linspace(0, 1, 14)

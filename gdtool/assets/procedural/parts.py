@@ -1,4 +1,4 @@
-"""Closed triangle parts from grids of points: lathes, extrusions, boxes, balls, tubes, and how to place them."""
+"""Build closed triangle parts from grids of points (lathes, extrusions, boxes, balls, tubes) and transform them."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 @dataclass(frozen=True)
 class Part:
-    """One closed surface. vertices (v, 3) and unit normals (v, 3), outward; faces (f, 3) counter-clockwise from
-    outside.
+    """Hold one closed surface: vertices (v, 3), outward unit normals (v, 3), faces (f, 3) of outward winding.
 
-    Vertices are doubled along creases and texture seams; welded by position, every edge has exactly two faces.
-    uv (v, 2): along the grid in [0, 1] when `extent` is given (the length of one unit of u and of v), otherwise a box
-    projection in the part's own length units.
+    Vertices are doubled along creases and texture seams. Welded by position, every edge has exactly two faces.
+    uv (v, 2) runs along the grid in [0, 1] where `extent` is given, the lengths that one unit of u and of v stands for.
+    Without extent it is a box projection in the part's own unit of length.
     """
 
     vertices: np.ndarray
@@ -25,11 +25,11 @@ class Part:
     extent: tuple[float, float] | None = None
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Part:
-        """Return the part moved by (x, y, z)."""
+        """Translate the part by (x, y, z)."""
         return replace(self, vertices=self.vertices + np.array([x, y, z], float))
 
     def scaled(self, x: float, y: float | None = None, z: float | None = None) -> Part:
-        """Scaled about the origin; one number scales all axes, a negative one mirrors."""
+        """Scale the part about the origin; x alone scales all axes, a negative factor mirrors."""
         factors = np.array([x, x if y is None else y, x if z is None else z], float)
         faces = self.faces if np.prod(factors) > 0 else self.faces[:, ::-1]
         mean = float(np.abs(factors).mean())
@@ -45,31 +45,31 @@ class Part:
         )
 
     def turned(self, axis: str, degrees: float) -> Part:
-        """Rotated about the origin, right-handed, axis "x", "y" or "z"."""
+        """Rotate the part about the origin, right-handed about axis "x", "y" or "z"."""
         matrix = rotation(axis, degrees)
         return replace(self, vertices=product(self.vertices, matrix), normals=product(self.normals, matrix))
 
     def mirrored(self) -> Part:
-        """Return the other hand: x negated."""
+        """Mirror the part in x."""
         return self.scaled(-1.0, 1.0, 1.0)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) scaled to length 1; a zero vector stays zero."""
+    """Scale vectors (..., 3) to length 1; a zero vector stays zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.maximum(length, 1e-30)
 
 
 def product(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """points (n, 3) by matrix (k, 3) transposed -> (n, k), or by a vector (3,) -> (n,).
+    """Multiply points (n, 3) by a transposed matrix (k, 3), giving (n, k), or by a vector (3,), giving (n,).
 
-    Not by BLAS: its last bits depend on the number of threads, and a seed's object must not.
+    einsum instead of BLAS: the last bits of BLAS depend on the number of threads, and a seed's object must not.
     """
     return np.einsum("ij,kj->ik" if matrix.ndim == 2 else "ij,j->i", points, matrix)
 
 
 def rotation(axis: str, degrees: float) -> np.ndarray:
-    """3x3 right-handed rotation about one coordinate axis."""
+    """Compute the right-handed rotation matrix (3, 3) about a coordinate axis."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3
@@ -79,14 +79,17 @@ def rotation(axis: str, degrees: float) -> np.ndarray:
 
 
 def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Volume inside closed faces, positive when they wind counter-clockwise seen from outside."""
+    """Compute the volume inside closed faces, positive where they wind counter-clockwise seen from outside."""
     a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
 
 def _crease_flags(quads: np.ndarray, axis: int, wraps: bool, cosine: float) -> np.ndarray:
-    """Which grid lines across `axis` are sharp: the median angle of the quads on both sides; open ends count as
-    sharp."""
+    """Find the sharp grid lines across an axis: where the median angle between the quads of both sides is large.
+
+    quads: area vectors (rows, columns, 3). wraps: the grid closes along the axis; open ends count as sharp.
+    cosine: of the angle from which a line is sharp.
+    """
     normals = unit(quads)
     cosines = np.einsum("...i,...i->...", normals, np.roll(normals, 1, axis))
     area = np.linalg.norm(quads, axis=-1)
@@ -104,11 +107,11 @@ def _crease_flags(quads: np.ndarray, axis: int, wraps: bool, cosine: float) -> n
 
 
 def grid_part(points: np.ndarray, closed: bool = False, crease_degrees: float = 38.0, boxed: bool = False) -> Part:
-    """Return the closed surface through a grid of points (rows, columns, 3); columns wrap around, rows too when
-    `closed`.
+    """Make the closed surface through a grid of points (rows, columns, 3).
 
-    An open grid must begin and end in a row of coincident points (a pole). Grid lines that bend by more than
-    `crease_degrees` get separate normals. `boxed` chooses box-projected texture coordinates instead of the grid's own.
+    Columns wrap around, and rows do where `closed`. An open grid must begin and end in a row of coincident points, a
+    pole. Grid lines that bend by more than `crease_degrees` get separate normals. boxed: use box-projected texture
+    coordinates instead of the grid's own.
     """
     row_count, columns = points.shape[:2]
     strips = row_count if closed else row_count - 1
@@ -126,36 +129,39 @@ def grid_part(points: np.ndarray, closed: bool = False, crease_degrees: float = 
         if not closed and pole[row]:
             strip = by_row[side][0 if row == 0 else -1]
             total = strip.sum(axis=0)
-            if np.linalg.norm(total) > 0.7 * np.linalg.norm(strip, axis=1).sum():  # a pointed tip keeps its own normals
+            if (
+                np.linalg.norm(total) > 0.7 * np.linalg.norm(strip, axis=1).sum()
+            ):  # a pointed tip keeps separate normals
                 strip[:] = total
     keep_left, keep_right = ~sharp_column[:-1, None], ~sharp_column[1:, None]
 
+    # A vertex of the part for each grid point and side of a crease (key); corners of a quad in the order of `corners`.
+    corners = ((0, 0), (0, 1), (1, 1), (1, 0))
     rows, cols = np.meshgrid(np.arange(strips), np.arange(columns), indexing="ij")
-    keys, normals, where, welded = [], [], [], []
-    for up, right in ((0, 0), (0, 1), (1, 1), (1, 0)):
+    corner_keys, corner_normals, corner_points, corner_welded = [], [], [], []
+    for up, right in corners:
         strip = by_row[up]
         keep, shift = (keep_right, -1) if right else (keep_left, 1)
-        normals.append(strip + keep * np.roll(strip, shift, 1))
+        corner_normals.append(strip + keep * np.roll(strip, shift, 1))
         r, c = rows + up, cols + right
         row_key = 2 * r + (sharp_row[r] & (up == 0))
         column_key = 2 * c + (sharp_column[c] & (right == 0))
-        keys.append(row_key * (2 * columns + 3) + column_key)
-        where.append(np.stack([r, c], -1))
+        corner_keys.append(row_key * (2 * columns + 3) + column_key)
+        corner_points.append(np.stack([r, c], -1))
         wrapped = r % row_count
-        welded.append(np.where(pole[wrapped], wrapped * columns, wrapped * columns + c % columns))
-    keys, first, inverse = np.unique(np.stack(keys).reshape(-1), return_index=True, return_inverse=True)
+        corner_welded.append(np.where(pole[wrapped], wrapped * columns, wrapped * columns + c % columns))
+    _, first, inverse = np.unique(np.stack(corner_keys).reshape(-1), return_index=True, return_inverse=True)
     corner = inverse.reshape(4, strips, columns)
-    place = np.stack(where).reshape(-1, 2)[first]
+    place = np.stack(corner_points).reshape(-1, 2)[first]
     vertices = points[place[:, 0] % row_count, place[:, 1] % columns]
-    normals = unit(np.stack(normals).reshape(-1, 3)[first])
+    normals = unit(np.stack(corner_normals).reshape(-1, 3)[first])
 
-    welded = np.stack(welded)
-    faces = []
+    triangles = []
     for triangle in ((0, 1, 2), (0, 2, 3)):
-        corners = [welded[i] for i in triangle]
-        real = (corners[0] != corners[1]) & (corners[1] != corners[2]) & (corners[2] != corners[0])
-        faces.append(np.stack([corner[i][real] for i in triangle], -1))
-    faces = np.concatenate(faces).astype(np.int32)
+        a, b, c = (corner_welded[i] for i in triangle)
+        has_area = (a != b) & (b != c) & (c != a)  # at a pole, one triangle of a quad has none
+        triangles.append(np.stack([corner[i][has_area] for i in triangle], -1))
+    faces = np.concatenate(triangles).astype(np.int32)
 
     length_u = np.linalg.norm(np.diff(points[:, np.r_[0:columns, 0]], axis=1), axis=-1)
     widest = length_u[length_u.sum(axis=1).argmax()]
@@ -172,8 +178,7 @@ def grid_part(points: np.ndarray, closed: bool = False, crease_degrees: float = 
 
 
 def box_projected(part: Part) -> Part:
-    """Return the part with texture coordinates projected along each face's dominant axis, vertices doubled at the
-    seams."""
+    """Project texture coordinates along each face's dominant axis, with vertices doubled at the seams."""
     corners = part.vertices[part.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     axis = np.abs(normal).argmax(axis=1)
@@ -192,28 +197,27 @@ def box_projected(part: Part) -> Part:
 
 
 def circle(count: int = 40) -> np.ndarray:
-    """Return unit circle (count, 2) as outline for `loft`."""
+    """Make a unit circle (count, 2) as an outline for `loft`."""
     angle = 2 * np.pi * np.arange(count) / count
     return np.stack([np.cos(angle), np.sin(angle)], -1)
 
 
 def rectangle(width: float, depth: float, subdivisions: int = 6) -> np.ndarray:
-    """Outline (n, 2) of a rectangle about the origin; its sides are subdivided so that patterns have vertices to live
-    on."""
+    """Make the outline (n, 2) of a rectangle about the origin; sides are subdivided: field finishes need vertices."""
     corners = 0.5 * np.array([[width, -depth], [width, depth], [-width, depth], [-width, -depth]])
     return subdivided(corners, subdivisions)
 
 
 def subdivided(corners: np.ndarray, subdivisions: int) -> np.ndarray:
-    """Outline (n * subdivisions, 2) with each side of a polygon (n, 2) cut into equal pieces."""
+    """Cut each side of a polygon (n, 2) into equal pieces, giving (n * subdivisions, 2)."""
     t = np.arange(subdivisions)[None, :, None] / subdivisions
     return (corners[:, None] * (1 - t) + np.roll(corners, -1, 0)[:, None] * t).reshape(-1, 2)
 
 
 def _miter(outline: np.ndarray) -> np.ndarray:
-    """Per outline point the vector that moves its two sides outward by one unit.
+    """Compute for each point of an outline (n, 2) the vector that moves its two sides outward by one unit.
 
-    Points inside a straight side take their share of both ends' vectors, so that no point overtakes a corner.
+    Points inside a straight side interpolate the vectors of both its ends, so that no point overtakes a corner.
     """
     step = np.roll(outline, -1, 0) - outline
     length = np.maximum(np.linalg.norm(step, axis=1), 1e-12)
@@ -236,9 +240,10 @@ def loft(
     boxed: bool = False,
     twist_degrees: float = 0.0,
 ) -> Part:
-    """Return an outline (n, 2) in x and z carried up a profile of rows (scale, height) or (scale, height, inset).
+    """Sweep an outline (n, 2), in x and z, up a profile of rows (scale, height) or (scale, height, inset).
 
-    The first and the last row must have scale 0. inset moves the outline's sides inward by a length (bevels).
+    The first and the last row must have scale 0. inset moves the outline's sides inward by a length, for bevels. boxed,
+    crease_degrees: as in `grid_part`. twist_degrees: rotation about y from the first height to the last.
     """
     profile = np.asarray(profile, float)
     profile = profile[np.r_[True, np.abs(np.diff(profile, axis=0)).max(axis=1) > 1e-9]]  # a doubled row has no faces
@@ -252,28 +257,27 @@ def loft(
     return grid_part(np.stack([flat[..., 0], height, flat[..., 1]], -1), crease_degrees=crease_degrees, boxed=boxed)
 
 
-def refined(profile: np.ndarray, step: float) -> np.ndarray:
-    """Return the polyline (k, c) with extra rows so that no piece is longer than `step` in its first two columns."""
-    profile = np.asarray(profile, float)
-    rows = [profile[:1]]
-    for a, b in itertools.pairwise(profile):
+def refined(profile: ArrayLike, step: float) -> np.ndarray:
+    """Add rows to a polyline (k, c) until no piece is longer than `step` in its first two columns."""
+    points = np.asarray(profile, float)
+    rows = [points[:1]]
+    for a, b in itertools.pairwise(points):
         pieces = max(1, int(np.ceil(np.hypot(*(b - a)[:2]) / step)))
         rows.append(a + (b - a) * (np.arange(1, pieces + 1) / pieces)[:, None])
     return np.concatenate(rows)
 
 
-def smooth_curve(knots: np.ndarray, count: int) -> np.ndarray:
-    """Points (count, c) of the shape-preserving cubic (PCHIP) through knots (k, c), by chord length."""
+def smooth_curve(knots: ArrayLike, count: int) -> np.ndarray:
+    """Sample `count` points (count, c) of the shape-preserving cubic (PCHIP, by chord length) through knots (k, c)."""
     from scipy.interpolate import PchipInterpolator
 
-    knots = np.asarray(knots, float)
-    chord = np.r_[0.0, np.cumsum(np.maximum(np.linalg.norm(np.diff(knots, axis=0), axis=1), 1e-6))]
-    return PchipInterpolator(chord, knots)(np.linspace(0, chord[-1], count))
+    points = np.asarray(knots, float)
+    chord = np.r_[0.0, np.cumsum(np.maximum(np.linalg.norm(np.diff(points, axis=0), axis=1), 1e-6))]
+    return PchipInterpolator(chord, points)(np.linspace(0, chord[-1], count))
 
 
 def extrusion(outline: np.ndarray, height: float, bevel: float = 0.02, rows: int = 6) -> Part:
-    """Return an outline about the origin from y = 0 to `height` with bevelled rims; box-projected texture
-    coordinates."""
+    """Extrude an outline about the origin from y = 0 to `height`, with bevelled rims and box-projected UVs."""
     bevel = min(bevel, 0.45 * height, 0.4 * float(np.linalg.norm(outline, axis=1).min()))
     wall = [(1.0, y, 0.0) for y in np.linspace(bevel, height - bevel, rows)]
     caps = np.array([0.0, 0.3, 0.6])
@@ -283,7 +287,7 @@ def extrusion(outline: np.ndarray, height: float, bevel: float = 0.02, rows: int
 
 
 def box(width: float, height: float, depth: float, bevel: float = 0.02, subdivisions: int = 6) -> Part:
-    """Return a bevelled box about the origin."""
+    """Make a bevelled box about the origin."""
     part = extrusion(rectangle(width, depth, subdivisions), height, min(bevel, 0.2 * min(width, height, depth)))
     return part.moved(y=-height / 2)
 
@@ -291,7 +295,7 @@ def box(width: float, height: float, depth: float, bevel: float = 0.02, subdivis
 def cylinder(
     radius: float, height: float, bevel: float = 0.02, count: int = 36, top_radius: float | None = None
 ) -> Part:
-    """Return a bevelled cylinder or truncated cone about the origin, along y."""
+    """Make a bevelled cylinder or truncated cone about the origin, along y."""
     top = radius if top_radius is None else top_radius
     bevel = min(bevel, 0.3 * min(radius, max(top, 1e-3)), 0.3 * height)
     h = height / 2
@@ -303,7 +307,7 @@ def cylinder(
 
 
 def ball(rx: float, ry: float | None = None, rz: float | None = None, count: int = 32) -> Part:
-    """Return an ellipsoid about the origin."""
+    """Make an ellipsoid about the origin; radii that are not given equal rx."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, count // 2 + 1)
     profile = np.stack([np.cos(angle), np.sin(angle)], -1)
     profile[[0, -1], 0] = 0
@@ -311,27 +315,29 @@ def ball(rx: float, ry: float | None = None, rz: float | None = None, count: int
 
 
 def cone(radius: float, height: float, count: int = 32) -> Part:
-    """Return a cone from y = 0 to `height`, its foot slightly rounded."""
+    """Make a cone from y = 0 to `height`, its foot slightly rounded."""
     profile = refined([(0, 0), (0.97 * radius, 0), (radius, 0.03 * height), (0, height)], height / 8)
     return loft(profile, circle(count))
 
 
 def tube(path: np.ndarray, radius: float | np.ndarray, closed: bool = False, outline: np.ndarray | None = None) -> Part:
-    """Return a tube of radius (k,) or one number along points (k, 3); open ends are rounded off. Parallel-transported
-    frame."""
+    """Sweep an outline, a circle by default, along a path (k, 3), scaled by a radius or radii (k,).
+
+    The frame is parallel-transported. Open ends are rounded off; a closed path must not repeat its first point.
+    """
     path = np.asarray(path, float)
     outline = circle(16) if outline is None else outline
-    radius = np.broadcast_to(np.asarray(radius, float), len(path)).copy()
+    radii = np.broadcast_to(np.asarray(radius, float), len(path)).copy()
     ahead = np.roll(path, -1, 0) if closed else np.vstack([path[1:], 2 * path[-1] - path[-2]])
     behind = np.roll(path, 1, 0) if closed else np.vstack([2 * path[0] - path[1], path[:-1]])
     tangents = unit(ahead - behind)
     side = unit(np.cross(tangents[0], np.eye(3)[np.abs(tangents[0]).argmin()]))
-    sides = []
+    transported = []
     for tangent in tangents:
         side = unit(side - tangent * (side @ tangent))
-        sides.append(side)
-    sides = np.array(sides)
-    if closed:  # spread the frame's holonomy over the loop so that the ends meet
+        transported.append(side)
+    sides = np.array(transported)
+    if closed:  # the frame returns rotated to the start; spread that angle over the loop so that the ends meet
         last = unit(sides[-1] - tangents[0] * (sides[-1] @ tangents[0]))
         angle = np.arctan2(np.cross(sides[0], last) @ tangents[0], sides[0] @ last)
         share = -angle * np.arange(len(path)) / len(path)
@@ -339,11 +345,11 @@ def tube(path: np.ndarray, radius: float | np.ndarray, closed: bool = False, out
     ups = np.cross(tangents, sides)
     if not closed:
         bend = np.radians([0, 30, 60])
-        head = path[0] - tangents[0] * radius[0] * np.cos(bend)[:, None] * 0.8
-        tail = path[-1] + tangents[-1] * radius[-1] * np.cos(bend[::-1])[:, None] * 0.8
-        radius = np.r_[radius[0] * np.sin(bend), radius, radius[-1] * np.sin(bend[::-1])]
+        head = path[0] - tangents[0] * radii[0] * np.cos(bend)[:, None] * 0.8
+        tail = path[-1] + tangents[-1] * radii[-1] * np.cos(bend[::-1])[:, None] * 0.8
+        radii = np.r_[radii[0] * np.sin(bend), radii, radii[-1] * np.sin(bend[::-1])]
         path = np.vstack([head, path, tail])
         sides = np.vstack([np.repeat(sides[:1], 3, 0), sides, np.repeat(sides[-1:], 3, 0)])
         ups = np.vstack([np.repeat(ups[:1], 3, 0), ups, np.repeat(ups[-1:], 3, 0)])
     spread = outline[None, :, 0, None] * sides[:, None] + outline[None, :, 1, None] * ups[:, None]
-    return grid_part(path[:, None] + radius[:, None, None] * spread, closed=closed)
+    return grid_part(path[:, None] + radii[:, None, None] * spread, closed=closed)

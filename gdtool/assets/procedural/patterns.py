@@ -1,19 +1,22 @@
-"""Patterns: random smooth fields over points in space, and square height and label images that tile."""
+"""Draw patterns: smooth random fields over points in space, and square tiling images of heights and labels."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from gdtool.assets.procedural.parts import product
 
+Field = Callable[[np.ndarray], np.ndarray]  # a function of points (n, 3)
 
-def noise_field(rng: np.random.Generator, frequency: float, octaves: float = 2.0, waves: int = 28) -> Callable:
-    """Return a smooth random function of points (n, 3), about unit variance: a sum of sines from `frequency` up by
-    `octaves`.
 
-    frequency in cycles per unit length; higher waves are weaker in proportion.
+def noise_field(rng: np.random.Generator, frequency: float, octaves: float = 2.0, waves: int = 28) -> Field:
+    """Draw a smooth random function of points (n, 3), of about unit variance: a sum of `waves` sines.
+
+    Their frequencies, in cycles per unit length, lie within `octaves` above `frequency`; higher ones are weaker in
+    proportion.
     """
     direction = rng.normal(size=(waves, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -25,9 +28,8 @@ def noise_field(rng: np.random.Generator, frequency: float, octaves: float = 2.0
     return lambda points: product(np.sin(product(points.astype(np.float32), vectors) + phase), weight)
 
 
-def cell_field(rng: np.random.Generator, count: int) -> Callable:
-    """Distances (n, 2) from points in the unit box about the origin to the nearest and second nearest of random
-    sites."""
+def cell_field(rng: np.random.Generator, count: int) -> Field:
+    """Draw random sites in the unit box; returns a function of points (n, 3): distances (n, 2) to the nearest two."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(rng.uniform(-0.55, 0.55, (count, 3)))
@@ -35,16 +37,19 @@ def cell_field(rng: np.random.Generator, count: int) -> Callable:
 
 
 def tile_grid(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """u to the right and v downward (size, size), texel centres in (0, 1)."""
+    """Return u, to the right, and v, downward, of the texel centres of a tile: each (size, size) in (0, 1)."""
     axis = (np.arange(size) + 0.5) / size
-    return np.meshgrid(axis, axis)
+    u, v = np.meshgrid(axis, axis)
+    return u, v
 
 
 def tile_noise(
     rng: np.random.Generator, size: int, low: float = 2, high: float = 64, slope: float = 1.5, stretch: float = 1.0
 ) -> np.ndarray:
-    """Tiling noise (size, size), unit variance, power between `low` and `high` cycles per tile; stretch > 1: streaks
-    along u."""
+    """Draw tiling noise (size, size) of unit variance, with power between `low` and `high` cycles per tile.
+
+    slope: the exponent by which amplitude falls with frequency. stretch > 1 draws streaks along u.
+    """
     fy, fx = np.fft.fftfreq(size, 1 / size)[:, None], np.fft.rfftfreq(size, 1 / size)[None]
     frequency = np.hypot(fx * stretch, fy)
     gain = np.where((frequency >= low) & (frequency <= high), np.maximum(frequency, 1e-9) ** -slope, 0)
@@ -53,19 +58,26 @@ def tile_noise(
     return image / max(image.std(), 1e-12)
 
 
-def tile_cells(rng: np.random.Generator, size: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Tiling Voronoi cells: distance to the nearest and to the second nearest site, index of the nearest (size,
-    size)."""
+class TileCells(NamedTuple):
+    """Hold Voronoi cells, each (size, size): distances to the nearest and second nearest site, index of the nearest."""
+
+    nearest: np.ndarray
+    second: np.ndarray
+    site: np.ndarray
+
+
+def tile_cells(rng: np.random.Generator, size: int, count: int) -> TileCells:
+    """Draw tiling Voronoi cells of `count` random sites."""
     from scipy.spatial import cKDTree
 
     u, v = tile_grid(size)
     sites = rng.uniform(0, 1, (count, 2)) % 1.0
     distance, index = cKDTree(sites, boxsize=1).query(np.stack([u, v], -1).reshape(-1, 2), k=2)
-    return distance[:, 0].reshape(size, size), distance[:, 1].reshape(size, size), index[:, 0].reshape(size, size)
+    return TileCells(*(column.reshape(size, size) for column in (distance[:, 0], distance[:, 1], index[:, 0])))
 
 
 def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
-    """0 below low, 1 above high, cubic between."""
+    """Rise from 0 at `low` to 1 at `high` by a cubic."""
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)
 
@@ -73,7 +85,11 @@ def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
 def brick_cells(
     rng: np.random.Generator, size: int, rows: int, columns: int, gap: float, shift: float = 0.5, bevel: float = 0.06
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Running-bond bricks: height (size, size) in [0, 1] (0 in the joints) and a random shade per brick in [-1, 1]."""
+    """Draw running-bond bricks: height (size, size) in [0, 1], 0 in the joints, and a shade in [-1, 1] for each brick.
+
+    gap: half the width of a joint; bevel: the width of a brick's rim; both in units of a row's height. shift: of every
+    second row, in bricks.
+    """
     u, v = tile_grid(size)
     row = np.floor(v * rows).astype(int)
     across = u * columns + shift * (row % 2)
@@ -85,7 +101,7 @@ def brick_cells(
 
 
 def scratch_lines(rng: np.random.Generator, size: int, count: int) -> np.ndarray:
-    """Thin straight scratches (size, size) in [0, 1] that wrap around the tile."""
+    """Draw straight scratches (size, size), one texel wide, of strengths in [0, 1], that wrap around the tile."""
     image = np.zeros((size, size), np.float32)
     for _ in range(count):
         length, angle = rng.uniform(0.05, 0.4), rng.uniform(0, np.pi)
@@ -98,9 +114,10 @@ def scratch_lines(rng: np.random.Generator, size: int, count: int) -> np.ndarray
 
 
 def normal_from_height(height: np.ndarray, strength: float) -> np.ndarray:
-    """Tangent-space normal map (size, size, 3) uint8 of a tiling height; strength = height range over the tile's side.
+    """Compute the tangent-space normal map (size, size, 3) uint8 of a tiling height map.
 
-    glTF convention: X toward increasing u (right), Y toward the top of the image.
+    strength: what a height of 1 is in units of the tile's side. glTF convention: X toward increasing u (right), Y
+    toward the top of the image.
     """
     size = height.shape[0]
     slope_u = (np.roll(height, -1, 1) - np.roll(height, 1, 1)) * (0.5 * size * strength)

@@ -1,28 +1,39 @@
-"""Finishes of tiled images on the first UV set, most with a normal map, and the choice of a finish by theme."""
+"""Define finishes of tiled images on the first UV set, most with a normal map, and draw finishes by theme."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from gdtool.assets.procedural import finishes, patterns
-from gdtool.assets.procedural.finishes import Finish, Look, any_color, any_metal, hsv, near_color
+from gdtool.assets.procedural.colors import any_color, any_metal, hsv, near_color
+from gdtool.assets.procedural.finishes import Finish, Look
 
-SIZE = 256
+SIZE = 256  # pixels along a side of a tile
 
 
-def _tiled(name: str, color, metallic, roughness, height, strength: float, tiles: float) -> Finish:
+def _tiled(
+    name: str,
+    color: np.ndarray,
+    metallic: float,
+    roughness: np.ndarray,
+    height: np.ndarray | None,
+    strength: float,
+    tiles: float,
+) -> Finish:
+    """Make a finish of tiling maps; strength: the range of heights in units of a tile's side; tiles per unit length."""
     normal = None if height is None else patterns.normal_from_height(height, strength)
     roughness = np.broadcast_to(np.clip(roughness, 0.04, 1), (SIZE, SIZE))
-    material = finishes._material(name, np.clip(color, 0, 1), metallic, roughness, 0, "repeat", normal)
+    material = finishes.textured_material(name, np.clip(color, 0, 1), metallic, roughness, 0, "repeat", normal)
     return lambda shape: Look(material, None, tiles)
 
 
-def _mix(a, b, weight: np.ndarray) -> np.ndarray:
+def _mix(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Blend two colours or images by a weight (h, w)."""
     return np.asarray(a) * (1 - weight[..., None]) + np.asarray(b) * weight[..., None]
 
 
-def bricks(rng, color=None) -> Finish:
-    """Bricks, ashlar or tiles with joints."""
+def bricks(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw bricks, ashlar or tiles with joints."""
     color = hsv(rng.uniform(0.0, 0.1), rng.uniform(0.1, 0.7), rng.uniform(0.35, 0.8)) if color is None else color
     rows, columns = [(6, 3), (8, 4), (4, 4), (5, 3)][rng.integers(4)]
     shift = 0.0 if rows == columns else 0.5
@@ -37,8 +48,8 @@ def bricks(rng, color=None) -> Finish:
     )
 
 
-def planks(rng, color=None) -> Finish:
-    """Boards side by side with grain along u or v."""
+def planks(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw boards side by side, their grain along u or v."""
     color = hsv(rng.uniform(0.04, 0.11), rng.uniform(0.3, 0.7), rng.uniform(0.3, 0.8)) if color is None else color
     height, shade = patterns.brick_cells(rng, SIZE, int(rng.integers(3, 7)), 1, 0.015, rng.uniform(0.2, 0.8), 0.03)
     grain = patterns.tile_noise(rng, SIZE, 3, 120, 1.0, stretch=9)
@@ -50,8 +61,8 @@ def planks(rng, color=None) -> Finish:
     return _tiled("planks", image, 0.0, roughness, relief, 0.012, rng.uniform(1.0, 2.5))
 
 
-def shingles(rng, color=None) -> Finish:
-    """Overlapping rounded tiles: roofs, scales, feathers."""
+def shingles(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw overlapping rounded tiles: roofs, scales, feathers."""
     color = any_color(rng) if color is None else color
     rows = 2 * int(rng.integers(3, 6))
     columns = rows // 2 + int(rng.integers(0, 3))
@@ -72,8 +83,8 @@ def shingles(rng, color=None) -> Finish:
     )
 
 
-def woven(rng, color=None) -> Finish:
-    """Cloth, wicker or carbon fibre: threads over and under."""
+def woven(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw cloth, wicker or carbon fibre: threads that pass over and under each other."""
     color = any_color(rng) if color is None else color
     other = near_color(rng, color, 0.4) if rng.uniform() < 0.6 else any_color(rng)
     count = 2 * int(rng.integers(5, 14))
@@ -89,8 +100,8 @@ def woven(rng, color=None) -> Finish:
     )
 
 
-def tartan(rng, color=None) -> Finish:
-    """Crossing stripes of cloth or paper."""
+def tartan(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw the crossing stripes of cloth or paper."""
     color = any_color(rng) if color is None else color
     u, v = patterns.tile_grid(SIZE)
     image = np.broadcast_to(color, (SIZE, SIZE, 3)).copy()
@@ -104,10 +115,10 @@ def tartan(rng, color=None) -> Finish:
     )
 
 
-def hammered(rng, color=None) -> Finish:
-    """Metal with dents."""
+def hammered(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw metal with dents."""
     color = any_metal(rng) if color is None else color
-    near, _, _ = patterns.tile_cells(rng, SIZE, int(rng.integers(40, 160)))
+    near = patterns.tile_cells(rng, SIZE, int(rng.integers(40, 160))).nearest
     roughness = rng.uniform(0.15, 0.4) + 0.04 * patterns.tile_noise(rng, SIZE, 4, 60)
     return _tiled(
         "hammered",
@@ -120,8 +131,8 @@ def hammered(rng, color=None) -> Finish:
     )
 
 
-def brushed(rng, color=None) -> Finish:
-    """Metal or lacquer with directional streaks, scratches and smudges."""
+def brushed(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw metal or lacquer with directional streaks, scratches and smudges."""
     is_metal = rng.uniform() < 0.7
     color = (any_metal(rng) if is_metal else any_color(rng)) if color is None else color
     streaks = patterns.tile_noise(rng, SIZE, 4, 128, 0.6, stretch=12)
@@ -132,12 +143,12 @@ def brushed(rng, color=None) -> Finish:
     return _tiled("brushed", image, float(is_metal), roughness, -scratches + 0.1 * streaks, 0.002, rng.uniform(0.8, 2))
 
 
-def grained(rng, color=None) -> Finish:
-    """Leather, plaster, bread crust, felt, rock: bumps with darker pits."""
+def grained(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw leather, plaster, crust, felt or rock: bumps with darker pits."""
     color = any_color(rng) if color is None else color
     if rng.uniform() < 0.5:
-        near, second, _ = patterns.tile_cells(rng, SIZE, int(rng.integers(150, 700)))
-        height = patterns.smoothstep(0, 0.03, second - near)
+        cells = patterns.tile_cells(rng, SIZE, int(rng.integers(150, 700)))
+        height = patterns.smoothstep(0, 0.03, cells.second - cells.nearest)
         strength = 0.004
     else:
         height = 0.5 + 0.2 * patterns.tile_noise(rng, SIZE, 3, 100, rng.uniform(1.0, 2.0))
@@ -147,8 +158,8 @@ def grained(rng, color=None) -> Finish:
     return _tiled("grained", image, 0.0, rng.uniform(0.5, 0.95) - 0.1 * height, height, strength, rng.uniform(0.8, 2))
 
 
-def dotted(rng, color=None) -> Finish:
-    """Polka dots or a terrazzo of chips."""
+def dotted(rng: np.random.Generator, color: np.ndarray | None = None) -> Finish:
+    """Draw polka dots or a terrazzo of chips."""
     color, other = any_color(rng) if color is None else color, any_color(rng)
     if rng.uniform() < 0.5:
         count = int(rng.integers(2, 6))
@@ -157,9 +168,10 @@ def dotted(rng, color=None) -> Finish:
         weight = 1 - patterns.smoothstep(-0.02, 0.02, distance - rng.uniform(0.15, 0.28))
         image = _mix(color, other, weight)
     else:
-        near, second, index = patterns.tile_cells(rng, SIZE, 90)
-        chips = np.array([any_color(rng) for _ in range(4)])[index % 4]
-        weight = patterns.smoothstep(0.015, 0.025, second - near) * (index % 3 > 0)
+        cells = patterns.tile_cells(rng, SIZE, 90)
+        chips = np.array([any_color(rng) for _ in range(4)])[cells.site % 4]
+        is_chip = (cells.site % 3 > 0).astype(float)
+        weight = patterns.smoothstep(0.015, 0.025, cells.second - cells.nearest) * is_chip
         image = _mix(color, chips, weight)
     roughness = np.clip(rng.uniform(0.1, 0.6) + 0.2 * weight * rng.uniform(-1, 1), 0.05, 1)
     return _tiled("dots", image, 0.0, roughness, None, 0, rng.uniform(1, 2.5))
@@ -243,10 +255,13 @@ THEMES = {
 
 
 def pick(rng: np.random.Generator, theme: str = "any", color: np.ndarray | None = None) -> Finish:
-    """Return a finish of the theme with its own random stream, so that its details do not shift later choices."""
+    """Draw a finish of a theme, in the given colour if any; metals keep a metal's colour.
+
+    The finish gets a random stream of its own, so that its details do not change what is drawn after it.
+    """
     choices = THEMES[theme]
     chosen = choices[rng.integers(len(choices))]
-    own = np.random.default_rng(rng.integers(2**62))
+    stream = np.random.default_rng(rng.integers(2**62))
     if color is not None and chosen in (finishes.metal, hammered, finishes.rusty):
         color = None  # a metal has a metal's colour
-    return chosen(own, color)
+    return chosen(stream, color)

@@ -1,17 +1,21 @@
-"""Turned and poured things: vases, bottles, cups, teapots, bowls, goblets, lamps, candles, jars, pots."""
+"""Make vessels and other turned objects: vases, bottles, cups, teapots, bowls, goblets, lamps, candles, barrels."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from gdtool.assets.procedural import finishes, tiles
+from gdtool.assets.procedural import colors, finishes, tiles
 from gdtool.assets.procedural.assembly import Assembly
 from gdtool.assets.procedural.parts import Part, ball, circle, cylinder, loft, refined, smooth_curve, tube
 
 
 def walled(outer: np.ndarray, thickness: float, segments: int = 48, outline: np.ndarray | None = None) -> Part:
-    """Return an open vessel: outer profile rows (radius, height) from the foot's axis to the rim, returned inside at
-    `thickness`."""
+    """Make an open vessel with a wall.
+
+    outer: its outer profile (k, 2) of radius and height, from the axis at the foot to the rim; the inner profile runs
+    back at a distance of `thickness`. outline: the cross section for `loft`, a circle of `segments` points by default.
+    """
     outer = np.asarray(outer, float)
     inner = outer[outer[:, 1] > outer[0, 1] + 1.5 * thickness]
     inner = np.stack([np.maximum(inner[:, 0] - thickness, 0.01), inner[:, 1]], -1)
@@ -21,7 +25,8 @@ def walled(outer: np.ndarray, thickness: float, segments: int = 48, outline: np.
     return loft(profile, circle(segments) if outline is None else outline)
 
 
-def _outline(rng, plain_share: float = 0.6) -> np.ndarray:
+def _outline(rng: np.random.Generator, plain_share: float = 0.6) -> np.ndarray:
+    """Draw a cross section for `loft`: a circle with probability `plain_share`, else one with lobes."""
     if rng.uniform() < plain_share:
         return circle(48)
     lobes, depth = int(rng.integers(4, 13)), rng.uniform(0.02, 0.1)
@@ -30,8 +35,10 @@ def _outline(rng, plain_share: float = 0.6) -> np.ndarray:
     return circle(96) * (1 - depth + depth * wave)[:, None]
 
 
-def body_curve(rng, height: float, foot: float, belly: float, neck: float, rim: float, count: int = 28) -> np.ndarray:
-    """Return a random vessel contour (count, 2) through foot, belly, neck and rim radii."""
+def body_curve(
+    rng: np.random.Generator, height: float, foot: float, belly: float, neck: float, rim: float, count: int = 28
+) -> np.ndarray:
+    """Draw a vessel's contour (2 + count, 2) of radius and height, through radii of foot, belly, neck and rim."""
     where = np.sort(rng.uniform([0.2, 0.65], [0.5, 0.88]))
     curve = smooth_curve(
         [(foot, 0.02 * height), (belly, where[0] * height), (neck, where[1] * height), (rim, height)], count
@@ -39,17 +46,18 @@ def body_curve(rng, height: float, foot: float, belly: float, neck: float, rim: 
     return np.vstack([(0, 0), (foot * 0.92, 0), curve])
 
 
-def _handle(rng, start, end, bulge: float, radius: float) -> Part:
-    start, end = np.asarray(start, float), np.asarray(end, float)
+def _handle(rng: np.random.Generator, start: ArrayLike, end: ArrayLike, bulge: float, radius: float) -> Part:
+    """Make a handle between two points that bulges by `bulge` in x."""
+    first, last = np.asarray(start, float), np.asarray(end, float)
     t = np.linspace(0, 1, 22)
     out = np.sin(np.pi * t) ** rng.uniform(0.5, 1.0)
-    path = start + (end - start) * t[:, None] + np.array([bulge, 0, 0]) * out[:, None]
+    path = first + (last - first) * t[:, None] + np.array([bulge, 0, 0]) * out[:, None]
     outline = circle(14) * np.array([1.0, rng.uniform(0.8, 1.8)])
     return tube(path, radius, outline=outline)
 
 
-def vase(rng) -> Assembly:
-    """Return a vase: a turned profile, perhaps with a pattern."""
+def vase(rng: np.random.Generator) -> Assembly:
+    """Make a vase, perhaps with handles and metal rims."""
     a, height = Assembly(), rng.uniform(0.9, 1.8)
     curve = body_curve(
         rng, height, rng.uniform(0.15, 0.35), rng.uniform(0.3, 0.6), rng.uniform(0.1, 0.3), rng.uniform(0.15, 0.42)
@@ -59,7 +67,7 @@ def vase(rng) -> Assembly:
     a.add(part, finish)
     if rng.uniform() < 0.35:
         y0, y1 = height * rng.uniform(0.4, 0.55), height * rng.uniform(0.75, 0.95)
-        r0, r1 = (np.interp(y, curve[2:, 1], curve[2:, 0]) - 0.02 for y in (y0, y1))
+        r0, r1 = (float(np.interp(y, curve[2:, 1], curve[2:, 0])) - 0.02 for y in (y0, y1))
         a.add_pair(_handle(rng, (r0, y0, 0), (r1, y1, 0), rng.uniform(0.1, 0.25), 0.035), finish)
     if rng.uniform() < 0.4:
         trim = tiles.pick(rng, "metal")
@@ -78,8 +86,8 @@ def vase(rng) -> Assembly:
     return a
 
 
-def bottle(rng) -> Assembly:
-    """Return a bottle with a cap."""
+def bottle(rng: np.random.Generator) -> Assembly:
+    """Make a bottle with a cap, perhaps with a label."""
     a, height, r = Assembly(), rng.uniform(1.2, 1.9), rng.uniform(0.22, 0.42)
     neck, shoulder = r * rng.uniform(0.25, 0.5), rng.uniform(0.5, 0.7)
     knots = [
@@ -102,8 +110,8 @@ def bottle(rng) -> Assembly:
     return a
 
 
-def cup(rng) -> Assembly:
-    """Return a cup with a handle."""
+def cup(rng: np.random.Generator) -> Assembly:
+    """Make a cup with a handle, perhaps with a drink and a saucer."""
     a, height = Assembly(), rng.uniform(0.7, 1.2)
     rim = rng.uniform(0.35, 0.5)
     foot = rim * rng.uniform(0.55, 1.0)
@@ -128,10 +136,10 @@ def cup(rng) -> Assembly:
         handle,
     )
     if rng.uniform() < 0.6:
-        inner = np.interp(height * 0.85, curve[2:, 1], curve[2:, 0]) - 0.03
+        inner = float(np.interp(height * 0.85, curve[2:, 1], curve[2:, 0])) - 0.03
         a.add(
             cylinder(inner, 0.03, count=48).moved(y=height * 0.85),
-            finishes.glossy(rng, finishes.hsv(rng.uniform(0.03, 0.12), 0.7, rng.uniform(0.15, 0.8))),
+            finishes.glossy(rng, colors.hsv(rng.uniform(0.03, 0.12), 0.7, rng.uniform(0.15, 0.8))),
         )
     if rng.uniform() < 0.3:
         r = rim * 1.7
@@ -145,8 +153,8 @@ def cup(rng) -> Assembly:
     return a
 
 
-def teapot(rng) -> Assembly:
-    """Spout to one side and handle to the other, or bail handle over the top (kettle)."""
+def teapot(rng: np.random.Generator) -> Assembly:
+    """Make a teapot with spout and handle, or a kettle with its handle over the top."""
     a = Assembly()
     height, r = rng.uniform(0.6, 1.0), rng.uniform(0.45, 0.6)
     top = r * rng.uniform(0.4, 0.7)
@@ -202,8 +210,8 @@ def teapot(rng) -> Assembly:
     return a
 
 
-def bowl(rng) -> Assembly:
-    """Return a bowl, perhaps with fruit."""
+def bowl(rng: np.random.Generator) -> Assembly:
+    """Make a bowl, perhaps with fruit."""
     a, height, rim = Assembly(), rng.uniform(0.25, 0.6), rng.uniform(0.5, 0.7)
     foot = rim * rng.uniform(0.3, 0.6)
     curve = np.vstack(
@@ -211,7 +219,7 @@ def bowl(rng) -> Assembly:
     )
     a.add(walled(curve, 0.04, outline=_outline(rng)), tiles.pick(rng, "ceramic" if rng.uniform() < 0.6 else "any"))
     fruit = [
-        tiles.pick(rng, "skin", finishes.hsv(h, 0.85, 0.85))
+        tiles.pick(rng, "skin", colors.hsv(h, 0.85, 0.85))
         for h in rng.choice([0.0, 0.02, 0.09, 0.15, 0.25, 0.3, 0.8], 3)
     ]
     for _ in range(int(rng.integers(0, 8))):
@@ -224,8 +232,8 @@ def bowl(rng) -> Assembly:
     return a
 
 
-def goblet(rng) -> Assembly:
-    """Return a goblet: bowl, stem, foot."""
+def goblet(rng: np.random.Generator) -> Assembly:
+    """Make a goblet: foot, stem, bowl."""
     a, height = Assembly(), rng.uniform(1.2, 1.8)
     base, stem, rim = rng.uniform(0.3, 0.42), rng.uniform(0.04, 0.09), rng.uniform(0.28, 0.45)
     knot = rng.uniform(0.35, 0.5) * height
@@ -250,8 +258,8 @@ def goblet(rng) -> Assembly:
     return a
 
 
-def lamp(rng) -> Assembly:
-    """Return a lamp: foot, stem, shade."""
+def lamp(rng: np.random.Generator) -> Assembly:
+    """Make a table lamp: foot, stem, shade."""
     a, stem = Assembly(), rng.uniform(0.7, 1.2)
     finish = tiles.pick(rng, "metal" if rng.uniform() < 0.5 else "ceramic")
     belly = rng.uniform(0.08, 0.35)
@@ -264,12 +272,12 @@ def lamp(rng) -> Assembly:
     return a
 
 
-def candle(rng) -> Assembly:
-    """Return a candle on a holder."""
+def candle(rng: np.random.Generator) -> Assembly:
+    """Make one candle or three on a stand."""
     a, count = Assembly(), int(rng.choice([1, 1, 3]))
     stand = tiles.pick(rng, "metal")
-    wax = finishes.plastic(rng, finishes.any_color(rng))
-    flame = finishes.glossy(rng, finishes.hsv(0.1, 0.8, 1.0))
+    wax = finishes.plastic(rng, colors.any_color(rng))
+    flame = finishes.glossy(rng, colors.hsv(0.1, 0.8, 1.0))
     for i in range(count):
         x = (i - (count - 1) / 2) * 0.45
         y = 0.5 + (0.15 if count == 3 and i == 1 else 0.0)
@@ -307,8 +315,8 @@ def candle(rng) -> Assembly:
     return a
 
 
-def barrel(rng) -> Assembly:
-    """Return a barrel, drum, jar or tin: bulging body, hoops, a lid."""
+def barrel(rng: np.random.Generator) -> Assembly:
+    """Make a barrel, drum, jar or tin: a bulging body with hoops, perhaps a lid."""
     a, height, r = Assembly(), rng.uniform(0.9, 1.4), rng.uniform(0.35, 0.5)
     bulge = r * rng.uniform(1.0, 1.25)
     theme = ["wood", "paint", "ceramic", "metal"][rng.integers(4)]
@@ -334,9 +342,10 @@ def barrel(rng) -> Assembly:
         tiles.pick(rng, theme),
     )
     hoop = tiles.pick(rng, "metal")
-    for share in ([0.12, 0.3, 0.7, 0.88], [0.2, 0.8], [0.33, 0.66], [])[rng.integers(4)]:
-        at = np.interp(share * height, curve[:, 1], curve[:, 0]) + 0.012
-        profile = [(0, -0.035), (at, -0.035), (at, 0.035), (0, 0.035)]
+    shares: tuple[list[float], ...] = ([0.12, 0.3, 0.7, 0.88], [0.2, 0.8], [0.33, 0.66], [])
+    for share in shares[rng.integers(4)]:
+        radius = float(np.interp(share * height, curve[:, 1], curve[:, 0])) + 0.012
+        profile = [(0, -0.035), (radius, -0.035), (radius, 0.035), (0, 0.035)]
         a.add(loft(refined(profile, 0.08), circle(48)).moved(y=share * height), hoop)
     if rng.uniform() < 0.4:
         a.add(

@@ -1,18 +1,19 @@
-"""EXT_meshopt_compression, through the optional package meshopt."""
+"""Decode EXT_meshopt_compression with the optional package meshopt."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from gdtool.assets.gltf_schema import MeshoptView
+from gdtool.assets.gltf.schema import MeshoptView
 from gdtool.core.errors import InputError, ResourceError
 
 
-def decode_view(source: bytes, packed: MeshoptView, path: Path) -> bytes:
-    """Return the bytes that a compressed buffer view stands for: count elements, byteStride apart.
+def decode_view(source: bytes, compressed: MeshoptView, path: Path) -> bytes:
+    """Decompress a buffer view into count elements, byteStride apart.
 
-    path: the file that holds it, for messages. Raises InputError for a stream that does not decode, ResourceError
-    without the package."""
+    path: the file that holds it, for errors. Raises InputError for a stream that does not decode, ResourceError without
+    the package.
+    """
     try:
         import meshopt
     except ImportError:
@@ -23,7 +24,7 @@ def decode_view(source: bytes, packed: MeshoptView, path: Path) -> bytes:
         ) from None
     try:
         return meshopt.decode_gltf_buffer(
-            source, packed.count, packed.byte_stride, packed.mode, packed.filter
+            source, compressed.count, compressed.byte_stride, compressed.mode, compressed.filter
         ).tobytes()
     except (RuntimeError, ValueError) as error:
         raise InputError(

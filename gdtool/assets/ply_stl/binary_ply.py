@@ -1,10 +1,10 @@
-"""Binary PLY of triangles, whose elements are arrays as they stand: gdtool's own surfaces and what most scanners
-write."""
+"""Read binary PLY files of triangles as arrays: gdtool's own surfaces, and what most scanners write."""
 
 from __future__ import annotations
 
 import numpy as np
 
+# Numpy's names of PLY's types.
 _TYPES = {
     "char": "i1",
     "int8": "i1",
@@ -26,11 +26,11 @@ _TYPES = {
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-def binary_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Return records of the vertices (v,) and triangles (f, 3), in the file's own types, of a PLY's bytes.
+def read_binary_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """View the bytes of a PLY as vertex records (v,), with the file's properties as fields, and triangles (f, 3).
 
-    Raises ValueError with what keeps the file from being one vertex element of numbers and then one face element of
-    triangles and nothing else, in binary.
+    Raises ValueError, with the reason, for any file that is not binary with one vertex element of numbers followed by
+    one face element of triangles.
     """
     end = data.find(b"end_header\n")
     header = data[: max(end, 0)].decode("ascii", "replace").split("\n")
@@ -53,7 +53,10 @@ def binary_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _layout(header: list[str], order: str) -> tuple[dict[str, int], np.dtype, np.dtype]:
-    """Return counts by element, and the records of vertices and faces. Raises ValueError, IndexError or KeyError."""
+    """Parse a header into the counts of elements and the record types of vertices and faces.
+
+    order: the byte order, "<" or ">". Raises ValueError, IndexError or KeyError for any other layout.
+    """
     counts: dict[str, int] = {}
     fields, lists, element = [], [], ""
     for line in header:
@@ -74,5 +77,5 @@ def _layout(header: list[str], order: str) -> tuple[dict[str, int], np.dtype, np
 
 
 def columns(records: np.ndarray, names: str) -> np.ndarray:
-    """(n, len(names)) float64 of the named fields."""
+    """Stack fields of records, named in one string, as float64 (n, fields)."""
     return np.stack([records[name] for name in names.split()], -1).astype(np.float64)

@@ -1,14 +1,15 @@
-"""PLY and STL into a Scene: binary files of triangles by their arrays, all others through trimesh."""
+"""Read PLY and STL files into a Scene: binary files of triangles directly, all others with trimesh."""
 
 from __future__ import annotations
 
 import io
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from gdtool.assets.ply import binary_ply, columns
+from gdtool.assets.ply_stl.binary_ply import columns, read_binary_ply
 from gdtool.assets.scene import DEFAULT_MATERIAL, Scene
 from gdtool.core.errors import InputError
 from gdtool.core.reading import bytes_of
@@ -19,8 +20,8 @@ _STL_FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attrib
 
 
 @dataclass(frozen=True)
-class _Scan:
-    """vertices (v, 3) and faces (f, 3); normals (v, 3) as they stand and 8-bit colors (v, 4), or None."""
+class _RawMesh:
+    """Hold a file's vertices (v, 3), faces (f, 3), normals (v, 3) of any length, and 8-bit colours (v, 4)."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -29,17 +30,17 @@ class _Scan:
     notes: tuple[str, ...] = ()
 
 
-def read_scan(path: str | Path) -> Scene:
-    """Read a .ply or .stl: vertices, faces, and of PLY normals and vertex colours (taken as sRGB).
+def read_ply_or_stl(path: str | Path) -> Scene:
+    """Read a .ply or .stl: vertices, faces, and from PLY the normals and vertex colours, which are taken as sRGB.
 
-    The material is DEFAULT_MATERIAL (a dielectric of roughness 0.5), white under vertex colours. STL's vertices, which
-    repeat for each face, are welded where they are equal. Raises InputError.
+    The material is DEFAULT_MATERIAL, white where vertices have colours. STL repeats the vertices of each face; equal
+    ones are welded. Raises InputError.
     """
     path = Path(path)
     kind = path.suffix.lower()[1:]
     data = bytes_of(path)
-    scan = (_plain_stl if kind == "stl" else _plain_ply)(data) or _by_trimesh(data, kind, path)
-    vertices, faces = scan.vertices, scan.faces
+    raw = (read_plain_stl if kind == "stl" else read_plain_ply)(data) or read_with_trimesh(data, kind, path)
+    vertices, faces = raw.vertices, raw.faces
     if not len(faces):
         raise InputError(path, "has no faces", "export the model with its faces")
     if faces.min() < 0 or faces.max() >= len(vertices):
@@ -48,23 +49,24 @@ def read_scan(path: str | Path) -> Scene:
             f"a face refers to a vertex out of range (there are {len(vertices)})",
             "export it again with all its vertices",
         )
-    notes = ["has no material: a dielectric of roughness 0.5", *scan.notes]
+    notes = ["has no material: a dielectric of roughness 0.5", *raw.notes]
     if kind == "stl":
         if not np.isfinite(vertices).all():
             raise InputError(path, "has a vertex that is not finite", "remove that vertex or move it to a finite place")
-        vertices, _, place = unique_rows(vertices)
-        return Scene(vertices.astype(np.float64), place.astype(np.int32)[faces], name=path.stem, notes=tuple(notes))
+        vertices, _, welded_idx = unique_rows(vertices)
+        faces = welded_idx.astype(np.int32)[faces]
+        return Scene(vertices.astype(np.float64), faces, name=path.stem, notes=tuple(notes))
     material, colors, normals = DEFAULT_MATERIAL, None, None
-    if scan.colors is not None:
+    if raw.colors is not None:
         from gdtool.images.color import linear_from_srgb, unit_range
 
-        stored = unit_range(scan.colors).astype(np.float64)
+        stored = unit_range(raw.colors).astype(np.float64)
         colors = np.concatenate([linear_from_srgb(stored[:, :3]), stored[:, 3:]], 1)
         material = replace(material, base_color=(1.0, 1.0, 1.0, 1.0))
-    if scan.normals is not None:
-        length = np.linalg.norm(scan.normals, axis=1, keepdims=True)
-        if len(scan.normals) == len(vertices) and np.isfinite(scan.normals).all() and (length > 1e-6).all():
-            normals = scan.normals / length
+    if raw.normals is not None:
+        length = np.linalg.norm(raw.normals, axis=1, keepdims=True)
+        if len(raw.normals) == len(vertices) and np.isfinite(raw.normals).all() and (length > 1e-6).all():
+            normals = raw.normals / length
         else:
             notes.append("normals without a direction are ignored")
     return Scene(
@@ -78,25 +80,27 @@ def read_scan(path: str | Path) -> Scene:
     )
 
 
-def _plain_stl(data: bytes) -> _Scan | None:
-    """Return a binary STL; None for what is not as long as that says it is."""
+def read_plain_stl(data: bytes) -> _RawMesh | None:
+    """Read a binary STL without welding; None where the length does not match the count of faces, as in a text file."""
     if (
         len(data) < _STL_HEADER
         or (len(data) - _STL_HEADER) != int.from_bytes(data[80:84], "little") * _STL_FACE.itemsize
     ):
         return None
     corners = np.frombuffer(data, _STL_FACE, offset=_STL_HEADER)["corners"].reshape(-1, 3)
-    return _Scan(corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
+    return _RawMesh(corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
 
 
-def _plain_ply(data: bytes) -> _Scan | None:
-    """Return a binary PLY of triangles whose vertices have places, normals and 8-bit colours, if not more; None for
-    others."""
+def read_plain_ply(data: bytes) -> _RawMesh | None:
+    """Read a binary PLY of triangles; None for other layouts.
+
+    Vertices may have normals and 8-bit colours besides their position, but no texture coordinates.
+    """
     try:
-        records, faces = binary_ply(data)
+        records, faces = read_binary_ply(data)
     except ValueError:
         return None
-    kinds = {name: records.dtype[name] for name in records.dtype.names}
+    kinds = {name: records.dtype[name] for name in records.dtype.names or ()}
     colored = [name for name in ("red", "green", "blue", "alpha") if name in kinds]
     if not {"x", "y", "z"} <= set(kinds) or set(kinds) & {"u", "v", "s", "t", "texture_u", "texture_v"}:
         return None
@@ -107,7 +111,7 @@ def _plain_ply(data: bytes) -> _Scan | None:
         colors = np.full((len(records), 4), 255, np.uint8)
         for i, name in enumerate(colored):
             colors[:, i] = records[name]
-    return _Scan(
+    return _RawMesh(
         columns(records, "x y z"),
         faces,
         columns(records, "nx ny nz") if {"nx", "ny", "nz"} <= set(kinds) else None,
@@ -115,12 +119,13 @@ def _plain_ply(data: bytes) -> _Scan | None:
     )
 
 
-def _by_trimesh(data: bytes, kind: str, path: Path) -> _Scan:
+def read_with_trimesh(data: bytes, kind: str, path: Path) -> _RawMesh:
+    """Read any PLY or STL with trimesh. Raises InputError for what it cannot read."""
     import trimesh
 
     try:
-        mesh = trimesh.load(io.BytesIO(data), file_type=kind, process=False, force="mesh")
-    except Exception as error:  # the parsers raise whatever the malformed bytes lead to
+        mesh: Any = trimesh.load(io.BytesIO(data), file_type=kind, process=False, force="mesh")
+    except Exception as error:  # malformed bytes make the parsers raise anything
         raise InputError(
             path,
             f"is not a {kind.upper()} file that can be read ({type(error).__name__}: {str(error)[:60]!r})",
@@ -137,7 +142,7 @@ def _by_trimesh(data: bytes, kind: str, path: Path) -> _Scan:
     normals = None
     if all(key in names for key in ("nx", "ny", "nz")):
         normals = np.stack([np.asarray(stored[key], np.float64).reshape(-1) for key in ("nx", "ny", "nz")], 1)
-    return _Scan(
+    return _RawMesh(
         vertices,
         faces,
         normals,

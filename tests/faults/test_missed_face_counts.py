@@ -1,4 +1,4 @@
-"""A mesh that does not come out as asked says why, on stderr and in the manifest; what is hidden inside it is told."""
+"""Say why a mesh has another face count than asked for, and what is hidden inside it."""
 
 import json
 
@@ -10,10 +10,12 @@ from tests.geometry.solids import cube, joined, lattice, sphere, torus, write_ob
 
 
 def warnings_of(folder):
+    """Return the warnings of a manifest."""
     return json.loads((folder / "manifest.json").read_text())["warnings"]
 
 
 def scattered(count):
+    """Make a mesh of separate small spheres."""
     rng = np.random.default_rng(0)
     vertices, faces = sphere(8)
     return joined(*[(0.05 * vertices + rng.uniform(-1, 1, 3), faces) for _ in range(count)])
@@ -33,15 +35,17 @@ def scattered(count):
     ],
     ids=["pieces", "handle", "triangles"],
 )
-def test_a_count_that_is_missed_says_why(gdtool_here, tmp_path, mesh, options, reason):
+def test_a_warning_says_why_a_face_count_was_missed(gdtool_here, tmp_path, mesh, options, reason):
     write_obj(tmp_path / "x.obj", *mesh)
     done = gdtool_here("remesh", "x.obj", *options, "-o", "out")
     assert done.returncode == 0, done.stderr
-    said = [line for line in warnings_of(tmp_path / "out") if "asked for: " in line]
-    assert len(said) == 1 and reason in said[0] and said[0] in done.stderr, done.stderr
+    warnings = [line for line in warnings_of(tmp_path / "out") if "asked for: " in line]
+    assert len(warnings) == 1, done.stderr
+    assert reason in warnings[0], done.stderr
+    assert warnings[0] in done.stderr, done.stderr
 
 
-def test_a_reason_follows_from_what_the_mesh_is():
+def test_the_reason_for_a_missed_count_follows_from_the_topology():
     assert "40 separate pieces" in count_reason(scattered(40)[1], 480, 100, [])
     assert "28 handles" in count_reason(lattice()[1], 588, 200, [])
     assert (
@@ -56,16 +60,17 @@ def test_a_reason_follows_from_what_the_mesh_is():
     [["remesh", "x.obj", "--triangles", 200], ["render-dataset", "x.obj", "--size", 16, "--domains", "normal"]],
     ids=["remesh", "render-dataset"],
 )
-def test_internal_shells_are_told_with_their_share(gdtool_here, tmp_path, arguments):
+def test_a_warning_tells_the_share_of_faces_of_internal_shells(gdtool_here, tmp_path, arguments):
     (outer, faces), (inner, others) = sphere(16), sphere(16)
     write_obj(tmp_path / "x.obj", *joined((outer, faces), (0.4 * inner, others)))
     done = gdtool_here(*arguments, "-o", "out")
     assert done.returncode == 0, done.stderr
-    told = [line for line in warnings_of(tmp_path / "out") if "inside another" in line]
-    assert len(told) == 1 and "1 closed body lies inside another, with 50.0% of the faces" in told[0]
+    warnings = [line for line in warnings_of(tmp_path / "out") if "inside another" in line]
+    assert len(warnings) == 1
+    assert "1 closed body lies inside another, with 50.0% of the faces" in warnings[0]
 
 
-def test_one_body_has_no_internal_shell(gdtool_here, tmp_path):
+def test_a_single_body_gives_no_warning_of_internal_shells(gdtool_here, tmp_path):
     write_obj(tmp_path / "x.obj", *sphere(16))
     assert gdtool_here("remesh", "x.obj", "--triangles", 200, "-o", "out").returncode == 0
     assert not [line for line in warnings_of(tmp_path / "out") if "inside another" in line]

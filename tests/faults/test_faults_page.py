@@ -1,4 +1,4 @@
-"""docs/faults.md names a test for each fault, and each of these tests exists."""
+"""Check that docs/faults.md names a test for each fault, and that these tests exist."""
 
 import ast
 import re
@@ -10,16 +10,17 @@ NAMED = re.compile(r"`(tests/[\w/]+\.py)::(\w+)`")
 
 
 def rows():
+    """Return the rows of the table."""
     lines = PAGE.read_text().splitlines()
     return [line for line in lines if line.startswith("| ") and not line.startswith(("| fault", "|---"))]
 
 
-def test_each_line_has_a_test():
+def test_each_line_of_the_page_names_a_test():
     assert len(rows()) >= 40
     assert [row for row in rows() if not NAMED.search(row)] == []
 
 
-def test_each_test_exists():
+def test_each_test_that_the_page_names_exists():
     missing = []
     for file, name in NAMED.findall(PAGE.read_text()):
         path = ROOT / file

@@ -1,7 +1,8 @@
-"""The parts of a glTF 2.0 document that gdtool reads, as types to decode the JSON with.
+"""Declare the types that the JSON of a glTF 2.0 document is decoded into and checked against.
 
-Field names and defaults are those of the specification (https://registry.khronos.org/glTF/specs/2.0, section 5),
-written in snake case; fields that are not listed are passed over."""
+Field names and defaults are the specification's (https://registry.khronos.org/glTF/specs/2.0, section 5), the names in
+snake case. Fields that gdtool does not read are not listed; the decoder ignores them.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ Vector4 = tuple[float, float, float, float]
 
 
 class Gltf(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
-    """What every object of a document is."""
+    """Base of the types: immutable, with the specification's camelCase names in the file."""
 
 
 class Asset(Gltf, frozen=True, kw_only=True):

@@ -1,4 +1,4 @@
-"""A glTF 2.0 file as it lies on disk: container, JSON, URIs, buffers, accessors."""
+"""Open glTF 2.0 files: container, JSON, URIs, buffers, buffer views and accessors."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import base64
 import binascii
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, unquote_to_bytes
@@ -13,7 +14,7 @@ from urllib.parse import unquote, unquote_to_bytes
 import msgspec
 import numpy as np
 
-from gdtool.assets.gltf_schema import Accessor, Document
+from gdtool.assets.gltf.schema import Accessor, Document, Sparse
 from gdtool.core.errors import InputError, from_os_error
 from gdtool.core.memory import require_memory
 from gdtool.core.names import shown, uri_path
@@ -33,8 +34,9 @@ SUPPORTED = {
 }
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _SHAPES = {"SCALAR": (), "VEC2": (2,), "VEC3": (3,), "VEC4": (4,), "MAT2": (2, 2), "MAT3": (3, 3), "MAT4": (4, 4)}
-# Bytes of one object of the JSON once it is decoded, with what is made of a node: a node of three characters takes this
-# much.
+_FLOAT32 = 5126  # componentType
+# Bytes that an object of the JSON takes once it is decoded. Measured on the worst case: a node of three characters,
+# with the matrix that is computed for it.
 _OBJECT_BYTES = 600
 
 EXPORT = "export it again as glTF 2.0"
@@ -42,11 +44,27 @@ COPY = "copy or download it again"
 SIMPLIFY = "export it with fewer faces or fewer instances"
 
 
-class GltfFile:
-    """An opened .glb or .gltf: its decoded document, and bytes and accessors on demand.
+@dataclass(frozen=True)
+class _Elements:
+    """Where equally spaced elements lie: buffer view, byte offset, byte stride (None: packed), count, type, shape."""
 
-    Buffers, buffer views and the chunks of a GLB are views of what was read, not copies. Raises InputError for whatever
-    the specification forbids and is looked at, ResourceError for what would take more memory than one input may."""
+    view: int
+    offset: int
+    stride: int | None
+    count: int
+    dtype: np.dtype
+    shape: tuple[int, ...]
+
+
+class GltfFile:
+    """Hold an opened .glb or .gltf: its decoded document, and its bytes and accessors on demand.
+
+    Buffers, buffer views and the chunks of a GLB are memory views of what was read, not copies. All methods raise
+    InputError for breaches of the specification that they meet, and ResourceError where the result would take more
+    memory than one input may.
+
+    notes collects what was ignored or assumed, a line each.
+    """
 
     def __init__(self, path: Path):
         self.path = path
@@ -71,17 +89,17 @@ class GltfFile:
         self.notes += [f"extension {printed(name)} is ignored" for name in ignored]
 
     def refuse(self, fact: str, cure: str) -> InputError:
-        """Return the error to raise for a fault of this file."""
+        """Make the error to raise for a fault of this file."""
         return InputError(self.path, fact, cure)
 
     def item(self, items: Sequence[Any], index: int, what: str) -> Any:
-        """items[index]; InputError when there is none."""
+        """Return items[index]; raises InputError, naming the kind of item, where there is none."""
         if index >= len(items):
             raise self.refuse(f"refers to {what} {index}, but has {len(items)}", EXPORT)
         return items[index]
 
     def _split(self, content: bytes) -> tuple[bytes, memoryview | None]:
-        """JSON and binary chunks of a GLB (specification, section 4.4)."""
+        """Return the JSON chunk and the binary chunk of a GLB (glTF 2.0 specification, section 4.4)."""
         if len(content) < 20:
             raise self.refuse("is cut short (a GLB has at least 20 bytes)", COPY)
         version, length = struct.unpack_from("<II", content, 4)
@@ -104,6 +122,7 @@ class GltfFile:
         return bytes(chunks[0][1]), chunks[1][1] if len(chunks) > 1 and chunks[1][0] == b"BIN\0" else None
 
     def _decode(self, text: bytes) -> Document:
+        """Decode and check the JSON against the types of schema.py, and check its version."""
         self.check_memory(text.count(b"{") * _OBJECT_BYTES, f"its JSON of {text.count(b'{'):,} objects", SIMPLIFY)
         try:
             document = msgspec.json.decode(text.removeprefix(b"\xef\xbb\xbf").rstrip(b"\0 "), type=Document)
@@ -118,11 +137,11 @@ class GltfFile:
         return document
 
     def resolve(self, uri: str, what: str) -> bytes | Path:
-        """Bytes of a data: URI, or the path of the regular file that a relative one names, within the folder of this
-        file.
+        """Return the bytes of a data: URI, or the path of the regular file that a relative URI names.
 
-        Percent-encoded characters are decoded first and links followed; what leads outside is refused. Raises
-        InputError."""
+        That file must lie in the folder of this one, after percent-decoding and after following links: a model must not
+        make gdtool read other files. what names the reference in errors.
+        """
         if uri[:5].lower() == "data:":
             head, comma, body = uri[5:].partition(",")
             if not comma:
@@ -145,13 +164,13 @@ class GltfFile:
         return path
 
     def buffer(self, index: int) -> memoryview:
-        """Return the bytes of a buffer, byteLength of them."""
+        """Return the first byteLength bytes of a buffer."""
         if index not in self._buffers:
             record = self.item(self.document.buffers, index, "buffer")
+            content: bytes | memoryview
             if record.uri is not None:
-                content = self.resolve(record.uri, f"buffer {index}")
-                if isinstance(content, Path):
-                    content = self._read_buffer(content, record.byte_length, index)
+                place = self.resolve(record.uri, f"buffer {index}")
+                content = self._read_buffer(place, record.byte_length, index) if isinstance(place, Path) else place
             elif index == 0 and self._binary is not None:
                 content = self._binary
             else:
@@ -164,7 +183,7 @@ class GltfFile:
         return self._buffers[index]
 
     def _read_buffer(self, path: Path, length: int, index: int) -> bytes:
-        """Return the first length bytes of a file, fewer where it has fewer."""
+        """Read the first `length` bytes of a file, fewer where it has fewer."""
         try:
             self.check_memory(min(path.stat().st_size, length), f"buffer {index}", SIMPLIFY)
             with path.open("rb") as file:
@@ -173,12 +192,12 @@ class GltfFile:
             raise from_os_error(error, path) from None
 
     def view(self, index: int) -> memoryview:
-        """Return the bytes of a buffer view, decompressed where EXT_meshopt_compression packs them."""
+        """Return the bytes of a buffer view, decompressed where it uses EXT_meshopt_compression."""
         if index not in self._views:
             record = self.item(self.document.buffer_views, index, "buffer view")
             packed = record.extensions.EXT_meshopt_compression
             if packed is not None:
-                from gdtool.assets.meshopt import decode_view
+                from gdtool.assets.gltf.meshopt import decode_view
 
                 source = self._slice(self.buffer(packed.buffer), packed.byte_offset, packed.byte_length, index)
                 self._unpacked += packed.count * packed.byte_stride
@@ -199,12 +218,14 @@ class GltfFile:
         return content[offset : offset + length]
 
     def check_memory(self, size: int, what: str, cure: str) -> None:
-        """ResourceError when size bytes are more than one input may take."""
+        """Raise ResourceError where `size` bytes are more than one input may take; what tells their use."""
         require_memory(size, self.path, what, cure)
 
     def accessor(self, index: int) -> tuple[np.ndarray, Accessor]:
-        """Return the stored numbers of an accessor, (count, ...) in their own type with sparse values set in, and its
-        record."""
+        """Return an accessor's numbers (count, ...) as the file stores them, sparse values included, and its record.
+
+        Sparse accessors are copied; all others are views of the file's bytes.
+        """
         record: Accessor = self.item(self.document.accessors, index, "accessor")
         dtype, shape = np.dtype(_DTYPES[record.component_type]), _SHAPES[record.type]
         self.check_memory(record.count * dtype.itemsize * int(np.prod(shape)), f"accessor {index}", SIMPLIFY)
@@ -214,28 +235,22 @@ class GltfFile:
             view = self.item(self.document.buffer_views, record.buffer_view, "buffer view")
             packed = view.extensions.EXT_meshopt_compression
             stride = packed.byte_stride if packed is not None and packed.mode == "ATTRIBUTES" else view.byte_stride
-            out = self._strided(record.buffer_view, record.byte_offset, stride, record.count, dtype, shape, index)
+            elements = _Elements(record.buffer_view, record.byte_offset, stride, record.count, dtype, shape)
+            out = self._strided(elements, index)
         if record.sparse is not None:
             out = self._overridden(out, record.sparse, index)
         return out, record
 
-    def _strided(
-        self,
-        view: int,
-        offset: int,
-        stride: int | None,
-        count: int,
-        dtype: np.dtype,
-        shape: tuple[int, ...],
-        index: int,
-    ) -> np.ndarray:
-        content = self.view(view)
+    def _strided(self, elements: _Elements, index: int) -> np.ndarray:
+        """View equally spaced elements of a buffer view as an array (count, *shape); index: of the accessor."""
+        offset, count, dtype, shape = elements.offset, elements.count, elements.dtype, elements.shape
+        content = self.view(elements.view)
         rows = shape[0] if len(shape) == 2 else 1
-        # columns of matrices begin at multiples of four bytes (specification, section 3.6.2.4)
+        # The columns of matrices begin at multiples of four bytes (glTF 2.0 specification, section 3.6.2.4).
         column = (shape[-1] if shape else 1) * dtype.itemsize
         column_stride = -(-column // 4) * 4 if rows > 1 else column
         size = column_stride * rows
-        stride = stride or size
+        stride = elements.stride or size
         if stride < size:
             raise self.refuse(f"accessor {index} has elements of {size} bytes, {stride} apart", EXPORT)
         if offset + stride * (count - 1) + size > len(content):
@@ -247,15 +262,18 @@ class GltfFile:
         inner = (column_stride, dtype.itemsize) if rows > 1 else (dtype.itemsize,) * len(shape)
         return np.ndarray((count, *shape), dtype, content, offset, (stride, *inner))
 
-    def _overridden(self, base: np.ndarray, sparse: Any, index: int) -> np.ndarray:
+    def _overridden(self, base: np.ndarray, sparse: Sparse, index: int) -> np.ndarray:
+        """Copy the elements of an accessor and replace those that its sparse record lists."""
         if sparse.count > len(base):
             raise self.refuse(f"accessor {index} overrides {sparse.count} of its {len(base)} elements", EXPORT)
         dtype = np.dtype(_DTYPES[sparse.indices.component_type])
-        where = self._strided(
-            sparse.indices.buffer_view, sparse.indices.byte_offset, None, sparse.count, dtype, (), index
-        ).astype(np.int64)
+        places = _Elements(sparse.indices.buffer_view, sparse.indices.byte_offset, None, sparse.count, dtype, ())
+        where = self._strided(places, index).astype(np.int64)
         values = self._strided(
-            sparse.values.buffer_view, sparse.values.byte_offset, None, sparse.count, base.dtype, base.shape[1:], index
+            _Elements(
+                sparse.values.buffer_view, sparse.values.byte_offset, None, sparse.count, base.dtype, base.shape[1:]
+            ),
+            index,
         )
         if where.max() >= len(base) or (np.diff(where) <= 0).any():
             raise self.refuse(f"accessor {index} has sparse indices out of range or order", EXPORT)
@@ -264,16 +282,16 @@ class GltfFile:
         return out
 
     def floats(self, index: int, always_normalized: bool = False) -> np.ndarray:
-        """Return an accessor as float64, normalised integers decoded (specification, section 3.11).
+        """Read an accessor as float64, normalised integers scaled to [0, 1] or [-1, 1] (specification, section 3.11).
 
-        always_normalized: integers are normalised even where the file forgets to say so.
+        always_normalized: treat integers as normalised even where the file forgets to say so.
         """
         stored, record = self.accessor(index)
-        if record.component_type == 5126 or not (record.normalized or always_normalized):
+        if record.component_type == _FLOAT32 or not (record.normalized or always_normalized):
             return stored.astype(np.float64)
         return np.maximum(stored.astype(np.float64) / np.iinfo(stored.dtype).max, -1.0)
 
 
 def printed(name: str) -> str:
-    """Return a name from the file for a message: as it is where it is printable, else escaped."""
+    """Format a name from a file for a message: as it is where it is short and printable, else escaped and cut."""
     return name if name.isprintable() and len(name) <= 80 else shown(name)
