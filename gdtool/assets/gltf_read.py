@@ -13,7 +13,8 @@ from gdtool.assets.gltf_geometry import check_geometry
 from gdtool.assets.gltf_materials import MaterialReader
 from gdtool.assets.gltf_schema import Node, Primitive
 from gdtool.assets.scene import DEFAULT_MATERIAL, Material, Scene
-from gdtool.geometry.topology import repeats
+from gdtool.geometry.meshes import TriMesh
+from gdtool.geometry.topology import has_repeated_corner
 
 _UV_SET = re.compile(r"TEXCOORD_[0-9]{1,3}")
 _UNSKINNED = "export it without the skin"
@@ -241,7 +242,7 @@ def _triangles(indices: np.ndarray, mode: int) -> np.ndarray:
     i = np.arange(len(indices) - 2)
     corners = (i, i + 1 + i % 2, i + 2 - i % 2) if mode == 5 else (i + 1, i + 2, np.zeros_like(i))
     faces = indices[np.stack(corners, 1)]
-    return faces[~repeats(faces)]  # strips join by empty triangles
+    return faces[~has_repeated_corner(faces)]  # strips join by empty triangles
 
 
 def _joint_matrices(
@@ -394,7 +395,7 @@ def _flat(part: Part) -> Part:
     corner = part.faces.reshape(-1)
     vertices = part.vertices[corner]
     faces = np.arange(len(corner)).reshape(-1, 3)
-    normals = np.repeat(face_normals(vertices, faces)[0], 3, axis=0)
+    normals = np.repeat(face_normals(TriMesh(vertices, faces))[0], 3, axis=0)
     uvs = tuple(None if uv is None else uv[corner] for uv in part.uvs)
     return Part(
         vertices, faces, part.material, normals, None, uvs, None if part.colors is None else part.colors[corner]

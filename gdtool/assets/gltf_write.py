@@ -12,6 +12,7 @@ import numpy as np
 from gdtool import __version__
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.core.errors import OutputError, ResourceError, from_os_error
+from gdtool.geometry.meshes import TriMesh
 
 _COMPONENT = {"float32": 5126, "uint8": 5121, "uint16": 5123, "uint32": 5125}
 _WRAP = {"repeat": 10497, "clamp": 33071, "mirror": 33648}
@@ -100,13 +101,13 @@ def _split(
         return used, local, _unit_tangents(scene.tangents[used], normals[used])
     if material.normal_texture.uv_set not in uv_slots:
         return used, local, None
-    from gdtool.geometry.tangents import corner_tangents, weld
+    from gdtool.geometry.tangents import corner_tangents, number_distinct_rows
 
-    tangents = corner_tangents(
-        scene.vertices, faces, normals, scene.uvs[material.normal_texture.uv_set], faces
-    ).reshape(-1, 4)
+    uv = scene.uvs[material.normal_texture.uv_set]
+    assert uv is not None  # uv_slots are those that there are
+    tangents = corner_tangents(TriMesh(scene.vertices, faces), normals, uv, faces).reshape(-1, 4)
     corner = faces.reshape(-1, 1)
-    split = weld(corner // 4096, corner % 4096, tangents)  # weld compares float32, which holds no large index
+    split = number_distinct_rows(corner // 4096, corner % 4096, tangents)  # float32 holds no large index
     first = np.unique(split, return_index=True)[1]
     used = corner[first, 0]
     return used, split, _unit_tangents(tangents[first], normals[used])
@@ -144,7 +145,7 @@ def _unit_normals(scene: Scene) -> np.ndarray:
     if bad.any():
         from gdtool.geometry.normals import vertex_normals
 
-        normals[bad] = vertex_normals(scene.vertices, scene.faces)[bad]
+        normals[bad] = vertex_normals(TriMesh(scene.vertices, scene.faces))[bad]
         normals[np.linalg.norm(normals, axis=1) < 0.5] = (0, 1, 0)
     return normals
 

@@ -16,6 +16,7 @@ from gdtool.core.child import ChildFailed, call
 from gdtool.core.ending import temporary_folder
 from gdtool.core.native import imported
 from gdtool.core.threads import mapped
+from gdtool.geometry.meshes import TriMesh
 
 # The largest mean drift of a level, as a share of the extent: beyond it, a level shows the maps of other parts.
 MAX_DRIFT = 0.02
@@ -125,7 +126,7 @@ def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[
     if not len(faces) or not np.isfinite(vertices).all() or not np.isfinite(uv).all():
         return None, "the collapse left nothing"
     uv, corner = np.unique(np.round(uv.reshape(-1, 2), 7), axis=0, return_inverse=True)
-    return Target.of(vertices, faces, uv, corner.reshape(-1, 3)), ""
+    return Target.of(TriMesh(vertices, faces), uv, corner.reshape(-1, 3)), ""
 
 
 def drift(level: Target, full: Target, size: int = 1024, count: int = 20_000) -> dict[str, float]:
@@ -137,7 +138,9 @@ def drift(level: Target, full: Target, size: int = 1024, count: int = 20_000) ->
     from gdtool.geometry.distance import sample_surface
     from gdtool.geometry.uv_raster import Barycentrics, extend_owners, owners_of
 
-    points, face_idx, barycentric = sample_surface(level.vertices, level.faces, count, np.random.default_rng(0))
+    points, face_idx, barycentric = sample_surface(
+        TriMesh(level.vertices, level.faces), count, np.random.default_rng(0)
+    )
     uv = np.einsum("nk,nkc->nc", barycentric, level.uv[level.face_uvs[face_idx]])
     owner = owners_of(full.uv, full.face_uvs, size)
     inside = Barycentrics(full.uv, full.face_uvs)

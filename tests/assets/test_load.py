@@ -6,6 +6,7 @@ import pytest
 from gdtool.assets import scan_read
 from gdtool.assets.load import load_scene
 from gdtool.core.errors import InputError
+from gdtool.geometry.meshes import TriMesh
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
@@ -165,7 +166,7 @@ def test_faces_with_coinciding_corners_are_left_out_and_flat_seams_keep_a_body_c
     assert len(scene.faces) == len(scene.material_idx) == 6 and any(
         "two corners in one place" in note for note in scene.notes
     )
-    assert is_closed(scene.vertices, scene.faces) and not is_closed(scene.vertices, scene.faces[:-1])
+    assert is_closed(TriMesh(scene.vertices, scene.faces)) and not is_closed(TriMesh(scene.vertices, scene.faces[:-1]))
 
 
 def test_normals_without_a_direction_are_the_faces_own(tmp_path):

@@ -18,6 +18,8 @@ sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 
 from bake_score import Seams  # noqa: E402
 
+from gdtool.geometry.meshes import TriMesh
+
 SIZE = 1024
 
 
@@ -39,16 +41,16 @@ def stored():
     fine, fine_quads, fine_normals = torus(640, 360)
     coarse, quads, _ = torus(60, 30, minor=0.141)
     faces = triangles_of(quads)
-    target = Target.of(coarse, faces, *unwrapped(coarse, faces, SIZE))
+    target = Target.of(TriMesh(coarse, faces), *unwrapped(coarse, faces, SIZE))
     texels = texels_of(target, SIZE)
-    source = Source(fine, triangles_of(fine_quads))
+    source = Source(TriMesh(fine, triangles_of(fine_quads)))
     attributes = {"albedo": albedo_of(fine), "roughness": 0.5 + 0.8 * fine[:, 0], "metallic": np.full(len(fine), 0.25)}
     baked = bake(
         target,
         texels,
         source,
         vertex_lookup(source, attributes, fine_normals),
-        vertex_reach(coarse, faces, source),
+        vertex_reach(TriMesh(coarse, faces), source),
         BakeOptions(threads=2),
     )
     maps = make_maps(texels, baked.values)

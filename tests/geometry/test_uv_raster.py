@@ -75,7 +75,9 @@ def test_shared_edges_and_vertices_on_texel_centres_are_owned_once(size, n):
     count = owner_count(uv, faces, size)
     assert count.max() == 1
     # The square covers centres 0 … size-1; its right and lower rim belong to whoever would come next.
-    assert (count[:-1, :-1] == 1).all() and not count[-1].any() and not count[:, -1].any()
+    assert (count[:-1, :-1] == 1).all()
+    assert not count[-1].any()
+    assert not count[:, -1].any()
 
 
 def test_jittered_grid_leaves_no_hole_and_no_overlap():
@@ -93,7 +95,8 @@ def test_barycentric_gives_the_texel_centre_back():
     row, column = np.nonzero(face_idx >= 0)
     back = (uv[faces[face_idx[row, column]]] * barycentric[row, column][..., None]).sum(1)
     np.testing.assert_allclose(back, np.stack([column + 0.5, row + 0.5], 1) / 128, atol=2e-6)
-    assert barycentric.min() >= 0 and not barycentric[face_idx < 0].any()
+    assert barycentric.min() >= 0
+    assert not barycentric[face_idx < 0].any()
 
 
 def test_first_of_overlapping_triangles_owns_and_the_count_tells():

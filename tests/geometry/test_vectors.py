@@ -16,7 +16,9 @@ def test_products_are_numpys_in_the_type_given():
 
 def test_three_arrays_serve_as_one_and_one_vector_meets_many():
     a, b = np.random.default_rng(1).normal(size=(2, 3, 4, 50))
-    assert (cross(list(a), tuple(b)) == cross(a, b)).all() and (dot(list(a), tuple(b)) == dot(a, b)).all()
+    assert (cross(list(a), tuple(b)) == cross(a, b)).all()
+    assert (dot(list(a), tuple(b)) == dot(a, b)).all()
     one = b[:, :1, :1]
-    assert cross(a, one).shape == a.shape and (cross(a, one)[:, 2, 3] == cross(a[:, 2, 3:4], one[:, 0, :])[:, 0]).all()
+    assert cross(a, one).shape == a.shape
+    assert (cross(a, one)[:, 2, 3] == cross(a[:, 2, 3:4], one[:, 0, :])[:, 0]).all()
     assert dot(a, b[:, 0]).shape == (4, 50)
