@@ -70,7 +70,10 @@ def limited(code, megabytes):
 
 def test_embree_is_not_started_where_it_would_crash():
     """Without the question in front of it this is a segmentation fault."""
-    code = "from gdtool.geometry.rays import RayCaster\nRayCaster(numpy.eye(3), numpy.array([[0, 1, 2]]))"
+    code = (
+        "from gdtool.geometry.meshes import TriMesh\nfrom gdtool.geometry.rays import RayCaster\n"
+        "RayCaster(TriMesh(numpy.eye(3), numpy.array([[0, 1, 2]])))"
+    )
     done = limited(code, 60)
     assert done.returncode == 1 and "MemoryError: unable to allocate 0.19 GiB for rays at 1 faces" in done.stderr, (
         done.stderr

@@ -59,7 +59,7 @@ USES = {
     "pymeshlab": [
         lambda: simplify.collapse_keeping_topology(TriMesh(*TRIANGLE), 1),
         lambda: pair_and_split.isotropic_triangles(TriMesh(*TRIANGLE), 10, 30.0),
-        lambda: lods.collapse_textured(*TRIANGLE, np.zeros((1, 3, 2)), 1, "."),
+        lambda: lods.collapse_textured(TriMesh(*TRIANGLE), np.zeros((1, 3, 2)), 1, "."),
     ],
     "pynanoinstantmeshes": [lambda: run_instant_meshes(TriMesh(*TRIANGLE), 100, 30.0)],
     "xatlas": [lambda: charts.run_xatlas(TriMesh(*TRIANGLE), 2.0)],

@@ -23,7 +23,7 @@ def test_nearest_face_distance_and_weights_in_any_unit(scale, shift):
     assert np.allclose(hits.barycentric[0], (0.5, 0.2, 0.3), atol=1e-7)
 
 
-def test_miss_is_infinite_and_zero():
+def test_a_miss_has_infinite_distance_and_no_weights():
     hits = RayCaster(TriMesh(TWO, FACES)).first_hit(np.array([[3.0, 3, 5]]), DOWN)
     assert hits.face_idx[0] == -1
     assert np.isinf(hits.distance[0])
@@ -31,13 +31,13 @@ def test_miss_is_infinite_and_zero():
     assert not hits.found[0]
 
 
-def test_both_sides_are_hit():
+def test_a_face_is_hit_from_behind_too():
     hits = RayCaster(TriMesh(TWO, FACES)).first_hit(np.array([[0.2, 0.2, -5.0]]), -DOWN)
     assert hits.face_idx[0] == 0
     assert hits.distance[0] == pytest.approx(5)
 
 
-def test_occlusion_up_to_a_distance():
+def test_occlusion_counts_up_to_a_distance():
     caster = RayCaster(TriMesh(TWO, FACES))
     origin = np.array([[0.2, 0.2, 5.0]] * 3)
     direction = np.repeat(DOWN, 3, 0)
@@ -54,12 +54,12 @@ def test_hit_points_agree_with_weights_over_many_chunks():
     origins = rng.normal(size=(200_000, 3)) * 4
     directions = rng.normal(size=origins.shape) - origins
     hits = caster.first_hit(origins, directions)
-    found = hits.found
-    assert 0.1 < found.mean() < 1
-    along = origins[found] + directions[found] * hits.distance[found, None]
-    inside = np.einsum("nij,ni->nj", vertices[faces[hits.face_idx[found]]], hits.barycentric[found])
+    hit = hits.found
+    assert 0.1 < hit.mean() < 1
+    along = origins[hit] + directions[hit] * hits.distance[hit, None]
+    inside = np.einsum("nij,ni->nj", vertices[faces[hits.face_idx[hit]]], hits.barycentric[hit])
     assert np.quantile(np.abs(along - inside).max(1), 0.999) < 1e-6
-    assert (caster.occluded(origins, directions) == found).mean() > 0.99999
+    assert (caster.occluded(origins, directions) == hit).mean() > 0.99999
 
 
 def test_an_empty_mesh_is_never_hit():

@@ -19,7 +19,7 @@ def plane(n=4, turned=0.0):
     return vertices, np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]), np.tile([0.0, 0, 1], (n * n, 1)), uv
 
 
-def test_plane_has_image_right_as_tangent_and_image_up_as_bitangent():
+def test_the_tangent_is_image_right_and_the_bitangent_image_up():
     for turned in (0.0, 0.7, 2.5):
         vertices, faces, normals, uv = plane(turned=turned)
         tangents = corner_tangents(TriMesh(vertices, faces), normals, uv, faces)
@@ -30,7 +30,7 @@ def test_plane_has_image_right_as_tangent_and_image_up_as_bitangent():
         np.testing.assert_allclose(bitangent, [-s, c, 0], atol=1e-6)
 
 
-def test_mirrored_texture_turns_the_sign_and_still_points_up():
+def test_a_mirrored_texture_negates_the_sign_and_the_bitangent_points_up():
     vertices, faces, normals, uv = plane()
     uv = uv * (-1, 1) + (1, 0)
     tangents = corner_tangents(TriMesh(vertices, faces), normals, uv, faces)
@@ -39,8 +39,8 @@ def test_mirrored_texture_turns_the_sign_and_still_points_up():
     np.testing.assert_allclose(-np.cross([0, 0, 1], tangents[0, 0, :3]), [0, 1, 0], atol=1e-6)
 
 
-def test_mirror_line_splits_the_group():
-    # Two halves of a plane whose texture is mirrored at x = 0: along the line the two sides keep their own tangents.
+def test_tangents_differ_on_the_two_sides_of_a_mirrored_seam():
+    # The texture of a plane is mirrored at x = 0; along that line each side keeps its tangents.
     vertices = np.array([[-1, 0, 0], [0, 0, 0], [1, 0, 0], [-1, 1, 0], [0, 1, 0], [1, 1, 0.0]])
     uv = np.stack([np.abs(vertices[:, 0]), 1 - vertices[:, 1]], 1)
     faces = np.array([[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4]])
@@ -65,7 +65,7 @@ def test_group_tangent_is_the_angle_weighted_mean_of_unit_axes():
     np.testing.assert_allclose(tangents[0, 1, :3], [1, 0, 0], atol=1e-6)
 
 
-def test_triangles_without_texture_area_borrow_and_stay_finite():
+def test_triangles_without_texture_area_borrow_a_finite_frame():
     vertices, faces, normals, uv = plane(n=3)
     corners = np.vstack([faces, [0, 1, 4]])
     face_uvs = np.vstack([faces, [0, 0, 0]])
@@ -95,5 +95,5 @@ def test_encoding_decodes_to_the_same_normal_in_skewed_and_mirrored_frames():
     np.testing.assert_allclose(decode_tangent_space(frames, local), world, atol=1e-9)
     flat = encode_tangent_space(normal, tangent, sign, normal / np.linalg.norm(normal, axis=1, keepdims=True))
     np.testing.assert_allclose(flat, np.tile([0, 0, 1.0], (count, 1)), atol=1e-9)
-    # No frame at all.
+    # Normal and tangent are parallel, so there is no frame.
     np.testing.assert_array_equal(encode_tangent_space(normal[:1], normal[:1], sign[:1], world[:1]), [[0, 0, 1]])

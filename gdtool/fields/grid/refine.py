@@ -50,8 +50,7 @@ def refine(
     *,
     reach: float,
 ) -> np.ndarray:
-    """Move vertices to new positions (v, 3): least squares of distances to measured planes and of the umbrella
-    Laplacian.
+    """Fit vertices to the measured planes of the views, by least squares with the umbrella Laplacian; return (v, 3).
 
     Seen vertices follow the planes. Unseen ones minimise bending, held close to where carving put them and inside the
     silhouettes.
@@ -86,8 +85,7 @@ def fit_to_normals(
     *,
     reach: float,
 ) -> np.ndarray:
-    """Move vertices to new positions (v, 3): keep the place of a surface fused from disagreeing views, take its
-    normals' shape.
+    """Fit the edges of a surface fused from disagreeing views to the views' normals; return vertices (v, 3).
 
     Depths that differ a little from view to view leave bumps, which are low and steep; the normals show none. Every
     vertex moves along its normal, so that edges come to lie across the measured normals, and is held where it was

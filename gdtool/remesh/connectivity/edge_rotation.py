@@ -15,12 +15,11 @@ _FLAT_COSINE = 0.8  # least cosine between the normals of two quads whose edge m
 
 
 def cancel_pairs(mesh: QuadMesh) -> np.ndarray:
-    """Cancel pairs of irregular vertices by rotating edges; the number of faces and vertices stays.
+    """Cancel pairs of irregular vertices by rotating edges; return the new faces (q, 4).
 
-    faces (q, 4) of a manifold. The rotation of an edge moves such a pair on and leaves regular quads behind (Peng et
-    al. 2011, Connectivity editing for quadrilateral meshes). Each pair is moved both ways until a rotation beside it
-    leaves fewer irregular vertices; otherwise it is put back. Faces that are not consistently oriented are returned as
-    they are.
+    mesh: a manifold of quads. Rotating an edge moves such a pair on and leaves regular quads behind (Peng et al. 2011,
+    Connectivity editing for quadrilateral meshes). Each pair is moved both ways until a rotation beside it leaves fewer
+    irregular vertices; otherwise it is put back. Faces that are not consistently oriented are returned as they are.
     """
     vertices, faces = mesh.vertices, mesh.faces
     valence, inner = valences(faces, len(vertices))

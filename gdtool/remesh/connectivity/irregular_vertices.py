@@ -10,7 +10,7 @@ from gdtool.geometry.topology import compact
 
 
 def cancel_irregular(mesh: QuadMesh, rounds: int = 4) -> QuadMesh:
-    """Collapse quads (q, 4) along a diagonal wherever that leaves fewer irregular vertices.
+    """Collapse quads along a diagonal wherever that leaves fewer irregular vertices.
 
     The merged vertex has two edges fewer than its two ends together, and the other corners lose one each (Daniels et
     al. 2008, quad-vertex merge). A quad is collapsed only where the mesh around stays a manifold, and not beside

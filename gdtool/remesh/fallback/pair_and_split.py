@@ -3,8 +3,8 @@
 The result of any triangle mesh is (split_count(faces, quads), 4) quads, or about as many. No piece is lost; it is
 closed and manifold where the triangles are.
 
-Arguments in common: vertices (v, 3) in a unit box, faces (f, 3); seconds and memory_mb limit each run in a child
-process, whose failure costs evenness alone; `meanwhile` is called while a child works.
+Arguments in common: a mesh in a unit box; seconds and memory_mb limit each run in a child process, whose failure costs
+evenness alone; `meanwhile` is called while a child works.
 """
 
 from __future__ import annotations

@@ -230,7 +230,7 @@ class Constraints:
 def trace_features(mesh: QuadMesh, features: Features, edge: float) -> tuple[np.ndarray, Constraints]:
     """Snap paths of quad edges to the feature curves.
 
-    faces (f, 4); edge: the mean edge length. Each curve gets the shortest path of edges that stays near it. Paths do
+    edge: the mean edge length. Each curve gets the shortest path of edges that stays near it. Paths do
     not cross one another. Returns vertices (v, 3), those of paths moved onto the curves, and the constraints that hold
     them there.
     """
@@ -423,7 +423,7 @@ def _order_points(segments: np.ndarray) -> list[int]:
 def release_straight_corners(mesh: QuadMesh, constraints: Constraints) -> Constraints:
     """Release the middle of three corners of a quad that follow a feature in a straight line; the path is open there.
 
-    A quad with a straight angle degenerates. A crease cut short by half a quad is the smaller fault. faces (f, 4).
+    A quad with a straight angle degenerates. A crease cut short by half a quad is the smaller fault.
     """
     vertices, faces = mesh.vertices, mesh.faces
     curve, fixed, path = constraints.curve.copy(), constraints.fixed.copy(), np.sort(constraints.path, 1)

@@ -59,9 +59,9 @@ def hold_centres(constraints: Constraints, first_centre: int, face_idx: np.ndarr
 
 
 def choose_diagonals(mesh: QuadMesh, surface: ProjectionTarget) -> np.ndarray:
-    """Rotate the corners of faces (q, 4) so that the diagonal from the first corner is the one nearer to the surface.
+    """Rotate the corners of quads so that the diagonal from the first corner is the one nearer to the surface.
 
-    Faces are cut in two along that diagonal, so bent quads across a crease then follow it.
+    Quads are cut in two along that diagonal, so bent quads across a crease then follow it. Returns the faces (q, 4).
     """
     vertices, faces = mesh.vertices, mesh.faces
     columns = gather_corners(vertices, faces)

@@ -55,7 +55,7 @@ def square_up(
     iterations: int,
     strength: float = 1.2,
 ) -> np.ndarray:
-    """Move vertices so that the quads (f, 4) get right angles, on the surface and on the feature curves.
+    """Move vertices so that the quads get right angles, on the surface and on the feature curves.
 
     Shape projection (Bouaziz et al. 2012) onto rectangles in the plane of the surface under each quad. That plane says
     which way round a quad goes, so folded quads are asked to turn over. Returns the best vertices (v, 3) met: fewest

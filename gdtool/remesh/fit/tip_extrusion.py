@@ -55,7 +55,7 @@ def extrude_tips(
     edge: float,
     max_added: float = 0.03,
 ) -> ExtrudedQuads:
-    """Extrude quads (f, 4) of mean edge length `edge` over the parts of the surface that stray from them.
+    """Extrude quads of mean edge length `edge` over the parts of the surface that stray from them.
 
     The farthest tip goes first. The vertices nearest to it move along it, an edge or two at a time, with the quads
     around them, and a ring of new quads follows each step, as one models a horn by hand. It ends when max_added of the
@@ -134,7 +134,7 @@ def _move_to_near_tips(
 
 
 def _nearest_within(points: np.ndarray, away: np.ndarray, mesh: TriMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances (n,) from points (n, 3) to the triangles (t, 3), and the nearest triangles (n,).
+    """Return distances (n,) from points (n, 3) to a mesh, and the nearest triangles (n,).
 
     away (n,): about what the distances will be. Few points are searched for among the triangles that near alone.
     """

@@ -144,7 +144,7 @@ def _conformal(mesh: TriMesh, border: np.ndarray) -> np.ndarray | None:
 def extend_conformally(mesh: TriMesh, uv: np.ndarray) -> np.ndarray | None:
     """Extend uv (v, 2) to its non-finite rows by the least-squares conformal map that keeps the finite ones.
 
-    Only the corners of triangles (t, 3) are filled. None where fewer than two of them are given, or they have no area.
+    Only vertices that triangles use are filled. None where fewer than two of them are given, or they have no area.
     """
     vertices, triangles = mesh.vertices, mesh.faces
     igl = imported("igl")

@@ -148,9 +148,9 @@ class Segmentation(NamedTuple):
 
 
 def find_charts(adjacency: Callable[[], Adjacency], mesh: QuadMesh, *, until: float, max_cost: float) -> Segmentation:
-    """Segment faces (f, 4) into charts, with xatlas or, where it fails, by the box side that faces look at.
+    """Segment a mesh into charts, with xatlas or, where it fails, by the box side that faces look at.
 
-    vertices (v, 3) in a unit box. adjacency: returns that of the faces. until: when xatlas is given up, on the clock
+    mesh: in a unit box. adjacency: returns that of its faces. until: when xatlas is given up, on the clock
     time.monotonic. max_cost: xatlas' limit on the cost of a chart.
     """
     from gdtool.geometry.distance import closest_points
