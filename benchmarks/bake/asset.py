@@ -31,6 +31,7 @@ from benchmarks.common.fine_meshes import models_in
 from benchmarks.common.measure import ROOT, Failed, busy, gdtool, machine, number, say, table
 from benchmarks.common.resumable_rows import Rows
 from benchmarks.common.wireframe import file_name
+from gdtool.geometry.meshes import TriMesh
 
 LIGHTS = ("dark", "mid", "bright")
 VIEWS = 12
@@ -191,9 +192,9 @@ def shape(case: Case) -> float:
     from gdtool.geometry.topology import triangulated
 
     scene, low = load_scene(case.glb), read_low(case)
-    points = sample_surface(scene.vertices, scene.faces, 20_000, np.random.default_rng(0))[0]
+    points = sample_surface(TriMesh(scene.vertices, scene.faces), 20_000, np.random.default_rng(0))[0]
     return float(
-        np.quantile(closest_points(points, low.vertices, triangulated(low.faces)[0].astype(np.int64))[0], 0.99)
+        np.quantile(closest_points(points, TriMesh(low.vertices, triangulated(low.faces)[0].astype(np.int64)))[0], 0.99)
     )
 
 
@@ -216,12 +217,14 @@ def beside_three(asset: Path) -> dict[str, float]:
 
 def charts(case: Case, size: int) -> np.ndarray:
     """(size, size, 3) of the texture coordinates."""
+    from gdtool.geometry.meshes import QuadMesh
     from gdtool.unwrap.pipeline import uv_islands
     from gdtool.unwrap.preview import layout
 
     low = read_low(case)
     faces, face_uvs = low.faces.astype(np.int64), low.face_uvs.astype(np.int64)
-    return layout(faces, low.uv, face_uvs, uv_islands(low.vertices, faces, face_uvs)[0], size)
+    islands, _ = uv_islands(QuadMesh(low.vertices, faces, low.uv, face_uvs))
+    return layout(faces, low.uv, face_uvs, islands, size)
 
 
 def baked(case: Case, folder: Path) -> tuple[Path, dict[str, float]]:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.common.fine_meshes import marched, part, unit
+from gdtool.geometry.meshes import TriMesh
 
 PART_TRIANGLES = 166_000
 PART_TEXTURE = 1024
@@ -61,7 +62,7 @@ def textured_part():
 
     vertices, faces = marched(part, PART_TRIANGLES)
     vertices = unit(vertices)[0]
-    normals = vertex_normals(vertices, faces)
+    normals = vertex_normals(TriMesh(vertices, faces))
     own, corners, uv = xatlas.parametrize(
         vertices.astype(np.float32), faces.astype(np.uint32), normals.astype(np.float32)
     )
@@ -92,10 +93,9 @@ def quads_for(scene, quads: int = QUADS) -> dict[str, np.ndarray]:
     from gdtool.unwrap.pipeline import Request as Charts
     from gdtool.unwrap.pipeline import unwrap
 
-    vertices, faces, *_ = repair.clean(scene.vertices, scene.faces)
-    low, low_faces, _ = remesh(vertices, faces.astype(np.int64), Request(quads=quads))
-    flat = unwrap(low, low_faces, Charts(size=2048))
-    return {"vertices": low, "faces": low_faces, "uv": flat.uv, "face_uvs": flat.face_uvs}
+    low, _ = remesh(repair.clean(TriMesh(scene.vertices, scene.faces)).mesh, Request(quads=quads))
+    flat = unwrap(low, Charts(size=2048))
+    return {"vertices": low.vertices, "faces": low.faces, "uv": flat.uv, "face_uvs": flat.face_uvs}
 
 
 def case_of(source: str | Path, kept: Path) -> Case:
@@ -123,7 +123,7 @@ def case_of(source: str | Path, kept: Path) -> Case:
 
 def read_low(case: Case):
     """The case's quad mesh."""
-    from gdtool.folders.mesh import QuadMesh
+    from gdtool.geometry.meshes import QuadMesh
 
     with np.load(case.low) as found:
         return QuadMesh(found["vertices"], found["faces"], found["uv"], found["face_uvs"])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.bake.cases import Case, read_low
+from gdtool.geometry.meshes import TriMesh
 
 # Texels that are scored: a few at creases, where the nearest face is a matter of chance, weigh little among so many.
 CHOSEN = 1_000_000
@@ -34,7 +35,7 @@ class Truth:
         from gdtool.geometry.distance import barycentric_of, closest_points
         from gdtool.images.color import srgb_from_linear
 
-        _, near, at = closest_points(points, self.scene.vertices, self.scene.faces)
+        _, near, at = closest_points(points, TriMesh(self.scene.vertices, self.scene.faces))
         read = self._lookup.attributes(near, barycentric_of(at, self.scene.vertices[self.scene.faces[near]]))
         return {**read, "albedo": srgb_from_linear(read["albedo"])}
 

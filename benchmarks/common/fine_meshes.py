@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gdtool.geometry.meshes import TriMesh
+
 SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".gltf")
 _PART = {"half": (0.6, 0.5, 0.45), "bore": 0.28, "ball": (0.3, 0.5, 0.0), "radius": 0.35}
 _TRIANGLES_PER_CELL = 2.5  # marching cubes makes about so many per squared step of area
@@ -105,7 +107,7 @@ def solidified(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple
     from gdtool.geometry.distance import closest_points, winding_number
     from gdtool.geometry.normals import face_normals
 
-    area = face_normals(vertices, faces)[1].sum()
+    area = face_normals(TriMesh(vertices, faces))[1].sum()
     step = float((_TRIANGLES_PER_CELL * area / triangles) ** 0.5)
     factor = 8
     low = vertices.min(0) - 3 * step
@@ -113,8 +115,8 @@ def solidified(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple
     shape = blocks * factor + 1
 
     def signed(points: np.ndarray) -> np.ndarray:
-        distance = closest_points(points, vertices, faces)[0]
-        return np.where(winding_number(points, vertices, faces) > 0.5, -distance, distance)
+        distance = closest_points(points, TriMesh(vertices, faces))[0]
+        return np.where(winding_number(points, TriMesh(vertices, faces)) > 0.5, -distance, distance)
 
     centre = (
         low
@@ -134,10 +136,10 @@ def solidified(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple
     index = np.argwhere(wanted)
     # Only samples beside the surface matter: the distance tells which, and only they need a winding number.
     points = low + index * step
-    distance = closest_points(points, vertices, faces)[0]
+    distance = closest_points(points, TriMesh(vertices, faces))[0]
     beside = distance < 2.5 * step
     inside = values[tuple(index.T)] < 0
-    inside[beside] = winding_number(points[beside], vertices, faces) > 0.5
+    inside[beside] = winding_number(points[beside], TriMesh(vertices, faces)) > 0.5
     block = np.minimum(index // factor, blocks - 1)
     inside[~beside] = _nearest_sign(
         index[~beside], index[beside], inside[beside], coarse.reshape(blocks), block[~beside]

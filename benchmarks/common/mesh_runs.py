@@ -33,10 +33,10 @@ def cost_since(start: float) -> dict[str, float]:
 def as_commanded() -> None:
     """In a child process: start where a command does that reads a mesh next."""
     from gdtool.core import child
-    from gdtool.geometry.simplify import CHILD_MODULES, reduced
+    from gdtool.geometry.simplify import CHILD_MODULES, collapse_in_child
 
     child.end_waiting()
-    child.prepare(reduced, CHILD_MODULES)
+    child.prepare(collapse_in_child, CHILD_MODULES)
 
 
 def blender(

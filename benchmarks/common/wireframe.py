@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gdtool.geometry.meshes import QuadMesh, TriMesh
+
 ZOOMED = 1.2  # half widths of the model: the middle only, since with more of it the quads cannot be told apart
 
 
@@ -29,7 +31,7 @@ def wireframe(vertices: np.ndarray, faces: np.ndarray, size: int = 420, half_wid
     line = ((np.arange(size) + 0.5) / size - 0.5) * scale
     origins = centre + back * diagonal + (line[None, :, None] * right - line[:, None, None] * up)
     triangles, face_idx = triangulated(faces)
-    hits = RayCaster(vertices, triangles.astype(np.int64)).first_hit(
+    hits = RayCaster(TriMesh(vertices, triangles.astype(np.int64))).first_hit(
         origins.reshape(-1, 3), np.broadcast_to(-back, (size * size, 3)).copy()
     )
     found = np.flatnonzero(hits.face_idx >= 0)
@@ -40,7 +42,7 @@ def wireframe(vertices: np.ndarray, faces: np.ndarray, size: int = 420, half_wid
     along = after - corners
     share = np.clip(((point[:, None] - corners) * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-300), 0, 1)
     far = np.linalg.norm(corners + share[..., None] * along - point[:, None], axis=-1).min(1)
-    light = 0.35 + 0.6 * np.clip(polygon_normals(vertices, faces)[0][face] @ np.array([0.2, 0.7, 0.68]), 0, 1)
+    light = 0.35 + 0.6 * np.clip(polygon_normals(QuadMesh(vertices, faces))[0][face] @ np.array([0.2, 0.7, 0.68]), 0, 1)
     ink = far > 0.9 * scale / size
     out = np.ones((size * size, 3))
     out[found] = (light * (0.25 + 0.75 * ink))[:, None] * [0.95, 0.97, 1.0]

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gdtool.geometry.meshes import TriMesh
+
 MATERIALS = (
     ("albedo_psnr", "albedo dB", 1),
     ("relit_psnr", "relit dB", 1),
@@ -34,7 +36,7 @@ def looks(surface, truth, size: int = 192) -> dict:
         torch.tensor([20.0, 6.0, 4.0]),
         torch.tensor([[3.0, 2.8, 2.5], [0.6, 0.8, 1.0], [0.7, 0.6, 0.6]]),
     )
-    ours, true = RayCaster(surface.vertices, surface.faces), RayCaster(truth.vertices, truth.faces)
+    ours, true = RayCaster(TriMesh(surface.vertices, surface.faces)), RayCaster(TriMesh(truth.vertices, truth.faces))
     error = {name: [] for name, _, _ in MATERIALS}
     for i in range(4):
         camera = camera_at(22.5 + 90 * i, 20.0, name=str(i), size=size)
@@ -88,9 +90,9 @@ def picture(vertices: np.ndarray, faces: np.ndarray, size: int = EDGE) -> np.nda
 
     camera = camera_at(32.0, 28.0, name="sheet", size=2 * size)
     origins, directions = (x.reshape(-1, 3) for x in rays(camera))
-    hits = RayCaster(vertices, faces).first_hit(origins, directions)
+    hits = RayCaster(TriMesh(vertices, faces)).first_hit(origins, directions)
     image = np.ones((len(origins), 3))
-    normal = face_normals(vertices, faces)[0][hits.face_idx[hits.found]]
+    normal = face_normals(TriMesh(vertices, faces))[0][hits.face_idx[hits.found]]
     normal *= np.where((normal * directions[hits.found]).sum(1) > 0, -1.0, 1.0)[:, None]
     light = np.array([0.35, 0.8, 0.5]) / np.linalg.norm([0.35, 0.8, 0.5])
     image[hits.found] = CLAY * (0.3 + 0.7 * np.clip(normal @ light, 0, 1))[:, None]

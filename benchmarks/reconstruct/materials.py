@@ -22,6 +22,7 @@ import numpy as np
 from benchmarks.common.measure import ROOT, Failed, busy, gdtool, machine, number, say, table
 from benchmarks.common.resumable_rows import Rows
 from benchmarks.reconstruct.appearance import looks
+from gdtool.geometry.meshes import TriMesh
 
 FIRST_SEED = 3_000_000  # procedural objects that the bundled model has not seen
 MATERIAL_VIEWS, SOLVED = "material views", "color: PBR, visibility"
@@ -42,7 +43,7 @@ def true_albedo(vertices: np.ndarray, truth) -> np.ndarray:
     from gdtool.geometry.distance import barycentric_of, closest_points
     from gdtool.shading.render.surface_points import surface_attributes
 
-    _, face_idx, points = closest_points(vertices, truth.vertices, truth.faces)
+    _, face_idx, points = closest_points(vertices, TriMesh(truth.vertices, truth.faces))
     share = barycentric_of(points, truth.vertices[truth.faces[face_idx]])
     return np.asarray(surface_attributes(truth, face_idx, share)["albedo"])
 
@@ -78,8 +79,7 @@ def found_materials(way: str, views, surface, normals: np.ndarray, step: float):
         views.cameras,
         views.mask,
         images,
-        surface.vertices,
-        surface.faces,
+        TriMesh(surface.vertices, surface.faces),
         normals,
         AppearanceOptions(step=step, light=light, seed=0, shadows="no visibility" not in way),
     )
@@ -92,7 +92,7 @@ def fused_color(views, surface, normals: np.ndarray, step: float) -> tuple[np.nd
     """Lit linear color (v, 3) that the views show on the surface, and the weight (v,) of the views that show it."""
     from gdtool.fields.appearance.materials import fuse, observe, spread
 
-    seen = observe(views.cameras, views.mask, surface.vertices, surface.faces, normals, 0.5 * step)
+    seen = observe(views.cameras, views.mask, TriMesh(surface.vertices, surface.faces), normals, 0.5 * step)
     value, weight, _ = fuse(views.images["color"], views.mask, seen)
     return np.clip(spread(value, weight, surface.faces), 0, 1), weight
 
@@ -124,7 +124,7 @@ def measure(name: str, source: str, folder: Path, given: argparse.Namespace, way
     views, surface, truth = read_views(opened), read_surface(shape), load_scene(source)
     to_views = invert_similarity(np.array(opened.content.source_from_world).reshape(4, 4))
     truth = replace(truth, vertices=transform_points(to_views, truth.vertices))
-    step, normals = shape.content.report["grid_step"], vertex_normals(surface.vertices, surface.faces)
+    step, normals = shape.content.report["grid_step"], vertex_normals(TriMesh(surface.vertices, surface.faces))
     true, (color, weight) = true_albedo(surface.vertices, truth), fused_color(views, surface, normals, step)
     for way in ways:
         found, seconds = found_materials(way, views, surface, normals, step)

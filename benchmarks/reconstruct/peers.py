@@ -12,6 +12,7 @@ import numpy as np
 
 from gdtool.cameras import project, rays
 from gdtool.folders.views import Views
+from gdtool.geometry.meshes import TriMesh
 
 REACH = 0.6  # the grid covers the cube of this half side
 
@@ -104,8 +105,8 @@ def capped_poisson(views: Views, depth: int = 7, threads: int = 2) -> tuple[np.n
     points, normals = cloud(views)
     samples = 96
     vertices, faces = carved_hull(views, samples)
-    caps, face_idx, _ = sample_surface(vertices, faces, 60_000, np.random.default_rng(0))
-    cap_normals = face_normals(vertices, faces)[0][face_idx]
+    caps, face_idx, _ = sample_surface(TriMesh(vertices, faces), 60_000, np.random.default_rng(0))
+    cap_normals = face_normals(TriMesh(vertices, faces))[0][face_idx]
     unseen = (cKDTree(points).query(caps)[0] > 2.5 * 2 * REACH / samples) & (np.abs(cap_normals[:, 1]) > 0.5)
     return screened_poisson(
         np.concatenate([points, caps[unseen]]), np.concatenate([normals, cap_normals[unseen]]), depth, threads

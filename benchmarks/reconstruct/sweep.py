@@ -32,6 +32,7 @@ from benchmarks.reconstruct import peers
 from benchmarks.reconstruct.appearance import MATERIALS, keep_row, looks, sheet
 from benchmarks.reconstruct.perturbation import Perturbation, perturbed
 from benchmarks.reconstruct.report import COLUMNS, OURS, PAPER, kind, markdown, plot
+from gdtool.geometry.meshes import TriMesh
 
 FIRST_SEED = 3_000_000  # procedural objects that the bundled model has not seen
 MODEL_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
@@ -101,14 +102,13 @@ def publish(path: Path, views, cause: Path) -> Path:
 
 def measured(vertices: np.ndarray, faces: np.ndarray, truth, views, surface=None) -> dict:
     """Errors of one result against the true scene, in the frame of the exact views; with surface its materials' too."""
-    from gdtool.geometry.metrics import is_closed, surface_protocol
+    from gdtool.geometry.metrics import SurfaceOptions, is_closed, surface_protocol
 
     if len(faces) == 0:
         return {"failed": "nothing came out"}
-    found = surface_protocol(vertices, faces, truth.vertices, truth.faces, cameras=views.cameras, samples=40_000)
-    out = {name: float(found[name]) for name, _, _ in COLUMNS if name in found} | {
-        "watertight": is_closed(vertices, faces)
-    }
+    mesh, true_mesh = TriMesh(vertices, faces), TriMesh(truth.vertices, truth.faces)
+    found = surface_protocol(mesh, true_mesh, SurfaceOptions(cameras=views.cameras, samples=40_000))
+    out = {name: float(found[name]) for name, _, _ in COLUMNS if name in found} | {"watertight": is_closed(mesh)}
     out |= {"shown_normal_degrees": normals_beside(vertices, faces, views)}
     return out | (looks(surface, truth) if surface is not None else {})
 
@@ -122,7 +122,7 @@ def normals_beside(vertices: np.ndarray, faces: np.ndarray, views) -> float:
     from gdtool.geometry.normals import face_normals
     from gdtool.geometry.rays import RayCaster
 
-    caster, normals, angles = RayCaster(vertices, faces), face_normals(vertices, faces)[0], []
+    caster, normals, angles = RayCaster(TriMesh(vertices, faces)), face_normals(TriMesh(vertices, faces))[0], []
     for camera, cover, shown in zip(views.cameras, views.mask, views.images["normal"], strict=True):
         whole = (cover > 0.99).ravel()
         origins, directions = (x.reshape(-1, 3)[whole] for x in rays(camera))

@@ -19,6 +19,7 @@ import numpy as np
 
 from benchmarks.common.measure import Failed, busy, gdtool, machine, number, say, table
 from benchmarks.common.resumable_rows import Rows
+from gdtool.geometry.meshes import TriMesh
 
 PEER = "Instant Meshes"
 COLUMNS = (
@@ -63,28 +64,26 @@ def peer(path: Path, faces: int) -> dict:
     from gdtool.core.child import call
     from gdtool.geometry import mesh_quality, repair, topology
     from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
-    from gdtool.geometry.topology import triangulated
     from gdtool.remesh.engines.adapters import run_instant_meshes
 
     scene = load_scene(path)
-    vertices, triangles = topology.compact(scene.vertices, scene.faces.astype(np.int64))
-    vertices, triangles, *_ = repair.clean(
-        transform_points(invert_similarity(unit_box(vertices)), vertices), triangles, path
-    )
+    used = topology.compact(TriMesh(scene.vertices, scene.faces.astype(np.int64)))
+    vertices, triangles = used.vertices, used.faces
+    in_box = TriMesh(transform_points(invert_similarity(unit_box(vertices)), vertices), triangles)
+    mesh = repair.clean(in_box, path).mesh
     start = time.perf_counter()
-    out, found = call(
+    made = call(
         run_instant_meshes,
-        vertices.astype(np.float32),
-        triangles.astype(np.int32),
+        TriMesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)),
         faces,
         30.0,
         seconds=120,
         memory_mb=16000,
     )
     seconds = time.perf_counter() - start
-    report = mesh_quality.topology_figures(out, found) | mesh_quality.shape_figures(out, found)
-    report |= mesh_quality.distance_figures(out, triangulated(found)[0], vertices, triangles, 20000)
-    return {"seconds": seconds, "quads": len(found), "as": ""} | figures_of(report)
+    report = mesh_quality.topology_figures(made) | mesh_quality.shape_figures(made)
+    report |= mesh_quality.distance_figures(made.triangles, mesh, 20000)
+    return {"seconds": seconds, "quads": len(made.faces), "as": ""} | figures_of(report)
 
 
 def figures_of(report: dict) -> dict:

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.common.measure import busy, machine, number, say, table
+from gdtool.geometry.meshes import TriMesh
 
 COLUMNS = (
     "net",
@@ -62,27 +63,29 @@ def net(kind: str, cells: int, grid: int) -> tuple[np.ndarray, np.ndarray]:
         field = np.maximum(np.min([np.hypot(x, y), np.hypot(y, z), np.hypot(x, z)], 0) - radius, out - 0.9 * radius)
     vertices, faces, _, _ = marching_cubes(field, 0.0)
     low, high = vertices.min(0), vertices.max(0)
-    return repair.clean((vertices - (low + high) / 2) / (high - low).max(), faces[:, ::-1].astype(np.int64))[:2]
+    unit = TriMesh((vertices - (low + high) / 2) / (high - low).max(), faces[:, ::-1].astype(np.int64))
+    mesh = repair.clean(unit).mesh
+    return mesh.vertices, mesh.faces
 
 
 def measured(vertices: np.ndarray, faces: np.ndarray, count: int) -> dict:
     from gdtool.geometry import mesh_quality, topology
-    from gdtool.geometry.topology import triangulated
     from gdtool.remesh.pipeline import remesh
     from gdtool.remesh.task import Request
 
     start = time.perf_counter()
-    out, quads, record = remesh(vertices, faces, Request(quads=count))
+    made, record = remesh(TriMesh(vertices, faces), Request(quads=count))
+    quads = made.faces
     seconds = time.perf_counter() - start
-    shape = mesh_quality.shape_figures(out, quads)
+    shape = mesh_quality.shape_figures(made)
     return {
         "seconds": seconds,
         "quads": len(quads),
         "handles": topology.handles(quads, topology.components(quads)[0]),
         "jacobian": shape["jacobian_mean"],
         "least": shape["jacobian_min"],
-        "irregular": mesh_quality.topology_figures(out, quads)["irregular_share"],
-        "hausdorff": mesh_quality.distance_figures(out, triangulated(quads)[0], vertices, faces, 20000)["hausdorff"],
+        "irregular": mesh_quality.topology_figures(made)["irregular_share"],
+        "hausdorff": mesh_quality.distance_figures(made.triangles, TriMesh(vertices, faces), 20000)["hausdorff"],
         "as": record.engine,
     }
 

@@ -27,6 +27,7 @@ from benchmarks.common.measure import ROOT, busy, machine, number, say, table
 from benchmarks.common.mesh_runs import arguments, as_commanded, beside, blender, cost_since, plot
 from benchmarks.common.resumable_rows import Rows
 from benchmarks.common.wireframe import file_name, sheet, wireframe
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 
 OF_A_FILE = "ours, of a file"
 WAYS = {
@@ -71,8 +72,10 @@ def ours(vertices: np.ndarray, faces: np.ndarray, quads: int, options: dict, of_
         vertices = vertices.astype(np.float32)
     start = time.perf_counter()
     if of_a_file:
-        vertices, faces, *_ = clean(vertices, faces)
-    out, found, record = remesh(vertices, faces, Request(quads=quads, **options))
+        cleaned = clean(TriMesh(vertices, faces)).mesh
+        vertices, faces = cleaned.vertices, cleaned.faces
+    made, record = remesh(TriMesh(vertices, faces), Request(quads=quads, **options))
+    out, found = made.vertices, made.faces
     return out, found, cost_since(start), record.engine
 
 
@@ -82,8 +85,8 @@ def peer(vertices: np.ndarray, faces: np.ndarray, quads: int, name: str) -> tupl
 
     start = time.perf_counter()
     run = adapters.run_instant_meshes if name == "Instant Meshes" else adapters.run_quadriflow
-    out, found = run(vertices.astype(np.float32), faces.astype(np.int32), quads, 30.0)
-    return out, found, cost_since(start), name
+    made = run(TriMesh(vertices.astype(np.float32), faces.astype(np.int32)), quads, 30.0)
+    return made.vertices, made.faces, cost_since(start), name
 
 
 def float32_zero_area(vertices: np.ndarray, triangles: np.ndarray) -> int:
@@ -100,7 +103,7 @@ def crease_figures(
 
     from gdtool.geometry.sharpen import dihedral_degrees
 
-    ends, _, angle = dihedral_degrees(vertices, triangles)
+    ends, _, angle = dihedral_degrees(TriMesh(vertices, triangles))
     sharp = ends[angle > 30]
     if not len(sharp):
         return {"crease mean": float("nan"), "crease recall": 0.0}
@@ -121,8 +124,8 @@ def score(fine: Fine, vertices: np.ndarray, quads: np.ndarray) -> dict:
 
     triangles = triangulated(quads)[0]
     diagonal = float(np.linalg.norm(np.ptp(fine.vertices, 0)))
-    top, shape = topology_figures(vertices, quads), shape_figures(vertices, quads)
-    far = distance_figures(vertices, triangles, fine.vertices, fine.faces, 50_000)
+    top, shape = topology_figures(QuadMesh(vertices, quads)), shape_figures(QuadMesh(vertices, quads))
+    far = distance_figures(TriMesh(vertices, triangles), TriMesh(fine.vertices, fine.faces), 50_000)
     out = {
         "quads": len(quads),
         "watertight": top["watertight"],

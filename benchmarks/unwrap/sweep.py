@@ -24,6 +24,7 @@ from benchmarks.common.measure import ROOT, busy, machine, number, say, table
 from benchmarks.common.mesh_runs import arguments, as_commanded, beside, blender, cost_since, plot
 from benchmarks.common.resumable_rows import Rows
 from benchmarks.common.wireframe import file_name, sheet
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 
 SIZE, PADDING = 1024, 2
 FINE = 4096  # where overlaps are looked for
@@ -59,7 +60,7 @@ def ours(vertices: np.ndarray, faces: np.ndarray, options: dict) -> tuple:
     from gdtool.unwrap.pipeline import Request, unwrap
 
     start = time.perf_counter()
-    out = unwrap(vertices, faces, Request(size=SIZE, padding=PADDING, **options))
+    out = unwrap(QuadMesh(vertices, faces), Request(size=SIZE, padding=PADDING, **options))
     return out.uv, out.face_uvs.astype(np.int64), cost_since(start)
 
 
@@ -121,17 +122,17 @@ def measure(
                 "model": name,
                 "way": way,
                 **cost,
-                **figures(vertices, mine, uv, face_uvs, SIZE),
+                **figures(QuadMesh(vertices, mine, uv, face_uvs), SIZE),
                 "overlap": overlapping(mine, uv, face_uvs),
             }
             if way in ("ours", "xatlas", BLENDER):
-                chart = uv_islands(vertices, mine, face_uvs)[0]
+                chart = uv_islands(QuadMesh(vertices, mine, uv, face_uvs))[0]
                 (asked.kept / "pictures").mkdir(parents=True, exist_ok=True)
                 write_png(
                     asked.kept / "pictures" / file_name(name, f"{way} layout"), layout(mine, uv, face_uvs, chart, 420)
                 )
                 if way == "ours":
-                    board = checkerboard(vertices, mine, uv, face_uvs, chart)
+                    board = checkerboard(QuadMesh(vertices, mine, uv, face_uvs), chart)
                     write_png(
                         asked.kept / "pictures" / file_name(name, "ours checkerboard"),
                         board[::2, : board.shape[1] // 2 : 2],
@@ -159,7 +160,8 @@ def quads_of(source: str | Path, faces: int, triangles: int, kept: Path) -> tupl
             return name, found["vertices"], found["faces"]
     fine = of_solid(source, triangles, kept) if isinstance(source, str) else of_model(source, triangles, kept)
     say(f"{name}: remeshed first")
-    vertices, quads, _ = remesh(fine.vertices, fine.faces, Request(quads=faces))
+    made, _ = remesh(TriMesh(fine.vertices, fine.faces), Request(quads=faces))
+    vertices, quads = made.vertices, made.faces
     np.savez(at, vertices=vertices, faces=quads)
     return name, vertices, quads
 

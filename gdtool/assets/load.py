@@ -11,6 +11,7 @@ from gdtool.assets.scene import Scene
 from gdtool.core.errors import InputError
 from gdtool.core.memory import require_memory
 from gdtool.core.reading import require_regular_file
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.vectors import cross, dot
 
 _CHUNK = 2**14  # faces checked at once: their temporary arrays fit the processor's cache
@@ -130,7 +131,7 @@ def _with_sound_normals(scene: Scene) -> Scene:
     from gdtool.geometry.normals import vertex_normals
 
     normals = scene.normals.copy()
-    normals[bad] = vertex_normals(scene.vertices, scene.faces)[bad]
+    normals[bad] = vertex_normals(TriMesh(scene.vertices, scene.faces))[bad]
     return replace(
         scene,
         normals=normals,

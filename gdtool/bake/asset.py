@@ -11,9 +11,9 @@ import numpy as np
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.bake.maps import Maps
 from gdtool.bake.target import CornerNormals, SurfaceModes, Target
-from gdtool.folders.mesh import QuadMesh
 from gdtool.geometry.frames import transform_points
-from gdtool.geometry.tangents import weld
+from gdtool.geometry.meshes import QuadMesh
+from gdtool.geometry.tangents import number_distinct_rows
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def scene_of(target: Target, maps: Maps, material: Material, name: str) -> Scene
     columns = [position_idx[:, None], uv_idx[:, None], normals]
     if maps.normal is not None:
         columns.append(tangents)
-    vertex = weld(*columns)
+    vertex = number_distinct_rows(*columns)
     first = np.full(vertex.max(initial=-1) + 1, len(corner), np.int64)
     np.minimum.at(first, vertex, corner)
     # Vertices are numbered in order of first use, so that neighbours in the file are neighbours on the mesh.
@@ -188,7 +188,7 @@ def corner_normals_of_quads(meshes: AssetMeshes) -> CornerNormals:
     first = np.searchsorted(face_idx, np.arange(len(mesh.faces)))
     second = np.minimum(first + 1, len(face_idx) - 1)
     corners = np.concatenate([target.normals[first], target.normals[second][:, 2:]], 1)
-    idx = weld(corners.reshape(-1, 3))
+    idx = number_distinct_rows(corners.reshape(-1, 3))
     normals = np.zeros((idx.max() + 1, 3))
     normals[idx] = corners.reshape(-1, 3)
     return CornerNormals(np.where(mesh.is_quad[:, None] | (np.arange(4) < 3), idx.reshape(-1, 4), -1), normals)

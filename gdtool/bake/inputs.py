@@ -13,9 +13,10 @@ from gdtool.bake.picture import Picture, picture_of
 from gdtool.bake.target import Target, fineness, texel_width
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
-from gdtool.folders.mesh import QuadMesh, read_mesh, read_obj
+from gdtool.folders.mesh import read_mesh, read_obj
 from gdtool.folders.views import Views
 from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 
 # A mesh file is taken to be in the normalised frame when its bounding box is centred to this distance, and its longest
 # side is 1 to this difference.
@@ -121,15 +122,14 @@ def _triangles_of_scene(path: Path) -> QuadMesh:
 
 def target_of(mesh: QuadMesh) -> tuple[Target, np.ndarray]:
     """Cut quads into the triangles to bake into; also returns the quad (t,) that each comes from."""
-    from gdtool.geometry.topology import triangulated
-
-    faces, face_idx = triangulated(mesh.faces)
+    uv, quad_uvs = mesh.texture_coordinates()
+    faces, face_idx = mesh.triangulation
     # The texture corners are cut the same way: the second triangle of a quad has its corners 0, 2, 3.
     second = np.zeros(len(faces), bool)
     second[1:] = face_idx[1:] == face_idx[:-1]
     corners = np.where(second[:, None], [0, 2, 3], [0, 1, 2])
-    face_uvs = np.take_along_axis(mesh.face_uvs[face_idx], corners, 1)
-    return Target.of(mesh.vertices, faces, mesh.uv, face_uvs), face_idx
+    face_uvs = np.take_along_axis(quad_uvs[face_idx], corners, 1)
+    return Target.of(TriMesh(mesh.vertices, faces), uv, face_uvs), face_idx
 
 
 def uv_warnings(target: Target) -> list[str]:

@@ -16,6 +16,7 @@ from gdtool.core.child import ChildFailed, call
 from gdtool.core.ending import temporary_folder
 from gdtool.core.native import imported
 from gdtool.core.threads import mapped
+from gdtool.geometry.meshes import TriMesh
 
 # The largest mean drift of a level, as a share of the extent: beyond it, a level shows the maps of other parts.
 MAX_DRIFT = 0.02
@@ -65,13 +66,13 @@ def make_levels(target: Target, count: int, threads: int = 1) -> Levels:
 
 
 def collapse_textured(
-    vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray, target_faces: int, folder: str
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    mesh: TriMesh, corner_uvs: np.ndarray, target_faces: int, folder: str
+) -> tuple[TriMesh, np.ndarray]:
     """Collapse edges by quadrics of position and texture coordinates, seams kept; runs in a child process.
 
-    MeshLab's filter, after Garland & Heckbert 1998. vertices (v, 3), faces (t, 3), corner_uvs (t, 3, 2). folder holds
-    temporary files; the parent removes it, since a killed child cannot. Returns the same three arrays, of about
-    target_faces triangles.
+    MeshLab's filter, after Garland & Heckbert 1998. corner_uvs (t, 3, 2): texture coordinates of the faces' corners.
+    folder holds temporary files; the parent removes it, since a killed child cannot. Returns a mesh of about
+    target_faces triangles, and its corners' texture coordinates.
     """
     from gdtool.images.io import write_png
 
@@ -79,10 +80,11 @@ def collapse_textured(
     # The filter wants a mesh with a texture, which only a file can give it.
     write_png(Path(folder, "blank.png"), np.zeros((2, 2, 3), np.uint8))
     Path(folder, "full.mtl").write_text("newmtl one\nmap_Kd blank.png\n")
-    lines = ["mtllib full.mtl", "usemtl one", *(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist())]
+    lines = ["mtllib full.mtl", "usemtl one", *(f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist())]
     lines += [f"vt {u:.9g} {v:.9g}" for u, v in corner_uvs.reshape(-1, 2).tolist()]
     lines += [
-        "f " + " ".join(f"{v + 1}/{3 * k + i + 1}" for i, v in enumerate(face)) for k, face in enumerate(faces.tolist())
+        "f " + " ".join(f"{v + 1}/{3 * k + i + 1}" for i, v in enumerate(face))
+        for k, face in enumerate(mesh.faces.tolist())
     ]
     path = Path(folder, "full.obj")
     path.write_text("\n".join(lines) + "\n")
@@ -95,11 +97,10 @@ def collapse_textured(
         optimalplacement=True,
         planarquadric=True,
     )
-    mesh = meshes.current_mesh()
+    made = meshes.current_mesh()
     return (
-        np.asarray(mesh.vertex_matrix()),
-        np.asarray(mesh.face_matrix(), np.int64),
-        np.asarray(mesh.wedge_tex_coord_matrix()).reshape(-1, 3, 2),
+        TriMesh(np.asarray(made.vertex_matrix()), np.asarray(made.face_matrix(), np.int64)),
+        np.asarray(made.wedge_tex_coord_matrix()).reshape(-1, 3, 2),
     )
 
 
@@ -110,10 +111,9 @@ def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[
     """
     try:
         with temporary_folder() as folder:
-            vertices, faces, uv = call(
+            mesh, uv = call(
                 collapse_textured,
-                target.vertices,
-                target.faces.astype(np.int64),
+                TriMesh(target.vertices, target.faces.astype(np.int64)),
                 target.uv[target.face_uvs],
                 target_faces,
                 str(folder),
@@ -122,10 +122,10 @@ def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[
             )
     except ChildFailed as failure:
         return None, str(failure)
-    if not len(faces) or not np.isfinite(vertices).all() or not np.isfinite(uv).all():
+    if not len(mesh.faces) or not np.isfinite(mesh.vertices).all() or not np.isfinite(uv).all():
         return None, "the collapse left nothing"
     uv, corner = np.unique(np.round(uv.reshape(-1, 2), 7), axis=0, return_inverse=True)
-    return Target.of(vertices, faces, uv, corner.reshape(-1, 3)), ""
+    return Target.of(mesh, uv, corner.reshape(-1, 3)), ""
 
 
 def drift(level: Target, full: Target, size: int = 1024, count: int = 20_000) -> dict[str, float]:
@@ -137,7 +137,9 @@ def drift(level: Target, full: Target, size: int = 1024, count: int = 20_000) ->
     from gdtool.geometry.distance import sample_surface
     from gdtool.geometry.uv_raster import Barycentrics, extend_owners, owners_of
 
-    points, face_idx, barycentric = sample_surface(level.vertices, level.faces, count, np.random.default_rng(0))
+    points, face_idx, barycentric = sample_surface(
+        TriMesh(level.vertices, level.faces), count, np.random.default_rng(0)
+    )
     uv = np.einsum("nk,nkc->nc", barycentric, level.uv[level.face_uvs[face_idx]])
     owner = owners_of(full.uv, full.face_uvs, size)
     inside = Barycentrics(full.uv, full.face_uvs)

@@ -27,7 +27,7 @@ def ambient_visibility(
 ) -> np.ndarray:
     """Trace the share of ray_count cosine-distributed rays from points (n, 3) that leave the surface: (n,) in [0, 1].
 
-    normals (n, 3) unit; caster is a geometry.quick_rays.QuickCaster. Rays start `lift` above the surface, and only what
+    normals (n, 3) unit; caster is a SinglePrecisionCaster. Rays start `lift` above the surface, and only what
     lies within reach blocks them.
     """
     rng = np.random.default_rng(seed)
@@ -43,7 +43,7 @@ def ambient_visibility(
         radius = (shift + np.float32(square)) % np.float32(1)
         up, radius = np.sqrt(1 - radius)[:, None], np.sqrt(radius)[:, None]
         across = np.float32(np.cos(angle)) * tangent + np.float32(np.sin(angle)) * bitangent
-        blocked += caster.quick_occluded(origins, radius * across + up * normals, reach)
+        blocked += caster.occluded_single(origins, radius * across + up * normals, reach)
     return (1 - blocked / ray_count).astype(np.float32)
 
 

@@ -16,6 +16,7 @@ from gdtool.bake.reproject import Places, Source
 from gdtool.folders.surface import Surface
 from gdtool.folders.views import Views
 from gdtool.geometry.frames import invert_similarity, transform_points
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.normals import vertex_normals
 from gdtool.geometry.tangents import dot
 
@@ -84,8 +85,10 @@ def from_surface(
     field (material_field) replaces the vertices for materials that the views lack. picture: the one that the views were
     generated from, for its finer detail.
     """
-    source = Source(surface.vertices, surface.faces)
-    normals = surface.normals if surface.normals is not None else vertex_normals(surface.vertices, surface.faces)
+    source = Source(TriMesh(surface.vertices, surface.faces))
+    normals = (
+        surface.normals if surface.normals is not None else vertex_normals(TriMesh(surface.vertices, surface.faces))
+    )
     attributes = {
         "albedo": surface.albedo,
         "roughness": surface.roughness,
@@ -151,7 +154,7 @@ def texture_detail(scene: Scene) -> float | None:
     """
     from gdtool.geometry.normals import face_normals
 
-    area = face_normals(scene.vertices, scene.faces)[1]
+    area = face_normals(TriMesh(scene.vertices, scene.faces))[1]
     widths, weights = [], []
     for index in np.unique(scene.material_idx):
         material, faces = scene.materials[index], scene.material_idx == index
@@ -197,8 +200,10 @@ def from_scene(
     matrix = invert_similarity(source_from_world)
     turn = matrix[:3, :3] / np.sqrt((matrix[:3, 0] ** 2).sum())
     turn, unturned = turn.astype(np.float32), bool(np.allclose(turn, np.eye(3), atol=1e-9))
-    source = Source(transform_points(matrix, scene.vertices), scene.faces)
-    normals = scene.normals @ turn.T if scene.normals is not None else vertex_normals(source.vertices, source.faces)
+    source = Source(TriMesh(transform_points(matrix, scene.vertices), scene.faces))
+    normals = (
+        scene.normals @ turn.T if scene.normals is not None else vertex_normals(TriMesh(source.vertices, source.faces))
+    )
 
     # Single precision is exact to 1/1000 of a texel of a 16384² texture, and takes half the time.
     points = SurfaceLookup(

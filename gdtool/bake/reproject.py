@@ -10,9 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from gdtool.core.native import imported
-from gdtool.geometry.distance import barycentric_of, bisected
+from gdtool.geometry.distance import barycentric_of, split_long_faces
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.normals import face_normals
-from gdtool.geometry.tangents import dot, weld
+from gdtool.geometry.tangents import dot, number_distinct_rows
 
 # The least dot product of the source face's normal with the mesh's normal at which the face is on the right side.
 AGREEMENT = 0.1
@@ -28,20 +29,19 @@ _MOST_CUT = 100_000
 class Nearest:
     """Find closest points on some faces of a mesh; keeps the search tree, which libigl builds on each call otherwise.
 
-    vertices (v, 3), faces (f, 3), chosen (m,) indices of the faces to look among, all when None.
+    chosen (m,): indices of the faces to look among; None is all.
     """
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray, chosen: np.ndarray | None = None):
+    def __init__(self, mesh: TriMesh, chosen: np.ndarray | None = None):
         igl = imported("igl")
-        some = faces if chosen is None else faces[chosen]
-        cut_vertices, cut, whole = bisected(
-            vertices, some, _LONG_EDGE * float(np.ptp(vertices, axis=0).max(initial=0)), _MOST_CUT
-        )
+        searched = mesh if chosen is None else TriMesh(mesh.vertices, mesh.faces[chosen])
+        longest = _LONG_EDGE * float(np.ptp(mesh.vertices, axis=0).max(initial=0))
+        cut, face_idx = split_long_faces(searched, longest, _MOST_CUT)
         self._vertices, self._faces = (
-            np.ascontiguousarray(cut_vertices, np.float64),
-            np.ascontiguousarray(cut, np.int64),
+            np.ascontiguousarray(cut.vertices, np.float64),
+            np.ascontiguousarray(cut.faces, np.int64),
         )
-        self._face_idx = (whole if chosen is None else chosen[whole]).astype(np.int32)
+        self._face_idx = (face_idx if chosen is None else chosen[face_idx]).astype(np.int32)
         self._tree = igl.AABB()
         self._tree.init(self._vertices, self._faces)
 
@@ -56,18 +56,18 @@ class Nearest:
 class Source:
     """Triangles to bake from, with their ray caster and search trees.
 
-    vertices (v, 3), faces (f, 3), face_normals (f, 3) unit; extent: longest side of the bounding box.
+    vertices (v, 3) float64, faces (f, 3), face_normals (f, 3) unit; extent: longest side of the bounding box.
     """
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray):
-        from gdtool.geometry.quick_rays import QuickCaster
+    def __init__(self, mesh: TriMesh):
+        from gdtool.geometry.single_precision_rays import SinglePrecisionCaster
 
-        self.vertices, self.faces = np.asarray(vertices, np.float64), faces
-        self.face_normals = face_normals(vertices, faces)[0]
+        self.vertices, self.faces = np.asarray(mesh.vertices, np.float64), mesh.faces
+        self.face_normals = face_normals(mesh)[0]
         self._normal_rows = np.ascontiguousarray(self.face_normals.T, np.float32)
         self.extent = float(np.ptp(self.vertices, axis=0).max())
-        self.caster = QuickCaster(vertices, faces)
-        self.nearest = Nearest(self.vertices, faces)
+        self.caster = SinglePrecisionCaster(mesh)
+        self.nearest = Nearest(TriMesh(self.vertices, self.faces))
         self._facing: dict[tuple[int, float], Nearest | None] = {}
         self._lock = Lock()
 
@@ -78,7 +78,7 @@ class Source:
     @cached_property
     def twins(self) -> np.ndarray:
         """Index (f,) int32 of the face with the same corners that faces the other way, -1 where there is none."""
-        corners = np.sort(weld(self.vertices)[self.faces], axis=1)
+        corners = np.sort(number_distinct_rows(self.vertices)[self.faces], axis=1)
         order = np.lexsort(corners.T)
         first, second = order[:-1], order[1:]
         same = (corners[first] == corners[second]).all(1)
@@ -93,7 +93,7 @@ class Source:
         with self._lock:
             if (axis, sign) not in self._facing:
                 chosen = np.flatnonzero(self.face_normals[:, axis] * sign > 0.25)
-                self._facing[axis, sign] = Nearest(self.vertices, self.faces, chosen) if len(chosen) else None
+                self._facing[axis, sign] = Nearest(TriMesh(self.vertices, self.faces), chosen) if len(chosen) else None
             return self._facing[axis, sign]
 
     def turn_to(self, points: np.ndarray, normals: np.ndarray) -> bool:
@@ -128,12 +128,13 @@ class Places:
     from_behind: np.ndarray
 
 
-def vertex_reach(vertices: np.ndarray, faces: np.ndarray, source: Source) -> np.ndarray:
+def vertex_reach(mesh: TriMesh, source: Source) -> np.ndarray:
     """Compute how far from each triangle to look for the source, (t,): the offset of its cage.
 
     This is twice the largest distance of its corners to the source, plus a share of its size for the bulge between
     them. Distances are capped at the 99th percentile, since a corner may lie far out where remeshing lost a part.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     distance = np.linalg.norm(source.nearest.closest(vertices)[1] - vertices, axis=1)
     distance = np.minimum(distance, np.percentile(distance, 99) + 1e-12)
     corners = vertices[faces]
@@ -168,7 +169,7 @@ def _march(
     Rays begin `start` before their points. They step through faces on the wrong side. Without `through`, a ray whose
     first face is met from behind stops there: it has that face, a distance of infinity, and is listed in behind.
     """
-    face, t, barycentric = source.caster.quick_hits(points - directions * points.dtype.type(start), directions)
+    face, t, barycentric = source.caster.first_hit_single(points - directions * points.dtype.type(start), directions)
     t -= np.float32(start)
     near = (face >= 0) & (t <= reach)
     cosine = dot(source.normals_of(face), normals)
@@ -182,7 +183,7 @@ def _march(
     for _ in range(_RETRIES - 1):
         if not len(active):
             break
-        hit_face, t, hit_at = source.caster.quick_hits(
+        hit_face, t, hit_at = source.caster.first_hit_single(
             points[active] + directions[active] * travelled[:, None], directions[active]
         )
         t += travelled

@@ -9,8 +9,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from gdtool.core.threads import mapped
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.normals import face_normals
-from gdtool.geometry.tangents import corner_tangents, edge_pairs, frames_of
+from gdtool.geometry.tangents import corner_tangents, edge_pairs, tangent_frames
 from gdtool.geometry.uv_raster import Barycentrics, between_centres, centres_in, extend_owners, owners_of
 
 CREASE_DEGREES = 45.0  # smooth normals are split along edges that bend more
@@ -21,15 +22,16 @@ TEXELS_AT_ONCE = 65_536
 COARSE_TEXEL = 3.0
 
 
-def corner_normals(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float = CREASE_DEGREES) -> np.ndarray:
+def corner_normals(mesh: TriMesh, crease_degrees: float = CREASE_DEGREES) -> np.ndarray:
     """Compute shading normals (t, 3, 3) float64 of triangles' corners, split along edges that bend by crease_degrees.
 
     A vertex's faces are weighted by their angles there (Thürmer & Wüthrich 1998).
     """
+    vertices, faces = mesh.vertices, mesh.faces
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    normals, area = face_normals(vertices, faces)
+    normals, area = face_normals(mesh)
     count = len(faces)
     first, second = edge_pairs(faces)
     # A triangle without area has no normal: it joins its neighbours.
@@ -86,16 +88,16 @@ class Target:
     @classmethod
     def of(
         cls,
-        vertices: np.ndarray,
-        faces: np.ndarray,
+        mesh: TriMesh,
         uv: np.ndarray,
         face_uvs: np.ndarray,
         crease_degrees: float = CREASE_DEGREES,
     ) -> Target:
         """Make the target of a triangle mesh: smooth normals split at creases, and MikkTSpace tangents."""
-        normals = corner_normals(vertices, faces, crease_degrees)
+        vertices, faces = mesh.vertices, mesh.faces
+        normals = corner_normals(mesh, crease_degrees)
         normal_idx = np.arange(len(faces) * 3).reshape(-1, 3)
-        tangents = corner_tangents(vertices, faces, normals.reshape(-1, 3), uv, face_uvs, normal_idx)
+        tangents = corner_tangents(mesh, normals.reshape(-1, 3), uv, face_uvs, normal_idx)
         return cls(vertices, faces, uv, face_uvs, normals, tangents)
 
     @cached_property
@@ -171,8 +173,8 @@ def surface_at(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Interpolate positions, normals, tangents (n, 3) and handedness (n,) at places on the target, float32.
 
-    Normals and tangents are not made unit, as viewers interpolate them (see tangents.frames_of). Each component lies
-    side by side in memory, so that sums over components are fast.
+    Normals and tangents are not made unit, as viewers interpolate them (see tangents.tangent_frames). Each component is
+    contiguous in memory, so that sums over components are fast.
     """
     first, *others = target.packed
     face_idx, weights = np.asarray(face_idx, np.intp), np.ascontiguousarray(barycentric.T, np.float32)
@@ -191,12 +193,12 @@ def surface_at(
 def points_at(target: Target, face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Interpolate positions (n, 3) and tangent frames (n, 3, 3), columns tangent, bitangent, normal."""
     points, normal, tangent, sign = surface_at(target, face_idx, barycentric)
-    return points, frames_of(normal, tangent, sign)
+    return points, tangent_frames(normal, tangent, sign)
 
 
 def texel_width(target: Target, size: int) -> float:
     """Compute the mean width of a texel of a size x size map on the target, in its units: √(area / texels)."""
-    area = face_normals(target.vertices, target.faces)[1].sum()
+    area = face_normals(TriMesh(target.vertices, target.faces))[1].sum()
     u, v = (target.uv[target.face_uvs[:, k]] - target.uv[target.face_uvs[:, 0]] for k in (1, 2))
     covered = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum()
     return float(np.sqrt(area / max(covered, 1e-12)) / size)

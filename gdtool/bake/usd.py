@@ -14,7 +14,7 @@ from gdtool.bake.maps import Maps
 from gdtool.bake.target import CornerNormals, SurfaceModes
 from gdtool.core.errors import OutputError, ResourceError
 from gdtool.core.native import imported_if_installed
-from gdtool.folders.mesh import QuadMesh
+from gdtool.geometry.meshes import QuadMesh
 
 YEAR_2000 = 946_684_800  # seconds
 MESH, MATERIAL = "/asset/mesh", "/asset/material"

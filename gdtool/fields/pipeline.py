@@ -31,6 +31,7 @@ from gdtool.fields.grid.fusion import (
 from gdtool.fields.grid.refine import keep_pieces
 from gdtool.fields.views.depth_alignment import agreement, normals_fit_depth
 from gdtool.fields.views.prepared_view import PreparedView
+from gdtool.geometry.meshes import TriMesh
 
 if TYPE_CHECKING:
     from gdtool.fields.appearance.appearance import Appearance
@@ -215,19 +216,18 @@ def fit_paper(views: ViewImages, aligned: AlignedViews, shape: Shape, options: P
             views.cameras,
             views.mask,
             images,
-            shape.vertices,
-            shape.faces,
+            TriMesh(shape.vertices, shape.faces),
             replace(options, volume_steps=volume),
             lambda count, label: out.progress(range(count), count, label),
         )
     with out.step("extract"):
-        vertices, faces = extract_network(fit.sdf, shape.step, out.device)
-        if len(faces):
-            vertices, faces = keep_pieces(vertices, faces, shape.step)
-    if not is_closed_manifold(faces):
+        mesh = extract_network(fit.sdf, shape.step, out.device)
+        if len(mesh.faces):
+            mesh = keep_pieces(mesh, shape.step)
+    if not is_closed_manifold(mesh.faces):
         out.warn("the networks' surface is not closed; the grid's is kept")
         return Surface(shape.vertices, shape.faces, None, figures)
-    return Surface(vertices, faces, fit, figures)
+    return Surface(mesh.vertices, mesh.faces, fit, figures)
 
 
 def use_fit(surface: Surface, views: ViewImages, look: Appearance, out: Output) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,27 +9,9 @@ import numpy as np
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
 from gdtool.core.stage import Output
+from gdtool.geometry.meshes import QuadMesh
 
 _UNWRAP = "run gdtool unwrap on the mesh again"
-
-
-@dataclass(frozen=True)
-class QuadMesh:
-    """Quads, and triangles where faces[:, 3] is -1; counter-clockwise seen from outside, normalised frame.
-
-    vertices (v, 3) float64, faces (f, 4) int32. uv (c, 2) float64 in [0, 1], (0, 0) at the image's top left, and
-    face_uvs (f, 4) int32 into uv (-1 with the triangle's fourth corner); both None without texture coordinates.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    uv: np.ndarray | None = None
-    face_uvs: np.ndarray | None = None
-
-    @property
-    def is_quad(self) -> np.ndarray:
-        """(f,) bool."""
-        return self.faces[:, 3] >= 0
 
 
 def write_obj(path: Path, mesh: QuadMesh, header: tuple[str, ...] = ()) -> None:

@@ -15,6 +15,7 @@ from gdtool.core.kinds import IDENTITY, SurfaceContent
 from gdtool.core.reading import bytes_of
 from gdtool.core.stage import Output
 from gdtool.folders.records import read_record, write_record
+from gdtool.geometry.meshes import TriMesh
 
 # albedo is 8-bit sRGB under the names that viewers show.
 _VERTEX = np.dtype(
@@ -87,7 +88,9 @@ def write_surface_ply(path: Path, surface: Surface) -> None:
     known = surface.views is not None and surface.residual is not None
     layout = np.dtype(_VERTEX.descr + _EVIDENCE) if known else _VERTEX
     vertex = np.empty(len(surface.vertices), layout)
-    normals = surface.normals if surface.normals is not None else vertex_normals(surface.vertices, surface.faces)
+    normals = (
+        surface.normals if surface.normals is not None else vertex_normals(TriMesh(surface.vertices, surface.faces))
+    )
     albedo = np.clip(surface.albedo, 0, 1)
     encoded = np.round(srgb_from_linear(albedo) * 255)
     for axis, names in enumerate((("x", "nx", "red"), ("y", "ny", "green"), ("z", "nz", "blue"))):

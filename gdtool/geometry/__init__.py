@@ -1,1 +1,6 @@
-"""Work on triangle meshes: rays, distances, topology, repair, simplification, tangents, quality."""
+"""Work on triangle and quad meshes.
+
+`meshes` holds the two mesh values that the other rooms pass around. The rest: edges and connectivity (`topology`,
+`nonmanifold_edges`, `enclosed_bodies`), repair, simplification, creases (`sharpen`), normals and tangents, rays,
+distances, grids of signed distances, quality and comparison (`mesh_quality`, `metrics`), and the UV rasteriser.
+"""

@@ -1,4 +1,4 @@
-"""Similarities between a source's own frame and the normalised one."""
+"""Compute similarities between a source's frame and the normalised world frame."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import numpy as np
 
 
 def unit_box(vertices: np.ndarray) -> np.ndarray:
-    """(4, 4) source_from_world: world is the frame in which the bounding box is centred and its longest side is 1."""
+    """Return source_from_world (4, 4) for vertices (v, 3) in the source's frame.
+
+    In the world frame their bounding box is centred and its longest side is 1.
+    """
     low, high = vertices.min(0), vertices.max(0)
     out = np.eye(4)
     extent = float((high - low).max())
@@ -21,7 +24,7 @@ def transform_points(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def invert_similarity(matrix: np.ndarray) -> np.ndarray:
-    """Inverse of a (4, 4) similarity (rotation, uniform scale, translation)."""
+    """Invert a (4, 4) similarity (rotation, uniform scale, translation)."""
     scale_squared = float((matrix[:3, 0] ** 2).sum())
     out = np.eye(4)
     out[:3, :3] = matrix[:3, :3].T / scale_squared

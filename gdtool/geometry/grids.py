@@ -1,4 +1,4 @@
-"""Regular grids of signed distances: layout, narrow bands, extraction of a watertight surface.
+"""Lay out regular grids of signed distances, find the band of cells around the surface, and extract the surface.
 
 A grid's values are signed distances, negative inside. Index (i, j, k) runs along x, y, z.
 """
@@ -9,26 +9,31 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gdtool.geometry.meshes import TriMesh
+
 
 @dataclass(frozen=True)
 class Grid:
-    """Sample points origin + step * (i, j, k); origin (3,) world, step world units, shape the number of points."""
+    """Sample points at origin + step * (i, j, k), i, j, k below shape.
+
+    origin (3,) and step in world units; shape: the number of points along each axis.
+    """
 
     origin: np.ndarray
     step: float
     shape: tuple[int, int, int]
 
     def points(self, index: np.ndarray) -> np.ndarray:
-        """World positions (n, 3) float64 of index (n, 3)."""
+        """Return the world positions (n, 3) float64 of index (n, 3)."""
         return self.origin + self.step * index
 
     def locate(self, points: np.ndarray) -> np.ndarray:
-        """Fractional index (n, 3) of world points (n, 3)."""
+        """Return the fractional index (n, 3) of world points (n, 3)."""
         return (points - self.origin) / self.step
 
 
 def grid_over(low: np.ndarray, high: np.ndarray, step: float, margin: int, multiple: int = 1) -> Grid:
-    """Return the grid of the given step that covers the box low..high and margin points more on each side.
+    """Return a grid that covers the box from low (3,) to high (3,) and `margin` cells more on each side.
 
     The number of cells along each axis is a multiple of `multiple`, and the grid is centred on the box.
     """
@@ -40,17 +45,17 @@ def grid_over(low: np.ndarray, high: np.ndarray, step: float, margin: int, multi
 
 
 def dilate(mask: np.ndarray, steps: int) -> np.ndarray:
-    """Boolean grid or image grown by a cube or square of the given half-size."""
+    """Dilate a boolean grid or image by a cube or square that reaches `steps` elements to each side."""
     from scipy.ndimage import maximum_filter
 
     return mask if steps < 1 else maximum_filter(mask, size=2 * steps + 1, mode="constant", cval=0)
 
 
 def band_cells(inside: np.ndarray, touched: np.ndarray) -> np.ndarray:
-    """Cells of a coarse grid that the surface may cross.
+    """Return the cells (a-1, b-1, c-1) bool of a coarse grid that the surface may cross.
 
-    inside (a, b, c) bool at the coarse points, touched (a-1, b-1, c-1) bool: cells known to hold surface. A cell is
-    in the band when its corners disagree, when it is touched, or when it neighbours such a cell.
+    inside (a, b, c) bool at the coarse points; touched (a-1, b-1, c-1) bool: cells known to hold surface. A cell is
+    in the band when its corners disagree, when it is touched, or when it is next to such a cell.
     """
     count = np.zeros(tuple(n - 1 for n in inside.shape), np.int8)
     for i in (0, 1):
@@ -61,7 +66,10 @@ def band_cells(inside: np.ndarray, touched: np.ndarray) -> np.ndarray:
 
 
 def fine_points(cells: np.ndarray, factor: int) -> np.ndarray:
-    """Boolean grid of the fine points (factor fine steps a coarse cell) that lie in or on the given coarse cells."""
+    """Return a boolean grid of the fine points that lie in or on coarse cells (a, b, c) bool.
+
+    factor: fine steps along one side of a coarse cell.
+    """
     fine = np.zeros(tuple(n * factor + 1 for n in cells.shape), bool)
     grown = cells
     for axis in range(3):
@@ -75,18 +83,19 @@ def fine_points(cells: np.ndarray, factor: int) -> np.ndarray:
 
 
 def sample_trilinear(values: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """values (a, b, c) at fractional index (n, 3), clamped to the border -> (n,) float32."""
+    """Interpolate values (a, b, c) at fractional index (n, 3), clamped to the border; (n,) float32."""
     from scipy.ndimage import map_coordinates
 
     return map_coordinates(values, index.T, order=1, mode="nearest", output=np.float32)
 
 
-def extract(values: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Return the zero surface as a closed mesh: vertices (v, 3) float64 world, faces (f, 3) int32 wound outward.
+def extract_surface(values: np.ndarray, grid: Grid) -> TriMesh:
+    """Extract the surface where values, shaped like the grid, are zero, as a closed mesh.
 
-    Lewiner's marching cubes (topologically consistent) on the grid padded with outside, so that nothing stays open.
-    Values nearer to zero than a thousandth of a step are pushed off it: a level equal to a sample makes faces of zero
-    area. Empty arrays when nothing is inside.
+    vertices float64 in world units, faces int32, counter-clockwise seen from outside; no faces where no value is
+    negative. Lewiner's marching cubes (topologically consistent) run on the grid padded with outside values, so that
+    the mesh has no boundary. Values nearer to zero than a thousandth of a step are moved to that distance: a sample
+    equal to the level makes faces without area.
     """
     from skimage.measure import marching_cubes
 
@@ -94,23 +103,23 @@ def extract(values: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     padded = np.pad(values, 1, constant_values=grid.step)
     padded = np.where(np.abs(padded) < tiny, np.where(padded < 0, -tiny, tiny), padded).astype(np.float32)
     if not (padded < 0).any():
-        return np.zeros((0, 3)), np.zeros((0, 3), np.int32)
+        return TriMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
     vertices, faces, _, _ = marching_cubes(padded, 0.0, allow_degenerate=True)
     vertices = (vertices.astype(np.float64) - 1) * grid.step + grid.origin
     faces = np.ascontiguousarray(faces, np.int32)
-    if signed_volume(vertices, faces) < 0:
+    if signed_volume(TriMesh(vertices, faces)) < 0:
         faces = faces[:, ::-1].copy()
-    return vertices, faces
+    return TriMesh(vertices, faces)
 
 
-def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Volume enclosed by an outward mesh; negative when it is wound inward."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
+def signed_volume(mesh: TriMesh) -> float:
+    """Return the volume that a closed mesh encloses; negative where its faces look inward."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
 
 
 def components(faces: np.ndarray, vertex_count: int) -> np.ndarray:
-    """Label (f,) of the connected piece each face belongs to, from 0."""
+    """Return the connected piece (f,) of each face, from 0; faces that share a vertex are of one piece."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -121,15 +130,14 @@ def components(faces: np.ndarray, vertex_count: int) -> np.ndarray:
     return np.unique(labels[faces[:, 0]], return_inverse=True)[1]
 
 
-def keep_faces(vertices: np.ndarray, faces: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the mesh of faces where keep (f,) is true, without unused vertices, and the old index of each vertex."""
-    faces = faces[keep]
-    used, faces = np.unique(faces, return_inverse=True)
-    return vertices[used], faces.reshape(-1, 3).astype(np.int32), used
+def keep_faces(mesh: TriMesh, keep: np.ndarray) -> TriMesh:
+    """Return the mesh of the faces where keep (f,) is true, without unused vertices; faces become int32."""
+    used, faces = np.unique(mesh.faces[keep], return_inverse=True)
+    return TriMesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32))
 
 
 def edge_counts(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Undirected edges (e, 2) and how many faces share each (e,). A closed manifold mesh has 2 everywhere."""
+    """Return the undirected edges (e, 2) of triangles, and how many faces share each (e,); 2 in a closed manifold."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1).astype(np.int64)
     key = edges[:, 0] * (int(faces.max()) + 1 if len(faces) else 1) + edges[:, 1]
     _, first, count = np.unique(key, return_index=True, return_counts=True)

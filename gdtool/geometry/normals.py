@@ -1,20 +1,22 @@
-"""Face and vertex normals."""
+"""Compute face and vertex normals."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.vectors import cross, dot
 
-CHUNK = 2**14  # faces at a time: what they need in between stays in the cache
+CHUNK = 2**14  # faces at a time, so that intermediate arrays stay in the cache
 
 
-def face_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit normals (f, 3) and areas (f,) of triangles; zero-area faces have normal 0."""
-    # A row per coordinate: several times faster than (f, 3) products.
-    rows = np.ascontiguousarray(vertices.T)
-    kind = np.result_type(vertices, np.float32)
-    normals, area = np.empty((len(faces), 3), kind), np.empty(len(faces), kind)
+def face_normals(mesh: TriMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit normals (f, 3) and areas (f,) of the faces; faces without area have normal 0."""
+    faces = mesh.faces
+    # A row for each coordinate: several times faster than (f, 3) products.
+    rows = np.ascontiguousarray(mesh.vertices.T)
+    dtype = np.result_type(mesh.vertices, np.float32)
+    normals, area = np.empty((len(faces), 3), dtype), np.empty(len(faces), dtype)
     for i in range(0, len(faces), CHUNK):
         normals[i : i + CHUNK].T[:], area[i : i + CHUNK] = normals_of(
             rows, np.ascontiguousarray(faces[i : i + CHUNK].T, np.intp)
@@ -23,17 +25,20 @@ def face_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, n
 
 
 def normals_of(position: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit normals (3, f) and areas (f,) of triangles: position (3, v), corners (3, f). Quickest of some CHUNK
-    at a time."""
+    """Return unit normals (3, f) and areas (f,) of triangles: position (3, v), corners (3, f) indices.
+
+    Fastest for about CHUNK triangles at a time.
+    """
     a, b, c = (position.take(corner, 1) for corner in corners)
     normal = cross(b - a, c - a)
     length = np.sqrt(dot(normal, normal))
     return normal * (1 / np.maximum(length, np.finfo(length.dtype).tiny)), length / 2
 
 
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(v, 3) unit normals, faces weighted by their angle at the vertex (Thürmer & Wüthrich 1998)."""
-    normals = face_normals(vertices, faces)[0].T
+def vertex_normals(mesh: TriMesh) -> np.ndarray:
+    """Return unit normals (v, 3) of the vertices: faces weighted by their angle there (Thürmer & Wüthrich 1998)."""
+    vertices, faces = mesh.vertices, mesh.faces
+    normals = face_normals(mesh)[0].T
     out = np.zeros((3, len(vertices)))
     corners = np.ascontiguousarray(faces.T, np.intp)
     at = [np.ascontiguousarray(vertices[corner].T) for corner in corners]

@@ -1,4 +1,4 @@
-"""Ray queries against a triangle mesh with Embree; hits are refined in double precision."""
+"""Cast rays at a triangle mesh with Embree, and refine hits in double precision."""
 
 from __future__ import annotations
 
@@ -9,23 +9,26 @@ import numpy as np
 
 from gdtool.core.native import imported, require_address_space
 from gdtool.core.threads import cores
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.vectors import cross, dot
 
-# Rays handed to Embree at a time: few enough that a chunk stays in the cache, enough that threads are busy.
+# Rays passed to Embree at a time: few enough that a chunk stays in the cache, enough that threads are busy.
 CHUNK = 1 << 16
-# Corners above which a mesh is not tested for being convex: a second of work.
+# Vertices above which a mesh is not tested for convexity, which would take more than a second.
 MAX_CONVEX = 200_000
-# Address space that Embree reserves while it builds a tree, and crashes without: 200 MB whatever the mesh is, and for
-# each face twice what was measured for 20 to 500 thousand of them on two cores.
+# Address space in bytes that Embree reserves while it builds a tree, and crashes without: for any mesh, and for each
+# face. The latter is twice what was measured with 20 to 500 thousand faces on two cores.
 _TREE_BYTES, _FACE_BYTES = 200_000_000, 400
-_MOST_BY_PAIRS = 20_000_000  # faces times corners; of more the hull is quicker
+_MAX_PAIRS = 20_000_000  # faces times vertices, above which comparing with the convex hull is quicker
 
 
 @dataclass(frozen=True)
 class Hits:
-    """First hits of n rays. face_idx (n,) int32, -1 = miss; distance (n,) along the given direction, inf at a miss;
-    barycentric (n, 3) weights of the face's corners, zero at a miss,
-    component by component in memory."""
+    """Nearest hits of n rays.
+
+    face_idx (n,) int32, -1 for a miss; distance (n,) in units of the direction's length, inf for a miss; barycentric
+    (n, 3) weights of the face's corners, 0 for a miss, component by component in memory.
+    """
 
     face_idx: np.ndarray
     distance: np.ndarray
@@ -33,26 +36,27 @@ class Hits:
 
     @property
     def found(self) -> np.ndarray:
-        """(n,) bool."""
+        """(n,) bool: which rays hit."""
         return self.face_idx >= 0
 
 
-def intersect_planes(
-    origins: np.ndarray, directions: np.ndarray, triangles: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (n,) and barycentric weights (n, 3) where rays meet the planes of their triangles (n, 3, 3).
+def intersect_planes(origins: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return distance (n,) and barycentric weights (n, 3) where rays meet the planes of triangles, corners (n, 3, 3).
 
-    Möller & Trumbore 1997 in double precision; weights are clamped to the triangle, since Embree's watertight edges
-    may give a face whose exact weights are a rounding below zero. A ray inside its plane gives the nearest corner's.
+    Möller & Trumbore 1997 in double precision. Weights are clamped to the triangle, because Embree's watertight edges
+    may return a face whose exact weights are a rounding error below zero. A ray inside its plane gets the nearest
+    corner.
     """
-    a, b, c = triangles.transpose(1, 2, 0)
-    return _meet(origins, directions, np.concatenate([a, b - a, c - a]))
+    a, b, c = corners.transpose(1, 2, 0)
+    return _intersect(origins, directions, np.concatenate([a, b - a, c - a]))
 
 
-def _meet(origins: np.ndarray, directions: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """intersect_planes for triangles (9, n): a corner and two edges. Component by component, so that every sum runs
-    over numbers that lie side by side."""
-    o, d, a, e1, e2 = origins.T, directions.T, triangles[:3], triangles[3:6], triangles[6:]
+def _intersect(origins: np.ndarray, directions: np.ndarray, packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Do what intersect_planes() does, for packed (9, n): a corner and two edge vectors of each triangle.
+
+    The layout keeps each component contiguous.
+    """
+    o, d, a, e1, e2 = origins.T, directions.T, packed[:3], packed[3:6], packed[6:]
     p = cross(d, e2)
     determinant = dot(e1, p)
     flat = determinant == 0
@@ -75,19 +79,20 @@ def _meet(origins: np.ndarray, directions: np.ndarray, triangles: np.ndarray) ->
 
 
 class RayCaster:
-    """An Embree scene over one mesh.
+    """An Embree scene of one mesh.
 
-    vertices (v, 3), faces (f, 3). The mesh is moved into a unit box before it is rounded to Embree's single precision,
-    so that neither a far origin nor an odd unit costs accuracy; all arguments and results are in the caller's frame.
-    Raises MemoryError where a limit on the address space leaves too little.
+    The mesh is moved into a unit box before it is rounded to Embree's single precision, so that neither a far origin
+    nor an odd unit costs accuracy; all arguments and results are in the caller's frame. Raises MemoryError where a
+    limit on the address space leaves too little.
     """
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray, threads: int | None = None):
-        require_address_space(_TREE_BYTES + _FACE_BYTES * len(faces), f"rays at {len(faces)} faces")
+    def __init__(self, mesh: TriMesh, threads: int | None = None):
+        face_count = len(mesh.faces)
+        require_address_space(_TREE_BYTES + _FACE_BYTES * face_count, f"rays at {face_count} faces")
         TriangleMesh = imported("embreex.mesh_construction").TriangleMesh
         EmbreeScene = imported("embreex.rtcore_scene").EmbreeScene
-        self.vertices = np.asarray(vertices, np.float64)
-        self.faces = np.asarray(faces, np.int32)
+        self.vertices = np.asarray(mesh.vertices, np.float64)
+        self.faces = np.asarray(mesh.faces, np.int32)
         self.threads = threads or cores()
         used = self.vertices[np.unique(self.faces)] if len(self.faces) else np.zeros((1, 3))
         low, high = used.min(0), used.max(0)
@@ -104,6 +109,7 @@ class RayCaster:
             self._scene.run(np.full((1, 3), 9, np.float32), np.full((1, 3), 1, np.float32), query="OCCLUDED")
 
     def _run(self, origins: np.ndarray, directions: np.ndarray, query: str, limits: np.ndarray | None) -> np.ndarray:
+        """Run one kind of query ("INTERSECT" or "OCCLUDED") on all rays; return (n,) int32 as Embree does."""
         origins, directions = np.asarray(origins), np.asarray(directions)
         if origins.dtype.kind != "f":
             origins = origins.astype(np.float64)
@@ -141,11 +147,11 @@ class RayCaster:
         distance, barycentric = np.full(len(face_idx), np.inf), np.zeros((3, len(face_idx))).T
         hit = np.flatnonzero(face_idx >= 0)
         if len(hit) == len(face_idx):
-            distance, barycentric = _meet(origins, directions, np.take(self._edges, face_idx, axis=1))
+            distance, barycentric = _intersect(origins, directions, np.take(self._edges, face_idx, axis=1))
         elif len(hit):
-            found = np.take(self._edges, face_idx[hit], axis=1)
-            distance[hit], barycentric[hit] = _meet(
-                origins.T.take(hit, axis=1).T, directions.T.take(hit, axis=1).T, found
+            packed = np.take(self._edges, face_idx[hit], axis=1)
+            distance[hit], barycentric[hit] = _intersect(
+                origins.T.take(hit, axis=1).T, directions.T.take(hit, axis=1).T, packed
             )
         return Hits(face_idx, distance, barycentric)
 
@@ -161,46 +167,48 @@ class RayCaster:
         return self._run(origins, directions, "OCCLUDED", limits) >= 0
 
 
-def is_convex(vertices: np.ndarray, faces: np.ndarray, tolerance: float = 1e-6) -> bool:
-    """Whether all faces lie on the hull of their corners, so that none hides another from outside.
+def is_convex(mesh: TriMesh, tolerance: float = 1e-6) -> bool:
+    """Whether all faces lie on the convex hull of their corners, so that none hides another from outside.
 
-    Each face's plane must have everything on one side (to tolerance, of the longest side). A scatter of faces is
-    tested first: nearly every mesh that is not convex fails there. Those of many faces are held
-    against the hull (Qhull): no middle of a face may lie deeper in it than the tolerance.
+    Each face's plane must have all vertices on one side, within `tolerance` of the longest side. A few faces are
+    tested first, because nearly every mesh that is not convex fails there. A mesh of many faces is compared with the
+    hull (Qhull): no centre of a face may lie deeper in it than the tolerance.
     """
     from gdtool.geometry.normals import face_normals
 
-    used = np.unique(faces)
+    used = np.unique(mesh.faces)
     if not len(used) or len(used) > MAX_CONVEX:
         return False
-    points = vertices[used]
+    points = mesh.vertices[used]
     extent = float((points.max(0) - points.min(0)).max())
-    normals, areas = face_normals(vertices, faces)
+    normals, areas = face_normals(mesh)
     solid = np.flatnonzero(areas > 1e-12 * extent**2)
     few = solid[:: max(1, len(solid) // 64)]
-    if not _all_before(vertices, faces, normals, few, points, tolerance * extent):
+    if not _on_one_side(mesh, normals, few, points, tolerance * extent):
         return False
-    if len(solid) * len(points) > _MOST_BY_PAIRS and (away := _off_hull(vertices, faces[solid], points)) is not None:
-        return away <= tolerance * extent
-    return _all_before(vertices, faces, normals, solid, points, tolerance * extent)
+    if len(solid) * len(points) > _MAX_PAIRS:
+        depth = _depth_in_hull(TriMesh(mesh.vertices, mesh.faces[solid]), points)
+        if depth is not None:
+            return depth <= tolerance * extent
+    return _on_one_side(mesh, normals, solid, points, tolerance * extent)
 
 
-def _all_before(
-    vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, chosen: np.ndarray, points: np.ndarray, height: float
-) -> bool:
-    """Whether the planes of the chosen faces have all points on one side, but for that height."""
-    for start in range(0, len(chosen), 512):
-        part = chosen[start : start + 512]
-        over = normals[part] @ points.T - np.einsum("ij,ij->i", normals[part], vertices[faces[part, 0]])[:, None]
-        if (np.minimum(over.max(1), -over.min(1)) > height).any():
+def _on_one_side(mesh: TriMesh, normals: np.ndarray, face_idx: np.ndarray, points: np.ndarray, slack: float) -> bool:
+    """Whether the plane of each of some faces has all points (n, 3) on one side, but for a distance of `slack`."""
+    for start in range(0, len(face_idx), 512):
+        part = face_idx[start : start + 512]
+        offset = np.einsum("ij,ij->i", normals[part], mesh.vertices[mesh.faces[part, 0]])
+        height = normals[part] @ points.T - offset[:, None]
+        if (np.minimum(height.max(1), -height.min(1)) > slack).any():
             return False
     return True
 
 
-def _off_hull(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> float | None:
-    """How far the middle of a face is within the hull of points (n, 3) at most; None where they lie in a plane.
+def _depth_in_hull(mesh: TriMesh, points: np.ndarray) -> float | None:
+    """Return how deep the deepest face centre lies in the convex hull of points (n, 3); None where they are coplanar.
 
-    What has its middle on the hull lies on it: the plane that touches the hull there has none of the face before it.
+    A face whose centre is on the hull lies on it as a whole: no part of the face can be beyond the plane that touches
+    the hull there.
     """
     from scipy.spatial import ConvexHull, QhullError
 
@@ -210,5 +218,6 @@ def _off_hull(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> fl
         hull = ConvexHull(points)
     except QhullError:
         return None
-    middle = (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3
-    return float(closest_points(middle, points, hull.simplices.astype(np.int64))[0].max())
+    vertices, faces = mesh.vertices, mesh.faces
+    centre = (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3
+    return float(closest_points(centre, TriMesh(points, hull.simplices.astype(np.int64)))[0].max())

@@ -1,10 +1,16 @@
-"""Quadric edge collapse in a killable child, with the error it made."""
+"""Simplify triangle meshes by quadric edge collapse (Garland & Heckbert 1997) in a child process.
+
+Two libraries do the work. fast-simplification is quick, and now and then tears a closed mesh. MeshLab takes ten times
+as long and refuses collapses that change the topology. The quick one goes first, unless the caller asks otherwise.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations, combinations_with_replacement
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,144 +19,202 @@ from gdtool.core.errors import InputError
 from gdtool.core.native import imported
 from gdtool.core.threads import cores
 from gdtool.geometry import repair, topology
+from gdtool.geometry.meshes import TriMesh
+from gdtool.geometry.nonmanifold_edges import separate_sheets
 from gdtool.geometry.normals import CHUNK, face_normals
-from gdtool.geometry.rows import first_rows, unique_rows
-from gdtool.geometry.sharpen import corners_in, restore_creases
-from gdtool.geometry.unpinch import unpinched
+from gdtool.geometry.sharpen import marked_corner_counts, restore_creases
+from gdtool.geometry.unique_rows import indices_of_distinct, unique_rows
 
 CHILD_MODULES = ("scipy.sparse.csgraph", "scipy.spatial")  # that a child imports while it waits (core.child.prepare)
-# How steeply the collapse's bound rises, tried in turn; the unit of lengths, in sizes of the mesh.
-_PACES, _UNIT = (4.0, 3.0, 8.0), 0.5
-_BY_WAY = 6  # times the triangles asked for, to which the quicker collapse still goes well
-# Edge lengths that what is flat is moved by; determinant of the mean of its normals' squares.
-_UNEVEN, _FLAT = 1e-3, 1e-14
-SHAKEN = 0.03  # edge lengths that all is moved by where the triangles are to be even
-_FEW_FLAT, _SAMPLE = 0.01, 20000  # of the vertices: so few stop no collapse; how many of them tell
-_STUCK, _FEW = 1.25, 32  # triangles in units of those asked for, and so many more, that a collapse may leave
+# Of fast-simplification: how steeply the bound on the error rises from round to round, tried in turn.
+_AGGRESSIVENESS = (4.0, 3.0, 8.0)
+_EVEN_UNIT = 0.5  # unit of length that leaves even triangles, as a share of the mesh's longest side
+_FIRST_PASS_FACTOR = 6  # times the requested triangles, down to which the quick collapse is always good
+_COPLANAR_JITTER_EDGES = 1e-3  # edge lengths by which coplanar vertices are moved
+JITTER_EDGES = 0.03  # edge lengths by which all vertices are moved for triangles of one size
+# Determinant of the mean outer product of a vertex's face normals below which they lie in a plane, but for rounding.
+_COPLANAR_DETERMINANT = 1e-14
+_MIN_COPLANAR_SHARE = 0.01  # of the vertices: fewer coplanar ones do not hinder the quick collapse
+_SAMPLES = 20_000  # vertices or faces from which a property of the whole is estimated
+# A quick collapse that leaves more triangles than this factor of the request, and so many more, did not finish.
+_UNFINISHED_FACTOR, _UNFINISHED_FACES = 1.25, 32
+_CHILD_MEMORY_MB = 16000
+
+QUICK_METHOD, TOPOLOGY_METHOD = "quadric collapse", "quadric collapse, topology kept"  # as reports name them
 
 
-def shaken(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Vertices (v, 3) moved by noise of SHAKEN times the shortest edge of their faces (f, 3), for a collapse that
-    leaves triangles of one size.
+@dataclass(frozen=True)
+class SimplifyOptions:
+    """How to simplify a mesh.
 
-    With it every vertex that is taken in adds about the same to an edge's error, where the surface is flat as where it
-    is curved less than the noise; without it what is flat comes out in a few large triangles, and slivers around it.
+    seconds: time limit of each child process. crease_degrees: first restore creases that turn by more from the bevels
+    of marching cubes, unless the result cannot be collapsed; 0 restores none. topology_first: start with MeshLab's
+    collapse, for meshes with more small parts than triangles to spare, where the quick one tears down large parts.
+    low_deviation: let the quick collapse stay nearer to the surface, at a fifth of the error, with less even triangles.
+    uniform: leave triangles of one size, off the surface by some hundredths of the input's edges (JITTER_EDGES).
+    measure_error: compute the error; a quick result that is as far off as its edges are long is then compared with
+    MeshLab's. is_closed: tells whether the input is watertight, where the caller can tell sooner than
+    topology.is_watertight(). while_waiting: called once while each child works.
     """
+
+    seconds: float = 120.0
+    crease_degrees: float = 0.0
+    topology_first: bool = False
+    low_deviation: bool = False
+    uniform: bool = False
+    measure_error: bool = True
+    is_closed: Callable[[], bool] | None = None
+    while_waiting: Callable[[], object] | None = None
+
+
+@dataclass(frozen=True)
+class SimplifyReport:
+    """What simplify() did.
+
+    faces: triangles of the result. method: how it was made, "none" where the result is the input. creases: how many
+    vertices moved to restored creases. error: the largest distance of either mesh's vertices to the other surface (at
+    most about 20,000 vertices each), in the input's units; None where it was not measured. failed: what failed on the
+    way, None where nothing did.
+    """
+
+    faces: int
+    method: str
+    creases: int | None = 0
+    error: float | None = None
+    failed: str | None = None
+
+
+class Simplified(NamedTuple):
+    """A simplified mesh, attributes (v, ...) of its vertices where some were given, and a report."""
+
+    mesh: TriMesh
+    attributes: np.ndarray | None
+    report: SimplifyReport
+
+
+class ChildResult(NamedTuple):
+    """What a child made: the collapsed mesh, and how many vertices it moved to restored creases before."""
+
+    mesh: TriMesh
+    creases: int
+
+
+class CollapseCall(NamedTuple):
+    """One call of a collapse function below: function(mesh, *arguments)."""
+
+    function: Callable[..., TriMesh]
+    arguments: tuple
+
+
+def jitter_vertices(mesh: TriMesh) -> np.ndarray:
+    """Move vertices (v, 3) by noise of JITTER_EDGES times their faces' shortest edge, for triangles of one size.
+
+    The collapse takes the edges that add the least error. With the noise each adds about the same error where the
+    surface is flat as where it curves less than the noise. Without it flat parts end as a few large triangles with
+    slivers around them.
+    """
+    vertices, faces = mesh.vertices, mesh.faces
     position = np.ascontiguousarray(vertices, np.float32)
-    far = np.full(len(vertices), median_edge(vertices, faces) ** 2, np.float32)
+    shortest_squared = np.full(len(vertices), median_edge(mesh) ** 2, np.float32)
     for i in range(0, len(faces), CHUNK):
         corners = np.ascontiguousarray(faces[i : i + CHUNK].T, np.intp)
         shortest = np.full(corners.shape[1], np.inf, np.float32)
-        for one, other in combinations(corners, 2):
-            side = position.take(one, 0) - position.take(other, 0)
+        for start, end in combinations(corners, 2):
+            side = position.take(start, 0) - position.take(end, 0)
             np.minimum(shortest, np.einsum("fi,fi->f", side, side), out=shortest)
         for corner in corners:
-            np.minimum.at(far, corner, shortest)
-    return vertices + SHAKEN * np.sqrt(far)[:, None] * np.random.default_rng(0).standard_normal(
+            np.minimum.at(shortest_squared, corner, shortest)
+    return vertices + JITTER_EDGES * np.sqrt(shortest_squared)[:, None] * np.random.default_rng(0).standard_normal(
         vertices.shape, np.float32
     )
 
 
-def uneven(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Vertices (v, 3), those that lie in a plane but for rounding, where there are more than a few, moved by up to
-    _UNEVEN edge lengths.
+def break_coplanarity(mesh: TriMesh) -> np.ndarray:
+    """Move vertices that are coplanar but for rounding by up to _COPLANAR_JITTER_EDGES edge lengths; return all (v, 3).
 
-    The quadric of an edge in a plane has its least value all over. Where its determinant is exactly zero the collapse
-    takes an end or the middle; where rounding makes it a little more it takes a point somewhere far, has to pass the
-    edge over, and what is curved is taken down to its last triangles instead."""
-    some = np.arange(len(vertices)) % max(len(vertices) // _SAMPLE, 1) == 0
-    around, few = topology.renumbered(faces[np.flatnonzero(corners_in(faces, some))], len(vertices))
-    if _flat(vertices[around], few)[some[around]].sum() / some.sum() < _FEW_FLAT:
+    Returns the array itself where hardly any are. In an exact plane, the quadric of an edge has determinant zero, and
+    the collapse takes an end or the middle. Where rounding makes the determinant a little more than zero, it takes a
+    point far away, and then has to skip the edge: so curved parts are collapsed to their last triangles instead.
+    """
+    vertices, faces = mesh.vertices, mesh.faces
+    sampled = np.arange(len(vertices)) % max(len(vertices) // _SAMPLES, 1) == 0
+    around, few = topology.renumbered(faces[np.flatnonzero(marked_corner_counts(faces, sampled))], len(vertices))
+    sampled_coplanar = _nearly_coplanar(TriMesh(vertices[around], few))[sampled[around]]
+    if sampled_coplanar.sum() / sampled.sum() < _MIN_COPLANAR_SHARE:
         return vertices
-    flat = np.flatnonzero(_flat(vertices, faces))
+    coplanar = np.flatnonzero(_nearly_coplanar(mesh))
     out = vertices.astype(np.float64)
-    out[flat] += _UNEVEN * median_edge(vertices, faces) * np.random.default_rng(0).uniform(-1, 1, vertices.shape)[flat]
+    noise = np.random.default_rng(0).uniform(-1, 1, vertices.shape)[coplanar]
+    out[coplanar] += _COPLANAR_JITTER_EDGES * median_edge(mesh) * noise
     return out
 
 
-def _flat(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(v,) bool: vertices all of whose faces lie in a plane that rounding bends."""
-    normals, corners = (
-        face_normals(vertices.astype(np.float32).astype(np.float64), faces)[0].T,
-        np.ascontiguousarray(faces.T, np.intp),
-    )
+def _nearly_coplanar(mesh: TriMesh) -> np.ndarray:
+    """(v,) bool: vertices all of whose faces lie in one plane that rounding bends."""
+    vertices, faces = mesh.vertices, mesh.faces
+    single = TriMesh(vertices.astype(np.float32).astype(np.float64), faces)
+    normals, corners = face_normals(single)[0].T, np.ascontiguousarray(faces.T, np.intp)
     sums = np.zeros((6, len(vertices)))
-    for total, (one, other) in zip(sums, combinations_with_replacement(normals, 2), strict=True):
-        product = one * other
+    for total, (first, second) in zip(sums, combinations_with_replacement(normals, 2), strict=True):
+        product = first * second
         for corner in corners:
             np.add.at(total, corner, product)
     sums /= np.maximum(np.bincount(corners.ravel(), minlength=len(vertices)), 1)
     xx, xy, xz, yy, yz, zz = sums
     determinant = abs(xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz))
-    return (determinant > 0) & (determinant < _FLAT)
+    return (determinant > 0) & (determinant < _COPLANAR_DETERMINANT)
 
 
-def collapse(
-    vertices: np.ndarray, faces: np.ndarray, target_faces: int, aggressiveness: float, unit: float = 1.0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return what the child runs: fast-simplification's quadric collapse (Garland & Heckbert 1997), with lengths in
-    units of `unit`.
+def collapse(mesh: TriMesh, target_faces: int, aggressiveness: float, unit: float = 1.0) -> TriMesh:
+    """Collapse edges with fast-simplification, which is quick but does not keep the topology.
 
-    It takes all edges whose error is below a bound that rises from round to round, from the same number whatever the
-    size of the mesh: in a large unit the first rounds take what they meet, which leaves even triangles; in a small one
-    it takes the flattest first, which leaves a fifth of the error."""
+    Each round takes all edges whose error is below a bound that rises from round to round, and starts at the same
+    number for a mesh of any size. unit: the length that counts as 1. With a large one the first rounds take edges in
+    any order, which leaves even triangles; with a small one they take the flattest first, which leaves a fifth of the
+    error.
+    """
     fast_simplification = imported("fast_simplification")
-    out_vertices, out_faces = fast_simplification.simplify(
-        np.ascontiguousarray(vertices / unit, np.float32),
-        np.ascontiguousarray(faces, np.int32),
+    vertices, faces = fast_simplification.simplify(
+        np.ascontiguousarray(mesh.vertices / unit, np.float32),
+        np.ascontiguousarray(mesh.faces, np.int32),
         target_count=target_faces,
         agg=aggressiveness,
     )
-    return np.asarray(out_vertices, np.float64) * unit, np.asarray(out_faces, np.int64)
+    return TriMesh(np.asarray(vertices, np.float64) * unit, np.asarray(faces, np.int64))
 
 
-def _edge(vertices: np.ndarray, faces: np.ndarray, count: int) -> float:
-    """About how long the edges are of so many even triangles in its place."""
-    return float((4 / 3**0.5 * face_normals(vertices, _few(faces))[1].mean() * len(faces) / count) ** 0.5)
+def collapse_keeping_topology(mesh: TriMesh, target_faces: int) -> TriMesh:
+    """Collapse edges with MeshLab, which refuses collapses that change the topology.
 
-
-def median_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Return the median length of the edges, of some of them."""
-    corners = vertices[_few(faces)]
-    return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1)))
-
-
-def _few(faces: np.ndarray) -> np.ndarray:
-    """Return some 20,000 of the faces, enough to tell their size."""
-    return faces[:: max(len(faces) // 20000, 1)]
-
-
-def collapse_topology(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return what the child runs where the quicker collapse tears the mesh: MeshLab's, which refuses what changes the
-    topology.
-
-    Without its cleaning afterwards, which joins what coincides.
+    Its cleaning afterwards is off, because that joins vertices at one position.
     """
     pymeshlab = imported("pymeshlab")
     meshes = pymeshlab.MeshSet()
-    meshes.add_mesh(pymeshlab.Mesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int32)))
+    meshes.add_mesh(pymeshlab.Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)))
     meshes.meshing_decimation_quadric_edge_collapse(
         targetfacenum=target_faces, preservetopology=True, preservenormal=True, planarquadric=True, autoclean=False
     )
-    mesh = meshes.current_mesh()
-    return np.asarray(mesh.vertex_matrix()), np.asarray(mesh.face_matrix(), np.int64)
+    result = meshes.current_mesh()
+    return TriMesh(np.asarray(result.vertex_matrix()), np.asarray(result.face_matrix(), np.int64))
 
 
-def collapse_by_way(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return what the child runs where the quicker collapse does not come to its end: that one as far as it goes well,
-    MeshLab's from there.
+def collapse_in_two_passes(mesh: TriMesh, target_faces: int) -> TriMesh:
+    """Collapse quickly down to _FIRST_PASS_FACTOR times the requested triangles, and with MeshLab from there.
 
-    A third of the time of MeshLab's alone. No triangles at all where the quicker one does not come so far either.
+    Takes a third of the time of MeshLab alone. The result has no triangles where the quick pass does not finish.
     """
-    vertices, faces = collapse(vertices, faces, _BY_WAY * target_faces, 5.0)
-    if len(faces) > _STUCK * _BY_WAY * target_faces:
-        return vertices, faces[:0]
-    return collapse_topology(vertices, faces, target_faces)
+    mesh = collapse(mesh, _FIRST_PASS_FACTOR * target_faces, 5.0)
+    if len(mesh.faces) > _UNFINISHED_FACTOR * _FIRST_PASS_FACTOR * target_faces:
+        return TriMesh(mesh.vertices, mesh.faces[:0])
+    return collapse_keeping_topology(mesh, target_faces)
 
 
-def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Fallback that cannot fail: vertices of one grid cell become their mean (Rossignac & Borrel 1993). May join
-    sheets."""
+def cluster(mesh: TriMesh, target_faces: int) -> TriMesh:
+    """Merge the vertices in each cell of a grid into their mean (Rossignac & Borrel 1993).
+
+    The fallback for open meshes: it always gives a result, but may join sheets.
+    """
+    vertices, faces = mesh.vertices, mesh.faces
     low, extent = vertices.min(0), float(np.ptp(vertices, 0).max())
     cells = int(np.clip((target_faces / 2) ** 0.5 / 2, 4, 2000))
     while True:
@@ -158,220 +222,259 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple
         _, _, inverse = unique_rows(grid)
         out = np.stack([np.bincount(inverse, vertices[:, i]) for i in range(3)], -1) / np.bincount(inverse)[:, None]
         merged = inverse[faces]
-        merged = merged[~topology.repeats(merged)]
-        merged = merged[first_rows(np.sort(merged, 1))]
+        merged = merged[~topology.has_repeated_corner(merged)]
+        merged = merged[indices_of_distinct(np.sort(merged, 1))]
         if len(merged) or cells > 4000:
-            return topology.compact(out, merged)
+            return topology.compact(TriMesh(out, merged))
         cells *= 2
 
 
-def reduced(
-    vertices: np.ndarray, faces: np.ndarray, way: str, arguments: tuple, even: bool, crease_degrees: float = 0.0
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return what the child runs: one of the collapses above of what is shaken, or uneven, first, and before that drawn
-    out to creases that turn by more than crease_degrees, if any; and how many vertices were."""
-    moved = 0
+def median_edge(mesh: TriMesh) -> float:
+    """Return the median edge length, of a sample of the faces."""
+    corners = mesh.vertices[_sample_faces(mesh.faces)]
+    return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1)))
+
+
+def _expected_edge(mesh: TriMesh, count: int) -> float:
+    """Return about how long the edges are of `count` equilateral triangles with the mesh's area."""
+    faces = mesh.faces
+    mean_area = face_normals(TriMesh(mesh.vertices, _sample_faces(faces)))[1].mean()
+    return float((4 / 3**0.5 * mean_area * len(faces) / count) ** 0.5)
+
+
+def _sample_faces(faces: np.ndarray) -> np.ndarray:
+    """Return about _SAMPLES of the faces."""
+    return faces[:: max(len(faces) // _SAMPLES, 1)]
+
+
+def collapse_in_child(mesh: TriMesh, call: CollapseCall, uniform: bool, crease_degrees: float = 0.0) -> ChildResult:
+    """Restore creases, jitter the vertices and collapse; this is the function that child processes run.
+
+    uniform: jitter all vertices, not only coplanar ones. crease_degrees: as in SimplifyOptions.
+    """
+    creases = 0
     if crease_degrees:
-        vertices, faces, creases = restore_creases(vertices, faces, crease_degrees)
-        moved = int(creases["moved"])
-    vertices = (shaken if even else uneven)(vertices, faces)
-    return *globals()[way](vertices, faces.astype(np.int32, copy=False), *arguments), moved
+        restored = restore_creases(mesh, crease_degrees)
+        mesh, creases = restored.mesh, restored.moved
+    vertices = (jitter_vertices if uniform else break_coplanarity)(mesh)
+    collapsed = call.function(TriMesh(vertices, mesh.faces.astype(np.int32, copy=False)), *call.arguments)
+    return ChildResult(collapsed, creases)
 
 
 def simplify(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    target_faces: int,
-    attributes: np.ndarray | None = None,
-    *,
-    seconds: float = 120.0,
-    closed: Callable[[], bool] | None = None,
-    crease_degrees: float = 0.0,
-    careful: bool = False,
-    near: bool = False,
-    even: bool = False,
-    measured: bool = True,
-    meanwhile: Callable[[], object] = lambda: None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, dict[str, float | int | str]]:
-    """Return a mesh of about target_faces triangles of the same shape and topology.
+    mesh: TriMesh, target_faces: int, attributes: np.ndarray | None = None, options: SimplifyOptions | None = None
+) -> Simplified:
+    """Simplify a mesh to about target_faces triangles of the same shape and topology.
 
-    vertices (v, 3), faces (f, 3), attributes (v, a) or None. Returns vertices, faces, attributes (read at the closest
-    point of the input) and a report: faces, method, and error, the largest distance of the result's vertices and of the
-    input's vertices (at most 20,000 of them) to the other surface, in units of the input. A closed, manifold input
-    stays so (closed says whether it is, soon). With crease_degrees, bevels are drawn out first to creases that turn by
-    more, unless what comes of it cannot be collapsed; the report says how many vertices moved (creases). `careful`
-    takes the slow way first, for meshes with more small parts than triangles to spare: the quick one reaches any
-    number, even by tearing down what is large. With `near` the quick one keeps nearer to the surface, its triangles
-    less even; with `even` the triangles are of one size, and off the surface by some hundredths of the input's edges
-    (SHAKEN). Without `measured` the error is left out; with it, a quick result that is as far off as its edges are long
-    is compared with the slow one's. `meanwhile` is called while each child works.
-    Raises InputError as repair.check does.
+    attributes (v, ...): interpolated at the point of the input that is closest to each new vertex. A closed, manifold
+    input stays closed and manifold; where nothing keeps it so, the input is returned. Raises InputError as
+    repair.check() does.
+
+    Example:
+        simplify(mesh, 5000, options=SimplifyOptions(low_deviation=True)).mesh
     """
-    repair.check(vertices, faces)
+    options = options or SimplifyOptions()
+    repair.check(mesh)
     target_faces = max(int(target_faces), 4)
-    if len(faces) <= target_faces:
-        report = {"faces": len(faces), "method": "none", "error": 0.0, "creases": 0}
-        if crease_degrees:
-            vertices, faces, drawn = restore_creases(vertices, faces, crease_degrees)
-            report |= {"faces": len(faces), "creases": drawn["moved"]}
-        return vertices, faces, attributes, report
-    rows = np.ascontiguousarray(vertices.T)  # several times faster than along the columns
-    low, high = rows.min(1), rows.max(1)
-    centre, extent = (low + high) / 2, float((high - low).max())
-    if not extent > 0:
-        raise InputError("mesh", "all its faces lie in one point", repair.NO_AREA)
-    unit = (vertices - centre) / extent
-    edge = _edge(unit, faces, target_faces)
-    is_closed, pieces = (
-        cache(closed or (lambda: topology.is_watertight(faces))),
-        cache(lambda: topology.components(faces)[0]),
-    )
-
-    def beside() -> None:
-        if closed is not None and cores() > 1 and is_closed():
-            pieces()  # asked for where what comes out is in several
-        meanwhile()
-
-    def collapsed(crease_degrees: float) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str], int | None]:
-        return _collapsed(
-            unit,
-            faces,
-            target_faces,
-            edge if near else _UNIT,
-            even,
-            crease_degrees,
-            careful,
-            seconds,
-            is_closed,
-            beside,
+    if len(mesh.faces) <= target_faces:
+        creases = 0
+        if options.crease_degrees:
+            restored = restore_creases(mesh, options.crease_degrees)
+            mesh, creases = restored.mesh, restored.moved
+        return Simplified(mesh, attributes, SimplifyReport(len(mesh.faces), "none", creases, error=0.0))
+    run = _Simplification(mesh, target_faces, options)
+    collapsed = run.collapse()
+    if collapsed is None:
+        report = SimplifyReport(len(mesh.faces), "none", error=0.0, failed="; ".join(run.failed))
+        return Simplified(mesh, attributes, report)
+    result = run.finish(collapsed, attributes)
+    report = result.report
+    if (
+        report.error is not None
+        and not options.topology_first
+        and report.method == QUICK_METHOD
+        and report.error > run.edge * run.extent
+    ):
+        slow_options = replace(
+            options, topology_first=True, crease_degrees=0.0, is_closed=lambda: run.is_closed, while_waiting=None
         )
+        slow = simplify(mesh, target_faces, attributes, slow_options)
+        return min(result, slow, key=_comparable_error)
+    return result
 
-    found, method, reasons, moved = collapsed(crease_degrees)
-    if found is None and moved != 0:
-        reasons.append("creases restored: the result cannot be simplified")
-        found, method, more, moved = collapsed(0.0)
-        reasons += more
-    if found is None and not is_closed():
-        found, method = cluster(unit, faces, target_faces), "vertex clustering"
-        if not len(found[1]):
-            found = None
-    if found is None:
-        return (
-            vertices,
-            faces,
-            attributes,
-            {"faces": len(faces), "method": "none", "error": 0.0, "creases": 0, "failed": "; ".join(reasons)},
+
+def _comparable_error(made: Simplified) -> float:
+    """Return the error; infinite where nothing was simplified, or measured."""
+    report = made.report
+    return np.inf if report.method == "none" or report.error is None else report.error
+
+
+class _Collapsed(NamedTuple):
+    """A usable mesh and the method that made it; creases: how many vertices moved to restored creases.
+
+    creases is None where no child reported it.
+    """
+
+    mesh: TriMesh
+    method: str
+    creases: int | None
+
+
+class _Simplification:
+    """One run of simplify(), in a unit box around the mesh."""
+
+    def __init__(self, mesh: TriMesh, target_faces: int, options: SimplifyOptions):
+        self.target_faces, self.options = target_faces, options
+        self.failed: list[str] = []
+        rows = np.ascontiguousarray(mesh.vertices.T)  # several times faster to reduce than the columns
+        low, high = rows.min(1), rows.max(1)
+        self.centre, self.extent = (low + high) / 2, float((high - low).max())
+        if not self.extent > 0:
+            raise InputError("mesh", "all its faces lie in one point", repair.NO_AREA)
+        self.mesh = TriMesh((mesh.vertices - self.centre) / self.extent, mesh.faces)
+        self.edge = _expected_edge(self.mesh, target_faces)  # of the result, in the unit box
+
+    @cached_property
+    def is_closed(self) -> bool:
+        """Whether the input is watertight."""
+        return (self.options.is_closed or (lambda: topology.is_watertight(self.mesh.faces)))()
+
+    @cached_property
+    def pieces(self) -> int:
+        """Number of the input's pieces."""
+        return topology.components(self.mesh.faces)[0]
+
+    def collapse(self) -> _Collapsed | None:
+        """Collapse the mesh in the best way that works; None where none does."""
+        collapsed, creases = self._collapse_in_children(self.options.crease_degrees)
+        if collapsed is None and creases != 0:
+            self.failed.append("creases restored: the result cannot be simplified")
+            collapsed, creases = self._collapse_in_children(0.0)
+        if collapsed is None and not self.is_closed:
+            collapsed = _Collapsed(cluster(self.mesh, self.target_faces), "vertex clustering", creases)
+        return collapsed if collapsed is not None and len(collapsed.mesh.faces) else None
+
+    def finish(self, collapsed: _Collapsed, attributes: np.ndarray | None) -> Simplified:
+        """Drop small pieces that came off, interpolate attributes, measure the error and scale back."""
+        made = topology.compact(collapsed.mesh)
+        if topology.components(made.faces)[0] > 1 and self.is_closed:
+            made = repair.drop_small_pieces(made, self.pieces)
+        report = SimplifyReport(
+            len(made.faces),
+            collapsed.method,
+            collapsed.creases,
+            deviation(self.mesh, made) * self.extent if self.options.measure_error else None,
+            "; ".join(self.failed) or None,
         )
-    out_vertices, out_faces = topology.compact(*found)
-    if topology.components(out_faces)[0] > 1 and is_closed():
-        out_vertices, out_faces = repair.without_crumbs(out_vertices, out_faces, pieces())
-    out_attributes = None
-    if attributes is not None:
+        made_attributes = None if attributes is None else self._interpolate(attributes, made.vertices)
+        return Simplified(TriMesh(made.vertices * self.extent + self.centre, made.faces), made_attributes, report)
+
+    def _interpolate(self, attributes: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the input's attributes (v, ...) at its points closest to points (n, 3)."""
         from gdtool.geometry.distance import barycentric_of, closest_points
 
-        _, face_idx, point = closest_points(out_vertices, unit, faces)
-        weights = barycentric_of(point, unit[faces[face_idx]])
-        out_attributes = np.einsum("nc,nc...->n...", weights, attributes[faces[face_idx]])
-    report = {"faces": len(out_faces), "method": method, "creases": moved}
-    if measured:
-        report["error"] = deviation(unit, faces, out_vertices, out_faces) * extent
-    if reasons:
-        report["failed"] = "; ".join(reasons)
-    out = out_vertices * extent + centre, out_faces, out_attributes, report
-    if measured and not careful and method == "quadric collapse" and report["error"] > edge * extent:
-        other = simplify(
-            vertices,
-            faces,
-            target_faces,
-            attributes,
-            seconds=seconds,
-            closed=is_closed,
-            careful=True,
-            near=near,
-            even=even,
+        _, face_idx, point = closest_points(points, self.mesh)
+        corner_idx = self.mesh.faces[face_idx]
+        weights = barycentric_of(point, self.mesh.vertices[corner_idx])
+        return np.einsum("nc,nc...->n...", weights, attributes[corner_idx])
+
+    def _calls(self) -> Iterator[CollapseCall]:
+        """Yield the collapses to try, in order."""
+        # The quick collapse tears a closed mesh now and then (a handful of edges with four faces), at one
+        # aggressiveness and not at another. It collapses no parts made of slivers, at any. MeshLab's takes ten times
+        # as long.
+        unit = self.edge if self.options.low_deviation else _EVEN_UNIT
+        quick = [CollapseCall(collapse, (self.target_faces, pace, unit)) for pace in _AGGRESSIVENESS]
+        slow = [CollapseCall(collapse_keeping_topology, (self.target_faces,))]
+        if len(self.mesh.faces) > 2 * _FIRST_PASS_FACTOR * self.target_faces:
+            slow.insert(0, CollapseCall(collapse_in_two_passes, (self.target_faces,)))
+        yield from slow + quick if self.options.topology_first else quick + slow
+
+    def _collapse_in_children(self, crease_degrees: float) -> tuple[_Collapsed | None, int | None]:
+        """Run collapses in children until one leaves the mesh as closed as it is; record what failed.
+
+        Returns an unfinished quick result where nothing else works, None where nothing works. Also returns how many
+        vertices the last child moved to restored creases, None where no child reported it.
+        """
+        topology_first = self.options.topology_first
+        unfinished, creases = None, None if crease_degrees else 0
+        for call in self._calls():
+            is_quick = call.function is collapse
+            if unfinished is not None and is_quick:
+                continue
+            if call.function is collapse_in_two_passes and unfinished is None and not topology_first:
+                continue
+            if creases != 0 and not is_quick and not topology_first:
+                break  # folds hinder the collapse, of bevels that were moved where there is no crease
+            try:
+                made, creases = self._run_child(call, crease_degrees)
+            except ChildFailed as failure:
+                self.failed.append(str(failure))
+                continue
+            made, is_sound = self._separated_if_torn(made)
+            if not is_sound and (self.is_closed or not _is_usable(made)):
+                self.failed.append("the result is not as closed as the input")
+            elif is_quick and not creases and len(made.faces) > self._most_finished_faces:
+                unfinished = made
+                self.failed.append(f"the quick collapse stopped at {len(made.faces)} triangles")
+            else:
+                return _Collapsed(made, QUICK_METHOD if is_quick else TOPOLOGY_METHOD, creases), creases
+        return None if unfinished is None else _Collapsed(unfinished, QUICK_METHOD, creases), creases
+
+    @property
+    def _most_finished_faces(self) -> float:
+        """Triangles that a finished quick collapse leaves at most."""
+        return _UNFINISHED_FACTOR * self.target_faces + _UNFINISHED_FACES
+
+    def _run_child(self, call: CollapseCall, crease_degrees: float) -> ChildResult:
+        """Run one collapse in a child; do meanwhile what can be done without its result."""
+        options = self.options
+        running = begin(
+            collapse_in_child,
+            TriMesh(self.mesh.vertices, self.mesh.faces.astype(np.int32)),
+            call,
+            options.uniform,
+            crease_degrees,
+            seconds=options.seconds,
+            memory_mb=_CHILD_MEMORY_MB,
         )
-        return min(out, other, key=lambda one: one[3]["error"] if one[3]["method"] != "none" else np.inf)
-    return out
+        if options.is_closed is not None and cores() > 1 and self.is_closed:
+            _ = self.pieces  # needed where the result is in several pieces
+        if options.while_waiting is not None:
+            options.while_waiting()
+        return running.result()
+
+    def _separated_if_torn(self, made: TriMesh) -> tuple[TriMesh, bool]:
+        """Separate sheets where a closed mesh was torn; return the mesh, and whether it is closed and manifold."""
+        # A closed result does for any input, so whether the input is closed is asked only for other results.
+        if _is_closed_manifold(made):
+            return made, True
+        if self.is_closed and _is_usable(made):
+            made = separate_sheets(made)  # most tears are two sheets that meet in an edge
+            return made, _is_closed_manifold(made)
+        return made, False
 
 
-def _collapsed(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    target_faces: int,
-    unit: float,
-    even: bool,
-    crease_degrees: float,
-    careful: bool,
-    seconds: float,
-    is_closed: Callable[[], bool],
-    meanwhile: Callable[[], object],
-) -> tuple[tuple[np.ndarray, np.ndarray] | None, str, list[str], int | None]:
-    """Return what the first way leaves that keeps the mesh as closed as it is, or None; its name, what failed, and how
-    many vertices were drawn out to creases, None where no child came to tell."""
-    # The quick collapse tears a closed mesh now and then (a handful of edges with four faces), at one pace and not at
-    # another, and of parts made of slivers it collapses nothing, at any; MeshLab's takes ten times as long.
-    quick = [("collapse", (target_faces, pace, unit)) for pace in _PACES]
-    slow = [("collapse_topology", (target_faces,))]
-    if len(faces) > 2 * _BY_WAY * target_faces:
-        slow.insert(0, ("collapse_by_way", (target_faces,)))
-    reasons, stuck, moved = [], None, None if crease_degrees else 0
-    for way, arguments in slow + quick if careful else quick + slow:
-        if stuck is not None and way == "collapse" or way == "collapse_by_way" and stuck is None and not careful:
-            continue
-        if moved != 0 and way != "collapse" and not careful:
-            break  # what cannot be collapsed are folds, of bevels that were drawn out where there is no crease
-        try:
-            running = begin(
-                reduced,
-                vertices,
-                faces.astype(np.int32),
-                way,
-                arguments,
-                even,
-                crease_degrees,
-                seconds=seconds,
-                memory_mb=16000,
-            )
-            meanwhile()
-            *out, moved = running.result()
-        except ChildFailed as failure:
-            reasons.append(str(failure))
-            continue
-        # What comes out closed does for any input: whether that is closed is asked of no other.
-        sound = _sound(*out, True, target_faces)
-        if not sound and is_closed() and _sound(*out, False, target_faces):
-            out = unpinched(*out)  # what the quick collapse tears are mostly two sheets that meet in an edge
-            sound = _sound(*out, True, target_faces)
-        if not sound and (is_closed() or not _sound(*out, False, target_faces)):
-            reasons.append("the result is not as closed as the input")
-        elif way == "collapse" and not moved and len(out[1]) > _STUCK * target_faces + _FEW:
-            stuck = out
-            reasons.append(f"the quick collapse stopped at {len(out[1])} triangles")
-        else:
-            return out, "quadric collapse" if way == "collapse" else "quadric collapse, topology kept", reasons, moved
-    return stuck, "quadric collapse", reasons, moved
+def _is_usable(mesh: TriMesh) -> bool:
+    """Whether a native library's result has faces, indices in range and finite vertices."""
+    faces = mesh.faces
+    return bool(
+        len(faces) and faces.min() >= 0 and faces.max() < len(mesh.vertices) and np.isfinite(mesh.vertices).all()
+    )
 
 
-def _sound(vertices: np.ndarray, faces: np.ndarray, closed: bool, target_faces: int) -> bool:
-    """Whether a native result can be used: finite, in range, not empty, closed when the input was."""
-    if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
-        return False
-    return not closed or (topology.is_watertight(faces) and topology.is_manifold(faces))
+def _is_closed_manifold(mesh: TriMesh) -> bool:
+    """Whether a native library's result is usable, watertight and manifold."""
+    return _is_usable(mesh) and topology.is_watertight(mesh.faces) and topology.is_manifold(mesh.faces)
 
 
-def deviation(
-    vertices_a: np.ndarray, faces_a: np.ndarray, vertices_b: np.ndarray, faces_b: np.ndarray, limit: int = 20000
-) -> float:
-    """Largest distance of the vertices of one mesh to the surface of the other, both ways, at most `limit` vertices
-    each."""
+def deviation(mesh: TriMesh, other: TriMesh, limit: int = _SAMPLES) -> float:
+    """Return the largest distance of either mesh's vertices to the other surface; about `limit` vertices of each."""
     from gdtool.geometry.distance import closest_points
 
     out = 0.0
-    for (points, faces), surface in (
-        ((vertices_a, faces_a), (vertices_b, faces_b)),
-        ((vertices_b, faces_b), (vertices_a, faces_a)),
-    ):
-        used = np.unique(faces)
+    for measured, surface in ((mesh, other), (other, mesh)):
+        used = np.unique(measured.faces)
         step = max(len(used) // limit, 1)
-        out = max(out, float(closest_points(points[used[::step]], *surface)[0].max()))
+        out = max(out, float(closest_points(measured.vertices[used[::step]], surface)[0].max()))
     return out

@@ -1,7 +1,7 @@
-"""Tangent frames by the MikkTSpace algorithm (Mikkelsen 2008, "Simulation of Wrinkled Surfaces Revisited", section
-3.7).
+"""Compute tangent frames by the MikkTSpace algorithm (Mikkelsen 2008, "Simulation of Wrinkled Surfaces Revisited").
 
-glTF viewers decode normal maps in this basis whether a file carries tangents or not, so a baker has to encode in it.
+This is its section 3.7. glTF viewers decode normal maps in this basis whether a file carries tangents or not, so a
+baker has to encode in it.
 The steps follow the algorithm's reference description: corners with identical position, normal and texture coordinate
 are one vertex; around each vertex, triangles that hang together by edges and turn the same way in texture space form a
 group; a group's tangent is the sum of its triangles' texture axes, each projected to the tangent plane, normalised and
@@ -13,34 +13,43 @@ from __future__ import annotations
 
 import numpy as np
 
+from gdtool.geometry.meshes import TriMesh
 
-def weld(*columns: np.ndarray) -> np.ndarray:
-    """For rows given as columns (n, k_i): the index (n,) of the distinct row each one equals, bit by bit."""
+
+def number_distinct_rows(*columns: np.ndarray) -> np.ndarray:
+    """Number the distinct rows of columns (n, k_i) side by side; return the number (n,) of each row.
+
+    Rows are equal where they are as float32, bit by bit; 0 and -0 are equal.
+    """
     rows = np.concatenate([np.ascontiguousarray(c).reshape(len(c), -1).astype(np.float32) + 0.0 for c in columns], 1)
     keys = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.dtype.itemsize * rows.shape[1]))).ravel()
     return np.unique(keys, return_inverse=True)[1].ravel()
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(...,) scalar products of vectors (..., c); numpy's sum over a short last axis takes several times as long."""
+    """Return scalar products (...,) of vectors (..., c).
+
+    numpy's sum over a short last axis takes several times as long.
+    """
     return np.einsum("...c,...c->...", a, b)
 
 
 def unit(v: np.ndarray) -> np.ndarray:
-    """Vectors (..., c) of length 1; those without length stay 0."""
+    """Scale vectors (..., c) to length 1; those of length 0 stay 0."""
     length = np.sqrt(dot(v, v))[..., None]
     return v / np.where(length > 0, length, 1.0)
 
 
 def _flatten(v: np.ndarray, n: np.ndarray) -> np.ndarray:
-    """v projected to the plane of n, unit."""
+    """Project vectors v to the planes with unit normals n, and scale them to length 1."""
     return unit(v - n * dot(n, v)[..., None])
 
 
 def edge_pairs(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where two of the triangles (t, 3) meet: half-edges one, two (m,), numbered 3 t + k from corner k to the next.
+    """Pair the half edges of triangles (t, 3) that run along one edge in opposite directions.
 
-    They run along the edge in opposite directions. Of an edge with more than two faces one pair is given at most.
+    Returns both half edges (m,) of each pair. Half edge 3 t + k of triangle t runs from its corner k to the next. An
+    edge with more than two faces gives one pair at most.
     """
     start, end = faces.ravel(), np.roll(faces, -1, 1).ravel()
     low, high, forward = np.minimum(start, end).astype(np.int64), np.maximum(start, end).astype(np.int64), start < end
@@ -52,21 +61,25 @@ def edge_pairs(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _groups(vertex: np.ndarray, sign: np.ndarray) -> np.ndarray:
-    """Group (t, 3) of each corner: corners of one vertex, connected by edges of triangles with one non-zero sign."""
+    """Return the group (t, 3) of each corner.
+
+    A group is corners of one vertex (vertex (t, 3)) whose triangles hang together by edges and have the same sign (t,),
+    which is not 0.
+    """
     count = len(vertex)
-    one, two = edge_pairs(vertex)
-    fits = (sign[one // 3] == sign[two // 3]) & (sign[one // 3] != 0)
-    one, two = one[fits], two[fits]
+    first, second = edge_pairs(vertex)
+    fits = (sign[first // 3] == sign[second // 3]) & (sign[first // 3] != 0)
+    first, second = first[fits], second[fits]
     following = np.arange(count * 3).reshape(count, 3)[:, [1, 2, 0]].ravel()
-    a, b = np.concatenate([one, following[one]]), np.concatenate([following[two], two])
-    return connected(count * 3, a, b).reshape(count, 3)
+    a, b = np.concatenate([first, following[first]]), np.concatenate([following[second], second])
+    return label_connected(count * 3, a, b).reshape(count, 3)
 
 
-def connected(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(count,) number of the connected part that each of count nodes is in, from edges a, b (m,); quicker here than
+def label_connected(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Label the connected components of a graph of `count` nodes with edges a, b (m,); (count,) labels from 0.
+
+    Every node takes the smallest label beside it, and then its label's label, until nothing changes. Quicker here than
     importing scipy.sparse, which takes a quarter of a second.
-
-    Every node takes the least label beside it and then its label's label, until nothing changes.
     """
     label = np.arange(count)
     while len(a):
@@ -83,24 +96,24 @@ def connected(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def corner_tangents(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: TriMesh,
     normals: np.ndarray,
     uv: np.ndarray,
     face_uvs: np.ndarray,
     face_normals_idx: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Tangents (t, 3, 4) float32 of the corners of triangles, glTF's form.
+    """Compute tangents (t, 3, 4) float32 of the corners of triangles, as glTF stores them.
 
-    vertices (v, 3), faces (t, 3); normals (n, 3) unit, indexed by face_normals_idx (t, 3) or like vertices; uv (c, 2)
-    with (0, 0) at the image's top left, indexed by face_uvs (t, 3). xyz is unit and orthogonal to the corner's normal;
-    the bitangent w · cross(normal, tangent) points up in the image. Corners whose vertex has no triangle with area in
-    texture space get some tangent orthogonal to the normal and w = 1.
+    normals (n, 3) unit, indexed by face_normals_idx (t, 3), or one for each vertex; uv (c, 2) with (0, 0) at the
+    image's top left, indexed by face_uvs (t, 3). xyz is unit and orthogonal to the corner's normal; the bitangent
+    w · cross(normal, tangent) points up in the image. Corners whose vertex has no triangle with area in texture space
+    get some tangent orthogonal to the normal and w = 1.
     """
-    position = np.asarray(vertices, np.float64)[faces]
+    faces = mesh.faces
+    position = np.asarray(mesh.vertices, np.float64)[faces]
     normal = unit(np.asarray(normals, np.float64)[faces if face_normals_idx is None else face_normals_idx])
     texture = np.asarray(uv, np.float64)[face_uvs] * (1, -1) + (0, 1)
-    vertex = weld(position.reshape(-1, 3), normal.reshape(-1, 3), texture.reshape(-1, 2)).reshape(-1, 3)
+    vertex = number_distinct_rows(position.reshape(-1, 3), normal.reshape(-1, 3), texture.reshape(-1, 2)).reshape(-1, 3)
 
     e1, e2 = position[:, 1] - position[:, 0], position[:, 2] - position[:, 0]
     t1, t2 = texture[:, 1] - texture[:, 0], texture[:, 2] - texture[:, 0]
@@ -120,7 +133,7 @@ def corner_tangents(
     frame = unit(total)[group]
     handed = np.repeat(sign[:, None], 3, 1).astype(np.float64)
 
-    # Corners of unusable triangles borrow from the first usable corner of their vertex.
+    # Corners of triangles without usable texture coordinates borrow from the first usable corner of their vertex.
     lender = np.full(vertex.max(initial=-1) + 1, -1)
     good = np.flatnonzero(np.repeat(usable, 3))
     lender[vertex.ravel()[good][::-1]] = good[::-1]
@@ -137,20 +150,20 @@ def corner_tangents(
     return np.concatenate([frame, np.where(handed < 0, -1.0, 1.0)[..., None]], -1).astype(np.float32)
 
 
-def frames_of(normal: np.ndarray, tangent: np.ndarray, sign: np.ndarray) -> np.ndarray:
-    """Tangent frames (n, 3, 3), columns tangent, bitangent, normal, of interpolated normals and tangents (n, 3), sign
-    (n,).
+def tangent_frames(normal: np.ndarray, tangent: np.ndarray, sign: np.ndarray) -> np.ndarray:
+    """Build frames (n, 3, 3), columns tangent, bitangent, normal, from interpolated normals and tangents (n, 3).
 
-    Nothing is normalised after interpolation, as MikkTSpace asks: encoder and decoder then use the same basis.
+    sign (n,): handedness. Nothing is normalised after interpolation, as MikkTSpace requires, so that encoder and
+    decoder use the same basis.
     """
     return np.stack([tangent, np.cross(normal, tangent) * sign[:, None], normal], -1)
 
 
 def encode_tangent_space(normal: np.ndarray, tangent: np.ndarray, sign: np.ndarray, world: np.ndarray) -> np.ndarray:
-    """Return unit tangent-space normals (n, 3), +Y up, that decode to the unit world normals (n, 3) in interpolated
-    frames.
+    """Return unit tangent-space normals (n, 3), +Y up, that decode to unit world normals (n, 3).
 
-    normal and tangent (n, 3) need be neither unit nor orthogonal, the bitangent is sign (n,) · cross(normal, tangent).
+    normal and tangent (n, 3), interpolated, need be neither unit nor orthogonal; the bitangent is
+    sign (n,) · cross(normal, tangent).
     """
     across = np.empty_like(normal)
     for k in range(3):
@@ -158,7 +171,7 @@ def encode_tangent_space(normal: np.ndarray, tangent: np.ndarray, sign: np.ndarr
         across[:, k] = normal[:, i] * tangent[:, j] - normal[:, j] * tangent[:, i]
     nn, tt, nt = dot(normal, normal), dot(tangent, tangent), dot(normal, tangent)
     along, up = dot(world, tangent), dot(world, normal)
-    # The frame's inverse, up to a positive factor: the dual of each axis from the others' products.
+    # The inverse of the frame, up to a positive factor: the dual of each axis from products of the other two.
     out = np.stack([along * nn - up * nt, sign * dot(world, across), up * tt - along * nt]).T
     lost = nn * tt - nt * nt <= 1e-9
     if lost.any():
@@ -167,5 +180,5 @@ def encode_tangent_space(normal: np.ndarray, tangent: np.ndarray, sign: np.ndarr
 
 
 def decode_tangent_space(frames: np.ndarray, local: np.ndarray) -> np.ndarray:
-    """World normals (n, 3), unit, of tangent-space normals (n, 3), +Y up, in frames (n, 3, 3)."""
+    """Return unit world normals (n, 3) of tangent-space normals (n, 3), +Y up, in frames (n, 3, 3)."""
     return unit(np.einsum("...ck,...k->...c", frames, local))

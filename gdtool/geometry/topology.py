@@ -1,27 +1,31 @@
-"""What the indices of a mesh tell: its edges, the fans around its vertices, its pieces, whether it is closed and
-manifold."""
+"""Answer questions about a mesh from its indices: edges, fans, pieces, whether it is closed and manifold.
+
+A fan is a set of faces around one vertex that hang together by edges. A half edge is one side of an edge: one row for
+each corner of each face, directed from that corner to the face's next one.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from gdtool.geometry.hashing import splitmix64
+from gdtool.geometry.meshes import Mesh
 
-_FAN = 64  # edges at a vertex; of more a walk around it step by step takes too long
-_CHUNK = 2**14  # triangles at a time: what they need in between stays in the cache
-_FEW = 4000  # keys, below which sorting is quicker than building a sparse matrix
+_MAX_FAN_STEPS = 64  # edges at a vertex beyond which walking around it step by step takes too long
+_CHUNK = 2**14  # triangles at a time, so that intermediate arrays stay in the cache
+_MIN_COUNTING_KEYS = 4000  # with fewer keys, sorting is quicker than building a sparse matrix
 
 
 @dataclass(frozen=True)
 class Edges:
-    """Undirected edges of a mesh of triangles and quads.
+    """Undirected edges of a mesh of triangles and quads, and its half edges.
 
-    ends (e, 2) vertices, lower first; count (e,) faces at it; turned (e,) bool: two faces walk it in one direction.
-    half_edge_idx (h,) into ends, half_face (h,) the face, half_ends (h, 2) the directed edge: one row a face corner.
-    order (h,) the half edges edge by edge, those of one edge as they come.
+    ends (e, 2): vertices, the lower first; count (e,): number of faces; turned (e,) bool: its two faces traverse it in
+    the same direction. half_edge_idx (h,): the edge of each half edge; half_face (h,): its face; half_ends (h, 2): the
+    vertices it runs from and to. order (h,): half edges sorted by edge, those of one edge in their order.
     """
 
     ends: np.ndarray
@@ -33,14 +37,14 @@ class Edges:
     order: np.ndarray
 
     def face_pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Edges (k,) with exactly two faces, and those faces (k, 2)."""
+        """Return the edges (k,) with exactly two faces, and those faces (k, 2)."""
         edge_idx = np.flatnonzero(self.count == 2)
         first = (np.cumsum(self.count) - self.count)[edge_idx]
         return edge_idx, self.half_face[self.order[np.stack([first, first + 1], -1)]]
 
 
 def edges_of(faces: np.ndarray) -> Edges:
-    """Edges of faces (f, 3), or (f, 4) where a fourth corner of -1 marks a triangle."""
+    """Find the edges of faces (f, 3), or (f, 4) where a fourth corner of -1 marks a triangle."""
     faces = np.asarray(faces, np.int64)
     following = np.roll(faces, -1, 1)
     if faces.shape[1] == 4:
@@ -70,14 +74,14 @@ def edges_of(faces: np.ndarray) -> Edges:
 
 
 def twins_of(faces: np.ndarray) -> np.ndarray | None:
-    """(3 f,) the half edge the other way round for each half edge of triangles (f, 3); None where one has none or
-    several, and for other faces.
+    """Return for each half edge of triangles (f, 3) the opposite half edge, (3 f,) int32.
 
-    In linear time: half edges are the entries of a sparse matrix, whose transpose has the same entries elsewhere.
+    None where a half edge has no opposite or several, and for faces that are not triangles. Takes linear time: half
+    edges are the entries of a sparse matrix, and the transpose holds the same entries at the opposite places.
     """
     from scipy.sparse import csr_array
 
-    if not _plain(faces):
+    if not _may_have_twins(faces):
         return None
     start = faces.astype(np.int32).ravel()
     end = np.ascontiguousarray(faces[:, [1, 2, 0]]).astype(np.int32).ravel()
@@ -95,54 +99,54 @@ def twins_of(faces: np.ndarray) -> np.ndarray | None:
     return out
 
 
-def even(faces: np.ndarray) -> bool:
-    """Whether each edge of faces (f, 3) is one of an even number of them, by the exclusive or of hashes (splitmix64's):
-    wrong once in 2^64.
+def has_even_edge_counts(faces: np.ndarray) -> bool:
+    """Whether each edge of triangles (f, 3) belongs to an even number of them.
 
-    A manifold whose faces all look out is watertight where it is so; that is told in a tenth of the time that
-    is_watertight takes."""
-    together = np.uint64(0)
+    The exclusive or of a hash of every half edge's ends is 0 then; it is also 0 otherwise once in 2^64. A consistently
+    oriented manifold is watertight where this holds, and this takes a tenth of the time of is_watertight().
+    """
+    total = np.uint64(0)
     for i in range(0, len(faces), _CHUNK):
         start = np.ascontiguousarray(faces[i : i + _CHUNK].T, np.uint64)
         end = start[[1, 2, 0]]
         key = np.minimum(start, end) << np.uint64(32) | np.maximum(start, end)
-        together ^= np.bitwise_xor.reduce(splitmix64(key), axis=None)
-    return not together
+        total ^= np.bitwise_xor.reduce(splitmix64(key), axis=None)
+    return not total
 
 
 def is_watertight(faces: np.ndarray) -> bool:
-    """Every edge has exactly two faces, which walk it in opposite directions."""
+    """Whether every edge has exactly two faces, which traverse it in opposite directions."""
     faces = np.asarray(faces)
     if not len(faces):
         return False
-    if _plain(faces):
+    if _may_have_twins(faces):
         return twins_of(faces) is not None
     edges = edges_of(faces)
     return bool((edges.count == 2).all() and not edges.turned.any())
 
 
 def is_manifold(faces: np.ndarray) -> bool:
-    """No edge has more than two faces, and the faces around each vertex form one fan."""
+    """Whether no edge has more than two faces, and the faces around each vertex form one fan."""
     if not len(faces):
         return False
     if (twins := twins_of(faces)) is not None:
-        return one_fan_each(faces, twins)
+        return has_one_fan_per_vertex(faces, twins)
     return bool((edges_of(faces).count <= 2).all()) and not len(split_vertices(faces))
 
 
 def split_vertices(faces: np.ndarray) -> np.ndarray:
-    """Vertices (k,) whose faces form more than one fan (bow-ties)."""
+    """Return the vertices (k,) whose faces form more than one fan (bow-ties)."""
     return np.flatnonzero(corner_fans(faces)[1] > 1)
 
 
 def corner_fans(
     faces: np.ndarray, mates: np.ndarray | None = None, edges: Edges | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the fan (f, c) each face corner belongs to (numbered over the mesh), and the number of fans at each
-    vertex.
+    """Return the fan (f, c) of each face corner, numbered over the whole mesh, and the number of fans at each vertex.
 
-    Fans go on across edges of exactly two faces, and across mates (k, 2), pairs of half edges that belong together.
-    edges: those of the faces, where they are known."""
+    Faces on both sides of an edge of exactly two faces are of one fan. mates (k, 2): more pairs of half edges whose
+    faces are. edges: the edges of the faces, where they are known.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -151,20 +155,20 @@ def corner_fans(
     corner_idx = np.full(faces.shape, -1, np.int64)
     corner_idx[used] = np.arange(int(used.sum()))
     vertex_of = np.asarray(faces)[used]
-    # Two faces at a manifold edge join their corners at both of its ends. The half edge of a corner starts there.
+    # Two faces at a manifold edge join their corners at both of its ends. A corner and its half edge share an index.
     keep = edges.count == 2
-    first = (np.cumsum(edges.count) - edges.count)[keep]
-    one, two = edges.order[first], edges.order[first + 1]
+    first_half = (np.cumsum(edges.count) - edges.count)[keep]
+    left, right = edges.order[first_half], edges.order[first_half + 1]
     if mates is not None:
-        one, two = np.concatenate([one, mates[:, 0]]), np.concatenate([two, mates[:, 1]])
+        left, right = np.concatenate([left, mates[:, 0]]), np.concatenate([right, mates[:, 1]])
     after = np.roll(corner_idx, -1, 1)
     if faces.shape[1] == 4:
         triangle = np.asarray(faces)[:, 3] < 0
         after[triangle, 2] = corner_idx[triangle, 0]
     after = after[used]
     rows, columns = [], []
-    for a in (one, after[one]):
-        for b in (two, after[two]):
+    for a in (left, after[left]):
+        for b in (right, after[right]):
             same = vertex_of[a] == vertex_of[b]
             rows.append(a[same])
             columns.append(b[same])
@@ -179,15 +183,14 @@ def corner_fans(
 
 
 def components(faces: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return number of pieces and the piece (f,) of each face; faces that share an edge are of one piece."""
+    """Return the number of pieces and the piece (f,) of each face; faces that share an edge are of one piece."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     if (twins := twins_of(faces)) is not None:
-        return _pieces(twins)
+        return _components_of_twins(twins)
     edges = edges_of(faces)
-    # The faces of an edge in a row, each tied to the next: linear in the number of corners, whatever the edges'
-    # valence.
+    # The faces of an edge form a chain, each tied to the next: linear in the corners, however many faces an edge has.
     edge, face = edges.half_edge_idx[edges.order], edges.half_face[edges.order]
     tied = edge[1:] == edge[:-1]
     rows, columns = face[:-1][tied], face[1:][tied]
@@ -195,7 +198,10 @@ def components(faces: np.ndarray) -> tuple[int, np.ndarray]:
 
 
 def triangulated(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (t, 3) of quads (f, 4), each cut along corners 0 and 2, and the face (t,) each comes from."""
+    """Cut quads (f, 4) along corners 0 and 2; a fourth corner of -1 marks a triangle.
+
+    Returns triangles (t, 3) int32 and the face (t,) int32 that each comes from, in the order of the faces.
+    """
     quads = np.flatnonzero(faces[:, 3] >= 0)
     if not len(quads):
         return faces[:, :3].astype(np.int32), np.arange(len(faces), dtype=np.int32)
@@ -206,22 +212,24 @@ def triangulated(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def euler_number(faces: np.ndarray) -> int:
-    """Vertices that are used, less edges, plus faces."""
+    """Return Euler's number: the vertices that faces use, less the edges, plus the faces."""
     return len(np.unique(faces[faces >= 0])) - len(edges_of(faces).ends) + len(faces)
 
 
 def handles(faces: np.ndarray, pieces: int, edges: Edges | None = None) -> int:
-    """How many handles a manifold of so many pieces has, by Euler's formula, from the loops of its rim; edges: its own,
-    where they are known."""
+    """Return how many handles a manifold of `pieces` pieces has, by Euler's formula; it may have boundary loops.
+
+    edges: the edges of the faces, where they are known.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     edges = edges_of(faces) if edges is None else edges
     rim = edges.ends[edges.count == 1]
     corners, local = np.unique(rim, return_inverse=True)
-    one, two = local.reshape(-1, 2).T
+    start, end = local.reshape(-1, 2).T
     loops = (
-        connected_components(coo_matrix((np.ones(len(one)), (one, two)), (len(corners),) * 2), False)[0]
+        connected_components(coo_matrix((np.ones(len(start)), (start, end)), (len(corners),) * 2), False)[0]
         if len(rim)
         else 0
     )
@@ -229,7 +237,7 @@ def handles(faces: np.ndarray, pieces: int, edges: Edges | None = None) -> int:
 
 
 class Invariants(NamedTuple):
-    """What a mesh must not change in when it is made coarser or even."""
+    """Topological properties that simplification and remeshing must keep."""
 
     watertight: bool
     manifold: bool
@@ -238,56 +246,61 @@ class Invariants(NamedTuple):
 
 
 def invariants(faces: np.ndarray) -> Invariants:
-    """Of a mesh of faces (f, 3) or (f, 4)."""
+    """Compute the invariants of faces (f, 3) or (f, 4)."""
     if (twins := twins_of(faces)) is not None:
         corners = len(np.unique(faces))
-        return Invariants(True, one_fan_each(faces, twins), _pieces(twins)[0], corners - len(faces) // 2)
+        return Invariants(
+            True, has_one_fan_per_vertex(faces, twins), _components_of_twins(twins)[0], corners - len(faces) // 2
+        )
     return Invariants(is_watertight(faces), is_manifold(faces), components(faces)[0], euler_number(faces))
 
 
-def repeats(faces: np.ndarray) -> np.ndarray:
-    """(f,) bool: triangles (f, 3) that have a vertex twice."""
+def has_repeated_corner(faces: np.ndarray) -> np.ndarray:
+    """(f,) bool: which triangles (f, 3) have a vertex twice."""
     return (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
 
 
-def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Without the vertices that no face uses."""
-    used, faces = renumbered(faces, len(vertices))
-    return vertices if len(used) == len(vertices) else vertices.take(used, 0), faces
+def compact(mesh: Mesh) -> Mesh:
+    """Drop the vertices that no face uses; faces become int64, and vertices are the same array where all are used."""
+    vertices = mesh.vertices
+    used, faces = renumbered(mesh.faces, len(vertices))
+    return replace(mesh, vertices=vertices if len(used) == len(vertices) else vertices.take(used, 0), faces=faces)
 
 
 def renumbered(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Which of `count` vertices faces use (u,), in order, and the faces by their place among these, int64; -1 stays."""
+    """Return which of `count` vertices the faces use (u,), rising, and the faces as indices into these, int64.
+
+    -1, a triangle's fourth corner, stays.
+    """
     out = np.array(faces, np.int64)
     used = np.zeros(count + 1, bool)
     used[out] = True
-    used[-1] = False  # where -1, a triangle's fourth corner, points
-    places = np.flatnonzero(used)
-    if len(places) < count:
-        number = np.full(count + 1, -1)
-        number[places] = np.arange(len(places))
-        out = number.take(out)
-    return places, out
+    used[-1] = False  # the element that -1 marks
+    used_idx = np.flatnonzero(used)
+    if len(used_idx) < count:
+        new_idx = np.full(count + 1, -1)
+        new_idx[used_idx] = np.arange(len(used_idx))
+        out = new_idx.take(out)
+    return used_idx, out
 
 
-def _plain(faces: np.ndarray) -> bool:
-    """Whether these are triangles (f, 3) that twins_of can take."""
+def _may_have_twins(faces: np.ndarray) -> bool:
+    """Whether these are triangles (f, 3) whose indices twins_of() can handle: not negative, and 32 bits wide."""
     return len(faces) > 0 and faces.shape[1] == 3 and faces.min() >= 0 and max(faces.max(), 3 * len(faces)) < 2**31 - 1
 
 
 def _counting_order(keys: np.ndarray, width: int) -> np.ndarray:
-    """Return what np.argsort(keys, kind="stable") gives for keys (n,) below width, in linear time: as a sparse matrix'
-    rows."""
+    """Do np.argsort(keys, kind="stable") for keys (n,) below width in linear time, as rows of a sparse matrix."""
     from scipy.sparse import csr_array
 
-    if len(keys) < _FEW or width > 2**31 - 1 or len(keys) > 2**31 - 1:
+    if len(keys) < _MIN_COUNTING_KEYS or width > 2**31 - 1 or len(keys) > 2**31 - 1:
         return np.argsort(keys, kind="stable")
-    where = keys.astype(np.int32), np.arange(len(keys), dtype=np.int32)
-    return csr_array((np.ones(len(keys), bool), where), (width, max(len(keys), 1))).indices
+    entries = keys.astype(np.int32), np.arange(len(keys), dtype=np.int32)
+    return csr_array((np.ones(len(keys), bool), entries), (width, max(len(keys), 1))).indices
 
 
-def _pieces(twins: np.ndarray) -> tuple[int, np.ndarray]:
-    """components() of triangles that have twins."""
+def _components_of_twins(twins: np.ndarray) -> tuple[int, np.ndarray]:
+    """Do what components() does, for triangles that have twins (3 f,)."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
@@ -297,27 +310,31 @@ def _pieces(twins: np.ndarray) -> tuple[int, np.ndarray]:
     )
 
 
-def one_fan_each(faces: np.ndarray, twins: np.ndarray) -> bool:
-    """Whether the faces around each vertex of triangles (f, 3) that have twins (3 f,) form one fan: who walks around
-    it, from an edge that leaves it to the next one, meets all that do."""
+def has_one_fan_per_vertex(faces: np.ndarray, twins: np.ndarray) -> bool:
+    """Whether the faces around each vertex of triangles (f, 3) that have twins (3 f,) form one fan.
+
+    Walks around all vertices at once, from one half edge that leaves the vertex to the next; with one fan the walk
+    meets all half edges that leave it before it comes back.
+    """
     n, start = len(twins), faces.ravel()
-    turn = twins.take(np.arange(n, dtype=np.int32).reshape(-1, 3)[:, [2, 0, 1]].ravel())
-    number = np.bincount(start)
-    one = np.empty(len(number), np.int32)
-    one[start] = np.arange(n, dtype=np.int32)
-    home = one.take(np.flatnonzero(number))
-    left, at, steps = number.take(start.take(home)), turn.take(home), 1
-    while len(home) and steps < _FAN:
-        back = at == home
-        if (left[back] != steps).any():
+    next_around = twins.take(np.arange(n, dtype=np.int32).reshape(-1, 3)[:, [2, 0, 1]].ravel())
+    leaving_count = np.bincount(start)
+    last_leaving = np.empty(len(leaving_count), np.int32)
+    last_leaving[start] = np.arange(n, dtype=np.int32)
+    home = last_leaving.take(np.flatnonzero(leaving_count))
+    expected, at, steps = leaving_count.take(start.take(home)), next_around.take(home), 1
+    while len(home) and steps < _MAX_FAN_STEPS:
+        is_back = at == home
+        if (expected[is_back] != steps).any():
             return False
-        on = np.flatnonzero(~back)
-        home, left, at, steps = home.take(on), left.take(on), turn.take(at.take(on)), steps + 1
+        walking = np.flatnonzero(~is_back)
+        home, expected, at = home.take(walking), expected.take(walking), next_around.take(at.take(walking))
+        steps += 1
     if not len(home):
         return True
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
-    # Around some there are very many: the walks are the cycles of a graph.
-    graph = csr_array((np.ones(n, np.int8), turn, np.arange(n + 1)), (n, n))
-    return connected_components(graph, True, "strong", return_labels=False) == int((number > 0).sum())
+    # Some vertices have very many edges. The walks are the cycles of a graph, one for each fan.
+    graph = csr_array((np.ones(n, np.int8), next_around, np.arange(n + 1)), (n, n))
+    return connected_components(graph, True, "strong", return_labels=False) == int((leaving_count > 0).sum())

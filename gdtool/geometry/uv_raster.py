@@ -1,4 +1,4 @@
-"""Exact rasterising of texture coordinates: which triangle owns which texel.
+"""Rasterise texture coordinates exactly: find the triangle that owns each texel.
 
 Texture coordinates are snapped to 1/4096 of a texel and everything after that is integer arithmetic, with the top-left
 rule of the graphics interfaces (Direct3D 11 functional specification, section 3.4.1.2): triangles that share an edge or
@@ -12,25 +12,25 @@ from collections.abc import Iterator
 import numpy as np
 
 SUBTEXEL_BITS = 12
-_ONE = 1 << SUBTEXEL_BITS
-_FARTHEST_UV = 64.0  # keeps edge functions far below 2**63 for every size up to 65536
-# Few enough that what is computed of them stays in the cache.
+_ONE = 1 << SUBTEXEL_BITS  # one texel in the integer coordinates
+_MAX_UV = 64.0  # keeps edge functions far below 2**63 for every size up to 65536
+# Rows of triangles, and texels, that are worked on at a time, so that intermediate arrays stay in the cache.
 _SPANS_AT_ONCE = 65_536
 _TEXELS_AT_ONCE = 131_072
 
 
 def _snapped(uv: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Corners x, y (t, 3) in 1/4096 texel, origin at the image's top-left corner."""
+    """Return the corners' x and y (t, 3) in 1/4096 texel, from the image's top-left corner."""
     if not 1 <= size <= 65536:
         raise ValueError(f"size {size} is not in 1..65536")
-    if len(uv) and not (np.abs(uv) <= _FARTHEST_UV).all():  # catches NaN as well
-        raise ValueError(f"texture coordinates must be finite and within ±{_FARTHEST_UV:g}")
+    if len(uv) and not (np.abs(uv) <= _MAX_UV).all():  # catches NaN as well
+        raise ValueError(f"texture coordinates must be finite and within ±{_MAX_UV:g}")
     fixed = np.rint(np.asarray(uv, np.float64) * (size * _ONE)).astype(np.int64)
     return fixed[:, 0][faces], fixed[:, 1][faces]
 
 
 def _chunks(cost: np.ndarray, limit: int) -> Iterator[slice]:
-    """Consecutive slices whose summed cost stays near limit."""
+    """Yield consecutive slices whose summed cost stays near limit; each holds at least one element."""
     total = np.cumsum(cost)
     start = 0
     while start < len(cost):
@@ -41,18 +41,17 @@ def _chunks(cost: np.ndarray, limit: int) -> Iterator[slice]:
 
 
 def _expand(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For counts (n,): the index of the group each element belongs to, and its place within the group."""
+    """Enumerate the elements of groups of counts (n,): the group of each element, and its index in the group."""
     group = np.repeat(np.arange(len(counts)), counts)
     first = np.cumsum(counts) - counts
     return group, np.arange(len(group)) - first[group]
 
 
 def owned_texels(uv: np.ndarray, faces: np.ndarray, size: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Batches of (face_idx (n,), row (n,), column (n,)): every texel whose centre a triangle owns, in order of
-    triangles.
+    """Yield batches of face_idx (n,), row (n,), column (n,): all texels whose centre a triangle owns, by triangle.
 
     uv (v, 2), (0, 0) at the image's top left; faces (t, 3) into uv. Triangles may turn either way; those without area
-    own nothing. A texel comes up once per triangle that covers it: more than once only where triangles overlap.
+    own nothing. A texel appears once for each triangle that covers it: more than once only where triangles overlap.
     """
     x, y = _snapped(uv, faces, size)
     area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (x[:, 2] - x[:, 0]) * (y[:, 1] - y[:, 0])
@@ -89,7 +88,7 @@ def owned_texels(uv: np.ndarray, faces: np.ndarray, size: int) -> Iterator[tuple
 
 
 class Barycentrics:
-    """Barycentric coordinates of texture points in triangles; what they need of each triangle is kept.
+    """Compute barycentric coordinates of texture points in triangles; coefficients of each triangle are kept.
 
     uv (v, 2), faces (t, 3) into uv. Triangles without area give their first corner.
     """
@@ -104,7 +103,7 @@ class Barycentrics:
         )
 
     def at(self, face_idx: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """(n, 3) float64 of texture points u, v (n,) in triangles face_idx (n,); linear beyond them."""
+        """Return (n, 3) float64 for texture points u, v (n,) in triangles face_idx (n,); linear outside them."""
         face = np.take(self._of_face, face_idx, axis=0)
         u, v = u - face[:, 0], v - face[:, 1]
         out = np.empty((len(face), 3))
@@ -114,30 +113,30 @@ class Barycentrics:
         return out
 
     def at_centres(self, face_idx: np.ndarray, texel: np.ndarray, size: int) -> np.ndarray:
-        """(n, 3) float64 at the centres of texels (n,), row-major, of a size x size map."""
+        """Return (n, 3) float64 for the centres of texels (n,), row-major indices into a size x size map."""
         row, column = np.divmod(texel, size)
         return self.at(face_idx, (column + 0.5) / size, (row + 0.5) / size)
 
 
 def owners_of(uv: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
-    """(size * size,) int32: the triangle that owns each texel, -1 where none covers its centre; the first where several
-    do.
+    """Return the triangle that owns each texel, (size * size,) int32; -1 where none covers its centre.
 
-    uv (v, 2) with (0, 0) at the image's top left, faces (t, 3). Raises ValueError for coordinates that are not finite
-    or beyond ±64."""
+    Where several do, the first owns it. uv (v, 2) with (0, 0) at the image's top left, faces (t, 3). Raises ValueError
+    for coordinates that are not finite or beyond ±64.
+    """
     owner = np.full(size * size, -1, np.int32)
     for face, row, column in owned_texels(uv, faces, size):
         texel = row.astype(np.int64) * size + column
         free = owner[texel] < 0
-        # Reversed, because of several assignments to one element the last one stays.
+        # Reversed: of several assignments to one element the last one stays.
         owner[texel[free][::-1]] = face[free][::-1]
     return owner
 
 
 def rasterize_uv(uv: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Owner of each texel and the place of its centre in the owner.
+    """Find the owner of each texel and the barycentric coordinates of the texel's centre in it.
 
-    Returns face_idx (size, size) int32 as owners_of says, and barycentric (size, size, 3) float32, 0 where none is.
+    Returns face_idx (size, size) int32, as owners_of() does, and barycentric (size, size, 3) float32, 0 without owner.
     """
     owner = owners_of(uv, faces, size)
     covered = np.flatnonzero(owner >= 0)
@@ -147,7 +146,7 @@ def rasterize_uv(uv: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarr
 
 
 def centres_in(barycentrics: Barycentrics, owner: np.ndarray, texel: np.ndarray, size: int) -> np.ndarray:
-    """(n, 3) float32: where the centres of texels (n,) lie in the triangles (n,) that own them."""
+    """Return barycentric coordinates (n, 3) float32 of the centres of texels (n,) in their owners (n,)."""
     out = np.empty((len(texel), 3), np.float32)
     for start in range(0, len(texel), _TEXELS_AT_ONCE):
         part = slice(start, start + _TEXELS_AT_ONCE)
@@ -158,7 +157,7 @@ def centres_in(barycentrics: Barycentrics, owner: np.ndarray, texel: np.ndarray,
 
 
 def owner_count(uv: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
-    """(size, size) int32: how many triangles cover each texel centre; above 1 where texture coordinates overlap."""
+    """Count the triangles that cover each texel centre, (size, size) int32; above 1 where charts overlap."""
     count = np.zeros(size * size, np.int32)
     for _, row, column in owned_texels(uv, faces, size):
         count += np.bincount(row.astype(np.int64) * size + column, minlength=size * size).astype(np.int32)
@@ -166,12 +165,12 @@ def owner_count(uv: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
 
 
 def between_centres(uv: np.ndarray, faces: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Texels that charts pass through too far from any texel they own: texel (n,) flat indices, and the triangle (n,)
-    there.
+    """Find texels that a chart's outline passes through and that are not next to any owned texel.
 
-    owner (size, size) as from owners_of. Charts smaller than a texel, and slivers' ends, cover no texel's centre;
-    lookups on them would read what the charts around them are continued with. Texels beside owned ones are left to
-    extend_owners."""
+    Charts smaller than a texel, and the ends of slivers, cover no texel's centre; lookups there would read the
+    continuation of neighbouring charts. Texels next to owned ones are left to extend_owners(). owner (size, size) as
+    from owners_of(). Returns texel (n,), row-major indices, and the triangle (n,) there.
+    """
     from gdtool.geometry.topology import edges_of
 
     size, wide = owner.shape[0], owner.shape[0] + 2
@@ -194,12 +193,12 @@ def between_centres(uv: np.ndarray, faces: np.ndarray, owner: np.ndarray) -> tup
 def extend_owners(
     barycentrics: Barycentrics, face_idx: np.ndarray, rings: int, farthest: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Texels just outside the charts and where they would lie if the triangle beside them went on.
+    """Extend the charts' triangles to texels just outside, which lookups at a chart's border read.
 
-    face_idx (size, size) as from rasterize_uv. Returns texel (n,) flat indices of up to `rings` texels around all
-    charts, owner (n,) the face of the nearest covered texel (of a smaller ring), barycentric (n, 3) float64, linearly
-    extrapolated and held within `farthest` outside [0, 1]. Lookups between texel centres at a chart's border read
-    these."""
+    face_idx (size, size) as from rasterize_uv(). Returns texel (n,), row-major indices of up to `rings` texels around
+    all charts; owner (n,), the face of the nearest covered texel of a smaller ring; and barycentric (n, 3) float64,
+    linearly extrapolated and clamped to `farthest` outside [0, 1].
+    """
     size = face_idx.shape[0]
     owner = np.pad(face_idx, 1, constant_values=-1)
     flat, wide = owner.ravel(), size + 2
@@ -215,19 +214,19 @@ def extend_owners(
         near &= ~covered
         near[[0, -1]], near[:, [0, -1]] = False, False
         new = np.flatnonzero(near)
-        found = np.full(len(new), -1, np.int32)
-        # Straight neighbours last, so that they win over diagonal ones.
+        new_owner = np.full(len(new), -1, np.int32)
+        # Straight neighbours come last, so that they win over diagonal ones.
         for step in (-wide - 1, -wide + 1, wide - 1, wide + 1, -1, 1, -wide, wide):
-            seen = flat[new + step]
-            found = np.where(seen >= 0, seen, found)
-        flat[new] = found
+            beside = flat[new + step]
+            new_owner = np.where(beside >= 0, beside, new_owner)
+        flat[new] = new_owner
         covered |= near
         texels.append((new // wide - 1) * size + new % wide - 1)
-        owners.append(found)
+        owners.append(new_owner)
     texel, owned_by = np.concatenate(texels), np.concatenate(owners)
     barycentric = barycentrics.at_centres(owned_by, texel, size)
     within = np.clip(barycentric, 0, 1)
     within /= within.sum(1, keepdims=True)
-    # A sliver goes on for many times its own width: hold what lies beyond it back, in the same direction.
+    # Coordinates far outside a sliver reach many times its width: clamp their distance, not their direction.
     beyond = np.abs(barycentric - within).max(1, keepdims=True)
     return texel, owned_by, within + (barycentric - within) * np.minimum(1, farthest / np.maximum(beyond, 1e-12))

@@ -6,6 +6,7 @@ import numpy as np
 
 from gdtool.geometry import topology
 from gdtool.geometry.distance import closest_points
+from gdtool.geometry.meshes import QuadMesh
 from gdtool.remesh.engines.candidate import Candidate, repair_and_judge
 from gdtool.remesh.fallback.pair_and_split import split_count
 from gdtool.remesh.fit.shaping import CUT_OFF, finalize, fit_to_surface, rejection_reason, snap_to_features
@@ -57,34 +58,34 @@ def accept_good_pieces(patch: RemeshPatch, whole: Candidate | None) -> tuple[Qua
         return None, good
     parts = [patch.subset(piece == k, 0) for k in range(count)]
     judged = [
-        repair_and_judge(*quads, topology.invariants(part.faces))
-        for part, quads in zip(parts, quads_by_piece(whole.vertices, whole.quads, patch), strict=True)
+        repair_and_judge(quads, topology.invariants(part.mesh.faces))
+        for part, quads in zip(parts, quads_by_piece(whole.mesh, patch), strict=True)
     ]
-    good[:] = [fault is None for fault, _, _ in judged]
+    good[:] = [quads.fault is None for quads in judged]
     if not good.any():
         return None, good
     fitted = whole.fitted
     if fitted is None or not good.all():
         good_patch = patch.subset(good[piece], patch.quads)
         snapped = snap_to_features(
-            *concatenate_meshes([mesh[1:] for mesh, is_good in zip(judged, good, strict=True) if is_good]),
+            concatenate_meshes([quads.mesh for quads in judged if quads.fault is None]),
             good_patch.surface,
             good_patch.features,
             0,
             patch.request,
         )
         fitted = fit_to_surface(snapped, good_patch.surface, good_patch.features, patch.request)
-    made = quads_by_piece(*finalize(*fitted, patch.full_surface(), patch.request), patch)
+    made = quads_by_piece(finalize(fitted, patch.full_surface(), patch.request), patch)
     for k in np.flatnonzero(good):
         good[k] = (
-            len(made[k][1]) > 0
-            and rejection_reason(*made[k], parts[k].surface, patch.edge, _MAX_PIECE_EDGES, CUT_OFF)[0] is None
+            len(made[k].faces) > 0
+            and rejection_reason(made[k], parts[k].surface, patch.edge, _MAX_PIECE_EDGES, CUT_OFF)[0] is None
         )
     if not good.any():
         return None, good
-    result = QuadResult(*concatenate_meshes([made[k] for k in np.flatnonzero(good)]), whole.attempt.label)
+    result = QuadResult(concatenate_meshes([made[k] for k in np.flatnonzero(good)]), whole.attempt.label)
     rest = patch.quads * patch.piece_areas[~good].sum() / patch.piece_areas.sum()
-    if abs(patch.quads - len(result.quads) - rest) > max(COUNT_TOLERANCE * patch.quads, _MAX_MAKE_UP * rest):
+    if abs(patch.quads - len(result.mesh.faces) - rest) > max(COUNT_TOLERANCE * patch.quads, _MAX_MAKE_UP * rest):
         return None, np.zeros_like(good)  # the other pieces could not make up for this count
     return result, good
 
@@ -110,7 +111,7 @@ def remaining_patches(patch: RemeshPatch, done: np.ndarray, quads: int) -> list[
     patches = []
     if rest.any():
         patches.append(patch.subset(rest[piece], max(int(quads * share[rest].sum()), 1), skip_engines=True))
-        quads -= split_count(patches[0].faces, patches[0].quads)
+        quads -= split_count(patches[0].mesh.faces, patches[0].quads)
     counts = np.maximum((counts * (quads / max(counts.sum(), 1))).round().astype(int), _MIN_PIECE_QUADS)
     spare = max(COUNT_TOLERANCE * patch.quads - _MIN_TOLERANCE * counts.sum(), 0)
     tolerance = np.minimum(_MIN_TOLERANCE + spare * np.sqrt(counts) / np.sqrt(counts).sum() / counts, _MAX_TOLERANCE)
@@ -120,22 +121,24 @@ def remaining_patches(patch: RemeshPatch, done: np.ndarray, quads: int) -> list[
     ]
 
 
-def quads_by_piece(vertices: np.ndarray, quads: np.ndarray, patch: RemeshPatch) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return vertices and quads of each piece: the connected components of a quad mesh that lie on it.
+def quads_by_piece(mesh: QuadMesh, patch: RemeshPatch) -> list[QuadMesh]:
+    """Return the quads of each piece: the connected components of a quad mesh that lie on it.
 
     A component that lies on two pieces belongs to neither.
     """
+    vertices, quads = mesh.vertices, mesh.faces
     (count, piece), (components, label) = patch.pieces, topology.components(quads)
-    nearest = piece[closest_points(vertices[quads].mean(1), patch.vertices, patch.faces)[1]]
+    nearest = piece[closest_points(vertices[quads].mean(1), patch.mesh)[1]]
     share = np.zeros((components, count))
     np.add.at(share, (label, nearest), 1)
     owner = np.where(share.max(1) >= _MIN_SHARE_ON_ONE * share.sum(1), share.argmax(1), -1)
-    return [topology.compact(vertices, quads[owner[label] == k]) for k in range(count)]
+    return [topology.compact(QuadMesh(vertices, quads[owner[label] == k])) for k in range(count)]
 
 
-def concatenate_meshes(meshes: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return several meshes (vertices, faces) as one."""
-    offset = np.cumsum([0] + [len(vertices) for vertices, _ in meshes])
-    return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(
-        [faces + o for (_, faces), o in zip(meshes, offset, strict=False)]
+def concatenate_meshes(meshes: list[QuadMesh]) -> QuadMesh:
+    """Return several meshes as one."""
+    offset = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
+    return QuadMesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + o for mesh, o in zip(meshes, offset, strict=False)]),
     )

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from gdtool.geometry import topology
-from gdtool.geometry.normals import face_normals
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.simplify import deviation
-from gdtool.geometry.topology import triangulated
 from gdtool.remesh.limits import COUNT_TOLERANCE
 from gdtool.remesh.pipeline import remesh
 from gdtool.remesh.task import Record, Request
@@ -20,9 +20,20 @@ _SAME_COUNT = 1.15  # counts within this factor of each other are not told apart
 _MAX_RUNS = 6
 
 
-def quads_of_size(vertices: np.ndarray, faces: np.ndarray, size: float) -> int:
+MakeQuads = Callable[[TriMesh, Request], tuple[QuadMesh, Record]]  # as pipeline.remesh
+
+
+class BudgetedQuads(NamedTuple):
+    """Quads, the record of how they were made, and the distance from the surface that they reach."""
+
+    mesh: QuadMesh
+    record: Record
+    reached: float
+
+
+def quads_of_size(mesh: TriMesh, size: float) -> int:
     """Return how many quads with sides of `size` cover the triangles: their area over size squared."""
-    return round(face_normals(vertices, faces)[1].sum() / size**2)
+    return round(mesh.area / size**2)
 
 
 def is_finished(quads: np.ndarray, count: int) -> bool:
@@ -33,30 +44,28 @@ def is_finished(quads: np.ndarray, count: int) -> bool:
 
 
 def coarsest_within(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: TriMesh,
     request: Request,
     limit: float,
-    make_quads: Callable[..., tuple] | None = None,
-) -> tuple[np.ndarray, np.ndarray, Record, float]:
+    make_quads: MakeQuads | None = None,
+) -> BudgetedQuads:
     """Find the fewest quads, at most request.quads, that stay within the distance `limit` of the surface.
 
-    Returns vertices, quads, the record and the distance reached. The distance is the largest from the vertices of
-    either mesh to the other surface (simplify.deviation). It falls about as one over the number of quads, which
-    predicts the next count to try. When even request.quads are too few, those are returned.
-
-    make_quads: called as remesh(vertices, faces, request); None is remesh itself.
+    The distance is the largest from the vertices of either mesh to the other surface (simplify.deviation). It falls
+    about as one over the number of quads, which predicts the next count to try. When even request.quads are too few,
+    those are returned. make_quads: None is remesh itself.
     """
-    too_few, enough = min(_MIN_QUADS, request.quads) / _SAME_COUNT, None
-    quads = request.quads
+    too_few, quads = min(_MIN_QUADS, request.quads) / _SAME_COUNT, request.quads
+    enough: tuple[int, BudgetedQuads] | None = None
     for _ in range(_MAX_RUNS):
-        quad_vertices, quad_faces, record = (make_quads or remesh)(vertices, faces, replace(request, quads=quads))
-        reached = deviation(vertices, faces, quad_vertices, triangulated(quad_faces)[0])
+        made, record = (make_quads or remesh)(mesh, replace(request, quads=quads))
+        reached = deviation(mesh, made.triangles)
+        budgeted = BudgetedQuads(made, record, reached)
         if reached <= limit:
-            enough = (quads, (quad_vertices, quad_faces, record, reached))
+            enough = (quads, budgeted)
+        elif enough is None:
+            return budgeted
         else:
-            if enough is None:
-                return quad_vertices, quad_faces, record, reached
             too_few = quads
         if enough[0] <= _SAME_COUNT * too_few or request.engine_seconds_left <= 0:
             break
@@ -66,4 +75,5 @@ def coarsest_within(
         quads = int(max(guess if inside else middle, min(_MIN_QUADS, request.quads)))
         if quads >= enough[0]:
             break
+    assert enough is not None  # the first run sets it, or returns
     return enough[1]

@@ -10,9 +10,9 @@ from functools import partial
 import numpy as np
 
 from gdtool.geometry import mesh_quality
-from gdtool.geometry.simplify import simplify
-from gdtool.geometry.topology import triangulated
-from gdtool.remesh.face_budget import coarsest_within
+from gdtool.geometry.meshes import QuadMesh, TriMesh
+from gdtool.geometry.simplify import SimplifyOptions, simplify
+from gdtool.remesh.face_budget import MakeQuads, coarsest_within
 from gdtool.remesh.limits import COUNT_TOLERANCE, QUADS_OF_A_PIECE, TRIANGLES_OF_A_PIECE
 from gdtool.remesh.pipeline import remesh
 from gdtool.remesh.symmetry import AXES, mirror_plane, remesh_mirrored
@@ -40,29 +40,25 @@ class Goal:
 
 @dataclass
 class MadeMesh:
-    """A mesh, the record of how it was made, sentences to warn of, and (what, why) of skipped work.
+    """A mesh, the record of how it was made, sentences to warn of, and (what, why) of skipped work."""
 
-    vertices (v, 3); faces (f, 4), -1 as a triangle's fourth corner.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
+    mesh: QuadMesh
     record: Record
     warnings: list[str] = field(default_factory=list)
     skipped: list[tuple[str, str]] = field(default_factory=list)
 
 
-def make_mesh(vertices: np.ndarray, faces: np.ndarray, goal: Goal, step: Step) -> MadeMesh:
-    """Make the faces of a clean triangle mesh, vertices (v, 3) in a unit box, faces (f, 3).
+def make_mesh(mesh: TriMesh, goal: Goal, step: Step) -> MadeMesh:
+    """Make the faces of a clean triangle mesh in a unit box.
 
     step: a context manager that times a named step.
     """
-    return (_decimated if goal.triangles else _quads)(vertices, faces, goal, step)
+    return (_decimated if goal.triangles else _quads)(mesh, goal, step)
 
 
-def passed_through(vertices: np.ndarray, quads: np.ndarray) -> MadeMesh:
+def passed_through(mesh: QuadMesh) -> MadeMesh:
     """Return quads that are taken from the input as they are."""
-    return MadeMesh(vertices, quads, Record(engine=PASSED_THROUGH))
+    return MadeMesh(mesh, Record(engine=PASSED_THROUGH))
 
 
 def repair_warnings(repairs: dict[str, int | bool], closed: bool) -> list[str]:
@@ -79,21 +75,16 @@ def repair_warnings(repairs: dict[str, int | bool], closed: bool) -> list[str]:
     return warnings
 
 
-def report_figures(made: MadeMesh, vertices: np.ndarray, faces: np.ndarray) -> dict:
+def report_figures(made: MadeMesh, mesh: TriMesh) -> dict:
     """Return the report: the record's figures, topology, shape, and distances to the triangles that were remeshed."""
-    figures = (
-        made.record.figures
-        | mesh_quality.topology_figures(made.vertices, made.faces)
-        | mesh_quality.shape_figures(made.vertices, made.faces)
-    )
+    figures = made.record.figures | mesh_quality.topology_figures(made.mesh) | mesh_quality.shape_figures(made.mesh)
     if made.record.engine != PASSED_THROUGH:
+        source = made.record.source
         figures |= mesh_quality.distance_figures(
-            made.vertices,
-            triangulated(made.faces)[0],
-            vertices,
-            faces,
+            made.mesh.triangles,
+            mesh,
             _DISTANCE_SAMPLES,
-            source=made.record.source,
+            closest_on_source=None if source is None else source.closest,
         )
     return figures
 
@@ -103,7 +94,7 @@ def count_warning(made: MadeMesh, faces: np.ndarray, goal: Goal) -> str | None:
 
     faces (f, 3): the triangles that were remeshed. Fewer triangles than --triangles are right.
     """
-    count = len(made.faces)
+    count = len(made.mesh.faces)
     asked = goal.triangles or (count if goal.max_deviation else goal.request.quads)
     if made.record.engine == PASSED_THROUGH or abs(count / asked - 1) <= COUNT_TOLERANCE:
         return None
@@ -114,51 +105,47 @@ def count_warning(made: MadeMesh, faces: np.ndarray, goal: Goal) -> str | None:
     return f"{count} faces, not the {asked} asked for: {why}"
 
 
-def _decimated(vertices: np.ndarray, faces: np.ndarray, goal: Goal, step: Step) -> MadeMesh:
+def _decimated(mesh: TriMesh, goal: Goal, step: Step) -> MadeMesh:
     """Decimate to goal.triangles triangles."""
+    options = SimplifyOptions(seconds=goal.request.seconds, low_deviation=True)
     with step("simplify"):
-        vertices, faces, _, report = simplify(vertices, faces, goal.triangles, seconds=goal.request.seconds, near=True)
-    record = Record(engine=report["method"], figures={"simplify_error": report["error"]})
-    corners = np.concatenate([faces, np.full((len(faces), 1), -1)], 1)
+        simplified, _, report = simplify(mesh, goal.triangles, options=options)
+    record = Record(engine=report.method, figures={"simplify_error": report.error})
+    corners = np.concatenate([simplified.faces, np.full((len(simplified.faces), 1), -1)], 1)
     return MadeMesh(
-        vertices,
-        corners,
+        QuadMesh(simplified.vertices, corners),
         record,
-        [f"simplify: {report['failed']}"] if "failed" in report else [],
+        [f"simplify: {report.failed}"] if report.failed is not None else [],
         [("symmetry", "--triangles decimates the whole")] if goal.symmetry != "none" else [],
     )
 
 
-def _quads(vertices: np.ndarray, faces: np.ndarray, goal: Goal, step: Step) -> MadeMesh:
+def _quads(mesh: TriMesh, goal: Goal, step: Step) -> MadeMesh:
     """Make quads of the requested count, or the fewest within goal.max_deviation."""
-    make_quads, figures, skipped = _with_symmetry(vertices, faces, goal, step)
+    make_quads, figures, skipped = _with_symmetry(mesh, goal, step)
     warnings = []
     if goal.max_deviation:
-        vertices, quads, record, reached = coarsest_within(
-            vertices, faces, goal.request, goal.max_deviation, make_quads
-        )
+        quads, record, reached = coarsest_within(mesh, goal.request, goal.max_deviation, make_quads)
         if reached > goal.max_deviation:
             warnings.append(
-                f"{reached:.2g} from the surface with {len(quads)} quads, farther than --max-deviation; "
+                f"{reached:.2g} from the surface with {len(quads.faces)} quads, farther than --max-deviation; "
                 "allow more --faces"
             )
     else:
-        vertices, quads, record = make_quads(vertices, faces, goal.request)
+        quads, record = make_quads(mesh, goal.request)
     record.figures |= figures
-    return MadeMesh(vertices, quads, record, warnings, skipped)
+    return MadeMesh(quads, record, warnings, skipped)
 
 
 def _with_symmetry(
-    vertices: np.ndarray, faces: np.ndarray, goal: Goal, step: Step
-) -> tuple[Callable[..., tuple], dict[str, float | str], list[tuple[str, str]]]:
+    mesh: TriMesh, goal: Goal, step: Step
+) -> tuple[MakeQuads, dict[str, float | str], list[tuple[str, str]]]:
     """Return the function that makes the quads, figures of the mirror plane, and what is skipped and why."""
     if goal.symmetry == "none":
         return remesh, {}, []
     with step("find the mirror plane"):
-        axis, distances = mirror_plane(
-            vertices, faces, goal.request.quads, AXES if goal.symmetry == "auto" else goal.symmetry
-        )
-    figures = {f"mirror_{name}_deviation": value for name, value in distances.items()}
+        axis, distances = mirror_plane(mesh, goal.request.quads, AXES if goal.symmetry == "auto" else goal.symmetry)
+    figures: dict[str, float | str] = {f"mirror_{name}_deviation": value for name, value in distances.items()}
     if axis is not None:
         return partial(remesh_mirrored, axis=axis), figures, []
     why = "no half is the other's mirror image: " + ", ".join(

@@ -8,12 +8,17 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 
-import numpy as np
-
 from gdtool.core.child import prepare
-from gdtool.geometry.normals import face_normals
-from gdtool.geometry.simplify import CHILD_MODULES, SHAKEN, median_edge, reduced, simplify
-from gdtool.geometry.topology import even
+from gdtool.geometry.meshes import QuadMesh, TriMesh
+from gdtool.geometry.simplify import (
+    CHILD_MODULES,
+    JITTER_EDGES,
+    SimplifyOptions,
+    collapse_in_child,
+    median_edge,
+    simplify,
+)
+from gdtool.geometry.topology import has_even_edge_counts
 from gdtool.remesh.components import (
     SMALL_PIECE_QUADS,
     accept_good_pieces,
@@ -38,37 +43,36 @@ _MAX_CREASE_EDGE = 0.75  # of the quads' edge: bevels of triangles larger than t
 _TRIANGLES_PER_QUAD, _MIN_TRIANGLES = 3, 20000  # triangles that show all that the quads can
 
 
-def remesh(vertices: np.ndarray, faces: np.ndarray, request: Request) -> tuple[np.ndarray, np.ndarray, Record]:
-    """Return vertices, quads (q, 4) and the record for the surface of a clean triangle mesh (repair.clean).
+def remesh(mesh: TriMesh, request: Request) -> tuple[QuadMesh, Record]:
+    """Return quads of the surface of a clean triangle mesh (repair.clean), and the record of how they were made.
 
-    vertices (v, 3) in a unit box, faces (f, 3). All faces are quads. The result is closed and manifold where the input
-    is. Pieces that nearly touch are moved apart meanwhile, so that no quads are fitted to a neighbouring piece.
+    mesh: in a unit box. No face of the result is a triangle. The result is closed and manifold where the input is.
+    Pieces that nearly touch are moved apart meanwhile, so that no quads are fitted to a neighbouring piece.
     """
-    if len(faces) > _triangles_needed(request):
-        prepare(reduced, CHILD_MODULES)
-    edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
-    if (pieces := separate_pieces(vertices, faces, _PIECE_GAP_EDGES * edge)) is not None:
-        quad_vertices, quads, record = _Remesher(pieces.vertices, faces, edge, request).run()
+    if len(mesh.faces) > _triangles_needed(request):
+        prepare(collapse_in_child, CHILD_MODULES)
+    edge = (mesh.area / request.quads) ** 0.5
+    if (pieces := separate_pieces(mesh, _PIECE_GAP_EDGES * edge)) is not None:
+        quads, record = _Remesher(pieces.mesh, edge, request).run()
         record.source = None
-        return pieces.to_original(quad_vertices), quads, record
-    return _Remesher(vertices, faces, edge, request).run()
+        return QuadMesh(pieces.to_original(quads.vertices), quads.faces), record
+    return _Remesher(mesh, edge, request).run()
 
 
 @dataclass
 class _Remesher:
     """One run of remesh() on a mesh whose pieces are apart, or are too many to move apart."""
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    mesh: TriMesh
     edge: float
     request: Request
 
     def __post_init__(self) -> None:
         self.record = Record()
-        self.full_surface = cache(lambda: ProjectionTarget(self.vertices, self.faces))
+        self.full_surface = cache(lambda: ProjectionTarget(self.mesh))
 
-    def run(self) -> tuple[np.ndarray, np.ndarray, Record]:
-        """Return vertices, quads and the record."""
+    def run(self) -> tuple[QuadMesh, Record]:
+        """Return the quads and the record."""
         small, large = split_small_pieces(self._simplified_patch())
         # Small pieces cannot always be made of as few quads as requested: the large ones make up for the count.
         if small is None:
@@ -76,32 +80,36 @@ class _Remesher:
         elif small.has_only_tiny_pieces:
             start = time.perf_counter()
             small.input_quads = quads_from_input(
-                small.vertices, small.faces, split_count(small.faces, small.quads), self.request.fallback_seconds
+                small.mesh, split_count(small.mesh.faces, small.quads), self.request.fallback_seconds
             )
             self.record.clock("fallback", start)
-            large.quads = max(self.request.quads - len(small.input_quads[1]), 4)
+            large.quads = max(self.request.quads - len(small.input_quads.faces), 4)
             results = _quads_of(large, self.record) + _quads_of(small, self.record)
         else:
             small_results = _quads_of(small, self.record)
-            large.quads = max(self.request.quads - sum(len(result.quads) for result in small_results), 4)
+            large.quads = max(self.request.quads - sum(len(result.mesh.faces) for result in small_results), 4)
             results = _quads_of(large, self.record) + small_results
         self.record.source = self.full_surface()
         self.record.engine = "; ".join(dict.fromkeys(result.method for result in results))
-        return *concatenate_meshes([(result.vertices, result.quads) for result in results]), self.record
+        return concatenate_meshes([result.mesh for result in results]), self.record
 
     def _simplified_patch(self) -> RemeshPatch:
-        """Simplify the mesh to what the quads need, creases restored; again with care where that strays too far."""
-        for careful in (False, True):
+        """Simplify the mesh to what the quads need, creases restored.
+
+        Where the result strays too far, simplify again with the collapse that keeps the topology.
+        """
+        for topology_first in (False, True):
             start = time.perf_counter()
-            vertices, faces = _simplified(self, careful)
+            simplified = _simplified(self, topology_first)
             error = 0.0
-            if len(faces) < len(self.faces):
+            if len(simplified.faces) < len(self.mesh.faces):
                 # Undo the noise that keeps triangles of one size; vertices farther away stand on restored creases.
+                vertices = simplified.vertices
                 distance, _, point = self.full_surface().closest(vertices)
-                near = distance < _NOISE_REACH * SHAKEN * median_edge(self.vertices, self.faces)
+                near = distance < _NOISE_REACH * JITTER_EDGES * median_edge(self.mesh)
                 vertices[near] = point[near]
                 error = float(distance.max())
-            patch = RemeshPatch(vertices, faces, self.request.quads, self.edge, self.request, self.full_surface)
+            patch = RemeshPatch(simplified, self.request.quads, self.edge, self.request, self.full_surface)
             if error:
                 error = max(error, max_distance(patch.surface, self.full_surface()))
             self.record.figures["simplify_error"] = error
@@ -121,12 +129,12 @@ def _quads_of(patch: RemeshPatch, record: Record) -> list[QuadResult]:
         if patch.pieces[0] > 1:
             start = time.perf_counter()
             result, good = accept_good_pieces(patch, search.whole)
-            rest = remaining_patches(patch, good, patch.quads - (len(result.quads) if result is not None else 0))
+            rest = remaining_patches(patch, good, patch.quads - (len(result.mesh.faces) if result is not None else 0))
             record.clock("pieces", start)
             accepted = [] if result is None else [result]
             return accepted + [piece for remaining in rest for piece in _quads_of(remaining, record)]
     start = time.perf_counter()
-    result = QuadResult(*split(patch), "pair and split")
+    result = QuadResult(split(patch), "pair and split")
     record.clock("fallback", start)
     return [result]
 
@@ -163,27 +171,25 @@ def _while_simplifying(request: Request, full_surface: Callable[[], ProjectionTa
         import_module(module)
 
 
-def _simplified(run: _Remesher, careful: bool) -> tuple[np.ndarray, np.ndarray]:
+def _simplified(run: _Remesher, topology_first: bool) -> TriMesh:
     """Return the triangles, creases restored, simplified to what the quads need; the input where that fails."""
     request, record = run.request, run.record
-    if len(run.faces) <= _triangles_needed(request):
+    if len(run.mesh.faces) <= _triangles_needed(request):
         prepare_engines(request)
-    restore = request.restore_creases and median_edge(run.vertices, run.faces) < _MAX_CREASE_EDGE * run.edge
-    vertices, faces, _, report = simplify(
-        run.vertices,
-        run.faces,
-        _triangles_needed(request),
+    restore = request.restore_creases and median_edge(run.mesh) < _MAX_CREASE_EDGE * run.edge
+    options = SimplifyOptions(
         seconds=request.fallback_seconds,
         crease_degrees=request.crease_degrees if restore else 0.0,
-        closed=lambda: even(run.faces),
-        careful=careful,
-        even=True,
-        measured=False,
-        meanwhile=lambda: _while_simplifying(request, run.full_surface),
+        topology_first=topology_first,
+        uniform=True,
+        measure_error=False,
+        is_closed=lambda: has_even_edge_counts(run.mesh.faces),
+        while_waiting=lambda: _while_simplifying(request, run.full_surface),
     )
-    record.figures |= {"simplified_to": report["faces"]} | (
-        {"crease_vertices_restored": report["creases"]} if restore else {}
+    simplified, _, report = simplify(run.mesh, _triangles_needed(request), options=options)
+    record.figures |= {"simplified_to": report.faces} | (
+        {"crease_vertices_restored": report.creases} if restore else {}
     )
-    if "failed" in report:
-        record.failed.append(f"simplify: {report['failed']}")
-    return vertices, faces
+    if report.failed is not None:
+        record.failed.append(f"simplify: {report.failed}")
+    return simplified

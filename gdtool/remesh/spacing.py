@@ -6,32 +6,33 @@ import numpy as np
 
 from gdtool.geometry import topology
 from gdtool.geometry.distance import closest_points
+from gdtool.geometry.meshes import TriMesh
 
 _MAX_FACES = 200_000  # pieces of larger meshes are not looked for: that takes too long
 _MAX_PIECES = 1000  # more pieces stay where they are: all pairs of boxes are compared
 
 
 class SeparatedPieces:
-    """A mesh whose pieces were moved: vertices (v, 3); the faces are those of the input."""
+    """A mesh whose pieces were moved apart."""
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray, piece: np.ndarray, offset: np.ndarray):
+    def __init__(self, mesh: TriMesh, piece: np.ndarray, offset: np.ndarray):
         """piece (f,): the piece of each face. offset (pieces, 3): how far each piece moves."""
-        self._faces, self._piece, self._offset = faces, piece, offset
-        piece_of_vertex = np.zeros(len(vertices), np.int64)
-        piece_of_vertex[faces.ravel()] = np.repeat(piece, 3)
-        self.vertices = vertices + offset[piece_of_vertex]
+        self._piece, self._offset = piece, offset
+        piece_of_vertex = np.zeros(len(mesh.vertices), np.int64)
+        piece_of_vertex[mesh.faces.ravel()] = np.repeat(piece, 3)
+        self.mesh = TriMesh(mesh.vertices + offset[piece_of_vertex], mesh.faces)
 
     def to_original(self, points: np.ndarray) -> np.ndarray:
         """Move points (n, 3) on or near the separated pieces back to where the pieces came from."""
-        return points - self._offset[self._piece[closest_points(points, self.vertices, self._faces)[1]]]
+        return points - self._offset[self._piece[closest_points(points, self.mesh)[1]]]
 
 
-def separate_pieces(vertices: np.ndarray, faces: np.ndarray, gap: float) -> SeparatedPieces | None:
+def separate_pieces(mesh: TriMesh, gap: float) -> SeparatedPieces | None:
     """Place the pieces in rows, with at least `gap` between their bounding boxes.
 
-    vertices (v, 3), faces (f, 3). Returns None where the boxes are that far apart already, or where the mesh or the
-    number of its pieces is too large.
+    Returns None where the boxes are that far apart already, or where the mesh or the number of its pieces is too large.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     if len(faces) > _MAX_FACES:
         return None
     count, piece = topology.components(faces)
@@ -52,4 +53,4 @@ def separate_pieces(vertices: np.ndarray, faces: np.ndarray, gap: float) -> Sepa
             x, y, row_height = 0.0, y + row_height, 0.0
         position[k, :2] = x, y
         x, row_height = x + size[k, 0], max(row_height, size[k, 1])
-    return SeparatedPieces(vertices, faces, piece, position - low)
+    return SeparatedPieces(mesh, piece, position - low)

@@ -8,7 +8,7 @@ import numpy as np
 
 from gdtool.geometry import topology
 from gdtool.geometry.mesh_quality import scaled_jacobian
-from gdtool.geometry.normals import face_normals
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.sharpen import restore_creases
 from gdtool.remesh.fit.feature_curves import Constraints, Features
 from gdtool.remesh.fit.surface_projection import ProjectionTarget, fill_holes, remove_doublets
@@ -25,19 +25,16 @@ _INSIDE_EDGES = 0.05  # quad edge lengths that vertices off the seam keep from t
 AXES = "xyz"
 
 
-def mirror_plane(
-    vertices: np.ndarray, faces: np.ndarray, quads: int, axes: str = AXES, limit: int = 8000
-) -> tuple[int | None, dict[str, float]]:
+def mirror_plane(mesh: TriMesh, quads: int, axes: str = AXES, limit: int = 8000) -> tuple[int | None, dict[str, float]]:
     """Find the axis (0, 1, 2) across whose plane through the origin the mesh is its own mirror image.
 
-    vertices (v, 3) in a unit box about the origin; quads: how many will be made; axes: those to try; limit: vertices
-    measured at most. Returns the best axis, None where no half is near enough to the other's mirror image, and for each
-    axis the largest distance from a reflected vertex to the surface. Differences finer than a quarter of a quad do not
-    count.
+    mesh: in a unit box about the origin; quads: how many will be made; axes: those to try; limit: vertices measured at
+    most. Returns the best axis, None where no half is near enough to the other's mirror image, and for each axis the
+    largest distance from a reflected vertex to the surface. Differences finer than a quarter of a quad do not count.
     """
-    edge = (face_normals(vertices, faces)[1].sum() / quads) ** 0.5
-    surface = ProjectionTarget(vertices, faces)
-    points = vertices[np.unique(faces)]
+    edge = (mesh.area / quads) ** 0.5
+    surface = ProjectionTarget(mesh)
+    points = mesh.vertices[np.unique(mesh.faces)]
     points = points[:: max(len(points) // limit, 1)]
     distances = {
         AXES[i]: float(surface.closest(points * np.where(np.arange(3) == i, -1.0, 1.0))[0].max())
@@ -48,11 +45,12 @@ def mirror_plane(
     return (AXES.index(best) if distances[best] <= min(_TOLERANCE_EDGES * edge, _TOLERANCE_SIDE) else None), distances
 
 
-def half_mesh(vertices: np.ndarray, faces: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+def half_mesh(mesh: TriMesh, axis: int) -> TriMesh:
     """Cut a triangle mesh at the plane through the origin and return the half where coordinate `axis` is not negative.
 
     The half is open along the plane.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     extents = np.ptp(vertices[faces], axis=1).max(1)
     vertices = vertices.copy()
     vertices[np.abs(vertices[:, axis]) < _SNAP_EDGES * np.median(extents), axis] = 0.0
@@ -60,7 +58,7 @@ def half_mesh(vertices: np.ndarray, faces: np.ndarray, axis: int) -> tuple[np.nd
     lowest, highest = sign[faces].min(1), sign[faces].max(1)
     whole, split = faces[(lowest >= 0) & (highest > 0)], faces[(lowest < 0) & (highest > 0)]
     if not len(split):
-        return topology.compact(vertices, whole)
+        return topology.compact(TriMesh(vertices, whole))
     # In order around each cut face: its corners on this side, and where its edges cross the plane.
     following = np.roll(split, -1, 1)
     crosses = sign[split] * sign[following] < 0
@@ -76,32 +74,31 @@ def half_mesh(vertices: np.ndarray, faces: np.ndarray, axis: int) -> tuple[np.nd
     ring = np.take_along_axis(ring, np.argsort(ring < 0, 1, kind="stable"), 1)
     has_four = ring[:, 3] >= 0
     return topology.compact(
-        np.concatenate([vertices, added]), np.concatenate([whole, ring[:, :3], ring[has_four][:, [0, 2, 3]]])
+        TriMesh(np.concatenate([vertices, added]), np.concatenate([whole, ring[:, :3], ring[has_four][:, [0, 2, 3]]]))
     )
 
 
-def join_with_mirror(
-    vertices: np.ndarray, quads: np.ndarray, axis: int, edge: float, surface: ProjectionTarget | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Join a half of quads (q, 4) and its reflection into one mesh.
+def join_with_mirror(mesh: QuadMesh, axis: int, edge: float, surface: ProjectionTarget | None = None) -> QuadMesh:
+    """Join a half of quads and its reflection into one mesh.
 
     Boundary vertices near the plane move onto it and are shared. Quads that this folds are untangled on `surface`,
     where it is given. edge: length of the quads' sides.
     """
+    vertices, quads = mesh.vertices, mesh.faces
     edges = topology.edges_of(quads)
     rim = np.zeros(len(vertices), bool)
     rim[edges.ends[edges.count == 1].ravel()] = True
     seam = rim & (np.abs(vertices[:, axis]) < _SEAM_EDGES * edge)
     vertices = vertices.copy()
     vertices[:, axis] = np.where(seam, 0.0, np.maximum(vertices[:, axis], _INSIDE_EDGES * edge))
-    if surface is not None and scaled_jacobian(vertices, quads).min() < _MIN_JACOBIAN:
+    if surface is not None and scaled_jacobian(QuadMesh(vertices, quads)).min() < _MIN_JACOBIAN:
         surface_edges = topology.edges_of(surface.faces)
         segments = surface_edges.ends[surface_edges.count == 1]
         segments = segments[(np.abs(surface.vertices[segments, axis]) < _SNAP_EDGES * edge).all(1)]
         outline = Features(surface.vertices, segments, np.zeros(len(segments), np.int64), np.zeros(0, np.int64))
         free = Constraints.none(len(vertices))
         vertices = untangle(
-            vertices, quads, surface, outline, replace(free, curve=np.where(seam & bool(outline), 0, -1))
+            QuadMesh(vertices, quads), surface, outline, replace(free, curve=np.where(seam & bool(outline), 0, -1))
         )
         vertices[:, axis] = np.where(seam, 0.0, np.maximum(vertices[:, axis], _INSIDE_EDGES * edge))
     off_seam = np.flatnonzero(~seam)
@@ -111,46 +108,45 @@ def join_with_mirror(
     # Start one corner later, so that the diagonal from the first corner is reflected too.
     mirrored_quads = mirrored_index[quads][:, [0, 3, 2, 1]]
     # A quad with three corners on the seam and its reflection become one quad across the seam.
-    return remove_doublets(np.concatenate([vertices, reflected]), np.concatenate([quads, mirrored_quads]))
+    return remove_doublets(QuadMesh(np.concatenate([vertices, reflected]), np.concatenate([quads, mirrored_quads])))
 
 
-def remesh_mirrored(
-    vertices: np.ndarray, faces: np.ndarray, request: Request, axis: int
-) -> tuple[np.ndarray, np.ndarray, Record]:
+def remesh_mirrored(mesh: TriMesh, request: Request, axis: int) -> tuple[QuadMesh, Record]:
     """Remesh as pipeline.remesh does, the quads being their own mirror image across `axis`.
 
     The plane goes through the origin. Where the halves do not close, the whole is remeshed without symmetry, and the
     figure "symmetry" of the record is "none".
     """
-    edge = (face_normals(vertices, faces)[1].sum() / request.quads) ** 0.5
-    fine_vertices, fine_faces, moved = vertices, faces, None
+    edge = (mesh.area / request.quads) ** 0.5
+    sharp, moved = mesh, None
     if request.restore_creases and request.crease_degrees > 0:
-        fine_vertices, fine_faces, report = restore_creases(vertices, faces, request.crease_degrees)
-        moved = report["moved"]
-    half = half_mesh(fine_vertices, fine_faces, axis)
-    quad_vertices, quads, record = remesh(
-        *half,
+        restored = restore_creases(mesh, request.crease_degrees)
+        sharp, moved = restored.mesh, restored.moved
+    half = half_mesh(sharp, axis)
+    half_quads, record = remesh(
+        half,
         replace(request, quads=max(request.quads // 2, 8), restore_creases=False, min_jacobian=_MIN_JACOBIAN / 2),
     )
-    quad_vertices, quads = join_with_mirror(quad_vertices, quads, axis, edge, record.source or ProjectionTarget(*half))
+    joined = join_with_mirror(half_quads, axis, edge, record.source or ProjectionTarget(half))
     if moved is not None:
         record.figures["crease_vertices_restored"] = moved
-    if topology.is_watertight(faces):
-        quad_vertices, quads = fill_holes(quad_vertices, quads)
-    fault = _seam_fault(quad_vertices, quads, faces, request)
+    if topology.is_watertight(mesh.faces):
+        joined = fill_holes(joined)
+    fault = _seam_fault(joined, mesh.faces, request)
     record.source = None
     if fault is None:
         record.figures["symmetry"] = AXES[axis]
-        return quad_vertices, quads, record
+        return joined, record
     failed = [*record.failed, f"mirrored about {AXES[axis]}: {fault}"]
-    quad_vertices, quads, record = remesh(vertices, faces, request)
+    whole, record = remesh(mesh, request)
     record.failed[:0] = failed
     record.figures["symmetry"] = "none"
-    return quad_vertices, quads, record
+    return whole, record
 
 
-def _seam_fault(quad_vertices: np.ndarray, quads: np.ndarray, faces: np.ndarray, request: Request) -> str | None:
+def _seam_fault(joined: QuadMesh, faces: np.ndarray, request: Request) -> str | None:
     """Return what is wrong with the joined halves of a surface with triangles (f, 3), None where nothing is."""
+    quads = joined.faces
     if topology.is_watertight(faces):
         if not topology.is_watertight(quads):
             return "it does not close along the plane"
@@ -158,7 +154,7 @@ def _seam_fault(quad_vertices: np.ndarray, quads: np.ndarray, faces: np.ndarray,
             return "pieces are lost or joined"
     if not topology.is_manifold(quads):
         return "it is not manifold"
-    jacobian = scaled_jacobian(quad_vertices, quads)
+    jacobian = scaled_jacobian(joined)
     if jacobian.min() <= 0 and request.smooth_iterations:
         return f"{int((jacobian <= 0).sum())} quads are folded"
     return None

@@ -12,6 +12,7 @@ import numpy as np
 
 from gdtool.geometry import topology
 from gdtool.geometry.distance import sample_surface
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.rays import RayCaster
 from gdtool.geometry.vectors import dot
@@ -73,13 +74,9 @@ class Request:
 
 
 class QuadResult(NamedTuple):
-    """Quads of a patch, and the method that made them as the manifest names it.
+    """Quads of a patch, and the method that made them as the manifest names it."""
 
-    vertices (v, 3), quads (q, 4).
-    """
-
-    vertices: np.ndarray
-    quads: np.ndarray
+    mesh: QuadMesh
     method: str
 
 
@@ -89,7 +86,7 @@ class Record:
 
     engine: str = ""
     failed: list[str] = field(default_factory=list)
-    figures: dict[str, float | int | bool | str] = field(default_factory=dict)
+    figures: dict[str, float | int | bool | str | None] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     source: ProjectionTarget | None = None  # the input with its search tree, built while a child worked
 
@@ -122,25 +119,24 @@ def count_reason(
 class RemeshPatch:
     """Triangles to remesh: the whole surface or some of its pieces. What is derived from them is computed once.
 
-    vertices (v, 3) in a unit box, faces (f, 3). `quads` is the wanted count and `edge` the wanted edge length.
+    mesh: the triangles, in a unit box. `quads` is the wanted count and `edge` the wanted edge length.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    mesh: TriMesh
     quads: int
     edge: float
     request: Request
     full_surface: Callable[[], ProjectionTarget]  # the whole input as it was before it was simplified
     skip_engines: bool = False
     tolerance: float = COUNT_TOLERANCE  # relative error of the count that is accepted
-    input_quads: tuple[np.ndarray, np.ndarray] | None = None  # vertices and quads cut from its triangles beforehand
+    input_quads: QuadMesh | None = None  # quads cut from its triangles beforehand
 
     def subset(
         self, chosen: np.ndarray, quads: int, skip_engines: bool = False, tolerance: float = COUNT_TOLERANCE
     ) -> RemeshPatch:
         """Return a patch of some of the triangles. chosen (f,) bool."""
         return RemeshPatch(
-            *topology.compact(self.vertices, self.faces[chosen]),
+            topology.compact(TriMesh(self.mesh.vertices, self.mesh.faces[chosen])),
             quads,
             self.edge,
             self.request,
@@ -156,7 +152,7 @@ class RemeshPatch:
     @cached_property
     def pieces(self) -> tuple[int, np.ndarray]:
         """Number of connected pieces, and (f,) the piece of each triangle."""
-        return topology.components(self.faces)
+        return topology.components(self.mesh.faces)
 
     @property
     def has_only_tiny_pieces(self) -> bool:
@@ -166,17 +162,17 @@ class RemeshPatch:
     @cached_property
     def handles(self) -> int:
         """Number of handles (the sum of the genus of all pieces)."""
-        return topology.handles(self.faces, self.pieces[0])
+        return topology.handles(self.mesh.faces, self.pieces[0])
 
     @cached_property
     def piece_areas(self) -> np.ndarray:
         """(pieces,) area of each piece."""
-        return np.bincount(self.pieces[1], face_normals(self.vertices, self.faces)[1], self.pieces[0])
+        return np.bincount(self.pieces[1], face_normals(self.mesh)[1], self.pieces[0])
 
     @cached_property
     def surface(self) -> ProjectionTarget:
         """The triangles with their search tree."""
-        return ProjectionTarget(self.vertices, self.faces)
+        return ProjectionTarget(self.mesh)
 
     @cached_property
     def has_narrow_strips(self) -> bool:
@@ -185,7 +181,7 @@ class RemeshPatch:
         Always False for a mesh with more triangles than quads.
         """
         return (
-            len(self.faces) < self.quads
+            len(self.mesh.faces) < self.quads
             and self.features.share_in_strips(_NARROW_EDGES * self.edge) > _MAX_NARROW_SHARE
         )
 
@@ -195,18 +191,16 @@ class RemeshPatch:
 
         Always False for a mesh with fewer triangles than quads, for which a coarser mesh may work all the same.
         """
-        if len(self.faces) < self.quads:
+        if len(self.mesh.faces) < self.quads:
             return False
-        points, face_idx = sample_surface(self.vertices, self.faces, _WALL_RAYS, np.random.default_rng(0))[:2]
-        normals = face_normals(self.vertices, self.faces)[0]
+        points, face_idx = sample_surface(self.mesh, _WALL_RAYS, np.random.default_rng(0))[:2]
+        normals = face_normals(self.mesh)[0]
         inward = -normals[face_idx]
-        hits = RayCaster(self.vertices, self.faces, 1).first_hit(points + _RAY_OFFSET * self.edge * inward, inward)
+        hits = RayCaster(self.mesh, 1).first_hit(points + _RAY_OFFSET * self.edge * inward, inward)
         leaves = dot(normals[hits.face_idx].T, inward.T) > _WALL_COSINE
         return bool((hits.found & leaves & (hits.distance < _WALL_EDGES * self.edge)).mean() > _MAX_WALL_SHARE)
 
     @cached_property
     def features(self) -> Features:
         """Creases and boundaries of the triangles."""
-        return find_features(
-            self.vertices, self.faces, self.request.crease_degrees or 181.0, _MIN_FEATURE_EDGES * self.edge
-        )
+        return find_features(self.mesh, self.request.crease_degrees or 181.0, _MIN_FEATURE_EDGES * self.edge)

@@ -162,9 +162,10 @@ def _bake_maps(options: Options, out: Output, target, texels, origin, samples: i
     from gdtool.bake.occlusion import bake_occlusion
     from gdtool.bake.pipeline import BakeOptions, bake, occlusion_tracer
     from gdtool.bake.reproject import vertex_reach
+    from gdtool.geometry.meshes import TriMesh
 
     with out.step("bake"):
-        reach = vertex_reach(target.vertices, target.faces, origin.source)
+        reach = vertex_reach(TriMesh(target.vertices, target.faces), origin.source)
         how = BakeOptions(samples, out.threads, options.height, options.confidence)
         baked = bake(target, texels, origin.source, origin.lookup, reach, how, out.progress)
     occlusion = None

@@ -198,13 +198,15 @@ def _load(path: Path | str) -> Scene:
 def _shape(geometry: Geometry) -> Report:
     import numpy as np
 
-    from gdtool.geometry.metrics import is_closed, weld
+    from gdtool.geometry.meshes import TriMesh
+    from gdtool.geometry.metrics import is_closed, weld_faces
 
+    mesh = TriMesh(geometry.vertices, geometry.faces)
     return {
-        "vertices": len(np.unique(weld(geometry.vertices, geometry.faces))),
+        "vertices": len(np.unique(weld_faces(mesh))),
         "faces": len(geometry.faces) - geometry.quads,
         "quads": geometry.quads,
-        "watertight": is_closed(geometry.vertices, geometry.faces),
+        "watertight": is_closed(mesh),
     }
 
 
@@ -221,6 +223,7 @@ def _surfaces(geometry: Geometry, truth: Source, options: Options, views: Folder
     """Both protocols, in the normalised frame of the result."""
     from gdtool.folders.records import read_cameras
     from gdtool.geometry import metrics
+    from gdtool.geometry.meshes import TriMesh
 
     true_geometry = read_geometry(truth)
     vertices, true_vertices = _in_world(geometry), _in_world(true_geometry)
@@ -229,22 +232,20 @@ def _surfaces(geometry: Geometry, truth: Source, options: Options, views: Folder
     cameras = read_cameras(views.file("cameras.json")) if views is not None else None
     # The cameras are in the normalised frame: of two files nothing says where that is.
     known = geometry.source_from_world is not None or options.frame == "box"
-    found = metrics.surface_protocol(
-        vertices,
-        geometry.faces,
-        true_vertices,
-        true_geometry.faces,
+    mesh, true_mesh = TriMesh(vertices, geometry.faces), TriMesh(true_vertices, true_geometry.faces)
+    how = metrics.SurfaceOptions(
+        cameras=cameras if cameras is not None and known else (),
         samples=options.samples,
         seed=options.seed,
         threshold=options.threshold,
-        cameras=cameras if known else None,
     )
+    found = metrics.surface_protocol(mesh, true_mesh, how)
     report: Report = {
         f"surface_{name}" if not name.startswith("seen_") else name: value for name, value in found.items()
     }
     report["reference_watertight"] = "iou" in found
     if options.syncdreamer:
-        found = metrics.syncdreamer_protocol(vertices, geometry.faces, true_vertices, true_geometry.faces)
+        found = metrics.syncdreamer_protocol(mesh, true_mesh)
         report |= {f"syncdreamer_{name}": value for name, value in found.items()}
     return report
 

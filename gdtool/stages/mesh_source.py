@@ -23,6 +23,7 @@ def read_triangles(inputs: Inputs, out: Output):
     import numpy as np
 
     from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
+    from gdtool.geometry.meshes import QuadMesh, TriMesh
     from gdtool.geometry.repair import check
     from gdtool.geometry.topology import compact
 
@@ -44,13 +45,13 @@ def read_triangles(inputs: Inputs, out: Output):
     else:
         scene = _load_scene(inputs, out)
         vertices, faces = scene.vertices, scene.faces.astype(np.int64)
-    check(vertices, faces, source_path(inputs))
-    kept, faces = compact(vertices, faces)
-    _require_extent(float(np.ptp(kept, 0).max()), inputs)
-    matrix = unit_box(kept)
+    check(TriMesh(vertices, faces), source_path(inputs))
+    kept = compact(TriMesh(vertices, faces))
+    _require_extent(float(np.ptp(kept.vertices, 0).max()), inputs)
+    matrix = unit_box(kept.vertices)
     if quads is not None:
-        _, quads = compact(vertices, quads)
-    return transform_points(invert_similarity(matrix), kept), faces, matrix, quads
+        quads = compact(QuadMesh(vertices, quads)).faces
+    return transform_points(invert_similarity(matrix), kept.vertices), kept.faces, matrix, quads
 
 
 def read_quad_mesh(inputs: Inputs, out: Output):
@@ -61,8 +62,9 @@ def read_quad_mesh(inputs: Inputs, out: Output):
     """
     import numpy as np
 
-    from gdtool.folders.mesh import QuadMesh, read_mesh, read_obj
+    from gdtool.folders.mesh import read_mesh, read_obj
     from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
+    from gdtool.geometry.meshes import QuadMesh
 
     main = inputs.main
     if hasattr(main, "content"):
@@ -109,8 +111,8 @@ def _scene_as_mesh(inputs: Inputs, out: Output):
     """Read the triangles of any mesh file, and merge the vertices that only texture coordinates tell apart."""
     import numpy as np
 
-    from gdtool.folders.mesh import QuadMesh
-    from gdtool.geometry.rows import unique_rows
+    from gdtool.geometry.meshes import QuadMesh
+    from gdtool.geometry.unique_rows import unique_rows
 
     scene = _load_scene(inputs, out)
     if not len(scene.faces):
@@ -128,12 +130,12 @@ def _without_degenerate(mesh, inputs: Inputs, out: Output):
     """Leave out faces without area or with a repeated corner, and warn of them."""
     import numpy as np
 
-    from gdtool.folders.mesh import QuadMesh
     from gdtool.geometry.mesh_quality import polygon_normals
+    from gdtool.geometry.meshes import QuadMesh
 
     corners = np.where(mesh.faces < 0, -1 - np.arange(4), mesh.faces)
     ordered = np.sort(corners, 1)
-    good = (ordered[:, 1:] != ordered[:, :-1]).all(1) & (polygon_normals(mesh.vertices, mesh.faces)[1] > 0)
+    good = (ordered[:, 1:] != ordered[:, :-1]).all(1) & (polygon_normals(mesh)[1] > 0)
     if not good.any():
         raise InputError(source_path(inputs), "no face has an area", "name a mesh whose faces span a surface")
     if good.all():

@@ -80,6 +80,7 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.fields.neural.paper import PaperOptions
     from gdtool.folders.surface import Surface, write_surface
     from gdtool.folders.views import read_views
+    from gdtool.geometry.meshes import TriMesh
     from gdtool.geometry.normals import vertex_normals
 
     folder = inputs.main
@@ -113,13 +114,13 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         )
         mesh = pipeline.fit_paper(views, aligned, shape, settings, out)
     with out.step("materials"):
-        normals = vertex_normals(mesh.vertices, mesh.faces)
+        triangles = TriMesh(mesh.vertices, mesh.faces)
+        normals = vertex_normals(triangles)
         look = appearance(
             views.cameras,
             views.mask,
             views.images,
-            mesh.vertices,
-            mesh.faces,
+            triangles,
             normals,
             AppearanceOptions(shape.step, read.light, options.seed),
         )

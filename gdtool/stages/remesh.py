@@ -100,27 +100,29 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
 
 def _run(inputs: Inputs, options: Options, out: Output) -> None:
-    from gdtool.geometry.simplify import CHILD_MODULES, reduced
+    from gdtool.geometry.simplify import CHILD_MODULES, collapse_in_child
 
-    prepare(reduced, CHILD_MODULES)  # for the first child of remesh(), while the mesh is read
+    prepare(collapse_in_child, CHILD_MODULES)  # for the first child of remesh(), while the mesh is read
 
     import numpy as np
 
-    from gdtool.folders.mesh import QuadMesh, write_mesh
+    from gdtool.folders.mesh import write_mesh
+    from gdtool.geometry.meshes import QuadMesh, TriMesh
     from gdtool.remesh.face_budget import is_finished
     from gdtool.remesh.methods import count_warning, make_mesh, passed_through, report_figures
     from gdtool.stages.mesh_source import read_triangles
 
     with out.step("read"):
         vertices, faces, matrix, quads = read_triangles(inputs, out)
-    options = _with_count(vertices, faces, options, out)
+    mesh = TriMesh(vertices, faces)
+    options = _with_count(mesh, options, out)
     is_plain = not options.triangles and not options.max_deviation and options.symmetry == "none"
     if quads is not None and options.keep and is_plain and is_finished(quads, options.faces):
         out.skip("remeshing", f"the mesh already is {len(quads)} quads, closed and manifold")
-        made = passed_through(vertices, quads)
+        made = passed_through(QuadMesh(vertices, quads))
     else:
-        vertices, faces = _clean(vertices, faces, inputs, options, out)
-        made = make_mesh(vertices, faces, _goal(options), out.step)
+        mesh = _clean(mesh, inputs, options, out)
+        made = make_mesh(mesh, _goal(options), out.step)
         for what, why in made.skipped:
             out.skip(what, why)
         for text in made.warnings:
@@ -128,14 +130,14 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         for name, seconds in made.record.seconds.items():
             out.seconds[name] = out.seconds.get(name, 0.0) + seconds
     with out.step("measure"):
-        figures = report_figures(made, vertices, faces)
-    if text := count_warning(made, faces, _goal(options)):
+        figures = report_figures(made, mesh)
+    if text := count_warning(made, mesh.faces, _goal(options)):
         out.warn(f"{inputs.name}: {text}")
     with out.step("write"):
-        write_mesh(out, QuadMesh(made.vertices, made.faces.astype(np.int32)))
-    is_quad = made.faces[:, 3] >= 0
+        write_mesh(out, QuadMesh(made.mesh.vertices, made.mesh.faces.astype(np.int32)))
+    is_quad = made.mesh.is_quad
     out.content = MeshContent(
-        vertices=len(made.vertices),
+        vertices=len(made.mesh.vertices),
         quads=int(is_quad.sum()),
         triangles=int((~is_quad).sum()),
         watertight=bool(figures["watertight"]),
@@ -146,37 +148,38 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
     )
 
 
-def _with_count(vertices, faces, options: Options, out: Output) -> Options:
+def _with_count(mesh, options: Options, out: Output) -> Options:
     """Return options with --quad-size turned into a number of faces."""
     from gdtool.remesh.face_budget import quads_of_size
     from gdtool.remesh.limits import MAX_QUADS, MIN_QUADS
 
     if not options.quad_size or options.triangles:
         return options
-    count = quads_of_size(vertices, faces, options.quad_size)
+    count = quads_of_size(mesh, options.quad_size)
     possible = min(max(count, MIN_QUADS), MAX_QUADS)
     if count != possible:
         out.warn(f"--quad-size {options.quad_size:g} asks for {count} faces; {MIN_QUADS} to {MAX_QUADS} can be made")
     return msgspec.structs.replace(options, faces=possible)
 
 
-def _clean(vertices, faces, inputs: Inputs, options: Options, out: Output):
-    """Return repaired vertices and triangles; warn of what was repaired, of open surfaces and of hidden shells."""
-    from gdtool.geometry import repair, shells
+def _clean(mesh, inputs: Inputs, options: Options, out: Output):
+    """Return the repaired TriMesh; warn of what was repaired, of open surfaces and of enclosed bodies."""
+    from gdtool.geometry import repair
+    from gdtool.geometry.enclosed_bodies import enclosed_bodies_warning
     from gdtool.remesh.limits import SECONDS_PER_QUAD
     from gdtool.remesh.methods import repair_warnings
     from gdtool.stages.limits import require_time
     from gdtool.stages.mesh_source import source_path
 
     with out.step("clean"):
-        vertices, faces, repairs, closed = repair.clean(vertices, faces, source_path(inputs))
-    for text in repair_warnings(repairs, closed):
+        cleaned = repair.clean(mesh, source_path(inputs))
+    for text in repair_warnings(cleaned.repairs, cleaned.is_closed):
         out.warn(f"{inputs.name}: {text}")
     if not options.triangles:
         require_time(SECONDS_PER_QUAD * options.faces, options.seconds, "--seconds", inputs.name, "lower --faces")
-    if inner := shells.told(vertices, faces):
+    if inner := enclosed_bodies_warning(cleaned.mesh):
         out.warn(f"{inputs.name}: {inner}")
-    return vertices, faces
+    return cleaned.mesh
 
 
 def _goal(options: Options):

@@ -171,7 +171,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 def _read_scene(inputs: Inputs, options: Options, out: Output) -> Scene:
     """Read the model, warn of what is odd in it, and refuse it where --filter asks for more."""
     from gdtool.assets.load import load_scene
-    from gdtool.geometry import shells
+    from gdtool.geometry.enclosed_bodies import enclosed_bodies_warning
+    from gdtool.geometry.meshes import TriMesh
     from gdtool.shading.render.dataset import require_complete_pbr
 
     with out.step("read"):
@@ -179,7 +180,9 @@ def _read_scene(inputs: Inputs, options: Options, out: Output) -> Scene:
     for note in scene.notes:
         out.warn(note)
     # The parts of generated objects overlap on purpose.
-    if not isinstance(inputs.main, str) and (inner := shells.told(scene.vertices, scene.faces, welded=False)):
+    if not isinstance(inputs.main, str) and (
+        inner := enclosed_bodies_warning(TriMesh(scene.vertices, scene.faces), welded=False)
+    ):
         out.warn(inner)
     if options.filter != "all":
         require_complete_pbr(scene, inputs.name)

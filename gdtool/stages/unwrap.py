@@ -56,9 +56,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
 
 def _run(inputs: Inputs, options: Options, out: Output) -> None:
-    from gdtool.geometry.simplify import CHILD_MODULES, reduced
+    from gdtool.geometry.simplify import CHILD_MODULES, collapse_in_child
 
-    prepare(reduced, CHILD_MODULES)  # for the first child of unwrap(), while the mesh is read
+    prepare(collapse_in_child, CHILD_MODULES)  # for the first child of unwrap(), while the mesh is read
 
     import numpy as np
 
@@ -76,11 +76,11 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         mesh, tried, twin = _unwrapped(mesh, padding, options, inputs, out)
     with out.step("measure"):
         report = _report(mesh, twin, kept, options, inputs, out)
-    faces, face_uvs = mesh.faces.astype(np.int64), mesh.face_uvs.astype(np.int64)
+    wide = _with_wide_indices(mesh)
     with out.step("preview"):
-        chart = pipeline.uv_islands(mesh.vertices, faces, face_uvs)[0]
-        write_png(out.path("layout.png"), preview.layout(faces, mesh.uv, face_uvs, chart))
-        write_png(out.path("checkerboard.png"), preview.checkerboard(mesh.vertices, faces, mesh.uv, face_uvs, chart))
+        chart = pipeline.uv_islands(wide)[0]
+        write_png(out.path("layout.png"), preview.layout(wide.faces, mesh.uv, wide.face_uvs, chart))
+        write_png(out.path("checkerboard.png"), preview.checkerboard(wide, chart))
     with out.step("write"):
         write_mesh(out, mesh)
     quads = int(mesh.is_quad.sum())
@@ -101,13 +101,11 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
 
 def _keeps_uv(mesh, options: Options, inputs: Inputs, out: Output) -> bool:
     """Whether the mesh's own texture coordinates are kept; say so, or warn why they are not."""
-    import numpy as np
-
     from gdtool.unwrap.pipeline import invalid_reason
 
     if mesh.uv is None or options.redo:
         return False
-    reason = invalid_reason(mesh.vertices, mesh.faces.astype(np.int64), mesh.uv, mesh.face_uvs.astype(np.int64))
+    reason = invalid_reason(_with_wide_indices(mesh))
     if reason is None:
         out.skip("unwrapping", "the mesh has valid texture coordinates; --redo makes new ones")
     else:
@@ -119,7 +117,7 @@ def _unwrapped(mesh, padding: int, options: Options, inputs: Inputs, out: Output
     """Return the mesh with new texture coordinates, what was tried, and the twin (f,) of each face or -1."""
     import numpy as np
 
-    from gdtool.folders.mesh import QuadMesh
+    from gdtool.geometry.meshes import QuadMesh
     from gdtool.stages.limits import require_time
     from gdtool.unwrap import pipeline
     from gdtool.unwrap.limits import SECONDS_PER_FACE
@@ -133,7 +131,7 @@ def _unwrapped(mesh, padding: int, options: Options, inputs: Inputs, out: Output
     with out.step("unwrap"):
         twin, corner = _twins(mesh, options, inputs, out)
         without_twin = np.flatnonzero(twin < 0)
-        result = pipeline.unwrap(mesh.vertices, mesh.faces[without_twin].astype(np.int64), request)
+        result = pipeline.unwrap(QuadMesh(mesh.vertices, mesh.faces[without_twin].astype(np.int64)), request)
     for what, why, seconds in result.skipped:
         out.skip(what, why, seconds)
     face_uvs = copy_twin_corners(result.face_uvs, without_twin, twin, corner)
@@ -142,15 +140,14 @@ def _unwrapped(mesh, padding: int, options: Options, inputs: Inputs, out: Output
 
 def _report(mesh, twin, kept: bool, options: Options, inputs: Inputs, out: Output) -> dict:
     """Return figures of the texture coordinates; warn of mirrored and overlapping charts."""
-    import numpy as np
-
+    from gdtool.geometry.meshes import QuadMesh
     from gdtool.unwrap.pipeline import figures, texels_per_unit
 
-    faces, face_uvs = mesh.faces.astype(np.int64), mesh.face_uvs.astype(np.int64)
+    wide, alone = _with_wide_indices(mesh), twin < 0
     # Faces that share a twin's texels on purpose are left out.
-    report = figures(mesh.vertices, faces[twin < 0], mesh.uv, face_uvs[twin < 0])
+    report = figures(QuadMesh(mesh.vertices, wide.faces[alone], mesh.uv, wide.face_uvs[alone]))
     report["shared"] = float((twin >= 0).mean())
-    report["texels_per_unit"] = texels_per_unit(mesh.vertices, mesh.faces, mesh.uv, mesh.face_uvs, options.size)
+    report["texels_per_unit"] = texels_per_unit(mesh, options.size)
     if kept and report["mirrored"] > 0:
         out.warn(
             f"{inputs.name}: {report['mirrored']:.0%} of the surface is mirrored in its texture coordinates; "
@@ -162,15 +159,25 @@ def _report(mesh, twin, kept: bool, options: Options, inputs: Inputs, out: Outpu
     return report
 
 
+def _with_wide_indices(mesh):
+    """Return the mesh with 64-bit indices, which the unwrapping computes with."""
+    import numpy as np
+
+    from gdtool.geometry.meshes import QuadMesh
+
+    return QuadMesh(mesh.vertices, mesh.faces.astype(np.int64), mesh.uv, mesh.face_uvs.astype(np.int64))
+
+
 def _twins(mesh, options: Options, inputs: Inputs, out: Output):
     """Return twins and corners as mirror_twins() does; nothing has a twin without --symmetry."""
     import numpy as np
 
+    from gdtool.geometry.meshes import QuadMesh
     from gdtool.unwrap.symmetry import mirror_twins
 
     if options.symmetry == "none":
         return np.full(len(mesh.faces), -1), np.full(mesh.faces.shape, -1)
-    twin, corner = mirror_twins(mesh.vertices, mesh.faces.astype(np.int64), "xyz".index(options.symmetry))
+    twin, corner = mirror_twins(QuadMesh(mesh.vertices, mesh.faces.astype(np.int64)), "xyz".index(options.symmetry))
     if not (twin >= 0).any():
         out.warn(
             f"{inputs.name}: no face mirrors another along {options.symmetry}, so that none share texels; "

@@ -13,8 +13,8 @@ import numpy as np
 
 from gdtool.core.child import ChildFailed, begin, prepare
 from gdtool.geometry.mesh_quality import polygon_normals
-from gdtool.geometry.simplify import CHILD_MODULES, reduced
-from gdtool.geometry.topology import triangulated
+from gdtool.geometry.meshes import QuadMesh, TriMesh
+from gdtool.geometry.simplify import CHILD_MODULES, collapse_in_child
 from gdtool.geometry.uv_raster import owner_count
 from gdtool.unwrap.chart import Chart
 from gdtool.unwrap.pack.search import WELL_PACKED, PlacementOrder, choose_cut, pack
@@ -85,27 +85,28 @@ class UnwrapResult:
     skipped: list[Skipped] = field(default_factory=list)
 
 
-def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> UnwrapResult:
-    """Make texture coordinates for quads and triangles, faces (f, 4); a quad lies in one chart.
+def unwrap(mesh: QuadMesh, request: Request) -> UnwrapResult:
+    """Make texture coordinates for a mesh with finite vertices; a quad lies in one chart.
 
-    vertices (v, 3) finite. Charts are never mirrored and do not overlap; all have one texel density. As the time runs
+    Charts are never mirrored and do not overlap; all have one texel density. As the time runs
     out, simpler ways take over: charts by the side of a box that faces look at, flattened by projection, at last each
     face as a chart, packed in rows.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     started = time.monotonic()
     deadlines = _Deadlines(*(started + share * request.seconds for share in _DEADLINE_SHARES))
-    prepare(reduced, CHILD_MODULES)
+    prepare(collapse_in_child, CHILD_MODULES)
     extent = float(np.ptp(vertices[np.unique(faces[faces >= 0])], 0).max())
-    unit = (vertices - vertices.mean(0)) / (extent if extent > 0 else 1.0)
+    unit = QuadMesh((vertices - vertices.mean(0)) / (extent if extent > 0 else 1.0), faces)
 
     @cache
     def adjacency() -> Adjacency:  # first asked for while a child simplifies the mesh
         prepare(run_xatlas)
         prepare(flatten_all, (*CHILD_MODULES, "igl"))
-        return Adjacency(unit, faces)
+        return Adjacency(unit)
 
-    segmentation = find_charts(adjacency, unit, faces, until=deadlines.charts_found, max_cost=request.max_cost)
-    charts, failed = _flatten_in_child(unit, faces, segmentation, request, deadlines)
+    segmentation = find_charts(adjacency, unit, until=deadlines.charts_found, max_cost=request.max_cost)
+    charts, failed = _flatten_in_child(unit, segmentation, request, deadlines)
     failed = segmentation.failed + failed
     gap = request.padding / request.size
     orders, skipped = [], []
@@ -125,15 +126,14 @@ def unwrap(vertices: np.ndarray, faces: np.ndarray, request: Request) -> UnwrapR
 
 
 def _flatten_in_child(
-    vertices: np.ndarray, faces: np.ndarray, segmentation: Segmentation, request: Request, deadlines: _Deadlines
+    mesh: QuadMesh, segmentation: Segmentation, request: Request, deadlines: _Deadlines
 ) -> tuple[list[Chart], list[str]]:
     """Flatten the charts in a child process; where it fails, project charts by the side of a box they look at."""
     limits = FlattenLimits(request.good_stretch, request.max_stretch, deadlines.shaped, deadlines.projected)
     try:
         child = begin(
             flatten_all,
-            vertices,
-            faces,
+            mesh,
             segmentation.label,
             limits,
             segmentation.proxy,
@@ -145,7 +145,7 @@ def _flatten_in_child(
         return child.result()
     except ChildFailed as failure:
         until = time.monotonic() + deadlines.projected - deadlines.shaped
-        charts, reasons = flatten_all(vertices, faces, segmentation.label, replace(limits, single_after=until))
+        charts, reasons = flatten_all(mesh, segmentation.label, replace(limits, single_after=until))
         return charts, [f"flattening: {failure}; charts by the side they look at", *reasons]
 
 
@@ -182,41 +182,38 @@ def _cut_for_packing(
     return tried[best.index], best.orders, skipped
 
 
-def figures(
-    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, size: int = 1024
-) -> dict[str, float | int]:
-    """Measure texture coordinates: charts, coverage and overlap of the square, stretch, distortion, mirroring and
-    seams.
+def figures(mesh: QuadMesh, size: int = 1024) -> dict[str, float | int]:
+    """Measure a mesh's texture coordinates: charts, coverage, overlap, stretch, distortion, mirroring and seams.
 
     size: texels of the raster for coverage and overlap. Stretch is L2; mirrored and overlap are shares of area; seam
     length is in diagonals of the bounding box, each seam counted once.
     """
-    triangles, face_idx = triangulated(faces)
+    (uv, face_uvs), (triangles, face_idx) = mesh.texture_coordinates(), mesh.triangulation
     corners = corner_triangles(face_uvs, face_idx)
     # A mesh with one vertex for each texture corner, so that the two sides of a seam are measured apart.
     points = np.zeros((len(uv), 3))
-    points[corners.ravel()] = vertices[triangles.ravel()]
+    points[corners.ravel()] = mesh.vertices[triangles.ravel()]
     upward = np.stack([uv[:, 0], 1 - uv[:, 1]], -1)
-    values, area = singular_values(points, corners, upward)
+    values, area = singular_values(TriMesh(points, corners), upward)
     a, b, c = (upward[corners[:, i]] for i in range(3))
     flat = ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
     use = (area > _MIN_AREA_SHARE * area.sum()) & (np.abs(flat) > _MIN_UV_AREA)
     weight = area[use] / area[use].sum()
     ratio = np.abs(flat[use]) / np.abs(flat[use]).sum() / weight
     count = owner_count(uv, corners, size)
-    label, seam = uv_islands(vertices, faces, face_uvs)
+    label, seam = uv_islands(mesh)
     return {
         "charts": int(label.max()) + 1,
         "coverage": float((count > 0).mean()),
         "overlap": float((count > 1).sum() / max((count > 0).sum(), 1)),
-        "stretch": stretch(points, corners, upward),
+        "stretch": stretch(TriMesh(points, corners), upward),
         "area_distortion": float((weight * np.maximum(ratio, 1 / ratio)).sum()),
         "angle_distortion": float(
             (weight * np.minimum(values[use, 0] / np.maximum(values[use, 1], 1e-12), _MAX_ANISOTROPY)).sum()
         ),
         "mirrored": float(area[flat < 0].sum() / area.sum()),
         "degenerate": float(1 - use.mean()),
-        "seam_length": seam / float(np.linalg.norm(np.ptp(vertices, 0))),
+        "seam_length": seam / float(np.linalg.norm(np.ptp(mesh.vertices, 0))),
     }
 
 
@@ -227,7 +224,7 @@ def corner_triangles(face_uvs: np.ndarray, face_idx: np.ndarray) -> np.ndarray:
     return np.take_along_axis(face_uvs[face_idx], np.where(second[:, None], [0, 2, 3], [0, 1, 2]), 1).astype(np.int64)
 
 
-def uv_islands(vertices: np.ndarray, faces: np.ndarray, face_uvs: np.ndarray) -> tuple[np.ndarray, float]:
+def uv_islands(mesh: QuadMesh) -> tuple[np.ndarray, float]:
     """Return (f,) the chart of each face, and the length of all seams.
 
     Faces are in one chart where their shared edge has the same texture corners on both sides.
@@ -237,32 +234,31 @@ def uv_islands(vertices: np.ndarray, faces: np.ndarray, face_uvs: np.ndarray) ->
 
     from gdtool.geometry.topology import edges_of
 
-    edges = edges_of(faces)
+    vertices, edges = mesh.vertices, edges_of(mesh.faces)
     order = edges.order
     edge_idx, pairs = edges.face_pairs()
     first = (np.cumsum(edges.count) - edges.count)[edge_idx]
-    ends_uv = edges_of(face_uvs).half_ends  # in the same order of corners
+    ends_uv = edges_of(mesh.texture_coordinates()[1]).half_ends  # in the same order of corners
     first_uv, second_uv = ends_uv[order[first]], ends_uv[order[first + 1]]
     backward = edges.half_ends[order[first]][:, 0] != edges.half_ends[order[first + 1]][:, 0]
     second_uv = np.where(backward[:, None], second_uv[:, ::-1], second_uv)
-    merge_small_charts = (first_uv == second_uv).all(1)
-    graph = coo_matrix(
-        (np.ones(int(merge_small_charts.sum())), (pairs[merge_small_charts, 0], pairs[merge_small_charts, 1])),
-        (len(faces), len(faces)),
-    )
-    ends = edges.ends[edge_idx[~merge_small_charts]]
+    joined = (first_uv == second_uv).all(1)
+    count = len(mesh.faces)
+    graph = coo_matrix((np.ones(int(joined.sum())), (pairs[joined, 0], pairs[joined, 1])), (count, count))
+    ends = edges.ends[edge_idx[~joined]]
     return connected_components(graph, False)[1], float(
         np.linalg.norm(vertices[ends[:, 0]] - vertices[ends[:, 1]], axis=1).sum()
     )
 
 
-def invalid_reason(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray) -> str | None:
-    """Return why texture coordinates of a mesh cannot be kept, None where they can."""
+def invalid_reason(mesh: QuadMesh) -> str | None:
+    """Return why the texture coordinates of a mesh cannot be kept, None where they can."""
+    uv, _ = mesh.texture_coordinates()
     if not np.isfinite(uv).all():
         return "some are not finite"
     if uv.min() < -_UV_SLACK or uv.max() > 1 + _UV_SLACK:
         return "some lie outside the unit square"
-    measured = figures(vertices, faces, uv, face_uvs)
+    measured = figures(mesh)
     if measured["overlap"] > _MAX_KEPT_OVERLAP:
         return f"they overlap on {100 * measured['overlap']:.1f} % of what they cover"
     if measured["degenerate"] > _MAX_KEPT_DEGENERATE:
@@ -270,11 +266,12 @@ def invalid_reason(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face
     return None
 
 
-def texels_per_unit(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, size: int) -> float:
+def texels_per_unit(mesh: QuadMesh, size: int) -> float:
     """Return the texel density: how many texels of a texture of `size` a unit of the surface has."""
+    uv, face_uvs = mesh.texture_coordinates()
     flat = np.concatenate([uv, np.zeros((len(uv), 1))], 1)
-    area = polygon_normals(vertices, faces)[1].sum()
-    return float(size * (polygon_normals(flat, face_uvs)[1].sum() / area) ** 0.5)
+    area = polygon_normals(mesh)[1].sum()
+    return float(size * (polygon_normals(QuadMesh(flat, face_uvs))[1].sum() / area) ** 0.5)
 
 
 def padding_for_mips(size: int, smallest_mip: int) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.topology import triangulated
 from gdtool.geometry.uv_raster import rasterize_uv
 from gdtool.unwrap.pipeline import corner_triangles
@@ -34,19 +35,21 @@ def layout(faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, chart: np.nd
     return out
 
 
-def checkerboard(
-    vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, chart: np.ndarray, size: int = 512
-) -> np.ndarray:
-    """Render the mesh (size, 2 size, 3) in [0, 1] under a checkerboard, charts tinted: front right and back left."""
+def checkerboard(mesh: QuadMesh, chart: np.ndarray, size: int = 512) -> np.ndarray:
+    """Render the mesh (size, 2 size, 3) in [0, 1] under a checkerboard: front right and back left.
+
+    mesh: with texture coordinates. chart (f,): the chart of each face, which tints it.
+    """
     from gdtool.cameras import rays, rig
     from gdtool.geometry.normals import face_normals
     from gdtool.geometry.rays import RayCaster
 
-    triangles, face_idx = triangulated(faces)
+    vertices, (triangles, face_idx) = mesh.vertices, mesh.triangulation
+    uv, face_uvs = mesh.texture_coordinates()
     corners = corner_triangles(face_uvs, face_idx)
     middle, extent = (vertices.min(0) + vertices.max(0)) / 2, float(np.ptp(vertices, 0).max()) or 1.0
-    points = (vertices - middle) / extent
-    caster, normals = RayCaster(points, triangles), face_normals(points, triangles)[0]
+    centred = TriMesh((vertices - middle) / extent, triangles)
+    caster, normals = RayCaster(centred), face_normals(centred)[0]
     colors = _colors(int(chart.max()) + 1)
     six = {camera.name: camera for camera in rig("six", size)}
     pictures = []

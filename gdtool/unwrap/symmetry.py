@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
+from gdtool.geometry.meshes import QuadMesh
+
 _TOLERANCE = 1e-4  # of the longest side: how near to a vertex the mirror image of its twin has to lie
 
 
-def mirror_twins(vertices: np.ndarray, faces: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+def mirror_twins(mesh: QuadMesh, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Match each face of the lower half with its mirror image in the upper half.
 
-    vertices (v, 3), faces (f, 4), -1 as a triangle's fourth corner; the plane is across `axis`, through the middle of
+    The plane is across `axis`, through the middle of
     the bounding box. Returns twin (f,): the face of the upper half that mirrors a face of the lower half, -1 for all
     others (upper faces, faces across the middle, faces without a twin); and corner (f, 4): which corner of its twin
     each corner is, -1 where there is none.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     from scipy.spatial import cKDTree
 
     used = np.unique(faces[faces >= 0])

@@ -8,6 +8,7 @@ import pytest
 from gdtool.assets.load import load_scene
 from gdtool.assets.ply_stl import read as ply_stl_read
 from gdtool.core.errors import InputError
+from gdtool.geometry.meshes import TriMesh
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
@@ -180,8 +181,8 @@ def test_faces_with_coincident_corners_are_removed_and_collinear_ones_stay(tmp_p
     scene = load_scene(tmp_path / "x.obj")
     assert len(scene.faces) == len(scene.material_idx) == 6
     assert any("two corners in one place" in note for note in scene.notes)
-    assert is_closed(scene.vertices, scene.faces)
-    assert not is_closed(scene.vertices, scene.faces[:-1])
+    assert is_closed(TriMesh(scene.vertices, scene.faces))
+    assert not is_closed(TriMesh(scene.vertices, scene.faces[:-1]))
 
 
 def test_zero_normals_are_replaced_by_those_of_the_faces(tmp_path):

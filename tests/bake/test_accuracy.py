@@ -10,6 +10,7 @@ from gdtool.bake.maps import make_maps
 from gdtool.bake.pipeline import BakeOptions, bake, vertex_lookup
 from gdtool.bake.reproject import Source, vertex_reach
 from gdtool.bake.target import Target, points_at, texels_of
+from gdtool.geometry.meshes import TriMesh
 from gdtool.images.color import srgb_from_linear
 from tests.bake.shapes import albedo_of, psnr, torus, triangles_of, unwrapped
 
@@ -34,16 +35,16 @@ def stored():
     fine, fine_quads, fine_normals = torus(640, 360)
     coarse, quads, _ = torus(60, 30, minor=0.141)
     faces = triangles_of(quads)
-    target = Target.of(coarse, faces, *unwrapped(coarse, faces, SIZE))
+    target = Target.of(TriMesh(coarse, faces), *unwrapped(coarse, faces, SIZE))
     texels = texels_of(target, SIZE)
-    source = Source(fine, triangles_of(fine_quads))
+    source = Source(TriMesh(fine, triangles_of(fine_quads)))
     attributes = {"albedo": albedo_of(fine), "roughness": 0.5 + 0.8 * fine[:, 0], "metallic": np.full(len(fine), 0.25)}
     baked = bake(
         target,
         texels,
         source,
         vertex_lookup(source, attributes, fine_normals),
-        vertex_reach(coarse, faces, source),
+        vertex_reach(TriMesh(coarse, faces), source),
         BakeOptions(threads=2),
     )
     maps = make_maps(texels, baked.values)

@@ -5,13 +5,14 @@ from dataclasses import replace
 from gdtool.bake import lods
 from gdtool.bake.lods import coarser, drift, make_levels
 from gdtool.bake.target import Target, size_for
+from gdtool.geometry.meshes import TriMesh
 from tests.bake.shapes import torus, triangles_of, unwrapped
 
 
 def target():
     vertices, quads, _ = torus(60, 30)
     faces = triangles_of(quads)
-    return Target.of(vertices, faces, *unwrapped(vertices, faces, 256))
+    return Target.of(TriMesh(vertices, faces), *unwrapped(vertices, faces, 256))
 
 
 def test_a_level_has_the_triangles_asked_for_and_stays_on_its_texels():

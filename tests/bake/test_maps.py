@@ -5,6 +5,7 @@ import pytest
 
 from gdtool.bake.maps import MapOptions, constant_of, contact_sheet_of, directx, flat_angle, make_maps, quantise
 from gdtool.bake.target import Target, texels_of
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.uv_raster import rasterize_uv
 
 
@@ -14,7 +15,7 @@ def texels():
     uv = np.array([[0.2, 0.8], [0.8, 0.8], [0.8, 0.2], [0.2, 0.2]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     assert (rasterize_uv(uv, faces, 64)[0] >= 0).any()
-    return texels_of(Target.of(vertices, faces, uv, faces), 64)
+    return texels_of(Target.of(TriMesh(vertices, faces), uv, faces), 64)
 
 
 def values(texels, albedo=(0.5, 0.2, 0.1), roughness=0.4, metallic=0.0, normal=(0.0, 0.0, 1.0)):

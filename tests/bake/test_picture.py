@@ -10,6 +10,7 @@ from gdtool.bake.picture import picture_of
 from gdtool.cameras import project, rig
 from gdtool.folders.surface import Surface
 from gdtool.folders.views import Views
+from gdtool.geometry.meshes import TriMesh
 from gdtool.images.metrics import resized
 from tests.bake.shapes import albedo_of, psnr, torus, triangles_of
 from tests.stages.bake_folders import torus_views
@@ -113,7 +114,7 @@ def test_a_picture_tells_color_where_other_views_face_the_surface_better_and_not
     normal = np.cross(across, up)
     assert normal @ cameras[1].backward > 0.95 > normal @ cameras[0].backward
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    caster = RayCaster(corners, faces)
+    caster = RayCaster(TriMesh(corners, faces))
     visibilities = [view_visibility(camera, caster, np.ones((64, 64), np.float32)) for camera in cameras]
     stack = np.stack([np.full((64, 64, 4), value, np.float32) for value in (0.3, 0.4)])
     points = np.random.default_rng(0).uniform(-0.15, 0.15, (40, 2)) @ np.stack([across, up])

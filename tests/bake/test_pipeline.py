@@ -8,6 +8,7 @@ from gdtool.bake.occlusion import ambient_visibility, bake_occlusion
 from gdtool.bake.pipeline import BakeOptions, bake, occlusion_tracer, vertex_lookup
 from gdtool.bake.reproject import Source, vertex_reach
 from gdtool.bake.target import Target, corner_normals, points_at, texels_of
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.tangents import decode_tangent_space
 from gdtool.geometry.uv_raster import rasterize_uv
 from tests.bake.shapes import albedo_of, psnr, sphere, torus, triangles_of, unwrapped
@@ -31,12 +32,12 @@ def torus_bake():
     coarse, coarse_quads, _ = torus(36, 18, minor=0.142)
     faces = triangles_of(coarse_quads)
     uv, face_uvs = unwrapped(coarse, faces, 256)
-    target = Target.of(coarse, faces, uv, face_uvs)
+    target = Target.of(TriMesh(coarse, faces), uv, face_uvs)
     texels = texels_of(target, 256)
-    source = Source(fine, triangles_of(fine_quads))
+    source = Source(TriMesh(fine, triangles_of(fine_quads)))
     attributes = {"albedo": albedo_of(fine), "roughness": 0.5 + 0.3 * fine[:, 0], "metallic": np.full(len(fine), 0.25)}
     lookup = vertex_lookup(source, attributes, fine_normals)
-    reach = vertex_reach(coarse, faces, source)
+    reach = vertex_reach(TriMesh(coarse, faces), source)
     return target, texels, source, lookup, reach, bake(target, texels, source, lookup, reach, BakeOptions(threads=2))
 
 
@@ -91,7 +92,7 @@ def test_thin_wall_does_not_bleed_through():
     vertices = np.array([[-0.5, 0, -0.5], [0.5, 0, -0.5], [0.5, 0, 0.5], [-0.5, 0, 0.5]])
     top, bottom = vertices + (0, 0.002, 0), vertices - (0, 0.002, 0)
     up, down = np.array([[0, 2, 1], [0, 3, 2]]), np.array([[4, 5, 6], [4, 6, 7]])
-    source = Source(np.concatenate([top, bottom]), np.concatenate([up, down]))
+    source = Source(TriMesh(np.concatenate([top, bottom]), np.concatenate([up, down])))
     albedo = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], 4, 0)
     lookup = vertex_lookup(
         source,
@@ -104,9 +105,9 @@ def test_thin_wall_does_not_bleed_through():
             [[0.05, 0.1], [0.45, 0.1], [0.45, 0.9], [0.05, 0.9], [0.55, 0.1], [0.95, 0.1], [0.95, 0.9], [0.55, 0.9]]
         )
         faces = np.concatenate([up, down])
-        target = Target.of(low, faces, uv, faces)
+        target = Target.of(TriMesh(low, faces), uv, faces)
         texels = texels_of(target, 64)
-        baked = bake(target, texels, source, lookup, vertex_reach(low, faces, source))
+        baked = bake(target, texels, source, lookup, vertex_reach(TriMesh(low, faces), source))
         expected = np.where((texels.face_idx < 2)[:, None], [1.0, 0, 0], [0, 0, 1.0])
         np.testing.assert_allclose(baked.values["albedo"], expected, atol=1e-6)
 
@@ -128,13 +129,13 @@ def test_a_chart_smaller_than_a_texel_has_its_own_color():
     uv = np.array(
         [[0.1, 0.1], [0.5, 0.1], [0.5, 0.5], [0.1, 0.5], *((np.array([[40.1, 20.7], [40.4, 20.7], [40.1, 20.9]])) / 64)]
     )
-    target, source = Target.of(vertices, faces, uv, faces), Source(vertices, faces)
+    target, source = Target.of(TriMesh(vertices, faces), uv, faces), Source(TriMesh(vertices, faces))
     albedo = np.repeat([[1.0, 0, 0], [0, 0, 1.0]], [4, 3], 0)
     lookup = vertex_lookup(
         source, {"albedo": albedo, "roughness": np.ones(7), "metallic": np.zeros(7)}, np.repeat([[0, 1.0, 0]], 7, 0)
     )
     texels = texels_of(target, 64)
-    baked = bake(target, texels, source, lookup, vertex_reach(vertices, faces, source))
+    baked = bake(target, texels, source, lookup, vertex_reach(TriMesh(vertices, faces), source))
     image = make_maps(texels, baked.values).base_color
     assert rasterize_uv(uv, faces, 64)[0].max() == 1
     np.testing.assert_array_equal(image[19:23, 39:43], np.broadcast_to([0, 0, 255], (4, 4, 3)))
@@ -152,12 +153,12 @@ def test_every_covered_texel_is_read_and_ring_texels_continue_it(torus_bake):
 
 def test_corner_normals_are_smooth_on_a_sphere_and_split_on_a_cube():
     vertices, faces = sphere(4)
-    np.testing.assert_allclose(corner_normals(vertices, faces), 2 * vertices[faces], atol=0.02)
+    np.testing.assert_allclose(corner_normals(TriMesh(vertices, faces)), 2 * vertices[faces], atol=0.02)
     cube = np.array([[a, b, c] for a in (0, 1.0) for b in (0, 1.0) for c in (0, 1.0)])
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
-    normals = corner_normals(cube, triangles_of(quads))
+    normals = corner_normals(TriMesh(cube, triangles_of(quads)))
     np.testing.assert_allclose(np.abs(normals).max(-1), 1, atol=1e-12)
-    joined = corner_normals(cube, triangles_of(quads), crease_degrees=120)
+    joined = corner_normals(TriMesh(cube, triangles_of(quads)), crease_degrees=120)
     np.testing.assert_allclose(np.abs(joined), 3**-0.5, atol=1e-9)
 
 
@@ -165,14 +166,14 @@ def test_ambient_visibility_of_a_plane_a_corner_and_a_box():
     plane = np.array([[-50.0, 0, -50], [50, 0, -50], [50, 0, 50], [-50, 0, 50]])
     wall = np.array([[0.0, 0, -50], [0, 50, -50], [0, 50, 50], [0, 0, 50]])
     quad = np.array([[0, 2, 1], [0, 3, 2]])
-    source = Source(np.concatenate([plane, wall]), np.concatenate([quad, quad + 4]))
+    source = Source(TriMesh(np.concatenate([plane, wall]), np.concatenate([quad, quad + 4])))
     points = np.array([[0.05, 0, 0.0], [0.05, 0, 1.0], [0.05, 0, -1.0]])
     up = np.tile([0.0, 1, 0], (3, 1))
     # An infinite wall at right angles hides half of the cosine-weighted hemisphere.
     np.testing.assert_allclose(ambient_visibility(points, up, source.caster, 4096, 0), 0.5, atol=0.01)
     np.testing.assert_allclose(ambient_visibility(points + (25, 0, 0), up, source.caster, 64, 0, reach=1.0), 1)
     vertices, faces = sphere(2)
-    inside = Source(vertices, faces[:, ::-1])
+    inside = Source(TriMesh(vertices, faces[:, ::-1]))
     assert ambient_visibility(np.zeros((1, 3)), np.array([[0, 1.0, 0]]), inside.caster, 64, 0)[0] == 0
 
 

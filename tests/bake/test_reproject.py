@@ -3,6 +3,7 @@
 import numpy as np
 
 from gdtool.bake.reproject import Source, reproject, vertex_reach
+from gdtool.geometry.meshes import TriMesh
 from tests.bake.shapes import sphere, torus, triangles_of
 
 
@@ -20,7 +21,7 @@ def at(source, places):
 
 def test_sphere_inside_and_outside_points_meet_it_along_the_normal():
     vertices, faces = sphere(5)
-    source = Source(vertices, faces)
+    source = Source(TriMesh(vertices, faces))
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(2000, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -33,7 +34,7 @@ def test_sphere_inside_and_outside_points_meet_it_along_the_normal():
 def test_thin_wall_is_never_crossed():
     # A plate 0.1 % thick; the baked mesh strays by several times that, to either side.
     vertices, faces = box((1.0, 1.0, 0.001))
-    source = Source(vertices, faces)
+    source = Source(TriMesh(vertices, faces))
     rng = np.random.default_rng(1)
     xy = rng.uniform(-0.45, 0.45, (3000, 2))
     for side in (1.0, -1.0):
@@ -48,7 +49,7 @@ def test_thin_wall_is_never_crossed():
 
 def test_nearest_point_serves_where_the_normal_misses_and_stays_on_its_side():
     vertices, faces = box((1.0, 1.0, 0.001))
-    source = Source(vertices, faces)
+    source = Source(TriMesh(vertices, faces))
     # Beside the plate: the normal meets nothing, the other side's rim is as near.
     points = np.array([[0.6, 0.1, 0.0005], [0.6, 0.1, -0.0005], [0.6, 0.1, -0.0006]])
     normals = np.array([[0.0, 0, 1], [0, 0, -1], [0, 0, 1]])
@@ -63,7 +64,7 @@ def test_reach_covers_the_distance_but_not_the_object():
     vertices, quads, _ = torus(300, 150)
     coarse, coarse_quads, _ = torus(40, 20, minor=0.145)
     faces = triangles_of(coarse_quads)
-    reach = vertex_reach(coarse, faces, Source(vertices, triangles_of(quads)))
+    reach = vertex_reach(TriMesh(coarse, faces), Source(TriMesh(vertices, triangles_of(quads))))
     assert reach.min() > 0.005
     assert reach.max() < 0.08
 
@@ -72,7 +73,9 @@ def test_a_sheet_without_another_side_is_read_from_behind():
     # A square at z = 0 that looks along +z, and a floor far below its middle that looks the way its back does not.
     square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    source = Source(np.concatenate([square, square + (0, 0, -0.3)]), np.concatenate([faces, faces[:, ::-1] + 4]))
+    source = Source(
+        TriMesh(np.concatenate([square, square + (0, 0, -0.3)]), np.concatenate([faces, faces[:, ::-1] + 4]))
+    )
     rng = np.random.default_rng(2)
     points = np.column_stack([rng.uniform(-0.45, 0.45, (500, 2)), rng.uniform(-0.002, 0.002, 500)])
     for side in (1.0, -1.0):
@@ -89,7 +92,9 @@ def test_a_sheet_is_not_looked_through():
     # for.
     square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
     faces = np.array([[0, 2, 1], [0, 3, 2]])
-    source = Source(np.concatenate([square, square * 0.9 - (0, 0, 0.01)]), np.concatenate([faces, faces[:, ::-1] + 4]))
+    source = Source(
+        TriMesh(np.concatenate([square, square * 0.9 - (0, 0, 0.01)]), np.concatenate([faces, faces[:, ::-1] + 4]))
+    )
     rng = np.random.default_rng(3)
     for height in (0.0, 0.002):  # the mesh lies on the sheet, or a little above it
         points = np.column_stack([rng.uniform(-0.4, 0.4, (500, 2)), np.full(500, height)])
@@ -105,7 +110,7 @@ def test_of_two_faces_back_to_back_the_one_that_looks_the_same_way_is_read():
     rng = np.random.default_rng(4)
     points = np.column_stack([rng.uniform(-0.45, 0.45, (500, 2)), rng.uniform(-0.002, 0.002, 500)])
     for order in (1, -1):  # whichever of the two the ray meets
-        source = Source(np.concatenate([square, square]), np.concatenate([front, front[:, ::-1] + 4])[::order])
+        source = Source(TriMesh(np.concatenate([square, square]), np.concatenate([front, front[:, ::-1] + 4])[::order]))
         np.testing.assert_array_equal(source.twins, [2, 3, 0, 1])
         for side in (1.0, -1.0):
             normals = np.tile([0.0, 0.0, side], (500, 1))

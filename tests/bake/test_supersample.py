@@ -7,6 +7,7 @@ from gdtool.bake import supersample
 from gdtool.bake.pipeline import BakeOptions, bake, vertex_lookup
 from gdtool.bake.reproject import Source, vertex_reach
 from gdtool.bake.target import COARSE_TEXEL, Target, samples_for, texels_of
+from gdtool.geometry.meshes import TriMesh
 from gdtool.images.color import srgb_from_linear
 from tests.bake.shapes import albedo_of, torus, triangles_of, unwrapped
 
@@ -23,7 +24,10 @@ def plate(material, left=4.0, right=28.0, samples=16, threads=1):
     material(x (n,))."""
     vertices = np.array([[left, 0, 4], [right, 0, 4], [right, 0, 28], [left, 0, 28.0]])
     faces = np.array([[0, 2, 1], [0, 3, 2]])
-    target, source = Target.of(vertices, faces, vertices[:, [0, 2]] / SIZE, faces), Source(vertices, faces)
+    target, source = (
+        Target.of(TriMesh(vertices, faces), vertices[:, [0, 2]] / SIZE, faces),
+        Source(TriMesh(vertices, faces)),
+    )
 
     def lookup(places):
         x = source.at(places.face_idx, places.barycentric, source.vertices)[:, 0]
@@ -36,7 +40,9 @@ def plate(material, left=4.0, right=28.0, samples=16, threads=1):
         return {name: value.astype(np.float32) for name, value in (plain | material(x)).items()}
 
     texels = texels_of(target, SIZE)
-    baked = bake(target, texels, source, lookup, vertex_reach(vertices, faces, source), BakeOptions(samples, threads))
+    baked = bake(
+        target, texels, source, lookup, vertex_reach(TriMesh(vertices, faces), source), BakeOptions(samples, threads)
+    )
     return {name: texels.image(value) for name, value in baked.values.items()}
 
 
@@ -75,15 +81,15 @@ def ring():
     fine, quads, normals = torus(240, 140)
     coarse, coarse_quads, _ = torus(36, 18, minor=0.142)
     faces = triangles_of(coarse_quads)
-    target = Target.of(coarse, faces, *unwrapped(coarse, faces, 128))
-    source = Source(fine, triangles_of(quads))
+    target = Target.of(TriMesh(coarse, faces), *unwrapped(coarse, faces, 128))
+    source = Source(TriMesh(fine, triangles_of(quads)))
     attributes = {"albedo": albedo_of(fine), "roughness": (fine[:, 1] > 0.05) * 1.0, "metallic": np.zeros(len(fine))}
     return (
         target,
         texels_of(target, 128),
         source,
         vertex_lookup(source, attributes, normals),
-        vertex_reach(coarse, faces, source),
+        vertex_reach(TriMesh(coarse, faces), source),
     )
 
 

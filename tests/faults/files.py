@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gdtool.folders.mesh import QuadMesh, write_obj
+from gdtool.folders.mesh import write_obj
+from gdtool.geometry.meshes import QuadMesh
 
 CUBE = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float) - 0.5
 QUADS = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]], np.int32)

@@ -68,7 +68,10 @@ def limited(code, megabytes):
 
 def test_embree_is_not_started_under_a_limit_that_would_crash_it():
     """Embree would end the process with a segmentation fault."""
-    code = "from gdtool.geometry.rays import RayCaster\nRayCaster(numpy.eye(3), numpy.array([[0, 1, 2]]))"
+    code = (
+        "from gdtool.geometry.meshes import TriMesh\nfrom gdtool.geometry.rays import RayCaster\n"
+        "RayCaster(TriMesh(numpy.eye(3), numpy.array([[0, 1, 2]])))"
+    )
     done = limited(code, 60)
     assert done.returncode == 1, done.stderr
     assert "MemoryError: unable to allocate 0.19 GiB for rays at 1 faces" in done.stderr, done.stderr

@@ -12,6 +12,7 @@ from gdtool.core.errors import ResourceError
 from gdtool.core.native import imported, imported_if_installed
 from gdtool.geometry import repair, simplify
 from gdtool.geometry.distance import _fcpw_search, closest_points, winding_number
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.rays import RayCaster
 from gdtool.images.cutout import both_frames
 from gdtool.remesh.engines.adapters import run_instant_meshes, run_quadriflow
@@ -46,23 +47,23 @@ def broken(tmp_path, monkeypatch):
 
 USES = {
     "igl": [
-        lambda: closest_points(np.zeros((1, 3)), *TRIANGLE),
-        lambda: winding_number(np.zeros((1, 3)), *TRIANGLE),
-        lambda: Nearest(*TRIANGLE),
-        lambda: repair._split(*TRIANGLE),
-        lambda: pair_and_split.quads_from_input(*TRIANGLE, 16, 1.0),
-        lambda: flatten._conformal(*TRIANGLE, np.array([0, 1, 2])),
+        lambda: closest_points(np.zeros((1, 3)), TriMesh(*TRIANGLE)),
+        lambda: winding_number(np.zeros((1, 3)), TriMesh(*TRIANGLE)),
+        lambda: Nearest(TriMesh(*TRIANGLE)),
+        lambda: repair._split_nonmanifold(TriMesh(*TRIANGLE)),
+        lambda: pair_and_split.quads_from_input(TriMesh(*TRIANGLE), 16, 1.0),
+        lambda: flatten._conformal(TriMesh(*TRIANGLE), np.array([0, 1, 2])),
     ],
-    "fcpw": [lambda: _fcpw_search(*TRIANGLE)],
-    "embreex": [lambda: RayCaster(*TRIANGLE)],
-    "fast_simplification": [lambda: simplify.collapse(*TRIANGLE, 1, 5.0)],
+    "fcpw": [lambda: _fcpw_search(TriMesh(*TRIANGLE))],
+    "embreex": [lambda: RayCaster(TriMesh(*TRIANGLE))],
+    "fast_simplification": [lambda: simplify.collapse(TriMesh(*TRIANGLE), 1, 5.0)],
     "pymeshlab": [
-        lambda: simplify.collapse_topology(*TRIANGLE, 1),
-        lambda: pair_and_split.isotropic_triangles(*TRIANGLE, 10, 30.0),
-        lambda: lods.collapse_textured(*TRIANGLE, np.zeros((1, 3, 2)), 1, "."),
+        lambda: simplify.collapse_keeping_topology(TriMesh(*TRIANGLE), 1),
+        lambda: pair_and_split.isotropic_triangles(TriMesh(*TRIANGLE), 10, 30.0),
+        lambda: lods.collapse_textured(TriMesh(*TRIANGLE), np.zeros((1, 3, 2)), 1, "."),
     ],
-    "pynanoinstantmeshes": [lambda: run_instant_meshes(*TRIANGLE, 100, 30.0)],
-    "xatlas": [lambda: charts.run_xatlas(*TRIANGLE, 2.0)],
+    "pynanoinstantmeshes": [lambda: run_instant_meshes(TriMesh(*TRIANGLE), 100, 30.0)],
+    "xatlas": [lambda: charts.run_xatlas(TriMesh(*TRIANGLE), 2.0)],
     "cv2": [lambda: both_frames(np.zeros((40, 40, 3)))],
 }
 
@@ -105,7 +106,7 @@ def test_a_package_that_fails_to_load_is_not_reported_as_missing(broken):
 def test_quadriflow_without_its_package_is_an_error(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyQuadriFlow", None)  # as where it is not installed
     with pytest.raises(ResourceError, match=r"pip install 'gdtool\[quadriflow\]'"):
-        run_quadriflow(*TRIANGLE, 100, 30.0)
+        run_quadriflow(TriMesh(*TRIANGLE), 100, 30.0)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +115,7 @@ def test_quadriflow_without_its_package_is_an_error(monkeypatch):
 def test_remesh_does_not_fall_back_when_a_library_is_missing(broken, module, engine):
     broken(module)
     with pytest.raises(ResourceError, match=f"libGL.so.1: is not installed, and {module} needs it"):
-        remesh(*sphere(24), Request(quads=3000, engine=engine))
+        remesh(TriMesh(*sphere(24)), Request(quads=3000, engine=engine))
 
 
 def test_remesh_exits_5_when_a_library_is_missing(broken, gdtool_here, tmp_path):

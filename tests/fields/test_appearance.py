@@ -15,6 +15,7 @@ from gdtool.fields.appearance.light import (
     visibility,
 )
 from gdtool.fields.appearance.materials import Observations, confidence, fuse, spread
+from gdtool.geometry.meshes import TriMesh
 from gdtool.shading.bsdf.closed_form import shade
 from gdtool.shading.bsdf.sg import SphericalGaussians
 from gdtool.shading.sampling import fibonacci
@@ -111,7 +112,7 @@ def test_a_wall_hides_the_light_behind_it_alone():
     points = np.array([[0.05, 0.0, 0.0], [0.1, 0.0, 1.0]])
     mesh = np.concatenate([floor, wall, points])
     normals = np.tile([0.0, 1.0, 0.0], (len(mesh), 1))
-    seen = visibility(mesh, faces, normals, 1e-3, np.random.default_rng(0), rays=64).at(np.array([8, 9]))
+    seen = visibility(TriMesh(mesh, faces), normals, 1e-3, np.random.default_rng(0), rays=64).at(np.array([8, 9]))
     axes = np.array([[-0.8, 0.6, 0.0], [0.8, 0.6, 0.0], [0.0, 1.0, 0.0]])
     share = seen.of_lobes(axes, np.full(3, 12.0))
     assert (share[:, 0] < 0.15).all()

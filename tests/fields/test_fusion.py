@@ -35,6 +35,7 @@ from gdtool.fields.views.prepared_view import (
 )
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import components, signed_volume
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.metrics import inside
 from gdtool.geometry.normals import vertex_normals
 from gdtool.geometry.topology import euler_number
@@ -64,7 +65,9 @@ def test_all_domains_meet_the_analytic_surface(seen, solid, volume):
     assert is_closed_manifold(shape.faces)
     assert error.mean() < 0.002
     assert error.max() < 0.04
-    assert signed_volume(shape.vertices, shape.faces) == pytest.approx(volume, rel=0.02)  # positive: wound outward
+    assert signed_volume(TriMesh(shape.vertices, shape.faces)) == pytest.approx(
+        volume, rel=0.02
+    )  # positive: wound outward
 
 
 @pytest.mark.parametrize("depth, normal, bound", [(True, False, 0.003), (False, True, 0.006), (False, False, 0.02)])
@@ -92,11 +95,11 @@ def test_edges_are_drawn_out(monkeypatch):
     def missed():
         shape = fuse_views(prepared, step)
         assert is_closed_manifold(shape.faces)
-        assert len(fold_midpoints(shape.vertices, shape.faces)) == 0
-        return np.array([closest_points(edge, shape.vertices, shape.faces)[0].mean() for edge in edges])
+        assert len(fold_midpoints(TriMesh(shape.vertices, shape.faces))) == 0
+        return np.array([closest_points(edge, TriMesh(shape.vertices, shape.faces))[0].mean() for edge in edges])
 
     sharp = missed()
-    monkeypatch.setattr("gdtool.fields.grid.fusion.sharpen_creases", lambda vertices, faces, *_: (vertices, faces))
+    monkeypatch.setattr("gdtool.fields.grid.fusion.sharpen_creases", lambda mesh, *_: mesh)
     blunt = missed()
     assert (sharp < blunt).all()
     assert sharp.mean() < 0.85 * blunt.mean()
@@ -119,8 +122,8 @@ def test_a_narrow_gap_stays_open():
     along, up = np.meshgrid(np.linspace(-0.1, 0.38, 25), np.linspace(-0.08, 0.08, 9))
     between, within = (np.stack([along, up, np.full_like(along, z)], -1).reshape(-1, 3) for z in (0.0, 0.1))
     assert is_closed_manifold(shape.faces)
-    assert inside(between, shape.vertices, shape.faces).mean() < 0.1
-    assert inside(within, shape.vertices, shape.faces).all()
+    assert inside(between, TriMesh(shape.vertices, shape.faces)).mean() < 0.1
+    assert inside(within, TriMesh(shape.vertices, shape.faces)).all()
 
 
 def test_what_leaves_a_silhouette_goes_back_as_far_as_it_must():
@@ -205,7 +208,7 @@ def bumpy(seen, name):
 
 
 def degrees_off(solid, vertices, faces):
-    cosine = (vertex_normals(vertices, faces) * gradient(solid, vertices)).sum(1)
+    cosine = (vertex_normals(TriMesh(vertices, faces)) * gradient(solid, vertices)).sum(1)
     return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
 
 
@@ -238,10 +241,11 @@ def test_a_surface_that_fits_its_normals_hardly_follows_them(seen, solid):
     step = grid_step(cameras, 0)
     shape = reconstruct(cameras, images, mask)
     prepared = prepare_all(cameras, mask, images["depth"], images["normal"])
-    assert normal_deviation_degrees(shape.vertices, shape.faces, prepared, 2 * step) < BUMPY_DEGREES
+    assert normal_deviation_degrees(TriMesh(shape.vertices, shape.faces), prepared, 2 * step) < BUMPY_DEGREES
     moved = (
         np.linalg.norm(
-            fit_to_normals(shape.vertices, shape.faces, prepared, step, reach=2 * step) - shape.vertices, axis=1
+            fit_to_normals(TriMesh(shape.vertices, shape.faces), prepared, step, reach=2 * step) - shape.vertices,
+            axis=1,
         )
         / step
     )
@@ -305,7 +309,8 @@ def test_a_hollow_stays_where_views_see_into_it(seen_vertices, hollows, left):
     vertices, inner = vertices - 0.6, np.linalg.norm(vertices - 0.6, axis=1) < 0.3
     support = np.where(inner, 0.0, 1.0)
     support[np.flatnonzero(inner)[:seen_vertices]] = 1.0
-    vertices, faces, dropped = drop_debris(vertices, faces, support, 0.02, hollows)
+    made, dropped = drop_debris(TriMesh(vertices, faces), support, 0.02, hollows)
+    vertices, faces = made.vertices, made.faces
     assert components(faces, len(vertices)).max() + 1 == left
     assert dropped == 2 - left
 
@@ -352,7 +357,7 @@ def test_views_that_contradict_one_another_still_close(seen):
     shape = reconstruct(cameras, images, np.stack([seen[kind][2][k] for k, kind in enumerate(kinds)]))
     assert is_closed_manifold(shape.faces)
     assert np.isfinite(shape.vertices).all()
-    assert signed_volume(shape.vertices, shape.faces) > 0.01
+    assert signed_volume(TriMesh(shape.vertices, shape.faces)) > 0.01
 
 
 def test_flat_card_and_empty_views_close():
@@ -396,7 +401,7 @@ def test_what_no_view_sees_stays_where_the_carving_put_it():
     for _ in range(5):
         cube = cube.subdivide()
     move = np.linalg.norm(
-        refine(np.asarray(cube.vertices), np.asarray(cube.faces), [], cell, reach=0.1) - cube.vertices, axis=1
+        refine(TriMesh(np.asarray(cube.vertices), np.asarray(cube.faces)), [], cell, reach=0.1) - cube.vertices, axis=1
     )
     assert 0 < move.max() < 0.8 * cell
     assert move.mean() < 0.08 * cell

@@ -7,6 +7,7 @@ from gdtool.fields.grid.fusion import FusionOptions, fuse_views, grid_step, is_c
 from gdtool.fields.grid.picture_silhouette import missing_pixels, opposite, restore_picture_silhouette
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import grid_over
+from gdtool.geometry.meshes import TriMesh
 
 from .shapes import views_of
 
@@ -57,7 +58,7 @@ def test_a_wing_that_the_other_views_look_through_is_there(seen):
     assert np.abs(wing[:, 2]).max() == pytest.approx(CHORD, abs=0.02)
     # The body is as it was.
     tail = without.vertices[np.abs(without.vertices[:, 2]) > 0.25]
-    assert closest_points(tail, found.vertices, found.faces)[0].max() < 0.5 * step
+    assert closest_points(tail, TriMesh(found.vertices, found.faces))[0].max() < 0.5 * step
 
 
 def test_views_that_agree_are_left_alone(seen):

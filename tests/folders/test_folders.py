@@ -11,10 +11,11 @@ from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
 from gdtool.core.manifest import Manifest
 from gdtool.core.stage import Output
-from gdtool.folders.mesh import QuadMesh, read_obj, write_obj
+from gdtool.folders.mesh import read_obj, write_obj
 from gdtool.folders.records import read_cameras, read_record, write_cameras, write_record
 from gdtool.folders.surface import Surface, read_surface, write_surface, write_surface_ply
 from gdtool.folders.views import Views, read_views, write_views
+from gdtool.geometry.meshes import QuadMesh
 from gdtool.geometry.topology import triangulated
 
 CUBE = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float) - 0.5

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gdtool.geometry.meshes import QuadMesh
+
 
 def cube(side: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Twelve triangles, outward, centred."""
@@ -16,13 +18,11 @@ def quad_cube(rounds: int) -> tuple[np.ndarray, np.ndarray]:
     """A cube of 6 * 4**rounds quads."""
     from gdtool.remesh.fit.surface_projection import subdivide
 
-    vertices, faces = (
-        cube()[0],
-        np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]),
-    )
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    mesh = QuadMesh(cube()[0], quads)
     for _ in range(rounds):
-        vertices, faces, _ = subdivide(vertices, faces)
-    return vertices, faces
+        mesh, _ = subdivide(mesh)
+    return mesh.vertices, mesh.faces
 
 
 def quad_torus(n: int = 12) -> tuple[np.ndarray, np.ndarray]:

@@ -1,29 +1,42 @@
-"""Normals of meshes with faces that have none."""
+"""Face and vertex normals, also of faces without area."""
 
 import numpy as np
 import pytest
 
 from gdtool.geometry import normals as normals_module
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.normals import face_normals, vertex_normals
 from tests.geometry.solids import sphere
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_faces_without_area_have_no_normal_and_spoil_none(kind):
+def test_faces_without_area_have_normal_zero_and_do_not_affect_vertex_normals(kind):
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.5, 0, 0]], kind)
     faces = np.array([[0, 1, 2], [0, 1, 3], [1, 1, 1]])
-    normals, area = face_normals(vertices, faces)
-    assert np.array_equal(normals, [[0, 0, 1], [0, 0, 0], [0, 0, 0]]) and np.allclose(area, [0.5, 0, 0])
-    assert np.allclose(vertex_normals(vertices, faces)[:3], [0, 0, 1])
+    normals, area = face_normals(TriMesh(vertices, faces))
+    assert np.array_equal(normals, [[0, 0, 1], [0, 0, 0], [0, 0, 0]])
+    assert np.allclose(area, [0.5, 0, 0])
+    assert np.allclose(vertex_normals(TriMesh(vertices, faces))[:3], [0, 0, 1])
 
 
-def test_normals_are_the_same_however_many_faces_are_taken_at_a_time(monkeypatch):
-    vertices, faces = sphere(24)
-    whole = face_normals(vertices, faces)
+def test_normals_do_not_depend_on_the_chunk_size(monkeypatch):
+    mesh = TriMesh(*sphere(24))
+    normals, areas = face_normals(mesh)
     monkeypatch.setattr(normals_module, "CHUNK", 100)
-    assert all(np.array_equal(one, other) for one, other in zip(whole, face_normals(vertices, faces), strict=True))
-    assert (whole[0] * vertices[faces].mean(1)).sum(1).min() > 0.7 and abs(
-        np.linalg.norm(whole[0], axis=1) - 1
-    ).max() < 1e-6
-    assert (vertex_normals(vertices, faces) * vertices).sum(1).min() > 0.79
-    assert [len(part) for part in face_normals(vertices, faces[:0])] == [0, 0]
+    chunked_normals, chunked_areas = face_normals(mesh)
+    assert np.array_equal(normals, chunked_normals)
+    assert np.array_equal(areas, chunked_areas)
+
+
+def test_normals_of_a_sphere_look_outward():
+    mesh = TriMesh(*sphere(24))
+    normals, _ = face_normals(mesh)
+    assert (normals * mesh.vertices[mesh.faces].mean(1)).sum(1).min() > 0.7
+    assert abs(np.linalg.norm(normals, axis=1) - 1).max() < 1e-6
+    assert (vertex_normals(mesh) * mesh.vertices).sum(1).min() > 0.79
+
+
+def test_a_mesh_without_faces_has_no_face_normals():
+    normals, areas = face_normals(TriMesh(np.eye(3), np.zeros((0, 3), int)))
+    assert normals.shape == (0, 3)
+    assert areas.shape == (0,)

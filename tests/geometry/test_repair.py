@@ -1,111 +1,124 @@
-"""Repair: what is whole passes unchanged, what is broken becomes manifold, what is hopeless is refused."""
+"""Repair: a sound mesh passes unchanged, a broken one becomes manifold, a hopeless one is refused."""
 
 import numpy as np
 import pytest
 
 from gdtool.core.errors import InputError
 from gdtool.geometry import repair, topology
-from gdtool.geometry.unpinch import unpinched
+from gdtool.geometry.meshes import TriMesh
+from gdtool.geometry.nonmanifold_edges import separate_sheets
 from tests.geometry.solids import cube, joined, plane, sphere, volume
 
 
-def test_cube_is_watertight_and_passes_unchanged():
+def soup_of(vertices: np.ndarray, faces: np.ndarray) -> TriMesh:
+    """The same triangles, with three vertices each."""
+    return TriMesh(vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3))
+
+
+def cubes_sharing_corners(shift: tuple[float, float, float]) -> TriMesh:
+    """Two cubes, the second moved by `shift`, with one vertex where two corners coincide."""
+    vertices, faces = joined(cube(), (cube()[0] + shift, cube()[1]))
+    _, first, inverse = np.unique(vertices.round(6), axis=0, return_index=True, return_inverse=True)
+    return TriMesh(vertices, first[inverse.ravel()][faces])
+
+
+def test_a_cube_passes_unchanged():
     vertices, faces = cube(2.0)
-    assert topology.is_watertight(faces) and topology.is_manifold(faces)
-    out_vertices, out_faces, report, closed = repair.clean(vertices, faces)
-    assert closed and report == {} and (out_vertices == vertices).all() and (out_faces == faces).all()
-    assert volume(out_vertices, out_faces) == pytest.approx(8)
+    mesh, repairs, is_closed = repair.clean(TriMesh(vertices, faces))
+    assert is_closed
+    assert repairs == {}
+    assert (mesh.vertices == vertices).all()
+    assert (mesh.faces == faces).all()
+    assert volume(mesh.vertices, mesh.faces) == pytest.approx(8)
 
 
-def test_soup_is_welded():
-    vertices, faces = cube()
-    soup, soup_faces = vertices[faces].reshape(-1, 3), np.arange(36).reshape(-1, 3)
-    out_vertices, out_faces, report, closed = repair.clean(soup, soup_faces)
-    assert len(out_vertices) == 8 and closed and topology.is_watertight(out_faces) and report == {"welded_vertices": 28}
+def test_a_soup_of_triangles_is_welded():
+    mesh, repairs, is_closed = repair.clean(soup_of(*cube()))
+    assert len(mesh.vertices) == 8
+    assert is_closed
+    assert topology.is_watertight(mesh.faces)
+    assert repairs == {"welded_vertices": 28}
 
 
-def test_what_welding_closes_is_not_looked_at_further(monkeypatch):
-    """As in a file whose numbers were rounded: an edge of no length, its two faces left out by who wrote it."""
+@pytest.mark.parametrize("is_turned", [False, True], ids=["outward", "inside out"])
+def test_a_mesh_that_welding_closes_needs_no_other_repair(monkeypatch, is_turned):
+    """As in a file with rounded coordinates: an edge has no length, and its two faces were left out."""
     vertices, faces = sphere(24)
     a, b = faces[0, :2].tolist()
     vertices[b] = vertices[a]
     torn = faces[~((faces == a).any(1) & (faces == b).any(1))]
-    assert len(torn) == len(faces) - 2 and not topology.is_watertight(torn)
-    monkeypatch.setattr(repair, "corner_fans", None)
-    out, found, report, closed = repair.clean(vertices, torn)
-    assert closed and topology.is_watertight(found) and topology.is_manifold(found) and report == {"welded_vertices": 1}
-    assert np.array_equal(out[found], vertices[torn])
-    _, turned, report, closed = repair.clean(vertices, torn[:, ::-1])
-    assert closed and np.array_equal(turned, found) and report == {"welded_vertices": 1, "turned_inside_out": True}
+    assert len(torn) == len(faces) - 2
+    assert not topology.is_watertight(torn)
+    monkeypatch.setattr(repair, "_repair_structure", None)
+    mesh, repairs, is_closed = repair.clean(TriMesh(vertices, torn[:, ::-1] if is_turned else torn))
+    assert is_closed
+    assert topology.is_watertight(mesh.faces)
+    assert topology.is_manifold(mesh.faces)
+    assert repairs == {"welded_vertices": 1} | ({"turned_inside_out": True} if is_turned else {})
+    assert np.array_equal(mesh.vertices[mesh.faces], vertices[torn])
 
 
-def test_two_faces_back_to_back_are_one_once_welded():
+def test_two_faces_back_to_back_become_one():
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]] * 2, float)
-    _, found, report, closed = repair.clean(vertices, np.array([[0, 1, 2], [3, 5, 4]]))
-    assert len(found) == 1 and not closed and report == {"welded_vertices": 3, "duplicate_faces": 1}
+    mesh, repairs, is_closed = repair.clean(TriMesh(vertices, np.array([[0, 1, 2], [3, 5, 4]])))
+    assert len(mesh.faces) == 1
+    assert not is_closed
+    assert repairs == {"welded_vertices": 3, "duplicate_faces": 1}
 
 
-def test_two_cubes_at_one_edge_become_two_manifolds():
-    one, two = cube(), cube()
-    vertices, faces = joined(one, (two[0] + [1, 1, 0], two[1]))
-    _, first, inverse = np.unique(vertices.round(6), axis=0, return_index=True, return_inverse=True)
-    shared = first[inverse.ravel()][faces]
-    assert not topology.is_manifold(shared)
-    out_vertices, out_faces, report, closed = repair.clean(vertices, shared)
-    assert closed and report["nonmanifold_edges"] == 1
-    assert (
-        topology.is_watertight(out_faces) and topology.is_manifold(out_faces) and topology.components(out_faces)[0] == 2
-    )
-    assert volume(out_vertices, out_faces) == pytest.approx(2)
+def test_two_cubes_that_share_an_edge_become_two_pieces():
+    shared = cubes_sharing_corners((1, 1, 0))
+    assert not topology.is_manifold(shared.faces)
+    mesh, repairs, is_closed = repair.clean(shared)
+    assert is_closed
+    assert repairs["nonmanifold_edges"] == 1
+    assert topology.is_watertight(mesh.faces)
+    assert topology.is_manifold(mesh.faces)
+    assert topology.components(mesh.faces)[0] == 2
+    assert volume(mesh.vertices, mesh.faces) == pytest.approx(2)
 
 
-def test_bow_tie_is_parted():
-    one, two = cube(), cube()
-    vertices, faces = joined(one, (two[0] + 1, two[1]))
-    _, first, inverse = np.unique(vertices.round(6), axis=0, return_index=True, return_inverse=True)
-    shared = first[inverse.ravel()][faces]
-    assert (
-        topology.is_watertight(shared)
-        and not topology.is_manifold(shared)
-        and len(topology.split_vertices(shared)) == 1
-    )
-    out_vertices, out_faces, report, closed = repair.clean(vertices, shared)
-    assert (
-        closed and report == {"nonmanifold_vertices": 1} and topology.is_manifold(out_faces) and len(out_vertices) == 16
-    )
+def test_a_vertex_that_two_cubes_share_is_doubled():
+    shared = cubes_sharing_corners((1, 1, 1))
+    assert topology.is_watertight(shared.faces)
+    assert not topology.is_manifold(shared.faces)
+    assert len(topology.split_vertices(shared.faces)) == 1
+    mesh, repairs, is_closed = repair.clean(shared)
+    assert is_closed
+    assert repairs == {"nonmanifold_vertices": 1}
+    assert topology.is_manifold(mesh.faces)
+    assert len(mesh.vertices) == 16
 
 
-def test_turned_faces_are_turned_back():
+def test_a_face_in_the_wrong_direction_is_turned():
     vertices, faces = cube()
     faces[3] = faces[3][::-1]
-    out_vertices, out_faces, report, closed = repair.clean(vertices, faces)
-    assert (
-        closed
-        and report["turned_edges"] == 3
-        and topology.is_watertight(out_faces)
-        and volume(out_vertices, out_faces) == pytest.approx(1)
-    )
+    mesh, repairs, is_closed = repair.clean(TriMesh(vertices, faces))
+    assert is_closed
+    assert repairs["turned_edges"] == 3
+    assert topology.is_watertight(mesh.faces)
+    assert volume(mesh.vertices, mesh.faces) == pytest.approx(1)
 
 
-def test_inside_out_is_turned():
+def test_a_mesh_that_is_inside_out_is_turned():
     vertices, faces = cube()
-    out_vertices, out_faces, report, closed = repair.clean(vertices, faces[:, ::-1])
-    assert closed and report == {"turned_inside_out": True} and volume(out_vertices, out_faces) == pytest.approx(1)
+    mesh, repairs, is_closed = repair.clean(TriMesh(vertices, faces[:, ::-1]))
+    assert is_closed
+    assert repairs == {"turned_inside_out": True}
+    assert volume(mesh.vertices, mesh.faces) == pytest.approx(1)
 
 
-def test_duplicate_and_flat_faces_go():
+def test_duplicate_flat_and_degenerate_faces_are_removed():
     vertices, faces = plane(2)
     vertices = np.concatenate([vertices, [[0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0]]])
     n = len(vertices)
     more = np.concatenate([faces, faces[:2], [[n - 3, n - 2, n - 1], [0, 0, 1]]])
-    _, out, report, closed = repair.clean(vertices, more)
-    assert (
-        not closed
-        and len(out) == 8
-        and report["duplicate_faces"] == 2
-        and report["zero_area_faces"] == 1
-        and report["degenerate_faces"] == 1
-    )
+    mesh, repairs, is_closed = repair.clean(TriMesh(vertices, more))
+    assert not is_closed
+    assert len(mesh.faces) == 8
+    assert repairs["duplicate_faces"] == 2
+    assert repairs["zero_area_faces"] == 1
+    assert repairs["degenerate_faces"] == 1
 
 
 @pytest.mark.parametrize(
@@ -120,28 +133,26 @@ def test_duplicate_and_flat_faces_go():
         (np.eye(3), np.array([[0, 0, 1], [1, 2, 2]]), "no face has an area"),
     ],
 )
-def test_refused(vertices, faces, fact):
+def test_a_mesh_without_a_surface_is_refused(vertices, faces, fact):
     with pytest.raises(InputError, match=fact):
-        repair.clean(vertices, faces, "x.obj")
+        repair.clean(TriMesh(vertices, faces), "x.obj")
 
 
 @pytest.mark.parametrize("scale", [1e-20, 1e20])
-def test_scale_does_not_matter(scale):
-    vertices, faces = cube(scale)
-    soup, soup_faces = vertices[faces].reshape(-1, 3), np.arange(36).reshape(-1, 3)
-    assert len(repair.clean(soup, soup_faces)[0]) == 8
+def test_welding_does_not_depend_on_the_unit_of_length(scale):
+    assert len(repair.clean(soup_of(*cube(scale))).mesh.vertices) == 8
 
 
-def test_sheets_that_meet_in_an_edge_are_parted():
+def test_sheets_that_share_an_edge_are_separated():
+    """Two cubes stand side by side along one edge, which therefore has four faces."""
     vertices, faces = cube()
-    # Two cubes side by side along one edge, which then has four faces.
-    shift = np.array([1.0, 1.0, 0])
-    assert np.ptp(vertices, 0).tolist() == [1, 1, 1]
-    both = np.concatenate([vertices, vertices + shift])
-    _, joined = np.unique(both, axis=0, return_inverse=True)
-    points = np.unique(both, axis=0)
-    pinched = joined.ravel()[np.concatenate([faces, faces + 8])]
-    assert len(points) == 14 and not topology.is_watertight(pinched)
-    out, parted = unpinched(points, pinched)
-    assert topology.is_watertight(parted) and topology.is_manifold(parted)
-    assert topology.components(parted)[0] == 2 and len(out) == 16
+    both = np.concatenate([vertices, vertices + [1.0, 1.0, 0]])
+    points, merged = np.unique(both, axis=0, return_inverse=True)
+    shared = merged.ravel()[np.concatenate([faces, faces + 8])]
+    assert len(points) == 14
+    assert not topology.is_watertight(shared)
+    mesh = separate_sheets(TriMesh(points, shared))
+    assert topology.is_watertight(mesh.faces)
+    assert topology.is_manifold(mesh.faces)
+    assert topology.components(mesh.faces)[0] == 2
+    assert len(mesh.vertices) == 16

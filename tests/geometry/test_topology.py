@@ -1,29 +1,33 @@
-"""What the indices of a mesh tell: edges, pieces, whether it is closed and manifold."""
+"""Edges, pieces, handles, and whether a mesh is closed and manifold, from its indices."""
 
 import numpy as np
 import pytest
 
 from gdtool.geometry import topology
+from gdtool.geometry.meshes import QuadMesh
 from tests.geometry.solids import joined, lattice, plane, sphere, torus
 
 
-def test_plane_is_manifold_and_not_watertight():
+def test_a_plane_is_manifold_and_not_watertight():
     _, faces = plane(3)
     edges = topology.edges_of(faces)
     assert (edges.count == 1).sum() == 12
-    assert topology.is_manifold(faces) and not topology.is_watertight(faces)
+    assert topology.is_manifold(faces)
+    assert not topology.is_watertight(faces)
 
 
-def test_torus_has_euler_characteristic_zero():
+def test_a_torus_has_euler_number_zero():
     vertices, faces = torus()
-    assert len(vertices) - len(topology.edges_of(faces).ends) + len(faces) == 0 == topology.euler_number(faces)
+    assert len(vertices) - len(topology.edges_of(faces).ends) + len(faces) == 0
+    assert topology.euler_number(faces) == 0
 
 
 def test_triangulation_cuts_between_first_and_third_corner_and_keeps_volume():
     corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float) - 0.5
     quads = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])
     triangles, face_idx = topology.triangulated(quads)
-    assert len(triangles) == 12 and np.array_equal(face_idx, np.repeat(np.arange(6), 2))
+    assert len(triangles) == 12
+    assert np.array_equal(face_idx, np.repeat(np.arange(6), 2))
     a, b, c = (corners[triangles[:, i]] for i in range(3))
     assert np.isclose((a * np.cross(b, c)).sum() / 6, 1)  # outward: positive volume
 
@@ -38,38 +42,40 @@ def test_triangulation_cuts_between_first_and_third_corner_and_keeps_volume():
         (lattice(), 0, 28),
         (joined(torus(20), sphere(12), plane(4)), 0, 1),
     ],
-    ids=["ball", "ring", "open ring", "sheet", "net", "several"],
+    ids=["ball", "torus", "open torus", "sheet", "lattice", "several"],
 )
-def test_handles(mesh, cut, handles):
-    """As many as there are however many loops the rim has."""
+def test_handles_are_counted_however_many_boundary_loops_there_are(mesh, cut, handles):
     vertices, faces = mesh
     faces = faces[cut:]
     pieces = topology.components(faces)[0]
-    assert topology.handles(faces, pieces) == topology.handles(faces, pieces, topology.edges_of(faces)) == handles
+    assert topology.handles(faces, pieces) == handles
+    assert topology.handles(faces, pieces, topology.edges_of(faces)) == handles
 
 
 def test_quads_and_triangles_share_edges():
     faces = np.array([[0, 1, 2, 3], [1, 4, 2, -1]])
     edges = topology.edges_of(faces)
-    assert len(edges.ends) == 6 and edges.count.max() == 2 and not edges.turned.any()
+    assert len(edges.ends) == 6
+    assert edges.count.max() == 2
+    assert not edges.turned.any()
     assert edges.face_pairs()[1].tolist() == [[0, 1]]
 
 
-def test_edges_count_as_sorting_does():
+def test_edges_agree_with_sorting():
     rng = np.random.default_rng(0)
     faces = rng.integers(0, 40, (300, 4))
     faces[::3, 3] = -1
     edges = topology.edges_of(faces)
     half = np.sort(edges.half_ends, 1)
     ends, inverse, count = np.unique(half, axis=0, return_inverse=True, return_counts=True)
-    assert (
-        (edges.ends == ends).all() and (edges.count == count).all() and (edges.half_edge_idx == inverse.ravel()).all()
-    )
+    assert (edges.ends == ends).all()
+    assert (edges.count == count).all()
+    assert (edges.half_edge_idx == inverse.ravel()).all()
     assert (edges.order == np.argsort(inverse.ravel(), kind="stable")).all()
 
 
 @pytest.mark.parametrize("change", ["none", "turned", "opened", "doubled", "wedge"])
-def test_watertight_as_the_edges_say(change):
+def test_is_watertight_agrees_with_the_edges(change):
     _, faces = torus(20)
     faces = {
         "none": faces,
@@ -84,12 +90,10 @@ def test_watertight_as_the_edges_say(change):
     )
 
 
-def test_unused_vertices_go_and_triangles_among_quads_stay():
+def test_compact_drops_unused_vertices_and_keeps_triangles_among_quads():
     vertices = np.arange(21.0).reshape(7, 3)
-    out, faces = topology.compact(vertices, np.array([[1, 2, 4, 5], [1, 5, 6, -1]], np.int32))
-    assert (
-        (out == vertices[[1, 2, 4, 5, 6]]).all()
-        and (faces == [[0, 1, 2, 3], [0, 3, 4, -1]]).all()
-        and faces.dtype == np.int64
-    )
-    assert topology.compact(out, faces)[0] is out
+    used = topology.compact(QuadMesh(vertices, np.array([[1, 2, 4, 5], [1, 5, 6, -1]], np.int32)))
+    assert (used.vertices == vertices[[1, 2, 4, 5, 6]]).all()
+    assert (used.faces == [[0, 1, 2, 3], [0, 3, 4, -1]]).all()
+    assert used.faces.dtype == np.int64
+    assert topology.compact(used).vertices is used.vertices

@@ -1,4 +1,4 @@
-"""Each texel is owned once, whatever lies on its centre; checked against rational arithmetic."""
+"""Each texel has one owner, also where a vertex or an edge lies on its centre; compared with rational arithmetic."""
 
 from fractions import Fraction
 
@@ -28,7 +28,7 @@ def grid(n: int, low: float, high: float, jitter: float = 0.0, seed: int = 0):
 
 
 def exact_owner(uv, faces, size):
-    """The same question answered in rational arithmetic, one texel and one triangle at a time."""
+    """Compute owners in rational arithmetic, one texel and one triangle at a time."""
     owner = np.full((size, size), -1)
     snapped = [[Fraction(round(float(c) * size * 2**SUBTEXEL_BITS), 2**SUBTEXEL_BITS) for c in p] for p in uv]
     for k, face in enumerate(faces):
@@ -53,7 +53,7 @@ def exact_owner(uv, faces, size):
     return owner
 
 
-def test_agrees_with_rational_arithmetic_on_adversaries():
+def test_owners_agree_with_rational_arithmetic_on_degenerate_triangles():
     rng = np.random.default_rng(1)
     size = 12
     centres = (np.array([[0, 0], [5, 0], [5, 7], [11, 11], [3, 9]]) + 0.5) / size  # vertices on texel centres
@@ -75,7 +75,9 @@ def test_shared_edges_and_vertices_on_texel_centres_are_owned_once(size, n):
     count = owner_count(uv, faces, size)
     assert count.max() == 1
     # The square covers centres 0 … size-1; its right and lower rim belong to whoever would come next.
-    assert (count[:-1, :-1] == 1).all() and not count[-1].any() and not count[:, -1].any()
+    assert (count[:-1, :-1] == 1).all()
+    assert not count[-1].any()
+    assert not count[:, -1].any()
 
 
 def test_jittered_grid_leaves_no_hole_and_no_overlap():
@@ -86,24 +88,25 @@ def test_jittered_grid_leaves_no_hole_and_no_overlap():
     np.testing.assert_array_equal(count, np.outer(inside, inside))
 
 
-def test_barycentric_gives_the_texel_centre_back():
+def test_barycentric_coordinates_reproduce_the_texel_centre():
     uv, faces = grid(9, 0.05, 0.95, jitter=0.03, seed=3)
-    faces[::2] = faces[::2][:, [0, 2, 1]]  # turned either way
+    faces[::2] = faces[::2][:, [0, 2, 1]]  # half of them face the other way
     face_idx, barycentric = rasterize_uv(uv, faces, 128)
     row, column = np.nonzero(face_idx >= 0)
     back = (uv[faces[face_idx[row, column]]] * barycentric[row, column][..., None]).sum(1)
     np.testing.assert_allclose(back, np.stack([column + 0.5, row + 0.5], 1) / 128, atol=2e-6)
-    assert barycentric.min() >= 0 and not barycentric[face_idx < 0].any()
+    assert barycentric.min() >= 0
+    assert not barycentric[face_idx < 0].any()
 
 
-def test_first_of_overlapping_triangles_owns_and_the_count_tells():
+def test_the_first_of_overlapping_triangles_owns_the_texel_and_all_are_counted():
     uv = np.array([[0.1, 0.1], [0.9, 0.1], [0.1, 0.9]])
     face_idx, _ = rasterize_uv(uv, np.array([[0, 1, 2], [0, 1, 2], [0, 2, 1]]), 32)
     assert set(np.unique(face_idx)) == {-1, 0}
     assert owner_count(uv, np.array([[0, 1, 2], [0, 2, 1]]), 32).max() == 2
 
 
-def test_tiny_triangles_own_nothing_and_nothing_breaks():
+def test_triangles_without_area_own_nothing():
     uv = np.array([[0.5, 0.5], [0.5, 0.5], [0.5, 0.5], [0.3, 0.3], [0.7, 0.7]])
     faces = np.array([[0, 1, 2], [0, 3, 4]])
     assert (rasterize_uv(uv, faces, 64)[0] == -1).all()
@@ -111,7 +114,7 @@ def test_tiny_triangles_own_nothing_and_nothing_breaks():
     assert rasterize_uv(uv, np.empty((0, 3), int), 8)[0].max() == -1
 
 
-def test_coordinates_beyond_the_map_are_cut_off_and_bad_ones_refused():
+def test_coordinates_beyond_the_map_are_clipped_and_invalid_ones_refused():
     uv = np.array([[-2.0, -2.0], [5.0, -2.0], [-2.0, 5.0]])
     assert (rasterize_uv(uv, np.array([[0, 1, 2]]), 16)[0] == 0).all()
     for bad in (np.nan, np.inf, 1e9):
@@ -119,7 +122,7 @@ def test_coordinates_beyond_the_map_are_cut_off_and_bad_ones_refused():
             rasterize_uv(np.array([[0, 0], [1, 0], [0, bad]]), np.array([[0, 1, 2]]), 16)
 
 
-def test_extended_owners_go_on_linearly():
+def test_owners_are_extended_linearly():
     uv = np.array([[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     face_idx, _ = rasterize_uv(uv, faces, 32)
@@ -134,9 +137,8 @@ def test_extended_owners_go_on_linearly():
     np.testing.assert_allclose(back, np.stack([texel % 32 + 0.5, texel // 32 + 0.5], 1) / 32, atol=1e-9)
 
 
-def test_charts_between_texel_centres_get_what_they_pass_through():
-    """A square, a triangle a third of a texel wide and a sliver of nine texels' length and a tenth's width, apart from
-    one another."""
+def test_charts_without_a_texel_centre_get_the_texels_that_they_pass_through():
+    """A square, a triangle a third of a texel wide, and a sliver nine texels long and a tenth of a texel wide."""
     square = [[4, 4], [12, 4], [12, 12], [4, 12]]
     tiny = [[20.6, 6.6], [20.9, 6.6], [20.6, 6.9]]
     sliver = [[4.1, 20.05], [13.3, 20.05], [13.3, 20.15]]
@@ -145,7 +147,7 @@ def test_charts_between_texel_centres_get_what_they_pass_through():
     owner = owners_of(uv, faces, 32).reshape(32, 32)
     assert set(np.unique(owner)) == {-1, 0, 1}
     texel, face = between_centres(uv, faces, owner)
-    found = {(int(t) // 32, int(t) % 32): int(f) for t, f in zip(texel, face, strict=True)}
-    assert found == {(6, 20): 2} | {(20, column): 3 for column in range(4, 14)}
-    # A chart that is cut off by the map's border, and one beside texels it owns, add nothing.
+    faces_of_texels = {(int(t) // 32, int(t) % 32): int(f) for t, f in zip(texel, face, strict=True)}
+    assert faces_of_texels == {(6, 20): 2} | {(20, column): 3 for column in range(4, 14)}
+    # A chart clipped by the map's border, and one next to texels that it owns, add nothing.
     assert len(between_centres(uv[:4] - 0.2, faces[:2], owners_of(uv[:4] - 0.2, faces[:2], 32).reshape(32, 32))[0]) == 0

@@ -5,10 +5,12 @@ import pytest
 
 from gdtool.geometry import topology
 from gdtool.geometry.mesh_quality import distance_figures, topology_figures
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.topology import triangulated
 from gdtool.remesh import components, pipeline
 from gdtool.remesh.engines import candidate, search
 from gdtool.remesh.fit.feature_curves import Constraints
+from gdtool.remesh.fit.shaping import FittedQuads
 from gdtool.remesh.task import RemeshPatch, Request
 from tests.geometry.solids import cube, joined, sphere
 from tests.remesh.engines import in_this_process, whole
@@ -17,7 +19,7 @@ from tests.remesh.engines import in_this_process, whole
 def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
     """Each has its share of the quads asked for, the small one enough for its shape, and none is lost."""
     vertices, faces = joined(sphere(48, 0.4, (0, -0.2, 0)), sphere(48, 0.12, (0, 0.5, 0)))
-    both = RemeshPatch(vertices, faces, 4000, 0.03, Request(), None)
+    both = RemeshPatch(TriMesh(vertices, faces), 4000, 0.03, Request(), None)
     assert components.accept_good_pieces(both, None)[0] is None
     patches = components.remaining_patches(both, np.zeros(2, bool), 4000)
     assert len(patches) == 2
@@ -38,7 +40,8 @@ def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
         return None if tried[-1] > 1 else real(search_run)
 
     monkeypatch.setattr(search.EngineSearch, "run", fails_together)
-    out, quads_out, _ = pipeline.remesh(vertices, faces, Request(quads=4000))
+    made, _ = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000))
+    quads_out = made.faces
     assert tried == [2, 1, 1]
     assert topology.components(quads_out)[0] == 2
     assert whole(quads_out)
@@ -53,23 +56,26 @@ def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless)
     vertices, faces = joined(*balls, (large[0] + (0.4, 0.3, 0.5), large[1]))
     real = candidate.repair_and_judge
 
-    def fails(quad_vertices, quad_faces, wanted):
-        fault, *mended = real(quad_vertices, quad_faces, wanted)
-        bad = wanted.pieces > 1 or hopeless and np.ptp(quad_vertices, 0).max() > 0.5
-        return "not watertight, though the input is" if bad else fault, *mended
+    def fails(mesh, wanted):
+        judged = real(mesh, wanted)
+        bad = wanted.pieces > 1 or hopeless and np.ptp(mesh.vertices, 0).max() > 0.5
+        return judged._replace(fault="not watertight, though the input is") if bad else judged
 
     in_this_process(monkeypatch)
     monkeypatch.setattr(candidate, "repair_and_judge", fails)
     monkeypatch.setattr(components, "repair_and_judge", fails)
-    out, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000))
+    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000))
+    out, quads_out = made.vertices, made.faces
     assert record.engine == ("instant-meshes; pair and split" if hopeless else "instant-meshes")
     assert topology.components(quads_out)[0] == 21
     assert whole(quads_out)
     assert abs(len(quads_out) / 4000 - 1) <= 0.03
     small = quads_out[(out[quads_out][..., 2] < 0.15).all(1)]
     # Eight of a ball's hundred; of paired triangles a fifth and more.
-    assert topology_figures(*topology.compact(out, small))["irregular_share"] < 0.1
-    assert distance_figures(out, triangulated(quads_out)[0], vertices, faces, 5000)["hausdorff"] < 0.02
+    assert topology_figures(topology.compact(QuadMesh(out, small)))["irregular_share"] < 0.1
+    assert (
+        distance_figures(TriMesh(out, triangulated(quads_out)[0]), TriMesh(vertices, faces), 5000)["hausdorff"] < 0.02
+    )
 
 
 @pytest.mark.parametrize("wanted, kept", [(1.0, True), (1.2, False)])
@@ -77,25 +83,27 @@ def test_pieces_are_kept_as_they_were_drawn_where_the_others_can_make_up_for_the
     """Two balls of which an engine's quads are those of both: all are kept, or none where there are a sixth too few;
     none is drawn again."""
     meshes = [sphere(24, 0.3, (x, 0, 0)) for x in (-0.4, 0.4)]
-    out, quads_out = components.concatenate_meshes(
-        [pipeline.remesh(*mesh, Request(quads=500, engine="split"))[:2] for mesh in meshes]
+    made = components.concatenate_meshes(
+        [pipeline.remesh(TriMesh(*mesh), Request(quads=500, engine="split"))[0] for mesh in meshes]
     )
-    patch = RemeshPatch(*joined(*meshes), round(wanted * len(quads_out)), 0.05, Request(), None)
+    quads_out = made.faces
+    patch = RemeshPatch(TriMesh(*joined(*meshes)), round(wanted * len(quads_out)), 0.05, Request(), None)
     patch.full_surface = lambda: patch.surface
-    whole = candidate.Candidate(
-        search.EngineAttempt("instant-meshes", 0, (1.0,), 30.0), len(quads_out), None, out, quads_out
-    )
-    whole.fitted = out, quads_out, Constraints.none(len(out))
+    whole = candidate.Candidate(search.EngineAttempt("instant-meshes", 0, (1.0,), 30.0), len(quads_out), None, made)
+    whole.fitted = FittedQuads(made, Constraints.none(len(made.vertices)))
     monkeypatch.setattr(components, "snap_to_features", None)
-    made, good = components.accept_good_pieces(patch, whole)
+    kept_quads, good = components.accept_good_pieces(patch, whole)
     assert good.all() == good.any() == kept
-    assert (made is None) != kept
-    assert not kept or len(made[1]) == len(quads_out) and made[2] == "instant-meshes"
+    assert (kept_quads is None) != kept
+    if kept:
+        assert len(kept_quads.mesh.faces) == len(quads_out)
+        assert kept_quads.method == "instant-meshes"
 
 
 def test_small_piece_is_not_lost():
     vertices, faces = joined(sphere(40, 0.7), sphere(40, 0.05, (0.9, 0.9, 0.9)))
-    out, quads_out, record = pipeline.remesh(vertices / 2, faces, Request(quads=1000))
+    made, record = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=1000))
+    out, quads_out = made.vertices, made.faces
     assert topology.components(quads_out)[0] == 2
     assert whole(quads_out)
     assert "pair and split" in record.engine
@@ -110,7 +118,8 @@ def test_pieces_of_a_few_quads_each_are_not_given_to_an_engine(monkeypatch):
     monkeypatch.setattr(
         search.EngineSearch, "run", lambda search_run: tried.append(search_run.patch.pieces[0]) or run(search_run)
     )
-    _, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000))
+    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000))
+    quads_out = made.faces
     assert tried == [1]
     assert "engines: not tried, 20 pieces of so few quads" in record.failed
     assert topology.components(quads_out)[0] == 21
@@ -124,7 +133,8 @@ def test_the_count_holds_where_small_pieces_take_more_than_their_share():
     vertices, faces = cube(0.01)
     trays = [(vertices + 0.05 * corner + 0.3, faces[:-2]) for corner in corners]
     vertices, faces = joined(sphere(60, 0.25), *trays)
-    out, quads_out, _ = pipeline.remesh(vertices, faces, Request(quads=4000, engine="split"))
+    made, _ = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000, engine="split"))
+    out, quads_out = made.vertices, made.faces
     assert abs(len(quads_out) / 4000 - 1) < 0.03
     assert topology.components(quads_out)[0] == 101
     assert 1000 < (np.linalg.norm(out, axis=1)[quads_out].max(1) < 0.27).sum() < 2700

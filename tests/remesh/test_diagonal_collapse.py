@@ -9,6 +9,7 @@ import pytest
 
 from gdtool.geometry import topology
 from gdtool.geometry.mesh_quality import scaled_jacobian
+from gdtool.geometry.meshes import QuadMesh
 from gdtool.remesh.connectivity.diagonal_collapse import collapse_folded_quads
 from gdtool.remesh.fit.feature_curves import Constraints
 from gdtool.remesh.fit.shaping import target_of_quads
@@ -39,16 +40,17 @@ def test_a_folded_quad_goes_and_its_surroundings_stay(apart):
     torn, quads, _ = opened(vertices, faces, 17, apart)
     assert topology.is_watertight(quads)
     assert len(quads) == len(faces) + 1
-    assert scaled_jacobian(torn, quads).min() < 0.05
-    out, quads_out, _ = collapse_folded_quads(
-        torn, quads, target_of_quads(vertices, faces), Constraints.none(len(torn))
+    assert scaled_jacobian(QuadMesh(torn, quads)).min() < 0.05
+    made, _ = collapse_folded_quads(
+        QuadMesh(torn, quads), target_of_quads(QuadMesh(vertices, faces)), Constraints.none(len(torn))
     )
+    out, quads_out = made.vertices, made.faces
     assert len(quads_out) == len(faces)
     assert len(out) == len(vertices)
     assert topology.is_watertight(quads_out)
     assert topology.is_manifold(quads_out)
     assert topology.euler_number(quads_out) == topology.euler_number(faces)
-    assert scaled_jacobian(out, quads_out).min() > 0.8 * scaled_jacobian(vertices, faces).min()
+    assert scaled_jacobian(QuadMesh(out, quads_out)).min() > 0.8 * scaled_jacobian(QuadMesh(vertices, faces)).min()
     assert len(np.unique(np.concatenate([out, vertices]).round(9), axis=0)) <= len(vertices) + 1
 
 
@@ -57,14 +59,18 @@ def test_what_is_held_stays():
     torn, quads, new = opened(vertices, faces, 17, 0.1)
     constraints = Constraints.none(len(torn))
     constraints.curve[[new[0], new[2]]] = 0
-    out, quads_out, _ = collapse_folded_quads(
-        torn, quads, target_of_quads(vertices, faces), replace(constraints, fixed=np.ones(len(torn), bool))
+    made, _ = collapse_folded_quads(
+        QuadMesh(torn, quads),
+        target_of_quads(QuadMesh(vertices, faces)),
+        replace(constraints, fixed=np.ones(len(torn), bool)),
     )
+    out, quads_out = made.vertices, made.faces
     assert out is torn
     assert quads_out is quads
     # One of the two is held: it is the one that stays, where it was.
     constraints.curve[new[2]] = -1
-    out, quads_out, after = collapse_folded_quads(torn, quads, target_of_quads(vertices, faces), constraints)
+    made, after = collapse_folded_quads(QuadMesh(torn, quads), target_of_quads(QuadMesh(vertices, faces)), constraints)
+    out, quads_out = made.vertices, made.faces
     assert len(quads_out) == len(faces)
     assert (after.curve >= 0).sum() == 1
     assert (out[after.curve >= 0] == torn[new[0]]).all()
@@ -72,8 +78,9 @@ def test_what_is_held_stays():
 
 def test_nothing_happens_without_folded_quads():
     vertices, faces = quad_torus()
-    out, quads_out, _ = collapse_folded_quads(
-        vertices, faces, target_of_quads(vertices, faces), Constraints.none(len(vertices))
+    made, _ = collapse_folded_quads(
+        QuadMesh(vertices, faces), target_of_quads(QuadMesh(vertices, faces)), Constraints.none(len(vertices))
     )
+    out, quads_out = made.vertices, made.faces
     assert out is vertices
     assert quads_out is faces

@@ -6,6 +6,7 @@ import pytest
 
 from gdtool.geometry import topology
 from gdtool.geometry.mesh_quality import valences
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.sharpen import dihedral_degrees
 from gdtool.remesh.connectivity.edge_rotation import cancel_pairs
 from gdtool.remesh.engines import candidate as candidates
@@ -42,7 +43,7 @@ def test_what_was_pulled_apart_closes(apart):
     points, quads = quad_torus(n)
     torn = sheared(quads, [(i * n + 3, i * n + 4) for i in range(2, 2 + apart)])
     assert irregular(points, torn) == 4
-    quads_out = cancel_pairs(points, torn)
+    quads_out = cancel_pairs(QuadMesh(points, torn))
     assert irregular(points, quads_out) == 0
     assert topology.is_watertight(quads_out)
     assert topology.is_manifold(quads_out)
@@ -53,18 +54,18 @@ def test_what_is_too_far_apart_is_put_back():
     n = 40
     points, quads = quad_torus(n)
     torn = sheared(quads, [(i * n + 3, i * n + 4) for i in range(2, 22)])
-    quads_out = cancel_pairs(points, torn)
+    quads_out = cancel_pairs(QuadMesh(points, torn))
     assert {frozenset(f) for f in quads_out.tolist()} == {frozenset(f) for f in torn.tolist()}
 
 
 def test_a_regular_mesh_and_an_open_one_stay():
     for points, quads in (quad_torus(), quad_cube(3)):
-        assert (np.sort(cancel_pairs(points, quads), 1) == np.sort(quads, 1)).all()
+        assert (np.sort(cancel_pairs(QuadMesh(points, quads)), 1) == np.sort(quads, 1)).all()
     n = 8
     points, _ = plane(n)
     at = np.arange(n * n).reshape(n, n)
     quads = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]], -1).reshape(-1, 4)
-    assert (cancel_pairs(points, quads) == quads).all()
+    assert (cancel_pairs(QuadMesh(points, quads)) == quads).all()
 
 
 def test_a_band_with_one_side_stays():
@@ -74,13 +75,13 @@ def test_a_band_with_one_side_stays():
     following = np.concatenate([at[1:], at[:1, ::-1]])
     quads = np.stack([at[:, :-1], following[:, :-1], following[:, 1:], at[:, 1:]], -1).reshape(-1, 4)
     points = np.random.default_rng(0).standard_normal((n * 5, 3))
-    assert (cancel_pairs(points, quads) == quads).all()
+    assert (cancel_pairs(QuadMesh(points, quads)) == quads).all()
 
 
 def test_creases_stay():
     """Edges of a cube turn no more, whatever would cancel across them."""
     points, quads = quad_cube(3)
-    ends, _, degrees = dihedral_degrees(points, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]))
+    ends, _, degrees = dihedral_degrees(TriMesh(points, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])))
     crease = {tuple(sorted(edge)) for edge in ends[degrees > 45].tolist()}
     flat = [tuple(sorted(edge)) for edge in topology.edges_of(quads).ends.tolist() if tuple(sorted(edge)) not in crease]
     rng, torn = np.random.default_rng(0), quads
@@ -92,7 +93,7 @@ def test_creases_stay():
         valence = valences(turned, len(points))[0]
         if valence.min() > 2 and topology.is_manifold(turned):
             torn = turned
-    quads_out = cancel_pairs(points, torn)
+    quads_out = cancel_pairs(QuadMesh(points, torn))
     kept = {tuple(sorted(edge)) for edge in topology.edges_of(quads_out).ends.tolist()}
     assert crease <= kept
     assert topology.is_watertight(quads_out)
@@ -103,10 +104,11 @@ def test_creases_stay():
 def test_an_engine_s_quads_have_fewer(monkeypatch):
     vertices, faces = marching(lambda x, y, z: (np.hypot(x, y) - 0.6) ** 2 + z**2 - 0.06 - 0.02 * np.sin(7 * x), 48)
     attempt = EngineAttempt("instant-meshes", 1, (1.0,), 30.0)
-    quads_out = make_candidate(vertices / 2, faces, attempt, 8000)
-    monkeypatch.setattr(candidates, "cancel_pairs", lambda _, quads: quads)
-    before = make_candidate(vertices / 2, faces, attempt, 8000)
+    quads_out = make_candidate(TriMesh(vertices / 2, faces), attempt, 8000)
+    monkeypatch.setattr(candidates, "cancel_pairs", lambda mesh: mesh.faces)
+    before = make_candidate(TriMesh(vertices / 2, faces), attempt, 8000)
     assert quads_out.fault is None
     assert quads_out.count == before.count
-    assert topology.is_watertight(quads_out.quads)
-    assert irregular(quads_out.vertices, quads_out.quads) < 0.9 * irregular(before.vertices, before.quads)
+    assert topology.is_watertight(quads_out.mesh.faces)
+    after = irregular(quads_out.mesh.vertices, quads_out.mesh.faces)
+    assert after < 0.9 * irregular(before.mesh.vertices, before.mesh.faces)

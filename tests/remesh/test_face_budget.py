@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.remesh import face_budget
 from gdtool.remesh.task import Record, Request
 
@@ -12,28 +13,30 @@ def counted(monkeypatch):
     """remesh that only remembers the counts it is asked for; its distance is 2 / count."""
     asked = []
 
-    def remesh(vertices, faces, request):
+    def remesh(mesh, request):
         asked.append(request.quads)
-        return vertices, np.zeros((request.quads, 4), np.int64), Record()
+        return QuadMesh(mesh.vertices, np.zeros((request.quads, 4), np.int64)), Record()
 
     monkeypatch.setattr(face_budget, "remesh", remesh)
-    monkeypatch.setattr(face_budget, "deviation", lambda v, f, out, quads_out: 2 / (len(quads_out) / 2))
+    monkeypatch.setattr(face_budget, "deviation", lambda mesh, made: 2 / (len(made.faces) / 2))
     return asked
 
 
 def test_fewest_quads_within_a_distance_are_found_in_a_few_runs(counted):
-    _, quads_out, _, reached = face_budget.coarsest_within(
-        np.zeros((3, 3)), np.zeros((1, 3), int), Request(quads=20000), 0.002
+    made, _, reached = face_budget.coarsest_within(
+        TriMesh(np.zeros((3, 3)), np.zeros((1, 3), int)), Request(quads=20000), 0.002
     )
+    quads_out = made.faces
     assert reached <= 0.002
     assert 1000 <= len(quads_out) <= 1150
     assert len(counted) <= 6
 
 
 def test_when_all_are_too_few_the_most_are_given(counted):
-    _, quads_out, _, reached = face_budget.coarsest_within(
-        np.zeros((3, 3)), np.zeros((1, 3), int), Request(quads=500), 0.002
+    made, _, reached = face_budget.coarsest_within(
+        TriMesh(np.zeros((3, 3)), np.zeros((1, 3), int)), Request(quads=500), 0.002
     )
+    quads_out = made.faces
     assert len(quads_out) == 500
     assert reached > 0.002
     assert counted == [500]

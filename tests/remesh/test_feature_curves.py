@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.sharpen import dihedral_degrees
 from gdtool.remesh.fit.feature_curves import Features, _clean_arcs, find_features, trace_features
 from tests.geometry.solids import cube
@@ -22,15 +23,15 @@ def square(turned_degrees: float) -> np.ndarray:
 
 def test_a_folded_sliver_is_no_crease():
     vertices = square(0.0)
-    assert dihedral_degrees(vertices, FACES)[2].max() > 170
-    assert dihedral_degrees(vertices, FACES, 0.05)[2].max() < 1e-5
-    boundary = find_features(vertices, FACES, 30.0, 0.1)
+    assert dihedral_degrees(TriMesh(vertices, FACES))[2].max() > 170
+    assert dihedral_degrees(TriMesh(vertices, FACES), 0.05)[2].max() < 1e-5
+    boundary = find_features(TriMesh(vertices, FACES), 30.0, 0.1)
     on_rim = [tuple(sorted(np.round(boundary.points[s].sum(1), 6))) for s in boundary.segments]
     assert sorted(on_rim) == [(0, 1), (0, 1), (1, 2), (1, 2)]
 
 
 def test_a_crease_beside_a_sliver_is_kept():
-    ends, _, angle = dihedral_degrees(square(60.0), FACES, 0.05)
+    ends, _, angle = dihedral_degrees(TriMesh(square(60.0), FACES), 0.05)
     at = {tuple(sorted(pair)): degrees for pair, degrees in zip(ends.tolist(), angle, strict=True)}
     assert at[0, 2] < 1e-5
     assert at[0, 4] == pytest.approx(60)
@@ -64,7 +65,7 @@ def test_both_rims_of_a_thin_plate_are_kept(thickness):
     """Its short edges are half a quad or more than one long; drawn together they would bend the rims by their whole
     length."""
     vertices, faces = plate(thickness)
-    found = find_features(vertices, faces, 30.0, 0.03)
+    found = find_features(TriMesh(vertices, faces), 30.0, 0.03)
     length = np.linalg.norm(found.points[found.segments[:, 0]] - found.points[found.segments[:, 1]], axis=1)
     assert len(found.corners) == 8
     assert length.sum() == pytest.approx(8 + 4 * thickness)
@@ -82,7 +83,7 @@ def test_a_curve_whose_corner_has_no_vertex_of_its_own_is_followed_all_the_same(
     faces = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]], -1).reshape(-1, 4)
     points = np.array([(3.0, 10.1, 0), (17.0, 10.0, 0), (3.0, 10.3, 0), (17.0, 11.0, 0)])
     features = Features(points, np.array([(0, 1), (2, 3)]), np.array([0, 1]), np.arange(4))
-    _, held = trace_features(vertices, faces, features, 1.0)
+    _, held = trace_features(QuadMesh(vertices, faces), features, 1.0)
     for curve in (0, 1):
         path = vertices[held.path[held.path_curve == curve]].reshape(-1, 3)
         assert len(path)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.remesh.fit.feature_curves import Constraints, release_straight_corners
 from gdtool.remesh.fit.feature_diagonals import choose_diagonals, hold_centres, quads_crossed_by_features
 from gdtool.remesh.fit.surface_projection import ProjectionTarget, subdivide
@@ -28,11 +29,12 @@ def test_a_path_round_a_corner_crosses_its_quad():
     assert len(face_idx) == 1
     assert set(faces[face_idx[0]]) == {5, 6, 10, 11}
     assert found.tolist() == [3]
-    new_vertices, _, halved = subdivide(vertices, faces, after)
+    made, halved = subdivide(QuadMesh(vertices, faces), after)
+    new_vertices = made.vertices
     held = hold_centres(halved, len(new_vertices) - len(faces), face_idx, found)
     added = np.flatnonzero(held.curve != halved.curve)
     assert np.allclose(new_vertices[added], [[0.5, 1.5, 0]])
-    released = release_straight_corners(vertices, faces, before)
+    released = release_straight_corners(QuadMesh(vertices, faces), before)
     assert (released.curve[[6, 11]] < 0).all()
     assert not len(quads_crossed_by_features(faces, before, before)[0])
 
@@ -40,9 +42,9 @@ def test_a_path_round_a_corner_crosses_its_quad():
 def test_bent_quads_are_cut_along_the_ridge():
     # The ridge runs from the first corner to the third.
     ridge = np.array([[0, 0, 0], [2, 0, -1], [2, 2, 0], [0, 2, -1.0]])
-    surface = ProjectionTarget(ridge, np.array([[0, 1, 2], [0, 2, 3]]))
+    surface = ProjectionTarget(TriMesh(ridge, np.array([[0, 1, 2], [0, 2, 3]])))
     for turn in range(4):
         quad = np.roll([0, 1, 2, 3], turn)[None]
-        out = choose_diagonals(ridge, quad, surface)[0]
+        out = choose_diagonals(QuadMesh(ridge, quad), surface)[0]
         assert out[0] in (0, 2)
         assert np.roll(out, -int(np.argmin(out))).tolist() == [0, 1, 2, 3]

@@ -4,6 +4,7 @@ import numpy as np
 
 from gdtool.geometry import topology
 from gdtool.geometry.mesh_quality import valences
+from gdtool.geometry.meshes import QuadMesh
 from gdtool.remesh.connectivity.irregular_vertices import cancel_irregular
 from tests.geometry.solids import quad_torus
 
@@ -29,7 +30,8 @@ def test_an_opened_vertex_closes_again():
     more_points, more = opened(points, quads, 40)
     assert topology.is_watertight(more)
     assert (valences(more, len(more_points))[0] != 4).sum() == 4
-    out, quads_out = cancel_irregular(more_points, more)
+    made = cancel_irregular(QuadMesh(more_points, more))
+    out, quads_out = made.vertices, made.faces
     assert len(quads_out) == len(quads)
     assert topology.is_watertight(quads_out)
     assert topology.is_manifold(quads_out)
@@ -38,6 +40,7 @@ def test_an_opened_vertex_closes_again():
 
 def test_a_regular_mesh_stays():
     points, quads = quad_torus()
-    out, quads_out = cancel_irregular(points, quads)
+    made = cancel_irregular(QuadMesh(points, quads))
+    out, quads_out = made.vertices, made.faces
     assert (quads_out == quads).all()
     assert (out == points).all()

@@ -5,6 +5,7 @@ import pytest
 
 from gdtool.geometry import simplify, topology
 from gdtool.geometry.mesh_quality import distance_figures, polygon_normals, shape_figures
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.topology import triangulated
 from gdtool.remesh import pipeline
 from gdtool.remesh.fallback import pair_and_split as fallback
@@ -21,7 +22,8 @@ from tests.remesh.engines import whole
 def test_pairing_gives_the_asked_count_exactly():
     vertices, faces = sphere(24)
     for count in (3 * len(faces) - 500, int(2.2 * len(faces))):
-        out, quads_out = pair_and_split(vertices, faces, count)
+        made = pair_and_split(TriMesh(vertices, faces), count)
+        out, quads_out = made.vertices, made.faces
         assert abs(len(quads_out) - count) <= 1
         assert whole(quads_out)
         assert volume(out, quads_out) > 0
@@ -33,14 +35,18 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
     vertices, faces = joined((small[0] * 0.1 + 3, small[1]), large)
     tried = []
 
-    def losing(vertices, faces, target, **how):
+    def losing(mesh, target, **how):
         tried.append(target)
-        own = simplify.simplify(*large, target - (len(small[1]) if target > 1000 else 0), measured=False)
-        return (*(joined(small, own[:2]) if target > 1000 else own[:2]), None, {})
+        keeps = target > 1000
+        options = simplify.SimplifyOptions(measure_error=False)
+        made = simplify.simplify(TriMesh(*large), target - (len(small[1]) if keeps else 0), options=options)
+        both = TriMesh(*joined(small, (made.mesh.vertices, made.mesh.faces)))
+        return made._replace(mesh=both) if keeps else made
 
     monkeypatch.setattr(fallback, "simplify", losing)
     asked = 1800  # 800 triangles, of which 1.15 times as many lose the piece and 1.3 times keep it
-    out, quads_out = fallback.quads_from_input(vertices, faces, asked, 60.0)
+    made = fallback.quads_from_input(TriMesh(vertices, faces), asked, 60.0)
+    quads_out = made.faces
     assert tried[:3] == [800, 919, 1040]
     assert topology.components(quads_out)[0] == 2
     assert asked < len(quads_out) < 1.5 * asked < 1.8 * len(faces)
@@ -53,10 +59,10 @@ def test_even_triangles_are_sought_no_longer_than_they_come_nearer_to_their_numb
     runs, mesh_set = [], pymeshlab.MeshSet
     monkeypatch.setattr(pymeshlab, "MeshSet", lambda: runs.append(1) or mesh_set())
     cubes = joined(*((cube()[0] + (3 * i, 0, 0), cube()[1]) for i in range(20)))
-    assert len(fallback.isotropic_triangles(*cubes, 100, 30.0)[1]) == 240
+    assert len(fallback.isotropic_triangles(TriMesh(*cubes), 100, 30.0).faces) == 240
     assert len(runs) == 2
     runs.clear()
-    assert abs(len(fallback.isotropic_triangles(*sphere(24), 500, 30.0)[1]) / 500 - 1) < 0.05
+    assert abs(len(fallback.isotropic_triangles(TriMesh(*sphere(24)), 500, 30.0).faces) / 500 - 1) < 0.05
     assert 1 <= len(runs) <= 4
 
 
@@ -76,8 +82,9 @@ def test_even_triangles_that_would_be_too_few_are_not_sought(monkeypatch, mesh, 
     sought = []
     monkeypatch.setattr(smoothed, "quads_from_isotropic", lambda *given: sought.append(given))
     monkeypatch.setattr(smoothed, "split_count", lambda faces, quads: quads)
-    patch = RemeshPatch(*mesh, quads, 0.1, Request(quads=quads), lambda: ProjectionTarget(*mesh))
-    _, faces = smoothed.split(patch)
+    patch = RemeshPatch(TriMesh(*mesh), quads, 0.1, Request(quads=quads), lambda: ProjectionTarget(TriMesh(*mesh)))
+    made = smoothed.split(patch)
+    faces = made.faces
     assert fallback.too_few_for_isotropic(mesh[1], quads) == few
     assert len(sought) == (not few)
     assert topology.is_watertight(faces)
@@ -86,7 +93,8 @@ def test_even_triangles_that_would_be_too_few_are_not_sought(monkeypatch, mesh, 
 def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
     """Pins with few triangles around: what bends too much stays single, and there are fewer triangles for it."""
     vertices, faces = joined(*((pin[0] + (0.3 * k, 0, 0), pin[1]) for k, pin in enumerate([rod(24)] * 8)))
-    _, quads_out = fallback.quads_from_input(vertices, faces, 400, 60.0)
+    made = fallback.quads_from_input(TriMesh(vertices, faces), 400, 60.0)
+    quads_out = made.faces
     assert abs(len(quads_out) / 400 - 1) < 0.1
     assert topology.components(quads_out)[0] == 8
     assert topology.is_watertight(quads_out)
@@ -103,37 +111,40 @@ def test_splitting_makes_square_quads_of_any_triangles(shape):
         vertices = vertices.copy()
         vertices[8:, 0] += np.ptp(vertices[:8, 0])  # shares a side with the first
     vertices = vertices / np.ptp(vertices, 0).max()
-    out, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=3000, engine="split"))
+    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=3000, engine="split"))
+    out, quads_out = made.vertices, made.faces
     assert record.engine == "pair and split"
     assert whole(quads_out)
     assert abs(len(quads_out) / 3000 - 1) <= 0.03
     assert topology.components(quads_out)[0] == topology.components(faces)[0]
-    figures = shape_figures(out, quads_out)
+    figures = shape_figures(QuadMesh(out, quads_out))
     assert figures["jacobian_mean"] > 0.85
     assert figures["folded_share"] == 0
     assert figures["angle_deviation_deg"] < 18
-    assert distance_figures(out, triangulated(quads_out)[0], vertices, faces, 5000)["hausdorff"] < 0.01
+    assert (
+        distance_figures(TriMesh(out, triangulated(quads_out)[0]), TriMesh(vertices, faces), 5000)["hausdorff"] < 0.01
+    )
 
 
 def test_quads_without_area_are_evened_out_where_their_neighbours_stay(monkeypatch):
     """A mesh of the fallback whose every vertex is to stay, but one quad was split without area."""
     vertices, faces = sphere(24, 0.5)
-    split, quad_faces = pair_and_split(vertices, faces, 600)
+    made = pair_and_split(TriMesh(vertices, faces), 600)
+    split, quad_faces = made.vertices, made.faces
     a, b, c, d = quad_faces[100]
     split[b], split[d] = split[a], split[c]
-    assert polygon_normals(split, quad_faces)[1][100] < 1e-12
+    assert polygon_normals(QuadMesh(split, quad_faces))[1][100] < 1e-12
     monkeypatch.setattr(shaping, "_abandoning_faces", lambda *given: np.arange(len(quad_faces)))
-    surface, request = ProjectionTarget(vertices, faces), Request(quads=600)
+    surface, request = ProjectionTarget(TriMesh(vertices, faces)), Request(quads=600)
     out = shaping.keep_better_vertices(
-        split,
-        quad_faces,
-        *shaping.smoothed(split, quad_faces, surface, NO_FEATURES, request),
+        QuadMesh(split, quad_faces),
+        *shaping.smoothed(QuadMesh(split, quad_faces), surface, NO_FEATURES, request),
         surface,
         request,
         surface,
     )
-    edge = (polygon_normals(out, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
-    assert polygon_normals(out, quad_faces)[1].min() > 1e-4 * edge**2
+    edge = (polygon_normals(QuadMesh(out, quad_faces))[1].sum() / len(quad_faces)) ** 0.5
+    assert polygon_normals(QuadMesh(out, quad_faces))[1].min() > 1e-4 * edge**2
     touched = np.isin(quad_faces, quad_faces[100]).any(1)
     kept = np.setdiff1d(quad_faces[~touched], quad_faces[touched])
     assert np.array_equal(out[kept], split[kept])

@@ -5,6 +5,7 @@ import pytest
 
 from gdtool.geometry import simplify, topology
 from gdtool.geometry.mesh_quality import distance_figures, shape_figures
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.topology import triangulated
 from gdtool.remesh import pipeline
 from gdtool.remesh.engines.adapters import ENGINES
@@ -18,26 +19,31 @@ def test_large_parts_are_not_torn_down_for_small_ones():
     """An assembly with more pins than the count has quads to spare, all of slivers, which the quick collapse does not
     touch."""
     vertices, faces = assembly(60, 128)
-    out, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=3000))
+    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=3000))
+    out, quads_out = made.vertices, made.faces
     assert any("the quick collapse stopped" in line for line in record.failed)
     assert record.figures["simplified_to"] == 20000
     assert abs(len(quads_out) / 3000 - 1) < 0.1
     assert whole(quads_out)
     assert topology.components(quads_out)[0] == 61
-    assert distance_figures(out, triangulated(quads_out)[0], vertices, faces, 5000)["hausdorff"] < 0.015
+    assert (
+        distance_figures(TriMesh(out, triangulated(quads_out)[0]), TriMesh(vertices, faces), 5000)["hausdorff"] < 0.015
+    )
 
 
 def test_what_the_quick_collapse_ruins_is_made_again_with_care(monkeypatch):
     vertices, faces = sphere(120, 0.5)
     begun, begin = [], simplify.begin
 
-    def shrinking(function, vertices, faces, way, *given, **limits):
-        begun.append(way)
-        return begin(function, vertices * (0.5 if way == "collapse" else 1), faces, way, *given, **limits)
+    def shrinking(function, mesh, call, *given, **limits):
+        begun.append(call.function)
+        smaller = TriMesh(mesh.vertices * (0.5 if call.function is simplify.collapse else 1), mesh.faces)
+        return begin(function, smaller, call, *given, **limits)
 
     monkeypatch.setattr(simplify, "begin", shrinking)
-    out, _, record = pipeline.remesh(vertices, faces, Request(quads=2000))
-    assert begun == ["collapse", "collapse_topology"]
+    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=2000))
+    out = made.vertices
+    assert begun == [simplify.collapse, simplify.collapse_keeping_topology]
     assert abs(np.linalg.norm(out, axis=1) - 0.5).max() < 0.01
     assert any(line.startswith("simplify: strays") for line in record.failed)
     assert record.figures["simplify_error"] < 0.01
@@ -45,17 +51,19 @@ def test_what_the_quick_collapse_ruins_is_made_again_with_care(monkeypatch):
 
 def test_sphere():
     vertices, faces = sphere(48)
-    out, quads_out, record = pipeline.remesh(vertices / 2, faces, Request(quads=1000))
+    made, record = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=1000))
+    out, quads_out = made.vertices, made.faces
     assert record.engine.startswith("instant-meshes")
     assert whole(quads_out)
     assert abs(len(quads_out) / 1000 - 1) <= 0.03
     assert np.abs(np.linalg.norm(out, axis=1) - 0.4).max() < 2e-3
-    assert shape_figures(out, quads_out)["jacobian_min"] > 0.2
+    assert shape_figures(QuadMesh(out, quads_out))["jacobian_min"] > 0.2
 
 
 def test_torus_keeps_its_hole():
     vertices, faces = torus()
-    out, quads_out, _ = pipeline.remesh(vertices / 2, faces, Request(quads=1500))
+    made, _ = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=1500))
+    out, quads_out = made.vertices, made.faces
     # Euler characteristic 0: E = 2F, V = F
     assert whole(quads_out)
     assert len(out) == len(quads_out)
@@ -67,25 +75,27 @@ def test_a_net_of_so_many_handles_that_engines_lose_some_keeps_all(each, ways):
     """With few quads for each handle what would fail is not tried: no engine, or only none that starts from fewer
     still."""
     vertices, faces = lattice()
-    out, quads_out, record = pipeline.remesh(vertices / 2, faces, Request(quads=28 * each))
+    made, record = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=28 * each))
+    out, quads_out = made.vertices, made.faces
     assert whole(quads_out)
     assert topology.handles(quads_out, 1) == 28
     assert abs(len(quads_out) / (28 * each) - 1) <= 0.03
     assert ways == {line.split(":")[0] for line in record.failed if "not tried" in line and "28 handles" in line}
     assert record.engine == "pair and split" or each > 100
-    assert shape_figures(out, quads_out)["jacobian_mean"] > 0.75
-    assert shape_figures(out, quads_out)["folded_share"] < 1e-3
+    assert shape_figures(QuadMesh(out, quads_out))["jacobian_mean"] > 0.75
+    assert shape_figures(QuadMesh(out, quads_out))["folded_share"] < 1e-3
 
 
 def test_an_engine_that_is_asked_for_is_tried_whatever_the_handles(monkeypatch):
     tried = in_this_process(monkeypatch, lambda *given: ENGINES["instant-meshes"](*given))
-    pipeline.remesh(*lattice(), Request(quads=1000, engine="instant-meshes"))
+    pipeline.remesh(TriMesh(*lattice()), Request(quads=1000, engine="instant-meshes"))
     assert tried
 
 
 def test_creases_lie_on_quad_edges():
     vertices, faces = bored_box()
-    out, quads_out, _ = pipeline.remesh(vertices / 2, faces, Request(quads=2500))
+    made, _ = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=2500))
+    out, quads_out = made.vertices, made.faces
     assert whole(quads_out)
     assert abs(len(quads_out) / 2500 - 1) <= 0.03
     triangles, _ = triangulated(quads_out)
@@ -95,26 +105,30 @@ def test_creases_lie_on_quad_edges():
     truth = np.concatenate(
         [np.stack([line, 0 * line + 0.3 * s, 0 * line + 0.25 * t], -1) for s in (-1, 1) for t in (-1, 1)]
     )
-    assert np.median(closest_points(truth, out, triangles)[0]) < 1e-3  # marching cubes cuts these edges off by 8e-3
+    assert (
+        np.median(closest_points(truth, TriMesh(out, triangles))[0]) < 1e-3
+    )  # marching cubes cuts these edges off by 8e-3
 
 
 def test_coarse_cube_is_filled_with_quads():
-    out, quads_out, _ = pipeline.remesh(*cube(), Request(quads=600))
+    made, _ = pipeline.remesh(TriMesh(*cube()), Request(quads=600))
+    out, quads_out = made.vertices, made.faces
     assert whole(quads_out)
     assert abs(len(quads_out) / 600 - 1) <= 0.03
     assert volume(out, quads_out) == pytest.approx(1, rel=0.02)
 
 
 def test_open_plane_stays_open_and_flat():
-    out, quads_out, _ = pipeline.remesh(*plane(), Request(quads=400))
+    made, _ = pipeline.remesh(TriMesh(*plane()), Request(quads=400))
+    out, quads_out = made.vertices, made.faces
     assert topology.is_manifold(quads_out)
     assert np.abs(out[:, 2]).max() < 1e-9
-    area = distance_figures(out, triangulated(quads_out)[0], *plane(), 2000)
+    area = distance_figures(TriMesh(out, triangulated(quads_out)[0]), TriMesh(*plane()), 2000)
     assert area["hausdorff"] < 0.03  # less than an edge length: the boundary is where it was
 
 
 def test_equal_input_gives_equal_quads():
     vertices, faces = sphere(24)
-    one, two = (pipeline.remesh(vertices / 2, faces, Request(quads=500)) for _ in range(2))
-    assert (one[0] == two[0]).all()
-    assert (one[1] == two[1]).all()
+    one, two = (pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=500)) for _ in range(2))
+    assert (one[0].vertices == two[0].vertices).all()
+    assert (one[0].faces == two[0].faces).all()

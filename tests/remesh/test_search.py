@@ -8,6 +8,7 @@ import pytest
 
 from gdtool.core.child import ChildFailed
 from gdtool.geometry import topology
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.topology import triangulated
 from gdtool.remesh import pipeline
@@ -26,7 +27,8 @@ from tests.remesh.engines import Ended, around, in_this_process, inner_face, who
 def test_dead_engine_is_replaced(monkeypatch, failure):
     monkeypatch.setattr(search, "begin", lambda *_, **__: Ended(ChildFailed(failure)))
     vertices, faces = torus()
-    _, quads_out, record = pipeline.remesh(vertices / 2, faces, Request(quads=900))
+    made, record = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=900))
+    quads_out = made.faces
     assert record.engine == "pair and split"
     assert any(failure in text for text in record.failed)
     assert whole(quads_out)
@@ -37,22 +39,22 @@ def test_dead_engine_is_replaced(monkeypatch, failure):
 def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypatch, outcome, runs):
     """Another density or no creases mend a seam that tore; a part that is too fine for the quads stays so."""
     vertices, faces = sphere(24)
-    out, quads_out, _ = pipeline.remesh(vertices / 2, faces, Request(quads=1000, engine="split"))
+    made, _ = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=1000, engine="split"))
+    out, quads_out = made.vertices, made.faces
 
     def engine(*_):
         if outcome == "a crash":
             raise ChildFailed("died of SIGSEGV")
-        return out / 2, quads_out
+        return QuadMesh(out / 2, quads_out)
 
     calls = in_this_process(monkeypatch, engine)
     # Drawn onto the large sphere the small one would become it.
     monkeypatch.setattr(
         candidates,
         "snap_to_features",
-        lambda vertices, faces, *_: SnappedQuads(
-            vertices,
-            faces,
-            Constraints.none(len(vertices)),
+        lambda mesh, *_: SnappedQuads(
+            mesh,
+            Constraints.none(len(mesh.vertices)),
             tips=np.zeros(0, int),
             edge=1.0,
             distance_edges=0.0,
@@ -60,7 +62,8 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
             hopeless=True,
         ),
     )
-    _, quads_out, record = pipeline.remesh(vertices / 2, faces, Request(quads=1000))
+    made, record = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=1000))
+    quads_out = made.faces
     assert len(calls) == runs
     assert record.engine == "pair and split"
     assert whole(quads_out)
@@ -75,11 +78,14 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
 def test_of_two_the_one_much_nearer_to_the_surface_comes_first_where_the_other_is_in_doubt(tops, wanted, order):
     """Balls without a cap, and whole ones."""
     vertices, faces = sphere(24, 0.4)
-    out, quads_out, _ = pipeline.remesh(vertices, faces, Request(quads=1000, engine="split"))
-    patch = RemeshPatch(vertices, faces, 1000, 0.045, Request(), None)
+    made, _ = pipeline.remesh(TriMesh(vertices, faces), Request(quads=1000, engine="split"))
+    out, quads_out = made.vertices, made.faces
+    patch = RemeshPatch(TriMesh(vertices, faces), 1000, 0.045, Request(), None)
     attempt = search.EngineAttempt("instant-meshes", 0, (1.0,), 30.0)
     pair = [
-        Candidate(attempt, 1000, None, *topology.compact(out, quads_out[out[quads_out].mean(1)[:, 2] < height]))
+        Candidate(
+            attempt, 1000, None, topology.compact(QuadMesh(out, quads_out[out[quads_out].mean(1)[:, 2] < height]))
+        )
         for height in tops
     ]
     assert [id(one) for one in search.EngineSearch(patch, Record())._nearer_first(pair, wanted)] == [
@@ -91,24 +97,25 @@ def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(mon
     """Half a ball, a tenth too few quads; a whole one lacks nothing, nor one without a cap that its tip can be drawn
     over."""
     vertices, faces = sphere(24, 0.4)
-    out, quads_out, _ = pipeline.remesh(vertices, faces, Request(quads=1000, engine="split"))
-    patch = RemeshPatch(vertices, faces, 1000, 0.045, Request(), None)
+    made, _ = pipeline.remesh(TriMesh(vertices, faces), Request(quads=1000, engine="split"))
+    out, quads_out = made.vertices, made.faces
+    patch = RemeshPatch(TriMesh(vertices, faces), 1000, 0.045, Request(), None)
     height = out[quads_out].mean(1)[:, 2]
     left = [
         Candidate(
             search.EngineAttempt("instant-meshes", 0, (1.0,), 30.0),
             1000,
             None,
-            *topology.compact(out, quads_out[height < most]),
+            topology.compact(QuadMesh(out, quads_out[height < most])),
         ).missing_surface(patch)
         for most in (1.0, 0.37, 0.0)
     ]
     assert left[:2] == [None, None]
     assert "leaves out 3" in left[2]
-    calls = in_this_process(monkeypatch, lambda *_: topology.compact(out, quads_out[height < 0.0]))
-    monkeypatch.setattr(candidates, "repair_and_judge", lambda vertices, quads_out, *_: (None, vertices, quads_out))
+    calls = in_this_process(monkeypatch, lambda *_: topology.compact(QuadMesh(out, quads_out[height < 0.0])))
+    monkeypatch.setattr(candidates, "repair_and_judge", lambda mesh, *_: candidates.JudgedQuads(None, mesh))
     monkeypatch.setattr(search.EngineSearch, "_fit_first_good", None)
-    _, _, record = pipeline.remesh(vertices, faces, Request(quads=1000))
+    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=1000))
     assert len(calls) == 1
     assert record.engine == "pair and split"
     assert "leaves out" in record.failed[0]
@@ -118,22 +125,27 @@ def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(mon
 def test_a_coarser_mesh_is_given_up_where_walls_are_thinner_than_quads(thickness, thin):
     vertices, faces = igl.upsample(*cube(), 5)
     vertices = vertices * (0.9, 0.9, thickness)
-    patch = RemeshPatch(vertices, faces, 4000, (2 * 0.81 / 4000) ** 0.5, Request(), None)
+    patch = RemeshPatch(TriMesh(vertices, faces), 4000, (2 * 0.81 / 4000) ** 0.5, Request(), None)
     assert patch.has_thin_walls == thin
     wedge = vertices.copy()
     wedge[:, 2] *= 0.01 + (wedge[:, 0] + 0.45) / 0.9 * 0.7 / thickness
-    assert not RemeshPatch(wedge, faces, 4000, 0.02, Request(), None).has_thin_walls
+    assert not RemeshPatch(TriMesh(wedge, faces), 4000, 0.02, Request(), None).has_thin_walls
     # One side of a sheet is no wall, nor is what lies outside, before it.
     assert not RemeshPatch(
-        vertices, faces[face_normals(vertices, faces)[0][:, 2] > 0.5], 2000, patch.edge, Request(), None
+        TriMesh(vertices, faces[face_normals(TriMesh(vertices, faces))[0][:, 2] > 0.5]),
+        2000,
+        patch.edge,
+        Request(),
+        None,
     ).has_thin_walls
     # A coarse mesh is not asked.
     assert not RemeshPatch(
-        cube()[0] * (0.9, 0.9, thickness), cube()[1], 4000, patch.edge, Request(), None
+        TriMesh(cube()[0] * (0.9, 0.9, thickness), cube()[1]), 4000, patch.edge, Request(), None
     ).has_thin_walls
-    assert not RemeshPatch(vertices, faces[:, ::-1], 4000, patch.edge, Request(), None).has_thin_walls
+    assert not RemeshPatch(TriMesh(vertices, faces[:, ::-1]), 4000, patch.edge, Request(), None).has_thin_walls
     # Without creases, or its narrow sides tell.
-    _, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000, crease_degrees=0.0))
+    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000, crease_degrees=0.0))
+    quads_out = made.faces
     assert whole(quads_out)
     assert any("walls" in text for text in record.failed) == thin
     assert not (thin and "1 subdivision" in record.engine)
@@ -157,13 +169,15 @@ def bored_ball():
 @pytest.mark.parametrize("shape, given_up", [("a skin-deep tunnel", True), ("a bore", False)])
 def test_a_handle_is_given_up_only_where_it_is_finer_than_a_quad(monkeypatch, shape, given_up):
     vertices, faces = sphere(96, 0.4)
-    out, quads_out, _ = pipeline.remesh(vertices, faces, Request(quads=1000, engine="split"))
+    made, _ = pipeline.remesh(TriMesh(vertices, faces), Request(quads=1000, engine="split"))
+    out, quads_out = made.vertices, made.faces
     vertices, faces = with_tunnel(vertices, faces, 0.07) if given_up else bored_ball()
     assert topology.is_watertight(faces)
     assert topology.is_manifold(faces)
     assert topology.euler_number(faces) == 0
-    in_this_process(monkeypatch, lambda *_: (out, quads_out))  # an engine that makes a ball of it
-    _, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=1000))
+    in_this_process(monkeypatch, lambda *_: QuadMesh(out, quads_out))  # an engine that makes a ball of it
+    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=1000))
+    quads_out = made.faces
     assert whole(quads_out)
     assert (record.engine == "instant-meshes, handles are lost") == given_up
     assert topology.euler_number(quads_out) == (2 if given_up else 0)
@@ -172,9 +186,10 @@ def test_a_handle_is_given_up_only_where_it_is_finer_than_a_quad(monkeypatch, sh
 def test_torn_output_is_not_believed(monkeypatch):
     # Three quads at one edge.
     book = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [1, 0, 6, 7]])
-    in_this_process(monkeypatch, lambda *_: (np.random.default_rng(0).random((8, 3)), book))
+    in_this_process(monkeypatch, lambda *_: QuadMesh(np.random.default_rng(0).random((8, 3)), book))
     vertices, faces = sphere(24)
-    _, quads_out, record = pipeline.remesh(vertices / 2, faces, Request(quads=300))
+    made, record = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=300))
+    quads_out = made.faces
     assert whole(quads_out)
     assert record.engine == "pair and split"
     assert any("pieces are lost" in text for text in record.failed)
@@ -187,7 +202,8 @@ def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
     assert len(corners) == 4
     assert len(sides) == 4
     torn = np.delete(faces, [*corners[1:], *sides], 0)
-    fault, out, quads_out = candidates.repair_and_judge(vertices, torn, topology.invariants(faces))
+    fault, mended = candidates.repair_and_judge(QuadMesh(vertices, torn), topology.invariants(faces))
+    out, quads_out = mended.vertices, mended.faces
     assert fault is None
     assert whole(quads_out)
     assert topology.components(quads_out)[0] == 1
@@ -201,47 +217,52 @@ def test_candidates_are_in_the_order_of_place(monkeypatch):
     rng = np.random.default_rng(1)
     mixed, number = rng.permutation(len(vertices)), np.empty(len(vertices), np.int64)
     number[mixed] = np.arange(len(vertices))
-    monkeypatch.setitem(candidates.ENGINES, "quadriflow", lambda *_: (vertices[mixed], rng.permutation(number[faces])))
+    monkeypatch.setitem(
+        candidates.ENGINES, "quadriflow", lambda *_: QuadMesh(vertices[mixed], rng.permutation(number[faces]))
+    )
     one = candidates.make_candidate(
-        vertices, triangulated(faces)[0], candidates.EngineAttempt("quadriflow", 0, (1.0,), 30.0), len(faces)
+        TriMesh(vertices, triangulated(faces)[0]), candidates.EngineAttempt("quadriflow", 0, (1.0,), 30.0), len(faces)
     )
     assert one.fault is None
-    assert len(one.quads) == len(faces)
+    assert len(one.mesh.faces) == len(faces)
 
     def places(v, q):
         return sorted(map(tuple, v[q].reshape(len(q), 12).tolist()))
 
-    assert places(one.vertices, one.quads) == places(vertices, faces)
-    ends = topology.edges_of(one.quads).ends
+    assert places(one.mesh.vertices, one.mesh.faces) == places(vertices, faces)
+    ends = topology.edges_of(one.mesh.faces).ends
     # A third of them, on average, where it is by chance.
     assert np.abs(np.diff(ends, axis=1)).mean() < 0.3 * len(vertices) / 3
 
 
 def test_output_without_area_is_no_quads():
     vertices, faces = quad_cube(1)
-    assert candidates.repair_and_judge(vertices, faces[:, [0, 1, 1, 0]], topology.invariants(faces))[0] == "no quads"
+    assert (
+        candidates.repair_and_judge(QuadMesh(vertices, faces[:, [0, 1, 1, 0]]), topology.invariants(faces)).fault
+        == "no quads"
+    )
 
 
 def test_quads_that_cut_edges_off_do_not_do():
     vertices, faces = quad_cube(3)
-    surface, edge = ProjectionTarget(vertices, triangulated(faces)[0]), 0.125 * np.ptp(vertices[:, 0])
-    assert rejection_reason(vertices, faces, surface, edge, 1.0, 0.005)[0] is None
+    surface, edge = ProjectionTarget(TriMesh(vertices, triangulated(faces)[0])), 0.125 * np.ptp(vertices[:, 0])
+    assert rejection_reason(QuadMesh(vertices, faces), surface, edge, 1.0, 0.005)[0] is None
     cut = vertices.copy()
     on_two = np.isclose(np.abs(vertices), np.abs(vertices).max()).sum(1) >= 2  # the cube's twelve edges
     cut[on_two] *= 1 - 0.5 * edge / np.ptp(vertices[:, 0])
-    assert rejection_reason(cut, faces, surface, edge, 1.0, 0.5)[0] is None
-    assert rejection_reason(cut, faces, surface, edge, 1.0, 0.005)[0].startswith("cuts off")
+    assert rejection_reason(QuadMesh(cut, faces), surface, edge, 1.0, 0.5)[0] is None
+    assert rejection_reason(QuadMesh(cut, faces), surface, edge, 1.0, 0.005)[0].startswith("cuts off")
 
 
 def test_surface_that_the_quads_do_without_is_measured():
     vertices, faces = cube()
     lid = faces[np.all(vertices[faces][:, :, 2] == vertices[:, 2].max(), 1)]
     rest = np.array([f for f in faces.tolist() if f not in lid.tolist()])
-    surface = ProjectionTarget(vertices, faces)
+    surface = ProjectionTarget(TriMesh(vertices, faces))
     closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, rest))
-    assert uncovered_shares(target_of_quads(vertices, closed), surface, (0.1,)) == [0]
+    assert uncovered_shares(target_of_quads(QuadMesh(vertices, closed)), surface, (0.1,)) == [0]
     # The lid but its rim.
-    assert uncovered_shares(target_of_quads(vertices, opened), surface, (0.1, 2.0)) == pytest.approx(
+    assert uncovered_shares(target_of_quads(QuadMesh(vertices, opened)), surface, (0.1, 2.0)) == pytest.approx(
         [0.8**2 / 6, 0], abs=0.02
     )
 
@@ -252,10 +273,10 @@ def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_fine
 
     engine = candidates.ENGINES["instant-meshes"]
 
-    def torn(vertices, faces, quads, degrees):
+    def torn(mesh, quads, degrees):
         if quads > 2000:
             raise ChildFailed("died of SIGSEGV")
-        return engine(vertices, faces, quads, degrees)
+        return engine(mesh, quads, degrees)
 
     calls = in_this_process(monkeypatch)
     monkeypatch.setitem(candidates.ENGINES, "instant-meshes", torn)
@@ -265,27 +286,29 @@ def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_fine
         lambda *given: ("cuts off 0.7% of the surface" if given[-1] < 0.007 else None, 0.5),
     )
     vertices, faces = sphere(96, 0.45)
-    _, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000))
+    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000))
+    quads_out = made.faces
     assert record.engine == "instant-meshes, 1 subdivision"
     assert whole(quads_out)
     assert abs(len(quads_out) / 4000 - 1) <= 0.03
     assert "cuts off" in record.failed[0]
     assert "SIGSEGV" in record.failed[1]
-    assert sum(not attempt.subdivisions for _, _, attempt, _ in calls) == 1
+    assert sum(not attempt.subdivisions for _, attempt, _ in calls) == 1
     monkeypatch.setattr(candidates, "FAR_SUBDIVIDED", 0.4)  # farther than that it is not unfolded
-    assert pipeline.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
+    assert pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000))[1].engine == "pair and split"
     monkeypatch.undo()
     in_this_process(monkeypatch)
     monkeypatch.setitem(candidates.ENGINES, "instant-meshes", torn)
     monkeypatch.setattr(candidates, "rejection_reason", lambda *given: ("cuts off 2% of the surface", 0.5))
-    assert pipeline.remesh(vertices, faces, Request(quads=4000))[2].engine == "pair and split"
+    assert pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000))[1].engine == "pair and split"
 
 
 def test_when_the_time_is_over_no_engine_is_begun():
     """What was asked for comes all the same, as paired triangles, and the record says why."""
     vertices, faces = sphere(96, 0.45)
     start = time.monotonic()
-    out, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000, seconds=0.0))
+    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000, seconds=0.0))
+    quads_out = made.faces
     assert record.engine == "pair and split"
     assert record.failed == ["instant-meshes, 1 subdivision: not tried, the time is over"]
     assert whole(quads_out)
@@ -323,8 +346,7 @@ def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypa
             attempt,
             1000,
             None,
-            np.zeros((0, 3)),
-            np.zeros((0, 4), int),
+            QuadMesh(np.zeros((0, 3)), np.zeros((0, 4), int)),
             distance_edges=far,
             min_jacobian=least,
             rejection=wrong,
@@ -338,7 +360,7 @@ def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypa
 
     monkeypatch.setattr(Candidate, "is_promising", snap_to_features)
     monkeypatch.setattr(Candidate, "fit", lambda one, patch: drawn.append(one))
-    choose = search.EngineSearch(RemeshPatch(*cube(), 1000, 0.1, Request(), None), Record())._fit_first_good
+    choose = search.EngineSearch(RemeshPatch(TriMesh(*cube()), 1000, 0.1, Request(), None), Record())._fit_first_good
     good, better, bare, thin = candidate(0.5, 0.3), candidate(0.1, 0.9), candidate(0.9, 0.5), candidate(0.3, 0.1)
     assert choose([good, better]) is good
     assert drawn == [good]
@@ -361,12 +383,18 @@ def test_the_quads_of_tips_count_before_any_are_drawn(monkeypatch):
     """What has too many quads with those of its tips is not drawn; another that has as many tips but fewer quads is,
     and only then a new one asked for."""
     attempt = search._attempts(20000, Request())[0]
-    search_run = search.EngineSearch(RemeshPatch(*cube(), 4000, 0.1, Request(), None), Record())
+    search_run = search.EngineSearch(RemeshPatch(TriMesh(*cube()), 4000, 0.1, Request(), None), Record())
 
     def candidate(count, tips, hopeless=False):
-        quads_out = Candidate(attempt, count, None, np.zeros((0, 3)), np.zeros((count // 4, 4), int))
+        quads_out = Candidate(attempt, count, None, QuadMesh(np.zeros((0, 3)), np.zeros((count // 4, 4), int)))
         quads_out.traced = SnappedQuads(
-            np.zeros((0, 3)), np.zeros((count + tips, 4), int), None, np.zeros(0, int), 0.1, 0.0, 1.0, hopeless
+            QuadMesh(np.zeros((0, 3)), np.zeros((count + tips, 4), int)),
+            None,
+            np.zeros(0, int),
+            0.1,
+            0.0,
+            1.0,
+            hopeless,
         )
         return quads_out
 
@@ -386,14 +414,17 @@ def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypat
     calls = in_this_process(monkeypatch)
     vertices, faces = cube()
     vertices = vertices * (1, 0.8, 0.02)
-    out, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=8000))
-    assert all(not attempt.subdivisions for _, _, attempt, _ in calls)
+    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=8000))
+    out, quads_out = made.vertices, made.faces
+    assert all(not attempt.subdivisions for _, attempt, _ in calls)
     assert "not tried, its quads are wider" in record.failed[0]
     assert record.engine == "instant-meshes"
     assert whole(quads_out)
     corners = vertices[np.abs(vertices[:, None] - out[None]).max(-1).min(1) < 1e-9]
     assert len(corners) == 8
-    assert uncovered_shares(target_of_quads(out, quads_out), ProjectionTarget(vertices, faces), (0.005,)) == [0.0]
+    assert uncovered_shares(
+        target_of_quads(QuadMesh(out, quads_out)), ProjectionTarget(TriMesh(vertices, faces)), (0.005,)
+    ) == [0.0]
 
 
 @pytest.mark.parametrize("given, least, most", [(16000, 2000, 2500), (500, 500, 500)])
@@ -407,7 +438,8 @@ def test_an_engine_has_a_memory_limit_of_its_own_within_the_request(monkeypatch,
 
     monkeypatch.setattr(search, "begin", begin)
     vertices, faces = sphere(48, 0.45)
-    _, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=4000, memory_mb=given))
+    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000, memory_mb=given))
+    quads_out = made.faces
     assert limits
     assert all(least <= limit <= most for limit in limits)
     assert record.engine == "pair and split"

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from gdtool.geometry.meshes import QuadMesh
 from gdtool.remesh.fit import shaping
 from gdtool.remesh.fit.feature_curves import Constraints
 from gdtool.remesh.fit.shaping import SnappedQuads
@@ -16,13 +17,12 @@ def test_tips_stay_where_folded_quads_before_them_are_taken_out(monkeypatch):
     constraints.fixed[fixed] = True
     eased = []
 
-    def without_one(vertices, faces, surface, constraints):
+    def without_one(mesh, surface, constraints):
         """A vertex becomes another, a quad is gone."""
         number = np.arange(len(vertices)) - (np.arange(len(vertices)) > gone)
         kept = np.delete(np.arange(len(vertices)), gone)
         return (
-            vertices[kept],
-            number[np.where(faces == gone, 0, faces)][1:],
+            QuadMesh(mesh.vertices[kept], number[np.where(mesh.faces == gone, 0, mesh.faces)][1:]),
             Constraints(constraints.curve[kept], constraints.fixed[kept], *held[2:]),
         )
 
@@ -30,26 +30,26 @@ def test_tips_stay_where_folded_quads_before_them_are_taken_out(monkeypatch):
     monkeypatch.setattr(
         shaping,
         "_square_twice",
-        lambda vertices, faces, surface, features, constraints, request: (vertices, constraints),
+        lambda mesh, surface, features, constraints, request: (mesh.vertices, constraints),
     )
     monkeypatch.setattr(
         shaping,
         "_untangle_and_release",
-        lambda vertices, faces, surface, features, constraints, tips: (vertices, constraints),
+        lambda mesh, surface, features, constraints, tips: (mesh.vertices, constraints),
     )
     monkeypatch.setattr(shaping, "collapse_folded_quads", without_one)
-    monkeypatch.setattr(shaping, "untangle", lambda vertices, *_: vertices)
+    monkeypatch.setattr(shaping, "untangle", lambda mesh, *_: mesh.vertices)
     monkeypatch.setattr(
         shaping,
         "release_and_smooth",
-        lambda vertices, *given, tips, **_: eased.append(vertices[tips]) or (vertices, given[3]),
+        lambda mesh, *given, tips, **_: eased.append(mesh.vertices[tips]) or (mesh.vertices, given[2]),
     )
     for jacobian in (0.1, -0.1):
         monkeypatch.setattr(
-            shaping, "scaled_jacobian", lambda vertices, faces, jacobian=jacobian: np.full(len(faces), jacobian)
+            shaping, "scaled_jacobian", lambda mesh, jacobian=jacobian: np.full(len(mesh.faces), jacobian)
         )
         shaping.fit_to_surface(
-            SnappedQuads(vertices, quads, constraints, tips, 0.1, 0.0, 1.0, False), None, None, Request()
+            SnappedQuads(QuadMesh(vertices, quads), constraints, tips, 0.1, 0.0, 1.0, False), None, None, Request()
         )
     # of the folded ones alone
     assert len(eased) == 1

@@ -4,6 +4,7 @@ import numpy as np
 
 from gdtool.geometry import topology
 from gdtool.geometry.mesh_quality import scaled_jacobian
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.remesh import pipeline
 from gdtool.remesh.spacing import separate_pieces
 from gdtool.remesh.task import Request
@@ -23,33 +24,34 @@ def test_pieces_are_laid_apart_and_brought_back():
         ((0.1, 0.1, 0.1), (0, 0, 0)),
         ((0.9, 0.05, 0.05), (0, 0, 0.4)),
     )
-    quads_out = separate_pieces(vertices, faces, 0.1)
+    apart = separate_pieces(TriMesh(vertices, faces), 0.1)
     _, piece = topology.components(faces)
     boxes_of = [
-        (quads_out.vertices[faces[piece == k]].min((0, 1)), quads_out.vertices[faces[piece == k]].max((0, 1)))
+        (apart.mesh.vertices[faces[piece == k]].min((0, 1)), apart.mesh.vertices[faces[piece == k]].max((0, 1)))
         for k in range(4)
     ]
     for i, (low, high) in enumerate(boxes_of):
         for other_low, other_high in boxes_of[:i]:
             assert (np.maximum(low - other_high, other_low - high)).max() >= 0.1 - 1e-9
-    assert np.abs(quads_out.to_original(quads_out.vertices) - vertices).max() < 1e-12
-    middle = quads_out.vertices[faces].mean(1)
-    assert np.abs(quads_out.to_original(middle) - vertices[faces].mean(1)).max() < 1e-12
+    assert np.abs(apart.to_original(apart.mesh.vertices) - vertices).max() < 1e-12
+    middle = apart.mesh.vertices[faces].mean(1)
+    assert np.abs(apart.to_original(middle) - vertices[faces].mean(1)).max() < 1e-12
 
 
 def test_what_is_one_piece_or_apart_as_it_is_stays():
-    assert separate_pieces(*cube(), 0.1) is None
-    assert separate_pieces(*boxes((0.3, (0, 0, 0)), (0.3, (0, 0.5, 0))), 0.1) is None
-    assert separate_pieces(*boxes((0.3, (0, 0, 0)), (0.3, (0, 0.5, 0))), 0.25) is not None
+    assert separate_pieces(TriMesh(*cube()), 0.1) is None
+    assert separate_pieces(TriMesh(*boxes((0.3, (0, 0, 0)), (0.3, (0, 0.5, 0)))), 0.1) is None
+    assert separate_pieces(TriMesh(*boxes((0.3, (0, 0, 0)), (0.3, (0, 0.5, 0)))), 0.25) is not None
 
 
 def test_quads_of_one_piece_are_not_drawn_onto_another():
     """Two balls, one in the other, a tenth of a quad apart: each keeps its radius. Not laid apart both come to lie
     between the two."""
     vertices, faces = joined(sphere(48, 0.4), sphere(48, 0.397))
-    out, quads_out, record = pipeline.remesh(vertices, faces, Request(quads=3000))
+    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=3000))
+    out, quads_out = made.vertices, made.faces
     assert "instant-meshes" in record.engine
-    assert scaled_jacobian(out, quads_out).min() > 0.2
+    assert scaled_jacobian(QuadMesh(out, quads_out)).min() > 0.2
     assert topology.is_watertight(quads_out)
     count, piece = topology.components(quads_out)
     assert count == 2

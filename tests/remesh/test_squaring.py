@@ -5,6 +5,7 @@ import pytest
 
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.mesh_quality import scaled_jacobian
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.topology import triangulated
 from gdtool.remesh.fit.feature_curves import Constraints, Features, release_straight_corners
 from gdtool.remesh.fit.squaring import ReleaseOptions, balance_heights, release_and_smooth, square_up
@@ -25,9 +26,11 @@ def test_folded_quads_are_turned_over_again_and_stay_on_the_surface():
     vertices, quads = grid()
     bent = vertices.copy()
     bent[40] += [0.19, 0.17, 0]  # past its neighbour
-    assert scaled_jacobian(bent, quads).min() < 0
-    out = square_up(bent, quads, ProjectionTarget(*plane()), NO_FEATURES, Constraints.none(len(vertices)), 20)
-    assert scaled_jacobian(out, quads).min() > 0.8
+    assert scaled_jacobian(QuadMesh(bent, quads)).min() < 0
+    out = square_up(
+        QuadMesh(bent, quads), ProjectionTarget(TriMesh(*plane())), NO_FEATURES, Constraints.none(len(vertices)), 20
+    )
+    assert scaled_jacobian(QuadMesh(out, quads)).min() > 0.8
     assert np.abs(out[:, 2]).max() < 1e-12
     rim = np.abs(vertices[:, :2]).max(1) > 0.49
     assert np.array_equal(out[rim], vertices[rim])
@@ -40,7 +43,7 @@ def test_middle_of_three_corners_in_a_row_is_let_off_its_curve():
     curve[[39, 40, 49]] = 0
     fixed = np.zeros(len(vertices), bool)
     fixed[[38, 50]] = True
-    found = release_straight_corners(vertices, quads, Constraints(curve, fixed, path, np.zeros(4, np.int64)))
+    found = release_straight_corners(QuadMesh(vertices, quads), Constraints(curve, fixed, path, np.zeros(4, np.int64)))
     assert found.curve[40] == -1
     assert found.curve[49] == -1
     assert found.curve[39] == 0
@@ -48,7 +51,12 @@ def test_middle_of_three_corners_in_a_row_is_let_off_its_curve():
     assert found.fixed[[38, 50]].all()
     fixed[[40, 49]] = True  # true corners of the surface, square here: they stay
     assert (
-        len(release_straight_corners(vertices, quads, Constraints(curve, fixed, path, np.zeros(4, np.int64))).path) == 4
+        len(
+            release_straight_corners(
+                QuadMesh(vertices, quads), Constraints(curve, fixed, path, np.zeros(4, np.int64))
+            ).path
+        )
+        == 4
     )
 
 
@@ -59,8 +67,8 @@ def test_a_corner_pinned_in_the_wrong_place_is_eased():
     fixed = np.zeros(len(vertices), bool)
     fixed[40] = True
     pinned = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
-    out, left = release_and_smooth(bent, quads, ProjectionTarget(*plane()), NO_FEATURES, pinned)
-    assert scaled_jacobian(out, quads).min() >= 0.2
+    out, left = release_and_smooth(QuadMesh(bent, quads), ProjectionTarget(TriMesh(*plane())), NO_FEATURES, pinned)
+    assert scaled_jacobian(QuadMesh(out, quads)).min() >= 0.2
     assert not left.fixed[40]
 
 
@@ -71,22 +79,22 @@ def test_a_tip_beside_folded_quads_stays_where_easing_would_draw_it_back(height,
     tip = 40
     vertices[tip, 2] = height
     triangles = triangulated(quads)[0]
-    surface, held = ProjectionTarget(vertices, triangles.astype(np.int64)), Constraints.none(len(vertices))
+    surface, held = ProjectionTarget(TriMesh(vertices, triangles.astype(np.int64))), Constraints.none(len(vertices))
     held.fixed[tip] = True
     bent = vertices.copy()
     bent[moved] += by
     bent = surface.closest(bent)[2]
-    assert scaled_jacobian(bent, quads).min() < 0
+    assert scaled_jacobian(QuadMesh(bent, quads)).min() < 0
 
     def bare(out):
-        return closest_points(vertices[[tip]], out, triangles)[0][0] * 8  # edges are 1/8 long
+        return closest_points(vertices[[tip]], TriMesh(out, triangles))[0][0] * 8  # edges are 1/8 long
 
-    out, left = release_and_smooth(bent, quads, surface, NO_FEATURES, held)
-    assert scaled_jacobian(out, quads).min() > 0.5
+    out, left = release_and_smooth(QuadMesh(bent, quads), surface, NO_FEATURES, held)
+    assert scaled_jacobian(QuadMesh(out, quads)).min() > 0.5
     assert bare(out) < 1e-9
     assert left.fixed[tip]
     out, left = release_and_smooth(
-        bent, quads, surface, NO_FEATURES, held, options=ReleaseOptions(max_uncovered_edges=2.0)
+        QuadMesh(bent, quads), surface, NO_FEATURES, held, options=ReleaseOptions(max_uncovered_edges=2.0)
     )
     assert 0.75 < bare(out) < 2
     assert not left.fixed[tip]
@@ -99,9 +107,12 @@ def test_easing_folds_nothing_that_was_not_folded():
         fixed = rng.random(len(vertices)) < 0.2
         pinned = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
         bent = vertices + rng.normal(0, 0.06, vertices.shape) * (1, 1, 0)
-        before = scaled_jacobian(bent, quads)
+        before = scaled_jacobian(QuadMesh(bent, quads))
         after = scaled_jacobian(
-            release_and_smooth(bent, quads, ProjectionTarget(*plane()), NO_FEATURES, pinned)[0], quads
+            QuadMesh(
+                release_and_smooth(QuadMesh(bent, quads), ProjectionTarget(TriMesh(*plane())), NO_FEATURES, pinned)[0],
+                quads,
+            )
         )
         assert (after <= 0).sum() <= (before <= 0).sum()
 
@@ -112,12 +123,12 @@ def test_balancing_lifts_quads_to_the_surface_but_leaves_thin_ones():
     vertices = vertices * 0.3
     thin = quads[[10, 30, 50]]
     vertices[thin[:, 0]] = 0.55 * vertices[thin[:, 1]] + 0.45 * vertices[thin[:, 3]]
-    ball = ProjectionTarget(*sphere(48, 0.8))
+    ball = ProjectionTarget(TriMesh(*sphere(48, 0.8)))
     vertices[:, 2] = np.sqrt(0.8**2 - (vertices[:, :2] ** 2).sum(1))
     vertices = ball.closest(vertices)[2]
-    before = scaled_jacobian(vertices, quads)
-    out = balance_heights(vertices, quads, ball, Constraints.none(len(vertices)))
-    after = scaled_jacobian(out, quads)
+    before = scaled_jacobian(QuadMesh(vertices, quads))
+    out = balance_heights(QuadMesh(vertices, quads), ball, Constraints.none(len(vertices)))
+    after = scaled_jacobian(QuadMesh(out, quads))
     assert (before < 0.3).any()
     assert (after[before < 0.3] >= before[before < 0.3] - 1e-12).all()
     centre = np.abs(ball.closest(out[quads].mean(1))[0]).mean(), np.abs(ball.closest(vertices[quads].mean(1))[0]).mean()

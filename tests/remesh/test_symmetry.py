@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.geometry import topology
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.normals import face_normals
 from gdtool.remesh.symmetry import half_mesh, join_with_mirror, mirror_plane
 from tests.geometry.solids import cube, sphere, torus
@@ -13,9 +14,10 @@ from tests.geometry.solids import cube, sphere, torus
 def test_half_has_half_the_area_and_ends_at_the_plane(axis):
     vertices, faces = torus(31)
     vertices = vertices + 0.003 * (np.arange(3) == axis)  # the plane cuts through faces
-    half_vertices, half = half_mesh(vertices, faces, axis)
-    whole = face_normals(vertices, faces)[1].sum()
-    assert face_normals(half_vertices, half)[1].sum() == pytest.approx(whole / 2, rel=0.02)
+    made = half_mesh(TriMesh(vertices, faces), axis)
+    half_vertices, half = made.vertices, made.faces
+    whole = face_normals(TriMesh(vertices, faces))[1].sum()
+    assert face_normals(TriMesh(half_vertices, half))[1].sum() == pytest.approx(whole / 2, rel=0.02)
     edges = topology.edges_of(half)
     rim = np.unique(edges.ends[edges.count == 1])
     assert topology.is_manifold(half)
@@ -27,16 +29,16 @@ def test_half_has_half_the_area_and_ends_at_the_plane(axis):
 
 def test_mirror_planes_are_found_and_missed():
     vertices, faces = sphere(24, 0.45)
-    assert mirror_plane(vertices, faces, 2000)[0] is not None
+    assert mirror_plane(TriMesh(vertices, faces), 2000)[0] is not None
     vertices = np.where(vertices > 0.3, 0.3 + 0.5 * (vertices - 0.3), vertices)  # three sides flattened
-    axis, apart = mirror_plane(vertices, faces, 2000)
+    axis, apart = mirror_plane(TriMesh(vertices, faces), 2000)
     assert axis is None
     assert min(apart.values()) > 0.01
     vertices[:, 1] = np.where(np.abs(vertices[:, 1]) > 0.3, np.sign(vertices[:, 1]) * 0.3, vertices[:, 1])
-    axis, apart = mirror_plane(vertices, faces, 2000)
+    axis, apart = mirror_plane(TriMesh(vertices, faces), 2000)
     assert axis == 1
     assert apart["y"] < 1e-3 < apart["x"]
-    assert list(mirror_plane(vertices, faces, 2000, "x")[1]) == ["x"]
+    assert list(mirror_plane(TriMesh(vertices, faces), 2000, "x")[1]) == ["x"]
 
 
 def test_halves_of_a_box_close():
@@ -45,7 +47,8 @@ def test_halves_of_a_box_close():
     side = (vertices[quads][..., 0] < 0).all(1)
     half = vertices.copy()
     half[:, 0] = np.where(half[:, 0] < 0, 0.02, half[:, 0])  # the open end near the plane
-    out, quads_out = join_with_mirror(half, quads[~side], 0, 0.5)
+    made = join_with_mirror(QuadMesh(half, quads[~side]), 0, 0.5)
+    out, quads_out = made.vertices, made.faces
     assert len(quads_out) == 10
     assert topology.is_watertight(quads_out)
     assert np.ptp(out[:, 0]) == pytest.approx(1)

@@ -5,6 +5,7 @@ import pytest
 
 from gdtool.geometry import topology
 from gdtool.geometry.mesh_quality import distance_figures, scaled_jacobian
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.topology import triangulated
 from gdtool.remesh import pipeline
@@ -12,7 +13,7 @@ from gdtool.remesh.fit import shaping
 from gdtool.remesh.fit.feature_curves import Constraints
 from gdtool.remesh.fit.shaping import max_distance, target_of_quads
 from gdtool.remesh.fit.surface_projection import ProjectionTarget
-from gdtool.remesh.fit.tip_extrusion import extrude_tips
+from gdtool.remesh.fit.tip_extrusion import ExtrudedQuads, extrude_tips
 from gdtool.remesh.task import Request
 from tests.geometry.solids import quad_cube, sphere
 from tests.remesh.engines import in_this_process
@@ -40,12 +41,13 @@ def ball(rounds=4):
 @pytest.mark.parametrize("length, bend", [(0.08, 0.0), (0.25, 0.0), (0.25, 0.15)])
 def test_a_horn_is_drawn_out(length, bend):
     vertices, faces, edge = ball()
-    surface = ProjectionTarget(*horned(length, bend=bend))
-    assert max_distance(target_of_quads(vertices, faces), surface) > 1.4 * edge
-    out, quads_out, constraints, tips, _, _ = extrude_tips(
-        vertices, faces, Constraints.none(len(vertices)), surface, edge, max_added=0.3
+    surface = ProjectionTarget(TriMesh(*horned(length, bend=bend)))
+    assert max_distance(target_of_quads(QuadMesh(vertices, faces)), surface) > 1.4 * edge
+    made, constraints, tips, _, _ = extrude_tips(
+        QuadMesh(vertices, faces), Constraints.none(len(vertices)), surface, edge, max_added=0.3
     )
-    assert max_distance(target_of_quads(out, quads_out), surface) < 0.8 * edge
+    out, quads_out = made.vertices, made.faces
+    assert max_distance(target_of_quads(QuadMesh(out, quads_out)), surface) < 0.8 * edge
     assert topology.is_watertight(quads_out)
     assert topology.is_manifold(quads_out)
     assert topology.euler_number(quads_out) == 2
@@ -64,15 +66,20 @@ def test_a_horn_is_drawn_out(length, bend):
 def test_no_more_quads_than_allowed_are_spent():
     vertices, faces, edge = ball()
     quads_out = extrude_tips(
-        vertices, faces, Constraints.none(len(vertices)), ProjectionTarget(*horned(0.25)), edge, max_added=0.01
-    )[1]
+        QuadMesh(vertices, faces),
+        Constraints.none(len(vertices)),
+        ProjectionTarget(TriMesh(*horned(0.25))),
+        edge,
+        max_added=0.01,
+    ).mesh.faces
     assert 0 < len(quads_out) - len(faces) < 0.01 * len(faces) + 40  # those of the step that went over it
 
 
 def test_what_is_near_enough_is_left_alone():
     vertices, faces, edge = ball()
-    surface = ProjectionTarget(*horned(0.4 * edge))
-    out, quads_out, _, tips, far, _ = extrude_tips(vertices, faces, Constraints.none(len(vertices)), surface, edge)
+    surface = ProjectionTarget(TriMesh(*horned(0.4 * edge)))
+    made, _, tips, far, _ = extrude_tips(QuadMesh(vertices, faces), Constraints.none(len(vertices)), surface, edge)
+    out, quads_out = made.vertices, made.faces
     assert out is vertices
     assert quads_out is faces
     assert not len(tips)
@@ -86,13 +93,13 @@ def test_what_is_bare_is_told_by_area_and_not_by_how_many_vertices_are_there():
     fine, triangles = sphere(160, 0.4)
     narrow = fine[:, 0] > 0.39
     fine = np.where(narrow[:, None], fine * (1 + 0.4 * edge / 0.4), fine)  # lifted by less than what makes a tip
-    many = ProjectionTarget(*_cut_in_four(fine, triangles, narrow[triangles].all(1), 3))
+    many = ProjectionTarget(TriMesh(*_cut_in_four(fine, triangles, narrow[triangles].all(1), 3)))
     assert (many.vertices[:, 0] > 0.39).mean() > 0.5
-    far, away = extrude_tips(vertices, faces, Constraints.none(len(vertices)), many, edge)[4:]
-    share = face_normals(many.vertices, many.faces)[1] * (many.vertices[many.faces].mean(1)[:, 0] > 0.39)
+    far, away = extrude_tips(QuadMesh(vertices, faces), Constraints.none(len(vertices)), many, edge)[3:]
+    share = face_normals(TriMesh(many.vertices, many.faces))[1] * (many.vertices[many.faces].mean(1)[:, 0] > 0.39)
     assert far == pytest.approx(0.4 * edge, rel=0.2)
     assert (away > 0.25 * edge).mean() == pytest.approx(
-        share.sum() / face_normals(many.vertices, many.faces)[1].sum(), abs=0.01
+        share.sum() / face_normals(TriMesh(many.vertices, many.faces))[1].sum(), abs=0.01
     )
 
 
@@ -112,13 +119,14 @@ def _cut_in_four(vertices, faces, which, rounds):
 
 def test_one_vertex_reaches_a_tip_that_is_less_than_an_edge_away():
     vertices, faces, edge = ball()
-    surface = ProjectionTarget(*horned(0.9 * edge))
-    assert 0.6 * edge < max_distance(target_of_quads(vertices, faces), surface) < edge
-    out, quads_out, constraints, tips, _, _ = extrude_tips(
-        vertices, faces, Constraints.none(len(vertices)), surface, edge
+    surface = ProjectionTarget(TriMesh(*horned(0.9 * edge)))
+    assert 0.6 * edge < max_distance(target_of_quads(QuadMesh(vertices, faces)), surface) < edge
+    made, constraints, tips, _, _ = extrude_tips(
+        QuadMesh(vertices, faces), Constraints.none(len(vertices)), surface, edge
     )
+    out, quads_out = made.vertices, made.faces
     assert quads_out is faces
-    assert max_distance(target_of_quads(out, faces), surface) < 0.4 * edge
+    assert max_distance(target_of_quads(QuadMesh(out, faces)), surface) < 0.4 * edge
     assert len(tips) == 1
     assert constraints.fixed[tips].all()
     assert (out == vertices).all(1).sum() == len(vertices) - 1
@@ -133,7 +141,10 @@ def test_paths_along_creases_end_where_a_tip_is_drawn_out():
     curve = np.full(len(vertices), -1)
     curve[around] = 0
     held = Constraints(curve, np.zeros(len(vertices), bool), path, np.zeros(len(path), int))
-    _, quads_out, constraints, tips, _, _ = extrude_tips(vertices, faces, held, ProjectionTarget(*horned(0.2)), edge)
+    made, constraints, tips, _, _ = extrude_tips(
+        QuadMesh(vertices, faces), held, ProjectionTarget(TriMesh(*horned(0.2))), edge
+    )
+    quads_out = made.faces
     edges = set(map(tuple, topology.edges_of(quads_out).ends.tolist()))
     assert 0.8 * len(path) < len(constraints.path) < len(path)
     assert all(tuple(sorted(ends)) in edges for ends in constraints.path.tolist())
@@ -144,18 +155,19 @@ def test_an_engine_that_cuts_a_horn_short_is_still_taken(monkeypatch):
     vertices, faces = horned(0.35, 0.04)
     asked = Request(quads=2000)
     edge = (4 * np.pi * 0.4**2 / 2000) ** 0.5
-    out, quads_out, record = pipeline.remesh(vertices, faces, asked)
-    figures = distance_figures(out, triangulated(quads_out)[0], vertices, faces, 20000)
+    made, record = pipeline.remesh(TriMesh(vertices, faces), asked)
+    out, quads_out = made.vertices, made.faces
+    figures = distance_figures(TriMesh(out, triangulated(quads_out)[0]), TriMesh(vertices, faces), 20000)
     assert "instant-meshes" in record.engine
     assert abs(len(quads_out) / 2000 - 1) <= 0.03
     assert topology.is_watertight(quads_out)
     assert figures["hausdorff"] < 2 * edge
-    assert (scaled_jacobian(out, quads_out) <= 0).mean() < 0.003
+    assert (scaled_jacobian(QuadMesh(out, quads_out)) <= 0).mean() < 0.003
     in_this_process(monkeypatch)
     monkeypatch.setattr(
-        shaping, "extrude_tips", lambda v, f, constraints, *_: (v, f, constraints, None, 0.0, np.zeros(1))
+        shaping, "extrude_tips", lambda mesh, constraints, *_: ExtrudedQuads(mesh, constraints, None, 0.0, np.zeros(1))
     )
-    assert pipeline.remesh(vertices, faces, asked)[2].engine == "pair and split"
+    assert pipeline.remesh(TriMesh(vertices, faces), asked)[1].engine == "pair and split"
 
 
 def test_what_is_held_on_a_blunt_tip_leaves_room_for_quads():
@@ -165,9 +177,14 @@ def test_what_is_held_on_a_blunt_tip_leaves_room_for_quads():
     # A ridge some edges wide and a tenth of that thick: all vertices of its cap are drawn about as far.
     blunt = (fine[:, 0] > 0) & (abs(fine[:, 1]) < 2.2 * edge) & (abs(fine[:, 2]) < 0.4 * edge)
     fine[blunt, 0] += 1.4 * edge
-    out, _, _, tips, _, _ = extrude_tips(
-        vertices, faces, Constraints.none(len(vertices)), ProjectionTarget(fine, triangles), edge, max_added=0.3
+    made, _, tips, _, _ = extrude_tips(
+        QuadMesh(vertices, faces),
+        Constraints.none(len(vertices)),
+        ProjectionTarget(TriMesh(fine, triangles)),
+        edge,
+        max_added=0.3,
     )
+    out = made.vertices
     apart = np.linalg.norm(out[tips][:, None] - out[tips], axis=-1)[np.triu_indices(len(tips), 1)]
     assert len(tips) > 2
     assert apart.min() > 0.7 * edge

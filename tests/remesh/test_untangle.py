@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.geometry.mesh_quality import scaled_jacobian
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.remesh.fit.feature_curves import Constraints, find_features
 from gdtool.remesh.fit.surface_projection import ProjectionTarget, faces_around_vertices
 from gdtool.remesh.fit.untangle import _independent_batches, untangle
@@ -28,17 +29,16 @@ def folded(n, step=0.25):
 
 def test_many_folds_are_mended_at_once_and_the_rest_stays():
     vertices, faces, pulled = folded(12)
-    assert (scaled_jacobian(vertices, faces) <= 0).sum() >= len(pulled)
+    assert (scaled_jacobian(QuadMesh(vertices, faces)) <= 0).sum() >= len(pulled)
     out = untangle(
-        vertices,
-        faces,
-        ProjectionTarget(*plane()),
-        find_features(*plane(), 181.0, 1.0),
+        QuadMesh(vertices, faces),
+        ProjectionTarget(TriMesh(*plane())),
+        find_features(TriMesh(*plane()), 181.0, 1.0),
         Constraints.none(len(vertices)),
     )
-    assert scaled_jacobian(out, faces).min() > 0.2
+    assert scaled_jacobian(QuadMesh(out, faces)).min() > 0.2
     assert np.abs(out[:, 2]).max() < 1e-12
-    touched = np.unique(faces[scaled_jacobian(vertices, faces) < 0.3])
+    touched = np.unique(faces[scaled_jacobian(QuadMesh(vertices, faces)) < 0.3])
     around = np.unique(faces[np.isin(faces, touched).any(1)])
     still = np.setdiff1d(np.arange(len(vertices)), around)
     assert len(still)
@@ -50,16 +50,18 @@ def test_what_is_fixed_leaves_its_place_in_the_last_rounds_only():
     fixed = np.zeros(len(vertices), bool)
     fixed[pulled] = True
     held = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
-    surface, features = ProjectionTarget(*plane()), find_features(*plane(), 181.0, 1.0)
-    kept = untangle(vertices, faces, surface, features, held, max_visits=10)  # no visit is left for the last rounds
+    surface, features = ProjectionTarget(TriMesh(*plane())), find_features(TriMesh(*plane()), 181.0, 1.0)
+    kept = untangle(
+        QuadMesh(vertices, faces), surface, features, held, max_visits=10
+    )  # no visit is left for the last rounds
     assert np.array_equal(kept[pulled], vertices[pulled])
-    out = untangle(vertices, faces, surface, features, held)
-    assert scaled_jacobian(out, faces).min() > scaled_jacobian(vertices, faces).min()
+    out = untangle(QuadMesh(vertices, faces), surface, features, held)
+    assert scaled_jacobian(QuadMesh(out, faces)).min() > scaled_jacobian(QuadMesh(vertices, faces)).min()
 
 
 def test_vertices_on_a_crease_slide_along_it():
     vertices, faces = quad_cube(2)
-    surface, features = ProjectionTarget(*cube()), find_features(*cube(), 30.0, 0.1)
+    surface, features = ProjectionTarget(TriMesh(*cube())), find_features(TriMesh(*cube()), 30.0, 0.1)
     top, front = np.isclose(vertices[:, 1], vertices[:, 1].max()), np.isclose(vertices[:, 2], vertices[:, 2].max())
     on = np.flatnonzero(top & front)
     on = on[np.argsort(vertices[on, 0])]
@@ -69,15 +71,14 @@ def test_vertices_on_a_crease_slide_along_it():
     held[on[1:-1]] = curve
     moved = vertices.copy()
     moved[on[1], 0] = vertices[on[2], 0] + 0.3 * (vertices[on[3], 0] - vertices[on[2], 0])  # past the next one
-    assert scaled_jacobian(moved, faces).min() <= 0
+    assert scaled_jacobian(QuadMesh(moved, faces)).min() <= 0
     out = untangle(
-        moved,
-        faces,
+        QuadMesh(moved, faces),
         surface,
         features,
         Constraints(held, np.zeros(len(vertices), bool), np.zeros((0, 2), np.int64), np.zeros(0, np.int64)),
     )
-    assert scaled_jacobian(out, faces).min() > 0.2
+    assert scaled_jacobian(QuadMesh(out, faces)).min() > 0.2
     assert np.abs(out[on, 1:] - vertices[on, 1:]).max() < 1e-9
 
 
@@ -94,11 +95,15 @@ def test_vertices_of_a_batch_move_as_each_would_alone(monkeypatch):
     """Whatever number of faces and neighbours the others have: folds beside the rim, in corners and within."""
     vertices, faces, _ = folded(9)
     vertices[[12, 38, 56], 1] += 0.2
-    how = faces, ProjectionTarget(*plane()), find_features(*plane(), 181.0, 1.0), Constraints.none(len(vertices))
-    together, whole = untangle(vertices, *how), _independent_batches
+    how = (
+        ProjectionTarget(TriMesh(*plane())),
+        find_features(TriMesh(*plane()), 181.0, 1.0),
+        Constraints.none(len(vertices)),
+    )
+    together, whole = untangle(QuadMesh(vertices, faces), *how), _independent_batches
     monkeypatch.setattr(
         "gdtool.remesh.fit.untangle._independent_batches",
         lambda *given: [batch[k : k + 1] for batch in whole(*given) for k in range(len(batch))],
     )
-    np.testing.assert_array_equal(untangle(vertices, *how), together)
+    np.testing.assert_array_equal(untangle(QuadMesh(vertices, faces), *how), together)
     assert (together != vertices).any(1).sum() > 10

@@ -14,6 +14,7 @@ import gdtool.shading.render.render as render
 from gdtool.assets.scene import Scene, Texture
 from gdtool.cameras import rig
 from gdtool.geometry import rays
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.rays import is_convex
 from gdtool.shading.bsdf.reflection import PointReflection
 from gdtool.shading.lights.prefilter import ROUGHNESS_LEVELS
@@ -26,21 +27,21 @@ from tests.shading.test_render import GREY, four_colors, quad, sphere
 
 @pytest.mark.parametrize("most", [0, 10**18], ids=["by the hull", "by pairs"])
 def test_convex_is_what_lies_on_its_hull(most, monkeypatch):
-    monkeypatch.setattr(rays, "_MOST_BY_PAIRS", most)
+    monkeypatch.setattr(rays, "_MAX_PAIRS", most)
     ball = sphere(rings=24)
     turned = ball.vertices @ np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    assert is_convex(ball.vertices, ball.faces)
-    assert is_convex(turned * [1, 2, 3], ball.faces)
-    assert is_convex(ball.vertices, ball.faces[:, ::-1])
+    assert is_convex(TriMesh(ball.vertices, ball.faces))
+    assert is_convex(TriMesh(turned * [1, 2, 3], ball.faces))
+    assert is_convex(TriMesh(ball.vertices, ball.faces[:, ::-1]))
     # Open; in a plane.
-    assert is_convex(ball.vertices, ball.faces[:500])
-    assert is_convex(ball.vertices * [1, 0, 1], ball.faces[:60])
+    assert is_convex(TriMesh(ball.vertices, ball.faces[:500]))
+    assert is_convex(TriMesh(ball.vertices * [1, 0, 1], ball.faces[:60]))
     for corner in (0, 300, 1199):
         dented = ball.vertices.copy()
         dented[corner] *= 0.98
-        assert not is_convex(dented, ball.faces)
+        assert not is_convex(TriMesh(dented, ball.faces))
     two = np.concatenate([ball.vertices, ball.vertices * 0.5])
-    assert not is_convex(two, np.concatenate([ball.faces, ball.faces + len(ball.vertices)]))
+    assert not is_convex(TriMesh(two, np.concatenate([ball.faces, ball.faces + len(ball.vertices)])))
 
 
 def test_convex_objects_need_no_shadow_rays(monkeypatch):
@@ -48,11 +49,11 @@ def test_convex_objects_need_no_shadow_rays(monkeypatch):
     monkeypatch.setattr(direct, "ROULETTE_SHARE", 0.0)
     vertices, faces = cube()
     ball = sphere(rings=12)
-    assert is_convex(vertices, faces)
-    assert is_convex(ball.vertices, ball.faces)
+    assert is_convex(TriMesh(vertices, faces))
+    assert is_convex(TriMesh(ball.vertices, ball.faces))
     dented = np.array(vertices, float)
     dented[0] *= 0.2
-    assert not is_convex(dented, faces)
+    assert not is_convex(TriMesh(dented, faces))
     pictures = []
     for skip in (True, False):
         renderer = Renderer(ball)

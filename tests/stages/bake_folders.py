@@ -13,9 +13,10 @@ from gdtool.core.kinds import AtlasContent
 from gdtool.core.manifest import MANIFEST, InputEntry, Manifest, encode, list_files
 from gdtool.core.sources import digest
 from gdtool.core.stage import Output
-from gdtool.folders.mesh import QuadMesh, write_mesh
+from gdtool.folders.mesh import write_mesh
 from gdtool.folders.surface import Surface, write_surface
 from gdtool.folders.views import Views, write_views
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.rays import RayCaster
 from tests.bake.shapes import albedo_of, torus, triangles_of, unwrapped
 
@@ -48,7 +49,7 @@ def torus_views(size: int = 96) -> Views:
     """Six true views of the torus: albedo, roughness, metallic, normal."""
     vertices, quads, normals = torus(160, 90)
     faces = triangles_of(quads)
-    caster = RayCaster(vertices, faces)
+    caster = RayCaster(TriMesh(vertices, faces))
     cameras = rig("six", size)
     stacks: dict[str, list] = {"albedo": [], "roughness": [], "metallic": [], "normal": []}
     masks = []

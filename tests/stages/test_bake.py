@@ -8,8 +8,9 @@ import pytest
 
 from gdtool.cameras import rig
 from gdtool.core.folder import open_folder
-from gdtool.folders.mesh import QuadMesh, write_obj
+from gdtool.folders.mesh import write_obj
 from gdtool.folders.views import Views, write_views
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.images.io import read_image, write_png
 from tests.bake.shapes import psnr
 from tests.stages.bake_folders import finish, fresh, make_chain, torus_atlas, torus_views, write_atlas
@@ -32,7 +33,7 @@ def rendered_albedo(asset: Path, views: Views | None = None, facing: float = 0.0
     from gdtool.shading.render.surface_points import SurfaceLookup
 
     scene, views = load_scene(asset / "asset.glb"), views or torus_views()
-    lookup, caster = SurfaceLookup(scene), RayCaster(scene.vertices, scene.faces)
+    lookup, caster = SurfaceLookup(scene), RayCaster(TriMesh(scene.vertices, scene.faces))
     ours, theirs = [], []
     for k, camera in enumerate(views.cameras):
         origins, directions = rays(camera)

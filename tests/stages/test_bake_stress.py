@@ -10,7 +10,8 @@ import pytest
 from gdtool.assets.gltf.write import write_glb
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.core.folder import open_folder
-from gdtool.folders.mesh import QuadMesh, write_obj
+from gdtool.folders.mesh import write_obj
+from gdtool.geometry.meshes import QuadMesh
 from gdtool.images.io import read_image
 
 FAST = ("--size", 64, "--ao-rays", 4)

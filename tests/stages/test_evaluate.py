@@ -13,9 +13,10 @@ from gdtool.core.errors import InputError, UsageError
 from gdtool.core.folder import open_folder
 from gdtool.core.kinds import MeshContent, RendersContent
 from gdtool.core.manifest import MANIFEST, InputEntry, encode, read_manifest
-from gdtool.folders.mesh import QuadMesh, write_mesh
+from gdtool.folders.mesh import write_mesh
 from gdtool.folders.surface import Surface, write_surface
 from gdtool.folders.views import Views, read_views, write_views
+from gdtool.geometry.meshes import QuadMesh
 from gdtool.images.io import write_png
 from gdtool.stages import evaluate
 from tests.stages.bake_folders import finish, fresh

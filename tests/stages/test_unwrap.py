@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from gdtool.core.folder import open_folder
-from gdtool.folders.mesh import QuadMesh, read_mesh, write_obj
+from gdtool.folders.mesh import read_mesh, write_obj
+from gdtool.geometry.meshes import QuadMesh
 from tests.bake.shapes import torus
 
 

@@ -20,6 +20,7 @@ from gdtool.folders.surface import read_surface
 from gdtool.folders.views import Views
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import components, signed_volume
+from gdtool.geometry.meshes import TriMesh
 from tests.fields.shapes import cube, sphere, torus, two_balls, views_folder, views_of
 
 SIZE = 48
@@ -54,7 +55,7 @@ def check_whole(shape, reach=0.75):
     assert np.isfinite(shape.vertices).all()
     assert np.abs(shape.vertices).max() < reach
     assert is_closed_manifold(shape.faces)
-    assert signed_volume(shape.vertices, shape.faces) > 0
+    assert signed_volume(TriMesh(shape.vertices, shape.faces)) > 0
 
 
 def picked(views, keep):
@@ -77,7 +78,7 @@ def test_awkward_solids(seen, name, pieces):
 def test_symmetric_solids_stay_symmetric(seen, name):
     """The rig is its own mirror image, left and right."""
     shape = reconstruct(*seen[name])
-    apart = closest_points(shape.vertices[::10] * [-1, 1, 1], shape.vertices, shape.faces)[0]
+    apart = closest_points(shape.vertices[::10] * [-1, 1, 1], TriMesh(shape.vertices, shape.faces))[0]
     assert apart.mean() < 0.02 * shape.step
     assert np.quantile(apart, 0.99) < 0.3 * shape.step
 
@@ -96,7 +97,7 @@ def test_a_doubled_view_changes_little(seen):
     shape = reconstruct(*picked(seen["torus"], [0, 1, 1, 2, 3, 4, 5]))
     check_whole(shape)
     once = reconstruct(cameras, images, mask)
-    assert closest_points(shape.vertices[::10], once.vertices, once.faces)[0].mean() < 0.1 * shape.step
+    assert closest_points(shape.vertices[::10], TriMesh(once.vertices, once.faces))[0].mean() < 0.1 * shape.step
 
 
 @pytest.mark.parametrize("view", [1, 3])
@@ -111,7 +112,11 @@ def test_a_mirrored_view(seen, view):
         stack[view] = stack[view][:, ::-1]
     shape = reconstruct(cameras, images, mask)
     check_whole(shape)
-    assert 0.3 < signed_volume(shape.vertices, shape.faces) / signed_volume(true.vertices, true.faces) < 2
+    assert (
+        0.3
+        < signed_volume(TriMesh(shape.vertices, shape.faces)) / signed_volume(TriMesh(true.vertices, true.faces))
+        < 2
+    )
 
 
 def test_sixty_four_pixels():

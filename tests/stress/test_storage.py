@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from gdtool.assets.scene import Texture
 from gdtool.bake.maps import quantise
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.tangents import corner_tangents
 from gdtool.geometry.uv_raster import owner_count
 from gdtool.images.color import decode_normal, encode_normal, linear_from_srgb, srgb_from_linear
@@ -142,7 +143,7 @@ def test_tangents_without_texture_area():
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     uv = rng.random((33, 2))
     uv[:15] = 0.25
-    out = corner_tangents(vertices, faces, normals, uv, faces).astype(np.float64)
+    out = corner_tangents(TriMesh(vertices, faces), normals, uv, faces).astype(np.float64)
     assert np.isfinite(out).all()
     assert set(np.unique(out[..., 3])) <= {-1.0, 1.0}
     assert np.abs(np.linalg.norm(out[..., :3], axis=-1) - 1).max() <= 1e-6

@@ -3,6 +3,7 @@
 import numpy as np
 import trimesh
 
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.topology import triangulated
 from gdtool.unwrap.parameterize import schedule
 from gdtool.unwrap.segment.charts import Adjacency
@@ -23,19 +24,19 @@ def sheet(n, height=0.0, bend=0.0, down=False):
 
 
 def proxy_of(vertices, faces):
-    return vertices, triangulated(faces)[0].astype(np.int64)
+    return TriMesh(vertices, triangulated(faces)[0].astype(np.int64))
 
 
 def test_a_strip_beside_a_sheet_joins_it():
     vertices, faces = sheet(110, bend=1.0)
     label = (np.arange(110 * 110) % 110 >= 108).astype(int)
-    assert (merge_small_charts(vertices, faces, label, *proxy_of(*sheet(55, bend=1.0)), GOOD) == 0).all()
+    assert (merge_small_charts(QuadMesh(vertices, faces), label, proxy_of(*sheet(55, bend=1.0)), GOOD) == 0).all()
 
 
 def test_large_charts_stay_apart():
     vertices, faces = sheet(20)
     label = (np.arange(400) % 20 >= 10).astype(int)
-    assert (merge_small_charts(vertices, faces, label, *proxy_of(vertices, faces), GOOD) == label).all()
+    assert (merge_small_charts(QuadMesh(vertices, faces), label, proxy_of(vertices, faces), GOOD) == label).all()
 
 
 def test_what_would_close_or_stretch_stays_apart():
@@ -44,7 +45,11 @@ def test_what_would_close_or_stretch_stays_apart():
     height = ball.triangles_center[:, 2]
     for label in ((height > 0.98).astype(int), np.where(height > 0.98, 2, (height < 0).astype(int))):
         assert (
-            len(np.unique(merge_small_charts(ball.vertices, faces, label, ball.vertices, ball.faces, GOOD)))
+            len(
+                np.unique(
+                    merge_small_charts(QuadMesh(ball.vertices, faces), label, TriMesh(ball.vertices, ball.faces), GOOD)
+                )
+            )
             == label.max() + 1
         )
 
@@ -55,8 +60,10 @@ def test_the_sides_of_a_thin_wall_keep_their_labels():
     label = np.repeat([0, 1], 900)
     (one, up), (two, down) = sheet(7), sheet(7, height=0.002, down=True)
     proxy = proxy_of(np.concatenate([one, two]), np.concatenate([up, down + len(one)]))
-    adjacency = Adjacency(proxy[0], np.concatenate([proxy[1], np.full((len(proxy[1]), 1), -1)], 1))
-    assert (_transfer_labels(vertices, faces, label, *proxy, adjacency) == np.repeat([0, 1], 98)).all()
+    corners = np.concatenate([proxy.faces, np.full((len(proxy.faces), 1), -1)], 1)
+    adjacency = Adjacency(QuadMesh(proxy.vertices, corners))
+    labels = _transfer_labels(QuadMesh(vertices, faces), label, proxy, adjacency)
+    assert (labels == np.repeat([0, 1], 98)).all()
 
 
 def test_what_lay_flat_together_on_the_proxy_alone_comes_apart_again(monkeypatch):
@@ -69,7 +76,7 @@ def test_what_lay_flat_together_on_the_proxy_alone_comes_apart_again(monkeypatch
     monkeypatch.setattr(schedule, "merge_small_charts", lambda *given: np.zeros(len(faces), int))
     monkeypatch.setattr(schedule, "_MAX_TOTAL_EXCESS", np.inf)
     charts, _ = schedule.flatten_all(
-        ball.vertices, faces, label, schedule.FlattenLimits(GOOD, 1.5), (ball.vertices, ball.faces)
+        QuadMesh(ball.vertices, faces), label, schedule.FlattenLimits(GOOD, 1.5), TriMesh(ball.vertices, ball.faces)
     )
     owner = np.full(len(faces), -1)
     for i, (faces_idx, _, uv, _) in enumerate(charts):
@@ -84,6 +91,7 @@ def test_a_chart_that_touches_itself_in_a_vertex_has_it_twice():
 
     vertices, faces = sheet(2)
     for own, count in (([0, 1], 6), ([0, 3], 8), ([0, 1, 3], 8), ([0, 1, 2, 3], 9)):
-        points, corners = chart_mesh(vertices, faces[own])
+        made = chart_mesh(QuadMesh(vertices, faces[own]))
+        points, corners = made.vertices, made.faces
         assert len(points) == count
         np.testing.assert_array_equal(points[corners], vertices[faces[own]])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.topology import edges_of, triangulated
 from gdtool.unwrap.chart import Chart
 from gdtool.unwrap.parameterize import schedule
@@ -27,7 +28,7 @@ def test_the_end_that_lies_on_the_beginning_is_taken_off():
     vertices, faces, uv = spiral(1.05)
     triangles, face_idx = triangulated(faces)
     assert 0 < overlapping_triangles(uv, triangles).mean() < 0.2
-    keep = remove_overlaps(Adjacency(vertices, faces), np.arange(len(faces)), triangles, face_idx, uv)
+    keep = remove_overlaps(Adjacency(QuadMesh(vertices, faces)), np.arange(len(faces)), triangles, face_idx, uv)
     # One of the two ends, not both; the rest lies apart.
     assert 0.9 < keep.mean() < 0.97
     assert not overlapping_triangles(uv, triangles[keep[face_idx]]).any()
@@ -63,17 +64,16 @@ def test_a_rim_that_crosses_itself_where_two_of_its_corners_coincide(past):
 def test_what_lies_on_itself_by_half_is_not_peeled():
     vertices, faces, uv = spiral(1.6)
     triangles, face_idx = triangulated(faces)
-    assert remove_overlaps(Adjacency(vertices, faces), np.arange(len(faces)), triangles, face_idx, uv) is None
+    assert remove_overlaps(Adjacency(QuadMesh(vertices, faces)), np.arange(len(faces)), triangles, face_idx, uv) is None
 
 
 def test_a_peeled_band_is_two_charts_and_not_many_halves():
     vertices, faces, _ = spiral(1.05)
     charts, cut = schedule.flatten_all(
-        vertices,
-        faces,
+        QuadMesh(vertices, faces),
         np.zeros(len(faces), int),
         schedule.FlattenLimits(GOOD, 1.5),
-        (vertices, triangulated(faces)[0].astype(np.int64)),
+        TriMesh(vertices, triangulated(faces)[0].astype(np.int64)),
     )
     assert len(charts) == 2
     assert cut == ["1 charts were cut: a chart overlaps itself"]
@@ -92,18 +92,21 @@ def test_a_piece_goes_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
 
     def chart(faces_idx):
         return schedule.flatten_all(
-            vertices,
-            faces[faces_idx],
+            QuadMesh(vertices, faces[faces_idx]),
             np.zeros(len(faces_idx), int),
             schedule.FlattenLimits(GOOD, 1.5),
-            (vertices, triangulated(faces[faces_idx])[0].astype(np.int64)),
+            TriMesh(vertices, triangulated(faces[faces_idx])[0].astype(np.int64)),
         )[0][0]
 
     def left(home, beside=(dome, flat), good=GOOD):
         charts = [chart(own)._replace(faces_idx=own) for own in beside]
         return len(
             give_to_neighbours(
-                Adjacency(vertices, faces), vertices, faces, charts, [OverlapPiece(int(home[0]), piece)], good
+                Adjacency(QuadMesh(vertices, faces)),
+                QuadMesh(vertices, faces),
+                charts,
+                [OverlapPiece(int(home[0]), piece)],
+                good,
             )
         ), charts
 
@@ -125,15 +128,20 @@ def test_a_chart_much_larger_than_a_piece_stays_as_it_lies(columns, stays):
     vertices, faces = sheet(12, bend=1.0)
     column = np.arange(144) % 12
     piece, own = np.flatnonzero(column < columns), np.flatnonzero(column >= columns)
-    points, corners = chart_mesh(vertices, faces[own])
+    made = chart_mesh(QuadMesh(vertices, faces[own]))
+    points, corners = made.vertices, made.faces
     # Bent and slanted: laid anew it would not come to lie so.
     lies = np.stack([np.arcsin(points[:, 0]), points[:, 1] + 0.01 * points[:, 0]], -1)
     charts = [Chart(own, corners, lies, triangulated(corners)[0])]
     assert not give_to_neighbours(
-        Adjacency(vertices, faces), vertices, faces, charts, [OverlapPiece(int(piece[0]), piece)], 1.01
+        Adjacency(QuadMesh(vertices, faces)),
+        QuadMesh(vertices, faces),
+        charts,
+        [OverlapPiece(int(piece[0]), piece)],
+        1.01,
     )
     faces_idx, corners, uv, triangles = charts[0]
     assert sorted(faces_idx) == list(range(144))
     assert not overlapping_triangles(uv, triangles).any()
     assert (uv[: len(lies)] == lies).all() == stays
-    assert stretch(chart_mesh(vertices, faces[faces_idx])[0], triangles, uv) < 1.02
+    assert stretch(TriMesh(chart_mesh(QuadMesh(vertices, faces[faces_idx])).vertices, triangles), uv) < 1.02

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gdtool.core.child import ChildFailed
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.topology import triangulated
 from gdtool.geometry.uv_raster import owner_count
 from gdtool.unwrap import pipeline
@@ -30,7 +31,8 @@ def box(n: int = 6):
 
     vertices, quads = cube()[0], CUBE_QUADS
     while len(quads) < 6 * n * n:
-        vertices, quads, _ = subdivide(vertices, quads)
+        made, _ = subdivide(QuadMesh(vertices, quads))
+        vertices, quads = made.vertices, made.faces
     return vertices, quads
 
 
@@ -41,7 +43,7 @@ def checked(vertices, faces, result, size=512):
     assert result.uv.max() <= 1
     assert ((result.face_uvs >= 0) == (faces >= 0)).all()
     assert result.face_uvs.max() == len(result.uv) - 1
-    figures = pipeline.figures(vertices, faces, result.uv, result.face_uvs, size)
+    figures = pipeline.figures(QuadMesh(vertices, faces, result.uv, result.face_uvs), size)
     assert figures["overlap"] == 0
     assert figures["mirrored"] == 0
     return figures
@@ -49,7 +51,7 @@ def checked(vertices, faces, result, size=512):
 
 def test_box_unfolds_without_stretch():
     vertices, faces = box()
-    result = pipeline.unwrap(vertices, faces, SMALL)
+    result = pipeline.unwrap(QuadMesh(vertices, faces), SMALL)
     figures = checked(vertices, faces, result)
     assert figures["charts"] <= 6
     assert figures["stretch"] == pytest.approx(1, abs=2e-3)
@@ -60,7 +62,7 @@ def test_box_unfolds_without_stretch():
 
 def test_torus_has_even_density_and_gap():
     vertices, faces, _ = torus(48, 24)
-    result = pipeline.unwrap(vertices, faces, SMALL)
+    result = pipeline.unwrap(QuadMesh(vertices, faces), SMALL)
     figures = checked(vertices, faces, result)
     assert figures["stretch"] < 1.1
     assert figures["area_distortion"] < 1.3
@@ -84,12 +86,12 @@ def test_two_pieces_and_triangles_mixed():
     two, triangles = cube(0.3)
     vertices = np.concatenate([one, two + 2])
     faces = np.concatenate([quads, np.concatenate([triangles + len(one), np.full((12, 1), -1)], 1)])
-    checked(vertices, faces, pipeline.unwrap(vertices, faces, SMALL))
+    checked(vertices, faces, pipeline.unwrap(QuadMesh(vertices, faces), SMALL))
 
 
 def test_open_square_fills_the_texture():
     vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
-    result = pipeline.unwrap(vertices, np.array([[0, 1, 2, 3]]), SMALL)
+    result = pipeline.unwrap(QuadMesh(vertices, np.array([[0, 1, 2, 3]])), SMALL)
     assert checked(vertices, np.array([[0, 1, 2, 3]]), result)["coverage"] > 0.95
 
 
@@ -99,9 +101,9 @@ def test_degenerate_and_turned_faces_survive():
     faces[3] = faces[3][::-1]
     vertices = vertices.copy()
     vertices[faces[7, 1]] = vertices[faces[7, 0]]
-    result = pipeline.unwrap(vertices, faces, SMALL)
+    result = pipeline.unwrap(QuadMesh(vertices, faces), SMALL)
     assert np.isfinite(result.uv).all()
-    assert pipeline.figures(vertices, faces, result.uv, result.face_uvs)["overlap"] == 0
+    assert pipeline.figures(QuadMesh(vertices, faces, result.uv, result.face_uvs))["overlap"] == 0
 
 
 def test_dead_xatlas_leaves_box_projection(monkeypatch):
@@ -111,7 +113,7 @@ def test_dead_xatlas_leaves_box_projection(monkeypatch):
     monkeypatch.setattr(unwrap_charts, "call", dead)
     monkeypatch.setattr(pipeline, "begin", dead)
     vertices, faces, _ = torus(24, 12)
-    result = pipeline.unwrap(vertices, faces, SMALL)
+    result = pipeline.unwrap(QuadMesh(vertices, faces), SMALL)
     checked(vertices, faces, result)
     assert len(result.failed) >= 2
     assert "took longer" in result.failed[0]
@@ -121,7 +123,7 @@ def test_dead_xatlas_leaves_box_projection(monkeypatch):
 def test_with_hardly_any_time_the_atlas_is_plain_and_valid(seconds):
     vertices, faces, _ = torus(96, 48)
     start = time.monotonic()
-    result = pipeline.unwrap(vertices, faces, pipeline.Request(size=512, padding=4, seconds=seconds))
+    result = pipeline.unwrap(QuadMesh(vertices, faces), pipeline.Request(size=512, padding=4, seconds=seconds))
     assert time.monotonic() - start < 20
     assert result.failed
     checked(vertices, faces, result)
@@ -129,10 +131,10 @@ def test_with_hardly_any_time_the_atlas_is_plain_and_valid(seconds):
 
 def test_what_is_left_when_the_time_is_over_goes_face_by_face():
     vertices, faces, _ = torus(24, 12)
-    charts, why = flatten_all(vertices, faces, np.zeros(len(faces), int), FlattenLimits(1.002, 1.1, 0.0, 0.0))
+    charts, why = flatten_all(QuadMesh(vertices, faces), np.zeros(len(faces), int), FlattenLimits(1.002, 1.1, 0.0, 0.0))
     assert len(charts) == len(faces)
     assert why == ["1 charts were cut: a chart was left when the time was over"]
-    result = pipeline.unwrap(vertices, faces, pipeline.Request(size=512, padding=4, seconds=1e-9))
+    result = pipeline.unwrap(QuadMesh(vertices, faces), pipeline.Request(size=512, padding=4, seconds=1e-9))
     assert checked(vertices, faces, result)["charts"] == len(faces)
 
 
@@ -146,9 +148,9 @@ def test_what_the_conformal_map_refuses_starts_from_a_circle(monkeypatch):
 
     triangles = scipy.spatial.Delaunay(points).simplices.astype(np.int64)
     bowl = np.concatenate([points, ((points - 0.5) ** 2).sum(1, keepdims=True) * 2], 1)
-    flat = flatten(bowl, triangles, 1.0001, 1.5)
+    flat = flatten(TriMesh(bowl, triangles), 1.0001, 1.5)
     assert flat.uv is not None
-    assert stretch(bowl, triangles, flat.uv) < 1.2
+    assert stretch(TriMesh(bowl, triangles), flat.uv) < 1.2
 
 
 def test_charts_stay_whole_where_they_fill_the_square(monkeypatch):
@@ -162,13 +164,13 @@ def test_charts_stay_whole_where_they_fill_the_square(monkeypatch):
     meshes = [(plate, quads)] * 8 + [(plate, ell)]
     vertices = np.concatenate([points + [0, 0, height] for height, (points, _) in enumerate(meshes)])
     faces = np.concatenate([own + 81 * k for k, (_, own) in enumerate(meshes)])
-    found = pipeline.unwrap(vertices, faces, SMALL)
+    found = pipeline.unwrap(QuadMesh(vertices, faces), SMALL)
     assert [what for what, _, _ in found.skipped] == ["cutting further for packing"]
     assert found.skipped[0][2] > 0
     monkeypatch.setattr(pipeline, "WELL_PACKED", 1.0)
     monkeypatch.setattr(search, "WELL_PACKED", 1.0)
     monkeypatch.setattr(search, "_MAX_STEP_GAIN", 1.0)
-    other = pipeline.unwrap(vertices, faces, SMALL)
+    other = pipeline.unwrap(QuadMesh(vertices, faces), SMALL)
     few, many = checked(vertices, faces, found), checked(vertices, faces, other)
     assert not other.skipped
     assert many["coverage"] < 1.1 * few["coverage"]
@@ -181,34 +183,34 @@ def test_cylinder_side_is_developable():
     vertices = np.stack([np.sin(x.ravel()), z.ravel(), np.cos(x.ravel())], -1)
     i = (np.arange(4)[:, None] * 25 + np.arange(24)).ravel()
     triangles = np.concatenate([np.stack([i, i + 1, i + 26], -1), np.stack([i, i + 26, i + 25], -1)])
-    flat = flatten(vertices, triangles, 1.001, 1.05)
+    flat = flatten(TriMesh(vertices, triangles), 1.001, 1.05)
     assert flat.reason == ""
-    assert stretch(vertices, triangles, flat.uv) < 1.001
+    assert stretch(TriMesh(vertices, triangles), flat.uv) < 1.001
 
 
 def test_stretch_of_known_maps():
     vertices, triangles = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]])
-    assert stretch(vertices, triangles, 7 * vertices[:, :2]) == pytest.approx(1)
+    assert stretch(TriMesh(vertices, triangles), 7 * vertices[:, :2]) == pytest.approx(1)
     # Stretched by two one way: sqrt((a + 1/a) / 2) with a = 2.
-    assert stretch(vertices, triangles, vertices[:, :2] * [2, 1]) == pytest.approx((2.5 / 2) ** 0.5)
+    assert stretch(TriMesh(vertices, triangles), vertices[:, :2] * [2, 1]) == pytest.approx((2.5 / 2) ** 0.5)
 
 
 def test_closed_mesh_cannot_lie_flat():
     vertices, triangles = cube()
-    assert flatten(vertices, triangles, 1.001, 1.1) == FlattenResult(None, "closed")
+    assert flatten(TriMesh(vertices, triangles), 1.001, 1.1) == FlattenResult(None, "closed")
 
 
 @pytest.mark.parametrize("holes", [1, 2, 5])
 def test_a_torus_with_holes_has_a_handle_and_a_bent_sheet_with_holes_lies_flat(holes):
     vertices, faces, _ = torus(24, 12)
-    assert flatten(vertices, np.delete(triangulated(faces)[0], 40 * np.arange(holes), 0), 1.001, 1.1) == FlattenResult(
-        None, "has a handle"
-    )
+    assert flatten(
+        TriMesh(vertices, np.delete(triangulated(faces)[0], 40 * np.arange(holes), 0)), 1.001, 1.1
+    ) == FlattenResult(None, "has a handle")
     vertices, faces = sheet(20, bend=1.0)
     triangles = triangulated(np.delete(faces, 42 + 42 * np.arange(holes), 0))[0]
-    flat = flatten(vertices, triangles, 1.001, 1.1)
+    flat = flatten(TriMesh(vertices, triangles), 1.001, 1.1)
     assert flat.reason == ""
-    assert stretch(vertices, triangles, flat.uv) < 1.001
+    assert stretch(TriMesh(vertices, triangles), flat.uv) < 1.001
 
 
 def test_four_squares_pack_tight_and_turned_ones_are_set_upright():
@@ -295,7 +297,7 @@ def test_a_ring_is_cut_into_arcs_that_keep_their_coordinates():
 
     vertices, quads, uv = ring_of_quads()
     chart = Chart(np.arange(len(quads)), quads, uv, triangulated(quads)[0])
-    adjacency = Adjacency(vertices, quads)
+    adjacency = Adjacency(QuadMesh(vertices, quads))
     assert not list(cut_to_pack(adjacency, [chart], [1]))
     few, parts = cut_to_pack(adjacency, [chart], [2, 40])
     assert 2 <= len(few) <= 3 < len(parts)
@@ -308,7 +310,9 @@ def test_a_ring_is_cut_into_arcs_that_keep_their_coordinates():
     faces = np.stack([i, i + 1, i + 12, i + 11], -1)
     flat = np.concatenate([square, np.zeros((121, 1))], 1)
     assert not list(
-        cut_to_pack(Adjacency(flat, faces), [Chart(np.arange(100), faces, square, triangulated(faces)[0])], [40])
+        cut_to_pack(
+            Adjacency(QuadMesh(flat, faces)), [Chart(np.arange(100), faces, square, triangulated(faces)[0])], [40]
+        )
     )
 
 
@@ -316,7 +320,7 @@ def test_two_rings_fill_the_square_better_once_cut():
     vertices, quads, _ = ring_of_quads()
     both = np.concatenate([vertices, vertices + (2, 0, 0)])
     faces = np.concatenate([quads, quads + len(vertices)])
-    found = checked(both, faces, pipeline.unwrap(both, faces, SMALL))
+    found = checked(both, faces, pipeline.unwrap(QuadMesh(both, faces), SMALL))
     # Two whole rings cannot cover more than 2 * 0.75 pi / 4 of the square around the two of them, which is 1.707 of
     # their width.
     assert found["coverage"] > 0.45 > 2 * 0.75 * np.pi / 4 / 1.707**2
@@ -351,11 +355,11 @@ def test_ways_leapt_over_cost_no_coverage_and_a_seam_or_two(monkeypatch, around,
     found = []
     for gains in (search._MAX_STEP_GAIN, np.inf):
         monkeypatch.setattr(search, "_MAX_STEP_GAIN", gains)
-        laid = pipeline.unwrap(vertices, faces, pipeline.Request(size=1024, padding=4))
+        laid = pipeline.unwrap(QuadMesh(vertices, faces), pipeline.Request(size=1024, padding=4))
         leapt = [why for what, why, _ in laid.skipped if what.startswith("packing")]
         assert len(leapt) == (gains < np.inf)
         assert not laid.failed
-        found.append(pipeline.figures(vertices, faces, laid.uv, laid.face_uvs))
+        found.append(pipeline.figures(QuadMesh(vertices, faces, laid.uv, laid.face_uvs)))
     quick, whole = found
     assert quick["coverage"] > whole["coverage"] - 0.02
     assert quick["charts"] <= whole["charts"] + 8

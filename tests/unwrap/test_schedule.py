@@ -3,6 +3,7 @@
 import numpy as np
 import trimesh
 
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.unwrap.parameterize import schedule
 from gdtool.unwrap.parameterize.flatten import overlapping_triangles, stretch
 from gdtool.unwrap.pipeline import Request, figures, unwrap
@@ -23,22 +24,22 @@ def whole_stretch(vertices, faces, charts):
         corners.append(triangles + offset)
         uvs.append(uv)
         offset += len(uv)
-    return stretch(np.concatenate(points), np.concatenate(corners).astype(np.int64), np.concatenate(uvs))
+    return stretch(TriMesh(np.concatenate(points), np.concatenate(corners).astype(np.int64)), np.concatenate(uvs))
 
 
 def test_charts_that_stretch_most_are_cut_until_the_whole_stretches_little(monkeypatch):
     vertices, faces, centre = ball()
     label = (centre[:, 2] > 0).astype(int)
-    proxy = vertices, faces[:, :3]
+    proxy = TriMesh(vertices, faces[:, :3])
     monkeypatch.setattr(schedule, "merge_small_charts", lambda *given: label)
-    charts, why = schedule.flatten_all(vertices, faces, label, schedule.FlattenLimits(1.01, 1.5), proxy)
+    charts, why = schedule.flatten_all(QuadMesh(vertices, faces), label, schedule.FlattenLimits(1.01, 1.5), proxy)
     assert 1.002 < whole_stretch(vertices, faces, charts) < 1.014
     assert 3 <= len(charts) <= 8
     assert any("stretches more than most" in line for line in why)
     assert sorted(np.concatenate([chart[0] for chart in charts])) == list(range(len(faces)))
     assert not any(overlapping_triangles(uv, triangles.astype(np.int64)).any() for _, _, uv, triangles in charts)
     monkeypatch.setattr(schedule, "_MAX_TOTAL_EXCESS", np.inf)
-    charts, _ = schedule.flatten_all(vertices, faces, label, schedule.FlattenLimits(1.01, 1.5), proxy)
+    charts, _ = schedule.flatten_all(QuadMesh(vertices, faces), label, schedule.FlattenLimits(1.01, 1.5), proxy)
     assert len(charts) == 2
     assert whole_stretch(vertices, faces, charts) > 1.02
 
@@ -47,8 +48,8 @@ def test_charts_that_stretch_little_stay_whole():
     mesh = trimesh.creation.cylinder(0.4, 1.0, sections=64)
     mesh = mesh.subdivide().subdivide()
     faces = np.concatenate([mesh.faces, np.full((len(mesh.faces), 1), -1)], 1).astype(np.int64)
-    result = unwrap(np.asarray(mesh.vertices), faces, Request(size=512, padding=4))
-    assert figures(mesh.vertices, faces, result.uv, result.face_uvs)["stretch"] < 1.002
+    result = unwrap(QuadMesh(np.asarray(mesh.vertices), faces), Request(size=512, padding=4))
+    assert figures(QuadMesh(mesh.vertices, faces, result.uv, result.face_uvs))["stretch"] < 1.002
     assert not any("more than most" in line for line in result.failed)
 
 
@@ -59,7 +60,7 @@ def test_what_cannot_be_relieved_ends(monkeypatch):
     label = (centre[:, 2] > 0).astype(int)
     monkeypatch.setattr(schedule, "merge_small_charts", lambda *given: label)
     charts, why = schedule.flatten_all(
-        crumpled, faces, label, schedule.FlattenLimits(1.0000001, 1.1), (crumpled, faces[:, :3])
+        QuadMesh(crumpled, faces), label, schedule.FlattenLimits(1.0000001, 1.1), TriMesh(crumpled, faces[:, :3])
     )
     cuts = [int(line.split()[0]) for line in why if "more than most" in line]
     assert cuts
@@ -73,7 +74,7 @@ def test_a_chart_is_cut_between_its_parts_and_without_any_through_the_middle():
 
     vertices, faces = sheet(20)
     vertices = vertices * [2, 1, 1]
-    adjacency, column = Adjacency(vertices, faces), np.arange(400) % 20
+    adjacency, column = Adjacency(QuadMesh(vertices, faces)), np.arange(400) % 20
     for part, first in ((column >= 6, 6), (np.where(column < 12, 7, np.where(column < 15, 3, 5)), 12)):
         one, other = schedule._split_set(adjacency, part, np.arange(400))
         assert {len(one), len(other)} == {20 * first, 400 - 20 * first}

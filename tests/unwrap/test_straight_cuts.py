@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from gdtool.geometry.meshes import QuadMesh
 from gdtool.geometry.topology import triangulated
 from gdtool.unwrap.chart import Chart
 from gdtool.unwrap.segment.charts import Adjacency
@@ -24,7 +25,7 @@ def plates(*cells):
         points.append(np.concatenate([uv, np.full((len(uv), 1), float(height))], 1))
         quads.append(own + vertices)
         vertices, faces = vertices + len(uv), faces + len(own)
-    return Adjacency(np.concatenate(points), np.concatenate(quads)), charts
+    return Adjacency(QuadMesh(np.concatenate(points), np.concatenate(quads))), charts
 
 
 def ell(size, arm):

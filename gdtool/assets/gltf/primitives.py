@@ -9,7 +9,7 @@ import numpy as np
 
 from gdtool.assets.gltf.document import EXPORT, GltfFile, printed
 from gdtool.assets.gltf.schema import Primitive
-from gdtool.geometry.topology import repeats
+from gdtool.geometry.topology import has_repeated_corner
 
 _UV_SET = re.compile(r"TEXCOORD_[0-9]{1,3}")
 _MAX_UV_SETS = 32  # a higher number is a fault of the file, and each set below it would cost an array
@@ -140,7 +140,7 @@ def _triangles(indices: np.ndarray, mode: int) -> np.ndarray:
     i = np.arange(len(indices) - 2)
     corners = (i, i + 1 + i % 2, i + 2 - i % 2) if mode == 5 else (i + 1, i + 2, np.zeros_like(i))
     faces = indices[np.stack(corners, 1)]
-    return faces[~repeats(faces)]
+    return faces[~has_repeated_corner(faces)]
 
 
 def _uv_sets(attributes: dict[str, np.ndarray]) -> tuple[np.ndarray | None, ...]:

@@ -12,6 +12,7 @@ from gdtool.assets.gltf.materials import MaterialReader
 from gdtool.assets.gltf.nodes import joint_matrices, visible_nodes, world_matrices
 from gdtool.assets.gltf.primitives import MeshPart, compact, placed, read_primitive, unit
 from gdtool.assets.scene import DEFAULT_MATERIAL, Material, Scene
+from gdtool.geometry.meshes import TriMesh
 
 
 def read_gltf(path: str | Path) -> Scene:
@@ -88,7 +89,7 @@ def _flat_shaded(part: MeshPart) -> MeshPart:
     corner = part.faces.reshape(-1)
     vertices = part.vertices[corner]
     faces = np.arange(len(corner)).reshape(-1, 3)
-    normals = np.repeat(face_normals(vertices, faces)[0], 3, axis=0)
+    normals = np.repeat(face_normals(TriMesh(vertices, faces))[0], 3, axis=0)
     uvs = tuple(None if uv is None else uv[corner] for uv in part.uvs)
     colors = None if part.colors is None else part.colors[corner]
     return MeshPart(vertices, faces, part.material, normals, None, uvs, colors)

@@ -11,6 +11,7 @@ import numpy as np
 from gdtool.assets.gltf.builder import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, GlbBuilder
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.core.errors import OutputError, from_os_error
+from gdtool.geometry.meshes import TriMesh
 
 _MIN_LENGTH = 1e-6  # of a normal or tangent, which should be 1; a shorter one has no usable direction
 
@@ -110,11 +111,11 @@ def _primitive_vertices(scene: Scene, material: Material, faces: np.ndarray, uv_
     uv = scene.uvs[uv_set] if uv_set in uv_slots else None
     if uv is None:
         return _PrimitiveVertices(used, local, None)
-    from gdtool.geometry.tangents import corner_tangents, weld
+    from gdtool.geometry.tangents import corner_tangents, number_distinct_rows
 
-    tangents = corner_tangents(scene.vertices, faces, normals, uv, faces).reshape(-1, 4)
+    tangents = corner_tangents(TriMesh(scene.vertices, faces), normals, uv, faces).reshape(-1, 4)
     corner = faces.reshape(-1, 1)
-    split = weld(corner // 4096, corner % 4096, tangents)  # weld compares float32, which is not exact for large indices
+    split = number_distinct_rows(corner // 4096, corner % 4096, tangents)  # float32 is not exact for large indices
     first = np.unique(split, return_index=True)[1]
     used = corner[first, 0]
     return _PrimitiveVertices(used, split, _unit_tangents(tangents[first], normals[used]))
@@ -154,7 +155,7 @@ def _unit_normals(scene: Scene) -> np.ndarray:
     if bad.any():
         from gdtool.geometry.normals import vertex_normals
 
-        normals[bad] = vertex_normals(scene.vertices, scene.faces)[bad]
+        normals[bad] = vertex_normals(TriMesh(scene.vertices, scene.faces))[bad]
         normals[np.linalg.norm(normals, axis=1) < 0.5] = (0, 1, 0)
     return normals
 

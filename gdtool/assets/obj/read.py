@@ -12,8 +12,8 @@ from gdtool.assets.obj.materials import obj_materials
 from gdtool.assets.obj.polygons import triangulate
 from gdtool.assets.scene import Scene
 from gdtool.core.errors import InputError
-from gdtool.geometry.rows import unique_rows
 from gdtool.geometry.topology import renumbered
+from gdtool.geometry.unique_rows import unique_rows
 
 
 def read_obj(path: str | Path) -> Scene:

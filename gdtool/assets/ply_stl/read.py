@@ -13,7 +13,7 @@ from gdtool.assets.ply_stl.binary_ply import columns, read_binary_ply
 from gdtool.assets.scene import DEFAULT_MATERIAL, Scene
 from gdtool.core.errors import InputError
 from gdtool.core.reading import bytes_of
-from gdtool.geometry.rows import unique_rows
+from gdtool.geometry.unique_rows import unique_rows
 
 _STL_HEADER = 84
 _STL_FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gdtool.fields.appearance.materials import confidence, fuse, observe, spread
+from gdtool.geometry.meshes import TriMesh
 
 MATERIALS = ("albedo", "roughness", "metallic")
 LEAST_SAMPLES = 64  # pixels of color below which no light is solved for
@@ -49,12 +50,12 @@ def appearance(
     cameras,
     mask: np.ndarray,
     images: dict[str, np.ndarray],
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: TriMesh,
     normals: np.ndarray,
     options: AppearanceOptions,
 ) -> Appearance:
     """Fuse the material views; recover the light from color; solve for materials without a view from color."""
+    vertices, faces = mesh.vertices, mesh.faces
     from gdtool.fields.appearance.light import (
         ShadedPoints,
         color_samples,
@@ -65,7 +66,7 @@ def appearance(
     )
 
     rng = np.random.default_rng(options.seed)
-    seen = observe(cameras, mask, vertices, faces, normals, 0.5 * options.step)
+    seen = observe(cameras, mask, mesh, normals, 0.5 * options.step)
     weight = seen.weight.sum(0)
     out = Appearance(
         np.full((len(vertices), 3), 0.5, np.float32),
@@ -95,7 +96,7 @@ def appearance(
         out.skipped.append(("light", "too few pixels of color are seen and not clipped"))
         out.albedo = fused.get("color", out.albedo)
         return out
-    reaches = visibility(vertices, faces, normals, 0.5 * options.step, rng) if options.shadows else unoccluded(normals)
+    reaches = visibility(mesh, normals, 0.5 * options.step, rng) if options.shadows else unoccluded(normals)
     if "albedo" in fused:
         points = ShadedPoints(
             normals[samples.vertex],

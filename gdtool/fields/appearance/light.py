@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gdtool.fields.appearance.materials import Observations, toward_camera
+from gdtool.geometry.meshes import TriMesh
 from gdtool.images.sampling import bilinear
 
 SAMPLES = 4000  # pixels of color that the light is solved from
@@ -182,17 +183,17 @@ class Visibility:
 
 
 def visibility(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: TriMesh,
     normals: np.ndarray,
     offset: float,
     rng: np.random.Generator,
     rays: int = 16,
 ) -> Visibility:
     """Trace `rays` directions from each vertex against the surface. offset: world units by which rays start off it."""
+    vertices = mesh.vertices
     from gdtool.geometry.rays import RayCaster
 
-    caster = RayCaster(vertices, faces)
+    caster = RayCaster(mesh)
     up = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
     tangent = np.cross(up, normals)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)

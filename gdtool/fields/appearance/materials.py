@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.cameras import Camera, project
+from gdtool.geometry.meshes import TriMesh
 from gdtool.images.sampling import bilinear
 
 _SHARPEN = 4  # exponent of the cosine in a view's weight, so that the view that faces a point decides
@@ -28,19 +29,18 @@ def toward_camera(camera: Camera, points: np.ndarray) -> np.ndarray:
     return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
 
 
-def observe(
-    cameras: list[Camera], mask: np.ndarray, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, offset: float
-) -> Observations:
+def observe(cameras: list[Camera], mask: np.ndarray, mesh: TriMesh, normals: np.ndarray, offset: float) -> Observations:
     """Find which views (mask (k, h, w)) see which vertices, by rays against the surface.
 
     offset: world units by which a ray starts off the surface, along the normal and toward the camera. The weight is the
     cosine to a power, less beside the silhouette, where pixels average over the edge.
     """
+    vertices = mesh.vertices
     from scipy.ndimage import minimum_filter
 
     from gdtool.geometry.rays import RayCaster
 
-    caster = RayCaster(vertices, faces)
+    caster = RayCaster(mesh)
     weights, places = [], []
     for camera, cover in zip(cameras, mask, strict=True):
         direction = toward_camera(camera, vertices)

@@ -1,4 +1,4 @@
-"""Fuse views into a watertight mesh: carve a signed distance grid, extract its surface and refine it."""
+"""Fuse views into a watertight mesh: carve a signed distance grid, extract_surface its surface and refine it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ from gdtool.fields.views.prepared_view import (
     pixel_footprint,
     prepare,
 )
-from gdtool.geometry.grids import edge_counts, extract
+from gdtool.geometry.grids import edge_counts, extract_surface
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.normals import vertex_normals
 from gdtool.geometry.sharpen import dihedral_degrees, restore_creases
 
@@ -237,25 +238,26 @@ def fuse_views(views: list[PreparedView], step: float, options: FusionOptions = 
     for view in views:
         if noise and view.camera.name == options.picture_view:
             values, restored = restore_picture_silhouette(values, grid, views, view)
-    vertices, faces = extract(values, grid)
-    if len(faces) == 0:
+    mesh = extract_surface(values, grid)
+    if len(mesh.faces) == 0:
         raise ValueError("the silhouettes have no common volume")
     reach = 1.5 * step + noise
-    support = measured_planes(views, vertices, vertex_normals(vertices, faces), reach)[2]
+    support = measured_planes(views, mesh.vertices, vertex_normals(mesh), reach)[2]
     deep = any(s.planes is not None for s in views)
-    vertices, faces, dropped = drop_debris(
-        vertices, faces, support if deep else np.ones(len(vertices)), step, hollows=deep and not noise
+    mesh, dropped = drop_debris(
+        mesh, support if deep else np.ones(len(mesh.vertices)), step, hollows=deep and not noise
     )
     if not noise and not outvoted:
-        # A sheet's two sides would both be drawn onto its one measured surface.
-        moved = refine(vertices, faces, views, step, reach=reach)
-        thickened = vertices_near(vertices, thin, 2 * step)
-        vertices, faces = sharpen_creases(np.where(thickened[:, None], vertices, moved), faces, views, thickened, step)
-    bumps = normal_deviation_degrees(vertices, faces, views, reach + noise) if noise and options.has_normals else None
+        # Refining would move both sides of a sheet onto its one measured surface.
+        moved = refine(mesh, views, step, reach=reach)
+        thickened = vertices_near(mesh.vertices, thin, 2 * step)
+        refined = TriMesh(np.where(thickened[:, None], mesh.vertices, moved), mesh.faces)
+        mesh = sharpen_creases(refined, views, thickened, step)
+    bumps = normal_deviation_degrees(mesh, views, reach + noise) if noise and options.has_normals else None
     if bumps is not None and bumps > BUMPY_DEGREES:
-        vertices = fit_to_normals(vertices, faces, views, step, reach=reach + noise)
-    support = measured_planes(views, vertices, vertex_normals(vertices, faces), reach)[2]
-    return Shape(vertices, faces, support, step, dropped, bumps, restored)
+        mesh = TriMesh(fit_to_normals(mesh, views, step, reach=reach + noise), mesh.faces)
+    support = measured_planes(views, mesh.vertices, vertex_normals(mesh), reach)[2]
+    return Shape(mesh.vertices, mesh.faces, support, step, dropped, bumps, restored)
 
 
 def _smoothed(values: np.ndarray, noise: float) -> np.ndarray:
@@ -270,14 +272,13 @@ def _smoothed(values: np.ndarray, noise: float) -> np.ndarray:
     return np.where(binary_dilation(more < 0, iterations=2), little, more)
 
 
-def sharpen_creases(
-    vertices: np.ndarray, faces: np.ndarray, views: list[PreparedView], fixed: np.ndarray, step: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Replace the bevels that marching cubes leaves along sharp edges by creases; keep the mesh where that would open
-    it.
+def sharpen_creases(mesh: TriMesh, views: list[PreparedView], fixed: np.ndarray, step: float) -> TriMesh:
+    """Replace the bevels that marching cubes leaves along sharp edges by creases.
 
     fixed (v,) bool: vertices that stay. No vertex leaves the silhouettes or enters space that a view sees to be free.
+    Returns the input where the result would not be closed and manifold.
     """
+    vertices = mesh.vertices
 
     def outside(points: np.ndarray) -> np.ndarray:
         """Compute how far points lie outside the silhouettes or in front of seen surfaces."""
@@ -294,26 +295,26 @@ def sharpen_creases(
 
     fixed = fixed.copy()
     for _ in range(CREASE_ROUNDS):
-        sharp, sharp_faces, _ = restore_creases(vertices, faces, accept=accept)
-        folded = fold_midpoints(sharp, sharp_faces)
+        sharp = restore_creases(mesh, accept=accept).mesh
+        folded = fold_midpoints(sharp)
         fresh = (
             vertices_near(vertices, folded, 2 * step)
-            & ~vertices_near(vertices, fold_midpoints(vertices, faces), 2 * step)
+            & ~vertices_near(vertices, fold_midpoints(mesh), 2 * step)
             & ~fixed
         )
         if not fresh.any():
             break
         fixed |= fresh
     else:
-        return vertices, faces
-    sharp_faces = np.ascontiguousarray(sharp_faces, np.int32)
-    return (sharp, sharp_faces) if is_closed_manifold(sharp_faces) else (vertices, faces)
+        return mesh
+    sharp_faces = np.ascontiguousarray(sharp.faces, np.int32)
+    return TriMesh(sharp.vertices, sharp_faces) if is_closed_manifold(sharp_faces) else mesh
 
 
-def fold_midpoints(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def fold_midpoints(mesh: TriMesh) -> np.ndarray:
     """Return the midpoints (n, 3) of edges at which a mesh folds back onto itself."""
-    ends, _, angle = dihedral_degrees(vertices, faces)
-    return vertices[ends[angle > FOLD_DEGREES]].mean(1)
+    ends, _, angle = dihedral_degrees(mesh)
+    return mesh.vertices[ends[angle > FOLD_DEGREES]].mean(1)
 
 
 def is_closed_manifold(faces: np.ndarray) -> bool:

@@ -7,6 +7,7 @@ import numpy as np
 from gdtool.fields.appearance.materials import neighbour_matrix
 from gdtool.fields.views.prepared_view import WEAK, PreparedView, hull_distance, tangent_distance
 from gdtool.geometry.grids import components, keep_faces, signed_volume
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.normals import face_normals, vertex_normals
 from gdtool.geometry.topology import edges_of
 
@@ -43,24 +44,23 @@ def measured_planes(views: list[PreparedView], vertices: np.ndarray, normals: np
 
 
 def refine(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: TriMesh,
     views: list[PreparedView],
     step: float,
     *,
     reach: float,
 ) -> np.ndarray:
-    """Move vertices to new positions (v, 3): least squares of distances to measured planes and of the umbrella
-    Laplacian.
+    """Fit vertices to the measured planes of the views, by least squares with the umbrella Laplacian; return (v, 3).
 
     Seen vertices follow the planes. Unseen ones minimise bending, held close to where carving put them and inside the
     silhouettes.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     from scipy.sparse import diags
 
     umbrella, start = _umbrella(faces, len(vertices)), vertices
     for _ in range(REFINE_ROUNDS):
-        matrix, vector, total = measured_planes(views, vertices, vertex_normals(vertices, faces), reach)
+        matrix, vector, total = measured_planes(views, vertices, vertex_normals(TriMesh(vertices, faces)), reach)
         unseen = np.exp(-10.0 * total)
         bending = diags((REFINE_SMOOTHNESS + unseen).astype(np.float32))
         energy = (umbrella.T @ bending @ umbrella).tocsr().astype(np.float32)
@@ -79,15 +79,13 @@ def refine(
 
 
 def fit_to_normals(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: TriMesh,
     views: list[PreparedView],
     step: float,
     *,
     reach: float,
 ) -> np.ndarray:
-    """Move vertices to new positions (v, 3): keep the place of a surface fused from disagreeing views, take its
-    normals' shape.
+    """Fit the edges of a surface fused from disagreeing views to the views' normals; return vertices (v, 3).
 
     Depths that differ a little from view to view leave bumps, which are low and steep; the normals show none. Every
     vertex moves along its normal, so that edges come to lie across the measured normals, and is held where it was
@@ -95,6 +93,7 @@ def fit_to_normals(
     about WAVELENGTH go. Unseen vertices move along with their neighbours. reach: how far off a view's surface may be
     (world units).
     """
+    vertices, faces = mesh.vertices, mesh.faces
     from scipy.sparse import csr_array, diags_array
 
     start, ends = vertices, edges_of(faces).ends
@@ -110,7 +109,7 @@ def fit_to_normals(
         )
 
     for _ in range(NORMAL_ROUNDS):
-        surface = vertex_normals(vertices, faces)
+        surface = vertex_normals(TriMesh(vertices, faces))
         measured, trust = measured_normals(views, vertices, surface, reach)
         across = measured[a] + measured[b]
         across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
@@ -159,9 +158,10 @@ def measured_normals(
     return total / np.maximum(length, 1e-12)[:, None], np.clip(length / 0.1, 0, 1)
 
 
-def normal_deviation_degrees(vertices: np.ndarray, faces: np.ndarray, views: list[PreparedView], reach: float) -> float:
+def normal_deviation_degrees(mesh: TriMesh, views: list[PreparedView], reach: float) -> float:
     """Measure the median degrees between a surface's normals and the views' normals there; 0 where there are none."""
-    surface = vertex_normals(vertices, faces)
+    vertices = mesh.vertices
+    surface = vertex_normals(mesh)
     measured, trust = measured_normals(views, vertices, surface, reach)
     cosine = np.einsum("vi,vi->v", measured, surface)[trust > 0.5]
     return float(np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1)))) if len(cosine) else 0.0
@@ -216,13 +216,13 @@ def _undo_folds(vertices: np.ndarray, start: np.ndarray, faces: np.ndarray, roun
 
     The vertices around them go back less.
     """
-    before, _ = face_normals(start, faces)
+    before, _ = face_normals(TriMesh(start, faces))
     beside = edges_of(faces).face_pairs()[1]
     folded_before = _folded(before, beside)
     share = np.ones(len(vertices))
     moved = vertices
     for _ in range(rounds):
-        after, _ = face_normals(vertices, faces)
+        after, _ = face_normals(TriMesh(vertices, faces))
         turned = (before * after).sum(1) < 0
         turned[beside[_folded(after, beside) & ~folded_before]] = True
         if not turned.any():
@@ -242,40 +242,35 @@ def _folded(normals: np.ndarray, beside: np.ndarray) -> np.ndarray:
     return np.einsum("ij,ij->i", normals[beside[:, 0]], normals[beside[:, 1]]) < np.cos(np.radians(FOLD_DEGREES))
 
 
-def drop_debris(
-    vertices: np.ndarray, faces: np.ndarray, support: np.ndarray, step: float, hollows: bool = False
-) -> tuple[np.ndarray, np.ndarray, int]:
+def drop_debris(mesh: TriMesh, support: np.ndarray, step: float, hollows: bool = False) -> tuple[TriMesh, int]:
     """Remove bubbles, tiny pieces and pieces without support (v,) from views; also returns the number removed.
 
     The largest piece always stays. hollows: keep an inner wall that views saw. Use it for views that agree only: others
     see through walls.
     """
-    labels, volume = _pieces(vertices, faces)
-    held = np.bincount(labels, support[faces].mean(1) > 0.02)
+    labels, volume = _pieces(mesh)
+    held = np.bincount(labels, support[mesh.faces].mean(1) > 0.02)
     # Of a plate seen edge-on only the rim has support: a few faces say that it is there.
     seen = np.where(
         volume > 0, (held > 0.2 * np.bincount(labels)) | (held >= _SEEN_FACES), hollows & (held >= _HOLLOW_FACES)
     )
     keep = (np.abs(volume) > (2 * step) ** 3) & seen
     keep[np.argmax(volume)] = True
-    vertices, faces, _ = keep_faces(vertices, faces, keep[labels])
-    return vertices, faces, int((~keep).sum())
+    return keep_faces(mesh, keep[labels]), int((~keep).sum())
 
 
-def keep_pieces(
-    vertices: np.ndarray, faces: np.ndarray, step: float, share: float = 0.01
-) -> tuple[np.ndarray, np.ndarray]:
+def keep_pieces(mesh: TriMesh, step: float, share: float = 0.01) -> TriMesh:
     """Keep the pieces with more than `share` of the largest one's volume; bubbles go."""
-    labels, volume = _pieces(vertices, faces)
-    vertices, faces, _ = keep_faces(vertices, faces, (volume > max(share * volume.max(), (2 * step) ** 3))[labels])
-    return vertices, faces
+    labels, volume = _pieces(mesh)
+    return keep_faces(mesh, (volume > max(share * volume.max(), (2 * step) ** 3))[labels])
 
 
-def _pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _pieces(mesh: TriMesh) -> tuple[np.ndarray, np.ndarray]:
     """Label the connected piece of each face (f,) and compute each piece's signed volume."""
+    vertices, faces = mesh.vertices, mesh.faces
     labels = components(faces, len(vertices))
     order = np.argsort(labels, kind="stable")
     bounds = np.searchsorted(labels[order], np.arange(int(labels.max()) + 2))
     return labels, np.array(
-        [signed_volume(vertices, faces[order[a:b]]) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+        [signed_volume(TriMesh(vertices, faces[order[a:b]])) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
     )

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.cameras import Camera, rays
-from gdtool.geometry.grids import band_cells, extract, fine_points, grid_over
+from gdtool.geometry.grids import band_cells, extract_surface, fine_points, grid_over
+from gdtool.geometry.meshes import TriMesh
 
 # World units around the first geometry in which a ray looks for the surface, and its samples there: by whether depth
 # shaped it (the views' own, or what their normals gave), or only silhouettes did.
@@ -40,21 +41,19 @@ class PaperOptions:
     precision: str = "float32"
 
 
-def distance_pool(
-    vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def distance_pool(mesh: TriMesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Sample points (count, 3) and their signed distances (count,) to a closed mesh: three quarters near it, the rest
     in the box.
     """
     from gdtool.geometry.distance import closest_points, sample_surface, winding_number
 
-    near = sample_surface(vertices, faces, count * 3 // 4, rng)[0]
+    near = sample_surface(mesh, count * 3 // 4, rng)[0]
     spread = np.repeat([0.004, 0.015, 0.06], -(-len(near) // 3))[: len(near), None]
     points = np.concatenate(
         [near + spread * rng.standard_normal(near.shape), rng.uniform(-0.6, 0.6, (count - len(near), 3))]
     )
-    distance = closest_points(points, vertices, faces)[0]
-    inside = winding_number(points, vertices, faces) > 0.5
+    distance = closest_points(points, mesh)[0]
+    inside = winding_number(points, mesh) > 0.5
     order = rng.permutation(len(points))
     return points[order], np.where(inside, -distance, distance)[order]
 
@@ -63,19 +62,19 @@ def gather_pixels(
     cameras: list[Camera],
     mask: np.ndarray,
     images: dict[str, np.ndarray],
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: TriMesh,
     device: str,
     reach: float,
 ):
     """Collect the rays of pixels fully inside the silhouettes, or outside but close to them, as `fit.Pixels`."""
+    vertices = mesh.vertices
     import torch
     from scipy.ndimage import distance_transform_edt
 
     from gdtool.fields.neural.fit import Pixels
     from gdtool.geometry.rays import RayCaster
 
-    caster = RayCaster(vertices, faces)
+    caster = RayCaster(mesh)
     radius = float(np.linalg.norm(vertices, axis=1).max()) + 0.02
     parts: dict[str, list[np.ndarray]] = {}
     for k, camera in enumerate(cameras):
@@ -145,7 +144,7 @@ def evaluate_sdf(sdf, points: np.ndarray, device: str, chunk: int = 1 << 17) -> 
     return out
 
 
-def extract_network(sdf, step: float, device: str) -> tuple[np.ndarray, np.ndarray]:
+def extract_network(sdf, step: float, device: str) -> TriMesh:
     """Extract the closed mesh of the network's zero set in the box, sampled every step where a coarse pass finds it."""
     factor = 4
     grid = grid_over(np.full(3, -0.56), np.full(3, 0.56), step, margin=2, multiple=factor)
@@ -162,7 +161,7 @@ def extract_network(sdf, step: float, device: str) -> tuple[np.ndarray, np.ndarr
         np.where(values < 0, -step, step)[: grid.shape[0], : grid.shape[1], : grid.shape[2]], np.float32
     )
     values[fine] = evaluate_sdf(sdf, grid.points(np.argwhere(fine)), device)
-    return extract(values, grid)
+    return extract_surface(values, grid)
 
 
 def network_materials(material, points: np.ndarray, device: str) -> dict[str, np.ndarray]:
@@ -185,8 +184,7 @@ def fit_networks(
     cameras: list[Camera],
     mask: np.ndarray,
     images: dict[str, np.ndarray],
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: TriMesh,
     options: PaperOptions,
     track: Callable,
 ):
@@ -201,7 +199,7 @@ def fit_networks(
     rng = np.random.default_rng(options.seed)
     began = time.monotonic()
     fit = start(options.seed, options.device)
-    pool = distance_pool(vertices, faces, POOL, rng)
+    pool = distance_pool(mesh, POOL, rng)
     points, distances = (torch.as_tensor(x, dtype=torch.float32, device=options.device) for x in pool)
 
     def sample(n: int):
@@ -223,7 +221,7 @@ def fit_networks(
         HALF_SHARE if options.precision == "bfloat16" else 0.0,
     )
     reach, samples = _MEASURED if "depth" in images else _BOUNDED
-    pixels = gather_pixels(cameras, mask, images, vertices, faces, options.device, reach)
+    pixels = gather_pixels(cameras, mask, images, mesh, options.device, reach)
     done = train(
         fit,
         pixels,

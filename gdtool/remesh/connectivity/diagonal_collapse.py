@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gdtool.geometry.mesh_quality import scaled_jacobian
+from gdtool.geometry.meshes import QuadMesh
 from gdtool.geometry.topology import edges_of, renumbered
 from gdtool.remesh.fit.feature_curves import Constraints
 from gdtool.remesh.fit.surface_projection import ProjectionTarget, faces_around_vertices, neighbours
@@ -29,18 +30,19 @@ class _Collapse(NamedTuple):
 
 
 def collapse_folded_quads(
-    vertices: np.ndarray, faces: np.ndarray, surface: ProjectionTarget, constraints: Constraints
-) -> tuple[np.ndarray, np.ndarray, Constraints]:
+    mesh: QuadMesh, surface: ProjectionTarget, constraints: Constraints
+) -> tuple[QuadMesh, Constraints]:
     """Collapse folded quads along a diagonal (Daniels et al. 2008) where that improves the quads around much.
 
     The lost corner is on no feature. The kept one moves to where the worst of the quads around them comes out best. The
     result is closed and manifold as before, with as many handles and pieces, without new vertices of two edges;
-    boundaries stay as they are. Returns vertices, faces (f, 4) and constraints.
+    boundaries stay as they are.
     """
-    quality = scaled_jacobian(vertices, faces)
+    vertices, faces = mesh.vertices, mesh.faces
+    quality = scaled_jacobian(mesh)
     folded = np.flatnonzero(quality < _FOLDED)
     if not len(folded) or len(folded) > _MAX_FOLDED:
-        return vertices, faces, constraints
+        return mesh, constraints
     edges = edges_of(faces)
     face_lists = faces_around_vertices(faces, len(vertices))
     neighbour_lists = neighbours(edges.ends, len(vertices))
@@ -76,7 +78,7 @@ def collapse_folded_quads(
                 )
             for position in positions:
                 corners = np.where(moves[..., None], position, out[rest]).reshape(-1, 3)
-                worst = scaled_jacobian(corners, np.arange(len(corners)).reshape(-1, 4)).min()
+                worst = scaled_jacobian(QuadMesh(corners, np.arange(len(corners)).reshape(-1, 4))).min()
                 if worst > (best.quality if best else quality[around].min() + _MIN_GAIN):
                     all_touched = np.concatenate([around, face_lists[side], face_lists[other]])
                     best = _Collapse(worst, keep, lose, position, all_touched)
@@ -85,12 +87,11 @@ def collapse_folded_quads(
             touched[best.touched] = True
             dead.append(quad)
     if not dead:
-        return vertices, faces, constraints
+        return mesh, constraints
     used, collapsed = renumbered(merged_into[np.delete(faces, dead, 0)], len(out))
     number = np.full(len(out), -1)
     number[used] = np.arange(len(used))
-    return (
-        out[used],
-        collapsed,
-        Constraints(constraints.curve[used], constraints.fixed[used], number[constraints.path], constraints.path_curve),
+    remaining = Constraints(
+        constraints.curve[used], constraints.fixed[used], number[constraints.path], constraints.path_curve
     )
+    return QuadMesh(out[used], collapsed), remaining

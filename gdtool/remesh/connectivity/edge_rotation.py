@@ -8,30 +8,31 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.geometry.mesh_quality import valences
+from gdtool.geometry.meshes import QuadMesh
 
 _MAX_STEPS = 3, 6, 10  # rotations in one direction, by round over all pairs: the nearest pairs meet first
 _FLAT_COSINE = 0.8  # least cosine between the normals of two quads whose edge may rotate: creases stay
 
 
-def cancel_pairs(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Cancel pairs of irregular vertices by rotating edges; the number of faces and vertices stays.
+def cancel_pairs(mesh: QuadMesh) -> np.ndarray:
+    """Cancel pairs of irregular vertices by rotating edges; return the new faces (q, 4).
 
-    faces (q, 4) of a manifold. The rotation of an edge moves such a pair on and leaves regular quads behind (Peng et
-    al. 2011, Connectivity editing for quadrilateral meshes). Each pair is moved both ways until a rotation beside it
-    leaves fewer irregular vertices; otherwise it is put back. Faces that are not consistently oriented are returned as
-    they are.
+    mesh: a manifold of quads. Rotating an edge moves such a pair on and leaves regular quads behind (Peng et al. 2011,
+    Connectivity editing for quadrilateral meshes). Each pair is moved both ways until a rotation beside it leaves fewer
+    irregular vertices; otherwise it is put back. Faces that are not consistently oriented are returned as they are.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     valence, inner = valences(faces, len(vertices))
-    mesh = _RotatableMesh(vertices, faces, valence, inner)
-    if not mesh.is_oriented():
+    rotatable = _RotatableMesh(vertices, faces, valence, inner)
+    if not rotatable.is_oriented():
         return faces
     for steps in _MAX_STEPS:
-        for vertex in np.flatnonzero(inner & (np.array(mesh.valence) > 4)).tolist():
-            mesh.apply_gains(vertex)
+        for vertex in np.flatnonzero(inner & (np.array(rotatable.valence) > 4)).tolist():
+            rotatable.apply_gains(vertex)
             direction = 0
-            while mesh.valence[vertex] > 4 and mesh.move_pair(vertex, direction, steps) is False:
+            while rotatable.valence[vertex] > 4 and rotatable.move_pair(vertex, direction, steps) is False:
                 direction += 1
-    return np.array(mesh.faces, faces.dtype)
+    return np.array(rotatable.faces, faces.dtype)
 
 
 @dataclass(frozen=True)

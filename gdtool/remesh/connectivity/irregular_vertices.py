@@ -5,16 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.geometry.mesh_quality import valences
+from gdtool.geometry.meshes import QuadMesh
 from gdtool.geometry.topology import compact
 
 
-def cancel_irregular(vertices: np.ndarray, faces: np.ndarray, rounds: int = 4) -> tuple[np.ndarray, np.ndarray]:
-    """Collapse quads (q, 4) along a diagonal wherever that leaves fewer irregular vertices.
+def cancel_irregular(mesh: QuadMesh, rounds: int = 4) -> QuadMesh:
+    """Collapse quads along a diagonal wherever that leaves fewer irregular vertices.
 
     The merged vertex has two edges fewer than its two ends together, and the other corners lose one each (Daniels et
     al. 2008, quad-vertex merge). A quad is collapsed only where the mesh around stays a manifold, and not beside
-    another that collapses in the same round. Returns vertices and quads.
+    another that collapses in the same round.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     for _ in range(rounds):
         valence, inner = valences(faces, len(vertices))
         valence_of_corner = valence[faces]
@@ -55,8 +57,9 @@ def cancel_irregular(vertices: np.ndarray, faces: np.ndarray, rounds: int = 4) -
         vertices = vertices.copy()
         merged = np.flatnonzero(merged_into != np.arange(len(vertices)))
         vertices[merged_into[merged]] = (vertices[merged_into[merged]] + vertices[merged]) / 2
-        vertices, faces = compact(vertices, merged_into[np.delete(faces, dead, 0)])
-    return vertices, faces
+        mesh = compact(QuadMesh(vertices, merged_into[np.delete(faces, dead, 0)]))
+        vertices, faces = mesh.vertices, mesh.faces
+    return mesh
 
 
 def _is_irregular(valence: np.ndarray) -> np.ndarray:

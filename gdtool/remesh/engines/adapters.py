@@ -1,6 +1,6 @@
 """Call the native quad remeshers; each runs in a child process, for it may hang or crash.
 
-Every engine takes vertices (v, 3) in a unit box and faces (f, 3), and returns vertices and quads (q, 4), unchecked.
+Every engine takes a triangle mesh in a unit box, and returns quads, unchecked.
 """
 
 from __future__ import annotations
@@ -8,16 +8,15 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.core.native import imported
-from gdtool.geometry.repair import without_crumbs
+from gdtool.geometry.meshes import QuadMesh, TriMesh
+from gdtool.geometry.nonmanifold_edges import separate_sheets
+from gdtool.geometry.repair import drop_small_pieces
 from gdtool.geometry.topology import Invariants, compact, edges_of, invariants
-from gdtool.geometry.unpinch import unpinched
 
 _FACES_PER_QUAD = 4  # triangles per requested quad that an engine needs to see the shape
 
 
-def simplify_for_engine(
-    vertices: np.ndarray, faces: np.ndarray, quads: int, wanted: Invariants
-) -> tuple[np.ndarray, np.ndarray]:
+def simplify_for_engine(mesh: TriMesh, quads: int, wanted: Invariants) -> TriMesh:
     """Simplify the engine's input to what `quads` quads can show, where that keeps its invariants.
 
     Saves half of Instant Meshes' time: it splits long edges itself, so its cost follows the vertices it is given more
@@ -25,23 +24,22 @@ def simplify_for_engine(
     """
     from gdtool.geometry.simplify import collapse
 
-    if len(faces) <= _FACES_PER_QUAD * quads:
-        return vertices, faces
-    simplified_vertices, simplified = compact(*collapse(vertices, faces, _FACES_PER_QUAD * quads, 5.0))
-    if invariants(simplified) != wanted:  # most often where two sheets meet in an edge
-        simplified_vertices, simplified = without_crumbs(*unpinched(simplified_vertices, simplified), wanted.pieces)
-    return (simplified_vertices, simplified) if invariants(simplified) == wanted else (vertices, faces)
+    if len(mesh.faces) <= _FACES_PER_QUAD * quads:
+        return mesh
+    simplified = compact(collapse(mesh, _FACES_PER_QUAD * quads, 5.0))
+    if invariants(simplified.faces) != wanted:  # most often where two sheets meet in an edge
+        simplified = drop_small_pieces(separate_sheets(simplified), wanted.pieces)
+    return simplified if invariants(simplified.faces) == wanted else mesh
 
 
-def run_instant_meshes(
-    vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float
-) -> tuple[np.ndarray, np.ndarray]:
+def run_instant_meshes(mesh: TriMesh, quads: int, crease_degrees: float) -> QuadMesh:
     """Run Instant Meshes (Jakob et al. 2015): a quarter as many mixed faces, then one regular subdivision to pure
     quads.
 
     Its deterministic mode, so that equal input gives equal files. Intrinsic smoothing leaves a tenth fewer irregular
     vertices, but its quads follow creases less well.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     pynanoinstantmeshes = imported("pynanoinstantmeshes")
     quad_vertices, quad_faces = pynanoinstantmeshes.remesh(
         np.ascontiguousarray(vertices, np.float32),
@@ -55,16 +53,15 @@ def run_instant_meshes(
         smooth_iter=0,
         deterministic=True,
     )
-    return np.asarray(quad_vertices, np.float64), np.asarray(quad_faces, np.int64)
+    return QuadMesh(np.asarray(quad_vertices, np.float64), np.asarray(quad_faces, np.int64))
 
 
-def run_quadriflow(
-    vertices: np.ndarray, faces: np.ndarray, quads: int, crease_degrees: float
-) -> tuple[np.ndarray, np.ndarray]:
+def run_quadriflow(mesh: TriMesh, quads: int, crease_degrees: float) -> QuadMesh:
     """Run QuadriFlow (Huang et al. 2018) through pyQuadriFlow, an optional package.
 
     It ends the process on non-manifold input.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     pyQuadriFlow = imported("pyQuadriFlow.pyQuadriFlow")
     result = pyQuadriFlow.pyquadriflow(
         int(quads),
@@ -77,7 +74,7 @@ def run_quadriflow(
         False,
         False,
     )
-    return np.asarray(result["vertices"], np.float64), np.asarray(result["faces"], np.int64)
+    return QuadMesh(np.asarray(result["vertices"], np.float64), np.asarray(result["faces"], np.int64))
 
 
 ENGINES = {"instant-meshes": run_instant_meshes, "quadriflow": run_quadriflow}

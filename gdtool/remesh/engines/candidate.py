@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from gdtool.geometry import repair, topology
-from gdtool.geometry.distance import by_place
+from gdtool.geometry.distance import spatial_order
 from gdtool.geometry.mesh_quality import scaled_jacobian, valences
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.remesh.connectivity.edge_rotation import cancel_pairs
 from gdtool.remesh.connectivity.irregular_vertices import cancel_irregular
 from gdtool.remesh.engines.adapters import ENGINES, simplify_for_engine
-from gdtool.remesh.fit.feature_curves import Constraints
 from gdtool.remesh.fit.shaping import (
     CUT_OFF,
     CUT_SUBDIVIDED,
@@ -20,6 +21,7 @@ from gdtool.remesh.fit.shaping import (
     FAR_SUBDIVIDED,
     LEAVES_OUT,
     STICKS_OUT,
+    FittedQuads,
     SnappedQuads,
     fit_to_surface,
     max_distance,
@@ -92,10 +94,9 @@ class Candidate:
     attempt: EngineAttempt
     requested: float
     fault: str | None
-    vertices: np.ndarray
-    quads: np.ndarray
+    mesh: QuadMesh
     snapped: SnappedQuads | None = None
-    fitted: tuple[np.ndarray, np.ndarray, Constraints] | None = None
+    fitted: FittedQuads | None = None
     distance_edges: float = np.inf  # largest distance from the surface to the fitted quads, in edge lengths
     min_jacobian: float = -1.0  # worst scaled Jacobian of the fitted quads
     rejection: str | None = None  # why the fitted quads are not acceptable
@@ -105,7 +106,19 @@ class Candidate:
     @property
     def count(self) -> int:
         """Number of quads after subdivision."""
-        return len(self.quads) * self.attempt.quads_per_engine_quad
+        return len(self.mesh.faces) * self.attempt.quads_per_engine_quad
+
+    @property
+    def snapped_count(self) -> int:
+        """Number of snapped quads, subdivided and with tips; snap() comes before."""
+        assert self.snapped is not None
+        return len(self.snapped.mesh.faces)
+
+    @property
+    def fitted_count(self) -> int:
+        """Number of fitted quads; fit() comes before."""
+        assert self.fitted is not None
+        return len(self.fitted.mesh.faces)
 
     def count_error(self, wanted: float) -> float:
         """Return the relative error of the count, signed."""
@@ -135,29 +148,29 @@ class Candidate:
         return (
             self.fault is None
             or self.fault == LOST
-            and max_overshoot(self.vertices, self.quads, patch.surface) < 2 * _OVERSHOOT_EDGES * patch.edge
+            and max_overshoot(self.mesh, patch.surface) < 2 * _OVERSHOOT_EDGES * patch.edge
         )
 
     def missing_surface(self, patch: RemeshPatch) -> str | None:
         """Return a rejection reason where it leaves out surface that tip extrusion cannot bring back, else None."""
-        uncovered = uncovered_shares(
-            target_of_quads(self.vertices, self.quads), patch.surface, (_UNCOVERED_EDGES * patch.edge,)
-        )[0]
+        uncovered = uncovered_shares(target_of_quads(self.mesh), patch.surface, (_UNCOVERED_EDGES * patch.edge,))[0]
         return f"{LEAVES_OUT} {uncovered:.1%} of the surface" if uncovered > _MAX_UNCOVERED_SHARE else None
 
     def raw_distance(self, patch: RemeshPatch) -> float:
         """Return the largest distance from the surface to the engine's quads, in edge lengths (computed once)."""
         if self._raw_distance_edges is None:
-            self._raw_distance_edges = (
-                max_distance(target_of_quads(self.vertices, self.quads), patch.surface) / patch.edge
-            )
+            self._raw_distance_edges = max_distance(target_of_quads(self.mesh), patch.surface) / patch.edge
         return self._raw_distance_edges
 
     def snap(self, patch: RemeshPatch) -> None:
         """Snap the quads to the features and extrude tips (once)."""
         if self.snapped is None:
             self.snapped = snap_to_features(
-                self.vertices, self.quads, patch.surface, patch.features, self.attempt.subdivisions, patch.request
+                self.mesh,
+                patch.surface,
+                patch.features,
+                self.attempt.subdivisions,
+                patch.request,
             )
 
     def is_promising(self, patch: RemeshPatch) -> bool:
@@ -171,12 +184,12 @@ class Candidate:
             return
         subdivisions, surface = self.attempt.subdivisions, patch.surface
         self.fitted = fit_to_surface(self.snapped, surface, patch.features, patch.request)
-        vertices, quads, _ = self.fitted
-        self.min_jacobian = float(scaled_jacobian(vertices, quads).min())
+        mesh = self.fitted.mesh
+        self.min_jacobian = float(scaled_jacobian(mesh).min())
         limits = (FAR_SUBDIVIDED, CUT_SUBDIVIDED) if subdivisions else (FAR_EDGES, CUT_OFF)
-        self.rejection, self.distance_edges = rejection_reason(vertices, quads, surface, patch.edge, *limits)
+        self.rejection, self.distance_edges = rejection_reason(mesh, surface, patch.edge, *limits)
         # A lost handle whose bridge sticks out by less was finer than a quad.
-        if self.fault and (overshoot := max_overshoot(vertices, quads, surface) / patch.edge) > _OVERSHOOT_EDGES:
+        if self.fault and (overshoot := max_overshoot(mesh, surface) / patch.edge) > _OVERSHOOT_EDGES:
             self.rejection = f"{STICKS_OUT} {overshoot:.2g} edge lengths"
         if self.rejection is None and subdivisions and self.min_jacobian < patch.request.min_jacobian:
             self.rejection = f"has a quad of scaled Jacobian {self.min_jacobian:.2g}"
@@ -188,76 +201,80 @@ class Candidate:
             and self.distance_edges <= FAR_SUBDIVIDED
             and not self.snapped.hopeless
         ):
-            self.acceptable_as_finer = (
-                rejection_reason(vertices, quads, surface, patch.edge, FAR_EDGES, CUT_OFF)[0] is None
-            )
+            self.acceptable_as_finer = rejection_reason(mesh, surface, patch.edge, FAR_EDGES, CUT_OFF)[0] is None
 
     def _irregular_count(self) -> int:
         """Number of inner vertices without exactly four edges."""
-        valence, inner = valences(self.quads, int(self.quads.max(initial=0)) + 1)
+        valence, inner = valences(self.mesh.faces, int(self.mesh.faces.max(initial=0)) + 1)
         return int((valence[inner] != 4).sum())
 
 
-def make_candidate(vertices: np.ndarray, faces: np.ndarray, attempt: EngineAttempt, requested: float) -> Candidate:
+def make_candidate(mesh: TriMesh, attempt: EngineAttempt, requested: float) -> Candidate:
     """Run an engine on triangles and judge its quads; this is the function that child processes run.
 
-    vertices (v, 3) in a unit box, faces (f, 3). requested: final quads, after subdivision.
+    mesh: in a unit box. requested: final quads, after subdivision.
     """
     quads = max(int(requested / attempt.quads_per_engine_quad), _MIN_ENGINE_QUADS)
-    wanted = topology.invariants(faces)
-    mesh = vertices.astype(np.float32), faces.astype(np.int32)
+    wanted = topology.invariants(mesh.faces)
+    engine_input = TriMesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
     if attempt.engine == "instant-meshes" and attempt.subdivisions:
-        mesh = simplify_for_engine(*mesh, quads, wanted)
-    fault, *quad_mesh = repair_and_judge(*ENGINES[attempt.engine](*mesh, quads, attempt.degrees), wanted)
-    return Candidate(attempt, requested, fault, *_sort_spatially(*quad_mesh))
+        engine_input = simplify_for_engine(engine_input, quads, wanted)
+    judged = repair_and_judge(ENGINES[attempt.engine](engine_input, quads, attempt.degrees), wanted)
+    return Candidate(attempt, requested, judged.fault, _sort_spatially(judged.mesh))
 
 
-def _sort_spatially(vertices: np.ndarray, quads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _sort_spatially(mesh: QuadMesh) -> QuadMesh:
     """Reorder vertices and quads so that neighbours in space are neighbours in memory; later reads hit the cache."""
+    vertices, quads = mesh.vertices, mesh.faces
     if not len(quads):
-        return vertices, quads
-    order = by_place(vertices)
+        return mesh
+    order = spatial_order(vertices)
     number = np.empty(len(order), np.int64)
     number[order] = np.arange(len(order))
-    return vertices[order], number[quads[by_place(vertices[quads].mean(1))]]
+    return QuadMesh(vertices[order], number[quads[spatial_order(vertices[quads].mean(1))]])
 
 
-def repair_and_judge(
-    quad_vertices: np.ndarray, quad_faces: np.ndarray, wanted: topology.Invariants
-) -> tuple[str | None, np.ndarray, np.ndarray]:
+class JudgedQuads(NamedTuple):
+    """Repaired quads, and the fault that they have; None where they have none."""
+
+    fault: str | None
+    mesh: QuadMesh
+
+
+def repair_and_judge(mesh: QuadMesh, wanted: topology.Invariants) -> JudgedQuads:
     """Repair small defects of an engine's quads and compare their topology with the surface's.
 
-    quad_faces should be (q, 4); any shape and any indices are handled. wanted: invariants of the triangles that the
-    engine was given. Returns the fault or None, vertices (v, 3) and quads (q, 4).
+    mesh: faces should be (q, 4); any shape and any indices are handled. wanted: invariants of the triangles that the
+    engine was given.
     """
     closed, _, pieces, euler_number = wanted
-    if quad_faces.ndim != 2 or quad_faces.shape[1] != 4 or not len(quad_faces):
-        return "no quads", quad_vertices, quad_faces
-    if quad_faces.min() < 0 or quad_faces.max() >= len(quad_vertices) or not np.isfinite(quad_vertices).all():
-        return "indices or coordinates out of range", quad_vertices, quad_faces
-    whole = (np.sort(quad_faces, 1)[:, 1:] != np.sort(quad_faces, 1)[:, :-1]).all(1)
+    faces = mesh.faces
+    if faces.ndim != 2 or faces.shape[1] != 4 or not len(faces):
+        return JudgedQuads("no quads", mesh)
+    if faces.min() < 0 or faces.max() >= len(mesh.vertices) or not np.isfinite(mesh.vertices).all():
+        return JudgedQuads("indices or coordinates out of range", mesh)
+    whole = (np.sort(faces, 1)[:, 1:] != np.sort(faces, 1)[:, :-1]).all(1)
     if not whole.any():
-        return "no quads", quad_vertices, quad_faces
-    quad_vertices, quad_faces = topology.compact(quad_vertices, quad_faces[whole])
+        return JudgedQuads("no quads", mesh)
+    mesh = topology.compact(QuadMesh(mesh.vertices, faces[whole]))
     for turn in range(_REPAIR_ROUNDS):
-        if turn and (not closed or topology.is_watertight(quad_faces)):
+        if turn and (not closed or topology.is_watertight(mesh.faces)):
             break
         if closed:
-            quad_vertices, quad_faces = fill_holes(quad_vertices, quad_faces)
-        # Splitting pinched vertices and dropping crumbs open new holes, which the next round fills.
-        quad_vertices, quad_faces = remove_doublets(*repair.one_vertex_per_fan(quad_vertices, quad_faces))
-        quad_vertices, quad_faces = cancel_irregular(quad_vertices, quad_faces)
-        quad_vertices, quad_faces = repair.without_crumbs(quad_vertices, quad_faces, pieces)
-        if not len(quad_faces):
-            return "no quads", quad_vertices, quad_faces
-    if closed and not topology.is_watertight(quad_faces):
-        return "not watertight, though the input is", quad_vertices, quad_faces
-    if not topology.is_manifold(quad_faces):
-        return "not manifold", quad_vertices, quad_faces
-    if topology.components(quad_faces)[0] != pieces:
+            mesh = fill_holes(mesh)
+        # Splitting pinched vertices and dropping small pieces open new holes, which the next round fills.
+        mesh = remove_doublets(repair.one_vertex_per_fan(mesh))
+        mesh = repair.drop_small_pieces(cancel_irregular(mesh), pieces)
+        if not len(mesh.faces):
+            return JudgedQuads("no quads", mesh)
+    if closed and not topology.is_watertight(mesh.faces):
+        return JudgedQuads("not watertight, though the input is", mesh)
+    if not topology.is_manifold(mesh.faces):
+        return JudgedQuads("not manifold", mesh)
+    if topology.components(mesh.faces)[0] != pieces:
         # Irregular vertices stay for now: the pieces that are kept are judged again one by one.
-        return PIECES, quad_vertices, quad_faces
-    quad_faces = cancel_pairs(quad_vertices, quad_faces)
-    if closed and (difference := topology.euler_number(quad_faces) - euler_number):
-        return LOST if difference > 0 else ADDED, quad_vertices, quad_faces
-    return None, quad_vertices, quad_faces
+        return JudgedQuads(PIECES, mesh)
+    mesh = QuadMesh(mesh.vertices, cancel_pairs(mesh))
+    if closed and (difference := topology.euler_number(mesh.faces) - euler_number):
+        return JudgedQuads(LOST if difference > 0 else ADDED, mesh)
+    return JudgedQuads(None, mesh)

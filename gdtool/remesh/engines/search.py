@@ -126,11 +126,11 @@ class EngineSearch:
             count, has_count = best.count, self.patch.has_count(best.count, wanted)
             usable = best.is_usable(self.patch)
             is_together = self._has_pieces and not attempt.subdivisions
-            if is_together and len(best.quads):
+            if is_together and len(best.mesh.faces):
                 self.whole = best
             if (
                 (is_together or usable and (self._has_pieces or not has_count))
-                and len(best.quads)
+                and len(best.mesh.faces)
                 and (missing := best.missing_surface(self.patch))
             ):
                 return self._fail(attempt, missing)
@@ -155,9 +155,9 @@ class EngineSearch:
             if taken is not None and taken.rejection is not None:
                 return self._reject(taken)
             if taken is None:  # the first was snapped, and does not have the count together with its tips
-                taken, count = in_order[0], len(in_order[0].snapped.faces)
+                taken, count = in_order[0], in_order[0].snapped_count
             else:
-                count = len(taken.fitted[1])
+                count = taken.fitted_count
             if not self.patch.has_count(count, quads):
                 tip_quads = count - taken.count
                 requests = attempt.counts_around(taken.requested * (quads - tip_quads) / taken.count)
@@ -177,7 +177,7 @@ class EngineSearch:
 
     def _reject(self, taken: Candidate) -> None:
         """Record why a fitted candidate is rejected; keep it where it would do as a finer result."""
-        if taken.acceptable_as_finer and self.patch.has_count(len(taken.fitted[1]), self.patch.quads):
+        if taken.acceptable_as_finer and self.patch.has_count(taken.fitted_count, self.patch.quads):
             self._acceptable = taken
         self._fail(taken.attempt, f"{taken.fault}; {taken.rejection}" if taken.fault else taken.rejection)
 
@@ -187,13 +187,12 @@ class EngineSearch:
         running = [
             begin(
                 make_candidate,
-                patch.vertices,
-                patch.faces,
+                patch.mesh,
                 attempt,
                 number,
                 seconds=request.child_seconds,
                 memory_mb=min(
-                    int(_BASE_MEMORY_MB + _MEMORY_MB_PER_FACE * (number + len(patch.faces))), request.memory_mb
+                    int(_BASE_MEMORY_MB + _MEMORY_MB_PER_FACE * (number + len(patch.mesh.faces))), request.memory_mb
                 ),
             )
             for number in requests
@@ -236,7 +235,7 @@ class EngineSearch:
             if candidate is not candidates[0] and not self.patch.has_count(candidate.count + tip_quads, quads):
                 continue
             candidate.snap(self.patch)
-            tip_quads = len(candidate.snapped.faces) - candidate.count
+            tip_quads = candidate.snapped_count - candidate.count
             if candidate.snapped.hopeless or self.patch.has_count(candidate.count + tip_quads, quads):
                 yield candidate
 
@@ -272,10 +271,11 @@ class EngineSearch:
     def _finalized(self, taken: Candidate) -> QuadResult:
         """Return the finalized quads of a fitted candidate."""
         start = time.perf_counter()
-        vertices, quads = finalize(*taken.fitted, self.patch.full_surface(), self.patch.request)
+        assert taken.fitted is not None
+        mesh = finalize(taken.fitted, self.patch.full_surface(), self.patch.request)
         self.record.clock("fit", start)
         label = taken.attempt.label
-        return QuadResult(vertices, quads, f"{label}, {taken.fault}" if taken.fault else label)
+        return QuadResult(mesh, f"{label}, {taken.fault}" if taken.fault else label)
 
     def _fail(self, attempt: EngineAttempt, reason: str, torn: bool = False) -> None:
         """Record why an attempt failed, and skip the attempts that would fail for the same reason."""

@@ -3,8 +3,8 @@
 The result of any triangle mesh is (split_count(faces, quads), 4) quads, or about as many. No piece is lost; it is
 closed and manifold where the triangles are.
 
-Arguments in common: vertices (v, 3) in a unit box, faces (f, 3); seconds and memory_mb limit each run in a child
-process, whose failure costs evenness alone; `meanwhile` is called while a child works.
+Arguments in common: a mesh in a unit box; seconds and memory_mb limit each run in a child process, whose failure costs
+evenness alone; `meanwhile` is called while a child works.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import numpy as np
 
 from gdtool.core.child import ChildFailed, call
 from gdtool.core.native import imported
-from gdtool.geometry.normals import face_normals
-from gdtool.geometry.simplify import simplify
+from gdtool.geometry.meshes import QuadMesh, TriMesh
+from gdtool.geometry.simplify import SimplifyOptions, simplify
 from gdtool.geometry.topology import compact, components, edges_of, handles, invariants, is_manifold
 from gdtool.remesh.fit.surface_projection import subdivide
 from gdtool.remesh.limits import QUADS_OF_A_PIECE
@@ -48,57 +48,50 @@ def too_few_for_isotropic(faces: np.ndarray, quads: int) -> bool:
 
 
 def quads_from_isotropic(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: TriMesh,
     quads: int,
     crease_degrees: float,
     seconds: float,
     memory_mb: int,
     meanwhile: Callable[[], object] = lambda: None,
-) -> tuple[np.ndarray, np.ndarray] | None:
+) -> QuadMesh | None:
     """Make quads from triangles of one size and shape, of the same topology, creases sharper than crease_degrees kept.
 
     Returns None where no such triangles split into this many quads, as on small intricate meshes.
     """
     triangles = int(quads / _QUADS_PER_TRIANGLE)
-    simplified_vertices, simplified = simplify(
-        vertices, faces, 2 * triangles, seconds=seconds, careful=True, measured=False, meanwhile=meanwhile
-    )[:2]
+    simplified = simplify(mesh, 2 * triangles, options=_simplify_options(seconds, meanwhile)).mesh
     try:
-        even_vertices, even_faces = call(
-            isotropic_triangles,
-            simplified_vertices,
-            simplified,
-            triangles,
-            crease_degrees,
-            seconds=seconds,
-            memory_mb=memory_mb,
+        isotropic = call(
+            isotropic_triangles, simplified, triangles, crease_degrees, seconds=seconds, memory_mb=memory_mb
         )
     except ChildFailed:
         return None
-    if not 2.1 * len(even_faces) <= quads <= 3 * len(even_faces):
+    if not 2.1 * len(isotropic.faces) <= quads <= 3 * len(isotropic.faces):
         return None
-    even_vertices, even_faces = compact(even_vertices, even_faces)
-    return (
-        pair_and_split(even_vertices, even_faces, quads)
-        if invariants(even_faces) == invariants(faces) and np.isfinite(even_vertices).all()
-        else None
-    )
+    isotropic = compact(isotropic)
+    if invariants(isotropic.faces) != invariants(mesh.faces) or not np.isfinite(isotropic.vertices).all():
+        return None
+    return pair_and_split(isotropic, quads)
 
 
-def isotropic_triangles(
-    vertices: np.ndarray, faces: np.ndarray, triangles: int, crease_degrees: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _simplify_options(seconds: float, meanwhile: Callable[[], object]) -> SimplifyOptions:
+    """Return how the fallback simplifies: keeping the topology, without a measured error."""
+    return SimplifyOptions(seconds, topology_first=True, measure_error=False, while_waiting=meanwhile)
+
+
+def isotropic_triangles(mesh: TriMesh, triangles: int, crease_degrees: float) -> TriMesh:
     """Remesh to triangles of equal size and shape, about `triangles` of them, unchecked.
 
     MeshLab's isotropic remeshing (Botsch & Kobbelt 2004, "A remeshing approach to multiresolution modeling"). Creases
     sharper than crease_degrees stay. The surface moves by a tenth of an edge at most.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     pymeshlab = imported("pymeshlab")
     # MeshLab merges coincident vertices, which closes slits and leaves edges with four faces: noise keeps them apart.
     noise = np.random.default_rng(0).uniform(-1, 1, vertices.shape) * _SEPARATION * np.ptp(vertices, 0).max()
     mesh_input = np.ascontiguousarray(vertices + noise, np.float64), np.ascontiguousarray(faces, np.int32)
-    edge, faces_out, error = (4 / 3**0.5 * face_normals(vertices, faces)[1].sum() / triangles) ** 0.5, faces, np.inf
+    edge, faces_out, error = (4 / 3**0.5 * mesh.area / triangles) ** 0.5, faces, np.inf
     for _ in range(_MAX_LENGTHS):
         meshes = pymeshlab.MeshSet()
         meshes.add_mesh(pymeshlab.Mesh(*mesh_input))
@@ -109,8 +102,8 @@ def isotropic_triangles(
             checksurfdist=True,
             maxsurfdist=pymeshlab.PureValue(edge / 10),
         )
-        mesh = meshes.current_mesh()
-        vertices, faces_out = np.asarray(mesh.vertex_matrix()), np.asarray(mesh.face_matrix(), np.int64)
+        result = meshes.current_mesh()
+        vertices, faces_out = np.asarray(result.vertex_matrix()), np.asarray(result.face_matrix(), np.int64)
         if (
             abs(len(faces_out) / triangles - 1) < _COUNT_TOLERANCE
             or not len(faces_out)
@@ -121,13 +114,14 @@ def isotropic_triangles(
         if error > _MAX_ERROR_LEFT * previous_error:
             break  # the creases alone need more triangles than this
         edge *= (len(faces_out) / triangles) ** 0.7  # not 0.5: along creases the count follows 1 / edge
-    return vertices, faces_out
+    return TriMesh(vertices, faces_out)
 
 
 def quads_from_input(
-    vertices: np.ndarray, faces: np.ndarray, quads: int, seconds: float, meanwhile: Callable[[], object] = lambda: None
-) -> tuple[np.ndarray, np.ndarray]:
+    mesh: TriMesh, quads: int, seconds: float, meanwhile: Callable[[], object] = lambda: None
+) -> QuadMesh:
     """Make quads from the triangles of the input itself, subdivided or collapsed to the right number."""
+    vertices, faces = mesh.vertices, mesh.faces
     igl = imported("igl")
     triangles = max(int(quads / _QUADS_PER_TRIANGLE), 4)
     while len(faces) < triangles:
@@ -135,43 +129,42 @@ def quads_from_input(
             np.asarray(x)
             for x in igl.upsample(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64), 1)
         )
-    best = None
+    best: QuadMesh | None = None
     for _ in range(_MAX_TRIES):
-        mesh = pair_and_split(*_collapsed(vertices, faces, triangles, seconds, meanwhile), quads)
-        if best is None or abs(len(mesh[1]) - quads) < abs(len(best[1]) - quads):
-            best = mesh
-        if abs(len(mesh[1]) / quads - 1) < _COUNT_TOLERANCE:
+        made = pair_and_split(_collapsed(TriMesh(vertices, faces), triangles, seconds, meanwhile), quads)
+        count = len(made.faces)
+        if best is None or abs(count - quads) < abs(len(best.faces) - quads):
+            best = made
+        if abs(count / quads - 1) < _COUNT_TOLERANCE:
             break
         # Triangles that bend too much stay single and give more quads.
-        triangles = max(int(triangles * quads / len(mesh[1])), 4)
+        triangles = max(int(triangles * quads / count), 4)
+    assert best is not None  # there is at least one try
     return best
 
 
-def _collapsed(
-    vertices: np.ndarray, faces: np.ndarray, triangles: int, seconds: float, meanwhile: Callable[[], object]
-) -> tuple[np.ndarray, np.ndarray]:
+def _collapsed(mesh: TriMesh, triangles: int, seconds: float, meanwhile: Callable[[], object]) -> TriMesh:
     """Collapse to `triangles` triangles, or a few more.
 
     A collapse that loses pieces is repeated more gently; where all lose some, the mesh stays as it is.
     """
-    pieces = components(faces)[0]
+    pieces = components(mesh.faces)[0]
     for factor in _COLLAPSE_FACTORS:
-        if factor * triangles >= len(faces):
+        if factor * triangles >= len(mesh.faces):
             break
-        out, out_faces, _, _ = simplify(
-            vertices, faces, int(factor * triangles), seconds=seconds, careful=True, measured=False, meanwhile=meanwhile
-        )
-        if components(out_faces)[0] == pieces and is_manifold(out_faces) >= is_manifold(faces):
-            return out, out_faces
-    return vertices, faces
+        made = simplify(mesh, int(factor * triangles), options=_simplify_options(seconds, meanwhile)).mesh
+        if components(made.faces)[0] == pieces and is_manifold(made.faces) >= is_manifold(mesh.faces):
+            return made
+    return mesh
 
 
-def pair_and_split(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple[np.ndarray, np.ndarray]:
+def pair_and_split(mesh: TriMesh, quads: int) -> QuadMesh:
     """Join triangles in pairs, best first, then cut every face into one quad per corner.
 
     Each pair spares two quads, so about quads / 2.2 triangles give exactly `quads` quads. The result is closed and
     manifold exactly where the triangles are.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     edges = edges_of(faces)
     edge_idx, pairs = edges.face_pairs()
     ends = edges.ends[edge_idx]
@@ -214,5 +207,4 @@ def pair_and_split(vertices: np.ndarray, faces: np.ndarray, quads: int) -> tuple
         mixed[int(is_single.sum()) :] = np.stack(
             [tips[chosen, 0], first[row, (turn + 1) % 3], tips[chosen, 1], first[row, (turn + 2) % 3]], -1
         )
-    quad_vertices, quad_faces, _ = subdivide(vertices, mixed)
-    return quad_vertices, quad_faces
+    return subdivide(QuadMesh(vertices, mixed))[0]

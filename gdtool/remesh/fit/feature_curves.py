@@ -8,6 +8,7 @@ import numpy as np
 
 from gdtool.core.native import imported
 from gdtool.geometry.mesh_quality import corner_jacobians, polygon_normals
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.sharpen import dihedral_degrees
 from gdtool.geometry.topology import edges_of
 
@@ -72,17 +73,18 @@ class Features:
 NO_FEATURES = Features(np.zeros((0, 3)), np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
-def find_features(vertices: np.ndarray, faces: np.ndarray, crease_degrees: float, shortest: float) -> Features:
+def find_features(mesh: TriMesh, crease_degrees: float, shortest: float) -> Features:
     """Find the creases and open boundaries of triangles.
 
     A crease is sharper than crease_degrees somewhere, and sharper than 0.6 of that all along. Connected sets whose
     total length is below `shortest` are noise.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     edges = edges_of(faces)
-    ends, _, angle = dihedral_degrees(vertices, faces, _MIN_TRIANGLE_HEIGHT, edges)
+    ends, _, angle = dihedral_degrees(mesh, _MIN_TRIANGLE_HEIGHT, edges)
     boundary = edges.ends[edges.count != 2]
     strong = np.concatenate([angle > crease_degrees, np.ones(len(boundary), bool)])
     segments = np.concatenate([ends, boundary])
@@ -225,15 +227,14 @@ class Constraints:
         return cls(np.full(count, -1), np.zeros(count, bool), np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
 
 
-def trace_features(
-    vertices: np.ndarray, faces: np.ndarray, features: Features, edge: float
-) -> tuple[np.ndarray, Constraints]:
+def trace_features(mesh: QuadMesh, features: Features, edge: float) -> tuple[np.ndarray, Constraints]:
     """Snap paths of quad edges to the feature curves.
 
-    faces (f, 4); edge: the mean edge length. Each curve gets the shortest path of edges that stays near it. Paths do
+    edge: the mean edge length. Each curve gets the shortest path of edges that stays near it. Paths do
     not cross one another. Returns vertices (v, 3), those of paths moved onto the curves, and the constraints that hold
     them there.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     if not features:
         return vertices, Constraints.none(len(vertices))
     tracer = _FeatureTracer(vertices, faces, features, edge)
@@ -419,17 +420,18 @@ def _order_points(segments: np.ndarray) -> list[int]:
             return walk
 
 
-def release_straight_corners(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints) -> Constraints:
+def release_straight_corners(mesh: QuadMesh, constraints: Constraints) -> Constraints:
     """Release the middle of three corners of a quad that follow a feature in a straight line; the path is open there.
 
-    A quad with a straight angle degenerates. A crease cut short by half a quad is the smaller fault. faces (f, 4).
+    A quad with a straight angle degenerates. A crease cut short by half a quad is the smaller fault.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     curve, fixed, path = constraints.curve.copy(), constraints.fixed.copy(), np.sort(constraints.path, 1)
     width = len(vertices) + 1
     kept = np.ones(len(path), bool)
     corner = faces[faces[:, 3] >= 0]
     after, before = np.roll(corner, -1, 1), np.roll(corner, 1, 1)
-    straight = corner_jacobians(vertices, corner, polygon_normals(vertices, corner)[0]) < _STRAIGHT
+    straight = corner_jacobians(QuadMesh(vertices, corner), polygon_normals(QuadMesh(vertices, corner))[0]) < _STRAIGHT
 
     def on_path(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.isin(np.minimum(a, b) * width + np.maximum(a, b), (path[:, 0] * width + path[:, 1])[kept])

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gdtool.geometry.mesh_quality import columns_of
+from gdtool.geometry.mesh_quality import gather_corners
+from gdtool.geometry.meshes import QuadMesh
 from gdtool.geometry.topology import edges_of
 from gdtool.remesh.fit.feature_curves import Constraints, closest_on_segments
 from gdtool.remesh.fit.surface_projection import ProjectionTarget
@@ -57,12 +58,13 @@ def hold_centres(constraints: Constraints, first_centre: int, face_idx: np.ndarr
     return replace(constraints, curve=curve_of_vertex)
 
 
-def choose_diagonals(vertices: np.ndarray, faces: np.ndarray, surface: ProjectionTarget) -> np.ndarray:
-    """Rotate the corners of faces (q, 4) so that the diagonal from the first corner is the one nearer to the surface.
+def choose_diagonals(mesh: QuadMesh, surface: ProjectionTarget) -> np.ndarray:
+    """Rotate the corners of quads so that the diagonal from the first corner is the one nearer to the surface.
 
-    Faces are cut in two along that diagonal, so bent quads across a crease then follow it.
+    Quads are cut in two along that diagonal, so bent quads across a crease then follow it. Returns the faces (q, 4).
     """
-    columns = columns_of(vertices, faces)
+    vertices, faces = mesh.vertices, mesh.faces
+    columns = gather_corners(vertices, faces)
     middle = np.stack([(columns[:, 0] + columns[:, 2]) / 2, (columns[:, 1] + columns[:, 3]) / 2])
     gap = np.sqrt(((middle[0] - middle[1]) ** 2).sum(0))
     size = np.sqrt(((columns[:, 0] - columns[:, 2]) ** 2).sum(0))
@@ -74,11 +76,12 @@ def choose_diagonals(vertices: np.ndarray, faces: np.ndarray, surface: Projectio
     return out
 
 
-def snap_boundary(vertices: np.ndarray, faces: np.ndarray, surface: ProjectionTarget, reach: float) -> np.ndarray:
+def snap_boundary(mesh: QuadMesh, surface: ProjectionTarget, reach: float) -> np.ndarray:
     """Move boundary vertices of the quads to the boundary of the surface where it is within `reach`.
 
     Returns vertices (v, 3).
     """
+    vertices, faces = mesh.vertices, mesh.faces
     surface_edges = edges_of(surface.faces)
     segments = surface_edges.ends[surface_edges.count == 1]
     if not len(segments):

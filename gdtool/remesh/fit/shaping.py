@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from gdtool.geometry import topology
 from gdtool.geometry.distance import closest_points, sample_surface
 from gdtool.geometry.mesh_quality import polygon_normals, scaled_jacobian
-from gdtool.geometry.topology import triangulated
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.remesh.connectivity.diagonal_collapse import collapse_folded_quads
 from gdtool.remesh.fit.feature_curves import Constraints, Features, release_straight_corners, trace_features
 from gdtool.remesh.fit.feature_diagonals import choose_diagonals, hold_centres, quads_crossed_by_features, snap_boundary
@@ -50,13 +50,12 @@ TOO_COARSE = _STRAYS, LEAVES_OUT, STICKS_OUT, _CUTS_OFF = "strays", "leaves out"
 class SnappedQuads:
     """An engine's quads snapped to the features, subdivided and extruded over tips, before they are smoothed.
 
-    vertices (v, 3), faces (f, 4); tips (t,): vertices that have to stay; edge: about the edge length of the quads.
-    distance_edges: the largest distance from samples of the surface, and limit_edges: how far the fitted quads may
-    stray, both in edge lengths. hopeless: they are too far away for fitting to help.
+    tips (t,): vertices that have to stay; edge: about the edge length of the quads. distance_edges: the largest
+    distance from samples of the surface, and limit_edges: how far the fitted quads may stray, both in edge lengths.
+    hopeless: they are too far away for fitting to help.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    mesh: QuadMesh
     constraints: Constraints
     tips: np.ndarray
     edge: float
@@ -65,116 +64,123 @@ class SnappedQuads:
     hopeless: bool
 
 
+class FittedQuads(NamedTuple):
+    """Quads fitted to the surface, and the constraints that hold from then on."""
+
+    mesh: QuadMesh
+    constraints: Constraints
+
+
 def snap_to_features(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: QuadMesh,
     surface: ProjectionTarget,
     features: Features,
     subdivisions: int,
     request: Request,
 ) -> SnappedQuads:
     """Snap an engine's quads to creases and boundaries, subdivide them, and extrude tips that they cut short."""
-    edge = (polygon_normals(vertices, faces)[1].sum() / len(faces)) ** 0.5
+    vertices, faces = mesh.vertices, mesh.faces
+    edge = (polygon_normals(mesh)[1].sum() / len(faces)) ** 0.5
     vertices, traced = trace_features(
-        snap_boundary(vertices, faces, surface, _BOUNDARY_EDGES * edge), faces, features, edge
+        QuadMesh(snap_boundary(mesh, surface, _BOUNDARY_EDGES * edge), faces), features, edge
     )
-    constraints = release_straight_corners(vertices, faces, traced)
+    constraints = release_straight_corners(QuadMesh(vertices, faces), traced)
     crossed_quads, curve = quads_crossed_by_features(faces, traced, constraints)
 
     def relaxed() -> np.ndarray:
         projected = project(vertices, surface, features, constraints)
-        return relax(projected, faces, surface, features, constraints, request.smooth_iterations)
+        return relax(QuadMesh(projected, faces), surface, features, constraints, request.smooth_iterations)
 
     vertices = relaxed()
     for turn in range(subdivisions):
         count = len(faces)
-        vertices, faces, constraints = subdivide(vertices, faces, constraints)
+        subdivided, constraints = subdivide(QuadMesh(vertices, faces), constraints)
+        vertices, faces = subdivided.vertices, subdivided.faces
         if not turn:
             constraints = hold_centres(constraints, len(vertices) - count, crossed_quads, curve)
         vertices = relaxed()
     edge /= 2**subdivisions
     if subdivisions:  # features that ran across a quad have vertices nearer to them now
-        vertices, constraints = trace_features(vertices, faces, features, edge)
-    vertices, faces, constraints, tips, distance, sample_distances = extrude_tips(
-        vertices, faces, constraints, surface, edge
-    )
+        vertices, constraints = trace_features(QuadMesh(vertices, faces), features, edge)
+    extruded = extrude_tips(QuadMesh(vertices, faces), constraints, surface, edge)
     hopeless = subdivisions > 0 and (
-        distance > _HOPELESS_EDGES * edge or (sample_distances > _CUT_EDGES * edge).mean() > _HOPELESS_SHARE
+        extruded.distance > _HOPELESS_EDGES * edge
+        or (extruded.sample_distances > _CUT_EDGES * edge).mean() > _HOPELESS_SHARE
     )
     limit = FAR_SUBDIVIDED if subdivisions else FAR_EDGES
-    return SnappedQuads(vertices, faces, constraints, tips, edge, distance / edge, limit, hopeless)
+    return SnappedQuads(
+        extruded.mesh, extruded.constraints, extruded.tips, edge, extruded.distance / edge, limit, hopeless
+    )
 
 
 def fit_to_surface(
     snapped: SnappedQuads, surface: ProjectionTarget, features: Features, request: Request
-) -> tuple[np.ndarray, np.ndarray, Constraints]:
+) -> FittedQuads:
     """Smooth snapped quads on the surface, untangle them, and collapse those that stay folded.
 
-    Hopeless quads are returned as they are. Returns vertices, faces and the constraints that hold from then on.
+    Hopeless quads are returned as they are.
     """
     if snapped.hopeless:
-        return snapped.vertices, snapped.faces, snapped.constraints
-    faces = snapped.faces
-    vertices, constraints = _square_twice(snapped.vertices, faces, surface, features, snapped.constraints, request)
+        return FittedQuads(snapped.mesh, snapped.constraints)
+    faces = snapped.mesh.faces
+    vertices, constraints = _square_twice(snapped.mesh, surface, features, snapped.constraints, request)
     if (
         snapped.distance_edges > _LIKELY_SHARE * snapped.limit_edges
-        and max_distance(target_of_quads(vertices, faces), surface) > snapped.limit_edges * snapped.edge
+        and max_distance(target_of_quads(QuadMesh(vertices, faces)), surface) > snapped.limit_edges * snapped.edge
     ):
-        return vertices, faces, constraints  # rejected anyway: untangling brings quads no nearer
-    vertices, constraints = _untangle_and_release(vertices, faces, surface, features, constraints, snapped.tips)
+        return FittedQuads(QuadMesh(vertices, faces), constraints)  # rejected anyway: untangling brings it no nearer
+    vertices, constraints = _untangle_and_release(
+        QuadMesh(vertices, faces), surface, features, constraints, snapped.tips
+    )
     fixed = np.flatnonzero(constraints.fixed)
-    vertices, faces, constraints = collapse_folded_quads(vertices, faces, surface, constraints)
-    if len(faces) < len(snapped.faces):
-        vertices = untangle(vertices, faces, surface, features, constraints)
-    if (scaled_jacobian(vertices, faces) <= 0).any():
+    mesh, constraints = collapse_folded_quads(QuadMesh(vertices, faces), surface, constraints)
+    if len(mesh.faces) < len(faces):
+        mesh = QuadMesh(untangle(mesh, surface, features, constraints), mesh.faces)
+    if (scaled_jacobian(mesh) <= 0).any():
         # Collapsing keeps fixed vertices, in their order: so the tips are found again.
         tips = np.flatnonzero(constraints.fixed)[np.isin(fixed, snapped.tips)]
         options = ReleaseOptions(_FOLDED_JACOBIAN, _MAX_UNCOVERED_EDGES)
-        vertices, constraints = release_and_smooth(
-            vertices, faces, surface, features, constraints, tips=tips, options=options
-        )
-    return vertices, faces, constraints
+        vertices, constraints = release_and_smooth(mesh, surface, features, constraints, tips=tips, options=options)
+        mesh = QuadMesh(vertices, mesh.faces)
+    return FittedQuads(mesh, constraints)
 
 
-def finalize(
-    vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, full_surface: ProjectionTarget, request: Request
-) -> tuple[np.ndarray, np.ndarray]:
+def finalize(fitted: FittedQuads, full_surface: ProjectionTarget, request: Request) -> QuadMesh:
     """Balance fitted quads about the input as it was before simplification, and choose their diagonals along it."""
+    mesh = fitted.mesh
     if request.smooth_iterations:
-        vertices = balance_heights(vertices, faces, full_surface, constraints)
-    return vertices, choose_diagonals(vertices, faces, full_surface)
+        mesh = QuadMesh(balance_heights(mesh, full_surface, fitted.constraints), mesh.faces)
+    return QuadMesh(mesh.vertices, choose_diagonals(mesh, full_surface))
 
 
 def _square_twice(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: QuadMesh,
     surface: ProjectionTarget,
     features: Features,
     constraints: Constraints,
     request: Request,
 ) -> tuple[np.ndarray, Constraints]:
     """Square up the quads, release straight corners, and square up again; return vertices and constraints."""
-    vertices = square_up(vertices, faces, surface, features, constraints, request.smooth_iterations)
-    constraints = release_straight_corners(vertices, faces, constraints)
-    return square_up(vertices, faces, surface, features, constraints, 2 * request.smooth_iterations), constraints
+    vertices = square_up(mesh, surface, features, constraints, request.smooth_iterations)
+    squared = QuadMesh(vertices, mesh.faces)
+    constraints = release_straight_corners(squared, constraints)
+    return square_up(squared, surface, features, constraints, 2 * request.smooth_iterations), constraints
 
 
 def _untangle_and_release(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: QuadMesh,
     surface: ProjectionTarget,
     features: Features,
     constraints: Constraints,
     tips: np.ndarray | None = None,
 ) -> tuple[np.ndarray, Constraints]:
     """Untangle the few quads that stay folded or thin, releasing them from features where needed."""
-    vertices = untangle(vertices, faces, surface, features, constraints)
-    return release_and_smooth(vertices, faces, surface, features, constraints, tips=tips)
+    untangled = QuadMesh(untangle(mesh, surface, features, constraints), mesh.faces)
+    return release_and_smooth(untangled, surface, features, constraints, tips=tips)
 
 
 def smoothed(
-    quad_vertices: np.ndarray,
-    quad_faces: np.ndarray,
+    mesh: QuadMesh,
     surface: ProjectionTarget,
     features: Features,
     request: Request,
@@ -183,24 +189,23 @@ def smoothed(
 
     Returns vertices (v, 3) and constraints; keep_better_vertices() chooses between these vertices and the input's.
     """
-    edge = (polygon_normals(quad_vertices, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
-    vertices, constraints = trace_features(quad_vertices, quad_faces, features, edge)
-    constraints = release_straight_corners(vertices, quad_faces, constraints)
+    quad_faces = mesh.faces
+    edge = (polygon_normals(mesh)[1].sum() / len(quad_faces)) ** 0.5
+    vertices, constraints = trace_features(mesh, features, edge)
+    constraints = release_straight_corners(QuadMesh(vertices, quad_faces), constraints)
     vertices = relax(
-        project(vertices, surface, features, constraints),
-        quad_faces,
+        QuadMesh(project(vertices, surface, features, constraints), quad_faces),
         surface,
         features,
         constraints,
         request.smooth_iterations,
     )
-    vertices, constraints = _square_twice(vertices, quad_faces, surface, features, constraints, request)
-    return _untangle_and_release(vertices, quad_faces, surface, features, constraints)
+    vertices, constraints = _square_twice(QuadMesh(vertices, quad_faces), surface, features, constraints, request)
+    return _untangle_and_release(QuadMesh(vertices, quad_faces), surface, features, constraints)
 
 
 def keep_better_vertices(
-    quad_vertices: np.ndarray,
-    quad_faces: np.ndarray,
+    mesh: QuadMesh,
     moved: np.ndarray,
     constraints: Constraints,
     surface: ProjectionTarget,
@@ -211,41 +216,39 @@ def keep_better_vertices(
 
     moved (v, 3) and constraints are those of smoothed(). Smoothed positions are balanced about the full surface first.
     """
-    edge = (polygon_normals(quad_vertices, quad_faces)[1].sum() / len(quad_faces)) ** 0.5
+    quad_vertices, quad_faces = mesh.vertices, mesh.faces
+    edge = (polygon_normals(mesh)[1].sum() / len(quad_faces)) ** 0.5
     if request.smooth_iterations:
-        moved = balance_heights(moved, quad_faces, full_surface, constraints)
+        moved = balance_heights(QuadMesh(moved, quad_faces), full_surface, constraints)
     # Pieces a few quads wide fold and shrink when smoothed, so they keep their original vertices. Elsewhere the quads
     # that folded, or left a corner of the surface uncovered, keep theirs.
     count, piece = topology.components(quad_faces)
-    original_quality, quality = (scaled_jacobian(v, quad_faces) for v in (quad_vertices, moved))
+    original_quality, quality = (scaled_jacobian(QuadMesh(v, quad_faces)) for v in (quad_vertices, moved))
     worse = (np.bincount(piece, quality, count) < np.bincount(piece, original_quality, count))[piece]
-    worse[_abandoning_faces(surface, quad_vertices, moved, quad_faces, _ABANDONED_EDGES * edge)] = True
+    worse[_abandoning_faces(surface, mesh, moved, _ABANDONED_EDGES * edge)] = True
     stays = np.zeros(len(quad_vertices), bool)
     while worse.any():
         stays[quad_faces[worse]] = True
-        quality = scaled_jacobian(np.where(stays[:, None], quad_vertices, moved), quad_faces)
+        quality = scaled_jacobian(QuadMesh(np.where(stays[:, None], quad_vertices, moved), quad_faces))
         worse = (quality < _FOLDED_JACOBIAN) & (original_quality > quality) & ~stays[quad_faces].all(1)
     # Quads without area in the original position are better off smoothed.
     min_area = _MIN_AREA * edge**2
-    flat = polygon_normals(np.where(stays[:, None], quad_vertices, moved), quad_faces)[1] < min_area
-    stays[quad_faces[flat & (polygon_normals(moved, quad_faces)[1] >= min_area)]] = False
+    flat = polygon_normals(QuadMesh(np.where(stays[:, None], quad_vertices, moved), quad_faces))[1] < min_area
+    stays[quad_faces[flat & (polygon_normals(QuadMesh(moved, quad_faces))[1] >= min_area)]] = False
     return np.where(stays[:, None], quad_vertices, moved)
 
 
-def _abandoning_faces(
-    surface: ProjectionTarget, vertices: np.ndarray, moved: np.ndarray, faces: np.ndarray, distance: float
-) -> np.ndarray:
+def _abandoning_faces(surface: ProjectionTarget, mesh: QuadMesh, moved: np.ndarray, distance: float) -> np.ndarray:
     """Return the faces (k,) whose move leaves surface farther than `distance` from all quads, and twice as far."""
-    points = sample_surface(surface.vertices, surface.faces, _SURFACE_SAMPLES, np.random.default_rng(0))[0]
-    triangles, face_idx = triangulated(faces)
-    before, nearest = closest_points(points, vertices, triangles)[:2]
-    after = closest_points(points, moved, triangles)[0]
+    points = sample_surface(surface.mesh, _SURFACE_SAMPLES, np.random.default_rng(0))[0]
+    triangles, face_idx = mesh.triangulation
+    before, nearest = closest_points(points, TriMesh(mesh.vertices, triangles))[:2]
+    after = closest_points(points, TriMesh(moved, triangles))[0]
     return np.unique(face_idx[nearest[(after > distance) & (after > 2 * before)]])
 
 
 def rejection_reason(
-    vertices: np.ndarray,
-    quads: np.ndarray,
+    mesh: QuadMesh,
     surface: ProjectionTarget,
     edge: float,
     limit_edges: float,
@@ -257,24 +260,24 @@ def rejection_reason(
     edge that they cut off. Returns the reason to reject them, None where they are acceptable, and their largest
     distance from the surface in edge lengths.
     """
-    quad_surface = target_of_quads(vertices, quads)
+    quad_surface = target_of_quads(mesh)
     if (distance := max_distance(quad_surface, surface) / edge) > limit_edges:
         return f"{_STRAYS} {distance:.2g} edge lengths from the surface", distance
     lost, cut = uncovered_shares(quad_surface, surface, (_LOST_EDGES * edge, _CUT_EDGES * edge))
     if lost > _MAX_LOST_SHARE:
         return f"{LEAVES_OUT} {lost:.1%} of the surface", distance
-    if (overshoot := max_overshoot(vertices, quads, surface) / edge) > limit_edges:
+    if (overshoot := max_overshoot(mesh, surface) / edge) > limit_edges:
         return f"{STICKS_OUT} {overshoot:.2g} edge lengths", distance
-    if (folded := float((scaled_jacobian(vertices, quads) <= 0).mean())) > _MAX_FOLDED_SHARE:
+    if (folded := float((scaled_jacobian(mesh) <= 0).mean())) > _MAX_FOLDED_SHARE:
         return f"{folded:.1%} of the quads are folded", distance
     if cut > max_cut_share:
         return f"{_CUTS_OFF} {cut:.1%} of the surface", distance
     return None, distance
 
 
-def target_of_quads(vertices: np.ndarray, quads: np.ndarray) -> ProjectionTarget:
+def target_of_quads(mesh: QuadMesh) -> ProjectionTarget:
     """Return the surface of the triangles that quads are cut into."""
-    return ProjectionTarget(vertices, triangulated(quads)[0])
+    return ProjectionTarget(mesh.triangles)
 
 
 def max_distance(quads: ProjectionTarget, surface: ProjectionTarget) -> float:
@@ -286,13 +289,13 @@ def max_distance(quads: ProjectionTarget, surface: ProjectionTarget) -> float:
     return float(quads.closest(surface.vertices[::step])[0].max())
 
 
-def max_overshoot(vertices: np.ndarray, faces: np.ndarray, surface: ProjectionTarget) -> float:
+def max_overshoot(mesh: QuadMesh, surface: ProjectionTarget) -> float:
     """Return the largest distance from a quad's centre to the surface: large where quads bridge a gap."""
-    return float(surface.closest(vertices[faces].mean(1))[0].max())
+    return float(surface.closest(mesh.vertices[mesh.faces].mean(1))[0].max())
 
 
 def uncovered_shares(quads: ProjectionTarget, surface: ProjectionTarget, distances: tuple[float, ...]) -> list[float]:
     """Return for each distance the share of the surface's area that lies farther from the quads."""
-    points = sample_surface(surface.vertices, surface.faces, _SHARE_SAMPLES, np.random.default_rng(0))[0]
+    points = sample_surface(surface.mesh, _SHARE_SAMPLES, np.random.default_rng(0))[0]
     away = quads.closest(points)[0]
     return [float((away > distance).mean()) for distance in distances]

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.geometry.distance import closest_points
-from gdtool.geometry.mesh_quality import columns_of, polygon_normals, scaled_jacobian, worst_jacobian
+from gdtool.geometry.mesh_quality import gather_corners, polygon_normals, scaled_jacobian, worst_jacobian
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.topology import edges_of, triangulated
 from gdtool.geometry.vectors import cross, dot
 from gdtool.remesh.fit.feature_curves import Constraints, Features
@@ -47,21 +48,21 @@ class ReleaseOptions:
 
 
 def square_up(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: QuadMesh,
     surface: ProjectionTarget,
     features: Features,
     constraints: Constraints,
     iterations: int,
     strength: float = 1.2,
 ) -> np.ndarray:
-    """Move vertices so that the quads (f, 4) get right angles, on the surface and on the feature curves.
+    """Move vertices so that the quads get right angles, on the surface and on the feature curves.
 
     Shape projection (Bouaziz et al. 2012) onto rectangles in the plane of the surface under each quad. That plane says
     which way round a quad goes, so folded quads are asked to turn over. Returns the best vertices (v, 3) met: fewest
     folded quads first, then the largest mean Jacobian. strength: over-relaxation; at 1.2 ten rounds do what takes
     fifteen at 0.8.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     if not len(faces) or not iterations:
         return vertices
     immovable = immovable_vertices(edges_of(faces), len(vertices), constraints)
@@ -70,8 +71,8 @@ def square_up(
     projector = ConstrainedProjector(surface, features, constraints)
     for turn in range(iterations + 1):
         if turn % _NORMALS_EVERY == 0:
-            normals = np.ascontiguousarray(surface_normals_below(vertices, faces, surface).T)
-        p = columns_of(vertices, faces)
+            normals = np.ascontiguousarray(surface_normals_below(QuadMesh(vertices, faces), surface).T)
+        p = gather_corners(vertices, faces)
         quality = worst_jacobian(p, normals)
         rank = (-int((quality < _FOLDED).sum()), float(quality.mean()))
         if best_rank is None or rank > best_rank:
@@ -92,18 +93,17 @@ def square_up(
     return best if best is projector.placed else projector.exact(best)
 
 
-def balance_heights(
-    vertices: np.ndarray, faces: np.ndarray, surface: ProjectionTarget, constraints: Constraints
-) -> np.ndarray:
+def balance_heights(mesh: QuadMesh, surface: ProjectionTarget, constraints: Constraints) -> np.ndarray:
     """Move vertices off the surface so that as much of it lies above their quads as below.
 
     A quad whose corners lie on a curved surface lies beneath it everywhere, which is half of its error. Vertices move
     by the mean height of the surface over their quads. Features and boundaries stay where they are. So do vertices of
     quads that do not run along the surface, and of thin quads that would become thinner.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     edges = edges_of(faces)
     free = (constraints.curve < 0) & ~immovable_vertices(edges, len(vertices), constraints)
-    normals, area = polygon_normals(vertices, faces)
+    normals, area = polygon_normals(mesh)
     corners = vertices[faces]
     # Samples on the two triangles of each quad: their centroids, and midpoints of their edges. Midpoints of quad edges
     # are shared with the neighbouring quads.
@@ -128,7 +128,7 @@ def balance_heights(
         / total[:, None]
     )
     out = np.where(free[:, None], vertices + move, vertices)
-    before, after = scaled_jacobian(vertices, faces), scaled_jacobian(out, faces)
+    before, after = scaled_jacobian(mesh), scaled_jacobian(QuadMesh(out, faces))
     thin = faces[(after < _THIN) & (after < before)]
     out[thin] = vertices[thin]
     return out
@@ -174,8 +174,7 @@ def _nearest_rectangles(p: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def release_and_smooth(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: QuadMesh,
     surface: ProjectionTarget,
     features: Features,
     constraints: Constraints,
@@ -188,9 +187,10 @@ def release_and_smooth(
     Smoothing shrinks corners and tips of the surface: where it would uncover them by more than the options allow, the
     vertices at corners stay. tips: vertices that stay in any case. Returns vertices and constraints.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     in_vain, left = 0, np.inf
     for turn in range(_RELEASE_ROUNDS):
-        bad = scaled_jacobian(vertices, faces) < options.min_jacobian
+        bad = scaled_jacobian(QuadMesh(vertices, faces)) < options.min_jacobian
         in_vain, left = in_vain + 1 if bad.sum() > _MOST_LEFT * left else 0, bad.sum()
         if not left or in_vain == _MAX_ROUNDS_IN_VAIN and left > _FEW_BAD:
             break
@@ -215,9 +215,11 @@ def release_and_smooth(
                 constraints.path[:0],
                 constraints.path_curve[:0],
             )
-            trial = _smooth_region(before, local, surface, features, local_constraints, turn)
+            trial = _smooth_region(QuadMesh(before, local), surface, features, local_constraints, turn)
             limit = options.min_jacobian
-            if _badness(scaled_jacobian(trial, local), limit) >= _badness(scaled_jacobian(before, local), limit):
+            if _badness(scaled_jacobian(QuadMesh(trial, local)), limit) >= _badness(
+                scaled_jacobian(QuadMesh(before, local)), limit
+            ):
                 break
             if not _uncovers_surface(before, trial, local, options.max_uncovered_edges):
                 vertices = vertices.copy()
@@ -228,17 +230,17 @@ def release_and_smooth(
 
 
 def _smooth_region(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: QuadMesh,
     surface: ProjectionTarget,
     features: Features,
     constraints: Constraints,
     turn: int,
 ) -> np.ndarray:
     """Smooth, square up and untangle a small region, the more rounds the later the turn."""
-    vertices = relax(vertices, faces, surface, features, constraints, 10 + 10 * turn)
-    vertices = square_up(vertices, faces, surface, features, constraints, 10)
-    return untangle(vertices, faces, surface, features, constraints, max_visits=1500)
+    vertices, faces = mesh.vertices, mesh.faces
+    vertices = relax(QuadMesh(vertices, faces), surface, features, constraints, 10 + 10 * turn)
+    vertices = square_up(QuadMesh(vertices, faces), surface, features, constraints, 10)
+    return untangle(QuadMesh(vertices, faces), surface, features, constraints, max_visits=1500)
 
 
 def _released(constraints: Constraints, released: np.ndarray) -> Constraints:
@@ -254,8 +256,8 @@ def _released(constraints: Constraints, released: np.ndarray) -> Constraints:
 
 def _uncovers_surface(before: np.ndarray, after: np.ndarray, faces: np.ndarray, most: float) -> bool:
     """Whether moving vertices leaves a place where one was more than `most` edge lengths from the quads (f, 4)."""
-    edge = (polygon_normals(before, faces)[1].sum() / len(faces)) ** 0.5
-    return bool(closest_points(before, after, triangulated(faces)[0])[0].max() > most * edge)
+    edge = (polygon_normals(QuadMesh(before, faces))[1].sum() / len(faces)) ** 0.5
+    return bool(closest_points(before, TriMesh(after, triangulated(faces)[0]))[0].max() > most * edge)
 
 
 def _badness(jacobian: np.ndarray, limit: float) -> tuple[int, int, float]:

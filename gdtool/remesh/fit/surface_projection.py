@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import overload
 
 import numpy as np
 
 from gdtool.geometry.distance import SearchTree
 from gdtool.geometry.mesh_quality import polygon_normals, valences
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.topology import Edges, compact, corner_fans, edges_of
 from gdtool.remesh.fit.feature_curves import Constraints, Features, closest_on_segments
@@ -20,17 +22,26 @@ _DOUBLET_ROUNDS = 8  # of removal; each can make new doublets
 class ProjectionTarget(SearchTree):
     """A triangle mesh to project points to, with its search tree and the normals (f, 3) of its faces."""
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray):
-        super().__init__(vertices, faces)
-        self.normals = face_normals(self.vertices, self.faces)[0]
+    def __init__(self, mesh: TriMesh):
+        super().__init__(mesh)
+        self.normals = face_normals(self.mesh)[0]
 
 
-def subdivide(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints | None = None):
+@overload
+def subdivide(mesh: QuadMesh) -> tuple[QuadMesh, None]: ...
+
+
+@overload
+def subdivide(mesh: QuadMesh, constraints: Constraints) -> tuple[QuadMesh, Constraints]: ...
+
+
+def subdivide(mesh: QuadMesh, constraints: Constraints | None = None) -> tuple[QuadMesh, Constraints | None]:
     """Cut each face into one quad per corner: quads into four, triangles into three.
 
-    faces (f, 4), -1 as the fourth corner of triangles. Returns vertices (edge midpoints, then face centres, behind the
-    old ones), faces (4 q + 3 t, 4), and the constraints with every path edge halved (None without constraints).
+    Returns 4 q + 3 t quads, whose vertices are the old ones, then edge midpoints, then face centres; and the
+    constraints with every path edge halved (None without constraints).
     """
+    vertices, faces = mesh.vertices, mesh.faces
     edges = edges_of(faces)
     used = faces >= 0
     centre = np.where(used[..., None], vertices[np.where(used, faces, 0)], 0).sum(1) / used.sum(1)[:, None]
@@ -45,7 +56,7 @@ def subdivide(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints 
     face_idx = np.repeat(np.arange(len(faces)), used.sum(1))
     quads = np.stack([faces[used], v + next_edge[used], v + e + face_idx, v + previous_edge[used]], -1)
     if constraints is None:
-        return out, quads, None
+        return QuadMesh(out, quads), None
     width = v + 1
     key = edges.ends[:, 0] * width + edges.ends[:, 1]
     path = np.sort(constraints.path, 1)
@@ -54,7 +65,7 @@ def subdivide(vertices: np.ndarray, faces: np.ndarray, constraints: Constraints 
     curve[:v], fixed[:v] = constraints.curve, constraints.fixed
     curve[v + edge_idx] = constraints.path_curve
     halves = np.concatenate([np.stack([path[:, 0], v + edge_idx], -1), np.stack([path[:, 1], v + edge_idx], -1)])
-    return out, quads, Constraints(curve, fixed, halves, np.tile(constraints.path_curve, 2))
+    return QuadMesh(out, quads), Constraints(curve, fixed, halves, np.tile(constraints.path_curve, 2))
 
 
 def _average_matrix(pairs: np.ndarray, count: int):
@@ -130,8 +141,7 @@ class ConstrainedProjector:
 
 
 def relax(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: QuadMesh,
     surface: ProjectionTarget,
     features: Features,
     constraints: Constraints,
@@ -139,6 +149,7 @@ def relax(
     strength: float = 0.6,
 ) -> np.ndarray:
     """Smooth vertices along the surface: each moves toward the mean of its neighbours, and back onto the surface."""
+    vertices, faces = mesh.vertices, mesh.faces
     edges = edges_of(faces)
     average = _average_matrix(edges.ends, len(vertices))
     along = _average_matrix(constraints.path, len(vertices)) if len(constraints.path) else None
@@ -168,15 +179,16 @@ def immovable_vertices(edges: Edges, count: int, constraints: Constraints) -> np
     return constraints.fixed | (boundary & (constraints.curve < 0))
 
 
-def surface_normals_below(vertices: np.ndarray, faces: np.ndarray, surface: ProjectionTarget) -> np.ndarray:
+def surface_normals_below(mesh: QuadMesh, surface: ProjectionTarget) -> np.ndarray:
     """Return (f, 3) unit normals of the surface under each quad, sampled at its centre.
 
     Where the surface bends away from the quad's own normal, points half-way to its corners are sampled too.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     corners = vertices[faces]
     centre = corners.mean(1, keepdims=True)
     below = surface.normals[surface.closest(centre[:, 0])[1]]
-    bent = np.flatnonzero((below * polygon_normals(vertices, faces)[0]).sum(1) < _BENT_COSINE)
+    bent = np.flatnonzero((below * polygon_normals(mesh)[0]).sum(1) < _BENT_COSINE)
     inner = ((corners[bent] + centre[bent]) / 2).reshape(-1, 3)
     below[bent] += surface.normals[surface.closest(inner)[1]].reshape(len(bent), 4, 3).sum(1)
     return below / np.maximum(np.linalg.norm(below, axis=1), 1e-300)[:, None]
@@ -212,16 +224,17 @@ def neighbours(ends: np.ndarray, count: int) -> GroupedLists:
     return GroupedLists(ends.T.ravel(), ends[:, ::-1].T.ravel(), count)
 
 
-def fill_holes(vertices: np.ndarray, faces: np.ndarray, longest: int = 64) -> tuple[np.ndarray, np.ndarray]:
+def fill_holes(mesh: QuadMesh, longest: int = 64) -> QuadMesh:
     """Close boundary loops with an even number of edges, at most `longest`, by quads around a new vertex.
 
-    Returns vertices and quads. Where two holes meet at a vertex, each is closed by itself.
+    Where two holes meet at a vertex, each is closed by itself.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     edges = edges_of(faces)
     border = edges.count[edges.half_edge_idx] == 1
     half = edges.half_ends[border]
     if not len(half):
-        return vertices, faces
+        return mesh
     fans = corner_fans(faces)[0]
     leaving, arriving = fans.ravel()[border], np.roll(fans, -1, 1).ravel()[border]
     starts: dict[int, list[int]] = {}
@@ -250,14 +263,16 @@ def fill_holes(vertices: np.ndarray, faces: np.ndarray, longest: int = 64) -> tu
         new_points.append(vertices[loop].mean(0))
         new_faces.extend([centre, loop[i - 1], loop[i], loop[(i + 1) % len(loop)]] for i in range(0, len(loop), 2))
     if not new_faces:
-        return vertices, faces
-    return np.concatenate([vertices, *(p[None] for p in new_points)]), np.concatenate(
-        [faces, np.array(new_faces, faces.dtype)]
+        return mesh
+    return QuadMesh(
+        np.concatenate([vertices, *(p[None] for p in new_points)]),
+        np.concatenate([faces, np.array(new_faces, faces.dtype)]),
     )
 
 
-def remove_doublets(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def remove_doublets(mesh: QuadMesh) -> QuadMesh:
     """Remove inner vertices with two edges and join their two quads (Daniels et al. 2008, doublet collapse)."""
+    vertices, faces = mesh.vertices, mesh.faces
     for _ in range(_DOUBLET_ROUNDS):
         valence, inner = valences(faces, len(vertices))
         doublets = np.flatnonzero(inner & (valence == 2))
@@ -281,4 +296,4 @@ def remove_doublets(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
         if not dead.any():
             break
         faces = faces[~dead]
-    return compact(vertices, faces)
+    return compact(QuadMesh(vertices, faces))

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gdtool.geometry.distance import closest_points, sample_surface
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.topology import components, edges_of, euler_number, triangulated
 from gdtool.remesh.fit.feature_curves import Constraints
 from gdtool.remesh.fit.surface_projection import ProjectionTarget
@@ -28,13 +29,11 @@ _SAMPLES = 20000  # points of the surface: half vertices, half spread over its a
 class ExtrudedQuads(NamedTuple):
     """Quads extruded over the tips of a surface.
 
-    vertices (v, 3), faces (f, 4); tips (t,): the vertices at tips, fixed in the constraints. distance: the largest from
-    the surface to the quads before the last vertices moved. sample_distances (n,): those of samples spread over its
-    area.
+    tips (t,): the vertices at tips, fixed in the constraints. distance: the largest from the surface to the quads
+    before the last vertices moved. sample_distances (n,): those of samples spread over its area.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    mesh: QuadMesh
     constraints: Constraints
     tips: np.ndarray
     distance: float
@@ -50,35 +49,35 @@ class _Tip(NamedTuple):
 
 
 def extrude_tips(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: QuadMesh,
     constraints: Constraints,
     surface: ProjectionTarget,
     edge: float,
     max_added: float = 0.03,
 ) -> ExtrudedQuads:
-    """Extrude quads (f, 4) of mean edge length `edge` over the parts of the surface that stray from them.
+    """Extrude quads of mean edge length `edge` over the parts of the surface that stray from them.
 
     The farthest tip goes first. The vertices nearest to it move along it, an edge or two at a time, with the quads
     around them, and a ring of new quads follows each step, as one models a horn by hand. It ends when max_added of the
     quads are new: surfaces that need more have other faults than tips. A tip nearer than an edge takes one vertex and
     no ring. The quads stay closed and manifold as they were, with as many pieces and handles.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     step = max(len(surface.vertices) // _SAMPLES, 1)
     points = samples = np.concatenate(
         [
             surface.vertices[::step],
-            sample_surface(surface.vertices, surface.faces, _SAMPLES // 2, np.random.default_rng(0))[0],
+            sample_surface(surface.mesh, _SAMPLES // 2, np.random.default_rng(0))[0],
         ]
     )
     max_faces, input_constraints = len(faces) * (1 + max_added), constraints
     triangles, face_idx = triangulated(faces)
-    away, nearest, _ = closest_points(points, vertices, triangles)
+    away, nearest, _ = closest_points(points, TriMesh(vertices, triangles))
     of_samples = away, face_idx[nearest]  # None once the quads have changed
     for turn in range(_MAX_STEPS):
         if turn:
             triangles, face_idx = triangulated(faces)
-            away, nearest = _nearest_within(points, away, vertices, triangles)
+            away, nearest = _nearest_within(points, away, TriMesh(vertices, triangles))
         uncovered = away > _UNCOVERED * edge  # the other samples stay near
         points, away, nearest = points[uncovered], away[uncovered], nearest[uncovered]
         if not len(points) or not turn and away.max() < _STRAYS * edge:
@@ -88,32 +87,36 @@ def extrude_tips(
             if away[tip].max() < _CLOSE * edge or len(faces) > max_faces:
                 break
             samples_of_tip = _Tip(points[tip], face_idx[nearest[tip]], away[tip])
-            extruded = _extrude_tip(vertices, faces, constraints, samples_of_tip, surface, edge)
+            extruded = _extrude_tip(QuadMesh(vertices, faces), constraints, samples_of_tip, surface, edge)
             if extruded is None:
                 alive[tip] = False
             else:
-                vertices, faces, constraints = extruded
+                longer, constraints = extruded
+                vertices, faces = longer.vertices, longer.faces
                 of_samples = None
         points, away = points[alive], away[alive]
         if not len(points) or len(faces) > max_faces or away.max() < _CLOSE * edge:
             break
     if of_samples is None:
         triangles, face_idx = triangulated(faces)
-        away, nearest, _ = closest_points(samples, vertices, triangles)
+        away, nearest, _ = closest_points(samples, TriMesh(vertices, triangles))
         of_samples = away, face_idx[nearest]
     away, nearest = of_samples
-    vertices, constraints = _move_to_near_tips(vertices, faces, constraints, _Tip(samples, nearest, away), edge)
+    vertices, constraints = _move_to_near_tips(
+        QuadMesh(vertices, faces), constraints, _Tip(samples, nearest, away), edge
+    )
     if constraints is not input_constraints:
         constraints = _remaining_paths(constraints, faces)
     was_fixed = np.concatenate([input_constraints.fixed, np.zeros(len(vertices) - len(input_constraints.fixed), bool)])
     tips = np.flatnonzero(constraints.fixed & ~was_fixed)
-    return ExtrudedQuads(vertices, faces, constraints, tips, float(away.max()), away[-(_SAMPLES // 2) :])
+    return ExtrudedQuads(QuadMesh(vertices, faces), constraints, tips, float(away.max()), away[-(_SAMPLES // 2) :])
 
 
 def _move_to_near_tips(
-    vertices: np.ndarray, faces: np.ndarray, constraints: Constraints, samples: _Tip, edge: float
+    mesh: QuadMesh, constraints: Constraints, samples: _Tip, edge: float
 ) -> tuple[np.ndarray, Constraints]:
     """Move the nearest vertex to the end of each tip less than an edge away, and fix it there."""
+    vertices, faces = mesh.vertices, mesh.faces
     near = (samples.distances > _UNCOVERED * edge) & (samples.distances < _STRAYS * edge)
     points, quads, away = samples.points[near], samples.quads[near], samples.distances[near]
     if not len(points):
@@ -130,14 +133,14 @@ def _move_to_near_tips(
     return out, _extend_constraints(constraints, len(vertices), moved, moved)
 
 
-def _nearest_within(
-    points: np.ndarray, away: np.ndarray, vertices: np.ndarray, triangles: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances (n,) from points (n, 3) to the triangles (t, 3), and the nearest triangles (n,).
+def _nearest_within(points: np.ndarray, away: np.ndarray, mesh: TriMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Return distances (n,) from points (n, 3) to a mesh, and the nearest triangles (n,).
 
     away (n,): about what the distances will be. Few points are searched for among the triangles that near alone.
     """
     from scipy.spatial import cKDTree
+
+    vertices, triangles = mesh.vertices, mesh.faces
 
     corners = vertices[triangles]
     reach = away.max()
@@ -145,10 +148,10 @@ def _nearest_within(
     near = np.isfinite(cKDTree(points).query(vertices, distance_upper_bound=reach + longest)[0])
     few = np.flatnonzero(near[triangles].any(1))
     if len(few):
-        distances, nearest, _ = closest_points(points, vertices, triangles[few])
+        distances, nearest, _ = closest_points(points, TriMesh(vertices, triangles[few]))
         if distances.max() <= reach:
             return distances, few[nearest]
-    return closest_points(points, vertices, triangles)[:2]
+    return closest_points(points, mesh)[:2]
 
 
 def _group_tips(points: np.ndarray, away: np.ndarray, edge: float) -> list[np.ndarray]:
@@ -166,14 +169,14 @@ def _group_tips(points: np.ndarray, away: np.ndarray, edge: float) -> list[np.nd
 
 
 def _extrude_tip(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: QuadMesh,
     constraints: Constraints,
     tip: _Tip,
     surface: ProjectionTarget,
     edge: float,
-) -> tuple[np.ndarray, np.ndarray, Constraints] | None:
+) -> tuple[QuadMesh, Constraints] | None:
     """Extrude the disc of quads under one tip toward it; None where no disc of quads lies under it."""
+    vertices, faces = mesh.vertices, mesh.faces
     points, away = tip.points, tip.distances
     corner = faces[tip.quads, np.linalg.norm(vertices[faces[tip.quads]] - points[:, None], axis=-1).argmin(1)]
     # Each vertex aims at its farthest point within a step, or at its nearest where all are farther.
@@ -208,7 +211,7 @@ def _extrude_tip(
     vertices[cap] = aim
     far_first = [k for k in np.argsort(-length, kind="stable") if length[k] > _FIXED_SHARE * length.max()]
     fixed = cap[_spaced_out(aim, far_first, _MIN_SPACING * edge)]
-    return vertices, faces, _extend_constraints(constraints, len(vertices), cap, fixed)
+    return QuadMesh(vertices, faces), _extend_constraints(constraints, len(vertices), cap, fixed)
 
 
 def _spaced_out(points: np.ndarray, order: list[int], distance: float) -> list[int]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gdtool.geometry.mesh_quality import columns_of, worst_jacobian
+from gdtool.geometry.mesh_quality import gather_corners, worst_jacobian
+from gdtool.geometry.meshes import QuadMesh
 from gdtool.geometry.topology import edges_of
 from gdtool.remesh.fit.feature_curves import Constraints, Features, closest_on_segments
 from gdtool.remesh.fit.surface_projection import (
@@ -26,8 +27,7 @@ _NEAR_RING, _FAR_RING = 0.12, 0.35  # radii of the two rings of positions, in me
 
 
 def untangle(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: QuadMesh,
     surface: ProjectionTarget,
     features: Features,
     constraints: Constraints,
@@ -40,6 +40,7 @@ def untangle(
     bounds the work by a count, not a time, so that equal input gives equal output. Vertices that share no quad move at
     once. Returns vertices (v, 3).
     """
+    vertices, faces = mesh.vertices, mesh.faces
     edges = edges_of(faces)
     face_lists = faces_around_vertices(faces, len(vertices))
     neighbour_lists = neighbours(edges.ends, len(vertices))
@@ -47,14 +48,14 @@ def untangle(
     is_boundary[edges.ends[edges.count != 2].ravel()] = True
     is_held = constraints.curve >= 0
     vertices = vertices.copy()
-    normals = surface_normals_below(vertices, faces, surface)
+    normals = surface_normals_below(QuadMesh(vertices, faces), surface)
     normal_columns = np.ascontiguousarray(normals.T)
     is_settled = np.zeros(len(vertices), bool)  # found no better position, and nothing beside it moved since
     for turn in range(_ROUNDS):
         is_loose = turn >= _ROUNDS - _LOOSE_ROUNDS
         if turn == _ROUNDS - _LOOSE_ROUNDS:
             is_settled &= ~is_held & ~constraints.fixed
-        bad = worst_jacobian(columns_of(vertices, faces), normal_columns) < (
+        bad = worst_jacobian(gather_corners(vertices, faces), normal_columns) < (
             _LOOSE_JACOBIAN if is_loose else _MIN_JACOBIAN
         )
         if not bad.any():

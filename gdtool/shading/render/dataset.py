@@ -16,6 +16,7 @@ from gdtool.core import sources
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder, is_folder, open_folder
 from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.normals import face_normals
 from gdtool.shading.bsdf.sg import SphericalGaussians
 from gdtool.shading.lights.bundled import BUNDLED
@@ -45,7 +46,7 @@ def require_complete_pbr(scene: Scene, name: str) -> None:
             for m in scene.materials
         ]
     )
-    area = face_normals(scene.vertices, scene.faces)[1]
+    area = face_normals(TriMesh(scene.vertices, scene.faces))[1]
     share = float(area[complete[scene.material_idx]].sum() / max(area.sum(), 1e-300))
     if share < MIN_COMPLETE_AREA:
         raise InputError(

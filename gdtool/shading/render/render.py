@@ -21,6 +21,7 @@ import numpy as np
 
 from gdtool.assets.scene import Scene
 from gdtool.cameras import Camera, project, rays
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.rays import RayCaster, is_convex
 from gdtool.geometry.vectors import dot
 from gdtool.images.color import srgb_from_linear
@@ -112,18 +113,18 @@ class Renderer:
     def __init__(self, scene: Scene, threads: int | None = None):
         self.scene = scene
         self.lookup = SurfaceLookup(scene)
-        self.caster = RayCaster(scene.vertices, scene.faces, threads)
+        self.caster = RayCaster(TriMesh(scene.vertices, scene.faces), threads)
         tested = self.lookup.alpha_faces()
         self.tested = tested if tested.any() else None
         self.solid_caster, self.tested_faces, self.tested_caster = self.caster, None, None
         if self.tested is not None:
-            self.solid_caster = RayCaster(scene.vertices, scene.faces[~tested], threads)
+            self.solid_caster = RayCaster(TriMesh(scene.vertices, scene.faces[~tested]), threads)
             self.tested_faces = np.flatnonzero(tested)
-            self.tested_caster = RayCaster(scene.vertices, scene.faces[tested], threads)
+            self.tested_caster = RayCaster(TriMesh(scene.vertices, scene.faces[tested]), threads)
         used = scene.vertices[np.unique(scene.faces)]
         self.bounds = np.stack([used.min(0), used.max(0)])
         self.extent = float((self.bounds[1] - self.bounds[0]).max()) or 1.0
-        self.convex = self.tested is None and is_convex(scene.vertices, scene.faces)
+        self.convex = self.tested is None and is_convex(TriMesh(scene.vertices, scene.faces))
         self.counts = Counts()
         self.pool = ThreadPoolExecutor(self.caster.threads)
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gdtool.assets.scene import Material, Scene, Texture
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.vectors import dot
 from gdtool.shading.render.textures import TextureReader, same_layout
@@ -68,7 +69,7 @@ class SurfaceLookup:
 
     def __init__(self, scene: Scene):
         self.scene = scene
-        self.face_normals, self.face_areas = face_normals(scene.vertices, scene.faces)
+        self.face_normals, self.face_areas = face_normals(TriMesh(scene.vertices, scene.faces))
         self._readers: dict[tuple[int, ...], TextureReader] = {}
         self._constants: dict[int, np.ndarray | None] = {}
         self.skip_constant = True
@@ -188,9 +189,11 @@ class SurfaceLookup:
         from gdtool.geometry.tangents import corner_tangents
 
         flat = scene.normals is None
-        normals = self.face_normals if flat else scene.normals
+        normals = self.face_normals if scene.normals is None else scene.normals
         normal_idx = np.repeat(np.arange(len(scene.faces))[:, None], 3, 1) if flat else None
-        tangents = corner_tangents(scene.vertices, scene.faces, normals, self._uv(texture), scene.faces, normal_idx)
+        tangents = corner_tangents(
+            TriMesh(scene.vertices, scene.faces), normals, self._uv(texture), scene.faces, normal_idx
+        )
         self._tangents[texture.uv_set] = _columns(tangents.reshape(-1, 4))
 
     def _normal_mapped(

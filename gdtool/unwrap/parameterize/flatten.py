@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gdtool.core.native import imported
+from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.topology import Edges, edges_of, handles
 from gdtool.geometry.uv_raster import owned_texels, owner_count
@@ -28,32 +29,33 @@ class FlattenResult(NamedTuple):
     overlapped: np.ndarray | None = None
 
 
-def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, max_stretch: float) -> FlattenResult:
-    """Flatten one connected chart to uv (v, 2), v up, at the scale of the surface.
+def flatten(mesh: TriMesh, good_stretch: float, max_stretch: float) -> FlattenResult:
+    """Flatten one connected chart, a manifold with boundary, to uv (v, 2), v up, at the scale of the surface.
 
-    vertices (v, 3), triangles (t, 3), a manifold with boundary. Least-squares conformal map (Lévy et al. 2002), or
+    Least-squares conformal map (Lévy et al. 2002), or
     Tutte's embedding where that folds, then SLIM (Rabinovich et al. 2017) on the symmetric Dirichlet energy until
     good_stretch is reached. A chart beyond max_stretch has to be cut.
     """
+    triangles = mesh.faces
     edges = edges_of(triangles)
     border = edges.count == 1
     if not border.any():
         return FlattenResult(None, "closed")
-    surface, uv = StretchMeasure(vertices, triangles), _view_along_normal(vertices, triangles)
-    disk = is_disk(len(vertices), triangles, edges)
+    surface, uv = StretchMeasure(mesh), _view_along_normal(mesh)
+    disk = is_disk(mesh, edges)
     if uv is not None and surface.stretch(uv) < good_stretch and not overlaps_itself(uv, triangles, edges, disk):
         return FlattenResult(uv)
     if not disk and edges.count.max() == 2 and handles(triangles, 1, edges):  # no part of the plane has one
         return FlattenResult(None, "has a handle")
-    uv = _conformal(vertices, triangles, edges.ends[border])
+    uv = _conformal(mesh, edges.ends[border])
     if uv is None or not is_unfolded(uv, triangles):
         if not disk:
             return FlattenResult(None, "folds, and is no disk")
-        uv = _tutte(vertices, triangles)
+        uv = _tutte(mesh)
         if uv is None or not is_unfolded(uv, triangles):
             return FlattenResult(None, "folds")
     uv = _scaled(uv, triangles, surface.area)
-    uv, reached = _isometric(vertices, triangles, uv, surface, good_stretch, max_stretch)
+    uv, reached = _isometric(mesh, uv, surface, good_stretch, max_stretch)
     if reached > max_stretch:
         return FlattenResult(None, "stretches")
     return (
@@ -61,9 +63,9 @@ def flatten(vertices: np.ndarray, triangles: np.ndarray, good_stretch: float, ma
     )
 
 
-def is_disk(vertices: int, triangles: np.ndarray, edges: Edges) -> bool:
-    """Whether connected triangles (t, 3) of so many vertices, with these edges, are a disk."""
-    return vertices - len(edges.ends) + len(triangles) == 1 and edges.count.max() == 2
+def is_disk(mesh: TriMesh, edges: Edges) -> bool:
+    """Whether a connected mesh with these edges, which uses all its vertices, is a disk."""
+    return len(mesh.vertices) - len(edges.ends) + len(mesh.faces) == 1 and edges.count.max() == 2
 
 
 def _areas(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -83,18 +85,20 @@ def _scaled(uv: np.ndarray, triangles: np.ndarray, area: np.ndarray) -> np.ndarr
     return (uv - uv.mean(0)) * (area.sum() / max(_areas(uv, triangles).sum(), 1e-300)) ** 0.5
 
 
-def project_to_plane(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
+def project_to_plane(mesh: TriMesh) -> np.ndarray | None:
     """Project a chart along its mean normal; exact for flat charts.
 
     None unless all of it faces that way and nothing overlaps.
     """
-    uv = _view_along_normal(vertices, triangles)
+    triangles = mesh.faces
+    uv = _view_along_normal(mesh)
     return None if uv is None or overlapping_triangles(uv, triangles).any() else uv
 
 
-def _view_along_normal(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
+def _view_along_normal(mesh: TriMesh) -> np.ndarray | None:
     """Return the chart seen along its mean normal, at the scale of the surface; None where a triangle turns away."""
-    normals, area = face_normals(vertices, triangles)
+    vertices, triangles = mesh.vertices, mesh.faces
+    normals, area = face_normals(mesh)
     mean = (normals * area[:, None]).sum(0)
     length = np.linalg.norm(mean)
     if length < 1e-12:
@@ -108,11 +112,12 @@ def _view_along_normal(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarra
     return _scaled(uv, triangles, area) if is_unfolded(uv, triangles) else None
 
 
-def _conformal(vertices: np.ndarray, triangles: np.ndarray, border: np.ndarray) -> np.ndarray | None:
+def _conformal(mesh: TriMesh, border: np.ndarray) -> np.ndarray | None:
     """Return the least-squares conformal map, None where it fails.
 
     Two far vertices of the boundary, border (b, 2) edges, are pinned.
     """
+    vertices, triangles = mesh.vertices, mesh.faces
     igl = imported("igl")
     rim = np.unique(border)
     first = rim[np.linalg.norm(vertices[rim] - vertices[rim].mean(0), axis=1).argmax()]
@@ -136,11 +141,12 @@ def _conformal(vertices: np.ndarray, triangles: np.ndarray, border: np.ndarray) 
     return uv * [1.0, -1.0] if _areas(uv, triangles).sum() < 0 else uv
 
 
-def extend_conformally(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> np.ndarray | None:
+def extend_conformally(mesh: TriMesh, uv: np.ndarray) -> np.ndarray | None:
     """Extend uv (v, 2) to its non-finite rows by the least-squares conformal map that keeps the finite ones.
 
-    Only the corners of triangles (t, 3) are filled. None where fewer than two of them are given, or they have no area.
+    Only vertices that triangles use are filled. None where fewer than two of them are given, or they have no area.
     """
+    vertices, triangles = mesh.vertices, mesh.faces
     igl = imported("igl")
     used, local = np.unique(triangles, return_inverse=True)
     is_given = np.isfinite(uv[used, 0])
@@ -163,10 +169,11 @@ def extend_conformally(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarr
     return uv
 
 
-def _tutte(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
+def _tutte(mesh: TriMesh) -> np.ndarray | None:
     """Return the uniform-weight embedding onto a circle (Tutte 1963), which never folds; None unless it has one
     boundary.
     """
+    vertices, triangles = mesh.vertices, mesh.faces
     from scipy.sparse import coo_matrix, diags
     from scipy.sparse.linalg import spsolve
 
@@ -193,8 +200,7 @@ def _tutte(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
 
 
 def _isometric(
-    vertices: np.ndarray,
-    triangles: np.ndarray,
+    mesh: TriMesh,
     uv: np.ndarray,
     surface: StretchMeasure,
     good_stretch: float,
@@ -204,6 +210,7 @@ def _isometric(
 
     Stops at good_stretch, when it gains little, or when it is clear that max_stretch will not be reached.
     """
+    vertices, triangles = mesh.vertices, mesh.faces
     igl = imported("igl")
     best, reached = uv, surface.stretch(uv)
     if reached < good_stretch:
@@ -228,8 +235,9 @@ def _isometric(
     return best, reached
 
 
-def singular_values(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def singular_values(mesh: TriMesh, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (t, 2) singular values, larger first, of the map from uv to the surface, and areas (t,)."""
+    vertices, triangles = mesh.vertices, mesh.faces
     e1, e2 = (
         vertices[triangles[:, 1]] - vertices[triangles[:, 0]],
         vertices[triangles[:, 2]] - vertices[triangles[:, 0]],
@@ -245,16 +253,17 @@ def singular_values(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray)
     return values, np.linalg.norm(np.cross(e1, e2), axis=1) / 2
 
 
-def stretch(vertices: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> float:
+def stretch(mesh: TriMesh, uv: np.ndarray) -> float:
     """Return the L2 stretch (Sander et al. 2001), 1 for an isometry, at the scale where the areas agree."""
-    return StretchMeasure(vertices, triangles).stretch(uv)
+    return StretchMeasure(mesh).stretch(uv)
 
 
 class StretchMeasure:
-    """Measures the stretch of maps of triangles (t, 3) to the plane; what all maps share is computed once."""
+    """Measures the stretch of maps of a mesh to the plane; what all maps share is computed once."""
 
-    def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
-        self._abc = tuple(triangles.T)
+    def __init__(self, mesh: TriMesh):
+        vertices = mesh.vertices
+        self._abc = tuple(mesh.faces.T)
         a, b, c = self._abc
         side_ab, side_ac = (vertices[b] - vertices[a]).T, (vertices[c] - vertices[a]).T
         self._metric = (side_ab * side_ab).sum(0), (side_ab * side_ac).sum(0), (side_ac * side_ac).sum(0)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gdtool.geometry.mesh_quality import polygon_normals
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.repair import one_vertex_per_fan
 from gdtool.geometry.topology import triangulated
 from gdtool.unwrap.chart import Chart
@@ -61,54 +62,50 @@ class ParameterizedCharts:
 
 
 @dataclass(frozen=True)
-class ChartMesh:
+class LabelledMesh:
     """The mesh whose charts are flattened.
 
-    vertices (v, 3), one for each fan of faces; faces (f, 4). label (f,): the chart of each face before merging. part
-    (f,): faces that stay together where a chart is cut, if they can.
+    mesh: with a vertex for each fan of faces. label (f,): the chart of each face before merging. part (f,): faces that
+    stay together where a chart is cut, if they can.
     """
 
     adjacency: Adjacency
-    vertices: np.ndarray
-    faces: np.ndarray
+    mesh: QuadMesh
     label: np.ndarray
     part: np.ndarray
 
 
 def flatten_all(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: QuadMesh,
     label: np.ndarray,
     limits: FlattenLimits,
-    proxy: tuple[np.ndarray, np.ndarray] | None = None,
+    proxy: TriMesh | None = None,
     part: np.ndarray | None = None,
 ) -> tuple[list[Chart], list[str]]:
-    """Flatten each chart of faces (f, 4) with label (f,); return the charts and a sentence for each reason to cut.
+    """Flatten each chart of a mesh, label (f,) of its faces; return the charts and a sentence for each reason to cut.
 
-    proxy: vertices and triangles of a coarse mesh of the surface, on which merging is tried. Without one nothing is
-    merged, and charts are only projected to a plane and cut until that works. part (f,): see ChartMesh.
+    proxy: a coarse mesh of the surface, on which merging is tried. Without one nothing is merged, and charts are only
+    projected to a plane and cut until that works. part (f,): see LabelledMesh.
     """
-    adjacency = Adjacency(vertices, faces)
-    mesh = ChartMesh(adjacency, *one_vertex_per_fan(vertices, faces), label, label if part is None else part)
+    adjacency = Adjacency(mesh)
+    labelled = LabelledMesh(adjacency, one_vertex_per_fan(mesh), label, label if part is None else part)
     if proxy is None:
-        flat = parameterize(mesh, _faces_by_label(label), limits, project_only=True)
+        flat = parameterize(labelled, _faces_by_label(label), limits, project_only=True)
         return flat.charts, flat.reasons()
     merged = label
     if time.monotonic() < limits.project_after:
-        merged = merge_small_charts(mesh.vertices, mesh.faces, label, *proxy, limits.good_stretch)
-    flat = parameterize(mesh, _faces_by_label(merged), limits, removes_overlaps=True)
+        merged = merge_small_charts(labelled.mesh, label, proxy, limits.good_stretch)
+    flat = parameterize(labelled, _faces_by_label(merged), limits, removes_overlaps=True)
     if time.monotonic() < limits.project_after:
-        flat.removed = give_to_neighbours(
-            adjacency, mesh.vertices, mesh.faces, flat.charts, flat.removed, limits.good_stretch
-        )
-    flat.add(parameterize(mesh, [piece.faces_idx for piece in flat.removed], limits))
+        flat.removed = give_to_neighbours(adjacency, labelled.mesh, flat.charts, flat.removed, limits.good_stretch)
+    flat.add(parameterize(labelled, [piece.faces_idx for piece in flat.removed], limits))
     if time.monotonic() < limits.project_after:
-        _cut_most_stretched(mesh, flat, limits)
+        _cut_most_stretched(labelled, flat, limits)
     return flat.charts, flat.reasons()
 
 
 def parameterize(
-    mesh: ChartMesh,
+    labelled: LabelledMesh,
     sets: list[np.ndarray],
     limits: FlattenLimits,
     *,
@@ -125,67 +122,66 @@ def parameterize(
         faces_idx, now = queue.pop(), time.monotonic()
         if now > limits.single_after:
             flat.cut[_LATE] += len(faces_idx) > 1
-            flat.charts += _one_chart_per_face(mesh.vertices, mesh.faces, faces_idx)
+            flat.charts += _one_chart_per_face(labelled.mesh, faces_idx)
             continue
         if now > limits.project_after:
             removes_overlaps, project_only = False, True
-        labels = _faces_by_label(mesh.label[faces_idx])
-        points, corners = chart_mesh(mesh.vertices, mesh.faces[faces_idx])
-        triangles, face_idx = triangulated(corners)
-        result = _flatten_set(points, triangles, limits, is_merged=len(labels) > 1, project_only=project_only)
+        labels = _faces_by_label(labelled.label[faces_idx])
+        chart = chart_mesh(QuadMesh(labelled.mesh.vertices, labelled.mesh.faces[faces_idx]))
+        corners, (triangles, face_idx) = chart.faces, chart.triangulation
+        result = _flatten_set(chart.triangles, limits, is_merged=len(labels) > 1, project_only=project_only)
         uv = result.uv
         if uv is None and len(labels) > 1:  # flat together on the proxy, but not here
             queue.extend(faces_idx[part] for part in labels)
             continue
         if uv is None and len(faces_idx) == 1:
-            uv = _square_or_triangle(points, corners[0])
+            uv = _square_or_triangle(chart.vertices, corners[0])
         if uv is not None:
             flat.charts.append(Chart(faces_idx, corners, uv, triangles))
             continue
         flat.cut[result.reason] += 1
         keep = None
         if removes_overlaps and result.overlapped is not None:
-            keep = remove_overlaps(mesh.adjacency, faces_idx, triangles, face_idx, result.overlapped)
+            keep = remove_overlaps(labelled.adjacency, faces_idx, triangles, face_idx, result.overlapped)
         if keep is None:
-            queue.extend(_split_set(mesh.adjacency, mesh.part, faces_idx))
+            queue.extend(_split_set(labelled.adjacency, labelled.part, faces_idx))
             continue
-        connected = connected_masks(mesh.adjacency, faces_idx, keep)
+        connected = connected_masks(labelled.adjacency, faces_idx, keep)
         largest, *others = sorted(connected, key=np.count_nonzero, reverse=True)
         flat.charts.append(sub_chart(Chart(faces_idx, corners, result.overlapped, triangles), largest))
         home = int(flat.charts[-1].faces_idx[0])
-        others += connected_masks(mesh.adjacency, faces_idx, ~keep)
+        others += connected_masks(labelled.adjacency, faces_idx, ~keep)
         flat.removed += [OverlapPiece(home, faces_idx[mask]) for mask in others]
     return flat
 
 
-def _flatten_set(
-    points: np.ndarray, triangles: np.ndarray, limits: FlattenLimits, is_merged: bool, project_only: bool
-) -> FlattenResult:
+def _flatten_set(mesh: TriMesh, limits: FlattenLimits, is_merged: bool, project_only: bool) -> FlattenResult:
     """Flatten one set of triangles, by projection alone or within the stretch that it may have."""
     if project_only:
-        return FlattenResult(project_to_plane(points, triangles), "is not flat")
+        return FlattenResult(project_to_plane(mesh), "is not flat")
     max_stretch = merged_stretch_limit(limits.good_stretch) if is_merged else limits.max_stretch
-    return flatten(points, triangles.astype(np.int64), limits.good_stretch, max_stretch)
+    return flatten(TriMesh(mesh.vertices, mesh.faces.astype(np.int64)), limits.good_stretch, max_stretch)
 
 
-def _excess(mesh: ChartMesh, chart: Chart) -> float:
+def _excess(labelled: LabelledMesh, chart: Chart) -> float:
     """Return a chart's area times the excess of its squared stretch over 1."""
     points = np.zeros((len(chart.uv), 3))
     used = chart.corners >= 0
+    mesh = labelled.mesh
     points[chart.corners[used]] = mesh.vertices[mesh.faces[chart.faces_idx][used]]
-    value = stretch(points, chart.triangles.astype(np.int64), chart.uv) ** 2 - 1
-    return float(mesh.adjacency.area[chart.faces_idx].sum()) * value if np.isfinite(value) else 0.0
+    value = stretch(TriMesh(points, chart.triangles.astype(np.int64)), chart.uv) ** 2 - 1
+    return float(labelled.adjacency.area[chart.faces_idx].sum()) * value if np.isfinite(value) else 0.0
 
 
-def _cut_most_stretched(mesh: ChartMesh, flat: ParameterizedCharts, limits: FlattenLimits) -> None:
+def _cut_most_stretched(labelled: LabelledMesh, flat: ParameterizedCharts, limits: FlattenLimits) -> None:
     """Cut the charts that make all charts together stretch too much, in place, the worst first.
 
     The square of the stretch of the whole is the mean of the charts' squares by area, because each chart is at the
     scale of the surface.
     """
     max_cut = _MAX_CUT + int(_MAX_CUT_SHARE * len(flat.charts))
-    allowed = ((1 + _MAX_TOTAL_EXCESS * (limits.good_stretch - 1)) ** 2 - 1) * float(mesh.adjacency.area.sum())
-    values = [_excess(mesh, chart) for chart in flat.charts]
+    allowed = ((1 + _MAX_TOTAL_EXCESS * (limits.good_stretch - 1)) ** 2 - 1) * float(labelled.adjacency.area.sum())
+    values = [_excess(labelled, chart) for chart in flat.charts]
     total, gone = sum(values), set()
     queue = [(-value, i) for i, value in enumerate(values) if value > 0 and len(flat.charts[i].faces_idx) > 1]
     heapq.heapify(queue)
@@ -196,9 +192,11 @@ def _cut_most_stretched(mesh: ChartMesh, flat: ParameterizedCharts, limits: Flat
             worst.append(heapq.heappop(queue))
             rest += worst[-1][0]
         gone.update(i for _, i in worst)
-        sets = [half for _, i in worst for half in _split_set(mesh.adjacency, mesh.part, flat.charts[i].faces_idx)]
-        halves = parameterize(mesh, sets, limits)
-        values = [_excess(mesh, chart) for chart in halves.charts]
+        sets = [
+            half for _, i in worst for half in _split_set(labelled.adjacency, labelled.part, flat.charts[i].faces_idx)
+        ]
+        halves = parameterize(labelled, sets, limits)
+        values = [_excess(labelled, chart) for chart in halves.charts]
         total = rest + sum(values)
         for i, value in enumerate(values):
             if value > 0 and len(halves.charts[i].faces_idx) > 1:
@@ -231,16 +229,17 @@ def _faces_by_label(label: np.ndarray) -> list[np.ndarray]:
     return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
 
 
-def _one_chart_per_face(vertices: np.ndarray, faces: np.ndarray, faces_idx: np.ndarray) -> list[Chart]:
+def _one_chart_per_face(mesh: QuadMesh, faces_idx: np.ndarray) -> list[Chart]:
     """Make each of some faces (k,) a chart, seen along its normal.
 
     A face that folds this way becomes a square or right triangle of its size.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     own_faces = faces[faces_idx]
     corner = vertices[np.where(own_faces < 0, own_faces[:, :1], own_faces)]
     x = corner[:, 1] - corner[:, 0]
     x /= np.maximum(np.linalg.norm(x, axis=1), 1e-300)[:, None]
-    y = np.cross(polygon_normals(vertices, own_faces)[0], x)
+    y = np.cross(polygon_normals(QuadMesh(vertices, own_faces))[0], x)
     uv = np.stack([np.einsum("kcd,kd->kc", corner, x), np.einsum("kcd,kd->kc", corner, y)], -1)
     charts = []
     for face, used, flat, points in zip(faces_idx.tolist(), own_faces >= 0, uv, corner, strict=True):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +12,9 @@ import numpy as np
 from gdtool.core.child import ChildFailed, call
 from gdtool.core.native import imported
 from gdtool.geometry.mesh_quality import polygon_normals
+from gdtool.geometry.meshes import Mesh, QuadMesh, TriMesh
 from gdtool.geometry.repair import one_vertex_per_fan
-from gdtool.geometry.topology import edges_of, triangulated
+from gdtool.geometry.topology import edges_of
 
 _PROXY_TRIANGLES = 6000  # xatlas' time grows faster than the triangles; this many show where charts end
 _CREASE_DEGREES = 30.0  # edges that turn by more are creases ...
@@ -26,11 +28,12 @@ _MAX_MERGES = 20  # rounds of merging small charts
 _CREASE_FACTOR = 5.0  # times longer is the way across a crease, so that halves part there
 
 
-def run_xatlas(vertices: np.ndarray, triangles: np.ndarray, max_cost: float) -> np.ndarray:
+def run_xatlas(mesh: TriMesh, max_cost: float) -> np.ndarray:
     """Return (t,) the chart of each triangle by xatlas, -1 for triangles that it drops.
 
     Runs in a child process, because xatlas can hang.
     """
+    vertices, triangles = mesh.vertices, mesh.faces
     xatlas = imported("xatlas")
     charts = xatlas.ChartOptions()
     charts.max_cost = max_cost
@@ -52,11 +55,12 @@ class Adjacency:
     vertices. area (f,) and normals (f, 3) of the faces; count of the faces.
     """
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray):
+    def __init__(self, mesh: QuadMesh):
+        vertices, faces = mesh.vertices, mesh.faces
         edges = edges_of(faces)
         edge_idx, self.pairs = edges.face_pairs()
         self.ends = edges.ends[edge_idx]
-        normals, self.area = polygon_normals(vertices, faces)
+        normals, self.area = polygon_normals(mesh)
         cosine = (normals[self.pairs[:, 0]] * normals[self.pairs[:, 1]]).sum(1)
         length = np.linalg.norm(vertices[self.ends[:, 0]] - vertices[self.ends[:, 1]], axis=1)
         self.crease = cosine < np.cos(np.radians(_CREASE_DEGREES))
@@ -134,49 +138,43 @@ class Segmentation(NamedTuple):
     """Charts of a mesh.
 
     label (f,): the connected chart of each face; part (f,): the part of its chart, a candidate for cutting; proxy: the
-    coarse mesh (vertices, triangles) that charts were found on; failed: sentences on what failed on the way.
+    coarse mesh that charts were found on; failed: sentences on what failed on the way.
     """
 
     label: np.ndarray
     part: np.ndarray
-    proxy: tuple[np.ndarray, np.ndarray]
+    proxy: TriMesh
     failed: list[str]
 
 
-def find_charts(
-    adjacency: Callable[[], Adjacency], vertices: np.ndarray, faces: np.ndarray, *, until: float, max_cost: float
-) -> Segmentation:
-    """Segment faces (f, 4) into charts, with xatlas or, where it fails, by the box side that faces look at.
+def find_charts(adjacency: Callable[[], Adjacency], mesh: QuadMesh, *, until: float, max_cost: float) -> Segmentation:
+    """Segment a mesh into charts, with xatlas or, where it fails, by the box side that faces look at.
 
-    vertices (v, 3) in a unit box. adjacency: returns that of the faces. until: when xatlas is given up, on the clock
+    mesh: in a unit box. adjacency: returns that of its faces. until: when xatlas is given up, on the clock
     time.monotonic. max_cost: xatlas' limit on the cost of a chart.
     """
     from gdtool.geometry.distance import closest_points
-    from gdtool.geometry.simplify import simplify
+    from gdtool.geometry.simplify import SimplifyOptions, simplify
 
+    vertices, faces = mesh.vertices, mesh.faces
     failed: list[str] = []
-    triangles, _ = triangulated(faces)
-    proxy_vertices, proxy, _, report = simplify(
-        vertices,
-        triangles.astype(np.int64),
-        _PROXY_TRIANGLES,
-        measured=False,
-        meanwhile=adjacency,
-        seconds=max(until - time.monotonic(), _MIN_CHILD_SECONDS),
+    triangles = mesh.triangles
+    options = SimplifyOptions(
+        seconds=max(until - time.monotonic(), _MIN_CHILD_SECONDS), measure_error=False, while_waiting=adjacency
     )
-    if report["method"] == "vertex clustering":
-        proxy_vertices, proxy = vertices, triangles
+    proxy, _, report = simplify(TriMesh(vertices, triangles.faces.astype(np.int64)), _PROXY_TRIANGLES, options=options)
+    if report.method == "vertex clustering":
+        proxy = triangles
     try:
         chart = call(
             run_xatlas,
-            proxy_vertices.astype(np.float32),
-            proxy.astype(np.int32),
+            TriMesh(proxy.vertices.astype(np.float32), proxy.faces.astype(np.int32)),
             max_cost,
             seconds=max(until - time.monotonic(), _MIN_CHILD_SECONDS),
             memory_mb=_CHILD_MEMORY_MB,
         )
         centre = vertices[np.where(faces < 0, faces[:, :1], faces)].mean(1)
-        label = chart[closest_points(centre, proxy_vertices, proxy)[1]]
+        label = chart[closest_points(centre, proxy)[1]]
         if (label < 0).all():
             raise ChildFailed("xatlas made no charts")
     except ChildFailed as failure:
@@ -185,14 +183,16 @@ def find_charts(
         axis = np.abs(normals).argmax(1)
         label = axis * 2 + (normals[np.arange(len(faces)), axis] < 0)
     label = np.where(label < 0, label.max() + 1, label)
-    return Segmentation(*tidy_labels(adjacency(), label), (proxy_vertices, proxy.astype(np.int64)), failed)
+    proxy = TriMesh(proxy.vertices, proxy.faces.astype(np.int64))
+    return Segmentation(*tidy_labels(adjacency(), label), proxy, failed)
 
 
-def chart_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices of some faces alone, those where the chart touches itself doubled, and the faces into them.
+def chart_mesh(mesh: Mesh) -> Mesh:
+    """Return a chart's faces with vertices of their own, doubled where the chart touches itself.
 
-    faces (k, 3) or (k, 4). In the whole mesh each vertex must have one fan of faces.
+    mesh: some faces of a mesh in which each vertex has one fan of faces; its other vertices are left out.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     used, corners = faces >= 0, np.full(faces.shape, -1, np.int64)
     vertex = faces[used]
     first = np.empty(len(vertices), np.int64)
@@ -213,7 +213,8 @@ def chart_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
         - np.bincount(high, minlength=len(points))
     )
     several = fans.max(initial=0) > 1 or (key[2:] == key[:-2]).any()
-    return one_vertex_per_fan(points, corners) if several else (points, corners)
+    chart = replace(mesh, vertices=points, faces=corners)
+    return one_vertex_per_fan(chart) if several else chart
 
 
 def tidy_labels(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> tuple[np.ndarray, np.ndarray]:

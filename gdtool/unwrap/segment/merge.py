@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.geometry.mesh_quality import polygon_normals
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.repair import one_vertex_per_fan
 from gdtool.unwrap.parameterize.flatten import flatten
 from gdtool.unwrap.segment.charts import Adjacency, chart_mesh
@@ -19,20 +20,19 @@ def merged_stretch_limit(good_stretch: float) -> float:
 
 
 def merge_small_charts(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: QuadMesh,
     label: np.ndarray,
-    proxy_vertices: np.ndarray,
-    proxy: np.ndarray,
+    proxy_mesh: TriMesh,
     good_stretch: float,
 ) -> np.ndarray:
     """Merge small charts into the neighbour with the longest common seam, where the two lie flat together.
 
-    That is tried on the proxy, triangles (t, 3) of the same surface. Returns labels (f,) of faces (f, 4).
+    That is tried on proxy_mesh, a coarse mesh of the same surface. Returns labels (f,) of the mesh's faces.
     """
-    proxy_vertices, proxy = one_vertex_per_fan(proxy_vertices, proxy)
-    adjacency = Adjacency(proxy_vertices, np.concatenate([proxy, np.full((len(proxy), 1), -1)], 1))
-    proxy_label = _transfer_labels(vertices, faces, label, proxy_vertices, proxy, adjacency)
+    proxy_mesh = one_vertex_per_fan(proxy_mesh)
+    proxy_vertices, proxy = proxy_mesh.vertices, proxy_mesh.faces
+    adjacency = Adjacency(QuadMesh(proxy_vertices, np.concatenate([proxy, np.full((len(proxy), 1), -1)], 1)))
+    proxy_label = _transfer_labels(mesh, label, proxy_mesh, adjacency)
     total, count, max_stretch = adjacency.area.sum(), int(label.max()) + 1, merged_stretch_limit(good_stretch)
     merged_into = np.arange(count)
     tried: set[tuple[int, int]] = set()
@@ -56,10 +56,9 @@ def merge_small_charts(
             break
         i, j = int(first[k]), int(second[k])
         tried.add((i, j))
-        points, triangles = chart_mesh(proxy_vertices, proxy[(proxy_label == i) | (proxy_label == j)])
-        if (
-            flatten(points, triangles, max_stretch, max_stretch).uv is not None
-        ):  # flattening may stop as soon as it is good enough
+        chart = chart_mesh(TriMesh(proxy_vertices, proxy[(proxy_label == i) | (proxy_label == j)]))
+        # Flattening may stop as soon as it is good enough.
+        if flatten(chart, max_stretch, max_stretch).uv is not None:
             proxy_label[proxy_label == j] = i
             merged_into[merged_into == j] = i
             tried = {pair for pair in tried if i not in pair and j not in pair}
@@ -67,11 +66,9 @@ def merge_small_charts(
 
 
 def _transfer_labels(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: QuadMesh,
     label: np.ndarray,
-    proxy_vertices: np.ndarray,
-    proxy: np.ndarray,
+    proxy_mesh: TriMesh,
     adjacency: Adjacency,
 ) -> np.ndarray:
     """Return (t,) the label of the nearest face that faces the same way, for each triangle of the proxy.
@@ -80,7 +77,10 @@ def _transfer_labels(
     """
     from scipy.spatial import cKDTree
 
-    normals, area = polygon_normals(vertices, faces)
+    vertices, faces = mesh.vertices, mesh.faces
+    proxy_vertices, proxy = proxy_mesh.vertices, proxy_mesh.faces
+
+    normals, area = polygon_normals(mesh)
     # Normals, weighted by this distance, tell the two sides of a thin wall apart.
     normal_weight = 2 * float(np.sqrt(area.mean()))
     centres = vertices[np.where(faces < 0, faces[:, :1], faces)].mean(1)

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gdtool.geometry.topology import edges_of, triangulated
+from gdtool.geometry.meshes import QuadMesh, TriMesh
+from gdtool.geometry.topology import edges_of
 from gdtool.unwrap.chart import Chart
 from gdtool.unwrap.parameterize.flatten import (
     StretchMeasure,
@@ -57,8 +58,7 @@ def remove_overlaps(
 
 def give_to_neighbours(
     adjacency: Adjacency,
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    mesh: QuadMesh,
     charts: list[Chart],
     pieces: list[OverlapPiece],
     good_stretch: float,
@@ -67,6 +67,7 @@ def give_to_neighbours(
 
     Chart and piece together may stretch as much as two merged charts.
     """
+    vertices, faces = mesh.vertices, mesh.faces
     owner, number = np.full((2, adjacency.count), -1)
     for i, chart in enumerate(charts):
         owner[chart.faces_idx] = i
@@ -86,45 +87,44 @@ def give_to_neighbours(
                 continue
             faces_idx = np.concatenate([charts[i].faces_idx, piece.faces_idx])
             work += len(faces_idx)
-            points, corners = chart_mesh(vertices, faces[faces_idx])
-            triangles, max_stretch = triangulated(corners)[0].astype(np.int64), merged_stretch_limit(good_stretch)
+            both = chart_mesh(QuadMesh(vertices, faces[faces_idx]))
+            triangles = TriMesh(both.vertices, both.triangulation.faces.astype(np.int64))
+            max_stretch = merged_stretch_limit(good_stretch)
             if len(charts[i].faces_idx) > _FIXED_FACTOR * len(piece.faces_idx):
-                uv = _extend_chart(points, corners, triangles, charts[i], max_stretch)
+                uv = _extend_chart(both, triangles, charts[i], max_stretch)
             else:
-                uv = flatten(points, triangles, good_stretch, max_stretch).uv
+                uv = flatten(triangles, good_stretch, max_stretch).uv
             if uv is not None:
-                charts[i], owner[piece.faces_idx] = Chart(faces_idx, corners, uv, triangles), i
+                charts[i], owner[piece.faces_idx] = Chart(faces_idx, both.faces, uv, triangles.faces), i
                 break
         else:
             left.append(piece)
     return left
 
 
-def _extend_chart(
-    points: np.ndarray, corners: np.ndarray, triangles: np.ndarray, chart: Chart, max_stretch: float
-) -> np.ndarray | None:
+def _extend_chart(both: QuadMesh, triangles: TriMesh, chart: Chart, max_stretch: float) -> np.ndarray | None:
     """Flatten a piece beside a chart that keeps its coordinates, conformally from their common seam on.
 
-    points (v, 3), corners (k, 4) of the chart's faces and then the piece's, triangles (t, 3) of both. Returns uv (v,
-    2), or None where the piece does not lie flat this way, or where it would close a cut of the chart.
+    both: the chart's faces and then the piece's; triangles: the same, triangulated. Returns uv (v, 2), or None where
+    the piece does not lie flat this way, or where it would close a cut of the chart.
     """
-    chart_corners = corners[: len(chart.corners)][chart.corners >= 0]
+    chart_corners = both.faces[: len(chart.corners)][chart.corners >= 0]
     chart_uv = chart.uv[chart.corners[chart.corners >= 0]]
-    uv = np.full((len(points), 2), np.nan)
+    uv = np.full((len(both.vertices), 2), np.nan)
     uv[chart_corners] = chart_uv
     if (uv[chart_corners] != chart_uv).any():
         return None
-    piece = triangles[len(chart.triangles) :]
-    uv = extend_conformally(points, piece, uv)
-    if uv is None or not is_unfolded(uv, triangles):
+    piece = TriMesh(triangles.vertices, triangles.faces[len(chart.triangles) :])
+    uv = extend_conformally(piece, uv)
+    if uv is None or not is_unfolded(uv, triangles.faces):
         return None
-    piece_stretch, edges = StretchMeasure(points, piece).at_scale(uv), edges_of(triangles)
+    piece_stretch, edges = StretchMeasure(piece).at_scale(uv), edges_of(triangles.faces)
     if (
         not 1 / _MAX_PIECE_STRETCH < piece_stretch < _MAX_PIECE_STRETCH
-        or StretchMeasure(points, triangles).stretch(uv) > max_stretch
+        or StretchMeasure(triangles).stretch(uv) > max_stretch
     ):
         return None
-    return None if overlaps_itself(uv, triangles, edges, is_disk(len(points), triangles, edges)) else uv
+    return None if overlaps_itself(uv, triangles.faces, edges, is_disk(triangles, edges)) else uv
 
 
 def _rows_by_number(number: np.ndarray, rows: np.ndarray, count: int) -> list[np.ndarray]:
