@@ -65,7 +65,17 @@ def test_heavy_packages_load_inside_functions(path):
         assert not name.startswith(
             tuple(
                 f"gdtool.{room}"
-                for room in ("geometry", "images", "shading", "fields", "diffusion", "remesh", "unwrap", "bake")
+                for room in (
+                    "geometry",
+                    "images",
+                    "shading",
+                    "fields",
+                    "diffusion",
+                    "remesh",
+                    "unwrap",
+                    "bake",
+                    "evaluation",
+                )
             )
         ), name
 

@@ -16,6 +16,7 @@ from gdtool.cameras import Camera
 from gdtool.core.errors import InputError
 
 ADAPTERS = ("wonder3d", "nerf", "plain")
+MIN_COVERAGE = 1 / 512  # of a pixel: half a step of 8-bit storage; what is below counts as background
 
 
 @dataclass(frozen=True)
@@ -64,3 +65,36 @@ def stacked(parts: list[np.ndarray], paths: list[Path]) -> np.ndarray:
                 "scale all views to one size",
             )
     return np.stack(parts)
+
+
+def without_traces(mask: np.ndarray) -> np.ndarray:
+    """Set coverage (k, h, w) below half a step of 8-bit storage to 0."""
+    return np.where(mask > MIN_COVERAGE, mask, 0).astype(np.float32)
+
+
+def upright(up: str) -> np.ndarray:
+    """Return the rotation (4, 4) that takes a world with the given axis up, "y" or "z", to one with y up."""
+    out = np.eye(4)
+    if up == "z":
+        out[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    return out
+
+
+def transform_images(images: dict[str, np.ndarray], matrix: np.ndarray) -> dict[str, np.ndarray]:
+    """Apply a similarity (4, 4) of the world to the images by domain: it turns normals and scales depth."""
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    out = dict(images)
+    if "normal" in out:
+        out["normal"] = (out["normal"] @ (matrix[:3, :3] / scale).T).astype(np.float32)
+    if "depth" in out:
+        out["depth"] = (out["depth"] * scale).astype(np.float32)
+    return out
+
+
+def cut_out(images: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
+    """Set the images by domain (k, h, w[, 3]) to 0 where the mask (k, h, w) is 0."""
+    inside = mask > 0
+    return {
+        name: np.where(inside[..., None] if stack.ndim == 4 else inside, stack, 0).astype(np.float32)
+        for name, stack in images.items()
+    }
