@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 
@@ -22,13 +22,9 @@ MOST_SEED = 2**63 - 1  # a 64-bit integer
 MOST_SECONDS = 7 * 86400.0  # a week
 LEAST_EXPOSURE, MOST_EXPOSURE = 1e-4, 1e4  # factors on radiance, 13 stops either way
 
-# An option that names a file: its content enters the key, its path relative to the output the manifest.
+# Marks an option that names a file (msgspec.Meta's extra), or one of the stage's built-in names. The file's content
+# enters the key, its path relative to the output the manifest.
 FILE = {"file": True}
-
-
-def file_option(description: str) -> Any:
-    """Return the annotation of an option that names a file, or one of a stage's built-in names."""
-    return Annotated[str | None, msgspec.Meta(description=description, extra=FILE)]
 
 
 @dataclass(frozen=True)
@@ -54,6 +50,27 @@ class Inputs:
     name: str
     second: dict[str, Folder | Path | None] = field(default_factory=dict)
     all: tuple[Source, ...] = ()
+
+    @property
+    def folder(self) -> Folder:
+        """The source of a stage that reads folders only. Raises TypeError for a file or a generated object."""
+        if not isinstance(self.main, Folder):
+            raise TypeError(f"{self.main} is not a folder")
+        return self.main
+
+    @property
+    def path(self) -> Path:
+        """The source of a stage that reads files, or folders of other programs. Raises TypeError for any other."""
+        if not isinstance(self.main, Path):
+            raise TypeError(f"{self.main} is not a path")
+        return self.main
+
+    def second_folder(self, flag: str) -> Folder | None:
+        """Return a second input that is a folder of gdtool's, or None. Raises TypeError for another program's."""
+        folder = self.second.get(flag)
+        if isinstance(folder, Path):
+            raise TypeError(f"{folder} is not a folder with a manifest")
+        return folder
 
 
 @dataclass(frozen=True)

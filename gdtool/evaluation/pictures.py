@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gdtool.assets.load import load_scene
 from gdtool.assets.scene import Material, Scene
 from gdtool.cameras import Camera, same_view
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
 from gdtool.core.kinds import AssetContent, RendersContent
 from gdtool.core.sources import Source
+from gdtool.folders.models import load_model
 from gdtool.folders.records import read_cameras
 from gdtool.folders.surface import Surface, read_surface
 from gdtool.folders.views import read_views
@@ -138,11 +138,10 @@ def _scenes_of(source: Source) -> list[tuple[Scene, dict[str, Callable[[Buffers]
     """
     if not isinstance(source, Folder) or source.kind != "surface":
         all_domains = {name: _buffer(name) for name in (*UNLIT_DOMAINS, "mask")}
-        if not isinstance(source, Folder):
-            return [(load_scene(source), all_domains)]
-        scene = load_scene(source.file("asset.glb"))
-        in_source_frame = source.content_as(AssetContent).frame == "source"
-        return [(_normalised(scene, source) if in_source_frame else scene, all_domains)]
+        scene = load_model(source)
+        if isinstance(source, Folder) and source.content_as(AssetContent).frame == "source":
+            scene = _normalised(scene, source)
+        return [(scene, all_domains)]
     surface = read_surface(source)
     scene = _scene_of_surface(surface)
     packed = _rgba(np.stack([surface.roughness, surface.metallic, surface.metallic], -1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -185,3 +186,12 @@ def write_views(out: Output, views: Views, *, source_from_world: np.ndarray | No
     out.content = ViewsContent(
         views=views.names, domains=present, source_from_world=matrix, light=views.light is not None, **extra
     )
+
+
+def write_conditions(out: Output, cameras: list[Camera], pictures: Iterable[np.ndarray]) -> None:
+    """Write condition pictures (h, w, 4), sRGB with straight alpha in [0, 1], and the cameras that took them."""
+    from gdtool.images.io import write_png
+
+    for camera, picture in zip(cameras, out.progress(pictures, len(cameras), "conditions"), strict=True):
+        write_png(out.path(f"condition/{camera.name}.png"), picture)
+    write_cameras(out.path("condition.json"), cameras)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -41,6 +42,12 @@ def contact_sheet(
         (_MARGIN, top + i * (height + _MARGIN) + (height - text) // 2, label) for i, label in enumerate(labels_left)
     ]
     return _with_text(sheet, labels, text)
+
+
+def square_sheet(images: Sequence[np.ndarray]) -> np.ndarray:
+    """Lay images out in rows of about as many as there are rows -> (h, w, 3) uint8."""
+    columns = math.ceil(math.sqrt(len(images)))
+    return contact_sheet([images[i : i + columns] for i in range(0, len(images), columns)])
 
 
 def _shown(image: np.ndarray) -> np.ndarray:

@@ -34,21 +34,29 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     frame: Annotated[
         Literal["auto", "source", "box", "same"],
         Meta(
-            description="how a model file gets into the result's frame: source = by the result's source_from_world, "
-            "box = centred with longest side 1, same = it is there already; auto: same for two files, source where the "
-            "result has one, else box"
+            description="How to bring a model file into the result's frame. source: by the result's source_from_world. "
+            "box: centred, longest side 1. same: it is in that frame. auto: same for two files, source where the "
+            "result has a matrix, else box."
         ),
     ] = "auto"
-    samples: Annotated[int, Meta(ge=100, le=10_000_000, description="points drawn on each surface")] = 100_000
+    samples: Annotated[int, Meta(ge=100, le=10_000_000, description="Number of points sampled on each surface.")] = (
+        100_000
+    )
     threshold: Annotated[
         float,
-        Meta(gt=0, le=1, description="distance that counts as a match in the F-score, largest extent of the truth 1"),
+        Meta(
+            gt=0,
+            le=1,
+            description="Distance that counts as a match in the F-score, as a share of the reference's longest side.",
+        ),
     ] = 0.01
-    syncdreamer: Annotated[bool, Meta(description="measure by the protocol of the published tables too")] = True
-    render: Annotated[
-        bool, Meta(description="render an asset or a model through the cameras of the views and compare the pictures")
+    syncdreamer: Annotated[
+        bool, Meta(description="Also measure by the protocol of SyncDreamer's published tables.")
     ] = True
-    seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="of the drawn points")] = 0
+    render: Annotated[
+        bool, Meta(description="Render an asset or a model through the cameras of the views and compare the pictures.")
+    ] = True
+    seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="Seed of the sampled points.")] = 0
 
 
 def evaluate(result: Source, reference: Source | None, options: Options, views: Folder | None = None) -> Report:

@@ -11,7 +11,6 @@ Example:
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
@@ -25,13 +24,15 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Options of import-views."""
 
     format: Annotated[
-        Literal["auto", "wonder3d", "nerf", "plain"], Meta(description="what the folder is; auto: by what it holds")
+        Literal["auto", "wonder3d", "nerf", "plain"],
+        Meta(description="Format of the folder; auto: by the files in it."),
     ] = "auto"
     up: Annotated[
-        Literal["auto", "y", "z"], Meta(description="axis of its world that points up; auto: z for nerf, y for plain")
+        Literal["auto", "y", "z"],
+        Meta(description="Axis of the folder's world that points up; auto: z for nerf, y for the others."),
     ] = "auto"
     normalize: Annotated[
-        bool, Meta(description="centre what the silhouettes have in common and scale its longest side to 1")
+        bool, Meta(description="Centre the volume that the silhouettes have in common and scale its longest side to 1.")
     ] = True
 
 
@@ -45,13 +46,12 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.folders.views import Views, write_views
 
     with out.step("read"):
-        assert isinstance(inputs.main, Path)
-        module = adapters.adapter(inputs.main, options.format)
-        pictures = module.read(inputs.main)
+        module = adapters.adapter(inputs.path, options.format)
+        pictures = module.read(inputs.path)
     mask = adapters.without_traces(pictures.mask)
     if not (mask > 0.5).any():
         raise InputError(
-            inputs.main, "every mask is empty", "give pictures with an alpha, or white masks as mask/VIEW.png"
+            inputs.path, "every mask is empty", "give pictures with an alpha, or white masks as mask/VIEW.png"
         )
     # From the world of the pictures to the normalised frame.
     matrix = adapters.upright(pictures.up if options.up == "auto" else options.up)

@@ -18,41 +18,46 @@ from msgspec import Meta
 
 from gdtool.core.errors import UsageError
 from gdtool.core.kinds import DOMAINS
-from gdtool.core.stage import MOST_SECONDS, MOST_SEED, Inputs, Output, Stage
+from gdtool.core.stage import MOST_SECONDS, Inputs, Output, Stage
+from gdtool.stages.shared_options import Seed
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of reconstruct."""
 
     method: Annotated[
-        Literal["grid", "paper"], Meta(description="grid: carve and refine; paper: SDF and material networks")
+        Literal["grid", "paper"],
+        Meta(description="grid: carve and refine a distance grid. paper: fit networks of distance and material."),
     ] = "grid"
     resolution: Annotated[
         int,
-        Meta(ge=0, le=512, description="grid samples along a unit of length; 0: a little finer than the views' pixels"),
+        Meta(
+            ge=0, le=512, description="Grid samples along a unit of length; 0: a little finer than the views' pixels."
+        ),
     ] = 0
-    steps: Annotated[int, Meta(ge=1, le=100_000, description="paper: the most optimisation steps of each phase")] = 1000
+    steps: Annotated[int, Meta(ge=1, le=100_000, description="paper: most optimisation steps of each phase.")] = 1000
     precision: Annotated[
         Literal["float32", "bfloat16"],
-        Meta(description="paper: of the networks' layers while the first shape is fitted; the end is always float32"),
+        Meta(description="paper: arithmetic while the first shape is fitted; the rest is always float32."),
     ] = "float32"
     root: Annotated[
-        Literal["secant", "median"], Meta(description="paper: surface point between two samples of a ray")
+        Literal["secant", "median"],
+        Meta(description="paper: how the surface point between two samples of a ray is found."),
     ] = "secant"
-    brdf: Annotated[Literal["gltf", "paper"], Meta(description="paper: reflection model that color is fitted with")] = (
-        "gltf"
-    )
+    brdf: Annotated[
+        Literal["gltf", "paper"], Meta(description="paper: reflection model that color is fitted with.")
+    ] = "gltf"
     budget: Annotated[
         float,
         Meta(
             ge=0,
             le=MOST_SECONDS,
-            description="seconds to be done in: grid takes a coarser grid, paper shortens its schedule; "
-            "0: as long as it helps",
+            description="Seconds that the run may take: grid then uses a coarser grid, paper fewer steps. 0: as long "
+            "as it helps.",
         ),
     ] = 0.0
-    ignore: Annotated[tuple[str, ...], Meta(description="domains to leave out, for example depth,normal")] = ()
-    seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="seed of everything random")] = 0
+    ignore: Annotated[tuple[str, ...], Meta(description="Domains to leave out, for example depth,normal.")] = ()
+    seed: Seed = 0
 
 
 def check(inputs: Inputs, options: Options) -> None:

@@ -25,13 +25,13 @@ from gdtool.core.stage import MOST_SECONDS, Inputs, Output, Stage
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of remesh."""
 
-    faces: Annotated[int, Meta(ge=16, le=2_000_000, description="quads to make, met within 3 %")] = 20000
+    faces: Annotated[int, Meta(ge=16, le=2_000_000, description="Number of quads, met within 3 %.")] = 20000
     quad_size: Annotated[
         float,
         Meta(
             ge=0,
             le=1,
-            description="mean side of the quads, as a share of the longest side, instead of --faces; 0: --faces",
+            description="Mean edge length of the quads as a share of the longest side, instead of --faces; 0: --faces.",
         ),
     ] = 0.0
     max_deviation: Annotated[
@@ -39,41 +39,43 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         Meta(
             ge=0,
             le=1,
-            description="the fewest quads, up to --faces, that stay within this share of the longest "
-            "side of the surface; 0: --faces",
+            description="Make the fewest quads, up to --faces, that stay within this distance of the surface, a share "
+            "of its longest side; 0: --faces.",
         ),
     ] = 0.0
     triangles: Annotated[
-        int, Meta(ge=0, le=10_000_000, description="decimate to this many triangles instead of making quads; 0: quads")
+        int, Meta(ge=0, le=10_000_000, description="Decimate to so many triangles instead of making quads; 0: quads.")
     ] = 0
     crease_angle: Annotated[
-        float, Meta(ge=0, le=180, description="edges that turn by more degrees are kept sharp; 0: none")
+        float, Meta(ge=0, le=180, description="Keep edges sharp whose faces turn by more degrees than this; 0: none.")
     ] = 30.0
-    restore_creases: Annotated[bool, Meta(description="draw out the bevels of marching cubes to sharp creases")] = True
+    restore_creases: Annotated[bool, Meta(description="Sharpen the bevels that marching cubes leave at creases.")] = (
+        True
+    )
     symmetry: Annotated[
         Literal["none", "auto", "x", "y", "z"],
         Meta(
-            description="make one half and mirror it where the surface is its own mirror image across the middle of "
-            "this axis; auto: of the best of the three"
+            description="Remesh one half and mirror it, where the surface mirrors itself across the middle of this "
+            "axis. auto: the axis that fits best."
         ),
     ] = "none"
     engine: Annotated[
         Literal["auto", "instant-meshes", "quadriflow", "split"],
-        Meta(description="auto is instant-meshes with fallbacks; quadriflow needs pyQuadriFlow; split needs no engine"),
+        Meta(description="auto: instant-meshes with fallbacks. quadriflow needs gdtool[quadriflow], split nothing."),
     ] = "auto"
     smooth_iterations: Annotated[
-        int, Meta(ge=0, le=100, description="rounds of evening out the quads on the surface")
+        int, Meta(ge=0, le=100, description="Rounds of smoothing the quads on the surface.")
     ] = 5
     seconds: Annotated[
         float,
         Meta(
             gt=0,
             le=MOST_SECONDS,
-            description="time limit; engines are tried in the first 70 % of it, what is not done by then is paired "
-            "triangles; after twice the limit and 5 s the run fails",
+            description="Time limit. Engines are tried in the first 70 % of it; parts that are not done by then are "
+            "made of paired triangles. After twice the limit and 5 s the run fails.",
         ),
     ] = 120.0
-    keep: Annotated[bool, Meta(description="pass a mesh through that already meets the request")] = True
+    keep: Annotated[bool, Meta(description="Pass a mesh through that already meets the request.")] = True
 
 
 def check(inputs: Inputs, options: Options) -> None:

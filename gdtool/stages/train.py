@@ -19,7 +19,7 @@ import msgspec
 from msgspec import Meta
 
 from gdtool.core.errors import UsageError
-from gdtool.core.stage import MOST_SEED, Inputs, Output, SecondInput, Stage, file_option
+from gdtool.core.stage import FILE, MOST_SEED, Inputs, Output, SecondInput, Stage
 
 MOST_STEPS = 10**9
 MOST_MINUTES = 525_600.0  # a year
@@ -34,15 +34,18 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         Literal["none", "no_cross_domain", "one_way", "two_way", "no_pbr", "color_normal"],
         Meta(description="Part of the method to leave out or change; color_normal: Wonder3D's two domains."),
     ] = "none"
-    config: file_option('JSON file of changes to it: {"model": {...}, "train": {...}}.') = None
+    config: Annotated[
+        str | None,
+        Meta(description='JSON file of changes to the preset: {"model": {...}, "train": {...}}.', extra=FILE),
+    ] = None
     size: (
         Annotated[
             int,
             Meta(
                 ge=16,
                 le=1024,
-                description="Width and height of a view in pixels, patches in proportion, so at the same cost; "
-                "a smaller model of --start is grown to it.",
+                description="Width and height of a view, pixels. Patches grow in proportion, so that a step costs the "
+                "same. A smaller model of --start is grown to it.",
             ),
         ]
         | None
@@ -56,7 +59,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             Meta(
                 gt=0,
                 le=MOST_MINUTES,
-                description="Stop after so many minutes of training; the learning rate falls accordingly.",
+                description="Stop after so many minutes of training; the learning rate has fallen by then.",
             ),
         ]
         | None
@@ -68,7 +71,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         Meta(
             ge=0,
             le=1_000_000,
-            description="Last objects of the data that are not trained on but shown in validation images.",
+            description="Number of objects, the last of the data, that validation images show and training leaves out.",
         ),
     ] = HELD_OUT
     checkpoint_every: Annotated[int, Meta(ge=1, le=MOST_STEPS, description="Steps between checkpoints.")] = 100
@@ -76,8 +79,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     tensorboard: Annotated[
         bool,
         Meta(
-            description="Write TensorBoard's event files as well, into the run's workspace and the model "
-            "(needs tensorboard)."
+            description="Also write TensorBoard's event files, into the run's workspace and the model (needs "
+            "gdtool[tensorboard])."
         ),
     ] = False
 

@@ -23,25 +23,35 @@ from gdtool.core.stage import MOST_SECONDS, Inputs, Output, Stage
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of unwrap."""
 
-    size: Annotated[int, Meta(ge=16, le=65536, description="texture size in texels that the padding is for")] = 2048
+    size: Annotated[int, Meta(ge=16, le=65536, description="Side of the texture that the padding is for, texels.")] = (
+        2048
+    )
     mip_safe: Annotated[
-        int, Meta(ge=1, le=65536, description="charts stay a texel apart down to the mip level of this size")
+        int,
+        Meta(
+            ge=1,
+            le=65536,
+            description="Side of the smallest mip level at which charts are still a texel apart, texels.",
+        ),
     ] = 256
     padding: Annotated[
-        int, Meta(ge=0, le=1024, description="texels between charts at --size; 0: what --mip-safe needs")
+        int, Meta(ge=0, le=1024, description="Texels between charts at --size; 0: as many as --mip-safe needs.")
     ] = 0
-    max_stretch: Annotated[float, Meta(gt=1, le=100, description="a chart with more L2 stretch is cut")] = 1.1
+    max_stretch: Annotated[
+        float, Meta(gt=1, le=100, description="Most L2 stretch of a chart; one with more is cut.")
+    ] = 1.1
     symmetry: Annotated[
-        Literal["none", "x", "y", "z"], Meta(description="faces that mirror others along this axis share their texels")
+        Literal["none", "x", "y", "z"],
+        Meta(description="Let faces that mirror others along this axis share their texels."),
     ] = "none"
-    redo: Annotated[bool, Meta(description="make new texture coordinates even where the mesh has valid ones")] = False
+    redo: Annotated[bool, Meta(description="Make new texture coordinates even where the mesh has valid ones.")] = False
     seconds: Annotated[
         float,
         Meta(
             gt=0,
             le=MOST_SECONDS,
-            description="time limit; charts are shaped in the first 60 % of it, what is left then goes in simpler "
-            "ways; after twice the limit and 5 s the run fails",
+            description="Time limit. Charts are shaped in the first 60 % of it, and simpler methods do the rest. After "
+            "twice the limit and 5 s the run fails.",
         ),
     ] = 120.0
 
