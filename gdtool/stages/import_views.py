@@ -63,7 +63,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
                 out.warn("the silhouettes have no common volume: the frame is left as it is")
             else:
                 cameras, matrix = [transform_camera(camera, box) for camera in cameras], box @ matrix
-    images = adapters.cut_out(adapters.transform_images(pictures.images, matrix), mask)
+    images = adapters.clear_background(adapters.transform_images(pictures.images, matrix), mask)
     with out.step("write"):
         write_views(
             out,

@@ -18,8 +18,8 @@ import msgspec
 
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder, open_folder
+from gdtool.core.keys import key_of, names_file
 from gdtool.core.manifest import MANIFEST
-from gdtool.core.runner import key_of, names_file
 from gdtool.core.sources import digest
 
 STAGES = (

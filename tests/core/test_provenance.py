@@ -10,7 +10,8 @@ from gdtool.core.errors import InputError
 from gdtool.core.folder import open_folder
 from gdtool.core.kinds import RendersContent
 from gdtool.core.provenance import ancestors, find_ancestor, find_source, missing_origin
-from gdtool.core.runner import Settings, run_all, second_inputs
+from gdtool.core.runner import Settings, run_all
+from gdtool.core.second_inputs import second_inputs
 from gdtool.core.stage import SecondInput
 from tests.core.toy import STAGE, Options
 

@@ -251,8 +251,8 @@ def test_two_processes_on_one_output_do_not_mix():
 
 def test_a_folder_that_ships_with_gdtool_is_an_input_like_any_other():
     """A new bundled model makes old views stale: it is among the inputs that the key is made of."""
-    from gdtool.core.runner import second_inputs
+    from gdtool.core.second_inputs import second_inputs
     from gdtool.stages.sample_views import STAGE as sample_views
 
-    found = second_inputs(sample_views, Path("cat.png"), {"model": None}).found["model"]
+    found = second_inputs(sample_views, Path("cat.png"), {"model": None}).by_flag["model"]
     assert found.kind == "model" and found.name == "default"

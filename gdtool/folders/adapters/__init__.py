@@ -91,7 +91,7 @@ def transform_images(images: dict[str, np.ndarray], matrix: np.ndarray) -> dict[
     return out
 
 
-def cut_out(images: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
+def clear_background(images: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
     """Set the images by domain (k, h, w[, 3]) to 0 where the mask (k, h, w) is 0."""
     inside = mask > 0
     return {
