@@ -49,7 +49,7 @@ def main(load: Callable[[], click.Command] = _cli) -> None:
 
     ending.listen()  # before click and all else: Ctrl-C is quiet from the start
     try:
-        from ._common import guarded
+        from ._exit import guarded
 
         command = load()
         if COMPLETION in os.environ:

@@ -12,7 +12,9 @@ from gdtool.core.errors import GdtoolError
 from gdtool.core.folder import Folder
 from gdtool.stages import evaluate as stage
 
-from ._common import TEXT, build_options, emit, exit_code, help_of, options_from, set_verbosity, tell, verbosity_options
+from ._exit import emit, exit_code, tell
+from ._options import TEXT, build_options, options_from, set_verbosity, verbosity_options
+from ._stage_command import help_of
 
 # Groups of figures in the table on a terminal: title, and the beginnings of the names. docs/metrics.md defines each.
 GROUPS: tuple[tuple[str, tuple[str, ...]], ...] = (

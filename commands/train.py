@@ -6,7 +6,8 @@ import click
 
 from gdtool.stages import train as stage
 
-from ._common import build_options, help_of, stage_command
+from ._options import build_options
+from ._stage_command import help_of, stage_command
 
 command = stage_command(stage.STAGE, help=help_of(stage))
 command.params.append(

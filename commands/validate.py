@@ -12,7 +12,9 @@ from gdtool.core import ending, sources
 from gdtool.core.errors import InputError
 from gdtool.stages import validate as stage
 
-from ._common import TEXT, emit, help_of, report_text, set_verbosity, tell, verbosity_options
+from ._exit import emit, report_text, tell
+from ._options import TEXT, set_verbosity, verbosity_options
+from ._stage_command import help_of
 
 SHOWN = 10  # the first faults are enough to start mending
 

@@ -37,7 +37,7 @@ EXCEPTIONS: dict[tuple[str, str], tuple[set[str], str]] = {
     ("gdtool/core/cluster.py", "_connected"): ({"--ray"}, "called where --ray was given, by the commands that have it"),
     ("gdtool/stages/early.py", "require_device"): ({"--device"}, "called by the commands whose stage runs networks"),
     ("gdtool/stages/early.py", "require_fov"): ({"--fov"}, "called by the stages that have --fov"),
-    ("commands/_common.py", "shard_of"): ({"--shard"}, "called where --shard was given, by the commands that have it"),
+    ("commands/_options.py", "shard_of"): ({"--shard"}, "called where --shard was given, by the commands that have it"),
 }
 
 FILES = {

@@ -35,7 +35,7 @@ if __name__ == "__main__":
     from gdtool.commands import main
 
     def command():
-        from gdtool.commands._common import stage_command
+        from gdtool.commands._stage_command import stage_command
 
         return stage_command(STAGE, "Toy.")
 

@@ -16,7 +16,7 @@ import click
 import numpy as np
 import pytest
 
-from gdtool.commands import _common, _group
+from gdtool.commands import _exit, _group, _stage_command
 from gdtool.core import child, ending, log, runner
 from gdtool.core.errors import GdtoolError, InputError, OutputError, ResourceError, from_exception
 from tests.conftest import ROOT
@@ -157,7 +157,7 @@ def test_the_command_line_catches_all(monkeypatch, capsys, raised, code, debug):
 
     monkeypatch.setattr(sys, "argv", ["gdtool", *(["--debug"] if debug else [])])
     with pytest.raises(SystemExit) as ended:
-        _common.guarded(command)
+        _exit.guarded(command)
     told = capsys.readouterr().err
     assert ended.value.code == code and ("Traceback" in told) == debug
     last = told.splitlines()[-1]
@@ -178,7 +178,7 @@ def test_one_source_that_fails_unexpectedly_does_not_stop_the_rest(monkeypatch, 
 
     monkeypatch.setattr(sys, "argv", ["gdtool", *pictures, "-q"])
     with pytest.raises(SystemExit) as ended:
-        _common.guarded(_common.stage_command(dataclasses.replace(toy.STAGE, run=run), "Toy."))
+        _exit.guarded(_stage_command.stage_command(dataclasses.replace(toy.STAGE, run=run), "Toy."))
     out, told = capsys.readouterr()
     assert ended.value.code == 1 and out.split() == ["a.asset/renders", "c.asset/renders"]
     assert lines_of(told) == [
@@ -190,7 +190,7 @@ def test_one_source_that_fails_unexpectedly_does_not_stop_the_rest(monkeypatch, 
 @pytest.mark.parametrize("name", ["a\nb", "a\r\x1b[2J", "a\x85b\u2028c"], ids=ascii)
 def test_what_is_printed_is_one_line_whatever_a_name_holds(capsys, monkeypatch, name):
     monkeypatch.setattr(log, "level", log.NORMAL)
-    _common.report(InputError(name, f"is {name}", "mend it"))
+    _exit.report(InputError(name, f"is {name}", "mend it"))
     log.say(f"  {name}")
     told = capsys.readouterr().err
     assert len(told.splitlines()) == 2 and "\x1b" not in told
