@@ -26,7 +26,7 @@ VERBOSITY = {
 
 
 class IntegerRange(click.IntRange):
-    """Parse an integer between bounds; the help calls it so."""
+    """Parse an integer between bounds; the help shows INTEGER."""
 
     name = "integer"
 

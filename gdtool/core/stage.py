@@ -65,12 +65,22 @@ class Inputs:
             raise TypeError(f"{self.main} is not a path")
         return self.main
 
+    @property
+    def on_disk(self) -> tuple[Folder | Path, ...]:
+        """All sources that are folders or files, without generated objects."""
+        return tuple(source for source in self.all if not isinstance(source, str))
+
     def second_folder(self, flag: str) -> Folder | None:
         """Return a second input that is a folder of gdtool's, or None. Raises TypeError for another program's."""
         folder = self.second.get(flag)
         if isinstance(folder, Path):
             raise TypeError(f"{folder} is not a folder with a manifest")
         return folder
+
+    def second_path(self, flag: str) -> Path | None:
+        """Return where a second input lies, whatever wrote it; None where there is none."""
+        source = self.second.get(flag)
+        return source.path if isinstance(source, Folder) else source
 
 
 @dataclass(frozen=True)

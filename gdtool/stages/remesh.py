@@ -131,8 +131,8 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
             out.seconds[name] = out.seconds.get(name, 0.0) + seconds
     with out.step("measure"):
         figures = report_figures(made, vertices, faces)
-    if text := count_warning(made, faces, _goal(options)):
-        out.warn(f"{inputs.name}: {text}")
+    if warning := count_warning(made, faces, _goal(options)):
+        out.warn(f"{inputs.name}: {warning}")
     with out.step("write"):
         write_mesh(out, QuadMesh(made.vertices, made.faces.astype(np.int32)))
     is_quad = made.faces[:, 3] >= 0

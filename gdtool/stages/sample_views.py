@@ -119,15 +119,15 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     torch.set_num_threads(out.threads)
     with out.step("load"):
-        chosen = inputs.second["model"]
-        folder = getattr(chosen, "path", chosen)
+        folder = inputs.second_path("model")
+        assert folder is not None  # the bundled model is the default
         model = (wonder3d.load if wonder3d.recognises(folder) else load_model)(folder).to(out.device)
     config = model.config
     domains = choose_domains(None if options.domains == DOMAINS else options.domains, config)
     with out.step("condition"):
         extent = extent_of(config.convention)
         framing = PictureOptions(options.mask, options.matting, options.crop, extent, config.image_size)
-        condition, picture = condition_of(inputs.main, inputs.name, framing, out.warn)
+        condition, picture = condition_of(inputs.path, inputs.name, framing, out.warn)
     with out.step("sample"):
         settings = SamplingOptions(
             domains=domains,

@@ -96,7 +96,7 @@ def check(inputs: Inputs, options: Options) -> None:
         )
     from gdtool.diffusion.data.sources import count_views_folders
 
-    count = count_views_folders(inputs.all)
+    count = count_views_folders(inputs.on_disk)
     # Of fewer objects than the default holds out, one is left to train on: that is no mistake of the user's.
     if options.held_out >= count and options.held_out != HELD_OUT:
         raise UsageError(
@@ -119,9 +119,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     torch.set_num_threads(out.threads)
     model_config, train_config = configured(options)
-    start = inputs.second["start"]
     with out.step("decode"):
-        folders, count = views_folders(inputs.all, out.workspace), count_views_folders(inputs.all)
+        folders, count = views_folders(inputs.on_disk, out.workspace), count_views_folders(inputs.on_disk)
         objects = decode_dataset(folders, count, model_config, out.workspace, warn=out.warn)
     used = len(objects) - min(options.held_out, len(objects) - 1)
     shown, objects = objects.part(slice(used, None)), objects.part(slice(used))
@@ -131,7 +130,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         options.seed, options.minutes, options.checkpoint_every, options.validate_every, out.device
     )
     workspace = out.workspace.absolute()
-    order = Order(model_config, train_config, start and start.path, workspace, used, run_options)
+    order = Order(model_config, train_config, inputs.second_path("start"), workspace, used, run_options)
     distributed.send(order)
     with out.step("train"):
         state = execute(order, objects, recorder.observers(out))
