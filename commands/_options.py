@@ -32,7 +32,7 @@ class IntegerRange(click.IntRange):
 
 
 class FiniteRange(click.FloatRange):
-    """Parse a finite float between bounds. NaN is refused: it compares as outside of no bound."""
+    """Parse a finite float between bounds; click's own range lets NaN pass."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Return the number; fail for NaN and infinities."""

@@ -1,4 +1,4 @@
-"""`gdtool train`: options and help come from the stage; --plan, and the processes of torchrun that follow the first."""
+"""`gdtool train`: options and help come from the stage; adds --plan, and follows the first process of torchrun."""
 
 import os
 
@@ -22,6 +22,7 @@ _train = command.callback
 
 
 def _invoke(*, plan: bool, **values):
+    """Plan the training, run it, or take part in it as a later process of torchrun."""
     if plan:
         click.echo(stage.plan(build_options(stage.Options, values), values["as_json"]))
         return 0

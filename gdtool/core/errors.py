@@ -1,5 +1,4 @@
-"""Errors that a user reads: one line that names the thing, the fact and the cure, and the exit code that goes with
-it."""
+"""Errors that a user reads: one line that names the subject, the fact and the cure, and an exit code."""
 
 from __future__ import annotations
 
@@ -8,9 +7,9 @@ import re
 
 
 class GdtoolError(Exception):
-    """An error with a one-line message `subject: fact; cure` and an exit code.
+    """Hold an error with a one-line message `subject: fact; cure` and an exit code.
 
-    Raised directly it means exit 1; the subclasses have the exit codes of docs/format.md.
+    An instance of this class itself has exit code 1; the subclasses have the exit codes of docs/format.md.
     """
 
     exit_code = 1
@@ -24,31 +23,31 @@ class GdtoolError(Exception):
 
 
 class UsageError(GdtoolError):
-    """The command line asks for something that cannot be meant."""
+    """Tell that the command line asks for something impossible."""
 
     exit_code = 2
 
 
 class InputError(GdtoolError):
-    """A file, folder or manifest is not what it has to be."""
+    """Tell that a file, folder or manifest breaks the rules of its format."""
 
     exit_code = 3
 
 
 class OutputError(GdtoolError):
-    """Something cannot be read or written: permission, disk, lock."""
+    """Tell that something cannot be read or written: permission, disk, lock."""
 
     exit_code = 4
 
 
 class ResourceError(GdtoolError):
-    """A missing optional dependency or device, or a memory or time limit."""
+    """Tell that an optional dependency or a device is missing, or that a memory or time limit is reached."""
 
     exit_code = 5
 
 
 class ChildFailed(Exception):
-    """A child process crashed, ran out of time or memory, or ended without a result; str() says which."""
+    """Tell that a child process crashed, ran out of time or memory, or ended without a result; str() says which."""
 
 
 # What to do about an error of the system, by its number.
@@ -80,10 +79,11 @@ _BAD_NAMES = {
 
 
 def from_os_error(error: OSError, subject: object) -> GdtoolError:
-    """Return the error to report for an OSError: what failed is in its file name, else in subject.
+    """Turn an OSError into an error for the user; its subject is the error's file name, else `subject`.
 
-    InputError for names that are too long or lead in a circle, ResourceError for the machine's limits, OutputError for
-    all else."""
+    InputError stands for names that are too long or lead in a circle, ResourceError for limits of the machine,
+    OutputError for all else.
+    """
     fact = error.strerror or str(error) or type(error).__name__
     fact, place = fact[0].lower() + fact[1:], error.filename or subject
     if error.errno in _BAD_NAMES:
@@ -133,15 +133,14 @@ _MOST_SHOWN = 200  # characters of another program's message
 
 
 def first_line(error: BaseException) -> str:
-    """Return what an exception says, cut to a part of a line."""
+    """Return the first line of an exception's message, shortened."""
     return (str(error).strip() or "no message").splitlines()[0][:_MOST_SHOWN]
 
 
 def missing_library(error: ImportError) -> GdtoolError | None:
-    """Return the error to report for an import that lacks a shared library of the system or a Python package; None for
-    any other.
+    """Turn an ImportError for a missing system library or Python package into an error for the user.
 
-    A module of gdtool that cannot be imported is a fault of gdtool.
+    Returns None for any other ImportError: a module of gdtool that cannot be imported is a fault of gdtool.
     """
     found = _NO_LIBRARY.search(str(error))
     if found:
@@ -158,10 +157,11 @@ def missing_library(error: ImportError) -> GdtoolError | None:
 
 
 def from_exception(error: Exception, subject: object) -> GdtoolError:
-    """Return the error to report for anything that was raised while working on subject.
+    """Turn any exception that was raised while working on subject into an error for the user.
 
-    GdtoolError: itself. OutputError, InputError or ResourceError for what the system, the memory, a device or a missing
-    library does. A GdtoolError with exit code 1, "internal error", for all else."""
+    A GdtoolError stays. Faults of the system, the memory, a device or a missing library become OutputError, InputError
+    or ResourceError. All else becomes a GdtoolError with exit code 1, "internal error".
+    """
     if isinstance(error, GdtoolError):
         return error
     found: GdtoolError | None = None
@@ -193,12 +193,12 @@ def from_exception(error: Exception, subject: object) -> GdtoolError:
 
 
 def is_unmapped(error: BaseException) -> bool:
-    """Whether an import failed because there was no memory to load a library into."""
+    """Tell whether an import failed because there was no memory to load a library into."""
     return bool(_NOT_MAPPED.search(str(error)))
 
 
 def asked_for(error: BaseException) -> str:
-    """How much the allocation that failed asked for, in parentheses; empty where the message does not say."""
+    """Return the size of the allocation that failed, in parentheses; empty where the message does not say."""
     found = _ASKED.search(str(error))
     if not found:
         return ""
@@ -207,7 +207,7 @@ def asked_for(error: BaseException) -> str:
 
 
 def internal_error(error: BaseException, subject: object) -> GdtoolError:
-    """Return the error to report for a fault of gdtool itself."""
+    """Make the error that reports a fault of gdtool itself."""
     return GdtoolError(
         subject,
         f"internal error ({type(error).__name__}: {first_line(error)})",

@@ -15,7 +15,10 @@ from gdtool.core.stage import Stage
 
 
 def option_record(options: Any, folder: Path | None) -> dict[str, Any]:
-    """Options as plain values; files by digest (folder None, for the key) or by path relative to folder."""
+    """Convert options to plain values, in which files stand by digest (for the key) or by path (for the manifest).
+
+    folder: the folder that paths are relative to; None for digests.
+    """
     record = msgspec.to_builtins(options)
     for field in msgspec.structs.fields(options):
         value = record.get(field.name)
@@ -27,21 +30,23 @@ def option_record(options: Any, folder: Path | None) -> dict[str, Any]:
 
 
 def names_file(field: Any) -> bool:
-    """Whether a field of a stage's Options names a file."""
+    """Tell whether a field of a stage's Options names a file."""
     extra = getattr(getattr(field.type, "__metadata__", (None,))[0], "extra", None) or {}
     return bool(extra.get("file"))
 
 
 def key_of(stage: str, version: int, options: dict[str, Any], inputs: list[tuple[str, str]]) -> str:
-    """Return what tells one result of a stage from another: sha256 of its name, version, options (files by digest), and
-    (role, digest) of its inputs."""
+    """Compute the sha256 of a stage's name, version and options (files by digest), and of its inputs (role, digest).
+
+    Two runs with the same key have the same result.
+    """
     return digest_of([stage, version, options, inputs])
 
 
 def stale_reason(
     target: Path, stage: Stage, key: str, options: dict[str, Any], inputs: list[tuple[str, str]]
 ) -> str | None:
-    """Why the folder at target is not the result of this key, cheapest check first; None when it is."""
+    """Say why the folder at target is not the result of this key; None when it is. The cheapest check comes first."""
     if not is_folder(target):
         return "not made yet"
     try:

@@ -37,7 +37,7 @@ from gdtool.core.stage import Inputs, Output, Stage
 
 @dataclass(frozen=True)
 class Settings:
-    """How to run, as against what to make: none of it enters the key."""
+    """Hold how to run, as against what to make: none of it enters the key."""
 
     output: Path | None = None
     several: bool = False
@@ -53,7 +53,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Result:
-    """What became of one source. path is the finished folder, or the one that would be made."""
+    """Describe the outcome for one source. path: the finished folder, or the one that would be made."""
 
     path: Path
     kind: str
@@ -205,10 +205,10 @@ def _manifest(job: Job, out: Output, start: float) -> Manifest:
 
 
 def default_output(stage: Stage, source: Source, output: Path | None, several: bool) -> Path:
-    """Where the result goes.
+    """Return the folder of the result.
 
-    Without -o: beside the source folder, for files and datasets in ./<name>.asset of the working directory.
-    -o names the folder itself for one source, and the parent of <name>.asset/<kind> for several.
+    Without -o it lies beside the source folder; for files and datasets it is ./<name>.asset/<kind> in the working
+    directory. -o names the folder itself for one source, and the parent of <name>.asset/<kind> for several.
     """
     name = sources.name_of(source)
     if output is not None:
@@ -230,7 +230,7 @@ def _refuse_other_source(target: Path, stage: Stage, source: Source, chosen: boo
 
 
 def _is_resumable(stage: Stage, workspace: Path) -> bool:
-    """Whether the same run can go on from what is in its workspace."""
+    """Tell whether the same run can go on from its workspace."""
     return bool(stage.checkpoint) and (workspace / stage.checkpoint).is_file()
 
 
@@ -247,7 +247,7 @@ def _paths(inputs: Iterable[Source | None]) -> list[Path]:
 
 @contextlib.contextmanager
 def _parents(target: Path) -> Iterator[None]:
-    """Make the folders above target; what stays empty, because the run failed, goes again."""
+    """Make the folders above target; those that stay empty, because the run failed, are removed again."""
     made = [folder for folder in target.parents if not folder.exists()]
     target.parent.mkdir(parents=True, exist_ok=True)
 
@@ -261,13 +261,14 @@ def _parents(target: Path) -> Iterator[None]:
 
 
 def _record(out: Output, start: float) -> RunRecord:
+    """Record the seconds of each step, the memory and the time of day."""
     finished = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     seconds = {name: round(value, 4) for name, value in out.seconds.items()}
     return RunRecord(seconds, round(time.perf_counter() - start, 4), round(_peak_memory_mb(), 1), finished)
 
 
 def _peak_memory_mb() -> float:
-    """Largest resident set of this process or of one of its children."""
+    """Return the largest resident set of this process or of one of its children, in MB."""
     children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     try:
         # Not RUSAGE_SELF: that counts what the process was before it became gdtool, a large parent say.

@@ -22,7 +22,7 @@ __all__ = ["Result", "Settings", "run_all", "run_one"]
 def _attempt(
     stage: Stage, text: str, *, options: Any, flags: dict[str, str | None], settings: Settings
 ) -> Result | GdtoolError:
-    """Return the result of one source, or what was wrong with it."""
+    """Run a stage on one source; returns its result, or the error that stopped it."""
     try:
         source = sources.resolve(text, stage.reads, stage.name, allow_missing=settings.dry_run)
         return run_one(stage, [source], options, flags, settings)
@@ -36,7 +36,7 @@ def _attempt(
 
 
 def _on_cluster(work: functools.partial, stream: Iterator[str], settings: Settings) -> Iterator[Result | GdtoolError]:
-    """One source a task; a task takes the cores that --threads says, one without it."""
+    """Run one task for each source on a cluster; a task takes --threads cores, or one."""
     from gdtool.core import cluster
 
     threads, address = settings.threads or 1, settings.ray
@@ -53,7 +53,7 @@ def _on_cluster(work: functools.partial, stream: Iterator[str], settings: Settin
 def run_all(
     stage: Stage, arguments: tuple[str, ...], options: Any, flags: dict[str, str | None], settings: Settings
 ) -> Iterator[Result | GdtoolError]:
-    """Run a stage on every source, as they arrive; a source that fails yields its error and the rest go on."""
+    """Run a stage on every source as it arrives; yields a result or an error for each."""
     stream = sources.incoming(arguments)
     part, parts = settings.shard
     if parts > 1:

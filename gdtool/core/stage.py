@@ -1,4 +1,4 @@
-"""What a stage is: a pure step from folders to a folder, and what it is handed to do that."""
+"""Declare what a stage is: a function from folders to a folder, with its options, inputs and output."""
 
 from __future__ import annotations
 
@@ -29,10 +29,11 @@ FILE = {"file": True}
 
 @dataclass(frozen=True)
 class SecondInput:
-    """An input beside the source: a flag, and when search is set found along the provenance chain without it.
+    """Declare an input beside the source: it has a flag, and with `search` is found along the provenance chain.
 
-    default: a folder that ships with gdtool, as "package/folder", taken when neither gives one. foreign: a folder of
-    another program, or an id of the Hugging Face hub, will do as well, and arrives as a Path."""
+    default: a folder that ships with gdtool, as "package/folder", where neither gives one. foreign: a folder of another
+    program, or an id of the Hugging Face hub, is accepted too, and arrives as a Path.
+    """
 
     kind: str
     required: bool = False
@@ -44,7 +45,7 @@ class SecondInput:
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a run reads. second has an entry for each second input; None where there is none."""
+    """Hold what a run reads. second has an entry for each second input, None where there is none."""
 
     main: Source
     name: str
@@ -85,14 +86,15 @@ class Inputs:
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage and all that its command line, its manifest and its schema are derived from.
+    """Declare a stage; its command line, its manifest and its schema are derived from this.
 
-    reads: folder kinds, and "image-file", "model-file", "mesh-file" for files. version rises when results change.
+    reads: folder kinds, and "image-file", "model-file", "mesh-file" for files. version: raised when results change.
     gathers: all sources go into one run (train). dataset: several results share a root with an index. check(inputs,
-    options) is called before any work: it raises a GdtoolError for what the run would find out only later (a file that
-    an option names, a package that it needs), and takes no time. checkpoint: the file of the workspace that a later run
-    goes on from; without it a failed run leaves no workspace. networks: it runs neural networks, so that its command
-    takes --device."""
+    options): called before any work; it takes no time, and raises a GdtoolError for what the run would find out only
+    later (a file that an option names, a package that it needs). checkpoint: the file of the workspace that a later run
+    goes on from; without it a failed run leaves no workspace. networks: the stage runs neural networks, so its command
+    takes --device.
+    """
 
     name: str
     version: int
@@ -114,7 +116,7 @@ class Stage:
 
 
 class Output:
-    """The unpublished folder a run writes into, and the record it keeps of the run."""
+    """Hold the unpublished folder that a run writes, and the record of the run."""
 
     def __init__(self, folder: Path, workspace: Path, threads: int, device: str):
         self.folder, self.place_of_workspace = folder, workspace
@@ -125,20 +127,20 @@ class Output:
         self.warnings: list[str] = []
 
     def path(self, relative: str) -> Path:
-        """Where to write a file of the result; its parents exist."""
+        """Return where to write a file of the result, and make the folders above it."""
         path = self.folder / relative
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
     @property
     def workspace(self) -> Path:
-        """A folder that survives a kill and is removed when the result is published: checkpoints, caches."""
+        """Folder that survives a kill and is removed when the result is published: for checkpoints and caches."""
         self.place_of_workspace.mkdir(parents=True, exist_ok=True)
         return self.place_of_workspace
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Time a step; its seconds go into the manifest, added up when a name comes twice."""
+        """Measure the seconds of a block for the manifest; blocks of the same name are added up."""
         log.say(f"  {name}", at=log.VERBOSE)
         start = time.perf_counter()
         try:
@@ -147,12 +149,12 @@ class Output:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
     def skip(self, what: str, reason: str, saved_seconds: float | None = None) -> None:
-        """Record work that the scene did not need."""
+        """Record work that the scene or the options did not need."""
         self.skipped.append(Skip(what, reason, saved_seconds))
         log.say(f"  skipped {what}: {reason}", at=log.VERBOSE)
 
     def warn(self, text: str) -> None:
-        """Record a warning and tell it."""
+        """Record a warning and show it."""
         self.warnings.append(text)
         log.say(f"warning: {text}")
 

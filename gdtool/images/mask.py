@@ -1,5 +1,4 @@
-"""Where the subject of a picture is: its alpha, a mask given with it, what a network says, or its difference from the
-background."""
+"""Find the subject of a picture: by a mask, its alpha, a network, or its difference from the background."""
 
 from __future__ import annotations
 
@@ -23,14 +22,17 @@ def foreground(
     tell: Callable[[str], None] = lambda text: None,
     network: str | Path | None = None,
 ) -> np.ndarray:
-    """Coverage (h, w) float32 in [0, 1] of a picture's subject.
+    """Find the coverage (h, w) of a picture's subject, float32 in [0, 1].
 
-    image (h, w, c) as read_image gives it; mask (h, w[, c]) of the same size, brighter or more opaque is subject. In
-    this order: the mask; the picture's own alpha, unless it is opaque everywhere; the network (matting.py), where one
-    is given; segmentation against a background that is plain (a smooth gradient and soft shadows are); GrabCut against
-    one that is not. That is a guess (one in four that it does not refuse lacks or has too much:
-    docs/benchmarks/cutout.md), and `tell` is told.
-    Raises InputError, naming `subject`, for a picture or mask without a subject, or a background that it blends into.
+    image (h, w, c): as read_image returns it. mask (h, w[, c]): of the same size, the subject brighter or more opaque.
+
+    The first of these decides: the mask; the picture's alpha, unless it is opaque everywhere; the network (matting.py),
+    where one is given; segmentation where the background is plain, gradients and soft shadows included; GrabCut where
+    it is not. GrabCut guesses: one result in four that it does not refuse lacks a part or has too much
+    (docs/benchmarks/cutout.md). So `tell` gets a warning.
+
+    Raises InputError, naming `subject`, for a picture or mask without a subject, or a subject that blends into its
+    background.
     """
     image = image.reshape(*image.shape[:2], -1)
     if mask is not None:
@@ -56,6 +58,7 @@ def foreground(
 
 
 def _mask_coverage(mask: np.ndarray) -> np.ndarray:
+    """Convert a mask picture to coverage: its alpha where that has transparent parts, else its brightness."""
     pixels = np.clip(unit_range(mask), 0, 1).astype(np.float32).reshape(*mask.shape[:2], -1)
     if pixels.shape[2] in (2, 4) and pixels[..., -1].min() < 0.5:
         return pixels[..., -1]
@@ -63,13 +66,13 @@ def _mask_coverage(mask: np.ndarray) -> np.ndarray:
 
 
 def _encoded(image: np.ndarray) -> np.ndarray:
-    """sRGB (h, w, 3) in [0, 1] of a picture as read_image gives it."""
+    """Return the sRGB color (h, w, 3) in [0, 1] of a picture as read_image returns it."""
     color = rgba(image)[..., :3]
     return srgb_from_linear(np.clip(color, 0, 1)) if image.dtype.kind == "f" else color
 
 
 def _salient(image: np.ndarray, subject: object, network: str | Path) -> np.ndarray:
-    """Coverage by a trained network."""
+    """Find the coverage by a trained network. Raises InputError where it finds nothing, or all of the picture."""
     from gdtool.images.matting import saliency
 
     coverage = _without_specks(saliency(_encoded(image), network)).astype(np.float32)
@@ -79,8 +82,7 @@ def _salient(image: np.ndarray, subject: object, network: str | Path) -> np.ndar
 
 
 def _segmented(image: np.ndarray, subject: object, tell: Callable[[str], None]) -> np.ndarray:
-    """Coverage by the difference from a background model fitted to the border, its edge by random walks (Grady
-    2006)."""
+    """Find the coverage by the difference from a plain background, its edge by random walks (Grady 2006)."""
     from skimage.color import rgb2lab
     from skimage.segmentation import random_walker
     from skimage.transform import resize
@@ -110,8 +112,10 @@ def _segmented(image: np.ndarray, subject: object, tell: Callable[[str], None]) 
 
 
 def _labels(lab: np.ndarray, color: np.ndarray, subject: object, tell: Callable[[str], None]) -> np.ndarray:
-    """Labels (h, w) as of _trimap, by the difference from a plain background, else by GrabCut. lab and color (h, w, 3)
-    are one picture."""
+    """Label pixels as _trimap does, by the difference from a plain background, else by GrabCut.
+
+    lab and color (h, w, 3) are the same picture.
+    """
     fitted = _background(lab)
     if fitted is None:
         labels = _labels_without_plain_background(color, subject)
@@ -134,6 +138,7 @@ def _labels(lab: np.ndarray, color: np.ndarray, subject: object, tell: Callable[
 
 
 def _labels_without_plain_background(color: np.ndarray, subject: object) -> np.ndarray:
+    """Label pixels as _trimap does, by GrabCut; a band along its edge is undecided."""
     from scipy import ndimage
 
     from gdtool.images.cutout import cut_out
@@ -146,10 +151,10 @@ def _labels_without_plain_background(color: np.ndarray, subject: object) -> np.n
 
 
 def _background(lab: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Lab (h, w, 3) of the background everywhere, and its noise: a quadratic in x and y fitted to the border.
+    """Fit a plain background to the border: a quadratic in x and y for each Lab channel.
 
-    Pixels far from the fit are left out again and again, so a subject may touch some of the border. None where no
-    such fit holds for more than half of it.
+    Returns the background's Lab (h, w, 3) and its noise. Pixels far from the fit are left out repeatedly, so a subject
+    may touch a part of the border. None where no fit holds for more than half of it.
     """
     height, width = lab.shape[:2]
     y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
@@ -178,8 +183,11 @@ def _background(lab: np.ndarray) -> tuple[np.ndarray, float] | None:
 
 
 def _trimap(distance: np.ndarray, sure: float, spread: float) -> np.ndarray:
-    """Labels (h, w): 1 subject, 2 background, 0 to be decided. distance (h, w) is the colour difference from the
-    background."""
+    """Label pixels (h, w) by their colour distance (h, w) from the background.
+
+    1 is the subject, 2 the background, 0 undecided. sure: the distance above which a pixel is the subject. spread: the
+    noise of the background.
+    """
     from scipy import ndimage
 
     near = distance < sure
@@ -207,7 +215,7 @@ def _trimap(distance: np.ndarray, sure: float, spread: float) -> np.ndarray:
 
 
 def _without_specks(coverage: np.ndarray) -> np.ndarray:
-    """coverage without pieces smaller than a hundredth of the largest."""
+    """Remove pieces that are smaller than a hundredth of the largest."""
     from scipy import ndimage
 
     pieces, count = ndimage.label(coverage > 0.5)

@@ -1,5 +1,4 @@
-"""A subject cut out by a network that was trained to: U²-Net (Qin et al. 2020) as an ONNX file, run by onnxruntime
-(gdtool[matting])."""
+"""Cut out a subject by a trained network: U²-Net (Qin et al. 2020) as an ONNX file, run by onnxruntime."""
 
 from __future__ import annotations
 
@@ -15,11 +14,14 @@ MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's 
 
 
 def saliency(color: np.ndarray, network: str | Path) -> np.ndarray:
-    """Coverage (h, w) float32 in [0, 1] of what stands out in a picture, color (h, w, 3) sRGB in [0, 1].
+    """Find the coverage (h, w) of the subject of a picture, float32 in [0, 1].
 
-    network: an .onnx file of U²-Net's structure: one picture (1, 3, s, s), normalised as ImageNet's, to maps (1, 1, s,
-    s) of which the first counts, stretched to [0, 1] as the authors do. Raises ResourceError without onnxruntime,
-    InputError for a file that is no such network or gives nothing finite."""
+    color (h, w, 3): sRGB in [0, 1]. network: an .onnx file with the structure of U²-Net. It takes one picture (1, 3, s,
+    s), normalised as ImageNet's, and returns maps (1, 1, s, s). The first one is used, stretched to [0, 1] as the
+    authors do.
+
+    Raises ResourceError without onnxruntime, InputError for a file that is no such network or returns nothing finite.
+    """
     from skimage.transform import resize
 
     onnxruntime = imported_if_installed("onnxruntime")

@@ -1,10 +1,11 @@
-"""Mesh with texture coordinates to an engine-ready asset: maps from the surface it came from, .glb, quad .obj, OpenUSD.
+"""Bake a mesh with texture coordinates to an engine-ready asset: maps, .glb, quad .obj, OpenUSD.
 
 Use it after unwrap. Base color, occlusion-roughness-metallic and tangent-space normals are read texel by texel from the
-surface: from its confident views where there are any (found along the provenance chain), else from its vertices, or
-from the textures of the model that was remeshed. The picture that sample-views made the views of adds what it shows
-finer than they. Maps that would be constant become factors, a flat normal map is left out. Without --size a texel is as
-fine as the source's detail: a texel of its textures, half a pixel of its views, a pixel of the picture.
+surface that the mesh was made from: from its confident views where there are any (found along the provenance chain),
+else from its vertices, or from the textures of the model that was remeshed. Detail that is finer than the views comes
+from the picture that sample-views made them from. A map that would be constant becomes a factor, a flat normal map is
+left out. Without --size a texel is as fine as the source's detail: a texel of its textures, half a pixel of its views,
+a pixel of the picture.
 
 Example:
   gdtool bake cat.asset/atlas --size 2048 --lods 4
@@ -92,7 +93,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 def check(inputs: Inputs, options: Options) -> None:
-    """Raise what --model, --usd and a missing surface would stop the run with."""
+    """Refuse, before the run, a bad --model, --usd without its package, and a mesh with nothing to bake from."""
     from gdtool.stages import early
 
     if options.usd != "none":

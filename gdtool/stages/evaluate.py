@@ -1,10 +1,9 @@
 """Measure a result against a reference, and print the figures.
 
 Use it at the end of a pipe, or on any two of: folders of views, surface, mesh, atlas, asset or renders, and model
-files. Geometry is measured against geometry in two protocols, pictures against pictures, whatever both hold. Without
---reference the model that the result came from is found along its provenance, and the views it came from say what part
-of the truth was seen. An asset is also rendered through the cameras of those views. docs/metrics.md says what each
-figure is.
+files. Shapes are compared by two protocols, pictures by image metrics. Without --reference the model that the result
+was made from is found along its provenance. The views that it was made from tell which part of the model was seen, and
+an asset is also rendered through their cameras. docs/metrics.md defines each figure.
 
 Example:
   gdtool render-dataset procedural:7 | gdtool reconstruct | gdtool evaluate
@@ -29,7 +28,7 @@ Report = dict[str, bool | int | float | str]
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How to measure."""
+    """Options of evaluate."""
 
     frame: Annotated[
         Literal["auto", "source", "box", "same"],

@@ -1,9 +1,9 @@
-"""Pictures made by another program to a views folder that reconstruct reads.
+"""Convert pictures of another program to a views folder that reconstruct reads.
 
 Use it on a Wonder3D output folder (colors and normals of six views), on a folder with NeRF's transforms.json, or on a
-plain folder with a cameras.json (docs/format.md's) and pictures as DOMAIN/VIEW.png or VIEW.png. The mask is the
-picture's alpha or a mask/VIEW.png, else the subject is told from a plain background. The object is moved into the
-normalised frame.
+plain folder with a cameras.json (see docs/format.md) and pictures as DOMAIN/VIEW.png or VIEW.png. The mask is
+mask/VIEW.png or the picture's alpha; without them the subject is cut out of a plain background. The object is moved
+into the normalised frame.
 
 Example:
   gdtool import-views outputs/cropsize-192-cfg1.0/owl | gdtool reconstruct

@@ -1,8 +1,8 @@
-"""Views to a watertight surface with albedo, roughness and metallic at every vertex.
+"""Reconstruct a watertight surface from views, with albedo, roughness and metallic at every vertex.
 
-Use it after sample-views or render-dataset, or on a views folder of your own. Any subset of the domains will do: depth
-and normals shape the surface where there are any, silhouettes bound it, material views color it. The grid method
-(default) carves and refines a signed distance grid in seconds; the paper method fits the SDF and material networks.
+Use it after sample-views or render-dataset, or on a views folder of your own. Any subset of the domains is accepted:
+depth and normals shape the surface, silhouettes bound it, material views color it. The grid method (default) carves and
+refines a signed distance grid in seconds; the paper method fits networks of distance and material.
 
 Example:
   gdtool reconstruct cat.asset/views
@@ -69,7 +69,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 def check(inputs: Inputs, options: Options) -> None:
-    """Raise UsageError for domains that there are not."""
+    """Raise UsageError for an unknown domain."""
     unknown = sorted(set(options.ignore) - set(DOMAINS))
     if unknown:
         raise UsageError("--ignore", f"{unknown[0]!r} is no domain", f"choose from {', '.join(DOMAINS)}")

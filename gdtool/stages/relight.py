@@ -1,9 +1,9 @@
-"""Pictures of an asset or a model under any light.
+"""Render pictures of an asset or a model under any light.
 
-Use it to see what bake made, to compare lights, and for turntables. Takes an asset folder or a .glb, .gltf, .obj, .ply
-or .stl file, and lights it by one of the bundled lights or by a lat-long .hdr or .exr image (--env). --light says how:
-sampled becomes exact with more samples, prefiltered is quick and close, sg is what training and reconstruction compute
-with. --budget and --target-psnr say how long to go on instead of --samples.
+Use it to see a baked asset, to compare lights, and for turntables. It takes an asset folder or a .glb, .gltf, .obj,
+.ply or .stl file, and lights it by one of the bundled lights or by a lat-long .hdr or .exr image (--env). --light
+chooses the method: sampled becomes exact with more samples, prefiltered is quick and close, sg is the one that training
+and reconstruction use. --budget and --target-psnr end the rendering instead of --samples.
 
 Example:
   gdtool relight cat.asset/asset --env bright --views 8
@@ -87,7 +87,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 def check(inputs: Inputs, options: Options) -> None:
-    """Raise what --env and options that exclude one another would stop the run with."""
+    """Refuse, before the run, a bad --env and options that exclude one another."""
     from gdtool.shading.lights.bundled import BUNDLED
     from gdtool.stages import early
 

@@ -1,9 +1,8 @@
-"""Surface to clean quads: about as many as asked, along creases and flat parts, watertight where the surface is.
+"""Turn a surface into clean quads along creases and flat parts, watertight where the surface is.
 
 Use it after reconstruct, or on any mesh file (.obj, .ply, .stl, .glb) whose triangles you want to edit, subdivide or
-animate. Bevels that marching cubes left are restored to the creases they cut off. A mesh that already meets the
-request is passed through. --triangles N decimates instead; --symmetry auto mirrors one half where the surface allows
-it.
+animate. Bevels that marching cubes left are restored to sharp creases. A mesh that already meets the request is passed
+through. --triangles N decimates instead; --symmetry auto mirrors one half where the surface is symmetric.
 
 Example:
   gdtool remesh cat.asset/surface --faces 20000
@@ -149,7 +148,7 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
 
 
 def _with_count(vertices, faces, options: Options, out: Output) -> Options:
-    """Return options with --quad-size turned into a number of faces."""
+    """Return options with --quad-size converted to a number of faces."""
     from gdtool.remesh.face_budget import quads_of_size
     from gdtool.remesh.limits import MAX_QUADS, MIN_QUADS
 
@@ -163,7 +162,7 @@ def _with_count(vertices, faces, options: Options, out: Output) -> Options:
 
 
 def _clean(vertices, faces, inputs: Inputs, options: Options, out: Output):
-    """Return repaired vertices and triangles; warn of what was repaired, of open surfaces and of hidden shells."""
+    """Repair vertices and triangles; warn of each repair, of open surfaces and of hidden shells."""
     from gdtool.geometry import repair, shells
     from gdtool.remesh.limits import SECONDS_PER_QUAD
     from gdtool.remesh.methods import repair_warnings
@@ -182,7 +181,7 @@ def _clean(vertices, faces, inputs: Inputs, options: Options, out: Output):
 
 
 def _goal(options: Options):
-    """Return the room's Goal from the options."""
+    """Make the room's Goal of the options."""
     from gdtool.remesh.methods import Goal
     from gdtool.remesh.task import Request
 

@@ -1,9 +1,9 @@
-"""Ground-truth views of PBR models: lit color, normal, depth, albedo, roughness, metallic and mask.
+"""Render ground-truth views of PBR models: lit color, normal, depth, albedo, roughness, metallic and mask.
 
 Use it to make training data, to feed a model you already have into reconstruct, and to judge a finished asset: with
 --cameras it is rendered through the cameras of other views. Sources are .glb, .gltf, .obj, .ply or .stl files, and
 procedural:SEED or procedural:FIRST..LAST for generated objects. Faces are seen from both sides; BLEND materials are
-seen where alpha is at least one half.
+opaque where alpha is at least one half.
 
 Example:
   gdtool render-dataset procedural:0..9 -o data
@@ -85,7 +85,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 def check(inputs: Inputs, options: Options) -> None:
-    """Raise what --light and options that contradict one another would stop the run with."""
+    """Refuse, before the run, a bad --light and options that contradict one another."""
     from gdtool.shading.lights.bundled import BUNDLED
     from gdtool.stages import early
 

@@ -87,7 +87,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 def check(inputs: Inputs, options: Options) -> None:
-    """Raise what --mask and --matting would stop the run with."""
+    """Refuse, before the run, a bad --mask and a --matting without its package."""
     from gdtool.stages import early
 
     if options.mask is not None:

@@ -1,11 +1,13 @@
 """Train the multi-view PBR diffusion model on rendered objects.
 
-Takes a dataset folder (or any views folders with all six domains) of render-dataset and writes a model folder for
-sample-views: weights, configuration, card, loss curve and validation images. Use it to train the small configuration on
-a processor, to go on from a model you have (--start; with --size, at a larger size), or, with --preset paper, to grow
-Stable Diffusion to six domains. Killed at any time, the same line goes on where it was. Sources may be .tar files of
-views folders, plain or in WebDataset's naming. `torchrun --nproc_per_node N -m -- gdtool train …` trains in N processes
-(GDTOOL_SHARD=1 splits the weights as well). --plan tells what a configuration costs, without data.
+It takes a dataset folder of render-dataset, or any views folders with all six domains, also in .tar files, plain or in
+WebDataset's naming. It writes a model folder for sample-views: weights, configuration, card, loss curve and validation
+images.
+
+Use it to train the small configuration on a processor, to go on from a model you have (--start; with --size, at a
+larger size), or, with --preset paper, to extend Stable Diffusion to six domains. Killed at any time, the same command
+goes on where it was. `torchrun --nproc_per_node N -m -- gdtool train …` trains in N processes (GDTOOL_SHARD=1 splits
+the weights as well). --plan predicts the cost of a configuration, without data.
 
 Example:
   gdtool render-dataset procedural:0..99 --size 64 -o objects && gdtool train objects --minutes 60 -o my-model
@@ -86,7 +88,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 def check(inputs: Inputs, options: Options) -> None:
-    """Raise what --config, --tensorboard and --held-out would stop the run with."""
+    """Refuse, before the run, a bad --config, --tensorboard without its package, and too many --held-out."""
     from gdtool.stages import early
 
     configured(options)
@@ -147,7 +149,7 @@ def follow(threads: int) -> None:
 
 
 def dismiss() -> None:
-    """End the first of several processes, its work done, and let the others go."""
+    """Let the other processes end, as the first one's last step."""
     from gdtool.diffusion.training import distributed
 
     distributed.leave()
@@ -162,7 +164,7 @@ def plan(options: Options, as_json: bool) -> str:
 
 
 def configured(options: Options):
-    """Return the preset with the changes of the ablation, of --config and of the flags. Raises InputError."""
+    """Apply the ablation, --config and the flags to the preset. Raises InputError."""
     from gdtool.diffusion.configure import configuration
 
     # Without --steps the minutes decide when the training ends.

@@ -1,8 +1,8 @@
-"""Mesh to atlas: few charts, cut along quad edges and creases, flattened without mirroring and packed for mip-mapping.
+"""Unwrap a mesh: few charts, cut along quad edges and creases, flattened without mirroring, packed for mip-mapping.
 
-Use it after remesh, or on a mesh file of your own. Texture coordinates that a mesh already has are kept when they are
-valid, unless --redo. With --symmetry the halves of a symmetric mesh share their texels. layout.png shows the charts,
-checkerboard.png the mesh under them.
+Use it after remesh, or on a mesh file of your own. Valid texture coordinates of the mesh are kept, unless --redo. With
+--symmetry the halves of a symmetric mesh share their texels. layout.png shows the charts, checkerboard.png the mesh
+with a checkerboard in them.
 
 Example:
   gdtool unwrap cat.asset/mesh --size 2048
@@ -110,7 +110,7 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
 
 
 def _keeps_uv(mesh, options: Options, inputs: Inputs, out: Output) -> bool:
-    """Whether the mesh's own texture coordinates are kept; say so, or warn why they are not."""
+    """Tell whether the mesh's own texture coordinates are kept; record it, or warn why they are not."""
     import numpy as np
 
     from gdtool.unwrap.pipeline import invalid_reason
@@ -126,7 +126,7 @@ def _keeps_uv(mesh, options: Options, inputs: Inputs, out: Output) -> bool:
 
 
 def _unwrapped(mesh, padding: int, options: Options, inputs: Inputs, out: Output):
-    """Return the mesh with new texture coordinates, what was tried, and the twin (f,) of each face or -1."""
+    """Make new texture coordinates; returns the mesh, the failed attempts, and the twin (f,) of each face or -1."""
     import numpy as np
 
     from gdtool.folders.mesh import QuadMesh
@@ -151,7 +151,7 @@ def _unwrapped(mesh, padding: int, options: Options, inputs: Inputs, out: Output
 
 
 def _report(mesh, twin, kept: bool, options: Options, inputs: Inputs, out: Output) -> dict:
-    """Return figures of the texture coordinates; warn of mirrored and overlapping charts."""
+    """Measure the texture coordinates; warn of mirrored and overlapping charts."""
     import numpy as np
 
     from gdtool.unwrap.pipeline import figures, texels_per_unit
@@ -173,7 +173,7 @@ def _report(mesh, twin, kept: bool, options: Options, inputs: Inputs, out: Outpu
 
 
 def _twins(mesh, options: Options, inputs: Inputs, out: Output):
-    """Return twins and corners as mirror_twins() does; nothing has a twin without --symmetry."""
+    """Find twins and corners as mirror_twins() does; without --symmetry no face has a twin."""
     import numpy as np
 
     from gdtool.unwrap.symmetry import mirror_twins

@@ -61,7 +61,7 @@ def _checks() -> ModuleType:
 
 
 def _unreadable_as_fault(check: Callable[[], Iterator[str]]) -> Iterator[str]:
-    """Yield the faults that a check finds; where it cannot read a file, that is the last one."""
+    """Yield the faults that a check finds; a file that it cannot read is the last one."""
     try:
         yield from check()
     except InputError as error:

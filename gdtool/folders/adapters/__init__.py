@@ -1,7 +1,8 @@
-"""Readers of other programs' pictures: each turns a folder into cameras and images in gdtool's conventions.
+"""Read other programs' pictures: each adapter turns a folder into cameras and images in gdtool's conventions.
 
-An adapter is a module with `recognises(folder) -> bool` and `read(folder) -> Pictures`; ADAPTERS lists them in the
-order in which they are asked. Add a module and its name, and `gdtool import-views` reads one format more."""
+An adapter is a module with `recognises(folder) -> bool` and `read(folder) -> Pictures`. ADAPTERS lists them in the
+order in which they are asked. For another format, add a module and its name.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +22,10 @@ MIN_COVERAGE = 1 / 512  # of a pixel: half a step of 8-bit storage; what is belo
 
 @dataclass(frozen=True)
 class Pictures:
-    """What an adapter read: one image size, any subset of the domains.
+    """Hold what an adapter read: images of one size, in any subset of the domains.
 
-    images: domain to (k, h, w, 3) or (k, h, w) float32 as folders.views.Views holds them (linear colors, normals in
-    world axes, depth along the axis); mask (k, h, w). up: the world axis that points up, "y" or "z".
+    images: domain to (k, h, w, 3) or (k, h, w) float32 as in folders.views.Views (linear colors, normals in world axes,
+    depth along the axis). mask (k, h, w). up: the world axis that points up, "y" or "z".
     """
 
     cameras: list[Camera]
@@ -34,7 +35,7 @@ class Pictures:
 
 
 def adapter(folder: Path, name: str = "auto") -> ModuleType:
-    """Return the adapter of that name, or the first that recognises the folder. Raises InputError."""
+    """Return the adapter of a name, or the first one that recognises the folder. Raises InputError."""
     for known in ADAPTERS if name == "auto" else (name,):
         module = import_module(f"{__name__}.{known}")
         if module.recognises(folder):
@@ -48,7 +49,10 @@ def adapter(folder: Path, name: str = "auto") -> ModuleType:
 
 
 def linear_color(image: np.ndarray) -> np.ndarray:
-    """(h, w, 3) linear float32 of a picture as read_image gives it: integers are sRGB, floats linear."""
+    """Convert a picture as read_image returns it to linear color (h, w, 3), float32.
+
+    Integers are sRGB, floats linear.
+    """
     from gdtool.images.color import linear_from_srgb, unit_range
 
     image = np.repeat(image, 3, -1)[..., :3] if image.shape[-1] < 3 else image[..., :3]
@@ -56,7 +60,7 @@ def linear_color(image: np.ndarray) -> np.ndarray:
 
 
 def stacked(parts: list[np.ndarray], paths: list[Path]) -> np.ndarray:
-    """Images of one size as one array. Raises InputError naming the first of another size."""
+    """Stack images of one size. Raises InputError naming the first of another size."""
     for part, path in zip(parts, paths, strict=True):
         if part.shape != parts[0].shape:
             raise InputError(
